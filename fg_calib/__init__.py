@@ -1,0 +1,93 @@
+"""fg_calib: robot-arm calibration as a factor graph.
+
+    robot = read_robot("robot.yaml")
+    measurements = read_measurements("poses.csv", robot, noise=Noise(position=1e-3, orientation=2e-4))
+    problem = build_problem(robot, measurements, model="distance-rotation")
+    solution = solve(problem)
+    uncertainty = assess(solution)
+    print(format_report(solution, uncertainty))
+
+Names are imported when they are first used, so that `fg-calib --help` need not wait for GTSAM.
+"""
+
+from __future__ import annotations
+
+import logging
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
+    from fg_calib.files.job import Job, read_job
+    from fg_calib.files.robot_yaml import read_robot, write_robot
+    from fg_calib.files.tables import read_measurements
+    from fg_calib.files.units import Units
+    from fg_calib.kinematics import pose
+    from fg_calib.measurements import Measurements, Noise, Pairing
+    from fg_calib.problem import Problem, build_problem
+    from fg_calib.report import format_report
+    from fg_calib.results import result_document, write_results
+    from fg_calib.robot import Robot
+    from fg_calib.solve import Solution, SolverOptions, solve
+    from fg_calib.uncertainty import Uncertainty, assess
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
+    "fg_calib.files.job": ("Job", "read_job"),
+    "fg_calib.files.robot_yaml": ("read_robot", "write_robot"),
+    "fg_calib.files.tables": ("read_measurements",),
+    "fg_calib.files.units": ("Units",),
+    "fg_calib.kinematics": ("pose",),
+    "fg_calib.measurements": ("Measurements", "Noise", "Pairing"),
+    "fg_calib.problem": ("Problem", "build_problem"),
+    "fg_calib.report": ("format_report",),
+    "fg_calib.results": ("result_document", "write_results"),
+    "fg_calib.robot": ("Robot",),
+    "fg_calib.solve": ("Solution", "SolverOptions", "solve"),
+    "fg_calib.uncertainty": ("Uncertainty", "assess"),
+}
+_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
+
+__all__ = [
+    "CalibrationError",
+    "InputError",
+    "Job",
+    "Measurements",
+    "Noise",
+    "Pairing",
+    "Problem",
+    "ProblemError",
+    "Robot",
+    "Solution",
+    "SolverError",
+    "SolverOptions",
+    "Uncertainty",
+    "Units",
+    "assess",
+    "build_problem",
+    "format_report",
+    "pose",
+    "read_job",
+    "read_measurements",
+    "read_robot",
+    "result_document",
+    "solve",
+    "write_results",
+    "write_robot",
+]
+
+logging.getLogger(__name__).addHandler(logging.NullHandler())
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name from the module where it lives."""
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOME_OF[name]), name)
+
+
+def __dir__() -> list[str]:
+    """The public names."""
+    return sorted([*globals(), *__all__])
