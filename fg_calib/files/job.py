@@ -1,0 +1,164 @@
+"""Calibration jobs: which robot, which measurements, which model."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, StrictBool
+
+from fg_calib.errors import InputError
+from fg_calib.files.robot_yaml import read_robot, robot_from_mapping
+from fg_calib.files.schema import Count, NotNegative, Positive, Schema, read_yaml, shown, validate
+from fg_calib.files.tables import read_measurements
+from fg_calib.files.units import Units
+from fg_calib.measurements import Measurements, Model, Noise, Pairing
+from fg_calib.robot import Robot
+
+Frame = Literal["known", "unknown"]
+
+
+@dataclass(frozen=True)
+class Job:
+    """A calibration job with everything it refers to.
+
+    Attributes:
+        path: The job's file.
+        robot: The robot as it is before the calibration.
+        measurements: What was measured.
+        model: What is compared with the measurements.
+        pairing: How pairs are formed where they come from poses.
+        frame: Whether the measurement frame is the base frame (`known`) or to be estimated.
+        prior: Whether the tolerances are used as priors; None: where the robot has them.
+        loss: The robust loss; `none` is least squares.
+        units: The units of the tables and of the noise.
+        inputs: SHA-256 of every file read, by its path relative to the job.
+    """
+
+    path: Path
+    robot: Robot
+    measurements: Measurements
+    model: Model
+    pairing: Pairing
+    frame: Frame
+    prior: bool | None
+    loss: str
+    units: Units
+    inputs: dict[str, str]
+
+
+class _Noise(Schema):
+    position: Positive | None = None
+    orientation: Positive | None = None
+    joint: Any = 0.0  # an `_OneFigure` or a `_FigureEach`
+    distance: Positive | None = None
+    angle: Positive | None = None
+
+
+class _OneFigure(Schema):
+    joint: NotNegative
+
+
+class _FigureEach(Schema):
+    joint: tuple[NotNegative, ...]
+
+
+class _RandomPairing(Schema):
+    random: Annotated[Count, Field(gt=0)]
+    seed: Count = 0
+
+
+class _Job(Schema):
+    robot: Any  # a path, or the mapping of a robot file
+    measurements: str
+    pairs: str | None = None
+    model: Model
+    pairing: Any = "star"  # a strategy's name, or a `_RandomPairing`
+    frame: Frame = "known"
+    units: Units = Units()
+    noise: _Noise = _Noise()
+    prior: StrictBool | None = None
+    loss: str = "none"
+
+
+def read_job(path: Path | str) -> Job:
+    """The calibration job in a YAML file, with its robot and its measurements.
+
+    Args:
+        path: The job; the paths in it are relative to its folder.
+
+    Raises:
+        InputError: It or a file that it names is missing or cannot be used.
+    """
+    path = Path(path)
+    folder = path.parent
+    file = validate(_Job, read_yaml(path), path.name)
+    if file.loss != "none":
+        raise InputError(
+            f"{path.name}: loss", f"found {shown(file.loss)}", "none", "robust losses are not available yet"
+        )
+    pairing = _pairing(file.pairing, f"{path.name}: pairing")
+    robot, robot_files = _robot(file.robot, f"{path.name}: robot", folder)
+    measurements = read_measurements(
+        folder / file.measurements,
+        robot,
+        pairs=None if file.pairs is None else folder / file.pairs,
+        units=file.units,
+        noise=_noise(file.noise, file.units, robot, f"{path.name}: noise"),
+    )
+    names = [path.name, *robot_files, file.measurements, *([file.pairs] if file.pairs else [])]
+    inputs = {name: _sha256(folder / name) for name in names}
+    return Job(path, robot, measurements, file.model, pairing, file.frame, file.prior, file.loss, file.units, inputs)
+
+
+def _robot(given: object, place: str, folder: Path) -> tuple[Robot, list[str]]:
+    """The robot and the files that it was read from, relative to `folder`."""
+    if isinstance(given, dict):
+        robot = robot_from_mapping(given, place, folder)
+        return robot, [given["urdf"]] if robot.urdf else []
+    if not isinstance(given, str):
+        raise InputError(place, f"found {shown(given)}", "a path, or the mapping of a robot file")
+    robot = read_robot(folder / given)
+    if robot.urdf is None or given.lower().endswith(".urdf"):
+        return robot, [given]
+    return robot, [given, str(PurePath(given).parent / read_yaml(folder / given)["urdf"])]
+
+
+def _pairing(given: object, place: str) -> Pairing:
+    match given:
+        case "star" | "chain" | "all":
+            return Pairing(given)
+        case dict():
+            file = validate(_RandomPairing, given, place)
+            return Pairing("random", file.random, file.seed)
+    raise InputError(place, f"found {shown(given)}", "one of star, chain, all, {random: N, seed: S}")
+
+
+def _noise(file: _Noise, units: Units, robot: Robot, place: str) -> Noise:
+    """The noise in [m] and [rad], that of the readings joint by joint."""
+    figures: tuple[float, ...]
+    if isinstance(file.joint, list):
+        figures = validate(_FigureEach, {"joint": file.joint}, place).joint
+        if len(figures) != robot.n_joints:
+            expected = f"one for all or {robot.n_joints}, one a joint"
+            raise InputError(f"{place}: joint", f"{len(figures)} figures", expected)
+    else:
+        figures = (validate(_OneFigure, {"joint": file.joint}, place).joint,) * robot.n_joints
+
+    def si(figure: float | None, unit: str) -> float | None:
+        return None if figure is None else figure * units.factor(unit)
+
+    return Noise(
+        position=si(file.position, "m"),
+        orientation=si(file.orientation, "rad"),
+        joint=tuple(f * units.factor(j.unit) for f, j in zip(figures, robot.joints, strict=True)),
+        distance=si(file.distance, "m"),
+        angle=si(file.angle, "rad"),
+    )
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,270 @@
+"""Robots in YAML: a DH convention with a row a joint, or a URDF with what it cannot hold itself.
+
+```yaml
+name: arm                              urdf: arm.urdf        # relative to this file
+convention: mdh                        base_link: base_link  # default: the root link
+units: {length: mm, angle: deg}        tip_link: flange      # default: the only leaf link
+joints:                                units: {length: mm, angle: deg}
+  - {a: 0, alpha: 0, d: 340, theta: 0, limits: [-170, 170]}
+  - {a: 0, alpha: -90, d: 0, theta: 0, type: prismatic, name: slide}
+```
+Both take `name`, `base`, `tool`, `fixed`, `estimate` and `tolerance` too. Rows without `name` are called q1 to qn.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import Field
+
+from fg_calib.errors import InputError
+from fg_calib.files.disk import write_text
+from fg_calib.files.schema import Bound, Number, Positive, Schema, read_yaml, shown, validate
+from fg_calib.files.units import Units
+from fg_calib.robot import (
+    AXIS_OF_KIND,
+    CONVENTIONS,
+    FRAME_KINDS,
+    Axis,
+    Joint,
+    Parameter,
+    Robot,
+    RobotBuilder,
+    tolerance_kind,
+)
+
+
+class _Frame(Schema):
+    x: Number = 0.0
+    y: Number = 0.0
+    z: Number = 0.0
+    roll: Number = 0.0
+    pitch: Number = 0.0
+    yaw: Number = 0.0
+
+    def si(self, units: Units) -> dict[str, float]:
+        """The six values by kind, [m] and [rad]."""
+        return {kind: getattr(self, kind) * units.factor(_unit_of_kind(kind)) for kind in FRAME_KINDS}
+
+
+class _Robot(Schema):
+    """The keys that both forms of a robot file have."""
+
+    name: str | None = None
+    units: Units = Units()
+    base: _Frame = _Frame()
+    tool: _Frame = _Frame()
+    fixed: tuple[str, ...] = ()
+    estimate: tuple[str, ...] = ()
+    tolerance: dict[str, Positive] = Field(default_factory=dict)
+
+    def choices(self) -> dict[str, Any]:
+        """What `RobotBuilder.build` wants to know, [m] and [rad]."""
+        tolerance = {key: value * self.units.factor(_unit_of_key(key)) for key, value in self.tolerance.items()}
+        return {"fixed": self.fixed, "estimate": self.estimate, "tolerance": tolerance}
+
+
+_Limits = Annotated[list[Bound], Field(min_length=2, max_length=2)]
+
+
+class _Row(Schema):
+    type: Literal["revolute", "prismatic"] = "revolute"
+    name: str | None = None
+    a: Number | None = None
+    alpha: Number | None = None
+    d: Number | None = None
+    theta: Number | None = None
+    beta: Number = 0.0
+    limits: _Limits | None = None
+
+
+class _DhRobot(_Robot):
+    convention: Literal["dh", "mdh", "mdh-hayati", "dh-hayati"]
+    joints: Annotated[list[_Row], Field(min_length=1)]
+
+
+class _UrdfRobot(_Robot):
+    urdf: str
+    base_link: str | None = None
+    tip_link: str | None = None
+
+
+def read_robot(path: Path | str, *, base_link: str | None = None, tip_link: str | None = None) -> Robot:
+    """The robot in a YAML file or a URDF, told apart by the ending `.urdf`.
+
+    Args:
+        path: The file.
+        base_link: Link of the URDF where the chain starts, instead of the one the file names.
+        tip_link: Link of the URDF where the chain ends, instead of the one the file names.
+
+    Raises:
+        InputError: There is no such file, or it does not describe a robot.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".urdf":
+        from fg_calib.files.urdf import read_urdf
+
+        return read_urdf(path, base_link=base_link, tip_link=tip_link)
+    mapping = read_yaml(path)
+    if "urdf" in mapping:
+        links = {"base_link": base_link, "tip_link": tip_link}
+        return robot_from_mapping(mapping | {k: v for k, v in links.items() if v is not None}, path.name, path.parent)
+    if base_link is not None or tip_link is not None:
+        raise InputError(path.name, "a robot without links", "a URDF", "base_link and tip_link name links of one")
+    return robot_from_mapping({"name": path.stem} | mapping, path.name, path.parent)
+
+
+def robot_from_mapping(mapping: Mapping[str, Any], place: str, folder: Path) -> Robot:
+    """The robot that a mapping of a YAML file describes.
+
+    Args:
+        mapping: The mapping: with `urdf`, or with `convention` and `joints`.
+        place: Its file, and its key there if it is not the whole file.
+        folder: What the path of a URDF is relative to.
+
+    Raises:
+        InputError: It does not describe a robot.
+    """
+    if "urdf" in mapping:
+        return _build_urdf(validate(_UrdfRobot, dict(mapping), place), place, folder)
+    return _build_dh(validate(_DhRobot, dict(mapping), place), place)
+
+
+def _build_urdf(file: _UrdfRobot, place: str, folder: Path) -> Robot:
+    from fg_calib.files.urdf import read_urdf
+
+    return read_urdf(
+        folder / file.urdf,
+        base_link=file.base_link,
+        tip_link=file.tip_link,
+        name=file.name,
+        base=file.base.si(file.units),
+        tool=file.tool.si(file.units),
+        place=place,
+        **file.choices(),
+    )
+
+
+def _build_dh(file: _DhRobot, place: str) -> Robot:
+    builder = RobotBuilder(file.name or "robot", file.convention)
+    builder.add_frame("base", file.base.si(file.units), 0, False)
+    names = [row.name or f"q{i}" for i, row in enumerate(file.joints, start=1)]
+    for i, (row, name) in enumerate(zip(file.joints, names, strict=True), start=1):
+        here = f"{place}: joint {i}"
+        if name in names[: i - 1]:
+            raise InputError(f"{here}: name", f"found {name!r}, the name of joint {names.index(name) + 1}", "another")
+        values = {}
+        for kind in CONVENTIONS[file.convention]:
+            value = getattr(row, kind)
+            if value is None:
+                raise InputError(here, f"missing key {kind!r}")
+            values[kind] = value * file.units.factor(_unit_of_kind(kind))
+        if row.beta != 0.0 and "beta" not in values:
+            raise InputError(
+                f"{here}: beta",
+                f"found {row.beta!r}",
+                f"none: the convention {file.convention} has no beta",
+                f"{file.convention}-hayati has",
+            )
+        lower, upper = row.limits or (-math.inf, math.inf)
+        if not lower < upper:
+            raise InputError(f"{here}: limits", f"found {shown([lower, upper])}", "lower below upper")
+        joint = Joint(name, prismatic=row.type == "prismatic")
+        factor = file.units.factor(joint.unit)
+        builder.add_convention_joint(Joint(name, joint.prismatic, lower * factor, upper * factor), values)
+    builder.add_frame("tool", file.tool.si(file.units), len(file.joints) + 1, False)
+    return builder.build(place=place, **file.choices())
+
+
+def write_robot(path: Path | str, robot: Robot, *, units: Units | None = None, urdf_name: str | None = None) -> None:
+    """Write a robot YAML that `read_robot` reads back to the same robot.
+
+    Args:
+        path: The file to write.
+        robot: The robot; its nominal values are written.
+        units: The file's units; default m and rad, in which every value reads back exactly.
+        urdf_name: For a URDF robot the path of its URDF, relative to `path`: the file refers to it and holds
+            what it cannot. The joints' own values are those of the URDF: see `write_urdf`.
+
+    Raises:
+        InputError: The folder does not exist or may not be written to.
+        ValueError: A URDF robot without `urdf_name`, or the other way round.
+    """
+    if (robot.urdf is None) != (urdf_name is None):
+        raise ValueError("a URDF robot, and no other, is written with urdf_name")
+    units = units or Units()
+    mapping: dict[str, Any] = {"name": robot.name}
+    if robot.urdf is None:
+        mapping |= {"convention": robot.convention}
+    else:
+        mapping |= {"urdf": urdf_name, "base_link": robot.urdf.base_link, "tip_link": robot.urdf.tip_link}
+    mapping |= {"units": _Flow(units.model_dump())}
+    if robot.urdf is None:
+        mapping |= {"joints": [_row(robot, i, units) for i in range(robot.n_joints)]}
+    base, tool = robot.owned_by(0), robot.owned_by(robot.n_joints + 1)
+    for key, owned in (("base", base), ("tool", tool)):
+        frame = [robot.parameters[i] for i in owned]
+        mapping |= {key: _Flow((p.kind, units.from_si(p.nominal, p.unit)) for p in frame if p.nominal != 0.0)}
+    frames = {*base, *tool}
+    mapping |= {
+        "fixed": [p.name for i, p in enumerate(robot.parameters) if i not in frames and not p.estimated],
+        "estimate": [p.name for i, p in enumerate(robot.parameters) if i in frames and p.estimated],
+        "tolerance": _Flow(_tolerances(robot, units)),
+    }
+    kept = {key: value for key, value in mapping.items() if value or key == "joints"}
+    write_text(Path(path), yaml.dump(kept, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=math.inf))
+
+
+def _unit_of_kind(kind: str) -> str:
+    """`m` or `rad`: the unit of a kind of parameter."""
+    return "m" if AXIS_OF_KIND[kind] < Axis.RX else "rad"
+
+
+def _unit_of_key(key: str) -> str:
+    """The unit of a tolerance by kind (`a`, `tool`) or by name (`alpha3`, `elbow.yaw`)."""
+    kind = re.sub(r".*\.|\d+$", "", key)
+    return _unit_of_kind(kind) if kind in AXIS_OF_KIND else "m"
+
+
+def _row(robot: Robot, index: int, units: Units) -> dict[str, Any]:
+    joint = robot.joints[index]
+    row: dict[str, Any] = {} if joint.name == f"q{index + 1}" else {"name": joint.name}
+    owned: list[Parameter] = [robot.parameters[i] for i in robot.owned_by(index + 1)]
+    row |= {p.kind: units.from_si(p.nominal, p.unit) for p in owned}
+    if joint.prismatic:
+        row["type"] = "prismatic"
+    if (joint.lower, joint.upper) != (-math.inf, math.inf):
+        row["limits"] = [units.from_si(limit, joint.unit) for limit in (joint.lower, joint.upper)]
+    return _Flow(row)
+
+
+def _tolerances(robot: Robot, units: Units) -> dict[str, float]:
+    """Tolerances by kind where all parameters of the kind share one, by name elsewhere."""
+    by_kind: dict[str | None, set[float | None]] = {}
+    for p in robot.parameters:
+        by_kind.setdefault(tolerance_kind(p), set()).add(p.tolerance)
+    tolerances = {}
+    for p in robot.parameters:
+        if p.tolerance is not None:
+            kind = tolerance_kind(p)
+            shared = kind is not None and len(by_kind[kind]) == 1
+            tolerances[kind if kind and shared else p.name] = units.from_si(p.tolerance, p.unit)
+    return tolerances
+
+
+class _Flow(dict[str, Any]):
+    """A mapping to be written on one line."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """The safe dumper, with rows and frames on one line."""
+
+
+_Dumper.add_representer(
+    _Flow, lambda dumper, row: dumper.represent_mapping("tag:yaml.org,2002:map", row, flow_style=True)
+)
