@@ -1,0 +1,375 @@
+"""GTSAM's side: which parameters are which variable, and measurements and priors as factors.
+
+| key | variable |
+|---|---|
+| `K(i)` | estimated parameters of joint i, a vector of just those |
+| `K(0)`, `K(n + 1)` | the same of the base, and of the tool where not all six of its parameters are estimated |
+| `T(0)` | the tool frame as a Pose3, where all six are |
+| `X(0)` | world_T_base as a Pose3, where the measurement frame is unknown |
+
+Pose3's tangent is rotation first, and a step moves the frame in itself (`pose * Exp(step)`).
+
+GTSAM 4.3 ends the interpreter when a custom factor leaves a Jacobian unset or gets its rows wrong, and returns the
+initial values without a word when it gets the columns wrong. So `custom_factor` alone fills its lists, after checks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib import residuals
+from fg_calib.errors import SolverError
+from fg_calib.kinematics import Chain, build_chain
+from fg_calib.residuals import Block
+from fg_calib.robot import FRAME_KINDS, Robot, names_of
+
+Floats = NDArray[np.float64]
+
+GRAM_ROWS = 20_000
+"""Blocks with more rows than this are reduced by their Gram matrix, if their conditioning allows it."""
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One GTSAM variable.
+
+    Attributes:
+        key: GTSAM's key.
+        symbol: How it is written: `K(3)`, `T(0)`, `X(0)`.
+        kind: A vector of parameters, the tool's pose, or the measurement frame's.
+        parameters: Indices into the parameter vector of `Variables.parameters`, in the variable's own order;
+            for poses in the order of `FRAME_KINDS`.
+        columns: Its columns in a Jacobian.
+    """
+
+    key: int
+    symbol: str
+    kind: Literal["vector", "tool", "frame"]
+    parameters: tuple[int, ...]
+    columns: slice
+
+
+@dataclass(frozen=True)
+class Variables:
+    """All variables of a problem, and the way between GTSAM's values and the parameter vector.
+
+    The parameter vector has the robot's parameters, then the measurement frame's six in the order of `FRAME_KINDS`.
+
+    Attributes:
+        robot: The robot, nominal.
+        items: The variables in the order of their columns.
+        names: Name of each estimated scalar, shape (n_columns,): a parameter's, or `frame.x` ... `frame.yaw`. Of a
+            pose the names stand in `FRAME_KINDS`' order although its columns are tangent directions.
+        chain: The kinematic chain with these columns.
+    """
+
+    robot: Robot
+    items: tuple[Variable, ...]
+    names: tuple[str, ...]
+    chain: Chain
+
+    @property
+    def n_columns(self) -> int:
+        """Number of columns of a Jacobian: the dimension of the tangent space."""
+        return len(self.names)
+
+    @property
+    def keys(self) -> list[int]:
+        """GTSAM's keys in the order of the columns."""
+        return [v.key for v in self.items]
+
+    @property
+    def n_robot_columns(self) -> int:
+        """Number of columns without the measurement frame's, which come last."""
+        return self.n_columns - 6 * any(v.kind == "frame" for v in self.items)
+
+    @property
+    def scales(self) -> Floats:
+        """A change of ordinary size in each column: tolerance, else 1 mm or 1 mrad, shape (n_columns,)."""
+        scales = np.full(self.n_columns, 1e-3)
+        for v in self.items:
+            if v.kind == "vector":
+                scales[v.columns] = [self.robot.parameters[i].scale for i in v.parameters]
+        return scales
+
+    def nominal(self) -> Floats:
+        """The parameter vector at the robot's nominal values, with the identity as measurement frame."""
+        return np.concatenate([self.robot.nominal, np.zeros(6)])
+
+    def values(self, parameters: Floats) -> gtsam.Values:
+        """GTSAM's values at a parameter vector."""
+        values = gtsam.Values()
+        for v in self.items:
+            chosen = parameters[list(v.parameters)]
+            values.insert(v.key, chosen if v.kind == "vector" else pose_of(chosen))
+        return values
+
+    def parameters(self, values: gtsam.Values) -> Floats:
+        """The parameter vector at GTSAM's values; what is not a variable keeps its nominal value."""
+        parameters = self.nominal()
+        for v in self.items:
+            chosen = values.atVector(v.key) if v.kind == "vector" else frame_of(values.atPose3(v.key))
+            parameters[list(v.parameters)] = chosen
+        return parameters
+
+    def step(self, start: gtsam.Values, end: gtsam.Values) -> Floats:
+        """The tangent step from some values to others, shape (n_columns,)."""
+        return np.concatenate(
+            [
+                end.atVector(v.key) - start.atVector(v.key)
+                if v.kind == "vector"
+                else gtsam.Pose3.Logmap(start.atPose3(v.key).between(end.atPose3(v.key)))
+                for v in self.items
+            ]
+        )
+
+    def named_derivative(self, parameters: Floats) -> Floats:
+        """Derivative of the named scalars in the columns, shape (n_columns, n_columns).
+
+        The identity but for poses, where it maps the tangent (rotation first) to x, y, z, yaw, pitch, roll.
+
+        Note:
+            At a pitch of a quarter turn roll and yaw have no derivative; the entries are then infinite or nan.
+        """
+        D = np.eye(self.n_columns)
+        for v in self.items:
+            if v.kind != "vector":
+                D[v.columns, v.columns] = _frame_derivative(parameters[list(v.parameters)])
+        return D
+
+    def describe(self, key: int) -> str:
+        """A key in words: `K(3) (a3, alpha3, d3)`."""
+        for v in self.items:
+            if v.key == key:
+                return f"{v.symbol} ({', '.join(self.names[v.columns])})"
+        return str(gtsam.Symbol(key))
+
+
+def build_variables(robot: Robot, frame: bool) -> Variables:
+    """The variables of a robot's estimated parameters, and of the measurement frame where it is unknown."""
+    items: list[Variable] = []
+    names: list[str] = []
+    columns: dict[int, int] = {}
+    tool_tangent = frame_tangent = None
+    for owner in range(robot.n_joints + 2):
+        owned = robot.owned_by(owner)
+        chosen = [i for i in owned if robot.parameters[i].estimated]
+        if not chosen:
+            continue
+        first = len(names)
+        names += names_of(robot.parameters[i] for i in chosen)
+        span = slice(first, len(names))
+        if owner == robot.n_joints + 1 and len(chosen) == 6:
+            tool_tangent = first
+            items.append(Variable(gtsam.symbol("T", 0), "T(0)", "tool", tuple(chosen), span))
+        else:
+            columns |= {i: first + k for k, i in enumerate(chosen)}
+            items.append(Variable(gtsam.symbol("K", owner), f"K({owner})", "vector", tuple(chosen), span))
+    if frame:
+        frame_tangent = len(names)
+        names += [f"frame.{kind}" for kind in FRAME_KINDS]
+        parameters = tuple(range(len(robot.parameters), len(robot.parameters) + 6))
+        span = slice(frame_tangent, len(names))
+        items.append(Variable(gtsam.symbol("X", 0), "X(0)", "frame", parameters, span))
+    chain = build_chain(robot, columns, tool_tangent=tool_tangent, frame_tangent=frame_tangent, frame=frame)
+    return Variables(robot, tuple(items), tuple(names), chain)
+
+
+def pose_of(frame: Floats) -> gtsam.Pose3:
+    """The pose of x, y, z, yaw, pitch, roll, [m] and [rad]."""
+    x, y, z, yaw, pitch, roll = (float(v) for v in frame)
+    return gtsam.Pose3(gtsam.Rot3.Ypr(yaw, pitch, roll), np.array([x, y, z]))
+
+
+def frame_of(pose: gtsam.Pose3) -> Floats:
+    """x, y, z, yaw, pitch, roll of a pose, [m] and [rad]."""
+    return np.concatenate([pose.translation(), pose.rotation().ypr()])
+
+
+def _frame_derivative(frame: Floats) -> Floats:
+    """Derivative of x, y, z, yaw, pitch, roll in Pose3's tangent (rotation first, in itself), shape (6, 6)."""
+    pitch, roll = frame[4], frame[5]
+    D = np.zeros((6, 6))
+    D[:3, 3:] = pose_of(frame).rotation().matrix()
+    # Body rates of Rz(yaw) Ry(pitch) Rx(roll), solved for the angles' rates.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        secant, tangent = np.float64(1.0) / np.cos(pitch), np.tan(pitch)
+        D[3, :3] = [0.0, np.sin(roll) * secant, np.cos(roll) * secant]
+        D[4, :3] = [0.0, np.cos(roll), -np.sin(roll)]
+        D[5, :3] = [1.0, np.sin(roll) * tangent, np.cos(roll) * tangent]
+    return D
+
+
+Residual = Callable[[gtsam.Values], Floats]
+Linearised = Callable[[gtsam.Values], tuple[Floats, Floats]]
+
+
+def custom_factor(
+    variables: Sequence[Variable], n_rows: int, residual: Residual, linearise: Linearised
+) -> gtsam.CustomFactor:
+    """A factor over whitened residuals: the one place where GTSAM's Jacobian lists are filled.
+
+    Args:
+        variables: The variables it depends on.
+        n_rows: Number of residuals.
+        residual: Whitened residuals at some values, shape (n_rows,).
+        linearise: The same with their derivatives, shape (n_rows, n_columns), in the variables' columns.
+
+    Raises:
+        SolverError: On linearising, if shapes are wrong or a derivative is not finite.
+    """
+    spans = [v.columns for v in variables]
+    n_columns = max(s.stop for s in spans)
+    symbols = ", ".join(v.symbol for v in variables)
+
+    def evaluate(_: gtsam.CustomFactor, values: gtsam.Values, H: list[Floats] | None) -> Floats:
+        if H is None:
+            r = residual(values)
+            if r.shape != (n_rows,):
+                raise SolverError(f"factor on {symbols}: residual of shape {r.shape}, expected ({n_rows},)")
+            return r
+        r, J = linearise(values)
+        if r.shape != (n_rows,) or J.shape != (n_rows, n_columns):
+            expected = f"({n_rows},), ({n_rows}, {n_columns})"
+            raise SolverError(f"factor on {symbols}: shapes {r.shape}, {J.shape}, expected {expected}")
+        if not (np.isfinite(r).all() and np.isfinite(J).all()):
+            raise SolverError(f"factor on {symbols}: a residual or derivative is not finite")
+        for i, span in enumerate(spans):
+            H[i] = J[:, span]
+        return r
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(n_rows), [v.key for v in variables], evaluate)
+
+
+def measurement_factor(block: Block, variables: Variables) -> gtsam.CustomFactor:
+    """A block of measurements as one factor; a block of one measurement is that measurement's own factor.
+
+    A block of more rows than the variables have columns is handed to GTSAM as the triangular factor of
+    [J r]: with `[J r] = Q [[R, z], [0, rho]]` the residual (z, rho) and the Jacobian (R, 0) have the same cost,
+    gradient and Gauss-Newton Hessian in n_columns + 1 rows.
+    """
+    n_rows = block.n * block.height
+    n_all = variables.n_columns + 1
+    chain = variables.chain
+
+    def at(values: gtsam.Values) -> Chain:
+        return chain.at(variables.parameters(values))
+
+    if n_rows <= n_all:
+
+        def residual(values: gtsam.Values) -> Floats:
+            return residuals.residual(block, at(values)).ravel()
+
+        def linearise(values: gtsam.Values) -> tuple[Floats, Floats]:
+            r, J = residuals.linearise(block, at(values))
+            return r.ravel(), J.reshape(n_rows, -1)
+
+        return custom_factor(variables.items, n_rows, residual, linearise)
+
+    reduce = Reduction(block)
+
+    def reduced_residual(values: gtsam.Values) -> Floats:
+        r = np.zeros(n_all)
+        r[0] = np.sqrt(residuals.squared_norm(block, at(values)))
+        return r
+
+    def reduced_linearise(values: gtsam.Values) -> tuple[Floats, Floats]:
+        R = reduce(at(values))
+        return R[:, -1], R[:, :-1]
+
+    return custom_factor(variables.items, n_all, reduced_residual, reduced_linearise)
+
+
+class Reduction:
+    """Square root of [J r]^T [J r], chosen by the conditioning met at the first linearisation.
+
+    The QR reduction keeps the conditioning. The Gram matrix takes a third of the time and squares it, which is
+    harmless where every singular value is either that of a dead direction or above 1e-5 of the largest.
+    """
+
+    def __init__(self, block: Block) -> None:
+        self._block = block
+        self._gram = False
+        self._decided = block.n * block.height <= GRAM_ROWS
+
+    def __call__(self, chain: Chain) -> Floats:
+        """A square matrix R with R^T R = [J r]^T [J r], shape (n_columns + 1, n_columns + 1)."""
+        if self._gram:
+            return square_root(residuals.gram(self._block, chain))
+        R = residuals.triangle(self._block, chain)
+        if not self._decided:
+            self._decided = True
+            self._gram = well_conditioned(R[:, :-1])
+        return R
+
+
+def square_root(gram: Floats) -> Floats:
+    """A square matrix R with R^T R = gram, which may be singular."""
+    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
+    root: Floats = np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] * vectors.T * scale
+    return root
+
+
+def well_conditioned(R: Floats) -> bool:
+    """Whether the singular values of R, columns scaled to length 1, are dead or above 1e-5 of the largest."""
+    lengths = np.linalg.norm(R, axis=0)
+    s = np.linalg.svd(R[:, lengths > 0.0] / lengths[lengths > 0.0], compute_uv=False)
+    return not bool(np.any((s > 1e-12 * s[0]) & (s < 1e-5 * s[0])))
+
+
+def prior_rows(variables: Variables, parameters: Floats, only: Variable | None = None) -> tuple[Floats, Floats]:
+    """Whitened priors (value - nominal) / tolerance and their derivatives, shapes (n_priors,), (n_priors, n_columns).
+
+    Args:
+        variables: The variables.
+        parameters: The parameter vector.
+        only: The variable whose priors are wanted; all if None.
+    """
+    D = variables.named_derivative(parameters)
+    nominal = variables.nominal()
+    r: list[float] = []
+    J: list[Floats] = []
+    for v in variables.items if only is None else (only,):
+        if v.kind == "frame":
+            continue
+        for k, i in enumerate(v.parameters):
+            parameter = variables.robot.parameters[i]
+            if parameter.tolerance is not None:
+                off = parameters[i] - nominal[i]
+                if v.kind == "tool" and parameter.unit == "rad":
+                    off = (off + np.pi) % (2 * np.pi) - np.pi
+                r.append(off / parameter.tolerance)
+                J.append(D[v.columns.start + k] / parameter.tolerance)
+    return np.array(r), np.array(J).reshape(len(r), variables.n_columns)
+
+
+def prior_factors(variables: Variables) -> list[gtsam.CustomFactor]:
+    """One factor for each variable that has parameters with a tolerance."""
+    factors = []
+    for v in variables.items:
+        n_rows = len(prior_rows(variables, variables.nominal(), v)[0])
+        if n_rows:
+            factors.append(_prior_factor(variables, v, n_rows))
+    return factors
+
+
+def _prior_factor(variables: Variables, variable: Variable, n_rows: int) -> gtsam.CustomFactor:
+    local = Variable(
+        variable.key, variable.symbol, variable.kind, variable.parameters, slice(0, len(variable.parameters))
+    )
+
+    def rows(values: gtsam.Values) -> tuple[Floats, Floats]:
+        parameters = variables.nominal()
+        chosen = values.atVector(variable.key) if variable.kind == "vector" else frame_of(values.atPose3(variable.key))
+        parameters[list(variable.parameters)] = chosen
+        r, J = prior_rows(variables, parameters, variable)
+        return r, J[:, variable.columns]
+
+    return custom_factor([local], n_rows, lambda values: rows(values)[0], rows)

@@ -1,0 +1,244 @@
+"""Levenberg-Marquardt by GTSAM, with a status of our own.
+
+GTSAM's optimiser takes the steps, one `iterate` at a time; whether it has arrived is judged here, because GTSAM returns
+without a word when it is stuck. The judge is the *decrement*: how far, in sigma, the Gauss-Newton step still leads
+along the directions that data and priors determine (the square root of the cost decrease it predicts, times two).
+
+Directions that nothing determines are left where they are: the damping `lambda I` never falls to zero, so every step is
+a minimum-norm step (lambda's floor is 1e-14 of the largest curvature: too little to slow any determined direction).
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.errors import SolverError
+from fg_calib.factors import Variables
+from fg_calib.problem import Problem, frames_only, judged_at
+from fg_calib.residuals import single_threaded_blas
+
+Floats = NDArray[np.float64]
+
+RANK_TOLERANCE = 1e-10
+"""A direction with less than this of the largest singular value is not determined."""
+
+
+@dataclass(frozen=True)
+class SolverOptions:
+    """Settings of the solver.
+
+    Attributes:
+        max_iterations: Steps after which it gives up.
+        decrement: Converged when a step began nearer than this to the optimum, [sigma]; far less is left after it.
+        lambda_ceiling: Damping beyond which it gives up, as a multiple of the largest curvature.
+        lambda_floor: Least damping, as a multiple of the largest curvature.
+        max_rounds: Times that rows are judged and whitened anew at the estimate.
+    """
+
+    max_iterations: int = 100
+    decrement: float = 1e-5
+    lambda_ceiling: float = 1e6
+    lambda_floor: float = 1e-14
+    max_rounds: int = 5
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One step of the solver.
+
+    Attributes:
+        cost: Half the sum of squared whitened residuals after the step.
+        damping: Levenberg-Marquardt's lambda after the step.
+        step: Length of the step, in changes of ordinary size (tolerances, else 1 mm and 1 mrad).
+        decrement: How far from the optimum it started, [sigma].
+    """
+
+    cost: float
+    damping: float
+    step: float
+    decrement: float
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What the solver found.
+
+    Attributes:
+        problem: The problem solved; its rows are judged at the estimate.
+        values: GTSAM's values at the estimate.
+        parameters: The parameter vector there (see `Variables`).
+        before: The parameter vector with the arm at nominal, and frame, base and tool alone fitted.
+        converged: Whether the optimum was reached.
+        message: Why it stopped.
+        history: Its steps.
+        initial_cost: Cost at `before`.
+        cost: Cost at the estimate.
+        seconds: Time taken.
+    """
+
+    problem: Problem
+    values: gtsam.Values
+    parameters: Floats
+    before: Floats
+    converged: bool
+    message: str
+    history: tuple[Iteration, ...]
+    initial_cost: float
+    cost: float
+    seconds: float
+
+    @property
+    def iterations(self) -> int:
+        """Number of steps."""
+        return len(self.history)
+
+
+def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
+    """Estimate the parameters.
+
+    First measurement frame, base and tool alone with the arm at nominal, then everything. Then the rows are judged and
+    whitened at the estimate; where that changes them, the solver goes on with the new rows.
+
+    Raises:
+        SolverError: GTSAM could not solve a step at all.
+    """
+    options = options or SolverOptions()
+    clock = time.perf_counter()
+    with single_threaded_blas():
+        before = problem.start
+        frames = frames_only(problem)
+        if frames is not None:
+            before = _Run(frames, options).parameters
+        run = _Run(judged_at(problem, before) if frames is not None else problem, options)
+        initial_cost, history = run.initial_cost, run.history
+        changed, rounds = False, 0
+        while run.converged and rounds < options.max_rounds:
+            again = judged_at(problem, run.parameters)
+            changed = _differs(run.problem, again)
+            if not changed:
+                break
+            run = _Run(again, options)
+            history = history + run.history
+            rounds += 1
+    message = run.message
+    if run.converged and changed and rounds == options.max_rounds:
+        message += "; which rows take part still changed"
+    return Solution(
+        problem=run.problem,
+        values=run.values,
+        parameters=run.parameters,
+        before=before,
+        converged=run.converged,
+        message=message,
+        history=tuple(history),
+        initial_cost=initial_cost,
+        cost=run.cost,
+        seconds=time.perf_counter() - clock,
+    )
+
+
+class _Run:
+    """One optimisation of one problem, from its start to the end."""
+
+    def __init__(self, problem: Problem, options: SolverOptions) -> None:
+        self.problem = problem
+        self.history: list[Iteration] = []
+        self.converged = False
+        variables = problem.variables
+        initial = problem.initial
+        try:
+            self.initial_cost = problem.graph.error(initial)
+            if not np.isfinite(self.initial_cost):
+                raise SolverError(
+                    f"the cost at the start is {self.initial_cost}: the measurements or the robot hold absurd numbers"
+                )
+            curvature = _largest_curvature(problem.graph.linearize(initial), variables.keys)
+            optimizer = gtsam.LevenbergMarquardtOptimizer(problem.graph, initial, _parameters(options, curvature))
+            self.message = self._iterate(optimizer, variables, options)
+        except RuntimeError as error:
+            raise SolverError(_in_words(str(error), variables)) from error
+        self.values = gtsam.Values(optimizer.values())
+        self.cost = optimizer.error()
+        self.parameters = variables.parameters(self.values)
+
+    def _iterate(
+        self, optimizer: gtsam.LevenbergMarquardtOptimizer, variables: Variables, options: SolverOptions
+    ) -> str:
+        values, cost = gtsam.Values(optimizer.values()), optimizer.error()
+        for _ in range(options.max_iterations):
+            decrement = _decrement(optimizer.iterate(), variables)
+            previous, values = values, gtsam.Values(optimizer.values())  # a copy: GTSAM hands out its own
+            last, cost = cost, optimizer.error()
+            step = _step_length(previous, values, variables)
+            self.history.append(Iteration(cost, optimizer.lambda_(), step, decrement))
+            if not np.isfinite(cost):
+                return f"not converged: the cost became {cost}"
+            if decrement <= options.decrement:
+                self.converged = True
+                return f"converged: the last step began {decrement:.1e} sigma from the optimum"
+            if cost >= last:
+                # The end of double precision, if hardly anything was left to gain.
+                self.converged = decrement <= max(1e-3, 1e-6 * np.sqrt(2.0 * cost))
+                if self.converged:
+                    return f"converged to rounding: no step lowers the cost, {decrement:.1e} sigma left"
+                return f"not converged: no step lowers the cost although {decrement:.1e} sigma are left to go"
+        return f"not converged: {options.max_iterations} iterations, {decrement:.1e} sigma left to go"
+
+
+def _parameters(options: SolverOptions, curvature: float) -> gtsam.LevenbergMarquardtParams:
+    """GTSAM's options: QR, lambda I damping, and no stopping rule of its own that could act before ours."""
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setLinearSolverType("MULTIFRONTAL_QR")
+    parameters.setDiagonalDamping(False)
+    parameters.setlambdaInitial(1e-8 * curvature)
+    parameters.setlambdaFactor(10.0)
+    parameters.setlambdaLowerBound(options.lambda_floor * curvature)
+    parameters.setlambdaUpperBound(options.lambda_ceiling * curvature)
+    parameters.setRelativeErrorTol(1e-13)  # no search for a lambda once the cost's own rounding decides
+    parameters.setAbsoluteErrorTol(0.0)
+    parameters.setMaxIterations(options.max_iterations + 1)
+    return parameters
+
+
+def _dense(linear: gtsam.GaussianFactorGraph, keys: list[int]) -> tuple[Floats, Floats]:
+    """The linear graph as one matrix in the order of the columns, and its right-hand side."""
+    ordering = gtsam.Ordering()
+    for key in keys:
+        ordering.push_back(key)
+    return linear.jacobian(ordering)
+
+
+def _largest_curvature(linear: gtsam.GaussianFactorGraph, keys: list[int]) -> float:
+    A, _ = _dense(linear, keys)
+    return max(float(np.max(np.sum(A * A, axis=0))), 1e-12)
+
+
+def _decrement(linear: gtsam.GaussianFactorGraph, variables: Variables) -> float:
+    """Length of the Gauss-Newton step in sigma, along determined directions only."""
+    A, b = _dense(linear, variables.keys)
+    U, s, _ = np.linalg.svd(A * variables.scales, full_matrices=False)
+    return float(np.linalg.norm((U.T @ b)[s > RANK_TOLERANCE * s[0]]))
+
+
+def _step_length(previous: gtsam.Values, values: gtsam.Values, variables: Variables) -> float:
+    return float(np.linalg.norm(variables.step(previous, values) / variables.scales))
+
+
+def _differs(old: Problem, new: Problem) -> bool:
+    """Whether rows were judged otherwise, or their sigma moved by more than 0.1 %."""
+    return old.judgement != new.judgement or not np.allclose(old.sigma, new.sigma, rtol=1e-3, atol=0.0, equal_nan=True)
+
+
+def _in_words(message: str, variables: Variables) -> str:
+    """GTSAM's message in one line, with the key it names as our variable and its parameters."""
+    found = re.search(r"Symbol:\s*(\w)(\d+)", message)
+    if "ndetermin" in message and found:
+        key = gtsam.symbol(found.group(1), int(found.group(2)))
+        return f"the linear system has no unique solution near {variables.describe(key)}"
+    return " ".join(message.split())

@@ -1,0 +1,370 @@
+"""How well the estimate is known: covariance, chi-square, residuals before and after, what the data determine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+from scipy.spatial.transform import Rotation
+
+from fg_calib import residuals
+from fg_calib.factors import pose_of, prior_rows
+from fg_calib.observability import RANK_TOLERANCE, SUPPORT_TOLERANCE, IdentifiabilityClass, Observability, analyse
+from fg_calib.problem import PAIR_KINDS, POSE_KINDS, Problem, all_rows
+from fg_calib.solve import Solution
+
+Floats = NDArray[np.float64]
+Booleans = NDArray[np.bool_]
+Integers = NDArray[np.int64]
+
+CONFIDENCE = 0.999
+"""A reduced chi-square outside this interval of its distribution, and outside `FACTOR`, is not to be trusted."""
+
+FACTOR = 2.0
+"""A reduced chi-square between 1 / FACTOR and FACTOR is good whatever its distribution: noise is never known better."""
+
+
+@dataclass(frozen=True)
+class ParameterEstimate:
+    """One parameter of the robot after calibration.
+
+    Attributes:
+        name: Its name.
+        unit: `m` or `rad`.
+        nominal: Nominal value.
+        estimate: Estimated value; nominal if it is fixed.
+        sigma: 1 sigma; 0 if fixed; None where neither data nor prior determine it.
+        prior_sigma: 1 sigma of its prior; None without one.
+        identifiability: What the data alone say of it: `independent`, `relative`, `ineffective`; or `fixed`.
+    """
+
+    name: str
+    unit: str
+    nominal: float
+    estimate: float
+    sigma: float | None
+    prior_sigma: float | None
+    identifiability: IdentifiabilityClass | str
+
+    @property
+    def correction(self) -> float:
+        """Estimate minus nominal; angles of a frame by the shorter way."""
+        difference = self.estimate - self.nominal
+        return (difference + np.pi) % (2 * np.pi) - np.pi if "." in self.name and self.unit == "rad" else difference
+
+
+@dataclass(frozen=True)
+class FrameEstimate:
+    """The measurement frame world_T_base.
+
+    Attributes:
+        xyz: Translation, shape (3,), [m].
+        quaternion_xyzw: Rotation, shape (4,).
+        sigma: 1 sigma of a small motion of the frame in itself, rotation first, shape (6,), [rad] and [m]; nan where
+            nothing determines it.
+    """
+
+    xyz: Floats
+    quaternion_xyzw: Floats
+    sigma: Floats
+
+
+@dataclass(frozen=True)
+class ResidualTable:
+    """Every scalar residual, train and test, before and after; [m] and [rad].
+
+    Attributes:
+        kind: `distance`, `angle`, `position.x`, ..., `orientation.z` of each row, shape (n,).
+        a: Row of the (first) configuration, shape (n,).
+        b: Row of the second configuration, -1 for poses, shape (n,).
+        test: Predicted only, shape (n,).
+        reason: Why a row takes no part, empty where it does, shape (n,).
+        measured: Measured value; nan for orientations, shape (n,).
+        before: Residual with the arm at nominal, shape (n,).
+        after: Residual at the estimate, shape (n,).
+        sigma: 1 sigma of the residual, shape (n,).
+    """
+
+    kind: NDArray[np.str_]
+    a: Integers
+    b: Integers
+    test: Booleans
+    reason: NDArray[np.str_]
+    measured: Floats
+    before: Floats
+    after: Floats
+    sigma: Floats
+
+    def rms(self) -> dict[str, dict[str, dict[str, float]]]:
+        """RMS by split, kind (the norm of a position's or orientation's three components), before and after."""
+        table: dict[str, dict[str, dict[str, float]]] = {"train": {}, "test": {}}
+        used = self.reason == ""
+        family = np.char.partition(self.kind, ".")[:, 0] if len(self.kind) else self.kind
+        for split, of_split in (("train", ~self.test), ("test", self.test)):
+            for name in ("position", "orientation", "distance", "angle"):
+                rows = used & of_split & (family == name)
+                if rows.any():
+                    per_row = 3.0 if name in ("position", "orientation") else 1.0
+                    table[split][name] = {
+                        when: float(np.sqrt(per_row * np.mean(values[rows] ** 2)))
+                        for when, values in (("before", self.before), ("after", self.after))
+                    }
+        return table
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """What `assess` finds out about a solution.
+
+    Attributes:
+        names: Estimated parameters, in the order of the covariance.
+        covariance: Of the estimated parameters, [m] and [rad]; nan in rows and columns of what nothing determines.
+        parameters: Every parameter of the robot.
+        frame: The measurement frame; None where it was not estimated.
+        chi2: Sum of squared whitened residuals, priors included.
+        dof: Residuals and priors, less the determined directions.
+        chi2_bounds: Interval of the reduced chi-square that is taken as good.
+        residuals: Every residual, before and after.
+        observability: What the data alone determine, at the nominal parameters.
+        findings: Why the result is not to be trusted; empty if it is.
+    """
+
+    names: tuple[str, ...]
+    covariance: Floats
+    parameters: tuple[ParameterEstimate, ...]
+    frame: FrameEstimate | None
+    chi2: float
+    dof: int
+    chi2_bounds: tuple[float, float]
+    residuals: ResidualTable
+    observability: Observability
+    findings: tuple[str, ...]
+
+    @property
+    def reduced_chi2(self) -> float | None:
+        """Chi-square over its degrees of freedom; None without any."""
+        return self.chi2 / self.dof if self.dof > 0 else None
+
+    @property
+    def trustworthy(self) -> bool:
+        """Whether nothing speaks against the result."""
+        return not self.findings
+
+
+def assess(solution: Solution) -> Uncertainty:
+    """Covariance, goodness of fit, residuals and identifiability of a solution.
+
+    The covariance comes from a singular value decomposition of the whitened Jacobian of data and priors, its
+    columns scaled, at the estimate. Directions below `RANK_TOLERANCE` are undetermined: a parameter with a share in one
+    has unknown sigma (None, nan in the covariance). It is not rescaled by chi-square.
+
+    Note:
+        Away from the nominal parameters undetermined directions turn, by about as many radians as the angles were
+        corrected, and get a small share of parameters that they did not have at nominal. Unknown is what has a share
+        in one both at the nominal parameters and at the estimate; the others are known given that the undetermined
+        directions are near nominal.
+    """
+    problem = solution.problem
+    variables = problem.variables
+    data = _triangle(problem, solution.parameters)
+    D = variables.named_derivative(solution.parameters)
+    priors = prior_rows(variables, solution.parameters)[1]
+    scales, n_robot = variables.scales, variables.n_robot_columns
+    tangent, loose, rank = _covariance(np.vstack([data, priors]), scales)
+    nominal = np.vstack([_triangle(problem, solution.before), prior_rows(variables, solution.before)[1]])
+    loose_at_nominal = _covariance(nominal, scales)[1]
+
+    def covariance_of(rows: Floats) -> Floats:
+        """Covariance of linear functions of the columns, nan where undetermined."""
+        with np.errstate(invalid="ignore"):  # a pose at a quarter turn of pitch has no derivative
+            out: Floats = rows @ tangent @ rows.T
+        unknown = _has_share(rows, loose, scales) & _has_share(rows, loose_at_nominal, scales)
+        unknown |= ~np.isfinite(np.diag(out))
+        out[unknown, :] = np.nan
+        out[:, unknown] = np.nan
+        return out
+
+    covariance = covariance_of(D)
+    at_nominal = observe(problem, solution.before)
+    sigma = np.sqrt(np.diag(covariance))
+    frame = None
+    if n_robot < variables.n_columns:
+        world_T_base = pose_of(solution.parameters[-6:])
+        frame = FrameEstimate(
+            xyz=world_T_base.translation(),
+            quaternion_xyzw=Rotation.from_matrix(world_T_base.rotation().matrix()).as_quat(canonical=True),
+            sigma=np.sqrt(np.diag(covariance_of(np.eye(len(D)))))[n_robot:],
+        )
+    chi2 = 2.0 * solution.cost
+    dof = problem.n_residuals + problem.n_priors - rank
+    bounds = chi2_bounds(dof)
+    return Uncertainty(
+        names=variables.names[:n_robot],
+        covariance=covariance[:n_robot, :n_robot],
+        parameters=_parameter_estimates(solution, dict(zip(variables.names, sigma, strict=True)), at_nominal),
+        frame=frame,
+        chi2=chi2,
+        dof=dof,
+        chi2_bounds=bounds,
+        residuals=residual_table(solution),
+        observability=at_nominal,
+        findings=_findings(solution, chi2, dof, bounds),
+    )
+
+
+def observe(problem: Problem, parameters: Floats) -> Observability:
+    """What the train rows, without priors, determine of the robot's parameters around a parameter vector."""
+    variables = problem.variables
+    n_robot = variables.n_robot_columns
+    kind_of = {p.name: p.kind for p in problem.robot.parameters}
+    names = variables.names[:n_robot]
+    scale_of = {p.name: p.scale for p in problem.robot.parameters}
+    # From tangent columns to named ones; at a tool pitch of a quarter turn there is no way back: the nearest one.
+    D = variables.named_derivative(parameters)
+    back = np.linalg.pinv(np.nan_to_num(D, posinf=1e12, neginf=-1e12))
+    return analyse(
+        _triangle(problem, parameters) @ back,
+        names,
+        np.array([scale_of[name] for name in names]),
+        [kind_of[name] for name in names],
+        problem.n_pairs or problem.n_configurations,
+        variables.n_columns - n_robot,
+    )
+
+
+def chi2_bounds(dof: int) -> tuple[float, float]:
+    """Interval of the reduced chi-square taken as good: its central `CONFIDENCE`, widened to `FACTOR` either way."""
+    if dof <= 0:
+        return 0.0, np.inf
+    low, high = (2.0 * special.gammaincinv(dof / 2.0, p) / dof for p in ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))
+    return min(float(low), 1.0 / FACTOR), max(float(high), FACTOR)
+
+
+def residual_table(solution: Solution) -> ResidualTable:
+    """Every scalar residual, train and test, with the arm at nominal and at the estimate."""
+    problem = solution.problem
+    block = all_rows(problem)
+    chain = problem.variables.chain
+    before, after = (residuals.residual(block, chain.at(p)) for p in (solution.before, solution.parameters))
+    if problem.pairs is not None:
+        return _pair_table(problem, before, after)
+    return _pose_table(problem, before, after)
+
+
+def _triangle(problem: Problem, parameters: Floats) -> Floats:
+    """Triangular factor of the train rows' whitened Jacobian, shape (m, n_columns)."""
+    chain = problem.variables.chain.at(parameters)
+    parts = [residuals.triangle(block, chain)[:, :-1] for block in problem.blocks]
+    return np.vstack(parts) if len(parts) > 1 else parts[0]
+
+
+def _covariance(J: Floats, scales: Floats) -> tuple[Floats, Floats, int]:
+    """Covariance of the determined part; unit-free orthonormal undetermined directions; rank."""
+    n = J.shape[1]
+    _, s, Vt = np.linalg.svd(np.vstack([J * scales, np.zeros((n, n))]), full_matrices=False)
+    rank = int(np.sum(s > RANK_TOLERANCE * s[0]))
+    half = scales[:, None] * Vt[:rank].T / s[:rank]
+    return half @ half.T, Vt[rank:], rank
+
+
+def _has_share(rows: Floats, loose: Floats, scales: Floats) -> Booleans:
+    """Whether linear functions of the columns have a share in undetermined directions."""
+    with np.errstate(invalid="ignore"):
+        share = np.linalg.norm((rows * scales) @ loose.T, axis=1)
+        has: Booleans = share > SUPPORT_TOLERANCE * np.linalg.norm(rows * scales, axis=1)
+        return has
+
+
+def _parameter_estimates(
+    solution: Solution, sigma: dict[str, float], observability: Observability
+) -> tuple[ParameterEstimate, ...]:
+    classes = dict(zip(observability.names, observability.classes, strict=True))
+    found = []
+    for i, p in enumerate(solution.problem.robot.parameters):
+        s = sigma.get(p.name, 0.0)
+        found.append(
+            ParameterEstimate(
+                name=p.name,
+                unit=p.unit,
+                nominal=p.nominal,
+                estimate=float(solution.parameters[i]),
+                sigma=float(s) if np.isfinite(s) else None,
+                prior_sigma=p.tolerance if p.estimated else None,
+                identifiability=classes.get(p.name, "fixed"),
+            )
+        )
+    return tuple(found)
+
+
+def _findings(solution: Solution, chi2: float, dof: int, bounds: tuple[float, float]) -> tuple[str, ...]:
+    findings = []
+    if not solution.converged:
+        findings.append(solution.message)
+    if dof > 0 and not bounds[0] <= chi2 / dof <= bounds[1]:
+        high = chi2 / dof > 1.0
+        cause = "noise stated too small, effects not modelled, or outliers" if high else "noise stated too large"
+        findings.append(f"reduced chi-square {chi2 / dof:.3g} is outside [{bounds[0]:.2f}, {bounds[1]:.2f}]: {cause}")
+    return tuple(findings)
+
+
+def _pair_table(problem: Problem, before: Floats, after: Floats) -> ResidualTable:
+    pairs, judgement = problem.pairs, problem.judgement
+    assert pairs is not None
+    assert judgement is not None
+    kinds = PAIR_KINDS[problem.settings.model]
+    reasons = np.full((pairs.n_pairs, 2), "", dtype="<U20")
+    for reason, mask in judgement.reasons.items():
+        reasons[mask, 0 if reason.startswith("distance") else 1] = reason
+    measured = np.stack([pairs.distance, pairs.angle], axis=1)
+    wide_before, wide_after = np.full_like(measured, np.nan), np.full_like(measured, np.nan)
+    wide_before[:, kinds], wide_after[:, kinds] = before, after
+    rows, columns = np.nonzero(np.isfinite(measured))
+    return ResidualTable(
+        kind=np.array(["distance", "angle"])[columns],
+        a=pairs.a[rows],
+        b=pairs.b[rows],
+        test=pairs.test[rows],
+        reason=reasons[rows, columns],
+        measured=measured[rows, columns],
+        before=wide_before[rows, columns],
+        after=wide_after[rows, columns],
+        sigma=problem.sigma[rows, columns],
+    )
+
+
+def _pose_table(problem: Problem, before: Floats, after: Floats) -> ResidualTable:
+    m, n = problem.measurements, problem.measurements.n_configurations
+    kinds = POSE_KINDS[problem.settings.model]
+    labels = [
+        f"{what}.{axis}"
+        for what, wanted in zip(("orientation", "position"), kinds, strict=True)
+        if wanted
+        for axis in "xyz"
+    ]
+    measured = np.full((n, 6), np.nan)
+    if m.position is not None:
+        measured[:, 3:] = m.position
+    wanted = np.repeat(kinds, 3)
+    return ResidualTable(
+        kind=np.tile(labels, n),
+        a=np.repeat(np.arange(n), len(labels)),
+        b=np.full(n * len(labels), -1),
+        test=np.repeat(m.test, len(labels)),
+        reason=np.full(n * len(labels), "", dtype="<U20"),
+        measured=measured[:, wanted].ravel(),
+        before=before.ravel(),
+        after=after.ravel(),
+        sigma=problem.sigma[:, wanted].ravel(),
+    )
+
+
+def marginals(solution: Solution) -> gtsam.Marginals:
+    """GTSAM's own marginals at the solution, where it grants them.
+
+    Raises:
+        RuntimeError: GTSAM finds the system indeterminate, which it also does to correct ones (condition above 1e4).
+    """
+    return gtsam.Marginals(solution.problem.graph, solution.values)
