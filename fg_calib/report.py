@@ -1,0 +1,187 @@
+"""The calibration report for people: verdict, statistics, residuals, parameters; lengths in mm, angles in degrees."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable
+
+import numpy as np
+from rich.console import Console, Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from fg_calib.solve import Solution
+from fg_calib.uncertainty import FrameEstimate, ParameterEstimate, Uncertainty
+
+WIDTH = 100
+"""Columns of the plain report."""
+
+_SHOWN = {"m": (1e3, "mm", 4), "rad": (180.0 / np.pi, "deg", 5)}
+"""Factor, unit and decimals in which a quantity is shown."""
+
+_FAMILY_UNIT = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad"}
+
+
+def format_report(solution: Solution, uncertainty: Uncertainty, width: int = WIDTH) -> str:
+    """The report as plain text."""
+    text = io.StringIO()
+    console = Console(file=text, width=width, color_system=None, highlight=False, legacy_windows=False)
+    console.print(build_report(solution, uncertainty))
+    return "\n".join(line.rstrip() for line in text.getvalue().splitlines())
+
+
+def build_report(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
+    """The report, to be printed by rich."""
+    parts: list[RenderableType] = [
+        _verdict(solution, uncertainty),
+        *_section("Fit statistics", _statistics(solution, uncertainty)),
+        *_section("Residuals (RMS)", _residuals(uncertainty)),
+        *_section("Parameters", _parameters(uncertainty)),
+    ]
+    if uncertainty.frame is not None:
+        parts += _section("Measurement frame (world_T_base)", _frame(uncertainty.frame))
+    notes = list(_notes(solution, uncertainty))
+    if notes:
+        parts += _section("Notes", *(Text(f"  {note}") for note in notes))
+    return Group(*parts)
+
+
+def _section(title: str, *content: RenderableType) -> list[RenderableType]:
+    return [Text(f"\n{title}", style="bold"), *content]
+
+
+def _verdict(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
+    settings = solution.problem.settings
+    what = f"{solution.problem.robot.name}: {settings.model}"
+    if settings.uses_pairs:
+        what += ", measured pairs" if solution.problem.measurements.pairs else f", pairs: {settings.pairing}"
+    elif settings.frame == "unknown":
+        what += ", measurement frame unknown"
+    if uncertainty.trustworthy:
+        return Group(Text(what), Text(f"GOOD: {solution.message}", style="bold green"))
+    doubts = (Text(f"DOUBTFUL: {finding}", style="bold red") for finding in uncertainty.findings)
+    return Group(Text(what), *doubts)
+
+
+def _plain_table(*columns: tuple[str, str]) -> Table:
+    """A table without a frame; columns as (heading, justification)."""
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="italic")
+    for heading, justify in columns:
+        table.add_column(heading, justify=justify, no_wrap=True)  # type: ignore[arg-type]
+    return table
+
+
+def _statistics(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
+    problem = solution.problem
+    rows = [("configurations", f"{problem.n_configurations}")]
+    if problem.settings.uses_pairs:
+        rows.append(("pairs", f"{problem.n_pairs}"))
+    reduced = uncertainty.reduced_chi2
+    low, high = uncertainty.chi2_bounds
+    determined = problem.n_residuals + problem.n_priors - uncertainty.dof
+    rows += [
+        ("residuals", f"{problem.n_residuals}, and {problem.n_priors} priors"),
+        ("estimated", f"{problem.variables.n_columns} unknowns, {determined} directions determined"),
+        ("chi-square", f"{uncertainty.chi2:.6g} with {uncertainty.dof} degrees of freedom"),
+        ("reduced chi-square", "unknown" if reduced is None else f"{reduced:.4g} (good from {low:.3g} to {high:.3g})"),
+        (
+            "solver",
+            f"{solution.iterations} iterations, {solution.seconds:.2f} s,"
+            f" cost {solution.initial_cost:.6g} -> {solution.cost:.6g}",
+        ),
+    ]
+    table = _plain_table(("", "left"), ("", "left"))
+    table.show_header = False
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def _residuals(uncertainty: Uncertainty) -> RenderableType:
+    rms = uncertainty.residuals.rms()
+    table = _plain_table(
+        ("", "left"), ("", "left"), *[(h, "right") for h in ("train before", "after", "test before", "after")]
+    )
+    for family, unit in _FAMILY_UNIT.items():
+        if family not in rms["train"] and family not in rms["test"]:
+            continue
+        factor, shown, _ = _SHOWN[unit]
+        figures = [
+            f"{rms[split][family][when] * factor:.4f}" if family in rms[split] else "-"
+            for split in ("train", "test")
+            for when in ("before", "after")
+        ]
+        table.add_row(family, shown, *figures)
+    return table
+
+
+def _parameters(uncertainty: Uncertainty) -> RenderableType:
+    headings = [("", "left"), ("estimate", "right"), ("", "left"), ("sigma", "right"), ("", "left")]
+    table = _plain_table(
+        *headings, ("correction", "right"), ("nominal", "right"), ("prior", "right"), ("class", "left")
+    )
+    for p in uncertainty.parameters:
+        if p.identifiability == "fixed" and p.name.startswith(("base.", "tool.")) and p.nominal == 0.0:
+            continue
+        factor, unit, decimals = _SHOWN[p.unit]
+        nominal = f"{p.nominal * factor:.{decimals}f}"
+        if p.identifiability == "fixed":
+            table.add_row(p.name, nominal, "", "", unit, "", "", "", "fixed", style="dim")
+            continue
+        table.add_row(
+            p.name,
+            f"{p.estimate * factor:.{decimals}f}",
+            "±",
+            "unknown" if p.sigma is None else f"{p.sigma * factor:.{decimals}f}",
+            unit,
+            f"{p.correction * factor:+.{decimals}f}",
+            nominal,
+            "" if p.prior_sigma is None else f"{p.prior_sigma * factor:.{decimals}f}",
+            p.identifiability,
+        )
+    return table
+
+
+def _frame(frame: FrameEstimate) -> RenderableType:
+    xyz = "  ".join(f"{v * 1e3:.4f}" for v in frame.xyz)
+    q = "  ".join(f"{v:.8f}" for v in frame.quaternion_xyzw)
+
+    def sigmas(values: Iterable[float], factor: float, decimals: int) -> str:
+        return "  ".join(f"{v * factor:.{decimals}f}" if np.isfinite(v) else "unknown" for v in values)
+
+    table = _plain_table(("", "left"), ("", "right"), ("", "left"))
+    table.show_header = False
+    table.add_row("xyz", xyz, "mm")
+    table.add_row("± along its axes", sigmas(frame.sigma[3:], 1e3, 4), "mm")
+    table.add_row("quaternion xyzw", q, "")
+    table.add_row("± about its axes", sigmas(frame.sigma[:3], 180.0 / np.pi, 5), "deg")
+    return table
+
+
+def _notes(solution: Solution, uncertainty: Uncertainty) -> Iterable[str]:
+    for reason, count in solution.problem.n_excluded.items():
+        if count:
+            yield f"{count} train rows take no part: {reason.replace('_', ' ')}"
+    judgement, pairs = solution.problem.judgement, solution.problem.pairs
+    if judgement is not None and pairs is not None and (same := int(np.sum(judgement.same_point & ~pairs.test))):
+        yield f"{same} train pairs are one point twice: three coordinates each instead of a distance"
+    for group in uncertainty.observability.relative:
+        yield f"the data determine only combinations of {', '.join(group.parameters)} ({group.lost} lost)"
+    ineffective = uncertainty.observability.named("ineffective")
+    if ineffective:
+        yield f"the data do not depend on {', '.join(ineffective)}"
+    held = [p for p in uncertainty.parameters if p.identifiability in ("relative", "ineffective")]
+    if held:
+        with_prior = [p for p in held if p.prior_sigma is not None]
+        without = [p for p in held if p.prior_sigma is None]
+        if with_prior:
+            yield f"what the data leave open of {_listed(with_prior)} is held by their priors"
+        if without:
+            yield f"what the data leave open of {_listed(without)} stays at nominal"
+    if not uncertainty.residuals.test.any():
+        yield "no test rows: how well this predicts new configurations was not checked"
+
+
+def _listed(parameters: list[ParameterEstimate], limit: int = 12) -> str:
+    names = [p.name for p in parameters]
+    return ", ".join(names[:limit]) + (f" and {len(names) - limit} more" if len(names) > limit else "")

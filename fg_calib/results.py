@@ -1,0 +1,232 @@
+"""Results for programs: `result.json`, the calibrated robot and the residual table, written whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import Any
+
+import numpy as np
+
+from fg_calib import __version__
+from fg_calib.errors import InputError
+from fg_calib.files.disk import write_text
+from fg_calib.files.robot_yaml import write_robot
+from fg_calib.files.tables import write_csv
+from fg_calib.files.urdf import write_urdf
+from fg_calib.observability import Observability
+from fg_calib.robot import Robot
+from fg_calib.solve import Solution
+from fg_calib.uncertainty import Uncertainty
+
+RESULT_SCHEMA = "fg-calib/result/1"
+OBSERVABILITY_SCHEMA = "fg-calib/observability/1"
+KINDS = ("position", "orientation", "distance", "angle")
+
+
+def result_document(
+    solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str, str] | None = None
+) -> dict[str, Any]:
+    """What `result.json` holds: SI, full precision, None for what is unknown or infinite.
+
+    Args:
+        solution: The solution.
+        uncertainty: Its assessment.
+        inputs: SHA-256 of the files it came from, by path.
+    """
+    problem, settings = solution.problem, solution.problem.settings
+    rms = uncertainty.residuals.rms()
+    pairing = None
+    if settings.uses_pairs:
+        pairing = "measured" if problem.measurements.pairs is not None else str(settings.pairing)
+    document = {
+        "schema": RESULT_SCHEMA,
+        "version": __version__,
+        "robot": problem.robot.name,
+        "model": settings.model,
+        "frame": settings.frame,
+        "pairing": pairing,
+        "n_configurations": problem.n_configurations,
+        "n_pairs": problem.n_pairs,
+        "n_residuals": problem.n_residuals,
+        "n_priors": problem.n_priors,
+        "n_excluded": problem.n_excluded,
+        "solver": {
+            "name": "gtsam-lm",
+            "converged": solution.converged,
+            "message": solution.message,
+            "iterations": solution.iterations,
+            "initial_cost": solution.initial_cost,
+            "cost": solution.cost,
+            "seconds": solution.seconds,
+            "history": [
+                {"cost": i.cost, "lambda": i.damping, "step": i.step, "decrement": i.decrement}
+                for i in solution.history
+            ],
+        },
+        "trustworthy": uncertainty.trustworthy,
+        "findings": list(uncertainty.findings),
+        "chi2": uncertainty.chi2,
+        "dof": uncertainty.dof,
+        "reduced_chi2": uncertainty.reduced_chi2,
+        "residual_rms": {split: {kind: rms[split].get(kind) for kind in KINDS} for split in ("train", "test")},
+        "parameters": [
+            {
+                "name": p.name,
+                "unit": p.unit,
+                "nominal": p.nominal,
+                "estimate": p.estimate,
+                "correction": p.correction,
+                "sigma": p.sigma,
+                "prior_sigma": p.prior_sigma,
+                "identifiability": p.identifiability,
+            }
+            for p in uncertainty.parameters
+        ],
+        "covariance": {"names": list(uncertainty.names), "matrix": uncertainty.covariance},
+        "frame_estimate": None if uncertainty.frame is None else asdict(uncertainty.frame),
+        "observability": observability_document(uncertainty.observability, settings.model, "practical"),
+        "inputs": dict(inputs or {}),
+    }
+    plain: dict[str, Any] = _plain(document)
+    return plain
+
+
+def observability_document(observability: Observability, model: str, kind: str) -> dict[str, Any]:
+    """What `observability.json` holds."""
+    o = observability
+    document: dict[str, Any] = _plain(
+        {
+            "schema": OBSERVABILITY_SCHEMA,
+            "model": model,
+            "kind": kind,
+            "n_parameters": len(o.names),
+            "rank": o.rank,
+            "names": list(o.names),
+            "singular_values": o.singular_values,
+            "gap": o.gap,
+            "independent": o.named("independent"),
+            "ineffective": o.named("ineffective"),
+            "relative": [
+                {
+                    "parameters": list(g.parameters),
+                    "lost": g.lost,
+                    "relations": list(g.relations),
+                    "keep": list(g.keep),
+                }
+                for g in o.relative
+            ],
+            "null_space": o.null_space,
+            "indices": o.indices,
+            "condition_number": o.condition_number,
+        }
+    )
+    return document
+
+
+def write_results(
+    folder: Path | str, solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str, str] | None = None
+) -> None:
+    """Write `result.json`, `residuals.csv` and the calibrated robot into a folder, all of them or none.
+
+    A robot from a URDF gives `robot_calibrated.urdf`; where base or tool have values of their own, which a URDF cannot
+    hold, a `robot_calibrated.yaml` beside it names them.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    robot = solution.problem.robot
+    calibrated = robot.with_values(solution.parameters[: len(robot.parameters)])
+    document = json.dumps(result_document(solution, uncertainty, inputs), indent=1, allow_nan=False) + "\n"
+
+    def write(into: Path) -> None:
+        write_text(into / "result.json", document)
+        write_calibrated_robot(into, calibrated)
+        _write_residuals(into / "residuals.csv", solution, uncertainty)
+
+    fill_folder(Path(folder), write)
+
+
+def write_calibrated_robot(folder: Path, robot: Robot) -> None:
+    """Write `robot_calibrated.yaml`, or `.urdf`, into a folder."""
+    if robot.urdf is None:
+        write_robot(folder / "robot_calibrated.yaml", robot)
+        return
+    write_urdf(folder / "robot_calibrated.urdf", robot)
+    if any(p.nominal != 0.0 or p.estimated for p in robot.parameters if p.owner in (0, robot.n_joints + 1)):
+        write_robot(folder / "robot_calibrated.yaml", robot, urdf_name="robot_calibrated.urdf")
+
+
+def fill_folder(folder: Path, write: Callable[[Path], None]) -> None:
+    """Let `write` fill a new folder, and move its files into `folder` once all of them are there.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    temporary = None
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        write(temporary)
+        if not folder.exists():
+            temporary.chmod(0o777 & ~_umask())
+            temporary.rename(folder)
+        else:
+            for file in sorted(temporary.iterdir()):
+                file.replace(folder / file.name)
+    except OSError as error:
+        raise InputError(
+            str(folder), f"cannot be written: {error.strerror or error}", "a folder that can be"
+        ) from error
+    finally:
+        if temporary is not None:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _write_residuals(path: Path, solution: Solution, uncertainty: Uncertainty) -> None:
+    """One line a scalar residual: what it is of, whether it was used, before and after, in [m] and [rad]."""
+    table = uncertainty.residuals
+    ids = solution.problem.measurements.ids
+    columns = {
+        "kind": table.kind,
+        "a": ids[table.a],
+        "b": np.where(table.b >= 0, ids[table.b], ""),
+        "split": np.where(table.test, "test", "train"),
+        "used": (table.reason == "") & ~table.test,
+        "excluded": table.reason,
+        "unit": np.where(np.isin(np.char.partition(table.kind, ".")[:, 0], ["distance", "position"]), "m", "rad"),
+        "measured": table.measured,
+        "predicted": table.measured + table.after,
+        "residual_before": table.before,
+        "residual": table.after,
+        "sigma": table.sigma,
+        "whitened": table.after / table.sigma,
+    }
+    write_csv(path, columns)
+
+
+def _plain(value: Any) -> Any:
+    """Arrays as lists, numpy numbers as Python's, and None for what is not finite."""
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
