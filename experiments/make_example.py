@@ -93,7 +93,7 @@ def simulate(seed: int, folder: Path) -> None:
     true = replace(robot.with_values(robot.nominal + errors), name="space-robot-true")
     fg_calib.write_robot(folder / "robot_true.yaml", true, units=fg_calib.Units(angle="deg"))
 
-    top = BOARD + [0.0, 0.0, RADIUS]
+    top = BOARD + np.array([0.0, 0.0, RADIUS])
     points = [top]
     for n in (51, 20):  # a golden spiral over the hemisphere, down to nearly its rim
         k = np.arange(n) + 0.5

@@ -19,6 +19,8 @@ from itertools import permutations, product
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.measurements import rotation_angle
+
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
 
@@ -68,7 +70,10 @@ def start_from_poses(
     R_M, p_M = (None if v is None else v[:MAX_ROWS] for v in measured)
     candidates = [(X.rotation, T.rotation)]
     if R_M is not None:
-        candidates = [_rotations(R_F, R_M, X.rotation, T.rotation, unknown)]
+        candidates = _rotations(R_F, R_M, X.rotation, T.rotation, unknown)
+        if len(candidates) > 1 and p_M is not None:
+            aligned = _frame_rotations(R_F, p_F, p_M, T.translation, unknown)
+            candidates += [(R, _tool_rotation(R_F, R_M, R)) for R in aligned]
     elif unknown.frame and p_M is not None:
         candidates = [(R, T.rotation) for R in _frame_rotations(R_F, p_F, p_M, T.translation, unknown)]
     fits = [_translations(R_F, p_F, p_M, R_X, R_T, X, T, unknown) for R_X, R_T in candidates]
@@ -135,32 +140,57 @@ def nearest_rotation(M: Floats) -> Floats:
     return rotation
 
 
-def _rotations(R_F: Floats, R_M: Floats, R_X: Floats, R_T: Floats, unknown: Unknown) -> tuple[Floats, Floats]:
-    """Rotations X and T with X F T = M in the least-squares sense."""
-    if unknown.frame and unknown.tool_rotation:
-        # trace(M^T X F T) = x^T (sum of Kronecker products) y: the largest singular vectors.
-        K = np.einsum("nab,ncd->acbd", R_M, R_F).reshape(9, 9)
-        U, s, Vt = np.linalg.svd(K)
-        if s[1] < 0.99 * s[0]:
-            u, v = U[:, 0].reshape(3, 3), Vt[0].reshape(3, 3).T
-            sign = np.sign(np.linalg.det(u))
-            return _alternate(R_F, R_M, nearest_rotation(sign * v), steps=2)[:2]
-        # All rotations about one axis: many solutions, so search from the nominal and from every quarter turn.
-        fits = [_alternate(R_F, R_M, start, steps=20) for start in (R_T, *(R_T @ Q for Q in _quarter_turns()))]
-        return max(fits, key=lambda fit: round(fit[2], 9))[:2]
-    if unknown.frame:
-        return nearest_rotation(np.einsum("nab,cb,ndc->ad", R_M, R_T, R_F)), R_T
-    if unknown.tool_rotation:
-        return R_X, nearest_rotation(np.einsum("nba,cb,ncd->ad", R_F, R_X, R_M))
-    return R_X, R_T
+def _rotations(R_F: Floats, R_M: Floats, R_X: Floats, R_T: Floats, unknown: Unknown) -> list[tuple[Floats, Floats]]:
+    """Rotations X and T with X F T = M in the least-squares sense; several where the rotations alone leave a choice."""
+    if not unknown.frame:
+        return [(R_X, _tool_rotation(R_F, R_M, R_X) if unknown.tool_rotation else R_T)]
+    if not unknown.tool_rotation:
+        return [(_frame_rotation(R_F, R_M, R_T), R_T)]
+    # trace(M^T X F T) = x^T (sum of Kronecker products) y: the largest singular vectors.
+    K = np.einsum("nab,ncd->acbd", R_M, R_F).reshape(9, 9)
+    U, s, Vt = np.linalg.svd(K)
+    if s[1] < 0.99 * s[0]:
+        u, v = U[:, 0].reshape(3, 3), Vt[0].reshape(3, 3).T
+        R_X = _frame_rotation(R_F, R_M, nearest_rotation(np.sign(np.linalg.det(u)) * v))
+        return [(R_X, _tool_rotation(R_F, R_M, R_X))]
+    # Every rotation is about one axis: X and T may turn about it against each other. Find one solution, from the
+    # nominal tool or any quarter turn of it, and leave the choice of the turn to the positions.
+    fits = [_alternate(R_F, R_M, start, steps=20) for start in (R_T, *(R_T @ Q for Q in _quarter_turns()))]
+    R_X, R_T = max(fits, key=lambda fit: round(fit[2], 9))[:2]
+    turns = [_about(_common_axis(R_F), angle) for angle in np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)]
+    return [(R_X @ turn, turn.T @ R_T) for turn in turns]
+
+
+def _frame_rotation(R_F: Floats, R_M: Floats, R_T: Floats) -> Floats:
+    """The best X for a T."""
+    return nearest_rotation(np.einsum("nab,cb,ndc->ad", R_M, R_T, R_F))
+
+
+def _tool_rotation(R_F: Floats, R_M: Floats, R_X: Floats) -> Floats:
+    """The best T for an X."""
+    return nearest_rotation(np.einsum("nba,cb,ncd->ad", R_F, R_X, R_M))
 
 
 def _alternate(R_F: Floats, R_M: Floats, R_T: Floats, steps: int) -> tuple[Floats, Floats, float]:
     """Best X for a T, then best T for that X, and so on; and the mean of trace(M^T X F T) reached."""
     for _ in range(steps):
-        R_X = nearest_rotation(np.einsum("nab,cb,ndc->ad", R_M, R_T, R_F))
-        R_T = nearest_rotation(np.einsum("nba,cb,ncd->ad", R_F, R_X, R_M))
+        R_X = _frame_rotation(R_F, R_M, R_T)
+        R_T = _tool_rotation(R_F, R_M, R_X)
     return R_X, R_T, float(np.einsum("nab,ac,ncd,db->", R_M, R_X, R_F, R_T)) / len(R_F)
+
+
+def _common_axis(R_F: Floats) -> Floats:
+    """The axis that takes the first rotation to the others, in the base frame, shape (3,); any if there is none."""
+    _, axes = rotation_angle(R_F @ R_F[0].T)
+    axis: Floats = np.linalg.svd(axes)[2][0]
+    return axis
+
+
+def _about(axis: Floats, angle: float) -> Floats:
+    """The rotation about a unit axis (Rodrigues)."""
+    K = np.cross(np.eye(3), axis)
+    turn: Floats = np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * (K @ K)
+    return turn
 
 
 def _quarter_turns() -> list[Floats]:

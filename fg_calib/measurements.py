@@ -202,20 +202,20 @@ def _choose(rows: Integers, pairing: Pairing) -> Integers:
 def _draw_pairs(n: int, count: int, generator: np.random.Generator) -> tuple[Integers, Integers]:
     """`count` different pairs a < b of n rows (all, if there are no more), each row about equally often.
 
-    Rounds of random perfect matchings: a row in many pairs would have its own errors count many times.
+    A row in many pairs would have its own errors count many times. So the pairs are rounds of a tournament in
+    which each row meets every other once (the circle method), rows and rounds in random order.
     """
-    total = n * (n - 1) // 2
-    if count >= total // 2:  # matchings would mostly meet pairs drawn before
-        first, second = np.triu_indices(n, 1)
-        chosen = np.sort(generator.permutation(total)[:count])
-        return first[chosen], second[chosen]
-    codes = np.empty(0, dtype=np.int64)
-    while len(codes) < count:
-        matching = np.sort(generator.permutation(n)[: n // 2 * 2].reshape(-1, 2), axis=1)
-        drawn = np.concatenate([codes, matching[:, 0] * n + matching[:, 1]])
-        codes = drawn[np.sort(np.unique(drawn, return_index=True)[1])]
-    codes = np.sort(codes[:count])
-    return codes // n, codes % n
+    m = n - 1 + n % 2  # rounds of the whole tournament; row n - 1 sits in the middle if n is even
+    per_round = n // 2
+    rounds = generator.permutation(m)[: -(-count // per_round), None]
+    step = np.arange(1, (m - 1) // 2 + 1)
+    meetings = np.stack([(rounds + step) % m, (rounds - step) % m], axis=2)  # (rounds, meetings, 2)
+    if n % 2 == 0:
+        middle = np.stack([rounds, np.full_like(rounds, n - 1)], axis=2)
+        meetings = np.concatenate([meetings, middle], axis=1)
+    pairs = np.sort(generator.permutation(n)[meetings.reshape(-1, 2)[:count]], axis=1)
+    first, second = pairs[np.lexsort(pairs.T[::-1])].T
+    return first, second
 
 
 def _sigma_along(sigma: Floats, a: Integers, b: Integers, direction: Floats) -> Floats:

@@ -1,5 +1,7 @@
 """Forward kinematics and its derivatives, against 4x4 products and central differences."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from oracle import central_differences, dh_joint, frame, random_robot, rotation, tool_pose, translation
@@ -48,9 +50,9 @@ def test_a_convention_is_the_product_its_table_says(convention):
 @pytest.mark.parametrize("prismatic", [False, True])
 def test_a_urdf_joint_moves_about_its_own_axis(prismatic):
     rng = np.random.default_rng(4)
-    axis = rng.normal(size=3)
-    axis /= np.linalg.norm(axis)
-    for axis in (axis, np.array([0.0, 0.0, -1.0]), np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])):
+    any_axis = rng.normal(size=3)
+    any_axis /= np.linalg.norm(any_axis)
+    for axis in (any_axis, np.array([0.0, 0.0, -1.0]), np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])):
         builder = RobotBuilder("one", "urdf")
         origin = {"x": 0.1, "y": -0.2, "z": 0.3, "roll": 0.4, "pitch": -0.5, "yaw": 0.6}
         builder.add_urdf_joint(Joint("j", prismatic), origin, axis)
@@ -122,8 +124,6 @@ def test_every_row_is_walked_whatever_the_number_of_rows(n):
 def test_elements_of_the_chain_may_run_against_a_joint():
     rng = np.random.default_rng(7)
     robot = random_robot("mdh", 3, rng)
-    from dataclasses import replace
-
     flipped = replace(robot, elements=tuple(replace(e, sign=-1) for e in reversed(robot.elements)))
     q = rng.uniform(-3, 3, (1, 3))
     poses = pose(flipped, q)

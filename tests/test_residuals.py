@@ -1,5 +1,7 @@
 """Residuals against scipy's rotations, their derivatives against central differences, and the reductions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from oracle import central_differences, random_robot, tool_pose
@@ -77,7 +79,8 @@ def test_same_point_residual_and_its_derivatives(convention):
     expected = central_differences(formula, x)
     # base columns, and what of the first joint comes before its reading, move both points as one body
     rigid = np.all(J[0] == 0.0, axis=0)
-    assert rigid[:6].all() and rigid.sum() >= 7
+    assert rigid[:6].all()
+    assert rigid.sum() >= 7
     d = np.linalg.solve(W, formula(x))
     assert d @ np.linalg.solve(W, expected[:, rigid]) == pytest.approx(0.0, abs=1e-7)  # they do not change the norm
     assert J[0][:, ~rigid] == pytest.approx(expected[:, ~rigid], abs=1e-7)
@@ -171,8 +174,6 @@ def test_a_row_without_weight_adds_nothing():
     block, chain = random_block("pairs", 40, np.random.default_rng(17))
     whitening = block.whitening.copy()
     whitening[7:, :] = 0.0
-    from dataclasses import replace
-
     short = replace(block, a=block.a[:7], b=block.b[:7], measured=block.measured[:7], whitening=whitening[:7])
     long = replace(block, whitening=whitening)
     assert residuals.gram(long, chain) == pytest.approx(residuals.gram(short, chain), rel=1e-13)

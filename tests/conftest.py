@@ -1,0 +1,54 @@
+"""Fixtures of several test files: the real data, the bundled example, and the command line as a function."""
+
+import os
+import shutil
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from fg_calib import cli
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def data_folder():
+    """The folder of real data; tests that need it are skipped without it."""
+    folder = Path(os.environ.get("FG_CALIB_DATA", REPOSITORY.parent / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip(f"no real data: FG_CALIB_DATA names the folder, {folder} is none")
+    return folder
+
+
+@pytest.fixture
+def example(tmp_path):
+    """A copy of the bundled example's folder, to be changed at will."""
+    return Path(shutil.copytree(cli.EXAMPLES / "space-robot", tmp_path / "space-robot"))
+
+
+class Ended(NamedTuple):
+    """How a command ended: exit code, stdout, stderr."""
+
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def fg_calib(monkeypatch, capsys):
+    """`fg_calib("calibrate", job)`: the command in this process, through the one door for errors."""
+
+    def run(*arguments):
+        capsys.readouterr()
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "argv", ["fg-calib", *map(str, arguments)])
+            try:
+                cli.main()
+                code = 0
+            except SystemExit as end:
+                code = int(end.code or 0)
+        return Ended(code, *capsys.readouterr())
+
+    return run
