@@ -109,7 +109,7 @@ def test_joints_stand_in_chain_order_with_their_own_parameters_and_limits(tree):
     xyz=st.tuples(*[st.floats(-2, 2)] * 3),
     axis=st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda a: np.linalg.norm(a) > 1e-3),
     kind=st.sampled_from(["continuous", "prismatic"]),
-    q=st.floats(-3, 3),
+    q=st.floats(-3, 3).filter(lambda q: q == 0.0 or abs(q) > 1e-6),  # yourdfpy rounds smaller ones to 0
 )
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 def test_every_joint_and_its_reverse_equal_yourdfpys(tmp_path, rpy, xyz, axis, kind, q):
