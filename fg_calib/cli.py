@@ -5,6 +5,7 @@ Exit codes: 0 good; 1 bad input; 2 wrong usage; 3 solved, but not to be trusted.
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 import sys
@@ -32,6 +33,9 @@ Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on 
 def main() -> None:
     """Run the command line."""
     logging.basicConfig(stream=sys.stderr, format="%(message)s", level=logging.WARNING)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show a letter gets a question mark
+            stream.reconfigure(errors="replace")
     try:
         app()
     except CalibrationError as error:

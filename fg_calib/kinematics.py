@@ -12,8 +12,13 @@ so that a unit change turns the tool by w and moves the tool point p by w x p + 
 
 All of it is compiled by numba and runs on blocks of `LANES` configurations at once: arrays are shaped
 (..., LANES) and the innermost loop runs over configurations, which the compiler turns into vector instructions.
-Sine and cosine of the readings are taken once a data set (`Trig`) and combined with those of the parameters by
-the addition theorem, so no trigonometry happens inside.
+(Inside the walk rotation and point are flat, so that it sees at which constant distance columns lie and that they do
+not overlap.) Sine and cosine of the readings are taken once a data set (`precompute_trig`) and combined with those of
+the parameters by the addition theorem, so no trigonometry happens inside.
+
+Note:
+    Numba's cache looks at the file of the outermost kernel alone: after a change here, kernels elsewhere that call
+    `walk` are compiled anew only once their cache (`fg_calib/__pycache__/*.nb*`) is deleted.
 
 References:
     Lynch & Park (2017), Modern Robotics, Cambridge University Press.
@@ -26,7 +31,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any, TypeVar
 
 import numba
@@ -41,8 +46,8 @@ Integers = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
-LANES = 16
-"""Configurations walked at once: the width of the innermost loops."""
+LANES = 32
+"""Configurations walked at once: the width of the innermost loops. Shorter loops would be unrolled, not vectorised."""
 
 T = TypeVar("T")
 
@@ -62,14 +67,18 @@ class _CompileNotice(event.Listener):  # type: ignore[misc]
         """Numba is done with one function."""
 
 
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     """Compile a kernel with numba, without the GIL; cached on disk wherever a folder can be written."""
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+    options = {"nogil": True, "error_model": "numpy"} | options
     try:
         kernel: Callable[..., Any] = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # neither the package's folder nor the user's cache can be written
         kernel = numba.njit(**options)(function)
     return kernel
+
+
+inlined = partial(compiled, forceinline=True)
+"""As `compiled`, for a part of a kernel that must see its caller's constants."""
 
 
 @dataclass(frozen=True)
@@ -240,89 +249,116 @@ def walk(axis, value, cosine, sine, sign, joint, column, n_columns, n_own, trig,
         start: Position in `rows` of the first lane.
         rotation: Filled: rotation matrix, [column, component, lane], shape (3, 3, LANES).
         point: Filled: tool point, shape (3, LANES), [m].
-        twist: Filled: (w, v) of each column, then of each joint, shape (n_columns + n_own, 6, LANES).
+        twist: Filled: (w, v) of each column, then of each joint, shape (n_columns + n_own, 6, LANES); must come with
+            w = 0 for translations.
     """
     last = rows.shape[0] - 1
     row = np.empty(LANES, np.int64)
+    reading = np.empty(2 * LANES)
     for i in range(LANES):
         row[i] = rows[min(start + i, last)]
-    gathered = np.empty((2, LANES))
-    rotation[:] = 0.0
-    point[:] = 0.0
-    for k in range(3):
-        for i in range(LANES):
-            rotation[k, k, i] = 1.0
+    R, p = rotation.reshape(9 * LANES), point.reshape(3 * LANES)
+    R[:] = 0.0
+    p[:] = 0.0
+    for i in range(LANES):
+        R[i] = 1.0
+        R[4 * LANES + i] = 1.0
+        R[8 * LANES + i] = 1.0
     for e in range(axis.shape[0]):
-        j = joint[e]
-        if j >= 0:
-            for i in range(LANES):
-                gathered[0, i] = trig[row[i], j, 0]
-                gathered[1, i] = trig[row[i], j, 1]
-        k = axis[e]
-        turns = k >= 3
-        if turns:
-            k -= 3
+        k, j = axis[e], joint[e]
         for target in (column[e], n_columns + j if n_own > 0 and j >= 0 else -1):
             if target < 0:
                 continue
-            if turns:
-                _write_rotation_twist(sign[e], rotation[k], point, twist[target])
+            if k >= 3:
+                _write_rotation_twist(sign[e], R, k - 3, p, twist[target])
             else:
-                _write_translation_twist(sign[e], rotation[k], twist[target])
-        if turns:
-            a, b = (k + 1) % 3, (k + 2) % 3
+                _write_translation_twist(sign[e], R, k, twist[target])
+        if j >= 0:
+            for i in range(LANES):
+                reading[i] = trig[row[i], j, 0]
+                reading[LANES + i] = sign[e] * trig[row[i], j, 1]
+        if k < 3:
             if j >= 0:
-                _turn_by_reading(cosine[e], sine[e], sign[e], gathered, rotation[a], rotation[b])
+                _shift_by_reading(value[e], sign[e], reading, R, k, p)
             else:
-                _turn(cosine[e], sine[e], rotation[a], rotation[b])
+                _shift(value[e], R, k, p)
         elif j >= 0:
-            for c in range(3):
-                for i in range(LANES):
-                    point[c, i] += (value[e] + sign[e] * gathered[0, i]) * rotation[k, c, i]
+            _add_angles(cosine[e], sine[e], reading)
+            if k == 3:
+                _turn_by_reading(reading, R, 1, 2)
+            elif k == 4:
+                _turn_by_reading(reading, R, 2, 0)
+            else:
+                _turn_by_reading(reading, R, 0, 1)
+        elif k == 3:
+            _turn(cosine[e], sine[e], R, 1, 2)
+        elif k == 4:
+            _turn(cosine[e], sine[e], R, 2, 0)
         else:
-            for c in range(3):
-                for i in range(LANES):
-                    point[c, i] += value[e] * rotation[k, c, i]
+            _turn(cosine[e], sine[e], R, 0, 1)
 
 
-@compiled
-def _write_rotation_twist(sign, w, p, twist):  # type: ignore[no-untyped-def]
+@inlined
+def _write_rotation_twist(sign, R, k, p, twist):  # type: ignore[no-untyped-def]
+    w = 3 * k * LANES
     for i in range(LANES):
-        w0, w1, w2 = sign * w[0, i], sign * w[1, i], sign * w[2, i]
+        w0 = sign * R[w + i]
+        w1 = sign * R[w + LANES + i]
+        w2 = sign * R[w + 2 * LANES + i]
         twist[0, i] = w0
         twist[1, i] = w1
         twist[2, i] = w2
-        twist[3, i] = p[1, i] * w2 - p[2, i] * w1
-        twist[4, i] = p[2, i] * w0 - p[0, i] * w2
-        twist[5, i] = p[0, i] * w1 - p[1, i] * w0
+        twist[3, i] = p[LANES + i] * w2 - p[2 * LANES + i] * w1
+        twist[4, i] = p[2 * LANES + i] * w0 - p[i] * w2
+        twist[5, i] = p[i] * w1 - p[LANES + i] * w0
 
 
-@compiled
-def _write_translation_twist(sign, c, twist):  # type: ignore[no-untyped-def]
-    for k in range(3):
-        for i in range(LANES):
-            twist[k, i] = 0.0
-            twist[3 + k, i] = sign * c[k, i]
-
-
-@compiled
-def _turn(cosine, sine, a, b):  # type: ignore[no-untyped-def]
+@inlined
+def _write_translation_twist(sign, R, k, twist):  # type: ignore[no-untyped-def]
     for c in range(3):
         for i in range(LANES):
-            x, y = a[c, i], b[c, i]
-            a[c, i] = cosine * x + sine * y
-            b[c, i] = cosine * y - sine * x
+            twist[3 + c, i] = sign * R[(3 * k + c) * LANES + i]
 
 
-@compiled
-def _turn_by_reading(cosine, sine, sign, gathered, a, b):  # type: ignore[no-untyped-def]
+@inlined
+def _shift(value, R, k, p):  # type: ignore[no-untyped-def]
+    for c in range(3):
+        for i in range(LANES):
+            p[c * LANES + i] += value * R[(3 * k + c) * LANES + i]
+
+
+@inlined
+def _shift_by_reading(value, sign, reading, R, k, p):  # type: ignore[no-untyped-def]
+    for c in range(3):
+        for i in range(LANES):
+            p[c * LANES + i] += (value + sign * reading[i]) * R[(3 * k + c) * LANES + i]
+
+
+@inlined
+def _turn(cosine, sine, R, a, b):  # type: ignore[no-untyped-def]
+    for c in range(3):
+        for i in range(LANES):
+            x, y = R[(3 * a + c) * LANES + i], R[(3 * b + c) * LANES + i]
+            R[(3 * a + c) * LANES + i] = cosine * x + sine * y
+            R[(3 * b + c) * LANES + i] = cosine * y - sine * x
+
+
+@inlined
+def _add_angles(cosine, sine, reading):  # type: ignore[no-untyped-def]
+    """Cosine and sine of the reading become those of its sum with a value."""
     for i in range(LANES):
-        cq, sq = gathered[0, i], sign * gathered[1, i]
-        ct, st = cosine * cq - sine * sq, sine * cq + cosine * sq
-        for c in range(3):
-            x, y = a[c, i], b[c, i]
-            a[c, i] = ct * x + st * y
-            b[c, i] = ct * y - st * x
+        c, s = reading[i], reading[LANES + i]
+        reading[i] = cosine * c - sine * s
+        reading[LANES + i] = sine * c + cosine * s
+
+
+@inlined
+def _turn_by_reading(reading, R, a, b):  # type: ignore[no-untyped-def]
+    for c in range(3):
+        for i in range(LANES):
+            x, y = R[(3 * a + c) * LANES + i], R[(3 * b + c) * LANES + i]
+            R[(3 * a + c) * LANES + i] = reading[i] * x + reading[LANES + i] * y
+            R[(3 * b + c) * LANES + i] = reading[i] * y - reading[LANES + i] * x
 
 
 @compiled
@@ -335,8 +371,9 @@ def _walk_all(  # type: ignore[no-untyped-def]
     twist = np.zeros((n_twists, 6, LANES))
     for first in range(start, stop, LANES):
         walk(
-            axis, value, cosine, sine, sign, joint, column, n_columns, n_own, trig, rows, first, rotation, point, twist
-        )
+            axis, value, cosine, sine, sign, joint, column, n_columns, n_own,
+            trig, rows, first, rotation, point, twist,
+        )  # fmt: skip
         for i in range(min(LANES, stop - first)):
             n = first + i
             for r in range(3):

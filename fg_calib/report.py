@@ -7,6 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 from rich.console import Console, Group, RenderableType
+from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
@@ -42,7 +43,7 @@ def build_report(solution: Solution, uncertainty: Uncertainty) -> RenderableType
         parts += _section("Measurement frame (world_T_base)", _frame(uncertainty.frame))
     notes = list(_notes(solution, uncertainty))
     if notes:
-        parts += _section("Notes", *(Text(f"  {note}") for note in notes))
+        parts += _section("Notes", *(Padding(Text(note), (0, 0, 0, 2)) for note in notes))
     return Group(*parts)
 
 
@@ -64,11 +65,16 @@ def _verdict(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
 
 
 def _plain_table(*columns: tuple[str, str]) -> Table:
-    """A table without a frame; columns as (heading, justification)."""
+    """A table without a frame; columns as (heading, justification). Where it is too wide its first column folds."""
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="italic")
-    for heading, justify in columns:
-        table.add_column(heading, justify=justify, no_wrap=True)  # type: ignore[arg-type]
+    for i, (heading, justify) in enumerate(columns):
+        table.add_column(heading, justify=justify, no_wrap=i > 0, overflow="fold")  # type: ignore[arg-type]
     return table
+
+
+def _figure(value: float, decimals: int, sign: str = "") -> str:
+    """A figure with `decimals`; one that rounds to zero has no minus, which rounding errors alone would decide on."""
+    return f"{value:{sign}z.{decimals}f}"
 
 
 def _statistics(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
@@ -124,17 +130,17 @@ def _parameters(uncertainty: Uncertainty) -> RenderableType:
         if p.identifiability == "fixed" and p.name.startswith(("base.", "tool.")) and p.nominal == 0.0:
             continue
         factor, unit, decimals = _SHOWN[p.unit]
-        nominal = f"{p.nominal * factor:.{decimals}f}"
+        nominal = _figure(p.nominal * factor, decimals)
         if p.identifiability == "fixed":
             table.add_row(p.name, nominal, "", "", unit, "", "", "", "fixed", style="dim")
             continue
         table.add_row(
             p.name,
-            f"{p.estimate * factor:.{decimals}f}",
+            _figure(p.estimate * factor, decimals),
             "±",
             "unknown" if p.sigma is None else f"{p.sigma * factor:.{decimals}f}",
             unit,
-            f"{p.correction * factor:+.{decimals}f}",
+            _figure(p.correction * factor, decimals, "+"),
             nominal,
             "" if p.prior_sigma is None else f"{p.prior_sigma * factor:.{decimals}f}",
             p.identifiability,
@@ -143,8 +149,8 @@ def _parameters(uncertainty: Uncertainty) -> RenderableType:
 
 
 def _frame(frame: FrameEstimate) -> RenderableType:
-    xyz = "  ".join(f"{v * 1e3:.4f}" for v in frame.xyz)
-    q = "  ".join(f"{v:.8f}" for v in frame.quaternion_xyzw)
+    xyz = "  ".join(_figure(v * 1e3, 4) for v in frame.xyz)
+    q = "  ".join(_figure(v, 8) for v in frame.quaternion_xyzw)
 
     def sigmas(values: Iterable[float], factor: float, decimals: int) -> str:
         return "  ".join(f"{v * factor:.{decimals}f}" if np.isfinite(v) else "unknown" for v in values)

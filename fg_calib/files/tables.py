@@ -307,11 +307,11 @@ def _joint_columns(header: _Header, robot: Robot) -> tuple[str, ...]:
     """The columns of joint readings, in chain order: all by the joints' names, or all by their numbers."""
     n = robot.n_joints
     names = tuple(joint.name for joint in robot.joints)
+    expected = tuple(f"q{i + 1}" for i in range(n))
     if _RESERVED.intersection(names):
         names = ()  # a slide called x, say: its column would be the tool's position
-    elif header.present(*names) == names:
+    elif names != expected and header.present(*names) == names:
         return names
-    expected = tuple(f"q{i + 1}" for i in range(n))
     numbered = tuple(c for c in header.columns if re.fullmatch(r"q\d+", c))
     if set(numbered) == set(expected):
         return expected
