@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from fg_calib.report import format_report
     from fg_calib.results import result_document, write_results
     from fg_calib.robot import Robot
-    from fg_calib.solve import Solution, SolverOptions, solve
+    from fg_calib.solver import Solution, SolverOptions, solve
     from fg_calib.uncertainty import Uncertainty, assess
 
 __version__ = "0.1.0"
@@ -45,7 +45,7 @@ _HOMES = {
     "fg_calib.report": ("format_report",),
     "fg_calib.results": ("result_document", "write_results"),
     "fg_calib.robot": ("Robot",),
-    "fg_calib.solve": ("Solution", "SolverOptions", "solve"),
+    "fg_calib.solver": ("Solution", "SolverOptions", "solve"),
     "fg_calib.uncertainty": ("Uncertainty", "assess"),
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}

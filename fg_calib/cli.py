@@ -10,11 +10,12 @@ import json
 import logging
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from fg_calib import __version__
+from fg_calib.choices import AngleUnit, FrameKnowledge, LengthUnit, Model
 from fg_calib.errors import CalibrationError, InputError
 
 app = typer.Typer(
@@ -37,7 +38,7 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show a letter gets a question mark
             stream.reconfigure(errors="replace")
     try:
-        app()
+        app(prog_name="fg-calib")
     except CalibrationError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(1)
@@ -77,7 +78,7 @@ def calibrate(
     from fg_calib.problem import build_problem
     from fg_calib.report import build_report
     from fg_calib.results import result_document, write_results
-    from fg_calib.solve import solve
+    from fg_calib.solver import solve
     from fg_calib.uncertainty import assess
 
     given = read_job(job)
@@ -101,6 +102,77 @@ def calibrate(
         print(f"not to be trusted: {finding}", file=sys.stderr)
     if not uncertainty.trustworthy:
         raise typer.Exit(3)
+
+
+@app.command()
+def observe(
+    robot: Annotated[Path, typer.Argument(metavar="ROBOT", help="The robot: robot.yaml or a URDF.")],
+    model: Annotated[
+        Model,
+        typer.Option("--model", help="What is measured."),
+    ] = "distance-rotation",
+    configurations: Annotated[
+        Path | None,
+        typer.Option(
+            "--configurations", metavar="TABLE", help="Your configurations; random ones within limits if none."
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Write observability.json and figures there.")
+    ] = None,
+    frame: Annotated[FrameKnowledge, typer.Option("--frame", help="Whether world_T_base is estimated too.")] = "known",
+    pairing: Annotated[
+        Literal["star", "chain", "all"], typer.Option("--pairing", help="Pairs of your configurations.")
+    ] = "star",
+    prefer: Annotated[
+        str, typer.Option("--prefer", metavar="NAMES", help="Parameters to keep, first choice first: theta2,d5.")
+    ] = "",
+    length: Annotated[LengthUnit, typer.Option("--length", help="Unit of lengths in TABLE and below.")] = "m",
+    angle: Annotated[AngleUnit, typer.Option("--angle", help="Unit of angles in TABLE and below.")] = "rad",
+    position_noise: Annotated[float | None, typer.Option(help="1 sigma of a position; 1 mm if not given.")] = None,
+    orientation_noise: Annotated[
+        float | None, typer.Option(help="1 sigma of an orientation; 1 mrad if not given.")
+    ] = None,
+    joint_noise: Annotated[float, typer.Option(help="1 sigma of a joint reading.")] = 0.0,
+    seed: Annotated[int, typer.Option(help="Of the random configurations.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """Say which parameters measurements can determine, which only together, and why not the others."""
+    from rich.console import Console
+
+    from fg_calib.files.robot_yaml import read_robot
+    from fg_calib.files.tables import read_measurements
+    from fg_calib.files.units import Units
+    from fg_calib.identifiability import observe_configurations, observe_structure
+    from fg_calib.measurements import Noise, Pairing
+    from fg_calib.report import build_identifiability_report
+    from fg_calib.results import observability_document, write_observability
+
+    arm = read_robot(robot)
+    names = [name.strip() for name in prefer.split(",") if name.strip()]
+    for name in names:
+        arm.index(name)
+    if configurations is None:
+        found = observe_structure(arm, model, frame=frame, prefer=names, seed=seed)
+    else:
+        units = Units(length=length, angle=angle)
+
+        def si(figure: float | None, unit: str) -> float | None:
+            return None if figure is None else figure * units.factor(unit)
+
+        noise = Noise(
+            position=si(position_noise, "m"),
+            orientation=si(orientation_noise, "rad"),
+            joint=tuple(joint_noise * units.factor(j.unit) for j in arm.joints),
+        )
+        table = read_measurements(configurations, arm, units=units, noise=noise)
+        found = observe_configurations(arm, table, model, frame=frame, pairing=Pairing(pairing), prefer=names)
+    if out is not None:
+        write_observability(out, found)
+    if as_json:
+        print(json.dumps(observability_document(found), allow_nan=False))
+    else:
+        Console(highlight=False).print(build_identifiability_report(found))
 
 
 @app.command()

@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.choices import Strategy
 from fg_calib.errors import InputError
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Booleans = NDArray[np.bool_]
-
-Strategy = Literal["star", "chain", "all", "random"]
-Model = Literal["pose", "position", "orientation", "distance", "rotation", "distance-rotation"]
-
-MODELS: tuple[Model, ...] = get_args(Model)
-"""What a calibration compares with the measurements: each pose, or part of it, or what lies between two poses."""
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.robot import Parameter, names_of
+
 Floats = NDArray[np.float64]
 
 IdentifiabilityClass = Literal["independent", "relative", "ineffective"]
@@ -29,8 +31,14 @@ RANK_TOLERANCE = 1e-10
 SUPPORT_TOLERANCE = 1e-6
 """A parameter takes part in a direction if its unit-free share in it is above this."""
 
-KEEP_ORDER = ("theta", "d", "a", "alpha", "beta", "x", "y", "z", "roll", "pitch", "yaw")
+KEEP_ORDER = ("theta", "d", "a", "alpha", "beta", "x", "y", "z", "yaw", "pitch", "roll")
 """Of parameters that only act together the earlier kind is kept, and of one kind the later joint, as in the paper."""
+
+WEAK = 10.0
+"""A direction with a signal-to-noise ratio below this is weak: its sigma is above a tenth of an ordinary change."""
+
+CORRELATED = 0.9
+"""Correlations above this are worth a line."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +48,7 @@ class RelativeGroup:
     Attributes:
         parameters: Their names.
         relations: Directions in which they may move together with no effect on any measurement: the change of
-            each, in [m] and [rad], the smallest being 1 or -1.
+            each, in [m] and [rad], the largest being 1 or -1.
         keep: Those that the package would estimate; the others stay at nominal.
     """
 
@@ -52,6 +60,19 @@ class RelativeGroup:
     def lost(self) -> int:
         """Number of directions that are lost."""
         return len(self.relations)
+
+
+@dataclass(frozen=True)
+class WeakDirection:
+    """A direction that the data determine, but badly.
+
+    Attributes:
+        signal_to_noise: Its singular value: 1 over its sigma in changes of ordinary size.
+        members: Its largest members, by name, as shares between -1 and 1.
+    """
+
+    signal_to_noise: float
+    members: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -68,6 +89,10 @@ class Observability:
         null_space: Orthonormal unit-free directions that are not determined, shape (n - rank, n).
         indices: O1 to O5.
         condition_number: Of the determined part.
+        sigma: 1 sigma of the independent and the kept parameters, the others being held at nominal, [m] and [rad].
+            That of a kept parameter is the sigma of the combination it stands for.
+        correlations: Pairs of those that are correlated by more than `CORRELATED`, strongest first.
+        weak: Directions among those with a signal-to-noise ratio below `WEAK`, weakest first.
     """
 
     names: tuple[str, ...]
@@ -79,48 +104,58 @@ class Observability:
     null_space: Floats
     indices: dict[str, float]
     condition_number: float
+    sigma: dict[str, float]
+    correlations: tuple[tuple[str, str, float], ...]
+    weak: tuple[WeakDirection, ...]
 
     def named(self, wanted: IdentifiabilityClass) -> list[str]:
         """Names of the parameters of one class."""
         return [name for name, c in zip(self.names, self.classes, strict=True) if c == wanted]
 
+    @property
+    def kept(self) -> list[str]:
+        """The parameters that can be estimated together: the independent ones and those kept of each group."""
+        keep = {name for group in self.relative for name in group.keep}
+        return [n for n, c in zip(self.names, self.classes, strict=True) if c == "independent" or n in keep]
+
+    @property
+    def lost(self) -> tuple[dict[str, float], ...]:
+        """Every lost direction by name: ineffective parameters alone, then the relations of the groups."""
+        alone = tuple({name: 1.0} for name in self.named("ineffective"))
+        return alone + tuple(relation for group in self.relative for relation in group.relations)
+
 
 def analyse(
     jacobian: Floats,
-    names: Sequence[str],
-    scales: Floats,
-    kinds: Sequence[str],
+    parameters: Sequence[Parameter],
+    *,
     n_measurements: int,
-    n_nuisance: int = 0,
+    prefer: Sequence[str] = (),
 ) -> Observability:
     """Analyse a whitened Jacobian, or the triangular factor of one.
 
     Args:
-        jacobian: Shape (m, n + n_nuisance), the nuisance columns (a measurement frame's) last.
-        names: The n parameters' names.
-        scales: A change of ordinary size of each, shape (n,), [m] or [rad].
-        kinds: Kind of each (`a`, `theta`, `x`), for the order of `KEEP_ORDER`.
+        jacobian: Shape (m, n).
+        parameters: The n parameters of the columns.
         n_measurements: Number of configurations or pairs, for O1.
-        n_nuisance: Columns that are free and of no interest; they are projected out.
+        prefer: Parameters to keep, first choice first, where only combinations are determined; then `KEEP_ORDER`.
     """
-    n = len(names)
-    J = jacobian[:, :n] * scales
-    reference = float(np.linalg.norm(J, axis=0).max(initial=0.0))
-    if n_nuisance:
-        U, s, _ = np.linalg.svd(jacobian[:, n:], full_matrices=False)
-        Q = U[:, s > RANK_TOLERANCE * s.max(initial=0.0)]
-        J = J - Q @ (Q.T @ J)
+    n, names = len(parameters), names_of(parameters)
+    scales = np.array([p.scale for p in parameters])
+    J = jacobian * scales
     _, s, Vt = np.linalg.svd(np.vstack([J, np.zeros((n, n))]), full_matrices=False)
-    # What projecting the nuisance out leaves of a dead column is rounding of the column before.
-    rank = int(np.sum(s > RANK_TOLERANCE * max(s[0], 1e-3 * reference)))
+    threshold = RANK_TOLERANCE * s[0]
+    rank = int(np.sum(s > threshold))
     null = Vt[rank:]
-    share = np.linalg.norm(null, axis=0)
-    dead = np.linalg.norm(J, axis=0) <= RANK_TOLERANCE * max(s[0], 1e-3 * reference)
-    relative = (share > SUPPORT_TOLERANCE) & ~dead
+    dead = np.linalg.norm(J, axis=0) <= threshold
+    relative = (np.linalg.norm(null, axis=0) > SUPPORT_TOLERANCE) & ~dead
     classes: list[IdentifiabilityClass] = [
         "ineffective" if d else "relative" if r else "independent" for d, r in zip(dead, relative, strict=True)
     ]
-    kept = s[:rank]
+    groups = _groups(null, dead, scales, parameters, prefer)
+    dropped = {name for g in groups for name in g.parameters if name not in g.keep}
+    kept = [i for i in range(n) if not dead[i] and names[i] not in dropped]
+    sigma, correlations, weak = _spread(J[:, kept], [names[i] for i in kept], scales[kept])
     with np.errstate(divide="ignore", invalid="ignore"):
         gap = float(s[rank - 1] / s[rank]) if 0 < rank < n else np.inf
     return Observability(
@@ -129,10 +164,13 @@ def analyse(
         rank=rank,
         gap=gap,
         classes=tuple(classes),
-        relative=_groups(null, dead, scales, names, kinds),
+        relative=groups,
         null_space=null,
-        indices=observability_indices(kept, n_measurements),
-        condition_number=float(kept[0] / kept[-1]) if rank else np.inf,
+        indices=observability_indices(s[:rank], n_measurements),
+        condition_number=float(s[0] / s[rank - 1]) if rank else np.inf,
+        sigma=sigma,
+        correlations=correlations,
+        weak=weak,
     )
 
 
@@ -153,8 +191,38 @@ def observability_indices(singular_values: Floats, n_measurements: int) -> dict[
     }
 
 
+def _spread(
+    J: Floats, names: Sequence[str], scales: Floats
+) -> tuple[dict[str, float], tuple[tuple[str, str, float], ...], tuple[WeakDirection, ...]]:
+    """Sigmas, strong correlations and weak directions of columns that are determined together."""
+    if not names:
+        return {}, (), ()
+    _, s, Vt = np.linalg.svd(J, full_matrices=False)
+    half = Vt.T / s
+    spread = np.linalg.norm(half, axis=1)
+    correlation = (half @ half.T) / np.outer(spread, spread)
+    above = np.argwhere(np.triu(np.abs(correlation) > CORRELATED, 1))
+    strongest = sorted(above.tolist(), key=lambda ij: -abs(correlation[ij[0], ij[1]]))
+    weak = []
+    for value, direction in zip(s[::-1], Vt[::-1], strict=True):
+        if value >= WEAK:
+            break
+        largest = np.flatnonzero(np.abs(direction) > 0.3 * np.abs(direction).max())
+        members = sorted(largest.tolist(), key=lambda i: -abs(direction[i]))
+        weak.append(WeakDirection(float(value), {names[i]: float(direction[i]) for i in members}))
+    return (
+        dict(zip(names, (spread * scales).tolist(), strict=True)),
+        tuple((names[i], names[j], float(correlation[i, j])) for i, j in strongest),
+        tuple(weak),
+    )
+
+
 def _groups(
-    null: Floats, dead: NDArray[np.bool_], scales: Floats, names: Sequence[str], kinds: Sequence[str]
+    null: Floats,
+    dead: NDArray[np.bool_],
+    scales: Floats,
+    parameters: Sequence[Parameter],
+    prefer: Sequence[str],
 ) -> tuple[RelativeGroup, ...]:
     """Connected relative groups with sparse relations, from an orthonormal basis of the null space."""
     alive: list[int] = np.flatnonzero(~dead).tolist()
@@ -162,54 +230,79 @@ def _groups(
     if n_lost <= 0:
         return ()
     # Eliminate the parameters one would rather give up: each relation then holds one of them and kept ones only.
-    order = sorted(alive, key=lambda i: (-_preference(kinds[i]), i))
+    order = sorted(alive, key=lambda i: (-_preference(parameters[i], prefer), i))
     N = null[:, order]
     dropped = _first_independent(N, n_lost)
     relations = np.linalg.lstsq(N[:, dropped].T, np.eye(n_lost), rcond=None)[0].T @ N  # (n_lost, n_alive)
     relations[np.abs(relations) < SUPPORT_TOLERANCE] = 0.0
-    groups: list[tuple[set[int], list[int]]] = []
-    for r in range(n_lost):
-        support: set[int] = set(np.flatnonzero(relations[r]).tolist())
-        touching = [g for g in groups if g[0] & support]
-        groups = [g for g in groups if not g[0] & support]
-        groups.append((support.union(*(g[0] for g in touching)), sorted([r, *(k for g in touching for k in g[1])])))
+    names = names_of(parameters)
     found = []
-    for support, rows in groups:
+    for support, rows in _connected(relations):
         members = sorted(order[i] for i in support)
-        physical = [relations[r] * scales[order] for r in rows]
+        given_up = {order[dropped[r]] for r in rows}
+        rows.sort(key=lambda r: order[dropped[r]])
+        physical = _chained(relations[rows]) * scales[order]
         found.append(
             RelativeGroup(
                 parameters=tuple(names[i] for i in members),
-                relations=tuple(_relation(v, order, names) for v in physical),
-                keep=tuple(names[i] for i in members if i not in {order[dropped[r]] for r in rows}),
+                relations=tuple(_relation(direction, order, names) for direction in physical),
+                keep=tuple(names[i] for i in members if i not in given_up),
             )
         )
     return tuple(sorted(found, key=lambda g: names.index(g.parameters[0])))
 
 
-def _preference(kind: str) -> int:
-    """Rank of a kind in the order of keeping; unknown kinds come last."""
-    return KEEP_ORDER.index(kind) if kind in KEEP_ORDER else len(KEEP_ORDER)
+def _preference(parameter: Parameter, prefer: Sequence[str]) -> int:
+    """Rank in the order of keeping, 0 first: the user's choice, then `KEEP_ORDER`."""
+    if parameter.name in prefer:
+        return list(prefer).index(parameter.name)
+    return len(prefer) + KEEP_ORDER.index(parameter.kind)
 
 
 def _first_independent(N: Floats, count: int) -> list[int]:
-    """The first columns of N, in order, that are linearly independent."""
+    """The first columns of N, in order, that are clearly linearly independent."""
     chosen: list[int] = []
     basis = np.zeros((len(N), 0))
-    for i in range(N.shape[1]):
-        rest = N[:, i] - basis @ (basis.T @ N[:, i])
-        rest -= basis @ (basis.T @ rest)
-        if np.linalg.norm(rest) > SUPPORT_TOLERANCE:
-            chosen.append(i)
-            basis = np.column_stack([basis, rest / np.linalg.norm(rest)])
-        if len(chosen) == count:
-            break
+    for clearly in (1e-2, SUPPORT_TOLERANCE, 0.0):
+        for i in range(N.shape[1]):
+            if len(chosen) == count:
+                return chosen
+            rest = N[:, i] - basis @ (basis.T @ N[:, i])
+            rest -= basis @ (basis.T @ rest)
+            if i not in chosen and np.linalg.norm(rest) > clearly:
+                chosen.append(i)
+                basis = np.column_stack([basis, rest / np.linalg.norm(rest)])
     return chosen
 
 
+def _connected(relations: Floats) -> list[tuple[set[int], list[int]]]:
+    """Relations that share a parameter, together: (parameters, relations) of each group."""
+    groups: list[tuple[set[int], list[int]]] = []
+    for r, relation in enumerate(relations):
+        support: set[int] = set(np.flatnonzero(relation).tolist())
+        touching = [g for g in groups if g[0] & support]
+        groups = [g for g in groups if not g[0] & support]
+        groups.append((support.union(*(g[0] for g in touching)), [r, *(k for g in touching for k in g[1])]))
+    return groups
+
+
+def _chained(relations: Floats) -> Floats:
+    """Each relation against the next, where that needs no more parameters: d3 - d4, d4 - d5 for d3 - d5, d4 - d5."""
+    chained = relations.copy()
+    for r in range(len(relations) - 1):
+        shared = np.flatnonzero((relations[r] != 0.0) & (relations[r + 1] != 0.0))
+        if len(shared):
+            ratio = relations[r, shared[-1]] / relations[r + 1, shared[-1]]
+            against = relations[r] - ratio * relations[r + 1]
+            against[np.abs(against) < SUPPORT_TOLERANCE] = 0.0
+            if np.count_nonzero(against) <= np.count_nonzero(relations[r]):
+                chained[r] = against
+    return chained
+
+
 def _relation(direction: Floats, order: Sequence[int], names: Sequence[str]) -> dict[str, float]:
-    """A direction as changes by name, the smallest of which is 1 in size and the first positive."""
+    """A direction as changes by name, the largest of which is 1 in size and the first positive."""
     support = sorted((i for i in range(len(order)) if direction[i]), key=lambda i: order[i])
-    smallest = min(abs(direction[i]) for i in support)
+    largest = max(abs(direction[i]) for i in support)
     sign = np.sign(direction[support[0]])
-    return {names[order[i]]: float(sign * direction[i] / smallest) for i in support}
+    return {names[order[i]]: float(f"{sign * direction[i] / largest:.9g}") for i in support}

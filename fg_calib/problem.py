@@ -6,14 +6,15 @@ take part and why the others do not.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib import frames, residuals
+from fg_calib.choices import FrameKnowledge, Model
 from fg_calib.errors import ProblemError
 from fg_calib.factors import (
     Variables,
@@ -26,9 +27,10 @@ from fg_calib.factors import (
 )
 from fg_calib.frames import Frame, Unknown
 from fg_calib.kinematics import Chain, build_chain, forward, precompute_trig
-from fg_calib.measurements import Measurements, Model, Pairing, Pairs, form_pairs
+from fg_calib.measurements import Measurements, Pairing, Pairs, form_pairs
+from fg_calib.observability import RANK_TOLERANCE, Observability, analyse
 from fg_calib.residuals import Block, PairBlock, PoseBlock, SamePointBlock
-from fg_calib.robot import Robot
+from fg_calib.robot import Parameter, Robot
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -71,7 +73,7 @@ class Settings:
 
     model: Model = "distance-rotation"
     pairing: Pairing = field(default_factory=Pairing)
-    frame: Literal["known", "unknown"] = "known"
+    frame: FrameKnowledge = "known"
     prior: bool = True
 
     @property
@@ -143,6 +145,12 @@ class Problem:
         return self.variables.values(self.start)
 
     @property
+    def estimated(self) -> list[Parameter]:
+        """The robot's estimated parameters, in the order of the columns."""
+        parameters = {p.name: p for p in self.robot.parameters}
+        return [parameters[name] for name in self.variables.names[: self.variables.n_robot_columns]]
+
+    @property
     def n_pairs(self) -> int:
         """Train pairs that give at least one row."""
         if self.pairs is None or self.judgement is None:
@@ -185,7 +193,7 @@ def build_problem(
     *,
     model: Model,
     pairing: Pairing | None = None,
-    frame: Literal["known", "unknown"] = "known",
+    frame: FrameKnowledge = "known",
     prior: bool | None = None,
 ) -> Problem:
     """The calibration problem of a robot and its measurements.
@@ -217,6 +225,67 @@ def build_problem(
     return problem
 
 
+def predicted_problem(
+    robot: Robot,
+    readings: Floats,
+    model: Model,
+    *,
+    frame: FrameKnowledge = "known",
+    pairing: Pairing | None = None,
+    sigmas: tuple[Floats | None, Floats | None, Floats | None] = (None, None, None),
+) -> Problem:
+    """The problem that a robot's own predictions at some configurations make: what could be measured there.
+
+    Args:
+        robot: The robot.
+        readings: Joint readings, shape (n, n_joints), [rad] (prismatic: [m]).
+        model: Which measurements take part.
+        frame: Whether the measurement frame is estimated too.
+        pairing: How pairs are formed; a star if None.
+        sigmas: Of positions, shape (n, 3), [m], of orientations, shape (n, 3), [rad], and of readings, shape
+            (n_joints,); 1 mm, 1 mrad and none where None.
+    """
+    settings = Settings(model, pairing or Pairing(), frame, prior=False)
+    variables = build_variables(robot, frame == "unknown" and not settings.uses_pairs)
+    trig = precompute_trig(robot, readings)
+    poses = forward(build_chain(robot), trig)
+    n = len(readings)
+    usual = np.full((n, 3), 1e-3)
+    sigma_position, sigma_orientation, sigma_joint = sigmas
+    measurements = Measurements(
+        readings=readings,
+        ids=np.arange(n).astype(str),
+        test=np.zeros(n, dtype=np.bool_),
+        position=poses.position,
+        rotation=poses.rotation,
+        sigma_position=usual if sigma_position is None else sigma_position,
+        sigma_orientation=usual if sigma_orientation is None else sigma_orientation,
+        sigma_joint=np.zeros(robot.n_joints) if sigma_joint is None else sigma_joint,
+        source="predictions",
+    )
+    pairs = _usable_pairs(measurements, settings) if settings.uses_pairs else None
+    return _assemble(robot, measurements, settings, variables, variables.nominal(), trig, pairs)
+
+
+def random_problem(
+    robot: Robot, model: Model, frame: FrameKnowledge = "known", *, n_configurations: int = 0, seed: int = 0
+) -> Problem:
+    """`predicted_problem` at random configurations: what a model can determine at all.
+
+    Args:
+        robot: The robot; revolute joints without limits turn over +-180 degrees, prismatic ones slide over +-1 m.
+        model: Which measurements take part; pairs are chained.
+        frame: Whether the measurement frame is estimated too.
+        n_configurations: How many; 0 for ten for every parameter, 300 at least.
+        seed: Of the random configurations.
+    """
+    n = n_configurations or max(300, 10 * len(robot.parameters))
+    span = np.array([1.0 if joint.prismatic else np.pi for joint in robot.joints])
+    lower, upper = np.clip(robot.limits, -span[:, None], span[:, None]).T
+    readings = np.random.default_rng(seed).uniform(lower, upper, (n, robot.n_joints))
+    return predicted_problem(robot, readings, model, frame=frame, pairing=Pairing("chain"))
+
+
 def judged_at(problem: Problem, parameters: Floats) -> Problem:
     """The same problem with its rows judged and whitened, and started, at other parameters."""
     p = problem
@@ -233,6 +302,49 @@ def frames_only(problem: Problem) -> Problem | None:
         return None
     p = problem
     return _assemble(robot, p.measurements, p.settings, variables, p.start, p.trig, p.pairs)
+
+
+def whitened_triangle(problem: Problem, parameters: Floats) -> Floats:
+    """Triangular factor of the train rows' whitened Jacobian at a parameter vector, shape (m, n_columns)."""
+    chain = problem.variables.chain.at(parameters)
+    return np.vstack([residuals.triangle(block, chain)[:, :-1] for block in problem.blocks])
+
+
+def named_triangle(problem: Problem, parameters: Floats) -> Floats:
+    """`whitened_triangle` by named parameters, the measurement frame projected out: shape (m, n_robot_columns).
+
+    Note:
+        At a tool pitch of a quarter turn there is no way back from tangent columns to angles; the nearest is taken.
+    """
+    variables = problem.variables
+    n = variables.n_robot_columns
+    D = np.nan_to_num(variables.named_derivative(parameters), posinf=1e12, neginf=-1e12)
+    J: Floats = whitened_triangle(problem, parameters) @ np.linalg.pinv(D)
+    out: Floats = J[:, :n]
+    if n == variables.n_columns:
+        return out
+    U, s, _ = np.linalg.svd(J[:, n:], full_matrices=False)
+    Q = U[:, s > RANK_TOLERANCE * s.max(initial=0.0)]
+    out = out - Q @ (Q.T @ out)
+    # What projecting leaves of a column that was all frame is rounding.
+    out[:, np.linalg.norm(out, axis=0) <= RANK_TOLERANCE * np.linalg.norm(J[:, :n], axis=0)] = 0.0
+    return out
+
+
+def observe(problem: Problem, parameters: Floats, prefer: Sequence[str] = ()) -> Observability:
+    """What the train rows, without priors, determine of the robot's parameters around a parameter vector.
+
+    Args:
+        problem: The problem.
+        parameters: The parameter vector (see `Variables`).
+        prefer: Parameters to keep, first choice first, where only combinations are determined.
+    """
+    return analyse(
+        named_triangle(problem, parameters),
+        problem.estimated,
+        n_measurements=problem.n_pairs or problem.n_configurations,
+        prefer=prefer,
+    )
 
 
 def all_rows(problem: Problem) -> Block:
@@ -309,32 +421,15 @@ def _check_enough(problem: Problem) -> None:
     rows = problem.n_residuals + problem.n_priors
     if rows >= problem.variables.n_columns:
         return
-    needed = _structural_rank(problem)
+    s = problem.settings
+    anywhere = random_problem(problem.robot, s.model, s.frame)
+    priors = prior_rows(problem.variables, problem.start)[1]
+    stacked = np.vstack([whitened_triangle(anywhere, anywhere.start), priors])
+    needed = int(np.linalg.matrix_rank(stacked * problem.variables.scales, rtol=RANK_TOLERANCE))
     if rows < needed:
         raise ProblemError(
             source, f"{rows} residuals", f"at least {needed} to determine what model {problem.settings.model} can"
         )
-
-
-def _structural_rank(problem: Problem, n: int = 300) -> int:
-    """Rank of data and priors on n random configurations within the joint limits."""
-    robot = problem.robot
-    lower, upper = np.nan_to_num(robot.limits, neginf=-np.pi, posinf=np.pi).T
-    q = np.random.default_rng(0).uniform(lower, upper, (n, robot.n_joints))
-    trig, rows = precompute_trig(robot, q), np.arange(n)
-    block: Block
-    if problem.settings.uses_pairs:
-        nothing = np.zeros(n - 1)
-        pairs = Pairs(rows[:-1], rows[1:], nothing, nothing, nothing, nothing, nothing > 0)
-        block = _pair_block(trig, pairs, PAIR_KINDS[problem.settings.model], np.array([1.0, 0.0, 1.0]))
-    else:
-        kinds = POSE_KINDS[problem.settings.model]
-        poses = forward(problem.variables.chain.at(problem.start).without_columns(), trig)
-        m = replace(problem.measurements, position=poses.position, rotation=poses.rotation)
-        block = _pose_block(trig, rows, m, kinds, np.eye(3 * sum(kinds)))
-    R = residuals.triangle(block, problem.variables.chain.at(problem.start))[:, :-1]
-    stacked = np.vstack([R, prior_rows(problem.variables, problem.start)[1]])
-    return int(np.linalg.matrix_rank(stacked * problem.variables.scales, rtol=1e-9))
 
 
 def _start(

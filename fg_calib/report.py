@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from rich.console import Console, Group, RenderableType
@@ -11,7 +11,11 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from fg_calib.solve import Solution
+from fg_calib.identifiability import Identifiability
+from fg_calib.observability import CORRELATED, Observability
+from fg_calib.reasons import LostDirection
+from fg_calib.robot import AXIS_OF_KIND, Axis
+from fg_calib.solver import Solution
 from fg_calib.uncertainty import FrameEstimate, ParameterEstimate, Uncertainty
 
 WIDTH = 100
@@ -25,9 +29,13 @@ _FAMILY_UNIT = {"position": "m", "orientation": "rad", "distance": "m", "angle":
 
 def format_report(solution: Solution, uncertainty: Uncertainty, width: int = WIDTH) -> str:
     """The report as plain text."""
+    return _plain_text(build_report(solution, uncertainty), width)
+
+
+def _plain_text(report: RenderableType, width: int) -> str:
     text = io.StringIO()
     console = Console(file=text, width=width, color_system=None, highlight=False, legacy_windows=False)
-    console.print(build_report(solution, uncertainty))
+    console.print(report)
     return "\n".join(line.rstrip() for line in text.getvalue().splitlines())
 
 
@@ -41,6 +49,11 @@ def build_report(solution: Solution, uncertainty: Uncertainty) -> RenderableType
     ]
     if uncertainty.frame is not None:
         parts += _section("Measurement frame (world_T_base)", _frame(uncertainty.frame))
+    if uncertainty.identifiability.lost:
+        parts += _section("What the data do not determine", _lost(uncertainty.identifiability.lost))
+    weak = _weak(uncertainty.observability)
+    if weak is not None:
+        parts += _section("What they determine badly (sigma above a tenth of an ordinary change)", weak)
     notes = list(_notes(solution, uncertainty))
     if notes:
         parts += _section("Notes", *(Padding(Text(note), (0, 0, 0, 2)) for note in notes))
@@ -64,11 +77,14 @@ def _verdict(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
     return Group(Text(what), *doubts)
 
 
-def _plain_table(*columns: tuple[str, str]) -> Table:
-    """A table without a frame; columns as (heading, justification). Where it is too wide its first column folds."""
+def _plain_table(*columns: tuple[str, str], wrap: bool = False) -> Table:
+    """A table without a frame; columns as (heading, justification).
+
+    Where it is too wide its first column folds; with `wrap` all of them wrap at words.
+    """
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="italic")
     for i, (heading, justify) in enumerate(columns):
-        table.add_column(heading, justify=justify, no_wrap=i > 0, overflow="fold")  # type: ignore[arg-type]
+        table.add_column(heading, justify=justify, no_wrap=i > 0 and not wrap, overflow="fold")  # type: ignore[arg-type]
     return table
 
 
@@ -171,11 +187,6 @@ def _notes(solution: Solution, uncertainty: Uncertainty) -> Iterable[str]:
     judgement, pairs = solution.problem.judgement, solution.problem.pairs
     if judgement is not None and pairs is not None and (same := int(np.sum(judgement.same_point & ~pairs.test))):
         yield f"{same} train pairs are one point twice: three coordinates each instead of a distance"
-    for group in uncertainty.observability.relative:
-        yield f"the data determine only combinations of {', '.join(group.parameters)} ({group.lost} lost)"
-    ineffective = uncertainty.observability.named("ineffective")
-    if ineffective:
-        yield f"the data do not depend on {', '.join(ineffective)}"
     held = [p for p in uncertainty.parameters if p.identifiability in ("relative", "ineffective")]
     if held:
         with_prior = [p for p in held if p.prior_sigma is not None]
@@ -191,3 +202,105 @@ def _notes(solution: Solution, uncertainty: Uncertainty) -> Iterable[str]:
 def _listed(parameters: list[ParameterEstimate], limit: int = 12) -> str:
     names = [p.name for p in parameters]
     return ", ".join(names[:limit]) + (f" and {len(names) - limit} more" if len(names) > limit else "")
+
+
+def format_identifiability(found: Identifiability, width: int = WIDTH) -> str:
+    """`build_identifiability_report` as plain text."""
+    return _plain_text(build_identifiability_report(found), width)
+
+
+def build_identifiability_report(found: Identifiability) -> RenderableType:
+    """What can be identified, as in the paper's Tables 3 and 4, and why the rest cannot."""
+    where = "random configurations" if found.kind == "structural" else "configurations"
+    title = f"{found.robot}: {found.model}, {found.kind}, {found.n_configurations} {where}"
+    parts = [Text(title, style="bold"), *_classes(found)]
+    known = found.with_fixed_known
+    if known is not None:
+        parts += [
+            Text(f"\nWith {', '.join(found.fixed)} known, as the robot's file says", style="bold"),
+            *_classes(known),
+        ]
+    return Group(*parts)
+
+
+def _classes(found: Identifiability) -> list[RenderableType]:
+    o = found.observability
+    table = _plain_table(("Identifiability", "left"), ("Kinematic parameters", "left"), wrap=True)
+    table.add_row("Independent", ", ".join(o.named("independent")) or "None")
+    relations = (f"[{' '.join(relation)}]" for group in o.relative for relation in group.relations)
+    table.add_row("Relative", Text(", ".join(relations) or "None"))
+    table.add_row("Ineffective", ", ".join(o.named("ineffective")) or "None")
+    table.add_row("Kept", ", ".join(o.kept) or "None")
+    parts: list[RenderableType] = [Text(f"rank {o.rank} of {len(o.names)}\n"), table]
+    if found.lost:
+        parts += _section("Lost directions", _lost(found.lost))
+    practical = found.kind == "practical"
+    parts += _section("Singular values" + (" (signal-to-noise ratios)" if practical else ""), _singular_values(o))
+    if practical:
+        indices = "  ".join(f"{name} {value:.4g}" for name, value in o.indices.items())
+        parts += _section("Observability indices", Text(f"{indices}  condition number {o.condition_number:.4g}"))
+        weak = _weak(o)
+        if weak is not None:
+            parts += _section("Weak directions (sigma above a tenth of an ordinary change)", weak)
+        parts += _section("Sigma of what is kept, the rest at nominal", _sigmas(o))
+        if o.correlations:
+            correlated = (Text(f"{a}, {b}: {rho:+.3f}") for a, b, rho in o.correlations)
+            parts += _section(f"Correlations above {CORRELATED:g}", *correlated)
+    return parts
+
+
+def _lost(lost: Sequence[LostDirection]) -> RenderableType:
+    """One line a reason, with the directions that have it."""
+    by_reason: dict[str, list[str]] = {}
+    for direction in lost:
+        by_reason.setdefault(direction.reason, []).append(format_relation(direction.relation))
+    table = _plain_table(("", "left"), ("because", "left"), wrap=True)
+    for reason, relations in by_reason.items():
+        table.add_row(", ".join(relations), reason)
+    return table
+
+
+def format_relation(relation: Mapping[str, float]) -> str:
+    """`d3 - d4` where sizes are equal, else `d6 by +0.5 m with alpha7 by +1 rad`."""
+    names, values = list(relation), list(relation.values())
+    if all(abs(v) == 1.0 for v in values):
+        return names[0] + "".join(f" {'+' if v > 0 else '-'} {n}" for n, v in zip(names[1:], values[1:], strict=True))
+    return " with ".join(f"{n} by {v:+.4g} {unit_of(n)}" for n, v in relation.items())
+
+
+def unit_of(name: str) -> str:
+    """`m` or `rad`, by a parameter's name."""
+    kind = name.rsplit(".", 1)[-1].rstrip("0123456789") if "." not in name else name.rsplit(".", 1)[-1]
+    return "m" if AXIS_OF_KIND[kind] < Axis.RX else "rad"
+
+
+def _weak(observability: Observability) -> RenderableType | None:
+    """Weak directions by their largest members; None if there are none."""
+    if not observability.weak:
+        return None
+    table = _plain_table(("sigma / ordinary change", "right"), ("largest members", "left"), wrap=True)
+    for weak in observability.weak[:8]:
+        members = ", ".join(f"{name} {share:+.2f}" for name, share in weak.members.items())
+        table.add_row(f"{1.0 / weak.signal_to_noise:.3g}", members)
+    if len(observability.weak) > 8:
+        table.add_row("", f"and {len(observability.weak) - 8} more")
+    return table
+
+
+def _singular_values(observability: Observability) -> RenderableType:
+    o = observability
+    kept, dropped = o.singular_values[: o.rank], o.singular_values[o.rank :]
+    lines = [" ".join(f"{v:.3g}" for v in kept) or "none"]
+    if len(dropped):
+        lines.append(f"gap of {o.gap:.1e}, then {len(dropped)} of at most {dropped[0]:.1e}")
+    return Text("\n".join(lines))
+
+
+def _sigmas(observability: Observability) -> RenderableType:
+    table = _plain_table(("", "left"), ("sigma", "right"), ("", "left"), ("stands for", "left"))
+    for name, sigma in observability.sigma.items():
+        factor, unit, decimals = _SHOWN[unit_of(name)]
+        others = [g for g in observability.relative if name in g.keep]
+        stands = " ".join(others[0].parameters) if others else ""
+        table.add_row(name, f"{sigma * factor:.{decimals}f}", unit, stands)
+    return table

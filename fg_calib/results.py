@@ -20,9 +20,9 @@ from fg_calib.files.disk import write_text
 from fg_calib.files.robot_yaml import write_robot
 from fg_calib.files.tables import write_csv
 from fg_calib.files.urdf import write_urdf
-from fg_calib.observability import Observability
+from fg_calib.identifiability import Identifiability
 from fg_calib.robot import Robot
-from fg_calib.solve import Solution
+from fg_calib.solver import Solution
 from fg_calib.uncertainty import Uncertainty
 
 RESULT_SCHEMA = "fg-calib/result/1"
@@ -91,43 +91,58 @@ def result_document(
         ],
         "covariance": {"names": list(uncertainty.names), "matrix": uncertainty.covariance},
         "frame_estimate": None if uncertainty.frame is None else asdict(uncertainty.frame),
-        "observability": observability_document(uncertainty.observability, settings.model, "practical"),
+        "observability": observability_document(uncertainty.identifiability),
         "inputs": dict(inputs or {}),
     }
     plain: dict[str, Any] = _plain(document)
     return plain
 
 
-def observability_document(observability: Observability, model: str, kind: str) -> dict[str, Any]:
-    """What `observability.json` holds."""
-    o = observability
-    document: dict[str, Any] = _plain(
-        {
-            "schema": OBSERVABILITY_SCHEMA,
-            "model": model,
-            "kind": kind,
-            "n_parameters": len(o.names),
-            "rank": o.rank,
-            "names": list(o.names),
-            "singular_values": o.singular_values,
-            "gap": o.gap,
-            "independent": o.named("independent"),
-            "ineffective": o.named("ineffective"),
-            "relative": [
-                {
-                    "parameters": list(g.parameters),
-                    "lost": g.lost,
-                    "relations": list(g.relations),
-                    "keep": list(g.keep),
-                }
-                for g in o.relative
-            ],
-            "null_space": o.null_space,
-            "indices": o.indices,
-            "condition_number": o.condition_number,
-        }
-    )
-    return document
+def observability_document(found: Identifiability) -> dict[str, Any]:
+    """What `observability.json` holds: sigmas, correlations and weak directions only where the noise is the user's."""
+    o = found.observability
+    document: dict[str, Any] = {
+        "schema": OBSERVABILITY_SCHEMA,
+        "robot": found.robot,
+        "model": found.model,
+        "kind": found.kind,
+        "n_configurations": found.n_configurations,
+        "n_parameters": len(o.names),
+        "rank": o.rank,
+        "names": list(o.names),
+        "singular_values": o.singular_values,
+        "gap": o.gap,
+        "independent": o.named("independent"),
+        "ineffective": o.named("ineffective"),
+        "relative": [
+            {"parameters": list(g.parameters), "lost": g.lost, "relations": list(g.relations), "keep": list(g.keep)}
+            for g in o.relative
+        ],
+        "kept": o.kept,
+        "lost": [{"relation": direction.relation, "reason": direction.reason} for direction in found.lost],
+        "null_space": o.null_space,
+        "indices": o.indices,
+        "condition_number": o.condition_number,
+    }
+    if found.kind == "practical":
+        document["sigma"] = o.sigma
+        document["correlations"] = [{"parameters": [a, b], "correlation": rho} for a, b, rho in o.correlations]
+        document["weak"] = [{"signal_to_noise": w.signal_to_noise, "members": w.members} for w in o.weak]
+    if found.with_fixed_known is not None:
+        document["fixed"] = list(found.fixed)
+        document["with_fixed_known"] = observability_document(found.with_fixed_known)
+    plain: dict[str, Any] = _plain(document)
+    return plain
+
+
+def write_observability(folder: Path | str, found: Identifiability) -> None:
+    """Write `observability.json` into a folder.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    text = json.dumps(observability_document(found), indent=1, allow_nan=False) + "\n"
+    fill_folder(Path(folder), lambda into: write_text(into / "observability.json", text))
 
 
 def write_results(

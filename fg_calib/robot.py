@@ -176,6 +176,11 @@ class Robot:
         """Indices of the parameters of joint `owner` (0 is the base, n + 1 the tool)."""
         return [i for i, p in enumerate(self.parameters) if p.owner == owner]
 
+    def with_estimated(self, names: Iterable[str]) -> Robot:
+        """The same robot with just the parameters called `names` estimated."""
+        wanted = set(names)
+        return replace(self, parameters=tuple(replace(p, estimated=p.name in wanted) for p in self.parameters))
+
     def with_values(self, values: Floats | Sequence[float]) -> Robot:
         """The same robot with other nominal values, shape (n_parameters,), [m] or [rad]."""
         changed = (replace(p, nominal=float(v)) for p, v in zip(self.parameters, values, strict=True))

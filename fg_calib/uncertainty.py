@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib import residuals
 from fg_calib.factors import pose_of, prior_rows
-from fg_calib.observability import RANK_TOLERANCE, SUPPORT_TOLERANCE, IdentifiabilityClass, Observability, analyse
-from fg_calib.problem import PAIR_KINDS, POSE_KINDS, Problem, all_rows
-from fg_calib.solve import Solution
+from fg_calib.identifiability import Identifiability, identify
+from fg_calib.observability import RANK_TOLERANCE, SUPPORT_TOLERANCE, IdentifiabilityClass, Observability
+from fg_calib.problem import PAIR_KINDS, POSE_KINDS, Problem, all_rows, whitened_triangle
+from fg_calib.solver import Solution
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -128,7 +129,7 @@ class Uncertainty:
         dof: Residuals and priors, less the determined directions.
         chi2_bounds: Interval of the reduced chi-square that is taken as good.
         residuals: Every residual, before and after.
-        observability: What the data alone determine, at the nominal parameters.
+        identifiability: What the data alone determine, at the nominal parameters.
         findings: Why the result is not to be trusted; empty if it is.
     """
 
@@ -140,8 +141,13 @@ class Uncertainty:
     dof: int
     chi2_bounds: tuple[float, float]
     residuals: ResidualTable
-    observability: Observability
+    identifiability: Identifiability
     findings: tuple[str, ...]
+
+    @property
+    def observability(self) -> Observability:
+        """Rank, classes and groups of `identifiability`."""
+        return self.identifiability.observability
 
     @property
     def reduced_chi2(self) -> float | None:
@@ -169,12 +175,12 @@ def assess(solution: Solution) -> Uncertainty:
     """
     problem = solution.problem
     variables = problem.variables
-    data = _triangle(problem, solution.parameters)
+    data = whitened_triangle(problem, solution.parameters)
     D = variables.named_derivative(solution.parameters)
     priors = prior_rows(variables, solution.parameters)[1]
     scales, n_robot = variables.scales, variables.n_robot_columns
     tangent, loose, rank = _covariance(np.vstack([data, priors]), scales)
-    nominal = np.vstack([_triangle(problem, solution.before), prior_rows(variables, solution.before)[1]])
+    nominal = np.vstack([whitened_triangle(problem, solution.before), prior_rows(variables, solution.before)[1]])
     loose_at_nominal = _covariance(nominal, scales)[1]
 
     def covariance_of(rows: Floats) -> Floats:
@@ -188,7 +194,7 @@ def assess(solution: Solution) -> Uncertainty:
         return out
 
     covariance = covariance_of(D)
-    at_nominal = observe(problem, solution.before)
+    at_nominal = identify(problem, solution.before, "practical")
     sigma = np.sqrt(np.diag(covariance))
     frame = None
     if n_robot < variables.n_columns:
@@ -204,34 +210,16 @@ def assess(solution: Solution) -> Uncertainty:
     return Uncertainty(
         names=variables.names[:n_robot],
         covariance=covariance[:n_robot, :n_robot],
-        parameters=_parameter_estimates(solution, dict(zip(variables.names, sigma, strict=True)), at_nominal),
+        parameters=_parameter_estimates(
+            solution, dict(zip(variables.names, sigma, strict=True)), at_nominal.observability
+        ),
         frame=frame,
         chi2=chi2,
         dof=dof,
         chi2_bounds=bounds,
         residuals=residual_table(solution),
-        observability=at_nominal,
+        identifiability=at_nominal,
         findings=_findings(solution, chi2, dof, bounds),
-    )
-
-
-def observe(problem: Problem, parameters: Floats) -> Observability:
-    """What the train rows, without priors, determine of the robot's parameters around a parameter vector."""
-    variables = problem.variables
-    n_robot = variables.n_robot_columns
-    kind_of = {p.name: p.kind for p in problem.robot.parameters}
-    names = variables.names[:n_robot]
-    scale_of = {p.name: p.scale for p in problem.robot.parameters}
-    # From tangent columns to named ones; at a tool pitch of a quarter turn there is no way back: the nearest one.
-    D = variables.named_derivative(parameters)
-    back = np.linalg.pinv(np.nan_to_num(D, posinf=1e12, neginf=-1e12))
-    return analyse(
-        _triangle(problem, parameters) @ back,
-        names,
-        np.array([scale_of[name] for name in names]),
-        [kind_of[name] for name in names],
-        problem.n_pairs or problem.n_configurations,
-        variables.n_columns - n_robot,
     )
 
 
@@ -252,13 +240,6 @@ def residual_table(solution: Solution) -> ResidualTable:
     if problem.pairs is not None:
         return _pair_table(problem, before, after)
     return _pose_table(problem, before, after)
-
-
-def _triangle(problem: Problem, parameters: Floats) -> Floats:
-    """Triangular factor of the train rows' whitened Jacobian, shape (m, n_columns)."""
-    chain = problem.variables.chain.at(parameters)
-    parts = [residuals.triangle(block, chain)[:, :-1] for block in problem.blocks]
-    return np.vstack(parts) if len(parts) > 1 else parts[0]
 
 
 def _covariance(J: Floats, scales: Floats) -> tuple[Floats, Floats, int]:

@@ -6,10 +6,11 @@ import math
 import numpy as np
 import pytest
 
+from fg_calib.choices import MODELS
 from fg_calib.errors import InputError
 from fg_calib.files.job import read_job
 from fg_calib.files.units import Units
-from fg_calib.measurements import MODELS, Pairing
+from fg_calib.measurements import Pairing
 
 ROBOT = """\
 convention: mdh

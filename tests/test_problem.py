@@ -12,7 +12,7 @@ from fg_calib.errors import ProblemError
 from fg_calib.kinematics import build_chain, pose
 from fg_calib.measurements import Measurements, Pairing, Pairs
 from fg_calib.problem import all_rows, build_problem, judged_at
-from fg_calib.solve import solve
+from fg_calib.solver import solve
 
 
 def direct_pairs(distance, angle, sigma=(1e-3, 1e-3), test=None):

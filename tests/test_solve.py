@@ -15,7 +15,7 @@ from fg_calib.factors import prior_rows
 from fg_calib.kinematics import pose
 from fg_calib.measurements import Pairing
 from fg_calib.problem import build_problem
-from fg_calib.solve import SolverOptions, solve
+from fg_calib.solver import SolverOptions, solve
 
 TOLERANCE = {"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3}
 FRAME = (Rotation.from_rotvec(np.pi * np.array([0.0, 0.6, 0.8])), np.array([7.0, -30.0, 2.0]))

@@ -10,7 +10,7 @@ from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_
 
 from fg_calib.measurements import Measurements, Pairing
 from fg_calib.problem import build_problem
-from fg_calib.solve import SolverOptions, solve
+from fg_calib.solver import SolverOptions, solve
 from fg_calib.uncertainty import assess, chi2_bounds, marginals
 
 TOLERANCE = {"a": 5e-3, "d": 5e-3, "alpha": 2e-3, "theta": 2e-3, "beta": 2e-3, "tool": 5e-3}

@@ -5,19 +5,18 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import Field, StrictBool
 
+from fg_calib.choices import FrameKnowledge, Model
 from fg_calib.errors import InputError
 from fg_calib.files.robot_yaml import read_robot, robot_from_mapping
 from fg_calib.files.schema import Count, NotNegative, Positive, Schema, read_yaml, shown, validate
 from fg_calib.files.tables import read_measurements
 from fg_calib.files.units import Units
-from fg_calib.measurements import Measurements, Model, Noise, Pairing
+from fg_calib.measurements import Measurements, Noise, Pairing
 from fg_calib.robot import Robot
-
-Frame = Literal["known", "unknown"]
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class Job:
     measurements: Measurements
     model: Model
     pairing: Pairing
-    frame: Frame
+    frame: FrameKnowledge
     prior: bool | None
     loss: str
     units: Units
@@ -76,7 +75,7 @@ class _Job(Schema):
     pairs: str | None = None
     model: Model
     pairing: Any = "star"  # a strategy's name, or a `_RandomPairing`
-    frame: Frame = "known"
+    frame: FrameKnowledge = "known"
     units: Units = Units()
     noise: _Noise = _Noise()
     prior: StrictBool | None = None

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Literal
 
+from fg_calib.choices import AngleUnit, LengthUnit
 from fg_calib.files.schema import Schema
 
 LENGTHS: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
@@ -23,8 +23,8 @@ class Units(Schema):
         angle: Unit of angle.
     """
 
-    length: Literal["m", "cm", "mm", "um"] = "m"
-    angle: Literal["rad", "deg", "mrad"] = "rad"
+    length: LengthUnit = "m"
+    angle: AngleUnit = "rad"
 
     def name(self, unit: str) -> str:
         """The file's unit for what is in `m` or `rad` inside the program."""

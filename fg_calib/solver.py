@@ -20,13 +20,11 @@ from numpy.typing import NDArray
 
 from fg_calib.errors import SolverError
 from fg_calib.factors import Variables
+from fg_calib.observability import RANK_TOLERANCE
 from fg_calib.problem import Problem, frames_only, judged_at
 from fg_calib.residuals import single_threaded_blas
 
 Floats = NDArray[np.float64]
-
-RANK_TOLERANCE = 1e-10
-"""A direction with less than this of the largest singular value is not determined."""
 
 
 @dataclass(frozen=True)

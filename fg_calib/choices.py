@@ -1,0 +1,17 @@
+"""What a user can choose among, word by word; light enough for the command line's help."""
+
+from typing import Literal, get_args
+
+Model = Literal["pose", "position", "orientation", "distance", "rotation", "distance-rotation"]
+"""What a calibration compares with the measurements: each pose, or part of it, or what lies between two poses."""
+
+FrameKnowledge = Literal["known", "unknown"]
+"""Whether the measurement frame is the base, or world_T_base is estimated too."""
+
+Strategy = Literal["star", "chain", "all", "random"]
+"""How pairs are formed from poses."""
+
+LengthUnit = Literal["m", "cm", "mm", "um"]
+AngleUnit = Literal["rad", "deg", "mrad"]
+
+MODELS: tuple[Model, ...] = get_args(Model)
