@@ -8,6 +8,9 @@ Model = Literal["pose", "position", "orientation", "distance", "rotation", "dist
 FrameKnowledge = Literal["known", "unknown"]
 """Whether the measurement frame is the base, or world_T_base is estimated too."""
 
+Gauge = Literal["prior", "keep", "none"]
+"""What holds the directions that data do not determine: tolerances as priors; leaving parameters out; nothing."""
+
 Strategy = Literal["star", "chain", "all", "random"]
 """How pairs are formed from poses."""
 

@@ -89,6 +89,8 @@ def calibrate(
         pairing=given.pairing,
         frame=given.frame,
         prior=given.prior,
+        gauge=given.gauge,
+        prefer=given.prefer,
     )
     solution = solve(problem)
     uncertainty = assess(solution)

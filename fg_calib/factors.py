@@ -67,12 +67,14 @@ class Variables:
         names: Name of each estimated scalar, shape (n_columns,): a parameter's, or `frame.x` ... `frame.yaw`. Of a
             pose the names stand in `FRAME_KINDS`' order although its columns are tangent directions.
         chain: The kinematic chain with these columns.
+        priors: Whether the robot's tolerances are priors.
     """
 
     robot: Robot
     items: tuple[Variable, ...]
     names: tuple[str, ...]
     chain: Chain
+    priors: bool
 
     @property
     def n_columns(self) -> int:
@@ -151,7 +153,7 @@ class Variables:
         return str(gtsam.Symbol(key))
 
 
-def build_variables(robot: Robot, frame: bool) -> Variables:
+def build_variables(robot: Robot, frame: bool, priors: bool = True) -> Variables:
     """The variables of a robot's estimated parameters, and of the measurement frame where it is unknown."""
     items: list[Variable] = []
     names: list[str] = []
@@ -178,7 +180,7 @@ def build_variables(robot: Robot, frame: bool) -> Variables:
         span = slice(frame_tangent, len(names))
         items.append(Variable(gtsam.symbol("X", 0), "X(0)", "frame", parameters, span))
     chain = build_chain(robot, columns, tool_tangent=tool_tangent, frame_tangent=frame_tangent, frame=frame)
-    return Variables(robot, tuple(items), tuple(names), chain)
+    return Variables(robot, tuple(items), tuple(names), chain, priors)
 
 
 def pose_of(frame: Floats) -> gtsam.Pose3:
@@ -337,7 +339,7 @@ def prior_rows(variables: Variables, parameters: Floats, only: Variable | None =
     r: list[float] = []
     J: list[Floats] = []
     for v in variables.items if only is None else (only,):
-        if v.kind == "frame":
+        if v.kind == "frame" or not variables.priors:
             continue
         for k, i in enumerate(v.parameters):
             parameter = variables.robot.parameters[i]

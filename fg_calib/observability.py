@@ -253,10 +253,15 @@ def _groups(
 
 
 def _preference(parameter: Parameter, prefer: Sequence[str]) -> int:
-    """Rank in the order of keeping, 0 first: the user's choice, then `KEEP_ORDER`."""
+    """Rank in the order of keeping, 0 first: the user's choice, then base and tool, then `KEEP_ORDER`.
+
+    Base and tool are estimated only where the user asks for it, and may be far from nominal.
+    """
     if parameter.name in prefer:
         return list(prefer).index(parameter.name)
-    return len(prefer) + KEEP_ORDER.index(parameter.kind)
+    if parameter.name.startswith(("base.", "tool.")):
+        return len(prefer)
+    return len(prefer) + 1 + KEEP_ORDER.index(parameter.kind)
 
 
 def _first_independent(N: Floats, count: int) -> list[int]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib import frames, residuals
-from fg_calib.choices import FrameKnowledge, Model
+from fg_calib.choices import FrameKnowledge, Gauge, Model
 from fg_calib.errors import ProblemError
 from fg_calib.factors import (
     Variables,
@@ -69,12 +69,14 @@ class Settings:
         pairing: How pairs are formed from poses where none were measured directly.
         frame: Whether the measurement frame is known to be the base, or world_T_base is estimated too.
         prior: Whether the robot's tolerances are priors.
+        gauge: What holds the directions that the data do not determine.
     """
 
     model: Model = "distance-rotation"
     pairing: Pairing = field(default_factory=Pairing)
     frame: FrameKnowledge = "known"
     prior: bool = True
+    gauge: Gauge = "prior"
 
     @property
     def uses_pairs(self) -> bool:
@@ -113,7 +115,7 @@ class Problem:
     """A calibration problem, ready to be solved.
 
     Attributes:
-        robot: The nominal robot (without tolerances where priors are off).
+        robot: The nominal robot.
         measurements: Everything measured.
         settings: What is estimated from what.
         variables: The GTSAM variables and their columns.
@@ -125,6 +127,7 @@ class Problem:
             shape (n_configurations, 6): measurement noise and joint noise together, [m] and [rad].
         blocks: The whitened train rows.
         graph: Factors and priors.
+        whole: The problem with everything estimated, where this one leaves parameters out to fix the gauge.
     """
 
     robot: Robot
@@ -138,6 +141,7 @@ class Problem:
     sigma: Floats
     blocks: tuple[Block, ...]
     graph: gtsam.NonlinearFactorGraph
+    whole: Problem | None = None
 
     @property
     def initial(self) -> gtsam.Values:
@@ -195,6 +199,8 @@ def build_problem(
     pairing: Pairing | None = None,
     frame: FrameKnowledge = "known",
     prior: bool | None = None,
+    gauge: Gauge = "prior",
+    prefer: Sequence[str] = (),
 ) -> Problem:
     """The calibration problem of a robot and its measurements.
 
@@ -205,16 +211,20 @@ def build_problem(
         pairing: How pairs are formed from poses where none were measured directly; a star if None.
         frame: `unknown` estimates world_T_base with the parameters; of no meaning for models of pairs.
         prior: Whether the robot's tolerances are priors; None for yes.
+        gauge: What holds the directions that the data do not determine. `prior`: the tolerances. `none`: nothing;
+            everything is estimated by minimum-norm steps, and what is not determined has no sigma. `keep`: only
+            the independent parameters and those kept of each relative group are estimated, without priors, the
+            others stay at nominal (the paper's way).
+        prefer: For `keep`: parameters to keep, first choice first.
 
     Raises:
         ProblemError: The measurements lack what the model needs, or do not suffice.
     """
-    settings = Settings(model, pairing or Pairing(), frame, prior is not False)
-    if not settings.prior:
-        robot = replace(robot, parameters=tuple(replace(p, tolerance=None) for p in robot.parameters))
-    variables = build_variables(robot, frame == "unknown" and not settings.uses_pairs)
+    settings = Settings(model, pairing or Pairing(), frame, prior is not False and gauge == "prior", gauge)
     if not any(p.estimated for p in robot.parameters):
-        raise ProblemError(robot.name, "nothing to estimate", "at least one parameter that is not fixed")
+        raise ProblemError(f"robot {robot.name}", "nothing to estimate", "at least one parameter that is not fixed")
+    unknown_frame = frame == "unknown" and not settings.uses_pairs
+    variables = build_variables(robot, unknown_frame, settings.prior)
     pairs = _usable_pairs(measurements, settings) if settings.uses_pairs else None
     if pairs is None:
         _check_poses(measurements, settings)
@@ -222,7 +232,11 @@ def build_problem(
     start = _start(robot, measurements, settings, variables, trig, pairs)
     problem = _assemble(robot, measurements, settings, variables, start, trig, pairs)
     _check_enough(problem)
-    return problem
+    if gauge != "keep":
+        return problem
+    reduced = robot.with_estimated(observe(problem, start, prefer).kept)
+    variables = build_variables(reduced, unknown_frame, False)
+    return replace(_assemble(reduced, measurements, settings, variables, start, trig, pairs), whole=problem)
 
 
 def predicted_problem(
@@ -246,7 +260,7 @@ def predicted_problem(
             (n_joints,); 1 mm, 1 mrad and none where None.
     """
     settings = Settings(model, pairing or Pairing(), frame, prior=False)
-    variables = build_variables(robot, frame == "unknown" and not settings.uses_pairs)
+    variables = build_variables(robot, frame == "unknown" and not settings.uses_pairs, priors=False)
     trig = precompute_trig(robot, readings)
     poses = forward(build_chain(robot), trig)
     n = len(readings)
@@ -289,7 +303,8 @@ def random_problem(
 def judged_at(problem: Problem, parameters: Floats) -> Problem:
     """The same problem with its rows judged and whitened, and started, at other parameters."""
     p = problem
-    return _assemble(p.robot, p.measurements, p.settings, p.variables, parameters, p.trig, p.pairs)
+    anew = _assemble(p.robot, p.measurements, p.settings, p.variables, parameters, p.trig, p.pairs)
+    return replace(anew, whole=p.whole)
 
 
 def frames_only(problem: Problem) -> Problem | None:
@@ -297,7 +312,7 @@ def frames_only(problem: Problem) -> Problem | None:
     n = problem.robot.n_joints
     parameters = tuple(replace(p, estimated=p.estimated and not 1 <= p.owner <= n) for p in problem.robot.parameters)
     robot = replace(problem.robot, parameters=parameters)
-    variables = build_variables(robot, any(v.kind == "frame" for v in problem.variables.items))
+    variables = build_variables(robot, any(v.kind == "frame" for v in problem.variables.items), problem.settings.prior)
     if not variables.items:
         return None
     p = problem

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import special
 from scipy.spatial.transform import Rotation
 
@@ -15,6 +16,7 @@ from fg_calib.factors import pose_of, prior_rows
 from fg_calib.identifiability import Identifiability, identify
 from fg_calib.observability import RANK_TOLERANCE, SUPPORT_TOLERANCE, IdentifiabilityClass, Observability
 from fg_calib.problem import PAIR_KINDS, POSE_KINDS, Problem, all_rows, whitened_triangle
+from fg_calib.robot import Robot
 from fg_calib.solver import Solution
 
 Floats = NDArray[np.float64]
@@ -74,6 +76,66 @@ class FrameEstimate:
 
 
 @dataclass(frozen=True)
+class Prediction:
+    """A function of the parameters at the estimate.
+
+    Attributes:
+        value: Its value, shape (m,).
+        sigma: 1 sigma, shape (m,); nan where the measurements do not determine it.
+        covariance: Shape (m, m), nan in rows and columns of what is not determined.
+    """
+
+    value: Floats
+    sigma: Floats
+    covariance: Floats
+
+
+@dataclass(frozen=True)
+class Spread:
+    """The covariance in the tangent space of the variables, and the directions that nothing determines.
+
+    Attributes:
+        names: Named scalars, in the order of the columns (see `Variables.names`).
+        n_robot_columns: Columns without the measurement frame's.
+        tangent: Covariance of the determined part, shape (n_columns, n_columns).
+        loose: Undetermined directions at the estimate, orthonormal in changes of ordinary size, shape
+            (n_loose, n_columns).
+        loose_at_nominal: The same at the nominal parameters.
+        scales: A change of ordinary size in each column.
+        named_derivative: Of the named scalars in the columns.
+        rank: Number of determined directions.
+    """
+
+    names: tuple[str, ...]
+    n_robot_columns: int
+    tangent: Floats
+    loose: Floats
+    loose_at_nominal: Floats
+    scales: Floats
+    named_derivative: Floats
+    rank: int
+
+    def covariance(self, rows: Floats) -> Floats:
+        """Covariance of linear functions of the columns, shape (m, n_columns); nan where undetermined."""
+        with np.errstate(invalid="ignore"):  # a pose at a quarter turn of pitch has no derivative
+            out: Floats = rows @ self.tangent @ rows.T
+            size = np.linalg.norm(rows * self.scales, axis=1)
+            share, share_at_nominal = (
+                np.linalg.norm((rows * self.scales) @ loose.T, axis=1) for loose in (self.loose, self.loose_at_nominal)
+            )
+            unknown = (share > SUPPORT_TOLERANCE * size) & (share_at_nominal > SUPPORT_TOLERANCE * size)
+        unknown |= ~np.isfinite(np.diag(out))
+        out[unknown, :] = np.nan
+        out[:, unknown] = np.nan
+        return out
+
+    def named(self) -> Floats:
+        """Covariance of the robot's estimated parameters, shape (n_robot_columns, n_robot_columns)."""
+        n = self.n_robot_columns
+        return self.covariance(self.named_derivative[:n])
+
+
+@dataclass(frozen=True)
 class ResidualTable:
     """Every scalar residual, train and test, before and after; [m] and [rad].
 
@@ -130,6 +192,8 @@ class Uncertainty:
         chi2_bounds: Interval of the reduced chi-square that is taken as good.
         residuals: Every residual, before and after.
         identifiability: What the data alone determine, at the nominal parameters.
+        robot: The calibrated robot.
+        spread: The covariance in the variables' tangent space, behind `predict`.
         findings: Why the result is not to be trusted; empty if it is.
     """
 
@@ -142,7 +206,32 @@ class Uncertainty:
     chi2_bounds: tuple[float, float]
     residuals: ResidualTable
     identifiability: Identifiability
+    robot: Robot
+    spread: Spread
     findings: tuple[str, ...]
+
+    def predict(self, function: Callable[[Robot], ArrayLike]) -> Prediction:
+        """Value and sigma of any function of the robot: a tool position, a distance, a sum of parameters.
+
+        It may be determined although the parameters it depends on are not; where it is not, its sigma is nan.
+
+        Args:
+            function: From a robot to a number or an array; smooth, for it is differentiated by central differences.
+
+        Note:
+            Directions that were left out to fix the gauge (`keep`) count as known.
+        """
+        value = np.atleast_1d(np.asarray(function(self.robot), dtype=np.float64)).ravel()
+        names = self.spread.names[: self.spread.n_robot_columns]
+        nominal = self.robot.nominal
+        G = np.empty((len(value), len(names)))
+        for k, name in enumerate(names):
+            step = np.zeros(len(nominal))
+            step[self.robot.index(name)] = 1e-5
+            up, down = (function(self.robot.with_values(nominal + h)) for h in (step, -step))
+            G[:, k] = (np.ravel(np.asarray(up)) - np.ravel(np.asarray(down))) / 2e-5
+        covariance = self.spread.covariance(G @ self.spread.named_derivative[: len(names)])
+        return Prediction(value, np.sqrt(np.diag(covariance)), covariance)
 
     @property
     def observability(self) -> Observability:
@@ -175,50 +264,32 @@ def assess(solution: Solution) -> Uncertainty:
     """
     problem = solution.problem
     variables = problem.variables
-    data = whitened_triangle(problem, solution.parameters)
-    D = variables.named_derivative(solution.parameters)
-    priors = prior_rows(variables, solution.parameters)[1]
-    scales, n_robot = variables.scales, variables.n_robot_columns
-    tangent, loose, rank = _covariance(np.vstack([data, priors]), scales)
-    nominal = np.vstack([whitened_triangle(problem, solution.before), prior_rows(variables, solution.before)[1]])
-    loose_at_nominal = _covariance(nominal, scales)[1]
-
-    def covariance_of(rows: Floats) -> Floats:
-        """Covariance of linear functions of the columns, nan where undetermined."""
-        with np.errstate(invalid="ignore"):  # a pose at a quarter turn of pitch has no derivative
-            out: Floats = rows @ tangent @ rows.T
-        unknown = _has_share(rows, loose, scales) & _has_share(rows, loose_at_nominal, scales)
-        unknown |= ~np.isfinite(np.diag(out))
-        out[unknown, :] = np.nan
-        out[:, unknown] = np.nan
-        return out
-
-    covariance = covariance_of(D)
-    at_nominal = identify(problem, solution.before, "practical")
-    sigma = np.sqrt(np.diag(covariance))
+    spread = _spread(solution)
+    whole = identify(problem.whole or problem, solution.before, "practical")
+    covariance = spread.named()
     frame = None
-    if n_robot < variables.n_columns:
+    if variables.n_robot_columns < variables.n_columns:
         world_T_base = pose_of(solution.parameters[-6:])
         frame = FrameEstimate(
             xyz=world_T_base.translation(),
             quaternion_xyzw=Rotation.from_matrix(world_T_base.rotation().matrix()).as_quat(canonical=True),
-            sigma=np.sqrt(np.diag(covariance_of(np.eye(len(D)))))[n_robot:],
+            sigma=np.sqrt(np.diag(spread.covariance(np.eye(variables.n_columns))))[variables.n_robot_columns :],
         )
     chi2 = 2.0 * solution.cost
-    dof = problem.n_residuals + problem.n_priors - rank
+    dof = problem.n_residuals + problem.n_priors - spread.rank
     bounds = chi2_bounds(dof)
     return Uncertainty(
-        names=variables.names[:n_robot],
-        covariance=covariance[:n_robot, :n_robot],
-        parameters=_parameter_estimates(
-            solution, dict(zip(variables.names, sigma, strict=True)), at_nominal.observability
-        ),
+        names=variables.names[: variables.n_robot_columns],
+        covariance=covariance,
+        parameters=_parameter_estimates(solution, np.sqrt(np.diag(covariance)), whole.observability),
         frame=frame,
         chi2=chi2,
         dof=dof,
         chi2_bounds=bounds,
         residuals=residual_table(solution),
-        identifiability=at_nominal,
+        identifiability=whole,
+        robot=problem.robot.with_values(solution.parameters[:-6]),
+        spread=spread,
         findings=_findings(solution, chi2, dof, bounds),
     )
 
@@ -242,30 +313,39 @@ def residual_table(solution: Solution) -> ResidualTable:
     return _pose_table(problem, before, after)
 
 
-def _covariance(J: Floats, scales: Floats) -> tuple[Floats, Floats, int]:
-    """Covariance of the determined part; unit-free orthonormal undetermined directions; rank."""
-    n = J.shape[1]
-    _, s, Vt = np.linalg.svd(np.vstack([J * scales, np.zeros((n, n))]), full_matrices=False)
-    rank = int(np.sum(s > RANK_TOLERANCE * s[0]))
+def _spread(solution: Solution) -> Spread:
+    problem, variables = solution.problem, solution.problem.variables
+    scales = variables.scales
+
+    def stacked(parameters: Floats) -> Floats:
+        rows = [whitened_triangle(problem, parameters), prior_rows(variables, parameters)[1]]
+        return np.vstack([*rows, np.zeros((variables.n_columns, variables.n_columns))]) * scales
+
+    _, s, Vt = np.linalg.svd(stacked(solution.parameters), full_matrices=False)
+    _, s_nominal, Vt_nominal = np.linalg.svd(stacked(solution.before), full_matrices=False)
+    rank, rank_nominal = (int(np.sum(v > RANK_TOLERANCE * v[0])) for v in (s, s_nominal))
     half = scales[:, None] * Vt[:rank].T / s[:rank]
-    return half @ half.T, Vt[rank:], rank
-
-
-def _has_share(rows: Floats, loose: Floats, scales: Floats) -> Booleans:
-    """Whether linear functions of the columns have a share in undetermined directions."""
-    with np.errstate(invalid="ignore"):
-        share = np.linalg.norm((rows * scales) @ loose.T, axis=1)
-        has: Booleans = share > SUPPORT_TOLERANCE * np.linalg.norm(rows * scales, axis=1)
-        return has
+    return Spread(
+        names=variables.names,
+        n_robot_columns=variables.n_robot_columns,
+        tangent=half @ half.T,
+        loose=Vt[rank:],
+        loose_at_nominal=Vt_nominal[rank_nominal:],
+        scales=scales,
+        named_derivative=variables.named_derivative(solution.parameters),
+        rank=rank,
+    )
 
 
 def _parameter_estimates(
-    solution: Solution, sigma: dict[str, float], observability: Observability
+    solution: Solution, sigma: Floats, observability: Observability
 ) -> tuple[ParameterEstimate, ...]:
+    problem = solution.problem
     classes = dict(zip(observability.names, observability.classes, strict=True))
+    sigmas = dict(zip(problem.variables.names, sigma, strict=False))
     found = []
-    for i, p in enumerate(solution.problem.robot.parameters):
-        s = sigma.get(p.name, 0.0)
+    for i, p in enumerate(problem.robot.parameters):
+        s = sigmas.get(p.name, np.nan if p.name in classes else 0.0)  # nan: left out, but not known
         found.append(
             ParameterEstimate(
                 name=p.name,
@@ -273,7 +353,7 @@ def _parameter_estimates(
                 nominal=p.nominal,
                 estimate=float(solution.parameters[i]),
                 sigma=float(s) if np.isfinite(s) else None,
-                prior_sigma=p.tolerance if p.estimated else None,
+                prior_sigma=p.tolerance if p.estimated and problem.settings.prior else None,
                 identifiability=classes.get(p.name, "fixed"),
             )
         )

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
 
+from fg_calib.kinematics import pose
 from fg_calib.measurements import Measurements, Pairing
 from fg_calib.problem import build_problem
 from fg_calib.solver import SolverOptions, solve
@@ -211,3 +212,74 @@ def test_frame_estimate_is_world_T_base():
     # the base itself is not determined beside the frame: where its columns are open, the frame moves with them
     assert turned.magnitude() < 0.01
     assert found.xyz == pytest.approx(frame[1], abs=0.01)
+
+
+@pytest.mark.parametrize("model", ["distance-rotation", "pose", "position"])
+def test_every_gauge_predicts_the_same_where_prediction_is_possible(model):
+    rng = np.random.default_rng(10)
+    robot = paper_robot(tolerance={"a": 1.0, "d": 1.0, "alpha": 1.0, "theta": 1.0, "beta": 1.0})  # hardly a prior
+    measurements = measure(true_robot(paper_robot(), rng), 80, rng)
+    q = rng.uniform(-2, 2, (2, 7))
+
+    def distance(r):
+        p = pose(r, q).position
+        return [np.linalg.norm(p[1] - p[0])]
+
+    found = {}
+    for gauge in ("prior", "keep", "none"):
+        solution = solve(build_problem(robot, measurements, model=model, gauge=gauge))
+        assert solution.converged
+        found[gauge] = assess(solution)
+    values = {gauge: u.predict(distance) for gauge, u in found.items()}
+    sigma = values["none"].sigma[0]
+    assert np.isfinite(sigma)
+    for gauge in ("prior", "keep"):
+        # priors of 1 m and 1 rad pull by some millionths of a sigma; null directions turn with the estimate
+        assert values[gauge].value[0] == pytest.approx(values["none"].value[0], abs=1e-2 * sigma)
+        assert values[gauge].sigma[0] == pytest.approx(sigma, rel=1e-2)
+    n_kept = len(found["none"].observability.kept)
+    assert found["keep"].covariance.shape == (n_kept, n_kept)
+    assert np.isfinite(found["keep"].covariance).all()
+    assert found["keep"].dof == found["none"].dof
+    classes = [[p.identifiability for p in found[g].parameters] for g in ("keep", "none")]
+    assert classes[0] == classes[1]
+    left_out = {p.name for p in found["keep"].parameters if p.sigma is None}
+    assert left_out == set(found["none"].names) - set(found["none"].observability.kept)
+
+
+def test_a_sum_is_known_although_its_terms_are_not():
+    rng = np.random.default_rng(11)
+    robot = paper_robot()
+    uncertainty = assess(
+        solve(build_problem(robot, measure(true_robot(robot, rng), 100, rng), model="distance-rotation"))
+    )
+    index = robot.index
+
+    def parameter_sum(r):
+        v = r.nominal
+        return [
+            v[index("beta2")] + v[index("theta3")],
+            v[index("d3")] + v[index("d4")] + v[index("d5")],
+            v[index("d3")],
+        ]
+
+    found = uncertainty.predict(parameter_sum)
+    assert np.isfinite(found.sigma[:2]).all()
+    assert np.isnan(found.sigma[2])
+    assert found.sigma[0] < 1e-3
+    assert np.isnan(
+        uncertainty.predict(lambda r: pose(r, np.zeros((1, 7))).position[0]).sigma
+    ).all()  # the base is not known
+
+
+def test_predicted_sigmas_cover_the_truth():
+    rng = np.random.default_rng(12)
+    robot = small_arm(tolerance={"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3})
+    q = rng.uniform(-2, 2, (1, 4))
+    z = []
+    for _ in range(60):
+        true = true_robot(robot, rng)
+        uncertainty = assess(solve(build_problem(robot, measure(true, 20, rng), model="distance-rotation")))
+        found = uncertainty.predict(lambda r: pose(r, q).position[0])
+        z.append((found.value - pose(true, q).position[0]) / found.sigma)
+    assert 0.7 < np.std(z) < 1.4  # pairs of a star share a configuration: sigmas are somewhat off, not by factors

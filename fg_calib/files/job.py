@@ -9,14 +9,14 @@ from typing import Annotated, Any
 
 from pydantic import Field, StrictBool
 
-from fg_calib.choices import FrameKnowledge, Model
+from fg_calib.choices import FrameKnowledge, Gauge, Model
 from fg_calib.errors import InputError
 from fg_calib.files.robot_yaml import read_robot, robot_from_mapping
 from fg_calib.files.schema import Count, NotNegative, Positive, Schema, read_yaml, shown, validate
 from fg_calib.files.tables import read_measurements
 from fg_calib.files.units import Units
 from fg_calib.measurements import Measurements, Noise, Pairing
-from fg_calib.robot import Robot
+from fg_calib.robot import Robot, known_names, names_of
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,8 @@ class Job:
         pairing: How pairs are formed where they come from poses.
         frame: Whether the measurement frame is the base frame (`known`) or to be estimated.
         prior: Whether the tolerances are used as priors; None: where the robot has them.
+        gauge: What holds the directions that the data do not determine.
+        prefer: Parameters to keep where only combinations are determined, first choice first.
         loss: The robust loss; `none` is least squares.
         units: The units of the tables and of the noise.
         inputs: SHA-256 of every file read, by its path relative to the job.
@@ -43,6 +45,8 @@ class Job:
     pairing: Pairing
     frame: FrameKnowledge
     prior: bool | None
+    gauge: Gauge
+    prefer: tuple[str, ...]
     loss: str
     units: Units
     inputs: dict[str, str]
@@ -79,6 +83,8 @@ class _Job(Schema):
     units: Units = Units()
     noise: _Noise = _Noise()
     prior: StrictBool | None = None
+    gauge: Gauge = "prior"
+    prefer: tuple[str, ...] = ()
     loss: str = "none"
 
 
@@ -109,7 +115,25 @@ def read_job(path: Path | str) -> Job:
     )
     names = [path.name, *robot_files, file.measurements, *([file.pairs] if file.pairs else [])]
     inputs = {name: _sha256(folder / name) for name in names}
-    return Job(path, robot, measurements, file.model, pairing, file.frame, file.prior, file.loss, file.units, inputs)
+    for name in file.prefer:
+        if name not in names_of(robot.parameters):
+            raise InputError(
+                f"{path.name}: prefer", f"unknown parameter {name!r}", known_names(names_of(robot.parameters))
+            )
+    return Job(
+        path=path,
+        robot=robot,
+        measurements=measurements,
+        model=file.model,
+        pairing=pairing,
+        frame=file.frame,
+        prior=file.prior,
+        gauge=file.gauge,
+        prefer=file.prefer,
+        loss=file.loss,
+        units=file.units,
+        inputs=inputs,
+    )
 
 
 def _robot(given: object, place: str, folder: Path) -> tuple[Robot, list[str]]:
