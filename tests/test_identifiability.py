@@ -1,0 +1,225 @@
+"""Structural and practical identifiability of arms whose answer is known, with the reason for every lost direction."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from simulated import measure, paper_robot, planar_robot, small_arm
+
+from fg_calib.errors import ProblemError
+from fg_calib.identifiability import identify, observe_configurations, observe_structure
+from fg_calib.measurements import Pairing
+from fg_calib.problem import build_problem, named_triangle, random_problem
+from fg_calib.reasons import NO_CAUSE, NOT_EXCITED
+from fg_calib.robot import Joint, RobotBuilder
+
+MODELS = ("distance", "rotation", "distance-rotation", "position", "pose")
+OFF_AXIS = {"x": 0.1, "y": 0.05, "z": 0.2, "roll": 0.3}
+H = np.pi / 2
+
+
+def mdh_robot(name, a, alpha, d, tool=None, prismatic=(), theta=None):
+    builder = RobotBuilder(name, "mdh")
+    builder.add_frame("base", {}, 0, False)
+    for i in range(len(a)):
+        values = {"a": a[i], "alpha": alpha[i], "d": d[i], "theta": 0.0 if theta is None else theta[i]}
+        builder.add_convention_joint(Joint(f"q{i + 1}", prismatic=i + 1 in prismatic), values)
+    builder.add_frame("tool", tool or {}, len(a) + 1, False)
+    return builder.build()
+
+
+def generic(tool=None):
+    rng = np.random.default_rng(0)
+    alpha = rng.uniform(0.3, 1.2, 7) * rng.choice([-1, 1], 7)
+    return mdh_robot(
+        "generic", rng.uniform(0.2, 0.8, 7), alpha, rng.uniform(0.2, 0.8, 7), tool, theta=rng.uniform(-2, 2, 7)
+    )
+
+
+def ur10(tool=None):
+    d = [0.1273, 0, 0, 0.163941, 0.1157, 0.0922]
+    return mdh_robot("ur10", [0, 0, -0.612, -0.5723, 0, 0], [0, H, 0, 0, H, -H], d, tool)
+
+
+def scara(tool=None):
+    return mdh_robot("scara", [0, 0.4, 0.3, 0], [0, 0, 0, np.pi], [0.3, 0, 0, 0.1], tool, prismatic=(3,))
+
+
+def stanford():
+    return mdh_robot("stanford", [0] * 6, [0, -H, H, 0, -H, H], [0.4, 0.15, 0.5, 0, 0, 0.2], prismatic=(3,))
+
+
+def planar(tool=None):
+    return mdh_robot("planar", [0, 2, 1], [0, 0, 0], [0, 0, 0], tool or {"x": 0.5})
+
+
+# Ranks of the generic and UR10 arms: computed independently (4 n less base, tool and parallel axes).
+# SCARA, Stanford and planar by hand: the reasons asserted below account for every lost direction.
+RANKS = [
+    (generic(), (21, 11, 23, 25, 28), 28),
+    (generic(OFF_AXIS), (24, 11, 24, 28, 28), 28),
+    (ur10(), (15, 7, 17, 19, 22), 24),
+    (ur10(OFF_AXIS), (18, 7, 18, 22, 22), 24),
+    (scara(), (5, 2, 5, 9, 11), 16),
+    (stanford(), (14, 7, 16, 18, 21), 24),
+    (planar(), (4, 0, 4, 10, 10), 12),
+]
+
+
+@pytest.mark.parametrize(("robot", "ranks", "n"), RANKS, ids=[f"{r.name}-{i}" for i, (r, _, _) in enumerate(RANKS)])
+def test_ranks_of_known_arms(robot, ranks, n):
+    for model, rank in zip(MODELS, ranks, strict=True):
+        found = observe_structure(robot, model)
+        assert (found.observability.rank, len(found.observability.names)) == (rank, n), model
+        assert len(found.lost) == n - rank
+        assert found.observability.gap > 1e6
+
+
+def reasons(robot, model, **options):
+    found = observe_structure(robot, model, **options)
+    return {tuple(sorted(lost.relation)): lost.reason for lost in found.lost}
+
+
+def test_reasons_of_the_papers_robot():
+    base = "the measurement is blind to the base: the whole arm moves as one body"
+    on_axis = "the tool point lies on the last axis: "
+    found = reasons(paper_robot(), "distance-rotation")
+    assert {name: found[(name,)] for name in ("a1", "alpha1", "d1", "theta1")} == dict.fromkeys(
+        ("a1", "alpha1", "d1", "theta1"), base
+    )
+    assert all(found[(name,)].startswith(on_axis) for name in ("beta6", "theta7", "beta7"))
+    assert found[("beta1", "theta2")] == found[("beta5", "theta6")] == "only their sum turns about the same axis"
+    assert found[("d3", "d4")] == "parallel axes 3, 4: only the sum of the shifts along them acts"
+    distance = reasons(paper_robot(), "distance")
+    assert distance[("alpha7", "d6")] == on_axis + "the tool only turns about it, unseen by distance"
+    rotation = reasons(paper_robot(), "rotation")
+    assert rotation[("theta3", "theta4")] == (
+        "parallel axes 3, 4: only the sum of their turns is seen, and no lengths are"
+    )
+    assert rotation[("a4",)] == "the tool only moves without turning, unseen by rotation"
+
+
+def test_an_off_axis_tool_leaves_only_the_base():
+    assert set(reasons(generic(OFF_AXIS), "distance").values()) == {
+        "the measurement is blind to the base: the whole arm moves as one body"
+    }
+    assert "last axis" not in " ".join(reasons(ur10(OFF_AXIS), "distance").values())
+
+
+def test_a_planar_arm_cannot_see_its_tilts_in_distances():
+    found = reasons(planar(), "distance")
+    tilt = "parallel axes, all of them: it only tilts the arm out of its plane, unseen to first order"
+    assert found[("alpha2",)] == found[("alpha3",)] == tilt
+
+
+def test_an_unknown_frame_hides_the_base_from_poses():
+    found = reasons(paper_robot(), "pose", frame="unknown")
+    assert found[("d1",)] == "the measurement is blind to the base: the whole arm moves as one body"
+    assert ("beta6", "theta7") in found  # the tool's own frame is seen
+
+
+def test_no_reason_is_given_where_no_check_succeeds():
+    found = reasons(scara(), "distance-rotation")
+    assert list(found.values()).count(NO_CAUSE) == 1
+
+
+def test_the_kept_set_follows_the_users_order():
+    kept = observe_structure(paper_robot(), "pose", prefer=["d3", "beta2"]).observability.kept
+    assert {"d3", "beta2"} <= set(kept)
+    assert not {"d4", "d5", "theta3"} & set(kept)
+
+
+def test_what_a_file_calls_fixed_is_looked_at_as_unknown_and_as_known():
+    robot = paper_robot(fixed=["a1", "alpha1", "d1", "theta1", "beta1"])
+    found = observe_structure(robot, "distance-rotation")
+    assert (found.observability.rank, len(found.observability.names)) == (23, 35)
+    known = found.with_fixed_known
+    assert (known.observability.rank, len(known.observability.names)) == (23, 30)
+    assert "theta2" in known.observability.named("independent")
+    assert found.fixed == ("a1", "alpha1", "d1", "theta1", "beta1")
+
+
+def test_a_12_joint_arm_is_analysed():
+    rng = np.random.default_rng(1)
+    robot = mdh_robot("long", rng.uniform(0.1, 0.5, 12), rng.uniform(0.3, 1.2, 12), rng.uniform(0.1, 0.5, 12), OFF_AXIS)
+    assert observe_structure(robot, "pose").observability.rank == 48
+
+
+def test_configurations_that_do_not_move_a_joint_are_named_as_the_reason():
+    rng = np.random.default_rng(2)
+    robot = generic(OFF_AXIS)
+    q = rng.uniform(-2, 2, (60, 7))
+    # The eight parameters of joints 6 and 7 make one fixed pose of six coordinates, two of which are d5 and theta5's.
+    q[:, 5:] = 0.3
+    found = observe_configurations(robot, measure(robot, 60, rng, readings=q), "pose")
+    assert found.observability.rank == 24
+    assert {lost.reason for lost in found.lost} == {NOT_EXCITED}
+
+
+def test_practical_sigmas_are_those_of_the_kept_set():
+    rng = np.random.default_rng(3)
+    robot = paper_robot()
+    measurements = measure(robot, 100, rng)
+    found = observe_configurations(robot, measurements, "distance-rotation", pairing=Pairing("chain"))
+    o = found.observability
+    problem = build_problem(robot, measurements, model="distance-rotation", pairing=Pairing("chain"), gauge="keep")
+    R = named_triangle(problem, problem.start)
+    sigma = np.sqrt(np.diag(np.linalg.inv(R.T @ R)))
+    assert list(o.sigma) == list(problem.variables.names) == o.kept
+    # the same rows but for noise in the measured values, which decides on pairs near a kink only
+    assert list(o.sigma.values()) == pytest.approx(sigma, rel=1e-3)
+    assert o.indices["O3"] == pytest.approx(o.singular_values[o.rank - 1])
+
+
+def test_weak_directions_and_correlations_are_named():
+    rng = np.random.default_rng(4)
+    robot = small_arm()
+    q = rng.uniform(-2, 2, (60, 4))
+    q[:, 3] = 1e-3 * rng.normal(size=60)  # joint 4 hardly moves: theta4 and the tool's turn act alike
+    found = observe_configurations(robot, measure(robot, 60, rng, readings=q), "pose").observability
+    assert found.rank == len(found.names) - len(found.null_space)
+    assert found.weak
+    assert found.weak[0].signal_to_noise < 10
+    assert all(abs(rho) > 0.9 for _, _, rho in found.correlations)
+    assert found.weak[0].members
+
+
+def test_the_answer_does_not_depend_on_the_unit_of_length():
+    rng = np.random.default_rng(5)
+    q = rng.uniform(-2, 2, (80, 7))
+
+    def scaled(k):
+        tolerance = {kind: 1e-3 * (k if kind in ("a", "d") else 1.0) for kind in ("a", "alpha", "d", "theta", "beta")}
+        robot = paper_robot(tolerance=tolerance)
+        values = [p.nominal * (k if p.unit == "m" else 1.0) for p in robot.parameters]
+        measurements = measure(robot.with_values(values), 80, rng, readings=q, sigma=(1e-3 * k, 1e-3))
+        return observe_configurations(robot.with_values(values), measurements, "distance-rotation").observability
+
+    metres, millimetres = scaled(1.0), scaled(1000.0)
+    assert millimetres.singular_values[: metres.rank] == pytest.approx(metres.singular_values[: metres.rank], rel=1e-9)
+    assert (millimetres.rank, millimetres.classes) == (metres.rank, metres.classes)
+    assert [g.parameters for g in millimetres.relative] == [g.parameters for g in metres.relative]
+
+
+def test_nothing_to_look_at_is_refused():
+    robot = planar_robot()
+    fixed = replace(robot, parameters=tuple(replace(p, estimated=False) for p in robot.parameters))
+    with pytest.raises(ProblemError, match="nothing to estimate"):
+        observe_configurations(fixed, measure(robot, 5, np.random.default_rng(6)), "pose")
+
+
+def test_random_configurations_stay_within_limits_and_repeat_with_their_seed():
+    robot = replace(scara(), joints=tuple(Joint(f"j{i}", i == 2, -0.5, 0.25) for i in range(4)))
+    one, again, other = (random_problem(robot, "pose", seed=s).measurements.readings for s in (1, 1, 2))
+    assert np.array_equal(one, again)
+    assert not np.array_equal(one, other)
+    assert one.min() >= -0.5
+    assert one.max() <= 0.25
+    free = random_problem(scara(), "pose").measurements.readings
+    assert np.abs(free[:, 2]).max() <= 1.0 < np.abs(free[:, 0]).max() <= np.pi
+
+
+def test_structure_and_problem_agree():
+    problem = random_problem(paper_robot(), "distance")
+    found = identify(problem, problem.start, "structural")
+    assert found.observability.rank == observe_structure(paper_robot(), "distance").observability.rank == 21
