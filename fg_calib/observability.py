@@ -91,6 +91,7 @@ class Observability:
         condition_number: Of the determined part.
         sigma: 1 sigma of the independent and the kept parameters, the others being held at nominal, [m] and [rad].
             That of a kept parameter is the sigma of the combination it stands for.
+        correlation: Correlations of the same parameters, shape (n_kept, n_kept).
         correlations: Pairs of those that are correlated by more than `CORRELATED`, strongest first.
         weak: Directions among those with a signal-to-noise ratio below `WEAK`, weakest first.
     """
@@ -105,6 +106,7 @@ class Observability:
     indices: dict[str, float]
     condition_number: float
     sigma: dict[str, float]
+    correlation: Floats
     correlations: tuple[tuple[str, str, float], ...]
     weak: tuple[WeakDirection, ...]
 
@@ -155,7 +157,7 @@ def analyse(
     groups = _groups(null, dead, scales, parameters, prefer)
     dropped = {name for g in groups for name in g.parameters if name not in g.keep}
     kept = [i for i in range(n) if not dead[i] and names[i] not in dropped]
-    sigma, correlations, weak = _spread(J[:, kept], [names[i] for i in kept], scales[kept])
+    sigma, correlation, correlations, weak = _spread(J[:, kept], [names[i] for i in kept], scales[kept])
     with np.errstate(divide="ignore", invalid="ignore"):
         gap = float(s[rank - 1] / s[rank]) if 0 < rank < n else np.inf
     return Observability(
@@ -169,6 +171,7 @@ def analyse(
         indices=observability_indices(s[:rank], n_measurements),
         condition_number=float(s[0] / s[rank - 1]) if rank else np.inf,
         sigma=sigma,
+        correlation=correlation,
         correlations=correlations,
         weak=weak,
     )
@@ -193,10 +196,10 @@ def observability_indices(singular_values: Floats, n_measurements: int) -> dict[
 
 def _spread(
     J: Floats, names: Sequence[str], scales: Floats
-) -> tuple[dict[str, float], tuple[tuple[str, str, float], ...], tuple[WeakDirection, ...]]:
-    """Sigmas, strong correlations and weak directions of columns that are determined together."""
+) -> tuple[dict[str, float], Floats, tuple[tuple[str, str, float], ...], tuple[WeakDirection, ...]]:
+    """Sigmas, correlations, strong correlations and weak directions of columns that are determined together."""
     if not names:
-        return {}, (), ()
+        return {}, np.zeros((0, 0)), (), ()
     _, s, Vt = np.linalg.svd(J, full_matrices=False)
     half = Vt.T / s
     spread = np.linalg.norm(half, axis=1)
@@ -212,6 +215,7 @@ def _spread(
         weak.append(WeakDirection(float(value), {names[i]: float(direction[i]) for i in members}))
     return (
         dict(zip(names, (spread * scales).tolist(), strict=True)),
+        correlation,
         tuple((names[i], names[j], float(correlation[i, j])) for i, j in strongest),
         tuple(weak),
     )

@@ -16,6 +16,7 @@ import numpy as np
 
 from fg_calib import __version__
 from fg_calib.errors import InputError
+from fg_calib.figures import write_figures
 from fg_calib.files.disk import write_text
 from fg_calib.files.robot_yaml import write_robot
 from fg_calib.files.tables import write_csv
@@ -136,13 +137,18 @@ def observability_document(found: Identifiability) -> dict[str, Any]:
 
 
 def write_observability(folder: Path | str, found: Identifiability) -> None:
-    """Write `observability.json` into a folder.
+    """Write `observability.json` and its figures (see `write_figures`) into a folder, all of them or none.
 
     Raises:
         InputError: The folder cannot be written.
     """
     text = json.dumps(observability_document(found), indent=1, allow_nan=False) + "\n"
-    fill_folder(Path(folder), lambda into: write_text(into / "observability.json", text))
+
+    def write(into: Path) -> None:
+        write_text(into / "observability.json", text)
+        write_figures(into, found)
+
+    fill_folder(Path(folder), write)
 
 
 def write_results(

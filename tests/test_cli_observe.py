@@ -1,0 +1,101 @@
+"""`fg-calib observe`: tables, files, options, and what it refuses."""
+
+import json
+
+import pytest
+
+
+def test_structure_prints_the_papers_table(fg_calib, example):
+    ended = fg_calib("observe", example / "robot_nominal.yaml")
+    assert (ended.code, ended.err) == (0, "")
+    assert "rank 23 of 35" in ended.out
+    assert "[beta1 theta2], [beta2 theta3], [d3 d4], [d4 d5], [beta5 theta6]" in ended.out
+    assert "Ineffective     a1, alpha1, d1, theta1, beta6, theta7, beta7" in ended.out
+    assert "With a1, alpha1, d1, theta1, beta1 known" in ended.out
+    assert "rank 23 of 30" in ended.out
+
+
+@pytest.mark.parametrize(
+    ("model", "rank"),
+    [
+        ("pose", 29),
+        ("distance-rotation", 23),
+        ("distance", 21),
+        ("rotation", 11),
+        ("position", 25),
+        ("orientation", 15),
+    ],
+)
+def test_json_has_every_key_of_its_schema(fg_calib, example, model, rank):
+    ended = fg_calib("observe", example / "robot_nominal.yaml", "--model", model, "--json")
+    found = json.loads(ended.out)
+    assert found["schema"] == "fg-calib/observability/1"
+    assert (found["model"], found["kind"], found["rank"], found["n_parameters"]) == (model, "structural", rank, 35)
+    assert len(found["names"]) == len(found["singular_values"]) == 35
+    assert len(found["null_space"]) == 35 - rank == len(found["lost"])
+    assert found["gap"] > 1e6
+    assert set(found["indices"]) == {"O1", "O2", "O3", "O4", "O5"}
+    lost = len(found["ineffective"]) + sum(group["lost"] for group in found["relative"])
+    assert lost == 35 - rank
+    members = [name for group in found["relative"] for name in group["parameters"]]
+    assert sorted([*found["independent"], *found["ineffective"], *members]) == sorted(found["names"])
+    for group in found["relative"]:
+        assert len(group["relations"]) == group["lost"] == len(group["parameters"]) - len(group["keep"])
+    assert all(direction["reason"] for direction in found["lost"])
+
+
+def test_configurations_give_sigmas_and_files(fg_calib, example, tmp_path):
+    folder = tmp_path / "seen"
+    ended = fg_calib(
+        *("observe", example / "robot_nominal.yaml", "--configurations", example / "poses.csv", "--angle", "deg"),
+        *("--orientation-noise", 0.01, "--joint-noise", 0.005, "--out", folder, "--json"),
+    )
+    assert ended.code == 0
+    found = json.loads(ended.out)
+    assert json.loads((folder / "observability.json").read_text()) == found
+    assert (found["kind"], found["n_configurations"], found["rank"]) == ("practical", 52, 23)
+    assert set(found["sigma"]) == set(found["kept"])
+    assert found["weak"][0]["signal_to_noise"] < 10
+    assert all(abs(pair["correlation"]) > 0.9 for pair in found["correlations"])
+    finer = fg_calib(
+        *("observe", example / "robot_nominal.yaml", "--configurations", example / "poses.csv", "--angle", "deg"),
+        *("--orientation-noise", 0.005, "--position-noise", 0.0005, "--joint-noise", 0.0025, "--json"),
+    )
+    halved = json.loads(finer.out)["sigma"]
+    assert halved["a2"] == pytest.approx(found["sigma"]["a2"] / 2, rel=1e-3)
+
+
+def test_the_users_order_decides_what_is_kept(fg_calib, example):
+    found = json.loads(fg_calib("observe", example / "robot_nominal.yaml", "--prefer", "d3, beta2", "--json").out)
+    assert {"d3", "beta2"} <= set(found["kept"])
+    assert not {"d5", "theta3"} & set(found["kept"])
+
+
+def test_a_frame_may_be_unknown(fg_calib, example):
+    ended = fg_calib("observe", example / "robot_nominal.yaml", "--model", "pose", "--frame", "unknown", "--json")
+    assert json.loads(ended.out)["rank"] == 25
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (("missing.yaml",), 1, "no such file"),
+        (("{robot}", "--prefer", "d9"), 1, "no parameter 'd9'"),
+        (("{robot}", "--configurations", "missing.csv"), 1, "no such file"),
+        (("{robot}", "--configurations", "{poses}"), 1, "is the table in deg?"),
+        (("{robot}", "--model", "poses"), 2, "--model"),
+        (("{robot}", "--angle", "grad"), 2, "--angle"),
+        ((), 2, "ROBOT"),
+    ],
+)
+def test_what_it_refuses(fg_calib, example, tmp_path, arguments, code, message):
+    places = {"robot": str(example / "robot_nominal.yaml"), "poses": str(example / "poses.csv")}
+    folder = tmp_path / "out"
+    ended = fg_calib("observe", *(a.format(**places) for a in arguments), "--out", folder)
+    assert ended.code == code
+    assert message in ended.err
+    assert ended.out == ""
+    assert not folder.exists()
+    if code == 1:
+        assert ended.err.startswith("error: ")
+        assert ended.err.count("\n") == 1
