@@ -226,7 +226,10 @@ def _frame_rotations(R_F: Floats, p_F: Floats, p_M: Floats, t: Floats, unknown: 
 def _translations(
     R_F: Floats, p_F: Floats, p_M: Floats | None, R_X: Floats, R_T: Floats, X: Frame, T: Frame, unknown: Unknown
 ) -> tuple[tuple[Frame, Frame], float]:
-    """Translations for given rotations: linear, from the nominal ones in the minimum-norm sense; and the cost."""
+    """Translations for given rotations: linear, from the nominal ones in the minimum-norm sense; and the cost.
+
+    Where frame and tool act together the frame takes it all: the tool is near nominal, the frame may be anywhere.
+    """
     if p_M is None:
         return (Frame(R_X, X.translation), Frame(R_T, T.translation)), 0.0
     rest = p_M - X.translation - (p_F + R_F @ T.translation) @ R_X.T  # what is left to explain, (n, 3)
@@ -234,6 +237,8 @@ def _translations(
     free = np.concatenate([np.full(3, unknown.frame), unknown.tool_translation])
     step = np.zeros(6)
     if free.any():
-        step[free] = np.linalg.lstsq(A.reshape(-1, 6)[:, free], rest.ravel(), rcond=1e-10)[0]
+        reluctance = np.where(np.arange(6) < 3, 1.0, 1e-3)[free]
+        scaled = A.reshape(-1, 6)[:, free] * reluctance
+        step[free] = reluctance * np.linalg.lstsq(scaled, rest.ravel(), rcond=1e-10)[0]
     left = rest.ravel() - A.reshape(-1, 6) @ step
     return (Frame(R_X, X.translation + step[:3]), Frame(R_T, T.translation + step[3:])), float(left @ left)

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from fg_calib.choices import FrameKnowledge, Model
 from fg_calib.errors import ProblemError
 from fg_calib.measurements import Measurements, Pairing
-from fg_calib.observability import Observability
-from fg_calib.problem import Problem, observe, predicted_problem, random_problem
+from fg_calib.observability import SIGNAL_FLOOR, Observability
+from fg_calib.problem import STRUCTURAL_FLOOR, Problem, observe, predicted_problem, random_problem
 from fg_calib.reasons import LostDirection, explain
 from fg_calib.robot import Robot, names_of
 
@@ -141,7 +141,8 @@ def identify(
     prefer: Sequence[str] = (),
 ) -> Identifiability:
     """What the train rows of a problem, without priors, determine around a parameter vector."""
-    observability = observe(problem, parameters, prefer)
+    floor = STRUCTURAL_FLOOR if kind == "structural" else SIGNAL_FLOOR
+    observability = observe(problem, parameters, prefer, floor)
     return Identifiability(
         robot=problem.robot.name,
         model=problem.settings.model,

@@ -68,7 +68,7 @@ class _CompileNotice(event.Listener):  # type: ignore[misc]
 
 
 def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
-    """Compile a kernel with numba: without the GIL, with fused multiply-adds, cached wherever a folder can be written."""
+    """Compile a kernel with numba: without the GIL, with fused multiply-adds, cached where a folder can be written."""
     options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}} | options
     try:
         kernel: Callable[..., Any] = numba.njit(cache=True, **options)(function)

@@ -28,6 +28,9 @@ IdentifiabilityClass = Literal["independent", "relative", "ineffective"]
 RANK_TOLERANCE = 1e-10
 """Singular values below this part of the largest are those of directions that the data do not determine."""
 
+SIGNAL_FLOOR = 1e-3
+"""Nor are directions with a smaller signal-to-noise ratio: sigma above 1000 ordinary changes, 1 m or 1 rad."""
+
 SUPPORT_TOLERANCE = 1e-6
 """A parameter takes part in a direction if its unit-free share in it is above this."""
 
@@ -133,6 +136,7 @@ def analyse(
     *,
     n_measurements: int,
     prefer: Sequence[str] = (),
+    floor: float = SIGNAL_FLOOR,
 ) -> Observability:
     """Analyse a whitened Jacobian, or the triangular factor of one.
 
@@ -141,15 +145,15 @@ def analyse(
         parameters: The n parameters of the columns.
         n_measurements: Number of configurations or pairs, for O1.
         prefer: Parameters to keep, first choice first, where only combinations are determined; then `KEEP_ORDER`.
+        floor: Signal-to-noise ratio below which a direction counts as not determined.
     """
     n, names = len(parameters), names_of(parameters)
     scales = np.array([p.scale for p in parameters])
     J = jacobian * scales
     _, s, Vt = np.linalg.svd(np.vstack([J, np.zeros((n, n))]), full_matrices=False)
-    threshold = RANK_TOLERANCE * s[0]
-    rank = int(np.sum(s > threshold))
+    rank = determined(s, floor)
     null = Vt[rank:]
-    dead = np.linalg.norm(J, axis=0) <= threshold
+    dead = np.linalg.norm(J, axis=0) <= max(RANK_TOLERANCE * s[0], floor)
     relative = (np.linalg.norm(null, axis=0) > SUPPORT_TOLERANCE) & ~dead
     classes: list[IdentifiabilityClass] = [
         "ineffective" if d else "relative" if r else "independent" for d, r in zip(dead, relative, strict=True)
@@ -175,6 +179,16 @@ def analyse(
         correlations=correlations,
         weak=weak,
     )
+
+
+def singular_values(matrix: Floats) -> Floats:
+    """Singular values, descending."""
+    return np.linalg.svd(matrix, compute_uv=False).astype(np.float64)
+
+
+def determined(singular_values: Floats, floor: float = SIGNAL_FLOOR) -> int:
+    """Number of directions that are determined: above `RANK_TOLERANCE` of the largest, and above the floor."""
+    return int(np.sum(singular_values > max(RANK_TOLERANCE * singular_values.max(initial=0.0), floor)))
 
 
 def observability_indices(singular_values: Floats, n_measurements: int) -> dict[str, float]:

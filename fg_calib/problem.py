@@ -28,7 +28,7 @@ from fg_calib.factors import (
 from fg_calib.frames import Frame, Unknown
 from fg_calib.kinematics import Chain, build_chain, forward, precompute_trig
 from fg_calib.measurements import Measurements, Pairing, Pairs, form_pairs
-from fg_calib.observability import RANK_TOLERANCE, Observability, analyse
+from fg_calib.observability import RANK_TOLERANCE, SIGNAL_FLOOR, Observability, analyse, determined, singular_values
 from fg_calib.residuals import Block, PairBlock, PoseBlock, SamePointBlock
 from fg_calib.robot import Parameter, Robot
 
@@ -55,6 +55,9 @@ POSE_KINDS: dict[str, tuple[bool, bool]] = {
     "pose": (True, True),
 }
 """Whether a model uses orientations and positions."""
+
+STRUCTURAL_FLOOR = 1e-6
+"""Signal-to-noise ratio that counts as nothing on random configurations with an assumed noise: rounding alone."""
 
 _CHUNK = 65_536
 """Rows whose derivatives in the joints are held at once."""
@@ -346,19 +349,23 @@ def named_triangle(problem: Problem, parameters: Floats) -> Floats:
     return out
 
 
-def observe(problem: Problem, parameters: Floats, prefer: Sequence[str] = ()) -> Observability:
+def observe(
+    problem: Problem, parameters: Floats, prefer: Sequence[str] = (), floor: float = SIGNAL_FLOOR
+) -> Observability:
     """What the train rows, without priors, determine of the robot's parameters around a parameter vector.
 
     Args:
         problem: The problem.
         parameters: The parameter vector (see `Variables`).
         prefer: Parameters to keep, first choice first, where only combinations are determined.
+        floor: Signal-to-noise ratio below which a direction counts as not determined.
     """
     return analyse(
         named_triangle(problem, parameters),
         problem.estimated,
         n_measurements=problem.n_pairs or problem.n_configurations,
         prefer=prefer,
+        floor=floor,
     )
 
 
@@ -440,7 +447,7 @@ def _check_enough(problem: Problem) -> None:
     anywhere = random_problem(problem.robot, s.model, s.frame)
     priors = prior_rows(problem.variables, problem.start)[1]
     stacked = np.vstack([whitened_triangle(anywhere, anywhere.start), priors])
-    needed = int(np.linalg.matrix_rank(stacked * problem.variables.scales, rtol=RANK_TOLERANCE))
+    needed = determined(singular_values(stacked * problem.variables.scales), STRUCTURAL_FLOOR)
     if rows < needed:
         raise ProblemError(
             source, f"{rows} residuals", f"at least {needed} to determine what model {problem.settings.model} can"
@@ -524,7 +531,8 @@ def _assemble(
         whole = _pair_block(trig, pairs, kinds, np.array([1.0, 0.0, 1.0]))
         covariance = _pair_covariance(whole, chain, pairs, measurements.sigma_joint, kinds)
         sigma = np.sqrt(covariance[:, [0, 2]])
-        judgement = _judge(pairs, _predicted(whole, chain, kinds), sigma)
+        same = np.all(measurements.readings[pairs.a] == measurements.readings[pairs.b], axis=1)
+        judgement = _judge(pairs, _predicted(whole, chain, kinds), sigma, same)
         blocks = _pair_blocks(trig, chain, pairs, judgement, covariance, measurements.sigma_joint, kinds)
     else:
         pose_kinds = POSE_KINDS[settings.model]
@@ -567,9 +575,9 @@ def _predicted(block: PairBlock, chain: Chain, kinds: tuple[bool, bool]) -> Floa
     return predicted
 
 
-def _judge(pairs: Pairs, predicted: Floats, sigma: Floats) -> PairJudgement:
-    """Which rows of each pair take part."""
-    measured_distance, measured_angle = np.isfinite(pairs.distance), np.isfinite(pairs.angle)
+def _judge(pairs: Pairs, predicted: Floats, sigma: Floats, same: Booleans) -> PairJudgement:
+    """Which rows of each pair take part; none where both readings are the same: no parameter changes the prediction."""
+    measured_distance, measured_angle = np.isfinite(pairs.distance) & ~same, np.isfinite(pairs.angle) & ~same
     smallest = np.fmin(pairs.distance, predicted[:, 0])
     small = measured_distance & (smallest < KINK_SIGMAS * sigma[:, 0])
     same_point = small & (pairs.distance <= SAME_POINT_SIGMAS * sigma[:, 0])
@@ -584,6 +592,7 @@ def _judge(pairs: Pairs, predicted: Floats, sigma: Floats) -> PairJudgement:
             "distance_near_zero": small & ~same_point,
             "angle_near_zero": near_zero,
             "angle_near_pi": near_pi,
+            "same_configuration": same,
         },
     )
 

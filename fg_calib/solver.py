@@ -5,7 +5,8 @@ without a word when it is stuck. The judge is the *decrement*: how far, in sigma
 along the directions that data and priors determine (the square root of the cost decrease it predicts, times two).
 
 Directions that nothing determines are left where they are: the damping `lambda I` never falls to zero, so every step is
-a minimum-norm step (lambda's floor is 1e-14 of the largest curvature: too little to slow any determined direction).
+a minimum-norm step. Its floor is that of a direction whose signal-to-noise ratio is just too small to count as
+determined: less damping lets noise carry such directions off by metres, and what is determined is hardly slowed by it.
 """
 
 from __future__ import annotations
@@ -20,11 +21,15 @@ from numpy.typing import NDArray
 
 from fg_calib.errors import SolverError
 from fg_calib.factors import Variables
-from fg_calib.observability import RANK_TOLERANCE
+from fg_calib.observability import SIGNAL_FLOOR, determined
 from fg_calib.problem import Problem, frames_only, judged_at
 from fg_calib.residuals import single_threaded_blas
 
 Floats = NDArray[np.float64]
+
+
+_DAMPING_FLOOR = 10.0 * (SIGNAL_FLOOR / 1e-3) ** 2
+"""Least damping in [1/m^2] and [1/rad^2]: ten times the curvature at the floor, in changes of 1 mm and 1 mrad."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +40,7 @@ class SolverOptions:
         max_iterations: Steps after which it gives up.
         decrement: Converged when a step began nearer than this to the optimum, [sigma]; far less is left after it.
         lambda_ceiling: Damping beyond which it gives up, as a multiple of the largest curvature.
-        lambda_floor: Least damping, as a multiple of the largest curvature.
+        lambda_floor: Least damping, as a multiple of the largest curvature (rounding), beside `_DAMPING_FLOOR` (noise).
         max_rounds: Times that rows are judged and whitened anew at the estimate.
     """
 
@@ -194,9 +199,10 @@ def _parameters(options: SolverOptions, curvature: float) -> gtsam.LevenbergMarq
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setLinearSolverType("MULTIFRONTAL_QR")
     parameters.setDiagonalDamping(False)
-    parameters.setlambdaInitial(1e-8 * curvature)
+    parameters.setlambdaInitial(max(1e-8 * curvature, _DAMPING_FLOOR))
     parameters.setlambdaFactor(10.0)
-    parameters.setlambdaLowerBound(options.lambda_floor * curvature)
+    floor = max(options.lambda_floor * curvature, _DAMPING_FLOOR)
+    parameters.setlambdaLowerBound(floor)
     parameters.setlambdaUpperBound(options.lambda_ceiling * curvature)
     parameters.setRelativeErrorTol(1e-13)  # no search for a lambda once the cost's own rounding decides
     parameters.setAbsoluteErrorTol(0.0)
@@ -221,7 +227,7 @@ def _decrement(linear: gtsam.GaussianFactorGraph, variables: Variables) -> float
     """Length of the Gauss-Newton step in sigma, along determined directions only."""
     A, b = _dense(linear, variables.keys)
     U, s, _ = np.linalg.svd(A * variables.scales, full_matrices=False)
-    return float(np.linalg.norm((U.T @ b)[s > RANK_TOLERANCE * s[0]]))
+    return float(np.linalg.norm((U.T @ b)[: determined(s)]))
 
 
 def _step_length(previous: gtsam.Values, values: gtsam.Values, variables: Variables) -> float:

@@ -14,8 +14,10 @@ from scipy.spatial.transform import Rotation
 from fg_calib import residuals
 from fg_calib.factors import pose_of, prior_rows
 from fg_calib.identifiability import Identifiability, identify
-from fg_calib.observability import RANK_TOLERANCE, SUPPORT_TOLERANCE, IdentifiabilityClass, Observability
+from fg_calib.measurements import rotation_angle
+from fg_calib.observability import SUPPORT_TOLERANCE, IdentifiabilityClass, Observability, determined
 from fg_calib.problem import PAIR_KINDS, POSE_KINDS, Problem, all_rows, whitened_triangle
+from fg_calib.residuals import PairBlock
 from fg_calib.robot import Robot
 from fg_calib.solver import Solution
 
@@ -28,6 +30,10 @@ CONFIDENCE = 0.999
 
 FACTOR = 2.0
 """A reduced chi-square between 1 / FACTOR and FACTOR is good whatever its distribution: noise is never known better."""
+
+
+_MANY_ROWS = 10_000
+"""Pairs beyond which `expected_chi2` is not worked out: chi-square then has far more rows than unknowns."""
 
 
 @dataclass(frozen=True)
@@ -189,6 +195,7 @@ class Uncertainty:
         frame: The measurement frame; None where it was not estimated.
         chi2: Sum of squared whitened residuals, priors included.
         dof: Residuals and priors, less the determined directions.
+        expected_chi2: What chi-square is on average; less than `dof` for pairs that share measured poses.
         chi2_bounds: Interval of the reduced chi-square that is taken as good.
         residuals: Every residual, before and after.
         identifiability: What the data alone determine, at the nominal parameters.
@@ -203,6 +210,7 @@ class Uncertainty:
     frame: FrameEstimate | None
     chi2: float
     dof: int
+    expected_chi2: float
     chi2_bounds: tuple[float, float]
     residuals: ResidualTable
     identifiability: Identifiability
@@ -253,8 +261,8 @@ def assess(solution: Solution) -> Uncertainty:
     """Covariance, goodness of fit, residuals and identifiability of a solution.
 
     The covariance comes from a singular value decomposition of the whitened Jacobian of data and priors, its
-    columns scaled, at the estimate. Directions below `RANK_TOLERANCE` are undetermined: a parameter with a share in one
-    has unknown sigma (None, nan in the covariance). It is not rescaled by chi-square.
+    columns scaled, at the estimate. Directions that `determined` does not count are undetermined: a parameter with a
+    share in one has unknown sigma (None, nan in the covariance). It is not rescaled by chi-square.
 
     Note:
         Away from the nominal parameters undetermined directions turn, by about as many radians as the angles were
@@ -277,7 +285,8 @@ def assess(solution: Solution) -> Uncertainty:
         )
     chi2 = 2.0 * solution.cost
     dof = problem.n_residuals + problem.n_priors - spread.rank
-    bounds = chi2_bounds(dof)
+    expected = expected_chi2(solution, dof)
+    bounds = chi2_bounds(dof, expected, _independent_dof(problem, dof, spread.rank))
     return Uncertainty(
         names=variables.names[: variables.n_robot_columns],
         covariance=covariance,
@@ -285,6 +294,7 @@ def assess(solution: Solution) -> Uncertainty:
         frame=frame,
         chi2=chi2,
         dof=dof,
+        expected_chi2=expected,
         chi2_bounds=bounds,
         residuals=residual_table(solution),
         identifiability=whole,
@@ -294,12 +304,74 @@ def assess(solution: Solution) -> Uncertainty:
     )
 
 
-def chi2_bounds(dof: int) -> tuple[float, float]:
-    """Interval of the reduced chi-square taken as good: its central `CONFIDENCE`, widened to `FACTOR` either way."""
+def chi2_bounds(dof: int, expected: float | None = None, independent: int | None = None) -> tuple[float, float]:
+    """Interval of the reduced chi-square taken as good: its central `CONFIDENCE`, widened to `FACTOR` either way.
+
+    Args:
+        dof: Degrees of freedom that chi-square is divided by.
+        expected: Mean of chi-square; `dof` if None.
+        independent: Degrees of freedom of the noise behind it; `dof` if None.
+    """
     if dof <= 0:
         return 0.0, np.inf
-    low, high = (2.0 * special.gammaincinv(dof / 2.0, p) / dof for p in ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))
-    return min(float(low), 1.0 / FACTOR), max(float(high), FACTOR)
+    k = max(1, min(dof, independent or dof))
+    ratio = 1.0 if expected is None else expected / dof
+    low, high = (2.0 * special.gammaincinv(k / 2.0, p) / k for p in ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))
+    return ratio * min(float(low), 1.0 / FACTOR), max(1.0, ratio) * max(float(high), FACTOR)
+
+
+def expected_chi2(solution: Solution, dof: int) -> float:
+    """Mean of chi-square if the stated noise is right.
+
+    That is `dof` for independent rows. Pairs formed from poses are treated as independent but share the errors of
+    their configurations: with C the true covariance of the whitened residuals e and Q an orthonormal basis of the
+    whitened Jacobian (priors included), the mean of |e - Q Q^T e|^2 is that of |e|^2 less tr(Q^T C Q), a sum over
+    configurations. Beyond `_MANY_ROWS` pairs the difference does not matter and `dof` is returned.
+    """
+    problem = solution.problem
+    shared = problem.pairs is not None and problem.measurements.pairs is None
+    block = next((b for b in problem.blocks if isinstance(b, PairBlock)), None)
+    if not shared or block is None or block.n > _MANY_ROWS:
+        return float(dof)
+    variables = problem.variables
+    chain = variables.chain.at(solution.parameters).with_joint_columns()
+    n, p, n_joints = block.n, variables.n_columns, problem.robot.n_joints
+    J = residuals.linearise(block, chain)[1]  # (n, height, p + 2 n_joints)
+    own = J[:, :, p:] * np.tile(problem.measurements.sigma_joint, 2)
+    G_a = np.concatenate([_pose_noise(problem, block, block.a, -1.0), own[:, :, :n_joints]], axis=2)
+    G_b = np.concatenate([_pose_noise(problem, block, block.b, 1.0), own[:, :, n_joints:]], axis=2)
+    rows = np.vstack([J[:, :, :p].reshape(-1, p), prior_rows(variables, solution.parameters)[1]]) * variables.scales
+    U, s, _ = np.linalg.svd(rows, full_matrices=False)
+    Q = U[: n * block.height, : determined(s)].reshape(n, block.height, -1)
+    M = np.zeros((problem.measurements.n_configurations, Q.shape[2], G_a.shape[2]))
+    np.add.at(M, block.a, np.einsum("nhp,nhs->nps", Q, G_a))
+    np.add.at(M, block.b, np.einsum("nhp,nhs->nps", Q, G_b))
+    return max(0.0, dof + float(np.sum(Q**2)) - float(np.sum(M**2)))
+
+
+def _pose_noise(problem: Problem, block: PairBlock, rows: Integers, sign: float) -> Floats:
+    """Whitened residuals per sigma of one configuration's measured position and orientation, shape (n, height, 6)."""
+    m = problem.measurements
+    G = np.zeros((block.n, 2, 6))
+    if m.position is not None and m.sigma_position is not None and block.kinds[0]:
+        step = m.position[block.b] - m.position[block.a]
+        unit = step / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-300)
+        G[:, 0, :3] = -sign * unit * m.sigma_position[rows]
+    if m.rotation is not None and m.sigma_orientation is not None and block.kinds[1]:
+        _, axis = rotation_angle(np.swapaxes(m.rotation[block.a], 1, 2) @ m.rotation[block.b])
+        unit = axis / np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-300)
+        G[:, 1, 3:] = -sign * unit * m.sigma_orientation[rows]
+    w_dd, w_ad, w_aa = block.whitening.T[:, :, None]
+    whitened = np.stack([w_dd * G[:, 0], w_ad * G[:, 0] + w_aa * G[:, 1]], axis=1)
+    return whitened[:, block.kinds]
+
+
+def _independent_dof(problem: Problem, dof: int, rank: int) -> int:
+    """Degrees of freedom of the noise behind the residuals: pairs hold no more than the poses they come from."""
+    if problem.pairs is None or problem.measurements.pairs is not None:
+        return dof
+    each = 3 * sum(PAIR_KINDS[problem.settings.model])
+    return min(dof, each * (problem.n_configurations - 1) + problem.n_priors - rank)
 
 
 def residual_table(solution: Solution) -> ResidualTable:
@@ -323,7 +395,7 @@ def _spread(solution: Solution) -> Spread:
 
     _, s, Vt = np.linalg.svd(stacked(solution.parameters), full_matrices=False)
     _, s_nominal, Vt_nominal = np.linalg.svd(stacked(solution.before), full_matrices=False)
-    rank, rank_nominal = (int(np.sum(v > RANK_TOLERANCE * v[0])) for v in (s, s_nominal))
+    rank, rank_nominal = determined(s), determined(s_nominal)
     half = scales[:, None] * Vt[:rank].T / s[:rank]
     return Spread(
         names=variables.names,
@@ -378,7 +450,8 @@ def _pair_table(problem: Problem, before: Floats, after: Floats) -> ResidualTabl
     kinds = PAIR_KINDS[problem.settings.model]
     reasons = np.full((pairs.n_pairs, 2), "", dtype="<U20")
     for reason, mask in judgement.reasons.items():
-        reasons[mask, 0 if reason.startswith("distance") else 1] = reason
+        named = [kind in reason for kind in ("distance", "angle")]
+        reasons[np.outer(mask, named if any(named) else (True, True))] = reason
     measured = np.stack([pairs.distance, pairs.angle], axis=1)
     wide_before, wide_after = np.full_like(measured, np.nan), np.full_like(measured, np.nan)
     wide_before[:, kinds], wide_after[:, kinds] = before, after

@@ -63,7 +63,12 @@ def test_angles_near_the_kinks_give_no_angle_row_but_keep_their_distance():
     problem = build_problem(planar_robot(), planar_pairs(angles, sigma=(1e-5, 1e-3)), model="distance-rotation")
     assert problem.judgement.angle.tolist() == [True, False, False, True, False, True, True]
     assert problem.judgement.distance.all()
-    assert problem.n_excluded == {"distance_near_zero": 0, "angle_near_zero": 2, "angle_near_pi": 1}
+    assert problem.n_excluded == {
+        "distance_near_zero": 0,
+        "angle_near_zero": 2,
+        "angle_near_pi": 1,
+        "same_configuration": 0,
+    }
     assert problem.n_residuals == 7 + 4
 
 
@@ -88,7 +93,7 @@ def test_a_distance_measured_as_zero_becomes_three_coordinates_and_a_small_one_i
 
 def test_a_large_distance_predicted_as_nothing_is_excluded():
     problem = build_problem(
-        planar_robot({"a": 0.01, "theta": 0.01}), planar_pairs([0.0, 1.0], distance=[0.3, 2.8]), model="distance"
+        planar_robot({"a": 0.01, "theta": 0.01}), planar_pairs([0.001, 1.0], distance=[0.3, 2.8]), model="distance"
     )
     assert problem.judgement.same_point.tolist() == [False, False]
     assert problem.n_excluded["distance_near_zero"] == 1
@@ -236,3 +241,11 @@ def test_frame_of_a_pair_model_does_not_matter():
     ]
     assert names[0] == names[1]
     assert build_chain(robot).n_columns == 0
+
+
+def test_a_configuration_against_itself_says_nothing_of_the_arm():
+    problem = build_problem(
+        planar_robot({"a": 0.01, "theta": 0.01}), planar_pairs([0.0, 1.0]), model="distance-rotation"
+    )
+    assert problem.n_excluded["same_configuration"] == 1
+    assert problem.n_residuals == 2

@@ -1,0 +1,150 @@
+"""Imports run one way, only the command line prints, no global generator is drawn from, public names are explained."""
+
+import ast
+import importlib
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import fg_calib
+
+PACKAGE = Path(fg_calib.__file__).parent
+FLOORS = (
+    *("choices", "errors", "robot", "measurements", "files", "kinematics", "residuals", "factors", "frames"),
+    *(
+        "observability",
+        "problem",
+        "solver",
+        "reasons",
+        "identifiability",
+        "uncertainty",
+        "report",
+        "figures",
+        "results",
+    ),
+    "cli",
+)
+"""From the ground up: a module may import from those before it; within `files` see `FILES`."""
+
+FILES = ("disk", "schema", "units", "tables", "urdf", "robot_yaml", "job")
+
+MODULES = sorted(p for p in PACKAGE.rglob("*.py") if p.name != "__init__.py" and "examples" not in p.parts)
+NAMES = [p.relative_to(PACKAGE).with_suffix("").as_posix() for p in MODULES]
+EVERY_MODULE = pytest.mark.parametrize(("name", "path"), list(zip(NAMES, MODULES, strict=True)), ids=NAMES)
+
+
+def parse(path):
+    return ast.parse(path.read_text(encoding="utf-8"), str(path))
+
+
+def imported(tree):
+    """Modules of the package that a module imports anywhere, as paths below the package: `robot`, `files/units`."""
+    found = set()
+    for node in ast.walk(tree):
+        names = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are absolute"
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        for name in names:
+            first, *rest = name.split(".")
+            if first == "fg_calib":
+                path = "/".join(rest)
+                while path and not (PACKAGE / f"{path}.py").is_file() and not (PACKAGE / path).is_dir():
+                    path = path.rpartition("/")[0]  # the last word names something in the module
+                found.add(path)
+    return found - {""}  # "" is the package itself: __version__
+
+
+def floor(name):
+    first, _, rest = name.partition("/")
+    return FLOORS.index(first), FILES.index(rest) if rest else -1
+
+
+def test_every_module_stands_on_a_floor():
+    assert {name.partition("/")[0] for name in NAMES} == set(FLOORS)
+    assert {name.partition("/")[2] for name in NAMES if name.startswith("files/")} == set(FILES)
+
+
+@EVERY_MODULE
+def test_a_module_imports_from_lower_floors_only(name, path):
+    upward = {other for other in imported(parse(path)) if floor(other) >= floor(name)}
+    assert upward == set()
+
+
+def test_upward_imports_would_be_seen():
+    """The check itself: all forms of an import, wherever they stand."""
+    code = "import fg_calib.cli\ndef f():\n from fg_calib import solver, pose\n from fg_calib.files.units import Units"
+    assert imported(ast.parse(code)) == {"cli", "solver", "files/units"}
+    assert floor("files/units") < floor("files/job") < floor("kinematics") < floor("cli")
+
+
+@EVERY_MODULE
+def test_only_the_command_line_prints(name, path):
+    calls = [node for node in ast.walk(parse(path)) if isinstance(node, ast.Call)]
+    printing = [c for c in calls if isinstance(c.func, ast.Name) and c.func.id == "print"]
+    assert name == "cli" or printing == []
+
+
+@EVERY_MODULE
+def test_no_module_uses_global_random_state(name, path):
+    """`np.random.default_rng` with a seed, and the type `Generator`, are all of numpy.random there is."""
+    tree = parse(path)
+    used = {
+        node.attr
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Attribute) and node.value.attr == "random"
+    }
+    assert used <= {"default_rng", "Generator"}
+    assert not any(isinstance(n, ast.Import) and any(a.name == "random" for a in n.names) for n in ast.walk(tree))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("default_rng"):
+            assert node.args, "a generator without a seed"
+    at_import = [n for statement in tree.body if not isinstance(statement, ast.FunctionDef | ast.ClassDef)
+                 for n in ast.walk(statement) if isinstance(n, ast.Call)]  # fmt: skip
+    assert not any("random" in ast.unparse(call.func) for call in at_import)
+
+
+@pytest.mark.parametrize("name", fg_calib.__all__)
+def test_a_public_name_is_a_class_or_function_that_is_explained(name):
+    """Also where the module that holds it has been imported, which binds a submodule of the same name."""
+    importlib.import_module(fg_calib._HOME_OF[name])
+    public = getattr(fg_calib, name)
+    assert inspect.isclass(public) or inspect.isfunction(public)
+    assert (public.__doc__ or "").strip()
+    assert public.__module__ == fg_calib._HOME_OF[name]
+
+
+def test_public_names_are_listed_once_and_in_order():
+    assert fg_calib.__all__ == sorted(set(fg_calib.__all__))
+    assert set(fg_calib.__all__) == set(fg_calib._HOME_OF)
+    assert set(fg_calib.__all__) <= set(dir(fg_calib))
+
+
+def run_python(code):
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    return ended.stdout
+
+
+def test_public_names_come_from_a_fresh_import():
+    code = "from fg_calib import *; import fg_calib, types; "
+    code += "print([n for n in fg_calib.__all__ if isinstance(globals()[n], types.ModuleType)])"
+    assert run_python(code) == "[]\n"
+
+
+def test_the_command_line_is_there_before_the_heavy_libraries():
+    code = "import sys, fg_calib.cli; print(sorted({m.partition('.')[0] for m in sys.modules}))"
+    loaded = set(ast.literal_eval(run_python(code)))
+    assert "fg_calib" in loaded
+    heavy = {"gtsam", "numba", "polars", "scipy", "numpy", "matplotlib", "yourdfpy", "lxml", "pydantic"}
+    assert loaded & heavy == set()
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="module 'fg_calib' has no attribute 'calibrate_all'"):
+        _ = fg_calib.calibrate_all

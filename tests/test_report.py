@@ -1,0 +1,207 @@
+"""The report: its whole text for a problem one can draw, its width, and the README's six lines."""
+
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fg_calib import (
+    Measurements,
+    assess,
+    build_problem,
+    cli,
+    format_report,
+    read_measurements,
+    read_robot,
+    solve,
+    write_robot,
+)
+from fg_calib.files.tables import write_csv
+from fg_calib.files.units import Units
+from fg_calib.robot import Joint, Robot, RobotBuilder
+
+README = Path(__file__).resolve().parents[1] / "README.md"
+
+
+def planar_arm(tolerance=None) -> Robot:
+    """Two links of 2 m and 1 m in a plane; unknown are both lengths, and by `tolerance` the last joint's offset d2."""
+    builder = RobotBuilder("two-links", "dh")
+    builder.add_frame("base", {}, 0, False)
+    for i, length in enumerate((2.0, 1.0)):
+        builder.add_convention_joint(Joint(f"q{i + 1}"), {"theta": 0.0, "d": 0.0, "a": length, "alpha": 0.0})
+    builder.add_frame("tool", {}, 3, False)
+    return builder.build(fixed=["theta1", "d1", "alpha1", "theta2", "alpha2"], tolerance=tolerance)
+
+
+def planar_measurements(n_test=2) -> Measurements:
+    """Positions by hand of an arm with links of 2.003 m and 0.998 m, each coordinate off by 1 mm to and fro."""
+    q = np.deg2rad([[0, 0], [0, 90], [90, 90], [45, -90], [-30, 60], [120, -45], [10, 30], [-80, -20]])
+    first, second = q[:, 0], q[:, 0] + q[:, 1]
+    position = np.stack(
+        [2.003 * np.cos(first) + 0.998 * np.cos(second), 2.003 * np.sin(first) + 0.998 * np.sin(second)]
+    )
+    position = np.vstack([position, np.zeros(8)]).T
+    position[:, :2] += 1e-3 * np.array([[1, -1], [-1, 1], [1, 1], [-1, -1], [1, -1], [-1, 1], [1, 1], [-1, -1]])
+    return Measurements(
+        readings=q,
+        ids=np.arange(8).astype(str),
+        test=np.arange(8) >= 8 - n_test,
+        position=position,
+        rotation=None,
+        sigma_position=np.full((8, 3), 1e-3),
+        sigma_orientation=None,
+        sigma_joint=np.zeros(2),
+    )
+
+
+def report(robot, measurements, **settings):
+    """The report, with what depends on the machine replaced: time, steps and how far the last one had to go."""
+    solution = solve(build_problem(robot, measurements, **settings))
+    text = format_report(solution, assess(solution))
+    text = re.sub(r"began \S+ sigma", "began ... sigma", text)
+    return re.sub(r"\d+ iterations, \S+ s,", "N iterations, T s,", text)
+
+
+GOLDEN = """\
+two-links: position
+GOOD: converged: the last step began ... sigma from the optimum
+
+Fit statistics
+configurations     6
+residuals          18, and 1 priors
+estimated          3 unknowns, 3 directions determined
+chi-square         10.8175 with 16 degrees of freedom
+reduced chi-square 0.6761 (good from 0.221 to 2.58)
+solver             N iterations, T s, cost 34.5646 -> 5.40874
+
+Residuals (RMS)
+            train before  after test before  after
+position mm       3.3943 1.3427      2.2226 1.0383
+
+Parameters
+        estimate    sigma     correction   nominal  prior class
+theta1   0.00000          deg                             fixed
+d1        0.0000          mm                              fixed
+a1     2003.2998 ± 0.4390 mm     +3.2998 2000.0000        independent
+alpha1   0.00000          deg                             fixed
+theta2   0.00000          deg                             fixed
+d2        0.0000 ± 0.3780 mm     +0.0000    0.0000 1.0000 independent
+a2      998.2353 ± 0.4390 mm     -1.7647 1000.0000        independent
+alpha2   0.00000          deg                             fixed"""
+
+GOLDEN_OPEN = {
+    "Parameters": """\
+        estimate     sigma     correction   nominal prior class
+theta1   0.00000           deg                            fixed
+d1        0.0000           mm                             fixed
+a1     2003.4954 ±  0.5298 mm     +3.4954 2000.0000       independent
+alpha1   0.00000           deg                            fixed
+theta2   0.00000           deg                            fixed
+d2        0.0000 ± unknown mm     +0.0000    0.0000       ineffective
+a2      998.4334 ±  0.4644 mm     -1.5666 1000.0000       independent
+alpha2   0.00000           deg                            fixed""",
+    "Measurement frame (world_T_base)": """\
+xyz                                     -0.6005  -0.0083  0.0000 mm
+± along its axes                         0.5375  0.5397  unknown mm
+quaternion xyzw  0.00000000  0.00000000  -0.00010889  0.99999999
+± about its axes                       0.05496  0.03790  0.01237 deg""",
+    "Notes": """\
+  what the data leave open of d2 stays at nominal
+  no test rows: how well this predicts new configurations was not checked""",
+}
+
+
+def sections(text):
+    """A report's sections by heading; the first one is called `""`."""
+    first, *rest = text.split("\n\n")
+    return {"": first} | dict(section.split("\n", 1) for section in rest)
+
+
+def test_the_report_of_two_links_is_this_text():
+    found = sections(report(planar_arm({"d2": 0.001}), planar_measurements(), model="position"))
+    expected = sections(GOLDEN)
+    assert list(found)[:4] == list(expected)
+    assert {heading: found[heading] for heading in expected} == expected
+
+
+def test_its_figures_are_those_of_linear_least_squares_by_hand():
+    """Lengths are linear in the positions: normal equations in mm; d2 is 6 readings of 0 and a prior, all 1 mm."""
+    m = planar_measurements()
+    first, both = m.readings[:6, 0], m.readings[:6].sum(axis=1)
+    J = np.stack([np.concatenate([np.cos(q), np.sin(q)]) for q in (first, both)], axis=1)  # (12, 2)
+    y = 1e3 * m.position[:6, :2].T.ravel()
+    lengths, left = np.linalg.lstsq(J, y, rcond=None)[:2]
+    sigma = np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
+    for name, length, s in zip(("a1", "a2"), lengths, sigma, strict=True):
+        assert re.search(rf"{name} +{length:.4f} ± {s:.4f} mm", GOLDEN)
+    assert f"chi-square         {left.item():.6g} with {18 + 1 - 3} degrees" in GOLDEN
+    assert f"-> {left.item() / 2:.6g}" in GOLDEN
+    assert f"± {1 / np.sqrt(7):.4f} mm     +0.0000    0.0000 1.0000" in GOLDEN
+    assert f"3.3943 {np.sqrt(left.item() / 6):.4f} " in GOLDEN
+
+
+def test_the_report_names_the_frame_and_what_stays_open():
+    m = planar_measurements()
+    train = replace(
+        m,
+        readings=m.readings[:6],
+        ids=m.ids[:6],
+        test=m.test[:6],
+        position=m.position[:6],
+        sigma_position=m.sigma_position[:6],
+    )
+    found = sections(report(planar_arm(), train, model="position", frame="unknown"))
+    assert {heading: found[heading] for heading in GOLDEN_OPEN} == GOLDEN_OPEN
+    assert re.search("^d2 ", found["What the data do not determine"], flags=re.M)
+
+
+def test_doubt_stands_first():
+    m = planar_measurements()
+    text = report(planar_arm(), replace(m, sigma_position=m.sigma_position / 5), model="position")
+    assert re.match("two-links: position\nDOUBTFUL: reduced chi-square .* noise stated too small", text)
+    assert "GOOD" not in text
+
+
+@pytest.mark.parametrize("width", [70, 80, 100, 200])
+def test_no_width_cuts_a_figure(width):
+    """Names fold where they are long; a cut figure would be a wrong one."""
+    robot = planar_arm({"d2": 0.001})
+    long = {p.name: f"a_rather_long_name_of_the_joint.{p.name}" for p in robot.parameters}
+    robot = replace(robot, parameters=tuple(replace(p, name=long[p.name]) for p in robot.parameters))
+    solution = solve(build_problem(robot, planar_measurements(), model="position", frame="unknown"))
+    lines = format_report(solution, assess(solution), width=width).splitlines()
+    assert max(map(len, lines)) <= width
+    assert not any("…" in line for line in lines)
+    assert any("1.0000 ineffective" in line for line in lines)
+    assert all(line == line.rstrip() for line in lines)
+    notes = lines[lines.index("Notes") + 1 :]
+    assert all(note.startswith("  ") for note in notes)
+
+
+def test_the_six_lines_of_the_readme_print_a_report(tmp_path):
+    """As a user runs them, in an interpreter of its own, on the bundled example in SI."""
+    (code,) = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.S)
+    example = cli.EXAMPLES / "space-robot"
+    robot = read_robot(example / "robot_nominal.yaml")
+    given = read_measurements(example / "poses.csv", robot, units=Units(angle="deg"))
+    write_robot(tmp_path / "robot.yaml", robot)
+    quaternion = Rotation.from_matrix(given.rotation).as_quat()
+    columns = dict(zip([f"q{i}" for i in range(1, 8)], given.readings.T, strict=True))
+    columns |= dict(zip("xyz", given.position.T, strict=True))
+    columns |= dict(zip(("qx", "qy", "qz", "qw"), quaternion.T, strict=True))
+    write_csv(tmp_path / "poses.csv", columns | {"id": given.ids, "split": np.where(given.test, "test", "train")})
+    ended = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert ended.stdout.startswith("space-robot: distance-rotation, pairs: star\n")
+    assert [line for line in ended.stdout.splitlines() if line in {"Fit statistics", "Parameters", "Notes"}] == [
+        "Fit statistics",
+        "Parameters",
+        "Notes",
+    ]
