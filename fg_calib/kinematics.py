@@ -10,15 +10,7 @@ multiple of one. The derivative of the pose in an element is the element's twist
 
 so that a unit change turns the tool by w and moves the tool point p by w x p + v (Lynch & Park 2017, ch. 5).
 
-All of it is compiled by numba and runs on blocks of `LANES` configurations at once: arrays are shaped
-(..., LANES) and the innermost loop runs over configurations, which the compiler turns into vector instructions.
-(Inside the walk rotation and point are flat, so that it sees at which constant distance columns lie and that they do
-not overlap.) Sine and cosine of the readings are taken once a data set (`precompute_trig`) and combined with those of
-the parameters by the addition theorem, so no trigonometry happens inside.
-
-Note:
-    Numba's cache looks at the file of the outermost kernel alone: after a change here, kernels elsewhere that call
-    `walk` are compiled anew only once their cache (`fg_calib/__pycache__/*.nb*`) is deleted.
+The walk itself is compiled, see `kernels`.
 
 References:
     Lynch & Park (2017), Modern Robotics, Cambridge University Press.
@@ -26,59 +18,23 @@ References:
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from typing import Any, TypeVar
 
-import numba
 import numpy as np
-from numba.core import event
 from numpy.typing import NDArray
 
+from fg_calib.kernels import walk_all
 from fg_calib.robot import AXIS_OF_KIND, FRAME_KINDS, Axis, Element, Robot
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-logger = logging.getLogger(__name__)
-
-LANES = 32
-"""Configurations walked at once: the width of the innermost loops. Shorter loops would be unrolled, not vectorised."""
-
 T = TypeVar("T")
-
-
-class _CompileNotice(event.Listener):  # type: ignore[misc]
-    """Says once, when numba starts to compile, why the program is silent for some seconds."""
-
-    said = False
-
-    def on_start(self, event: object) -> None:
-        """Numba begins to compile (a kernel found in its cache does not come here)."""
-        if not _CompileNotice.said:
-            _CompileNotice.said = True
-            logger.warning("compiling the kernels: some seconds, once an installation")
-
-    def on_end(self, event: object) -> None:
-        """Numba is done with one function."""
-
-
-def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
-    """Compile a kernel with numba: without the GIL, with fused multiply-adds, cached where a folder can be written."""
-    options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}} | options
-    try:
-        kernel: Callable[..., Any] = numba.njit(cache=True, **options)(function)
-    except RuntimeError:  # neither the package's folder nor the user's cache can be written
-        kernel = numba.njit(**options)(function)
-    return kernel
-
-
-inlined = partial(compiled, forceinline=True)
-"""As `compiled`, for a part of a kernel that must see its caller's constants."""
 
 
 @dataclass(frozen=True)
@@ -238,157 +194,6 @@ def precompute_trig(robot: Robot, readings: Floats) -> Floats:
     )
 
 
-@compiled
-def walk(axis, value, cosine, sine, sign, joint, column, n_columns, n_own, trig, rows, start, rotation, point, twist):  # type: ignore[no-untyped-def]
-    """Walk `LANES` configurations down the chain.
-
-    Args:
-        axis, value, cosine, sine, sign, joint, column, n_columns, n_own: `Chain.arguments`.
-        trig: From `precompute_trig`, shape (n, n_joints, 2).
-        rows: Rows of `trig`, shape (m,); positions beyond its end repeat the last.
-        start: Position in `rows` of the first lane.
-        rotation: Filled: rotation matrix, [column, component, lane], shape (3, 3, LANES).
-        point: Filled: tool point, shape (3, LANES), [m].
-        twist: Filled: (w, v) of each column, then of each joint, shape (n_columns + n_own, 6, LANES); must come with
-            w = 0 for translations.
-    """
-    last = rows.shape[0] - 1
-    row = np.empty(LANES, np.int64)
-    reading = np.empty(2 * LANES)
-    for i in range(LANES):
-        row[i] = rows[min(start + i, last)]
-    R, p = rotation.reshape(9 * LANES), point.reshape(3 * LANES)
-    R[:] = 0.0
-    p[:] = 0.0
-    for i in range(LANES):
-        R[i] = 1.0
-        R[4 * LANES + i] = 1.0
-        R[8 * LANES + i] = 1.0
-    for e in range(axis.shape[0]):
-        k, j = axis[e], joint[e]
-        for target in (column[e], n_columns + j if n_own > 0 and j >= 0 else -1):
-            if target < 0:
-                continue
-            if k >= 3:
-                _write_rotation_twist(sign[e], R, k - 3, p, twist[target])
-            else:
-                _write_translation_twist(sign[e], R, k, twist[target])
-        if j >= 0:
-            for i in range(LANES):
-                reading[i] = trig[row[i], j, 0]
-                reading[LANES + i] = sign[e] * trig[row[i], j, 1]
-        if k < 3:
-            if j >= 0:
-                _shift_by_reading(value[e], sign[e], reading, R, k, p)
-            else:
-                _shift(value[e], R, k, p)
-        elif j >= 0:
-            _add_angles(cosine[e], sine[e], reading)
-            if k == 3:
-                _turn_by_reading(reading, R, 1, 2)
-            elif k == 4:
-                _turn_by_reading(reading, R, 2, 0)
-            else:
-                _turn_by_reading(reading, R, 0, 1)
-        elif k == 3:
-            _turn(cosine[e], sine[e], R, 1, 2)
-        elif k == 4:
-            _turn(cosine[e], sine[e], R, 2, 0)
-        else:
-            _turn(cosine[e], sine[e], R, 0, 1)
-
-
-@inlined
-def _write_rotation_twist(sign, R, k, p, twist):  # type: ignore[no-untyped-def]
-    w = 3 * k * LANES
-    for i in range(LANES):
-        w0 = sign * R[w + i]
-        w1 = sign * R[w + LANES + i]
-        w2 = sign * R[w + 2 * LANES + i]
-        twist[0, i] = w0
-        twist[1, i] = w1
-        twist[2, i] = w2
-        twist[3, i] = p[LANES + i] * w2 - p[2 * LANES + i] * w1
-        twist[4, i] = p[2 * LANES + i] * w0 - p[i] * w2
-        twist[5, i] = p[i] * w1 - p[LANES + i] * w0
-
-
-@inlined
-def _write_translation_twist(sign, R, k, twist):  # type: ignore[no-untyped-def]
-    for c in range(3):
-        for i in range(LANES):
-            twist[3 + c, i] = sign * R[(3 * k + c) * LANES + i]
-
-
-@inlined
-def _shift(value, R, k, p):  # type: ignore[no-untyped-def]
-    for c in range(3):
-        for i in range(LANES):
-            p[c * LANES + i] += value * R[(3 * k + c) * LANES + i]
-
-
-@inlined
-def _shift_by_reading(value, sign, reading, R, k, p):  # type: ignore[no-untyped-def]
-    for c in range(3):
-        for i in range(LANES):
-            p[c * LANES + i] += (value + sign * reading[i]) * R[(3 * k + c) * LANES + i]
-
-
-@inlined
-def _turn(cosine, sine, R, a, b):  # type: ignore[no-untyped-def]
-    for c in range(3):
-        for i in range(LANES):
-            x, y = R[(3 * a + c) * LANES + i], R[(3 * b + c) * LANES + i]
-            R[(3 * a + c) * LANES + i] = cosine * x + sine * y
-            R[(3 * b + c) * LANES + i] = cosine * y - sine * x
-
-
-@inlined
-def _add_angles(cosine, sine, reading):  # type: ignore[no-untyped-def]
-    """Cosine and sine of the reading become those of its sum with a value."""
-    for i in range(LANES):
-        c, s = reading[i], reading[LANES + i]
-        reading[i] = cosine * c - sine * s
-        reading[LANES + i] = sine * c + cosine * s
-
-
-@inlined
-def _turn_by_reading(reading, R, a, b):  # type: ignore[no-untyped-def]
-    for c in range(3):
-        for i in range(LANES):
-            x, y = R[(3 * a + c) * LANES + i], R[(3 * b + c) * LANES + i]
-            R[(3 * a + c) * LANES + i] = reading[i] * x + reading[LANES + i] * y
-            R[(3 * b + c) * LANES + i] = reading[i] * y - reading[LANES + i] * x
-
-
-@compiled
-def _walk_all(  # type: ignore[no-untyped-def]
-    axis, value, cosine, sine, sign, joint, column, n_columns, n_own, trig, rows, start, stop, out_R, out_p, out_J
-):
-    """Rotation (n, 3, 3), point (n, 3) and derivatives (n, 6, n_columns + n_own) of rows start to stop."""
-    n_twists = n_columns + n_own
-    rotation, point = np.empty((3, 3, LANES)), np.empty((3, LANES))
-    twist = np.zeros((n_twists, 6, LANES))
-    for first in range(start, stop, LANES):
-        walk(
-            axis, value, cosine, sine, sign, joint, column, n_columns, n_own,
-            trig, rows, first, rotation, point, twist,
-        )  # fmt: skip
-        for i in range(min(LANES, stop - first)):
-            n = first + i
-            for r in range(3):
-                out_p[n, r] = point[r, i]
-                for c in range(3):
-                    out_R[n, r, c] = rotation[c, r, i]
-            for t in range(n_twists):
-                for r in range(3):
-                    a, b = (r + 1) % 3, (r + 2) % 3
-                    out_J[n, r, t] = twist[t, r, i]
-                    out_J[n, 3 + r, t] = (
-                        twist[t, a, i] * point[b, i] - twist[t, b, i] * point[a, i] + twist[t, 3 + r, i]
-                    )
-
-
 @dataclass(frozen=True)
 class Poses:
     """Tool poses with their derivatives.
@@ -424,7 +229,7 @@ def forward(chain: Chain, trig: Floats, rows: Integers | None = None) -> Poses:
     arguments = chain.arguments
 
     def run(start: int, stop: int) -> None:
-        _walk_all(*arguments, trig, rows, start, stop, rotation, position, jacobian)
+        walk_all(*arguments, trig, rows, start, stop, rotation, position, jacobian)
 
     for _ in over_spans(run, n):
         pass
@@ -467,6 +272,3 @@ def processors() -> int:
 @cache
 def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(processors(), thread_name_prefix="fg-calib")
-
-
-event.register("numba:compile", _CompileNotice())

@@ -13,7 +13,7 @@ import fg_calib
 
 PACKAGE = Path(fg_calib.__file__).parent
 FLOORS = (
-    *("choices", "errors", "robot", "measurements", "files", "kinematics", "residuals", "factors", "frames"),
+    *("choices", "errors", "robot", "measurements", "files", "kernels", "kinematics", "residuals", "factors", "frames"),
     *(
         "observability",
         "problem",

@@ -280,7 +280,9 @@ def test_noise_stated_wrong_by_5_is_exit_code_3_with_the_reason_and_results(fg_c
     ended = fg_calib("calibrate", example / JOB, "--out", example / "result")
     finding = "noise stated too large" if factor > 1 else "noise stated too small, effects not modelled, or outliers"
     assert ended.code == 3
-    assert re.fullmatch(rf"not to be trusted: reduced chi-square \S+ is outside \[0.3\d, 2.00\]: {finding}\n", ended.err)
+    assert re.fullmatch(
+        rf"not to be trusted: reduced chi-square \S+ is outside \[0.3\d, 2.00\]: {finding}\n", ended.err
+    )
     assert ended.out.splitlines()[1].startswith("DOUBTFUL: reduced chi-square")
     result = json.loads((example / "result" / "result.json").read_text())
     assert (result["trustworthy"], len(result["findings"])) == (False, 1)

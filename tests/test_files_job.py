@@ -113,7 +113,7 @@ def test_a_robot_may_be_a_file_or_stand_in_the_job(folder, robot, files):
     assert list(job.inputs) == ["calibration.yaml", *files, "one.csv"]
 
 
-KEYS = "one of robot, measurements, pairs, model, pairing, frame, units, noise, prior, loss"
+KEYS = "one of robot, measurements, pairs, model, pairing, frame, units, noise, prior, gauge, prefer, loss"
 MISTAKES = [
     ("", "calibration.yaml: an empty file, expected a mapping, key: value"),
     ("robot: a\n", "calibration.yaml: missing key 'measurements' (and 1 more)"),

@@ -7,7 +7,8 @@ import pytest
 from oracle import central_differences, dh_joint, frame, random_robot, rotation, tool_pose, translation
 from scipy.spatial.transform import Rotation
 
-from fg_calib.kinematics import LANES, SPAN, build_chain, forward, pose, precompute_trig
+from fg_calib.kernels import LANES
+from fg_calib.kinematics import SPAN, build_chain, forward, pose, precompute_trig
 from fg_calib.robot import CONVENTIONS, Joint, RobotBuilder
 
 CASES = [(c, n) for c in [*CONVENTIONS, "urdf"] for n in (1, 2, 3, 6, 7, 12)]

@@ -8,7 +8,8 @@ from oracle import central_differences, random_robot, tool_pose
 from scipy.spatial.transform import Rotation
 
 from fg_calib import residuals
-from fg_calib.kinematics import LANES, SPAN, build_chain, precompute_trig
+from fg_calib.kernels import LANES
+from fg_calib.kinematics import SPAN, build_chain, precompute_trig
 from fg_calib.residuals import PairBlock, PoseBlock, SamePointBlock
 
 CONVENTIONS = ["dh", "mdh", "mdh-hayati", "dh-hayati", "urdf"]

@@ -1,0 +1,466 @@
+"""The compiled loops: the walk down a chain, and the rows of a Jacobian for each kind of measurement.
+
+All of this is compiled by numba and runs on blocks of `LANES` configurations at once: arrays are shaped
+(..., LANES) and the innermost loop runs over configurations, which the compiler turns into vector instructions.
+(Inside the walk rotation and point are flat, so that it sees at which constant distance columns lie and that they do
+not overlap.) Sine and cosine of the readings are taken once a data set (`precompute_trig`) and combined with those of
+the parameters by the addition theorem, so no trigonometry happens inside.
+
+All kernels stand in this one file because numba's cache looks at the file of the outermost kernel alone: a change in
+any of them then has all of them compiled anew.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numba
+import numpy as np
+from numba.core import event
+
+logger = logging.getLogger(__name__)
+
+LANES = 32
+"""Configurations walked at once: the width of the innermost loops. Shorter loops would be unrolled, not vectorised."""
+
+
+class _CompileNotice(event.Listener):  # type: ignore[misc]
+    """Says once, when numba starts to compile, why the program is silent for some seconds."""
+
+    said = False
+
+    def on_start(self, event: object) -> None:
+        """Numba begins to compile (a kernel found in its cache does not come here)."""
+        if not _CompileNotice.said:
+            _CompileNotice.said = True
+            logger.warning("compiling the kernels: some seconds, once an installation")
+
+    def on_end(self, event: object) -> None:
+        """Numba is done with one function."""
+
+
+def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+    """Compile a kernel with numba: without the GIL, with fused multiply-adds, cached where a folder can be written."""
+    options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}} | options
+    try:
+        kernel: Callable[..., Any] = numba.njit(cache=True, **options)(function)
+    except RuntimeError:  # neither the package's folder nor the user's cache can be written
+        kernel = numba.njit(**options)(function)
+    return kernel
+
+
+inlined = partial(compiled, forceinline=True)
+"""As `compiled`, for a part of a kernel that must see its caller's constants."""
+
+
+event.register("numba:compile", _CompileNotice())
+
+
+@compiled
+def walk(axis, value, cosine, sine, sign, joint, column, n_columns, n_own, trig, rows, start, rotation, point, twist):  # type: ignore[no-untyped-def]
+    """Walk `LANES` configurations down the chain.
+
+    Args:
+        axis, value, cosine, sine, sign, joint, column, n_columns, n_own: `Chain.arguments`.
+        trig: From `precompute_trig`, shape (n, n_joints, 2).
+        rows: Rows of `trig`, shape (m,); positions beyond its end repeat the last.
+        start: Position in `rows` of the first lane.
+        rotation: Filled: rotation matrix, [column, component, lane], shape (3, 3, LANES).
+        point: Filled: tool point, shape (3, LANES), [m].
+        twist: Filled: (w, v) of each column, then of each joint, shape (n_columns + n_own, 6, LANES); must come with
+            w = 0 for translations.
+    """
+    last = rows.shape[0] - 1
+    row = np.empty(LANES, np.int64)
+    reading = np.empty(2 * LANES)
+    for i in range(LANES):
+        row[i] = rows[min(start + i, last)]
+    R, p = rotation.reshape(9 * LANES), point.reshape(3 * LANES)
+    R[:] = 0.0
+    p[:] = 0.0
+    for i in range(LANES):
+        R[i] = 1.0
+        R[4 * LANES + i] = 1.0
+        R[8 * LANES + i] = 1.0
+    for e in range(axis.shape[0]):
+        k, j = axis[e], joint[e]
+        for target in (column[e], n_columns + j if n_own > 0 and j >= 0 else -1):
+            if target < 0:
+                continue
+            if k >= 3:
+                _write_rotation_twist(sign[e], R, k - 3, p, twist[target])
+            else:
+                _write_translation_twist(sign[e], R, k, twist[target])
+        if j >= 0:
+            for i in range(LANES):
+                reading[i] = trig[row[i], j, 0]
+                reading[LANES + i] = sign[e] * trig[row[i], j, 1]
+        if k < 3:
+            if j >= 0:
+                _shift_by_reading(value[e], sign[e], reading, R, k, p)
+            else:
+                _shift(value[e], R, k, p)
+        elif j >= 0:
+            _add_angles(cosine[e], sine[e], reading)
+            if k == 3:
+                _turn_by_reading(reading, R, 1, 2)
+            elif k == 4:
+                _turn_by_reading(reading, R, 2, 0)
+            else:
+                _turn_by_reading(reading, R, 0, 1)
+        elif k == 3:
+            _turn(cosine[e], sine[e], R, 1, 2)
+        elif k == 4:
+            _turn(cosine[e], sine[e], R, 2, 0)
+        else:
+            _turn(cosine[e], sine[e], R, 0, 1)
+
+
+@inlined
+def _write_rotation_twist(sign, R, k, p, twist):  # type: ignore[no-untyped-def]
+    w = 3 * k * LANES
+    for i in range(LANES):
+        w0 = sign * R[w + i]
+        w1 = sign * R[w + LANES + i]
+        w2 = sign * R[w + 2 * LANES + i]
+        twist[0, i] = w0
+        twist[1, i] = w1
+        twist[2, i] = w2
+        twist[3, i] = p[LANES + i] * w2 - p[2 * LANES + i] * w1
+        twist[4, i] = p[2 * LANES + i] * w0 - p[i] * w2
+        twist[5, i] = p[i] * w1 - p[LANES + i] * w0
+
+
+@inlined
+def _write_translation_twist(sign, R, k, twist):  # type: ignore[no-untyped-def]
+    for c in range(3):
+        for i in range(LANES):
+            twist[3 + c, i] = sign * R[(3 * k + c) * LANES + i]
+
+
+@inlined
+def _shift(value, R, k, p):  # type: ignore[no-untyped-def]
+    for c in range(3):
+        for i in range(LANES):
+            p[c * LANES + i] += value * R[(3 * k + c) * LANES + i]
+
+
+@inlined
+def _shift_by_reading(value, sign, reading, R, k, p):  # type: ignore[no-untyped-def]
+    for c in range(3):
+        for i in range(LANES):
+            p[c * LANES + i] += (value + sign * reading[i]) * R[(3 * k + c) * LANES + i]
+
+
+@inlined
+def _turn(cosine, sine, R, a, b):  # type: ignore[no-untyped-def]
+    for c in range(3):
+        for i in range(LANES):
+            x, y = R[(3 * a + c) * LANES + i], R[(3 * b + c) * LANES + i]
+            R[(3 * a + c) * LANES + i] = cosine * x + sine * y
+            R[(3 * b + c) * LANES + i] = cosine * y - sine * x
+
+
+@inlined
+def _add_angles(cosine, sine, reading):  # type: ignore[no-untyped-def]
+    """Cosine and sine of the reading become those of its sum with a value."""
+    for i in range(LANES):
+        c, s = reading[i], reading[LANES + i]
+        reading[i] = cosine * c - sine * s
+        reading[LANES + i] = sine * c + cosine * s
+
+
+@inlined
+def _turn_by_reading(reading, R, a, b):  # type: ignore[no-untyped-def]
+    for c in range(3):
+        for i in range(LANES):
+            x, y = R[(3 * a + c) * LANES + i], R[(3 * b + c) * LANES + i]
+            R[(3 * a + c) * LANES + i] = reading[i] * x + reading[LANES + i] * y
+            R[(3 * b + c) * LANES + i] = reading[i] * y - reading[LANES + i] * x
+
+
+@compiled
+def walk_all(  # type: ignore[no-untyped-def]
+    axis, value, cosine, sine, sign, joint, column, n_columns, n_own, trig, rows, start, stop, out_R, out_p, out_J
+):
+    """Rotation (n, 3, 3), point (n, 3) and derivatives (n, 6, n_columns + n_own) of rows start to stop."""
+    n_twists = n_columns + n_own
+    rotation, point = np.empty((3, 3, LANES)), np.empty((3, LANES))
+    twist = np.zeros((n_twists, 6, LANES))
+    for first in range(start, stop, LANES):
+        walk(
+            axis, value, cosine, sine, sign, joint, column, n_columns, n_own,
+            trig, rows, first, rotation, point, twist,
+        )  # fmt: skip
+        for i in range(min(LANES, stop - first)):
+            n = first + i
+            for r in range(3):
+                out_p[n, r] = point[r, i]
+                for c in range(3):
+                    out_R[n, r, c] = rotation[c, r, i]
+            for t in range(n_twists):
+                for r in range(3):
+                    a, b = (r + 1) % 3, (r + 2) % 3
+                    out_J[n, r, t] = twist[t, r, i]
+                    out_J[n, 3 + r, t] = (
+                        twist[t, a, i] * point[b, i] - twist[t, b, i] * point[a, i] + twist[t, 3 + r, i]
+                    )
+
+
+@compiled
+def fill_pairs(  # type: ignore[no-untyped-def]
+    axis, value, cosine, sine, sign, joint, column, n_columns, n_own, turns,
+    trig, a, b, measured, whitening, with_distance, with_angle, start, stop, panel,
+):  # fmt: skip
+    """Distances and rotation angles of pairs start to stop (see `residuals.PairBlock`)."""
+    n_twists = n_columns + n_own
+    R_A, R_B = np.empty((3, 3, LANES)), np.empty((3, 3, LANES))
+    p_A, p_B = np.empty((3, LANES)), np.empty((3, LANES))
+    t_A, t_B = np.zeros((n_twists, 6, LANES)), np.zeros((n_twists, 6, LANES))
+    u, k, m_A, m_B = np.empty((3, LANES)), np.empty((3, LANES)), np.empty((3, LANES)), np.empty((3, LANES))
+    w_dd, w_ad, w_aa = np.empty(LANES), np.empty(LANES), np.empty(LANES)
+    distance, angle = np.empty(LANES), np.empty(LANES)
+    d_A, d_B, a_A, a_B = np.empty(LANES), np.empty(LANES), np.empty(LANES), np.empty(LANES)
+    angle_row = 1 if with_distance else 0
+    last_row = panel.shape[0] - 1
+    for first in range(start, stop, LANES):
+        at = first - start
+        walk(axis, value, cosine, sine, sign, joint, column, n_columns, n_own, trig, a, first, R_A, p_A, t_A)
+        walk(axis, value, cosine, sine, sign, joint, column, n_columns, n_own, trig, b, first, R_B, p_B, t_B)
+        for i in range(LANES):
+            n = first + i
+            w_dd[i], w_ad[i], w_aa[i], distance[i], angle[i] = 0.0, 0.0, 0.0, 0.0, 0.0
+            if n < stop:
+                w_dd[i], w_ad[i], w_aa[i] = whitening[n, 0], whitening[n, 1], whitening[n, 2]
+                distance[i], angle[i] = measured[n, 0], measured[n, 1]
+        for i in range(LANES):
+            x, y, z = p_B[0, i] - p_A[0, i], p_B[1, i] - p_A[1, i], p_B[2, i] - p_A[2, i]
+            length = np.sqrt(x * x + y * y + z * z)
+            inverse = 1.0 / max(length, 1e-300)
+            u[0, i], u[1, i], u[2, i] = x * inverse, y * inverse, z * inverse
+            distance[i] = length - distance[i]
+        for c in range(3):
+            for i in range(LANES):
+                m_A[c, i] = p_A[(c + 1) % 3, i] * u[(c + 2) % 3, i] - p_A[(c + 2) % 3, i] * u[(c + 1) % 3, i]
+                m_B[c, i] = p_B[(c + 1) % 3, i] * u[(c + 2) % 3, i] - p_B[(c + 2) % 3, i] * u[(c + 1) % 3, i]
+        if with_angle:
+            for i in range(LANES):
+                x, y, z, trace = 0.0, 0.0, 0.0, 0.0
+                for c in range(3):
+                    x += R_A[c, 1, i] * R_B[c, 2, i] - R_A[c, 2, i] * R_B[c, 1, i]
+                    y += R_A[c, 2, i] * R_B[c, 0, i] - R_A[c, 0, i] * R_B[c, 2, i]
+                    z += R_A[c, 0, i] * R_B[c, 1, i] - R_A[c, 1, i] * R_B[c, 0, i]
+                    trace += R_A[c, 0, i] * R_B[c, 0, i] + R_A[c, 1, i] * R_B[c, 1, i] + R_A[c, 2, i] * R_B[c, 2, i]
+                twice_sine = np.sqrt(x * x + y * y + z * z)
+                inverse = 1.0 / max(twice_sine, 1e-300)
+                k[0, i], k[1, i], k[2, i] = x * inverse, y * inverse, z * inverse
+                angle[i] = np.arctan2(twice_sine, trace - 1.0) - angle[i]
+        if with_distance:
+            for i in range(LANES):
+                panel[last_row, 0, at + i] = w_dd[i] * distance[i]
+        if with_angle:
+            for i in range(LANES):
+                panel[last_row, angle_row, at + i] = w_ad[i] * distance[i] + w_aa[i] * angle[i]
+        for t in range(n_twists):
+            for i in range(LANES):
+                d_A[i] = u[0, i] * t_A[t, 3, i] + u[1, i] * t_A[t, 4, i] + u[2, i] * t_A[t, 5, i]
+                d_B[i] = u[0, i] * t_B[t, 3, i] + u[1, i] * t_B[t, 4, i] + u[2, i] * t_B[t, 5, i]
+            if turns[t]:
+                for i in range(LANES):
+                    d_A[i] += t_A[t, 0, i] * m_A[0, i] + t_A[t, 1, i] * m_A[1, i] + t_A[t, 2, i] * m_A[2, i]
+                    d_B[i] += t_B[t, 0, i] * m_B[0, i] + t_B[t, 1, i] * m_B[1, i] + t_B[t, 2, i] * m_B[2, i]
+                if with_angle:
+                    for i in range(LANES):
+                        a_A[i] = k[0, i] * t_A[t, 0, i] + k[1, i] * t_A[t, 1, i] + k[2, i] * t_A[t, 2, i]
+                        a_B[i] = k[0, i] * t_B[t, 0, i] + k[1, i] * t_B[t, 1, i] + k[2, i] * t_B[t, 2, i]
+            else:
+                a_A[:] = 0.0
+                a_B[:] = 0.0
+            if t < n_columns:
+                if with_distance:
+                    for i in range(LANES):
+                        panel[t, 0, at + i] = w_dd[i] * (d_B[i] - d_A[i])
+                if with_angle:
+                    for i in range(LANES):
+                        panel[t, angle_row, at + i] = w_ad[i] * (d_B[i] - d_A[i]) + w_aa[i] * (a_B[i] - a_A[i])
+            else:
+                if with_distance:
+                    for i in range(LANES):
+                        panel[t, 0, at + i] = -w_dd[i] * d_A[i]
+                        panel[t + n_own, 0, at + i] = w_dd[i] * d_B[i]
+                if with_angle:
+                    for i in range(LANES):
+                        panel[t, angle_row, at + i] = -w_ad[i] * d_A[i] - w_aa[i] * a_A[i]
+                        panel[t + n_own, angle_row, at + i] = w_ad[i] * d_B[i] + w_aa[i] * a_B[i]
+
+
+@compiled
+def fill_same_points(  # type: ignore[no-untyped-def]
+    axis, value, cosine, sine, sign, joint, column, n_columns, n_own, turns,
+    trig, a, b, whitening, start, stop, panel,
+):  # fmt: skip
+    """Vectors between the points of pairs start to stop (see `residuals.SamePointBlock`)."""
+    n_twists = n_columns + n_own
+    R, p_A, p_B = np.empty((3, 3, LANES)), np.empty((3, LANES)), np.empty((3, LANES))
+    t_A, t_B = np.zeros((n_twists, 6, LANES)), np.zeros((n_twists, 6, LANES))
+    weight, raw = np.empty((3, 3, LANES)), np.empty((3, LANES))
+    last_row = panel.shape[0] - 1
+    for first in range(start, stop, LANES):
+        walk(axis, value, cosine, sine, sign, joint, column, n_columns, n_own, trig, a, first, R, p_A, t_A)
+        walk(axis, value, cosine, sine, sign, joint, column, n_columns, n_own, trig, b, first, R, p_B, t_B)
+        _gather_whitening(whitening, first, stop, weight)
+        for c in range(3):
+            for i in range(LANES):
+                raw[c, i] = p_B[c, i] - p_A[c, i]
+        _write_whitened(weight, raw, 3, 1.0, panel[last_row], first - start)
+        for t in range(n_twists):
+            if t < n_columns:
+                _point_derivative(t_A[t], p_A, raw)
+                for c in range(3):
+                    for i in range(LANES):
+                        raw[c, i] = -raw[c, i]
+                _add_point_derivative(t_B[t], p_B, raw)
+                _forget_rigid_motion(t_A[t], t_B[t], raw)
+                _write_whitened(weight, raw, 3, 1.0, panel[t], first - start)
+            else:
+                _point_derivative(t_A[t], p_A, raw)
+                _write_whitened(weight, raw, 3, -1.0, panel[t], first - start)
+                _point_derivative(t_B[t], p_B, raw)
+                _write_whitened(weight, raw, 3, 1.0, panel[t + n_own], first - start)
+
+
+@compiled
+def fill_poses(  # type: ignore[no-untyped-def]
+    axis, value, cosine, sine, sign, joint, column, n_columns, n_own, turns,
+    trig, rows, rotation, position, whitening, with_orientation, with_position, start, stop, panel,
+):  # fmt: skip
+    """Orientations and positions of measurements start to stop (see `residuals.PoseBlock`)."""
+    n_twists = n_columns + n_own
+    height = 3 * (with_orientation + with_position)
+    p0 = 3 if with_orientation else 0
+    R, p, twist = np.empty((3, 3, LANES)), np.empty((3, LANES)), np.zeros((n_twists, 6, LANES))
+    weight, raw, back = np.empty((height, height, LANES)), np.empty((height, LANES)), np.empty((3, 3, LANES))
+    last_row = panel.shape[0] - 1
+    for first in range(start, stop, LANES):
+        walk(axis, value, cosine, sine, sign, joint, column, n_columns, n_own, trig, rows, first, R, p, twist)
+        _gather_whitening(whitening, first, stop, weight)
+        if with_orientation:
+            for i in range(LANES):
+                _orientation_residual(rotation[min(first + i, stop - 1)], R, i, raw, back)
+        if with_position:
+            for i in range(LANES):
+                n = min(first + i, stop - 1)
+                for c in range(3):
+                    raw[p0 + c, i] = p[c, i] - position[n, c]
+        _write_whitened(weight, raw, height, 1.0, panel[last_row], first - start)
+        for t in range(n_twists):
+            if with_orientation:
+                for c in range(3):
+                    for i in range(LANES):
+                        raw[c, i] = (
+                            back[c, 0, i] * twist[t, 0, i]
+                            + back[c, 1, i] * twist[t, 1, i]
+                            + back[c, 2, i] * twist[t, 2, i]
+                        )
+            if with_position:
+                _point_derivative(twist[t], p, raw[p0:])
+            _write_whitened(weight, raw, height, 1.0, panel[t], first - start)
+
+
+@compiled
+def _gather_whitening(whitening, first, stop, weight):  # type: ignore[no-untyped-def]
+    for i in range(LANES):
+        n = first + i
+        for r in range(weight.shape[0]):
+            for c in range(weight.shape[0]):
+                weight[r, c, i] = whitening[n, r, c] if n < stop else 0.0
+
+
+@compiled
+def _point_derivative(twist, p, out):  # type: ignore[no-untyped-def]
+    out[:3] = 0.0
+    _add_point_derivative(twist, p, out)
+
+
+@compiled
+def _add_point_derivative(twist, p, out):  # type: ignore[no-untyped-def]
+    for c in range(3):
+        a, b = (c + 1) % 3, (c + 2) % 3
+        for i in range(LANES):
+            out[c, i] += twist[a, i] * p[b, i] - twist[b, i] * p[a, i] + twist[3 + c, i]
+
+
+@compiled
+def _forget_rigid_motion(twist_A, twist_B, raw):  # type: ignore[no-untyped-def]
+    """Zero the derivative in what moves both points as one body, such as the base.
+
+    It only turns the vector between them, which no measurement sees. Such elements come before the first reading,
+    so their twists are equal to the last bit.
+    """
+    for i in range(LANES):
+        same = True
+        for c in range(6):
+            same = same and twist_A[c, i] == twist_B[c, i]
+        if same:
+            for c in range(3):
+                raw[c, i] = 0.0
+
+
+@compiled
+def _write_whitened(weight, raw, height, factor, out, at):  # type: ignore[no-untyped-def]
+    """Lower triangular weight times raw, into out[row, at + lane]."""
+    for r in range(height):
+        for i in range(LANES):
+            out[r, at + i] = factor * weight[r, 0, i] * raw[0, i]
+        for c in range(1, r + 1):
+            for i in range(LANES):
+                out[r, at + i] += factor * weight[r, c, i] * raw[c, i]
+
+
+@compiled
+def _orientation_residual(measured, R, i, raw, back):  # type: ignore[no-untyped-def]
+    """Log(measured^T R) of lane i into raw[:3], and Jr^-1 R^T, which maps w to its derivative, into back."""
+    E = np.empty((3, 3))
+    for r in range(3):
+        for c in range(3):
+            E[r, c] = measured[0, r] * R[c, 0, i] + measured[1, r] * R[c, 1, i] + measured[2, r] * R[c, 2, i]
+    x, y, z = 0.5 * (E[2, 1] - E[1, 2]), 0.5 * (E[0, 2] - E[2, 0]), 0.5 * (E[1, 0] - E[0, 1])
+    sine = np.sqrt(x * x + y * y + z * z)
+    cosine = 0.5 * (E[0, 0] + E[1, 1] + E[2, 2] - 1.0)
+    angle = np.arctan2(sine, cosine)
+    if cosine > -0.99:
+        factor = angle / sine if sine > 1e-9 else 1.0
+        x, y, z = factor * x, factor * y, factor * z
+    else:  # near half a turn the sine vanishes: the axis comes from the symmetric part, its sign from the other
+        k = 0
+        for c in range(1, 3):
+            if E[c, c] > E[k, k]:
+                k = c
+        axis = np.empty(3)
+        for c in range(3):
+            axis[c] = 0.5 * (E[k, c] + E[c, k]) - (cosine if c == k else 0.0)
+        norm = np.sqrt(axis[0] ** 2 + axis[1] ** 2 + axis[2] ** 2)
+        if axis[0] * x + axis[1] * y + axis[2] * z < 0.0:
+            norm = -norm
+        x, y, z = angle * axis[0] / norm, angle * axis[1] / norm, angle * axis[2] / norm
+    raw[0, i], raw[1, i], raw[2, i] = x, y, z
+    # Jr^-1 = I + [r]x / 2 + g [r]x^2,  [r]x^2 = r r^T - angle^2 I
+    if angle < 1e-4:
+        g = 1.0 / 12.0 + angle * angle / 720.0
+    else:
+        half = 0.5 * angle
+        g = (1.0 - half * np.cos(half) / np.sin(half)) / (angle * angle)
+    log = (x, y, z)
+    for a in range(3):
+        b, c = (a + 1) % 3, (a + 2) % 3
+        for m in range(3):
+            # row a of Jr^-1 times column m of R^T (component m of each column of R)
+            diagonal = (1.0 + g * (log[a] * log[a] - angle * angle)) * R[a, m, i]
+            back[a, m, i] = (
+                diagonal
+                + (g * log[a] * log[b] - 0.5 * log[c]) * R[b, m, i]
+                + (g * log[a] * log[c] + 0.5 * log[b]) * R[c, m, i]
+            )
