@@ -142,7 +142,8 @@ def form_pairs(measurements: Measurements, pairing: Pairing) -> Pairs:
     """
     if measurements.position is None and measurements.rotation is None:
         raise InputError(measurements.source, "neither positions nor orientations", "measured poses to form pairs from")
-    chosen = [_choose(np.flatnonzero(measurements.test == test), pairing) for test in (False, True)]
+    generator = np.random.default_rng(pairing.seed)
+    chosen = [_choose(np.flatnonzero(measurements.test == test), pairing, generator) for test in (False, True)]
     a, b = np.concatenate(chosen).T
     n = len(a)
     distance, sigma_distance = np.full(n, np.nan), np.full(n, np.nan)
@@ -176,7 +177,7 @@ def rotation_angle(rotation: Floats) -> tuple[Floats, Floats]:
     return np.arctan2(np.linalg.norm(axis, axis=1), cosine), axis
 
 
-def _choose(rows: Integers, pairing: Pairing) -> Integers:
+def _choose(rows: Integers, pairing: Pairing, generator: np.random.Generator) -> Integers:
     """Pairs of `rows` by the strategy, shape (n_pairs, 2)."""
     n = len(rows)
     if n < 2:
@@ -189,7 +190,7 @@ def _choose(rows: Integers, pairing: Pairing) -> Integers:
         case "all":
             first, second = np.triu_indices(n, 1)
         case "random":
-            first, second = _draw_pairs(n, pairing.count, np.random.default_rng(pairing.seed))
+            first, second = _draw_pairs(n, pairing.count, generator)
     return np.stack([rows[first], rows[second]], axis=1)
 
 
