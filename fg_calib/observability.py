@@ -224,9 +224,10 @@ def _spread(
     for value, direction in zip(s[::-1], Vt[::-1], strict=True):
         if value >= WEAK:
             break
-        largest = np.flatnonzero(np.abs(direction) > 0.3 * np.abs(direction).max())
-        members = sorted(largest.tolist(), key=lambda i: -abs(direction[i]))
-        weak.append(WeakDirection(float(value), {names[i]: float(direction[i]) for i in members}))
+        size = np.round(np.abs(direction), 6)  # so that equal members keep their order whatever the rounding
+        members = sorted(np.flatnonzero(size > 0.3 * size.max()).tolist(), key=lambda i: -size[i])
+        sign = np.sign(direction[members[0]])
+        weak.append(WeakDirection(float(value), {names[i]: float(sign * direction[i]) for i in members}))
     return (
         dict(zip(names, (spread * scales).tolist(), strict=True)),
         correlation,

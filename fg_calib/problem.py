@@ -438,8 +438,15 @@ def _check_enough(problem: Problem) -> None:
     source = problem.measurements.source if problem.pairs is None else problem.pairs.source
     unit = "row" if problem.pairs is None else "pair"
     if problem.n_residuals == 0:
-        reasons = ", ".join(f"{count} {reason}" for reason, count in problem.n_excluded.items() if count)
-        raise ProblemError(source, f"no {unit} left to fit{f': {reasons}' if reasons else ''}", "train rows")
+        reasons = ", ".join(
+            f"{count} excluded for {reason.replace('_', ' ')}" for reason, count in problem.n_excluded.items() if count
+        )
+        found = f"no {unit} left to fit"
+        if reasons:
+            raise ProblemError(source, f"{found}: {reasons}", f"{unit}s that tell something")
+        if problem.pairs is not None and not problem.pairs.n_pairs:
+            raise ProblemError(source, f"{found}: none has a measurement that model {problem.settings.model} uses")
+        raise ProblemError(source, found, "train rows")
     rows = problem.n_residuals + problem.n_priors
     if rows >= problem.variables.n_columns:
         return

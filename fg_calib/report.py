@@ -279,11 +279,11 @@ def _weak(observability: Observability) -> RenderableType | None:
     if not observability.weak:
         return None
     table = _plain_table(("sigma / ordinary change", "right"), ("largest members", "left"), wrap=True)
-    for weak in observability.weak[:8]:
-        members = ", ".join(f"{name} {share:+.2f}" for name, share in weak.members.items())
+    for weak in observability.weak[:5]:
+        members = ", ".join(f"{name} {share:+.2f}" for name, share in list(weak.members.items())[:6])
         table.add_row(f"{1.0 / weak.signal_to_noise:.3g}", members)
-    if len(observability.weak) > 8:
-        table.add_row("", f"and {len(observability.weak) - 8} more")
+    if len(observability.weak) > 5:
+        table.add_row("", f"and {len(observability.weak) - 5} more")
     return table
 
 

@@ -201,7 +201,7 @@ def test_what_cannot_be_solved_is_refused_in_one_line():
     )
     still = planar_pairs([0.001, 0.002])
     assert refused(planar_robot(), still, model="rotation") == (
-        "pairs.csv: no pair left to fit: 2 angle_near_zero, expected train rows"
+        "pairs.csv: no pair left to fit: 2 excluded for angle near zero, expected pairs that tell something"
     )
     few = replace(measure(paper_robot(), 10, rng), source="poses.csv")
     assert refused(paper_robot(), few, model="distance-rotation") == (
