@@ -397,13 +397,12 @@ def _add_point_derivative(twist, p, out):  # type: ignore[no-untyped-def]
 def _forget_rigid_motion(twist_A, twist_B, raw):  # type: ignore[no-untyped-def]
     """Zero the derivative in what moves both points as one body, such as the base.
 
-    It only turns the vector between them, which no measurement sees. Such elements come before the first reading,
-    so their twists are equal to the last bit.
+    It only turns the vector between them, which no measurement sees. Its twist is the same at both configurations.
     """
     for i in range(LANES):
         same = True
         for c in range(6):
-            same = same and twist_A[c, i] == twist_B[c, i]
+            same = same and abs(twist_A[c, i] - twist_B[c, i]) <= 1e-12 * (1.0 + abs(twist_A[c, i]))
         if same:
             for c in range(3):
                 raw[c, i] = 0.0
