@@ -1,0 +1,130 @@
+"""How long does a whole calibration take, from the shell and in process?
+
+Command: python experiments/benchmarks/calibrate.py [--quick] [--out FOLDER]
+Takes about 20 s; the first run on a machine compiles the kernels, which takes some more and is not counted. Nothing
+here is random, so there is no seed.
+
+- `fg-calib calibrate` on the bundled space robot (51 pairs), a new process each time, median of 5: 2.5 to 3 s;
+- `fg-calib --help` in the same way: 0.2 to 0.3 s;
+- in process, on the same job: building the problem, 2 ms; solving it, with covariance and identifiability, 30 to 50 ms.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import fg_calib
+
+ROOT = Path(__file__).resolve().parents[2]
+NAME = "calibrate"
+JOB = Path(fg_calib.__file__).parent / "examples" / "space-robot" / "calibration.yaml"
+
+
+def in_a_process(*arguments: str) -> float:
+    """Seconds of one run of the command line, from start to exit.
+
+    Raises:
+        RuntimeError: It did not end with 0.
+    """
+    clock = time.perf_counter()
+    command = [sys.executable, "-P", "-m", "fg_calib.cli", *arguments]  # -P: the package that is timed here too
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    seconds = time.perf_counter() - clock
+    if done.returncode != 0:
+        raise RuntimeError(f"fg-calib {arguments[0]} ended with {done.returncode}: {done.stderr.strip()}")
+    return seconds
+
+
+def timed(work: Callable[[], object]) -> float:
+    """Seconds of one call."""
+    clock = time.perf_counter()
+    work()
+    return time.perf_counter() - clock
+
+
+def summary(seconds: list[float]) -> dict[str, Any]:
+    return {"median": median(seconds), "min": min(seconds), "max": max(seconds), "repeats": len(seconds)}
+
+
+def run(out: Path, quick: bool = False) -> dict[str, Any]:
+    """The benchmark; writes the numbers into `out`."""
+    job = fg_calib.read_job(JOB)
+
+    def build() -> fg_calib.Problem:
+        return fg_calib.build_problem(
+            job.robot,
+            job.measurements,
+            model=job.model,
+            pairing=job.pairing,
+            frame=job.frame,
+            prior=job.prior,
+        )
+
+    problem = build()
+    fg_calib.assess(fg_calib.solve(problem))  # compiles, or reads the compiled kernels
+    repeats, n_processes = (5, 1) if quick else (51, 5)
+    building, solving, assessing = [], [], []
+    for _ in range(repeats):
+        building.append(timed(build))
+        clock = time.perf_counter()
+        solution = fg_calib.solve(problem)
+        solving.append(time.perf_counter() - clock)
+        assessing.append(timed(lambda solution=solution: fg_calib.assess(solution)))
+    with TemporaryDirectory() as folder:
+        in_a_process("calibrate", str(JOB), "--out", folder)  # the system's file cache
+        calibrating, helping = [], []
+        for _ in range(n_processes):
+            calibrating.append(in_a_process("calibrate", str(JOB), "--out", folder))
+            helping.append(in_a_process("--help"))
+    results = {
+        "quick": quick,
+        "n_pairs": solution.problem.n_pairs,
+        "n_parameters": solution.problem.variables.n_columns,
+        "iterations": solution.iterations,
+        "seconds": {
+            "fg-calib calibrate": summary(calibrating),
+            "fg-calib --help": summary(helping),
+            "build_problem": summary(building),
+            "solve": summary(solving),
+            "assess": summary(assessing),
+            "solve and assess": summary([s + a for s, a in zip(solving, assessing, strict=True)]),
+        },
+    }
+    out.mkdir(parents=True, exist_ok=True)
+    (out / f"{NAME}.json").write_text(json.dumps(results, indent=1) + "\n")
+    return results
+
+
+def describe(results: dict[str, Any]) -> str:
+    """The table for people."""
+    lines = [
+        f"{results['n_pairs']} pairs, {results['n_parameters']} parameters, {results['iterations']} iterations",
+        f"{'milliseconds':24}{'median':>10}{'min':>10}{'max':>10}{'runs':>6}",
+    ]
+    for what, s in results["seconds"].items():
+        cells = "".join(f"{s[key] * 1e3:10.1f}" for key in ("median", "min", "max"))
+        lines.append(f"{what:24}{cells}{s['repeats']:6}")
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="one process each, few repeats")
+    parser.add_argument("--out", type=Path, default=ROOT / "experiments" / "results", help="folder for the results")
+    given = parser.parse_args(arguments)
+    print(describe(run(given.out, given.quick)))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
