@@ -116,8 +116,8 @@ def build_chain(
 ) -> Chain:
     """Prepare a robot for the walk, at its nominal values.
 
-    Of the joints' parameters only those that have a column may change through `Chain.at`; the others are
-    constants, and what does nothing is left out.
+    Only what has a column, the tool if it has a tangent, and the measurement frame may change through `Chain.at`; the
+    rest is constant, and what does nothing is left out.
 
     Args:
         robot: The robot.
@@ -150,7 +150,10 @@ def build_chain(
         n_columns=n_columns,
         n_joints=robot.n_joints,
     )
-    return _simplified(chain.at(np.concatenate([robot.nominal, np.zeros(6)])), set(columns), robot)
+    changing = set(columns) | set(range(n_parameters, n_parameters + 6))
+    if tool_tangent is not None:
+        changing |= set(robot.owned_by(robot.n_joints + 1))
+    return _without_idle(chain.at(np.concatenate([robot.nominal, np.zeros(6)])), changing)
 
 
 def _tangent(first: int | None) -> list[tuple[Element, int, int]]:
@@ -161,20 +164,15 @@ def _tangent(first: int | None) -> list[tuple[Element, int, int]]:
     return [(Element(axis), -1, first + (axis + 3) % 6) for axis in Axis]
 
 
-def _simplified(chain: Chain, estimated: set[int], robot: Robot) -> Chain:
-    """The chain without elements that do nothing.
+def _without_idle(chain: Chain, changing: set[int]) -> Chain:
+    """The chain without elements that do nothing: zero, and nothing will ever change them.
 
-    A parameter outside `estimated` may still change through `Chain.at` if it is the base's or the tool's (a
-    Pose3 stands for them there); a joint's is constant, and if it is zero it need not be walked.
+    Args:
+        chain: The chain at its nominal values.
+        changing: Indices of the parameters, and of the measurement frame's six, that `Chain.at` may change.
     """
-    constant = np.array(
-        [
-            0 <= s < len(robot.parameters) and s not in estimated and 1 <= robot.parameters[s].owner <= robot.n_joints
-            for s in chain.source
-        ]
-    ) | (chain.source < 0)
-    idle = constant & (chain.value == 0.0) & (chain.joint < 0) & (chain.column < 0)
-    keep = ~idle
+    fixed = np.array([source not in changing for source in chain.source])
+    keep = ~(fixed & (chain.value == 0.0) & (chain.joint < 0) & (chain.column < 0))
     arrays = {
         name: getattr(chain, name)[keep] for name in ("axis", "constant", "sign", "source", "value", "joint", "column")
     }

@@ -526,7 +526,10 @@ def several(*edits):
 
 
 UNSOLVABLE = {
-    "only angles near 0": (pairs("a,b,angle\np0,p1,1e-6\np0,p2,0\n", model="rotation"), "pairs.csv: .*2 excluded for angle near"),
+    "only angles near 0": (
+        pairs("a,b,angle\np0,p1,1e-6\np0,p2,0\n", model="rotation"),
+        "pairs.csv: .*2 excluded for angle near",
+    ),
     "only test rows": (
         table(lambda rows: [rows[0], *([*row[:-1], "test"] for row in rows[1:])]),
         "pairs from poses.csv: .*train rows",
