@@ -158,3 +158,22 @@ def test_calibrate_quick_times_the_bundled_example(tmp_path, capsys):
     results = json.loads((tmp_path / "calibrate.json").read_text())
     assert results["n_pairs"] == 51
     assert {"fg-calib calibrate", "fg-calib --help", "solve and assess"} <= set(results["seconds"])
+
+
+def test_identifiability_agrees_with_the_papers_tables_and_with_the_graph(tmp_path, capsys):
+    found = load("02_identifiability.py").main(["--quick", "--out", str(tmp_path)])
+    assert {model: row["rank"] for model, row in found["tables"].items()} == {
+        **{"pose": 29, "distance-rotation": 23, "distance": 21, "rotation": 11, "position": 25, "orientation": 15}
+    }
+    for model in ("pose", "distance-rotation"):
+        assert found["tables"][model]["entries_that_differ"] == []
+        assert found["tables"][model]["pairs_that_differ"] == []
+    kept = {model: row["directions_with_the_priors_variance"] for model, row in found["graph"].items()}
+    assert kept == {"pose": 6, "distance-rotation": 12, "distance": 14}
+    for row in found["graph"].values():
+        assert row["largest_ratio_of_the_others"] < 1e-4
+        assert row["largest_angle_to_the_null_space"] < 1e-9
+        assert row["marginals_against_our_covariance"] < 1e-6
+    assert "through the graph" in capsys.readouterr().out
+    assert (tmp_path / "02_identifiability.json").stat().st_size > 1000
+    assert (tmp_path / "02_identifiability.png").stat().st_size > 10_000
