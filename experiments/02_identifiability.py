@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -32,6 +33,7 @@ from fg_calib.choices import MODELS, Model
 from fg_calib.identifiability import observe_structure
 from fg_calib.measurements import Measurements
 from fg_calib.problem import random_problem
+from fg_calib.robot import CONVENTIONS, Joint, RobotBuilder
 from fg_calib.uncertainty import marginals
 
 Floats = NDArray[np.float64]
@@ -68,6 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     found: dict[str, Any] = {"seed": given.seed, "n_configurations": n, "tables": {}, "graph": {}}
     for model in MODELS:
         found["tables"][model] = table(robot, model, n, given.seed)
+    found["seconds"] = {str(n): structural_seconds(n, given.seed) for n in (7, 12)}
     spectra = {}
     for model in KEPT_PRIOR:
         found["graph"][model], spectra[model] = through_the_graph(robot, model, n, given.seed)
@@ -100,6 +103,22 @@ def table(robot: fg_calib.Robot, model: Model, n: int, seed: int) -> dict[str, A
         row["entries_that_differ"] = [name for name in o.names if paper[name] != ours[name]]
         row["pairs_that_differ"] = sorted(set(pairs) ^ set(relations))
     return row
+
+
+def structural_seconds(n_joints: int, seed: int) -> float:
+    """Time of the structural analysis of a random arm, once the kernels are loaded: the median of 5."""
+    rng = np.random.default_rng(seed)
+    builder = RobotBuilder(f"{n_joints} joints", "mdh-hayati")
+    for i in range(n_joints):
+        values = {kind: float(rng.uniform(0.2, 1.0)) for kind in CONVENTIONS["mdh-hayati"]}
+        builder.add_convention_joint(Joint(f"q{i + 1}"), values)
+    robot = builder.build()
+    seconds = []
+    for _ in range(5):
+        clock = time.perf_counter()
+        observe_structure(robot, "distance-rotation", seed=seed)
+        seconds.append(time.perf_counter() - clock)
+    return float(np.median(seconds))
 
 
 def through_the_graph(
@@ -169,6 +188,7 @@ def report(found: dict[str, Any]) -> None:
         compared = f"{row['entries_that_differ']} {row['pairs_that_differ']}" if model in PAPER else "no table"
         print(f"{model:18} {row['rank']:4} {row['rank_expected']:9}  {compared}")
         print(f"{'':18} ineffective: {', '.join(row['ineffective']) or 'none'}; relative: {row['relative']}")
+    print("\nstructural analysis: " + ", ".join(f"{n} joints {s:.3f} s" for n, s in found["seconds"].items()))
     print("\nthrough the graph  prior's variance kept  expected  angle to null space  Marginals against ours")
     for model, row in found["graph"].items():
         print(

@@ -22,11 +22,12 @@ if TYPE_CHECKING:
     from fg_calib.files.robot_yaml import read_robot, write_robot
     from fg_calib.files.tables import read_measurements
     from fg_calib.files.units import Units
+    from fg_calib.identifiability import Identifiability, observe_configurations, observe_structure
     from fg_calib.kinematics import pose
     from fg_calib.measurements import Measurements, Noise, Pairing
     from fg_calib.problem import Problem, build_problem
-    from fg_calib.report import format_report
-    from fg_calib.results import result_document, write_results
+    from fg_calib.report import format_identifiability, format_report
+    from fg_calib.results import observability_document, result_document, write_observability, write_results
     from fg_calib.robot import Robot
     from fg_calib.solver import Solution, SolverOptions, solve
     from fg_calib.uncertainty import Uncertainty, assess
@@ -39,11 +40,12 @@ _HOMES = {
     "fg_calib.files.robot_yaml": ("read_robot", "write_robot"),
     "fg_calib.files.tables": ("read_measurements",),
     "fg_calib.files.units": ("Units",),
+    "fg_calib.identifiability": ("Identifiability", "observe_configurations", "observe_structure"),
     "fg_calib.kinematics": ("pose",),
     "fg_calib.measurements": ("Measurements", "Noise", "Pairing"),
     "fg_calib.problem": ("Problem", "build_problem"),
-    "fg_calib.report": ("format_report",),
-    "fg_calib.results": ("result_document", "write_results"),
+    "fg_calib.report": ("format_identifiability", "format_report"),
+    "fg_calib.results": ("observability_document", "result_document", "write_observability", "write_results"),
     "fg_calib.robot": ("Robot",),
     "fg_calib.solver": ("Solution", "SolverOptions", "solve"),
     "fg_calib.uncertainty": ("Uncertainty", "assess"),
@@ -52,6 +54,7 @@ _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
     "CalibrationError",
+    "Identifiability",
     "InputError",
     "Job",
     "Measurements",
@@ -67,13 +70,18 @@ __all__ = [
     "Units",
     "assess",
     "build_problem",
+    "format_identifiability",
     "format_report",
+    "observability_document",
+    "observe_configurations",
+    "observe_structure",
     "pose",
     "read_job",
     "read_measurements",
     "read_robot",
     "result_document",
     "solve",
+    "write_observability",
     "write_results",
     "write_robot",
 ]

@@ -187,6 +187,12 @@ def _notes(solution: Solution, uncertainty: Uncertainty) -> Iterable[str]:
     judgement, pairs = solution.problem.judgement, solution.problem.pairs
     if judgement is not None and pairs is not None and (same := int(np.sum(judgement.same_point & ~pairs.test))):
         yield f"{same} train pairs are one point twice: three coordinates each instead of a distance"
+    formed = pairs is not None and solution.problem.measurements.pairs is None
+    if formed and solution.problem.n_pairs > solution.problem.n_configurations:
+        yield (
+            f"{solution.problem.n_pairs} pairs are formed from {solution.problem.n_configurations} poses and counted as"
+            " independent: the sigmas are too small, by a factor where there are many more pairs than poses"
+        )
     held = [p for p in uncertainty.parameters if p.identifiability in ("relative", "ineffective")]
     if held:
         with_prior = [p for p in held if p.prior_sigma is not None]
