@@ -149,5 +149,5 @@ def identify(
         kind=kind,
         n_configurations=problem.n_configurations,
         observability=observability,
-        lost=explain(problem, observability),
+        lost=explain(problem, observability, parameters),
     )

@@ -25,8 +25,8 @@ NOT_EXCITED = "not excited by these configurations"
 SEES_POSITION: tuple[Model, ...] = ("pose", "position", "distance", "distance-rotation")
 SEES_ORIENTATION: tuple[Model, ...] = ("pose", "orientation", "rotation", "distance-rotation")
 
-_NOTHING = 1e-9
-"""A motion below this part of what its members do one by one is none: rounding of some hundred operations."""
+_NOTHING = 1e-7
+"""A motion below this part of what its members do one by one is none: relations are rounded to nine digits."""
 
 
 @dataclass(frozen=True)
@@ -42,20 +42,20 @@ class LostDirection:
     reason: str
 
 
-def explain(problem: Problem, observability: Observability) -> tuple[LostDirection, ...]:
-    """The reason for every lost direction of an observability found for a problem at its nominal parameters."""
+def explain(problem: Problem, observability: Observability, parameters: Floats) -> tuple[LostDirection, ...]:
+    """The reason for every lost direction of an observability found for a problem at a parameter vector."""
     lost = observability.lost
     if not lost:
         return ()
     settings = problem.settings
-    anywhere = random_problem(problem.robot, settings.model, settings.frame)
+    anywhere = random_problem(problem.robot.with_values(parameters[:-6]), settings.model, settings.frame)
     effect = named_triangle(anywhere, anywhere.start)
     motion = _Motion(anywhere)
     largest = float(np.linalg.norm(effect, axis=0).max())
     found = []
     for relation in lost:
         direction = np.array([relation.get(name, 0.0) for name in observability.names])
-        if np.linalg.norm(effect @ direction) > 1e-9 * largest * np.abs(direction).max():
+        if np.linalg.norm(effect @ direction) > 1e-6 * largest * np.abs(direction).max():
             found.append(LostDirection(relation, NOT_EXCITED))
         else:
             found.append(LostDirection(relation, motion.reason(direction)))
@@ -105,9 +105,9 @@ class _Motion:
         if self._relative and self._rigid(w, dp, sees_position):
             return "the measurement is blind to the base: the whole arm moves as one body"
         if self._pairs and not moves and self._constant(np.einsum("nji,nj->ni", self._R, w)):
-            return self._tool_turned()
+            return self._tool_turned(direction)
         if self._pairs and not sees_position and self._constant(np.einsum("nji,nj->ni", self._R, w)):
-            return self._tool_turned()
+            return self._tool_turned(direction)
         if self._pairs and self._common_axis is not None and self._tilts(w, dp, self._common_axis):
             return "parallel axes, all of them: it only tilts the arm out of its plane, unseen to first order"
         return NO_CAUSE
@@ -118,9 +118,10 @@ class _Motion:
         in_plane = dp - np.sum(dp * axis, axis=1, keepdims=True) * axis
         return bool(np.abs(along).max() < 1e-8 and np.abs(in_plane).max() < 1e-8)
 
-    def _tool_turned(self) -> str:
+    def _tool_turned(self, direction: Floats) -> str:
         what = "the tool frame turns by the same in itself everywhere, which no angle between two poses shows"
-        return f"the tool point lies on the last axis: {what}" if self._on_last_axis else what
+        of_the_tool = all(p.name.startswith("tool.") for p in self._members(direction))
+        return f"the tool point lies on the last axis: {what}" if self._on_last_axis and not of_the_tool else what
 
     def _same_motion(self, direction: Floats) -> str:
         """The cause where several parameters cancel each other completely."""

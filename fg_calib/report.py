@@ -271,7 +271,10 @@ def format_relation(relation: Mapping[str, float]) -> str:
     names, values = list(relation), list(relation.values())
     if all(abs(v) == 1.0 for v in values):
         return names[0] + "".join(f" {'+' if v > 0 else '-'} {n}" for n, v in zip(names[1:], values[1:], strict=True))
-    return " with ".join(f"{n} by {v:+.4g} {unit_of(n)}" for n, v in relation.items())
+    large = {n: v for n, v in relation.items() if abs(v) >= 0.01}  # the largest is 1
+    text = " with ".join(f"{n} by {v:+.4g} {unit_of(n)}" for n, v in large.items())
+    n_small = len(relation) - len(large)
+    return text + (f" and a little of {n_small} more" if n_small else "")
 
 
 def unit_of(name: str) -> str:

@@ -12,6 +12,8 @@ from fg_calib.measurements import Pairing
 from fg_calib.problem import build_problem, named_triangle, random_problem
 from fg_calib.reasons import NO_CAUSE, NOT_EXCITED
 from fg_calib.robot import Joint, RobotBuilder
+from fg_calib.solver import solve
+from fg_calib.uncertainty import assess
 
 MODELS = ("distance", "rotation", "distance-rotation", "position", "pose")
 OFF_AXIS = {"x": 0.1, "y": 0.05, "z": 0.2, "roll": 0.3}
@@ -223,3 +225,17 @@ def test_structure_and_problem_agree():
     problem = random_problem(paper_robot(), "distance")
     found = identify(problem, problem.start, "structural")
     assert found.observability.rank == observe_structure(paper_robot(), "distance").observability.rank == 21
+
+
+@pytest.mark.parametrize("model", ["pose", "distance-rotation", "position"])
+def test_reasons_are_found_where_the_tool_turned_out_to_be(model):
+    """The tool is estimated and far from nominal: directions and reasons are those at the fitted tool."""
+    rng = np.random.default_rng(7)
+    robot = paper_robot(estimate=[f"tool.{k}" for k in ("x", "y", "z", "roll", "pitch", "yaw")])
+    values = robot.nominal
+    values[-6:] = [0.05, -0.03, 0.2, 0.1, 0.2, 0.3]
+    measurements = measure(robot.with_values(values), 150, rng)
+    found = assess(solve(build_problem(robot, measurements, model=model))).identifiability
+    assert found.lost
+    assert NOT_EXCITED not in {lost.reason for lost in found.lost}
+    assert not any("last axis" in lost.reason for lost in found.lost)
