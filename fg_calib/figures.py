@@ -27,12 +27,13 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 KEPT, LOST = "#0072B2", "#D55E00"
-GREY, PALE = "0.45", "0.88"
+GREY, PALE = "0.45", "0.93"
 
 NEAR_ZERO = 1e-18
 """Singular values below this part of the largest, most of them exactly zero, are drawn there: a log axis has no 0."""
 
 _DPI = 160
+_FAINTER = 1.5  # ends of the colours of `draw_groups`, whose +1 and -1 would be nearly black
 _SMALL, _TEXT, _TITLE = 7.0, 8.0, 9.0
 
 
@@ -49,7 +50,7 @@ def draw_spectrum(found: Identifiability) -> Figure:
     """Singular values on a log axis, kept and lost, with the gap between them.
 
     Those of a structural analysis are relative to the largest, for its noise is arbitrary; those of a practical one are
-    signal-to-noise ratios, and a line shows where they become weak.
+    signal-to-noise ratios, and a line shows where they become weak. Values below `NEAR_ZERO` stand on the lowest tick.
     """
     o, practical = found.observability, found.kind == "practical"
     largest = float(o.singular_values[0]) or 1.0
@@ -59,12 +60,14 @@ def draw_spectrum(found: Identifiability) -> Figure:
     n, rank = len(values), o.rank
     number = np.arange(1, n + 1)
     kept, zero = number <= rank, values < floor
+    weak = kept & practical & (values < WEAK)
     figure, axes = _figure(5.6, 3.6)
     axes.set_yscale("log")
     for chosen, marker, colour, face, label in (
-        (kept, "o", KEPT, KEPT, f"determined: {rank}"),
-        (~kept & ~zero, "o", LOST, "white", f"lost: {n - rank}"),
-        (~kept & zero, "v", LOST, "white", f"lost, below {NEAR_ZERO:.0e} of the largest"),
+        (kept & ~weak, "o", KEPT, KEPT, f"determined: {rank - int(weak.sum())}"),
+        (weak, "o", KEPT, "white", f"determined, but weak: {int(weak.sum())}"),
+        (~kept & ~zero, "s", LOST, LOST, f"lost: {int(np.sum(~kept & ~zero))}"),
+        (~kept & zero, "v", LOST, LOST, f"lost, zero: {int(np.sum(~kept & zero))}"),
     ):
         if chosen.any():
             shown = np.maximum(values[chosen], floor)
@@ -85,9 +88,11 @@ def draw_spectrum(found: Identifiability) -> Figure:
             fontsize=_SMALL,
         )
     axes.set_xlim(0.0, n + 1.0)
+    if not rank:
+        axes.set_ylim(floor / 10.0, 1.0)
     axes.set_xlabel("number of the singular value", fontsize=_TEXT)
     axes.set_ylabel("signal-to-noise ratio" if practical else "singular value / largest", fontsize=_TEXT)
-    axes.legend(frameon=False, fontsize=_SMALL, loc="lower left" if rank < n else "best")
+    axes.legend(frameon=False, fontsize=_SMALL, loc="lower left" if 0 < rank < n else "upper right")
     _title(axes, f"What is determined: rank {rank} of {n}", found)
     return figure
 
@@ -109,19 +114,18 @@ def draw_groups(found: Identifiability) -> Figure:
         for name, change in relation.items():
             changes[i, names.index(name)] = change
     figure, axes = _figure(2.7 + 0.30 * max(len(names), 6), 1.35 + 0.30 * max(len(rows), 2))
-    _draw_cells(axes, changes, "PuOr")
+    _draw_cells(axes, changes, "PuOr", _FAINTER)
     for (i, j), change in np.ndenumerate(changes):
         if np.isfinite(change):
-            dark = abs(change) > 0.7
-            axes.text(j, i, _cell(change), ha="center", va="center", fontsize=6, color="white" if dark else "black")
+            ink = "white" if abs(change) > 0.85 else "black"
+            axes.text(j, i, _cell(change), ha="center", va="center", fontsize=6, color=ink)
     _name_columns(axes, names, found.fixed)
     first = [next(i for i, row in enumerate(rows) if row[0] == reason) for reason in reasons]
     for start, end, reason in zip(first, [*first[1:], len(rows)], reasons, strict=True):
-        width = 34 if end - start < 3 else 26
         axes.text(
             -0.015,
             (start + end - 1) / 2,
-            "\n".join(wrap(reason, width)),
+            _balanced(reason),
             transform=axes.get_yaxis_transform(),
             ha="right",
             va="center",
@@ -130,7 +134,8 @@ def draw_groups(found: Identifiability) -> Figure:
         if start:
             axes.axhline(start - 0.5, color=GREY, linewidth=0.8)
     axes.set_yticks([])
-    axes.set_xlabel("change of each parameter [m], [rad], the largest of a row being 1", fontsize=_TEXT)
+    grey = "; grey: fixed in the robot's file" if involved & set(found.fixed) else ""
+    axes.set_xlabel(f"change of each parameter [m], [rad], the largest of a row being 1{grey}", fontsize=_TEXT)
     _title(axes, f"What moves unseen: {len(rows)} of {len(o.names)} directions lost", found)
     return figure
 
@@ -169,7 +174,7 @@ def _show_gap(axes: Axes, ends: tuple[float, float], rank: int, n: int, ratio: f
     right = rank > n / 2
     x = rank + 0.5
     axes.annotate("", (x, below), (x, above), arrowprops={"arrowstyle": "<->", "color": GREY, "linewidth": 0.9})
-    text = f"gap {ratio:.1e}" if np.isfinite(ratio) else "gap: what is lost is 0"
+    text = f"gap {_power(ratio)}" if np.isfinite(ratio) else "gap: what is lost is 0"
     axes.annotate(
         text,
         (x, float(np.sqrt(above * below))),
@@ -181,9 +186,23 @@ def _show_gap(axes: Axes, ends: tuple[float, float], rank: int, n: int, ratio: f
     )
 
 
+def _power(ratio: float) -> str:
+    """A ratio in two digits: `2.5`, `9.3 x 10^13` with a proper sign and exponent."""
+    if ratio < 1e3:
+        return f"{ratio:.2g}"
+    digits, exponent = f"{ratio:.1e}".split("e")
+    return rf"${digits} \times 10^{{{int(exponent)}}}$"
+
+
 def _short(reason: str) -> str:
     """The first words of a reason, which tell it from the others; its explanation is in the report."""
     return re.split(r": |, (?=unseen|which)", reason)[0]
+
+
+def _balanced(text: str) -> str:
+    """Text in lines of at most 30 characters that are about equally long."""
+    lines = len(wrap(text, 30))
+    return "\n".join(next(w for k in range(30) if len(w := wrap(text, max(1, len(text) // lines) + k)) <= lines))
 
 
 def _cell(change: float) -> str:
@@ -205,9 +224,9 @@ def _figure(width: float, height: float) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _draw_cells(axes: Axes, values: Floats, colours: str) -> Any:
-    """A diverging heat map from -1 to 1 with fine lines between the cells; what is nan stays white."""
-    image = axes.imshow(values, cmap=colours, vmin=-1.0, vmax=1.0, aspect="equal", interpolation="nearest")
+def _draw_cells(axes: Axes, values: Floats, colours: str, end: float = 1.0) -> Any:
+    """A diverging heat map from -`end` to `end` with fine lines between the cells; what is nan stays white."""
+    image = axes.imshow(values, cmap=colours, vmin=-end, vmax=end, aspect="equal", interpolation="nearest")
     axes.spines[:].set_visible(False)
     axes.set_xticks(np.arange(-0.5, values.shape[1]), minor=True)
     axes.set_yticks(np.arange(-0.5, values.shape[0]), minor=True)
