@@ -74,6 +74,13 @@ def test_ur10_drawn_pairs_agree_with_all_pairs_within_the_spread_of_draws(ur10_r
 
 
 @real_data
+def test_ur10_pairs_drawn_by_seed_0_are_predicted_within_the_limits(ur10_run):
+    drawn = ur10_run[0]["distance-rotation"]["residual_rms"]["test"]
+    assert drawn["distance"]["after"] <= 0.40 * MM
+    assert drawn["angle"]["after"] <= 0.044 * DEG
+
+
+@real_data
 def test_ur10_ranks_are_those_of_theory(ur10_run):
     # 4 * 6 + 6 = 30 from poses, 6 of them the frame's; less 6 of the base and 3 of the tool's rotation from pairs.
     assert ur10_run[0]["pose"]["rank"] == 24
