@@ -113,7 +113,7 @@ def test_a_robot_may_be_a_file_or_stand_in_the_job(folder, robot, files):
     assert list(job.inputs) == ["calibration.yaml", *files, "one.csv"]
 
 
-KEYS = "one of robot, measurements, pairs, model, pairing, frame, units, noise, prior, gauge, prefer, loss"
+KEYS = "one of robot, measurements, pairs, model, pairing, frame, units, noise, prior, gauge, prefer, loss, truth"
 MISTAKES = [
     ("", "calibration.yaml: an empty file, expected a mapping, key: value"),
     ("robot: a\n", "calibration.yaml: missing key 'measurements' (and 1 more)"),
@@ -169,3 +169,19 @@ def test_a_missing_job_is_named(tmp_path):
     with pytest.raises(InputError) as caught:
         read_job(tmp_path / "calibration.yaml")
     assert str(caught.value) == f"{tmp_path / 'calibration.yaml'}: no such file"
+
+
+def test_a_simulated_job_knows_the_truth(folder):
+    assert read(folder, JOB).truth is None
+    (folder / "true.yaml").write_text(ROBOT.replace("a: 0, alpha", "a: 0.25, alpha"))
+    job = read(folder, JOB + "truth: true.yaml\n")
+    assert job.truth.nominal[job.truth.index("a1")] == 0.25
+    assert job.robot.nominal[job.robot.index("a1")] == 0.0
+    assert "true.yaml" in job.inputs
+
+
+def test_the_truth_is_a_robot_with_the_same_parameters(folder):
+    (folder / "true.yaml").write_text(ROBOT.replace("mdh", "mdh-hayati"))
+    with pytest.raises(InputError) as error:
+        read(folder, JOB + "truth: true.yaml\n")
+    assert str(error.value) == "true.yaml: another robot, expected the parameters of robot, with their true values"

@@ -35,6 +35,7 @@ class Job:
         prefer: Parameters to keep where only combinations are determined, first choice first.
         loss: The robust loss; `none` is least squares.
         units: The units of the tables and of the noise.
+        truth: The robot as it truly is, known from a simulation; None where it is not.
         inputs: SHA-256 of every file read, by its path relative to the job.
     """
 
@@ -49,6 +50,7 @@ class Job:
     prefer: tuple[str, ...]
     loss: str
     units: Units
+    truth: Robot | None
     inputs: dict[str, str]
 
 
@@ -86,6 +88,7 @@ class _Job(Schema):
     gauge: Gauge = "prior"
     prefer: tuple[str, ...] = ()
     loss: str = "none"
+    truth: str | None = None
 
 
 def read_job(path: Path | str) -> Job:
@@ -113,7 +116,9 @@ def read_job(path: Path | str) -> Job:
         units=file.units,
         noise=_noise(file.noise, file.units, robot, f"{path.name}: noise"),
     )
-    names = [path.name, *robot_files, file.measurements, *([file.pairs] if file.pairs else [])]
+    truth = None if file.truth is None else _truth(folder / file.truth, robot)
+    others = [name for name in (file.pairs, file.truth) if name is not None]
+    names = [path.name, *robot_files, file.measurements, *others]
     inputs = {name: _sha256(folder / name) for name in names}
     for name in file.prefer:
         if name not in names_of(robot.parameters):
@@ -132,6 +137,7 @@ def read_job(path: Path | str) -> Job:
         prefer=file.prefer,
         loss=file.loss,
         units=file.units,
+        truth=truth,
         inputs=inputs,
     )
 
@@ -147,6 +153,14 @@ def _robot(given: object, place: str, folder: Path) -> tuple[Robot, list[str]]:
     if robot.urdf is None or given.lower().endswith(".urdf"):
         return robot, [given]
     return robot, [given, str(PurePath(given).parent / read_yaml(folder / given)["urdf"])]
+
+
+def _truth(path: Path, robot: Robot) -> Robot:
+    """The true robot: the nominal one with other values."""
+    truth = read_robot(path)
+    if names_of(truth.parameters) != names_of(robot.parameters) or truth.convention != robot.convention:
+        raise InputError(path.name, "another robot", f"the parameters of {robot.name}, with their true values")
+    return truth
 
 
 def _pairing(given: object, place: str) -> Pairing:
