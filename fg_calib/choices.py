@@ -14,6 +14,15 @@ Gauge = Literal["prior", "keep", "none"]
 Strategy = Literal["star", "chain", "all", "random"]
 """How pairs are formed from poses."""
 
+PairErrors = Literal["shared", "independent"]
+"""Whether pairs of one configuration are taken to share its errors, or to be independent as in the paper."""
+
+EncoderNoise = Literal["propagated", "estimated"]
+"""Whether the noise of joint readings is added to that of the rows, or each true joint vector is estimated too."""
+
+Loss = Literal["none", "huber", "cauchy", "geman-mcclure", "gnc"]
+"""What becomes of large residuals: least squares, or a robust loss."""
+
 LengthUnit = Literal["m", "cm", "mm", "um"]
 AngleUnit = Literal["rad", "deg", "mrad"]
 

@@ -91,6 +91,7 @@ def calibrate(
         prior=given.prior,
         gauge=given.gauge,
         prefer=given.prefer,
+        pair_errors=given.pair_errors,
     )
     solution = solve(problem)
     uncertainty = assess(solution)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from fg_calib import residuals
 from fg_calib.errors import SolverError
 from fg_calib.kinematics import Chain, build_chain
-from fg_calib.residuals import Block
+from fg_calib.residuals import AnyBlock
 from fg_calib.robot import FRAME_KINDS, Robot, names_of
 
 Floats = NDArray[np.float64]
@@ -249,7 +249,7 @@ def custom_factor(
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(n_rows), [v.key for v in variables], evaluate)
 
 
-def measurement_factor(block: Block, variables: Variables) -> gtsam.CustomFactor:
+def measurement_factor(block: AnyBlock, variables: Variables) -> gtsam.CustomFactor:
     """A block of measurements as one factor; a block of one measurement is that measurement's own factor.
 
     A block of more rows than the variables have columns is handed to GTSAM as the triangular factor of
@@ -295,7 +295,7 @@ class Reduction:
     harmless where every singular value is either that of a dead direction or above 1e-5 of the largest.
     """
 
-    def __init__(self, block: Block) -> None:
+    def __init__(self, block: AnyBlock) -> None:
         self._block = block
         self._gram = False
         self._decided = block.n * block.height <= GRAM_ROWS

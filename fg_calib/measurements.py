@@ -25,6 +25,7 @@ class Noise:
         joint: Of the joint readings: one figure for all joints or one a joint, [rad] (prismatic: [m]).
         distance: Of a directly measured distance, [m].
         angle: Of a directly measured rotation angle, [rad].
+        point: Of a touched point, per axis, [m].
     """
 
     position: float | None = None
@@ -32,6 +33,7 @@ class Noise:
     joint: float | tuple[float, ...] = 0.0
     distance: float | None = None
     angle: float | None = None
+    point: float | None = None
 
 
 @dataclass(frozen=True)

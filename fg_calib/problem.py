@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib import frames, residuals
-from fg_calib.choices import FrameKnowledge, Gauge, Model
+from fg_calib.choices import FrameKnowledge, Gauge, Model, PairErrors
 from fg_calib.errors import ProblemError
 from fg_calib.factors import (
     Variables,
@@ -26,21 +26,25 @@ from fg_calib.factors import (
     prior_rows,
 )
 from fg_calib.frames import Frame, Unknown
-from fg_calib.kinematics import Chain, build_chain, forward, precompute_trig
+from fg_calib.kinematics import build_chain, forward, precompute_trig
 from fg_calib.measurements import Measurements, Pairing, Pairs, form_pairs
 from fg_calib.observability import RANK_TOLERANCE, SIGNAL_FLOOR, Observability, analyse, determined, singular_values
-from fg_calib.residuals import Block, PairBlock, PoseBlock, SamePointBlock
+from fg_calib.residuals import AnyBlock, Block, CorrelatedBlock
 from fg_calib.robot import Parameter, Robot
+from fg_calib.whitening import (
+    MAX_SHARED,
+    Adjustment,
+    PairJudgement,
+    PairWhitening,
+    PoseWhitening,
+    Sharing,
+    pair_block,
+    pose_block,
+)
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
 Integers = NDArray[np.int64]
-
-KINK_SIGMAS = 5.0
-"""An angle nearer to 0 or pi, or a distance nearer to 0, than this many sigma gives no row of its own."""
-
-SAME_POINT_SIGMAS = 3.0
-"""A small distance that was measured as 0 within this many sigma says that both points are the same."""
 
 PAIR_KINDS: dict[str, tuple[bool, bool]] = {
     "distance": (True, False),
@@ -59,9 +63,6 @@ POSE_KINDS: dict[str, tuple[bool, bool]] = {
 STRUCTURAL_FLOOR = 1e-6
 """Signal-to-noise ratio that counts as nothing on random configurations with an assumed noise: rounding alone."""
 
-_CHUNK = 65_536
-"""Rows whose derivatives in the joints are held at once."""
-
 
 @dataclass(frozen=True)
 class Settings:
@@ -73,6 +74,7 @@ class Settings:
         frame: Whether the measurement frame is known to be the base, or world_T_base is estimated too.
         prior: Whether the robot's tolerances are priors.
         gauge: What holds the directions that the data do not determine.
+        pair_errors: Whether pairs of one configuration share its errors or count as independent.
     """
 
     model: Model = "distance-rotation"
@@ -80,37 +82,12 @@ class Settings:
     frame: FrameKnowledge = "known"
     prior: bool = True
     gauge: Gauge = "prior"
+    pair_errors: PairErrors = "shared"
 
     @property
     def uses_pairs(self) -> bool:
         """Whether the model is one of pairs."""
         return self.model in PAIR_KINDS
-
-
-@dataclass(frozen=True)
-class PairJudgement:
-    """What each pair contributes, shapes (n_pairs,).
-
-    Attributes:
-        distance: Gives a distance row.
-        angle: Gives an angle row.
-        same_point: Gives the 3-vector between its points instead of a distance.
-        reasons: Why measured rows take no part: masks by reason.
-    """
-
-    distance: Booleans
-    angle: Booleans
-    same_point: Booleans
-    reasons: dict[str, Booleans]
-
-    def __eq__(self, other: object) -> bool:
-        """Whether both use the same rows."""
-        if not isinstance(other, PairJudgement):
-            return NotImplemented
-        fields = ("distance", "angle", "same_point")
-        return all(np.array_equal(getattr(self, f), getattr(other, f)) for f in fields)
-
-    __hash__ = None  # type: ignore[assignment]
 
 
 @dataclass(frozen=True)
@@ -130,6 +107,8 @@ class Problem:
             shape (n_configurations, 6): measurement noise and joint noise together, [m] and [rad].
         blocks: The whitened train rows.
         graph: Factors and priors.
+        sharing: Which errors of configurations the rows carry in common.
+        adjustment: What has been learned of the measurements' noise.
         whole: The problem with everything estimated, where this one leaves parameters out to fix the gauge.
     """
 
@@ -142,8 +121,10 @@ class Problem:
     pairs: Pairs | None
     judgement: PairJudgement | None
     sigma: Floats
-    blocks: tuple[Block, ...]
+    blocks: tuple[AnyBlock, ...]
     graph: gtsam.NonlinearFactorGraph
+    sharing: Sharing
+    adjustment: Adjustment
     whole: Problem | None = None
 
     @property
@@ -162,16 +143,27 @@ class Problem:
         """Train pairs that give at least one row."""
         if self.pairs is None or self.judgement is None:
             return 0
-        used = self.judgement.distance | self.judgement.angle | self.judgement.same_point
-        return int(np.sum(used & ~self.pairs.test))
+        return int(np.sum(self.judgement.used & ~self.pairs.test))
 
     @property
     def n_configurations(self) -> int:
         """Configurations that the train rows come from."""
         if self.pairs is None or self.judgement is None:
             return int(np.sum(~self.measurements.test))
-        used = (self.judgement.distance | self.judgement.angle | self.judgement.same_point) & ~self.pairs.test
+        used = self.judgement.used & ~self.pairs.test
         return len(np.unique(np.concatenate([self.pairs.a[used], self.pairs.b[used]])))
+
+    @property
+    def formed(self) -> bool:
+        """Whether pairs were formed from measured poses."""
+        return self.pairs is not None and self.measurements.pairs is None
+
+    @property
+    def common(self) -> Sharing:
+        """Which errors of configurations reach more than one row, carried in common or not."""
+        if self.pairs is None:
+            return Sharing()
+        return Sharing(poses=self.formed, joints=bool(np.any(self.measurements.sigma_joint > 0.0)))
 
     @property
     def n_residuals(self) -> int:
@@ -180,6 +172,19 @@ class Problem:
             return sum(b.n * b.height for b in self.blocks)
         j, train = self.judgement, ~self.pairs.test
         return int(np.sum(j.distance & train) + np.sum(j.angle & train) + 3 * np.sum(j.same_point & train))
+
+    @property
+    def n_independent(self) -> int:
+        """Residuals that the noise can make differ freely: pairs formed from poses hold no more than the poses do."""
+        block = self.blocks[0] if self.blocks else None
+        if not (self.sharing.poses and isinstance(block, CorrelatedBlock)):
+            return self.n_residuals
+        return min(self.n_residuals, round(block.n_shared_rows))
+
+    @property
+    def approximate(self) -> bool:
+        """Whether rows share errors but were too many to carry them, and were weighted as if independent."""
+        return self.settings.pair_errors == "shared" and self.sharing != self.common
 
     @property
     def n_priors(self) -> int:
@@ -204,6 +209,7 @@ def build_problem(
     prior: bool | None = None,
     gauge: Gauge = "prior",
     prefer: Sequence[str] = (),
+    pair_errors: PairErrors = "shared",
 ) -> Problem:
     """The calibration problem of a robot and its measurements.
 
@@ -219,11 +225,14 @@ def build_problem(
             the independent parameters and those kept of each relative group are estimated, without priors, the
             others stay at nominal (the paper's way).
         prefer: For `keep`: parameters to keep, first choice first.
+        pair_errors: `shared`: pairs carry the errors of their configurations in common, as long as these are not too
+            many (`MAX_SHARED`); then, and with `independent`, they are weighted as if independent.
 
     Raises:
         ProblemError: The measurements lack what the model needs, or do not suffice.
     """
-    settings = Settings(model, pairing or Pairing(), frame, prior is not False and gauge == "prior", gauge)
+    with_priors = prior is not False and gauge == "prior"
+    settings = Settings(model, pairing or Pairing(), frame, with_priors, gauge, pair_errors)
     if not any(p.estimated for p in robot.parameters):
         raise ProblemError(f"robot {robot.name}", "nothing to estimate", "at least one parameter that is not fixed")
     unknown_frame = frame == "unknown" and not settings.uses_pairs
@@ -250,6 +259,7 @@ def predicted_problem(
     frame: FrameKnowledge = "known",
     pairing: Pairing | None = None,
     sigmas: tuple[Floats | None, Floats | None, Floats | None] = (None, None, None),
+    pair_errors: PairErrors = "shared",
 ) -> Problem:
     """The problem that a robot's own predictions at some configurations make: what could be measured there.
 
@@ -261,8 +271,9 @@ def predicted_problem(
         pairing: How pairs are formed; a star if None.
         sigmas: Of positions, shape (n, 3), [m], of orientations, shape (n, 3), [rad], and of readings, shape
             (n_joints,); 1 mm, 1 mrad and none where None.
+        pair_errors: Whether pairs of one configuration share its errors or count as independent.
     """
-    settings = Settings(model, pairing or Pairing(), frame, prior=False)
+    settings = Settings(model, pairing or Pairing(), frame, prior=False, pair_errors=pair_errors)
     variables = build_variables(robot, frame == "unknown" and not settings.uses_pairs, priors=False)
     trig = precompute_trig(robot, readings)
     poses = forward(build_chain(robot), trig)
@@ -300,14 +311,32 @@ def random_problem(
     span = np.array([1.0 if joint.prismatic else np.pi for joint in robot.joints])
     lower, upper = np.clip(robot.limits, -span[:, None], span[:, None]).T
     readings = np.random.default_rng(seed).uniform(lower, upper, (n, robot.n_joints))
-    return predicted_problem(robot, readings, model, frame=frame, pairing=Pairing("chain"))
+    return predicted_problem(robot, readings, model, frame=frame, pairing=Pairing("chain"), pair_errors="independent")
 
 
 def judged_at(problem: Problem, parameters: Floats) -> Problem:
     """The same problem with its rows judged and whitened, and started, at other parameters."""
     p = problem
-    anew = _assemble(p.robot, p.measurements, p.settings, p.variables, parameters, p.trig, p.pairs)
+    anew = _assemble(p.robot, p.measurements, p.settings, p.variables, parameters, p.trig, p.pairs, p.adjustment)
     return replace(anew, whole=p.whole)
+
+
+def correlation(problem: Problem, parameters: Floats) -> Floats | None:
+    """J^T (C - 1) J of the train rows where they share errors but are weighted as independent, else None.
+
+    Args:
+        problem: The problem.
+        parameters: The parameter vector.
+
+    Returns:
+        With J the whitened Jacobian and C the covariance of the whitened rows, shape (n_columns, n_columns).
+    """
+    p, missing = problem, problem.common != problem.sharing
+    if p.pairs is None or not missing:
+        return None
+    chain, kinds = p.variables.chain.at(parameters), PAIR_KINDS[p.settings.model]
+    of_pairs = PairWhitening(p.trig, chain, p.measurements, p.pairs, kinds, p.formed, p.adjustment)
+    return of_pairs.correlation(chain, p.common)
 
 
 def frames_only(problem: Problem) -> Problem | None:
@@ -371,11 +400,10 @@ def observe(
 
 def all_rows(problem: Problem) -> Block:
     """Every measured row, train and test, in [m] and [rad]: the block behind predictions and residual tables."""
-    m, n = problem.measurements, problem.measurements.n_configurations
+    m, model = problem.measurements, problem.settings.model
     if problem.pairs is not None:
-        return _pair_block(problem.trig, problem.pairs, PAIR_KINDS[problem.settings.model], np.array([1.0, 0.0, 1.0]))
-    kinds = POSE_KINDS[problem.settings.model]
-    return _pose_block(problem.trig, np.arange(n), m, kinds, np.eye(3 * sum(kinds)))
+        return pair_block(problem.trig, problem.pairs, PAIR_KINDS[model])
+    return pose_block(problem.trig, np.arange(m.n_configurations), m, POSE_KINDS[model])
 
 
 def _usable_pairs(measurements: Measurements, settings: Settings) -> Pairs:
@@ -528,172 +556,41 @@ def _assemble(
     start: Floats,
     trig: Floats,
     pairs: Pairs | None,
+    adjustment: Adjustment | None = None,
 ) -> Problem:
     """The problem with rows judged and whitened at `start`."""
-    chain = variables.chain.at(start).without_columns()
-    judgement = None
-    blocks: list[Block] = []
+    chain = variables.chain.at(start)
+    adjustment = adjustment or Adjustment()
+    judgement, sharing = None, Sharing()
     if pairs is not None:
+        formed = measurements.pairs is None
         kinds = PAIR_KINDS[settings.model]
-        whole = _pair_block(trig, pairs, kinds, np.array([1.0, 0.0, 1.0]))
-        covariance = _pair_covariance(whole, chain, pairs, measurements.sigma_joint, kinds)
-        sigma = np.sqrt(covariance[:, [0, 2]])
-        same = np.all(measurements.readings[pairs.a] == measurements.readings[pairs.b], axis=1)
-        judgement = _judge(pairs, _predicted(whole, chain, kinds), sigma, same)
-        blocks = _pair_blocks(trig, chain, pairs, judgement, covariance, measurements.sigma_joint, kinds)
+        of_pairs = PairWhitening(trig, chain, measurements, pairs, kinds, formed, adjustment)
+        judgement, sigma = of_pairs.judgement, of_pairs.sigma
+        if settings.pair_errors == "shared":
+            wanted = Sharing(poses=formed, joints=bool(np.any(measurements.sigma_joint > 0.0)))
+            sharing = wanted if of_pairs.n_shared(wanted) <= MAX_SHARED else Sharing()
+        blocks = of_pairs.blocks(sharing)
     else:
-        pose_kinds = POSE_KINDS[settings.model]
-        whole_poses = _pose_block(
-            trig, np.arange(measurements.n_configurations), measurements, pose_kinds, np.eye(3 * sum(pose_kinds))
-        )
-        factors, sigma = _pose_whitening(whole_poses, chain, measurements, pose_kinds)
-        train = np.flatnonzero(~measurements.test)
-        if len(train):
-            blocks = [_pose_block(trig, train, measurements, pose_kinds, factors[train])]
+        of_poses = PoseWhitening(trig, chain, measurements, POSE_KINDS[settings.model], adjustment)
+        sigma, blocks = of_poses.sigma, of_poses.blocks()
     graph = gtsam.NonlinearFactorGraph()
     for block in blocks:
         graph.add(measurement_factor(block, variables))
     for factor in prior_factors(variables):
         graph.add(factor)
-    return Problem(robot, measurements, settings, variables, start, trig, pairs, judgement, sigma, tuple(blocks), graph)
-
-
-def _pair_block(trig: Floats, pairs: Pairs, kinds: tuple[bool, bool], whitening: Floats) -> PairBlock:
-    measured = np.nan_to_num(np.stack([pairs.distance, pairs.angle], axis=1))
-    return PairBlock(
-        trig, pairs.a, pairs.b, measured, np.ascontiguousarray(np.broadcast_to(whitening, (pairs.n_pairs, 3))), kinds
+    return Problem(
+        robot=robot,
+        measurements=measurements,
+        settings=settings,
+        variables=variables,
+        start=start,
+        trig=trig,
+        pairs=pairs,
+        judgement=judgement,
+        sigma=sigma,
+        blocks=tuple(blocks),
+        graph=graph,
+        sharing=sharing,
+        adjustment=adjustment,
     )
-
-
-def _pose_block(
-    trig: Floats, rows: Integers, measurements: Measurements, kinds: tuple[bool, bool], whitening: Floats
-) -> PoseBlock:
-    n, height = len(rows), 3 * sum(kinds)
-    rotation = np.zeros((n, 3, 3)) if measurements.rotation is None else measurements.rotation[rows]
-    position = np.zeros((n, 3)) if measurements.position is None else measurements.position[rows]
-    weights = np.ascontiguousarray(np.broadcast_to(whitening, (n, height, height)))
-    return PoseBlock(trig, rows, np.ascontiguousarray(rotation), np.ascontiguousarray(position), weights, kinds)
-
-
-def _predicted(block: PairBlock, chain: Chain, kinds: tuple[bool, bool]) -> Floats:
-    """Predicted distance and angle of each pair, shape (n, 2); zero where the model has none."""
-    predicted = np.zeros((block.n, 2))
-    predicted[:, kinds] = residuals.residual(block, chain) + block.measured[:, kinds]
-    return predicted
-
-
-def _judge(pairs: Pairs, predicted: Floats, sigma: Floats, same: Booleans) -> PairJudgement:
-    """Which rows of each pair take part; none where both readings are the same: no parameter changes the prediction."""
-    measured_distance, measured_angle = np.isfinite(pairs.distance) & ~same, np.isfinite(pairs.angle) & ~same
-    smallest = np.fmin(pairs.distance, predicted[:, 0])
-    small = measured_distance & (smallest < KINK_SIGMAS * sigma[:, 0])
-    same_point = small & (pairs.distance <= SAME_POINT_SIGMAS * sigma[:, 0])
-    margin = KINK_SIGMAS * sigma[:, 1]
-    near_zero = measured_angle & (np.fmin(pairs.angle, predicted[:, 1]) < margin)
-    near_pi = measured_angle & ~near_zero & (np.fmax(pairs.angle, predicted[:, 1]) > np.pi - margin)
-    return PairJudgement(
-        distance=measured_distance & ~small,
-        angle=measured_angle & ~near_zero & ~near_pi,
-        same_point=same_point,
-        reasons={
-            "distance_near_zero": small & ~same_point,
-            "angle_near_zero": near_zero,
-            "angle_near_pi": near_pi,
-            "same_configuration": same,
-        },
-    )
-
-
-def _pair_covariance(
-    block: PairBlock, chain: Chain, pairs: Pairs, sigma_joint: Floats, kinds: tuple[bool, bool]
-) -> Floats:
-    """Variance of distance, covariance, variance of angle of each pair, shape (n, 3), [m^2, m rad, rad^2].
-
-    The noise of the readings reaches a measurement to first order through its derivatives in the joints. Pairs
-    count as independent of each other even where they share a configuration.
-    """
-    covariance = np.zeros((block.n, 3))
-    covariance[:, 0] = np.nan_to_num(pairs.sigma_distance) ** 2
-    covariance[:, 2] = np.nan_to_num(pairs.sigma_angle) ** 2
-    if np.any(sigma_joint > 0.0):
-        for rows, J in _joint_derivatives(block, chain, sigma_joint):
-            wide = np.zeros((len(J), 2, J.shape[2]))
-            wide[:, kinds] = J
-            covariance[rows, 0] += np.sum(wide[:, 0] ** 2, axis=1)
-            covariance[rows, 1] += np.sum(wide[:, 0] * wide[:, 1], axis=1)
-            covariance[rows, 2] += np.sum(wide[:, 1] ** 2, axis=1)
-    return covariance
-
-
-def _joint_derivatives(block: Block, chain: Chain, sigma_joint: Floats) -> list[tuple[slice, Floats]]:
-    """Derivatives of a block's rows in the readings times their sigma, in chunks: (rows, (n, height, n_own))."""
-    scale = np.tile(sigma_joint, block.n_configurations)
-    chain = chain.with_joint_columns()
-    chunks = []
-    for start in range(0, block.n, _CHUNK):
-        rows = slice(start, min(start + _CHUNK, block.n))
-        chunks.append((rows, residuals.linearise(residuals.rows_of(block, rows), chain)[1] * scale))
-    return chunks
-
-
-def _pair_blocks(
-    trig: Floats,
-    chain: Chain,
-    pairs: Pairs,
-    judgement: PairJudgement,
-    covariance: Floats,
-    sigma_joint: Floats,
-    kinds: tuple[bool, bool],
-) -> list[Block]:
-    """The train rows: a block of distances and angles, a block of same points."""
-    blocks: list[Block] = []
-    train = ~pairs.test
-    rows = np.flatnonzero((judgement.distance | judgement.angle) & train)
-    if len(rows):
-        whitening = _whiten_2x2(covariance[rows], judgement.distance[rows], judgement.angle[rows])
-        blocks.append(_pair_block(trig, pairs.select(rows), kinds, whitening))
-    rows = np.flatnonzero(judgement.same_point & train)
-    if len(rows):
-        variance = pairs.sigma_distance[rows] ** 2
-        same = SamePointBlock(trig, pairs.a[rows], pairs.b[rows], np.tile(np.eye(3), (len(rows), 1, 1)))
-        S = np.eye(3) * variance[:, None, None]
-        if np.any(sigma_joint > 0.0):
-            for chunk, J in _joint_derivatives(same, chain, sigma_joint):
-                S[chunk] += J @ np.swapaxes(J, 1, 2)
-        blocks.append(replace(same, whitening=_inverse_cholesky(S)))
-    return blocks
-
-
-def _whiten_2x2(covariance: Floats, distance: Booleans, angle: Booleans) -> Floats:
-    """(w_dd, w_ad, w_aa) that whiten the rows in use, shape (n, 3)."""
-    d, c, a = covariance.T
-    both = distance & angle
-    with np.errstate(divide="ignore", invalid="ignore"):
-        rest = np.sqrt(np.where(both, a - c * c / d, a))
-        w_dd = np.where(distance, 1.0 / np.sqrt(d), 0.0)
-        w_aa = np.where(angle, 1.0 / rest, 0.0)
-        w_ad = np.where(both, -c / d / rest, 0.0)
-    return np.stack([w_dd, w_ad, w_aa], axis=1)
-
-
-def _pose_whitening(
-    block: PoseBlock, chain: Chain, measurements: Measurements, kinds: tuple[bool, bool]
-) -> tuple[Floats, Floats]:
-    """Whitening of each pose, shape (n, height, height), and 1 sigma of (orientation, position), shape (n, 6)."""
-    n = block.n
-    sigmas = [measurements.sigma_orientation if kinds[0] else None, measurements.sigma_position if kinds[1] else None]
-    wanted = [s for s in sigmas if s is not None]
-    variance = np.concatenate(wanted, axis=1) ** 2  # (n, height)
-    S = variance[:, :, None] * np.eye(block.height)
-    if np.any(measurements.sigma_joint > 0.0):
-        for rows, J in _joint_derivatives(block, chain, measurements.sigma_joint):
-            S[rows] += J @ np.swapaxes(J, 1, 2)
-    sigma = np.full((n, 6), np.nan)
-    sigma[:, np.repeat(kinds, 3)] = np.sqrt(np.einsum("nii->ni", S))
-    return _inverse_cholesky(S), sigma
-
-
-def _inverse_cholesky(S: Floats) -> Floats:
-    """W with W S W^T = 1, lower triangular, for each of many small covariances."""
-    W: Floats = np.linalg.inv(np.linalg.cholesky(S))
-    return np.tril(W)

@@ -13,6 +13,7 @@ from rich.text import Text
 
 from fg_calib.identifiability import Identifiability
 from fg_calib.observability import CORRELATED, Observability
+from fg_calib.problem import Problem
 from fg_calib.reasons import LostDirection
 from fg_calib.robot import AXIS_OF_KIND, Axis
 from fg_calib.solver import Solution
@@ -187,12 +188,7 @@ def _notes(solution: Solution, uncertainty: Uncertainty) -> Iterable[str]:
     judgement, pairs = solution.problem.judgement, solution.problem.pairs
     if judgement is not None and pairs is not None and (same := int(np.sum(judgement.same_point & ~pairs.test))):
         yield f"{same} train pairs are one point twice: three coordinates each instead of a distance"
-    formed = pairs is not None and solution.problem.measurements.pairs is None
-    if formed and solution.problem.n_pairs > solution.problem.n_configurations:
-        yield (
-            f"{solution.problem.n_pairs} pairs are formed from {solution.problem.n_configurations} poses and counted as"
-            " independent: the sigmas are too small, by a factor where there are many more pairs than poses"
-        )
+    yield from _sharing_notes(solution.problem)
     held = [p for p in uncertainty.parameters if p.identifiability in ("relative", "ineffective")]
     if held:
         with_prior = [p for p in held if p.prior_sigma is not None]
@@ -203,6 +199,23 @@ def _notes(solution: Solution, uncertainty: Uncertainty) -> Iterable[str]:
             yield f"what the data leave open of {_listed(without)} stays at nominal"
     if not uncertainty.residuals.test.any():
         yield "no test rows: how well this predicts new configurations was not checked"
+
+
+def _sharing_notes(problem: Problem) -> Iterable[str]:
+    """What became of errors that pairs share."""
+    pairs, configurations = problem.n_pairs, problem.n_configurations
+    if problem.approximate:
+        yield (
+            f"{pairs} pairs share the errors of {configurations} configurations, too many to carry them: pairs are"
+            " weighted as independent, and sigmas account for what they share"
+        )
+        if problem.formed and pairs > 2 * configurations:
+            yield "model pose with frame unknown uses all that these poses hold, at less cost"
+    elif problem.formed and problem.sharing != problem.common and pairs >= configurations:
+        yield (
+            f"{pairs} pairs are formed from {configurations} poses and counted as independent: the sigmas are too"
+            " small, by a factor where there are many more pairs than poses"
+        )
 
 
 def _listed(parameters: list[ParameterEstimate], limit: int = 12) -> str:

@@ -25,7 +25,12 @@ whitened Jacobian and, in its last row, the whitened residual. Panels are handed
 stored for a whole block: `gram` and `triangle` reduce them as they come, `linearise` keeps them for those who want
 to look at every row.
 
+Measurements may share errors: with `y` the rows whitened by the noise of their own, and `L` how they follow from
+errors `z ~ N(0, 1)` that they share, the covariance of y is 1 + L L^T. A `CorrelatedBlock` whitens them by
+`1 - L G L^T`, where G = (1 + R)^-1 R^-T and R^T R = 1 + L^T L (Andrews 1968): of the size of z, not of y; L is sparse.
+
 References:
+    Andrews (1968), A square root formulation of the Kalman covariance equations. AIAA Journal 6(6).
     Jia, Wang, Chen, Sun (2019), Error Modeling in Distance and Rotation for Self-Calibration of Space Robots on
     Orbit. International Journal of Aerospace Engineering.
     Sola, Deray, Atchuthan (2018), A micro Lie theory for state estimation in robotics. arXiv:1812.01537.
@@ -33,23 +38,28 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Any, Protocol
 
 import numpy as np
+import scipy.linalg
+import scipy.sparse
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
 from fg_calib.kernels import LANES, fill_pairs, fill_poses, fill_same_points
-from fg_calib.kinematics import Chain, over_spans
+from fg_calib.kinematics import SPAN, Chain, over_spans
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 CHUNK = 512
 """Measurements in one panel; a multiple of `LANES`."""
+
+_KEPT = 10_000_000
+"""Figures of a correlated block that are kept between its two passes, instead of being worked out twice."""
 
 
 class Block(Protocol):
@@ -189,6 +199,95 @@ class PoseBlock:
         )
 
 
+@dataclass(frozen=True)
+class CorrelatedBlock:
+    """Blocks whose measurements share errors; every row counts as one measurement.
+
+    Attributes:
+        parts: The blocks, each whitened by the noise that its measurements do not share.
+        loadings: Of each part's rows, measurement by measurement, per 1 sigma of the shared errors: sparse, shape
+            (n * height, n_shared); none at all if nothing is shared.
+        gain: See the module; shape (n_shared, n_shared); None if nothing is shared.
+        offsets: Taken from each part's rows before anything else, shape (n * height,); none at all if zero.
+    """
+
+    parts: tuple[Block, ...]
+    loadings: tuple[scipy.sparse.csr_array, ...] = ()
+    gain: Floats | None = None
+    offsets: tuple[Floats, ...] = ()
+
+    height = 1
+
+    @property
+    def n(self) -> int:
+        """Number of rows."""
+        return sum(part.n * part.height for part in self.parts)
+
+    @property
+    def n_shared_rows(self) -> float:
+        """How many of the rows' degrees of freedom are noise that they share: trace of L L^T (1 + L L^T)^-1."""
+        return (
+            0.0 if self.gain is None else len(self.gain) - float(np.trace(np.linalg.inv(_information(self.loadings))))
+        )
+
+    def chunks(self, chain: Chain) -> Iterator[Floats]:
+        """[J r] with correlated rows whitened, chunk by chunk, shape (rows, n_columns + 1)."""
+        if self.gain is None:
+            yield from (chunk for _, _, chunk in self._private_chunks(chain))
+            return
+        kept = list(self._private_chunks(chain)) if self.n * (chain.n_columns + 1) <= _KEPT else None
+        shift = self.gain @ self._common(kept or self._private_chunks(chain))  # (n_shared, n_columns + 1)
+        for part, rows, chunk in kept or self._private_chunks(chain):
+            yield chunk - self.loadings[part][rows] @ shift
+
+    def shared_errors(self, chain: Chain) -> Floats:
+        """What the residuals say of the shared errors: their posterior mean at these parameters, shape (n_shared,)."""
+        if self.gain is None:
+            return np.zeros(0)
+        common = self._common(self._private_chunks(chain.without_columns()))
+        z: Floats = scipy.linalg.solve(_information(self.loadings), common[:, -1], assume_a="pos")
+        return z
+
+    def _common(self, chunks: Iterable[tuple[int, slice, Floats]]) -> Floats:
+        """L^T [J r], shape (n_shared, n_columns + 1)."""
+        terms = [self.loadings[part][rows].T @ chunk for part, rows, chunk in chunks]
+        total: Floats = np.sum(terms, axis=0)
+        return total
+
+    def _private_chunks(self, chain: Chain) -> Iterator[tuple[int, slice, Floats]]:
+        """Part, its rows, and [J r] before correlation is dealt with."""
+        for i, part in enumerate(self.parts):
+            for start in range(0, part.n, SPAN):
+                stop = min(start + SPAN, part.n)
+                r, J = linearise(rows_of(part, slice(start, stop)), chain)
+                rows = slice(start * part.height, stop * part.height)
+                r = r.ravel()
+                if self.offsets:
+                    r = r - self.offsets[i][rows]
+                yield i, rows, np.column_stack([J.reshape(len(r), -1), r])
+
+
+def correlate(
+    parts: tuple[Block, ...], loadings: tuple[scipy.sparse.csr_array, ...], offsets: tuple[Floats, ...] = ()
+) -> CorrelatedBlock:
+    """Blocks with the errors they share (see `CorrelatedBlock`)."""
+    R = scipy.linalg.cholesky(_information(loadings))
+    half = scipy.linalg.solve_triangular(np.eye(len(R)) + R, np.eye(len(R)))
+    gain: Floats = scipy.linalg.solve_triangular(R, half.T).T
+    return CorrelatedBlock(parts, loadings, gain, offsets)
+
+
+def _information(loadings: tuple[scipy.sparse.csr_array, ...]) -> Floats:
+    """1 + L^T L, shape (n_shared, n_shared)."""
+    total = np.eye(loadings[0].shape[1])
+    for L in loadings:
+        total += (L.T @ L).toarray()
+    return total
+
+
+AnyBlock = Block | CorrelatedBlock
+
+
 def rows_of(block: Block, rows: slice) -> Block:
     """The measurements at `rows` of a block."""
     parts = {f.name: getattr(block, f.name)[rows] for f in fields(block) if f.name not in ("trig", "kinds")}  # type: ignore[arg-type]
@@ -196,19 +295,22 @@ def rows_of(block: Block, rows: slice) -> Block:
     return part
 
 
-def residual(block: Block, chain: Chain) -> Floats:
+def residual(block: AnyBlock, chain: Chain) -> Floats:
     """Whitened residuals, shape (n, height)."""
     return linearise(block, chain.without_columns())[0]
 
 
-def linearise(block: Block, chain: Chain) -> tuple[Floats, Floats]:
+def linearise(block: AnyBlock, chain: Chain) -> tuple[Floats, Floats]:
     """Whitened residuals and their derivatives, row by row.
 
     Returns:
         The residuals, shape (n, height), and the derivatives, shape (n, height, n_columns + n_own): first in the
         chain's columns, then, if the chain has joint columns, in the joints of the measurement's first configuration,
-        then of its second.
+        then of its second. A correlated block has no derivatives in the joints.
     """
+    if isinstance(block, CorrelatedBlock):
+        rows = np.concatenate(list(block.chunks(chain)))[:, None]
+        return rows[:, :, -1], rows[:, :, :-1]
     n_all = _n_columns(block, chain) + 1
     out = np.empty((block.n, block.height, n_all))
 
@@ -221,9 +323,11 @@ def linearise(block: Block, chain: Chain) -> tuple[Floats, Floats]:
     return out[:, :, -1], out[:, :, :-1]
 
 
-def squared_norm(block: Block, chain: Chain) -> float:
+def squared_norm(block: AnyBlock, chain: Chain) -> float:
     """Sum of squared whitened residuals."""
     free = chain.without_columns()
+    if isinstance(block, CorrelatedBlock):
+        return sum(float(np.vdot(chunk, chunk)) for chunk in block.chunks(free))
 
     def run(start: int, stop: int) -> float:
         return sum(float(np.vdot(panel, panel)) for _, _, panel in _panels(block, free, start, stop))
@@ -231,8 +335,11 @@ def squared_norm(block: Block, chain: Chain) -> float:
     return sum(over_spans(run, block.n))
 
 
-def gram(block: Block, chain: Chain) -> Floats:
+def gram(block: AnyBlock, chain: Chain) -> Floats:
     """[J r]^T [J r] of the block, shape (n_columns + 1, n_columns + 1)."""
+    if isinstance(block, CorrelatedBlock):
+        total: Floats = sum(chunk.T @ chunk for chunk in block.chunks(chain))  # type: ignore[assignment]
+        return total
     n_all = _n_columns(block, chain) + 1
 
     def run(start: int, stop: int) -> Floats:
@@ -246,8 +353,13 @@ def gram(block: Block, chain: Chain) -> Floats:
         return sum(over_spans(run, block.n), np.zeros((n_all, n_all)))
 
 
-def triangle(block: Block, chain: Chain) -> Floats:
+def triangle(block: AnyBlock, chain: Chain) -> Floats:
     """R of a thin QR of [J r], shape (n_columns + 1, n_columns + 1): `gram` without squaring the condition number."""
+    if isinstance(block, CorrelatedBlock):
+        R = np.zeros((chain.n_columns + 1, chain.n_columns + 1))
+        for chunk in block.chunks(chain):
+            R = _upper(np.vstack([R, chunk]))
+        return R
     n_all = _n_columns(block, chain) + 1
 
     def run(start: int, stop: int) -> Floats:

@@ -14,10 +14,8 @@ from scipy.spatial.transform import Rotation
 from fg_calib import residuals
 from fg_calib.factors import pose_of, prior_rows
 from fg_calib.identifiability import Identifiability, identify
-from fg_calib.measurements import rotation_angle
 from fg_calib.observability import SUPPORT_TOLERANCE, IdentifiabilityClass, Observability, determined
-from fg_calib.problem import PAIR_KINDS, POSE_KINDS, Problem, all_rows, whitened_triangle
-from fg_calib.residuals import PairBlock
+from fg_calib.problem import PAIR_KINDS, POSE_KINDS, Problem, all_rows, correlation, whitened_triangle
 from fg_calib.robot import Robot
 from fg_calib.solver import Solution
 
@@ -30,10 +28,6 @@ CONFIDENCE = 0.999
 
 FACTOR = 2.0
 """A reduced chi-square between 1 / FACTOR and FACTOR is good whatever its distribution: noise is never known better."""
-
-
-_MANY_ROWS = 10_000
-"""Pairs beyond which `expected_chi2` is not worked out: chi-square then has far more rows than unknowns."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +104,8 @@ class Spread:
         scales: A change of ordinary size in each column.
         named_derivative: Of the named scalars in the columns.
         rank: Number of determined directions.
+        excess: By how much the mean of chi-square is below its degrees of freedom, because rows that share errors are
+            weighted as independent.
     """
 
     names: tuple[str, ...]
@@ -120,6 +116,7 @@ class Spread:
     scales: Floats
     named_derivative: Floats
     rank: int
+    excess: float
 
     def covariance(self, rows: Floats) -> Floats:
         """Covariance of linear functions of the columns, shape (m, n_columns); nan where undetermined."""
@@ -195,7 +192,7 @@ class Uncertainty:
         frame: The measurement frame; None where it was not estimated.
         chi2: Sum of squared whitened residuals, priors included.
         dof: Residuals and priors, less the determined directions.
-        expected_chi2: What chi-square is on average; less than `dof` for pairs that share measured poses.
+        expected_chi2: What chi-square is on average; not `dof` where rows that share errors count as independent.
         chi2_bounds: Interval of the reduced chi-square that is taken as good.
         residuals: Every residual, before and after.
         identifiability: What the data alone determine, at the nominal parameters.
@@ -284,8 +281,8 @@ def assess(solution: Solution) -> Uncertainty:
             sigma=np.sqrt(np.diag(spread.covariance(np.eye(variables.n_columns))))[variables.n_robot_columns :],
         )
     chi2 = 2.0 * solution.cost
-    dof = problem.n_residuals + problem.n_priors - spread.rank
-    expected = expected_chi2(solution, dof)
+    dof = problem.n_independent + problem.n_priors - spread.rank
+    expected = max(0.0, dof - spread.excess)
     bounds = chi2_bounds(dof, expected, _independent_dof(problem, dof, spread.rank))
     return Uncertainty(
         names=variables.names[: variables.n_robot_columns],
@@ -320,55 +317,9 @@ def chi2_bounds(dof: int, expected: float | None = None, independent: int | None
     return ratio * min(float(low), 1.0 / FACTOR), max(1.0, ratio) * max(float(high), FACTOR)
 
 
-def expected_chi2(solution: Solution, dof: int) -> float:
-    """Mean of chi-square if the stated noise is right.
-
-    That is `dof` for independent rows. Pairs formed from poses are treated as independent but share the errors of
-    their configurations: with C the true covariance of the whitened residuals e and Q an orthonormal basis of the
-    whitened Jacobian (priors included), the mean of |e - Q Q^T e|^2 is that of |e|^2 less tr(Q^T C Q), a sum over
-    configurations. Beyond `_MANY_ROWS` pairs the difference does not matter and `dof` is returned.
-    """
-    problem = solution.problem
-    shared = problem.pairs is not None and problem.measurements.pairs is None
-    block = next((b for b in problem.blocks if isinstance(b, PairBlock)), None)
-    if not shared or block is None or block.n > _MANY_ROWS:
-        return float(dof)
-    variables = problem.variables
-    chain = variables.chain.at(solution.parameters).with_joint_columns()
-    n, p, n_joints = block.n, variables.n_columns, problem.robot.n_joints
-    J = residuals.linearise(block, chain)[1]  # (n, height, p + 2 n_joints)
-    own = J[:, :, p:] * np.tile(problem.measurements.sigma_joint, 2)
-    G_a = np.concatenate([_pose_noise(problem, block, block.a, -1.0), own[:, :, :n_joints]], axis=2)
-    G_b = np.concatenate([_pose_noise(problem, block, block.b, 1.0), own[:, :, n_joints:]], axis=2)
-    rows = np.vstack([J[:, :, :p].reshape(-1, p), prior_rows(variables, solution.parameters)[1]]) * variables.scales
-    U, s, _ = np.linalg.svd(rows, full_matrices=False)
-    Q = U[: n * block.height, : determined(s)].reshape(n, block.height, -1)
-    M = np.zeros((problem.measurements.n_configurations, Q.shape[2], G_a.shape[2]))
-    np.add.at(M, block.a, np.einsum("nhp,nhs->nps", Q, G_a))
-    np.add.at(M, block.b, np.einsum("nhp,nhs->nps", Q, G_b))
-    return max(0.0, dof + float(np.sum(Q**2)) - float(np.sum(M**2)))
-
-
-def _pose_noise(problem: Problem, block: PairBlock, rows: Integers, sign: float) -> Floats:
-    """Whitened residuals per sigma of one configuration's measured position and orientation, shape (n, height, 6)."""
-    m = problem.measurements
-    G = np.zeros((block.n, 2, 6))
-    if m.position is not None and m.sigma_position is not None and block.kinds[0]:
-        step = m.position[block.b] - m.position[block.a]
-        unit = step / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-300)
-        G[:, 0, :3] = -sign * unit * m.sigma_position[rows]
-    if m.rotation is not None and m.sigma_orientation is not None and block.kinds[1]:
-        _, axis = rotation_angle(np.swapaxes(m.rotation[block.a], 1, 2) @ m.rotation[block.b])
-        unit = axis / np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-300)
-        G[:, 1, 3:] = -sign * unit * m.sigma_orientation[rows]
-    w_dd, w_ad, w_aa = block.whitening.T[:, :, None]
-    whitened = np.stack([w_dd * G[:, 0], w_ad * G[:, 0] + w_aa * G[:, 1]], axis=1)
-    return whitened[:, block.kinds]
-
-
 def _independent_dof(problem: Problem, dof: int, rank: int) -> int:
     """Degrees of freedom of the noise behind the residuals: pairs hold no more than the poses they come from."""
-    if problem.pairs is None or problem.measurements.pairs is not None:
+    if not problem.formed or problem.sharing.poses:
         return dof
     each = 3 * sum(PAIR_KINDS[problem.settings.model])
     return min(dof, each * (problem.n_configurations - 1) + problem.n_priors - rank)
@@ -386,6 +337,12 @@ def residual_table(solution: Solution) -> ResidualTable:
 
 
 def _spread(solution: Solution) -> Spread:
+    """The covariance: that of the weighted least-squares estimate under the noise as it is taken to be.
+
+    Where rows share errors but are weighted as independent, with H = J^T J and C their covariance, it is
+    H^-1 (J^T C J) H^-1 (priors are rows of their own), unless independence was asked for. The mean of chi-square,
+    tr C - tr(H^-1 J^T C J), is then below the degrees of freedom by tr(H^-1 J^T (C - 1) J).
+    """
     problem, variables = solution.problem, solution.problem.variables
     scales = variables.scales
 
@@ -397,15 +354,19 @@ def _spread(solution: Solution) -> Spread:
     _, s_nominal, Vt_nominal = np.linalg.svd(stacked(solution.before), full_matrices=False)
     rank, rank_nominal = determined(s), determined(s_nominal)
     half = scales[:, None] * Vt[:rank].T / s[:rank]
+    added = correlation(problem, solution.parameters)
+    middle = np.zeros((rank, rank)) if added is None else half.T @ added @ half
+    middle_of_sigma = np.eye(rank) + (middle if problem.approximate else 0.0)
     return Spread(
         names=variables.names,
         n_robot_columns=variables.n_robot_columns,
-        tangent=half @ half.T,
+        tangent=half @ middle_of_sigma @ half.T,
         loose=Vt[rank:],
         loose_at_nominal=Vt_nominal[rank_nominal:],
         scales=scales,
         named_derivative=variables.named_derivative(solution.parameters),
         rank=rank,
+        excess=float(np.trace(middle)),
     )
 
 

@@ -16,6 +16,7 @@ FLOORS = (
     *("choices", "errors", "robot", "measurements", "files", "kernels", "kinematics", "residuals", "factors", "frames"),
     *(
         "observability",
+        "whitening",
         "problem",
         "solver",
         "reasons",

@@ -31,7 +31,8 @@ def problem_of(model, n=8, frame="unknown", estimate=TOOL, tolerance=None, pairi
     rng = np.random.default_rng(seed)
     robot = small_arm(estimate=estimate, tolerance=tolerance)
     measurements = measure(true_robot(robot, rng), n, rng, frame=FRAME)
-    return build_problem(robot, measurements, model=model, frame=frame, pairing=pairing or Pairing("all"))
+    pairing = pairing or Pairing("all")
+    return build_problem(robot, measurements, model=model, frame=frame, pairing=pairing, pair_errors="independent")
 
 
 def moved(values, variables, step):

@@ -113,7 +113,10 @@ def test_a_robot_may_be_a_file_or_stand_in_the_job(folder, robot, files):
     assert list(job.inputs) == ["calibration.yaml", *files, "one.csv"]
 
 
-KEYS = "one of robot, measurements, pairs, model, pairing, frame, units, noise, prior, gauge, prefer, loss, truth"
+KEYS = (
+    "one of robot, measurements, pairs, model, pairing, frame, units, noise, prior, gauge, prefer, "
+    "pair_errors, encoder, loss, truth"
+)
 MISTAKES = [
     ("", "calibration.yaml: an empty file, expected a mapping, key: value"),
     ("robot: a\n", "calibration.yaml: missing key 'measurements' (and 1 more)"),
@@ -124,8 +127,11 @@ MISTAKES = [
      "orientation, distance, rotation, distance-rotation"),
     (JOB + "frame: free\n", "calibration.yaml: frame: found 'free', expected one of known, unknown"),
     (JOB + "prior: 1\n", "calibration.yaml: prior: found 1, expected true or false"),
-    (JOB + "loss: huber\n",
-     "calibration.yaml: loss: found 'huber', expected none; robust losses are not available yet"),
+    (JOB + "loss: tukey\n",
+     "calibration.yaml: loss: found 'tukey', expected one of none, huber, cauchy, geman-mcclure, gnc"),
+    (JOB + "noise: guess\n", "calibration.yaml: noise: found 'guess', expected a mapping of figures, or estimate"),
+    (JOB + "pair_errors: both\n",
+     "calibration.yaml: pair_errors: found 'both', expected one of shared, independent"),
     (JOB + "pairing: stars\n",
      "calibration.yaml: pairing: found 'stars', expected one of star, chain, all, {random: N, seed: S}"),
     (JOB + "pairing: {random: 0}\n", "calibration.yaml: pairing: random: found 0, expected a number above 0"),
@@ -135,14 +141,14 @@ MISTAKES = [
      "calibration.yaml: pairing: unknown key 'sed', expected one of random, seed; did you mean seed?"),
     (JOB + "units: {angle: grad}\n", "calibration.yaml: units: angle: found 'grad', expected one of rad, deg, mrad"),
     (JOB + "noise: {postion: 1}\n", "calibration.yaml: noise: unknown key 'postion', expected one of position, "
-     "orientation, joint, distance, angle; did you mean position?"),
+     "orientation, joint, distance, angle, point, estimate; did you mean position?"),
     (JOB + "noise: {position: 0}\n", "calibration.yaml: noise: position: found 0, expected a number above 0"),
     (JOB + "noise: {angle: low}\n", "calibration.yaml: noise: angle: found 'low', expected a finite number"),
     (JOB + "noise: {joint: -1}\n", "calibration.yaml: noise: joint: found -1, expected a number not below 0"),
     (JOB + "noise: {joint: [0, x]}\n", "calibration.yaml: noise: joint 2: found 'x', expected a finite number"),
     (JOB + "noise: {joint: [0, 0, 0]}\n",
      "calibration.yaml: noise: joint: 3 figures, expected one for all or 2, one a joint"),
-    (JOB + "noise: 1\n", "calibration.yaml: noise: found 1, expected a mapping"),
+    (JOB + "noise: 1\n", "calibration.yaml: noise: found 1, expected a mapping of figures, or estimate"),
     (JOB.replace("robots/robot.yaml", "[]"),
      "calibration.yaml: robot: found [], expected a path, or the mapping of a robot file"),
     (JOB.replace("robots/robot.yaml", "{convention: dh, joints: [{a: 0}]}"),
@@ -185,3 +191,15 @@ def test_the_truth_is_a_robot_with_the_same_parameters(folder):
     with pytest.raises(InputError) as error:
         read(folder, JOB + "truth: true.yaml\n")
     assert str(error.value) == "true.yaml: another robot, expected the parameters of robot, with their true values"
+
+
+def test_noise_may_be_left_to_the_data(folder):
+    poses = "q1,q2,x,y,z,roll,pitch,yaw\n0,0,0,0,0,0,0,0\n10,20,1000,0,0,0,0,0\n"
+    (folder / "poses.csv").write_text(poses)
+    given = read(folder, JOB + "noise: {position: 0.5, estimate: true}\n")
+    assert given.estimate_noise
+    assert (given.measurements.sigma_position[0, 0], given.measurements.sigma_orientation[0, 0]) == (0.5, 1e-3)
+    start = read(folder, JOB + "noise: estimate\n")
+    assert start.estimate_noise
+    assert (start.measurements.sigma_position[0, 0], start.measurements.sigma_orientation[0, 0]) == (1e-3, 1e-3)
+    assert not read(folder, JOB + "noise: {position: 0.5}\n").estimate_noise

@@ -135,7 +135,7 @@ def test_test_rows_are_counted_nowhere_and_give_no_residual():
     for model in ("pose", "distance-rotation"):
         problem = build_problem(robot, measure(robot, 10, rng, n_test=5), model=model, pairing=Pairing("star"))
         assert problem.n_configurations == 10
-        assert sum(b.n for b in problem.blocks) == (10 if model == "pose" else 9)
+        assert problem.n_residuals == sum(b.n * b.height for b in problem.blocks) == (60 if model == "pose" else 18)
         assert all_rows(problem).n == (15 if model == "pose" else 9 + 4)
 
 

@@ -187,7 +187,8 @@ def test_residual_table_holds_every_row_before_and_after(model):
         for kind in ("position", "orientation") if model == "pose" else ("distance", "angle"):
             assert rms[split][kind]["after"] < rms[split][kind]["before"]
     whitened = (table.after / table.sigma)[~table.test]
-    assert whitened @ whitened == pytest.approx(2 * solution.cost, rel=1e-9)
+    if model == "pose":  # pairs of a chain share the errors of their poses
+        assert whitened @ whitened == pytest.approx(2 * solution.cost, rel=1e-9)
 
 
 def test_position_rms_is_that_of_the_vectors_length():

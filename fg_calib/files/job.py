@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path, PurePath
 from typing import Annotated, Any
 
 from pydantic import Field, StrictBool
 
-from fg_calib.choices import FrameKnowledge, Gauge, Model
+from fg_calib.choices import EncoderNoise, FrameKnowledge, Gauge, Loss, Model, PairErrors
 from fg_calib.errors import InputError
 from fg_calib.files.robot_yaml import read_robot, robot_from_mapping
 from fg_calib.files.schema import Count, NotNegative, Positive, Schema, read_yaml, shown, validate
@@ -17,6 +17,9 @@ from fg_calib.files.tables import read_measurements
 from fg_calib.files.units import Units
 from fg_calib.measurements import Measurements, Noise, Pairing
 from fg_calib.robot import Robot, known_names, names_of
+
+UNSTATED = Noise(position=1e-3, orientation=1e-3, distance=1e-3, angle=1e-3, point=1e-3)
+"""Where the noise starts from if it is to be estimated and nothing was stated."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,10 @@ class Job:
         prior: Whether the tolerances are used as priors; None: where the robot has them.
         gauge: What holds the directions that the data do not determine.
         prefer: Parameters to keep where only combinations are determined, first choice first.
+        pair_errors: Whether pairs of one configuration share its errors or count as independent.
+        encoder: Whether the noise of joint readings is propagated to the rows or true joint values are estimated.
         loss: The robust loss; `none` is least squares.
+        estimate_noise: Whether the sigmas stated are only a start, and scaled to what is seen.
         units: The units of the tables and of the noise.
         truth: The robot as it truly is, known from a simulation; None where it is not.
         inputs: SHA-256 of every file read, by its path relative to the job.
@@ -48,7 +54,10 @@ class Job:
     prior: bool | None
     gauge: Gauge
     prefer: tuple[str, ...]
-    loss: str
+    pair_errors: PairErrors
+    encoder: EncoderNoise
+    loss: Loss
+    estimate_noise: bool
     units: Units
     truth: Robot | None
     inputs: dict[str, str]
@@ -60,6 +69,8 @@ class _Noise(Schema):
     joint: Any = 0.0  # an `_OneFigure` or a `_FigureEach`
     distance: Positive | None = None
     angle: Positive | None = None
+    point: Positive | None = None
+    estimate: StrictBool = False
 
 
 class _OneFigure(Schema):
@@ -83,11 +94,13 @@ class _Job(Schema):
     pairing: Any = "star"  # a strategy's name, or a `_RandomPairing`
     frame: FrameKnowledge = "known"
     units: Units = Units()
-    noise: _Noise = _Noise()
+    noise: Any = None  # a `_Noise`, or `estimate`
     prior: StrictBool | None = None
     gauge: Gauge = "prior"
     prefer: tuple[str, ...] = ()
-    loss: str = "none"
+    pair_errors: PairErrors = "shared"
+    encoder: EncoderNoise = "propagated"
+    loss: Loss = "none"
     truth: str | None = None
 
 
@@ -103,18 +116,15 @@ def read_job(path: Path | str) -> Job:
     path = Path(path)
     folder = path.parent
     file = validate(_Job, read_yaml(path), path.name)
-    if file.loss != "none":
-        raise InputError(
-            f"{path.name}: loss", f"found {shown(file.loss)}", "none", "robust losses are not available yet"
-        )
     pairing = _pairing(file.pairing, f"{path.name}: pairing")
     robot, robot_files = _robot(file.robot, f"{path.name}: robot", folder)
+    noise, estimate_noise = _noise(file.noise, file.units, robot, f"{path.name}: noise")
     measurements = read_measurements(
         folder / file.measurements,
         robot,
         pairs=None if file.pairs is None else folder / file.pairs,
         units=file.units,
-        noise=_noise(file.noise, file.units, robot, f"{path.name}: noise"),
+        noise=noise,
     )
     truth = None if file.truth is None else _truth(folder / file.truth, robot)
     others = [name for name in (file.pairs, file.truth) if name is not None]
@@ -135,7 +145,10 @@ def read_job(path: Path | str) -> Job:
         prior=file.prior,
         gauge=file.gauge,
         prefer=file.prefer,
+        pair_errors=file.pair_errors,
+        encoder=file.encoder,
         loss=file.loss,
+        estimate_noise=estimate_noise,
         units=file.units,
         truth=truth,
         inputs=inputs,
@@ -173,8 +186,13 @@ def _pairing(given: object, place: str) -> Pairing:
     raise InputError(place, f"found {shown(given)}", "one of star, chain, all, {random: N, seed: S}")
 
 
-def _noise(file: _Noise, units: Units, robot: Robot, place: str) -> Noise:
-    """The noise in [m] and [rad], that of the readings joint by joint."""
+def _noise(given: object, units: Units, robot: Robot, place: str) -> tuple[Noise, bool]:
+    """The noise in [m] and [rad], that of the readings joint by joint, and whether it is only where to start."""
+    if given == "estimate":
+        return replace(UNSTATED, joint=(0.0,) * robot.n_joints), True
+    if given is not None and not isinstance(given, dict):
+        raise InputError(place, f"found {shown(given)}", "a mapping of figures, or estimate")
+    file = validate(_Noise, given or {}, place)
     figures: tuple[float, ...]
     if isinstance(file.joint, list):
         figures = validate(_FigureEach, {"joint": file.joint}, place).joint
@@ -187,13 +205,18 @@ def _noise(file: _Noise, units: Units, robot: Robot, place: str) -> Noise:
     def si(figure: float | None, unit: str) -> float | None:
         return None if figure is None else figure * units.factor(unit)
 
-    return Noise(
+    noise = Noise(
         position=si(file.position, "m"),
         orientation=si(file.orientation, "rad"),
         joint=tuple(f * units.factor(j.unit) for f, j in zip(figures, robot.joints, strict=True)),
         distance=si(file.distance, "m"),
         angle=si(file.angle, "rad"),
+        point=si(file.point, "m"),
     )
+    if not file.estimate:
+        return noise, False
+    missing = {f.name: getattr(UNSTATED, f.name) for f in fields(Noise) if getattr(noise, f.name) is None}
+    return replace(noise, **missing), True
 
 
 def _sha256(path: Path) -> str:
