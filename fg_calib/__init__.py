@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from fg_calib.files.units import Units
     from fg_calib.identifiability import Identifiability, observe_configurations, observe_structure
     from fg_calib.kinematics import pose
+    from fg_calib.least_squares import LeastSquares, fit_least_squares
     from fg_calib.measurements import Measurements, Noise, Pairing
     from fg_calib.problem import Problem, build_problem
     from fg_calib.report import format_identifiability, format_report
@@ -42,6 +43,7 @@ _HOMES = {
     "fg_calib.files.units": ("Units",),
     "fg_calib.identifiability": ("Identifiability", "observe_configurations", "observe_structure"),
     "fg_calib.kinematics": ("pose",),
+    "fg_calib.least_squares": ("LeastSquares", "fit_least_squares"),
     "fg_calib.measurements": ("Measurements", "Noise", "Pairing"),
     "fg_calib.problem": ("Problem", "build_problem"),
     "fg_calib.report": ("format_identifiability", "format_report"),
@@ -57,6 +59,7 @@ __all__ = [
     "Identifiability",
     "InputError",
     "Job",
+    "LeastSquares",
     "Measurements",
     "Noise",
     "Pairing",
@@ -70,6 +73,7 @@ __all__ = [
     "Units",
     "assess",
     "build_problem",
+    "fit_least_squares",
     "format_identifiability",
     "format_report",
     "observability_document",
