@@ -23,6 +23,7 @@ FLOORS = (
         "reasons",
         "identifiability",
         "uncertainty",
+        "comparison",
         "report",
         "figures",
         "results",
