@@ -19,7 +19,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
@@ -173,37 +173,10 @@ def compare(job: Job) -> Comparison:
     estimates = [judge.of_graph("graph", solution, uncertainty)]
 
     before = job.robot.with_values(solution.before[:-6])
-    kept, start = None, solution.problem.start
     try:
-        problem = problem_of(job, prior=False, gauge="keep")
-        kept = [p.name for p in problem.estimated]
-        held = [i for i, p in enumerate(job.robot.parameters) if p.name not in kept]
-        start = problem.start.copy()
-        start[held] = job.robot.nominal[held]  # of an unknown tool too, as in the graph
-        keep = solve(problem)
-        estimates.append(judge.of_graph("graph-keep", keep, assess(keep)))
+        estimates += _without_priors(job, judge)
     except CalibrationError as error:
-        estimates.append(_failed("graph-keep", error))
-
-    def plain(name: str, **settings: object) -> None:
-        try:
-            fit = fit_least_squares(
-                job.robot,
-                job.measurements,
-                model=job.model,
-                pairing=job.pairing,
-                frame=job.frame,
-                names=kept,
-                start=start,
-                **settings,  # type: ignore[arg-type]
-            )
-            estimates.append(judge.of_baseline(name, fit))
-        except CalibrationError as error:
-            estimates.append(_failed(name, error))
-
-    plain("gauss-newton")
-    plain("weighted-gauss-newton", weighted=True)
-    plain("scipy", weighted=True, method="scipy")
+        estimates += [_failed(name, error) for name in list(ESTIMATORS)[1:]]
     return Comparison(
         job=job,
         estimates=tuple(estimates),
@@ -213,6 +186,43 @@ def compare(job: Job) -> Comparison:
         n_judged=len(readings),
         findings=uncertainty.findings,
     )
+
+
+def _without_priors(job: Job, judge: _Judge) -> list[Estimate]:
+    """The estimates of the kept parameters: by the graph, and by plain least squares from the same start."""
+    problem = problem_of(job, prior=False, gauge="keep")
+    kept = [p.name for p in problem.estimated]
+    held = [i for i, p in enumerate(job.robot.parameters) if p.name not in kept]
+    start = problem.start.copy()
+    start[held] = job.robot.nominal[held]  # of an unknown tool too, as in the graph
+    plain = partial(
+        fit_least_squares,
+        job.robot,
+        job.measurements,
+        model=job.model,
+        pairing=job.pairing,
+        frame=job.frame,
+        names=kept,
+        start=start,
+    )
+
+    def graph() -> Estimate:
+        solution = solve(problem)
+        return judge.of_graph("graph-keep", solution, assess(solution))
+
+    runs: dict[str, Callable[[], Estimate]] = {
+        "graph-keep": graph,
+        "gauss-newton": lambda: judge.of_baseline("gauss-newton", plain()),
+        "weighted-gauss-newton": lambda: judge.of_baseline("weighted-gauss-newton", plain(weighted=True)),
+        "scipy": lambda: judge.of_baseline("scipy", plain(weighted=True, method="scipy")),
+    }
+    estimates = []
+    for name, run in runs.items():
+        try:
+            estimates.append(run())
+        except CalibrationError as error:
+            estimates.append(_failed(name, error))
+    return estimates
 
 
 def real_errors(estimated: Robot, true: Robot, readings: Floats) -> RealErrors:

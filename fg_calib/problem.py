@@ -239,7 +239,14 @@ def build_problem(
     _check_enough(problem)
     if gauge != "keep":
         return problem
-    reduced = robot.with_estimated(observe(problem, start, prefer).kept)
+    kept = observe(problem, start, prefer).kept
+    if not kept and not unknown_frame:
+        raise ProblemError(
+            measurements.source if pairs is None else pairs.source,
+            "the rows determine none of the parameters to estimate",
+            "rows that some of them act on",
+        )
+    reduced = robot.with_estimated(kept)
     variables = build_variables(reduced, unknown_frame, False)
     return replace(_assemble(reduced, measurements, settings, variables, start, trig, pairs), whole=problem)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from oracle import tool_pose
 from scipy.spatial.transform import Rotation
-from simulated import TOOL, measure, paper_robot, small_arm, true_robot
+from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
 
 from fg_calib import comparison as comparison_module
 from fg_calib.comparison import ESTIMATORS, best_rigid_fit, compare, real_errors
@@ -205,6 +205,22 @@ def test_a_baseline_that_cannot_run_or_goes_astray_says_so(simulated_job, monkey
     assert "could not run: poses.csv: no sigma for distance" in " ".join(text.split())
     document = comparison_document(found)["estimates"][-1]
     assert (document["ran"], document["parameters"], document["residual_rms"]) == (False, [], None)
+
+
+def test_where_nothing_is_determined_only_the_graph_with_priors_runs(tmp_path):
+    robot = planar_robot(tolerance={"a": 1e-3}).with_estimated(["a1", "a2"])  # which turn nothing
+    measurements = measure(robot, 20, np.random.default_rng(0))
+    found = compare(job_of(robot, None, measurements, "rotation", tmp_path))
+    graph, *others = found.estimates
+    assert graph.converged
+    assert graph.sigma == pytest.approx({"a1": 1e-3, "a2": 1e-3})
+    for e in others:
+        assert (e.robot, e.converged) == (None, False)
+        assert e.message == (
+            "could not run: pairs from measurements: the rows determine none of the parameters to estimate, "
+            "expected rows that some of them act on"
+        )
+    assert re.search(r"parameters +- +2 +- +- +- +-\n", format_comparison(found))
 
 
 def test_problem_of_takes_the_jobs_settings_but_for_changes(simulated_job):
