@@ -190,20 +190,24 @@ def fit_least_squares(
 
     fit = _Fit(x=first[columns], converged=False, message="", iterations=0, steps=())
     whitening = None
-    for _ in range(_ROUNDS if weighted else 1):
-        whitening = _whitening(rows, chain.at(parameters(fit.x)), measurements.sigma_joint) if weighted else None
+    with residuals.single_threaded_blas():  # the kernels' threads are enough
+        for _ in range(_ROUNDS if weighted else 1):
+            whitening = _whitening(rows, chain.at(parameters(fit.x)), measurements.sigma_joint) if weighted else None
 
-        def evaluate(x: Floats, whitening: Floats | None = whitening) -> tuple[Floats, Floats]:
-            return _evaluate(rows, chain.at(parameters(x)), whitening)
+            def evaluate(x: Floats, whitening: Floats | None = whitening) -> tuple[Floats, Floats]:
+                return _evaluate(rows, chain.at(parameters(x)), whitening)
 
-        solver = _gauss_newton if method == "gauss-newton" else _scipy
-        again = solver(evaluate, fit.x, max_iterations, tolerance)
-        moved = float(np.linalg.norm(again.x - fit.x))
-        fit = replace(again, iterations=fit.iterations + again.iterations, steps=fit.steps + again.steps)
-        if not fit.converged or moved <= REWEIGHTED or not np.any(measurements.sigma_joint > 0.0):
-            break
-    r, J = _evaluate(rows, chain.at(parameters(fit.x)), whitening)
-    covariance, rank = _covariance(r, J, weighted)
+            solver = _gauss_newton if method == "gauss-newton" else _scipy
+            again = solver(evaluate, fit.x, max_iterations, tolerance)
+            moved = float(np.linalg.norm(again.x - fit.x))
+            fit = replace(again, iterations=fit.iterations + again.iterations, steps=fit.steps + again.steps)
+            if not fit.converged or moved <= REWEIGHTED or not np.any(measurements.sigma_joint > 0.0):
+                break
+        else:
+            if weighted:
+                fit = replace(fit, converged=False, message=f"not converged: new weights still move it by {moved:.1e}")
+        r, J = _evaluate(rows, chain.at(parameters(fit.x)), whitening)
+        covariance, rank = _covariance(r, J, weighted)
     full = parameters(fit.x)
     return LeastSquares(
         robot=robot.with_values(full[:n]),
@@ -327,7 +331,10 @@ def _whitening(rows: _Rows, chain: Chain, sigma_joint: Floats) -> Floats:
         J = J * np.tile(sigma_joint, rows.block.n_configurations)  # (n, height, n_own)
         S = S + J @ np.swapaxes(J, 1, 2)
     S = np.where(rows.use[:, :, None] & rows.use[:, None, :], S, np.eye(rows.block.height))
-    W: Floats = np.tril(np.linalg.inv(np.linalg.cholesky(S)))
+    try:
+        W: Floats = np.tril(np.linalg.inv(np.linalg.cholesky(S)))
+    except np.linalg.LinAlgError:
+        raise InputError("noise", "a row without any", "noise in every row, to weight by") from None
     return W
 
 

@@ -8,6 +8,7 @@ from oracle import central_differences, tool_pose
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
 
+from fg_calib import least_squares
 from fg_calib.errors import InputError
 from fg_calib.kinematics import pose
 from fg_calib.least_squares import fit_least_squares
@@ -344,6 +345,15 @@ def test_it_says_when_it_has_not_arrived():
     assert fit.message == "not converged: The maximum number of function evaluations is exceeded"
 
 
+def test_it_says_when_the_weights_do_not_settle(monkeypatch):
+    monkeypatch.setattr(least_squares, "_ROUNDS", 1)
+    measurements = simulated(paper_robot(), "pose", sigma_joint=3e-4)
+    fit = fit_least_squares(paper_robot(), measurements, model="pose", weighted=True)
+    assert not fit.converged
+    assert fit.message.startswith("not converged: new weights still move it by ")
+    assert fit_least_squares(paper_robot(), measurements, model="pose").converged
+
+
 def test_it_says_when_it_went_astray():
     robot = small_arm()
     measurements = measure(robot, 20, np.random.default_rng(7))
@@ -415,3 +425,6 @@ def test_what_measurements_lack_is_named():
     assert str(caught.value) == (
         "pairs from measurements: no sigma for distance, expected the noise of every row, to weight by"
     )
+    with pytest.raises(InputError) as caught:
+        fit_least_squares(ROBOT, replace(whole, sigma_position=np.zeros((4, 3))), model="position", weighted=True)
+    assert str(caught.value) == "noise: a row without any, expected noise in every row, to weight by"
