@@ -150,14 +150,19 @@ def test_predicted_errors_come_true(tmp_path):
         assert np.sqrt(np.mean(np.square(ratios[name]))) == pytest.approx(1.0, abs=0.2), name
 
 
-def test_unknown_frame_and_tool_start_where_the_graph_starts(tmp_path):
+@pytest.mark.parametrize("prefer", [(), ("theta4", "d4")])
+def test_unknown_frame_and_tool_start_where_the_graph_starts(tmp_path, prefer):
+    """What is held of an unknown tool stays at nominal, not where the closed form would start it."""
     rng = np.random.default_rng(4)
     robot = small_arm(estimate=TOOL)
     true = true_robot(robot, rng)
     measurements = measure(true, 60, rng, frame=FRAME, n_test=10)
-    found = compare(job_of(robot, true, measurements, "pose", tmp_path, frame="unknown"))
+    found = compare(job_of(robot, true, measurements, "pose", tmp_path, frame="unknown", prefer=prefer))
     assert all(e.converged for e in found.estimates)
     _, keep, _, weighted, _ = found.estimates
+    held = {p.name for p in robot.parameters if p.estimated} - set(keep.sigma)
+    assert any(name.startswith("tool.") for name in held) == bool(prefer)
+    assert all(weighted.robot.nominal[robot.index(name)] == robot.nominal[robot.index(name)] for name in held)
     for name, sigma in keep.sigma.items():
         values = [found.correction(e.robot, name) for e in (keep, weighted)]
         assert values[1] == pytest.approx(values[0], rel=0, abs=1e-4 * sigma), name
@@ -283,6 +288,15 @@ def test_an_arm_that_was_only_moved_has_no_error_after_the_fit():
     assert found.fitted.max == pytest.approx(0.0, abs=1e-12)
     assert found.fitted.orientation_rms == pytest.approx(0.0, abs=1e-12)
     assert real_errors(moved, robot, q[:2]).fitted is None
+
+
+def test_a_correction_goes_the_shorter_way(simulated_job):
+    found = compare(simulated_job)
+    robot = simulated_job.robot
+    for name, value, expected in (("tool.yaw", 6.0, 6.0 - 2 * np.pi), ("tool.x", 6.0, 6.0), ("theta2", 6.0, 6.0)):
+        values = robot.nominal
+        values[robot.index(name)] += value
+        assert found.correction(robot.with_values(values), name) == pytest.approx(expected, abs=1e-12)
 
 
 # --- report, document, command ----------------------------------------------------------------------------------------

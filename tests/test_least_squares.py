@@ -141,6 +141,22 @@ def test_weighted_by_joint_noise_it_is_the_graph(model, method):
     assert np.abs(plain.robot.nominal - fit.robot.nominal).max() > 1e-5
 
 
+def test_a_row_that_was_not_measured_does_not_weigh_on_the_other_of_its_pair():
+    robot = paper_robot()
+    measurements = simulated(robot, "distance-rotation", sigma=2e-4, sigma_joint=3e-4)
+    distance, angle = measurements.pairs.distance.copy(), measurements.pairs.angle.copy()
+    distance[::3], angle[1::3] = np.nan, np.nan
+    measurements = replace(measurements, pairs=replace(measurements.pairs, distance=distance, angle=angle))
+    problem = build_problem(robot, measurements, model="distance-rotation", gauge="keep")
+    for _ in range(4):
+        solution = solve(problem, TO_THE_END)
+        problem = judged_at(solution.problem, solution.parameters)
+    names = [p.name for p in problem.estimated]
+    fit = fit_least_squares(robot, measurements, model="distance-rotation", names=names, weighted=True)
+    assert fit.n_rows == problem.n_residuals == np.isfinite(distance).sum() + np.isfinite(angle).sum()
+    assert fit.robot.nominal == pytest.approx(solution.parameters[:-6], rel=0, abs=1e-9)
+
+
 @pytest.mark.parametrize("start", ["graph", "near"])
 @pytest.mark.parametrize("model", ["pose", "position", "orientation"])
 def test_an_unknown_frame_is_the_graphs(model, start):
