@@ -162,12 +162,13 @@ def comparison_document(comparison: Comparison) -> dict[str, Any]:
           "estimates": [{"name": a key of ESTIMATORS, "description", "ran", "converged", "message", "iterations",
                          "seconds", "n_estimated", "residual_rms": as above | null, "predicted_position_rms",
                          "errors": errors | null,
-                         "parameters": [{"name", "unit", "nominal", "true", "estimate", "correction", "sigma"}]}],
+                         "parameters": [{"name", "unit", "nominal", "true", "estimate", "correction", "sigma",
+                                         "held"}]}],
           "inputs": {path: sha256} }
 
     with errors = {"base_frame": figures, "best_rigid_fit": figures | null} and figures = {"max", "mean", "rms",
-    "orientation_rms"}. Parameters are those that the job estimates; those that an estimator held have sigma 0, and
-    "parameters" is empty where it did not run.
+    "orientation_rms"}. Parameters are those that the job estimates; those that an estimator held at nominal are not
+    thereby known, so their sigma is None. "parameters" is empty where it did not run.
     """
     job, first = comparison.job, comparison.estimates[0]
     uses_pairs = job.model in ("distance", "rotation", "distance-rotation")
@@ -238,7 +239,8 @@ def _estimated(comparison: Comparison, estimate: Estimate) -> list[dict[str, Any
             "true": None if job.truth is None else job.truth.parameters[i].nominal,
             "estimate": robot.parameters[i].nominal,
             "correction": comparison.correction(robot, p.name),
-            "sigma": estimate.sigma.get(p.name, 0.0),
+            "sigma": estimate.sigma.get(p.name),
+            "held": p.name not in estimate.sigma,
         }
         for i, p in enumerate(job.robot.parameters)
         if p.estimated

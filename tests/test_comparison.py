@@ -384,8 +384,9 @@ def test_comparing_the_bundled_example(fg_calib, example):
         for p in e["parameters"]:
             assert p["correction"] == p["estimate"] - p["nominal"]
             assert p["true"] is None
-            assert (p["sigma"] == 0.0) == (p["correction"] == 0.0)
-        assert sum(p["sigma"] > 0.0 for p in e["parameters"]) == e["n_estimated"]
+            assert p["held"] == (p["sigma"] is None) == (p["correction"] == 0.0)
+            assert p["held"] or p["sigma"] > 0.0
+        assert sum(not p["held"] for p in e["parameters"]) == e["n_estimated"]
     assert "poses.csv" in document["inputs"]
 
 
