@@ -17,6 +17,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from fg_calib.comparison import Comparison, compare
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
     from fg_calib.files.job import Job, read_job
     from fg_calib.files.robot_yaml import read_robot, write_robot
@@ -24,10 +25,18 @@ if TYPE_CHECKING:
     from fg_calib.files.units import Units
     from fg_calib.identifiability import Identifiability, observe_configurations, observe_structure
     from fg_calib.kinematics import pose
+    from fg_calib.least_squares import LeastSquares, fit_least_squares
     from fg_calib.measurements import Measurements, Noise, Pairing
-    from fg_calib.problem import Problem, build_problem
-    from fg_calib.report import format_identifiability, format_report
-    from fg_calib.results import observability_document, result_document, write_observability, write_results
+    from fg_calib.problem import Problem, build_problem, problem_of
+    from fg_calib.report import format_comparison, format_identifiability, format_report
+    from fg_calib.results import (
+        comparison_document,
+        observability_document,
+        result_document,
+        write_comparison,
+        write_observability,
+        write_results,
+    )
     from fg_calib.robot import Robot
     from fg_calib.solver import Solution, SolverOptions, solve
     from fg_calib.uncertainty import Uncertainty, assess
@@ -35,6 +44,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
+    "fg_calib.comparison": ("Comparison", "compare"),
     "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
     "fg_calib.files.job": ("Job", "read_job"),
     "fg_calib.files.robot_yaml": ("read_robot", "write_robot"),
@@ -42,10 +52,14 @@ _HOMES = {
     "fg_calib.files.units": ("Units",),
     "fg_calib.identifiability": ("Identifiability", "observe_configurations", "observe_structure"),
     "fg_calib.kinematics": ("pose",),
+    "fg_calib.least_squares": ("LeastSquares", "fit_least_squares"),
     "fg_calib.measurements": ("Measurements", "Noise", "Pairing"),
-    "fg_calib.problem": ("Problem", "build_problem"),
-    "fg_calib.report": ("format_identifiability", "format_report"),
-    "fg_calib.results": ("observability_document", "result_document", "write_observability", "write_results"),
+    "fg_calib.problem": ("Problem", "build_problem", "problem_of"),
+    "fg_calib.report": ("format_comparison", "format_identifiability", "format_report"),
+    "fg_calib.results": (
+        *("comparison_document", "observability_document", "result_document"),
+        *("write_comparison", "write_observability", "write_results"),
+    ),
     "fg_calib.robot": ("Robot",),
     "fg_calib.solver": ("Solution", "SolverOptions", "solve"),
     "fg_calib.uncertainty": ("Uncertainty", "assess"),
@@ -54,9 +68,11 @@ _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
     "CalibrationError",
+    "Comparison",
     "Identifiability",
     "InputError",
     "Job",
+    "LeastSquares",
     "Measurements",
     "Noise",
     "Pairing",
@@ -70,17 +86,23 @@ __all__ = [
     "Units",
     "assess",
     "build_problem",
+    "compare",
+    "comparison_document",
+    "fit_least_squares",
+    "format_comparison",
     "format_identifiability",
     "format_report",
     "observability_document",
     "observe_configurations",
     "observe_structure",
     "pose",
+    "problem_of",
     "read_job",
     "read_measurements",
     "read_robot",
     "result_document",
     "solve",
+    "write_comparison",
     "write_observability",
     "write_results",
     "write_robot",

@@ -9,6 +9,7 @@ import io
 import json
 import logging
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -75,25 +76,14 @@ def calibrate(
     from rich.console import Console
 
     from fg_calib.files.job import read_job
-    from fg_calib.problem import build_problem
+    from fg_calib.problem import problem_of
     from fg_calib.report import build_report
     from fg_calib.results import result_document, write_results
     from fg_calib.solver import solve
     from fg_calib.uncertainty import assess
 
     given = read_job(job)
-    problem = build_problem(
-        given.robot,
-        given.measurements,
-        model=given.model,
-        pairing=given.pairing,
-        frame=given.frame,
-        prior=given.prior,
-        gauge=given.gauge,
-        prefer=given.prefer,
-        pair_errors=given.pair_errors,
-    )
-    solution = solve(problem)
+    solution = solve(problem_of(given))
     uncertainty = assess(solution)
     if out is not None:
         write_results(out, solution, uncertainty, given.inputs)
@@ -101,9 +91,38 @@ def calibrate(
         print(json.dumps(result_document(solution, uncertainty, given.inputs), allow_nan=False))
     else:
         Console(highlight=False).print(build_report(solution, uncertainty))
-    for finding in uncertainty.findings:
+    _end(uncertainty.findings)
+
+
+@app.command(name="compare")
+def compare_estimators(
+    job: Annotated[Path, typer.Argument(metavar="JOB", help="The job, such as calibration.yaml.")],
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Write comparison.json there.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Run the factor graph beside plain least squares on the same job: errors, residuals, sigmas, time."""
+    from rich.console import Console
+
+    from fg_calib.comparison import compare
+    from fg_calib.files.job import read_job
+    from fg_calib.report import build_comparison_report
+    from fg_calib.results import comparison_document, write_comparison
+
+    comparison = compare(read_job(job))
+    if out is not None:
+        write_comparison(out, comparison)
+    if as_json:
+        print(json.dumps(comparison_document(comparison), allow_nan=False))
+    else:
+        Console(highlight=False).print(build_comparison_report(comparison))
+    _end(comparison.findings)
+
+
+def _end(findings: Sequence[str]) -> None:
+    """Say on stderr why a result is not to be trusted, and end with 3 if there is a reason."""
+    for finding in findings:
         print(f"not to be trusted: {finding}", file=sys.stderr)
-    if not uncertainty.trustworthy:
+    if findings:
         raise typer.Exit(3)
 
 

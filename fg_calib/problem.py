@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -25,6 +26,7 @@ from fg_calib.factors import (
     prior_factors,
     prior_rows,
 )
+from fg_calib.files.job import Job
 from fg_calib.frames import Frame, Unknown
 from fg_calib.kinematics import build_chain, forward, precompute_trig
 from fg_calib.measurements import Measurements, Pairing, Pairs, form_pairs
@@ -246,9 +248,38 @@ def build_problem(
     _check_enough(problem)
     if gauge != "keep":
         return problem
-    reduced = robot.with_estimated(observe(problem, start, prefer).kept)
+    kept = observe(problem, start, prefer).kept
+    if not kept and not unknown_frame:
+        raise ProblemError(
+            measurements.source if pairs is None else pairs.source,
+            "the rows determine none of the parameters to estimate",
+            "rows that some of them act on",
+        )
+    reduced = robot.with_estimated(kept)
     variables = build_variables(reduced, unknown_frame, False)
     return replace(_assemble(reduced, measurements, settings, variables, start, trig, pairs), whole=problem)
+
+
+def problem_of(job: Job, **changes: Any) -> Problem:
+    """The calibration problem of a job.
+
+    Args:
+        job: The job.
+        changes: Arguments of `build_problem` that shall differ from the job's.
+
+    Raises:
+        ProblemError: The measurements lack what the model needs, or do not suffice.
+    """
+    settings: dict[str, Any] = {
+        "model": job.model,
+        "pairing": job.pairing,
+        "frame": job.frame,
+        "prior": job.prior,
+        "gauge": job.gauge,
+        "prefer": job.prefer,
+        "pair_errors": job.pair_errors,
+    }
+    return build_problem(job.robot, job.measurements, **settings | changes)
 
 
 def predicted_problem(

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from fg_calib import __version__
+from fg_calib.comparison import Comparison, Estimate, RealErrors
 from fg_calib.errors import InputError
 from fg_calib.figures import write_figures
 from fg_calib.files.disk import write_text
@@ -28,6 +29,7 @@ from fg_calib.uncertainty import Uncertainty
 
 RESULT_SCHEMA = "fg-calib/result/1"
 OBSERVABILITY_SCHEMA = "fg-calib/observability/1"
+COMPARISON_SCHEMA = "fg-calib/comparison/1"
 KINDS = ("position", "orientation", "distance", "angle")
 
 
@@ -149,6 +151,110 @@ def write_observability(folder: Path | str, found: Identifiability) -> None:
         write_figures(into, found)
 
     fill_folder(Path(folder), write)
+
+
+def comparison_document(comparison: Comparison) -> dict[str, Any]:
+    """What `comparison.json` holds: SI, full precision, None for what is unknown or infinite.
+
+        { "schema": "fg-calib/comparison/1", "version", "robot", "model", "frame", "pairing",
+          "judged_on": "test" | "train", "n_judged", "truth_known", "trustworthy", "findings",
+          "nominal": {"residual_rms": {split: {kind: RMS | null}}, "errors": errors | null},
+          "estimates": [{"name": a key of ESTIMATORS, "description", "ran", "converged", "message", "iterations",
+                         "seconds", "n_estimated", "residual_rms": as above | null, "predicted_position_rms",
+                         "errors": errors | null,
+                         "parameters": [{"name", "unit", "nominal", "true", "estimate", "correction", "sigma",
+                                         "held"}]}],
+          "inputs": {path: sha256} }
+
+    with errors = {"base_frame": figures, "best_rigid_fit": figures | null} and figures = {"max", "mean", "rms",
+    "orientation_rms"}. Parameters are those that the job estimates; those that an estimator held at nominal are not
+    thereby known, so their sigma is None. "parameters" is empty where it did not run.
+    """
+    job, first = comparison.job, comparison.estimates[0]
+    uses_pairs = job.model in ("distance", "rotation", "distance-rotation")
+    pairing = ("measured" if job.measurements.pairs is not None else str(job.pairing)) if uses_pairs else None
+    document = {
+        "schema": COMPARISON_SCHEMA,
+        "version": __version__,
+        "robot": job.robot.name,
+        "model": job.model,
+        "frame": job.frame,
+        "pairing": pairing,
+        "judged_on": comparison.judged_on,
+        "n_judged": comparison.n_judged,
+        "truth_known": job.truth is not None,
+        "trustworthy": comparison.trustworthy,
+        "findings": list(comparison.findings),
+        "nominal": {
+            "residual_rms": _rms(first, "before"),
+            "errors": _errors(comparison.errors_before),
+        },
+        "estimates": [
+            {
+                "name": e.name,
+                "description": e.description,
+                "ran": e.robot is not None,
+                "converged": e.converged,
+                "message": e.message,
+                "iterations": e.iterations,
+                "seconds": e.seconds,
+                "n_estimated": len(e.sigma),
+                "residual_rms": _rms(e, "after"),
+                "predicted_position_rms": e.predicted_rms,
+                "errors": _errors(e.errors),
+                "parameters": _estimated(comparison, e),
+            }
+            for e in comparison.estimates
+        ],
+        "inputs": job.inputs,
+    }
+    plain: dict[str, Any] = _plain(document)
+    return plain
+
+
+def _rms(estimate: Estimate, when: str) -> dict[str, dict[str, float | None]] | None:
+    """RMS by split and kind."""
+    rms = estimate.residual_rms
+    if rms is None:
+        return None
+    return {split: {kind: rms[split].get(kind, {}).get(when) for kind in KINDS} for split in ("train", "test")}
+
+
+def _errors(errors: RealErrors | None) -> dict[str, Any] | None:
+    if errors is None:
+        return None
+    fitted = None if errors.fitted is None else asdict(errors.fitted)
+    return {"base_frame": asdict(errors.base), "best_rigid_fit": fitted}
+
+
+def _estimated(comparison: Comparison, estimate: Estimate) -> list[dict[str, Any]]:
+    job, robot = comparison.job, estimate.robot
+    if robot is None:
+        return []
+    return [
+        {
+            "name": p.name,
+            "unit": p.unit,
+            "nominal": p.nominal,
+            "true": None if job.truth is None else job.truth.parameters[i].nominal,
+            "estimate": robot.parameters[i].nominal,
+            "correction": comparison.correction(robot, p.name),
+            "sigma": estimate.sigma.get(p.name),
+            "held": p.name not in estimate.sigma,
+        }
+        for i, p in enumerate(job.robot.parameters)
+        if p.estimated
+    ]
+
+
+def write_comparison(folder: Path | str, comparison: Comparison) -> None:
+    """Write `comparison.json` into a folder, whole or not at all.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    text = json.dumps(comparison_document(comparison), indent=1, allow_nan=False) + "\n"
+    fill_folder(Path(folder), lambda into: write_text(into / "comparison.json", text))
 
 
 def write_results(

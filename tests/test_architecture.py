@@ -13,8 +13,10 @@ import fg_calib
 
 PACKAGE = Path(fg_calib.__file__).parent
 FLOORS = (
-    *("choices", "errors", "robot", "measurements", "files", "kernels", "kinematics", "residuals", "factors", "frames"),
+    *("choices", "errors", "robot", "measurements", "files", "kernels", "kinematics", "residuals", "least_squares"),
     *(
+        "factors",
+        "frames",
         "observability",
         "whitening",
         "problem",
@@ -22,6 +24,7 @@ FLOORS = (
         "reasons",
         "identifiability",
         "uncertainty",
+        "comparison",
         "report",
         "figures",
         "results",
@@ -82,6 +85,12 @@ def test_upward_imports_would_be_seen():
     code = "import fg_calib.cli\ndef f():\n from fg_calib import solver, pose\n from fg_calib.files.units import Units"
     assert imported(ast.parse(code)) == {"cli", "solver", "files/units"}
     assert floor("files/units") < floor("files/job") < floor("kinematics") < floor("cli")
+
+
+def test_the_baseline_shares_nothing_with_the_graph_but_residuals():
+    """So that agreement of the two says something: neither problem, factors and solver nor what assesses them."""
+    given = {"choices", "errors", "robot", "measurements", "kinematics", "residuals"}
+    assert imported(parse(PACKAGE / "least_squares.py")) == given
 
 
 @EVERY_MODULE

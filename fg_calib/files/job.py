@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path, PurePath
 from typing import Annotated, Any
 
@@ -49,18 +49,18 @@ class Job:
     robot: Robot
     measurements: Measurements
     model: Model
-    pairing: Pairing
-    frame: FrameKnowledge
-    prior: bool | None
-    gauge: Gauge
-    prefer: tuple[str, ...]
-    pair_errors: PairErrors
-    encoder: EncoderNoise
-    loss: Loss
-    estimate_noise: bool
-    units: Units
-    truth: Robot | None
-    inputs: dict[str, str]
+    pairing: Pairing = field(default_factory=Pairing)
+    frame: FrameKnowledge = "known"
+    prior: bool | None = None
+    gauge: Gauge = "prior"
+    prefer: tuple[str, ...] = ()
+    pair_errors: PairErrors = "shared"
+    encoder: EncoderNoise = "propagated"
+    loss: Loss = "none"
+    estimate_noise: bool = False
+    units: Units = field(default_factory=Units)
+    truth: Robot | None = None
+    inputs: dict[str, str] = field(default_factory=dict)
 
 
 class _Noise(Schema):
