@@ -183,7 +183,7 @@ def example(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write it to.")],
 ) -> None:
     """Write a ready job to try the package on: robot, measurements and calibration.yaml."""
-    from fg_calib.results import fill_folder
+    from fg_calib.files.disk import fill_folder
 
     known = sorted(folder.name for folder in EXAMPLES.iterdir() if folder.is_dir())
     if name not in known:
