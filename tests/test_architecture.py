@@ -13,7 +13,8 @@ import fg_calib
 
 PACKAGE = Path(fg_calib.__file__).parent
 FLOORS = (
-    *("choices", "errors", "robot", "measurements", "files", "kernels", "kinematics", "residuals", "factors", "frames"),
+    *("choices", "errors", "robot", "measurements", "files", "kernels", "kinematics"),
+    *("inverse", "residuals", "factors", "frames"),
     *(
         "observability",
         "problem",
