@@ -178,6 +178,30 @@ def observe(
 
 
 @app.command()
+def simulate(
+    scenario: Annotated[
+        str, typer.Argument(metavar="SCENARIO", help="The scenario: a YAML file, or a shipped one: space-robot.")
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write the job to.")],
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of all that is drawn.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """Simulate a calibration job: the true robot, and what is measured of it, with noise."""
+    from fg_calib.files.scenario import read_scenario, write_simulation
+    from fg_calib.simulator import simulate as run
+
+    simulation = run(read_scenario(scenario), seed)
+    names = write_simulation(out, simulation)
+    if as_json:
+        print(json.dumps({"files": [str(out / name) for name in names], **simulation.summary()}, allow_nan=False))
+    else:
+        test = simulation.measurements.test
+        print(f"{simulation.scenario.name}, seed {seed}: {sum(~test)} configurations to calibrate, {sum(test)} to test")
+    print(f"wrote {', '.join(names)} to {out}", file=sys.stderr)
+    print(f"now: fg-calib calibrate {out / 'calibration.yaml'} --out {out / 'result'}", file=sys.stderr)
+
+
+@app.command()
 def example(
     name: Annotated[str, typer.Argument(metavar="NAME", help="The example: space-robot.")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write it to.")],

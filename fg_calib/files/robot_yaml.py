@@ -39,7 +39,9 @@ from fg_calib.robot import (
 )
 
 
-class _Frame(Schema):
+class FrameValues(Schema):
+    """A frame as six values, those missing 0."""
+
     x: Number = 0.0
     y: Number = 0.0
     z: Number = 0.0
@@ -57,15 +59,15 @@ class _Robot(Schema):
 
     name: str | None = None
     units: Units = Units()
-    base: _Frame = _Frame()
-    tool: _Frame = _Frame()
+    base: FrameValues = FrameValues()
+    tool: FrameValues = FrameValues()
     fixed: tuple[str, ...] = ()
     estimate: tuple[str, ...] = ()
     tolerance: dict[str, Positive] = Field(default_factory=dict)
 
     def choices(self) -> dict[str, Any]:
         """What `RobotBuilder.build` wants to know, [m] and [rad]."""
-        tolerance = {key: value * self.units.factor(_unit_of_key(key)) for key, value in self.tolerance.items()}
+        tolerance = {key: value * self.units.factor(unit_of_key(key)) for key, value in self.tolerance.items()}
         return {"fixed": self.fixed, "estimate": self.estimate, "tolerance": tolerance}
 
 
@@ -225,7 +227,7 @@ def _unit_of_kind(kind: str) -> str:
     return "m" if AXIS_OF_KIND[kind] < Axis.RX else "rad"
 
 
-def _unit_of_key(key: str) -> str:
+def unit_of_key(key: str) -> str:
     """The unit of a tolerance by kind (`a`, `tool`) or by name (`alpha3`, `elbow.yaw`)."""
     kind = re.sub(r".*\.|\d+$", "", key)
     return _unit_of_kind(kind) if kind in AXIS_OF_KIND else "m"
