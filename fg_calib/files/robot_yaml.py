@@ -214,8 +214,8 @@ def write_robot(path: Path | str, robot: Robot, *, units: Units | None = None, u
         mapping |= {key: _Flow((p.kind, units.from_si(p.nominal, p.unit)) for p in frame if p.nominal != 0.0)}
     frames = {*base, *tool}
     mapping |= {
-        "fixed": [p.name for i, p in enumerate(robot.parameters) if i not in frames and not p.estimated],
-        "estimate": [p.name for i, p in enumerate(robot.parameters) if i in frames and p.estimated],
+        "fixed": _Line(p.name for i, p in enumerate(robot.parameters) if i not in frames and not p.estimated),
+        "estimate": _Line(p.name for i, p in enumerate(robot.parameters) if i in frames and p.estimated),
         "tolerance": _Flow(_tolerances(robot, units)),
     }
     kept = {key: value for key, value in mapping.items() if value or key == "joints"}
@@ -263,10 +263,17 @@ class _Flow(dict[str, Any]):
     """A mapping to be written on one line."""
 
 
+class _Line(list[str]):
+    """Names to be written on one line."""
+
+
 class _Dumper(yaml.SafeDumper):
-    """The safe dumper, with rows and frames on one line."""
+    """The safe dumper, with rows, frames and names on one line."""
 
 
 _Dumper.add_representer(
     _Flow, lambda dumper, row: dumper.represent_mapping("tag:yaml.org,2002:map", row, flow_style=True)
+)
+_Dumper.add_representer(
+    _Line, lambda dumper, names: dumper.represent_sequence("tag:yaml.org,2002:seq", names, flow_style=True)
 )
