@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from simulated import paper_robot, planar_robot
 
 import fg_calib
+from fg_calib.cli import EXAMPLES
 from fg_calib.errors import InputError
 from fg_calib.files.job import read_job
 from fg_calib.files.robot_yaml import read_robot
@@ -421,6 +422,20 @@ def test_the_command_writes_a_job_that_runs(fg_calib, tmp_path):
     assert [replace(p, nominal=0.0) for p in true.parameters] == [replace(p, nominal=0.0) for p in nominal.parameters]
     assert (true.name, true.joints) == (nominal.name, nominal.joints)
     assert fg_calib("calibrate", out / "calibration.yaml", "--out", out / "result").code == 0
+
+
+def test_the_bundled_example_is_the_shipped_scenario_with_seed_0(simulation, tmp_path):
+    """There is one implementation. Other machines may round otherwise, so the poses are compared to 1e-6 of a unit."""
+    write_simulation(tmp_path / "job", simulation)
+    for name in ("calibration.yaml", "robot_nominal.yaml"):
+        assert (EXAMPLES / "space-robot" / name).read_text() == (tmp_path / "job" / name).read_text()
+    written, bundled = (pl.read_csv(folder / "poses.csv") for folder in (tmp_path / "job", EXAMPLES / "space-robot"))
+    assert written.columns == bundled.columns
+    assert written.select("id", "split").equals(bundled.select("id", "split"))
+    numbers = [name for name in written.columns if name not in {"id", "split"}]
+    assert written.select(numbers).to_numpy() == pytest.approx(bundled.select(numbers).to_numpy(), abs=1e-6)
+    truth = read_robot(EXAMPLES / "space-robot" / "robot_true.yaml")
+    assert truth.nominal == pytest.approx(simulation.true_robot.nominal, abs=1e-12)
 
 
 def test_json_is_all_there_is_on_stdout(fg_calib, tmp_path):
