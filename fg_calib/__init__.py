@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
     from fg_calib.files.job import Job, read_job
     from fg_calib.files.robot_yaml import read_robot, write_robot
+    from fg_calib.files.scenario import read_scenario, write_simulation
     from fg_calib.files.tables import read_measurements
     from fg_calib.files.units import Units
     from fg_calib.identifiability import Identifiability, observe_configurations, observe_structure
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
         write_results,
     )
     from fg_calib.robot import Robot
+    from fg_calib.scenario import Scenario, Simulation
+    from fg_calib.simulator import simulate
     from fg_calib.solver import Solution, SolverOptions, solve
     from fg_calib.uncertainty import Uncertainty, assess
 
@@ -48,6 +51,7 @@ _HOMES = {
     "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
     "fg_calib.files.job": ("Job", "read_job"),
     "fg_calib.files.robot_yaml": ("read_robot", "write_robot"),
+    "fg_calib.files.scenario": ("read_scenario", "write_simulation"),
     "fg_calib.files.tables": ("read_measurements",),
     "fg_calib.files.units": ("Units",),
     "fg_calib.identifiability": ("Identifiability", "observe_configurations", "observe_structure"),
@@ -61,6 +65,8 @@ _HOMES = {
         *("write_comparison", "write_observability", "write_results"),
     ),
     "fg_calib.robot": ("Robot",),
+    "fg_calib.scenario": ("Scenario", "Simulation"),
+    "fg_calib.simulator": ("simulate",),
     "fg_calib.solver": ("Solution", "SolverOptions", "solve"),
     "fg_calib.uncertainty": ("Uncertainty", "assess"),
 }
@@ -79,6 +85,8 @@ __all__ = [
     "Problem",
     "ProblemError",
     "Robot",
+    "Scenario",
+    "Simulation",
     "Solution",
     "SolverError",
     "SolverOptions",
@@ -100,12 +108,15 @@ __all__ = [
     "read_job",
     "read_measurements",
     "read_robot",
+    "read_scenario",
     "result_document",
+    "simulate",
     "solve",
     "write_comparison",
     "write_observability",
     "write_results",
     "write_robot",
+    "write_simulation",
 ]
 
 logging.getLogger(__name__).addHandler(logging.NullHandler())

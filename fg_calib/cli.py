@@ -11,13 +11,16 @@ import logging
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from fg_calib import __version__
 from fg_calib.choices import AngleUnit, FrameKnowledge, LengthUnit, Model
 from fg_calib.errors import CalibrationError, InputError
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
 
 app = typer.Typer(
     name="fg-calib",
@@ -73,8 +76,6 @@ def calibrate(
     as_json: Json = False,
 ) -> None:
     """Estimate a robot's parameters from measurements, with their uncertainties."""
-    from rich.console import Console
-
     from fg_calib.files.job import read_job
     from fg_calib.problem import problem_of
     from fg_calib.report import build_report
@@ -90,7 +91,7 @@ def calibrate(
     if as_json:
         print(json.dumps(result_document(solution, uncertainty, given.inputs), allow_nan=False))
     else:
-        Console(highlight=False).print(build_report(solution, uncertainty))
+        _show(build_report(solution, uncertainty))
     _end(uncertainty.findings)
 
 
@@ -101,8 +102,6 @@ def compare_estimators(
     as_json: Json = False,
 ) -> None:
     """Run the factor graph beside plain least squares on the same job: errors, residuals, sigmas, time."""
-    from rich.console import Console
-
     from fg_calib.comparison import compare
     from fg_calib.files.job import read_job
     from fg_calib.report import build_comparison_report
@@ -114,8 +113,15 @@ def compare_estimators(
     if as_json:
         print(json.dumps(comparison_document(comparison), allow_nan=False))
     else:
-        Console(highlight=False).print(build_comparison_report(comparison))
+        _show(build_comparison_report(comparison), least=100)
     _end(comparison.findings)
+
+
+def _show(report: RenderableType, least: int = 80) -> None:
+    """Print a report; on a narrower terminal than `least` its lines wrap, where a table would cut its cells."""
+    from rich.console import Console
+
+    Console(highlight=False, width=max(least, Console().width)).print(report)
 
 
 def _end(findings: Sequence[str]) -> None:
@@ -160,8 +166,6 @@ def observe(
     as_json: Json = False,
 ) -> None:
     """Say which parameters measurements can determine, which only together, and why not the others."""
-    from rich.console import Console
-
     from fg_calib.files.robot_yaml import read_robot
     from fg_calib.files.tables import read_measurements
     from fg_calib.files.units import Units
@@ -194,7 +198,31 @@ def observe(
     if as_json:
         print(json.dumps(observability_document(found), allow_nan=False))
     else:
-        Console(highlight=False).print(build_identifiability_report(found))
+        _show(build_identifiability_report(found))
+
+
+@app.command()
+def simulate(
+    scenario: Annotated[
+        str, typer.Argument(metavar="SCENARIO", help="The scenario: a YAML file, or a shipped one: space-robot.")
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write the job to.")],
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of all that is drawn.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """Simulate a calibration job: the true robot, and what is measured of it, with noise."""
+    from fg_calib.files.scenario import read_scenario, write_simulation
+    from fg_calib.simulator import simulate as run
+
+    simulation = run(read_scenario(scenario), seed)
+    names = write_simulation(out, simulation)
+    if as_json:
+        print(json.dumps({"files": [str(out / name) for name in names], **simulation.summary()}, allow_nan=False))
+    else:
+        test = simulation.measurements.test
+        print(f"{simulation.scenario.name}, seed {seed}: {sum(~test)} configurations to calibrate, {sum(test)} to test")
+    print(f"wrote {', '.join(names)} to {out}", file=sys.stderr)
+    print(f"now: fg-calib calibrate {out / 'calibration.yaml'} --out {out / 'result'}", file=sys.stderr)
 
 
 @app.command()
@@ -203,7 +231,7 @@ def example(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write it to.")],
 ) -> None:
     """Write a ready job to try the package on: robot, measurements and calibration.yaml."""
-    from fg_calib.results import fill_folder
+    from fg_calib.files.disk import fill_folder
 
     known = sorted(folder.name for folder in EXAMPLES.iterdir() if folder.is_dir())
     if name not in known:

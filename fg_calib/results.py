@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
 
 from fg_calib import __version__
 from fg_calib.comparison import Comparison, Estimate, RealErrors
-from fg_calib.errors import InputError
 from fg_calib.figures import write_figures
-from fg_calib.files.disk import write_text
+from fg_calib.files.disk import fill_folder, write_text
 from fg_calib.files.robot_yaml import write_robot
 from fg_calib.files.tables import write_csv
 from fg_calib.files.urdf import write_urdf
@@ -288,38 +284,6 @@ def write_calibrated_robot(folder: Path, robot: Robot) -> None:
     write_urdf(folder / "robot_calibrated.urdf", robot)
     if any(p.nominal != 0.0 or p.estimated for p in robot.parameters if p.owner in (0, robot.n_joints + 1)):
         write_robot(folder / "robot_calibrated.yaml", robot, urdf_name="robot_calibrated.urdf")
-
-
-def fill_folder(folder: Path, write: Callable[[Path], None]) -> None:
-    """Let `write` fill a new folder, and move its files into `folder` once all of them are there.
-
-    Raises:
-        InputError: The folder cannot be written.
-    """
-    temporary = None
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-        write(temporary)
-        if not folder.exists():
-            temporary.chmod(0o777 & ~_umask())
-            temporary.rename(folder)
-        else:
-            for file in sorted(temporary.iterdir()):
-                file.replace(folder / file.name)
-    except OSError as error:
-        raise InputError(
-            str(folder), f"cannot be written: {error.strerror or error}", "a folder that can be"
-        ) from error
-    finally:
-        if temporary is not None:
-            shutil.rmtree(temporary, ignore_errors=True)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def _write_residuals(path: Path, solution: Solution, uncertainty: Uncertainty) -> None:

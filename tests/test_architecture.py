@@ -13,7 +13,8 @@ import fg_calib
 
 PACKAGE = Path(fg_calib.__file__).parent
 FLOORS = (
-    *("choices", "errors", "robot", "measurements", "files", "kernels", "kinematics", "residuals", "least_squares"),
+    *("choices", "errors", "robot", "measurements", "scenario", "files", "kernels", "kinematics"),
+    *("inverse", "simulator", "residuals", "least_squares"),
     *(
         "factors",
         "frames",
@@ -33,7 +34,7 @@ FLOORS = (
 )
 """From the ground up: a module may import from those before it; within `files` see `FILES`."""
 
-FILES = ("disk", "schema", "units", "tables", "urdf", "robot_yaml", "job")
+FILES = ("disk", "schema", "units", "tables", "urdf", "robot_yaml", "job", "scenario")
 
 MODULES = sorted(p for p in PACKAGE.rglob("*.py") if p.name != "__init__.py" and "examples" not in p.parts)
 NAMES = [p.relative_to(PACKAGE).with_suffix("").as_posix() for p in MODULES]

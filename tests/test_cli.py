@@ -21,7 +21,7 @@ from fg_calib import __version__, cli, read_measurements, read_robot, write_robo
 from fg_calib.files.units import Units
 from fg_calib.robot import Joint, RobotBuilder
 
-JOB, POSES, ROBOT = "calibration.yaml", "poses.csv", "robot_nominal.yaml"
+JOB, POSES, ROBOT, TRUTH = "calibration.yaml", "poses.csv", "robot_nominal.yaml", "robot_true.yaml"
 OUTPUTS = {"result.json", "robot_calibrated.yaml", "residuals.csv"}
 NUMBER = (int, float)
 
@@ -68,7 +68,7 @@ def test_calibrating_the_example_ends_well_and_writes_three_files(calibrated):
     assert (ended.exit_code, ended.stderr) == (0, "")
     assert ended.stdout.startswith("space-robot: distance-rotation, pairs: star\nGOOD: converged")
     assert {f.name for f in (folder / "result").iterdir()} == OUTPUTS
-    assert {f.name for f in folder.iterdir()} == {JOB, POSES, ROBOT, "robot_true.yaml", "result"}
+    assert {f.name for f in folder.iterdir()} == {JOB, POSES, ROBOT, TRUTH, "result"}
 
 
 def test_a_result_has_every_key_of_its_schema(result):
@@ -83,7 +83,7 @@ def test_a_result_has_every_key_of_its_schema(result):
     assert {key: type(result[key]) for key in shape} == shape  # more may be added
     assert result["schema"] == "fg-calib/result/1"
     assert (result["version"], result["robot"]) == (__version__, "space-robot")
-    assert (result["model"], result["frame"], result["pairing"]) == ("distance-rotation", "known", "star")
+    assert (result["model"], result["frame"], result["pairing"]) == ("distance-rotation", "unknown", "star")
     assert {key: type(value) for key, value in result["residual_rms"].items()} == rms
     solver = {"name": str, "converged": bool, "message": str, "iterations": int, "initial_cost": float, "cost": float}
     solver |= {"seconds": float, "history": list}
@@ -156,7 +156,7 @@ def test_rms_is_what_the_residuals_say(result, residuals):
         assert result["residual_rms"][split]["position"] is None
         assert result["residual_rms"][split]["orientation"] is None
     test = result["residual_rms"]["test"]
-    assert test["distance"]["after"] < 0.2 * test["distance"]["before"]
+    assert test["distance"]["after"] < 0.5 * test["distance"]["before"]
 
 
 def test_predictions_are_those_of_the_calibrated_robot(calibrated, residuals):
@@ -196,7 +196,9 @@ def test_the_truth_lies_within_four_sigma(calibrated, result):
 def test_inputs_are_named_with_their_hashes(calibrated, result):
     import hashlib
 
-    expected = {name: hashlib.sha256((calibrated[0] / name).read_bytes()).hexdigest() for name in (JOB, ROBOT, POSES)}
+    expected = {
+        name: hashlib.sha256((calibrated[0] / name).read_bytes()).hexdigest() for name in (JOB, ROBOT, POSES, TRUTH)
+    }
     assert result["inputs"] == expected
 
 
@@ -313,7 +315,7 @@ def test_the_version_is_printed(fg_calib):
 def test_the_example_is_written_and_its_next_step_named(fg_calib, tmp_path):
     out = tmp_path / "new" / "demo"
     ended = fg_calib("example", "space-robot", "--out", out)
-    names = [JOB, POSES, ROBOT, "robot_true.yaml"]
+    names = [JOB, POSES, ROBOT, TRUTH]
     assert (ended.code, ended.out) == (0, "")
     assert ended.err == (
         f"wrote {', '.join(names)} to {out}\nnow: fg-calib calibrate {out / JOB} --out {out / 'result'}\n"
@@ -461,7 +463,7 @@ BAD = {
     ),
     "degrees read as radians": (
         sub(JOB, "angle: deg", "angle: rad"),
-        "poses.csv:2: q1 = 98.0512 rad is outside [-3.14159, 3.14159]; is the table in deg?",
+        "poses.csv:2: q1 = 75.6136 rad is outside [-3.14159, 3.14159]; is the table in deg?",
     ),
     "outside the limits": (cell(2, "q1", "181"), "poses.csv:3: q1 = 181 deg is outside [-180, 180]"),
     "an unusable model": (
@@ -496,7 +498,7 @@ BAD = {
     "no rows": (table(lambda rows: rows[:1]), "poses.csv: no rows, expected at least one"),
     "a table instead of a job": (
         lambda folder: (folder / POSES).replace(folder / JOB),
-        "calibration.yaml: found 'id,q1,q2,q3,q4,q5,q6,q7,x,y,z,qx,qy,qz,qw,split p0,98.05..., expected a mapping, "
+        "calibration.yaml: found 'id,q1,q2,q3,q4,q5,q6,q7,x,y,z,qx,qy,qz,qw,split p0,75.61..., expected a mapping, "
         "key: value",
     ),
 }
@@ -644,7 +646,7 @@ def test_parquet_tables_give_the_result_of_csv(fg_calib, example):
     sub(JOB, "poses.csv", "poses.parquet")(example)
     result = calibrate(fg_calib, example / JOB)
     assert result["parameters"] == expected["parameters"]
-    assert set(result["inputs"]) == {JOB, ROBOT, "poses.parquet"}
+    assert set(result["inputs"]) == {JOB, ROBOT, TRUTH, "poses.parquet"}
 
 
 URDF = """<?xml version="1.0"?>

@@ -6,7 +6,9 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 EXPERIMENTS = Path(__file__).resolve().parents[1] / "experiments"
 MM, DEG = 1e-3, 3.141592653589793 / 180.0
@@ -27,6 +29,7 @@ def load(path: str) -> ModuleType:
 ur10 = load("01_ur10_real_data.py")
 linearise = load("benchmarks/linearise.py")
 calibrate = load("benchmarks/calibrate.py")
+inverse = load("benchmarks/inverse.py")
 
 real_data = pytest.mark.skipif(
     not ur10.data_folder().is_dir(), reason="no folder ur10_tmac in FG_CALIB_DATA, which names where the real data are"
@@ -165,6 +168,24 @@ def test_calibrate_quick_times_the_bundled_example(tmp_path, capsys):
     results = json.loads((tmp_path / "calibrate.json").read_text())
     assert results["n_pairs"] == 51
     assert {"fg-calib calibrate", "fg-calib --help", "solve and assess"} <= set(results["seconds"])
+
+
+def test_inverse_quick_reaches_every_pose(tmp_path, capsys):
+    assert inverse.main(["--quick", "--out", str(tmp_path)]) == 0
+    assert "ms a pose" in capsys.readouterr().out
+    results = json.loads((tmp_path / "inverse.json").read_text())
+    for ways in results["arms"].values():
+        assert set(ways) == {"own, 1 start", "own, 50 starts", "trf, 1 start", "trf, 50 starts"}
+        assert ways["own, 50 starts"]["reached"] == ways["own, 50 starts"]["n_poses"] == 20
+        assert ways["own, 50 starts"]["miss_of_reached_m"] < 1e-11  # rounding of a dozen metres, times ten
+
+
+def test_inverse_gives_trf_the_exact_derivative_of_a_rotation_vector():
+    for r in (np.array([0.5, -1.2, 0.7]), np.array([1e-6, 0.0, 2e-6])):
+        moved = [(Rotation.from_rotvec(h * axis) * Rotation.from_rotvec(r)).as_rotvec()
+                 for axis in np.eye(3) for h in (1e-6, -1e-6)]  # fmt: skip
+        differences = (np.array(moved[::2]) - np.array(moved[1::2])).T / 2e-6
+        assert inverse.inverse_left_jacobian(r) == pytest.approx(differences, abs=1e-9)
 
 
 def test_identifiability_agrees_with_the_papers_tables_and_with_the_graph(tmp_path, capsys):

@@ -141,11 +141,8 @@ joints:
 - {name: slide, a: 10.0, alpha: -90.0, d: 0.5, theta: 30.0, beta: 1.0, type: prismatic, limits: [0.0, 200.0]}
 base: {x: 1.0, yaw: 90.0}
 tool: {z: 50.0}
-fixed:
-- a1
-- beta2
-estimate:
-- tool.z
+fixed: [a1, beta2]
+estimate: [tool.z]
 tolerance: {base.yaw: 3.0, a: 1.0, alpha: 0.5, d2: 2.0, tool: 5.0}
 """
     )

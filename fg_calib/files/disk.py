@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+import shutil
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import mkdtemp
 
 from fg_calib.errors import InputError
 
@@ -65,3 +67,35 @@ def write_text(path: Path, text: str) -> None:
     """
     with replacing(path) as temporary:
         temporary.write_bytes(text.encode())
+
+
+def fill_folder(folder: Path, write: Callable[[Path], None]) -> None:
+    """Let `write` fill a new folder, and move its files into `folder` once all of them are there.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    temporary = None
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        write(temporary)
+        if not folder.exists():
+            temporary.chmod(0o777 & ~_umask())
+            temporary.rename(folder)
+        else:
+            for file in sorted(temporary.iterdir()):
+                file.replace(folder / file.name)
+    except OSError as error:
+        raise InputError(
+            str(folder), f"cannot be written: {error.strerror or error}", "a folder that can be"
+        ) from error
+    finally:
+        if temporary is not None:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

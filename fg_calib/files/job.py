@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path, PurePath
 from typing import Annotated, Any
@@ -117,7 +118,8 @@ def read_job(path: Path | str) -> Job:
     folder = path.parent
     file = validate(_Job, read_yaml(path), path.name)
     pairing = _pairing(file.pairing, f"{path.name}: pairing")
-    robot, robot_files = _robot(file.robot, f"{path.name}: robot", folder)
+    robot, robot_files = robot_of(file.robot, f"{path.name}: robot", folder)
+    _check_preferred(file, robot, path.name)
     noise, estimate_noise = _noise(file.noise, file.units, robot, f"{path.name}: noise")
     measurements = read_measurements(
         folder / file.measurements,
@@ -130,11 +132,6 @@ def read_job(path: Path | str) -> Job:
     others = [name for name in (file.pairs, file.truth) if name is not None]
     names = [path.name, *robot_files, file.measurements, *others]
     inputs = {name: _sha256(folder / name) for name in names}
-    for name in file.prefer:
-        if name not in names_of(robot.parameters):
-            raise InputError(
-                f"{path.name}: prefer", f"unknown parameter {name!r}", known_names(names_of(robot.parameters))
-            )
     return Job(
         path=path,
         robot=robot,
@@ -155,8 +152,42 @@ def read_job(path: Path | str) -> Job:
     )
 
 
-def _robot(given: object, place: str, folder: Path) -> tuple[Robot, list[str]]:
-    """The robot and the files that it was read from, relative to `folder`."""
+def check_choices(choices: Mapping[str, Any], robot: Robot, place: str) -> None:
+    """Check keys of a job for a robot before there is a job: model, pairing, gauge, ...
+
+    Args:
+        choices: The keys and their values, without `robot` and `measurements`.
+        robot: The robot.
+        place: File and key, for messages.
+
+    Raises:
+        InputError: A job with these keys could not be read.
+    """
+    file = validate(_Job, {"robot": "", "measurements": "", **choices}, place)
+    _pairing(file.pairing, f"{place}: pairing")
+    _check_preferred(file, robot, place)
+
+
+def _check_preferred(file: _Job, robot: Robot, place: str) -> None:
+    for name in file.prefer:
+        if name not in names_of(robot.parameters):
+            raise InputError(f"{place}: prefer", f"unknown parameter {name!r}", known_names(names_of(robot.parameters)))
+
+
+def robot_of(given: object, place: str, folder: Path) -> tuple[Robot, list[str]]:
+    """The robot under a key `robot`, and the files that it was read from.
+
+    Args:
+        given: A path relative to `folder`, or the mapping of a robot file.
+        place: File and key, for messages.
+        folder: The folder of the file that names it.
+
+    Returns:
+        The robot, and its files relative to `folder`.
+
+    Raises:
+        InputError: It is neither, or does not describe a robot.
+    """
     if isinstance(given, dict):
         robot = robot_from_mapping(given, place, folder)
         return robot, [given["urdf"]] if robot.urdf else []
@@ -193,14 +224,6 @@ def _noise(given: object, units: Units, robot: Robot, place: str) -> tuple[Noise
     if given is not None and not isinstance(given, dict):
         raise InputError(place, f"found {shown(given)}", "a mapping of figures, or estimate")
     file = validate(_Noise, given or {}, place)
-    figures: tuple[float, ...]
-    if isinstance(file.joint, list):
-        figures = validate(_FigureEach, {"joint": file.joint}, place).joint
-        if len(figures) != robot.n_joints:
-            expected = f"one for all or {robot.n_joints}, one a joint"
-            raise InputError(f"{place}: joint", f"{len(figures)} figures", expected)
-    else:
-        figures = (validate(_OneFigure, {"joint": file.joint}, place).joint,) * robot.n_joints
 
     def si(figure: float | None, unit: str) -> float | None:
         return None if figure is None else figure * units.factor(unit)
@@ -208,7 +231,7 @@ def _noise(given: object, units: Units, robot: Robot, place: str) -> tuple[Noise
     noise = Noise(
         position=si(file.position, "m"),
         orientation=si(file.orientation, "rad"),
-        joint=tuple(f * units.factor(j.unit) for f, j in zip(figures, robot.joints, strict=True)),
+        joint=joint_noise(file.joint, units, robot, place),
         distance=si(file.distance, "m"),
         angle=si(file.angle, "rad"),
         point=si(file.point, "m"),
@@ -217,6 +240,22 @@ def _noise(given: object, units: Units, robot: Robot, place: str) -> tuple[Noise
         return noise, False
     missing = {f.name: getattr(UNSTATED, f.name) for f in fields(Noise) if getattr(noise, f.name) is None}
     return replace(noise, **missing), True
+
+
+def joint_noise(given: object, units: Units, robot: Robot, place: str) -> tuple[float, ...]:
+    """Sigma of each joint's readings, [rad] (prismatic: [m]), from one figure for all or one a joint.
+
+    Raises:
+        InputError: It is neither.
+    """
+    if isinstance(given, list):
+        figures = validate(_FigureEach, {"joint": given}, place).joint
+        if len(figures) != robot.n_joints:
+            expected = f"one for all or {robot.n_joints}, one a joint"
+            raise InputError(f"{place}: joint", f"{len(figures)} figures", expected)
+    else:
+        figures = (validate(_OneFigure, {"joint": given}, place).joint,) * robot.n_joints
+    return tuple(f * units.factor(j.unit) for f, j in zip(figures, robot.joints, strict=True))
 
 
 def _sha256(path: Path) -> str:

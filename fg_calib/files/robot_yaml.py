@@ -39,7 +39,9 @@ from fg_calib.robot import (
 )
 
 
-class _Frame(Schema):
+class FrameValues(Schema):
+    """A frame as six values, those missing 0."""
+
     x: Number = 0.0
     y: Number = 0.0
     z: Number = 0.0
@@ -57,15 +59,15 @@ class _Robot(Schema):
 
     name: str | None = None
     units: Units = Units()
-    base: _Frame = _Frame()
-    tool: _Frame = _Frame()
+    base: FrameValues = FrameValues()
+    tool: FrameValues = FrameValues()
     fixed: tuple[str, ...] = ()
     estimate: tuple[str, ...] = ()
     tolerance: dict[str, Positive] = Field(default_factory=dict)
 
     def choices(self) -> dict[str, Any]:
         """What `RobotBuilder.build` wants to know, [m] and [rad]."""
-        tolerance = {key: value * self.units.factor(_unit_of_key(key)) for key, value in self.tolerance.items()}
+        tolerance = {key: value * self.units.factor(unit_of_key(key)) for key, value in self.tolerance.items()}
         return {"fixed": self.fixed, "estimate": self.estimate, "tolerance": tolerance}
 
 
@@ -212,8 +214,8 @@ def write_robot(path: Path | str, robot: Robot, *, units: Units | None = None, u
         mapping |= {key: _Flow((p.kind, units.from_si(p.nominal, p.unit)) for p in frame if p.nominal != 0.0)}
     frames = {*base, *tool}
     mapping |= {
-        "fixed": [p.name for i, p in enumerate(robot.parameters) if i not in frames and not p.estimated],
-        "estimate": [p.name for i, p in enumerate(robot.parameters) if i in frames and p.estimated],
+        "fixed": _Line(p.name for i, p in enumerate(robot.parameters) if i not in frames and not p.estimated),
+        "estimate": _Line(p.name for i, p in enumerate(robot.parameters) if i in frames and p.estimated),
         "tolerance": _Flow(_tolerances(robot, units)),
     }
     kept = {key: value for key, value in mapping.items() if value or key == "joints"}
@@ -225,7 +227,7 @@ def _unit_of_kind(kind: str) -> str:
     return "m" if AXIS_OF_KIND[kind] < Axis.RX else "rad"
 
 
-def _unit_of_key(key: str) -> str:
+def unit_of_key(key: str) -> str:
     """The unit of a tolerance by kind (`a`, `tool`) or by name (`alpha3`, `elbow.yaw`)."""
     kind = re.sub(r".*\.|\d+$", "", key)
     return _unit_of_kind(kind) if kind in AXIS_OF_KIND else "m"
@@ -261,10 +263,17 @@ class _Flow(dict[str, Any]):
     """A mapping to be written on one line."""
 
 
+class _Line(list[str]):
+    """Names to be written on one line."""
+
+
 class _Dumper(yaml.SafeDumper):
-    """The safe dumper, with rows and frames on one line."""
+    """The safe dumper, with rows, frames and names on one line."""
 
 
 _Dumper.add_representer(
     _Flow, lambda dumper, row: dumper.represent_mapping("tag:yaml.org,2002:map", row, flow_style=True)
+)
+_Dumper.add_representer(
+    _Line, lambda dumper, names: dumper.represent_sequence("tag:yaml.org,2002:seq", names, flow_style=True)
 )
