@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib import frames, residuals
-from fg_calib.choices import FrameKnowledge, Gauge, Model, PairErrors
+from fg_calib.choices import EncoderNoise, FrameKnowledge, Gauge, Loss, Model, PairErrors
 from fg_calib.errors import ProblemError
 from fg_calib.factors import (
     Variables,
@@ -77,6 +77,8 @@ class Settings:
         prior: Whether the robot's tolerances are priors.
         gauge: What holds the directions that the data do not determine.
         pair_errors: Whether pairs of one configuration share its errors or count as independent.
+        encoder: Whether the noise of joint readings is propagated to the rows or true joint values are estimated.
+        loss: What becomes of large residuals.
     """
 
     model: Model = "distance-rotation"
@@ -85,6 +87,8 @@ class Settings:
     prior: bool = True
     gauge: Gauge = "prior"
     pair_errors: PairErrors = "shared"
+    encoder: EncoderNoise = "propagated"
+    loss: Loss = "none"
 
     @property
     def uses_pairs(self) -> bool:
@@ -156,6 +160,13 @@ class Problem:
         return len(np.unique(np.concatenate([self.pairs.a[used], self.pairs.b[used]])))
 
     @property
+    def height(self) -> int:
+        """Rows of a measurement that has all that the model uses."""
+        if self.settings.uses_pairs:
+            return sum(PAIR_KINDS[self.settings.model])
+        return 3 * sum(POSE_KINDS[self.settings.model])
+
+    @property
     def formed(self) -> bool:
         """Whether pairs were formed from measured poses."""
         return self.pairs is not None and self.measurements.pairs is None
@@ -212,6 +223,8 @@ def build_problem(
     gauge: Gauge = "prior",
     prefer: Sequence[str] = (),
     pair_errors: PairErrors = "shared",
+    encoder: EncoderNoise = "propagated",
+    loss: Loss = "none",
 ) -> Problem:
     """The calibration problem of a robot and its measurements.
 
@@ -229,12 +242,15 @@ def build_problem(
         prefer: For `keep`: parameters to keep, first choice first.
         pair_errors: `shared`: pairs carry the errors of their configurations in common, as long as these are not too
             many (`MAX_SHARED`); then, and with `independent`, they are weighted as if independent.
+        encoder: `propagated`: the noise of joint readings is added to that of the rows, to first order. `estimated`:
+            the true joint values of every configuration are estimated too, with the readings as their priors.
+        loss: What becomes of large residuals: `none` or a robust loss (see `robust`).
 
     Raises:
         ProblemError: The measurements lack what the model needs, or do not suffice.
     """
     with_priors = prior is not False and gauge == "prior"
-    settings = Settings(model, pairing or Pairing(), frame, with_priors, gauge, pair_errors)
+    settings = Settings(model, pairing or Pairing(), frame, with_priors, gauge, pair_errors, encoder, loss)
     if not any(p.estimated for p in robot.parameters):
         raise ProblemError(f"robot {robot.name}", "nothing to estimate", "at least one parameter that is not fixed")
     unknown_frame = frame == "unknown" and not settings.uses_pairs
@@ -278,6 +294,8 @@ def problem_of(job: Job, **changes: Any) -> Problem:
         "gauge": job.gauge,
         "prefer": job.prefer,
         "pair_errors": job.pair_errors,
+        "encoder": job.encoder,
+        "loss": job.loss,
     }
     return build_problem(job.robot, job.measurements, **settings | changes)
 
@@ -345,11 +363,62 @@ def random_problem(
     return predicted_problem(robot, readings, model, frame=frame, pairing=Pairing("chain"), pair_errors="independent")
 
 
-def judged_at(problem: Problem, parameters: Floats) -> Problem:
-    """The same problem with its rows judged and whitened, and started, at other parameters."""
-    p = problem
-    anew = _assemble(p.robot, p.measurements, p.settings, p.variables, parameters, p.trig, p.pairs, p.adjustment)
+def judged_at(problem: Problem, parameters: Floats, adjustment: Adjustment | None = None) -> Problem:
+    """The same problem with its rows judged and whitened, and started, at other parameters.
+
+    Args:
+        problem: The problem.
+        parameters: The parameter vector.
+        adjustment: What has been learned of the noise; None for what the problem has.
+    """
+    p, a = problem, adjustment or problem.adjustment
+    anew = _assemble(p.robot, p.measurements, p.settings, p.variables, parameters, p.trig, p.pairs, a)
     return replace(anew, whole=p.whole)
+
+
+def lengths(problem: Problem, parameters: Floats) -> tuple[Floats, Integers]:
+    """Length of each measurement's residual, whitened by all its noise as stated, and its number of rows.
+
+    Args:
+        problem: The problem.
+        parameters: The parameter vector.
+
+    Returns:
+        Shapes (n_pairs,) or (n_configurations,); both are 0 for a measurement that takes no part, as test rows do.
+    """
+    length, height = _whitening(problem, parameters).lengths()
+    test = problem.measurements.test if problem.pairs is None else problem.pairs.test
+    return np.where(test, 0.0, length), np.where(test, 0, height)
+
+
+def joint_errors(problem: Problem, parameters: Floats) -> Floats:
+    """What the train rows say of the errors of the joint readings: true values less readings, to first order.
+
+    Returns:
+        Shape (n_configurations, n_joints), [rad] (prismatic: [m]); about the joint values that the problem has.
+    """
+    whitening, chain = _whitening(problem, problem.start), problem.variables.chain.at(parameters)
+    if isinstance(whitening, PoseWhitening):
+        return whitening.joint_errors(chain)
+    block = problem.blocks[0]
+    assert isinstance(block, CorrelatedBlock)
+    return whitening.joint_errors(block, chain)
+
+
+def _whitening(problem: Problem, parameters: Floats) -> PairWhitening | PoseWhitening:
+    """The rows of a problem, judged and whitened at a parameter vector."""
+    p, chain = problem, problem.variables.chain.at(parameters)
+    trig = _trig(p.robot, p.measurements, p.trig, p.adjustment)
+    if p.pairs is None:
+        return PoseWhitening(trig, chain, p.measurements, POSE_KINDS[p.settings.model], p.adjustment)
+    return PairWhitening(trig, chain, p.measurements, p.pairs, PAIR_KINDS[p.settings.model], p.formed, p.adjustment)
+
+
+def _trig(robot: Robot, measurements: Measurements, trig: Floats, adjustment: Adjustment) -> Floats:
+    """Readings for the kernels, or the joint values that are estimated in their place."""
+    if adjustment.joint_errors is None:
+        return trig
+    return precompute_trig(robot, measurements.readings + adjustment.joint_errors)
 
 
 def correlation(problem: Problem, parameters: Floats) -> Floats | None:
@@ -365,9 +434,9 @@ def correlation(problem: Problem, parameters: Floats) -> Floats | None:
     p, missing = problem, problem.common != problem.sharing
     if p.pairs is None or not missing:
         return None
-    chain, kinds = p.variables.chain.at(parameters), PAIR_KINDS[p.settings.model]
-    of_pairs = PairWhitening(p.trig, chain, p.measurements, p.pairs, kinds, p.formed, p.adjustment)
-    return of_pairs.correlation(chain, p.common)
+    of_pairs = _whitening(problem, parameters)
+    assert isinstance(of_pairs, PairWhitening)
+    return of_pairs.correlation(p.variables.chain.at(parameters), p.common)
 
 
 def frames_only(problem: Problem) -> Problem | None:
@@ -592,18 +661,27 @@ def _assemble(
     """The problem with rows judged and whitened at `start`."""
     chain = variables.chain.at(start)
     adjustment = adjustment or Adjustment()
+    joint_noise = bool(np.any(measurements.sigma_joint > 0.0))
+    encoder = settings.encoder == "estimated" and joint_noise
+    if encoder and adjustment.joint_errors is None:
+        adjustment = replace(adjustment, joint_errors=np.zeros_like(measurements.readings))
+    moved = _trig(robot, measurements, trig, adjustment)
     judgement, sharing = None, Sharing()
     if pairs is not None:
         formed = measurements.pairs is None
         kinds = PAIR_KINDS[settings.model]
-        of_pairs = PairWhitening(trig, chain, measurements, pairs, kinds, formed, adjustment)
+        of_pairs = PairWhitening(moved, chain, measurements, pairs, kinds, formed, adjustment)
         judgement, sigma = of_pairs.judgement, of_pairs.sigma
-        if settings.pair_errors == "shared":
-            wanted = Sharing(poses=formed, joints=bool(np.any(measurements.sigma_joint > 0.0)))
-            sharing = wanted if of_pairs.n_shared(wanted) <= MAX_SHARED else Sharing()
+        wanted = Sharing(poses=formed, joints=joint_noise) if settings.pair_errors == "shared" else Sharing()
+        wanted = replace(wanted, joints=wanted.joints or encoder)
+        if of_pairs.n_shared(wanted) <= MAX_SHARED:
+            sharing = wanted
+        elif encoder:
+            found = f"{of_pairs.n_shared(wanted)} joint values and errors that pairs share"
+            raise ProblemError("encoder: estimated", found, f"at most {MAX_SHARED} for models of pairs", "propagated")
         blocks = of_pairs.blocks(sharing)
     else:
-        of_poses = PoseWhitening(trig, chain, measurements, POSE_KINDS[settings.model], adjustment)
+        of_poses = PoseWhitening(moved, chain, measurements, POSE_KINDS[settings.model], adjustment)
         sigma, blocks = of_poses.sigma, of_poses.blocks()
     graph = gtsam.NonlinearFactorGraph()
     for block in blocks:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -22,14 +22,23 @@ from numpy.typing import NDArray
 from fg_calib.errors import SolverError
 from fg_calib.factors import Variables
 from fg_calib.observability import SIGNAL_FLOOR, determined
-from fg_calib.problem import Problem, frames_only, judged_at
+from fg_calib.problem import Problem, frames_only, joint_errors, judged_at, lengths
 from fg_calib.residuals import single_threaded_blas
+from fg_calib.robust import Weighting
+from fg_calib.whitening import Adjustment
 
 Floats = NDArray[np.float64]
 
 
 _DAMPING_FLOOR = 10.0 * (SIGNAL_FLOOR / 1e-3) ** 2
 """Least damping in [1/m^2] and [1/rad^2]: ten times the curvature at the floor, in changes of 1 mm and 1 mrad."""
+
+
+WEIGHT_TOLERANCE = 1e-7
+"""Robust weights that move by less have settled."""
+
+JOINT_TOLERANCE = 1e-7
+"""Estimated joint values that move by less than this many sigma of their readings have settled."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +51,7 @@ class SolverOptions:
         lambda_ceiling: Damping beyond which it gives up, as a multiple of the largest curvature.
         lambda_floor: Least damping, as a multiple of the largest curvature (rounding), beside `_DAMPING_FLOOR` (noise).
         max_rounds: Times that rows are judged and whitened anew at the estimate.
+        max_robust_rounds: The same with a robust loss, whose weights take some rounds to settle.
     """
 
     max_iterations: int = 100
@@ -49,6 +59,7 @@ class SolverOptions:
     lambda_ceiling: float = 1e6
     lambda_floor: float = 1e-14
     max_rounds: int = 5
+    max_robust_rounds: int = 200
 
 
 @dataclass(frozen=True)
@@ -81,7 +92,8 @@ class Solution:
         message: Why it stopped.
         history: Its steps.
         initial_cost: Cost at `before`.
-        cost: Cost at the estimate.
+        cost: Cost at the estimate, whatever the loss.
+        weighted_cost: The same with every measurement by its robust weight.
         seconds: Time taken.
     """
 
@@ -94,6 +106,7 @@ class Solution:
     history: tuple[Iteration, ...]
     initial_cost: float
     cost: float
+    weighted_cost: float
     seconds: float
 
     @property
@@ -105,8 +118,9 @@ class Solution:
 def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
     """Estimate the parameters.
 
-    First measurement frame, base and tool alone with the arm at nominal, then everything. Then the rows are judged and
-    whitened at the estimate; where that changes them, the solver goes on with the new rows.
+    First measurement frame, base and tool alone with the arm at nominal, then everything. Then, in rounds, the rows are
+    judged and whitened at the estimate, robust weights follow from the residuals there and joint errors, where they are
+    estimated, from what the rows say of them; where that changes the rows, the solver goes on with the new ones.
 
     Raises:
         SolverError: GTSAM could not solve a step at all.
@@ -120,30 +134,51 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
             before = _Run(frames, options).parameters
         run = _Run(judged_at(problem, before) if frames is not None else problem, options)
         initial_cost, history = run.initial_cost, run.history
-        changed, rounds = False, 0
-        while run.converged and rounds < options.max_rounds:
-            again = judged_at(problem, run.parameters)
-            changed = _differs(run.problem, again)
-            if not changed:
+        weighting = Weighting(problem.settings.loss)
+        settled, rounds = False, 0
+        most = options.max_rounds if problem.settings.loss == "none" else options.max_robust_rounds
+        while run.converged and rounds < most:
+            adjustment, final = _learn(run.problem, run.parameters, weighting)
+            again = judged_at(problem, run.parameters, adjustment)
+            settled = final and not _differs(run.problem, again)
+            if settled:
                 break
             run = _Run(again, options)
             history = history + run.history
             rounds += 1
+        cost = run.cost
+        if run.problem.adjustment.weights is not None:
+            stated = judged_at(problem, run.parameters, replace(run.problem.adjustment, weights=None))
+            cost = stated.graph.error(run.values)
     message = run.message
-    if run.converged and changed and rounds == options.max_rounds:
+    converged = run.converged
+    if run.converged and not settled and rounds == most:
         message += "; which rows take part still changed"
+        converged = problem.settings.loss == "none"
     return Solution(
         problem=run.problem,
         values=run.values,
         parameters=run.parameters,
         before=before,
-        converged=run.converged,
+        converged=converged,
         message=message,
         history=tuple(history),
         initial_cost=initial_cost,
-        cost=run.cost,
+        cost=cost,
+        weighted_cost=run.cost,
         seconds=time.perf_counter() - clock,
     )
+
+
+def _learn(problem: Problem, parameters: Floats, weighting: Weighting) -> tuple[Adjustment, bool]:
+    """What the residuals at some parameters say of the noise, and whether the loss has its final form."""
+    adjustment, final = problem.adjustment, True
+    if problem.settings.loss != "none":
+        weights, final = weighting.update(*lengths(problem, parameters))
+        adjustment = replace(adjustment, weights=weights)
+    if adjustment.joint_errors is not None:
+        adjustment = replace(adjustment, joint_errors=joint_errors(problem, parameters))
+    return adjustment, final
 
 
 class _Run:
@@ -235,7 +270,16 @@ def _step_length(previous: gtsam.Values, values: gtsam.Values, variables: Variab
 
 
 def _differs(old: Problem, new: Problem) -> bool:
-    """Whether rows were judged otherwise, or their sigma moved by more than 0.1 %."""
+    """Whether rows were judged otherwise, or their sigma, weights or joint values moved by more than matters."""
+    a, b = old.adjustment, new.adjustment
+    if a.weights is not None or b.weights is not None:
+        before, after = (np.ones(1) if x.weights is None else x.weights for x in (a, b))
+        if np.max(np.abs(before - after), initial=0.0) > WEIGHT_TOLERANCE:
+            return True
+    if a.joint_errors is not None and b.joint_errors is not None:
+        sigma = np.maximum(old.measurements.sigma_joint, 1e-300)
+        if np.max(np.abs(a.joint_errors - b.joint_errors) / sigma) > JOINT_TOLERANCE:
+            return True
     return old.judgement != new.judgement or not np.allclose(old.sigma, new.sigma, rtol=1e-3, atol=0.0, equal_nan=True)
 
 

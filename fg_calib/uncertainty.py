@@ -15,8 +15,9 @@ from fg_calib import residuals
 from fg_calib.factors import pose_of, prior_rows
 from fg_calib.identifiability import Identifiability, identify
 from fg_calib.observability import SUPPORT_TOLERANCE, IdentifiabilityClass, Observability, determined
-from fg_calib.problem import PAIR_KINDS, POSE_KINDS, Problem, all_rows, correlation, whitened_triangle
+from fg_calib.problem import PAIR_KINDS, POSE_KINDS, Problem, all_rows, correlation, lengths, whitened_triangle
 from fg_calib.robot import Robot
+from fg_calib.robust import effect
 from fg_calib.solver import Solution
 
 Floats = NDArray[np.float64]
@@ -280,9 +281,9 @@ def assess(solution: Solution) -> Uncertainty:
             quaternion_xyzw=Rotation.from_matrix(world_T_base.rotation().matrix()).as_quat(canonical=True),
             sigma=np.sqrt(np.diag(spread.covariance(np.eye(variables.n_columns))))[variables.n_robot_columns :],
         )
-    chi2 = 2.0 * solution.cost
-    dof = problem.n_independent + problem.n_priors - spread.rank
-    expected = max(0.0, dof - spread.excess)
+    chi2, n_rows, loss_factor = _weighted_chi2(solution)
+    dof = n_rows + problem.n_priors - spread.rank
+    expected = max(0.0, dof - spread.excess - (1.0 - loss_factor) * n_rows)
     bounds = chi2_bounds(dof, expected, _independent_dof(problem, dof, spread.rank))
     return Uncertainty(
         names=variables.names[: variables.n_robot_columns],
@@ -317,6 +318,23 @@ def chi2_bounds(dof: int, expected: float | None = None, independent: int | None
     return ratio * min(float(low), 1.0 / FACTOR), max(1.0, ratio) * max(float(high), FACTOR)
 
 
+def _weighted_chi2(solution: Solution) -> tuple[float, int, float]:
+    """Chi-square, the independent residuals in it, and what a robust loss makes of the mean of one of them.
+
+    With a robust loss only measurements count that keep at least half their weight.
+    """
+    problem = solution.problem
+    weights, chi2 = problem.adjustment.weights, 2.0 * solution.weighted_cost
+    if weights is None:
+        return chi2, problem.n_independent, 1.0
+    e, height = lengths(problem, solution.parameters)
+    outlier = weights < 0.5
+    chi2 -= float(np.sum(weights[outlier] * e[outlier] ** 2))
+    share = float(np.mean(~outlier[height > 0]))
+    of_loss = effect(problem.settings.loss, problem.height)
+    return max(0.0, chi2), round(problem.n_independent * share), of_loss.chi2
+
+
 def _independent_dof(problem: Problem, dof: int, rank: int) -> int:
     """Degrees of freedom of the noise behind the residuals: pairs hold no more than the poses they come from."""
     if not problem.formed or problem.sharing.poses:
@@ -341,13 +359,15 @@ def _spread(solution: Solution) -> Spread:
 
     Where rows share errors but are weighted as independent, with H = J^T J and C their covariance, it is
     H^-1 (J^T C J) H^-1 (priors are rows of their own), unless independence was asked for. The mean of chi-square,
-    tr C - tr(H^-1 J^T C J), is then below the degrees of freedom by tr(H^-1 J^T (C - 1) J).
+    tr C - tr(H^-1 J^T C J), is then below the degrees of freedom by tr(H^-1 J^T (C - 1) J). A robust loss loses some of
+    what clean data hold: see `robust.Effect`.
     """
     problem, variables = solution.problem, solution.problem.variables
     scales = variables.scales
 
     def stacked(parameters: Floats) -> Floats:
-        rows = [whitened_triangle(problem, parameters), prior_rows(variables, parameters)[1]]
+        data = whitened_triangle(problem, parameters) / np.sqrt(effect(problem.settings.loss, problem.height).variance)
+        rows = [data, prior_rows(variables, parameters)[1]]
         return np.vstack([*rows, np.zeros((variables.n_columns, variables.n_columns))]) * scales
 
     _, s, Vt = np.linalg.svd(stacked(solution.parameters), full_matrices=False)

@@ -166,6 +166,27 @@ class PairWhitening:
         sigma: Floats = np.sqrt(self._stated[:, [0, 2]]) * self._adjustment.factors
         return sigma
 
+    def lengths(self) -> tuple[Floats, Integers]:
+        """Length of each pair's residual whitened by all its noise, and its number of rows, shapes (n_pairs,).
+
+        For pairs that take no part 0 and 0.
+        """
+        n = self._pairs.n_pairs
+        squared, height = np.zeros(n), np.zeros(n, dtype=np.int64)
+        of_distance, of_angle = self._adjustment.factors
+        rows = np.flatnonzero(self.judgement.distance | self.judgement.angle)
+        W = _whiten_2x2(self._stated[rows], self.judgement.distance[rows], self.judgement.angle[rows])
+        part = pair_block(self._trig, self._pairs.select(rows), self._kinds)
+        part = replace(part, whitening=W / [of_distance, of_distance, of_angle])
+        squared[rows] = np.sum(residuals.residual(part, self._chain) ** 2, axis=1)
+        height[rows] = self.judgement.distance[rows].astype(np.int64) + self.judgement.angle[rows]
+        rows = np.flatnonzero(self.judgement.same_point)
+        if len(rows):
+            same = self._same_points(rows, Sharing(), joint_noise=True, weighted=False)
+            squared[rows] = np.sum(residuals.residual(self._scaled(same), self._chain) ** 2, axis=1)
+            height[rows] = 3
+        return np.sqrt(squared), height
+
     def n_shared(self, sharing: Sharing) -> int:
         """Number of errors that the train rows share."""
         train = self.judgement.used & ~self._pairs.test
@@ -242,17 +263,18 @@ class PairWhitening:
         shape = (n * height, self._measurements.n_configurations * width)
         return scipy.sparse.csr_array((G.ravel(), columns.ravel(), starts), shape=shape)
 
-    def joint_errors(self, block: CorrelatedBlock) -> Floats:
+    def joint_errors(self, block: CorrelatedBlock, chain: Chain) -> Floats:
         """What the train rows say of the joint errors, shape (n_configurations, n_joints), [rad] (prismatic: [m]).
 
         Args:
             block: From `blocks`, with the joints' errors shared.
+            chain: The chain at the parameters where the rows are asked.
         """
         m, width = self._measurements, self._width(Sharing(joints=True))
         found = np.zeros((m.n_configurations, len(m.sigma_joint)))
         pairs = self._pairs.select(self.judgement.used & ~self._pairs.test)
         used = np.unique(np.concatenate([pairs.a, pairs.b]))
-        z = block.shared_errors(self._chain).reshape(len(used), -1)[:, -width:]
+        z = block.shared_errors(chain).reshape(len(used), -1)[:, -width:]
         found[np.ix_(used, self._joints)] = -m.sigma_joint[self._joints] * z
         return found
 
@@ -335,7 +357,9 @@ class PairWhitening:
         both: Floats = np.nan_to_num(np.stack([of_distance, of_angle], axis=1), posinf=0.0)
         return both
 
-    def _same_points(self, rows: Integers, sharing: Sharing, joint_noise: bool) -> SamePointBlock:
+    def _same_points(
+        self, rows: Integers, sharing: Sharing, joint_noise: bool, weighted: bool = True
+    ) -> SamePointBlock:
         pairs = self._pairs
         same = SamePointBlock(self._trig, pairs.a[rows], pairs.b[rows], np.tile(np.eye(3), (len(rows), 1, 1)))
         of_joints = np.zeros((len(rows), 3, 3))
@@ -344,7 +368,7 @@ class PairWhitening:
                 of_joints[chunk] = J @ np.swapaxes(J, 1, 2)
         S = np.eye(3) * self._own[rows, 0][:, None, None]
         private = S + of_joints * (joint_noise and not sharing.joints)
-        if self._adjustment.weights is not None:
+        if weighted and self._adjustment.weights is not None:
             weight = np.maximum(self._adjustment.weights[rows], LEAST_WEIGHT)
             private = private + (1.0 / weight - 1.0)[:, None, None] * (S + of_joints)
         return replace(same, whitening=_inverse_cholesky(private))
@@ -463,12 +487,22 @@ class PoseWhitening:
         rows = [np.einsum("nhj,nj->nh", J, errors[chunk]) for chunk, J in joint_rows(block, self._chain, ones)]
         return [CorrelatedBlock((block,), offsets=(np.concatenate(rows).ravel(),))]
 
-    def joint_errors(self) -> Floats:
-        """What each pose says of the errors of its readings, shape (n_configurations, n_joints)."""
+    def lengths(self) -> tuple[Floats, Integers]:
+        """Length of each pose's residual whitened by all its noise, and its number of rows, shapes (n,)."""
+        W = _inverse_cholesky(self._own + self._of_joints) / self._factors
+        r = residuals.residual(replace(self._whole, whitening=W), self._chain)
+        return np.linalg.norm(r, axis=1), np.full(len(r), self._whole.height)
+
+    def joint_errors(self, chain: Chain) -> Floats:
+        """What each pose says of the errors of its readings, shape (n_configurations, n_joints).
+
+        Args:
+            chain: The chain at the parameters where the poses are asked.
+        """
         m = self._measurements
         W = self._whitening(True)
         whole = replace(self._whole, whitening=W)
-        r = residuals.residual(whole, self._chain)
+        r = residuals.residual(whole, chain.without_columns())
         found = np.zeros((m.n_configurations, len(m.sigma_joint)))
         for rows, J in joint_rows(whole, self._chain, np.ones_like(m.sigma_joint)):
             left = r[rows]

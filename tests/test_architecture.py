@@ -19,6 +19,7 @@ FLOORS = (
         "factors",
         "frames",
         "observability",
+        "robust",
         "whitening",
         "problem",
         "solver",
