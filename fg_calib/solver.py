@@ -51,7 +51,7 @@ class SolverOptions:
         lambda_ceiling: Damping beyond which it gives up, as a multiple of the largest curvature.
         lambda_floor: Least damping, as a multiple of the largest curvature (rounding), beside `_DAMPING_FLOOR` (noise).
         max_rounds: Times that rows are judged and whitened anew at the estimate.
-        max_robust_rounds: The same with a robust loss, whose weights take some rounds to settle.
+        max_learning_rounds: The same where robust weights or joint values are learned, which takes some rounds.
     """
 
     max_iterations: int = 100
@@ -59,7 +59,7 @@ class SolverOptions:
     lambda_ceiling: float = 1e6
     lambda_floor: float = 1e-14
     max_rounds: int = 5
-    max_robust_rounds: int = 200
+    max_learning_rounds: int = 200
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,8 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
         initial_cost, history = run.initial_cost, run.history
         weighting = Weighting(problem.settings.loss)
         settled, rounds = False, 0
-        most = options.max_rounds if problem.settings.loss == "none" else options.max_robust_rounds
+        learning = problem.settings.loss != "none" or run.problem.adjustment.joint_errors is not None
+        most = options.max_learning_rounds if learning else options.max_rounds
         while run.converged and rounds < most:
             adjustment, final = _learn(run.problem, run.parameters, weighting)
             again = judged_at(problem, run.parameters, adjustment)
@@ -154,7 +155,7 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
     converged = run.converged
     if run.converged and not settled and rounds == most:
         message += "; which rows take part still changed"
-        converged = problem.settings.loss == "none"
+        converged = not learning
     return Solution(
         problem=run.problem,
         values=run.values,
