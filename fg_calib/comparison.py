@@ -27,7 +27,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.errors import CalibrationError
+from fg_calib.errors import CalibrationError, ProblemError
 from fg_calib.files.job import Job
 from fg_calib.kinematics import Poses, build_chain, forward, precompute_trig
 from fg_calib.least_squares import LeastSquares, fit_least_squares
@@ -172,7 +172,7 @@ def compare(job: Job) -> Comparison:
     judge = _Judge(job, readings, solution)
     estimates = [judge.of_graph("graph", solution, uncertainty)]
 
-    before = job.robot.with_values(solution.before[:-6])
+    before = job.robot.with_values(solution.before[solution.problem.variables.robot_span])
     try:
         estimates += _without_priors(job, judge)
     except CalibrationError as error:
@@ -190,6 +190,8 @@ def compare(job: Job) -> Comparison:
 
 def _without_priors(job: Job, judge: _Judge) -> list[Estimate]:
     """The estimates of the kept parameters: by the graph, and by plain least squares from the same start."""
+    if job.measurements.groups is not None:
+        raise ProblemError(job.measurements.source, "a column group", "pairs or poses: they know no points")
     problem = problem_of(job, prior=False, gauge="keep")
     kept = [p.name for p in problem.estimated]
     held = [i for i, p in enumerate(job.robot.parameters) if p.name not in kept]

@@ -6,6 +6,10 @@
 | `K(0)`, `K(n + 1)` | the same of the base, and of the tool where not all six of its parameters are estimated |
 | `T(0)` | the tool frame as a Pose3, where all six are |
 | `X(0)` | world_T_base as a Pose3, where the measurement frame is unknown |
+| `L(g)` | base_p of the physical point that group g touches, a Point3 |
+
+The last is a *nuisance* variable: it must be estimated too, but is nobody's question. Columns of such variables follow
+those of the *core* (robot and measurement frame) and are eliminated before anything is said of the core.
 
 Pose3's tangent is rotation first, and a step moves the frame in itself (`pose * Exp(step)`).
 
@@ -16,8 +20,8 @@ initial values without a word when it gets the columns wrong. So `custom_factor`
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Literal, Protocol
 
 import gtsam
 import numpy as np
@@ -34,6 +38,9 @@ Floats = NDArray[np.float64]
 GRAM_ROWS = 20_000
 """Blocks with more rows than this are reduced by their Gram matrix, if their conditioning allows it."""
 
+_ROUNDING = 1e-10
+"""Share of a column's length that elimination may leave of nothing."""
+
 
 @dataclass(frozen=True)
 class Variable:
@@ -42,32 +49,41 @@ class Variable:
     Attributes:
         key: GTSAM's key.
         symbol: How it is written: `K(3)`, `T(0)`, `X(0)`.
-        kind: A vector of parameters, the tool's pose, or the measurement frame's.
+        kind: A vector of parameters, the tool's pose, the measurement frame's, or the position of a touched point.
         parameters: Indices into the parameter vector of `Variables.parameters`, in the variable's own order;
             for poses in the order of `FRAME_KINDS`.
         columns: Its columns in a Jacobian.
+        scales: Of a nuisance variable: a change of ordinary size in each of its columns.
     """
 
     key: int
     symbol: str
-    kind: Literal["vector", "tool", "frame"]
+    kind: Literal["vector", "tool", "frame", "point"]
     parameters: tuple[int, ...]
     columns: slice
+    scales: tuple[float, ...] = ()
+
+    @property
+    def is_pose(self) -> bool:
+        """Whether it is a Pose3; else it is a vector."""
+        return self.kind in ("tool", "frame")
 
 
 @dataclass(frozen=True)
 class Variables:
     """All variables of a problem, and the way between GTSAM's values and the parameter vector.
 
-    The parameter vector has the robot's parameters, then the measurement frame's six in the order of `FRAME_KINDS`.
+    The parameter vector has the robot's parameters, then the measurement frame's six in the order of `FRAME_KINDS`,
+    then the values of the nuisance variables.
 
     Attributes:
         robot: The robot, nominal.
-        items: The variables in the order of their columns.
+        items: The core variables in the order of their columns.
         names: Name of each estimated scalar, shape (n_columns,): a parameter's, or `frame.x` ... `frame.yaw`. Of a
             pose the names stand in `FRAME_KINDS`' order although its columns are tangent directions.
         chain: The kinematic chain with these columns.
         priors: Whether the robot's tolerances are priors.
+        nuisance: The nuisance variables; their columns follow those of the core.
     """
 
     robot: Robot
@@ -75,16 +91,37 @@ class Variables:
     names: tuple[str, ...]
     chain: Chain
     priors: bool
+    nuisance: tuple[Variable, ...] = ()
 
     @property
     def n_columns(self) -> int:
-        """Number of columns of a Jacobian: the dimension of the tangent space."""
+        """Number of columns of the core's Jacobian: the dimension of its tangent space."""
         return len(self.names)
 
     @property
+    def n_nuisance(self) -> int:
+        """Number of columns of the nuisance variables."""
+        return sum(len(v.parameters) for v in self.nuisance)
+
+    @property
     def keys(self) -> list[int]:
-        """GTSAM's keys in the order of the columns."""
-        return [v.key for v in self.items]
+        """GTSAM's keys in the order of the columns, the core's first."""
+        return [v.key for v in self.items + self.nuisance]
+
+    @property
+    def robot_span(self) -> slice:
+        """Where the robot's parameters stand in the parameter vector."""
+        return slice(0, len(self.robot.parameters))
+
+    @property
+    def frame_span(self) -> slice:
+        """Where the measurement frame's six stand in the parameter vector."""
+        return slice(len(self.robot.parameters), len(self.robot.parameters) + 6)
+
+    @property
+    def nuisance_span(self) -> slice:
+        """Where the nuisance values stand in the parameter vector."""
+        return slice(self.frame_span.stop, self.frame_span.stop + self.n_nuisance)
 
     @property
     def n_robot_columns(self) -> int:
@@ -100,36 +137,71 @@ class Variables:
                 scales[v.columns] = [self.robot.parameters[i].scale for i in v.parameters]
         return scales
 
+    @property
+    def all_scales(self) -> Floats:
+        """`scales`, then those of the nuisance columns, shape (n_columns + n_nuisance,)."""
+        return np.concatenate([self.scales, *(v.scales for v in self.nuisance)])
+
     def nominal(self) -> Floats:
-        """The parameter vector at the robot's nominal values, with the identity as measurement frame."""
-        return np.concatenate([self.robot.nominal, np.zeros(6)])
+        """The parameter vector at the robot's nominal values, measurement frame and nuisance values zero."""
+        return np.concatenate([self.robot.nominal, np.zeros(6 + self.n_nuisance)])
 
     def values(self, parameters: Floats) -> gtsam.Values:
         """GTSAM's values at a parameter vector."""
         values = gtsam.Values()
-        for v in self.items:
+        for v in self.items + self.nuisance:
             chosen = parameters[list(v.parameters)]
-            values.insert(v.key, chosen if v.kind == "vector" else pose_of(chosen))
+            values.insert(v.key, pose_of(chosen) if v.is_pose else chosen)
         return values
 
     def parameters(self, values: gtsam.Values) -> Floats:
         """The parameter vector at GTSAM's values; what is not a variable keeps its nominal value."""
         parameters = self.nominal()
-        for v in self.items:
-            chosen = values.atVector(v.key) if v.kind == "vector" else frame_of(values.atPose3(v.key))
+        for v in self.items + self.nuisance:
+            chosen = frame_of(values.atPose3(v.key)) if v.is_pose else values.atVector(v.key)
             parameters[list(v.parameters)] = chosen
         return parameters
 
     def step(self, start: gtsam.Values, end: gtsam.Values) -> Floats:
-        """The tangent step from some values to others, shape (n_columns,)."""
+        """The tangent step from some values to others, shape (n_columns + n_nuisance,)."""
         return np.concatenate(
             [
-                end.atVector(v.key) - start.atVector(v.key)
-                if v.kind == "vector"
-                else gtsam.Pose3.Logmap(start.atPose3(v.key).between(end.atPose3(v.key)))
-                for v in self.items
+                gtsam.Pose3.Logmap(start.atPose3(v.key).between(end.atPose3(v.key)))
+                if v.is_pose
+                else end.atVector(v.key) - start.atVector(v.key)
+                for v in self.items + self.nuisance
             ]
         )
+
+    def moved(self, values: gtsam.Values, step: Floats) -> gtsam.Values:
+        """Some values after a tangent step, shape (n_columns + n_nuisance,)."""
+        delta = gtsam.VectorValues()
+        for v in self.items + self.nuisance:
+            delta.insert(v.key, step[v.columns])
+        return values.retract(delta)
+
+    def with_nuisance(self, kind: Literal["point"], letter: str, count: int, scales: tuple[float, ...]) -> Variables:
+        """The same with `count` nuisance variables more: vectors with one figure for each of `scales`.
+
+        Args:
+            kind: What they are.
+            letter: Of their keys: `letter(0)`, `letter(1)`, ...
+            count: How many.
+            scales: A change of ordinary size in each of a variable's columns.
+        """
+        column, place, n = self.n_columns + self.n_nuisance, self.nuisance_span.stop, len(scales)
+        more = tuple(
+            Variable(
+                key=gtsam.symbol(letter, i),
+                symbol=f"{letter}({i})",
+                kind=kind,
+                parameters=tuple(range(place + n * i, place + n * (i + 1))),
+                columns=slice(column + n * i, column + n * (i + 1)),
+                scales=scales,
+            )
+            for i in range(count)
+        )
+        return replace(self, nuisance=self.nuisance + more)
 
     def named_derivative(self, parameters: Floats) -> Floats:
         """Derivative of the named scalars in the columns, shape (n_columns, n_columns).
@@ -141,15 +213,15 @@ class Variables:
         """
         D = np.eye(self.n_columns)
         for v in self.items:
-            if v.kind != "vector":
+            if v.is_pose:
                 D[v.columns, v.columns] = _frame_derivative(parameters[list(v.parameters)])
         return D
 
     def describe(self, key: int) -> str:
         """A key in words: `K(3) (a3, alpha3, d3)`."""
-        for v in self.items:
+        for v in self.items + self.nuisance:
             if v.key == key:
-                return f"{v.symbol} ({', '.join(self.names[v.columns])})"
+                return f"{v.symbol} ({', '.join(self.names[v.columns]) or v.kind})"
         return str(gtsam.Symbol(key))
 
 
@@ -288,6 +360,110 @@ def measurement_factor(block: AnyBlock, variables: Variables) -> gtsam.CustomFac
     return custom_factor(variables.items, n_all, reduced_residual, reduced_linearise)
 
 
+class Term(Protocol):
+    """Rows that depend on nuisance variables, and on the core or not."""
+
+    @property
+    def n_rows(self) -> int:
+        """Number of rows."""
+
+    @property
+    def nuisance(self) -> tuple[int, ...]:
+        """Which of `Variables.nuisance` they depend on."""
+
+    @property
+    def on_core(self) -> bool:
+        """Whether they depend on the core."""
+
+    def residual(self, variables: Variables, parameters: Floats) -> Floats:
+        """Whitened residuals, shape (n_rows,)."""
+
+    def linearise(self, variables: Variables, parameters: Floats) -> tuple[Floats, Floats]:
+        """The same with derivatives, shape (n_rows, n): in the core's columns if `on_core`, then in `nuisance`."""
+
+
+def term_factor(term: Term, variables: Variables) -> gtsam.CustomFactor:
+    """A term as one factor; one of more rows than columns as its triangular factor, like `measurement_factor`."""
+    items = (variables.items if term.on_core else ()) + tuple(variables.nuisance[i] for i in term.nuisance)
+    local, column = [], 0
+    for v in items:
+        width = v.columns.stop - v.columns.start
+        local.append(replace(v, columns=slice(column, column + width)))
+        column += width
+    reduced = term.n_rows > column + 1
+    n_rows = column + 1 if reduced else term.n_rows
+
+    def residual(values: gtsam.Values) -> Floats:
+        r = term.residual(variables, variables.parameters(values))
+        return np.append(np.linalg.norm(r), np.zeros(n_rows - 1)) if reduced else r
+
+    def linearise(values: gtsam.Values) -> tuple[Floats, Floats]:
+        r, J = term.linearise(variables, variables.parameters(values))
+        if reduced:
+            R: Floats = np.linalg.qr(np.column_stack([J, r]), mode="r")  # type: ignore[assignment]
+            r, J = R[:, -1], R[:, :-1]
+        return r, J
+
+    return custom_factor(local, n_rows, residual, linearise)
+
+
+def stacked_terms(terms: Sequence[Term], variables: Variables, parameters: Floats) -> Floats:
+    """Derivatives of all terms' rows in all columns, each term reduced: shape (m, n_columns + n_nuisance)."""
+    n = variables.n_columns
+    stacked = [np.zeros((0, n + variables.n_nuisance))]
+    for term in terms:
+        _, J = term.linearise(variables, parameters)
+        if len(J) > J.shape[1]:
+            J = np.linalg.qr(J, mode="r")  # type: ignore[assignment]
+        wide = np.zeros((len(J), n + variables.n_nuisance))
+        spans = [slice(0, n)] if term.on_core else []
+        spans += [variables.nuisance[i].columns for i in term.nuisance]
+        wide[:, np.concatenate([np.arange(n + variables.n_nuisance)[s] for s in spans])] = J
+        stacked.append(wide)
+    return np.vstack(stacked)
+
+
+@dataclass(frozen=True)
+class Eliminated:
+    """A linear system with its nuisance columns eliminated by QR.
+
+    Attributes:
+        own: What the nuisance columns can explain of the right-hand side, shape (n_nuisance,).
+        A: The core's columns, less what the nuisance columns can explain of them, shape (m, n_columns).
+        b: The right-hand side, less the same, shape (m,).
+        follow: How the nuisance variables follow the core, shape (n_nuisance, n_columns).
+        inverse: S with S S^T their covariance at a given core, shape (n_nuisance, n_nuisance).
+    """
+
+    own: Floats
+    A: Floats
+    b: Floats
+    follow: Floats
+    inverse: Floats
+
+
+def eliminate(A: Floats, b: Floats, n_columns: int) -> Eliminated:
+    """Eliminate all but the first `n_columns` of a linear system |A x - b|^2.
+
+    What is left of a core column that the nuisance columns explain altogether is rounding, and set to zero.
+
+    Note:
+        The nuisance columns must be determined by themselves: every touched point has touches of its own.
+    """
+    core, nuisance = A[:, :n_columns], A[:, n_columns:]
+    k = nuisance.shape[1]
+    if k == 0:
+        return Eliminated(np.zeros(0), core, b, np.zeros((0, n_columns)), np.zeros((0, 0)))
+    Q, R = np.linalg.qr(nuisance)
+    explained = Q.T @ core
+    left = core - Q @ explained
+    left = left - Q @ (Q.T @ left)  # once more: rounding of the first time
+    left[:, np.linalg.norm(left, axis=0) <= _ROUNDING * np.linalg.norm(core, axis=0)] = 0.0
+    own = Q.T @ b
+    inverse: Floats = np.linalg.inv(R)
+    return Eliminated(own, left, b - Q @ own, -inverse @ explained, inverse)
+
+
 class Reduction:
     """Square root of [J r]^T [J r], chosen by the conditioning met at the first linearisation.
 
@@ -369,7 +545,7 @@ def _prior_factor(variables: Variables, variable: Variable, n_rows: int) -> gtsa
 
     def rows(values: gtsam.Values) -> tuple[Floats, Floats]:
         parameters = variables.nominal()
-        chosen = values.atVector(variable.key) if variable.kind == "vector" else frame_of(values.atPose3(variable.key))
+        chosen = frame_of(values.atPose3(variable.key)) if variable.is_pose else values.atVector(variable.key)
         parameters[list(variable.parameters)] = chosen
         r, J = prior_rows(variables, parameters, variable)
         return r, J[:, variable.columns]

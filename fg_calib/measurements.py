@@ -99,6 +99,26 @@ class Pairs:
 
 
 @dataclass(frozen=True)
+class Groups:
+    """Configurations in which the tool point touched the same physical point, whose position is unknown.
+
+    Attributes:
+        names: Name of each group, shape (n_groups,).
+        index: Group of each configuration, -1 for none, shape (n_configurations,).
+        pairs: Distances measured between the points of two groups (a and b are groups, angles nan).
+    """
+
+    names: tuple[str, ...]
+    index: Integers
+    pairs: Pairs
+
+    @property
+    def n_groups(self) -> int:
+        """Number of groups."""
+        return len(self.names)
+
+
+@dataclass(frozen=True)
 class Measurements:
     """Configurations, and what was measured at them or between them.
 
@@ -113,6 +133,8 @@ class Measurements:
         sigma_joint: Of the readings, shape (n_joints,), [rad] (prismatic: [m]).
         pairs: Directly measured pairs; None if pairs are to be formed from the poses.
         source: File name, for messages.
+        groups: Which configurations touched the same point; None if none did.
+        sigma_point: Of a touch, per axis, shape (n_configurations,), [m]; nan where it is not stated.
     """
 
     readings: Floats
@@ -125,11 +147,19 @@ class Measurements:
     sigma_joint: Floats
     pairs: Pairs | None = None
     source: str = "measurements"
+    groups: Groups | None = None
+    sigma_point: Floats | None = None
 
     @property
     def n_configurations(self) -> int:
         """Number of configurations, train and test."""
         return len(self.readings)
+
+
+def no_pairs(source: str) -> Pairs:
+    """A table of pairs without any."""
+    rows, figures = np.empty(0, dtype=np.int64), np.empty(0)
+    return Pairs(rows, rows, figures, figures, figures, figures, np.empty(0, dtype=np.bool_), source)
 
 
 def form_pairs(measurements: Measurements, pairing: Pairing) -> Pairs:

@@ -18,18 +18,24 @@ from fg_calib import frames, residuals
 from fg_calib.choices import EncoderNoise, FrameKnowledge, Gauge, Loss, Model, PairErrors
 from fg_calib.errors import ProblemError
 from fg_calib.factors import (
+    Eliminated,
+    Term,
     Variables,
     build_variables,
+    eliminate,
     frame_of,
     measurement_factor,
     pose_of,
     prior_factors,
     prior_rows,
+    stacked_terms,
+    term_factor,
 )
 from fg_calib.files.job import Job
 from fg_calib.frames import Frame, Unknown
+from fg_calib.groups import PointGroups
 from fg_calib.kinematics import build_chain, forward, precompute_trig
-from fg_calib.measurements import Measurements, Pairing, Pairs, form_pairs
+from fg_calib.measurements import Measurements, Pairing, Pairs, form_pairs, no_pairs
 from fg_calib.observability import RANK_TOLERANCE, SIGNAL_FLOOR, Observability, analyse, determined, singular_values
 from fg_calib.residuals import AnyBlock, Block, CorrelatedBlock
 from fg_calib.robot import Parameter, Robot
@@ -116,6 +122,9 @@ class Problem:
         sharing: Which errors of configurations the rows carry in common.
         adjustment: What has been learned of the measurements' noise.
         whole: The problem with everything estimated, where this one leaves parameters out to fix the gauge.
+        points: The groups that touched the same point; None if none did.
+        sigma_point: 1 sigma of a touch, joint noise included, shape (n_configurations, 3), [m]; empty without groups.
+        terms: The whitened train rows that depend on nuisance variables.
     """
 
     robot: Robot
@@ -132,6 +141,9 @@ class Problem:
     sharing: Sharing
     adjustment: Adjustment
     whole: Problem | None = None
+    points: PointGroups | None = None
+    sigma_point: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    terms: tuple[Term, ...] = ()
 
     @property
     def initial(self) -> gtsam.Values:
@@ -157,7 +169,8 @@ class Problem:
         if self.pairs is None or self.judgement is None:
             return int(np.sum(~self.measurements.test))
         used = self.judgement.used & ~self.pairs.test
-        return len(np.unique(np.concatenate([self.pairs.a[used], self.pairs.b[used]])))
+        touched = [] if self.points is None else [np.flatnonzero(self.points.train)]
+        return len(np.unique(np.concatenate([self.pairs.a[used], self.pairs.b[used], *touched])))
 
     @property
     def height(self) -> int:
@@ -169,7 +182,7 @@ class Problem:
     @property
     def formed(self) -> bool:
         """Whether pairs were formed from measured poses."""
-        return self.pairs is not None and self.measurements.pairs is None
+        return self.pairs is not None and self.measurements.pairs is None and self.pairs.n_pairs > 0
 
     @property
     def common(self) -> Sharing:
@@ -184,7 +197,13 @@ class Problem:
         if self.pairs is None or self.judgement is None:
             return sum(b.n * b.height for b in self.blocks)
         j, train = self.judgement, ~self.pairs.test
-        return int(np.sum(j.distance & train) + np.sum(j.angle & train) + 3 * np.sum(j.same_point & train))
+        of_pairs = int(np.sum(j.distance & train) + np.sum(j.angle & train) + 3 * np.sum(j.same_point & train))
+        return of_pairs + self.n_of_points
+
+    @property
+    def n_of_points(self) -> int:
+        """Scalar residuals of touches, and of distances between touched points."""
+        return 0 if self.points is None else self.points.n_residuals
 
     @property
     def n_independent(self) -> int:
@@ -192,7 +211,7 @@ class Problem:
         block = self.blocks[0] if self.blocks else None
         if not (self.sharing.poses and isinstance(block, CorrelatedBlock)):
             return self.n_residuals
-        return min(self.n_residuals, round(block.n_shared_rows))
+        return min(self.n_residuals, round(block.n_shared_rows) + self.n_of_points)
 
     @property
     def approximate(self) -> bool:
@@ -255,12 +274,15 @@ def build_problem(
         raise ProblemError(f"robot {robot.name}", "nothing to estimate", "at least one parameter that is not fixed")
     unknown_frame = frame == "unknown" and not settings.uses_pairs
     variables = build_variables(robot, unknown_frame, settings.prior)
+    points = None if measurements.groups is None else PointGroups(measurements, model)
+    if points is not None:
+        variables = points.add_points(variables)
     pairs = _usable_pairs(measurements, settings) if settings.uses_pairs else None
     if pairs is None:
         _check_poses(measurements, settings)
     trig = precompute_trig(robot, measurements.readings)
-    start = _start(robot, measurements, settings, variables, trig, pairs)
-    problem = _assemble(robot, measurements, settings, variables, start, trig, pairs)
+    start = _start(robot, measurements, settings, variables, trig, pairs, points)
+    problem = _assemble(robot, measurements, settings, variables, start, trig, pairs, points=points)
     _check_enough(problem)
     if gauge != "keep":
         return problem
@@ -273,7 +295,10 @@ def build_problem(
         )
     reduced = robot.with_estimated(kept)
     variables = build_variables(reduced, unknown_frame, False)
-    return replace(_assemble(reduced, measurements, settings, variables, start, trig, pairs), whole=problem)
+    if points is not None:
+        variables = points.add_points(variables)
+    anew = _assemble(reduced, measurements, settings, variables, start, trig, pairs, points=points)
+    return replace(anew, whole=problem)
 
 
 def problem_of(job: Job, **changes: Any) -> Problem:
@@ -372,7 +397,7 @@ def judged_at(problem: Problem, parameters: Floats, adjustment: Adjustment | Non
         adjustment: What has been learned of the noise; None for what the problem has.
     """
     p, a = problem, adjustment or problem.adjustment
-    anew = _assemble(p.robot, p.measurements, p.settings, p.variables, parameters, p.trig, p.pairs, a)
+    anew = _assemble(p.robot, p.measurements, p.settings, p.variables, parameters, p.trig, p.pairs, a, p.points)
     return replace(anew, whole=p.whole)
 
 
@@ -448,13 +473,25 @@ def frames_only(problem: Problem) -> Problem | None:
     if not variables.items:
         return None
     p = problem
-    return _assemble(robot, p.measurements, p.settings, variables, p.start, p.trig, p.pairs)
+    if p.points is not None:
+        variables = p.points.add_points(variables)
+    return _assemble(robot, p.measurements, p.settings, variables, p.start, p.trig, p.pairs, points=p.points)
 
 
 def whitened_triangle(problem: Problem, parameters: Floats) -> Floats:
-    """Triangular factor of the train rows' whitened Jacobian at a parameter vector, shape (m, n_columns)."""
+    """Triangular factor of the train rows' whitened Jacobian at a parameter vector, shape (m, n_columns).
+
+    Nuisance variables are eliminated: what is left of the rows are what they say of the core.
+    """
     chain = problem.variables.chain.at(parameters)
-    return np.vstack([residuals.triangle(block, chain)[:, :-1] for block in problem.blocks])
+    blocks = [residuals.triangle(block, chain)[:, :-1] for block in problem.blocks]
+    return np.vstack([*blocks, eliminated_terms(problem, parameters).A])
+
+
+def eliminated_terms(problem: Problem, parameters: Floats) -> Eliminated:
+    """The rows of the terms at a parameter vector, with the nuisance columns eliminated; zero as right-hand side."""
+    A = stacked_terms(problem.terms, problem.variables, parameters)
+    return eliminate(A, np.zeros(len(A)), problem.variables.n_columns)
 
 
 def named_triangle(problem: Problem, parameters: Floats) -> Floats:
@@ -492,7 +529,7 @@ def observe(
     return analyse(
         named_triangle(problem, parameters),
         problem.estimated,
-        n_measurements=problem.n_pairs or problem.n_configurations,
+        n_measurements=(problem.n_pairs + problem.n_of_points) or problem.n_configurations,
         prefer=prefer,
         floor=floor,
     )
@@ -509,8 +546,11 @@ def all_rows(problem: Problem) -> Block:
 def _usable_pairs(measurements: Measurements, settings: Settings) -> Pairs:
     """The pairs, with nan where the model does not want a measurement; every wanted one has its sigma."""
     with_distance, with_angle = PAIR_KINDS[settings.model]
+    missing = (with_distance and measurements.position is None) or (with_angle and measurements.rotation is None)
     if measurements.pairs is not None:
         pairs = measurements.pairs
+    elif measurements.groups is not None and missing:  # touched points suffice
+        pairs = no_pairs(measurements.source)
     else:
         if with_distance and measurements.position is None:
             raise ProblemError(
@@ -575,7 +615,7 @@ def _check_enough(problem: Problem) -> None:
         if problem.pairs is not None and not problem.pairs.n_pairs:
             raise ProblemError(source, f"{found}: none has a measurement that model {problem.settings.model} uses")
         raise ProblemError(source, found, "train rows")
-    rows = problem.n_residuals + problem.n_priors
+    rows = problem.n_residuals + problem.n_priors - problem.variables.n_nuisance
     if rows >= problem.variables.n_columns:
         return
     s = problem.settings
@@ -596,8 +636,24 @@ def _start(
     variables: Variables,
     trig: Floats,
     pairs: Pairs | None,
+    points: PointGroups | None,
 ) -> Floats:
-    """The nominal parameters with the unknown frames from closed form, as a parameter vector."""
+    """The nominal parameters with the unknown frames from closed form, as a parameter vector; then touched points."""
+    start = _start_of_core(robot, measurements, settings, variables, trig, pairs, points)
+    if points is not None:
+        start[variables.nuisance_span] = points.start(variables.chain.at(start), trig)
+    return start
+
+
+def _start_of_core(
+    robot: Robot,
+    measurements: Measurements,
+    settings: Settings,
+    variables: Variables,
+    trig: Floats,
+    pairs: Pairs | None,
+    points: PointGroups | None,
+) -> Floats:
     start = variables.nominal()
     tool = robot.owned_by(robot.n_joints + 1)  # in the order of FRAME_KINDS
     free = np.array([robot.parameters[i].estimated for i in tool])
@@ -619,6 +675,8 @@ def _start(
         T = frames.start_from_distances(
             poses, pairs.a[chosen], pairs.b[chosen], pairs.distance[chosen], nominal_tool, free[:3]
         )
+        if points is not None and not chosen.any():
+            T = Frame(T.rotation, points.tool_point(poses, nominal_tool.translation, free[:3]))
         X = None
     else:
         with_orientation, with_position = POSE_KINDS[settings.model]
@@ -634,7 +692,7 @@ def _start(
     found = free & np.repeat([True, unknown.tool_rotation], 3)
     start[np.array(tool)[found]] = _coordinates(T)[found]
     if X is not None and unknown.frame:
-        start[-6:] = _coordinates(X)
+        start[variables.frame_span] = _coordinates(X)
     return start
 
 
@@ -657,6 +715,7 @@ def _assemble(
     trig: Floats,
     pairs: Pairs | None,
     adjustment: Adjustment | None = None,
+    points: PointGroups | None = None,
 ) -> Problem:
     """The problem with rows judged and whitened at `start`."""
     chain = variables.chain.at(start)
@@ -668,7 +727,7 @@ def _assemble(
     moved = _trig(robot, measurements, trig, adjustment)
     judgement, sharing = None, Sharing()
     if pairs is not None:
-        formed = measurements.pairs is None
+        formed = measurements.pairs is None and pairs.n_pairs > 0
         kinds = PAIR_KINDS[settings.model]
         of_pairs = PairWhitening(moved, chain, measurements, pairs, kinds, formed, adjustment)
         judgement, sigma = of_pairs.judgement, of_pairs.sigma
@@ -686,6 +745,14 @@ def _assemble(
     graph = gtsam.NonlinearFactorGraph()
     for block in blocks:
         graph.add(measurement_factor(block, variables))
+    terms: tuple[Term, ...] = ()
+    sigma_point = np.zeros((0, 3))
+    if points is not None:
+        covariance = points.covariance(chain, trig)
+        sigma_point = np.sqrt(np.einsum("nii->ni", covariance))
+        terms = points.terms(chain, trig, covariance)
+    for term in terms:
+        graph.add(term_factor(term, variables))
     for factor in prior_factors(variables):
         graph.add(factor)
     return Problem(
@@ -702,4 +769,7 @@ def _assemble(
         graph=graph,
         sharing=sharing,
         adjustment=adjustment,
+        points=points,
+        sigma_point=sigma_point,
+        terms=terms,
     )

@@ -48,7 +48,9 @@ def explain(problem: Problem, observability: Observability, parameters: Floats) 
     if not lost:
         return ()
     settings = problem.settings
-    anywhere = random_problem(problem.robot.with_values(parameters[:-6]), settings.model, settings.frame)
+    anywhere = random_problem(
+        problem.robot.with_values(parameters[problem.variables.robot_span]), settings.model, settings.frame
+    )
     effect = named_triangle(anywhere, anywhere.start)
     motion = _Motion(anywhere)
     largest = float(np.linalg.norm(effect, axis=0).max())

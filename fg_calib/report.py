@@ -26,7 +26,7 @@ WIDTH = 100
 _SHOWN = {"m": (1e3, "mm", 4), "rad": (180.0 / np.pi, "deg", 5)}
 """Factor, unit and decimals in which a quantity is shown."""
 
-_FAMILY_UNIT = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad"}
+_FAMILY_UNIT = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad", "point": "m"}
 
 
 def format_report(solution: Solution, uncertainty: Uncertainty, width: int = WIDTH) -> str:
@@ -70,7 +70,10 @@ def _verdict(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
     settings = solution.problem.settings
     what = f"{solution.problem.robot.name}: {settings.model}"
     if settings.uses_pairs:
-        what += ", measured pairs" if solution.problem.measurements.pairs else f", pairs: {settings.pairing}"
+        points, measured = solution.problem.points, solution.problem.measurements.pairs is not None
+        if measured or solution.problem.formed:
+            what += ", measured pairs" if measured else f", pairs: {settings.pairing}"
+        what += "" if points is None else f", {len(points.estimated)} touched points"
     elif settings.frame == "unknown":
         what += ", measurement frame unknown"
     if uncertainty.trustworthy:
@@ -98,14 +101,17 @@ def _figure(value: float, decimals: int, sign: str = "") -> str:
 def _statistics(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
     problem = solution.problem
     rows = [("configurations", f"{problem.n_configurations}")]
-    if problem.settings.uses_pairs:
+    if problem.settings.uses_pairs and (problem.points is None or problem.n_pairs):
         rows.append(("pairs", f"{problem.n_pairs}"))
+    if problem.points is not None:
+        rows.append(("touches", f"{problem.points.train.sum()} of {len(problem.points.estimated)} points"))
+        rows.append(("distances of points", f"{problem.points.used.sum()}"))
     reduced = uncertainty.reduced_chi2
     low, high = uncertainty.chi2_bounds
     determined = problem.n_residuals + problem.n_priors - uncertainty.dof
     rows += [
         ("residuals", f"{problem.n_residuals}, and {problem.n_priors} priors"),
-        ("estimated", f"{problem.variables.n_columns} unknowns, {determined} directions determined"),
+        ("estimated", f"{len(problem.variables.all_scales)} unknowns, {determined} directions determined"),
         ("chi-square", f"{uncertainty.chi2:.6g} with {uncertainty.dof} degrees of freedom"),
         ("reduced chi-square", "unknown" if reduced is None else f"{reduced:.4g} (good from {low:.3g} to {high:.3g})"),
         (

@@ -42,8 +42,9 @@ def result_document(
     problem, settings = solution.problem, solution.problem.settings
     rms = uncertainty.residuals.rms()
     pairing = None
-    if settings.uses_pairs:
+    if settings.uses_pairs and (problem.measurements.pairs is not None or problem.formed):
         pairing = "measured" if problem.measurements.pairs is not None else str(settings.pairing)
+    kinds = KINDS if problem.points is None else (*KINDS, "point")
     document = {
         "schema": RESULT_SCHEMA,
         "version": __version__,
@@ -74,7 +75,7 @@ def result_document(
         "chi2": uncertainty.chi2,
         "dof": uncertainty.dof,
         "reduced_chi2": uncertainty.reduced_chi2,
-        "residual_rms": {split: {kind: rms[split].get(kind) for kind in KINDS} for split in ("train", "test")},
+        "residual_rms": {split: {kind: rms[split].get(kind) for kind in kinds} for split in ("train", "test")},
         "parameters": [
             {
                 "name": p.name,
@@ -90,6 +91,7 @@ def result_document(
         ],
         "covariance": {"names": list(uncertainty.names), "matrix": uncertainty.covariance},
         "frame_estimate": None if uncertainty.frame is None else asdict(uncertainty.frame),
+        "groups": [{"name": p.name, "n": p.n, "xyz": p.xyz, "sigma": p.sigma} for p in uncertainty.points],
         "observability": observability_document(uncertainty.identifiability),
         "inputs": dict(inputs or {}),
     }
@@ -265,7 +267,7 @@ def write_results(
         InputError: The folder cannot be written.
     """
     robot = solution.problem.robot
-    calibrated = robot.with_values(solution.parameters[: len(robot.parameters)])
+    calibrated = robot.with_values(solution.parameters[solution.problem.variables.robot_span])
     document = json.dumps(result_document(solution, uncertainty, inputs), indent=1, allow_nan=False) + "\n"
 
     def write(into: Path) -> None:
@@ -289,15 +291,16 @@ def write_calibrated_robot(folder: Path, robot: Robot) -> None:
 def _write_residuals(path: Path, solution: Solution, uncertainty: Uncertainty) -> None:
     """One line a scalar residual: what it is of, whether it was used, before and after, in [m] and [rad]."""
     table = uncertainty.residuals
-    ids = solution.problem.measurements.ids
+    m = solution.problem.measurements
+    names = m.ids if m.groups is None else np.concatenate([m.ids, m.groups.names])
     columns = {
         "kind": table.kind,
-        "a": ids[table.a],
-        "b": np.where(table.b >= 0, ids[table.b], ""),
+        "a": names[table.a],
+        "b": np.where(table.b >= 0, names[table.b], ""),
         "split": np.where(table.test, "test", "train"),
         "used": (table.reason == "") & ~table.test,
         "excluded": table.reason,
-        "unit": np.where(np.isin(np.char.partition(table.kind, ".")[:, 0], ["distance", "position"]), "m", "rad"),
+        "unit": np.where(np.isin(np.char.partition(table.kind, ".")[:, 0], ["orientation", "angle"]), "rad", "m"),
         "measured": table.measured,
         "predicted": table.measured + table.after,
         "residual_before": table.before,

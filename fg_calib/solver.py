@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.errors import SolverError
-from fg_calib.factors import Variables
+from fg_calib.factors import Eliminated, Variables, eliminate
 from fg_calib.observability import SIGNAL_FLOOR, determined
 from fg_calib.problem import Problem, frames_only, joint_errors, judged_at, lengths
 from fg_calib.residuals import single_threaded_blas
@@ -198,22 +198,27 @@ class _Run:
                     f"the cost at the start is {self.initial_cost}: the measurements or the robot hold absurd numbers"
                 )
             curvature = _largest_curvature(problem.graph.linearize(initial), variables.keys)
-            optimizer = gtsam.LevenbergMarquardtOptimizer(problem.graph, initial, _parameters(options, curvature))
-            self.message = self._iterate(optimizer, variables, options)
+            self.values, self.cost = initial, self.initial_cost
+            self.message = self._iterate(_parameters(options, curvature), variables, options)
         except RuntimeError as error:
             raise SolverError(_in_words(str(error), variables)) from error
-        self.values = gtsam.Values(optimizer.values())
-        self.cost = optimizer.error()
         self.parameters = variables.parameters(self.values)
 
-    def _iterate(
-        self, optimizer: gtsam.LevenbergMarquardtOptimizer, variables: Variables, options: SolverOptions
-    ) -> str:
-        values, cost = gtsam.Values(optimizer.values()), optimizer.error()
+    def _iterate(self, settings: gtsam.LevenbergMarquardtParams, variables: Variables, options: SolverOptions) -> str:
+        optimizer = gtsam.LevenbergMarquardtOptimizer(self.problem.graph, self.values, settings)
         for _ in range(options.max_iterations):
-            decrement = _decrement(optimizer.iterate(), variables)
-            previous, values = values, gtsam.Values(optimizer.values())  # a copy: GTSAM hands out its own
-            last, cost = cost, optimizer.error()
+            linear = optimizer.iterate()
+            decrement = _decrement(linear, variables)
+            previous, values = self.values, gtsam.Values(optimizer.values())  # a copy: GTSAM hands out its own
+            last, cost = self.cost, optimizer.error()
+            held = _held(linear, variables.step(previous, values), variables) if cost < last else None
+            if held is not None:
+                moved = variables.moved(previous, held)
+                if (cost_there := self.problem.graph.error(moved)) < last:
+                    values, cost = moved, cost_there
+                    settings.setlambdaInitial(optimizer.lambda_())
+                    optimizer = gtsam.LevenbergMarquardtOptimizer(self.problem.graph, values, settings)
+            self.values, self.cost = values, cost
             step = _step_length(previous, values, variables)
             self.history.append(Iteration(cost, optimizer.lambda_(), step, decrement))
             if not np.isfinite(cost):
@@ -261,13 +266,38 @@ def _largest_curvature(linear: gtsam.GaussianFactorGraph, keys: list[int]) -> fl
 
 def _decrement(linear: gtsam.GaussianFactorGraph, variables: Variables) -> float:
     """Length of the Gauss-Newton step in sigma, along determined directions only."""
-    A, b = _dense(linear, variables.keys)
-    U, s, _ = np.linalg.svd(A * variables.scales, full_matrices=False)
-    return float(np.linalg.norm((U.T @ b)[: determined(s)]))
+    left = _without_nuisance(linear, variables)
+    U, s, _ = np.linalg.svd(left.A * variables.scales, full_matrices=False)
+    return float(np.hypot(np.linalg.norm(left.own), np.linalg.norm((U.T @ left.b)[: determined(s)])))
+
+
+def _without_nuisance(linear: gtsam.GaussianFactorGraph, variables: Variables) -> Eliminated:
+    """The linear graph with the nuisance columns eliminated."""
+    return eliminate(*_dense(linear, variables.keys), variables.n_columns)
+
+
+def _held(linear: gtsam.GaussianFactorGraph, step: Floats, variables: Variables) -> Floats | None:
+    """A step with the same effect on every row, but none on the core's undetermined directions; None if it is it.
+
+    Damping makes the step short in core and nuisance columns together. That leaves undetermined directions of the core
+    where they are only if no nuisance variable could follow them: points that move would drag the base along.
+    """
+    n = variables.n_columns
+    if n == len(step):
+        return None
+    left = _without_nuisance(linear, variables)
+    _, s, Vt = np.linalg.svd(np.vstack([left.A * variables.scales, np.zeros((n, n))]), full_matrices=False)
+    loose = Vt[determined(s) :]
+    if not len(loose):
+        return None
+    basis, _ = np.linalg.qr((loose * variables.scales).T)
+    drift = basis @ (basis.T @ step[:n])
+    held: Floats = step - np.concatenate([drift, left.follow @ drift])
+    return held
 
 
 def _step_length(previous: gtsam.Values, values: gtsam.Values, variables: Variables) -> float:
-    return float(np.linalg.norm(variables.step(previous, values) / variables.scales))
+    return float(np.linalg.norm(variables.step(previous, values) / variables.all_scales))
 
 
 def _differs(old: Problem, new: Problem) -> bool:
@@ -281,7 +311,10 @@ def _differs(old: Problem, new: Problem) -> bool:
         sigma = np.maximum(old.measurements.sigma_joint, 1e-300)
         if np.max(np.abs(a.joint_errors - b.joint_errors) / sigma) > JOINT_TOLERANCE:
             return True
-    return old.judgement != new.judgement or not np.allclose(old.sigma, new.sigma, rtol=1e-3, atol=0.0, equal_nan=True)
+    return old.judgement != new.judgement or not all(
+        np.allclose(one, other, rtol=1e-3, atol=0.0, equal_nan=True)
+        for one, other in ((old.sigma, new.sigma), (old.sigma_point, new.sigma_point))
+    )
 
 
 def _in_words(message: str, variables: Variables) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import gtsam
 import numpy as np
@@ -14,8 +14,18 @@ from scipy.spatial.transform import Rotation
 from fg_calib import residuals
 from fg_calib.factors import pose_of, prior_rows
 from fg_calib.identifiability import Identifiability, identify
+from fg_calib.kinematics import forward
 from fg_calib.observability import SUPPORT_TOLERANCE, IdentifiabilityClass, Observability, determined
-from fg_calib.problem import PAIR_KINDS, POSE_KINDS, Problem, all_rows, correlation, lengths, whitened_triangle
+from fg_calib.problem import (
+    PAIR_KINDS,
+    POSE_KINDS,
+    Problem,
+    all_rows,
+    correlation,
+    eliminated_terms,
+    lengths,
+    whitened_triangle,
+)
 from fg_calib.robot import Robot
 from fg_calib.robust import effect
 from fg_calib.solver import Solution
@@ -73,6 +83,23 @@ class FrameEstimate:
 
     xyz: Floats
     quaternion_xyzw: Floats
+    sigma: Floats
+
+
+@dataclass(frozen=True)
+class PointEstimate:
+    """A physical point that a group of configurations touched.
+
+    Attributes:
+        name: The group's name.
+        n: Train rows that touched it.
+        xyz: base_p of the point, [m]; of a group without train rows the mean of the predicted tool points.
+        sigma: 1 sigma along the base's axes, shape (3,), [m]; nan where it is not determined, or not estimated.
+    """
+
+    name: str
+    n: int
+    xyz: Floats
     sigma: Floats
 
 
@@ -144,9 +171,11 @@ class ResidualTable:
     """Every scalar residual, train and test, before and after; [m] and [rad].
 
     Attributes:
-        kind: `distance`, `angle`, `position.x`, ..., `orientation.z` of each row, shape (n,).
-        a: Row of the (first) configuration, shape (n,).
-        b: Row of the second configuration, -1 for poses, shape (n,).
+        kind: `distance`, `angle`, `position.x`, ..., `orientation.z`, `point.x`, ... of each row, shape (n,). A point's
+            residual is that of its predicted tool point from the mean of its group's (see `PointGroups.rows_of`); that
+            of a distance between groups is of these means.
+        a: Row of the (first) configuration, shape (n,); a group counts on from the number of configurations.
+        b: Row of the second configuration or group, -1 for poses and points, shape (n,).
         test: Predicted only, shape (n,).
         reason: Why a row takes no part, empty where it does, shape (n,).
         measured: Measured value; nan for orientations, shape (n,).
@@ -166,15 +195,15 @@ class ResidualTable:
     sigma: Floats
 
     def rms(self) -> dict[str, dict[str, dict[str, float]]]:
-        """RMS by split, kind (the norm of a position's or orientation's three components), before and after."""
+        """RMS by split, kind (the norm of three components but for distances and angles), before and after."""
         table: dict[str, dict[str, dict[str, float]]] = {"train": {}, "test": {}}
         used = self.reason == ""
         family = np.char.partition(self.kind, ".")[:, 0] if len(self.kind) else self.kind
         for split, of_split in (("train", ~self.test), ("test", self.test)):
-            for name in ("position", "orientation", "distance", "angle"):
+            for name in ("position", "orientation", "distance", "angle", "point"):
                 rows = used & of_split & (family == name)
                 if rows.any():
-                    per_row = 3.0 if name in ("position", "orientation") else 1.0
+                    per_row = 1.0 if name in ("distance", "angle") else 3.0
                     table[split][name] = {
                         when: float(np.sqrt(per_row * np.mean(values[rows] ** 2)))
                         for when, values in (("before", self.before), ("after", self.after))
@@ -200,6 +229,7 @@ class Uncertainty:
         robot: The calibrated robot.
         spread: The covariance in the variables' tangent space, behind `predict`.
         findings: Why the result is not to be trusted; empty if it is.
+        points: The points that groups of configurations touched.
     """
 
     names: tuple[str, ...]
@@ -215,6 +245,7 @@ class Uncertainty:
     robot: Robot
     spread: Spread
     findings: tuple[str, ...]
+    points: tuple[PointEstimate, ...] = ()
 
     def predict(self, function: Callable[[Robot], ArrayLike]) -> Prediction:
         """Value and sigma of any function of the robot: a tool position, a distance, a sum of parameters.
@@ -275,14 +306,14 @@ def assess(solution: Solution) -> Uncertainty:
     covariance = spread.named()
     frame = None
     if variables.n_robot_columns < variables.n_columns:
-        world_T_base = pose_of(solution.parameters[-6:])
+        world_T_base = pose_of(solution.parameters[variables.frame_span])
         frame = FrameEstimate(
             xyz=world_T_base.translation(),
             quaternion_xyzw=Rotation.from_matrix(world_T_base.rotation().matrix()).as_quat(canonical=True),
             sigma=np.sqrt(np.diag(spread.covariance(np.eye(variables.n_columns))))[variables.n_robot_columns :],
         )
     chi2, n_rows, loss_factor = _weighted_chi2(solution)
-    dof = n_rows + problem.n_priors - spread.rank
+    dof = n_rows + problem.n_priors - spread.rank - variables.n_nuisance
     expected = max(0.0, dof - spread.excess - (1.0 - loss_factor) * n_rows)
     bounds = chi2_bounds(dof, expected, _independent_dof(problem, dof, spread.rank))
     return Uncertainty(
@@ -296,9 +327,10 @@ def assess(solution: Solution) -> Uncertainty:
         chi2_bounds=bounds,
         residuals=residual_table(solution),
         identifiability=whole,
-        robot=problem.robot.with_values(solution.parameters[:-6]),
+        robot=problem.robot.with_values(solution.parameters[variables.robot_span]),
         spread=spread,
         findings=_findings(solution, chi2, dof, bounds),
+        points=_point_estimates(solution, spread),
     )
 
 
@@ -349,9 +381,12 @@ def residual_table(solution: Solution) -> ResidualTable:
     block = all_rows(problem)
     chain = problem.variables.chain
     before, after = (residuals.residual(block, chain.at(p)) for p in (solution.before, solution.parameters))
-    if problem.pairs is not None:
-        return _pair_table(problem, before, after)
-    return _pose_table(problem, before, after)
+    if problem.pairs is None:
+        return _pose_table(problem, before, after)
+    tables = [_pair_table(problem, before, after)]
+    if problem.points is not None:
+        tables += _point_tables(problem, solution.before, solution.parameters)
+    return ResidualTable(*(np.concatenate([getattr(t, f.name) for t in tables]) for f in fields(ResidualTable)))
 
 
 def _spread(solution: Solution) -> Spread:
@@ -447,6 +482,63 @@ def _pair_table(problem: Problem, before: Floats, after: Floats) -> ResidualTabl
         before=wide_before[rows, columns],
         after=wide_after[rows, columns],
         sigma=problem.sigma[rows, columns],
+    )
+
+
+def _point_tables(problem: Problem, before: Floats, after: Floats) -> list[ResidualTable]:
+    """Touches, then distances between touched points, at two parameter vectors."""
+    points, m = problem.points, problem.measurements
+    assert points is not None
+    chains = [problem.variables.chain.at(p) for p in (before, after)]
+    means = [points.means(chain, problem.trig) for chain in chains]
+    rows = np.flatnonzero(points.touched)
+    off = [
+        (forward(chain.without_columns(), problem.trig, rows).position - mean[points.groups.index[rows]]).ravel()
+        for chain, mean in zip(chains, means, strict=True)
+    ]
+    touches = ResidualTable(
+        kind=np.tile(["point.x", "point.y", "point.z"], len(rows)),
+        a=np.repeat(rows, 3),
+        b=np.full(3 * len(rows), -1),
+        test=np.repeat(m.test[rows], 3),
+        reason=np.full(3 * len(rows), "", dtype="<U20"),
+        measured=np.full(3 * len(rows), np.nan),
+        before=off[0],
+        after=off[1],
+        sigma=problem.sigma_point[rows].ravel(),
+    )
+    pairs, n = points.groups.pairs, m.n_configurations
+    miss = [np.linalg.norm(mean[pairs.b] - mean[pairs.a], axis=1) - pairs.distance for mean in means]
+    distances = ResidualTable(
+        kind=np.full(pairs.n_pairs, "distance"),
+        a=n + pairs.a,
+        b=n + pairs.b,
+        test=pairs.test,
+        reason=np.full(pairs.n_pairs, "", dtype="<U20"),
+        measured=pairs.distance,
+        before=miss[0],
+        after=miss[1],
+        sigma=pairs.sigma_distance,
+    )
+    return [touches, distances]
+
+
+def _point_estimates(solution: Solution, spread: Spread) -> tuple[PointEstimate, ...]:
+    """Where the groups' points are; sigma from that of the core, which they follow, and from their own touches."""
+    problem = solution.problem
+    points, variables = problem.points, problem.variables
+    if points is None:
+        return ()
+    xyz = points.means(variables.chain.at(solution.parameters), problem.trig)
+    xyz[points.estimated] = solution.parameters[variables.nuisance_span].reshape(-1, 3)
+    sigma = np.full_like(xyz, np.nan)
+    left = eliminated_terms(problem, solution.parameters)
+    variance = np.diag(spread.covariance(left.follow)) + np.sum(left.inverse**2, axis=1)
+    sigma[points.estimated] = np.sqrt(variance).reshape(-1, 3)
+    index = points.groups.index
+    return tuple(
+        PointEstimate(name, int(np.sum(points.train & (index == g))), xyz[g], sigma[g])
+        for g, name in enumerate(points.groups.names)
     )
 
 

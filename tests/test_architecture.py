@@ -17,6 +17,7 @@ FLOORS = (
     *("inverse", "simulator", "residuals", "least_squares"),
     *(
         "factors",
+        "groups",
         "frames",
         "observability",
         "robust",

@@ -2,12 +2,13 @@
 
 | table | columns |
 |---|---|
-| configurations | `q1 ... qn` or joint names; `id`; `x y z`; `qx qy qz qw` or `roll pitch yaw`; `split`; `sigma_*` |
-| pairs | `a`, `b`: ids or 0-based row numbers; `distance` and/or `angle`; `sigma_distance`, `sigma_angle`; `split` |
+| configurations | `q1 ... qn` or joint names; `id`; `x y z`; orientation; `split`; `group`; `sigma_*` |
+| pairs | `a`, `b`: ids, 0-based row numbers or groups; `distance` and/or `angle`; their `sigma_*`; `split` |
 
-Sigmas of a row: `sigma_position` or `sigma_x sigma_y sigma_z`; `sigma_orientation` or `sigma_rx sigma_ry sigma_rz`.
-An empty cell means not measured under `distance` and `angle`, the noise's default under `sigma_*`, and train under
-`split`; elsewhere it is an error. Any other column is ignored.
+An orientation is `qx qy qz qw` or `roll pitch yaw`. Sigmas of a row: `sigma_position` or `sigma_x sigma_y sigma_z`;
+`sigma_orientation` or `sigma_rx sigma_ry sigma_rz`; `sigma_point`. An empty cell means not measured under `distance`
+and `angle`, no touched point under `group`, the noise's default under `sigma_*`, and train under `split`; elsewhere it
+is an error. Any other column is ignored.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from numpy.typing import ArrayLike
 from fg_calib.errors import InputError
 from fg_calib.files.disk import replacing, require_file
 from fg_calib.files.units import ANGLES, LENGTHS, Units
-from fg_calib.measurements import Booleans, Floats, Measurements, Noise, Pairs
+from fg_calib.measurements import Booleans, Floats, Groups, Integers, Measurements, Noise, Pairs, no_pairs
 from fg_calib.robot import Robot
 
 if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it
@@ -48,7 +49,7 @@ _QUATERNION = ("qx", "qy", "qz", "qw")
 _ROLL_PITCH_YAW = ("roll", "pitch", "yaw")
 _SIGMA_POSITION = ("sigma_x", "sigma_y", "sigma_z")
 _SIGMA_ORIENTATION = ("sigma_rx", "sigma_ry", "sigma_rz")
-_RESERVED = {*_POSITION, *_QUATERNION, *_ROLL_PITCH_YAW, *_SIGMA_POSITION, *_SIGMA_ORIENTATION, "id", "split"}
+_RESERVED = {*_POSITION, *_QUATERNION, *_ROLL_PITCH_YAW, *_SIGMA_POSITION, *_SIGMA_ORIENTATION, "id", "split", "group"}
 _ROW, _SHORT = "row of the file", "last cell is empty"  # columns of our own beside those of the file
 
 
@@ -81,14 +82,19 @@ def read_measurements(
     orientation = _orientation_columns(header)
     sigma_position = header.sigmas("sigma_position", _SIGMA_POSITION) if position else ()
     sigma_orientation = header.sigmas("sigma_orientation", _SIGMA_ORIENTATION) if orientation else ()
+    sigma_point = header.present("sigma_point") if "group" in header.columns else ()
     table = _Table.read(
         header,
-        numbers=(*joints, *position, *orientation, *sigma_position, *sigma_orientation),
-        texts=header.present("id", "split"),
+        numbers=(*joints, *position, *orientation, *sigma_position, *sigma_orientation, *sigma_point),
+        texts=header.present("id", "split", "group"),
     )
     readings = table.numbers(joints) * [units.factor(joint.unit) for joint in robot.joints]
     _check_limits(readings, robot, joints, table, units)
     ids, test = _ids(table), _test_rows(table)
+    names, group = _groups(table)
+    between, between_groups = None, no_pairs(header.name)
+    if pairs is not None:
+        between, between_groups = _read_pairs(Path(pairs), table, ids, test, (names, group), units, noise)
     return Measurements(
         readings=readings,
         ids=ids.to_numpy().astype(np.str_),
@@ -98,8 +104,10 @@ def read_measurements(
         sigma_position=_sigma(table, sigma_position, noise.position, length) if position else None,
         sigma_orientation=_sigma(table, sigma_orientation, noise.orientation, angle) if orientation else None,
         sigma_joint=_joint_sigma(noise.joint, robot.n_joints),
-        pairs=None if pairs is None else _read_pairs(Path(pairs), table, ids, test, units, noise),
+        pairs=between,
         source=header.name,
+        groups=Groups(names, group, between_groups) if names else None,
+        sigma_point=_sigma_point(table, sigma_point, group >= 0, noise.point, length) if names else None,
     )
 
 
@@ -381,6 +389,28 @@ def _test_rows(table: _Table) -> Booleans:
     return (split == "test").to_numpy()
 
 
+def _groups(table: _Table) -> tuple[tuple[str, ...], Integers]:
+    """Names of the groups in the order met, and each row's group, -1 for none, shape (n_rows,)."""
+    if "group" not in table.header.columns:
+        return (), np.full(table.frame.height, -1, dtype=np.int64)
+    cells = table.frame["group"].to_list()
+    names = list(dict.fromkeys(c for c in cells if c is not None))
+    place = {name: i for i, name in enumerate(names)}
+    return tuple(names), np.array([-1 if c is None else place[c] for c in cells], dtype=np.int64)
+
+
+def _sigma_point(
+    table: _Table, column: Sequence[str], touched: Booleans, default: float | None, factor: float
+) -> Floats | None:
+    """Sigma of each touch, shape (n_rows,), [m]; any in rows that touch nothing; None if nothing states it."""
+    if not column:
+        return None if default is None else np.full(table.frame.height, default)
+    values = table.numbers(column, optional=True)[:, 0]
+    expected = "a number above 0" if default is None else "a number above 0, or an empty cell"
+    table.require(~touched | np.where(np.isnan(values), default is not None, values > 0.0), column[0], expected)
+    return np.where(np.isnan(values), np.nan if default is None else default, values * factor)
+
+
 def _rotation(table: _Table, columns: tuple[str, ...], angle: float) -> Floats:
     """Measured orientations as rotation matrices, shape (n_rows, 3, 3)."""
     from scipy.spatial.transform import Rotation
@@ -422,11 +452,15 @@ def _joint_sigma(joint: float | tuple[float, ...], n_joints: int) -> Floats:
 
 
 def _read_pairs(
-    path: Path, configurations: _Table, ids: pl.Series, test: Booleans, units: Units, noise: Noise
-) -> Pairs:
-    """The pairs of a table, with their configurations by `ids`, shape (n_configurations,)."""
-    import polars as pl
-
+    path: Path,
+    configurations: _Table,
+    ids: pl.Series,
+    test: Booleans,
+    groups: tuple[tuple[str, ...], Integers],
+    units: Units,
+    noise: Noise,
+) -> tuple[Pairs, Pairs]:
+    """The pairs of a table: those of configurations, by `ids`, shape (n_configurations,), and those of groups."""
     header = _Header.read(path)
     for column in ("a", "b"):
         if column not in header.columns:
@@ -437,21 +471,7 @@ def _read_pairs(
     sigmas = header.present("sigma_distance", "sigma_angle")
     table = _Table.read(header, (*measured, *sigmas), ("a", "b", *header.present("split")))
 
-    rows = pl.int_range(len(ids), eager=True)
-    ends = []
-    for column in ("a", "b"):
-        names = table.texts(column, "a configuration")
-        end = names.replace_strict(ids, rows, default=None, return_dtype=pl.Int64)
-        if end.null_count():
-            row = end.is_null().arg_true()[0]
-            by_id = "id" in configurations.header.columns
-            found = f"{column} = {names[row]!r} is not {'an id' if by_id else 'a row'} of {configurations.header.name}"
-            raise InputError(table.place(row), found, "" if by_id else f"a number from 0 to {len(ids) - 1}")
-        ends.append(end.to_numpy())
-    a, b = ends
-    if (a == b).any():
-        row = int(np.argmax(a == b))
-        raise InputError(table.place(row), f"a and b are both {ids[int(a[row])]!r}", "two different configurations")
+    a, b, between_groups = _ends(table, configurations, ids, groups[0])
 
     def column_of(name: str, default: float, *, positive: bool = False) -> Floats:
         if name not in header.columns:
@@ -472,13 +492,73 @@ def _read_pairs(
         figure = angle[np.argmin(good)] / units.factor("rad")
         hint = _unit_hint(figure, "rad", units, (0.0, np.pi))
         table.require(good, "angle", f"0 to {np.pi / units.factor('rad'):.6g} {units.angle}", hint)
-    return Pairs(
+    if between_groups.any():
+        _check_group_pairs(table, between_groups, distance, angle)
+    only_test = np.array([bool(test[groups[1] == g].all()) for g in range(len(groups[0]))], dtype=np.bool_)
+    of_rows = np.zeros(len(a), dtype=np.bool_)
+    for flags, chosen in ((test, ~between_groups), (only_test, between_groups)):
+        of_rows[chosen] = flags[a[chosen]] | flags[b[chosen]]
+    pairs = Pairs(
         a=a,
         b=b,
         distance=distance,
         angle=np.minimum(angle, np.pi),
         sigma_distance=column_of("sigma_distance", default_of(noise.distance), positive=True),
         sigma_angle=column_of("sigma_angle", default_of(noise.angle), positive=True),
-        test=_test_rows(table) | test[a] | test[b],
+        test=_test_rows(table) | of_rows,
         source=header.name,
     )
+    return pairs.select(~between_groups), pairs.select(between_groups)
+
+
+def _ends(
+    table: _Table, configurations: _Table, ids: pl.Series, group_names: tuple[str, ...]
+) -> tuple[Integers, Integers, Booleans]:
+    """What `a` and `b` name: rows of configurations or indices of groups, and whether groups; shapes (n_pairs,)."""
+    import polars as pl
+
+    rows = pl.int_range(len(ids), eager=True)
+    group_ids, group_rows = pl.Series(group_names, dtype=pl.String), pl.int_range(len(group_names), eager=True)
+    by_id = "id" in configurations.header.columns
+    kind = "an id" if by_id else "a row"
+    ends, of_groups = [], []
+    for column in ("a", "b"):
+        names = table.texts(column, "a configuration")
+        end = names.replace_strict(ids, rows, default=None, return_dtype=pl.Int64)
+        group = names.replace_strict(group_ids, group_rows, default=None, return_dtype=pl.Int64)
+        both, none = (end.is_not_null() & group.is_not_null()), (end.is_null() & group.is_null())
+        if both.any():
+            row = both.arg_true()[0]
+            found = f"{column} = {names[row]!r} is both {kind} and a group of {configurations.header.name}"
+            raise InputError(table.place(row), found, "different names")
+        if none.any():
+            row = none.arg_true()[0]
+            either = f"{kind} or a group" if len(group_names) else kind
+            found = f"{column} = {names[row]!r} is not {either} of {configurations.header.name}"
+            raise InputError(table.place(row), found, "" if by_id else f"a number from 0 to {len(ids) - 1}")
+        is_group = group.is_not_null().to_numpy()
+        of_groups.append(is_group)
+        ends.append(np.where(is_group, group.fill_null(-1).to_numpy(), end.fill_null(-1).to_numpy()))
+    a, b = ends
+    between_groups = of_groups[0]
+    mixed = of_groups[0] != of_groups[1]
+    if mixed.any():
+        row = int(np.argmax(mixed))
+        which = ("a is a group and b" if of_groups[0][row] else "b is a group and a") + " a configuration"
+        raise InputError(table.place(row), which, "two configurations or two groups")
+    if (a == b).any():
+        row = int(np.argmax(a == b))
+        what = "groups" if between_groups[row] else "configurations"
+        raise InputError(table.place(row), f"a and b are both {table.frame['a'][row]!r}", f"two different {what}")
+    return a, b, between_groups
+
+
+def _check_group_pairs(table: _Table, chosen: Booleans, distance: Floats, angle: Floats) -> None:
+    """Raise for the first pair of groups that has an angle, or no distance above 0."""
+    if "angle" in table.header.columns:
+        table.require(~chosen | np.isnan(angle), "angle", "an empty cell: two points have a distance, but no angle")
+    if "distance" not in table.header.columns:
+        row = int(np.argmax(chosen))
+        raise InputError(table.place(row), "two groups without a distance", "a column distance")
+    expected = "a number above 0 between two groups; one point is one group"
+    table.require(~chosen | (distance > 0.0), "distance", expected)
