@@ -7,8 +7,9 @@
 | `T(0)` | the tool frame as a Pose3, where all six are |
 | `X(0)` | world_T_base as a Pose3, where the measurement frame is unknown |
 | `L(g)` | base_p of the physical point that group g touches, a Point3 |
+| `Q(k)` | the true joint values of configuration k, a vector, where encoder noise is estimated |
 
-The last is a *nuisance* variable: it must be estimated too, but is nobody's question. Columns of such variables follow
+The last two are *nuisance* variables: they must be estimated too, but are nobody's question. Their columns follow
 those of the *core* (robot and measurement frame) and are eliminated before anything is said of the core.
 
 Pose3's tangent is rotation first, and a step moves the frame in itself (`pose * Exp(step)`).
@@ -49,7 +50,7 @@ class Variable:
     Attributes:
         key: GTSAM's key.
         symbol: How it is written: `K(3)`, `T(0)`, `X(0)`.
-        kind: A vector of parameters, the tool's pose, the measurement frame's, or the position of a touched point.
+        kind: A vector of parameters, the tool's pose, the measurement frame's, a touched point, or joint values.
         parameters: Indices into the parameter vector of `Variables.parameters`, in the variable's own order;
             for poses in the order of `FRAME_KINDS`.
         columns: Its columns in a Jacobian.
@@ -58,7 +59,7 @@ class Variable:
 
     key: int
     symbol: str
-    kind: Literal["vector", "tool", "frame", "point"]
+    kind: Literal["vector", "tool", "frame", "point", "joints"]
     parameters: tuple[int, ...]
     columns: slice
     scales: tuple[float, ...] = ()
@@ -102,6 +103,11 @@ class Variables:
     def n_nuisance(self) -> int:
         """Number of columns of the nuisance variables."""
         return sum(len(v.parameters) for v in self.nuisance)
+
+    @property
+    def n_without_prior(self) -> int:
+        """Number of nuisance columns that have no prior of their own, as true joint values have."""
+        return sum(len(v.parameters) for v in self.nuisance if v.kind == "point")
 
     @property
     def keys(self) -> list[int]:
@@ -154,10 +160,10 @@ class Variables:
             values.insert(v.key, pose_of(chosen) if v.is_pose else chosen)
         return values
 
-    def parameters(self, values: gtsam.Values) -> Floats:
-        """The parameter vector at GTSAM's values; what is not a variable keeps its nominal value."""
+    def parameters(self, values: gtsam.Values, only: Sequence[Variable] | None = None) -> Floats:
+        """The parameter vector at GTSAM's values; what is not a variable (or not in `only`) keeps its nominal value."""
         parameters = self.nominal()
-        for v in self.items + self.nuisance:
+        for v in self.items + self.nuisance if only is None else only:
             chosen = frame_of(values.atPose3(v.key)) if v.is_pose else values.atVector(v.key)
             parameters[list(v.parameters)] = chosen
         return parameters
@@ -180,26 +186,28 @@ class Variables:
             delta.insert(v.key, step[v.columns])
         return values.retract(delta)
 
-    def with_nuisance(self, kind: Literal["point"], letter: str, count: int, scales: tuple[float, ...]) -> Variables:
-        """The same with `count` nuisance variables more: vectors with one figure for each of `scales`.
+    def with_nuisance(
+        self, kind: Literal["point", "joints"], letter: str, indices: Sequence[int], scales: tuple[float, ...]
+    ) -> Variables:
+        """The same with more nuisance variables: vectors with one figure for each of `scales`.
 
         Args:
             kind: What they are.
-            letter: Of their keys: `letter(0)`, `letter(1)`, ...
-            count: How many.
+            letter: Of their keys.
+            indices: The numbers in their keys, `letter(index)`.
             scales: A change of ordinary size in each of a variable's columns.
         """
         column, place, n = self.n_columns + self.n_nuisance, self.nuisance_span.stop, len(scales)
         more = tuple(
             Variable(
-                key=gtsam.symbol(letter, i),
-                symbol=f"{letter}({i})",
+                key=gtsam.symbol(letter, index),
+                symbol=f"{letter}({index})",
                 kind=kind,
                 parameters=tuple(range(place + n * i, place + n * (i + 1))),
                 columns=slice(column + n * i, column + n * (i + 1)),
                 scales=scales,
             )
-            for i in range(count)
+            for i, index in enumerate(indices)
         )
         return replace(self, nuisance=self.nuisance + more)
 
@@ -394,11 +402,11 @@ def term_factor(term: Term, variables: Variables) -> gtsam.CustomFactor:
     n_rows = column + 1 if reduced else term.n_rows
 
     def residual(values: gtsam.Values) -> Floats:
-        r = term.residual(variables, variables.parameters(values))
+        r = term.residual(variables, variables.parameters(values, items))
         return np.append(np.linalg.norm(r), np.zeros(n_rows - 1)) if reduced else r
 
     def linearise(values: gtsam.Values) -> tuple[Floats, Floats]:
-        r, J = term.linearise(variables, variables.parameters(values))
+        r, J = term.linearise(variables, variables.parameters(values, items))
         if reduced:
             R: Floats = np.linalg.qr(np.column_stack([J, r]), mode="r")  # type: ignore[assignment]
             r, J = R[:, -1], R[:, :-1]

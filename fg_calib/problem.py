@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from fg_calib import frames, residuals
 from fg_calib.choices import EncoderNoise, FrameKnowledge, Gauge, Loss, Model, PairErrors
+from fg_calib.encoders import MAX_JOINT_VARIABLES, MovedRows, TrueJoints
 from fg_calib.errors import ProblemError
 from fg_calib.factors import (
     Eliminated,
@@ -123,6 +124,7 @@ class Problem:
         adjustment: What has been learned of the measurements' noise.
         whole: The problem with everything estimated, where this one leaves parameters out to fix the gauge.
         points: The groups that touched the same point; None if none did.
+        joints: The true joint values, where they are variables; else None.
         sigma_point: 1 sigma of a touch, joint noise included, shape (n_configurations, 3), [m]; empty without groups.
         terms: The whitened train rows that depend on nuisance variables.
     """
@@ -142,6 +144,7 @@ class Problem:
     adjustment: Adjustment
     whole: Problem | None = None
     points: PointGroups | None = None
+    joints: TrueJoints | None = None
     sigma_point: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     terms: tuple[Term, ...] = ()
 
@@ -195,7 +198,7 @@ class Problem:
     def n_residuals(self) -> int:
         """Scalar residuals of the fit, priors not counted."""
         if self.pairs is None or self.judgement is None:
-            return sum(b.n * b.height for b in self.blocks)
+            return self.height * int(np.sum(~self.measurements.test))
         j, train = self.judgement, ~self.pairs.test
         of_pairs = int(np.sum(j.distance & train) + np.sum(j.angle & train) + 3 * np.sum(j.same_point & train))
         return of_pairs + self.n_of_points
@@ -208,7 +211,8 @@ class Problem:
     @property
     def n_independent(self) -> int:
         """Residuals that the noise can make differ freely: pairs formed from poses hold no more than the poses do."""
-        block = self.blocks[0] if self.blocks else None
+        rows = (*self.blocks, *(term.block for term in self.terms if isinstance(term, MovedRows)))
+        block = rows[0] if rows else None
         if not (self.sharing.poses and isinstance(block, CorrelatedBlock)):
             return self.n_residuals
         return min(self.n_residuals, round(block.n_shared_rows) + self.n_of_points)
@@ -282,7 +286,11 @@ def build_problem(
         _check_poses(measurements, settings)
     trig = precompute_trig(robot, measurements.readings)
     start = _start(robot, measurements, settings, variables, trig, pairs, points)
-    problem = _assemble(robot, measurements, settings, variables, start, trig, pairs, points=points)
+    joints = _true_joints(robot, measurements, settings, pairs)
+    if joints is not None:
+        variables = joints.add_joints(variables)
+        start = np.concatenate([start, joints.start()])
+    problem = _assemble(robot, measurements, settings, variables, start, trig, pairs, None, points, joints)
     _check_enough(problem)
     if gauge != "keep":
         return problem
@@ -297,7 +305,9 @@ def build_problem(
     variables = build_variables(reduced, unknown_frame, False)
     if points is not None:
         variables = points.add_points(variables)
-    anew = _assemble(reduced, measurements, settings, variables, start, trig, pairs, points=points)
+    if joints is not None:
+        variables = joints.add_joints(variables)
+    anew = _assemble(reduced, measurements, settings, variables, start, trig, pairs, None, points, joints)
     return replace(anew, whole=problem)
 
 
@@ -397,7 +407,8 @@ def judged_at(problem: Problem, parameters: Floats, adjustment: Adjustment | Non
         adjustment: What has been learned of the noise; None for what the problem has.
     """
     p, a = problem, adjustment or problem.adjustment
-    anew = _assemble(p.robot, p.measurements, p.settings, p.variables, parameters, p.trig, p.pairs, a, p.points)
+    given = (p.robot, p.measurements, p.settings, p.variables, parameters, p.trig, p.pairs)
+    anew = _assemble(*given, a, p.points, p.joints)
     return replace(anew, whole=p.whole)
 
 
@@ -457,7 +468,7 @@ def correlation(problem: Problem, parameters: Floats) -> Floats | None:
         With J the whitened Jacobian and C the covariance of the whitened rows, shape (n_columns, n_columns).
     """
     p, missing = problem, problem.common != problem.sharing
-    if p.pairs is None or not missing:
+    if p.pairs is None or not missing or p.joints is not None:
         return None
     of_pairs = _whitening(problem, parameters)
     assert isinstance(of_pairs, PairWhitening)
@@ -475,7 +486,9 @@ def frames_only(problem: Problem) -> Problem | None:
     p = problem
     if p.points is not None:
         variables = p.points.add_points(variables)
-    return _assemble(robot, p.measurements, p.settings, variables, p.start, p.trig, p.pairs, points=p.points)
+    settings = replace(p.settings, encoder="propagated")
+    start = p.start[: variables.nuisance_span.stop]
+    return _assemble(robot, p.measurements, settings, variables, start, p.trig, p.pairs, points=p.points)
 
 
 def whitened_triangle(problem: Problem, parameters: Floats) -> Floats:
@@ -615,7 +628,7 @@ def _check_enough(problem: Problem) -> None:
         if problem.pairs is not None and not problem.pairs.n_pairs:
             raise ProblemError(source, f"{found}: none has a measurement that model {problem.settings.model} uses")
         raise ProblemError(source, found, "train rows")
-    rows = problem.n_residuals + problem.n_priors - problem.variables.n_nuisance
+    rows = problem.n_residuals + problem.n_priors - problem.variables.n_without_prior
     if rows >= problem.variables.n_columns:
         return
     s = problem.settings
@@ -627,6 +640,19 @@ def _check_enough(problem: Problem) -> None:
         raise ProblemError(
             source, f"{rows} residuals", f"at least {needed} to determine what model {problem.settings.model} can"
         )
+
+
+def _true_joints(
+    robot: Robot, measurements: Measurements, settings: Settings, pairs: Pairs | None
+) -> TrueJoints | None:
+    """The true joint values as variables, where they are estimated and not too many for that."""
+    if settings.encoder == "propagated" or not np.any(measurements.sigma_joint > 0.0):
+        return None
+    rows = np.flatnonzero(~measurements.test)
+    if pairs is not None:
+        train = ~pairs.test
+        rows = np.unique(np.concatenate([pairs.a[train], pairs.b[train]]))
+    return TrueJoints(robot, measurements, rows) if 0 < len(rows) <= MAX_JOINT_VARIABLES else None
 
 
 def _start(
@@ -716,12 +742,13 @@ def _assemble(
     pairs: Pairs | None,
     adjustment: Adjustment | None = None,
     points: PointGroups | None = None,
+    joints: TrueJoints | None = None,
 ) -> Problem:
     """The problem with rows judged and whitened at `start`."""
     chain = variables.chain.at(start)
     adjustment = adjustment or Adjustment()
     joint_noise = bool(np.any(measurements.sigma_joint > 0.0))
-    encoder = settings.encoder == "estimated" and joint_noise
+    encoder = settings.encoder == "estimated" and joint_noise and joints is None
     if encoder and adjustment.joint_errors is None:
         adjustment = replace(adjustment, joint_errors=np.zeros_like(measurements.readings))
     moved = _trig(robot, measurements, trig, adjustment)
@@ -732,25 +759,27 @@ def _assemble(
         of_pairs = PairWhitening(moved, chain, measurements, pairs, kinds, formed, adjustment)
         judgement, sigma = of_pairs.judgement, of_pairs.sigma
         wanted = Sharing(poses=formed, joints=joint_noise) if settings.pair_errors == "shared" else Sharing()
-        wanted = replace(wanted, joints=wanted.joints or encoder)
+        wanted = replace(wanted, joints=(wanted.joints or encoder) and joints is None)
         if of_pairs.n_shared(wanted) <= MAX_SHARED:
             sharing = wanted
         elif encoder:
             found = f"{of_pairs.n_shared(wanted)} joint values and errors that pairs share"
             raise ProblemError("encoder: estimated", found, f"at most {MAX_SHARED} for models of pairs", "propagated")
-        blocks = of_pairs.blocks(sharing)
+        blocks = of_pairs.blocks(sharing, joint_noise=joints is None)
     else:
         of_poses = PoseWhitening(moved, chain, measurements, POSE_KINDS[settings.model], adjustment)
-        sigma, blocks = of_poses.sigma, of_poses.blocks()
+        sigma, blocks = of_poses.sigma, of_poses.blocks(joint_noise=joints is None)
+    terms: tuple[Term, ...] = ()
+    if joints is not None:
+        terms, blocks, sharing = joints.terms(blocks, variables), [], replace(sharing, joints=True)
     graph = gtsam.NonlinearFactorGraph()
     for block in blocks:
         graph.add(measurement_factor(block, variables))
-    terms: tuple[Term, ...] = ()
     sigma_point = np.zeros((0, 3))
     if points is not None:
         covariance = points.covariance(chain, trig)
         sigma_point = np.sqrt(np.einsum("nii->ni", covariance))
-        terms = points.terms(chain, trig, covariance)
+        terms += points.terms(chain, trig, covariance)
     for term in terms:
         graph.add(term_factor(term, variables))
     for factor in prior_factors(variables):
@@ -770,6 +799,7 @@ def _assemble(
         sharing=sharing,
         adjustment=adjustment,
         points=points,
+        joints=joints,
         sigma_point=sigma_point,
         terms=terms,
     )

@@ -223,6 +223,14 @@ class CorrelatedBlock:
         """Number of rows."""
         return sum(part.n * part.height for part in self.parts)
 
+    def whiten(self, rows: Floats) -> Floats:
+        """All rows of the parts, shape (n, m), with their correlation taken out."""
+        if self.gain is None:
+            return rows
+        L = scipy.sparse.vstack(self.loadings, format="csr")
+        out: Floats = rows - L @ (self.gain @ (L.T @ rows))
+        return out
+
     @property
     def n_shared_rows(self) -> float:
         """How many of the rows' degrees of freedom are noise that they share: trace of L L^T (1 + L L^T)^-1."""

@@ -132,6 +132,7 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
         frames = frames_only(problem)
         if frames is not None:
             before = _Run(frames, options).parameters
+            before = np.concatenate([before, problem.start[len(before) :]])
         run = _Run(judged_at(problem, before) if frames is not None else problem, options)
         initial_cost, history = run.initial_cost, run.history
         weighting = Weighting(problem.settings.loss)

@@ -26,6 +26,7 @@ from fg_calib.problem import (
     lengths,
     whitened_triangle,
 )
+from fg_calib.residuals import single_threaded_blas
 from fg_calib.robot import Robot
 from fg_calib.robust import effect
 from fg_calib.solver import Solution
@@ -299,6 +300,11 @@ def assess(solution: Solution) -> Uncertainty:
         in one both at the nominal parameters and at the estimate; the others are known given that the undetermined
         directions are near nominal.
     """
+    with single_threaded_blas():
+        return _assess(solution)
+
+
+def _assess(solution: Solution) -> Uncertainty:
     problem = solution.problem
     variables = problem.variables
     spread = _spread(solution)
@@ -313,7 +319,7 @@ def assess(solution: Solution) -> Uncertainty:
             sigma=np.sqrt(np.diag(spread.covariance(np.eye(variables.n_columns))))[variables.n_robot_columns :],
         )
     chi2, n_rows, loss_factor = _weighted_chi2(solution)
-    dof = n_rows + problem.n_priors - spread.rank - variables.n_nuisance
+    dof = n_rows + problem.n_priors - spread.rank - variables.n_without_prior
     expected = max(0.0, dof - spread.excess - (1.0 - loss_factor) * n_rows)
     bounds = chi2_bounds(dof, expected, _independent_dof(problem, dof, spread.rank))
     return Uncertainty(
@@ -530,11 +536,12 @@ def _point_estimates(solution: Solution, spread: Spread) -> tuple[PointEstimate,
     if points is None:
         return ()
     xyz = points.means(variables.chain.at(solution.parameters), problem.trig)
-    xyz[points.estimated] = solution.parameters[variables.nuisance_span].reshape(-1, 3)
+    n = variables.n_without_prior  # the points come first among the nuisance variables
+    xyz[points.estimated] = solution.parameters[variables.nuisance_span][:n].reshape(-1, 3)
     sigma = np.full_like(xyz, np.nan)
     left = eliminated_terms(problem, solution.parameters)
     variance = np.diag(spread.covariance(left.follow)) + np.sum(left.inverse**2, axis=1)
-    sigma[points.estimated] = np.sqrt(variance).reshape(-1, 3)
+    sigma[points.estimated] = np.sqrt(variance[:n]).reshape(-1, 3)
     index = points.groups.index
     return tuple(
         PointEstimate(name, int(np.sum(points.train & (index == g))), xyz[g], sigma[g])

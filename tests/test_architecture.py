@@ -18,6 +18,7 @@ FLOORS = (
     *(
         "factors",
         "groups",
+        "encoders",
         "frames",
         "observability",
         "robust",

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 import pytest
 import scipy.optimize
@@ -74,11 +75,16 @@ def everything(robot, m, model):
     return values, 2.0 * found.cost
 
 
+@pytest.mark.parametrize("most", [100, 0], ids=["variables", "eliminated"])
 @pytest.mark.parametrize(("kind", "model"), [("poses", "pose"), ("direct", "distance-rotation")])
-def test_estimated_joint_values_give_the_optimum_over_everything(kind, model):
+def test_estimated_joint_values_give_the_optimum_over_everything(kind, model, most, monkeypatch):
+    monkeypatch.setattr(problem_module, "MAX_JOINT_VARIABLES", most)
     robot, m = measured(kind, 12, seed=1)
     values, chi2 = everything(robot, m, model)
-    solution = solve(build_problem(robot, m, model=model, encoder="estimated"))
+    problem = build_problem(robot, m, model=model, encoder="estimated")
+    keys = {gtsam.symbol("Q", k) for k in range(12)} & set(problem.graph.keyVector())
+    assert len(keys) == (12 if most else 0)
+    solution = solve(problem)
     assert solution.converged
     sigma = np.array([p.sigma or 1.0 for p in assess(solution).parameters])
     away = (solution.parameters[: len(values)] - values) / sigma
@@ -87,6 +93,54 @@ def test_estimated_joint_values_give_the_optimum_over_everything(kind, model):
     propagated = solve(build_problem(robot, m, model=model))
     apart = np.max(np.abs(propagated.parameters[: len(values)] - values) / sigma)
     assert 1e-3 < apart < 0.5  # the same to first order only: 2 mrad of encoder noise bend the arm's paths
+
+
+@pytest.mark.parametrize(
+    ("kind", "model", "options"),
+    [
+        ("poses", "pose", {"frame": "unknown"}),
+        ("poses", "distance-rotation", {"pairing": Pairing("star")}),
+        ("poses", "distance-rotation", {"pairing": Pairing("all")}),
+        ("poses", "distance", {"pairing": Pairing("chain"), "loss": "huber"}),
+        ("direct", "distance-rotation", {"loss": "gnc"}),
+    ],
+)
+def test_joint_values_as_variables_and_eliminated_have_one_optimum(kind, model, options, monkeypatch):
+    robot, m = measured(kind, 12, 5)
+    found = []
+    for most in (100, 0):
+        monkeypatch.setattr(problem_module, "MAX_JOINT_VARIABLES", most)
+        found.append(solve(build_problem(robot, m, model=model, encoder="estimated", **options)))
+    a, b = (assess(s) for s in found)
+    assert all(s.converged for s in found)
+    sigma = np.array([p.sigma or 1.0 for p in a.parameters])
+    apart = (found[0].parameters[: len(sigma)] - found[1].parameters[: len(sigma)]) / sigma
+    # With a loss the weights come from residuals at the readings as stated, or at the true joint values.
+    assert np.max(np.abs(apart)) < (0.2 if "loss" in options else 1e-4)
+    assert a.dof == b.dof
+    if "loss" not in options:
+        assert a.chi2 == pytest.approx(b.chi2, rel=1e-5)
+        assert np.allclose(a.covariance, b.covariance, rtol=1e-3, atol=1e-3 * np.abs(b.covariance).max())
+
+
+def test_derivatives_in_the_true_joint_values_are_those_of_the_rows():
+    """Every term against central differences, away from the readings."""
+    robot, m = measured("poses", 6, 6)
+    rng = np.random.default_rng(0)
+    for model, pairing in (("pose", "star"), ("distance-rotation", "star"), ("distance", "all")):
+        problem = build_problem(robot, m, model=model, pairing=Pairing(pairing), encoder="estimated")
+        v = problem.variables
+        at = problem.start.copy()
+        at[v.nuisance_span] += 1e-2 * rng.normal(size=v.n_nuisance)
+        for term in problem.terms:
+            J = term.linearise(v, at)[1]
+            places = [i for k in term.nuisance for i in v.nuisance[k].parameters]
+            J = J[:, len(J[0]) - len(places) :]
+            for column, place in enumerate(places):
+                h = np.zeros(len(at))
+                h[place] = 1e-6
+                numeric = (term.residual(v, at + h) - term.residual(v, at - h)) / 2e-6
+                assert np.allclose(J[:, column], numeric, rtol=1e-5, atol=1e-5 * np.abs(J).max())
 
 
 @pytest.mark.parametrize(
@@ -122,6 +176,7 @@ def test_both_ways_agree_to_first_order(kind, model, options):
 
 def test_too_many_joint_values_for_pairs_are_refused(monkeypatch):
     monkeypatch.setattr(problem_module, "MAX_SHARED", 20)
+    monkeypatch.setattr(problem_module, "MAX_JOINT_VARIABLES", 10)
     robot, m = measured("direct", 12, seed=3)
     with pytest.raises(ProblemError) as error:
         build_problem(robot, m, model="distance", encoder="estimated")
