@@ -616,8 +616,9 @@ def _check_poses(measurements: Measurements, settings: Settings) -> None:
 
 def _check_enough(problem: Problem) -> None:
     """Whether there are rows at all, and as many as unknowns that random configurations could determine."""
-    source = problem.measurements.source if problem.pairs is None else problem.pairs.source
-    unit = "row" if problem.pairs is None else "pair"
+    touches_only = problem.points is not None and problem.pairs is not None and not problem.pairs.n_pairs
+    source = problem.measurements.source if problem.pairs is None or touches_only else problem.pairs.source
+    unit = "touch" if touches_only else "row" if problem.pairs is None else "pair"
     if problem.n_residuals == 0:
         reasons = ", ".join(
             f"{count} excluded for {reason.replace('_', ' ')}" for reason, count in problem.n_excluded.items() if count
@@ -625,7 +626,7 @@ def _check_enough(problem: Problem) -> None:
         found = f"no {unit} left to fit"
         if reasons:
             raise ProblemError(source, f"{found}: {reasons}", f"{unit}s that tell something")
-        if problem.pairs is not None and not problem.pairs.n_pairs:
+        if problem.pairs is not None and not problem.pairs.n_pairs and not touches_only:
             raise ProblemError(source, f"{found}: none has a measurement that model {problem.settings.model} uses")
         raise ProblemError(source, found, "train rows")
     rows = problem.n_residuals + problem.n_priors - problem.variables.n_without_prior
