@@ -33,14 +33,15 @@ from fg_calib.kinematics import Poses, build_chain, forward, precompute_trig
 from fg_calib.least_squares import LeastSquares, fit_least_squares
 from fg_calib.measurements import rotation_angle
 from fg_calib.problem import problem_of
+from fg_calib.residual_table import residual_table
 from fg_calib.robot import Robot
 from fg_calib.solver import Solution, solve
-from fg_calib.uncertainty import Uncertainty, assess, residual_table
+from fg_calib.uncertainty import Uncertainty, assess
 
 Floats = NDArray[np.float64]
 
 ResidualRms = dict[str, dict[str, dict[str, float]]]
-"""RMS by split, kind, and before or after: see `ResidualTable.rms`."""
+"""RMS by split, kind, and before or after: see `residual_table.ResidualTable.rms`."""
 
 ESTIMATORS: Mapping[str, str] = {
     "graph": "the factor graph, as the job says",

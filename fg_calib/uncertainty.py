@@ -11,11 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 from scipy.spatial.transform import Rotation
 
-from fg_calib import residuals
-from fg_calib.factors import pose_of, prior_rows
+from fg_calib.covariance import Spread, spread_of
+from fg_calib.factors import pose_of
 from fg_calib.identifiability import Identifiability, identify
-from fg_calib.observability import SUPPORT_TOLERANCE, IdentifiabilityClass, Observability, determined
-from fg_calib.problem import PAIR_KINDS, POSE_KINDS, Problem, all_rows, correlation, whitened_triangle
+from fg_calib.observability import IdentifiabilityClass, Observability
+from fg_calib.problem import PAIR_KINDS, Problem
+from fg_calib.residual_table import ResidualTable, residual_table
 from fg_calib.robot import Robot
 from fg_calib.solver import Solution
 
@@ -88,97 +89,6 @@ class Prediction:
     value: Floats
     sigma: Floats
     covariance: Floats
-
-
-@dataclass(frozen=True)
-class Spread:
-    """The covariance in the tangent space of the variables, and the directions that nothing determines.
-
-    Attributes:
-        names: Named scalars, in the order of the columns (see `Variables.names`).
-        n_robot_columns: Columns without the measurement frame's.
-        tangent: Covariance of the determined part, shape (n_columns, n_columns).
-        loose: Undetermined directions at the estimate, orthonormal in changes of ordinary size, shape
-            (n_loose, n_columns).
-        loose_at_nominal: The same at the nominal parameters.
-        scales: A change of ordinary size in each column.
-        named_derivative: Of the named scalars in the columns.
-        rank: Number of determined directions.
-        excess: By how much the mean of chi-square is below its degrees of freedom, because rows that share errors are
-            weighted as independent.
-    """
-
-    names: tuple[str, ...]
-    n_robot_columns: int
-    tangent: Floats
-    loose: Floats
-    loose_at_nominal: Floats
-    scales: Floats
-    named_derivative: Floats
-    rank: int
-    excess: float
-
-    def covariance(self, rows: Floats) -> Floats:
-        """Covariance of linear functions of the columns, shape (m, n_columns); nan where undetermined."""
-        with np.errstate(invalid="ignore"):  # a pose at a quarter turn of pitch has no derivative
-            out: Floats = rows @ self.tangent @ rows.T
-            size = np.linalg.norm(rows * self.scales, axis=1)
-            share, share_at_nominal = (
-                np.linalg.norm((rows * self.scales) @ loose.T, axis=1) for loose in (self.loose, self.loose_at_nominal)
-            )
-            unknown = (share > SUPPORT_TOLERANCE * size) & (share_at_nominal > SUPPORT_TOLERANCE * size)
-        unknown |= ~np.isfinite(np.diag(out))
-        out[unknown, :] = np.nan
-        out[:, unknown] = np.nan
-        return out
-
-    def named(self) -> Floats:
-        """Covariance of the robot's estimated parameters, shape (n_robot_columns, n_robot_columns)."""
-        n = self.n_robot_columns
-        return self.covariance(self.named_derivative[:n])
-
-
-@dataclass(frozen=True)
-class ResidualTable:
-    """Every scalar residual, train and test, before and after; [m] and [rad].
-
-    Attributes:
-        kind: `distance`, `angle`, `position.x`, ..., `orientation.z` of each row, shape (n,).
-        a: Row of the (first) configuration, shape (n,).
-        b: Row of the second configuration, -1 for poses, shape (n,).
-        test: Predicted only, shape (n,).
-        reason: Why a row takes no part, empty where it does, shape (n,).
-        measured: Measured value; nan for orientations, shape (n,).
-        before: Residual with the arm at nominal, shape (n,).
-        after: Residual at the estimate, shape (n,).
-        sigma: 1 sigma of the residual, shape (n,).
-    """
-
-    kind: NDArray[np.str_]
-    a: Integers
-    b: Integers
-    test: Booleans
-    reason: NDArray[np.str_]
-    measured: Floats
-    before: Floats
-    after: Floats
-    sigma: Floats
-
-    def rms(self) -> dict[str, dict[str, dict[str, float]]]:
-        """RMS by split, kind (the norm of a position's or orientation's three components), before and after."""
-        table: dict[str, dict[str, dict[str, float]]] = {"train": {}, "test": {}}
-        used = self.reason == ""
-        family = np.char.partition(self.kind, ".")[:, 0] if len(self.kind) else self.kind
-        for split, of_split in (("train", ~self.test), ("test", self.test)):
-            for name in ("position", "orientation", "distance", "angle"):
-                rows = used & of_split & (family == name)
-                if rows.any():
-                    per_row = 3.0 if name in ("position", "orientation") else 1.0
-                    table[split][name] = {
-                        when: float(np.sqrt(per_row * np.mean(values[rows] ** 2)))
-                        for when, values in (("before", self.before), ("after", self.after))
-                    }
-        return table
 
 
 @dataclass(frozen=True)
@@ -269,7 +179,7 @@ def assess(solution: Solution) -> Uncertainty:
     """
     problem = solution.problem
     variables = problem.variables
-    spread = _spread(solution)
+    spread = spread_of(solution)
     whole = identify(problem.whole or problem, solution.before, "practical")
     covariance = spread.named()
     frame = None
@@ -325,51 +235,6 @@ def _independent_dof(problem: Problem, dof: int, rank: int) -> int:
     return min(dof, each * (problem.n_configurations - 1) + problem.n_priors - rank)
 
 
-def residual_table(solution: Solution) -> ResidualTable:
-    """Every scalar residual, train and test, with the arm at nominal and at the estimate."""
-    problem = solution.problem
-    block = all_rows(problem)
-    chain = problem.variables.chain
-    before, after = (residuals.residual(block, chain.at(p)) for p in (solution.before, solution.parameters))
-    if problem.pairs is not None:
-        return _pair_table(problem, before, after)
-    return _pose_table(problem, before, after)
-
-
-def _spread(solution: Solution) -> Spread:
-    """The covariance: that of the weighted least-squares estimate under the noise as it is taken to be.
-
-    Where rows share errors but are weighted as independent, with H = J^T J and C their covariance, it is
-    H^-1 (J^T C J) H^-1 (priors are rows of their own), unless independence was asked for. The mean of chi-square,
-    tr C - tr(H^-1 J^T C J), is then below the degrees of freedom by tr(H^-1 J^T (C - 1) J).
-    """
-    problem, variables = solution.problem, solution.problem.variables
-    scales = variables.scales
-
-    def stacked(parameters: Floats) -> Floats:
-        rows = [whitened_triangle(problem, parameters), prior_rows(variables, parameters)[1]]
-        return np.vstack([*rows, np.zeros((variables.n_columns, variables.n_columns))]) * scales
-
-    _, s, Vt = np.linalg.svd(stacked(solution.parameters), full_matrices=False)
-    _, s_nominal, Vt_nominal = np.linalg.svd(stacked(solution.before), full_matrices=False)
-    rank, rank_nominal = determined(s), determined(s_nominal)
-    half = scales[:, None] * Vt[:rank].T / s[:rank]
-    added = correlation(problem, solution.parameters)
-    middle = np.zeros((rank, rank)) if added is None else half.T @ added @ half
-    middle_of_sigma = np.eye(rank) + (middle if problem.approximate else 0.0)
-    return Spread(
-        names=variables.names,
-        n_robot_columns=variables.n_robot_columns,
-        tangent=half @ middle_of_sigma @ half.T,
-        loose=Vt[rank:],
-        loose_at_nominal=Vt_nominal[rank_nominal:],
-        scales=scales,
-        named_derivative=variables.named_derivative(solution.parameters),
-        rank=rank,
-        excess=float(np.trace(middle)),
-    )
-
-
 def _parameter_estimates(
     solution: Solution, sigma: Floats, observability: Observability
 ) -> tuple[ParameterEstimate, ...]:
@@ -402,58 +267,6 @@ def _findings(solution: Solution, chi2: float, dof: int, bounds: tuple[float, fl
         cause = "noise stated too small, effects not modelled, or outliers" if high else "noise stated too large"
         findings.append(f"reduced chi-square {chi2 / dof:.3g} is outside [{bounds[0]:.2f}, {bounds[1]:.2f}]: {cause}")
     return tuple(findings)
-
-
-def _pair_table(problem: Problem, before: Floats, after: Floats) -> ResidualTable:
-    pairs, judgement = problem.pairs, problem.judgement
-    assert pairs is not None
-    assert judgement is not None
-    kinds = PAIR_KINDS[problem.settings.model]
-    reasons = np.full((pairs.n_pairs, 2), "", dtype="<U20")
-    for reason, mask in judgement.reasons.items():
-        named = [kind in reason for kind in ("distance", "angle")]
-        reasons[np.outer(mask, named if any(named) else (True, True))] = reason
-    measured = np.stack([pairs.distance, pairs.angle], axis=1)
-    wide_before, wide_after = np.full_like(measured, np.nan), np.full_like(measured, np.nan)
-    wide_before[:, kinds], wide_after[:, kinds] = before, after
-    rows, columns = np.nonzero(np.isfinite(measured))
-    return ResidualTable(
-        kind=np.array(["distance", "angle"])[columns],
-        a=pairs.a[rows],
-        b=pairs.b[rows],
-        test=pairs.test[rows],
-        reason=reasons[rows, columns],
-        measured=measured[rows, columns],
-        before=wide_before[rows, columns],
-        after=wide_after[rows, columns],
-        sigma=problem.sigma[rows, columns],
-    )
-
-
-def _pose_table(problem: Problem, before: Floats, after: Floats) -> ResidualTable:
-    m, n = problem.measurements, problem.measurements.n_configurations
-    kinds = POSE_KINDS[problem.settings.model]
-    labels = [
-        f"{what}.{axis}"
-        for what, wanted in zip(("orientation", "position"), kinds, strict=True)
-        if wanted
-        for axis in "xyz"
-    ]
-    measured = np.full((n, 6), np.nan)
-    if m.position is not None:
-        measured[:, 3:] = m.position
-    wanted = np.repeat(kinds, 3)
-    return ResidualTable(
-        kind=np.tile(labels, n),
-        a=np.repeat(np.arange(n), len(labels)),
-        b=np.full(n * len(labels), -1),
-        test=np.repeat(m.test, len(labels)),
-        reason=np.full(n * len(labels), "", dtype="<U20"),
-        measured=measured[:, wanted].ravel(),
-        before=before.ravel(),
-        after=after.ravel(),
-        sigma=problem.sigma[:, wanted].ravel(),
-    )
 
 
 def marginals(solution: Solution) -> gtsam.Marginals:

@@ -24,6 +24,8 @@ FLOORS = (
         "solver",
         "reasons",
         "identifiability",
+        "covariance",
+        "residual_table",
         "uncertainty",
         "comparison",
         "report",
