@@ -13,43 +13,87 @@ from fg_calib.solver import Solution
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
-Integers = NDArray[np.int64]
+Codes = NDArray[np.int8]
+Indices = NDArray[np.int32]
+
+
+ROW_KINDS = (
+    *("distance", "angle"),
+    *("orientation.x", "orientation.y", "orientation.z"),
+    *("position.x", "position.y", "position.z"),
+)
+"""Kinds of scalar rows, in the order of their codes."""
+
+FAMILIES = ("distance", "angle", "orientation", "position")
+"""Kinds of noise, in the order of their codes."""
+
+FAMILY_OF_KIND = np.array([0, 1, 2, 2, 2, 3, 3, 3], dtype=np.int8)
+"""Code in `FAMILIES` of each code in `ROW_KINDS`."""
 
 
 @dataclass(frozen=True)
 class ResidualTable:
-    """Every scalar residual, train and test, before and after; [m] and [rad].
+    """Every scalar residual, train and test, before and after; [m] and [rad]. Words are codes: a table is long.
 
     Attributes:
-        kind: `distance`, `angle`, `position.x`, ..., `orientation.z` of each row, shape (n,).
+        kind_code: Of each row, in `ROW_KINDS`, shape (n,).
+        measurement: Number of each row's pair or configuration, shape (n,).
         a: Row of the (first) configuration, shape (n,).
         b: Row of the second configuration, -1 for poses, shape (n,).
         test: Predicted only, shape (n,).
-        reason: Why a row takes no part, empty where it does, shape (n,).
+        reason_code: Why a row takes no part, in `reasons`; 0 where it does, shape (n,).
+        reasons: Reasons by code; the first is empty.
         measured: Measured value; nan for orientations, shape (n,).
         before: Residual with the arm at nominal, shape (n,).
         after: Residual at the estimate, shape (n,).
         sigma: 1 sigma of the residual, shape (n,).
     """
 
-    kind: NDArray[np.str_]
-    a: Integers
-    b: Integers
+    kind_code: Codes
+    measurement: Indices
+    a: Indices
+    b: Indices
     test: Booleans
-    reason: NDArray[np.str_]
+    reason_code: Codes
+    reasons: tuple[str, ...]
     measured: Floats
     before: Floats
     after: Floats
     sigma: Floats
 
+    @property
+    def n(self) -> int:
+        """Number of rows."""
+        return len(self.kind_code)
+
+    @property
+    def kind(self) -> NDArray[np.str_]:
+        """`distance`, `angle`, `position.x`, ..., `orientation.z` of each row, shape (n,)."""
+        return np.array(ROW_KINDS)[self.kind_code]
+
+    @property
+    def reason(self) -> NDArray[np.str_]:
+        """Why a row takes no part, empty where it does, shape (n,)."""
+        return np.array(self.reasons)[self.reason_code]
+
+    @property
+    def family(self) -> Codes:
+        """Kind of noise of each row, in `FAMILIES`, shape (n,)."""
+        return FAMILY_OF_KIND[self.kind_code]
+
+    @property
+    def used(self) -> Booleans:
+        """Whether each row was fitted, shape (n,)."""
+        used: Booleans = (self.reason_code == 0) & ~self.test
+        return used
+
     def rms(self) -> dict[str, dict[str, dict[str, float]]]:
         """RMS by split, kind (the norm of a position's or orientation's three components), before and after."""
         table: dict[str, dict[str, dict[str, float]]] = {"train": {}, "test": {}}
-        used = self.reason == ""
-        family = np.char.partition(self.kind, ".")[:, 0] if len(self.kind) else self.kind
-        for split, of_split in (("train", ~self.test), ("test", self.test)):
+        family, counted = self.family, self.reason_code == 0
+        for split, of_split in (("train", counted & ~self.test), ("test", counted & self.test)):
             for name in ("position", "orientation", "distance", "angle"):
-                rows = used & of_split & (family == name)
+                rows = of_split & (family == FAMILIES.index(name))
                 if rows.any():
                     per_row = 3.0 if name in ("position", "orientation") else 1.0
                     table[split][name] = {
@@ -74,47 +118,46 @@ def _pair_table(problem: Problem, before: Floats, after: Floats) -> ResidualTabl
     pairs, judgement = problem.pairs, problem.judgement
     assert pairs is not None
     assert judgement is not None
-    kinds = PAIR_KINDS[problem.settings.model]
-    reasons = np.full((pairs.n_pairs, 2), "", dtype="<U20")
-    for reason, mask in judgement.reasons.items():
-        named = [kind in reason for kind in ("distance", "angle")]
-        reasons[np.outer(mask, named if any(named) else (True, True))] = reason
-    measured = np.stack([pairs.distance, pairs.angle], axis=1)
-    wide_before, wide_after = np.full_like(measured, np.nan), np.full_like(measured, np.nan)
-    wide_before[:, kinds], wide_after[:, kinds] = before, after
-    rows, columns = np.nonzero(np.isfinite(measured))
+    kinds = np.flatnonzero(PAIR_KINDS[problem.settings.model])
+    reasons = ("", *judgement.reasons)
+    codes = np.zeros((pairs.n_pairs, 2), dtype=np.int8)
+    for code, (reason, mask) in enumerate(judgement.reasons.items(), start=1):
+        named = [column for column, kind in enumerate(("distance", "angle")) if kind in reason]
+        for column in named or (0, 1):
+            codes[mask, column] = code
+    measured = np.stack([pairs.distance, pairs.angle], axis=1)[:, kinds]
+    there = np.isfinite(measured)
+    rows, columns = np.nonzero(there)
     return ResidualTable(
-        kind=np.array(["distance", "angle"])[columns],
-        a=pairs.a[rows],
-        b=pairs.b[rows],
+        kind_code=kinds.astype(np.int8)[columns],
+        measurement=rows.astype(np.int32),
+        a=pairs.a.astype(np.int32)[rows],
+        b=pairs.b.astype(np.int32)[rows],
         test=pairs.test[rows],
-        reason=reasons[rows, columns],
-        measured=measured[rows, columns],
-        before=wide_before[rows, columns],
-        after=wide_after[rows, columns],
-        sigma=problem.sigma[rows, columns],
+        reason_code=codes[:, kinds][there],
+        reasons=reasons,
+        measured=measured[there],
+        before=before[there],
+        after=after[there],
+        sigma=problem.sigma[:, kinds][there],
     )
 
 
 def _pose_table(problem: Problem, before: Floats, after: Floats) -> ResidualTable:
     m, n = problem.measurements, problem.measurements.n_configurations
-    kinds = POSE_KINDS[problem.settings.model]
-    labels = [
-        f"{what}.{axis}"
-        for what, wanted in zip(("orientation", "position"), kinds, strict=True)
-        if wanted
-        for axis in "xyz"
-    ]
+    wanted = np.flatnonzero(np.repeat(POSE_KINDS[problem.settings.model], 3))
     measured = np.full((n, 6), np.nan)
     if m.position is not None:
         measured[:, 3:] = m.position
-    wanted = np.repeat(kinds, 3)
+    each, rows = len(wanted), np.arange(n, dtype=np.int32)
     return ResidualTable(
-        kind=np.tile(labels, n),
-        a=np.repeat(np.arange(n), len(labels)),
-        b=np.full(n * len(labels), -1),
-        test=np.repeat(m.test, len(labels)),
-        reason=np.full(n * len(labels), "", dtype="<U20"),
+        kind_code=np.tile(wanted.astype(np.int8) + np.int8(ROW_KINDS.index("orientation.x")), n),
+        measurement=np.repeat(rows, each),
+        a=np.repeat(rows, each),
+        b=np.full(n * each, -1, dtype=np.int32),
+        test=np.repeat(m.test, each),
+        reason_code=np.zeros(n * each, dtype=np.int8),
+        reasons=("",),
         measured=measured[:, wanted].ravel(),
         before=before.ravel(),
         after=after.ravel(),

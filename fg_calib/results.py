@@ -16,9 +16,10 @@ from fg_calib.comparison import Comparison, Estimate, RealErrors
 from fg_calib.figures import write_figures
 from fg_calib.files.disk import fill_folder, write_text
 from fg_calib.files.robot_yaml import write_robot
-from fg_calib.files.tables import write_csv
+from fg_calib.files.tables import Words, write_csv_parts
 from fg_calib.files.urdf import write_urdf
 from fg_calib.identifiability import Identifiability
+from fg_calib.residual_table import FAMILIES, FAMILY_OF_KIND, ROW_KINDS
 from fg_calib.robot import Robot
 from fg_calib.solver import Solution
 from fg_calib.uncertainty import Uncertainty
@@ -27,6 +28,9 @@ RESULT_SCHEMA = "fg-calib/result/1"
 OBSERVABILITY_SCHEMA = "fg-calib/observability/1"
 COMPARISON_SCHEMA = "fg-calib/comparison/1"
 KINDS = ("position", "orientation", "distance", "angle")
+
+_ROWS_AT_ONCE = 200_000
+"""Rows of `residuals.csv` that are turned into text at once."""
 
 
 def result_document(
@@ -289,23 +293,30 @@ def write_calibrated_robot(folder: Path, robot: Robot) -> None:
 def _write_residuals(path: Path, solution: Solution, uncertainty: Uncertainty) -> None:
     """One line a scalar residual: what it is of, whether it was used, before and after, in [m] and [rad]."""
     table = uncertainty.residuals
-    ids = solution.problem.measurements.ids
-    columns = {
-        "kind": table.kind,
-        "a": ids[table.a],
-        "b": np.where(table.b >= 0, ids[table.b], ""),
-        "split": np.where(table.test, "test", "train"),
-        "used": (table.reason == "") & ~table.test,
-        "excluded": table.reason,
-        "unit": np.where(np.isin(np.char.partition(table.kind, ".")[:, 0], ["distance", "position"]), "m", "rad"),
-        "measured": table.measured,
-        "predicted": table.measured + table.after,
-        "residual_before": table.before,
-        "residual": table.after,
-        "sigma": table.sigma,
-        "whitened": table.after / table.sigma,
-    }
-    write_csv(path, columns)
+    ids = ["", *solution.problem.measurements.ids.tolist()]
+    kind_in_metres = np.array([FAMILIES[f] in ("distance", "position") for f in FAMILY_OF_KIND])
+
+    def columns(rows: slice) -> dict[str, Any]:
+        kind = table.kind_code[rows]
+        measured, after, sigma = table.measured[rows], table.after[rows], table.sigma[rows]
+        return {
+            "kind": Words(ROW_KINDS, kind),
+            "a": Words(ids, table.a[rows] + 1),
+            "b": Words(ids, table.b[rows] + 1),
+            "split": Words(("train", "test"), table.test[rows].astype(np.int8)),
+            "used": table.used[rows],
+            "excluded": Words(table.reasons, table.reason_code[rows]),
+            "unit": Words(("rad", "m"), kind_in_metres[kind].astype(np.int8)),
+            "measured": measured,
+            "predicted": measured + after,
+            "residual_before": table.before[rows],
+            "residual": after,
+            "sigma": sigma,
+            "whitened": after / sigma,
+        }
+
+    starts = range(0, max(table.n, 1), _ROWS_AT_ONCE)
+    write_csv_parts(path, (columns(slice(start, start + _ROWS_AT_ONCE)) for start in starts))
 
 
 def _plain(value: Any) -> Any:

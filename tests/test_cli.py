@@ -262,7 +262,7 @@ def test_a_failure_while_writing_leaves_no_file_behind(fg_calib, example, monkey
     def fail(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(results, "write_csv", fail)
+    monkeypatch.setattr(results, "write_csv_parts", fail)
     before = sorted(example.iterdir())
     out = example / "result"
     ended = fg_calib("calibrate", example / JOB, "--out", out)
