@@ -23,6 +23,7 @@ class Spread:
         names: Named scalars, in the order of the columns (see `Variables.names`).
         n_robot_columns: Columns without the measurement frame's.
         tangent: Covariance of the determined part, shape (n_columns, n_columns).
+        weighted: The same, were the rows' noise as they are weighted.
         loose: Undetermined directions at the estimate, orthonormal in changes of ordinary size, shape
             (n_loose, n_columns).
         loose_at_nominal: The same at the nominal parameters.
@@ -36,6 +37,7 @@ class Spread:
     names: tuple[str, ...]
     n_robot_columns: int
     tangent: Floats
+    weighted: Floats
     loose: Floats
     loose_at_nominal: Floats
     scales: Floats
@@ -88,6 +90,7 @@ def spread_of(solution: Solution) -> Spread:
         names=variables.names,
         n_robot_columns=variables.n_robot_columns,
         tangent=half @ middle_of_sigma @ half.T,
+        weighted=half @ half.T,
         loose=Vt[rank:],
         loose_at_nominal=Vt_nominal[rank_nominal:],
         scales=scales,

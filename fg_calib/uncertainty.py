@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.covariance import Spread, spread_of
 from fg_calib.factors import pose_of
+from fg_calib.goodness import Goodness, judge_fit
 from fg_calib.identifiability import Identifiability, identify
 from fg_calib.observability import IdentifiabilityClass, Observability
 from fg_calib.problem import PAIR_KINDS, Problem
@@ -104,7 +105,9 @@ class Uncertainty:
         dof: Residuals and priors, less the determined directions.
         expected_chi2: What chi-square is on average; not `dof` where rows that share errors count as independent.
         chi2_bounds: Interval of the reduced chi-square that is taken as good.
+        p_value: Probability of a chi-square as large, were the noise as stated; None where that is not known.
         residuals: Every residual, before and after.
+        goodness: Goodness of fit by kind, by row and by configuration.
         identifiability: What the data alone determine, at the nominal parameters.
         robot: The calibrated robot.
         spread: The covariance in the variables' tangent space, behind `predict`.
@@ -119,7 +122,9 @@ class Uncertainty:
     dof: int
     expected_chi2: float
     chi2_bounds: tuple[float, float]
+    p_value: float | None
     residuals: ResidualTable
+    goodness: Goodness
     identifiability: Identifiability
     robot: Robot
     spread: Spread
@@ -193,7 +198,9 @@ def assess(solution: Solution) -> Uncertainty:
     chi2 = 2.0 * solution.cost
     dof = problem.n_independent + problem.n_priors - spread.rank
     expected = max(0.0, dof - spread.excess)
-    bounds = chi2_bounds(dof, expected, _independent_dof(problem, dof, spread.rank))
+    independent = _independent_dof(problem, dof, spread.rank)
+    bounds = chi2_bounds(dof, expected, independent)
+    table = residual_table(solution)
     return Uncertainty(
         names=variables.names[: variables.n_robot_columns],
         covariance=covariance,
@@ -203,7 +210,9 @@ def assess(solution: Solution) -> Uncertainty:
         dof=dof,
         expected_chi2=expected,
         chi2_bounds=bounds,
-        residuals=residual_table(solution),
+        p_value=_p_value(problem, chi2, expected, independent),
+        residuals=table,
+        goodness=judge_fit(solution, spread, table),
         identifiability=whole,
         robot=problem.robot.with_values(solution.parameters[:-6]),
         spread=spread,
@@ -225,6 +234,13 @@ def chi2_bounds(dof: int, expected: float | None = None, independent: int | None
     ratio = 1.0 if expected is None else expected / dof
     low, high = (2.0 * special.gammaincinv(k / 2.0, p) / k for p in ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))
     return ratio * min(float(low), 1.0 / FACTOR), max(1.0, ratio) * max(float(high), FACTOR)
+
+
+def _p_value(problem: Problem, chi2: float, expected: float, independent: int) -> float | None:
+    """Upper p-value of chi-square, scaled to its mean; None after robust weights, which came from the residuals."""
+    if problem.adjustment.weights is not None or expected <= 0.0 or independent <= 0:
+        return None
+    return float(special.gammaincc(independent / 2.0, chi2 / expected * independent / 2.0))
 
 
 def _independent_dof(problem: Problem, dof: int, rank: int) -> int:

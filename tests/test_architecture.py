@@ -26,6 +26,7 @@ FLOORS = (
         "identifiability",
         "covariance",
         "residual_table",
+        "goodness",
         "uncertainty",
         "comparison",
         "report",
