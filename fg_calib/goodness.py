@@ -14,7 +14,7 @@ Rows weighted as independent although they share errors are another matter: with
 `A = (1 - J K J^T W) C (1 - J K J^T W)^T` and what the priors add. It is worked out for up to `MAX_DENSE` rows; beyond
 that the mean is that of all rows, shared among the kinds by leverage, and there is no p-value.
 
-A row with robust weight w counts as w rows; there is no p-value then, because the weights came from the residuals.
+A row with robust weight w counts as w rows. There is no p-value where weights or noise came from the residuals.
 
 References:
     Satterthwaite (1946), An approximate distribution of estimates of variance components. Biometrics Bulletin 2(6).
@@ -71,18 +71,20 @@ class KindFit:
         kind: `distance`, `angle`, `orientation` or `position`.
         unit: `m` or `rad`.
         n: Number of scalar rows.
-        stated_sigma_rms: Root of the mean square of their sigmas.
+        stated_sigma_rms: Root of the mean square of their sigmas as stated.
+        factor: What they were multiplied by: 1 unless the noise was estimated.
         seen_over_stated: Noise seen over noise stated; nan where the fit leaves less than one degree of freedom.
-        chi2: Sum of squared residuals over sigma.
-        expected: Its mean, were the noise as stated: the rows' redundancy.
-        p_value: Probability of a sum as large, were the noise as stated; None where it is not known.
-        typical: The same as `seen_over_stated`, from the median, which a few rows do not move.
+        chi2: Sum of squared residuals over sigma, as it was taken.
+        expected: Its mean, were the noise as taken: the rows' redundancy.
+        p_value: Probability of a sum as large, were the noise as taken; None where it is not known.
+        typical: Noise seen over noise taken, from the median, which a few rows do not move.
     """
 
     kind: str
     unit: str
     n: int
     stated_sigma_rms: float
+    factor: float
     seen_over_stated: float
     chi2: float
     expected: float
@@ -92,7 +94,7 @@ class KindFit:
     @property
     def verdict(self) -> str:
         """What the figures say, as a key of `VERDICTS`."""
-        ratio, p = self.seen_over_stated, self.p_value
+        ratio, p = self.seen_over_stated / self.factor, self.p_value
         if not np.isfinite(ratio):
             return "unknown"
         unlikely = abs(ratio - 1.0) > 0.2 if p is None else min(p, 1.0 - p) < ALARM / 2.0
@@ -101,7 +103,7 @@ class KindFit:
         if ratio < 1.0:
             return "too large"
         share = (self.typical**2 - 1.0) / (ratio**2 - 1.0)  # of the excess that rows have in common
-        return "outliers" if share < 0.25 else "too small" if share > 0.6 else "both"
+        return "outliers" if share < 0.35 else "too small" if share > 0.65 else "both"
 
 
 VERDICTS = {
@@ -249,14 +251,16 @@ class _Rows:
                 share = np.sum(self.leverage[fitted[rows]]) / leverage if leverage > 0.0 else 0.0
                 expected -= self._spread.excess * float(share)
             enough = expected >= 1.0
+            factor = float(_factors(self._problem)[code])
             studentised = np.abs(self.studentised[fitted[rows]])
             found.append(
                 KindFit(
                     kind=name,
                     unit="m" if name in ("distance", "position") else "rad",
                     n=len(rows),
-                    stated_sigma_rms=float(np.sqrt(np.mean(table.sigma[fitted[rows]] ** 2))),
-                    seen_over_stated=float(np.sqrt(chi2 / expected)) if enough else np.nan,
+                    stated_sigma_rms=float(np.sqrt(np.mean(table.sigma[fitted[rows]] ** 2))) / factor,
+                    factor=factor,
+                    seen_over_stated=factor * float(np.sqrt(chi2 / expected)) if enough else np.nan,
                     chi2=chi2,
                     expected=max(expected, 0.0),
                     p_value=self._p_value(rows, chi2) if enough else None,
@@ -301,7 +305,9 @@ class _Rows:
         return nu if self._covariance is not None or not self._shared else min(nu, 3.0)
 
     def _p_value(self, rows: Integers, chi2: float) -> float | None:
-        if self._robust or (self._covariance is None and self._shared):
+        if self._robust or self._solution.estimated_noise is not None:
+            return None
+        if self._covariance is None and self._shared:
             return None
         if self._covariance is None:
             v = self._means[rows]

@@ -18,6 +18,7 @@ from fg_calib.files.disk import fill_folder, write_text
 from fg_calib.files.robot_yaml import write_robot
 from fg_calib.files.tables import Words, write_csv_parts
 from fg_calib.files.urdf import write_urdf
+from fg_calib.goodness import FLAGS, VERDICTS
 from fg_calib.identifiability import Identifiability
 from fg_calib.residual_table import FAMILIES, FAMILY_OF_KIND, ROW_KINDS
 from fg_calib.robot import Robot
@@ -44,6 +45,7 @@ def result_document(
         inputs: SHA-256 of the files it came from, by path.
     """
     problem, settings = solution.problem, solution.problem.settings
+    ids = problem.measurements.ids
     rms = uncertainty.residuals.rms()
     pairing = None
     if settings.uses_pairs:
@@ -78,6 +80,26 @@ def result_document(
         "chi2": uncertainty.chi2,
         "dof": uncertainty.dof,
         "reduced_chi2": uncertainty.reduced_chi2,
+        "chi2_p_value": uncertainty.p_value,
+        "goodness": {
+            fit.kind: {
+                "n": fit.n,
+                "stated_sigma_rms": fit.stated_sigma_rms,
+                "seen_over_stated": fit.seen_over_stated,
+                "chi2": fit.chi2,
+                "expected": fit.expected,
+                "p_value": fit.p_value,
+                "verdict": VERDICTS[fit.verdict],
+            }
+            for fit in uncertainty.goodness.kinds
+        },
+        "noise_factors": None
+        if solution.estimated_noise is None
+        else {fit.kind: fit.factor for fit in uncertainty.goodness.kinds},
+        "suspect_configurations": [
+            {"id": ids[c.configuration], "n": c.n, "chi2": c.chi2, "expected": c.expected}
+            for c in uncertainty.goodness.configurations
+        ],
         "residual_rms": {split: {kind: rms[split].get(kind) for kind in KINDS} for split in ("train", "test")},
         "parameters": [
             {
@@ -292,7 +314,7 @@ def write_calibrated_robot(folder: Path, robot: Robot) -> None:
 
 def _write_residuals(path: Path, solution: Solution, uncertainty: Uncertainty) -> None:
     """One line a scalar residual: what it is of, whether it was used, before and after, in [m] and [rad]."""
-    table = uncertainty.residuals
+    table, fit = uncertainty.residuals, uncertainty.goodness
     ids = ["", *solution.problem.measurements.ids.tolist()]
     kind_in_metres = np.array([FAMILIES[f] in ("distance", "position") for f in FAMILY_OF_KIND])
 
@@ -313,6 +335,10 @@ def _write_residuals(path: Path, solution: Solution, uncertainty: Uncertainty) -
             "residual": after,
             "sigma": sigma,
             "whitened": after / sigma,
+            "leverage": fit.leverage[rows],
+            "studentised": fit.studentised[rows],
+            "weight": fit.weight[rows],
+            "flag": Words(FLAGS, fit.flag[rows]),
         }
 
     starts = range(0, max(table.n, 1), _ROWS_AT_ONCE)

@@ -83,6 +83,7 @@ class Solution:
         initial_cost: Cost at `before`.
         cost: Cost at the estimate.
         seconds: Time taken.
+        estimated_noise: Kinds whose noise was estimated (see `noise`); None where it was taken as stated.
     """
 
     problem: Problem
@@ -95,6 +96,7 @@ class Solution:
     initial_cost: float
     cost: float
     seconds: float
+    estimated_noise: tuple[str, ...] | None = None
 
     @property
     def iterations(self) -> int:

@@ -210,7 +210,7 @@ def assess(solution: Solution) -> Uncertainty:
         dof=dof,
         expected_chi2=expected,
         chi2_bounds=bounds,
-        p_value=_p_value(problem, chi2, expected, independent),
+        p_value=_p_value(solution, chi2, expected, independent),
         residuals=table,
         goodness=judge_fit(solution, spread, table),
         identifiability=whole,
@@ -236,9 +236,15 @@ def chi2_bounds(dof: int, expected: float | None = None, independent: int | None
     return ratio * min(float(low), 1.0 / FACTOR), max(1.0, ratio) * max(float(high), FACTOR)
 
 
-def _p_value(problem: Problem, chi2: float, expected: float, independent: int) -> float | None:
-    """Upper p-value of chi-square, scaled to its mean; None after robust weights, which came from the residuals."""
-    if problem.adjustment.weights is not None or expected <= 0.0 or independent <= 0:
+def _p_value(solution: Solution, chi2: float, expected: float, independent: int) -> float | None:
+    """Upper p-value of chi-square, scaled to its mean; None where weights or noise came from the residuals."""
+    problem = solution.problem
+    if (
+        problem.adjustment.weights is not None
+        or solution.estimated_noise is not None
+        or expected <= 0.0
+        or independent <= 0
+    ):
         return None
     return float(special.gammaincc(independent / 2.0, chi2 / expected * independent / 2.0))
 

@@ -27,6 +27,7 @@ FLOORS = (
         "covariance",
         "residual_table",
         "goodness",
+        "noise",
         "uncertainty",
         "comparison",
         "report",
