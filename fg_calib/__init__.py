@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from fg_calib.kinematics import pose
     from fg_calib.least_squares import LeastSquares, fit_least_squares
     from fg_calib.measurements import Measurements, Noise, Pairing
+    from fg_calib.noise import estimate_noise, solve_job
     from fg_calib.problem import Problem, build_problem, problem_of
     from fg_calib.report import format_comparison, format_identifiability, format_report
     from fg_calib.results import (
@@ -58,6 +59,7 @@ _HOMES = {
     "fg_calib.kinematics": ("pose",),
     "fg_calib.least_squares": ("LeastSquares", "fit_least_squares"),
     "fg_calib.measurements": ("Measurements", "Noise", "Pairing"),
+    "fg_calib.noise": ("estimate_noise", "solve_job"),
     "fg_calib.problem": ("Problem", "build_problem", "problem_of"),
     "fg_calib.report": ("format_comparison", "format_identifiability", "format_report"),
     "fg_calib.results": (
@@ -96,6 +98,7 @@ __all__ = [
     "build_problem",
     "compare",
     "comparison_document",
+    "estimate_noise",
     "fit_least_squares",
     "format_comparison",
     "format_identifiability",
@@ -112,6 +115,7 @@ __all__ = [
     "result_document",
     "simulate",
     "solve",
+    "solve_job",
     "write_comparison",
     "write_observability",
     "write_results",

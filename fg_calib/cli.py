@@ -77,14 +77,13 @@ def calibrate(
 ) -> None:
     """Estimate a robot's parameters from measurements, with their uncertainties."""
     from fg_calib.files.job import read_job
-    from fg_calib.problem import problem_of
+    from fg_calib.noise import solve_job
     from fg_calib.report import build_report
     from fg_calib.results import result_document, write_results
-    from fg_calib.solver import solve
     from fg_calib.uncertainty import assess
 
     given = read_job(job)
-    solution = solve(problem_of(given))
+    solution = solve_job(given)
     uncertainty = assess(solution)
     if out is not None:
         write_results(out, solution, uncertainty, given.inputs)

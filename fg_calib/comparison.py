@@ -8,6 +8,8 @@
 | `weighted-gauss-newton` | the same parameters, by the same steps | noise |
 | `scipy` | the same parameters, by `scipy.optimize.least_squares` | noise |
 
+Where a job has its noise estimated, both graphs do so; plain least squares weighs by the noise stated.
+
 All are judged on the same rows, by the same formulas, at the test configurations; at the train configurations where
 there are none. Where the truth is known (a simulation) the real errors stand beside the predicted ones.
 
@@ -32,15 +34,17 @@ from fg_calib.files.job import Job
 from fg_calib.kinematics import Poses, build_chain, forward, precompute_trig
 from fg_calib.least_squares import LeastSquares, fit_least_squares
 from fg_calib.measurements import rotation_angle
+from fg_calib.noise import solve_job
 from fg_calib.problem import problem_of
+from fg_calib.residual_table import residual_table
 from fg_calib.robot import Robot
-from fg_calib.solver import Solution, solve
-from fg_calib.uncertainty import Uncertainty, assess, residual_table
+from fg_calib.solver import Solution
+from fg_calib.uncertainty import Uncertainty, assess
 
 Floats = NDArray[np.float64]
 
 ResidualRms = dict[str, dict[str, dict[str, float]]]
-"""RMS by split, kind, and before or after: see `ResidualTable.rms`."""
+"""RMS by split, kind, and before or after: see `residual_table.ResidualTable.rms`."""
 
 ESTIMATORS: Mapping[str, str] = {
     "graph": "the factor graph, as the job says",
@@ -167,7 +171,7 @@ def compare(job: Job) -> Comparison:
     test = job.measurements.test
     judged_on: Literal["test", "train"] = "test" if test.any() else "train"
     readings = job.measurements.readings[test] if test.any() else job.measurements.readings
-    solution = solve(problem_of(job))
+    solution = solve_job(job)
     uncertainty = assess(solution)
     judge = _Judge(job, readings, solution)
     estimates = [judge.of_graph("graph", solution, uncertainty)]
@@ -209,7 +213,7 @@ def _without_priors(job: Job, judge: _Judge) -> list[Estimate]:
     )
 
     def graph() -> Estimate:
-        solution = solve(problem)
+        solution = solve_job(job, problem)
         return judge.of_graph("graph-keep", solution, assess(solution))
 
     runs: dict[str, Callable[[], Estimate]] = {

@@ -6,6 +6,7 @@ take part and why the others do not.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -50,6 +51,8 @@ from fg_calib.whitening import (
     pair_block,
     pose_block,
 )
+
+_log = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -284,6 +287,8 @@ def build_problem(
     pairs = _usable_pairs(measurements, settings) if settings.uses_pairs else None
     if pairs is None:
         _check_poses(measurements, settings)
+        if measurements.pairs is not None:
+            _log.warning("%s: not used, model %s is of poses", measurements.pairs.source, model)
     trig = precompute_trig(robot, measurements.readings)
     start = _start(robot, measurements, settings, variables, trig, pairs, points)
     joints = _true_joints(robot, measurements, settings, pairs)
@@ -396,6 +401,11 @@ def random_problem(
     lower, upper = np.clip(robot.limits, -span[:, None], span[:, None]).T
     readings = np.random.default_rng(seed).uniform(lower, upper, (n, robot.n_joints))
     return predicted_problem(robot, readings, model, frame=frame, pairing=Pairing("chain"), pair_errors="independent")
+
+
+def noise_kinds(model: Model) -> tuple[str, str]:
+    """The kinds of noise that an adjustment's factors are of."""
+    return ("distance", "angle") if model in PAIR_KINDS else ("orientation", "position")
 
 
 def judged_at(problem: Problem, parameters: Floats, adjustment: Adjustment | None = None) -> Problem:

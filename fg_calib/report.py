@@ -12,10 +12,12 @@ from rich.table import Table
 from rich.text import Text
 
 from fg_calib.comparison import Comparison, Estimate, PoseError
+from fg_calib.goodness import FLAGS, VERDICTS
 from fg_calib.identifiability import Identifiability
 from fg_calib.observability import CORRELATED, Observability
 from fg_calib.problem import Problem
 from fg_calib.reasons import LostDirection
+from fg_calib.residual_table import FAMILIES, ROW_KINDS
 from fg_calib.robot import AXIS_OF_KIND, Axis, Robot
 from fg_calib.solver import Solution
 from fg_calib.uncertainty import FrameEstimate, ParameterEstimate, Uncertainty
@@ -46,9 +48,14 @@ def build_report(solution: Solution, uncertainty: Uncertainty) -> RenderableType
     parts: list[RenderableType] = [
         _verdict(solution, uncertainty),
         *_section("Fit statistics", _statistics(solution, uncertainty)),
+        *_section("Goodness of fit (1 sigma of a row)", *_goodness(solution, uncertainty)),
         *_section("Residuals (RMS)", _residuals(uncertainty)),
         *_section("Parameters", _parameters(uncertainty)),
     ]
+    if len(uncertainty.goodness.suspects):
+        parts += _section("Suspicious rows", _suspects(solution, uncertainty))
+    if uncertainty.goodness.configurations:
+        parts += _section("Suspicious configurations", _suspect_configurations(solution, uncertainty))
     if uncertainty.frame is not None:
         parts += _section("Measurement frame (world_T_base)", _frame(uncertainty.frame))
     if uncertainty.identifiability.lost:
@@ -108,12 +115,17 @@ def _statistics(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
         rows.append(("distances of points", f"{problem.points.used.sum()}"))
     reduced = uncertainty.reduced_chi2
     low, high = uncertainty.chi2_bounds
-    determined = problem.n_residuals + problem.n_priors - uncertainty.dof
+    determined = uncertainty.spread.rank
     rows += [
         ("residuals", f"{problem.n_residuals}, and {problem.n_priors} priors"),
         ("estimated", f"{len(problem.variables.all_scales)} unknowns, {determined} directions determined"),
         ("chi-square", f"{uncertainty.chi2:.6g} with {uncertainty.dof} degrees of freedom"),
-        ("reduced chi-square", "unknown" if reduced is None else f"{reduced:.4g} (good from {low:.3g} to {high:.3g})"),
+        (
+            "reduced chi-square",
+            "unknown"
+            if reduced is None
+            else f"{reduced:.4g} (good from {low:.3g} to {high:.3g}){_of_p(uncertainty.p_value)}",
+        ),
         (
             "solver",
             f"{solution.iterations} iterations, {solution.seconds:.2f} s,"
@@ -124,6 +136,93 @@ def _statistics(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
     table.show_header = False
     for row in rows:
         table.add_row(*row)
+    return table
+
+
+def _of_p(p: float | None) -> str:
+    return "" if p is None else f", p-value {_probability(p)}"
+
+
+def _probability(p: float) -> str:
+    """A probability with two figures, none beyond a thousandth from 0 and 1."""
+    return "< 0.001" if p < 1e-3 else "> 0.999" if p > 0.999 else f"{p:.2g}" if p < 0.1 else f"{p:.2f}"
+
+
+def _goodness(solution: Solution, uncertainty: Uncertainty) -> Iterable[RenderableType]:
+    """Noise stated and noise seen by kind, what the difference means, and what can be done about it."""
+    estimated = solution.estimated_noise
+    table = _plain_table(
+        *(("", "left"), ("", "left"), ("stated", "right"), ("seen" if estimated is None else "estimated", "right")),
+        *(("ratio", "right"), ("p-value", "right"), ("", "left")),
+    )
+    table.columns[0].no_wrap, table.columns[-1].no_wrap = True, False
+    for fit in uncertainty.goodness.kinds:
+        factor, shown, decimals = _SHOWN[fit.unit]
+        seen, words = fit.seen_over_stated, VERDICTS[fit.verdict]
+        if estimated is not None:
+            seen = fit.factor
+            words = "estimated" if fit.kind in estimated else "too few rows to estimate it: as stated"
+        table.add_row(
+            fit.kind,
+            shown,
+            f"{fit.stated_sigma_rms * factor:.{decimals}f}",
+            "-" if np.isnan(seen) else f"{seen * fit.stated_sigma_rms * factor:.{decimals}f}",
+            "-" if np.isnan(seen) else f"{seen:.3f}",
+            "-" if fit.p_value is None else _probability(fit.p_value),
+            words,
+        )
+    yield table
+    yield from (Padding(Text(line), (0, 0, 0, 2)) for line in _goodness_lines(solution, uncertainty))
+
+
+def _goodness_lines(solution: Solution, uncertainty: Uncertainty) -> Iterable[str]:
+    goodness, estimated = uncertainty.goodness, solution.estimated_noise
+    verdicts = {fit.verdict for fit in goodness.kinds}
+    if estimated:
+        yield (
+            f"{' and '.join(estimated)} noise was estimated from these residuals: chi-square says nothing about it, and"
+            f" {len(estimated)} of its degrees of freedom went there"
+        )
+    elif verdicts & {"too large", "too small", "both"}:
+        yield "to take the noise seen for the noise there is: noise: estimate in the job"
+    if estimated is None and verdicts & {"outliers", "both"}:
+        yield "look at the suspicious rows below, or let a robust loss weigh them: loss in the job"
+    if not len(goodness.suspects) and not goodness.configurations:
+        yield f"no row (|studentised residual| above {goodness.level:.2f}) and no configuration is suspicious"
+
+
+def _suspects(solution: Solution, uncertainty: Uncertainty, limit: int = 5) -> RenderableType:
+    """The rows least likely, by studentised residual."""
+    rows, goodness, ids = uncertainty.residuals, uncertainty.goodness, solution.problem.measurements.ids
+    table = _plain_table(
+        *(("a", "left"), ("b", "left"), ("", "left"), ("residual", "right"), ("", "left")),
+        *(("in its sigma", "right"), ("", "left")),
+    )
+    for i in goodness.suspects[:limit]:
+        factor, shown, decimals = _SHOWN[_FAMILY_UNIT[FAMILIES[rows.family[i]]]]
+        b = ids[rows.b[i]] if rows.b[i] >= 0 else ""
+        table.add_row(
+            ids[rows.a[i]],
+            b,
+            ROW_KINDS[rows.kind_code[i]],
+            _figure(rows.after[i] * factor, decimals, "+"),
+            shown,
+            f"{goodness.studentised[i]:+.1f}",
+            FLAGS[goodness.flag[i]],
+        )
+    if len(goodness.suspects) > limit:
+        table.add_row("", "", f"and {len(goodness.suspects) - limit} more")
+    return table
+
+
+def _suspect_configurations(solution: Solution, uncertainty: Uncertainty, limit: int = 3) -> RenderableType:
+    """The configurations least likely, by all the rows that they take part in."""
+    found, ids = uncertainty.goodness.configurations, solution.problem.measurements.ids
+    table = _plain_table(("", "left"), ("rows", "right"), ("chi-square", "right"), ("expected", "right"))
+    for c in found[:limit]:
+        table.add_row(ids[c.configuration], f"{c.n}", f"{c.chi2:.4g}", f"{c.expected:.4g}")
+    if len(found) > limit:
+        table.add_row(f"and {len(found) - limit} more")
     return table
 
 
@@ -195,6 +294,9 @@ def _notes(solution: Solution, uncertainty: Uncertainty) -> Iterable[str]:
     judgement, pairs = solution.problem.judgement, solution.problem.pairs
     if judgement is not None and pairs is not None and (same := int(np.sum(judgement.same_point & ~pairs.test))):
         yield f"{same} train pairs are one point twice: three coordinates each instead of a distance"
+    if pairs is None and solution.problem.measurements.pairs is not None:
+        unused, model = solution.problem.measurements.pairs.source, solution.problem.settings.model
+        yield f"{unused} is not used: model {model} is of poses, not of pairs"
     yield from _sharing_notes(solution.problem)
     held = [p for p in uncertainty.parameters if p.identifiability in ("relative", "ineffective")]
     if held:

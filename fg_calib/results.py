@@ -16,9 +16,11 @@ from fg_calib.comparison import Comparison, Estimate, RealErrors
 from fg_calib.figures import write_figures
 from fg_calib.files.disk import fill_folder, write_text
 from fg_calib.files.robot_yaml import write_robot
-from fg_calib.files.tables import write_csv
+from fg_calib.files.tables import Words, write_csv_parts
 from fg_calib.files.urdf import write_urdf
+from fg_calib.goodness import FLAGS, VERDICTS
 from fg_calib.identifiability import Identifiability
+from fg_calib.residual_table import FAMILIES, FAMILY_OF_KIND, ROW_KINDS
 from fg_calib.robot import Robot
 from fg_calib.solver import Solution
 from fg_calib.uncertainty import Uncertainty
@@ -27,6 +29,9 @@ RESULT_SCHEMA = "fg-calib/result/1"
 OBSERVABILITY_SCHEMA = "fg-calib/observability/1"
 COMPARISON_SCHEMA = "fg-calib/comparison/1"
 KINDS = ("position", "orientation", "distance", "angle")
+
+_ROWS_AT_ONCE = 200_000
+"""Rows of `residuals.csv` that are turned into text at once."""
 
 
 def result_document(
@@ -40,6 +45,7 @@ def result_document(
         inputs: SHA-256 of the files it came from, by path.
     """
     problem, settings = solution.problem, solution.problem.settings
+    ids = problem.measurements.ids
     rms = uncertainty.residuals.rms()
     pairing = None
     if settings.uses_pairs and (problem.measurements.pairs is not None or problem.formed):
@@ -75,6 +81,26 @@ def result_document(
         "chi2": uncertainty.chi2,
         "dof": uncertainty.dof,
         "reduced_chi2": uncertainty.reduced_chi2,
+        "chi2_p_value": uncertainty.p_value,
+        "goodness": {
+            fit.kind: {
+                "n": fit.n,
+                "stated_sigma_rms": fit.stated_sigma_rms,
+                "seen_over_stated": fit.seen_over_stated,
+                "chi2": fit.chi2,
+                "expected": fit.expected,
+                "p_value": fit.p_value,
+                "verdict": VERDICTS[fit.verdict],
+            }
+            for fit in uncertainty.goodness.kinds
+        },
+        "noise_factors": None
+        if solution.estimated_noise is None
+        else {fit.kind: fit.factor for fit in uncertainty.goodness.kinds},
+        "suspect_configurations": [
+            {"id": ids[c.configuration], "n": c.n, "chi2": c.chi2, "expected": c.expected}
+            for c in uncertainty.goodness.configurations
+        ],
         "residual_rms": {split: {kind: rms[split].get(kind) for kind in kinds} for split in ("train", "test")},
         "parameters": [
             {
@@ -290,25 +316,36 @@ def write_calibrated_robot(folder: Path, robot: Robot) -> None:
 
 def _write_residuals(path: Path, solution: Solution, uncertainty: Uncertainty) -> None:
     """One line a scalar residual: what it is of, whether it was used, before and after, in [m] and [rad]."""
-    table = uncertainty.residuals
+    table, fit = uncertainty.residuals, uncertainty.goodness
     m = solution.problem.measurements
-    names = m.ids if m.groups is None else np.concatenate([m.ids, m.groups.names])
-    columns = {
-        "kind": table.kind,
-        "a": names[table.a],
-        "b": np.where(table.b >= 0, names[table.b], ""),
-        "split": np.where(table.test, "test", "train"),
-        "used": (table.reason == "") & ~table.test,
-        "excluded": table.reason,
-        "unit": np.where(np.isin(np.char.partition(table.kind, ".")[:, 0], ["orientation", "angle"]), "rad", "m"),
-        "measured": table.measured,
-        "predicted": table.measured + table.after,
-        "residual_before": table.before,
-        "residual": table.after,
-        "sigma": table.sigma,
-        "whitened": table.after / table.sigma,
-    }
-    write_csv(path, columns)
+    ids = ["", *m.ids.tolist(), *(() if m.groups is None else m.groups.names)]
+    kind_in_metres = np.array([FAMILIES[f] not in ("angle", "orientation") for f in FAMILY_OF_KIND])
+
+    def columns(rows: slice) -> dict[str, Any]:
+        kind = table.kind_code[rows]
+        measured, after, sigma = table.measured[rows], table.after[rows], table.sigma[rows]
+        return {
+            "kind": Words(ROW_KINDS, kind),
+            "a": Words(ids, table.a[rows] + 1),
+            "b": Words(ids, table.b[rows] + 1),
+            "split": Words(("train", "test"), table.test[rows].astype(np.int8)),
+            "used": table.used[rows],
+            "excluded": Words(table.reasons, table.reason_code[rows]),
+            "unit": Words(("rad", "m"), kind_in_metres[kind].astype(np.int8)),
+            "measured": measured,
+            "predicted": measured + after,
+            "residual_before": table.before[rows],
+            "residual": after,
+            "sigma": sigma,
+            "whitened": after / sigma,
+            "leverage": fit.leverage[rows],
+            "studentised": fit.studentised[rows],
+            "weight": fit.weight[rows],
+            "flag": Words(FLAGS, fit.flag[rows]),
+        }
+
+    starts = range(0, max(table.n, 1), _ROWS_AT_ONCE)
+    write_csv_parts(path, (columns(slice(start, start + _ROWS_AT_ONCE)) for start in starts))
 
 
 def _plain(value: Any) -> Any:

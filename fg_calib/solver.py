@@ -95,6 +95,7 @@ class Solution:
         cost: Cost at the estimate, whatever the loss.
         weighted_cost: The same with every measurement by its robust weight.
         seconds: Time taken.
+        estimated_noise: Kinds whose noise was estimated (see `noise`); None where it was taken as stated.
     """
 
     problem: Problem
@@ -108,6 +109,7 @@ class Solution:
     cost: float
     weighted_cost: float
     seconds: float
+    estimated_noise: tuple[str, ...] | None = None
 
     @property
     def iterations(self) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -11,21 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 from scipy.spatial.transform import Rotation
 
-from fg_calib import residuals
-from fg_calib.factors import pose_of, prior_rows
+from fg_calib.covariance import Spread, spread_of
+from fg_calib.factors import pose_of
+from fg_calib.goodness import Goodness, judge_fit
 from fg_calib.identifiability import Identifiability, identify
-from fg_calib.kinematics import forward
-from fg_calib.observability import SUPPORT_TOLERANCE, IdentifiabilityClass, Observability, determined
-from fg_calib.problem import (
-    PAIR_KINDS,
-    POSE_KINDS,
-    Problem,
-    all_rows,
-    correlation,
-    eliminated_terms,
-    lengths,
-    whitened_triangle,
-)
+from fg_calib.observability import IdentifiabilityClass, Observability
+from fg_calib.problem import PAIR_KINDS, Problem, eliminated_terms, lengths
+from fg_calib.residual_table import ResidualTable, residual_table
 from fg_calib.residuals import single_threaded_blas
 from fg_calib.robot import Robot
 from fg_calib.robust import effect
@@ -120,99 +112,6 @@ class Prediction:
 
 
 @dataclass(frozen=True)
-class Spread:
-    """The covariance in the tangent space of the variables, and the directions that nothing determines.
-
-    Attributes:
-        names: Named scalars, in the order of the columns (see `Variables.names`).
-        n_robot_columns: Columns without the measurement frame's.
-        tangent: Covariance of the determined part, shape (n_columns, n_columns).
-        loose: Undetermined directions at the estimate, orthonormal in changes of ordinary size, shape
-            (n_loose, n_columns).
-        loose_at_nominal: The same at the nominal parameters.
-        scales: A change of ordinary size in each column.
-        named_derivative: Of the named scalars in the columns.
-        rank: Number of determined directions.
-        excess: By how much the mean of chi-square is below its degrees of freedom, because rows that share errors are
-            weighted as independent.
-    """
-
-    names: tuple[str, ...]
-    n_robot_columns: int
-    tangent: Floats
-    loose: Floats
-    loose_at_nominal: Floats
-    scales: Floats
-    named_derivative: Floats
-    rank: int
-    excess: float
-
-    def covariance(self, rows: Floats) -> Floats:
-        """Covariance of linear functions of the columns, shape (m, n_columns); nan where undetermined."""
-        with np.errstate(invalid="ignore"):  # a pose at a quarter turn of pitch has no derivative
-            out: Floats = rows @ self.tangent @ rows.T
-            size = np.linalg.norm(rows * self.scales, axis=1)
-            share, share_at_nominal = (
-                np.linalg.norm((rows * self.scales) @ loose.T, axis=1) for loose in (self.loose, self.loose_at_nominal)
-            )
-            unknown = (share > SUPPORT_TOLERANCE * size) & (share_at_nominal > SUPPORT_TOLERANCE * size)
-        unknown |= ~np.isfinite(np.diag(out))
-        out[unknown, :] = np.nan
-        out[:, unknown] = np.nan
-        return out
-
-    def named(self) -> Floats:
-        """Covariance of the robot's estimated parameters, shape (n_robot_columns, n_robot_columns)."""
-        n = self.n_robot_columns
-        return self.covariance(self.named_derivative[:n])
-
-
-@dataclass(frozen=True)
-class ResidualTable:
-    """Every scalar residual, train and test, before and after; [m] and [rad].
-
-    Attributes:
-        kind: `distance`, `angle`, `position.x`, ..., `orientation.z`, `point.x`, ... of each row, shape (n,). A point's
-            residual is that of its predicted tool point from the mean of its group's (see `PointGroups.rows_of`); that
-            of a distance between groups is of these means.
-        a: Row of the (first) configuration, shape (n,); a group counts on from the number of configurations.
-        b: Row of the second configuration or group, -1 for poses and points, shape (n,).
-        test: Predicted only, shape (n,).
-        reason: Why a row takes no part, empty where it does, shape (n,).
-        measured: Measured value; nan for orientations, shape (n,).
-        before: Residual with the arm at nominal, shape (n,).
-        after: Residual at the estimate, shape (n,).
-        sigma: 1 sigma of the residual, shape (n,).
-    """
-
-    kind: NDArray[np.str_]
-    a: Integers
-    b: Integers
-    test: Booleans
-    reason: NDArray[np.str_]
-    measured: Floats
-    before: Floats
-    after: Floats
-    sigma: Floats
-
-    def rms(self) -> dict[str, dict[str, dict[str, float]]]:
-        """RMS by split, kind (the norm of three components but for distances and angles), before and after."""
-        table: dict[str, dict[str, dict[str, float]]] = {"train": {}, "test": {}}
-        used = self.reason == ""
-        family = np.char.partition(self.kind, ".")[:, 0] if len(self.kind) else self.kind
-        for split, of_split in (("train", ~self.test), ("test", self.test)):
-            for name in ("position", "orientation", "distance", "angle", "point"):
-                rows = used & of_split & (family == name)
-                if rows.any():
-                    per_row = 1.0 if name in ("distance", "angle") else 3.0
-                    table[split][name] = {
-                        when: float(np.sqrt(per_row * np.mean(values[rows] ** 2)))
-                        for when, values in (("before", self.before), ("after", self.after))
-                    }
-        return table
-
-
-@dataclass(frozen=True)
 class Uncertainty:
     """What `assess` finds out about a solution.
 
@@ -225,7 +124,9 @@ class Uncertainty:
         dof: Residuals and priors, less the determined directions.
         expected_chi2: What chi-square is on average; not `dof` where rows that share errors count as independent.
         chi2_bounds: Interval of the reduced chi-square that is taken as good.
+        p_value: Probability of a chi-square as large, were the noise as stated; None where that is not known.
         residuals: Every residual, before and after.
+        goodness: Goodness of fit by kind, by row and by configuration.
         identifiability: What the data alone determine, at the nominal parameters.
         robot: The calibrated robot.
         spread: The covariance in the variables' tangent space, behind `predict`.
@@ -241,7 +142,9 @@ class Uncertainty:
     dof: int
     expected_chi2: float
     chi2_bounds: tuple[float, float]
+    p_value: float | None
     residuals: ResidualTable
+    goodness: Goodness
     identifiability: Identifiability
     robot: Robot
     spread: Spread
@@ -307,7 +210,7 @@ def assess(solution: Solution) -> Uncertainty:
 def _assess(solution: Solution) -> Uncertainty:
     problem = solution.problem
     variables = problem.variables
-    spread = _spread(solution)
+    spread = spread_of(solution)
     whole = identify(problem.whole or problem, solution.before, "practical")
     covariance = spread.named()
     frame = None
@@ -321,7 +224,9 @@ def _assess(solution: Solution) -> Uncertainty:
     chi2, n_rows, loss_factor = _weighted_chi2(solution)
     dof = n_rows + problem.n_priors - spread.rank - variables.n_without_prior
     expected = max(0.0, dof - spread.excess - (1.0 - loss_factor) * n_rows)
-    bounds = chi2_bounds(dof, expected, _independent_dof(problem, dof, spread.rank))
+    independent = _independent_dof(problem, dof, spread.rank)
+    bounds = chi2_bounds(dof, expected, independent)
+    table = residual_table(solution)
     return Uncertainty(
         names=variables.names[: variables.n_robot_columns],
         covariance=covariance,
@@ -331,7 +236,9 @@ def _assess(solution: Solution) -> Uncertainty:
         dof=dof,
         expected_chi2=expected,
         chi2_bounds=bounds,
-        residuals=residual_table(solution),
+        p_value=_p_value(solution, chi2, expected, independent),
+        residuals=table,
+        goodness=judge_fit(solution, spread, table),
         identifiability=whole,
         robot=problem.robot.with_values(solution.parameters[variables.robot_span]),
         spread=spread,
@@ -373,62 +280,25 @@ def _weighted_chi2(solution: Solution) -> tuple[float, int, float]:
     return max(0.0, chi2), round(problem.n_independent * share), of_loss.chi2
 
 
+def _p_value(solution: Solution, chi2: float, expected: float, independent: int) -> float | None:
+    """Upper p-value of chi-square, scaled to its mean; None where weights or noise came from the residuals."""
+    problem = solution.problem
+    if (
+        problem.adjustment.weights is not None
+        or solution.estimated_noise is not None
+        or expected <= 0.0
+        or independent <= 0
+    ):
+        return None
+    return float(special.gammaincc(independent / 2.0, chi2 / expected * independent / 2.0))
+
+
 def _independent_dof(problem: Problem, dof: int, rank: int) -> int:
     """Degrees of freedom of the noise behind the residuals: pairs hold no more than the poses they come from."""
     if not problem.formed or problem.sharing.poses:
         return dof
     each = 3 * sum(PAIR_KINDS[problem.settings.model])
     return min(dof, each * (problem.n_configurations - 1) + problem.n_priors - rank)
-
-
-def residual_table(solution: Solution) -> ResidualTable:
-    """Every scalar residual, train and test, with the arm at nominal and at the estimate."""
-    problem = solution.problem
-    block = all_rows(problem)
-    chain = problem.variables.chain
-    before, after = (residuals.residual(block, chain.at(p)) for p in (solution.before, solution.parameters))
-    if problem.pairs is None:
-        return _pose_table(problem, before, after)
-    tables = [_pair_table(problem, before, after)]
-    if problem.points is not None:
-        tables += _point_tables(problem, solution.before, solution.parameters)
-    return ResidualTable(*(np.concatenate([getattr(t, f.name) for t in tables]) for f in fields(ResidualTable)))
-
-
-def _spread(solution: Solution) -> Spread:
-    """The covariance: that of the weighted least-squares estimate under the noise as it is taken to be.
-
-    Where rows share errors but are weighted as independent, with H = J^T J and C their covariance, it is
-    H^-1 (J^T C J) H^-1 (priors are rows of their own), unless independence was asked for. The mean of chi-square,
-    tr C - tr(H^-1 J^T C J), is then below the degrees of freedom by tr(H^-1 J^T (C - 1) J). A robust loss loses some of
-    what clean data hold: see `robust.Effect`.
-    """
-    problem, variables = solution.problem, solution.problem.variables
-    scales = variables.scales
-
-    def stacked(parameters: Floats) -> Floats:
-        data = whitened_triangle(problem, parameters) / np.sqrt(effect(problem.settings.loss, problem.height).variance)
-        rows = [data, prior_rows(variables, parameters)[1]]
-        return np.vstack([*rows, np.zeros((variables.n_columns, variables.n_columns))]) * scales
-
-    _, s, Vt = np.linalg.svd(stacked(solution.parameters), full_matrices=False)
-    _, s_nominal, Vt_nominal = np.linalg.svd(stacked(solution.before), full_matrices=False)
-    rank, rank_nominal = determined(s), determined(s_nominal)
-    half = scales[:, None] * Vt[:rank].T / s[:rank]
-    added = correlation(problem, solution.parameters)
-    middle = np.zeros((rank, rank)) if added is None else half.T @ added @ half
-    middle_of_sigma = np.eye(rank) + (middle if problem.approximate else 0.0)
-    return Spread(
-        names=variables.names,
-        n_robot_columns=variables.n_robot_columns,
-        tangent=half @ middle_of_sigma @ half.T,
-        loose=Vt[rank:],
-        loose_at_nominal=Vt_nominal[rank_nominal:],
-        scales=scales,
-        named_derivative=variables.named_derivative(solution.parameters),
-        rank=rank,
-        excess=float(np.trace(middle)),
-    )
 
 
 def _parameter_estimates(
@@ -465,70 +335,6 @@ def _findings(solution: Solution, chi2: float, dof: int, bounds: tuple[float, fl
     return tuple(findings)
 
 
-def _pair_table(problem: Problem, before: Floats, after: Floats) -> ResidualTable:
-    pairs, judgement = problem.pairs, problem.judgement
-    assert pairs is not None
-    assert judgement is not None
-    kinds = PAIR_KINDS[problem.settings.model]
-    reasons = np.full((pairs.n_pairs, 2), "", dtype="<U20")
-    for reason, mask in judgement.reasons.items():
-        named = [kind in reason for kind in ("distance", "angle")]
-        reasons[np.outer(mask, named if any(named) else (True, True))] = reason
-    measured = np.stack([pairs.distance, pairs.angle], axis=1)
-    wide_before, wide_after = np.full_like(measured, np.nan), np.full_like(measured, np.nan)
-    wide_before[:, kinds], wide_after[:, kinds] = before, after
-    rows, columns = np.nonzero(np.isfinite(measured))
-    return ResidualTable(
-        kind=np.array(["distance", "angle"])[columns],
-        a=pairs.a[rows],
-        b=pairs.b[rows],
-        test=pairs.test[rows],
-        reason=reasons[rows, columns],
-        measured=measured[rows, columns],
-        before=wide_before[rows, columns],
-        after=wide_after[rows, columns],
-        sigma=problem.sigma[rows, columns],
-    )
-
-
-def _point_tables(problem: Problem, before: Floats, after: Floats) -> list[ResidualTable]:
-    """Touches, then distances between touched points, at two parameter vectors."""
-    points, m = problem.points, problem.measurements
-    assert points is not None
-    chains = [problem.variables.chain.at(p) for p in (before, after)]
-    means = [points.means(chain, problem.trig) for chain in chains]
-    rows = np.flatnonzero(points.touched)
-    off = [
-        (forward(chain.without_columns(), problem.trig, rows).position - mean[points.groups.index[rows]]).ravel()
-        for chain, mean in zip(chains, means, strict=True)
-    ]
-    touches = ResidualTable(
-        kind=np.tile(["point.x", "point.y", "point.z"], len(rows)),
-        a=np.repeat(rows, 3),
-        b=np.full(3 * len(rows), -1),
-        test=np.repeat(m.test[rows], 3),
-        reason=np.full(3 * len(rows), "", dtype="<U20"),
-        measured=np.full(3 * len(rows), np.nan),
-        before=off[0],
-        after=off[1],
-        sigma=problem.sigma_point[rows].ravel(),
-    )
-    pairs, n = points.groups.pairs, m.n_configurations
-    miss = [np.linalg.norm(mean[pairs.b] - mean[pairs.a], axis=1) - pairs.distance for mean in means]
-    distances = ResidualTable(
-        kind=np.full(pairs.n_pairs, "distance"),
-        a=n + pairs.a,
-        b=n + pairs.b,
-        test=pairs.test,
-        reason=np.full(pairs.n_pairs, "", dtype="<U20"),
-        measured=pairs.distance,
-        before=miss[0],
-        after=miss[1],
-        sigma=pairs.sigma_distance,
-    )
-    return [touches, distances]
-
-
 def _point_estimates(solution: Solution, spread: Spread) -> tuple[PointEstimate, ...]:
     """Where the groups' points are; sigma from that of the core, which they follow, and from their own touches."""
     problem = solution.problem
@@ -546,32 +352,6 @@ def _point_estimates(solution: Solution, spread: Spread) -> tuple[PointEstimate,
     return tuple(
         PointEstimate(name, int(np.sum(points.train & (index == g))), xyz[g], sigma[g])
         for g, name in enumerate(points.groups.names)
-    )
-
-
-def _pose_table(problem: Problem, before: Floats, after: Floats) -> ResidualTable:
-    m, n = problem.measurements, problem.measurements.n_configurations
-    kinds = POSE_KINDS[problem.settings.model]
-    labels = [
-        f"{what}.{axis}"
-        for what, wanted in zip(("orientation", "position"), kinds, strict=True)
-        if wanted
-        for axis in "xyz"
-    ]
-    measured = np.full((n, 6), np.nan)
-    if m.position is not None:
-        measured[:, 3:] = m.position
-    wanted = np.repeat(kinds, 3)
-    return ResidualTable(
-        kind=np.tile(labels, n),
-        a=np.repeat(np.arange(n), len(labels)),
-        b=np.full(n * len(labels), -1),
-        test=np.repeat(m.test, len(labels)),
-        reason=np.full(n * len(labels), "", dtype="<U20"),
-        measured=measured[:, wanted].ravel(),
-        before=before.ravel(),
-        after=after.ravel(),
-        sigma=problem.sigma[:, wanted].ravel(),
     )
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+import yaml
 from oracle import tool_pose
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
@@ -262,7 +263,7 @@ def test_a_failure_while_writing_leaves_no_file_behind(fg_calib, example, monkey
     def fail(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(results, "write_csv", fail)
+    monkeypatch.setattr(results, "write_csv_parts", fail)
     before = sorted(example.iterdir())
     out = example / "result"
     ended = fg_calib("calibrate", example / JOB, "--out", out)
@@ -797,3 +798,44 @@ def test_measured_pairs_are_fitted(fg_calib, measured_pairs, model, header, cell
     determined = [p for p in result["parameters"] if p["identifiability"] == "independent"]
     assert determined
     assert min(p["sigma"] / p["prior_sigma"] for p in determined) < 0.1  # the data say more than the priors
+
+
+def test_residuals_say_how_suspicious_each_row_is(residuals, result):
+    """Existing columns keep their places; the new ones follow."""
+    old = "kind a b split used excluded unit measured predicted residual_before residual sigma whitened"
+    assert list(residuals[0]) == [*old.split(), "leverage", "studentised", "weight", "flag"]
+    for row in residuals:
+        assert row["flag"] == ("excluded" if row["excluded"] else "test" if row["split"] == "test" else "")
+        sign = 1.0 if row["split"] == "test" else -1.0
+        own = float(row["sigma"]) * math.sqrt(1.0 + sign * float(row["leverage"]))
+        if not row["excluded"]:
+            assert float(row["studentised"]) == pytest.approx(float(row["residual"]) / own)
+    for kind, fit in result["goodness"].items():
+        rows = [r for r in residuals if r["kind"] == kind and r["used"] == "true"]
+        assert fit["n"] == len(rows)
+        assert fit["chi2"] == pytest.approx(sum(float(r["whitened"]) ** 2 for r in rows))
+        assert fit["expected"] == pytest.approx(sum(1.0 - float(r["leverage"]) for r in rows))
+        assert fit["seen_over_stated"] == pytest.approx(math.sqrt(fit["chi2"] / fit["expected"]))
+        assert 0.001 < fit["p_value"] < 0.999
+    assert 0.001 < result["chi2_p_value"] < 0.999
+    assert result["noise_factors"] is None
+
+
+@pytest.mark.parametrize("given", ["estimate", {"position": 0.004, "orientation": 0.04, "estimate": True}])
+def test_a_job_may_leave_the_noise_to_the_residuals(fg_calib, example, given):
+    """Wherever it starts it ends with the same noise; `compare` takes the same."""
+    file = example / "calibration.yaml"
+    job = yaml.safe_load(file.read_text())
+    stated = json.loads(fg_calib("calibrate", file, "--json").out)["goodness"]
+    file.write_text(yaml.safe_dump(job | {"noise": given}))
+    ended = fg_calib("calibrate", file, "--json")
+    found = json.loads(ended.out)
+    assert ended.code == 0
+    assert found["chi2_p_value"] is None
+    for kind, fit in found["goodness"].items():  # about 30 degrees of freedom: 4 * sqrt(1 / 60) beside the other fit's
+        assert fit["seen_over_stated"] == pytest.approx(found["noise_factors"][kind], rel=2e-3)
+        sigma = fit["stated_sigma_rms"] * found["noise_factors"][kind]
+        assert sigma == pytest.approx(stated[kind]["stated_sigma_rms"], rel=0.5)
+    compared = json.loads(fg_calib("compare", file, "--json").out)
+    rms = compared["estimates"][0]["residual_rms"]["train"]
+    assert rms["distance"] == pytest.approx(found["residual_rms"]["train"]["distance"]["after"], rel=1e-9)

@@ -76,8 +76,13 @@ configurations     6
 residuals          18, and 1 priors
 estimated          3 unknowns, 3 directions determined
 chi-square         10.8175 with 16 degrees of freedom
-reduced chi-square 0.6761 (good from 0.221 to 2.58)
+reduced chi-square 0.6761 (good from 0.221 to 2.58), p-value 0.82
 solver             N iterations, T s, cost 34.5646 -> 5.40874
+
+Goodness of fit (1 sigma of a row)
+            stated   seen ratio p-value
+position mm 1.0000 0.8452 0.845    0.78 as stated
+  no row (|studentised residual| above 3.53) and no configuration is suspicious
 
 Residuals (RMS)
             train before  after test before  after
@@ -125,7 +130,7 @@ def sections(text):
 def test_the_report_of_two_links_is_this_text():
     found = sections(report(planar_arm({"d2": 0.001}), planar_measurements(), model="position"))
     expected = sections(GOLDEN)
-    assert list(found)[:4] == list(expected)
+    assert list(found)[:5] == list(expected)
     assert {heading: found[heading] for heading in expected} == expected
 
 
@@ -142,6 +147,9 @@ def test_its_figures_are_those_of_linear_least_squares_by_hand():
     assert f"chi-square         {left.item():.6g} with {18 + 1 - 3} degrees" in GOLDEN
     assert f"-> {left.item() / 2:.6g}" in GOLDEN
     assert f"± {1 / np.sqrt(7):.4f} mm     +0.0000    0.0000 1.0000" in GOLDEN
+    leverage = np.sum(J @ np.linalg.inv(J.T @ J) * J) + 6 / 7  # of d2, six times
+    seen = np.sqrt(left.item() / (18 - leverage))
+    assert f"position mm 1.0000 {seen:.4f} {seen:.3f} " in GOLDEN
     assert f"3.3943 {np.sqrt(left.item() / 6):.4f} " in GOLDEN
 
 

@@ -16,13 +16,13 @@ from __future__ import annotations
 import csv
 import logging
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from fg_calib.errors import InputError
 from fg_calib.files.disk import replacing, require_file
@@ -111,7 +111,15 @@ def read_measurements(
     )
 
 
-def write_csv(path: Path | str, columns: Mapping[str, ArrayLike]) -> None:
+@dataclass(frozen=True)
+class Words:
+    """A column of a few different words, as codes into them: shape (n,)."""
+
+    words: Sequence[str]
+    codes: NDArray[np.integer[Any]]
+
+
+def write_csv(path: Path | str, columns: Mapping[str, ArrayLike | Words]) -> None:
     """Write a CSV, whole or not at all; floats read back exactly.
 
     Args:
@@ -121,11 +129,32 @@ def write_csv(path: Path | str, columns: Mapping[str, ArrayLike]) -> None:
     Raises:
         InputError: The folder does not exist or may not be written to.
     """
+    write_csv_parts(path, [columns])
+
+
+def write_csv_parts(path: Path | str, parts: Iterable[Mapping[str, ArrayLike | Words]]) -> None:
+    """`write_csv` of a long table, some rows at a time.
+
+    Args:
+        path: The file to write.
+        parts: The columns of some rows after the other, at least once.
+
+    Raises:
+        InputError: The folder does not exist or may not be written to.
+    """
     import polars as pl
 
-    frame = pl.DataFrame({name: np.asarray(values) for name, values in columns.items()})
-    with replacing(Path(path)) as temporary:
-        frame.write_csv(temporary)
+    with replacing(Path(path)) as temporary, temporary.open("wb") as file:
+        for i, columns in enumerate(parts):
+            frame = pl.DataFrame(
+                {
+                    name: pl.Series(list(values.words), dtype=pl.String).gather(values.codes)
+                    if isinstance(values, Words)
+                    else np.asarray(values)
+                    for name, values in columns.items()
+                }
+            )
+            frame.write_csv(file, include_header=i == 0)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,95 @@
+"""Noise estimated from the residuals: one factor a kind on the sigmas stated, iterated with the fit.
+
+The sum of squared residuals over sigma of a kind has a known mean (see `goodness`); where it is not met, the sigmas of
+that kind are multiplied by the root of their ratio and everything is solved again, until nothing moves: iterated
+estimates of variance components (Helmert; Foerstner 1979). A kind that the parameters leave too few degrees of
+freedom keeps its stated noise.
+
+Note:
+    A factor multiplies all the noise of a row: that of the joint readings and of measured poses with it.
+
+References:
+    Foerstner (1979), Ein Verfahren zur Schaetzung von Varianz- und Kovarianzkomponenten. Allgemeine
+    Vermessungs-Nachrichten 86.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from fg_calib.covariance import spread_of
+from fg_calib.files.job import Job
+from fg_calib.goodness import KindFit, kind_fits
+from fg_calib.problem import Problem, judged_at, noise_kinds, problem_of
+from fg_calib.residual_table import residual_table
+from fg_calib.solver import Solution, SolverOptions, solve
+
+LEAST_REDUNDANCY = 3.0
+"""Degrees of freedom that a kind must have left for its noise to be estimated."""
+
+SETTLED = 1e-3
+"""Relative change of a factor below which it has settled."""
+
+MAX_ROUNDS = 20
+
+
+def solve_job(job: Job, problem: Problem | None = None) -> Solution:
+    """The solution of a job, its noise estimated if the job asks for it.
+
+    Args:
+        job: The job.
+        problem: Another problem with the job's measurements; the job's own if None.
+
+    Raises:
+        ProblemError: The measurements lack what the model needs, or do not suffice.
+        SolverError: GTSAM could not solve a step at all.
+    """
+    problem = problem or problem_of(job)
+    return estimate_noise(problem) if job.estimate_noise else solve(problem)
+
+
+def estimate_noise(problem: Problem, options: SolverOptions | None = None) -> Solution:
+    """Estimate the parameters and, with them, a factor on the stated noise of each kind.
+
+    Args:
+        problem: The problem; its stated noise is where the factors start from.
+        options: Of the solver.
+
+    Returns:
+        The solution with the noise it ends with: the factors are in its problem's `adjustment`, the kinds that they
+        were estimated of in `estimated_noise`. It has not converged if the factors have not settled.
+
+    Raises:
+        SolverError: GTSAM could not solve a step at all.
+    """
+    seconds = 0.0
+    for _ in range(MAX_ROUNDS):
+        solution = solve(problem, options)
+        seconds += solution.seconds
+        fits = kind_fits(solution, spread_of(solution), residual_table(solution))
+        found = {fit.kind: fit for fit in fits if _redundant(fit)}
+        solution = replace(solution, estimated_noise=tuple(found), seconds=seconds)
+        moves = max((abs(np.log(fit.seen_over_stated / fit.factor)) for fit in found.values()), default=0.0)
+        if not solution.converged or moves < SETTLED:
+            return solution
+        problem = _scaled(problem, {kind: fit.seen_over_stated for kind, fit in found.items()})
+    message = f"not converged: the estimated noise still moved by {moves:.1g} after {MAX_ROUNDS} rounds"
+    return replace(solution, converged=False, message=message)
+
+
+def _redundant(fit: KindFit) -> bool:
+    return fit.expected >= LEAST_REDUNDANCY and fit.chi2 > 0.0
+
+
+def _scaled(problem: Problem, factors: dict[str, float]) -> Problem:
+    """The problem from its start, with the stated noise of some kinds multiplied by factors."""
+    before = dict(zip(noise_kinds(problem.settings.model), problem.adjustment.factors, strict=True))
+    first, second = (before | factors).values()
+
+    def anew(p: Problem) -> Problem:
+        return judged_at(replace(p, adjustment=replace(p.adjustment, factors=(first, second))), p.start)
+
+    scaled = anew(problem)
+    return scaled if problem.whole is None else replace(scaled, whole=anew(problem.whole))
