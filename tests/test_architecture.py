@@ -25,6 +25,7 @@ FLOORS = (
         "reasons",
         "identifiability",
         "uncertainty",
+        "bounds",
         "comparison",
         "report",
         "figures",
