@@ -1,6 +1,6 @@
 """What do pairs hold of the poses they are formed from, and what is lost when nobody knows where the base is?
 
-Command: python experiments/07_unknown_frame.py [--quick] [--seed N] [--out FOLDER] [--processes N]
+Command: python experiments/07_unknown_frame.py [--quick] [--seed N] [--draws N] [--out FOLDER] [--processes N]
 Takes about five minutes on two cores.
 
 200 draws of the paper's scenario as it is (hemisphere of 0.5 m), and 60 with the camera 0.3 to 2 m from the board,

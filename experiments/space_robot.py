@@ -220,10 +220,11 @@ def arguments_of(
     parser = argparse.ArgumentParser(description=(docstring or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help=f"{n_quick} draws instead of {n_draws}")
     parser.add_argument("--seed", type=int, default=0, help="of the first draw")
+    parser.add_argument("--draws", type=int, help=f"instead of {n_draws}")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--out", type=Path, default=ROOT / "experiments" / "results")
     found = parser.parse_args(given)
-    found.draws = n_quick if found.quick else n_draws
+    found.draws = found.draws or (n_quick if found.quick else n_draws)
     found.processes = 1 if found.quick else found.processes
     found.out.mkdir(parents=True, exist_ok=True)
     found.file = found.out / name
