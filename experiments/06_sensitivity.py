@@ -9,9 +9,9 @@ configurations, encoder noise, and where the result is judged. 50 draws each (10
 for all; the paper's three models by plain least squares as in the paper and by the graph with tolerances as priors,
 beside the bounds.
 
-Expected: held self-motion costs most of all (a factor 2 for relative models with priors, 9 and more for absolute
+Expected: held self-motion costs most of all (a factor 2 for relative models with priors, 6 and more for absolute
 poses); for relative models the distance from the board gains most, for absolute poses the number of configurations.
-The board's place, roll and encoder noise hardly matter.
+Roll and encoder noise hardly matter, nor the board's place but for poses.
 """
 
 from __future__ import annotations
