@@ -17,6 +17,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from fg_calib.bounds import Bound, cramer_rao
     from fg_calib.comparison import Comparison, compare
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
     from fg_calib.files.job import Job, read_job
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
+    "fg_calib.bounds": ("Bound", "cramer_rao"),
     "fg_calib.comparison": ("Comparison", "compare"),
     "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
     "fg_calib.files.job": ("Job", "read_job"),
@@ -75,6 +77,7 @@ _HOMES = {
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
+    "Bound",
     "CalibrationError",
     "Comparison",
     "Identifiability",
@@ -98,6 +101,7 @@ __all__ = [
     "build_problem",
     "compare",
     "comparison_document",
+    "cramer_rao",
     "estimate_noise",
     "fit_least_squares",
     "format_comparison",

@@ -32,6 +32,7 @@ FLOORS = (
         "goodness",
         "noise",
         "uncertainty",
+        "bounds",
         "comparison",
         "report",
         "figures",

@@ -62,7 +62,7 @@ def case(name, robot, rng, n=16, stated=1.0):
     return build_problem(robot, m, model="distance-rotation", pairing=Pairing(pairing), pair_errors=errors)
 
 
-RUNS = {"pose": 200, "star": 200, "all": 200, "direct": 200, "direct joint": 200}
+RUNS = {"pose": 200, "star": 70, "all": 40, "direct": 100, "direct joint": 60}
 RUNS |= {"pose joint": 60, "star joint": 60, "star independent": 60}
 
 
