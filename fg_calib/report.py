@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fg_calib.comparison import Comparison, Estimate, PoseError
-from fg_calib.goodness import FLAGS, VERDICTS
+from fg_calib.goodness import FLAGS, OUTLIER_WEIGHT, VERDICTS
 from fg_calib.identifiability import Identifiability
 from fg_calib.observability import CORRELATED, Observability
 from fg_calib.problem import Problem
@@ -83,6 +83,9 @@ def _verdict(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
         what += "" if points is None else f", {len(points.estimated)} touched points"
     elif settings.frame == "unknown":
         what += ", measurement frame unknown"
+    if solution.problem.adjustment.joint_errors is not None or solution.problem.joints is not None:
+        what += ", joint values estimated"
+    what += "" if settings.loss == "none" else f", loss {settings.loss}"
     if uncertainty.trustworthy:
         return Group(Text(what), Text(f"GOOD: {solution.message}", style="bold green"))
     doubts = (Text(f"DOUBTFUL: {finding}", style="bold red") for finding in uncertainty.findings)
@@ -298,6 +301,14 @@ def _notes(solution: Solution, uncertainty: Uncertainty) -> Iterable[str]:
         unused, model = solution.problem.measurements.pairs.source, solution.problem.settings.model
         yield f"{unused} is not used: model {model} is of poses, not of pairs"
     yield from _sharing_notes(solution.problem)
+    weights = solution.problem.adjustment.weights
+    if weights is not None:
+        test = solution.problem.measurements.test if pairs is None else pairs.test
+        n, what = int(np.sum(weights[~test] < OUTLIER_WEIGHT)), "poses" if pairs is None else "pairs"
+        yield (
+            f"loss {solution.problem.settings.loss}: {n} of {int(np.sum(~test))} {what} lost more than half their"
+            " weight and count for nothing in chi-square"
+        )
     held = [p for p in uncertainty.parameters if p.identifiability in ("relative", "ineffective")]
     if held:
         with_prior = [p for p in held if p.prior_sigma is not None]

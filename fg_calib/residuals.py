@@ -28,6 +28,7 @@ to look at every row.
 Measurements may share errors: with `y` the rows whitened by the noise of their own, and `L` how they follow from
 errors `z ~ N(0, 1)` that they share, the covariance of y is 1 + L L^T. A `CorrelatedBlock` whitens them by
 `1 - L G L^T`, where G = (1 + R)^-1 R^-T and R^T R = 1 + L^T L (Andrews 1968): of the size of z, not of y; L is sparse.
+Where there are fewer rows than shared errors it whitens them by the Cholesky factor of 1 + L L^T.
 
 References:
     Andrews (1968), A square root formulation of the Kalman covariance equations. AIAA Journal 6(6).
@@ -59,7 +60,7 @@ CHUNK = 512
 """Measurements in one panel; a multiple of `LANES`."""
 
 _KEPT = 10_000_000
-"""Figures of a correlated block that are kept between its two passes, instead of being worked out twice."""
+"""Figures of a correlated block that are held at once; of a larger one the rows are worked out twice, in chunks."""
 
 
 class Block(Protocol):
@@ -207,13 +208,15 @@ class CorrelatedBlock:
         parts: The blocks, each whitened by the noise that its measurements do not share.
         loadings: Of each part's rows, measurement by measurement, per 1 sigma of the shared errors: sparse, shape
             (n * height, n_shared); none at all if nothing is shared.
-        gain: See the module; shape (n_shared, n_shared); None if nothing is shared.
+        gain: G of the module, shape (n_shared, n_shared), where there are more rows than shared errors; else None.
+        dense: Else the inverse Cholesky factor of 1 + L L^T, shape (n, n); None if nothing is shared.
         offsets: Taken from each part's rows before anything else, shape (n * height,); none at all if zero.
     """
 
     parts: tuple[Block, ...]
     loadings: tuple[scipy.sparse.csr_array, ...] = ()
     gain: Floats | None = None
+    dense: Floats | None = None
     offsets: tuple[Floats, ...] = ()
 
     height = 1
@@ -223,38 +226,53 @@ class CorrelatedBlock:
         """Number of rows."""
         return sum(part.n * part.height for part in self.parts)
 
-    def whiten(self, rows: Floats) -> Floats:
-        """All rows of the parts, shape (n, m), with their correlation taken out."""
-        if self.gain is None:
-            return rows
-        L = scipy.sparse.vstack(self.loadings, format="csr")
-        out: Floats = rows - L @ (self.gain @ (L.T @ rows))
-        return out
-
     @property
     def n_shared_rows(self) -> float:
         """How many of the rows' degrees of freedom are noise that they share: trace of L L^T (1 + L L^T)^-1."""
-        return (
-            0.0 if self.gain is None else len(self.gain) - float(np.trace(np.linalg.inv(_information(self.loadings))))
-        )
+        if self.dense is not None:
+            return self.n - float(np.vdot(self.dense, self.dense))
+        if self.gain is None:
+            return 0.0
+        R = scipy.linalg.cholesky(_information(self.loadings))
+        inverse = scipy.linalg.solve_triangular(R, np.eye(len(R)))
+        return len(R) - float(np.vdot(inverse, inverse))
+
+    def whiten(self, rows: Floats) -> Floats:
+        """All rows of the parts, shape (n, m), with their correlation taken out."""
+        if self.dense is not None:
+            return self.dense @ rows
+        if self.gain is None:
+            return rows
+        L = self._loading
+        out: Floats = rows - L @ (self.gain @ (L.T @ rows))
+        return out
 
     def chunks(self, chain: Chain) -> Iterator[Floats]:
         """[J r] with correlated rows whitened, chunk by chunk, shape (rows, n_columns + 1)."""
-        if self.gain is None:
-            yield from (chunk for _, _, chunk in self._private_chunks(chain))
+        if self.gain is None or self.n * (chain.n_columns + 1) <= _KEPT:
+            yield self.whiten(np.concatenate([chunk for _, _, chunk in self._private_chunks(chain)]))
             return
-        kept = list(self._private_chunks(chain)) if self.n * (chain.n_columns + 1) <= _KEPT else None
-        shift = self.gain @ self._common(kept or self._private_chunks(chain))  # (n_shared, n_columns + 1)
-        for part, rows, chunk in kept or self._private_chunks(chain):
+        common = self._common(self._private_chunks(chain))
+        shift = self.gain @ common  # (n_shared, n_columns + 1)
+        for part, rows, chunk in self._private_chunks(chain):
             yield chunk - self.loadings[part][rows] @ shift
 
     def shared_errors(self, chain: Chain) -> Floats:
         """What the residuals say of the shared errors: their posterior mean at these parameters, shape (n_shared,)."""
+        chunks = list(self._private_chunks(chain.without_columns()))
+        if self.dense is not None:
+            y = np.concatenate([chunk[:, -1] for _, _, chunk in chunks])
+            out: Floats = self._loading.T @ (self.dense.T @ (self.dense @ y))
+            return out
         if self.gain is None:
             return np.zeros(0)
-        common = self._common(self._private_chunks(chain.without_columns()))
-        z: Floats = scipy.linalg.solve(_information(self.loadings), common[:, -1], assume_a="pos")
+        z: Floats = scipy.linalg.solve(_information(self.loadings), self._common(chunks)[:, -1], assume_a="pos")
         return z
+
+    @property
+    def _loading(self) -> scipy.sparse.csr_array:
+        """L of all parts, shape (n, n_shared)."""
+        return self.loadings[0] if len(self.loadings) == 1 else scipy.sparse.vstack(self.loadings, format="csr")
 
     def _common(self, chunks: Iterable[tuple[int, slice, Floats]]) -> Floats:
         """L^T [J r], shape (n_shared, n_columns + 1)."""
@@ -279,10 +297,16 @@ def correlate(
     parts: tuple[Block, ...], loadings: tuple[scipy.sparse.csr_array, ...], offsets: tuple[Floats, ...] = ()
 ) -> CorrelatedBlock:
     """Blocks with the errors they share (see `CorrelatedBlock`)."""
+    n_rows, n_shared = sum(L.shape[0] for L in loadings), loadings[0].shape[1]
+    if n_rows <= n_shared:
+        L = scipy.sparse.vstack(loadings, format="csr")
+        factor = scipy.linalg.cholesky(np.eye(n_rows) + (L @ L.T).toarray(), lower=True)
+        dense: Floats = scipy.linalg.solve_triangular(factor, np.eye(n_rows), lower=True)
+        return CorrelatedBlock(parts, loadings, dense=dense, offsets=offsets)
     R = scipy.linalg.cholesky(_information(loadings))
     half = scipy.linalg.solve_triangular(np.eye(len(R)) + R, np.eye(len(R)))
     gain: Floats = scipy.linalg.solve_triangular(R, half.T).T
-    return CorrelatedBlock(parts, loadings, gain, offsets)
+    return CorrelatedBlock(parts, loadings, gain, offsets=offsets)
 
 
 def _information(loadings: tuple[scipy.sparse.csr_array, ...]) -> Floats:

@@ -112,7 +112,9 @@ def test_shared_errors_whiten_as_the_dense_covariance(pairing, model, direct):
 def test_chunks_of_a_correlated_block_are_the_same_with_and_without_memory(monkeypatch):
     rng = np.random.default_rng(1)
     robot = small_arm()
-    problem = build_problem(robot, measure(robot, 20, rng, sigma_joint=1e-4), model="distance-rotation")
+    m = measure(robot, 12, rng, sigma_joint=1e-4)
+    problem = build_problem(robot, m, model="distance-rotation", pairing=Pairing("all"))
+    assert problem.blocks[0].gain is not None
     R = residuals.triangle(problem.blocks[0], problem.variables.chain)
     monkeypatch.setattr(residuals, "_KEPT", 0)
     monkeypatch.setattr(residuals, "SPAN", 7)
