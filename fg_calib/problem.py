@@ -771,10 +771,10 @@ def _assemble(
         judgement, sigma = of_pairs.judgement, of_pairs.sigma
         wanted = Sharing(poses=formed, joints=joint_noise) if settings.pair_errors == "shared" else Sharing()
         wanted = replace(wanted, joints=(wanted.joints or encoder) and joints is None)
-        if of_pairs.n_shared(wanted) <= MAX_SHARED:
+        if of_pairs.size(wanted) <= MAX_SHARED:
             sharing = wanted
         elif encoder:
-            found = f"{of_pairs.n_shared(wanted)} joint values and errors that pairs share"
+            found = f"{of_pairs.size(wanted)} rows or errors that they share"
             raise ProblemError("encoder: estimated", found, f"at most {MAX_SHARED} for models of pairs", "propagated")
         blocks = of_pairs.blocks(sharing, joint_noise=joints is None)
     else:

@@ -32,7 +32,7 @@ SAME_POINT_SIGMAS = 3.0
 """A small distance that was measured as 0 within this many sigma says that both points are the same."""
 
 MAX_SHARED = 3000
-"""Shared errors (of all configurations together) beyond which their exact treatment takes too much time."""
+"""Rows, or errors that they share if these are fewer, beyond which the exact treatment takes too much time."""
 
 PRIVATE_SHARE = 1e-3
 """Share of a formed pair's variance that counts as its own: what it is not to first order, and rounding."""
@@ -187,11 +187,13 @@ class PairWhitening:
             height[rows] = 3
         return np.sqrt(squared), height
 
-    def n_shared(self, sharing: Sharing) -> int:
-        """Number of errors that the train rows share."""
-        train = self.judgement.used & ~self._pairs.test
+    def size(self, sharing: Sharing) -> int:
+        """Size of the dense system that carrying shared errors takes: the number of errors, or of rows if less."""
+        judgement, train = self.judgement, self.judgement.used & ~self._pairs.test
+        either = (judgement.distance | judgement.angle) & train
+        n_rows = sum(self._kinds) * int(either.sum()) + 3 * int((judgement.same_point & train).sum())
         n = len(np.unique(np.concatenate([self._pairs.a[train], self._pairs.b[train]])))
-        return n * self._width(sharing)
+        return min(n_rows, n * self._width(sharing))
 
     def blocks(self, sharing: Sharing, joint_noise: bool = True) -> list[AnyBlock]:
         """The train rows, whitened: a block of distances and angles, a block of same points, or both in one.

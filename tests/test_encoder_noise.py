@@ -181,7 +181,7 @@ def test_too_many_joint_values_for_pairs_are_refused(monkeypatch):
     with pytest.raises(ProblemError) as error:
         build_problem(robot, m, model="distance", encoder="estimated")
     assert str(error.value) == (
-        "encoder: estimated: 48 joint values and errors that pairs share, expected at most 20 for models of pairs;"
+        "encoder: estimated: 30 rows or errors that they share, expected at most 20 for models of pairs;"
         " propagated"
     )
 
