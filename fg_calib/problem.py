@@ -72,6 +72,15 @@ POSE_KINDS: dict[str, tuple[bool, bool]] = {
 }
 """Whether a model uses orientations and positions."""
 
+SIGMA_TOLERANCE = 1e-3
+"""Sigmas of rows that move by a smaller share have settled."""
+
+WEIGHT_TOLERANCE = 1e-7
+"""Robust weights that move by less have settled."""
+
+JOINT_TOLERANCE = 1e-7
+"""Estimated joint values that move by less than this many sigma of their readings have settled."""
+
 STRUCTURAL_FLOOR = 1e-6
 """Signal-to-noise ratio that counts as nothing on random configurations with an assumed noise: rounding alone."""
 
@@ -422,6 +431,33 @@ def judged_at(problem: Problem, parameters: Floats, adjustment: Adjustment | Non
     return replace(anew, whole=p.whole)
 
 
+def is_settled(problem: Problem, parameters: Floats, adjustment: Adjustment) -> bool:
+    """Whether rows judged and whitened anew, at other parameters and adjusted, would differ by nothing that matters.
+
+    Args:
+        problem: The problem.
+        parameters: The parameter vector.
+        adjustment: What has been learned of the noise there.
+    """
+    p, a, b = problem, problem.adjustment, adjustment
+    if a.weights is not None or b.weights is not None:
+        before, after = (np.ones(1) if x.weights is None else x.weights for x in (a, b))
+        if np.max(np.abs(before - after), initial=0.0) > WEIGHT_TOLERANCE:
+            return False
+    if a.joint_errors is not None and b.joint_errors is not None:
+        sigma = np.maximum(p.measurements.sigma_joint, 1e-300)
+        if np.max(np.abs(a.joint_errors - b.joint_errors) / sigma) > JOINT_TOLERANCE:
+            return False
+    whitening = _whitening(replace(p, adjustment=b), parameters)
+    if isinstance(whitening, PairWhitening) and whitening.judgement != p.judgement:
+        return False
+    sigmas = [(p.sigma, whitening.sigma)]
+    if p.points is not None:
+        covariance = p.points.covariance(p.variables.chain.at(parameters), p.trig)
+        sigmas.append((p.sigma_point, np.sqrt(np.einsum("nii->ni", covariance))))
+    return all(np.allclose(*pair, rtol=SIGMA_TOLERANCE, atol=0.0, equal_nan=True) for pair in sigmas)
+
+
 def lengths(problem: Problem, parameters: Floats) -> tuple[Floats, Integers]:
     """Length of each measurement's residual, whitened by all its noise as stated, and its number of rows.
 
@@ -496,7 +532,7 @@ def frames_only(problem: Problem) -> Problem | None:
     p = problem
     if p.points is not None:
         variables = p.points.add_points(variables)
-    settings = replace(p.settings, encoder="propagated")
+    settings = replace(p.settings, encoder="propagated", pair_errors="independent")  # good enough for a start
     start = p.start[: variables.nuisance_span.stop]
     return _assemble(robot, p.measurements, settings, variables, start, p.trig, p.pairs, points=p.points)
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from fg_calib.errors import SolverError
 from fg_calib.factors import Eliminated, Variables, eliminate
 from fg_calib.observability import SIGNAL_FLOOR, determined
-from fg_calib.problem import Problem, frames_only, joint_errors, judged_at, lengths
+from fg_calib.problem import Problem, frames_only, is_settled, joint_errors, judged_at, lengths
 from fg_calib.residuals import single_threaded_blas
 from fg_calib.robust import Weighting
 from fg_calib.whitening import Adjustment
@@ -32,13 +32,6 @@ Floats = NDArray[np.float64]
 
 _DAMPING_FLOOR = 10.0 * (SIGNAL_FLOOR / 1e-3) ** 2
 """Least damping in [1/m^2] and [1/rad^2]: ten times the curvature at the floor, in changes of 1 mm and 1 mrad."""
-
-
-WEIGHT_TOLERANCE = 1e-7
-"""Robust weights that move by less have settled."""
-
-JOINT_TOLERANCE = 1e-7
-"""Estimated joint values that move by less than this many sigma of their readings have settled."""
 
 
 @dataclass(frozen=True)
@@ -143,11 +136,10 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
         most = options.max_learning_rounds if learning else options.max_rounds
         while run.converged and rounds < most:
             adjustment, final = _learn(run.problem, run.parameters, weighting)
-            again = judged_at(problem, run.parameters, adjustment)
-            settled = final and not _differs(run.problem, again)
+            settled = final and is_settled(run.problem, run.parameters, adjustment)
             if settled:
                 break
-            run = _Run(again, options)
+            run = _Run(judged_at(problem, run.parameters, adjustment), options)
             history = history + run.history
             rounds += 1
         cost = run.cost
@@ -301,23 +293,6 @@ def _held(linear: gtsam.GaussianFactorGraph, step: Floats, variables: Variables)
 
 def _step_length(previous: gtsam.Values, values: gtsam.Values, variables: Variables) -> float:
     return float(np.linalg.norm(variables.step(previous, values) / variables.all_scales))
-
-
-def _differs(old: Problem, new: Problem) -> bool:
-    """Whether rows were judged otherwise, or their sigma, weights or joint values moved by more than matters."""
-    a, b = old.adjustment, new.adjustment
-    if a.weights is not None or b.weights is not None:
-        before, after = (np.ones(1) if x.weights is None else x.weights for x in (a, b))
-        if np.max(np.abs(before - after), initial=0.0) > WEIGHT_TOLERANCE:
-            return True
-    if a.joint_errors is not None and b.joint_errors is not None:
-        sigma = np.maximum(old.measurements.sigma_joint, 1e-300)
-        if np.max(np.abs(a.joint_errors - b.joint_errors) / sigma) > JOINT_TOLERANCE:
-            return True
-    return old.judgement != new.judgement or not all(
-        np.allclose(one, other, rtol=1e-3, atol=0.0, equal_nan=True)
-        for one, other in ((old.sigma, new.sigma), (old.sigma_point, new.sigma_point))
-    )
 
 
 def _in_words(message: str, variables: Variables) -> str:

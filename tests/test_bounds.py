@@ -159,7 +159,7 @@ def test_fits_of_drawn_errors_and_noise_have_the_bounds_error(pair_errors):
     options = {"model": "distance", "pairing": Pairing("all"), "pair_errors": pair_errors}
     squares, bounds, claims = [], [], []
     rng = np.random.default_rng(5)
-    for _ in range(120):
+    for _ in range(70):
         true = true_robot(robot, rng)
         measurements = measure(true, 8, rng, sigma=(SIGMA, 2e-4), sigma_joint=2e-4, readings=readings)
         fit = assess(solve(build_problem(robot, measurements, **options))).robot

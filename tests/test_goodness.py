@@ -190,11 +190,11 @@ def test_verdicts_tell_outliers_from_noise_stated_wrong():
 
 @pytest.mark.parametrize("name", ["pose", "star", "all", "direct joint"])
 def test_noise_stated_wrong_by_two_is_found(name):
-    """The mean of its logarithm over 25 fits, 4 of its own sigmas about the truth."""
+    """The mean of its logarithm over some fits, 4 of its own sigmas about the truth."""
     rng = np.random.default_rng(8)
     robot = small_arm(tolerance=TOLERANCE)
-    factors = []
-    for _ in range(25):
+    factors, n_fits = [], 25 if name == "pose" else 9
+    for _ in range(n_fits):
         if name == "direct joint":  # a factor is on all the noise of a row, joint noise with it
             problem = case(name, robot, rng, n=24)
             truth = 1.0
@@ -204,7 +204,7 @@ def test_noise_stated_wrong_by_two_is_found(name):
         assert solution.converged
         factors.append(solution.problem.adjustment.factors)
     logs = np.log(np.array(factors) / truth)
-    assert np.all(np.abs(logs.mean(axis=0)) < 4 * logs.std(axis=0) / 5)
+    assert np.all(np.abs(logs.mean(axis=0)) < 4 * logs.std(axis=0) / np.sqrt(n_fits))
     assert np.all(logs.std(axis=0) < 0.35)
 
 

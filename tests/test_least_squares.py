@@ -125,7 +125,7 @@ def test_weighted_by_joint_noise_it_is_the_graph(model, method):
     """With the weights of the same parameters; the graph leaves them once sigmas move by less than 0.1 %."""
     robot = paper_robot()
     measurements = simulated(robot, model, sigma=2e-4, sigma_joint=3e-4)
-    problem = build_problem(robot, measurements, model=model, gauge="keep")
+    problem = build_problem(robot, measurements, model=model, gauge="keep", pair_errors="independent")
     for _ in range(4):
         solution = solve(problem, TO_THE_END)
         problem = judged_at(solution.problem, solution.parameters)
@@ -147,7 +147,7 @@ def test_a_row_that_was_not_measured_does_not_weigh_on_the_other_of_its_pair():
     distance, angle = measurements.pairs.distance.copy(), measurements.pairs.angle.copy()
     distance[::3], angle[1::3] = np.nan, np.nan
     measurements = replace(measurements, pairs=replace(measurements.pairs, distance=distance, angle=angle))
-    problem = build_problem(robot, measurements, model="distance-rotation", gauge="keep")
+    problem = build_problem(robot, measurements, model="distance-rotation", gauge="keep", pair_errors="independent")
     for _ in range(4):
         solution = solve(problem, TO_THE_END)
         problem = judged_at(solution.problem, solution.parameters)
