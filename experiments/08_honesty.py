@@ -1,7 +1,7 @@
 """Are the sigmas honest: do true errors lie where the result says, and is what can be known found out?
 
 Command: python experiments/08_honesty.py [--quick] [--draws N] [--seed N] [--out FOLDER]
-Takes TIME.
+Takes 20 minutes on two cores that have other work too.
 
 Calibrations of three arms {the paper's robot, UR10-like 6R, SCARA} by {pose with known frame, pose with unknown frame,
 distance + rotation of a star of poses, distance + rotation measured directly}, with encoder noise {off, on}: 24 cells.
@@ -311,7 +311,7 @@ def run(out: Path, seed: int = 0, quick: bool = False, n_draws: int | None = Non
     """The whole experiment; quick takes a few cells, few draws and this process alone."""
     clock = time.perf_counter()
     n_draws = n_draws or (20 if quick else 500)
-    cells = [CELLS[i] for i in (1, 12, 22)] if quick else CELLS
+    cells = [CELLS[i] for i in (1, 13, 22)] if quick else CELLS
     breaking = {"direct pairs of small motions": BREAKING["direct pairs of small motions"][::4]} if quick else BREAKING
     found: dict[str, Any] = {"seed": seed, "n_draws": n_draws, "n_configurations": N_CONFIGURATIONS, "cells": []}
     pool = None if quick else ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
@@ -372,6 +372,7 @@ def draw(found: dict[str, Any]) -> Figure:
     cells = found["cells"]
     y = np.arange(len(cells))
     low, high = np.array([row["nees_bounds"] for row in cells]).T
+    nees.margins(x=0.08)
     nees.barh(y, high - low, left=low, height=0.7, color="0.85", label="99 % bounds")
     nees.plot([row["nees"] for row in cells], y, "o", color=COLOURS[0], label="NEES over its degrees of freedom")
     nees.axvline(1.0, color="0.5", lw=0.8)
@@ -398,7 +399,6 @@ def draw(found: dict[str, Any]) -> Figure:
         axes.set(xscale="log", xlabel="noise, multiple", title=title)
         axes.set_xticks(NOISE, [str(n) for n in NOISE])
         axes.minorticks_off()
-    panels[0].set_yscale("log")
     panels[0].axhline(1.0, color="0.5", lw=0.8)
     panels[1].axhspan(*(100 * np.array(COVERAGE)), color="0.85")
     panels[2].set_ylim(-5, 105)
