@@ -126,44 +126,68 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
         before = problem.start
         frames = frames_only(problem)
         if frames is not None:
-            before = _Run(frames, options).parameters
+            before = _fit(frames, options).run.parameters
             before = np.concatenate([before, problem.start[len(before) :]])
-        run = _Run(judged_at(problem, before) if frames is not None else problem, options)
-        initial_cost, history = run.initial_cost, run.history
-        weighting = Weighting(problem.settings.loss)
-        settled, rounds = False, 0
-        learning = problem.settings.loss != "none" or run.problem.adjustment.joint_errors is not None
-        most = options.max_learning_rounds if learning else options.max_rounds
-        while run.converged and rounds < most:
-            adjustment, final = _learn(run.problem, run.parameters, weighting)
-            settled = final and is_settled(run.problem, run.parameters, adjustment)
-            if settled:
-                break
-            run = _Run(judged_at(problem, run.parameters, adjustment), options)
-            history = history + run.history
-            rounds += 1
-        cost = run.cost
+            problem = judged_at(problem, before)
+        initial_cost = problem.graph.error(problem.initial)
+        fit = _fit(problem, options)
+        run, cost = fit.run, fit.run.cost
         if run.problem.adjustment.weights is not None:
             stated = judged_at(problem, run.parameters, replace(run.problem.adjustment, weights=None))
             cost = stated.graph.error(run.values)
-    message = run.message
-    converged = run.converged
-    if run.converged and not settled and rounds == most:
-        message += "; which rows take part still changed"
-        converged = not learning
     return Solution(
         problem=run.problem,
         values=run.values,
         parameters=run.parameters,
         before=before,
-        converged=converged,
-        message=message,
-        history=tuple(history),
+        converged=fit.converged,
+        message=fit.message,
+        history=fit.history,
         initial_cost=initial_cost,
         cost=cost,
         weighted_cost=run.cost,
         seconds=time.perf_counter() - clock,
     )
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """The last of the rounds of a fit, and how they went."""
+
+    run: _Run
+    history: tuple[Iteration, ...]
+    converged: bool
+    message: str
+
+
+def _fit(problem: Problem, options: SolverOptions) -> _Fit:
+    """Least squares in rounds, from the problem's start.
+
+    With a robust loss the first weights are those of the residuals at the start: gross errors would lead least squares
+    astray. A round that does not arrive still tells which measurements are far off.
+    """
+    robust = problem.settings.loss != "none"
+    weighting = Weighting(problem.settings.loss)
+    first = problem
+    if robust:
+        first = judged_at(problem, problem.start, _learn(problem, problem.start, weighting)[0])
+    run = _Run(first, options)
+    history = run.history
+    learning = robust or problem.adjustment.joint_errors is not None
+    most = options.max_learning_rounds if learning else options.max_rounds
+    settled, rounds = False, 0
+    while (run.converged or robust) and np.isfinite(run.parameters).all() and rounds < most:
+        adjustment, final = _learn(run.problem, run.parameters, weighting)
+        settled = final and is_settled(run.problem, run.parameters, adjustment)
+        if settled:
+            break
+        run = _Run(judged_at(problem, run.parameters, adjustment), options)
+        history = history + run.history
+        rounds += 1
+    message = run.message
+    if run.converged and not settled and rounds == most:
+        message += "; which rows take part still changed"
+    return _Fit(run, tuple(history), run.converged and (settled or not learning), message)
 
 
 def _learn(problem: Problem, parameters: Floats, weighting: Weighting) -> tuple[Adjustment, bool]:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.covariance import Spread, spread_of
 from fg_calib.factors import pose_of
-from fg_calib.goodness import Goodness, judge_fit
+from fg_calib.goodness import OUTLIER_WEIGHT, Goodness, judge_fit
 from fg_calib.identifiability import Identifiability, identify
 from fg_calib.observability import IdentifiabilityClass, Observability
 from fg_calib.problem import PAIR_KINDS, Problem, eliminated_terms, lengths
@@ -29,6 +29,9 @@ Integers = NDArray[np.int64]
 
 CONFIDENCE = 0.999
 """A reduced chi-square outside this interval of its distribution, and outside `FACTOR`, is not to be trusted."""
+
+MOST_OUTLIERS = 0.5
+"""Share of measurements beyond which they are not outliers but the majority."""
 
 FACTOR = 2.0
 """A reduced chi-square between 1 / FACTOR and FACTOR is good whatever its distribution: noise is never known better."""
@@ -273,7 +276,7 @@ def _weighted_chi2(solution: Solution) -> tuple[float, int, float]:
     if weights is None:
         return chi2, problem.n_independent, 1.0
     e, height = lengths(problem, solution.parameters)
-    outlier = weights < 0.5
+    outlier = weights < OUTLIER_WEIGHT
     chi2 -= float(np.sum(weights[outlier] * e[outlier] ** 2))
     share = float(np.mean(~outlier[height > 0]))
     of_loss = effect(problem.settings.loss, problem.height)
@@ -328,6 +331,15 @@ def _findings(solution: Solution, chi2: float, dof: int, bounds: tuple[float, fl
     findings = []
     if not solution.converged:
         findings.append(solution.message)
+    weights = solution.problem.adjustment.weights
+    if weights is not None:
+        _, height = lengths(solution.problem, solution.parameters)
+        n, lost = int(np.sum(height > 0)), int(np.sum(weights[height > 0] < OUTLIER_WEIGHT))
+        if lost > MOST_OUTLIERS * n:
+            loss = solution.problem.settings.loss
+            findings.append(
+                f"loss {loss} takes {lost} of {n} measurements for outliers: more than it can tell from noise"
+            )
     if dof > 0 and not bounds[0] <= chi2 / dof <= bounds[1]:
         high = chi2 / dof > 1.0
         cause = "noise stated too small, effects not modelled, or outliers" if high else "noise stated too large"

@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -379,3 +380,82 @@ def test_pairs_hold_what_poses_in_an_unknown_frame_hold(tmp_path, capsys):
         assert 0.3 < hemisphere[case]["anywhere"]["rms_over_bound"] < 2.3  # three draws of one weak direction
     assert hemisphere["pose known"]["anywhere"]["rms_over_bound"] == pytest.approx(1.0, abs=0.35)
     assert "claimed" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def honesty():
+    """The experiment; it shares its arms with another one."""
+    return load("08_honesty.py")
+
+
+def test_honesty_quick_finds_errors_where_the_result_says(honesty, tmp_path, capsys):
+    assert honesty.main(["--quick", "--out", str(tmp_path)]) == 0
+    assert "star of poses" in capsys.readouterr().out
+    found = json.loads((tmp_path / "08_honesty.json").read_text())
+    assert [(c["arm"], c["way"]) for c in found["cells"]] == [
+        ("space robot", "pose, frame known"), ("UR10", "star of poses"), ("SCARA", "direct pairs")
+    ]  # fmt: skip
+    for cell in found["cells"]:
+        k = cell["n_draws"] * cell["n_parameters"]
+        assert cell["nees"] == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / k))
+        # 20 draws of 20 to 30 parameters and 24 coordinates, which go together: half of them count as independent.
+        for covered in cell["coverage"].values():
+            assert covered == pytest.approx(0.95, abs=4.0 * np.sqrt(0.95 * 0.05 / (20 * 8)))
+        assert cell["rmse_over_bound"] <= 1.25
+        spread = cell["reduced_chi2_sd_expected"] / np.sqrt(cell["n_draws"])
+        assert cell["reduced_chi2"] == pytest.approx(1.0, abs=4.0 * spread)
+        assert cell["ks_p"] > 1e-4
+        assert cell["warned"] == cell["not_converged"] == 0.0
+    assert (tmp_path / "08_honesty.png").stat().st_size > 10_000
+
+
+def test_honesty_notices_noise_that_is_stated_half_as_large(honesty, monkeypatch):
+    right = honesty.measure
+
+    def understated(*given):
+        m = right(*given)
+        return replace(m, sigma_position=m.sigma_position / 2, sigma_orientation=m.sigma_orientation / 2)
+
+    monkeypatch.setattr(honesty, "measure", understated)
+    row = next(honesty.run_cells([honesty.CELLS[8]], 5, 0, None))
+    meets = honesty.judge(row, n_cells=1)
+    assert row["nees"] > 1.5
+    assert not any(meets[of] for of in ("nees", "coverage of parameters", "coverage of tool", "chi2"))
+
+
+@pytest.mark.parametrize("arm", ["space robot", "UR10", "SCARA"])
+def test_honesty_results_are_those_the_ledger_claims(arm):
+    """The run on record has every cell, and each says which criteria it meets."""
+    found = json.loads((EXPERIMENTS / "results" / "08_honesty.json").read_text())
+    cells = [cell for cell in found["cells"] if cell["arm"] == arm]
+    assert len(cells) == 8
+    for cell in cells:
+        assert cell["n_draws"] >= 500
+        assert set(cell["meets"]) == {"nees", "rmse", "chi2", *(f"coverage of {k}" for k in cell["coverage"])}
+
+
+@pytest.fixture(scope="module")
+def outliers_run(tmp_path_factory):
+    """The quick run: its rows by way, share and loss."""
+    sys.path.insert(0, str(EXPERIMENTS))
+    try:
+        outliers = load("09_outliers.py")
+    finally:
+        sys.path.remove(str(EXPERIMENTS))
+    out = tmp_path_factory.mktemp("outliers")
+    assert outliers.main(["--quick", "--out", str(out)]) == 0
+    assert (out / "09_outliers.png").stat().st_size > 10_000
+    found = json.loads((out / "09_outliers.json").read_text())
+    return {(row["way"], row["share"], row["loss"]): row for row in found["cells"]}
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3])
+@pytest.mark.parametrize("way", ["pose, frame known", "direct pairs"])
+def test_gross_errors_leave_gnc_where_the_wrong_rows_alone_would(outliers_run, way, share):
+    gnc, none = outliers_run[way, share, "gnc"], outliers_run[way, share, "none"]
+    # Five draws: the ratio to the fit that is told the wrong rows is 1 but for an outlier of a few sigma.
+    assert gnc["over_oracle"] <= 1.15
+    assert gnc["wrong_kept"] <= 0.1
+    assert gnc["clean_rejected"] <= 0.05
+    assert none["over_clean"] > 5.0
+    assert none["warned"] == 1.0
