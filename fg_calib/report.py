@@ -301,6 +301,7 @@ def _notes(solution: Solution, uncertainty: Uncertainty) -> Iterable[str]:
         unused, model = solution.problem.measurements.pairs.source, solution.problem.settings.model
         yield f"{unused} is not used: model {model} is of poses, not of pairs"
     yield from _sharing_notes(solution.problem)
+    yield from uncertainty.cautions
     weights = solution.problem.adjustment.weights
     if weights is not None:
         test = solution.problem.measurements.test if pairs is None else pairs.test

@@ -81,6 +81,7 @@ def result_document(
         },
         "trustworthy": uncertainty.trustworthy,
         "findings": list(uncertainty.findings),
+        "cautions": list(uncertainty.cautions),
         "chi2": uncertainty.chi2,
         "dof": uncertainty.dof,
         "reduced_chi2": uncertainty.reduced_chi2,

@@ -22,6 +22,7 @@ from fg_calib.residuals import single_threaded_blas
 from fg_calib.robot import Robot
 from fg_calib.robust import effect
 from fg_calib.solver import Solution
+from fg_calib.whitening import KINK_SIGMAS
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -32,6 +33,12 @@ CONFIDENCE = 0.999
 
 MOST_OUTLIERS = 0.5
 """Share of measurements beyond which they are not outliers but the majority."""
+
+BENDING = 0.5
+"""Bending of an angle by what the parameters may be off, in its sigma, beyond which its row is not linear enough."""
+
+MANY_NEAR_KINKS = 0.1
+"""Share of measured rows near a kink beyond which noise is large for the motions that were measured."""
 
 FACTOR = 2.0
 """A reduced chi-square between 1 / FACTOR and FACTOR is good whatever its distribution: noise is never known better."""
@@ -134,6 +141,7 @@ class Uncertainty:
         robot: The calibrated robot.
         spread: The covariance in the variables' tangent space, behind `predict`.
         findings: Why the result is not to be trusted; empty if it is.
+        cautions: Where its sigmas may be somewhat too small although nothing speaks against it.
         points: The points that groups of configurations touched.
     """
 
@@ -152,6 +160,7 @@ class Uncertainty:
     robot: Robot
     spread: Spread
     findings: tuple[str, ...]
+    cautions: tuple[str, ...]
     points: tuple[PointEstimate, ...] = ()
 
     def predict(self, function: Callable[[Robot], ArrayLike]) -> Prediction:
@@ -246,6 +255,7 @@ def _assess(solution: Solution) -> Uncertainty:
         robot=problem.robot.with_values(solution.parameters[variables.robot_span]),
         spread=spread,
         findings=_findings(solution, chi2, dof, bounds),
+        cautions=_cautions(problem),
         points=_point_estimates(solution, spread),
     )
 
@@ -325,6 +335,35 @@ def _parameter_estimates(
             )
         )
     return tuple(found)
+
+
+def _cautions(problem: Problem) -> tuple[str, ...]:
+    """Where the linear covariance may claim too much: near the kinks of angles and distances.
+
+    Near 0 an angle is the length of a vector of which the row sees one component. The others, d across, bend it by
+    d^2 / (2 angle); they are unknown to about what all rotation parameters together may be off.
+    """
+    pairs, judgement = problem.pairs, problem.judgement
+    if pairs is None or judgement is None:
+        return ()
+    train, cautions = ~pairs.test, []
+    across = 2.0 * sum(p.scale**2 for p in problem.estimated if p.unit == "rad")
+    used = judgement.angle & train
+    from_kink = np.minimum(pairs.angle[used], np.pi - pairs.angle[used])
+    bent = int(np.sum(across / (2.0 * from_kink) > BENDING * problem.sigma[used, 1]))
+    if bent:
+        cautions.append(
+            f"{bent} of {int(used.sum())} angles are so near 0 or half a turn that what the parameters may be off bends"
+            " them by more than half a sigma: sigmas of tilts may be 10 % too small"
+        )
+    near = sum(np.sum(mask & train) for reason, mask in judgement.reasons.items() if "near" in reason)
+    rows = problem.n_residuals + int(near)
+    if near > MANY_NEAR_KINKS * rows:
+        cautions.append(
+            f"{near} of {rows} rows lie within {KINK_SIGMAS:g} sigma of 0 or half a turn: the noise is large for these"
+            " motions, and sigmas may be 10 % too small"
+        )
+    return tuple(cautions)
 
 
 def _findings(solution: Solution, chi2: float, dof: int, bounds: tuple[float, float]) -> tuple[str, ...]:

@@ -284,3 +284,21 @@ def test_predicted_sigmas_cover_the_truth():
         found = uncertainty.predict(lambda r: pose(r, q).position[0])
         z.append((found.value - pose(true, q).position[0]) / found.sigma)
     assert 0.7 < np.std(z) < 1.4  # pairs of a star share a configuration: sigmas are somewhat off, not by factors
+
+
+def test_small_angles_and_large_noise_are_cautioned_about():
+    """A star of small motions: at little noise the tilts bend its angles, at much noise rows fall to the kinks."""
+    rng = np.random.default_rng(1)
+    robot = small_arm()  # angles off by 1 mrad each, by default
+    q = rng.uniform(-1, 1, (1, 4)) + 0.02 * rng.normal(size=(40, 4))
+    calm = measure(true_robot(robot, rng), 40, rng, sigma=(1e-4, 2e-4))
+    assert assess(solve(build_problem(robot, calm, model="distance-rotation"))).cautions == ()
+    small = measure(true_robot(robot, rng), 40, rng, sigma=(1e-4, 2e-5), readings=q)
+    cautions = assess(solution := solve(build_problem(robot, small, model="distance-rotation"))).cautions
+    assert len(cautions) == 1
+    n = int(np.sum(solution.problem.judgement.angle))
+    assert cautions[0].endswith("bends them by more than half a sigma: sigmas of tilts may be 10 % too small")
+    assert 0 < int(cautions[0].split()[0]) <= n
+    noisy = measure(true_robot(robot, rng), 40, rng, sigma=(1e-2, 5e-3), readings=q)
+    uncertainty = assess(solve(build_problem(robot, noisy, model="distance-rotation")))
+    assert any("rows lie within 5 sigma of 0 or half a turn" in caution for caution in uncertainty.cautions)
