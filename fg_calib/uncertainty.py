@@ -34,7 +34,7 @@ CONFIDENCE = 0.999
 MOST_OUTLIERS = 0.5
 """Share of measurements beyond which they are not outliers but the majority."""
 
-BENDING = 0.5
+BENDING = 2.0
 """Bending of an angle by what the parameters may be off, in its sigma, beyond which its row is not linear enough."""
 
 MANY_NEAR_KINKS = 0.1
@@ -354,7 +354,7 @@ def _cautions(problem: Problem) -> tuple[str, ...]:
     if bent:
         cautions.append(
             f"{bent} of {int(used.sum())} angles are so near 0 or half a turn that what the parameters may be off bends"
-            " them by more than half a sigma: sigmas of tilts may be 10 % too small"
+            " them by up to more than two sigma: sigmas of tilts may be 10 % too small"
         )
     near = sum(np.sum(mask & train) for reason, mask in judgement.reasons.items() if "near" in reason)
     rows = problem.n_residuals + int(near)

@@ -297,7 +297,7 @@ def test_small_angles_and_large_noise_are_cautioned_about():
     cautions = assess(solution := solve(build_problem(robot, small, model="distance-rotation"))).cautions
     assert len(cautions) == 1
     n = int(np.sum(solution.problem.judgement.angle))
-    assert cautions[0].endswith("bends them by more than half a sigma: sigmas of tilts may be 10 % too small")
+    assert cautions[0].endswith("bends them by up to more than two sigma: sigmas of tilts may be 10 % too small")
     assert 0 < int(cautions[0].split()[0]) <= n
     noisy = measure(true_robot(robot, rng), 40, rng, sigma=(1e-2, 5e-3), readings=q)
     uncertainty = assess(solve(build_problem(robot, noisy, model="distance-rotation")))
