@@ -31,7 +31,6 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
-import scipy.optimize
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -275,9 +274,11 @@ def _scipy(evaluate: _Evaluate, x: Floats, max_iterations: int, tolerance: float
     def derivative(x: Floats) -> Floats:
         return evaluate(x)[1]
 
+    from scipy import optimize  # here, for it takes as long to import as a small calibration
+
     exact = 1e-15  # near the least that MINPACK takes
     try:
-        found = scipy.optimize.least_squares(
+        found = optimize.least_squares(
             residual,
             x,
             jac=derivative,

@@ -37,7 +37,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize, special, stats
+from scipy import special
 
 from fg_calib.choices import Loss
 
@@ -83,7 +83,9 @@ def tuning(loss: Loss, height: int) -> float:
     if loss == "none":
         return np.inf
     if loss == "gnc":
-        return float(np.sqrt(stats.chi2.ppf(INLIERS, height)))
+        return float(np.sqrt(2.0 * special.gammaincinv(height / 2.0, INLIERS)))
+
+    from scipy import optimize  # here, for it takes as long to import as a small calibration
 
     def excess(c: float) -> float:
         _, squared, slope = _moments(loss, c, height)
