@@ -20,6 +20,7 @@ from dataclasses import replace
 import numpy as np
 
 from fg_calib.covariance import spread_of
+from fg_calib.errors import ProblemError
 from fg_calib.files.job import Job
 from fg_calib.goodness import KindFit, kind_fits
 from fg_calib.problem import Problem, judged_at, noise_kinds, problem_of
@@ -62,8 +63,11 @@ def estimate_noise(problem: Problem, options: SolverOptions | None = None) -> So
         were estimated of in `estimated_noise`. It has not converged if the factors have not settled.
 
     Raises:
+        ProblemError: There are touched points, whose noise cannot be estimated.
         SolverError: GTSAM could not solve a step at all.
     """
+    if problem.points is not None:
+        raise ProblemError(problem.measurements.source, "a column group with noise to be estimated", "noise as stated")
     seconds = 0.0
     for _ in range(MAX_ROUNDS):
         solution = solve(problem, options)

@@ -292,6 +292,7 @@ def build_problem(
     variables = build_variables(robot, unknown_frame, settings.prior)
     points = None if measurements.groups is None else PointGroups(measurements, model)
     if points is not None:
+        _check_points(measurements, settings)
         variables = points.add_points(variables)
     pairs = _usable_pairs(measurements, settings) if settings.uses_pairs else None
     if pairs is None:
@@ -638,6 +639,13 @@ def _usable_pairs(measurements: Measurements, settings: Settings) -> Pairs:
             raise ProblemError(pairs.source, f"no sigma for {kind}", f"noise.{noise} or a column sigma_{noise}")
     measured = np.isfinite(pairs.distance) | np.isfinite(pairs.angle)
     return pairs.select(measured)
+
+
+def _check_points(measurements: Measurements, settings: Settings) -> None:
+    """What has not been made for touched points is refused, rather than done to the other rows alone."""
+    for key, value, only in (("loss", settings.loss, "none"), ("encoder", settings.encoder, "propagated")):
+        if value != only:
+            raise ProblemError(measurements.source, f"a column group with {key} {value}", f"{key} {only}")
 
 
 def _check_poses(measurements: Measurements, settings: Settings) -> None:

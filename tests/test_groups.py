@@ -624,3 +624,19 @@ def test_a_job_without_the_noise_of_touches_is_one_line(fg_calib, tmp_path):
     assert ended.code == 1
     expected = "poses.csv: no sigma for touched points, expected noise.point or a column sigma_point"
     assert ended.err.splitlines() == [f"error: {expected}"] or ended.err.splitlines() == [expected]
+
+
+@pytest.mark.parametrize(
+    ("job", "message"),
+    [
+        ({"loss": "gnc"}, "a column group with loss gnc, expected loss none"),
+        ({"encoder": "estimated"}, "a column group with encoder estimated, expected encoder propagated"),
+        ({"noise": "estimate"}, "a column group with noise to be estimated, expected noise as stated"),
+    ],
+)
+def test_what_touched_points_have_not_is_refused_in_one_line(fg_calib, tmp_path, job, message):
+    path = write_job(tmp_path, **job)
+    ended = fg_calib("calibrate", path)
+    assert (ended.code, ended.out) == (1, "")
+    assert ended.err.startswith("error: ")
+    assert ended.err.endswith(f"{message}\n")
