@@ -165,11 +165,11 @@ class Weighting:
             e: Length of each measurement's whitened residual, shape (n,).
             height: Its number of rows, shape (n,); 0 for one that takes no part.
         """
-        c = np.array([tuning(self._loss, int(h)) if h else np.inf for h in range(height.max(initial=0) + 1)])[height]
+        c = np.array([tuning(self._loss, max(h, 1)) for h in range(height.max(initial=0) + 1)])[height]
+        e = np.where(height > 0, e, 0.0)  # what takes no part keeps its weight
         if self._loss != "gnc":
             return weight(self._loss, e, c), True
-        with np.errstate(invalid="ignore"):
-            ratio = np.where(np.isfinite(c), e / c, 0.0) ** 2  # in units of what is still taken for clean
+        ratio = (e / c) ** 2  # in units of what is still taken for clean
         if self._mu is None:
             worst = float(ratio.max(initial=0.0))
             if worst <= 1.0:

@@ -11,7 +11,7 @@ from simulated import measure, small_arm, true_robot
 from fg_calib import residuals
 from fg_calib.kinematics import pose
 from fg_calib.measurements import Pairing
-from fg_calib.problem import build_problem, judged_at
+from fg_calib.problem import build_problem, judged_at, lengths
 from fg_calib.robust import EFFICIENCY, HALF_WEIGHT, Weighting, effect, tuning, weight
 from fg_calib.solver import solve
 from fg_calib.uncertainty import assess
@@ -214,3 +214,30 @@ def test_gnc_starts_convex_and_ends_truncated():
         last, final = weighting.update(e, height)
     assert last.tolist() == [1.0, 1.0, 0.0]
     assert Weighting("gnc").update(np.array([0.5, 1.0]), np.array([1, 1]))[1]
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_a_measurement_that_takes_no_part_keeps_its_weight(loss):
+    weights, _ = Weighting(loss).update(np.array([0.1, 50.0, 0.0, np.nan]), np.array([2, 2, 0, 0]))
+    assert weights[[2, 3]].tolist() == [1.0, 1.0]
+    assert 0.0 <= weights[1] < weights[0] <= 1.0
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_weights_settle_where_rows_are_excluded(loss):
+    """Pairs at a kink take no part; the others' weights are those of the residuals at the estimate all the same."""
+    rng = np.random.default_rng(6)
+    robot = small_arm(tolerance=TOLERANCE)
+    m, _ = spoil(measure(true_robot(robot, rng), 40, rng), 0.15, rng, size=20.0)
+    readings = m.readings.copy()
+    readings[20] = readings[0]  # the same configuration twice: its pair with the hub says nothing
+    m = replace(m, readings=readings)
+    solution = solve(build_problem(robot, m, model="distance-rotation", loss=loss))
+    assert solution.converged
+    e, height = lengths(solution.problem, solution.parameters)
+    assert np.sum(height == 0) >= 1
+    weights = solution.problem.adjustment.weights
+    assert np.all(np.isfinite(weights))
+    used = height > 0
+    c = np.array([tuning(loss, int(h)) for h in height[used]])
+    assert weights[used] == pytest.approx(weight(loss, e[used], c), abs=1e-5)
