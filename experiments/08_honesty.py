@@ -246,7 +246,7 @@ def tool_derivative(setting: Setting, robot: fg_calib.Robot) -> Floats:
     """Of the tool's positions at the validation configurations in the estimated parameters, shape (m, n_parameters)."""
     unmeasured = unmeasured_problem(setting)
     chain = unmeasured.variables.chain.at(robot.nominal)
-    return residuals.linearise(all_rows(unmeasured), chain)[1].reshape(-1, chain.n_columns)
+    return residuals.linearise(all_rows(unmeasured, unmeasured.start), chain)[1].reshape(-1, chain.n_columns)
 
 
 _UNMEASURED: dict[int, Problem] = {}

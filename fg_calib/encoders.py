@@ -155,6 +155,13 @@ class TrueJoints:
         """Initial nuisance values: the readings, flat."""
         return self._measurements.readings[np.ix_(self.configurations, self.joints)].ravel()
 
+    def values(self, variables: Variables, parameters: Floats) -> Floats:
+        """Joint values at a parameter vector, readings where none are estimated: (n_configurations, n_joints)."""
+        q = self._measurements.readings.copy()
+        found = [parameters[list(v.parameters)] for v in variables.nuisance if v.kind == "joints"]
+        q[np.ix_(self.configurations, self.joints)] = found
+        return q
+
     def terms(self, blocks: list[AnyBlock], variables: Variables) -> tuple[Term, ...]:
         """The readings, a term each, and the rows: a term a pose, or one for all pairs.
 

@@ -35,11 +35,11 @@ from fg_calib import residuals
 from fg_calib.covariance import Spread
 from fg_calib.factors import prior_rows
 from fg_calib.kinematics import SPAN
-from fg_calib.problem import PAIR_KINDS, POSE_KINDS, Problem, all_rows
+from fg_calib.problem import PAIR_KINDS, POSE_KINDS, Problem, all_rows, pair_rows
 from fg_calib.residual_table import FAMILIES, ROW_KINDS, ResidualTable
 from fg_calib.residuals import Block, PoseBlock
 from fg_calib.solver import Solution
-from fg_calib.whitening import PairWhitening, joint_rows
+from fg_calib.whitening import joint_rows
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -213,7 +213,7 @@ class _Rows:
         self._solution = solution
         self._robust = problem.adjustment.weights is not None
         weights = problem.adjustment.weights
-        self._of_points = table.measurement >= all_rows(problem).n  # touches, and distances between points
+        self._of_points = table.measurement >= _n_measured(problem)  # touches, and distances between points
         self.weight = np.ones(table.n)
         if weights is not None:
             self.weight[~self._of_points] = weights[table.measurement[~self._of_points]]
@@ -352,8 +352,8 @@ class _Rows:
     def _read(self, with_shared: bool, with_derivatives: bool) -> tuple[scipy.sparse.csr_array | None, Floats | None]:
         """Leverage of every row; shared errors and derivatives of the fitted rows over sigma, where wanted."""
         table, problem = self._table, self._problem
-        block, parameters = all_rows(problem), self._solution.parameters
-        chain = problem.variables.chain.at(parameters)
+        parameters = self._solution.parameters
+        block, chain = all_rows(problem, parameters), problem.variables.chain.at(parameters)
         loadings = _loadings(problem, parameters) if with_shared else None
         columns = _first_code(problem)
         fitted = np.zeros(table.n, dtype=np.bool_)
@@ -372,8 +372,7 @@ class _Rows:
             if with_derivatives:
                 derivatives.append(flat[here])
             if loadings is not None:
-                scale = _factors(problem)[table.family[rows][here]] / table.sigma[rows][here]
-                shared.append(loadings(part)[grid[here]].multiply(scale[:, None]).tocsr())
+                shared.append(loadings(part)[grid[here]].multiply(1.0 / table.sigma[rows][here, None]).tocsr())
         self.leverage[~np.isfinite(self.leverage)] = np.nan
         L = scipy.sparse.csr_array(scipy.sparse.vstack(shared)) if shared else None
         return L, np.concatenate(derivatives) if derivatives else None
@@ -441,22 +440,28 @@ class _Dense:
 
 
 def _loadings(problem: Problem, parameters: Floats) -> Callable[[Block], scipy.sparse.csr_array]:
-    """How rows in [m] and [rad] follow from errors of 1 sigma as stated that they share, sparse (n * height, ...)."""
+    """How rows in [m] and [rad] follow from errors of 1 sigma that they share, sparse (n * height, ...)."""
     m, chain = problem.measurements, problem.variables.chain.at(parameters)
     if problem.pairs is not None:
-        kinds = PAIR_KINDS[problem.settings.model]
-        pairs = PairWhitening(problem.trig, chain, m, problem.pairs, kinds, problem.formed, problem.adjustment)
+        pairs = pair_rows(problem, parameters)
         return lambda part: pairs.loadings(part, problem.common)
+    factors = np.repeat(np.array(problem.adjustment.factors)[list(POSE_KINDS[problem.settings.model])], 3)
 
     def of_joints(part: Block) -> scipy.sparse.csr_array:
         assert isinstance(part, PoseBlock)
         J = np.concatenate([J for _, J in joint_rows(part, chain, m.sigma_joint)])  # (n, height, n_joints)
+        J = J * factors[:, None]
         n, height, n_joints = J.shape
         columns = np.broadcast_to(part.rows[:, None, None] * n_joints + np.arange(n_joints), J.shape)
         shape = (n * height, m.n_configurations * n_joints)
         return scipy.sparse.csr_array((J.ravel(), columns.ravel(), np.arange(n * height + 1) * n_joints), shape=shape)
 
     return of_joints
+
+
+def _n_measured(problem: Problem) -> int:
+    """Number of pairs or poses, train and test: what comes after them in a residual table are touches."""
+    return problem.measurements.n_configurations if problem.pairs is None else problem.pairs.n_pairs
 
 
 def _first_code(problem: Problem) -> int:

@@ -9,10 +9,9 @@ with p_k the predicted tool point and l_g the point, both in the base frame. Der
 `u . (dl_h - dl_g)` with u the unit vector from g to h. A touch has noise `sigma_point` on each axis, and that of the
 joint readings to first order.
 
-What moves all tool points of a group as one body moves the point with them, and changes no residual's length. At
-residuals that are not zero the derivative says so only if the body's motion is taken where the point is:
-`dp_k = w x l_g + v` instead of `w x p_k + v`, which turns the residual by the same motion, as `residuals` does for
-two points that are the same.
+What moves all tool points of a group as one body moves the point with them, and turns the residuals without changing
+their lengths. Each column's derivative is taken of residuals turned back by its share in such motions, `dp_k - dl_g -
+a x (p_k - l_g)` (see `kinematics.turning_of_base`): else directions that no touch determines would seem determined.
 
 Note:
     Noise of a reading that also takes part in a pair counts as independent of that in the pair.
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 
 from fg_calib.errors import ProblemError
 from fg_calib.factors import Term, Variables
-from fg_calib.kinematics import Chain, forward
+from fg_calib.kinematics import Chain, forward, turning_of_base
 from fg_calib.measurements import Groups, Measurements, Pairs
 
 Floats = NDArray[np.float64]
@@ -36,9 +35,6 @@ Integers = NDArray[np.int64]
 
 POINT_MODELS = ("distance", "distance-rotation")
 """Models that use touched points."""
-
-_RIGID = 1e-12
-"""Twists that differ by no more than this are the same, [rad] and [m]."""
 
 
 @dataclass(frozen=True)
@@ -79,14 +75,10 @@ class Touches:
         """The same with derivatives in the core's columns, then in the point, shape (n_rows, n_columns + 3)."""
         point = parameters[list(variables.nuisance[self.point].parameters)]
         at = forward(variables.chain.at(parameters), self.trig, self.rows)
-        w, dp = at.jacobian[:, :3], at.jacobian[:, 3:].copy()  # (n, 3, n_columns)
-        v = dp - np.cross(w, at.position[:, :, None], axis=1)
-        same = [np.abs(t - t[0]).max(axis=(0, 1)) <= _RIGID for t in (w, v)]
-        rigid = same[0] & same[1]
-        dp[:, :, rigid] = (np.cross(w, point, axisa=1, axisb=0, axisc=1) + v)[:, :, rigid]
+        w, dp, off = at.jacobian[:, :3], at.jacobian[:, 3:], (at.position - point)[:, :, None]
+        dp = dp - np.cross(turning_of_base(w, at.rotation)[None], off, axis=1)
         J = np.concatenate([dp, np.broadcast_to(-np.eye(3), (len(dp), 3, 3))], axis=2)
-        r = self.whitening @ (at.position - point)[:, :, None]
-        return r.ravel(), (self.whitening @ J).reshape(self.n_rows, -1)
+        return (self.whitening @ off).ravel(), (self.whitening @ J).reshape(self.n_rows, -1)
 
 
 @dataclass(frozen=True)
@@ -215,7 +207,7 @@ class PointGroups:
             S = S + J @ np.swapaxes(J, 1, 2)
         return S
 
-    def terms(self, chain: Chain, trig: Floats, covariance: Floats) -> tuple[Term, ...]:
+    def terms(self, trig: Floats, covariance: Floats) -> tuple[Term, ...]:
         """The train rows: a term a group, and one a distance between two of them."""
         place = {int(g): i for i, g in enumerate(self.estimated)}
         terms: list[Term] = []

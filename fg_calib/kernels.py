@@ -300,13 +300,13 @@ def fill_pairs(  # type: ignore[no-untyped-def]
 @compiled
 def fill_same_points(  # type: ignore[no-untyped-def]
     axis, value, cosine, sine, sign, joint, column, n_columns, n_own, turns,
-    trig, a, b, whitening, start, stop, panel,
+    trig, a, b, whitening, turning, start, stop, panel,
 ):  # fmt: skip
     """Vectors between the points of pairs start to stop (see `residuals.SamePointBlock`)."""
     n_twists = n_columns + n_own
     R, p_A, p_B = np.empty((3, 3, LANES)), np.empty((3, LANES)), np.empty((3, LANES))
     t_A, t_B = np.zeros((n_twists, 6, LANES)), np.zeros((n_twists, 6, LANES))
-    weight, raw = np.empty((3, 3, LANES)), np.empty((3, LANES))
+    weight, vector, raw = np.empty((3, 3, LANES)), np.empty((3, LANES)), np.empty((3, LANES))
     last_row = panel.shape[0] - 1
     for first in range(start, stop, LANES):
         walk(axis, value, cosine, sine, sign, joint, column, n_columns, n_own, trig, a, first, R, p_A, t_A)
@@ -314,8 +314,8 @@ def fill_same_points(  # type: ignore[no-untyped-def]
         _gather_whitening(whitening, first, stop, weight)
         for c in range(3):
             for i in range(LANES):
-                raw[c, i] = p_B[c, i] - p_A[c, i]
-        _write_whitened(weight, raw, 3, 1.0, panel[last_row], first - start)
+                vector[c, i] = p_B[c, i] - p_A[c, i]
+        _write_whitened(weight, vector, 3, 1.0, panel[last_row], first - start)
         for t in range(n_twists):
             if t < n_columns:
                 _point_derivative(t_A[t], p_A, raw)
@@ -323,7 +323,10 @@ def fill_same_points(  # type: ignore[no-untyped-def]
                     for i in range(LANES):
                         raw[c, i] = -raw[c, i]
                 _add_point_derivative(t_B[t], p_B, raw)
-                _forget_rigid_motion(t_A[t], t_B[t], raw)
+                for c in range(3):
+                    d, e = (c + 1) % 3, (c + 2) % 3
+                    for i in range(LANES):
+                        raw[c, i] -= turning[d, t] * vector[e, i] - turning[e, t] * vector[d, i]
                 _write_whitened(weight, raw, 3, 1.0, panel[t], first - start)
             else:
                 _point_derivative(t_A[t], p_A, raw)
@@ -391,21 +394,6 @@ def _add_point_derivative(twist, p, out):  # type: ignore[no-untyped-def]
         a, b = (c + 1) % 3, (c + 2) % 3
         for i in range(LANES):
             out[c, i] += twist[a, i] * p[b, i] - twist[b, i] * p[a, i] + twist[3 + c, i]
-
-
-@compiled
-def _forget_rigid_motion(twist_A, twist_B, raw):  # type: ignore[no-untyped-def]
-    """Zero the derivative in what moves both points as one body, such as the base.
-
-    It only turns the vector between them, which no measurement sees. Its twist is the same at both configurations.
-    """
-    for i in range(LANES):
-        same = True
-        for c in range(6):
-            same = same and abs(twist_A[c, i] - twist_B[c, i]) <= 1e-12 * (1.0 + abs(twist_A[c, i]))
-        if same:
-            for c in range(3):
-                raw[c, i] = 0.0
 
 
 @compiled

@@ -234,6 +234,27 @@ def forward(chain: Chain, trig: Floats, rows: Integers | None = None) -> Poses:
     return Poses(rotation, position, jacobian)
 
 
+def turning_of_base(w: Floats, rotation: Floats) -> Floats:
+    """What of the tool's turning is that of the base: the best a in `w_k = a + R_k b`, shape (3, n_columns), [rad/...].
+
+    Points that should coincide are off by some vectors. If the base turns, all of them turn with it, and their lengths
+    stay; if the tool turns about its own point they stay as they are. Which turn of all vectors together belongs to a
+    column is free, as it changes no length. This choice is linear in the columns, so that whatever they do together, if
+    it is a motion of the base and a turn of the tool about its point, has no effect on vectors turned back by it.
+
+    Args:
+        w: Turning of the tool in each column at some configurations, about the base's axes, shape (n, 3, n_columns).
+        rotation: base_R_tool there, shape (n, 3, 3).
+    """
+    w_mean, R_mean = w.mean(axis=0), rotation.mean(axis=0)
+    # Normal equations of b about the means; where the rotations leave it open it is zero, and the turn the base's.
+    values, V = np.linalg.eigh(np.eye(3) - R_mean.T @ R_mean)
+    right = np.einsum("nji,njp->ip", rotation, w) / len(w) - R_mean.T @ w_mean
+    inverse = np.divide(1.0, values, out=np.zeros(3), where=values > 1e-9)
+    a: Floats = w_mean - R_mean @ ((V * inverse) @ (V.T @ right))
+    return a
+
+
 def pose(robot: Robot, readings: Floats | Sequence[Sequence[float]]) -> Poses:
     """Tool poses of a robot in its base frame, and their derivatives in every parameter, then every joint.
 

@@ -48,7 +48,6 @@ from fg_calib.whitening import (
     PairWhitening,
     PoseWhitening,
     Sharing,
-    pair_block,
     pose_block,
 )
 
@@ -227,7 +226,7 @@ class Problem:
         block = rows[0] if rows else None
         if not (self.sharing.poses and isinstance(block, CorrelatedBlock)):
             return self.n_residuals
-        return min(self.n_residuals, round(block.n_shared_rows) + self.n_of_points)
+        return self.n_residuals - round(block.n_spare)
 
     @property
     def approximate(self) -> bool:
@@ -492,9 +491,25 @@ def _whitening(problem: Problem, parameters: Floats) -> PairWhitening | PoseWhit
     """The rows of a problem, judged and whitened at a parameter vector."""
     p, chain = problem, problem.variables.chain.at(parameters)
     trig = _trig(p.robot, p.measurements, p.trig, p.adjustment)
+    if p.joints is not None:
+        trig = precompute_trig(p.robot, p.joints.values(p.variables, parameters))
     if p.pairs is None:
         return PoseWhitening(trig, chain, p.measurements, POSE_KINDS[p.settings.model], p.adjustment)
-    return PairWhitening(trig, chain, p.measurements, p.pairs, PAIR_KINDS[p.settings.model], p.formed, p.adjustment)
+    kinds, estimated = PAIR_KINDS[p.settings.model], p.settings.encoder == "estimated"
+    return PairWhitening(trig, chain, p.measurements, p.pairs, kinds, p.formed, p.adjustment, estimated)
+
+
+def pair_rows(problem: Problem, parameters: Floats) -> PairWhitening:
+    """All pairs of a problem at a parameter vector, at their readings.
+
+    Raises:
+        ValueError: The problem is one of poses.
+    """
+    at_readings = replace(problem.adjustment, joint_errors=None)
+    whitening = _whitening(replace(problem, adjustment=at_readings, joints=None), parameters)
+    if not isinstance(whitening, PairWhitening):
+        raise ValueError("a problem of poses has no pairs")
+    return whitening
 
 
 def _trig(robot: Robot, measurements: Measurements, trig: Floats, adjustment: Adjustment) -> Floats:
@@ -595,11 +610,16 @@ def observe(
     )
 
 
-def all_rows(problem: Problem) -> Block:
-    """Every measured row, train and test, in [m] and [rad]: the block behind predictions and residual tables."""
+def all_rows(problem: Problem, parameters: Floats) -> Block:
+    """Every measured row, train and test, in [m] and [rad]: the block behind predictions and residual tables.
+
+    Args:
+        problem: The problem.
+        parameters: The parameter vector at which the rows are wanted: the mean of a noisy length depends on it.
+    """
     m, model = problem.measurements, problem.settings.model
     if problem.pairs is not None:
-        return pair_block(problem.trig, problem.pairs, PAIR_KINDS[model])
+        return pair_rows(problem, parameters).rows()
     return pose_block(problem.trig, np.arange(m.n_configurations), m, POSE_KINDS[model])
 
 
@@ -807,11 +827,14 @@ def _assemble(
     if encoder and adjustment.joint_errors is None:
         adjustment = replace(adjustment, joint_errors=np.zeros_like(measurements.readings))
     moved = _trig(robot, measurements, trig, adjustment)
+    if joints is not None:
+        moved = precompute_trig(robot, joints.values(variables, start))
     judgement, sharing = None, Sharing()
     if pairs is not None:
         formed = measurements.pairs is None and pairs.n_pairs > 0
         kinds = PAIR_KINDS[settings.model]
-        of_pairs = PairWhitening(moved, chain, measurements, pairs, kinds, formed, adjustment)
+        estimated = settings.encoder == "estimated"
+        of_pairs = PairWhitening(moved, chain, measurements, pairs, kinds, formed, adjustment, estimated)
         judgement, sigma = of_pairs.judgement, of_pairs.sigma
         wanted = Sharing(poses=formed, joints=joint_noise) if settings.pair_errors == "shared" else Sharing()
         wanted = replace(wanted, joints=(wanted.joints or encoder) and joints is None)
@@ -834,7 +857,7 @@ def _assemble(
     if points is not None:
         covariance = points.covariance(chain, trig)
         sigma_point = np.sqrt(np.einsum("nii->ni", covariance))
-        terms += points.terms(chain, trig, covariance)
+        terms += points.terms(trig, covariance)
     for term in terms:
         graph.add(term_factor(term, variables))
     for factor in prior_factors(variables):

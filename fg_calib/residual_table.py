@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fg_calib import residuals
 from fg_calib.kinematics import forward
-from fg_calib.problem import PAIR_KINDS, POSE_KINDS, Problem, all_rows
+from fg_calib.problem import PAIR_KINDS, POSE_KINDS, Problem, all_rows, pair_rows
 from fg_calib.solver import Solution
 
 Floats = NDArray[np.float64]
@@ -52,6 +52,8 @@ class ResidualTable:
         measured: Measured value; nan for orientations, shape (n,).
         before: Residual with the arm at nominal, shape (n,).
         after: Residual at the estimate, shape (n,).
+        excess: What noise adds to the measured value on average (see `moments`), at the estimate, shape (n,); the arm's
+            own prediction is measured + after - excess.
         sigma: 1 sigma of the residual, shape (n,).
     """
 
@@ -65,6 +67,7 @@ class ResidualTable:
     measured: Floats
     before: Floats
     after: Floats
+    excess: Floats
     sigma: Floats
 
     @property
@@ -112,12 +115,13 @@ class ResidualTable:
 def residual_table(solution: Solution) -> ResidualTable:
     """Every scalar residual, train and test, with the arm at nominal and at the estimate."""
     problem = solution.problem
-    block = all_rows(problem)
     chain = problem.variables.chain
-    before, after = (residuals.residual(block, chain.at(p)) for p in (solution.before, solution.parameters))
+    before, after = (
+        residuals.residual(all_rows(problem, p), chain.at(p)) for p in (solution.before, solution.parameters)
+    )
     if problem.pairs is None:
         return _pose_table(problem, before, after)
-    tables = [_pair_table(problem, before, after)]
+    tables = [_pair_table(problem, before, after, pair_rows(problem, solution.parameters).moments.excess)]
     if problem.points is not None:
         tables += _point_tables(problem, solution.before, solution.parameters)
     arrays = [f.name for f in fields(ResidualTable) if f.name != "reasons"]
@@ -126,7 +130,7 @@ def residual_table(solution: Solution) -> ResidualTable:
     )
 
 
-def _pair_table(problem: Problem, before: Floats, after: Floats) -> ResidualTable:
+def _pair_table(problem: Problem, before: Floats, after: Floats, excess: Floats) -> ResidualTable:
     pairs, judgement = problem.pairs, problem.judgement
     assert pairs is not None
     assert judgement is not None
@@ -151,6 +155,7 @@ def _pair_table(problem: Problem, before: Floats, after: Floats) -> ResidualTabl
         measured=measured[there],
         before=before[there],
         after=after[there],
+        excess=excess[:, kinds][there],
         sigma=problem.sigma[:, kinds][there],
     )
 
@@ -179,6 +184,7 @@ def _point_tables(problem: Problem, before: Floats, after: Floats) -> list[Resid
         measured=np.full(n_rows, np.nan),
         before=off[0],
         after=off[1],
+        excess=np.zeros(n_rows),
         sigma=problem.sigma_point[rows].ravel(),
     )
     miss = [np.linalg.norm(mean[between.b] - mean[between.a], axis=1) - between.distance for mean in means]
@@ -194,6 +200,7 @@ def _point_tables(problem: Problem, before: Floats, after: Floats) -> list[Resid
         measured=between.distance,
         before=miss[0],
         after=miss[1],
+        excess=np.zeros(between.n_pairs),
         sigma=between.sigma_distance,
     )
     return [touches, distances]
@@ -217,5 +224,6 @@ def _pose_table(problem: Problem, before: Floats, after: Floats) -> ResidualTabl
         measured=measured[:, wanted].ravel(),
         before=before.ravel(),
         after=after.ravel(),
+        excess=np.zeros(n * each),
         sigma=problem.sigma[:, wanted].ravel(),
     )

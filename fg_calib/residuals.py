@@ -13,8 +13,8 @@ Derivatives, with (w, v) the twist of a parameter at a configuration (see `kinem
 
     distance:        dl = u . (dp_B - dp_A)            Jia et al. (2019), Eq. (5); dp = w x p + v
     rotation angle:  dphi = k . (w_B - w_A)            the same, Eq. (21); k the unit axis of R_B R_A^T
-    same point:      dp_B - dp_A, but 0 for what moves both points as one body: the residual may be turned by
-                     any rotation without changing its norm, so by one that undoes such a motion
+    same point:      dp_B - dp_A - a x (p_B - p_A): all vectors may be turned by a rotation a of each column without
+                     changing their lengths, so by one that undoes motions of the base (`kinematics.turning_of_base`)
     orientation:     dr = Jr^-1(r) R_predicted^T w     Jr the right Jacobian of SO(3), Sola et al. (2018), Eq. (144)
 
 In the kernel of pairs `u . (w x p) = w . (p x u)`, so that p x u is computed once a pair, and the axis in the base
@@ -40,7 +40,7 @@ References:
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from typing import Any, Protocol
 
@@ -50,8 +50,8 @@ import scipy.sparse
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
-from fg_calib.kernels import LANES, fill_pairs, fill_poses, fill_same_points
-from fg_calib.kinematics import SPAN, Chain, over_spans
+from fg_calib.kernels import LANES, fill_pairs, fill_poses, fill_same_points, walk_all
+from fg_calib.kinematics import SPAN, Chain, over_spans, turning_of_base
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -94,6 +94,8 @@ class PairBlock:
         whitening: Lower triangle (w_dd, w_ad, w_aa) of a 2x2 matrix that whitens (distance, angle), shape (n, 3);
             zero for a row that is not measured.
         kinds: Whether distance and angle are wanted at all.
+        bent: 1 sigma of what distance and angle have of their poses' errors beyond the first order, shape (n, 2), for
+            those who look at shared errors; it is in the whitening.
     """
 
     trig: Floats
@@ -102,6 +104,7 @@ class PairBlock:
     measured: Floats
     whitening: Floats
     kinds: tuple[bool, bool] = (True, True)
+    bent: Floats = field(default_factory=lambda: np.zeros((0, 2)))
 
     n_configurations = 2
 
@@ -148,7 +151,13 @@ class SamePointBlock:
 
     def fill(self, arguments: tuple[Any, ...], turns: NDArray[np.bool_], start: int, stop: int, panel: Floats) -> None:
         """Fill the panel with pairs start to stop."""
-        fill_same_points(*arguments, turns, self.trig, self.a, self.b, self.whitening, start, stop, panel)
+        ends = np.concatenate([self.a[start:stop], self.b[start:stop]])
+        rotation, position = np.empty((len(ends), 3, 3)), np.empty((len(ends), 3))
+        *chain, n_columns, _ = arguments
+        jacobian = np.empty((len(ends), 6, n_columns))
+        walk_all(*chain, n_columns, 0, self.trig, ends, 0, len(ends), rotation, position, jacobian)
+        turning = turning_of_base(jacobian[:, :3], rotation)
+        fill_same_points(*arguments, turns, self.trig, self.a, self.b, self.whitening, turning, start, stop, panel)
 
 
 @dataclass(frozen=True)
@@ -211,6 +220,7 @@ class CorrelatedBlock:
         gain: G of the module, shape (n_shared, n_shared), where there are more rows than shared errors; else None.
         dense: Else the inverse Cholesky factor of 1 + L L^T, shape (n, n); None if nothing is shared.
         offsets: Taken from each part's rows before anything else, shape (n * height,); none at all if zero.
+        spare: Share of each part's rows' own noise that is there for numerical safety alone, shape (n * height,).
     """
 
     parts: tuple[Block, ...]
@@ -218,6 +228,7 @@ class CorrelatedBlock:
     gain: Floats | None = None
     dense: Floats | None = None
     offsets: tuple[Floats, ...] = ()
+    spare: tuple[Floats, ...] = ()
 
     height = 1
 
@@ -227,15 +238,19 @@ class CorrelatedBlock:
         return sum(part.n * part.height for part in self.parts)
 
     @property
-    def n_shared_rows(self) -> float:
-        """How many of the rows' degrees of freedom are noise that they share: trace of L L^T (1 + L L^T)^-1."""
-        if self.dense is not None:
-            return self.n - float(np.vdot(self.dense, self.dense))
-        if self.gain is None:
+    def n_spare(self) -> float:
+        """How many degrees of freedom the rows have by `spare` alone: its trace over the rows' covariance."""
+        if not self.spare:
             return 0.0
+        spare = np.concatenate(self.spare)
+        if self.dense is not None:
+            return float(spare @ np.sum(self.dense**2, axis=0))
+        if self.gain is None:
+            return float(spare.sum())
         R = scipy.linalg.cholesky(_information(self.loadings))
         inverse = scipy.linalg.solve_triangular(R, np.eye(len(R)))
-        return len(R) - float(np.vdot(inverse, inverse))
+        explained = np.sum((self._loading @ inverse) ** 2, axis=1)
+        return float(spare @ (1.0 - explained))
 
     def whiten(self, rows: Floats) -> Floats:
         """All rows of the parts, shape (n, m), with their correlation taken out."""
@@ -294,7 +309,10 @@ class CorrelatedBlock:
 
 
 def correlate(
-    parts: tuple[Block, ...], loadings: tuple[scipy.sparse.csr_array, ...], offsets: tuple[Floats, ...] = ()
+    parts: tuple[Block, ...],
+    loadings: tuple[scipy.sparse.csr_array, ...],
+    offsets: tuple[Floats, ...] = (),
+    spare: tuple[Floats, ...] = (),
 ) -> CorrelatedBlock:
     """Blocks with the errors they share (see `CorrelatedBlock`)."""
     n_rows, n_shared = sum(L.shape[0] for L in loadings), loadings[0].shape[1]
@@ -302,11 +320,11 @@ def correlate(
         L = scipy.sparse.vstack(loadings, format="csr")
         factor = scipy.linalg.cholesky(np.eye(n_rows) + (L @ L.T).toarray(), lower=True)
         dense: Floats = scipy.linalg.solve_triangular(factor, np.eye(n_rows), lower=True)
-        return CorrelatedBlock(parts, loadings, dense=dense, offsets=offsets)
+        return CorrelatedBlock(parts, loadings, dense=dense, offsets=offsets, spare=spare)
     R = scipy.linalg.cholesky(_information(loadings))
     half = scipy.linalg.solve_triangular(np.eye(len(R)) + R, np.eye(len(R)))
     gain: Floats = scipy.linalg.solve_triangular(R, half.T).T
-    return CorrelatedBlock(parts, loadings, gain, offsets=offsets)
+    return CorrelatedBlock(parts, loadings, gain, offsets=offsets, spare=spare)
 
 
 def _information(loadings: tuple[scipy.sparse.csr_array, ...]) -> Floats:

@@ -327,7 +327,8 @@ def _write_residuals(path: Path, solution: Solution, uncertainty: Uncertainty) -
 
     def columns(rows: slice) -> dict[str, Any]:
         kind = table.kind_code[rows]
-        measured, after, sigma = table.measured[rows], table.after[rows], table.sigma[rows]
+        excess, after, sigma = table.excess[rows], table.after[rows], table.sigma[rows]
+        measured = table.measured[rows] - excess  # so that predicted minus measured is 0 on average
         return {
             "kind": Words(ROW_KINDS, kind),
             "a": Words(ids, table.a[rows] + 1),
@@ -346,6 +347,7 @@ def _write_residuals(path: Path, solution: Solution, uncertainty: Uncertainty) -
             "studentised": fit.studentised[rows],
             "weight": fit.weight[rows],
             "flag": Words(FLAGS, fit.flag[rows]),
+            "noise_adds": excess,
         }
 
     starts = range(0, max(table.n, 1), _ROWS_AT_ONCE)

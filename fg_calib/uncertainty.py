@@ -22,7 +22,6 @@ from fg_calib.residuals import single_threaded_blas
 from fg_calib.robot import Robot
 from fg_calib.robust import effect
 from fg_calib.solver import Solution
-from fg_calib.whitening import KINK_SIGMAS
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -338,32 +337,8 @@ def _parameter_estimates(
 
 
 def _cautions(problem: Problem) -> tuple[str, ...]:
-    """Where the linear covariance may claim too much: near the kinks of angles and distances.
-
-    Near 0 an angle is the length of a vector of which the row sees one component. The others, d across, bend it by
-    d^2 / (2 angle); they are unknown to about what all rotation parameters together may be off.
-    """
-    pairs, judgement = problem.pairs, problem.judgement
-    if pairs is None or judgement is None:
-        return ()
-    train, cautions = ~pairs.test, []
-    across = 2.0 * sum(p.scale**2 for p in problem.estimated if p.unit == "rad")
-    used = judgement.angle & train
-    from_kink = np.minimum(pairs.angle[used], np.pi - pairs.angle[used])
-    bent = int(np.sum(across / (2.0 * from_kink) > BENDING * problem.sigma[used, 1]))
-    if bent:
-        cautions.append(
-            f"{bent} of {int(used.sum())} angles are so near 0 or half a turn that what the parameters may be off bends"
-            " them by up to more than two sigma: sigmas of tilts may be 10 % too small"
-        )
-    near = sum(np.sum(mask & train) for reason, mask in judgement.reasons.items() if "near" in reason)
-    rows = problem.n_residuals + int(near)
-    if near > MANY_NEAR_KINKS * rows:
-        cautions.append(
-            f"{near} of {rows} rows lie within {KINK_SIGMAS:g} sigma of 0 or half a turn: the noise is large for these"
-            " motions, and sigmas may be 10 % too small"
-        )
-    return tuple(cautions)
+    """Where the linear covariance may claim too much."""
+    return ()
 
 
 def _findings(solution: Solution, chi2: float, dof: int, bounds: tuple[float, float]) -> tuple[str, ...]:

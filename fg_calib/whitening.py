@@ -5,37 +5,42 @@ formed from poses; and that of the joint readings, through the row's derivatives
 a configuration and are the same in every pair that it takes part in. *Private* noise is a measurement's own. Shared
 noise is either counted as private too (`independent`) or carried as errors that the rows have in common (see
 `residuals.CorrelatedBlock`).
+
+What noise does to a length or an angle is not linear: rows of pairs are `M - measured`, M the mean of what would be
+measured, with its slope and variance (see `moments`). At given parameters that is an ordinary row, scaled and shifted.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
 from fg_calib import residuals
-from fg_calib.kinematics import SPAN, Chain
+from fg_calib.frames import nearest_rotation
+from fg_calib.kinematics import SPAN, Chain, forward
 from fg_calib.measurements import Measurements, Pairs, rotation_angle
+from fg_calib.moments import Moments, angle_moments, length_moments
 from fg_calib.residuals import AnyBlock, Block, CorrelatedBlock, PairBlock, PoseBlock, SamePointBlock, correlate
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
 Integers = NDArray[np.int64]
 
-KINK_SIGMAS = 5.0
-"""An angle nearer to 0 or pi, or a distance nearer to 0, than this many sigma gives no row of its own."""
-
-SAME_POINT_SIGMAS = 3.0
-"""A small distance that was measured as 0 within this many sigma says that both points are the same."""
+LEAST_SLOPE = 1e-3
+"""Slope of a mean, near a kink, that is taken for this at least: such a row says next to nothing."""
 
 MAX_SHARED = 3000
 """Rows, or errors that they share if these are fewer, beyond which the exact treatment takes too much time."""
 
 PRIVATE_SHARE = 1e-3
-"""Share of a formed pair's variance that counts as its own: what it is not to first order, and rounding."""
+"""Share of a pair's variance that counts as its own at least: shared errors are not all there is."""
+
+LEAST_BEND = 0.01
+"""What the parameters may be off bends a row by less than this many sigma: not worth looking at."""
 
 LEAST_WEIGHT = 1e-12
 """A robust weight below this is taken for this."""
@@ -63,11 +68,14 @@ class Adjustment:
         factors: What the stated sigmas are multiplied by: of distances and angles, or of orientations and positions.
         joint_errors: True joint values less their readings, where encoder noise is estimated, shape
             (n_configurations, n_joints), [rad] (prismatic: [m]); None for 0.
+        spread: A square root S of the parameters' covariance S S^T in the chain's columns, shape (n_columns, k), where
+            what they may be off bends a row; None for 0.
     """
 
     weights: Floats | None = None
     factors: tuple[float, float] = (1.0, 1.0)
     joint_errors: Floats | None = None
+    spread: Floats | None = None
 
 
 @dataclass(frozen=True)
@@ -128,9 +136,11 @@ class PairWhitening:
         kinds: Whether distances and angles are wanted at all.
         formed: Whether the pairs were formed from measured poses.
         adjustment: What has been learned of their noise.
+        joints_estimated: Whether true joint values are estimated, so that their errors bend no mean.
 
     Attributes:
         judgement: What each pair contributes.
+        moments: Mean and variance of each distance and angle under the noise of its vector, shapes (n_pairs, 2).
     """
 
     def __init__(
@@ -142,29 +152,48 @@ class PairWhitening:
         kinds: tuple[bool, bool],
         formed: bool,
         adjustment: Adjustment,
+        joints_estimated: bool = False,
     ) -> None:
         self._trig = trig
         self._chain = chain.without_columns()
+        self._columns = chain
         self._measurements = measurements
         self._pairs = pairs
         self._kinds = kinds
         self._formed = formed
         self._adjustment = adjustment
+        self._joints_estimated = joints_estimated
         self._joints = np.flatnonzero(measurements.sigma_joint > 0.0)
-        self._whole = pair_block(trig, pairs, kinds)
-        self._own = np.zeros((pairs.n_pairs, 3))  # of the measurement
-        self._own[:, 0] = np.nan_to_num(pairs.sigma_distance) ** 2
-        self._own[:, 2] = np.nan_to_num(pairs.sigma_angle) ** 2
-        self._of_joints = self._joint_covariance()
-        self._stated = self._own + self._of_joints
+        factors = np.array(adjustment.factors)
+        self._poses = forward(self._chain, trig)
+        # Of the measurement alone, along distance and angle, shape (n_pairs, 2), as it is thought to be.
+        stated = self._formed_variance() if formed else np.stack([pairs.sigma_distance, pairs.sigma_angle], axis=1) ** 2
+        self._own = np.nan_to_num(stated) * factors**2
+        self._of_joints = self._joint_covariance() * factors[[0, 0, 1]] * factors[[0, 1, 1]]
+        self.moments = self._moments(factors)
+        slope = self.moments.slope
+        self._stated = np.zeros((pairs.n_pairs, 3))  # (distance, both, angle)
+        self._stated[:, [0, 2]] = self.moments.variance
+        self._linear = self._of_joints * np.stack(
+            [slope[:, 0] ** 2, slope[:, 0] * slope[:, 1], slope[:, 1] ** 2], axis=1
+        )
+        self._stated += self._linear if joints_estimated else self._linear * [0.0, 1.0, 0.0]
+        # 1 sigma of what a pair formed from poses has of their errors beyond the first order, shape (n_pairs, 2).
+        linear = slope**2 * self._own + (0.0 if joints_estimated else self._linear[:, [0, 2]])
+        self._bent = np.sqrt(np.maximum(self.moments.variance - linear, 0.0))
         same = np.all(measurements.readings[pairs.a] == measurements.readings[pairs.b], axis=1)
         self.judgement = self._judge(same)
 
     @property
     def sigma(self) -> Floats:
         """1 sigma of distance and angle, all noise together, shape (n_pairs, 2), [m], [rad]."""
-        sigma: Floats = np.sqrt(self._stated[:, [0, 2]]) * self._adjustment.factors
+        sigma: Floats = np.sqrt(self._stated[:, [0, 2]])
         return sigma
+
+    def rows(self) -> PairBlock:
+        """All pairs, not whitened: mean minus measured, in [m] and [rad]."""
+        unit = np.broadcast_to([1.0, 0.0, 1.0], (self._pairs.n_pairs, 3))
+        return self._block(np.arange(self._pairs.n_pairs), unit)
 
     def lengths(self) -> tuple[Floats, Integers]:
         """Length of each pair's residual whitened by all its noise, and its number of rows, shapes (n_pairs,).
@@ -173,17 +202,14 @@ class PairWhitening:
         """
         n = self._pairs.n_pairs
         squared, height = np.zeros(n), np.zeros(n, dtype=np.int64)
-        of_distance, of_angle = self._adjustment.factors
         rows = np.flatnonzero(self.judgement.distance | self.judgement.angle)
         W = _whiten_2x2(self._stated[rows], self.judgement.distance[rows], self.judgement.angle[rows])
-        part = pair_block(self._trig, self._pairs.select(rows), self._kinds)
-        part = replace(part, whitening=W / [of_distance, of_distance, of_angle])
-        squared[rows] = np.sum(residuals.residual(part, self._chain) ** 2, axis=1)
+        squared[rows] = np.sum(residuals.residual(self._block(rows, W), self._chain) ** 2, axis=1)
         height[rows] = self.judgement.distance[rows].astype(np.int64) + self.judgement.angle[rows]
         rows = np.flatnonzero(self.judgement.same_point)
         if len(rows):
             same = self._same_points(rows, Sharing(), joint_noise=True, weighted=False)
-            squared[rows] = np.sum(residuals.residual(self._scaled(same), self._chain) ** 2, axis=1)
+            squared[rows] = np.sum(residuals.residual(same, self._chain) ** 2, axis=1)
             height[rows] = 3
         return np.sqrt(squared), height
 
@@ -204,14 +230,14 @@ class PairWhitening:
         """
         parts = self._parts(sharing, joint_noise)
         width = self._width(sharing)
-        scaled = tuple(self._scaled(part) for part in parts)
         if not width or not parts:
-            return list(scaled)
+            return list(parts)
         loadings = [self.loadings(part, sharing) for part in parts]
         used = np.unique(np.concatenate([L.indices // width for L in loadings]))
         columns = (used[:, None] * width + np.arange(width)).ravel()
-        offsets = tuple(map(self._offset, scaled)) if self._adjustment.joint_errors is not None else ()
-        return [correlate(scaled, tuple(L[:, columns] for L in loadings), offsets)]
+        offsets = tuple(map(self._offset, parts)) if self._adjustment.joint_errors is not None else ()
+        spare = tuple(map(_spare, parts)) if sharing.poses and self._formed else ()
+        return [correlate(tuple(parts), tuple(L[:, columns] for L in loadings), offsets, spare)]
 
     def correlation(self, chain: Chain, sharing: Sharing) -> Floats:
         """What correlation adds where rows are weighted as independent: J^T (C - 1) J, shape (n_columns, n_columns).
@@ -225,9 +251,8 @@ class PairWhitening:
         n = self._measurements.n_configurations * self._width(sharing)
         common, own = np.zeros((n, chain.n_columns)), np.zeros((chain.n_columns, chain.n_columns))
         for part in self._parts(Sharing(), joint_noise=True):
-            scaled = self._scaled(part)
             for rows, G in self._shared_rows(part, sharing):
-                J = residuals.linearise(residuals.rows_of(scaled, rows), chain)[1]  # (n, height, n_columns)
+                J = residuals.linearise(residuals.rows_of(part, rows), chain)[1]  # (n, height, n_columns)
                 each = np.einsum("nhew,nhp->newp", G, J)
                 own += np.einsum("newp,newq->pq", each, each)
                 L = self._sparse(residuals.rows_of(part, rows), G)
@@ -235,13 +260,12 @@ class PairWhitening:
         return common.T @ common - own
 
     def _parts(self, sharing: Sharing, joint_noise: bool) -> list[Block]:
-        """The train rows, whitened by their private noise as stated."""
+        """The train rows, whitened by their private noise."""
         parts: list[Block] = []
         train = ~self._pairs.test
         pair_rows = np.flatnonzero((self.judgement.distance | self.judgement.angle) & train)
         if len(pair_rows):
-            part = pair_block(self._trig, self._pairs.select(pair_rows), self._kinds)
-            parts.append(replace(part, whitening=self._private_whitening(pair_rows, sharing, joint_noise)))
+            parts.append(self._block(pair_rows, self._private_whitening(pair_rows, sharing, joint_noise)))
         same_rows = np.flatnonzero(self.judgement.same_point & train)
         if len(same_rows):
             parts.append(self._same_points(same_rows, sharing, joint_noise))
@@ -251,7 +275,7 @@ class PairWhitening:
         """How a block's whitened rows follow from shared errors, sparse, shape (n * height, n_configurations * width).
 
         A configuration's errors: those of its measured position and orientation, then those of its readings, each of
-        1 sigma as stated.
+        1 sigma.
         """
         G = [chunk for _, chunk in self._shared_rows(part, sharing)]
         return self._sparse(part, np.concatenate(G))
@@ -282,12 +306,115 @@ class PairWhitening:
 
     def _width(self, sharing: Sharing) -> int:
         """Shared errors of one configuration."""
-        return 3 * sum(self._kinds) * (sharing.poses and self._formed) + len(self._joints) * sharing.joints
+        return 4 * sum(self._kinds) * (sharing.poses and self._formed) + len(self._joints) * sharing.joints
+
+    def _block(self, rows: Integers, whitening: Floats) -> PairBlock:
+        """Pairs at `rows`, mean minus measured, whitened by (w_dd, w_ad, w_aa), shape (n, 3).
+
+        Near the parameters where the moments were taken the mean is M(f0) + slope (f - f0): an ordinary row, its
+        measured value shifted and its whitening multiplied by the slope.
+        """
+        part = pair_block(self._trig, self._pairs.select(rows), self._kinds)
+        predicted, excess = self._predicted[rows], self.moments.excess[rows]
+        slope = np.maximum(self.moments.slope[rows], LEAST_SLOPE)
+        measured = part.measured + (predicted - part.measured) * (1.0 - 1.0 / slope) - excess / slope
+        whitening = np.ascontiguousarray(whitening * slope[:, [0, 0, 1]])
+        return replace(part, measured=measured, whitening=whitening, bent=self._bent[rows] / slope)
+
+    def _moments(self, factors: Floats) -> Moments:
+        """Mean and variance of each distance and angle, shapes (n_pairs, 2); of no meaning where not wanted."""
+        pairs, m = self._pairs, self._measurements
+        whole = pair_block(self._trig, pairs, self._kinds)
+        self._predicted = np.zeros((pairs.n_pairs, 2))
+        self._predicted[:, self._kinds] = residuals.residual(whole, self._chain) + whole.measured[:, self._kinds]
+        along, trace = np.zeros((2, pairs.n_pairs, 2))
+        own = self._own
+        if self._formed:
+            along, own = self._own, np.zeros_like(self._own)
+            trace = np.stack([_trace(m.sigma_position, pairs), _trace(m.sigma_orientation, pairs)], axis=1) * factors**2
+        if len(self._joints) and not self._joints_estimated:
+            along = along + self._of_joints[:, [0, 2]]
+            trace = trace + self._joint_trace() * factors**2
+        across = np.maximum(trace - along, 0.0) / 2.0 + self._bending()
+        f = self._predicted
+        found = [
+            of(f[:, k], along[:, k], across[:, k], own[:, k]) for k, of in enumerate((length_moments, angle_moments))
+        ]
+        return Moments(*(np.stack(pair, axis=1) for pair in zip(*map(astuple, found), strict=True)))
+
+    def _formed_variance(self) -> Floats:
+        """Variance of distances and angles between measured poses, shape (n_pairs, 2); nan where not measured."""
+        m, pairs, both = self._measurements, self._pairs, np.full((self._pairs.n_pairs, 2), np.nan)
+        directions = self._directions(pairs.a, pairs.b)
+        for k, sigma in enumerate((m.sigma_position, m.sigma_orientation)):
+            if sigma is not None:
+                both[:, k] = np.sum(directions[k] ** 2 * (sigma[pairs.a] ** 2 + sigma[pairs.b] ** 2), axis=1)
+        return both
+
+    def _directions(self, a: Integers, b: Integers) -> tuple[Floats, Floats]:
+        """Unit vectors from a to b in the measurement frame, and axes of the rotation from a to b in a, shapes (n, 3).
+
+        As predicted: those of measured poses would depend on the very errors that they are to tell the effect of.
+        """
+        p, R = self._poses.position, self._poses.rotation
+        along = _unit(p[b] - p[a]) @ self._base_in_world().T
+        return along, _unit(rotation_angle(np.swapaxes(R[a], 1, 2) @ R[b])[1])
+
+    def _base_in_world(self) -> Floats:
+        """The rotation that brings the predicted points nearest to the measured ones, shape (3, 3)."""
+        m = self._measurements
+        if m.position is None or m.test.all():
+            return np.eye(3)
+        measured, p = m.position[~m.test], self._poses.position[~m.test]
+        return nearest_rotation((measured - measured.mean(axis=0)).T @ (p - p.mean(axis=0)))
+
+    def _bending(self) -> Floats:
+        """Variance in each direction across that the parameters' own gives each vector, shape (n_pairs, 2).
+
+        Along the vector it is what is estimated; across it lengthens the vector as noise does, and bends the row. Zero
+        where it could not matter, by the largest of some pairs evenly chosen.
+        """
+        across, train = np.zeros((self._pairs.n_pairs, 2)), np.flatnonzero(~self._pairs.test)
+        spread = self._adjustment.spread
+        if spread is None or not len(train):
+            return across
+        some = train[np.unique(np.linspace(0, len(train) - 1, 500).astype(np.int64))]
+        largest = 4.0 * self._spread_across(some, spread).max(axis=0)
+        with np.errstate(divide="ignore"):
+            bend = largest / self._predicted / np.sqrt(self._own)  # in sigma
+        rows = np.flatnonzero(np.any(bend[:, self._kinds] > LEAST_BEND, axis=1))
+        for start in range(0, len(rows), SPAN):
+            chunk = rows[start : start + SPAN]
+            across[chunk] = self._spread_across(chunk, spread)
+        return across
+
+    def _spread_across(self, rows: Integers, spread: Floats) -> Floats:
+        """What `_bending` is about at `rows`, shape (n, 2)."""
+        a, b = self._pairs.a[rows], self._pairs.b[rows]
+        at = [forward(self._columns, self._trig, end) for end in (a, b)]
+        turn, shift = np.split((at[1].jacobian - at[0].jacobian) @ spread, 2, axis=1)  # (n, 3, k)
+        along = _unit(at[1].position - at[0].position)
+        axis = np.einsum("nij,nj->ni", at[0].rotation, self._directions(a, b)[1])
+        of_each = [
+            np.sum(D**2, axis=(1, 2)) - np.sum(np.einsum("nc,nck->nk", u, D) ** 2, axis=1)
+            for u, D in ((along, shift), (axis, turn))
+        ]
+        across: Floats = np.maximum(np.stack(of_each, axis=1), 0.0) / 2.0
+        return across
+
+    def _joint_trace(self) -> Floats:
+        """Variance that joint noise gives each vector, all directions together, shape (n_pairs, 2)."""
+        J = forward(self._chain.with_joint_columns(), self._trig).jacobian  # (n_configurations, 6, n_joints)
+        J = J * self._measurements.sigma_joint
+        of_each = np.stack([np.sum(J[:, 3:] ** 2, axis=(1, 2)), np.sum(J[:, :3] ** 2, axis=(1, 2))], axis=1)
+        both: Floats = of_each[self._pairs.a] + of_each[self._pairs.b]
+        return both
 
     def _joint_covariance(self) -> Floats:
-        covariance = np.zeros((self._whole.n, 3))
+        """What joint noise does to distance and angle, to first order: (distance, both, angle), shape (n_pairs, 3)."""
+        covariance = np.zeros((self._pairs.n_pairs, 3))
         if len(self._joints):
-            for rows, J in self._joint_rows(self._whole):
+            for rows, J in self._joint_rows(pair_block(self._trig, self._pairs, self._kinds)):
                 wide = np.zeros((len(J), 2, J.shape[2]))
                 wide[:, self._kinds] = J
                 covariance[rows, 0] = np.sum(wide[:, 0] ** 2, axis=1)
@@ -300,64 +427,33 @@ class PairWhitening:
         return joint_rows(part, self._chain, self._measurements.sigma_joint)
 
     def _judge(self, same: Booleans) -> PairJudgement:
-        """Which rows of each pair take part; none where both readings are the same: nothing changes the prediction."""
-        pairs, sigma = self._pairs, self.sigma
-        predicted = np.zeros((pairs.n_pairs, 2))
-        predicted[:, self._kinds] = residuals.residual(self._whole, self._chain) + self._whole.measured[:, self._kinds]
-        measured_distance, measured_angle = np.isfinite(pairs.distance) & ~same, np.isfinite(pairs.angle) & ~same
-        smallest = np.fmin(pairs.distance, predicted[:, 0])
-        small = measured_distance & (smallest < KINK_SIGMAS * sigma[:, 0])
-        same_point = small & (pairs.distance <= SAME_POINT_SIGMAS * sigma[:, 0])
-        margin = KINK_SIGMAS * sigma[:, 1]
-        near_zero = measured_angle & (np.fmin(pairs.angle, predicted[:, 1]) < margin)
-        near_pi = measured_angle & ~near_zero & (np.fmax(pairs.angle, predicted[:, 1]) > np.pi - margin)
+        """Which rows of each pair take part; none where both readings are the same: nothing changes the prediction.
+
+        A directly measured distance of exactly 0 is not a noisy number: it says that both points are one.
+        """
+        measured_distance, measured_angle = (np.isfinite(v) & ~same for v in (self._pairs.distance, self._pairs.angle))
+        same_point = measured_distance & (self._pairs.distance == 0.0) & (not self._formed)
         return PairJudgement(
-            distance=measured_distance & ~small,
-            angle=measured_angle & ~near_zero & ~near_pi,
+            distance=measured_distance & ~same_point,
+            angle=measured_angle,
             same_point=same_point,
-            reasons={
-                "distance_near_zero": small & ~same_point,
-                "angle_near_zero": near_zero,
-                "angle_near_pi": near_pi,
-                "same_configuration": same,
-            },
+            reasons={"same_configuration": same},
         )
 
     def _private_whitening(self, rows: Integers, sharing: Sharing, joint_noise: bool) -> Floats:
         """(w_dd, w_ad, w_aa) that whiten the noise that pairs do not share, shape (n, 3)."""
+        stated = self._stated[rows]
+        private = stated.copy()
+        if sharing.joints or not joint_noise:
+            private -= self._linear[rows]
         if sharing.poses and self._formed:
-            own = np.zeros((len(rows), 3))
-            own[:, [0, 2]] = PRIVATE_SHARE * self._stated[rows][:, [0, 2]] + self._second_order(rows)
-        else:
-            own = self._own[rows].copy()
-        if joint_noise and not sharing.joints:
-            own += self._of_joints[rows]
+            private[:, [0, 2]] -= self.moments.slope[rows] ** 2 * self._own[rows] + 0.5 * self._bent[rows] ** 2
+        private[:, [0, 2]] = np.maximum(private[:, [0, 2]], PRIVATE_SHARE * stated[:, [0, 2]])
         if self._adjustment.weights is not None:
             # A down-weighted pair has noise of its own on top, so much that it says no more than its weight.
             weight = np.maximum(self._adjustment.weights[rows], LEAST_WEIGHT)
-            own += (1.0 / weight - 1.0)[:, None] * self._stated[rows]
-        return _whiten_2x2(own, self.judgement.distance[rows], self.judgement.angle[rows])
-
-    def _scaled(self, part: Block) -> Block:
-        """A block whitened as stated, for the noise as it is thought to be: each row divided by its factor."""
-        of_distance, of_angle = self._adjustment.factors
-        if isinstance(part, PairBlock):
-            return replace(part, whitening=part.whitening / [of_distance, of_distance, of_angle])
-        assert isinstance(part, SamePointBlock)
-        return replace(part, whitening=part.whitening / of_distance)
-
-    def _second_order(self, rows: Integers) -> Floats:
-        """Variance of what a formed pair has of its poses' errors to second order, shape (n, 2).
-
-        Errors across the line make a distance d longer by e^2 / (2 d), across the axis an angle phi by
-        e^2 cot(phi / 2) / 4, with e^2 / sigma^2 of 2 degrees of freedom.
-        """
-        pairs, (variance_d, _, variance_a) = self._pairs, self._stated[rows].T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            of_distance = variance_d**2 / pairs.distance[rows] ** 2
-            of_angle = variance_a**2 / (4.0 * np.tan(pairs.angle[rows] / 2.0) ** 2)
-        both: Floats = np.nan_to_num(np.stack([of_distance, of_angle], axis=1), posinf=0.0)
-        return both
+            private += (1.0 / weight - 1.0)[:, None] * stated
+        return _whiten_2x2(private, self.judgement.distance[rows], self.judgement.angle[rows])
 
     def _same_points(
         self, rows: Integers, sharing: Sharing, joint_noise: bool, weighted: bool = True
@@ -367,7 +463,7 @@ class PairWhitening:
         of_joints = np.zeros((len(rows), 3, 3))
         if len(self._joints):
             for chunk, J in self._joint_rows(same):
-                of_joints[chunk] = J @ np.swapaxes(J, 1, 2)
+                of_joints[chunk] = J @ np.swapaxes(J, 1, 2) * self._adjustment.factors[0] ** 2
         S = np.eye(3) * self._own[rows, 0][:, None, None]
         private = S + of_joints * (joint_noise and not sharing.joints)
         if weighted and self._adjustment.weights is not None:
@@ -377,36 +473,38 @@ class PairWhitening:
 
     def _shared_rows(self, part: Block, sharing: Sharing) -> Iterator[tuple[slice, Floats]]:
         """Whitened rows per 1 sigma of each shared error, in chunks: (rows, (n, height, 2, width))."""
-        joints = self._joint_rows(part) if sharing.joints and len(self._joints) else None
+        joints = None
+        if sharing.joints and len(self._joints):
+            of_distance, of_angle = self._adjustment.factors
+            factors = [of_distance, of_distance, of_angle] if isinstance(part, PairBlock) else of_distance
+            joints = self._joint_rows(replace(part, whitening=part.whitening * factors))  # type: ignore[attr-defined, type-var]
         for start in range(0, part.n, SPAN):
             rows = slice(start, min(start + SPAN, part.n))
-            chunk = residuals.rows_of(part, rows)
             columns = []
             if sharing.poses and self._formed:
-                columns.append(self._pose_errors(chunk))
+                columns.append(self._pose_errors(residuals.rows_of(part, rows)))
             if joints is not None:
                 J = next(joints)[1]
                 columns.append(J.reshape(*J.shape[:2], 2, -1)[..., self._joints])
             yield rows, np.concatenate(columns, axis=3)
 
     def _pose_errors(self, part: Block) -> Floats:
-        """Whitened rows per 1 sigma of the measured poses they were formed from, shape (n, height, 2, width)."""
-        m = self._measurements
-        if not isinstance(part, PairBlock):  # points that are the same share nothing worth the trouble
-            return np.zeros((part.n, part.height, 2, 3 * sum(self._kinds)))
-        G = np.zeros((part.n, 2, 2, 2, 3))  # row, (distance, angle), end, source, axis
+        """Whitened rows per 1 sigma of the measured poses they were formed from, shape (n, height, 2, width).
+
+        Of each kind a pose has three errors, along the axes, and a fourth, the square of its errors across: the latter
+        lengthen all pairs of the pose. Of what the squares at both ends add to the variance of a pair half is theirs,
+        a quarter at either end, and half that of their product, the pair's own.
+        """
+        assert isinstance(part, PairBlock)
+        m, factors = self._measurements, self._adjustment.factors
+        G = np.zeros((part.n, 2, 2, 2, 4))  # row, (distance, angle), end, source, (axes, square)
         ends = np.stack([part.a, part.b], axis=1)  # (n, 2)
         sign = np.array([1.0, -1.0])[:, None]  # of predicted minus measured in the error at a, at b
-        if self._kinds[0]:
-            assert m.position is not None
-            assert m.sigma_position is not None
-            u = _unit(m.position[part.b] - m.position[part.a])
-            G[:, 0, :, 0] = sign * u[:, None] * m.sigma_position[ends]
-        if self._kinds[1]:
-            assert m.rotation is not None
-            assert m.sigma_orientation is not None
-            k = _unit(rotation_angle(np.swapaxes(m.rotation[part.a], 1, 2) @ m.rotation[part.b])[1])
-            G[:, 1, :, 1] = sign * k[:, None] * m.sigma_orientation[ends]
+        directions = self._directions(part.a, part.b)
+        for k, sigma in enumerate((m.sigma_position, m.sigma_orientation)):
+            if sigma is not None:
+                G[:, k, :, k, :3] = factors[k] * sign * directions[k][:, None] * sigma[ends]
+                G[:, k, :, k, 3] = -0.5 * part.bent[:, k, None]
         wanted = G[:, :, :, self._kinds].reshape(part.n, 2, 2, -1)
         return _whiten_rows(part.whitening, wanted)[:, self._kinds]
 
@@ -523,10 +621,27 @@ class PoseWhitening:
         return W
 
 
+def _trace(sigma: Floats | None, pairs: Pairs) -> Floats:
+    """Variance of a difference between two configurations, all directions together, shape (n_pairs,)."""
+    if sigma is None:
+        return np.zeros(pairs.n_pairs)
+    of_each = np.sum(sigma**2, axis=1)
+    both: Floats = of_each[pairs.a] + of_each[pairs.b]
+    return both
+
+
 def _unit(vectors: Floats) -> Floats:
     """Vectors of length 1 along others (zero for zero), shape (n, 3)."""
     out: Floats = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
     return out
+
+
+def _spare(part: Block) -> Floats:
+    """Share of the own noise of pairs formed from poses that is beyond what they have, shape (n * height,)."""
+    assert isinstance(part, PairBlock)
+    whitening = part.whitening[:, [0, 2]]
+    share: Floats = np.where(whitening > 0.0, np.maximum(0.0, 1.0 - 0.5 * (part.bent * whitening) ** 2), 0.0)
+    return share[:, list(part.kinds)].ravel()
 
 
 def _whiten_rows(whitening: Floats, rows: Floats) -> Floats:

@@ -535,9 +535,12 @@ def several(*edits):
 
 
 UNSOLVABLE = {
-    "only angles near 0": (
-        pairs("a,b,angle\np0,p1,1e-6\np0,p2,0\n", model="rotation"),
-        "pairs.csv: .*2 excluded for angle near",
+    "only pairs of one configuration": (
+        several(
+            table(lambda rows: [*rows[:2], ["p1", *rows[1][1:]], *rows[3:]]),
+            pairs("a,b,angle\np0,p1,1e-6\n", model="rotation"),
+        ),
+        "pairs.csv: .*1 excluded for same configuration",
     ),
     "only test rows": (
         table(lambda rows: [rows[0], *([*row[:-1], "test"] for row in rows[1:])]),
@@ -811,7 +814,7 @@ def test_measured_pairs_are_fitted(fg_calib, measured_pairs, model, header, cell
 def test_residuals_say_how_suspicious_each_row_is(residuals, result):
     """Existing columns keep their places; the new ones follow."""
     old = "kind a b split used excluded unit measured predicted residual_before residual sigma whitened"
-    assert list(residuals[0]) == [*old.split(), "leverage", "studentised", "weight", "flag"]
+    assert list(residuals[0]) == [*old.split(), "leverage", "studentised", "weight", "flag", "noise_adds"]
     for row in residuals:
         assert row["flag"] == ("excluded" if row["excluded"] else "test" if row["split"] == "test" else "")
         sign = 1.0 if row["split"] == "test" else -1.0

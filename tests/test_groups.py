@@ -120,22 +120,21 @@ def test_residuals_are_those_of_4x4_products():
     problem = build(robot, m)
     rng = np.random.default_rng(1)
     variables, parameters = problem.variables, problem.start + 0.01 * rng.normal(size=len(problem.start))
+    fixed = [i for i, p in enumerate(robot.parameters) if not p.estimated]
+    parameters[fixed] = robot.nominal[fixed]
     points = parameters[variables.nuisance_span].reshape(-1, 3)
-    values = robot.nominal.copy()
-    for i, p in enumerate(robot.parameters):
-        if p.estimated:
-            values[i] = parameters[i]
-    there = robot.with_values(values)
+    there = robot.with_values(parameters[variables.robot_span])
     for g in range(4):
         rows = np.flatnonzero(m.groups.index == g)
-        expected = [(tool_pose(there, q)[:3, 3] - points[g]) / SIGMA for q in m.readings[rows]]
+        tools = [tool_pose(there, q) for q in m.readings[rows]]
+        expected = [(T[:3, 3] - points[g]) / SIGMA for T in tools]
         assert problem.terms[g].residual(variables, parameters) == pytest.approx(np.ravel(expected), abs=1e-8 / SIGMA)
     d = np.linalg.norm(points[1] - points[0])
     expected = (d - m.groups.pairs.distance[0]) / 1e-4
     assert problem.terms[4].residual(variables, parameters) == pytest.approx([expected], rel=1e-12)
 
 
-def test_derivatives_are_central_differences_and_rigid_motions_only_turn_the_residual():
+def test_derivatives_are_central_differences_up_to_a_turn_of_the_residuals():
     robot, _, _, m = case()
     problem = build(robot, m)
     variables = problem.variables
@@ -157,15 +156,13 @@ def test_derivatives_are_central_differences_and_rigid_motions_only_turn_the_res
                 term.residual(variables, variables.parameters(variables.moved(values, s))) for s in (step, -step)
             )
             numeric = (up - down) / (2 * h)
-            if column < variables.n_columns and variables.names[column] in RIGID:
-                turned = (numeric - J[:, k]).reshape(-1, 3)
-                assert np.sum(turned * r.reshape(-1, 3), axis=1) == pytest.approx(
-                    np.zeros(len(turned)), abs=1e-3 * size
-                )
-                assert J[:, k].reshape(-1, 3) == pytest.approx(np.tile(J[:3, k], (len(turned), 1)), abs=1e-9 * size)
-            else:
+            if column >= variables.n_columns or not term.on_core:
                 assert J[:, k] == pytest.approx(numeric, abs=1e-6 * size)
-            assert r @ numeric == pytest.approx(r @ J[:, k], abs=1e-6 * size * np.linalg.norm(r))
+            assert r @ J[:, k] == pytest.approx(r @ numeric, abs=1e-6 * size * np.linalg.norm(r))
+            turned, vectors = (v.reshape(-1, 3) for v in (numeric - J[:, k], r)) if term.on_core else ([[0.0] * 3],) * 2
+            M = np.vstack([np.cross(np.eye(3), v).T for v in vectors])  # a x v of each, as columns of a
+            left = np.ravel(turned) - M @ np.linalg.lstsq(M, np.ravel(turned), rcond=None)[0]
+            assert left == pytest.approx(0.0, abs=1e-6 * size)
 
 
 def test_the_graph_holds_a_point_a_group_and_has_the_cost_of_its_rows():
@@ -236,13 +233,14 @@ def test_groups_are_all_their_pairs(gauge):
     assert one.observability.rank == two.observability.rank
     assert one.observability.classes == two.observability.classes
     assert one.names == two.names
-    # Residuals of 0.1 mm at lever arms of 1 m: derivatives differ by 1e-4 of themselves where they are turned.
+    # Residuals of 0.1 mm at lever arms of 1 m: derivatives differ by 1e-4 of themselves where they are turned, which
+    # directions that are weakly determined magnify.
     known = np.array([p.sigma is not None for p in two.parameters])
     assert [p.sigma is not None for p in one.parameters] == list(known)
     a, b = (np.array([p.estimate for p in u.parameters])[known] for u in (one, two))
     sigma = np.array([p.sigma for p in two.parameters])[known]
-    assert np.abs(a - b).max() <= 1e-3 * sigma.max()
-    assert np.array([p.sigma for p in one.parameters])[known] == pytest.approx(sigma, rel=1e-3)
+    assert np.abs(a - b).max() <= 1e-2 * sigma.max()
+    assert np.array([p.sigma for p in one.parameters])[known] == pytest.approx(sigma, rel=1e-2)
 
 
 def test_without_noise_the_information_is_that_of_all_pairs():
