@@ -115,9 +115,9 @@ def _near_length(f: Floats, along: Floats, across: Floats) -> Moments:
     """The same near 0, shape (n,): `across` above 0."""
     t = np.sqrt(across)[:, None]
     s = np.maximum(np.sqrt(along)[:, None], 0.05 * t)  # what errors across add is as good as constant over less
-    end = f[:, None] + FAR * s
-    x = end * (0.5 + 0.5 * _NODES)  # (n, nodes), from 0: the rest is even in x
-    rest = t * np.sqrt(0.5 * np.pi) * special.erfcx(x / (t * np.sqrt(2.0))) * (0.5 * end * _WEIGHTS)
+    first, last = np.maximum(f[:, None] - FAR * s, 0.0), f[:, None] + FAR * s
+    x = first + (last - first) * (0.5 + 0.5 * _NODES)  # (n, nodes), none below 0: the rest is even in x
+    rest = t * np.sqrt(0.5 * np.pi) * special.erfcx(x / (t * np.sqrt(2.0))) * (0.5 * (last - first) * _WEIGHTS)
     right, left = (x - f[:, None]) / s, (x + f[:, None]) / s
     density = [np.exp(-0.5 * z * z) / (s * np.sqrt(2.0 * np.pi)) for z in (right, left)]
     fold = _fold(f, s[:, 0] ** 2)
