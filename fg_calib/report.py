@@ -52,6 +52,8 @@ def build_report(solution: Solution, uncertainty: Uncertainty) -> RenderableType
         *_section("Residuals (RMS)", _residuals(uncertainty)),
         *_section("Parameters", _parameters(uncertainty)),
     ]
+    if any(p.stands_for for p in uncertainty.parameters):
+        parts += _section("What kept parameters were estimated for", _combinations(uncertainty))
     if len(uncertainty.goodness.suspects):
         parts += _section("Suspicious rows", _suspects(solution, uncertainty))
     if uncertainty.goodness.configurations:
@@ -272,6 +274,25 @@ def _parameters(uncertainty: Uncertainty) -> RenderableType:
             p.identifiability,
         )
     return table
+
+
+def _combinations(uncertainty: Uncertainty) -> RenderableType:
+    """The combinations that kept parameters stand for, whose sigmas are those of the estimates."""
+    table = _plain_table(("", "left"), ("sigma", "right"), ("", "left"), ("of the sum", "left"), wrap=True)
+    for p in uncertainty.parameters:
+        if p.stands_for:
+            factor, unit, decimals = _SHOWN[p.unit]
+            sigma = p.sigma_of_combination
+            shown = "unknown" if sigma is None else f"{sigma * factor:.{decimals}f}"
+            table.add_row(p.name, shown, unit, format_combination(p.stands_for))
+    return table
+
+
+def format_combination(factors: Mapping[str, float]) -> str:
+    """`d5 + d3 + d4`, `a7 + 0.5 beta5`: errors of the parameters, each by its factor."""
+    sizes = {name: "" if abs(f) == 1.0 else f"{abs(f):.4g} " for name, f in factors.items()}
+    terms = (f"{'-' if f < 0.0 else '+'} {sizes[name]}{name}" for name, f in factors.items())
+    return " ".join(terms).removeprefix("+ ")
 
 
 def _frame(frame: FrameEstimate) -> RenderableType:
