@@ -1,6 +1,7 @@
 """Gauges that leave parameters out: what is said of the others, of combinations and of predictions is true."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 from simulated import TOOL, measure, paper_robot, small_arm, true_robot
 
+from fg_calib.bounds import cramer_rao
 from fg_calib.covariance import Spread
 from fg_calib.files.robot_yaml import write_robot
 from fg_calib.files.tables import write_csv
@@ -99,6 +101,25 @@ def test_a_kept_parameter_is_as_uncertain_as_what_it_stands_for():
     assert covariance[index("d5"), index("d4")] == pytest.approx(-(4e-3**2), rel=1e-3)
     ones = np.isin(found.names, ["d3", "d4", "d5"])
     assert ones @ covariance @ ones == pytest.approx(d5.sigma_of_combination**2, rel=1e-2)
+
+
+@pytest.mark.parametrize("model", ["pose", "distance-rotation"])
+def test_the_covariance_of_a_kept_arm_is_that_of_its_bound(model):
+    """`cramer_rao` has the same errors from another formula, at the truth; here the truth is nominal."""
+    rng = np.random.default_rng(8)
+    robot = paper_robot(tolerance=HAYATI)
+    measurements = measure(robot, 40, rng, sigma=(1e-9, 1e-9))
+    stated = replace(measurements, sigma_position=np.full((40, 3), 2e-4), sigma_orientation=np.full((40, 3), 1e-4))
+    solution = solve(build_problem(robot, stated, model=model, gauge="keep"))
+    kept = [p.name for p in solution.problem.estimated]
+    bound = cramer_rao(robot, stated, model=model, prior=False, kept=kept)
+    found = assess(solution)
+    assert found.names == bound.names
+    sigma = np.sqrt(np.diag(bound.covariance))
+    # rows near kinks are judged by measured values, which have noise of 1e-9
+    assert found.covariance / np.outer(sigma, sigma) == pytest.approx(
+        bound.covariance / np.outer(sigma, sigma), abs=1e-6
+    )
 
 
 @pytest.mark.parametrize("gauge", ["keep", "none"])
