@@ -138,7 +138,7 @@ def through_the_graph(
     _, s, Vt = np.linalg.svd(A, full_matrices=False)
     ratio = 1.0 / s**2
     held = ratio > 0.5
-    scales = np.array([p.scale for p in robot.parameters if p.estimated])
+    scales = np.array([robot.scale_of(p.unit) for p in robot.parameters if p.estimated])
     null = observe_structure(robot, model, n_configurations=n, seed=seed).observability.null_space * scales
     angle = float(scipy.linalg.subspace_angles(Vt[held].T, null.T).max())
     posterior = np.sqrt(np.sum((Vt.T / s) ** 2, axis=1))

@@ -123,6 +123,8 @@ def test_keys_are_joints_tool_and_frame():
     variables = build_variables(robot, frame=True)
     assert [v.symbol for v in variables.items] == ["K(1)", "K(2)", "K(3)", "K(4)", "T(0)", "X(0)"]
     assert variables.names[:4] == ("a1", "alpha1", "d1", "theta1")
+    both = small_arm(estimate=[*TOOL, *(name.replace("tool", "base") for name in TOOL)])
+    assert [v.symbol for v in build_variables(both, frame=False).items][::5] == ["B(0)", "T(0)"]
     partly = build_variables(small_arm(estimate=["tool.z"]), frame=False)
     assert [v.symbol for v in partly.items] == ["K(1)", "K(2)", "K(3)", "K(4)", "K(5)"]
     assert partly.names[-1] == "tool.z"

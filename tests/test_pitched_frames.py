@@ -21,6 +21,7 @@ from fg_calib.identifiability import observe_structure
 from fg_calib.kinematics import pose
 from fg_calib.measurements import Measurements
 from fg_calib.problem import build_problem
+from fg_calib.report import format_report
 from fg_calib.solver import solve
 from fg_calib.uncertainty import assess
 
@@ -125,6 +126,16 @@ def test_yaw_and_roll_have_no_sigma_at_a_quarter_turn_of_pitch(tmp_path, fg_cali
     assert by_name["tool.roll"]["sigma"] is None
     assert 1e-5 < by_name["tool.pitch"]["sigma"] < 3e-3
     assert all(abs(p["correction"]) < 1e-6 for p in by_name.values())  # the data are exact
+
+
+def test_the_report_says_where_corrections_are_turns():
+    robot = pitched("tool", 90.0)
+    solution = solve(build_problem(robot, measured(robot, "tool", 1.0), model="pose"))
+    note = "tool is pitched near a quarter turn: corrections of its angles are its turn about its own axes"
+    assert note in format_report(solution, assess(solution))
+    upright = pitched("tool", 20.0)
+    solution = solve(build_problem(upright, measured(upright, "tool", 1.0), model="pose"))
+    assert "quarter turn" not in format_report(solution, assess(solution))
 
 
 @pytest.mark.parametrize("frame", ["tool", "base"])
