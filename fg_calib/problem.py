@@ -278,7 +278,7 @@ def build_problem(
         gauge: What holds the directions that the data do not determine. `prior`: the tolerances. `none`: nothing;
             everything is estimated by minimum-norm steps, and what is not determined has no sigma. `keep`: only
             the independent parameters and those kept of each relative group are estimated, without priors, the
-            others stay at nominal (the paper's way).
+            others stay at nominal (the paper's way); what is said of errors counts them with their tolerance.
         prefer: For `keep`: parameters to keep, first choice first.
         pair_errors: `shared`: pairs carry the errors of their configurations in common, as long as these are not too
             many (`MAX_SHARED`); then, and with `independent`, they are weighted as if independent.
