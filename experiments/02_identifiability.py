@@ -127,7 +127,8 @@ def through_the_graph(
     """What GTSAM's linearised graph says with weak priors on everything, and with the kept parameters alone."""
     weak = replace(robot, parameters=tuple(replace(p, tolerance=1.0) for p in robot.parameters))
     predicted = random_problem(robot, model, n_configurations=n, seed=seed)
-    measurements: Measurements = predicted.measurements
+    m: Measurements = predicted.measurements
+    measurements = replace(m, sigma_position=np.full_like(m.sigma_position, 1e-3))
     options: dict[str, Any] = {"model": model, "pairing": predicted.settings.pairing}
     problem = fg_calib.build_problem(weak, measurements, **options)
     ordering = gtsam.Ordering()
@@ -138,13 +139,13 @@ def through_the_graph(
     _, s, Vt = np.linalg.svd(A, full_matrices=False)
     ratio = 1.0 / s**2
     held = ratio > 0.5
-    scales = np.array([p.scale for p in robot.parameters if p.estimated])
+    scales = np.array([robot.scale_of(p.unit) for p in robot.parameters if p.estimated])
     null = observe_structure(robot, model, n_configurations=n, seed=seed).observability.null_space * scales
     angle = float(scipy.linalg.subspace_angles(Vt[held].T, null.T).max())
     posterior = np.sqrt(np.sum((Vt.T / s) ** 2, axis=1))
 
     kept = fg_calib.solve(fg_calib.build_problem(robot, measurements, gauge="keep", **options))
-    ours = fg_calib.assess(kept).covariance
+    ours = fg_calib.assess(kept).spread.tangent
     joint = marginals(kept)
     worst = max(
         float(np.abs(joint.marginalCovariance(v.key) / ours[v.columns, v.columns] - 1.0).max())

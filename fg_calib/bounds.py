@@ -181,7 +181,7 @@ def cramer_rao(
     covariance = gain @ gain.T + of_errors @ of_errors.T
     added = correlation(problem, problem.start) if pair_errors == "independent" else None
     if added is not None:
-        back = np.linalg.pinv(problem.variables.named_derivative(problem.start))
+        back = problem.variables.tangent_derivative(problem.start)
         covariance = covariance + claimed @ (back.T @ added @ back) @ claimed
     return Bound(robot, names, covariance, claimed, rank)
 

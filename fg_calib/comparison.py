@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.errors import CalibrationError, ProblemError
+from fg_calib.factors import corrections_of
 from fg_calib.files.job import Job
 from fg_calib.kinematics import Poses, build_chain, forward, precompute_trig
 from fg_calib.least_squares import LeastSquares, fit_least_squares
@@ -153,11 +154,8 @@ class Comparison:
         return not self.findings
 
     def correction(self, robot: Robot, name: str) -> float:
-        """A robot's parameter minus the job's nominal one, [m] or [rad]; angles of a frame by the shorter way."""
-        i = self.job.robot.index(name)
-        difference = robot.parameters[i].nominal - self.job.robot.parameters[i].nominal
-        turns = "." in name and self.job.robot.parameters[i].unit == "rad"
-        return (difference + np.pi) % (2 * np.pi) - np.pi if turns else difference
+        """A robot's parameter minus the job's nominal one, [m] or [rad] (see `corrections_of`)."""
+        return float(corrections_of(self.job.robot, robot.nominal)[self.job.robot.index(name)])
 
 
 def compare(job: Job) -> Comparison:
@@ -278,15 +276,16 @@ class _Judge:
         self._solution = solution  # its rows are those that residuals are shown of
 
     def of_graph(self, name: str, solution: Solution, uncertainty: Uncertainty) -> Estimate:
-        """The graph's estimate."""
-        variances = []
+        """The graph's estimate; like plain least squares it takes here what was held at nominal for known."""
+        spread, variances = uncertainty.spread, []
         for start in range(0, len(self._readings), _CHUNK):
             readings = self._readings[start : start + _CHUNK]
-            variances.append(uncertainty.predict(partial(_tool_points, readings=readings)).sigma ** 2)
+            rows = spread.derivative(partial(_tool_points, readings=readings))
+            variances.append(np.diag(spread.covariance(rows)))
         return Estimate(
             name=name,
             robot=uncertainty.robot,
-            sigma=dict(zip(uncertainty.names, np.sqrt(np.diag(uncertainty.covariance)).tolist(), strict=True)),
+            sigma=dict(zip(spread.variables.names, np.sqrt(np.diag(spread.named())).tolist(), strict=False)),
             converged=solution.converged,
             message=solution.message,
             iterations=solution.iterations,

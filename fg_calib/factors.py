@@ -3,8 +3,8 @@
 | key | variable |
 |---|---|
 | `K(i)` | estimated parameters of joint i, a vector of just those |
-| `K(0)`, `K(n + 1)` | the same of the base, and of the tool where not all six of its parameters are estimated |
-| `T(0)` | the tool frame as a Pose3, where all six are |
+| `K(0)`, `K(n + 1)` | the same of the base, and of the tool, where not all six of its parameters are estimated |
+| `B(0)`, `T(0)` | the base frame, and the tool frame, as a Pose3 where all six are |
 | `X(0)` | world_T_base as a Pose3, where the measurement frame is unknown |
 | `L(g)` | base_p of the physical point that group g touches, a Point3 |
 | `Q(k)` | the true joint values of configuration k, a vector, where encoder noise is estimated |
@@ -13,6 +13,10 @@ The last two are *nuisance* variables: they must be estimated too, but are nobod
 those of the *core* (robot and measurement frame) and are eliminated before anything is said of the core.
 
 Pose3's tangent is rotation first, and a step moves the frame in itself (`pose * Exp(step)`).
+
+Priors are rows (value - nominal) / tolerance. Of a Pose3 they act on x, y and z as they stand, and on its turn away
+from nominal, `Log(R_nominal^T R)`, whose components about the frame's own x, y and z axes take the tolerances of roll,
+pitch and yaw. The angles themselves would not do: at a pitch of a quarter turn they are no coordinates.
 
 GTSAM 4.3 ends the interpreter when a custom factor leaves a Jacobian unset or gets its rows wrong, and returns the
 initial values without a word when it gets the columns wrong. So `custom_factor` alone fills its lists, after checks.
@@ -50,7 +54,7 @@ class Variable:
     Attributes:
         key: GTSAM's key.
         symbol: How it is written: `K(3)`, `T(0)`, `X(0)`.
-        kind: A vector of parameters, the tool's pose, the measurement frame's, a touched point, or joint values.
+        kind: A vector of parameters, the pose of tool, base or measurement frame, a touched point, or joint values.
         parameters: Indices into the parameter vector of `Variables.parameters`, in the variable's own order;
             for poses in the order of `FRAME_KINDS`.
         columns: Its columns in a Jacobian.
@@ -59,7 +63,7 @@ class Variable:
 
     key: int
     symbol: str
-    kind: Literal["vector", "tool", "frame", "point", "joints"]
+    kind: Literal["vector", "tool", "base", "frame", "point", "joints"]
     parameters: tuple[int, ...]
     columns: slice
     scales: tuple[float, ...] = ()
@@ -67,7 +71,7 @@ class Variable:
     @property
     def is_pose(self) -> bool:
         """Whether it is a Pose3; else it is a vector."""
-        return self.kind in ("tool", "frame")
+        return self.kind in ("tool", "base", "frame")
 
 
 @dataclass(frozen=True)
@@ -136,11 +140,27 @@ class Variables:
 
     @property
     def scales(self) -> Floats:
-        """A change of ordinary size in each column: tolerance, else 1 mm or 1 mrad, shape (n_columns,)."""
-        scales = np.full(self.n_columns, 1e-3)
-        for v in self.items:
-            if v.kind == "vector":
-                scales[v.columns] = [self.robot.parameters[i].scale for i in v.parameters]
+        """A change of ordinary size in each column (see `Robot.scale_of`), shape (n_columns,)."""
+        angle, length = self.robot.scale_of("rad"), self.robot.scale_of("m")
+        scales = np.repeat([angle, length], 3)
+        parts = [
+            scales
+            if v.is_pose
+            else np.array([length if self.robot.parameters[i].unit == "m" else angle for i in v.parameters])
+            for v in self.items
+        ]
+        return np.concatenate([np.zeros(0), *parts])
+
+    @property
+    def prior_scales(self) -> Floats:
+        """`scales`, but where there is a prior its sigma: how far each column may be off, shape (n_columns,)."""
+        scales = self.scales
+        for v in self.items if self.priors else ():
+            if v.kind != "frame":
+                order = [v.parameters[i] for i in _ALONG_TANGENT] if v.is_pose else v.parameters
+                tolerance = [self.robot.parameters[i].tolerance for i in order]
+                stated = np.array([t is not None for t in tolerance])
+                scales[v.columns] = np.where(stated, np.array(tolerance, dtype=np.float64), scales[v.columns])
         return scales
 
     @property
@@ -164,9 +184,24 @@ class Variables:
         """The parameter vector at GTSAM's values; what is not a variable (or not in `only`) keeps its nominal value."""
         parameters = self.nominal()
         for v in self.items + self.nuisance if only is None else only:
-            chosen = frame_of(values.atPose3(v.key)) if v.is_pose else values.atVector(v.key)
-            parameters[list(v.parameters)] = chosen
+            of_v = list(v.parameters)
+            if v.is_pose:
+                near = None if v.kind == "frame" else parameters[of_v]
+                parameters[of_v] = frame_of(values.atPose3(v.key), near)
+            else:
+                parameters[of_v] = values.atVector(v.key)
         return parameters
+
+    def stepped(self, parameters: Floats, step: Floats) -> Floats:
+        """The parameter vector after a tangent step of the core, shape (n_columns,)."""
+        after = parameters.copy()
+        for v in self.items:
+            of_v, part = list(v.parameters), step[v.columns]
+            if not v.is_pose:
+                after[of_v] += part
+            elif part.any():
+                after[of_v] = frame_of(pose_of(parameters[of_v]).retract(part), parameters[of_v])
+        return after
 
     def step(self, start: gtsam.Values, end: gtsam.Values) -> Floats:
         """The tangent step from some values to others, shape (n_columns + n_nuisance,)."""
@@ -217,13 +252,24 @@ class Variables:
         The identity but for poses, where it maps the tangent (rotation first) to x, y, z, yaw, pitch, roll.
 
         Note:
-            At a pitch of a quarter turn roll and yaw have no derivative; the entries are then infinite or nan.
+            At a pitch of a quarter turn roll and yaw have no derivative; their rows are then nan.
         """
         D = np.eye(self.n_columns)
         for v in self.items:
             if v.is_pose:
                 D[v.columns, v.columns] = _frame_derivative(parameters[list(v.parameters)])
         return D
+
+    def tangent_derivative(self, parameters: Floats) -> Floats:
+        """Derivative of the columns in the named scalars: the inverse of `named_derivative`, finite everywhere.
+
+        At a pitch of a quarter turn it is singular: there roll and yaw turn a frame about the same axis.
+        """
+        E = np.eye(self.n_columns)
+        for v in self.items:
+            if v.is_pose:
+                E[v.columns, v.columns] = _tangent_derivative(parameters[list(v.parameters)])
+        return E
 
     def describe(self, key: int) -> str:
         """A key in words: `K(3) (a3, alpha3, d3)`."""
@@ -238,7 +284,7 @@ def build_variables(robot: Robot, frame: bool, priors: bool = True) -> Variables
     items: list[Variable] = []
     names: list[str] = []
     columns: dict[int, int] = {}
-    tool_tangent = frame_tangent = None
+    tool_tangent = base_tangent = frame_tangent = None
     for owner in range(robot.n_joints + 2):
         owned = robot.owned_by(owner)
         chosen = [i for i in owned if robot.parameters[i].estimated]
@@ -250,6 +296,9 @@ def build_variables(robot: Robot, frame: bool, priors: bool = True) -> Variables
         if owner == robot.n_joints + 1 and len(chosen) == 6:
             tool_tangent = first
             items.append(Variable(gtsam.symbol("T", 0), "T(0)", "tool", tuple(chosen), span))
+        elif owner == 0 and len(chosen) == 6:
+            base_tangent = first
+            items.append(Variable(gtsam.symbol("B", 0), "B(0)", "base", tuple(chosen), span))
         else:
             columns |= {i: first + k for k, i in enumerate(chosen)}
             items.append(Variable(gtsam.symbol("K", owner), f"K({owner})", "vector", tuple(chosen), span))
@@ -259,7 +308,8 @@ def build_variables(robot: Robot, frame: bool, priors: bool = True) -> Variables
         parameters = tuple(range(len(robot.parameters), len(robot.parameters) + 6))
         span = slice(frame_tangent, len(names))
         items.append(Variable(gtsam.symbol("X", 0), "X(0)", "frame", parameters, span))
-    chain = build_chain(robot, columns, tool_tangent=tool_tangent, frame_tangent=frame_tangent, frame=frame)
+    tangents = {"tool_tangent": tool_tangent, "base_tangent": base_tangent, "frame_tangent": frame_tangent}
+    chain = build_chain(robot, columns, **tangents, frame=frame)
     return Variables(robot, tuple(items), tuple(names), chain, priors)
 
 
@@ -269,23 +319,79 @@ def pose_of(frame: Floats) -> gtsam.Pose3:
     return gtsam.Pose3(gtsam.Rot3.Ypr(yaw, pitch, roll), np.array([x, y, z]))
 
 
-def frame_of(pose: gtsam.Pose3) -> Floats:
-    """x, y, z, yaw, pitch, roll of a pose, [m] and [rad]."""
-    return np.concatenate([pose.translation(), pose.rotation().ypr()])
+def frame_of(pose: gtsam.Pose3, near: Floats | None = None) -> Floats:
+    """x, y, z, yaw, pitch, roll of a pose, [m] and [rad].
+
+    Args:
+        pose: The pose.
+        near: Of the angles that make the same rotation those nearest to the angles of this frame, in the same order,
+            are taken; those within half a turn and a quarter turn of pitch if None.
+    """
+    R = pose.rotation()
+    yaw, pitch, roll = R.ypr()
+    if near is None:
+        return np.concatenate([pose.translation(), [yaw, pitch, roll]])
+    wanted = np.asarray(near)[3:]
+    if np.cos(pitch) < _QUARTER_TURN:  # only the sum or difference of yaw and roll acts: both go half the way
+        M, sign = R.matrix(), -np.sign(np.sin(pitch))
+        off = np.arctan2(-sign * M[0, 1], M[1, 1]) - (wanted[2] + sign * wanted[0])
+        half = 0.5 * np.remainder(off + np.pi, 2.0 * np.pi) - 0.5 * np.pi
+        return np.concatenate([pose.translation(), [wanted[0] + sign * half, pitch, wanted[2] + half]])
+    same = np.array([[yaw, pitch, roll], [yaw + np.pi, np.pi - pitch, roll + np.pi]])
+    same += 2.0 * np.pi * np.round((wanted - same) / (2.0 * np.pi))
+    return np.concatenate([pose.translation(), same[np.argmin(np.sum((same - wanted) ** 2, axis=1))]])
+
+
+def corrections_of(robot: Robot, values: Floats) -> Floats:
+    """Parameter values minus a robot's nominal ones, shape (n_parameters,), [m] and [rad].
+
+    Angles of a frame (base, tool, origins of a URDF's joints) by the shorter way. Near a pitch of a quarter turn yaw
+    and roll change by much where the frame has turned by little; if they change by more than twice what it has turned,
+    its turn about its own z, y and x axes stands in place of the differences of yaw, pitch and roll.
+    """
+    off = values - robot.nominal
+    for owner in range(robot.n_joints + 2):
+        frame = [i for i in robot.owned_by(owner) if robot.parameters[i].kind in FRAME_KINDS]
+        if len(frame) == 6:
+            angles = frame[3:]
+            off[angles] = np.remainder(off[angles] + np.pi, 2.0 * np.pi) - np.pi
+            R = pose_of(robot.nominal[frame]).rotation()
+            turn = gtsam.Rot3.Logmap(R.between(pose_of(values[frame]).rotation()))
+            if np.abs(off[angles]).max() > 2.0 * np.linalg.norm(turn):
+                off[angles] = turn[::-1]
+    return off
+
+
+_ALONG_TANGENT = (5, 4, 3, 0, 1, 2)
+"""Which of `FRAME_KINDS` goes with each direction of a pose's tangent: roll, pitch, yaw with turns about x, y, z."""
+
+_QUARTER_TURN = 1e-9
+"""Cosine of a pitch that counts as a quarter turn: what is missed by that is rounding."""
 
 
 def _frame_derivative(frame: Floats) -> Floats:
     """Derivative of x, y, z, yaw, pitch, roll in Pose3's tangent (rotation first, in itself), shape (6, 6)."""
     pitch, roll = frame[4], frame[5]
+    secant = 1.0 / np.cos(pitch) if abs(np.cos(pitch)) > _QUARTER_TURN else np.nan
     D = np.zeros((6, 6))
     D[:3, 3:] = pose_of(frame).rotation().matrix()
     # Body rates of Rz(yaw) Ry(pitch) Rx(roll), solved for the angles' rates.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        secant, tangent = np.float64(1.0) / np.cos(pitch), np.tan(pitch)
-        D[3, :3] = [0.0, np.sin(roll) * secant, np.cos(roll) * secant]
-        D[4, :3] = [0.0, np.cos(roll), -np.sin(roll)]
-        D[5, :3] = [1.0, np.sin(roll) * tangent, np.cos(roll) * tangent]
+    D[3, :3] = [0.0, np.sin(roll) * secant, np.cos(roll) * secant]
+    D[4, :3] = [0.0, np.cos(roll), -np.sin(roll)]
+    D[5, :3] = [1.0, np.sin(roll) * np.sin(pitch) * secant, np.cos(roll) * np.sin(pitch) * secant]
     return D
+
+
+def _tangent_derivative(frame: Floats) -> Floats:
+    """Derivative of Pose3's tangent (rotation first, in itself) in x, y, z, yaw, pitch, roll, shape (6, 6)."""
+    pitch, roll = frame[4], frame[5]
+    E = np.zeros((6, 6))
+    E[3:, :3] = pose_of(frame).rotation().matrix().T
+    # Body rates of Rz(yaw) Ry(pitch) Rx(roll).
+    E[0, 3:] = [-np.sin(pitch), 0.0, 1.0]
+    E[1, 3:] = [np.cos(pitch) * np.sin(roll), np.cos(roll), 0.0]
+    E[2, 3:] = [np.cos(pitch) * np.cos(roll), -np.sin(roll), 0.0]
+    return E
 
 
 Residual = Callable[[gtsam.Values], Floats]
@@ -511,29 +617,46 @@ def well_conditioned(R: Floats) -> bool:
 
 
 def prior_rows(variables: Variables, parameters: Floats, only: Variable | None = None) -> tuple[Floats, Floats]:
-    """Whitened priors (value - nominal) / tolerance and their derivatives, shapes (n_priors,), (n_priors, n_columns).
+    """Whitened priors and their derivatives, shapes (n_priors,), (n_priors, n_columns): see the module's head.
 
     Args:
         variables: The variables.
         parameters: The parameter vector.
         only: The variable whose priors are wanted; all if None.
     """
-    D = variables.named_derivative(parameters)
     nominal = variables.nominal()
-    r: list[float] = []
-    J: list[Floats] = []
+    r: list[Floats] = [np.zeros(0)]
+    J: list[Floats] = [np.zeros((0, variables.n_columns))]
     for v in variables.items if only is None else (only,):
         if v.kind == "frame" or not variables.priors:
             continue
-        for k, i in enumerate(v.parameters):
-            parameter = variables.robot.parameters[i]
-            if parameter.tolerance is not None:
-                off = parameters[i] - nominal[i]
-                if v.kind == "tool" and parameter.unit == "rad":
-                    off = (off + np.pi) % (2 * np.pi) - np.pi
-                r.append(off / parameter.tolerance)
-                J.append(D[v.columns.start + k] / parameter.tolerance)
-    return np.array(r), np.array(J).reshape(len(r), variables.n_columns)
+        of_v = list(v.parameters)
+        tolerances = [variables.robot.parameters[i].tolerance for i in of_v]
+        stated = [k for k, t in enumerate(tolerances) if t is not None]
+        if v.is_pose:
+            off, D = _off_nominal(parameters[of_v], nominal[of_v])
+        else:
+            off, D = parameters[of_v] - nominal[of_v], np.eye(len(of_v))
+        weight = np.array([1.0 / t for t in tolerances if t is not None])
+        rows = np.zeros((len(stated), variables.n_columns))
+        rows[:, v.columns] = weight[:, None] * D[stated]
+        r.append(weight * off[stated])
+        J.append(rows)
+    return np.concatenate(r), np.vstack(J)
+
+
+def _off_nominal(frame: Floats, nominal: Floats) -> tuple[Floats, Floats]:
+    """How far a frame is from nominal, shape (6,), and the derivative in Pose3's tangent, shape (6, 6).
+
+    x, y, z less their nominal values, then the turn from nominal about its own z, y and x axes, [m] and [rad]. The
+    derivative of the turn r = Log(R_nominal^T R) is the inverse right Jacobian of SO(3) at r.
+    """
+    R = pose_of(frame).rotation()
+    turn = gtsam.Rot3.Logmap(pose_of(nominal).rotation().between(R))
+    D = np.zeros((6, 6))
+    D[:3, 3:] = R.matrix()
+    D[3:, :3] = gtsam.Rot3.LogmapDerivative(turn)[::-1]
+    return np.concatenate([frame[:3] - nominal[:3], turn[::-1]]), D
 
 
 def prior_factors(variables: Variables) -> list[gtsam.CustomFactor]:
@@ -552,10 +675,7 @@ def _prior_factor(variables: Variables, variable: Variable, n_rows: int) -> gtsa
     )
 
     def rows(values: gtsam.Values) -> tuple[Floats, Floats]:
-        parameters = variables.nominal()
-        chosen = frame_of(values.atPose3(variable.key)) if variable.is_pose else values.atVector(variable.key)
-        parameters[list(variable.parameters)] = chosen
-        r, J = prior_rows(variables, parameters, variable)
+        r, J = prior_rows(variables, variables.parameters(values, [variable]), variable)
         return r, J[:, variable.columns]
 
     return custom_factor([local], n_rows, lambda values: rows(values)[0], rows)

@@ -163,7 +163,7 @@ class PointGroups:
 
     def add_points(self, variables: Variables) -> Variables:
         """The variables with a point a group that has train rows."""
-        return variables.with_nuisance("point", "L", range(len(self.estimated)), (1e-3, 1e-3, 1e-3))
+        return variables.with_nuisance("point", "L", range(len(self.estimated)), 3 * (variables.robot.scale_of("m"),))
 
     def rows_of(self, group: int) -> Integers:
         """Rows that say where a group's point is: the train rows; of a group without any, all."""

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.kinematics import build_chain, forward, precompute_trig
-from fg_calib.robot import Axis, Robot
+from fg_calib.robot import Robot
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -140,7 +140,7 @@ class _Search:
         self._low, self._high = _range_of_starts(robot)
         self._middle = 0.5 * (self._low + self._high)
         self._turning = np.array([not joint.prismatic for joint in robot.joints])
-        self.length = _length_of(robot)
+        self.length = robot.reach
         self._unit = np.where(self._turning, 1.0, self.length)  # of a step, (n_joints,)
         self.good_enough = 0.1 * REACHED / max(1.0, self.length)
 
@@ -196,17 +196,6 @@ def _range_of_starts(robot: Robot) -> tuple[Floats, Floats]:
     low = np.where(np.isfinite(lower), lower, np.where(np.isfinite(upper), upper - 2.0 * span, -span))
     high = np.where(np.isfinite(upper), upper, np.where(np.isfinite(lower), lower + 2.0 * span, span))
     return low, high
-
-
-def _length_of(robot: Robot) -> float:
-    """How long the arm is stretched out, [m]; 1 if it has no length."""
-    nominal = robot.nominal
-    lengths = [
-        abs(element.constant + (0.0 if element.parameter is None else nominal[element.parameter]))
-        for element in robot.elements
-        if element.axis < Axis.RX
-    ]
-    return float(sum(lengths)) or 1.0
 
 
 def _rotation_vector(rotation: Floats) -> Floats:

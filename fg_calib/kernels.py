@@ -70,12 +70,13 @@ def walk(axis, value, cosine, sine, sign, joint, column, n_columns, n_own, trig,
         start: Position in `rows` of the first lane.
         rotation: Filled: rotation matrix, [column, component, lane], shape (3, 3, LANES).
         point: Filled: tool point, shape (3, LANES), [m].
-        twist: Filled: (w, v) of each column, then of each joint, shape (n_columns + n_own, 6, LANES); must come with
-            w = 0 for translations.
+        twist: Filled: (w, v) of each column, then of each joint, shape (n_columns + n_own, 6, LANES): the sum over the
+            elements that it belongs to. Must come with w = 0 for columns of translations alone.
     """
     last = rows.shape[0] - 1
     row = np.empty(LANES, np.int64)
     reading = np.empty(2 * LANES)
+    written = np.zeros(twist.shape[0], np.bool_)
     for i in range(LANES):
         row[i] = rows[min(start + i, last)]
     R, p = rotation.reshape(9 * LANES), point.reshape(3 * LANES)
@@ -90,6 +91,10 @@ def walk(axis, value, cosine, sine, sign, joint, column, n_columns, n_own, trig,
         for target in (column[e], n_columns + j if n_own > 0 and j >= 0 else -1):
             if target < 0:
                 continue
+            if written[target]:
+                _add_twist(sign[e], R, k, p, twist[target])
+                continue
+            written[target] = True
             if k >= 3:
                 _write_rotation_twist(sign[e], R, k - 3, p, twist[target])
             else:
@@ -139,6 +144,17 @@ def _write_translation_twist(sign, R, k, twist):  # type: ignore[no-untyped-def]
     for c in range(3):
         for i in range(LANES):
             twist[3 + c, i] = sign * R[(3 * k + c) * LANES + i]
+
+
+@compiled
+def _add_twist(sign, R, k, p, twist):  # type: ignore[no-untyped-def]
+    """The twist of a further element of a column: it moves with all of them."""
+    more = np.zeros((6, LANES))
+    if k >= 3:
+        _write_rotation_twist(sign, R, k - 3, p, more)
+    else:
+        _write_translation_twist(sign, R, k, more)
+    twist += more
 
 
 @inlined

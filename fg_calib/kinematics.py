@@ -101,8 +101,8 @@ class Chain:
         """For each column, joints included, whether it belongs to a rotation, shape (n_columns + n_joints,)."""
         turns = np.zeros(self.n_columns + self.n_joints, dtype=np.bool_)
         rotation = self.axis >= Axis.RX
-        turns[self.column[self.column >= 0]] = rotation[self.column >= 0]
-        turns[self.n_columns + self.joint[self.joint >= 0]] = rotation[self.joint >= 0]
+        turns[self.column[rotation & (self.column >= 0)]] = True
+        turns[self.n_columns + self.joint[rotation & (self.joint >= 0)]] = True
         return turns
 
 
@@ -111,34 +111,40 @@ def build_chain(
     columns: Mapping[int, int] | None = None,
     *,
     tool_tangent: int | None = None,
+    base_tangent: int | None = None,
     frame_tangent: int | None = None,
     frame: bool = False,
 ) -> Chain:
     """Prepare a robot for the walk, at its nominal values.
 
-    Only what has a column, the tool if it has a tangent, and the measurement frame may change through `Chain.at`; the
-    rest is constant, and what does nothing is left out.
+    Only what has a column, base and tool if they have a tangent, and the measurement frame may change through
+    `Chain.at`; the rest is constant, and what does nothing is left out.
 
     Args:
         robot: The robot.
         columns: Jacobian column of each parameter that has one, by the parameter's index.
         tool_tangent: First of six columns for a small motion of the tool frame in itself, rotation first
             (GTSAM's tangent of a Pose3); None if there are none.
+        base_tangent: The same for the base frame.
         frame_tangent: The same for the measurement frame world_T_base.
         frame: Whether the chain starts in a measurement frame; `Chain.at` then takes six more values, and the
             frame is the identity until it got them.
     """
     columns = dict(columns or {})
     n_parameters = len(robot.parameters)
+    base, tool = robot.owned_by(0), robot.owned_by(robot.n_joints + 1)
+    end_of_base = max((i for i, e in enumerate(robot.elements) if e.parameter in base), default=-1)
     elements: list[tuple[Element, int, int]] = []  # element, source, column
     if frame:
         elements += [(Element(AXIS_OF_KIND[k]), n_parameters + i, -1) for i, k in enumerate(FRAME_KINDS)]
         elements += _tangent(frame_tangent)
-    for element in robot.elements:
+    for i, element in enumerate(robot.elements):
         source = -1 if element.parameter is None else element.parameter
         elements.append((element, source, columns.get(source, -1)))
+        if i == end_of_base:
+            elements += _tangent(base_tangent)
     elements += _tangent(tool_tangent)
-    n_columns = len(columns) + 6 * (tool_tangent is not None) + 6 * (frame_tangent is not None)
+    n_columns = len(columns) + 6 * sum(t is not None for t in (tool_tangent, base_tangent, frame_tangent))
     chain = Chain(
         axis=np.array([e.axis for e, _, _ in elements], dtype=np.int8),
         constant=np.array([e.constant for e, _, _ in elements]),
@@ -151,8 +157,7 @@ def build_chain(
         n_joints=robot.n_joints,
     )
     changing = set(columns) | set(range(n_parameters, n_parameters + 6))
-    if tool_tangent is not None:
-        changing |= set(robot.owned_by(robot.n_joints + 1))
+    changing |= set(() if tool_tangent is None else tool) | set(() if base_tangent is None else base)
     return _without_idle(chain.at(np.concatenate([robot.nominal, np.zeros(6)])), changing)
 
 

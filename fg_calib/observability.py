@@ -1,8 +1,9 @@
 """What data determine: rank, null space, the paper's three classes, and observability indices.
 
 Everything is read from one matrix, the Jacobian of the whitened residuals with its columns scaled to changes of
-ordinary size (tolerance, else 1 mm or 1 mrad), so that a singular value is a signal-to-noise ratio: how many sigma
-a change of ordinary size along its direction moves the measurements.
+ordinary size (1 mrad, or what that moves at the arm's reach), so that a singular value is a signal-to-noise ratio: how
+many sigma a change of ordinary size along its direction moves the measurements. Rank, classes and groups are thus a
+matter of geometry and noise. What the parameters may be off, their tolerances, says only which directions are weak.
 
 References:
     Jia et al. (2019), section 4: independent, relative and ineffective parameters.
@@ -29,7 +30,7 @@ RANK_TOLERANCE = 1e-10
 """Singular values below this part of the largest are those of directions that the data do not determine."""
 
 SIGNAL_FLOOR = 1e-3
-"""Nor are directions with a smaller signal-to-noise ratio: sigma above 1000 ordinary changes, 1 m or 1 rad."""
+"""Nor are directions with a smaller signal-to-noise ratio: sigma above 1000 ordinary changes, 1 rad or the reach."""
 
 SUPPORT_TOLERANCE = 1e-6
 """A parameter takes part in a direction if its unit-free share in it is above this."""
@@ -38,7 +39,7 @@ KEEP_ORDER = ("theta", "d", "a", "alpha", "beta", "x", "y", "z", "yaw", "pitch",
 """Of parameters that only act together the earlier kind is kept, and of one kind the later joint, as in the paper."""
 
 WEAK = 10.0
-"""A direction with a signal-to-noise ratio below this is weak: its sigma is above a tenth of an ordinary change."""
+"""A direction is weak if its sigma is above one over this of what it may be off: tolerance, else an ordinary change."""
 
 CORRELATED = 0.9
 """Correlations above this are worth a line."""
@@ -64,13 +65,30 @@ class RelativeGroup:
         """Number of directions that are lost."""
         return len(self.relations)
 
+    def combinations(self, kept: Sequence[str]) -> dict[str, dict[str, float]]:
+        """What kept members are estimated for where the others are left at nominal: factors by name, by kept member.
+
+        With K the kept and L the others a relation moves `n_K + n_L` with no effect; the estimate of K stays the same
+        in `x_K + G x_L` where G undoes every relation: `n_K + G n_L = 0`.
+        """
+        left_out = [name for name in self.parameters if name not in kept]
+        of_kept = np.array([[relation.get(name, 0.0) for name in kept] for relation in self.relations])
+        of_left_out = np.array([[relation.get(name, 0.0) for name in left_out] for relation in self.relations])
+        G = -np.linalg.lstsq(of_left_out, of_kept, rcond=None)[0].T  # (n_kept, n_left_out)
+        found = {}
+        for name, row in zip(kept, G, strict=True):
+            others = {n: float(f"{g:.9g}") for n, g in zip(left_out, row, strict=True) if abs(g) > SUPPORT_TOLERANCE}
+            if others:
+                found[name] = {name: 1.0} | others
+        return found
+
 
 @dataclass(frozen=True)
 class WeakDirection:
     """A direction that the data determine, but badly.
 
     Attributes:
-        signal_to_noise: Its singular value: 1 over its sigma in changes of ordinary size.
+        signal_to_noise: 1 over its sigma, in what the parameters may be off: tolerance, else a change of ordinary size.
         members: Its largest members, by name, as shares between -1 and 1.
     """
 
@@ -134,6 +152,7 @@ def analyse(
     jacobian: Floats,
     parameters: Sequence[Parameter],
     *,
+    scales: Floats,
     n_measurements: int,
     prefer: Sequence[str] = (),
     floor: float = SIGNAL_FLOOR,
@@ -143,12 +162,12 @@ def analyse(
     Args:
         jacobian: Shape (m, n).
         parameters: The n parameters of the columns.
+        scales: A change of ordinary size in each of them, shape (n,), [m] and [rad].
         n_measurements: Number of configurations or pairs, for O1.
         prefer: Parameters to keep, first choice first, where only combinations are determined; then `KEEP_ORDER`.
         floor: Signal-to-noise ratio below which a direction counts as not determined.
     """
     n, names = len(parameters), names_of(parameters)
-    scales = np.array([p.scale for p in parameters])
     J = jacobian * scales
     _, s, Vt = np.linalg.svd(np.vstack([J, np.zeros((n, n))]), full_matrices=False)
     rank = determined(s, floor)
@@ -161,7 +180,10 @@ def analyse(
     groups = _groups(null, dead, scales, parameters, prefer)
     dropped = {name for g in groups for name in g.parameters if name not in g.keep}
     kept = [i for i in range(n) if not dead[i] and names[i] not in dropped]
-    sigma, correlation, correlations, weak = _spread(J[:, kept], [names[i] for i in kept], scales[kept])
+    may_be_off = np.array([s if p.tolerance is None else p.tolerance for p, s in zip(parameters, scales, strict=True)])
+    sigma, correlation, correlations, weak = _spread(
+        jacobian[:, kept] * may_be_off[kept], [names[i] for i in kept], may_be_off[kept]
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         gap = float(s[rank - 1] / s[rank]) if 0 < rank < n else np.inf
     return Observability(

@@ -36,12 +36,14 @@ from fg_calib.factors import (
 from fg_calib.files.job import Job
 from fg_calib.frames import Frame, Unknown
 from fg_calib.groups import PointGroups
+from fg_calib.inverse import random_readings
 from fg_calib.kinematics import build_chain, forward, precompute_trig
 from fg_calib.measurements import Measurements, Pairing, Pairs, form_pairs, no_pairs
 from fg_calib.observability import RANK_TOLERANCE, SIGNAL_FLOOR, Observability, analyse, determined, singular_values
 from fg_calib.residuals import AnyBlock, Block, CorrelatedBlock
 from fg_calib.robot import Parameter, Robot
 from fg_calib.whitening import (
+    KINK_SIGMAS,
     MAX_SHARED,
     Adjustment,
     PairJudgement,
@@ -79,6 +81,9 @@ WEIGHT_TOLERANCE = 1e-7
 
 JOINT_TOLERANCE = 1e-7
 """Estimated joint values that move by less than this many sigma of their readings have settled."""
+
+QUARTER_TURN = 1e-3
+"""Cosine of a pitch at which yaw and roll of a frame may be told apart no more."""
 
 STRUCTURAL_FLOOR = 1e-6
 """Signal-to-noise ratio that counts as nothing on random configurations with an assumed noise: rounding alone."""
@@ -272,7 +277,7 @@ def build_problem(
         gauge: What holds the directions that the data do not determine. `prior`: the tolerances. `none`: nothing;
             everything is estimated by minimum-norm steps, and what is not determined has no sigma. `keep`: only
             the independent parameters and those kept of each relative group are estimated, without priors, the
-            others stay at nominal (the paper's way).
+            others stay at nominal (the paper's way); what is said of errors counts them with their tolerance.
         prefer: For `keep`: parameters to keep, first choice first.
         pair_errors: `shared`: pairs carry the errors of their configurations in common, as long as these are not too
             many (`MAX_SHARED`); then, and with `independent`, they are weighted as if independent.
@@ -308,7 +313,7 @@ def build_problem(
     _check_enough(problem)
     if gauge != "keep":
         return problem
-    kept = observe(problem, start, prefer).kept
+    kept = _kept(problem, prefer)
     if not kept and not unknown_frame:
         raise ProblemError(
             measurements.source if pairs is None else pairs.source,
@@ -323,6 +328,21 @@ def build_problem(
         variables = joints.add_joints(variables)
     anew = _assemble(reduced, measurements, settings, variables, start, trig, pairs, None, points, joints)
     return replace(anew, whole=problem)
+
+
+def _kept(problem: Problem, prefer: Sequence[str]) -> list[str]:
+    """The parameters that gauge `keep` estimates.
+
+    At a pitch of a quarter turn yaw and roll of a frame are relative for want of coordinates, not of data: a frame that
+    lacks nothing else is kept whole, as a pose.
+    """
+    kept = observe(problem, problem.start, prefer).kept
+    for v in problem.variables.items:
+        if v.kind in ("base", "tool") and abs(np.cos(problem.start[v.parameters[4]])) < QUARTER_TURN:
+            lacking = set(problem.variables.names[v.columns]).difference(kept)
+            if len(lacking) == 1 and lacking <= {problem.variables.names[v.columns][k] for k in (3, 5)}:
+                kept += lacking
+    return kept
 
 
 def problem_of(job: Job, **changes: Any) -> Problem:
@@ -390,6 +410,10 @@ def predicted_problem(
         source="predictions",
     )
     pairs = _usable_pairs(measurements, settings) if settings.uses_pairs else None
+    if pairs is not None:
+        # Whether two near points would be measured as the same is a matter of noise: they tell nothing in advance.
+        apart = pairs.distance > KINK_SIGMAS * pairs.sigma_distance
+        pairs = replace(pairs, distance=np.where(apart, pairs.distance, np.nan))
     return _assemble(robot, measurements, settings, variables, variables.nominal(), trig, pairs)
 
 
@@ -399,17 +423,22 @@ def random_problem(
     """`predicted_problem` at random configurations: what a model can determine at all.
 
     Args:
-        robot: The robot; revolute joints without limits turn over +-180 degrees, prismatic ones slide over +-1 m.
-        model: Which measurements take part; pairs are chained.
+        robot: The robot; its joints move as `random_readings` says.
+        model: Which measurements take part; pairs are chained. Noise is assumed as `Robot.scale_of` says.
         frame: Whether the measurement frame is estimated too.
         n_configurations: How many; 0 for ten for every parameter, 300 at least.
         seed: Of the random configurations.
     """
     n = n_configurations or max(300, 10 * len(robot.parameters))
-    span = np.array([1.0 if joint.prismatic else np.pi for joint in robot.joints])
-    lower, upper = np.clip(robot.limits, -span[:, None], span[:, None]).T
-    readings = np.random.default_rng(seed).uniform(lower, upper, (n, robot.n_joints))
-    return predicted_problem(robot, readings, model, frame=frame, pairing=Pairing("chain"), pair_errors="independent")
+    return predicted_problem(
+        robot,
+        random_readings(robot, n, np.random.default_rng(seed)),
+        model,
+        frame=frame,
+        pairing=Pairing("chain"),
+        sigmas=(np.full((n, 3), robot.scale_of("m")), np.full((n, 3), robot.scale_of("rad")), None),
+        pair_errors="independent",
+    )
 
 
 def noise_kinds(model: Model) -> tuple[str, str]:
@@ -572,21 +601,20 @@ def eliminated_terms(problem: Problem, parameters: Floats) -> Eliminated:
 def named_triangle(problem: Problem, parameters: Floats) -> Floats:
     """`whitened_triangle` by named parameters, the measurement frame projected out: shape (m, n_robot_columns).
 
-    Note:
-        At a tool pitch of a quarter turn there is no way back from tangent columns to angles; the nearest is taken.
+    At a pitch of a quarter turn of base or tool the columns of yaw and roll are parallel: only their sum acts.
     """
     variables = problem.variables
     n = variables.n_robot_columns
-    D = np.nan_to_num(variables.named_derivative(parameters), posinf=1e12, neginf=-1e12)
-    J: Floats = whitened_triangle(problem, parameters) @ np.linalg.pinv(D)
-    out: Floats = J[:, :n]
+    J = whitened_triangle(problem, parameters)
+    out: Floats = J @ variables.tangent_derivative(parameters)[:, :n]
     if n == variables.n_columns:
         return out
+    length = np.linalg.norm(out, axis=0)
     U, s, _ = np.linalg.svd(J[:, n:], full_matrices=False)
     Q = U[:, s > RANK_TOLERANCE * s.max(initial=0.0)]
     out = out - Q @ (Q.T @ out)
     # What projecting leaves of a column that was all frame is rounding.
-    out[:, np.linalg.norm(out, axis=0) <= RANK_TOLERANCE * np.linalg.norm(J[:, :n], axis=0)] = 0.0
+    out[:, np.linalg.norm(out, axis=0) <= RANK_TOLERANCE * length] = 0.0
     return out
 
 
@@ -604,6 +632,7 @@ def observe(
     return analyse(
         named_triangle(problem, parameters),
         problem.estimated,
+        scales=np.array([problem.robot.scale_of(p.unit) for p in problem.estimated]),
         n_measurements=(problem.n_pairs + problem.n_of_points) or problem.n_configurations,
         prefer=prefer,
         floor=floor,
@@ -710,7 +739,7 @@ def _check_enough(problem: Problem) -> None:
     anywhere = random_problem(problem.robot, s.model, s.frame)
     priors = prior_rows(problem.variables, problem.start)[1]
     stacked = np.vstack([whitened_triangle(anywhere, anywhere.start), priors])
-    needed = determined(singular_values(stacked * problem.variables.scales), STRUCTURAL_FLOOR)
+    needed = determined(singular_values(stacked * problem.variables.prior_scales), STRUCTURAL_FLOOR)
     if rows < needed:
         raise ProblemError(
             source, f"{rows} residuals", f"at least {needed} to determine what model {problem.settings.model} can"
@@ -791,7 +820,7 @@ def _start_of_core(
             unknown,
         )
     found = free & np.repeat([True, unknown.tool_rotation], 3)
-    start[np.array(tool)[found]] = _coordinates(T)[found]
+    start[np.array(tool)[found]] = _coordinates(T, start[tool])[found]
     if X is not None and unknown.frame:
         start[variables.frame_span] = _coordinates(X)
     return start
@@ -802,9 +831,9 @@ def _rotation(frame: Floats) -> Floats:
     return pose_of(frame).rotation().matrix()
 
 
-def _coordinates(frame: Frame) -> Floats:
-    """x, y, z, yaw, pitch, roll of a frame."""
-    return frame_of(gtsam.Pose3(gtsam.Rot3(frame.rotation), frame.translation))
+def _coordinates(frame: Frame, near: Floats | None = None) -> Floats:
+    """x, y, z, yaw, pitch, roll of a frame (see `frame_of`)."""
+    return frame_of(gtsam.Pose3(gtsam.Rot3(frame.rotation), frame.translation), near)
 
 
 def _assemble(

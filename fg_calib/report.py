@@ -28,6 +28,8 @@ WIDTH = 100
 _SHOWN = {"m": (1e3, "mm", 4), "rad": (180.0 / np.pi, "deg", 5)}
 """Factor, unit and decimals in which a quantity is shown."""
 
+_WEAK = "sigma above a tenth of the tolerance, or of 1 mrad at the reach"
+
 _FAMILY_UNIT = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad", "point": "m"}
 
 
@@ -52,6 +54,8 @@ def build_report(solution: Solution, uncertainty: Uncertainty) -> RenderableType
         *_section("Residuals (RMS)", _residuals(uncertainty)),
         *_section("Parameters", _parameters(uncertainty)),
     ]
+    if any(p.stands_for for p in uncertainty.parameters):
+        parts += _section("What kept parameters were estimated for", _combinations(uncertainty))
     if len(uncertainty.goodness.suspects):
         parts += _section("Suspicious rows", _suspects(solution, uncertainty))
     if uncertainty.goodness.configurations:
@@ -62,7 +66,7 @@ def build_report(solution: Solution, uncertainty: Uncertainty) -> RenderableType
         parts += _section("What the data do not determine", _lost(uncertainty.identifiability.lost))
     weak = _weak(uncertainty.observability)
     if weak is not None:
-        parts += _section("What they determine badly (sigma above a tenth of an ordinary change)", weak)
+        parts += _section(f"What they determine badly ({_WEAK})", weak)
     notes = list(_notes(solution, uncertainty))
     if notes:
         parts += _section("Notes", *(Padding(Text(note), (0, 0, 0, 2)) for note in notes))
@@ -274,6 +278,25 @@ def _parameters(uncertainty: Uncertainty) -> RenderableType:
     return table
 
 
+def _combinations(uncertainty: Uncertainty) -> RenderableType:
+    """The combinations that kept parameters stand for, whose sigmas are those of the estimates."""
+    table = _plain_table(("", "left"), ("sigma", "right"), ("", "left"), ("of the sum", "left"), wrap=True)
+    for p in uncertainty.parameters:
+        if p.stands_for:
+            factor, unit, decimals = _SHOWN[p.unit]
+            sigma = p.sigma_of_combination
+            shown = "unknown" if sigma is None else f"{sigma * factor:.{decimals}f}"
+            table.add_row(p.name, shown, unit, format_combination(p.stands_for))
+    return table
+
+
+def format_combination(factors: Mapping[str, float]) -> str:
+    """`d5 + d3 + d4`, `a7 + 0.5 beta5`: errors of the parameters, each by its factor."""
+    sizes = {name: "" if abs(f) == 1.0 else f"{abs(f):.4g} " for name, f in factors.items()}
+    terms = (f"{'-' if f < 0.0 else '+'} {sizes[name]}{name}" for name, f in factors.items())
+    return " ".join(terms).removeprefix("+ ")
+
+
 def _frame(frame: FrameEstimate) -> RenderableType:
     xyz = "  ".join(_figure(v * 1e3, 4) for v in frame.xyz)
     q = "  ".join(_figure(v, 8) for v in frame.quaternion_xyzw)
@@ -318,8 +341,17 @@ def _notes(solution: Solution, uncertainty: Uncertainty) -> Iterable[str]:
             yield f"what the data leave open of {_listed(with_prior)} is held by their priors"
         if without:
             yield f"what the data leave open of {_listed(without)} stays at nominal"
+    turned = {p.name.split(".")[0] for p in uncertainty.parameters if _is_a_turn(p)}
+    for frame in sorted(turned):
+        yield f"{frame} is pitched near a quarter turn: corrections of its angles are its turn about its own axes"
     if not uncertainty.residuals.test.any():
         yield "no test rows: how well this predicts new configurations was not checked"
+
+
+def _is_a_turn(parameter: ParameterEstimate) -> bool:
+    """Whether a correction is about a frame's own axis, not the difference of an angle (see `corrections_of`)."""
+    off = parameter.estimate - parameter.nominal - parameter.correction
+    return parameter.unit == "rad" and abs(np.remainder(off + np.pi, 2.0 * np.pi) - np.pi) > 1e-9
 
 
 def _sharing_notes(problem: Problem) -> Iterable[str]:
@@ -381,7 +413,7 @@ def _classes(found: Identifiability) -> list[RenderableType]:
         parts += _section("Observability indices", Text(f"{indices}  condition number {o.condition_number:.4g}"))
         weak = _weak(o)
         if weak is not None:
-            parts += _section("Weak directions (sigma above a tenth of an ordinary change)", weak)
+            parts += _section(f"Weak directions ({_WEAK})", weak)
         parts += _section("Sigma of what is kept, the rest at nominal", _sigmas(o))
         if o.correlations:
             correlated = (Text(f"{a}, {b}: {rho:+.3f}") for a, b, rho in o.correlations)
@@ -421,7 +453,7 @@ def _weak(observability: Observability) -> RenderableType | None:
     """Weak directions by their largest members; None if there are none."""
     if not observability.weak:
         return None
-    table = _plain_table(("sigma / ordinary change", "right"), ("largest members", "left"), wrap=True)
+    table = _plain_table(("sigma / tolerance", "right"), ("largest members", "left"), wrap=True)
     for weak in observability.weak[:5]:
         members = ", ".join(f"{name} {share:+.2f}" for name, share in list(weak.members.items())[:6])
         table.add_row(f"{1.0 / weak.signal_to_noise:.3g}", members)

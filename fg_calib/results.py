@@ -23,7 +23,7 @@ from fg_calib.identifiability import Identifiability
 from fg_calib.residual_table import FAMILIES, FAMILY_OF_KIND, ROW_KINDS
 from fg_calib.robot import Robot
 from fg_calib.solver import Solution
-from fg_calib.uncertainty import Uncertainty
+from fg_calib.uncertainty import ParameterEstimate, Uncertainty
 
 RESULT_SCHEMA = "fg-calib/result/1"
 OBSERVABILITY_SCHEMA = "fg-calib/observability/1"
@@ -116,6 +116,7 @@ def result_document(
                 "sigma": p.sigma,
                 "prior_sigma": p.prior_sigma,
                 "identifiability": p.identifiability,
+                **_combination(p),
             }
             for p in uncertainty.parameters
         ],
@@ -127,6 +128,13 @@ def result_document(
     }
     plain: dict[str, Any] = _plain(document)
     return plain
+
+
+def _combination(parameter: ParameterEstimate) -> dict[str, Any]:
+    """What a kept parameter stands for, where others were left out to fix the gauge."""
+    if parameter.stands_for is None:
+        return {}
+    return {"stands_for": parameter.stands_for, "sigma_of_combination": parameter.sigma_of_combination}
 
 
 def observability_document(found: Identifiability) -> dict[str, Any]:

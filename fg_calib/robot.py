@@ -82,7 +82,7 @@ class Parameter:
 
     @property
     def scale(self) -> float:
-        """A change of ordinary size: the tolerance, else 1 mm or 1 mrad, [m] or [rad]."""
+        """How far it may be off: the tolerance, else 1 mm or 1 mrad, [m] or [rad]. Not for ranks: see `scale_of`."""
         return self.tolerance if self.tolerance is not None else 1e-3
 
 
@@ -160,6 +160,25 @@ class Robot:
     def limits(self) -> Floats:
         """Joint limits, lower and upper, shape (n_joints, 2), [rad] or [m]."""
         return np.array([(j.lower, j.upper) for j in self.joints]).reshape(-1, 2)
+
+    @property
+    def reach(self) -> float:
+        """Length of the arm stretched out, base to tool, sliding joints at their limits, [m]; 1 if it has none."""
+        nominal, all_limits, base, reach = self.nominal, self.limits, self.owned_by(0), 0.0
+        for element in self.elements:
+            if element.axis >= Axis.RX or element.parameter in base:
+                continue
+            length = element.constant + (0.0 if element.parameter is None else nominal[element.parameter])
+            limits = np.zeros(0) if element.joint is None else all_limits[element.joint]
+            reach += float(np.max(np.abs(length + limits[np.isfinite(limits)]), initial=abs(length)))
+        return reach or 1.0
+
+    def scale_of(self, unit: str) -> float:
+        """A change that moves the tool by about as much in either unit: 1 mrad, or what that moves at the arm's reach.
+
+        By it lengths and angles are compared where only geometry counts, such as in a rank; [m] and [rad].
+        """
+        return 1e-3 * (self.reach if unit == "m" else 1.0)
 
     def index(self, name: str) -> int:
         """Index of the parameter called `name`.

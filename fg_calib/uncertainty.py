@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 from scipy.spatial.transform import Rotation
 
-from fg_calib.covariance import Spread, spread_of
-from fg_calib.factors import pose_of
+from fg_calib.covariance import Spread, spread_of, with_left_out
+from fg_calib.factors import corrections_of, pose_of
 from fg_calib.goodness import OUTLIER_WEIGHT, Goodness, judge_fit
 from fg_calib.identifiability import Identifiability, identify
 from fg_calib.observability import IdentifiabilityClass, Observability
@@ -52,24 +52,26 @@ class ParameterEstimate:
         unit: `m` or `rad`.
         nominal: Nominal value.
         estimate: Estimated value; nominal if it is fixed.
-        sigma: 1 sigma; 0 if fixed; None where neither data nor prior determine it.
+        correction: Estimate minus nominal; angles of a frame by the shorter way (see `factors.corrections_of`).
+        sigma: 1 sigma of estimate minus true; 0 if fixed; None where neither data nor tolerances tell. Of a parameter
+            that was left out to fix the gauge its tolerance.
         prior_sigma: 1 sigma of its prior; None without one.
         identifiability: What the data alone say of it: `independent`, `relative`, `ineffective`; or `fixed`.
+        stands_for: Of a relative parameter that was kept where others were left out to fix the gauge: the combination
+            that it was estimated for, factors by name; else None.
+        sigma_of_combination: 1 sigma of the estimate as one of that combination; None where it stands for itself.
     """
 
     name: str
     unit: str
     nominal: float
     estimate: float
+    correction: float
     sigma: float | None
     prior_sigma: float | None
     identifiability: IdentifiabilityClass | str
-
-    @property
-    def correction(self) -> float:
-        """Estimate minus nominal; angles of a frame by the shorter way."""
-        difference = self.estimate - self.nominal
-        return (difference + np.pi) % (2 * np.pi) - np.pi if "." in self.name and self.unit == "rad" else difference
+    stands_for: dict[str, float] | None = None
+    sigma_of_combination: float | None = None
 
 
 @dataclass(frozen=True)
@@ -125,8 +127,9 @@ class Uncertainty:
     """What `assess` finds out about a solution.
 
     Attributes:
-        names: Estimated parameters, in the order of the covariance.
-        covariance: Of the estimated parameters, [m] and [rad]; nan in rows and columns of what nothing determines.
+        names: The parameters to be estimated, those left out to fix the gauge among them, in the covariance's order.
+        covariance: Of their errors, [m] and [rad]; nan in rows and columns of what nothing determines. What was left
+            out counts with its tolerance.
         parameters: Every parameter of the robot.
         frame: The measurement frame; None where it was not estimated.
         chi2: Sum of squared whitened residuals, priors included.
@@ -138,7 +141,8 @@ class Uncertainty:
         goodness: Goodness of fit by kind, by row and by configuration.
         identifiability: What the data alone determine, at the nominal parameters.
         robot: The calibrated robot.
-        spread: The covariance in the variables' tangent space, behind `predict`.
+        spread: The covariance in the tangent space of the variables that were estimated, the others taken as known.
+        whole: The same of all parameters, those left out to fix the gauge among them, behind `predict`.
         findings: Why the result is not to be trusted; empty if it is.
         cautions: Where its sigmas may be somewhat too small although nothing speaks against it.
         points: The points that groups of configurations touched.
@@ -158,6 +162,7 @@ class Uncertainty:
     identifiability: Identifiability
     robot: Robot
     spread: Spread
+    whole: Spread
     findings: tuple[str, ...]
     cautions: tuple[str, ...]
     points: tuple[PointEstimate, ...] = ()
@@ -171,18 +176,11 @@ class Uncertainty:
             function: From a robot to a number or an array; smooth, for it is differentiated by central differences.
 
         Note:
-            Directions that were left out to fix the gauge (`keep`) count as known.
+            Parameters that were left out to fix the gauge (`keep`) count with their tolerance: what depends on one
+            without is unknown.
         """
         value = np.atleast_1d(np.asarray(function(self.robot), dtype=np.float64)).ravel()
-        names = self.spread.names[: self.spread.n_robot_columns]
-        nominal = self.robot.nominal
-        G = np.empty((len(value), len(names)))
-        for k, name in enumerate(names):
-            step = np.zeros(len(nominal))
-            step[self.robot.index(name)] = 1e-5
-            up, down = (function(self.robot.with_values(nominal + h)) for h in (step, -step))
-            G[:, k] = (np.ravel(np.asarray(up)) - np.ravel(np.asarray(down))) / 2e-5
-        covariance = self.spread.covariance(G @ self.spread.named_derivative[: len(names)])
+        covariance = self.whole.covariance(self.whole.derivative(function))
         return Prediction(value, np.sqrt(np.diag(covariance)), covariance)
 
     @property
@@ -222,15 +220,16 @@ def _assess(solution: Solution) -> Uncertainty:
     problem = solution.problem
     variables = problem.variables
     spread = spread_of(solution)
-    whole = identify(problem.whole or problem, solution.before, "practical")
-    covariance = spread.named()
+    whole = with_left_out(solution, spread)
+    identified = identify(problem.whole or problem, solution.before, "practical")
+    covariance = whole.named()
     frame = None
     if variables.n_robot_columns < variables.n_columns:
         world_T_base = pose_of(solution.parameters[variables.frame_span])
         frame = FrameEstimate(
             xyz=world_T_base.translation(),
             quaternion_xyzw=Rotation.from_matrix(world_T_base.rotation().matrix()).as_quat(canonical=True),
-            sigma=np.sqrt(np.diag(spread.covariance(np.eye(variables.n_columns))))[variables.n_robot_columns :],
+            sigma=np.sqrt(np.diag(whole.covariance(np.eye(len(whole.tangent))[whole.variables.n_robot_columns :]))),
         )
     chi2, n_rows, loss_factor = _weighted_chi2(solution)
     dof = n_rows + problem.n_priors - spread.rank - variables.n_without_prior
@@ -239,9 +238,9 @@ def _assess(solution: Solution) -> Uncertainty:
     bounds = chi2_bounds(dof, expected, independent)
     table = residual_table(solution)
     return Uncertainty(
-        names=variables.names[: variables.n_robot_columns],
+        names=whole.variables.names[: whole.variables.n_robot_columns],
         covariance=covariance,
-        parameters=_parameter_estimates(solution, np.sqrt(np.diag(covariance)), whole.observability),
+        parameters=_parameter_estimates(solution, np.sqrt(np.diag(covariance)), spread, identified.observability),
         frame=frame,
         chi2=chi2,
         dof=dof,
@@ -250,12 +249,13 @@ def _assess(solution: Solution) -> Uncertainty:
         p_value=_p_value(solution, chi2, expected, independent),
         residuals=table,
         goodness=judge_fit(solution, spread, table),
-        identifiability=whole,
+        identifiability=identified,
         robot=problem.robot.with_values(solution.parameters[variables.robot_span]),
         spread=spread,
+        whole=whole,
         findings=_findings(solution, chi2, dof, bounds),
         cautions=_cautions(problem),
-        points=_point_estimates(solution, spread),
+        points=_point_estimates(solution, whole),
     )
 
 
@@ -314,26 +314,45 @@ def _independent_dof(problem: Problem, dof: int, rank: int) -> int:
 
 
 def _parameter_estimates(
-    solution: Solution, sigma: Floats, observability: Observability
+    solution: Solution, sigma: Floats, spread: Spread, observability: Observability
 ) -> tuple[ParameterEstimate, ...]:
-    problem = solution.problem
+    """Every parameter of the robot.
+
+    Args:
+        solution: The solution.
+        sigma: 1 sigma of the parameters of `observability`.
+        spread: The covariance of what was estimated.
+        observability: What the data alone determine.
+    """
+    problem, estimated = solution.problem, spread.variables.names
     classes = dict(zip(observability.names, observability.classes, strict=True))
-    sigmas = dict(zip(problem.variables.names, sigma, strict=False))
+    sigmas = dict(zip(observability.names, sigma, strict=True))
+    combinations: dict[str, dict[str, float]] = {}
+    for group in observability.relative if problem.whole is not None else ():
+        combinations |= group.combinations([name for name in group.parameters if name in estimated])
+    of_combinations = dict(zip(estimated, np.sqrt(np.diag(spread.named())), strict=False)) if combinations else {}
+    corrections = corrections_of(problem.robot, solution.parameters[problem.variables.robot_span])
     found = []
     for i, p in enumerate(problem.robot.parameters):
-        s = sigmas.get(p.name, np.nan if p.name in classes else 0.0)  # nan: left out, but not known
         found.append(
             ParameterEstimate(
                 name=p.name,
                 unit=p.unit,
                 nominal=p.nominal,
                 estimate=float(solution.parameters[i]),
-                sigma=float(s) if np.isfinite(s) else None,
+                correction=float(corrections[i]),
+                sigma=_known(sigmas.get(p.name, 0.0)),
                 prior_sigma=p.tolerance if p.estimated and problem.settings.prior else None,
                 identifiability=classes.get(p.name, "fixed"),
+                stands_for=combinations.get(p.name),
+                sigma_of_combination=_known(of_combinations[p.name]) if p.name in combinations else None,
             )
         )
     return tuple(found)
+
+
+def _known(sigma: float) -> float | None:
+    return float(sigma) if np.isfinite(sigma) else None
 
 
 def _cautions(problem: Problem) -> tuple[str, ...]:
@@ -362,7 +381,12 @@ def _findings(solution: Solution, chi2: float, dof: int, bounds: tuple[float, fl
 
 
 def _point_estimates(solution: Solution, spread: Spread) -> tuple[PointEstimate, ...]:
-    """Where the groups' points are; sigma from that of the core, which they follow, and from their own touches."""
+    """Where the groups' points are; sigma from that of the core, which they follow, and from their own touches.
+
+    Args:
+        solution: The solution.
+        spread: The covariance of all parameters.
+    """
     problem = solution.problem
     points, variables = problem.points, problem.variables
     if points is None:
@@ -371,7 +395,7 @@ def _point_estimates(solution: Solution, spread: Spread) -> tuple[PointEstimate,
     n = variables.n_without_prior  # the points come first among the nuisance variables
     xyz[points.estimated] = solution.parameters[variables.nuisance_span][:n].reshape(-1, 3)
     sigma = np.full_like(xyz, np.nan)
-    left = eliminated_terms(problem, solution.parameters)
+    left = eliminated_terms(replace(problem, variables=spread.variables), solution.parameters)
     variance = np.diag(spread.covariance(left.follow)) + np.sum(left.inverse**2, axis=1)
     sigma[points.estimated] = np.sqrt(variance[:n]).reshape(-1, 3)
     index = points.groups.index

@@ -123,6 +123,8 @@ def test_keys_are_joints_tool_and_frame():
     variables = build_variables(robot, frame=True)
     assert [v.symbol for v in variables.items] == ["K(1)", "K(2)", "K(3)", "K(4)", "T(0)", "X(0)"]
     assert variables.names[:4] == ("a1", "alpha1", "d1", "theta1")
+    both = small_arm(estimate=[*TOOL, *(name.replace("tool", "base") for name in TOOL)])
+    assert [v.symbol for v in build_variables(both, frame=False).items][::5] == ["B(0)", "T(0)"]
     partly = build_variables(small_arm(estimate=["tool.z"]), frame=False)
     assert [v.symbol for v in partly.items] == ["K(1)", "K(2)", "K(3)", "K(4)", "K(5)"]
     assert partly.names[-1] == "tool.z"
@@ -167,7 +169,9 @@ def test_priors_pull_to_nominal_with_their_tolerance_whatever_the_variable():
     parameters[names.index("tool.yaw")] += 0.03 - 2 * np.pi  # an angle is the same a turn further
     r, J = prior_rows(variables, parameters)
     assert len(r) == 4 + 3 + 1
-    assert r == pytest.approx([0, 2, 0, 0, 0, 0, 0, 3], abs=1e-9)
+    # of the tool it is the turn about its own z axis that counts, which at this pitch and roll is not that of yaw
+    of_yaw = 3 * np.cos(0.4) * np.cos(0.3)
+    assert r == pytest.approx([0, 2, 0, 0, 0, 0, 0, of_yaw], abs=1e-9)
     assert J.shape == (8, variables.n_columns)
     assert J[1, variables.names.index("a2")] == pytest.approx(500)
 

@@ -77,6 +77,55 @@ def test_ranks_of_known_arms(robot, ranks, n):
         assert found.observability.gap > 1e6
 
 
+RANDOM_11 = RobotBuilder("random-11", "dh-hayati")
+"""An arm whose random configurations often bring the tool near where it was."""
+for _i, (_d, _alpha) in enumerate(((0.0, 90.0), (0.3, 0.0), (0.0, 0.0))):
+    RANDOM_11.add_convention_joint(
+        Joint(f"q{_i + 1}", prismatic=_i == 0),
+        {"a": 0.1, "alpha": np.deg2rad(_alpha), "d": _d, "theta": 0.0, "beta": 0.0},
+    )
+
+DRAWN = [(robot, ranks) for robot, ranks, _ in RANKS] + [
+    (RANDOM_11.build(), (4, 0, 4, 11, 13)),
+    (paper_robot(), (21, 11, 23, 25, 29)),
+]
+
+
+def rank_at(robot, model, seed):
+    problem = random_problem(robot, model, seed=seed)
+    assert not np.any(problem.judgement.same_point if problem.judgement is not None else False)
+    return identify(problem, problem.start, "structural").observability.rank
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize(("robot", "ranks"), DRAWN, ids=[f"{r.name}-{i}" for i, (r, _) in enumerate(DRAWN)])
+def test_structural_rank_does_not_depend_on_the_draw(robot, ranks, model):
+    assert {rank_at(robot, model, seed) for seed in range(8)} == {ranks[MODELS.index(model)]}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize(("robot", "ranks"), DRAWN, ids=[f"{r.name}-{i}" for i, (r, _) in enumerate(DRAWN)])
+def test_structural_rank_is_the_same_over_200_draws(robot, ranks, model):
+    assert {rank_at(robot, model, seed) for seed in range(200)} == {ranks[MODELS.index(model)]}
+
+
+@pytest.mark.parametrize("model", ["distance-rotation", "pose"])
+def test_structural_rank_does_not_depend_on_where_limits_lie(model):
+    """A slide of 1.5 to 3 m, a joint of 190 to 350 degrees: no draw leaves them, and none freezes a joint."""
+    gantry = mdh_robot("gantry", [0, 0.1, 0.6, 0.4], [0, -H, 0.5, 1.4], [0, 0.3, 0.1, 0.2], OFF_AXIS, prismatic=(1,))
+    ranks = set()
+    for slide, last in (((0, 1), (-170, 170)), ((1.5, 3.0), (-170, 170)), ((0, 1), (190, 350)), ((-9, -7), (200, 500))):
+        limits = [slide, *np.deg2rad([(-170, 170), (-120, 120), last])]
+        joints = [replace(j, lower=low, upper=up) for j, (low, up) in zip(gantry.joints, limits, strict=True)]
+        robot = replace(gantry, joints=tuple(joints))
+        q = random_problem(robot, model).measurements.readings
+        assert np.all((q >= robot.limits[:, 0]) & (q <= robot.limits[:, 1]))
+        assert np.all(np.ptp(q, axis=0) > 0.9 * np.ptp(robot.limits, axis=1))
+        ranks.add(observe_structure(robot, model).observability.rank)
+    assert len(ranks) == 1
+
+
 def reasons(robot, model, **options):
     found = observe_structure(robot, model, **options)
     return {tuple(sorted(lost.relation)): lost.reason for lost in found.lost}
@@ -186,21 +235,46 @@ def test_weak_directions_and_correlations_are_named():
     assert found.weak[0].members
 
 
-def test_the_answer_does_not_depend_on_the_unit_of_length():
+def in_other_units(robot, k):
+    """The same robot with lengths times k, those of its tolerances and of its sliding joints' limits among them."""
+
+    def scaled(p):
+        length = k if p.unit == "m" else 1.0
+        return replace(p, nominal=p.nominal * length, tolerance=None if p.tolerance is None else p.tolerance * length)
+
+    joints = tuple(replace(j, lower=j.lower * k, upper=j.upper * k) if j.prismatic else j for j in robot.joints)
+    elements = tuple(replace(e, constant=e.constant * (k if e.axis < 3 else 1.0)) for e in robot.elements)
+    return replace(robot, parameters=tuple(map(scaled, robot.parameters)), joints=joints, elements=elements)
+
+
+@pytest.mark.parametrize("tolerance", [None, {"a": 1e-3, "d": 1e-4, "theta": 2e-3}], ids=["without", "with"])
+@pytest.mark.parametrize("model", ["pose", "distance-rotation"])
+@pytest.mark.parametrize("arm", ["paper", "small", "scara"])
+def test_the_answer_does_not_depend_on_the_unit_of_length(arm, model, tolerance):
+    """At the user's configurations and at random ones; the small arm and the scara have sliding joints."""
+    robot = {"paper": paper_robot(tolerance), "small": small_arm(tolerance), "scara": scara(OFF_AXIS)}[arm]
+    robot = replace(robot, joints=tuple(replace(j, lower=-0.5, upper=1.0) for j in robot.joints))
     rng = np.random.default_rng(5)
-    q = rng.uniform(-2, 2, (80, 7))
-
-    def scaled(k):
-        tolerance = {kind: 1e-3 * (k if kind in ("a", "d") else 1.0) for kind in ("a", "alpha", "d", "theta", "beta")}
-        robot = paper_robot(tolerance=tolerance)
-        values = [p.nominal * (k if p.unit == "m" else 1.0) for p in robot.parameters]
-        measurements = measure(robot.with_values(values), 80, rng, readings=q, sigma=(1e-3 * k, 1e-3))
-        return observe_configurations(robot.with_values(values), measurements, "distance-rotation").observability
-
-    metres, millimetres = scaled(1.0), scaled(1000.0)
-    assert millimetres.singular_values[: metres.rank] == pytest.approx(metres.singular_values[: metres.rank], rel=1e-9)
-    assert (millimetres.rank, millimetres.classes) == (metres.rank, metres.classes)
-    assert [g.parameters for g in millimetres.relative] == [g.parameters for g in metres.relative]
+    q = rng.uniform(-0.5, 1.0, (80, robot.n_joints))
+    found = {}
+    for k in (1.0, 1e-3, 1e3):
+        one = in_other_units(robot, k)
+        readings = q * [k if j.prismatic else 1.0 for j in robot.joints]
+        measurements = measure(one, 80, np.random.default_rng(6), readings=readings, sigma=(1e-3 * k, 1e-3))
+        found[k] = [
+            observe_configurations(one, measurements, model).observability,
+            observe_structure(one, model).observability,
+        ]
+    for k in (1e-3, 1e3):
+        for here, metres in zip(found[k], found[1.0], strict=True):
+            assert (here.rank, here.classes) == (metres.rank, metres.classes)
+            assert here.singular_values[: here.rank] == pytest.approx(metres.singular_values[: here.rank], rel=1e-6)
+            both = here.null_space @ metres.null_space.T  # the same space: unit-free directions
+            assert both @ both.T == pytest.approx(np.eye(len(both)), abs=1e-6)
+            assert [g.keep for g in here.relative] == [g.keep for g in metres.relative]
+            assert [w.signal_to_noise for w in here.weak] == pytest.approx(
+                [w.signal_to_noise for w in metres.weak], rel=1e-6
+            )
 
 
 def test_nothing_to_look_at_is_refused():

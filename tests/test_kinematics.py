@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.kernels import LANES
 from fg_calib.kinematics import SPAN, build_chain, forward, pose, precompute_trig
-from fg_calib.robot import CONVENTIONS, Joint, RobotBuilder
+from fg_calib.robot import CONVENTIONS, Element, Joint, RobotBuilder
 
 CASES = [(c, n) for c in [*CONVENTIONS, "urdf"] for n in (1, 2, 3, 6, 7, 12)]
 
@@ -87,14 +87,16 @@ def test_derivatives_equal_central_differences(convention, n):
         assert poses.jacobian[0, 3:, k] == pytest.approx(d_T[:3, 3, k], abs=1e-7)
 
 
-def test_tangent_columns_are_small_motions_of_tool_and_measurement_frame_in_themselves():
+def test_tangent_columns_are_small_motions_of_tool_base_and_measurement_frame_in_themselves():
     rng = np.random.default_rng(5)
     robot = random_robot("mdh", 3, rng)
     q = rng.uniform(-3, 3, (1, 3))
     world_T_base = np.array([0.3, -2.0, 1.0, 2.5, 0.4, -1.0])  # x y z yaw pitch roll
-    chain = build_chain(robot, tool_tangent=0, frame_tangent=6, frame=True).at(
+    chain = build_chain(robot, tool_tangent=0, frame_tangent=6, base_tangent=12, frame=True).at(
         np.concatenate([robot.nominal, world_T_base])
     )
+    values = dict(zip([p.name for p in robot.parameters], robot.nominal, strict=True))
+    base = frame(*(values[f"base.{k}"] for k in ("x", "y", "z", "roll", "pitch", "yaw")))
     poses = forward(chain, precompute_trig(robot, q))
     X = frame(*world_T_base[:3], *world_T_base[:2:-1])
 
@@ -104,10 +106,11 @@ def test_tangent_columns_are_small_motions_of_tool_and_measurement_frame_in_them
         T[:3, 3] = xi[3:]
         return T
 
-    d_T = central_differences(lambda x: X @ small(x[6:]) @ tool_pose(robot, q[0]) @ small(x[:6]), np.zeros(12))
+    arm = np.linalg.inv(base) @ tool_pose(robot, q[0])
+    d_T = central_differences(lambda x: X @ small(x[6:12]) @ base @ small(x[12:]) @ arm @ small(x[:6]), np.zeros(18))
     assert poses.position[0] == pytest.approx((X @ tool_pose(robot, q[0]))[:3, 3], abs=1e-13)
     assert poses.jacobian[0, 3:] == pytest.approx(d_T[:3, 3], abs=1e-8)
-    for k in range(12):
+    for k in range(18):
         turning = d_T[:3, :3, k] @ poses.rotation[0].T
         assert poses.jacobian[0, :3, k] == pytest.approx([turning[2, 1], turning[0, 2], turning[1, 0]], abs=1e-8)
 
@@ -136,3 +139,29 @@ def test_elements_of_the_chain_may_run_against_a_joint():
 
 def test_the_oracle_itself_turns_the_right_way():
     assert (rotation(2, np.pi / 2) @ translation(0, 1.0))[:3, 3] == pytest.approx([0, 1, 0])
+
+
+def test_a_parameter_and_a_joint_of_several_elements_have_the_sum_of_their_derivatives():
+    """Also where one of the elements runs against the others, and whatever was walked before."""
+    rng = np.random.default_rng(8)
+    robot = random_robot("mdh", 3, rng)
+    elements = list(robot.elements)
+    length, angle = (next(i for i, e in enumerate(elements) if robot.parameters[e.parameter].kind == k) for k in "xa")
+    turning = next(i for i, e in enumerate(elements) if e.joint is not None and e.axis >= 3)
+    again = [replace(elements[length], axis=2, sign=-1), replace(elements[angle], axis=0, constant=0.4)]
+    again += [replace(elements[turning], axis=4, sign=-1), Element(4, parameter=elements[turning].parameter)]
+    robot = replace(robot, elements=(*elements[:12], *again, *elements[12:]))
+    n, q = len(robot.parameters), rng.uniform(-3, 3, (LANES + 2, 3))
+    poses = pose(robot, q)
+    for i in (0, LANES + 1):  # a second batch writes over the first one's twists
+
+        def moved(x):
+            return tool_pose(robot.with_values(x[:n]), x[n:])
+
+        x = np.concatenate([robot.nominal, q[i]])
+        d_T = central_differences(moved, x)
+        assert poses.jacobian[i, 3:] == pytest.approx(d_T[:3, 3], abs=1e-7)  # step^2 times third derivatives
+        for k in range(n + 3):
+            turning_rate = d_T[:3, :3, k] @ moved(x)[:3, :3].T
+            w = [turning_rate[2, 1], turning_rate[0, 2], turning_rate[1, 0]]
+            assert poses.jacobian[i, :3, k] == pytest.approx(w, abs=1e-8)
