@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from fg_calib.kinematics import pose
     from fg_calib.least_squares import LeastSquares, fit_least_squares
     from fg_calib.measurements import Measurements, Noise, Pairing
+    from fg_calib.mistakes import SetupCheck, check_setup
     from fg_calib.noise import estimate_noise, solve_job
     from fg_calib.problem import Problem, build_problem, problem_of
     from fg_calib.report import format_comparison, format_identifiability, format_report
@@ -61,6 +62,7 @@ _HOMES = {
     "fg_calib.kinematics": ("pose",),
     "fg_calib.least_squares": ("LeastSquares", "fit_least_squares"),
     "fg_calib.measurements": ("Measurements", "Noise", "Pairing"),
+    "fg_calib.mistakes": ("SetupCheck", "check_setup"),
     "fg_calib.noise": ("estimate_noise", "solve_job"),
     "fg_calib.problem": ("Problem", "build_problem", "problem_of"),
     "fg_calib.report": ("format_comparison", "format_identifiability", "format_report"),
@@ -91,6 +93,7 @@ __all__ = [
     "ProblemError",
     "Robot",
     "Scenario",
+    "SetupCheck",
     "Simulation",
     "Solution",
     "SolverError",
@@ -99,6 +102,7 @@ __all__ = [
     "Units",
     "assess",
     "build_problem",
+    "check_setup",
     "compare",
     "comparison_document",
     "cramer_rao",

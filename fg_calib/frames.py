@@ -134,9 +134,10 @@ def _tool_point_by_distances(
 
 
 def nearest_rotation(M: Floats) -> Floats:
-    """The rotation nearest to a 3x3 matrix (maximises trace(R^T M))."""
+    """The rotations nearest to matrices, shape (..., 3, 3) (maximise trace(R^T M))."""
     U, _, Vt = np.linalg.svd(M)
-    rotation: Floats = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    U[..., 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
+    rotation: Floats = U @ Vt
     return rotation
 
 
@@ -155,8 +156,10 @@ def _rotations(R_F: Floats, R_M: Floats, R_X: Floats, R_T: Floats, unknown: Unkn
         return [(R_X, _tool_rotation(R_F, R_M, R_X))]
     # Every rotation is about one axis: X and T may turn about it against each other. Find one solution, from the
     # nominal tool or any quarter turn of it, and leave the choice of the turn to the positions.
-    fits = [_alternate(R_F, R_M, start, steps=20) for start in (R_T, *(R_T @ Q for Q in _quarter_turns()))]
-    R_X, R_T = max(fits, key=lambda fit: round(fit[2], 9))[:2]
+    starts = np.array([R_T, *(R_T @ Q for Q in _quarter_turns())])
+    all_X, all_T, reached = _alternate(R_F, R_M, starts, steps=20)
+    best = int(np.argmax(np.round(reached, 9)))
+    R_X, R_T = all_X[best], all_T[best]
     turns = [_about(_common_axis(R_F), angle) for angle in np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)]
     return [(R_X @ turn, turn.T @ R_T) for turn in turns]
 
@@ -171,12 +174,20 @@ def _tool_rotation(R_F: Floats, R_M: Floats, R_X: Floats) -> Floats:
     return nearest_rotation(np.einsum("nba,cb,ncd->ad", R_F, R_X, R_M))
 
 
-def _alternate(R_F: Floats, R_M: Floats, R_T: Floats, steps: int) -> tuple[Floats, Floats, float]:
-    """Best X for a T, then best T for that X, and so on; and the mean of trace(M^T X F T) reached."""
+def _alternate(R_F: Floats, R_M: Floats, R_T: Floats, steps: int) -> tuple[Floats, Floats, Floats]:
+    """Best X for a T, then best T for that X, and so on; and the mean of trace(M^T X F T) reached.
+
+    Args:
+        R_F: base_R_flange, shape (n, 3, 3).
+        R_M: world_R_tool, shape (n, 3, 3).
+        R_T: Where to start from, shape (k, 3, 3).
+        steps: How often.
+    """
+    K = np.einsum("nab,ncd->acbd", R_M, R_F)
     for _ in range(steps):
-        R_X = _frame_rotation(R_F, R_M, R_T)
-        R_T = _tool_rotation(R_F, R_M, R_X)
-    return R_X, R_T, float(np.einsum("nab,ac,ncd,db->", R_M, R_X, R_F, R_T)) / len(R_F)
+        R_X = nearest_rotation(np.einsum("acbd,kdb->kac", K, R_T))
+        R_T = nearest_rotation(np.einsum("acbd,kac->kdb", K, R_X))
+    return R_X, R_T, np.einsum("acbd,kac,kdb->k", K, R_X, R_T, optimize=True) / len(R_F)
 
 
 def _common_axis(R_F: Floats) -> Floats:

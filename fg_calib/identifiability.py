@@ -8,13 +8,14 @@ may be weak.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.choices import FrameKnowledge, Model
+from fg_calib.conventions import MissingMotion, missing_motions
 from fg_calib.errors import ProblemError
 from fg_calib.measurements import Measurements, Pairing
 from fg_calib.observability import SIGNAL_FLOOR, Observability
@@ -39,6 +40,7 @@ class Identifiability:
         with_fixed_known: The same where the parameters that the robot's file calls fixed are known; None if it calls
             none fixed, or if only the others were looked at anyway.
         fixed: Those parameters.
+        missing: Small motions between neighbouring axes that the robot's convention has no parameter for.
     """
 
     robot: str
@@ -49,6 +51,7 @@ class Identifiability:
     lost: tuple[LostDirection, ...]
     with_fixed_known: Identifiability | None = None
     fixed: tuple[str, ...] = ()
+    missing: tuple[MissingMotion, ...] = ()
 
 
 def observe_structure(
@@ -87,9 +90,7 @@ def observe_structure(
     if not fixed or not estimated:
         return whole
     known = look(names_of(estimated))
-    return Identifiability(
-        whole.robot, model, whole.kind, whole.n_configurations, whole.observability, whole.lost, known, fixed
-    )
+    return replace(whole, with_fixed_known=known, fixed=fixed)
 
 
 def observe_configurations(
@@ -150,4 +151,5 @@ def identify(
         n_configurations=problem.n_configurations,
         observability=observability,
         lost=explain(problem, observability, parameters),
+        missing=missing_motions(problem.robot),
     )

@@ -135,6 +135,7 @@ class Measurements:
         source: File name, for messages.
         groups: Which configurations touched the same point; None if none did.
         sigma_point: Of a touch, per axis, shape (n_configurations,), [m]; nan where it is not stated.
+        roll_pitch_yaw: What `rotation` was read from, shape (n_configurations, 3), [rad]; None for quaternions.
     """
 
     readings: Floats
@@ -149,6 +150,7 @@ class Measurements:
     source: str = "measurements"
     groups: Groups | None = None
     sigma_point: Floats | None = None
+    roll_pitch_yaw: Floats | None = None
 
     @property
     def n_configurations(self) -> int:

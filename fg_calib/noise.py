@@ -20,9 +20,10 @@ from dataclasses import replace
 import numpy as np
 
 from fg_calib.covariance import spread_of
-from fg_calib.errors import ProblemError
+from fg_calib.errors import ProblemError, SolverError
 from fg_calib.files.job import Job
 from fg_calib.goodness import KindFit, kind_fits
+from fg_calib.mistakes import check_setup
 from fg_calib.problem import Problem, judged_at, noise_kinds, problem_of
 from fg_calib.residual_table import residual_table
 from fg_calib.solver import Solution, SolverOptions, solve
@@ -48,7 +49,13 @@ def solve_job(job: Job, problem: Problem | None = None) -> Solution:
         SolverError: GTSAM could not solve a step at all.
     """
     problem = problem or problem_of(job)
-    return estimate_noise(problem) if job.estimate_noise else solve(problem)
+    try:
+        return estimate_noise(problem) if job.estimate_noise else solve(problem)
+    except SolverError as error:
+        check = check_setup(job.robot, job.measurements, job.model, job.frame, doubtful=True)
+        if not check.explanations:
+            raise
+        raise SolverError(f"{error}; {check}") from error
 
 
 def estimate_noise(problem: Problem, options: SolverOptions | None = None) -> Solution:

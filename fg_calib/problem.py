@@ -43,7 +43,6 @@ from fg_calib.observability import RANK_TOLERANCE, SIGNAL_FLOOR, Observability, 
 from fg_calib.residuals import AnyBlock, Block, CorrelatedBlock
 from fg_calib.robot import Parameter, Robot
 from fg_calib.whitening import (
-    KINK_SIGMAS,
     MAX_SHARED,
     Adjustment,
     PairJudgement,
@@ -410,10 +409,6 @@ def predicted_problem(
         source="predictions",
     )
     pairs = _usable_pairs(measurements, settings) if settings.uses_pairs else None
-    if pairs is not None:
-        # Whether two near points would be measured as the same is a matter of noise: they tell nothing in advance.
-        apart = pairs.distance > KINK_SIGMAS * pairs.sigma_distance
-        pairs = replace(pairs, distance=np.where(apart, pairs.distance, np.nan))
     return _assemble(robot, measurements, settings, variables, variables.nominal(), trig, pairs)
 
 

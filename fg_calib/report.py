@@ -20,7 +20,7 @@ from fg_calib.reasons import LostDirection
 from fg_calib.residual_table import FAMILIES, ROW_KINDS
 from fg_calib.robot import AXIS_OF_KIND, Axis, Robot
 from fg_calib.solver import Solution
-from fg_calib.uncertainty import FrameEstimate, ParameterEstimate, Uncertainty
+from fg_calib.uncertainty import LIKE_NOISE, FrameEstimate, ParameterEstimate, Uncertainty
 
 WIDTH = 100
 """Columns of the plain report."""
@@ -190,8 +190,10 @@ def _goodness_lines(solution: Solution, uncertainty: Uncertainty) -> Iterable[st
             f"{' and '.join(estimated)} noise was estimated from these residuals: chi-square says nothing about it, and"
             f" {len(estimated)} of its degrees of freedom went there"
         )
-    elif verdicts & {"too large", "too small", "both"}:
+    elif verdicts & {"too large", "too small", "both"} and uncertainty.noise_may_be_estimated:
         yield "to take the noise seen for the noise there is: noise: estimate in the job"
+    if uncertainty.noise_like is not None and uncertainty.noise_like < LIKE_NOISE:
+        yield "the residuals follow the arm, as noise does not: effects that are not modelled"
     if estimated is None and verdicts & {"outliers", "both"}:
         yield "look at the suspicious rows below, or let a robust loss weigh them: loss in the job"
     if not len(goodness.suspects) and not goodness.configurations:
@@ -385,7 +387,9 @@ def build_identifiability_report(found: Identifiability) -> RenderableType:
     """What can be identified, as in the paper's Tables 3 and 4, and why the rest cannot."""
     where = "random configurations" if found.kind == "structural" else "configurations"
     title = f"{found.robot}: {found.model}, {found.kind}, {found.n_configurations} {where}"
-    parts = [Text(title, style="bold"), *_classes(found)]
+    parts: list[RenderableType] = [Text(title, style="bold")]
+    parts += (Text(f"NOT MODELLED: {m}", style="bold red") for m in found.missing)
+    parts += _classes(found)
     known = found.with_fixed_known
     if known is not None:
         parts += [

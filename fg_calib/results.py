@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import numpy as np
 
 from fg_calib import __version__
 from fg_calib.comparison import Comparison, Estimate, RealErrors
+from fg_calib.conventions import WORDS
 from fg_calib.figures import write_figures
 from fg_calib.files.disk import fill_folder, write_text
 from fg_calib.files.robot_yaml import write_robot
@@ -20,8 +21,10 @@ from fg_calib.files.tables import Words, write_csv_parts
 from fg_calib.files.urdf import write_urdf
 from fg_calib.goodness import FLAGS, VERDICTS
 from fg_calib.identifiability import Identifiability
+from fg_calib.mistakes import SetupCheck
 from fg_calib.residual_table import FAMILIES, FAMILY_OF_KIND, ROW_KINDS
 from fg_calib.robot import Robot
+from fg_calib.setup import TypicalResidual
 from fg_calib.solver import Solution
 from fg_calib.uncertainty import ParameterEstimate, Uncertainty
 
@@ -82,6 +85,8 @@ def result_document(
         "trustworthy": uncertainty.trustworthy,
         "findings": list(uncertainty.findings),
         "cautions": list(uncertainty.cautions),
+        "setup": _setup(uncertainty.setup),
+        "probability_of_noise": uncertainty.noise_like,
         "chi2": uncertainty.chi2,
         "dof": uncertainty.dof,
         "reduced_chi2": uncertainty.reduced_chi2,
@@ -159,6 +164,16 @@ def observability_document(found: Identifiability) -> dict[str, Any]:
         ],
         "kept": o.kept,
         "lost": [{"relation": direction.relation, "reason": direction.reason} for direction in found.lost],
+        "missing": [
+            {
+                "axes": list(m.axes),
+                "motions": [WORDS[motion] for motion in m.motions],
+                "convention": m.convention,
+                "use": m.use,
+                "message": str(m),
+            }
+            for m in found.missing
+        ],
         "null_space": o.null_space,
         "indices": o.indices,
         "condition_number": o.condition_number,
@@ -172,6 +187,18 @@ def observability_document(found: Identifiability) -> dict[str, Any]:
         document["with_fixed_known"] = observability_document(found.with_fixed_known)
     plain: dict[str, Any] = _plain(document)
     return plain
+
+
+def _setup(check: SetupCheck) -> dict[str, Any]:
+    """Residuals before the calibration beside what noise and tolerances predict, and mistakes that explain them."""
+
+    def by_kind(residuals: Sequence[TypicalResidual]) -> dict[str, Any]:
+        return {r.kind: {"typical": r.size, "predicted": r.expected} for r in residuals}
+
+    return {
+        "residuals": by_kind(check.residuals),
+        "explanations": [{"mistakes": list(e.mistakes), "residuals": by_kind(e.residuals)} for e in check.explanations],
+    }
 
 
 def write_observability(folder: Path | str, found: Identifiability) -> None:

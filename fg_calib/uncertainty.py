@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -11,10 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 from scipy.spatial.transform import Rotation
 
+from fg_calib.conventions import MissingMotion
 from fg_calib.covariance import Spread, spread_of, with_left_out
 from fg_calib.factors import corrections_of, pose_of
 from fg_calib.goodness import OUTLIER_WEIGHT, Goodness, judge_fit
 from fg_calib.identifiability import Identifiability, identify
+from fg_calib.mistakes import SetupCheck, check_problem
 from fg_calib.observability import IdentifiabilityClass, Observability
 from fg_calib.problem import PAIR_KINDS, Problem, eliminated_terms, lengths
 from fg_calib.residual_table import ResidualTable, residual_table
@@ -22,6 +24,7 @@ from fg_calib.residuals import single_threaded_blas
 from fg_calib.robot import Robot
 from fg_calib.robust import effect
 from fg_calib.solver import Solution
+from fg_calib.structure import probability_of_noise
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -38,6 +41,12 @@ BENDING = 2.0
 
 MANY_NEAR_KINKS = 0.1
 """Share of measured rows near a kink beyond which noise is large for the motions that were measured."""
+
+MOST_ESTIMATED = 2.0
+"""Noise seen over noise stated above which it is more likely that something is not modelled."""
+
+LIKE_NOISE = 1e-3
+"""Probability below which residuals follow the arm more than noise does."""
 
 FACTOR = 2.0
 """A reduced chi-square between 1 / FACTOR and FACTOR is good whatever its distribution: noise is never known better."""
@@ -146,6 +155,9 @@ class Uncertainty:
         findings: Why the result is not to be trusted; empty if it is.
         cautions: Where its sigmas may be somewhat too small although nothing speaks against it.
         points: The points that groups of configurations touched.
+        setup: What residuals before the calibration say of its set-up.
+        noise_like: Probability that noise alone follows the arm as much as the residuals do; None where that was not
+            asked, because they are as small as stated, or cannot be told.
     """
 
     names: tuple[str, ...]
@@ -166,6 +178,8 @@ class Uncertainty:
     findings: tuple[str, ...]
     cautions: tuple[str, ...]
     points: tuple[PointEstimate, ...] = ()
+    setup: SetupCheck = field(default_factory=SetupCheck)
+    noise_like: float | None = None
 
     def predict(self, function: Callable[[Robot], ArrayLike]) -> Prediction:
         """Value and sigma of any function of the robot: a tool position, a distance, a sum of parameters.
@@ -187,6 +201,18 @@ class Uncertainty:
     def observability(self) -> Observability:
         """Rank, classes and groups of `identifiability`."""
         return self.identifiability.observability
+
+    @property
+    def noise_may_be_estimated(self) -> bool:
+        """Whether the noise seen may be taken for the noise there is: a little larger than stated, and like noise."""
+        too_large = [fit for fit in self.goodness.kinds if fit.verdict in ("too small", "both")]
+        return (
+            not self.points
+            and not self.setup.explanations
+            and not (too_large and self.identifiability.missing)
+            and all(fit.typical <= MOST_ESTIMATED for fit in too_large)
+            and (self.noise_like is None or self.noise_like > LIKE_NOISE)
+        )
 
     @property
     def reduced_chi2(self) -> float | None:
@@ -237,6 +263,16 @@ def _assess(solution: Solution) -> Uncertainty:
     independent = _independent_dof(problem, dof, spread.rank)
     bounds = chi2_bounds(dof, expected, independent)
     table = residual_table(solution)
+    goodness = judge_fit(solution, spread, table)
+    doubts = _findings(solution, chi2, dof, bounds)
+    estimated = max((fit.factor for fit in goodness.kinds), default=1.0) > MOST_ESTIMATED
+    setup = check_problem(problem, solution.before, doubtful=bool(doubts) or estimated)
+    too_large = {fit.verdict for fit in goodness.kinds} & {"too small", "both"}
+    asked = too_large or (identified.missing and solution.estimated_noise)
+    noise_like = probability_of_noise(solution) if asked else None
+    follow = noise_like is not None and noise_like < LIKE_NOISE
+    fits = not doubts and solution.estimated_noise is None
+    findings, cautions = _of_model(setup, identified.missing, fits=fits, high=chi2 > bounds[1] * dof or follow)
     return Uncertainty(
         names=whole.variables.names[: whole.variables.n_robot_columns],
         covariance=covariance,
@@ -248,14 +284,16 @@ def _assess(solution: Solution) -> Uncertainty:
         chi2_bounds=bounds,
         p_value=_p_value(solution, chi2, expected, independent),
         residuals=table,
-        goodness=judge_fit(solution, spread, table),
+        goodness=goodness,
         identifiability=identified,
         robot=problem.robot.with_values(solution.parameters[variables.robot_span]),
         spread=spread,
         whole=whole,
-        findings=_findings(solution, chi2, dof, bounds),
-        cautions=_cautions(problem),
+        findings=(*findings, *doubts),
+        cautions=(*cautions, *_cautions(problem)),
         points=_point_estimates(solution, whole),
+        setup=setup,
+        noise_like=noise_like,
     )
 
 
@@ -378,6 +416,28 @@ def _findings(solution: Solution, chi2: float, dof: int, bounds: tuple[float, fl
         cause = "noise stated too small, effects not modelled, or outliers" if high else "noise stated too large"
         findings.append(f"reduced chi-square {chi2 / dof:.3g} is outside [{bounds[0]:.2f}, {bounds[1]:.2f}]: {cause}")
     return tuple(findings)
+
+
+def _of_model(
+    setup: SetupCheck, missing: Sequence[MissingMotion], *, fits: bool, high: bool
+) -> tuple[list[str], list[str]]:
+    """Findings and cautions that come before all others: the set-up or the model is wrong, so no figure can be right.
+
+    Args:
+        setup: What residuals before the calibration say of the set-up.
+        missing: What the robot's convention has no parameter for.
+        fits: Whether nothing speaks against the calibration although the noise was as stated.
+        high: Whether the residuals are larger than the noise, or follow the arm.
+    """
+    findings: list[str] = []
+    cautions: list[str] = []
+    if setup.explanations:
+        (cautions if fits else findings).append(str(setup))
+    elif setup.far and high:
+        findings.append(str(setup))
+    for motion in missing:
+        (findings if high and not setup.explanations else cautions).append(str(motion))
+    return findings, cautions
 
 
 def _point_estimates(solution: Solution, spread: Spread) -> tuple[PointEstimate, ...]:

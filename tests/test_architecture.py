@@ -14,7 +14,7 @@ import fg_calib
 PACKAGE = Path(fg_calib.__file__).parent
 FLOORS = (
     *("choices", "errors", "robot", "measurements", "scenario", "files", "kernels", "kinematics"),
-    *("inverse", "simulator", "residuals", "least_squares", "moments"),
+    *("inverse", "simulator", "conventions", "residuals", "least_squares", "moments"),
     *(
         "factors",
         "groups",
@@ -25,6 +25,9 @@ FLOORS = (
         "whitening",
         "problem",
         "solver",
+        "setup",
+        "mistakes",
+        "structure",
         "reasons",
         "identifiability",
         "covariance",

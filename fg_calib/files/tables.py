@@ -108,6 +108,7 @@ def read_measurements(
         source=header.name,
         groups=Groups(names, group, between_groups) if names else None,
         sigma_point=_sigma_point(table, sigma_point, group >= 0, noise.point, length) if names else None,
+        roll_pitch_yaw=table.numbers(orientation) * angle if orientation == _ROLL_PITCH_YAW else None,
     )
 
 
