@@ -140,7 +140,7 @@ class _Search:
         self._low, self._high = _range_of_starts(robot)
         self._middle = 0.5 * (self._low + self._high)
         self._turning = np.array([not joint.prismatic for joint in robot.joints])
-        self.length = _length_of(robot)
+        self.length = length_of(robot)
         self._unit = np.where(self._turning, 1.0, self.length)  # of a step, (n_joints,)
         self.good_enough = 0.1 * REACHED / max(1.0, self.length)
 
@@ -198,7 +198,7 @@ def _range_of_starts(robot: Robot) -> tuple[Floats, Floats]:
     return low, high
 
 
-def _length_of(robot: Robot) -> float:
+def length_of(robot: Robot) -> float:
     """How long the arm is stretched out, [m]; 1 if it has no length."""
     nominal = robot.nominal
     lengths = [
