@@ -27,6 +27,7 @@ from fg_calib.files.job import Job
 from fg_calib.goodness import KindFit, kind_fits
 from fg_calib.problem import Problem, judged_at, noise_kinds, problem_of
 from fg_calib.residual_table import residual_table
+from fg_calib.restarts import look_elsewhere
 from fg_calib.solver import Solution, SolverOptions, solve
 
 LEAST_REDUNDANCY = 3.0
@@ -42,7 +43,7 @@ MAX_ROUNDS = 30
 
 
 def solve_job(job: Job, problem: Problem | None = None) -> Solution:
-    """The solution of a job, its noise estimated if the job asks for it.
+    """The solution of a job: the best optimum that is found, with its noise estimated if the job asks for it.
 
     Args:
         job: The job.
@@ -54,7 +55,8 @@ def solve_job(job: Job, problem: Problem | None = None) -> Solution:
     """
     problem = problem or problem_of(job)
     options = SolverOptions() if job.max_iterations is None else SolverOptions(max_iterations=job.max_iterations)
-    return estimate_noise(problem, options) if job.estimate_noise else solve(problem, options)
+    solution = estimate_noise(problem, options) if job.estimate_noise else solve(problem, options)
+    return look_elsewhere(solution, options)
 
 
 def estimate_noise(problem: Problem, options: SolverOptions | None = None) -> Solution:

@@ -46,6 +46,9 @@ FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-15, 1e12
 SMALL_ANGLE = 1e-3
 """A small change of an angle, [rad]; that of a length is this times the arm's length."""
 
+BACK = 0.1
+"""A descent from another start that ends this near to where one has been is back there, [sigma]."""
+
 COARSE = 1e-2
 """Rows are whitened anew once the optimum with the present ones is nearer than this, [sigma]."""
 
@@ -97,6 +100,7 @@ class Solution:
         weighted_cost: The same with every measurement by its robust weight.
         seconds: Time taken.
         estimated_noise: Kinds whose noise was estimated (see `noise`); None where it was taken as stated.
+        others: Parameter vectors of other optima that the data cannot tell from this one (see `restarts`).
     """
 
     problem: Problem
@@ -111,6 +115,7 @@ class Solution:
     weighted_cost: float
     seconds: float
     estimated_noise: tuple[str, ...] | None = None
+    others: tuple[Floats, ...] = ()
 
     @property
     def iterations(self) -> int:
@@ -139,10 +144,42 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
             before = np.concatenate([found, problem.start[len(found) :]])
             problem = judged_at(problem, before)
         run = _fit(problem, options)
-        cost = run.here.cost
-        if run.problem.adjustment.weights is not None:
-            stated = judged_at(problem, run.parameters, replace(run.problem.adjustment, weights=None))
-            cost = stated.graph.error(run.here.values)
+        return _solution(run, before, run.initial_cost, clock)
+
+
+def solve_from(solution: Solution, start: Floats, most: float, options: SolverOptions | None = None) -> Solution | None:
+    """The descent on a solution's problem from another start.
+
+    Args:
+        solution: What was found before; `before` and the initial cost stay as they are.
+        start: The parameter vector to start from.
+        most: Cost of an optimum that is of no interest, with the rows whitened as they are in the solution.
+        options: Settings of the solver.
+
+    Returns:
+        None if the descent leads nowhere, above `most` or back to where the solution is.
+
+    Raises:
+        SolverError: GTSAM could not solve a step at all.
+    """
+    clock, options = time.perf_counter(), options or SolverOptions()
+    with single_threaded_blas():
+        problem = replace(solution.problem, start=start)
+        rough = _Run(problem, options)
+        if not rough.descend(COARSE) or rough.here.cost >= most:
+            return None
+        if rough.here.decrement_to(solution.values) < BACK:
+            return None
+        run = _fit(judged_at(problem, rough.parameters), options)
+        found = _solution(run, solution.before, solution.initial_cost, clock)
+        return replace(found, estimated_noise=solution.estimated_noise)
+
+
+def _solution(run: _Run, before: Floats, initial_cost: float, clock: float) -> Solution:
+    cost, weights = run.here.cost, run.problem.adjustment.weights
+    if weights is not None:
+        stated = judged_at(run.problem, run.parameters, replace(run.problem.adjustment, weights=None))
+        cost = stated.graph.error(run.here.values)
     return Solution(
         problem=run.problem,
         values=run.here.values,
@@ -151,7 +188,7 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
         converged=run.converged,
         message=run.message,
         history=tuple(run.history),
-        initial_cost=run.initial_cost,
+        initial_cost=initial_cost,
         cost=cost,
         weighted_cost=run.here.cost,
         seconds=time.perf_counter() - clock,
@@ -346,6 +383,13 @@ class _Linearised:
         self.rounding = 10.0 * float(np.finfo(float).eps) / SMALL_ANGLE * float(s.max(initial=0.0))
         self.at_rounding = 0.5 * self.decrement**2 <= 10.0 * self.rounding * np.sqrt(2.0 * self.cost)
         self._loose, self._follow = Vt[rank:], left.follow
+        self._information = s[:rank, None] * Vt[:rank]
+        self._variables = variables
+
+    def decrement_to(self, values: gtsam.Values) -> float:
+        """How far some other values are, in sigma as seen from here."""
+        step = self._variables.step(self.values, values)[: len(self._sizes)]
+        return float(np.linalg.norm(self._information @ (step / self._sizes)))
 
     def held(self, step: Floats) -> Floats:
         """A step with the same effect on every row, but none on the core's undetermined directions."""

@@ -28,6 +28,7 @@ FLOORS = (
         "reasons",
         "identifiability",
         "covariance",
+        "restarts",
         "residual_table",
         "goodness",
         "noise",
