@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from fg_calib.noise import estimate_noise, solve_job
     from fg_calib.problem import Problem, build_problem, problem_of
     from fg_calib.report import format_comparison, format_identifiability, format_report
+    from fg_calib.restarts import look_elsewhere
     from fg_calib.results import (
         comparison_document,
         observability_document,
@@ -73,6 +74,7 @@ _HOMES = {
     "fg_calib.robot": ("Robot",),
     "fg_calib.scenario": ("Scenario", "Simulation"),
     "fg_calib.simulator": ("simulate",),
+    "fg_calib.restarts": ("look_elsewhere",),
     "fg_calib.solver": ("Solution", "SolverOptions", "solve"),
     "fg_calib.uncertainty": ("Uncertainty", "assess"),
 }
@@ -111,6 +113,7 @@ __all__ = [
     "format_comparison",
     "format_identifiability",
     "format_report",
+    "look_elsewhere",
     "observability_document",
     "observe_configurations",
     "observe_structure",

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
 import gtsam
 import numpy as np
+import scipy.sparse
 from numpy.typing import NDArray
 
 from fg_calib import frames, residuals
@@ -71,15 +72,6 @@ POSE_KINDS: dict[str, tuple[bool, bool]] = {
     "pose": (True, True),
 }
 """Whether a model uses orientations and positions."""
-
-SIGMA_TOLERANCE = 1e-3
-"""Sigmas of rows that move by a smaller share have settled."""
-
-WEIGHT_TOLERANCE = 1e-7
-"""Robust weights that move by less have settled."""
-
-JOINT_TOLERANCE = 1e-7
-"""Estimated joint values that move by less than this many sigma of their readings have settled."""
 
 QUARTER_TURN = 1e-3
 """Cosine of a pitch at which yaw and roll of a frame may be told apart no more."""
@@ -455,31 +447,22 @@ def judged_at(problem: Problem, parameters: Floats, adjustment: Adjustment | Non
     return replace(anew, whole=p.whole)
 
 
-def is_settled(problem: Problem, parameters: Floats, adjustment: Adjustment) -> bool:
-    """Whether rows judged and whitened anew, at other parameters and adjusted, would differ by nothing that matters.
+def same_rows(a: Problem, b: Problem) -> bool:
+    """Whether two problems have the very same rows, to the last figure."""
+    return _equal((a.blocks, a.terms), (b.blocks, b.terms))
 
-    Args:
-        problem: The problem.
-        parameters: The parameter vector.
-        adjustment: What has been learned of the noise there.
-    """
-    p, a, b = problem, problem.adjustment, adjustment
-    if a.weights is not None or b.weights is not None:
-        before, after = (np.ones(1) if x.weights is None else x.weights for x in (a, b))
-        if np.max(np.abs(before - after), initial=0.0) > WEIGHT_TOLERANCE:
-            return False
-    if a.joint_errors is not None and b.joint_errors is not None:
-        sigma = np.maximum(p.measurements.sigma_joint, 1e-300)
-        if np.max(np.abs(a.joint_errors - b.joint_errors) / sigma) > JOINT_TOLERANCE:
-            return False
-    whitening = _whitening(replace(p, adjustment=b), parameters)
-    if isinstance(whitening, PairWhitening) and whitening.judgement != p.judgement:
-        return False
-    sigmas = [(p.sigma, whitening.sigma)]
-    if p.points is not None:
-        covariance = p.points.covariance(p.variables.chain.at(parameters), p.trig)
-        sigmas.append((p.sigma_point, np.sqrt(np.einsum("nii->ni", covariance))))
-    return all(np.allclose(*pair, rtol=SIGMA_TOLERANCE, atol=0.0, equal_nan=True) for pair in sigmas)
+
+def _equal(a: Any, b: Any) -> bool:
+    """Whether two rows' data are equal: arrays, sparse arrays, tuples and dataclasses of them."""
+    if a is b or type(a) is not type(b):
+        return a is b
+    if isinstance(a, np.ndarray):
+        return np.array_equal(a, b)
+    if isinstance(a, tuple):
+        return len(a) == len(b) and all(map(_equal, a, b))
+    if isinstance(a, scipy.sparse.csr_array):
+        return _equal((a.data, a.indices, a.indptr), (b.data, b.indices, b.indptr))
+    return all(_equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(a)) if is_dataclass(a) else bool(a == b)
 
 
 def lengths(problem: Problem, parameters: Floats) -> tuple[Floats, Integers]:

@@ -168,7 +168,8 @@ def _goodness(solution: Solution, uncertainty: Uncertainty) -> Iterable[Renderab
         seen, words = fit.seen_over_stated, VERDICTS[fit.verdict]
         if estimated is not None:
             seen = fit.factor
-            words = "estimated" if fit.kind in estimated else "too few rows to estimate it: as stated"
+            settled = "estimated" if solution.converged else "not settled: the estimate has not converged"
+            words = settled if fit.kind in estimated else "too few rows to estimate it: as stated"
         table.add_row(
             fit.kind,
             shown,
@@ -185,12 +186,12 @@ def _goodness(solution: Solution, uncertainty: Uncertainty) -> Iterable[Renderab
 def _goodness_lines(solution: Solution, uncertainty: Uncertainty) -> Iterable[str]:
     goodness, estimated = uncertainty.goodness, solution.estimated_noise
     verdicts = {fit.verdict for fit in goodness.kinds}
-    if estimated:
+    if estimated and solution.converged:
         yield (
             f"{' and '.join(estimated)} noise was estimated from these residuals: chi-square says nothing about it, and"
             f" {len(estimated)} of its degrees of freedom went there"
         )
-    elif verdicts & {"too large", "too small", "both"} and uncertainty.noise_may_be_estimated:
+    elif estimated is None and verdicts & {"too large", "too small", "both"} and uncertainty.noise_may_be_estimated:
         yield "to take the noise seen for the noise there is: noise: estimate in the job"
     if uncertainty.noise_like is not None and uncertainty.noise_like < LIKE_NOISE:
         yield "the residuals follow the arm, as noise does not: effects that are not modelled"

@@ -39,6 +39,7 @@ References:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
@@ -377,12 +378,12 @@ def squared_norm(block: AnyBlock, chain: Chain) -> float:
     """Sum of squared whitened residuals."""
     free = chain.without_columns()
     if isinstance(block, CorrelatedBlock):
-        return sum(float(np.vdot(chunk, chunk)) for chunk in block.chunks(free))
+        return math.fsum(float(np.vdot(chunk, chunk)) for chunk in block.chunks(free))
 
     def run(start: int, stop: int) -> float:
-        return sum(float(np.vdot(panel, panel)) for _, _, panel in _panels(block, free, start, stop))
+        return math.fsum(float(np.vdot(panel, panel)) for _, _, panel in _panels(block, free, start, stop))
 
-    return sum(over_spans(run, block.n))
+    return math.fsum(over_spans(run, block.n))
 
 
 def gram(block: AnyBlock, chain: Chain) -> Floats:

@@ -1,12 +1,16 @@
-"""Levenberg-Marquardt by GTSAM, with a status of our own.
+"""Gauss-Newton steps with GTSAM's Levenberg-Marquardt as the safeguard, and a status of our own.
 
-GTSAM's optimiser takes the steps, one `iterate` at a time; whether it has arrived is judged here, because GTSAM returns
-without a word when it is stuck. The judge is the *decrement*: how far, in sigma, the Gauss-Newton step still leads
-along the directions that data and priors determine (the square root of the cost decrease it predicts, times two).
+The graph is GTSAM's. Each iteration linearises it and decomposes the dense system once (singular values, nuisance
+columns eliminated, columns in units of the arm's geometry). That gives the Gauss-Newton step along the directions that
+data and priors determine, and the *decrement*: how far, in sigma, the optimum still is along them (the square root of
+the cost decrease that the step promises, times two). Where the cost does not fall by a fair share of what was promised,
+GTSAM takes a damped step instead. Directions that nothing determines stay where they are: every step is a minimum-norm
+step. Near the optimum, where rounding of the cost is larger than what is left to gain, the decrement judges: it must
+fall.
 
-Directions that nothing determines are left where they are: the damping `lambda I` never falls to zero, so every step is
-a minimum-norm step. Its floor is that of a direction whose signal-to-noise ratio is just too small to count as
-determined: less damping lets noise carry such directions off by metres, and what is determined is hardly slowed by it.
+Rows are whitened at the parameters that are estimated (joint noise, errors that pairs share, robust weights), so that
+the optimum is one of frozen whitening only if whitening anew, there, leaves nothing to go. That is how convergence is
+judged: by the decrement of the problem whitened at the estimate itself.
 """
 
 from __future__ import annotations
@@ -20,18 +24,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.errors import SolverError
-from fg_calib.factors import Eliminated, Variables, eliminate
-from fg_calib.observability import SIGNAL_FLOOR, determined
-from fg_calib.problem import Problem, frames_only, is_settled, joint_errors, judged_at, lengths
+from fg_calib.factors import Variables, eliminate
+from fg_calib.observability import determined
+from fg_calib.problem import Problem, frames_only, joint_errors, judged_at, lengths, same_rows
 from fg_calib.residuals import single_threaded_blas
 from fg_calib.robust import Weighting
 from fg_calib.whitening import Adjustment
 
 Floats = NDArray[np.float64]
 
+FAIR_SHARE = 0.25
+"""Share of the promised decrease of the cost that an undamped step must bring."""
 
-_DAMPING_FLOOR = 10.0 * (SIGNAL_FLOOR / 1e-3) ** 2
-"""Least damping in [1/m^2] and [1/rad^2]: ten times the curvature at the floor, in changes of 1 mm and 1 mrad."""
+PATIENCE = 4
+"""Undamped steps in which the cost may rise before it has fallen."""
+
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-15, 1e12
+"""Damping of damped steps, as a share of each column's own curvature: that of the first one, and its bounds."""
+
+BACK = 0.1
+"""A descent from another start that ends this near to where one has been is back there, [sigma]."""
+
+COARSE = 1e-2
+"""Rows are whitened anew once the optimum with the present ones is nearer than this, [sigma]."""
 
 
 @dataclass(frozen=True)
@@ -40,19 +55,11 @@ class SolverOptions:
 
     Attributes:
         max_iterations: Steps after which it gives up.
-        decrement: Converged when a step began nearer than this to the optimum, [sigma]; far less is left after it.
-        lambda_ceiling: Damping beyond which it gives up, as a multiple of the largest curvature.
-        lambda_floor: Least damping, as a multiple of the largest curvature (rounding), beside `_DAMPING_FLOOR` (noise).
-        max_rounds: Times that rows are judged and whitened anew at the estimate.
-        max_learning_rounds: The same where robust weights or joint values are learned, which takes some rounds.
+        decrement: Converged when the optimum, with rows whitened at the estimate, is nearer than this, [sigma].
     """
 
-    max_iterations: int = 100
-    decrement: float = 1e-5
-    lambda_ceiling: float = 1e6
-    lambda_floor: float = 1e-14
-    max_rounds: int = 5
-    max_learning_rounds: int = 200
+    max_iterations: int = 200
+    decrement: float = 3e-7
 
 
 @dataclass(frozen=True)
@@ -61,7 +68,7 @@ class Iteration:
 
     Attributes:
         cost: Half the sum of squared whitened residuals after the step.
-        damping: Levenberg-Marquardt's lambda after the step.
+        damping: Of a step by Levenberg-Marquardt, as a share of each column's own curvature; 0 for an undamped one.
         step: Length of the step, in changes of ordinary size (tolerances, else 1 mm and 1 mrad).
         decrement: How far from the optimum it started, [sigma].
     """
@@ -89,6 +96,7 @@ class Solution:
         weighted_cost: The same with every measurement by its robust weight.
         seconds: Time taken.
         estimated_noise: Kinds whose noise was estimated (see `noise`); None where it was taken as stated.
+        others: Parameter vectors of other optima that the data cannot tell from this one (see `restarts`).
     """
 
     problem: Problem
@@ -103,6 +111,7 @@ class Solution:
     weighted_cost: float
     seconds: float
     estimated_noise: tuple[str, ...] | None = None
+    others: tuple[Floats, ...] = ()
 
     @property
     def iterations(self) -> int:
@@ -113,9 +122,10 @@ class Solution:
 def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
     """Estimate the parameters.
 
-    First measurement frame, base and tool alone with the arm at nominal, then everything. Then, in rounds, the rows are
-    judged and whitened at the estimate, robust weights follow from the residuals there and joint errors, where they are
-    estimated, from what the rows say of them; where that changes the rows, the solver goes on with the new ones.
+    First measurement frame, base and tool alone with the arm at nominal, then everything. Each time that the optimum is
+    near, the rows are judged and whitened at the estimate, robust weights follow from the residuals there and joint
+    errors, where they are estimated, from what the rows say of them; the solver goes on with the new rows until they
+    leave nothing to go.
 
     Raises:
         SolverError: GTSAM could not solve a step at all.
@@ -126,73 +136,94 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
         before = problem.start
         frames = frames_only(problem)
         if frames is not None:
-            before = _fit(frames, options).run.parameters
-            before = np.concatenate([before, problem.start[len(before) :]])
+            found = _fit(frames, replace(options, decrement=max(options.decrement, COARSE))).parameters
+            before = np.concatenate([found, problem.start[len(found) :]])
             problem = judged_at(problem, before)
-        initial_cost = problem.graph.error(problem.initial)
-        fit = _fit(problem, options)
-        run, cost = fit.run, fit.run.cost
-        if run.problem.adjustment.weights is not None:
-            stated = judged_at(problem, run.parameters, replace(run.problem.adjustment, weights=None))
-            cost = stated.graph.error(run.values)
+        run = _fit(problem, options)
+        return _solution(run, before, run.initial_cost, clock)
+
+
+def solve_from(solution: Solution, start: Floats, most: float, options: SolverOptions | None = None) -> Solution | None:
+    """The descent on a solution's problem from another start.
+
+    Args:
+        solution: What was found before; `before` and the initial cost stay as they are.
+        start: The parameter vector to start from.
+        most: Cost of an optimum that is of no interest, with the rows whitened as they are in the solution.
+        options: Settings of the solver.
+
+    Returns:
+        None if the descent leads nowhere, above `most` or back to where the solution is.
+
+    Raises:
+        SolverError: GTSAM could not solve a step at all.
+    """
+    clock, options = time.perf_counter(), options or SolverOptions()
+    with single_threaded_blas():
+        problem = replace(solution.problem, start=start)
+        rough = _Run(problem, options)
+        if not rough.descend(COARSE) or rough.here.cost >= most:
+            return None
+        if rough.here.decrement_to(solution.values) < BACK:
+            return None
+        run = _fit(judged_at(problem, rough.parameters), options)
+        found = _solution(run, solution.before, solution.initial_cost, clock)
+        return replace(found, estimated_noise=solution.estimated_noise)
+
+
+def _solution(run: _Run, before: Floats, initial_cost: float, clock: float) -> Solution:
+    cost, weights = run.here.cost, run.problem.adjustment.weights
+    if weights is not None:
+        stated = judged_at(run.problem, run.parameters, replace(run.problem.adjustment, weights=None))
+        cost = stated.graph.error(run.here.values)
     return Solution(
         problem=run.problem,
-        values=run.values,
+        values=run.here.values,
         parameters=run.parameters,
         before=before,
-        converged=fit.converged,
-        message=fit.message,
-        history=fit.history,
+        converged=run.converged,
+        message=run.message,
+        history=tuple(run.history),
         initial_cost=initial_cost,
         cost=cost,
-        weighted_cost=run.cost,
+        weighted_cost=run.here.cost,
         seconds=time.perf_counter() - clock,
     )
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """The last of the rounds of a fit, and how they went."""
-
-    run: _Run
-    history: tuple[Iteration, ...]
-    converged: bool
-    message: str
-
-
-def _fit(problem: Problem, options: SolverOptions) -> _Fit:
-    """Least squares in rounds, from the problem's start.
+def _fit(problem: Problem, options: SolverOptions) -> _Run:
+    """Least squares from the problem's start, to the optimum of the rows as they are whitened there.
 
     With a robust loss the first weights are those of the residuals at the start: gross errors would lead least squares
-    astray. A round that does not arrive still tells which measurements are far off.
+    astray. Where the weights of a round lead nowhere, those that follow may.
     """
     robust = problem.settings.loss != "none"
     weighting = Weighting(problem.settings.loss)
-    first = problem
+    run, goal = _Run(problem, options), COARSE
     if robust:
-        first = judged_at(problem, problem.start, _learn(problem, problem.start, weighting)[0])
-    run = _Run(first, options)
-    history = run.history
-    learning = robust or problem.adjustment.joint_errors is not None
-    most = options.max_learning_rounds if learning else options.max_rounds
-    settled, rounds = False, 0
-    while (run.converged or robust) and np.isfinite(run.parameters).all() and rounds < most:
-        adjustment, final = _learn(run.problem, run.parameters, weighting)
-        settled = final and is_settled(run.problem, run.parameters, adjustment)
-        if settled:
+        run.go_on_with(judged_at(problem, problem.start, _learn(run, weighting)[0]))
+    while run.descend(goal) or robust:
+        adjustment, final = _learn(run, weighting)
+        anew = judged_at(problem, run.parameters, adjustment)
+        unchanged = same_rows(anew, run.problem)
+        if not unchanged:
+            run.go_on_with(anew)
+        if final and (unchanged or run.here.decrement <= run.least):
+            run.descend(run.least)
             break
-        run = _Run(judged_at(problem, run.parameters, adjustment), options)
-        history = history + run.history
-        rounds += 1
-    message = run.message
-    if run.converged and not settled and rounds == most:
-        message += "; which rows take part still changed"
-    return _Fit(run, tuple(history), run.converged and (settled or not learning), message)
+        if run.exhausted:
+            run.give_up()
+            break
+        goal = min(COARSE, max(run.least, 0.1 * run.here.decrement))
+    return run
 
 
-def _learn(problem: Problem, parameters: Floats, weighting: Weighting) -> tuple[Adjustment, bool]:
-    """What the residuals at some parameters say of the noise, and whether the loss has its final form."""
-    adjustment, final = problem.adjustment, True
+def _learn(run: _Run, weighting: Weighting) -> tuple[Adjustment, bool]:
+    """What the residuals where a descent is say of the noise, and whether the loss has its final form."""
+    problem, parameters, final = run.problem, run.parameters, True
+    adjustment = problem.adjustment
+    if problem.pairs is not None:  # what the parameters may be off bends lengths and angles
+        adjustment = replace(adjustment, spread=run.here.spread)
     if problem.settings.loss != "none":
         weights, final = weighting.update(*lengths(problem, parameters))
         adjustment = replace(adjustment, weights=weights)
@@ -202,71 +233,183 @@ def _learn(problem: Problem, parameters: Floats, weighting: Weighting) -> tuple[
 
 
 class _Run:
-    """One optimisation of one problem, from its start to the end."""
+    """A descent from a problem's start, on one set of whitened rows after the other.
+
+    Attributes:
+        problem: The problem with the rows as they are whitened now.
+        here: The problem linearised where the descent has arrived.
+        history: The steps taken.
+        initial_cost: Cost at the start.
+        converged: Whether the last descent arrived.
+        message: Why it stopped.
+    """
 
     def __init__(self, problem: Problem, options: SolverOptions) -> None:
         self.problem = problem
         self.history: list[Iteration] = []
         self.converged = False
-        variables = problem.variables
-        initial = problem.initial
+        self.message = ""
+        self._options = options
+        self._damping = FIRST_DAMPING
+        self.initial_cost = problem.graph.error(problem.initial)
+        if not np.isfinite(self.initial_cost):
+            raise SolverError(
+                f"the cost at the start is {self.initial_cost}: the measurements or the robot hold absurd numbers"
+            )
+        self.here = _Linearised(problem, problem.initial)
+
+    @property
+    def parameters(self) -> Floats:
+        """The parameter vector where the descent has arrived."""
+        return self.problem.variables.parameters(self.here.values)
+
+    @property
+    def least(self) -> float:
+        """The decrement that counts as arrived, [sigma]: what the options say, or rounding."""
+        return max(self._options.decrement, self.here.rounding)
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether all iterations have been spent."""
+        return len(self.history) >= self._options.max_iterations
+
+    def go_on_with(self, problem: Problem) -> None:
+        """The same place with other rows."""
+        self.problem = problem
+        self.here = _Linearised(problem, self.here.values)
+
+    def descend(self, goal: float) -> bool:
+        """Step until the optimum of these rows is nearer than `goal`, [sigma]; whether it is."""
+        self.converged, stuck = self.here.decrement <= goal, False
+        while not (self.converged or stuck or self.exhausted):
+            path, damping = self._undamped(), 0.0
+            if not path:
+                path, damping = self._damped(), self._damping
+            stuck = not path
+            for there in path or [self.here]:
+                step = _step_length(self.here.values, there.values, self.problem.variables)
+                self.history.append(Iteration(there.cost, damping, step, self.here.decrement))
+                self.here = there
+            self.converged = self.here.at_rounding if stuck else self.here.decrement <= goal
+        if self.converged and not stuck:
+            self.message = f"converged: less than {goal:.0e} sigma from the optimum"
+        elif self.converged:
+            self.message = f"converged to rounding: no step lowers the cost, {self._left} left"
+        elif stuck:
+            self.message = f"not converged: no step lowers the cost although {self._left} are left to go"
+        else:
+            self.give_up()
+        return self.converged
+
+    def give_up(self) -> None:
+        """Say that all iterations have been spent."""
+        self.converged = False
+        self.message = f"not converged: {self._options.max_iterations} iterations, {self._left} left to go"
+
+    @property
+    def _left(self) -> str:
+        return f"{self.here.decrement:.1e} sigma"
+
+    def _undamped(self) -> list[_Linearised]:
+        """Where Gauss-Newton steps lead; nothing if they do not keep what they promise.
+
+        A valley that is weakly determined may be curved: a step along it leaves it, and the next ones come back. So the
+        cost may rise as long as the steps that follow are ever shorter.
+        """
+        path: list[_Linearised] = []
+        here = there = self.here
+        for _ in range(PATIENCE):
+            last = there
+            try:
+                there = _Linearised(self.problem, self.problem.variables.moved(last.values, last.step))
+            except SolverError:
+                return []  # so far off that the rows have no derivative there
+            path.append(there)
+            if here.at_rounding:
+                return path if there.decrement < here.decrement else []
+            if here.cost - there.cost >= FAIR_SHARE * 0.5 * here.decrement**2:
+                return path
+            if len(path) > 1 and there.decrement >= 0.5 * last.decrement:
+                return []
+        return []
+
+    def _damped(self) -> list[_Linearised]:
+        """Where GTSAM's next damped step leads, undetermined directions held; nothing if none lowers the cost."""
+        here, graph, variables = self.here, self.problem.graph, self.problem.variables
         try:
-            self.initial_cost = problem.graph.error(initial)
-            if not np.isfinite(self.initial_cost):
-                raise SolverError(
-                    f"the cost at the start is {self.initial_cost}: the measurements or the robot hold absurd numbers"
-                )
-            curvature = _largest_curvature(problem.graph.linearize(initial), variables.keys)
-            self.values, self.cost = initial, self.initial_cost
-            self.message = self._iterate(_parameters(options, curvature), variables, options)
+            optimizer = gtsam.LevenbergMarquardtOptimizer(graph, here.values, _parameters(self._damping))
+            optimizer.iterate()
         except RuntimeError as error:
             raise SolverError(_in_words(str(error), variables)) from error
-        self.parameters = variables.parameters(self.values)
-
-    def _iterate(self, settings: gtsam.LevenbergMarquardtParams, variables: Variables, options: SolverOptions) -> str:
-        optimizer = gtsam.LevenbergMarquardtOptimizer(self.problem.graph, self.values, settings)
-        for _ in range(options.max_iterations):
-            linear = optimizer.iterate()
-            decrement = _decrement(linear, variables)
-            previous, values = self.values, gtsam.Values(optimizer.values())  # a copy: GTSAM hands out its own
-            last, cost = self.cost, optimizer.error()
-            held = _held(linear, variables.step(previous, values), variables) if cost < last else None
-            if held is not None:
-                moved = variables.moved(previous, held)
-                if (cost_there := self.problem.graph.error(moved)) < last:
-                    values, cost = moved, cost_there
-                    settings.setlambdaInitial(optimizer.lambda_())
-                    optimizer = gtsam.LevenbergMarquardtOptimizer(self.problem.graph, values, settings)
-            self.values, self.cost = values, cost
-            step = _step_length(previous, values, variables)
-            self.history.append(Iteration(cost, optimizer.lambda_(), step, decrement))
-            if not np.isfinite(cost):
-                return f"not converged: the cost became {cost}"
-            if decrement <= options.decrement:
-                self.converged = True
-                return f"converged: the last step began {decrement:.1e} sigma from the optimum"
-            if cost >= last:
-                # The end of double precision, if hardly anything was left to gain.
-                self.converged = decrement <= max(1e-3, 1e-6 * np.sqrt(2.0 * cost))
-                if self.converged:
-                    return f"converged to rounding: no step lowers the cost, {decrement:.1e} sigma left"
-                return f"not converged: no step lowers the cost although {decrement:.1e} sigma are left to go"
-        return f"not converged: {options.max_iterations} iterations, {decrement:.1e} sigma left to go"
+        if not optimizer.error() < here.cost:
+            return []
+        self._damping = max(optimizer.lambda_(), LEAST_DAMPING)
+        step = variables.step(here.values, optimizer.values())
+        held = variables.moved(here.values, here.held(step))
+        lower = graph.error(held) < here.cost
+        return [_Linearised(self.problem, held if lower else gtsam.Values(optimizer.values()))]
 
 
-def _parameters(options: SolverOptions, curvature: float) -> gtsam.LevenbergMarquardtParams:
-    """GTSAM's options: QR, lambda I damping, and no stopping rule of its own that could act before ours."""
+class _Linearised:
+    """A problem linearised at some values.
+
+    Attributes:
+        values: GTSAM's values.
+        cost: Half the sum of squared whitened residuals.
+        decrement: Length of the Gauss-Newton step along determined directions, [sigma].
+        step: The step itself, shape (n_columns + n_nuisance,), of minimum norm in units of the arm's geometry.
+        spread: A square root S of the core's covariance S S^T, what is determined of it, shape (n_columns, rank).
+        rounding: What rounding of the residuals makes of the decrement, [sigma].
+        at_rounding: Whether rounding of the cost is above the decrease that the step promises.
+    """
+
+    def __init__(self, problem: Problem, values: gtsam.Values) -> None:
+        variables = problem.variables
+        try:
+            A, b = _dense(problem.graph.linearize(values), variables.keys)
+            left = eliminate(A, b, variables.n_columns)
+            self._sizes = variables.prior_scales
+            tall = np.vstack([left.A * self._sizes, np.zeros((len(self._sizes),) * 2)])  # so that Vt is square
+            U, s, Vt = np.linalg.svd(tall, full_matrices=False)
+        except (RuntimeError, np.linalg.LinAlgError) as error:
+            raise SolverError(_in_words(str(error), variables)) from error
+        rank = determined(s)
+        along = U[: len(left.b), :rank].T @ left.b
+        self.spread: Floats = self._sizes[:, None] * Vt[:rank].T / s[:rank]
+        core = self.spread @ along
+        self.values = values
+        self.cost = 0.5 * float(b @ b)
+        self.decrement = float(np.hypot(np.linalg.norm(left.own), np.linalg.norm(along)))
+        self.step: Floats = np.concatenate([core, left.inverse @ left.own + left.follow @ core])
+        self.rounding = 10.0 * float(np.finfo(float).eps) / variables.robot.scale_of("rad") * float(s.max(initial=0.0))
+        self.at_rounding = 0.5 * self.decrement**2 <= 10.0 * self.rounding * np.sqrt(2.0 * self.cost)
+        self._loose, self._follow = Vt[rank:], left.follow
+        self._information = s[:rank, None] * Vt[:rank]
+        self._variables = variables
+
+    def decrement_to(self, values: gtsam.Values) -> float:
+        """How far some other values are, in sigma as seen from here."""
+        step = self._variables.step(self.values, values)[: len(self._sizes)]
+        return float(np.linalg.norm(self._information @ (step / self._sizes)))
+
+    def held(self, step: Floats) -> Floats:
+        """A step with the same effect on every row, but none on the core's undetermined directions."""
+        n = len(self._sizes)
+        drift = self._sizes * (self._loose.T @ (self._loose @ (step[:n] / self._sizes)))
+        held: Floats = step - np.concatenate([drift, self._follow @ drift])
+        return held
+
+
+def _parameters(damping: float) -> gtsam.LevenbergMarquardtParams:
+    """GTSAM's options: QR, damping in each column's own unit, and no stopping rule of its own."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setLinearSolverType("MULTIFRONTAL_QR")
-    parameters.setDiagonalDamping(False)
-    parameters.setlambdaInitial(max(1e-8 * curvature, _DAMPING_FLOOR))
+    parameters.setDiagonalDamping(True)
+    parameters.setlambdaInitial(damping)
     parameters.setlambdaFactor(10.0)
-    floor = max(options.lambda_floor * curvature, _DAMPING_FLOOR)
-    parameters.setlambdaLowerBound(floor)
-    parameters.setlambdaUpperBound(options.lambda_ceiling * curvature)
+    parameters.setlambdaUpperBound(MOST_DAMPING)
     parameters.setRelativeErrorTol(1e-13)  # no search for a lambda once the cost's own rounding decides
     parameters.setAbsoluteErrorTol(0.0)
-    parameters.setMaxIterations(options.max_iterations + 1)
     return parameters
 
 
@@ -276,43 +419,6 @@ def _dense(linear: gtsam.GaussianFactorGraph, keys: list[int]) -> tuple[Floats, 
     for key in keys:
         ordering.push_back(key)
     return linear.jacobian(ordering)
-
-
-def _largest_curvature(linear: gtsam.GaussianFactorGraph, keys: list[int]) -> float:
-    A, _ = _dense(linear, keys)
-    return max(float(np.max(np.sum(A * A, axis=0))), 1e-12)
-
-
-def _decrement(linear: gtsam.GaussianFactorGraph, variables: Variables) -> float:
-    """Length of the Gauss-Newton step in sigma, along determined directions only."""
-    left = _without_nuisance(linear, variables)
-    U, s, _ = np.linalg.svd(left.A * variables.scales, full_matrices=False)
-    return float(np.hypot(np.linalg.norm(left.own), np.linalg.norm((U.T @ left.b)[: determined(s)])))
-
-
-def _without_nuisance(linear: gtsam.GaussianFactorGraph, variables: Variables) -> Eliminated:
-    """The linear graph with the nuisance columns eliminated."""
-    return eliminate(*_dense(linear, variables.keys), variables.n_columns)
-
-
-def _held(linear: gtsam.GaussianFactorGraph, step: Floats, variables: Variables) -> Floats | None:
-    """A step with the same effect on every row, but none on the core's undetermined directions; None if it is it.
-
-    Damping makes the step short in core and nuisance columns together. That leaves undetermined directions of the core
-    where they are only if no nuisance variable could follow them: points that move would drag the base along.
-    """
-    n = variables.n_columns
-    if n == len(step):
-        return None
-    left = _without_nuisance(linear, variables)
-    _, s, Vt = np.linalg.svd(np.vstack([left.A * variables.scales, np.zeros((n, n))]), full_matrices=False)
-    loose = Vt[determined(s) :]
-    if not len(loose):
-        return None
-    basis, _ = np.linalg.qr((loose * variables.scales).T)
-    drift = basis @ (basis.T @ step[:n])
-    held: Floats = step - np.concatenate([drift, left.follow @ drift])
-    return held
 
 
 def _step_length(previous: gtsam.Values, values: gtsam.Values, variables: Variables) -> float:

@@ -402,6 +402,7 @@ def _findings(solution: Solution, chi2: float, dof: int, bounds: tuple[float, fl
     findings = []
     if not solution.converged:
         findings.append(solution.message)
+    findings += _other_optima(solution)
     weights = solution.problem.adjustment.weights
     if weights is not None:
         _, height = lengths(solution.problem, solution.parameters)
@@ -438,6 +439,23 @@ def _of_model(
     for motion in missing:
         (findings if high and not setup.explanations else cautions).append(str(motion))
     return findings, cautions
+
+
+def _other_optima(solution: Solution, most: int = 4) -> list[str]:
+    """A line for each other optimum: the parameters that differ most, in their tolerances, with both corrections."""
+    robot, found = solution.problem.robot, []
+    for other in solution.others:
+        apart = {p.name: abs(other[i] - solution.parameters[i]) / p.scale for i, p in enumerate(robot.parameters)}
+        largest = max(apart.values())
+        named = sorted((name for name in apart if apart[name] > 0.3 * largest), key=lambda name: -apart[name])[:most]
+        words = []
+        for i in map(robot.index, named):
+            p = robot.parameters[i]
+            factor, unit = (1e3, "mm") if p.unit == "m" else (180.0 / np.pi, "deg")
+            here, there = (factor * (at[i] - p.nominal) for at in (solution.parameters, other))
+            words.append(f"{p.name} {here:+.3g} or {there:+.3g} {unit}")
+        found.append(f"a second optimum that the data cannot tell from this one: {', '.join(words)} from nominal")
+    return found
 
 
 def _point_estimates(solution: Solution, spread: Spread) -> tuple[PointEstimate, ...]:

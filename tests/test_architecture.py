@@ -31,6 +31,7 @@ FLOORS = (
         "reasons",
         "identifiability",
         "covariance",
+        "restarts",
         "residual_table",
         "goodness",
         "noise",

