@@ -42,6 +42,9 @@ PATIENCE = 4
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-15, 1e12
 """Damping of damped steps, as a share of each column's own curvature: that of the first one, and its bounds."""
 
+SHORT = 30
+"""Steps after which a descent from another start is given up: it wanders, and was only worth a try."""
+
 BACK = 0.1
 """A descent from another start that ends this near to where one has been is back there, [sigma]."""
 
@@ -161,7 +164,7 @@ def solve_from(solution: Solution, start: Floats, most: float, options: SolverOp
     clock, options = time.perf_counter(), options or SolverOptions()
     with single_threaded_blas():
         problem = replace(solution.problem, start=start)
-        rough = _Run(problem, options)
+        rough = _Run(problem, replace(options, max_iterations=min(SHORT, options.max_iterations)))
         if not rough.descend(COARSE) or rough.here.cost >= most:
             return None
         if rough.here.decrement_to(solution.values) < BACK:
