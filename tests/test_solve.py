@@ -56,7 +56,7 @@ def test_the_optimum_is_scipys(model):
     robot = paper_robot(tolerance=TOLERANCE)
     problem = build_problem(robot, measure(true_robot(robot, rng), 60, rng), model=model)
     solution = solve(problem)
-    variables, block = problem.variables, problem.blocks[0]
+    variables, block = problem.variables, solution.problem.blocks[0]  # whitened at the estimate
     columns = [robot.index(name) for name in variables.names]
 
     def parameters(x):
