@@ -48,7 +48,13 @@ SHORT = 30
 BACK = 0.1
 """A descent from another start that ends this near to where one has been is back there, [sigma]."""
 
-COARSE = 1e-2
+SPREAD_ROUNDS = 2
+"""Times that rows of pairs are bent by what the parameters may be off there; then that stays as it is."""
+
+WEAKEST = 0.1
+"""Signal-to-noise ratio below which a direction is not taken for weaker: rows are bent by no more than that."""
+
+COARSE = 0.3
 """Rows are whitened anew once the optimum with the present ones is nearer than this, [sigma]."""
 
 
@@ -203,15 +209,18 @@ def _fit(problem: Problem, options: SolverOptions) -> _Run:
     robust = problem.settings.loss != "none"
     weighting = Weighting(problem.settings.loss)
     run, goal = _Run(problem, options), COARSE
+    bends = SPREAD_ROUNDS if problem.pairs is not None and problem.adjustment.spread is None else 0
     if robust:
-        run.go_on_with(judged_at(problem, problem.start, _learn(run, weighting)[0]))
+        run.go_on_with(judged_at(problem, problem.start, _learn(problem, problem.start, weighting)[0]))
     while run.descend(goal) or robust:
-        adjustment, final = _learn(run, weighting)
+        adjustment, final = _learn(run.problem, run.parameters, weighting)
+        if bends:
+            adjustment, bends = replace(adjustment, spread=run.here.spread), bends - 1
         anew = judged_at(problem, run.parameters, adjustment)
         unchanged = same_rows(anew, run.problem)
         if not unchanged:
             run.go_on_with(anew)
-        if final and (unchanged or run.here.decrement <= run.least):
+        if final and (unchanged or (not bends and run.here.decrement <= run.least)):
             run.descend(run.least)
             break
         if run.exhausted:
@@ -221,12 +230,9 @@ def _fit(problem: Problem, options: SolverOptions) -> _Run:
     return run
 
 
-def _learn(run: _Run, weighting: Weighting) -> tuple[Adjustment, bool]:
-    """What the residuals where a descent is say of the noise, and whether the loss has its final form."""
-    problem, parameters, final = run.problem, run.parameters, True
-    adjustment = problem.adjustment
-    if problem.pairs is not None:  # what the parameters may be off bends lengths and angles
-        adjustment = replace(adjustment, spread=run.here.spread)
+def _learn(problem: Problem, parameters: Floats, weighting: Weighting) -> tuple[Adjustment, bool]:
+    """What the residuals at some parameters say of the noise, and whether the loss has its final form."""
+    adjustment, final = problem.adjustment, True
     if problem.settings.loss != "none":
         weights, final = weighting.update(*lengths(problem, parameters))
         adjustment = replace(adjustment, weights=weights)
@@ -361,7 +367,7 @@ class _Linearised:
         cost: Half the sum of squared whitened residuals.
         decrement: Length of the Gauss-Newton step along determined directions, [sigma].
         step: The step itself, shape (n_columns + n_nuisance,), of minimum norm in units of the arm's geometry.
-        spread: A square root S of the core's covariance S S^T, what is determined of it, shape (n_columns, rank).
+        spread: A square root S of the core's covariance S S^T, weak directions cut short, shape (n_columns, rank).
         rounding: What rounding of the residuals makes of the decrement, [sigma].
         at_rounding: Whether rounding of the cost is above the decrease that the step promises.
     """
@@ -378,8 +384,8 @@ class _Linearised:
             raise SolverError(_in_words(str(error), variables)) from error
         rank = determined(s)
         along = U[: len(left.b), :rank].T @ left.b
-        self.spread: Floats = self._sizes[:, None] * Vt[:rank].T / s[:rank]
-        core = self.spread @ along
+        core = self._sizes * (Vt[:rank].T @ (along / s[:rank]))
+        self.spread: Floats = self._sizes[:, None] * Vt[:rank].T / np.maximum(s[:rank], WEAKEST)
         self.values = values
         self.cost = 0.5 * float(b @ b)
         self.decrement = float(np.hypot(np.linalg.norm(left.own), np.linalg.norm(along)))

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from fg_calib import residuals
 from fg_calib.frames import nearest_rotation
-from fg_calib.kinematics import SPAN, Chain, forward
+from fg_calib.kinematics import SPAN, Chain, forward, turning_of_base
 from fg_calib.measurements import Measurements, Pairs, rotation_angle
 from fg_calib.moments import Moments, angle_moments, length_moments
 from fg_calib.residuals import AnyBlock, Block, CorrelatedBlock, PairBlock, PoseBlock, SamePointBlock, correlate
@@ -39,8 +39,11 @@ MAX_SHARED = 3000
 PRIVATE_SHARE = 1e-3
 """Share of a pair's variance that counts as its own at least: shared errors are not all there is."""
 
-LEAST_BEND = 0.01
-"""What the parameters may be off bends a row by less than this many sigma: not worth looking at."""
+LEAST_BEND = 0.05
+"""A row that what the parameters may be off bends by less than this many sigma is straight."""
+
+MOST_BEND = 1.0
+"""A row is bent by no more sigma: what is off by more than that is for the optimum to find, not to be called noise."""
 
 LEAST_WEIGHT = 1e-12
 """A robust weight below this is taken for this."""
@@ -372,32 +375,40 @@ class PairWhitening:
         """Variance in each direction across that the parameters' own gives each vector, shape (n_pairs, 2).
 
         Along the vector it is what is estimated; across it lengthens the vector as noise does, and bends the row. Zero
-        where it could not matter, by the largest of some pairs evenly chosen.
+        where it does not matter: not even looked at where the largest of some pairs evenly chosen would not.
         """
         across, train = np.zeros((self._pairs.n_pairs, 2)), np.flatnonzero(~self._pairs.test)
         spread = self._adjustment.spread
         if spread is None or not len(train):
             return across
         some = train[np.unique(np.linspace(0, len(train) - 1, 500).astype(np.int64))]
-        largest = 4.0 * self._spread_across(some, spread).max(axis=0)
-        with np.errstate(divide="ignore"):
-            bend = largest / self._predicted / np.sqrt(self._own)  # in sigma
-        rows = np.flatnonzero(np.any(bend[:, self._kinds] > LEAST_BEND, axis=1))
+        rows = np.flatnonzero(self._bends(4.0 * self._spread_across(some, spread).max(axis=0)).any(axis=1))
         for start in range(0, len(rows), SPAN):
             chunk = rows[start : start + SPAN]
             across[chunk] = self._spread_across(chunk, spread)
-        return across
+        return np.where(self._bends(across), np.minimum(across, MOST_BEND * self._predicted * np.sqrt(self._own)), 0.0)
+
+    def _bends(self, across: Floats, least: float = LEAST_BEND) -> Booleans:
+        """Whether variance across, shape (n_pairs, 2) or (2,), bends each row by so many sigma, shape (n_pairs, 2)."""
+        bends: Booleans = across >= least * self._predicted * np.sqrt(self._own)
+        return bends & self._kinds & (self._own > 0.0)
 
     def _spread_across(self, rows: Integers, spread: Floats) -> Floats:
-        """What `_bending` is about at `rows`, shape (n, 2)."""
-        a, b = self._pairs.a[rows], self._pairs.b[rows]
-        at = [forward(self._columns, self._trig, end) for end in (a, b)]
-        turn, shift = np.split((at[1].jacobian - at[0].jacobian) @ spread, 2, axis=1)  # (n, 3, k)
-        along = _unit(at[1].position - at[0].position)
-        axis = np.einsum("nij,nj->ni", at[0].rotation, self._directions(a, b)[1])
+        """What `_bending` is about at `rows`, shape (n, 2).
+
+        With Q the rotation from a to b, R_b R_a^T, turns w_a and w_b of the tool turn Q by w_b - Q w_a. Motions of the
+        base, and of the tool in itself, carry vector and rotation with them and bend nothing: they are taken out.
+        """
+        pairs, n = self._pairs, len(rows)
+        at = forward(self._columns, self._trig, np.concatenate([pairs.a[rows], pairs.b[rows]]))
+        base = turning_of_base(at.jacobian[:, :3], at.rotation) @ spread  # (3, k)
+        turn, shift = np.split(at.jacobian @ spread, 2, axis=1)  # (2 n, 3, k) each
+        Q = at.rotation[n:] @ np.swapaxes(at.rotation[:n], 1, 2)
+        vector, turn = at.position[n:] - at.position[:n], turn - base
+        change = (shift[n:] - shift[:n] - np.cross(base[None], vector[:, :, None], axis=1), turn[n:] - Q @ turn[:n])
         of_each = [
-            np.sum(D**2, axis=(1, 2)) - np.sum(np.einsum("nc,nck->nk", u, D) ** 2, axis=1)
-            for u, D in ((along, shift), (axis, turn))
+            np.sum(D**2, axis=(1, 2)) - np.sum(np.einsum("nc,nck->nk", _unit(u), D) ** 2, axis=1)
+            for u, D in zip((vector, rotation_angle(Q)[1]), change, strict=True)
         ]
         across: Floats = np.maximum(np.stack(of_each, axis=1), 0.0) / 2.0
         return across

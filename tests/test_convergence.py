@@ -1,7 +1,6 @@
 """The solver arrives: in few steps, whatever the unit of length, and at the optimum of the rows whitened there."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -124,7 +123,7 @@ def test_the_last_step_is_taken_although_the_cost_no_longer_shows_it(shift):
         solution = solve(problem)
         names = [p.name for p in problem.estimated]
         plain = fit_least_squares(robot, m, model="position", frame="unknown", names=names, start=problem.start)
-        sigma = np.array([assess(solution).parameters[robot.index(name)].sigma for name in names])
+        sigma = np.sqrt(np.diag(assess(solution).spread.named()))
         apart = (plain.robot.nominal - solution.parameters[:-6])[[robot.index(name) for name in names]] / sigma
         assert np.abs(apart).max() < 3e-7  # 1e-5 when the cost had the last word
 
@@ -156,10 +155,7 @@ def test_sixty_real_poses_without_priors_arrive_in_few_steps(model, data_folder)
     m = replace(m, test=m.test | ~sixty)
     solution = solve(build_problem(robot, m, model=model, frame="unknown", gauge="none"))
     assert solution.converged, solution.message
-    assert solution.iterations <= MOST
-    costs = [i.cost for i in solution.history]
-    assert any(b > a for a, b in pairwise(costs)) or model != "distance"
-    assert costs[-1] == pytest.approx(min(costs), rel=1e-12)
+    assert solution.iterations <= MOST + 1  # one more round: near their kinks rows change with the estimate
 
 
 @pytest.mark.parametrize(("allowed", "code"), [(1, 3), (50, 0)])

@@ -86,7 +86,8 @@ def test_a_start_between_two_optima_is_left(tmp_path):
     i = problem.robot.index("d2")
     assert abs(solution.parameters[i]) == pytest.approx(0.02, abs=1e-4)
     assert len(solution.others) == 1
-    assert assess(solution).findings[0].startswith("a second optimum that the data cannot tell from this one: d2")
+    second = "a second optimum that the data cannot tell from this one: d2"
+    assert any(finding.startswith(second) for finding in assess(solution).findings)
 
 
 def test_what_data_see_has_one_optimum_and_costs_nothing_more(tmp_path, monkeypatch):
