@@ -28,19 +28,19 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fg_calib import residuals
-from fg_calib.choices import MODELS, FrameKnowledge, Model
+from fg_calib.choices import FrameKnowledge, Model, check, check_flag, check_names, check_number
 from fg_calib.errors import InputError
 from fg_calib.kinematics import Chain, build_chain, precompute_trig
-from fg_calib.measurements import Measurements, Pairing, form_pairs
+from fg_calib.measurements import Measurements, Pairing, as_pairing, form_pairs
 from fg_calib.residuals import Block, PairBlock, PoseBlock
-from fg_calib.robot import AXIS_OF_KIND, FRAME_KINDS, Element, Parameter, Robot, known_names, names_of
+from fg_calib.robot import AXIS_OF_KIND, FRAME_KINDS, Element, Parameter, Robot, names_of
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -165,7 +165,16 @@ def fit_least_squares(
     Raises:
         InputError: An argument is not one of those possible, or the measurements lack what the model needs.
     """
-    _check(model, method, frame, max_iterations, tolerance)
+    for key, option, possible in (
+        ("model", model, Model),
+        ("method", method, Method),
+        ("frame", frame, FrameKnowledge),
+    ):
+        check(key, option, possible)
+    check_flag("weighted", weighted)
+    check_number("max_iterations", max_iterations, least=1, whole=True)
+    check_number("tolerance", tolerance, finite=False)
+    pairing = as_pairing(pairing)
     clock = time.perf_counter()
     values, world_T_base = _start(robot, start)
     chosen = _chosen(robot, names)
@@ -182,7 +191,7 @@ def fit_least_squares(
         full[columns] = x
         return full
 
-    rows = _rows(robot, measurements, model, pairing or Pairing(), weighted)
+    rows = _rows(robot, measurements, model, pairing, weighted)
     rows = _without_kinks(rows, chain.at(first), model)
     if not rows.use.any():
         raise InputError(measurements.source, "no row left to fit", f"train rows for model {model}")
@@ -458,9 +467,7 @@ def _chosen(robot: Robot, names: Sequence[str] | None) -> list[int]:
         chosen = [i for i, p in enumerate(robot.parameters) if p.estimated]
     else:
         known = names_of(robot.parameters)
-        for name in names:
-            if name not in known:
-                raise InputError("names", f"unknown parameter {name!r}", known_names(known))
+        check_names("names", names, known)
         chosen = [i for i, name in enumerate(known) if name in set(names)]
         if len(chosen) < len(names):
             twice = next(name for name in names if list(names).count(name) > 1)
@@ -468,14 +475,3 @@ def _chosen(robot: Robot, names: Sequence[str] | None) -> list[int]:
     if not chosen:
         raise InputError("names", "nothing to estimate", "at least one parameter")
     return chosen
-
-
-def _check(model: str, method: str, frame: str, max_iterations: int, tolerance: float) -> None:
-    choices = {"model": MODELS, "method": get_args(Method), "frame": get_args(FrameKnowledge)}
-    for (key, possible), found in zip(choices.items(), (model, method, frame), strict=True):
-        if found not in possible:
-            raise InputError(key, f"found {found!r}", f"one of {', '.join(possible)}")
-    if max_iterations < 1:
-        raise InputError("max_iterations", f"found {max_iterations}", "1 or more")
-    if not tolerance >= 0.0:
-        raise InputError("tolerance", f"found {tolerance}", "0 or more")

@@ -17,7 +17,17 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from fg_calib import frames, residuals
-from fg_calib.choices import EncoderNoise, FrameKnowledge, Gauge, Loss, Model, PairErrors
+from fg_calib.choices import (
+    EncoderNoise,
+    FrameKnowledge,
+    Gauge,
+    Loss,
+    Model,
+    PairErrors,
+    check,
+    check_flag,
+    check_names,
+)
 from fg_calib.encoders import MAX_JOINT_VARIABLES, MovedRows, TrueJoints
 from fg_calib.errors import ProblemError
 from fg_calib.factors import (
@@ -39,10 +49,10 @@ from fg_calib.frames import Frame, Unknown
 from fg_calib.groups import PointGroups
 from fg_calib.inverse import random_readings
 from fg_calib.kinematics import build_chain, forward, precompute_trig
-from fg_calib.measurements import Measurements, Pairing, Pairs, form_pairs, no_pairs
+from fg_calib.measurements import Measurements, Pairing, Pairs, as_pairing, form_pairs, no_pairs
 from fg_calib.observability import RANK_TOLERANCE, SIGNAL_FLOOR, Observability, analyse, determined, singular_values
 from fg_calib.residuals import AnyBlock, Block, CorrelatedBlock
-from fg_calib.robot import Parameter, Robot
+from fg_calib.robot import Parameter, Robot, names_of
 from fg_calib.whitening import (
     MAX_SHARED,
     Adjustment,
@@ -103,6 +113,12 @@ class Settings:
     pair_errors: PairErrors = "shared"
     encoder: EncoderNoise = "propagated"
     loss: Loss = "none"
+
+    def __post_init__(self) -> None:
+        options = {"model": Model, "frame": FrameKnowledge, "gauge": Gauge}
+        options |= {"pair_errors": PairErrors, "encoder": EncoderNoise, "loss": Loss}
+        for key, possible in options.items():
+            check(key, getattr(self, key), possible)
 
     @property
     def uses_pairs(self) -> bool:
@@ -277,10 +293,14 @@ def build_problem(
         loss: What becomes of large residuals: `none` or a robust loss (see `robust`).
 
     Raises:
+        InputError: An option is not one of those possible.
         ProblemError: The measurements lack what the model needs, or do not suffice.
     """
-    with_priors = prior is not False and gauge == "prior"
-    settings = Settings(model, pairing or Pairing(), frame, with_priors, gauge, pair_errors, encoder, loss)
+    if prior is not None:
+        check_flag("prior", prior)
+    check_names("prefer", prefer, names_of(robot.parameters))
+    with_priors = (prior is None or bool(prior)) and gauge == "prior"
+    settings = Settings(model, as_pairing(pairing), frame, with_priors, gauge, pair_errors, encoder, loss)
     if not any(p.estimated for p in robot.parameters):
         raise ProblemError(f"robot {robot.name}", "nothing to estimate", "at least one parameter that is not fixed")
     unknown_frame = frame == "unknown" and not settings.uses_pairs
@@ -382,7 +402,7 @@ def predicted_problem(
             (n_joints,); 1 mm, 1 mrad and none where None.
         pair_errors: Whether pairs of one configuration share its errors or count as independent.
     """
-    settings = Settings(model, pairing or Pairing(), frame, prior=False, pair_errors=pair_errors)
+    settings = Settings(model, as_pairing(pairing), frame, prior=False, pair_errors=pair_errors)
     variables = build_variables(robot, frame == "unknown" and not settings.uses_pairs, priors=False)
     trig = precompute_trig(robot, readings)
     poses = forward(build_chain(robot), trig)

@@ -11,6 +11,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from fg_calib.choices import check_number
 from fg_calib.comparison import Comparison, Estimate, PoseError
 from fg_calib.goodness import FLAGS, OUTLIER_WEIGHT, VERDICTS
 from fg_calib.identifiability import Identifiability
@@ -39,6 +40,7 @@ def format_report(solution: Solution, uncertainty: Uncertainty, width: int = WID
 
 
 def _plain_text(report: RenderableType, width: int) -> str:
+    check_number("width", width, least=1, whole=True)
     text = io.StringIO()
     console = Console(file=text, width=width, color_system=None, highlight=False, legacy_windows=False)
     console.print(report)

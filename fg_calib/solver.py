@@ -17,12 +17,13 @@ from __future__ import annotations
 
 import re
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.choices import check_number
 from fg_calib.errors import SolverError
 from fg_calib.factors import Variables, eliminate
 from fg_calib.observability import determined
@@ -63,6 +64,11 @@ class SolverOptions:
 
     max_iterations: int = 200
     decrement: float = 3e-7
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            least, whole = float(f.name == "max_iterations"), f.name.startswith("max_")
+            check_number(f"solver: {f.name}", getattr(self, f.name), least=least, whole=whole)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import fg_calib
 
 PACKAGE = Path(fg_calib.__file__).parent
 FLOORS = (
-    *("choices", "errors", "robot", "measurements", "scenario", "files", "kernels", "kinematics"),
+    *("errors", "choices", "robot", "measurements", "scenario", "files", "kernels", "kinematics"),
     *("inverse", "simulator", "conventions", "residuals", "least_squares", "moments"),
     *(
         "factors",

@@ -478,7 +478,7 @@ BAD = {
     "an unusable model": (
         sub(JOB, "^model: .*", "model: distances"),
         "calibration.yaml: model: found 'distances', expected one of pose, position, orientation, distance, rotation, "
-        "distance-rotation",
+        "distance-rotation; did you mean distance?",
     ),
     "a model without its orientations": (
         without("qx", "qy", "qz", "qw"),

@@ -124,7 +124,7 @@ MISTAKES = [
     (JOB + "measurments: a\n",
      f"calibration.yaml: unknown key 'measurments', expected {KEYS}; did you mean measurements?"),
     (JOB.replace("pose\n", "poses\n"), "calibration.yaml: model: found 'poses', expected one of pose, position, "
-     "orientation, distance, rotation, distance-rotation"),
+     "orientation, distance, rotation, distance-rotation; did you mean pose?"),
     (JOB + "frame: free\n", "calibration.yaml: frame: found 'free', expected one of known, unknown"),
     (JOB + "prior: 1\n", "calibration.yaml: prior: found 1, expected true or false"),
     (JOB + "loss: tukey\n",

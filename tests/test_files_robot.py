@@ -199,7 +199,7 @@ MISTAKES = {
     ),
     HEAD + ROW + "zzz: 1\n": f"robot.yaml: unknown key 'zzz', expected {KEYS}",
     f"convention: dhh\njoints:\n{ROW}": (
-        "robot.yaml: convention: found 'dhh', expected one of dh, mdh, mdh-hayati, dh-hayati"
+        "robot.yaml: convention: found 'dhh', expected one of dh, mdh, mdh-hayati, dh-hayati; did you mean dh?"
     ),
     "convention: dh\njoints: []\n": "robot.yaml: joints: found [], expected at least 1 in the list",
     "convention: dh\njoints: 3\n": "robot.yaml: joints: found 3, expected a list",

@@ -336,8 +336,8 @@ def test_a_missing_or_unknown_file_is_named(write, tmp_path):
     ("joint", "message"),
     [
         ((0.1, 0.2), "noise: joint: 2 figures, expected one for all or 3, one a joint"),
-        (-0.1, "noise: joint: found -0.1, expected finite numbers not below 0"),
-        (math.inf, "noise: joint: found inf, expected finite numbers not below 0"),
+        (-0.1, "noise: joint: found -0.1, expected a finite number not below 0"),
+        (math.inf, "noise: joint: found inf, expected a finite number not below 0"),
     ],
 )
 def test_noise_of_the_joints_must_fit(write, joint, message):

@@ -386,11 +386,11 @@ def test_scipy_takes_fewer_rows_than_unknowns():
 ROBOT = planar_robot()
 MISTAKES = [
     ({"model": "poses"}, "model: found 'poses', expected one of pose, position, orientation, distance, rotation, "
-     "distance-rotation"),
+     "distance-rotation; did you mean pose?"),
     ({"method": "newton"}, "method: found 'newton', expected one of gauss-newton, scipy"),
     ({"frame": "lost"}, "frame: found 'lost', expected one of known, unknown"),
-    ({"max_iterations": 0}, "max_iterations: found 0, expected 1 or more"),
-    ({"tolerance": float("nan")}, "tolerance: found nan, expected 0 or more"),
+    ({"max_iterations": 0}, "max_iterations: found 0, expected a whole number not below 1"),
+    ({"tolerance": float("nan")}, "tolerance: found nan, expected a number not below 0"),
     ({"start": np.zeros(3)}, "start: shape (3,), expected 20 values of the robot, or 26 with the measurement frame's"),
     ({"start": np.full(20, np.nan)},
      "start: a value that is not finite, expected 20 values of the robot, or 26 with the measurement frame's"),

@@ -380,7 +380,6 @@ def test_one_pose_out_of_reach_is_named_and_no_other(shipped):
         ({"errors": Errors("normal", {"a": -1.0})}, "space-robot: errors: normal: found -1, "
          "expected numbers not below 0"),
         ({"noise": Noise(1e-3, None)}, "space-robot: noise: orientation: found None, expected a number not below 0"),
-        ({"noise": Noise(-1.0, 1.0)}, "space-robot: noise: position: found -1.0, expected a number not below 0"),
         ({"noise": Noise(0.0, 1e-4)}, "space-robot: noise: position: found 0, expected a number above 0; a "
          "calibration takes nothing for exact: tell it what to assume under job: noise: position"),
     ],
@@ -394,7 +393,7 @@ def test_a_scenario_that_makes_no_sense_is_one_line(shipped, change, message):
 def test_a_seed_is_not_negative(shipped):
     with pytest.raises(InputError) as caught:
         simulate(shipped, -1)
-    assert str(caught.value) == "seed: found -1, expected a number not below 0"
+    assert str(caught.value) == "seed: found -1, expected a whole number not below 0"
 
 
 # --- files and the command --------------------------------------------------------------------------------------------

@@ -10,14 +10,14 @@ from typing import Annotated, Any
 
 from pydantic import Field, StrictBool
 
-from fg_calib.choices import EncoderNoise, FrameKnowledge, Gauge, Loss, Model, PairErrors
+from fg_calib.choices import EncoderNoise, FrameKnowledge, Gauge, Loss, Model, PairErrors, check_names
 from fg_calib.errors import InputError
 from fg_calib.files.robot_yaml import read_robot, robot_from_mapping
 from fg_calib.files.schema import Count, NotNegative, Positive, Schema, read_yaml, shown, validate
 from fg_calib.files.tables import read_measurements
-from fg_calib.files.units import Units
+from fg_calib.files.units import Units, UnitsOfFile
 from fg_calib.measurements import Measurements, Noise, Pairing
-from fg_calib.robot import Robot, known_names, names_of
+from fg_calib.robot import Robot, names_of
 
 UNSTATED = Noise(position=1e-3, orientation=1e-3, distance=1e-3, angle=1e-3, point=1e-3)
 """Where the noise starts from if it is to be estimated and nothing was stated."""
@@ -96,7 +96,7 @@ class _Job(Schema):
     model: Model
     pairing: Any = "star"  # a strategy's name, or a `_RandomPairing`
     frame: FrameKnowledge = "known"
-    units: Units = Units()
+    units: UnitsOfFile = Units()
     noise: Any = None  # a `_Noise`, or `estimate`
     prior: StrictBool | None = None
     gauge: Gauge = "prior"
@@ -173,9 +173,7 @@ def check_choices(choices: Mapping[str, Any], robot: Robot, place: str) -> None:
 
 
 def _check_preferred(file: _Job, robot: Robot, place: str) -> None:
-    for name in file.prefer:
-        if name not in names_of(robot.parameters):
-            raise InputError(f"{place}: prefer", f"unknown parameter {name!r}", known_names(names_of(robot.parameters)))
+    check_names(f"{place}: prefer", file.prefer, names_of(robot.parameters))
 
 
 def robot_of(given: object, place: str, folder: Path) -> tuple[Robot, list[str]]:

@@ -17,13 +17,14 @@ import csv
 import logging
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fg_calib.choices import check_number
 from fg_calib.errors import InputError
 from fg_calib.files.disk import replacing, require_file
 from fg_calib.files.units import ANGLES, LENGTHS, Units
@@ -75,6 +76,9 @@ def read_measurements(
             names its line and column.
     """
     units, noise = units or Units(), noise or Noise()
+    for f in fields(noise):
+        if f.name != "joint" and (figure := getattr(noise, f.name)) is not None:
+            check_number(f"noise: {f.name}", figure, above=True)  # nothing is measured exactly
     length, angle = units.factor("m"), units.factor("rad")
     header = _Header.read(Path(path))
     joints = _joint_columns(header, robot)
@@ -476,8 +480,6 @@ def _joint_sigma(joint: float | tuple[float, ...], n_joints: int) -> Floats:
     sigma = np.atleast_1d(np.asarray(joint, dtype=np.float64))
     if isinstance(joint, tuple) and len(joint) != n_joints:
         raise InputError("noise: joint", f"{len(joint)} figures", f"one for all or {n_joints}, one a joint")
-    if not (np.isfinite(sigma) & (sigma >= 0.0)).all():
-        raise InputError("noise: joint", f"found {joint!r}", "finite numbers not below 0")
     return np.broadcast_to(sigma, n_joints).copy()
 
 

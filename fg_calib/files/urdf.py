@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fg_calib.choices import NEAR, did_you_mean, known_names
 from fg_calib.errors import InputError
 from fg_calib.files.disk import require_file, write_text
-from fg_calib.robot import FRAME_KINDS, Joint, Robot, RobotBuilder, UrdfSource, known_names
+from fg_calib.robot import FRAME_KINDS, Joint, Robot, RobotBuilder, UrdfSource
 
 if TYPE_CHECKING:  # lxml is imported where it is used: `fg-calib --help` need not wait for it
     from lxml.etree import _Element as Element
@@ -233,7 +234,8 @@ class _Tree:
     def known(self, link: str) -> str:
         """`link`, if there is such a link."""
         if link not in self._links:
-            raise InputError(self._place, f"no link {link!r}", known_names(self._links, 40))
+            hint = did_you_mean(link, self._links, NEAR)
+            raise InputError(self._place, f"no link {link!r}", known_names(self._links, 40), hint)
         return link
 
     def root(self) -> str:
