@@ -37,6 +37,7 @@ from fg_calib.kinematics import build_chain, forward, precompute_trig
 from fg_calib.measurements import Measurements, Pairing
 from fg_calib.problem import correlation, named_triangle, predicted_problem
 from fg_calib.robot import Robot
+from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
 
@@ -85,6 +86,7 @@ class Bound:
     claimed: Floats
     rank: int
 
+    @single_threaded
     def position(self, readings: Floats, *, fitted: bool = False, claimed: bool = False) -> PositionBound:
         """The bound on the tool point at joint readings.
 
@@ -111,6 +113,7 @@ class Bound:
         )
 
 
+@single_threaded
 def cramer_rao(
     robot: Robot,
     measurements: Measurements,

@@ -22,6 +22,7 @@ from fg_calib.observability import SIGNAL_FLOOR, Observability
 from fg_calib.problem import STRUCTURAL_FLOOR, Problem, observe, predicted_problem, random_problem
 from fg_calib.reasons import LostDirection, explain
 from fg_calib.robot import Robot, names_of
+from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
 
@@ -54,6 +55,7 @@ class Identifiability:
     missing: tuple[MissingMotion, ...] = ()
 
 
+@single_threaded
 def observe_structure(
     robot: Robot,
     model: Model,
@@ -99,6 +101,7 @@ def observe_structure(
     return replace(whole, with_fixed_known=known, fixed=fixed)
 
 
+@single_threaded
 def observe_configurations(
     robot: Robot,
     measurements: Measurements,

@@ -41,6 +41,7 @@ from fg_calib.kinematics import Chain, build_chain, precompute_trig
 from fg_calib.measurements import Measurements, Pairing, as_pairing, form_pairs
 from fg_calib.residuals import Block, PairBlock, PoseBlock
 from fg_calib.robot import AXIS_OF_KIND, FRAME_KINDS, Element, Parameter, Robot, names_of
+from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -127,6 +128,7 @@ class LeastSquares:
         return np.concatenate([self.robot.nominal, self.frame])
 
 
+@single_threaded
 def fit_least_squares(
     robot: Robot,
     measurements: Measurements,
@@ -198,24 +200,23 @@ def fit_least_squares(
 
     fit = _Fit(x=first[columns], converged=False, message="", iterations=0, steps=())
     whitening = None
-    with residuals.single_threaded_blas():  # the kernels' threads are enough
-        for _ in range(_ROUNDS if weighted else 1):
-            whitening = _whitening(rows, chain.at(parameters(fit.x)), measurements.sigma_joint) if weighted else None
+    for _ in range(_ROUNDS if weighted else 1):
+        whitening = _whitening(rows, chain.at(parameters(fit.x)), measurements.sigma_joint) if weighted else None
 
-            def evaluate(x: Floats, whitening: Floats | None = whitening) -> tuple[Floats, Floats]:
-                return _evaluate(rows, chain.at(parameters(x)), whitening)
+        def evaluate(x: Floats, whitening: Floats | None = whitening) -> tuple[Floats, Floats]:
+            return _evaluate(rows, chain.at(parameters(x)), whitening)
 
-            solver = _gauss_newton if method == "gauss-newton" else _scipy
-            again = solver(evaluate, fit.x, max_iterations, tolerance)
-            moved = float(np.linalg.norm(again.x - fit.x))
-            fit = replace(again, iterations=fit.iterations + again.iterations, steps=fit.steps + again.steps)
-            if not fit.converged or moved <= REWEIGHTED or not np.any(measurements.sigma_joint > 0.0):
-                break
-        else:
-            if weighted:
-                fit = replace(fit, converged=False, message=f"not converged: new weights still move it by {moved:.1e}")
-        r, J = _evaluate(rows, chain.at(parameters(fit.x)), whitening)
-        covariance, rank = _covariance(r, J, weighted)
+        solver = _gauss_newton if method == "gauss-newton" else _scipy
+        again = solver(evaluate, fit.x, max_iterations, tolerance)
+        moved = float(np.linalg.norm(again.x - fit.x))
+        fit = replace(again, iterations=fit.iterations + again.iterations, steps=fit.steps + again.steps)
+        if not fit.converged or moved <= REWEIGHTED or not np.any(measurements.sigma_joint > 0.0):
+            break
+    else:
+        if weighted:
+            fit = replace(fit, converged=False, message=f"not converged: new weights still move it by {moved:.1e}")
+    r, J = _evaluate(rows, chain.at(parameters(fit.x)), whitening)
+    covariance, rank = _covariance(r, J, weighted)
     full = parameters(fit.x)
     return LeastSquares(
         robot=robot.with_values(full[:n]),

@@ -53,6 +53,7 @@ from fg_calib.measurements import Measurements, Pairing, Pairs, as_pairing, form
 from fg_calib.observability import RANK_TOLERANCE, SIGNAL_FLOOR, Observability, analyse, determined, singular_values
 from fg_calib.residuals import AnyBlock, Block, CorrelatedBlock
 from fg_calib.robot import Parameter, Robot, names_of
+from fg_calib.threads import single_threaded
 from fg_calib.whitening import (
     MAX_SHARED,
     Adjustment,
@@ -258,6 +259,7 @@ class Problem:
         return {reason: int(np.sum(mask & ~self.pairs.test)) for reason, mask in self.judgement.reasons.items()}
 
 
+@single_threaded
 def build_problem(
     robot: Robot,
     measurements: Measurements,
@@ -380,6 +382,7 @@ def problem_of(job: Job, **changes: Any) -> Problem:
     return build_problem(job.robot, job.measurements, **settings | changes)
 
 
+@single_threaded
 def predicted_problem(
     robot: Robot,
     readings: Floats,

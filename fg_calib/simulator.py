@@ -32,6 +32,7 @@ from fg_calib.scenario import (
     Simulation,
     figures_by_name,
 )
+from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
 
@@ -42,6 +43,7 @@ _PURPOSES = ("errors", "configurations", "validation", "frame", "noise", "noise 
 """Each has its own generator, so that changing one thing of a scenario leaves what is drawn for the others alone."""
 
 
+@single_threaded
 def simulate(scenario: Scenario, seed: int = 0) -> Simulation:
     """A scenario as it happens once.
 

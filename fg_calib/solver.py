@@ -28,8 +28,8 @@ from fg_calib.errors import SolverError
 from fg_calib.factors import Variables, eliminate
 from fg_calib.observability import determined
 from fg_calib.problem import Problem, frames_only, joint_errors, judged_at, lengths, same_rows
-from fg_calib.residuals import single_threaded_blas
 from fg_calib.robust import Weighting
+from fg_calib.threads import one_blas_thread
 from fg_calib.whitening import Adjustment
 
 Floats = NDArray[np.float64]
@@ -141,7 +141,7 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
     """
     options = options or SolverOptions()
     clock = time.perf_counter()
-    with single_threaded_blas():
+    with one_blas_thread:
         before = problem.start
         frames = frames_only(problem)
         if frames is not None:
