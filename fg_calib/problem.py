@@ -143,7 +143,7 @@ class Problem:
         sigma: 1 sigma of distance and angle, shape (n_pairs, 2), or of orientation and position components,
             shape (n_configurations, 6): measurement noise and joint noise together, [m] and [rad].
         blocks: The whitened train rows.
-        graph: Factors and priors.
+        graph: Factors and priors, for GTSAM's own tools to work on. `solve` and `assess` take no others.
         sharing: Which errors of configurations the rows carry in common.
         adjustment: What has been learned of the measurements' noise.
         whole: The problem with everything estimated, where this one leaves parameters out to fix the gauge.
@@ -151,6 +151,7 @@ class Problem:
         joints: The true joint values, where they are variables; else None.
         sigma_point: 1 sigma of a touch, joint noise included, shape (n_configurations, 3), [m]; empty without groups.
         terms: The whitened train rows that depend on nuisance variables.
+        factors: The factors that `graph` was made of.
     """
 
     robot: Robot
@@ -171,10 +172,11 @@ class Problem:
     joints: TrueJoints | None = None
     sigma_point: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     terms: tuple[Term, ...] = ()
+    factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
 
     @property
     def initial(self) -> gtsam.Values:
-        """GTSAM's initial values."""
+        """GTSAM's initial values, made anew: to change them changes nothing in the problem."""
         return self.variables.values(self.start)
 
     @property
@@ -449,6 +451,26 @@ def random_problem(
         sigmas=(np.full((n, 3), robot.scale_of("m")), np.full((n, 3), robot.scale_of("rad")), None),
         pair_errors="independent",
     )
+
+
+def check_graph(problem: Problem) -> None:
+    """Check that the graph has the problem's own factors and no others.
+
+    Rows are judged and whitened anew while a problem is solved, and the graph made anew with them: a factor that
+    somebody added would be lost.
+
+    Raises:
+        ProblemError: Factors were added, replaced or removed.
+    """
+    graph, own = problem.graph, problem.factors
+    n, n_own = graph.size(), own.size()
+    kept = sum(graph.at(i) is own.at(i) for i in range(min(n, n_own)))
+    hint = "for a graph of your own use GTSAM's optimisers, from problem.initial and with values for its variables"
+    if n > kept:
+        found = f"{n - kept} of {n} factors not made from this problem's measurements and priors"
+        raise ProblemError("problem.graph", found, "none: solve would leave them out", hint)
+    if n < n_own:
+        raise ProblemError("problem.graph", f"{n} of the problem's {n_own} factors", "all of them", hint)
 
 
 def noise_kinds(model: Model) -> tuple[str, str]:
@@ -910,4 +932,5 @@ def _assemble(
         joints=joints,
         sigma_point=sigma_point,
         terms=terms,
+        factors=gtsam.NonlinearFactorGraph(graph),
     )

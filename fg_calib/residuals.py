@@ -49,6 +49,7 @@ import scipy.linalg
 import scipy.sparse
 from numpy.typing import NDArray
 
+from fg_calib.errors import InputError
 from fg_calib.kernels import LANES, fill_pairs, fill_poses, fill_same_points, walk_all
 from fg_calib.kinematics import SPAN, Chain, over_spans, turning_of_base
 from fg_calib.threads import one_blas_thread
@@ -339,7 +340,14 @@ AnyBlock = Block | CorrelatedBlock
 
 
 def rows_of(block: Block, rows: slice) -> Block:
-    """The measurements at `rows` of a block."""
+    """The measurements at `rows` of a block.
+
+    Raises:
+        InputError: It is a `CorrelatedBlock`: its rows are whitened all together, so some of them are no block.
+    """
+    if isinstance(block, CorrelatedBlock):
+        hint = "linearise and residual give all its rows, whitened together"
+        raise InputError("rows_of", "a block whose rows share errors", "one of its parts", hint)
     parts = {f.name: getattr(block, f.name)[rows] for f in fields(block) if f.name not in ("trig", "kinds")}  # type: ignore[arg-type]
     part: Block = replace(block, **parts)  # type: ignore[type-var]
     return part

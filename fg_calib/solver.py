@@ -27,7 +27,7 @@ from fg_calib.choices import check_number
 from fg_calib.errors import SolverError
 from fg_calib.factors import Variables, eliminate
 from fg_calib.observability import determined
-from fg_calib.problem import Problem, frames_only, joint_errors, judged_at, lengths, same_rows
+from fg_calib.problem import Problem, check_graph, frames_only, joint_errors, judged_at, lengths, same_rows
 from fg_calib.robust import Weighting
 from fg_calib.threads import one_blas_thread
 from fg_calib.whitening import Adjustment
@@ -137,8 +137,10 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
     leave nothing to go.
 
     Raises:
+        ProblemError: The problem's graph has factors of somebody else.
         SolverError: GTSAM could not solve a step at all.
     """
+    check_graph(problem)
     options = options or SolverOptions()
     clock = time.perf_counter()
     with one_blas_thread:

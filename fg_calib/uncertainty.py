@@ -18,7 +18,7 @@ from fg_calib.goodness import OUTLIER_WEIGHT, Goodness, judge_fit
 from fg_calib.identifiability import Identifiability, identify
 from fg_calib.mistakes import SetupCheck, check_problem
 from fg_calib.observability import IdentifiabilityClass, Observability
-from fg_calib.problem import PAIR_KINDS, Problem, eliminated_terms, lengths
+from fg_calib.problem import PAIR_KINDS, Problem, check_graph, eliminated_terms, lengths
 from fg_calib.residual_table import ResidualTable, residual_table
 from fg_calib.robot import Robot
 from fg_calib.robust import effect
@@ -238,7 +238,11 @@ def assess(solution: Solution) -> Uncertainty:
         corrected, and get a small share of parameters that they did not have at nominal. Unknown is what has a share
         in one both at the nominal parameters and at the estimate; the others are known given that the undetermined
         directions are near nominal.
+
+    Raises:
+        ProblemError: The graph of the solution's problem has factors of somebody else.
     """
+    check_graph(solution.problem)
     with one_blas_thread:
         return _assess(solution)
 

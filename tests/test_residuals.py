@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.sparse
 from oracle import central_differences, random_robot, tool_pose
 from scipy.spatial.transform import Rotation
 
 from fg_calib import residuals
+from fg_calib.errors import InputError
 from fg_calib.kernels import LANES
 from fg_calib.kinematics import SPAN, build_chain, precompute_trig
 from fg_calib.residuals import PairBlock, PoseBlock, SamePointBlock
@@ -191,3 +193,20 @@ def test_the_sum_over_spans_does_not_depend_on_threads(monkeypatch):
     many = residuals.gram(block, chain)
     monkeypatch.setattr("fg_calib.kinematics.processors", lambda: 1)
     assert np.array_equal(residuals.gram(block, chain), many)
+
+
+@pytest.mark.parametrize(("n", "n_shared"), [(6, 3), (6, 30)], ids=["few shared errors", "many"])
+def test_some_rows_of_those_that_share_errors_are_no_block(n, n_shared):
+    """Whitened all together they are one piece; the parts, and the rows that come out, can be divided."""
+    block, chain = random_block("pairs", n, rng := np.random.default_rng(0))
+    loading = scipy.sparse.csr_array(rng.normal(size=(n * block.height, n_shared)))
+    correlated = residuals.correlate((block,), (loading,))
+    with pytest.raises(InputError) as caught:
+        residuals.rows_of(correlated, slice(0, 2))
+    assert str(caught.value) == (
+        "rows_of: a block whose rows share errors, expected one of its parts; linearise and residual give all its "
+        "rows, whitened together"
+    )
+    some = residuals.residual(residuals.rows_of(correlated.parts[0], slice(0, 2)), chain)
+    assert np.array_equal(some, residuals.residual(block, chain)[:2])
+    assert residuals.residual(correlated, chain).shape == (n * block.height, 1)
