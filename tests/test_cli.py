@@ -850,3 +850,22 @@ def test_a_job_may_leave_the_noise_to_the_residuals(fg_calib, example, given):
     compared = json.loads(fg_calib("compare", file, "--json").out)
     rms = compared["estimates"][0]["residual_rms"]["train"]
     assert rms["distance"] == pytest.approx(found["residual_rms"]["train"]["distance"]["after"], rel=1e-9)
+
+
+@pytest.mark.parametrize(("columns", "widest"), [(None, 100), ("40", 40), ("60", 60), ("200", 200)])
+@pytest.mark.parametrize("command", ["calibrate", "compare", "observe"])
+def test_a_report_is_as_wide_as_the_page(fg_calib, example, monkeypatch, command, columns, widest):
+    """A pipe has no width: 100 columns, in which all tables of the example have room."""
+    monkeypatch.delenv("COLUMNS", raising=False)
+    if columns is not None:
+        monkeypatch.setenv("COLUMNS", columns)
+    if command == "observe":
+        ended = fg_calib(command, example / "robot_nominal.yaml", "--configurations", example / POSES, "--angle", "deg")
+    else:
+        ended = fg_calib(command, example / JOB)
+    lines = ended.out.splitlines()
+    assert max(map(len, lines)) <= widest
+    assert all(name in " ".join(lines).replace(",", " ").split() for name in ("a2", "alpha7", "theta4", "beta3"))
+    if command == "calibrate":
+        row = next(line for line in lines[lines.index("Parameters") :] if line.startswith("a2"))
+        assert (row == "a2") is (widest < 80)
