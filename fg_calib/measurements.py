@@ -151,8 +151,9 @@ class Measurements:
         test: True for rows that are predicted but never fitted, shape (n_configurations,).
         position: world_p_tool, shape (n_configurations, 3), [m]; None where not measured.
         rotation: world_R_tool, shape (n_configurations, 3, 3); None where not measured.
-        sigma_position: Along the world's axes, shape (n_configurations, 3), [m].
-        sigma_orientation: Of the rotation vector about the tool's axes, shape (n_configurations, 3), [rad].
+        sigma_position: Along the world's axes, shape (n_configurations, 3), [m]; None where it is not stated. It may be
+            stated without a measurement: what one would be like.
+        sigma_orientation: The same of the rotation vector about the tool's axes, shape (n_configurations, 3), [rad].
         sigma_joint: Of the readings, shape (n_joints,), [rad] (prismatic: [m]).
         pairs: Directly measured pairs; None if pairs are to be formed from the poses.
         source: File name, for messages.

@@ -239,7 +239,8 @@ MISTAKES = [
      "torso.urdf:3: not XML: Opening and ending tag mismatch: link line 2 and robot, line 3, column 9"),
     ("", {}, "torso.urdf:1: not XML: Document is empty, line 1, column 1"),
     ("<html/>", {}, "torso.urdf: root element <html>, expected <robot>"),
-    (TREE, {}, "torso.urdf: 2 leaf links (left_tip, right_tip), expected one; name one as tip_link"),
+    (TREE, {}, "torso.urdf: 2 leaf links (left_tip, right_tip), expected one; name one as tip_link: {urdf: torso.urdf, "
+     "tip_link: ...} in a file, --tip-link of observe"),
     (TREE, {"base_link": "nowhere"}, f"torso.urdf: no link 'nowhere', expected {ALL}"),
     (TREE, {"tip_link": "nowhere"}, f"torso.urdf: no link 'nowhere', expected {ALL}"),
     (TREE, {"tip_link": "world"},
@@ -247,7 +248,8 @@ MISTAKES = [
     (TREE, {"base_link": "right_2", "tip_link": "right_tip"},
      "torso.urdf: no moving joint between links 'right_2' and 'right_tip', expected at least one"),
     (changed("</robot>", '<link name="island"/></robot>'), {"tip_link": "left_tip"},
-     "torso.urdf: 2 root links (world, island), expected one; name one as base_link"),
+     "torso.urdf: 2 root links (world, island), expected one; name one as base_link: {urdf: torso.urdf, "
+     "base_link: ...} in a file, --base-link of observe"),
     (changed("</robot>", '<link name="island"/></robot>'), {"base_link": "island", "tip_link": "left_tip"},
      "torso.urdf: links 'island' and 'left_tip' are not connected, expected two links of one tree"),
     (changed('<child link="right_1"/>', '<child link="left_1"/>'), {},

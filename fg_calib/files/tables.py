@@ -69,7 +69,7 @@ def read_measurements(
         robot: Whose configurations they are: names, number and limits of the joints.
         pairs: Table of pairs.
         units: Units of both tables; default m and rad.
-        noise: Sigmas where the tables state none, [m] and [rad].
+        noise: Sigmas where the tables state none, [m] and [rad]; also of what was not measured yet.
 
     Raises:
         InputError: A file is missing, is no table, lacks a column or holds a cell that cannot be used; the message
@@ -84,8 +84,8 @@ def read_measurements(
     joints = _joint_columns(header, robot)
     position = header.group(_POSITION)
     orientation = _orientation_columns(header)
-    sigma_position = header.sigmas("sigma_position", _SIGMA_POSITION) if position else ()
-    sigma_orientation = header.sigmas("sigma_orientation", _SIGMA_ORIENTATION) if orientation else ()
+    sigma_position = header.sigmas("sigma_position", _SIGMA_POSITION)
+    sigma_orientation = header.sigmas("sigma_orientation", _SIGMA_ORIENTATION)
     sigma_point = header.present("sigma_point") if "group" in header.columns else ()
     table = _Table.read(
         header,
@@ -105,8 +105,8 @@ def read_measurements(
         test=test,
         position=table.numbers(position) * length if position else None,
         rotation=_rotation(table, orientation, angle) if orientation else None,
-        sigma_position=_sigma(table, sigma_position, noise.position, length) if position else None,
-        sigma_orientation=_sigma(table, sigma_orientation, noise.orientation, angle) if orientation else None,
+        sigma_position=_sigma(table, sigma_position, noise.position, length),
+        sigma_orientation=_sigma(table, sigma_orientation, noise.orientation, angle),
         sigma_joint=_joint_sigma(noise.joint, robot.n_joints),
         pairs=between,
         source=header.name,

@@ -273,5 +273,8 @@ class _Tree:
     def _only(self, found: list[str], what: str, argument: str) -> str:
         if len(found) != 1:
             listed = ", ".join(found) or "none"
-            raise InputError(self._place, f"{len(found)} {what} links ({listed})", "one", f"name one as {argument}")
+            where = f"{{urdf: {self._place}, {argument}: ...}} in a file, --{argument.replace('_', '-')} of observe"
+            raise InputError(
+                self._place, f"{len(found)} {what} links ({listed})", "one", f"name one as {argument}: {where}"
+            )
         return found[0]
