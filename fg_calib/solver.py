@@ -170,7 +170,7 @@ def solve_from(solution: Solution, start: Floats, most: float, options: SolverOp
         SolverError: GTSAM could not solve a step at all.
     """
     clock, options = time.perf_counter(), options or SolverOptions()
-    with single_threaded_blas():
+    with one_blas_thread:
         problem = replace(solution.problem, start=start)
         rough = _Run(problem, replace(options, max_iterations=min(SHORT, options.max_iterations)))
         if not rough.descend(COARSE) or rough.here.cost >= most:

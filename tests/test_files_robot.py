@@ -8,6 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from oracle import dh_joint, frame, tool_pose
+from tolerances import rounding
 
 from fg_calib.errors import InputError
 from fg_calib.files.robot_yaml import read_robot, write_robot
@@ -66,7 +67,7 @@ def test_the_chain_is_base_then_joints_then_tool(tmp_path):
         @ dh_joint("mdh-hayati", second, q[1], True)
         @ frame(0, 0, 0.05, 0, 0, 0)
     )
-    assert tool_pose(robot, q) == pytest.approx(expected, abs=1e-15)  # rounding of a few products
+    assert tool_pose(robot, q) == pytest.approx(expected, abs=rounding(1.0))  # rounding of a few products
 
 
 def test_beta_may_be_left_out_and_units_default_to_si(tmp_path):

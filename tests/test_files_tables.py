@@ -9,6 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from oracle import frame
+from tolerances import rounding
 
 from fg_calib.errors import InputError
 from fg_calib.files.tables import read_measurements, write_csv
@@ -99,7 +100,7 @@ def test_noise_fills_what_the_table_does_not_state(write):
 
 def test_a_quaternion_is_normalised(write):
     path = write("q1,q2,q3,qx,qy,qz,qw\n0,0,0,0,0,0.6005,0.8005\n")
-    assert np.linalg.det(read_measurements(path, ARM).rotation[0]) == pytest.approx(1, abs=1e-15)
+    assert np.linalg.det(read_measurements(path, ARM).rotation[0]) == pytest.approx(1, abs=rounding(1.0))
 
 
 def test_columns_may_bear_the_joints_names_in_any_order(write):
