@@ -64,6 +64,16 @@ def check_flag(key: str, value: object) -> None:
         raise InputError(key, f"found {value!r}", "True or False")
 
 
+def check_type(key: str, value: object, kind: type, example: str) -> None:
+    """Check that an option is an object of a class, such as `Pairing` and no strategy's bare name; None is left alone.
+
+    Raises:
+        InputError: It is something else.
+    """
+    if value is not None and not isinstance(value, kind):
+        raise InputError(key, f"found {value!r}", f"a {kind.__name__}, such as {example}")
+
+
 def check_number(
     key: str, value: object, *, least: float = 0.0, above: bool = False, whole: bool = False, finite: bool = True
 ) -> None:

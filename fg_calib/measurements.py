@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.choices import Strategy, check, check_number
+from fg_calib.choices import Strategy, check, check_number, check_type
 from fg_calib.errors import InputError
 
 Floats = NDArray[np.float64]
@@ -73,8 +73,7 @@ def as_pairing(pairing: Pairing | None) -> Pairing:
     Raises:
         InputError: It is something else, such as a strategy's bare name.
     """
-    if pairing is not None and not isinstance(pairing, Pairing):
-        raise InputError("pairing", f"found {pairing!r}", "a Pairing, such as Pairing('chain')")
+    check_type("pairing", pairing, Pairing, "Pairing('chain')")
     return pairing or Pairing()
 
 

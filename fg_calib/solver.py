@@ -23,7 +23,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.choices import check_number
+from fg_calib.choices import check_number, check_type
 from fg_calib.errors import SolverError
 from fg_calib.factors import Variables, eliminate
 from fg_calib.observability import determined
@@ -141,6 +141,7 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
         SolverError: GTSAM could not solve a step at all.
     """
     check_graph(problem)
+    check_type("options", options, SolverOptions, "SolverOptions(max_iterations=200)")
     options = options or SolverOptions()
     clock = time.perf_counter()
     with one_blas_thread:

@@ -25,6 +25,7 @@ from fg_calib import (
     read_measurements,
     simulate,
     solve,
+    write_robot,
 )
 from fg_calib.errors import InputError
 from fg_calib.scenario import BoardViews, Errors, Placement, RandomReadings, Scenario
@@ -100,6 +101,14 @@ MISTAKES = {
     **{f"a bare strategy {f.__name__}": (
         lambda f=f: f(pairing="chain"), "pairing: found 'chain', expected a Pairing, such as Pairing('chain')"
     ) for f in (problem, bound, plain, practical)},
+    "a bare noise": (lambda: read_measurements("poses.csv", ROBOT, noise=1e-3), "noise: found 0.001, expected a Noise, "
+                     "such as Noise(position=1e-3)"),
+    "a bare unit": (lambda: read_measurements("poses.csv", ROBOT, units="mm"), "units: found 'mm', expected a Units, "
+                    "such as Units(length='mm')"),
+    "a unit to write in": (lambda: write_robot("robot.yaml", ROBOT, units="mm"), "units: found 'mm', expected a Units, "
+                           "such as Units(length='mm')"),
+    "options as a mapping": (lambda: solve(problem(), {"max_iterations": 5}), "options: found {'max_iterations': 5}, "
+                             "expected a SolverOptions, such as SolverOptions(max_iterations=200)"),
     "a prior that is a word": (lambda: problem(prior="no"), "prior: found 'no', expected True or False"),
     "a bound's prior": (lambda: bound(prior="no"), "prior: found 'no', expected True or False"),
     "weights that are a word": (lambda: plain(weighted="no"), "weighted: found 'no', expected True or False"),

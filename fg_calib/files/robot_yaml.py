@@ -23,6 +23,7 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import Field
 
+from fg_calib.choices import check_type
 from fg_calib.errors import InputError
 from fg_calib.files.disk import write_text
 from fg_calib.files.schema import Bound, Number, Positive, Schema, read_yaml, shown, validate
@@ -200,6 +201,7 @@ def write_robot(path: Path | str, robot: Robot, *, units: Units | None = None, u
     """
     if (robot.urdf is None) != (urdf_name is None):
         raise ValueError("a URDF robot, and no other, is written with urdf_name")
+    check_type("units", units, Units, "Units(length='mm')")
     units = units or Units()
     mapping: dict[str, Any] = {"name": robot.name}
     if robot.urdf is None:

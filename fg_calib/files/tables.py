@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fg_calib.choices import check_number
+from fg_calib.choices import check_number, check_type
 from fg_calib.errors import InputError
 from fg_calib.files.disk import replacing, require_file
 from fg_calib.files.units import ANGLES, LENGTHS, Units
@@ -75,6 +75,8 @@ def read_measurements(
         InputError: A file is missing, is no table, lacks a column or holds a cell that cannot be used; the message
             names its line and column.
     """
+    check_type("units", units, Units, "Units(length='mm')")
+    check_type("noise", noise, Noise, "Noise(position=1e-3)")
     units, noise = units or Units(), noise or Noise()
     for f in fields(noise):
         if f.name != "joint" and (figure := getattr(noise, f.name)) is not None:
