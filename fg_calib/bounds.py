@@ -31,12 +31,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.choices import FrameKnowledge, Model, PairErrors
+from fg_calib.choices import FrameKnowledge, Model, PairErrors, check_flag, check_names
 from fg_calib.errors import InputError
 from fg_calib.kinematics import build_chain, forward, precompute_trig
 from fg_calib.measurements import Measurements, Pairing
 from fg_calib.problem import correlation, named_triangle, predicted_problem
-from fg_calib.robot import Robot, known_names
+from fg_calib.robot import Robot
+from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
 
@@ -85,6 +86,7 @@ class Bound:
     claimed: Floats
     rank: int
 
+    @single_threaded
     def position(self, readings: Floats, *, fitted: bool = False, claimed: bool = False) -> PositionBound:
         """The bound on the tool point at joint readings.
 
@@ -111,6 +113,7 @@ class Bound:
         )
 
 
+@single_threaded
 def cramer_rao(
     robot: Robot,
     measurements: Measurements,
@@ -143,9 +146,8 @@ def cramer_rao(
         InputError: An unknown parameter, or one without tolerance whose error enters the estimate's.
     """
     names = tuple(p.name for p in robot.parameters if p.estimated)
-    for name in kept or ():
-        if name not in names:
-            raise InputError("kept", f"unknown or fixed parameter {name!r}", known_names(names))
+    check_names("kept", () if kept is None else kept, names, "or fixed parameter")
+    check_flag("prior", prior)
     k = np.array([kept is None or name in kept for name in names])
     train = ~measurements.test
     sigmas = tuple(

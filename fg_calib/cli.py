@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import json
 import logging
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -112,15 +113,19 @@ def compare_estimators(
     if as_json:
         print(json.dumps(comparison_document(comparison), allow_nan=False))
     else:
-        _show(build_comparison_report(comparison), least=100)
+        _show(build_comparison_report(comparison))
     _end(comparison.findings)
 
 
-def _show(report: RenderableType, least: int = 80) -> None:
-    """Print a report; on a narrower terminal than `least` its lines wrap, where a table would cut its cells."""
+def _show(report: RenderableType) -> None:
+    """Print a report as wide as the terminal, or as `COLUMNS` says; a pipe has no width of its own."""
     from rich.console import Console
 
-    Console(highlight=False, width=max(least, Console().width)).print(report)
+    from fg_calib.report import WIDTH, width_for
+
+    given = Console().is_terminal or "COLUMNS" in os.environ
+    width = width_for(report, Console().width if given else WIDTH)
+    Console(highlight=False, width=width).print(report)
 
 
 def _end(findings: Sequence[str]) -> None:
@@ -131,8 +136,22 @@ def _end(findings: Sequence[str]) -> None:
         raise typer.Exit(3)
 
 
+_OF_A_TABLE = ("pairing", "length", "angle", "position_noise", "orientation_noise", "joint_noise")
+"""Options of `observe` that say something of a table of configurations."""
+
+
+def _refuse_idle(context: typer.Context, names: Sequence[str], circumstance: str) -> None:
+    """Refuse options that were given although they do nothing in such a circumstance."""
+    for name in names:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name != "DEFAULT":
+            print(f"error: --{name.replace('_', '-')} has no effect {circumstance}", file=sys.stderr)
+            raise typer.Exit(2)
+
+
 @app.command()
 def observe(
+    context: typer.Context,
     robot: Annotated[Path, typer.Argument(metavar="ROBOT", help="The robot: robot.yaml or a URDF.")],
     model: Annotated[
         Model,
@@ -149,19 +168,27 @@ def observe(
     ] = None,
     frame: Annotated[FrameKnowledge, typer.Option("--frame", help="Whether world_T_base is estimated too.")] = "known",
     pairing: Annotated[
-        Literal["star", "chain", "all"], typer.Option("--pairing", help="Pairs of your configurations.")
+        Literal["star", "chain", "all"], typer.Option("--pairing", help="Pairs of TABLE's configurations.")
     ] = "star",
+    base_link: Annotated[
+        str | None, typer.Option("--base-link", metavar="LINK", help="Where the chain of a URDF starts.")
+    ] = None,
+    tip_link: Annotated[
+        str | None, typer.Option("--tip-link", metavar="LINK", help="Where the chain of a URDF ends.")
+    ] = None,
     prefer: Annotated[
         str, typer.Option("--prefer", metavar="NAMES", help="Parameters to keep, first choice first: theta2,d5.")
     ] = "",
-    length: Annotated[LengthUnit, typer.Option("--length", help="Unit of lengths in TABLE and below.")] = "m",
-    angle: Annotated[AngleUnit, typer.Option("--angle", help="Unit of angles in TABLE and below.")] = "rad",
-    position_noise: Annotated[float | None, typer.Option(help="1 sigma of a position; 1 mm if not given.")] = None,
-    orientation_noise: Annotated[
-        float | None, typer.Option(help="1 sigma of an orientation; 1 mrad if not given.")
+    length: Annotated[LengthUnit, typer.Option("--length", help="Unit of lengths in TABLE and of its noise.")] = "m",
+    angle: Annotated[AngleUnit, typer.Option("--angle", help="Unit of angles in TABLE and of its noise.")] = "rad",
+    position_noise: Annotated[
+        float | None, typer.Option(help="1 sigma of a position in TABLE; 1 mm if not given.")
     ] = None,
-    joint_noise: Annotated[float, typer.Option(help="1 sigma of a joint reading.")] = 0.0,
-    seed: Annotated[int, typer.Option(help="Of the random configurations.")] = 0,
+    orientation_noise: Annotated[
+        float | None, typer.Option(help="1 sigma of an orientation in TABLE; 1 mrad if not given.")
+    ] = None,
+    joint_noise: Annotated[float, typer.Option(help="1 sigma of a joint reading in TABLE.")] = 0.0,
+    seed: Annotated[int, typer.Option(help="Of the random configurations, without TABLE.")] = 0,
     as_json: Json = False,
 ) -> None:
     """Say which parameters measurements can determine, which only together, and why not the others."""
@@ -173,7 +200,11 @@ def observe(
     from fg_calib.report import build_identifiability_report
     from fg_calib.results import observability_document, write_observability
 
-    arm = read_robot(robot)
+    if configurations is None:
+        _refuse_idle(context, _OF_A_TABLE, "without --configurations")
+    else:
+        _refuse_idle(context, ("seed",), "with --configurations")
+    arm = read_robot(robot, base_link=base_link, tip_link=tip_link)
     names = [name.strip() for name in prefer.split(",") if name.strip()]
     for name in names:
         arm.index(name)

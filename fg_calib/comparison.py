@@ -40,6 +40,7 @@ from fg_calib.problem import problem_of
 from fg_calib.residual_table import residual_table
 from fg_calib.robot import Robot
 from fg_calib.solver import Solution
+from fg_calib.threads import single_threaded
 from fg_calib.uncertainty import Uncertainty, assess
 
 Floats = NDArray[np.float64]
@@ -158,6 +159,7 @@ class Comparison:
         return float(corrections_of(self.job.robot, robot.nominal)[self.job.robot.index(name)])
 
 
+@single_threaded
 def compare(job: Job) -> Comparison:
     """Run the factor graph and the plain estimators on one job.
 
@@ -229,6 +231,7 @@ def _without_priors(job: Job, judge: _Judge) -> list[Estimate]:
     return estimates
 
 
+@single_threaded
 def real_errors(estimated: Robot, true: Robot, readings: Floats) -> RealErrors:
     """Errors of an estimated arm at joint readings, shape (n, n_joints), [rad] (prismatic: [m])."""
     here, there = (forward(build_chain(r), precompute_trig(r, readings)) for r in (estimated, true))

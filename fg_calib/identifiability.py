@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.choices import FrameKnowledge, Model
+from fg_calib.choices import FrameKnowledge, Model, check_names, check_number
 from fg_calib.conventions import MissingMotion, missing_motions
 from fg_calib.errors import ProblemError
 from fg_calib.measurements import Measurements, Pairing
@@ -22,6 +22,7 @@ from fg_calib.observability import SIGNAL_FLOOR, Observability
 from fg_calib.problem import STRUCTURAL_FLOOR, Problem, observe, predicted_problem, random_problem
 from fg_calib.reasons import LostDirection, explain
 from fg_calib.robot import Robot, names_of
+from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
 
@@ -54,6 +55,7 @@ class Identifiability:
     missing: tuple[MissingMotion, ...] = ()
 
 
+@single_threaded
 def observe_structure(
     robot: Robot,
     model: Model,
@@ -75,7 +77,13 @@ def observe_structure(
         prefer: Parameters to keep, first choice first, where only combinations are determined.
         n_configurations: Random configurations; 0 for ten for every parameter, 300 at least.
         seed: Of the random configurations.
+
+    Raises:
+        InputError: An option is not one of those possible.
     """
+    check_names("prefer", prefer, names_of(robot.parameters))
+    check_number("n_configurations", n_configurations, whole=True)
+    check_number("seed", seed, whole=True)
     estimated = [p for p in robot.parameters if p.estimated]
     everything = [p for p in robot.parameters if p.estimated or 1 <= p.owner <= robot.n_joints]
 
@@ -93,6 +101,7 @@ def observe_structure(
     return replace(whole, with_fixed_known=known, fixed=fixed)
 
 
+@single_threaded
 def observe_configurations(
     robot: Robot,
     measurements: Measurements,
@@ -113,8 +122,10 @@ def observe_configurations(
         prefer: Parameters to keep, first choice first, where only combinations are determined.
 
     Raises:
+        InputError: An option is not one of those possible.
         ProblemError: Nothing is estimated, or no row takes part.
     """
+    check_names("prefer", prefer, names_of(robot.parameters))
     if not any(p.estimated for p in robot.parameters):
         raise ProblemError(f"robot {robot.name}", "nothing to estimate", "at least one parameter that is not fixed")
     train = ~measurements.test

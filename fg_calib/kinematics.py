@@ -28,6 +28,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.errors import InputError
 from fg_calib.kernels import walk_all
 from fg_calib.robot import AXIS_OF_KIND, FRAME_KINDS, Axis, Element, Robot
 
@@ -190,7 +191,12 @@ def precompute_trig(robot: Robot, readings: Floats) -> Floats:
     Args:
         robot: The robot.
         readings: Joint readings, shape (n, n_joints), [rad] (prismatic: [m]).
+
+    Raises:
+        InputError: The readings are of more or fewer joints.
     """
+    if np.ndim(readings) != 2 or np.shape(readings)[1] != robot.n_joints:
+        raise InputError("readings", f"shape {np.shape(readings)}", f"(n, {robot.n_joints}) for the robot's joints")
     prismatic = np.array([j.prismatic for j in robot.joints])
     return np.stack(
         [np.where(prismatic, readings, np.cos(readings)), np.where(prismatic, 0.0, np.sin(readings))], axis=2
@@ -266,8 +272,11 @@ def pose(robot: Robot, readings: Floats | Sequence[Sequence[float]]) -> Poses:
     Args:
         robot: The robot, at its nominal values.
         readings: Joint readings, shape (n, n_joints), [rad] (prismatic: [m]).
+
+    Raises:
+        InputError: The readings are of more or fewer joints.
     """
-    q = np.asarray(readings, dtype=np.float64).reshape(-1, robot.n_joints)
+    q = np.atleast_2d(np.asarray(readings, dtype=np.float64))
     chain = build_chain(robot, {i: i for i in range(len(robot.parameters))}).with_joint_columns()
     return forward(chain, precompute_trig(robot, q))
 

@@ -28,19 +28,20 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fg_calib import residuals
-from fg_calib.choices import MODELS, FrameKnowledge, Model
+from fg_calib.choices import FrameKnowledge, Model, check, check_flag, check_names, check_number
 from fg_calib.errors import InputError
 from fg_calib.kinematics import Chain, build_chain, precompute_trig
-from fg_calib.measurements import Measurements, Pairing, form_pairs
+from fg_calib.measurements import Measurements, Pairing, as_pairing, form_pairs
 from fg_calib.residuals import Block, PairBlock, PoseBlock
-from fg_calib.robot import AXIS_OF_KIND, FRAME_KINDS, Element, Parameter, Robot, known_names, names_of
+from fg_calib.robot import AXIS_OF_KIND, FRAME_KINDS, Element, Parameter, Robot, names_of
+from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -127,6 +128,7 @@ class LeastSquares:
         return np.concatenate([self.robot.nominal, self.frame])
 
 
+@single_threaded
 def fit_least_squares(
     robot: Robot,
     measurements: Measurements,
@@ -165,7 +167,16 @@ def fit_least_squares(
     Raises:
         InputError: An argument is not one of those possible, or the measurements lack what the model needs.
     """
-    _check(model, method, frame, max_iterations, tolerance)
+    for key, option, possible in (
+        ("model", model, Model),
+        ("method", method, Method),
+        ("frame", frame, FrameKnowledge),
+    ):
+        check(key, option, possible)
+    check_flag("weighted", weighted)
+    check_number("max_iterations", max_iterations, least=1, whole=True)
+    check_number("tolerance", tolerance, finite=False)
+    pairing = as_pairing(pairing)
     clock = time.perf_counter()
     values, world_T_base = _start(robot, start)
     chosen = _chosen(robot, names)
@@ -182,31 +193,30 @@ def fit_least_squares(
         full[columns] = x
         return full
 
-    rows = _rows(robot, measurements, model, pairing or Pairing(), weighted)
+    rows = _rows(robot, measurements, model, pairing, weighted)
     rows = _without_kinks(rows, chain.at(first), model)
     if not rows.use.any():
         raise InputError(measurements.source, "no row left to fit", f"train rows for model {model}")
 
     fit = _Fit(x=first[columns], converged=False, message="", iterations=0, steps=())
     whitening = None
-    with residuals.single_threaded_blas():  # the kernels' threads are enough
-        for _ in range(_ROUNDS if weighted else 1):
-            whitening = _whitening(rows, chain.at(parameters(fit.x)), measurements.sigma_joint) if weighted else None
+    for _ in range(_ROUNDS if weighted else 1):
+        whitening = _whitening(rows, chain.at(parameters(fit.x)), measurements.sigma_joint) if weighted else None
 
-            def evaluate(x: Floats, whitening: Floats | None = whitening) -> tuple[Floats, Floats]:
-                return _evaluate(rows, chain.at(parameters(x)), whitening)
+        def evaluate(x: Floats, whitening: Floats | None = whitening) -> tuple[Floats, Floats]:
+            return _evaluate(rows, chain.at(parameters(x)), whitening)
 
-            solver = _gauss_newton if method == "gauss-newton" else _scipy
-            again = solver(evaluate, fit.x, max_iterations, tolerance)
-            moved = float(np.linalg.norm(again.x - fit.x))
-            fit = replace(again, iterations=fit.iterations + again.iterations, steps=fit.steps + again.steps)
-            if not fit.converged or moved <= REWEIGHTED or not np.any(measurements.sigma_joint > 0.0):
-                break
-        else:
-            if weighted:
-                fit = replace(fit, converged=False, message=f"not converged: new weights still move it by {moved:.1e}")
-        r, J = _evaluate(rows, chain.at(parameters(fit.x)), whitening)
-        covariance, rank = _covariance(r, J, weighted)
+        solver = _gauss_newton if method == "gauss-newton" else _scipy
+        again = solver(evaluate, fit.x, max_iterations, tolerance)
+        moved = float(np.linalg.norm(again.x - fit.x))
+        fit = replace(again, iterations=fit.iterations + again.iterations, steps=fit.steps + again.steps)
+        if not fit.converged or moved <= REWEIGHTED or not np.any(measurements.sigma_joint > 0.0):
+            break
+    else:
+        if weighted:
+            fit = replace(fit, converged=False, message=f"not converged: new weights still move it by {moved:.1e}")
+    r, J = _evaluate(rows, chain.at(parameters(fit.x)), whitening)
+    covariance, rank = _covariance(r, J, weighted)
     full = parameters(fit.x)
     return LeastSquares(
         robot=robot.with_values(full[:n]),
@@ -458,9 +468,7 @@ def _chosen(robot: Robot, names: Sequence[str] | None) -> list[int]:
         chosen = [i for i, p in enumerate(robot.parameters) if p.estimated]
     else:
         known = names_of(robot.parameters)
-        for name in names:
-            if name not in known:
-                raise InputError("names", f"unknown parameter {name!r}", known_names(known))
+        check_names("names", names, known)
         chosen = [i for i, name in enumerate(known) if name in set(names)]
         if len(chosen) < len(names):
             twice = next(name for name in names if list(names).count(name) > 1)
@@ -468,14 +476,3 @@ def _chosen(robot: Robot, names: Sequence[str] | None) -> list[int]:
     if not chosen:
         raise InputError("names", "nothing to estimate", "at least one parameter")
     return chosen
-
-
-def _check(model: str, method: str, frame: str, max_iterations: int, tolerance: float) -> None:
-    choices = {"model": MODELS, "method": get_args(Method), "frame": get_args(FrameKnowledge)}
-    for (key, possible), found in zip(choices.items(), (model, method, frame), strict=True):
-        if found not in possible:
-            raise InputError(key, f"found {found!r}", f"one of {', '.join(possible)}")
-    if max_iterations < 1:
-        raise InputError("max_iterations", f"found {max_iterations}", "1 or more")
-    if not tolerance >= 0.0:
-        raise InputError("tolerance", f"found {tolerance}", "0 or more")

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.choices import Strategy
+from fg_calib.choices import Strategy, check, check_number, check_type
 from fg_calib.errors import InputError
 
 Floats = NDArray[np.float64]
@@ -35,6 +35,13 @@ class Noise:
     angle: float | None = None
     point: float | None = None
 
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            given = getattr(self, f.name)
+            for figure in given if isinstance(given, tuple | list) else (given,):
+                if figure is not None:
+                    check_number(f"noise: {f.name}", figure)
+
 
 @dataclass(frozen=True)
 class Pairing:
@@ -51,8 +58,23 @@ class Pairing:
     count: int = 0
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        check("pairing", self.strategy, Strategy)
+        check_number("pairing: count", self.count, above=self.strategy == "random", whole=True)
+        check_number("pairing: seed", self.seed, whole=True)
+
     def __str__(self) -> str:
         return self.strategy if self.strategy != "random" else f"random ({self.count}, seed {self.seed})"
+
+
+def as_pairing(pairing: Pairing | None) -> Pairing:
+    """The pairing given, a star if None.
+
+    Raises:
+        InputError: It is something else, such as a strategy's bare name.
+    """
+    check_type("pairing", pairing, Pairing, "Pairing('chain')")
+    return pairing or Pairing()
 
 
 @dataclass(frozen=True)
@@ -128,8 +150,9 @@ class Measurements:
         test: True for rows that are predicted but never fitted, shape (n_configurations,).
         position: world_p_tool, shape (n_configurations, 3), [m]; None where not measured.
         rotation: world_R_tool, shape (n_configurations, 3, 3); None where not measured.
-        sigma_position: Along the world's axes, shape (n_configurations, 3), [m].
-        sigma_orientation: Of the rotation vector about the tool's axes, shape (n_configurations, 3), [rad].
+        sigma_position: Along the world's axes, shape (n_configurations, 3), [m]; None where it is not stated. It may be
+            stated without a measurement: what one would be like.
+        sigma_orientation: The same of the rotation vector about the tool's axes, shape (n_configurations, 3), [rad].
         sigma_joint: Of the readings, shape (n_joints,), [rad] (prismatic: [m]).
         pairs: Directly measured pairs; None if pairs are to be formed from the poses.
         source: File name, for messages.

@@ -22,9 +22,9 @@ from fg_calib.factors import pose_of
 from fg_calib.frames import Frame
 from fg_calib.measurements import Measurements
 from fg_calib.problem import PAIR_KINDS, POSE_KINDS, Problem
-from fg_calib.residuals import single_threaded_blas
 from fg_calib.robot import CONVENTIONS, Robot
 from fg_calib.setup import Setup, TypicalResidual, setup_of
+from fg_calib.threads import one_blas_thread
 
 Floats = NDArray[np.float64]
 
@@ -135,7 +135,7 @@ def check_setup(
     Note:
         Pairs are formed anew from some of the rows, whatever the job's pairing.
     """
-    with single_threaded_blas():
+    with one_blas_thread:
         setup = setup_of(robot, measurements, model, frame)
         if setup is None:
             return SetupCheck()

@@ -30,6 +30,7 @@ from fg_calib.problem import Problem, judged_at, noise_kinds, problem_of
 from fg_calib.residual_table import residual_table
 from fg_calib.restarts import look_elsewhere
 from fg_calib.solver import Solution, SolverOptions, solve
+from fg_calib.threads import single_threaded
 
 LEAST_REDUNDANCY = 3.0
 """Degrees of freedom that a kind must have left for its noise to be estimated."""
@@ -66,6 +67,7 @@ def solve_job(job: Job, problem: Problem | None = None) -> Solution:
     return look_elsewhere(solution, options)
 
 
+@single_threaded
 def estimate_noise(problem: Problem, options: SolverOptions | None = None) -> Solution:
     """Estimate the parameters and, with them, a factor on the stated noise of each kind.
 

@@ -17,7 +17,17 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from fg_calib import frames, residuals
-from fg_calib.choices import EncoderNoise, FrameKnowledge, Gauge, Loss, Model, PairErrors
+from fg_calib.choices import (
+    EncoderNoise,
+    FrameKnowledge,
+    Gauge,
+    Loss,
+    Model,
+    PairErrors,
+    check,
+    check_flag,
+    check_names,
+)
 from fg_calib.encoders import MAX_JOINT_VARIABLES, MovedRows, TrueJoints
 from fg_calib.errors import ProblemError
 from fg_calib.factors import (
@@ -39,10 +49,11 @@ from fg_calib.frames import Frame, Unknown
 from fg_calib.groups import PointGroups
 from fg_calib.inverse import random_readings
 from fg_calib.kinematics import build_chain, forward, precompute_trig
-from fg_calib.measurements import Measurements, Pairing, Pairs, form_pairs, no_pairs
+from fg_calib.measurements import Measurements, Pairing, Pairs, as_pairing, form_pairs, no_pairs
 from fg_calib.observability import RANK_TOLERANCE, SIGNAL_FLOOR, Observability, analyse, determined, singular_values
 from fg_calib.residuals import AnyBlock, Block, CorrelatedBlock
-from fg_calib.robot import Parameter, Robot
+from fg_calib.robot import Parameter, Robot, names_of
+from fg_calib.threads import single_threaded
 from fg_calib.whitening import (
     MAX_SHARED,
     Adjustment,
@@ -104,6 +115,12 @@ class Settings:
     encoder: EncoderNoise = "propagated"
     loss: Loss = "none"
 
+    def __post_init__(self) -> None:
+        options = {"model": Model, "frame": FrameKnowledge, "gauge": Gauge}
+        options |= {"pair_errors": PairErrors, "encoder": EncoderNoise, "loss": Loss}
+        for key, possible in options.items():
+            check(key, getattr(self, key), possible)
+
     @property
     def uses_pairs(self) -> bool:
         """Whether the model is one of pairs."""
@@ -126,7 +143,7 @@ class Problem:
         sigma: 1 sigma of distance and angle, shape (n_pairs, 2), or of orientation and position components,
             shape (n_configurations, 6): measurement noise and joint noise together, [m] and [rad].
         blocks: The whitened train rows.
-        graph: Factors and priors.
+        graph: Factors and priors, for GTSAM's own tools to work on. `solve` and `assess` take no others.
         sharing: Which errors of configurations the rows carry in common.
         adjustment: What has been learned of the measurements' noise.
         whole: The problem with everything estimated, where this one leaves parameters out to fix the gauge.
@@ -134,6 +151,7 @@ class Problem:
         joints: The true joint values, where they are variables; else None.
         sigma_point: 1 sigma of a touch, joint noise included, shape (n_configurations, 3), [m]; empty without groups.
         terms: The whitened train rows that depend on nuisance variables.
+        factors: The factors that `graph` was made of.
     """
 
     robot: Robot
@@ -154,10 +172,11 @@ class Problem:
     joints: TrueJoints | None = None
     sigma_point: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     terms: tuple[Term, ...] = ()
+    factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
 
     @property
     def initial(self) -> gtsam.Values:
-        """GTSAM's initial values."""
+        """GTSAM's initial values, made anew: to change them changes nothing in the problem."""
         return self.variables.values(self.start)
 
     @property
@@ -242,6 +261,7 @@ class Problem:
         return {reason: int(np.sum(mask & ~self.pairs.test)) for reason, mask in self.judgement.reasons.items()}
 
 
+@single_threaded
 def build_problem(
     robot: Robot,
     measurements: Measurements,
@@ -277,10 +297,14 @@ def build_problem(
         loss: What becomes of large residuals: `none` or a robust loss (see `robust`).
 
     Raises:
+        InputError: An option is not one of those possible.
         ProblemError: The measurements lack what the model needs, or do not suffice.
     """
-    with_priors = prior is not False and gauge == "prior"
-    settings = Settings(model, pairing or Pairing(), frame, with_priors, gauge, pair_errors, encoder, loss)
+    if prior is not None:
+        check_flag("prior", prior)
+    check_names("prefer", prefer, names_of(robot.parameters))
+    with_priors = (prior is None or bool(prior)) and gauge == "prior"
+    settings = Settings(model, as_pairing(pairing), frame, with_priors, gauge, pair_errors, encoder, loss)
     if not any(p.estimated for p in robot.parameters):
         raise ProblemError(f"robot {robot.name}", "nothing to estimate", "at least one parameter that is not fixed")
     unknown_frame = frame == "unknown" and not settings.uses_pairs
@@ -360,6 +384,7 @@ def problem_of(job: Job, **changes: Any) -> Problem:
     return build_problem(job.robot, job.measurements, **settings | changes)
 
 
+@single_threaded
 def predicted_problem(
     robot: Robot,
     readings: Floats,
@@ -382,7 +407,7 @@ def predicted_problem(
             (n_joints,); 1 mm, 1 mrad and none where None.
         pair_errors: Whether pairs of one configuration share its errors or count as independent.
     """
-    settings = Settings(model, pairing or Pairing(), frame, prior=False, pair_errors=pair_errors)
+    settings = Settings(model, as_pairing(pairing), frame, prior=False, pair_errors=pair_errors)
     variables = build_variables(robot, frame == "unknown" and not settings.uses_pairs, priors=False)
     trig = precompute_trig(robot, readings)
     poses = forward(build_chain(robot), trig)
@@ -426,6 +451,26 @@ def random_problem(
         sigmas=(np.full((n, 3), robot.scale_of("m")), np.full((n, 3), robot.scale_of("rad")), None),
         pair_errors="independent",
     )
+
+
+def check_graph(problem: Problem) -> None:
+    """Check that the graph has the problem's own factors and no others.
+
+    Rows are judged and whitened anew while a problem is solved, and the graph made anew with them: a factor that
+    somebody added would be lost.
+
+    Raises:
+        ProblemError: Factors were added, replaced or removed.
+    """
+    graph, own = problem.graph, problem.factors
+    n, n_own = graph.size(), own.size()
+    kept = sum(graph.at(i) is own.at(i) for i in range(min(n, n_own)))
+    hint = "for a graph of your own use GTSAM's optimisers, from problem.initial and with values for its variables"
+    if n > kept:
+        found = f"{n - kept} of {n} factors not made from this problem's measurements and priors"
+        raise ProblemError("problem.graph", found, "none: solve would leave them out", hint)
+    if n < n_own:
+        raise ProblemError("problem.graph", f"{n} of the problem's {n_own} factors", "all of them", hint)
 
 
 def noise_kinds(model: Model) -> tuple[str, str]:
@@ -887,4 +932,5 @@ def _assemble(
         joints=joints,
         sigma_point=sigma_point,
         terms=terms,
+        factors=gtsam.NonlinearFactorGraph(graph),
     )

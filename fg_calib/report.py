@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import io
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import chain
+from typing import Any
 
 import numpy as np
-from rich.console import Console, Group, RenderableType
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.measure import Measurement
 from rich.padding import Padding
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
+from fg_calib.choices import check_number
 from fg_calib.comparison import Comparison, Estimate, PoseError
 from fg_calib.goodness import FLAGS, OUTLIER_WEIGHT, VERDICTS
 from fg_calib.identifiability import Identifiability
@@ -39,8 +44,11 @@ def format_report(solution: Solution, uncertainty: Uncertainty, width: int = WID
 
 
 def _plain_text(report: RenderableType, width: int) -> str:
+    check_number("width", width, least=1, whole=True)
     text = io.StringIO()
-    console = Console(file=text, width=width, color_system=None, highlight=False, legacy_windows=False)
+    console = Console(
+        file=text, width=width_for(report, width), color_system=None, highlight=False, legacy_windows=False
+    )
     console.print(report)
     return "\n".join(line.rstrip() for line in text.getvalue().splitlines())
 
@@ -50,14 +58,16 @@ def build_report(solution: Solution, uncertainty: Uncertainty) -> RenderableType
     parts: list[RenderableType] = [
         _verdict(solution, uncertainty),
         *_section("Fit statistics", _statistics(solution, uncertainty)),
-        *_section("Goodness of fit (1 sigma of a row)", *_goodness(solution, uncertainty)),
+        *_section(
+            f"Goodness of fit (1 sigma of a row{_with_joint_noise(solution)})", *_goodness(solution, uncertainty)
+        ),
         *_section("Residuals (RMS)", _residuals(uncertainty)),
         *_section("Parameters", _parameters(uncertainty)),
     ]
     if any(p.stands_for for p in uncertainty.parameters):
         parts += _section("What kept parameters were estimated for", _combinations(uncertainty))
     if len(uncertainty.goodness.suspects):
-        parts += _section("Suspicious rows", _suspects(solution, uncertainty))
+        parts += _section("Suspicious rows", *_poses_behind(solution, uncertainty), _suspects(solution, uncertainty))
     if uncertainty.goodness.configurations:
         parts += _section("Suspicious configurations", _suspect_configurations(solution, uncertainty))
     if uncertainty.frame is not None:
@@ -96,14 +106,77 @@ def _verdict(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
     return Group(Text(what), *doubts)
 
 
-def _plain_table(*columns: tuple[str, str], wrap: bool = False) -> Table:
-    """A table without a frame; columns as (heading, justification).
+class _WholeWords(Table):
+    """A table without a frame that breaks no word: it wraps at spaces, or gives each row a paragraph of its own."""
 
-    Where it is too wide its first column folds; with `wrap` all of them wrap at words.
-    """
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="italic")
-    for i, (heading, justify) in enumerate(columns):
-        table.add_column(heading, justify=justify, no_wrap=i > 0 and not wrap, overflow="fold")  # type: ignore[arg-type]
+    def add_row(self, *cells: RenderableType | None, **options: Any) -> None:
+        """Add a row of cells; text in brackets is no markup."""
+        super().add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in cells), **options)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        widths = self._widths(options.max_width)
+        if widths is None:
+            yield from self._paragraphs()
+            return
+        for column, width in zip(self.columns, widths, strict=True):
+            column.width = width
+        yield from super().__rich_console__(console, options.update_width(options.max_width + 1))  # not one blank less
+
+    def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
+        words = [_longest_word(text) for column in self.columns for text in self._texts(column)]
+        return Measurement(max(words, default=0) + _INDENT, options.max_width)
+
+    def _texts(self, column: Column) -> list[str]:
+        """The cells of a column, its heading first."""
+        heading = str(column.header) if self.show_header else ""
+        return [heading, *(str(cell) for cell in column.cells)]
+
+    def _widths(self, most: int) -> list[int] | None:
+        """Widths that the columns have room in, the widest wrapped most; None if there are none."""
+        texts = [self._texts(column) for column in self.columns]
+        widths = [max(map(len, cells)) for cells in texts]
+        least = [
+            width if column.no_wrap else max(map(_longest_word, cells))
+            for column, width, cells in zip(self.columns, widths, texts, strict=True)
+        ]
+        room = most - len(widths) + 1  # a blank between columns
+        while sum(widths) > room:
+            can = [i for i, width in enumerate(widths) if width > least[i]]
+            if not can:
+                return None
+            widths[max(can, key=lambda i: widths[i])] -= 1
+        return widths
+
+    def _paragraphs(self) -> Iterable[RenderableType]:
+        """The rows one below the other: the first cell, then the others behind their headings."""
+        columns = [self._texts(column) for column in self.columns]
+        for i, row in enumerate(self.rows, start=1):
+            words = [f"{cells[0]} {cells[i]}".strip() for cells in columns if cells[i]]
+            style = row.style or ""
+            yield Text("".join(words[:1]), style=style)
+            if words[1:]:
+                yield Padding(Text("  ".join(words[1:]), style=style), (0, 0, 0, _INDENT))
+
+
+_INDENT = 2
+
+_WIDEST = 10_000
+
+
+def _longest_word(text: str) -> int:
+    return max(map(len, text.split()), default=0)
+
+
+def width_for(report: RenderableType, width: int) -> int:
+    """`width`, or more where the longest word of a report needs it."""
+    return max(width, Console(width=_WIDEST).measure(report).minimum)
+
+
+def _plain_table(*columns: tuple[str, str], wrap: bool = False) -> Table:
+    """A table without a frame; columns as (heading, justification), which wrap at spaces with `wrap`."""
+    table = _WholeWords(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="italic")
+    for heading, justify in columns:
+        table.add_column(heading, justify=justify, no_wrap=not wrap, overflow="fold")  # type: ignore[arg-type]
     return table
 
 
@@ -155,6 +228,11 @@ def _probability(p: float) -> str:
     return "< 0.001" if p < 1e-3 else "> 0.999" if p > 0.999 else f"{p:.2g}" if p < 0.1 else f"{p:.2f}"
 
 
+def _with_joint_noise(solution: Solution) -> str:
+    """What a reader must know of `stated`: it is more than the noise of the measurement itself."""
+    return ", stated with joint noise" if np.any(solution.problem.measurements.sigma_joint > 0.0) else ""
+
+
 def _goodness(solution: Solution, uncertainty: Uncertainty) -> Iterable[RenderableType]:
     """Noise stated and noise seen by kind, what the difference means, and what can be done about it."""
     estimated = solution.estimated_noise
@@ -162,7 +240,7 @@ def _goodness(solution: Solution, uncertainty: Uncertainty) -> Iterable[Renderab
         *(("", "left"), ("", "left"), ("stated", "right"), ("seen" if estimated is None else "estimated", "right")),
         *(("ratio", "right"), ("p-value", "right"), ("", "left")),
     )
-    table.columns[0].no_wrap, table.columns[-1].no_wrap = True, False
+    table.columns[-1].no_wrap = False
     for fit in uncertainty.goodness.kinds:
         factor, shown, decimals = _SHOWN[fit.unit]
         seen, words = fit.seen_over_stated, VERDICTS[fit.verdict]
@@ -199,6 +277,34 @@ def _goodness_lines(solution: Solution, uncertainty: Uncertainty) -> Iterable[st
         yield "look at the suspicious rows below, or let a robust loss weigh them: loss in the job"
     if not len(goodness.suspects) and not goodness.configurations:
         yield f"no row (|studentised residual| above {goodness.level:.2f}) and no configuration is suspicious"
+
+
+def _poses_behind(solution: Solution, uncertainty: Uncertainty, limit: int = 5) -> Iterable[RenderableType]:
+    """The poses that suspicious pairs come from: one wrong pose makes all its pairs suspicious.
+
+    Those more than half of whose pairs are suspicious, the one in most of them first, each with the pairs that the
+    poses before it do not explain. A pose with one such pair alone is not told from the other pose of the pair.
+    """
+    rows, problem = uncertainty.residuals, solution.problem
+    if not problem.formed:
+        return
+    fitted, suspects = np.flatnonzero(rows.used), uncertainty.goodness.suspects
+    all_pairs, left = ({(int(rows.a[i]), int(rows.b[i])) for i in some} for some in (fitted, suspects))
+    n_pairs, n_suspicious = Counter(chain.from_iterable(all_pairs)), len(left)
+    lines = []
+    while left:
+        of_pose = Counter(chain.from_iterable(left))
+        wrong = [pose for pose, n in of_pose.items() if n > 1 and 2 * n > n_pairs[pose]]
+        if not wrong:
+            break
+        worst = max(wrong, key=lambda pose: (of_pose[pose], -pose))
+        n, all_of_it = of_pose[worst], n_pairs[worst]
+        name = problem.measurements.ids[worst]
+        lines.append(f"pose {name} is in {n} of {n_suspicious} suspicious pairs, and in {all_of_it} pairs in all")
+        left = {pair for pair in left if worst not in pair}
+    if len(lines) > limit:
+        lines[limit:] = [f"and {len(lines) - limit} more such poses"]
+    yield from (Padding(Text(line), (0, 0, 0, _INDENT)) for line in lines)
 
 
 def _suspects(solution: Solution, uncertainty: Uncertainty, limit: int = 5) -> RenderableType:
@@ -514,7 +620,7 @@ def build_comparison_report(comparison: Comparison) -> RenderableType:
     title = f"{job.robot.name}: {job.model}, judged at {comparison.n_judged} {comparison.judged_on} configurations"
     parts: list[RenderableType] = [Text(title)]
     parts += [Text(f"DOUBTFUL: {finding}", style="bold red") for finding in comparison.findings]
-    parts += ["", _accuracy(comparison)]
+    parts += [Text(""), _accuracy(comparison)]
     parts += _section("Corrections (± sigma claimed)", _corrections(comparison))
     parts += _section("Estimators", _estimators(comparison))
     notes = list(_comparison_notes(comparison))
@@ -525,7 +631,6 @@ def _accuracy(comparison: Comparison) -> RenderableType:
     estimates = comparison.estimates
     headings = ("nominal", *(_ESTIMATORS[e.name] for e in estimates))
     table = _plain_table(("", "left"), ("", "left"), *((heading, "right") for heading in headings))
-    table.columns[0].no_wrap = True
 
     def row(label: str, unit: str, values: Iterable[float | None]) -> None:
         factor, shown, decimals = _SHOWN[unit]

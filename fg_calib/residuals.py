@@ -42,17 +42,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields, replace
-from functools import cache
 from typing import Any, Protocol
 
 import numpy as np
 import scipy.linalg
 import scipy.sparse
 from numpy.typing import NDArray
-from threadpoolctl import ThreadpoolController
 
+from fg_calib.errors import InputError
 from fg_calib.kernels import LANES, fill_pairs, fill_poses, fill_same_points, walk_all
 from fg_calib.kinematics import SPAN, Chain, over_spans, turning_of_base
+from fg_calib.threads import one_blas_thread
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -340,7 +340,14 @@ AnyBlock = Block | CorrelatedBlock
 
 
 def rows_of(block: Block, rows: slice) -> Block:
-    """The measurements at `rows` of a block."""
+    """The measurements at `rows` of a block.
+
+    Raises:
+        InputError: It is a `CorrelatedBlock`: its rows are whitened all together, so some of them are no block.
+    """
+    if isinstance(block, CorrelatedBlock):
+        hint = "linearise and residual give all its rows, whitened together"
+        raise InputError("rows_of", "a block whose rows share errors", "one of its parts", hint)
     parts = {f.name: getattr(block, f.name)[rows] for f in fields(block) if f.name not in ("trig", "kinds")}  # type: ignore[arg-type]
     part: Block = replace(block, **parts)  # type: ignore[type-var]
     return part
@@ -400,7 +407,7 @@ def gram(block: AnyBlock, chain: Chain) -> Floats:
             total += rows @ rows.T
         return total
 
-    with single_threaded_blas():
+    with one_blas_thread:
         return sum(over_spans(run, block.n), np.zeros((n_all, n_all)))
 
 
@@ -419,7 +426,7 @@ def triangle(block: AnyBlock, chain: Chain) -> Floats:
             running = _upper(np.vstack([running, panel.reshape(n_all, -1).T]))
         return running
 
-    with single_threaded_blas():
+    with one_blas_thread:
         return _upper(np.vstack([*over_spans(run, block.n), np.zeros((n_all, n_all))]))
 
 
@@ -427,16 +434,6 @@ def _upper(A: Floats) -> Floats:
     """R of a thin QR."""
     R: Floats = np.linalg.qr(A, mode="r")  # type: ignore[assignment]
     return R
-
-
-def single_threaded_blas() -> Any:
-    """A context in which BLAS keeps to one thread: the chunks already use every processor."""
-    return _threadpools().limit(limits=1, user_api="blas")
-
-
-@cache
-def _threadpools() -> ThreadpoolController:
-    return ThreadpoolController()
 
 
 def _n_columns(block: Block, chain: Chain) -> int:

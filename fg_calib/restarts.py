@@ -22,8 +22,8 @@ from fg_calib.covariance import spread_of
 from fg_calib.factors import prior_rows
 from fg_calib.observability import SIGNAL_FLOOR
 from fg_calib.problem import Problem, whitened_triangle
-from fg_calib.residuals import single_threaded_blas
 from fg_calib.solver import Solution, SolverOptions, solve_from
+from fg_calib.threads import one_blas_thread
 
 Floats = NDArray[np.float64]
 
@@ -61,7 +61,7 @@ def look_elsewhere(solution: Solution, options: SolverOptions | None = None) -> 
     if not solution.converged or solution.problem.settings.loss != "none":
         return solution
     variables, seconds = solution.problem.variables, solution.seconds
-    with single_threaded_blas():
+    with one_blas_thread:
         steps = _steps(solution)
     found = [solution]
     for step in steps:

@@ -15,6 +15,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.choices import NEAR, check_names, did_you_mean, known_names
 from fg_calib.errors import InputError
 
 Floats = NDArray[np.float64]
@@ -189,28 +190,33 @@ class Robot:
         for i, parameter in enumerate(self.parameters):
             if parameter.name == name:
                 return i
-        raise InputError(self.name, f"no parameter {name!r}", known_names(p.name for p in self.parameters))
+        names = names_of(self.parameters)
+        raise InputError(self.name, f"no parameter {name!r}", known_names(names), did_you_mean(name, names, NEAR))
 
     def owned_by(self, owner: int) -> list[int]:
         """Indices of the parameters of joint `owner` (0 is the base, n + 1 the tool)."""
         return [i for i, p in enumerate(self.parameters) if p.owner == owner]
 
     def with_estimated(self, names: Iterable[str]) -> Robot:
-        """The same robot with just the parameters called `names` estimated."""
+        """The same robot with just the parameters called `names` estimated.
+
+        Raises:
+            InputError: There is no such parameter.
+        """
         wanted = set(names)
+        check_names(self.name, sorted(wanted), names_of(self.parameters))
         return replace(self, parameters=tuple(replace(p, estimated=p.name in wanted) for p in self.parameters))
 
     def with_values(self, values: Floats | Sequence[float]) -> Robot:
-        """The same robot with other nominal values, shape (n_parameters,), [m] or [rad]."""
+        """The same robot with other nominal values, shape (n_parameters,), [m] or [rad].
+
+        Raises:
+            InputError: There are more or fewer values than parameters.
+        """
+        if len(values) != len(self.parameters):
+            raise InputError(self.name, f"{len(values)} values", f"{len(self.parameters)}, one a parameter")
         changed = (replace(p, nominal=float(v)) for p, v in zip(self.parameters, values, strict=True))
         return replace(self, parameters=tuple(changed))
-
-
-def known_names(names: Iterable[str], limit: int = 12) -> str:
-    """`one of a, b, c` for an error message, cut after `limit` names."""
-    listed = list(names)
-    shown = ", ".join(listed[:limit])
-    return f"one of {shown}{', ...' if len(listed) > limit else ''}"
 
 
 class RobotBuilder:
@@ -297,11 +303,7 @@ class RobotBuilder:
         if len(names) < len(self._parameters):
             raise InputError(place, "two joints share a name, or one is called base or tool", "different names")
         for key, listed in (("fixed", fixed), ("estimate", estimate)):
-            for name in listed:
-                if name not in names:
-                    raise InputError(
-                        f"{place}: {key}", f"unknown parameter {name!r}", known_names(names_of(self._parameters))
-                    )
+            check_names(f"{place}: {key}", listed, names_of(self._parameters))
         both = sorted(set(fixed) & set(estimate))
         if both:
             raise InputError(f"{place}: estimate", f"{both[0]!r} stands under fixed too", "it under one of the two")
@@ -309,11 +311,9 @@ class RobotBuilder:
         kinds = {tolerance_kind(p) for p in self._parameters} - {None}
         for name in tolerance:
             if name not in names and name not in kinds:
-                raise InputError(
-                    f"{place}: tolerance",
-                    f"unknown parameter or kind {name!r}",
-                    known_names(sorted(str(k) for k in kinds)),
-                )
+                listed = sorted(str(k) for k in kinds)
+                found, hint = f"unknown parameter or kind {name!r}", did_you_mean(name, [*listed, *names], NEAR)
+                raise InputError(f"{place}: tolerance", found, known_names(listed), hint)
         parameters = tuple(
             replace(
                 p,

@@ -15,10 +15,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.choices import AngleUnit, LengthUnit
+from fg_calib.choices import NEAR, AngleUnit, LengthUnit, check, check_number, did_you_mean, known_names
 from fg_calib.errors import InputError
 from fg_calib.measurements import Measurements, Noise
-from fg_calib.robot import Robot, known_names, names_of, tolerance_kind
+from fg_calib.robot import Robot, names_of, tolerance_kind
 
 Floats = NDArray[np.float64]
 
@@ -49,6 +49,9 @@ class Errors:
 
     law: Literal["uniform", "normal", "values"]
     figures: Mapping[str, float]
+
+    def __post_init__(self) -> None:
+        check("errors: law", self.law, ("uniform", "normal", "values"))
 
 
 @dataclass(frozen=True)
@@ -84,12 +87,21 @@ class BoardViews:
     self_motion: Literal["random", "held"] = "random"
     posture: tuple[float, ...] | None = None
 
+    def __post_init__(self) -> None:
+        check("board: self_motion", self.self_motion, ("random", "held"))
+        check_number("board: count", self.count, whole=True)
+        for key in ("height", "radius", "cone"):
+            check_number(f"board: {key}", getattr(self, key), above=True)
+
 
 @dataclass(frozen=True)
 class RandomReadings:
     """Configurations drawn evenly within the joint limits, +-180 degrees or +-1 m where there are none."""
 
     count: int
+
+    def __post_init__(self) -> None:
+        check_number("random: count", self.count, above=True, whole=True)
 
 
 @dataclass(frozen=True)
@@ -138,6 +150,12 @@ class Scenario:
     angle_unit: AngleUnit = "rad"
     name: str = "scenario"
     source: str = "scenario"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.frame, Placement):
+            check(f"{self.source}: frame", self.frame, ("base", "unknown"))
+        check(f"{self.source}: length_unit", self.length_unit, LengthUnit)
+        check(f"{self.source}: angle_unit", self.angle_unit, AngleUnit)
 
 
 @dataclass(frozen=True)
@@ -207,6 +225,7 @@ def figures_by_name(robot: Robot, figures: Mapping[str, float], place: str) -> d
     kinds = sorted({kind for p in robot.parameters if (kind := tolerance_kind(p)) is not None})
     for key in figures:
         if key not in names and key not in kinds:
-            raise InputError(place, f"unknown parameter or kind {key!r}", known_names(kinds))
+            hint = did_you_mean(key, [*kinds, *names], NEAR)
+            raise InputError(place, f"unknown parameter or kind {key!r}", known_names(kinds), hint)
     found = {p.name: figures.get(p.name, figures.get(tolerance_kind(p) or "")) for p in robot.parameters}
     return {name: figure for name, figure in found.items() if figure is not None}

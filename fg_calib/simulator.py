@@ -15,6 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.choices import check_number
 from fg_calib.errors import InputError
 from fg_calib.inverse import Inverse, random_readings, solve_inverse
 from fg_calib.kinematics import build_chain, forward, precompute_trig
@@ -31,6 +32,7 @@ from fg_calib.scenario import (
     Simulation,
     figures_by_name,
 )
+from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
 
@@ -41,6 +43,7 @@ _PURPOSES = ("errors", "configurations", "validation", "frame", "noise", "noise 
 """Each has its own generator, so that changing one thing of a scenario leaves what is drawn for the others alone."""
 
 
+@single_threaded
 def simulate(scenario: Scenario, seed: int = 0) -> Simulation:
     """A scenario as it happens once.
 
@@ -52,8 +55,7 @@ def simulate(scenario: Scenario, seed: int = 0) -> Simulation:
         InputError: The scenario cannot be: poses that the robot does not reach within its joint limits, names that
             are no parameters, figures that make no sense.
     """
-    if seed < 0:
-        raise InputError("seed", f"found {seed}", "a number not below 0")
+    check_number("seed", seed, whole=True)
     robot = scenario.robot
     draw = dict(zip(_PURPOSES, np.random.default_rng(seed).spawn(len(_PURPOSES)), strict=True))
     true_robot = _true_robot(robot, scenario.errors, draw["errors"], f"{scenario.source}: errors")

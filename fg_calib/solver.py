@@ -17,18 +17,19 @@ from __future__ import annotations
 
 import re
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.choices import check_number, check_type
 from fg_calib.errors import SolverError
 from fg_calib.factors import Variables, eliminate
 from fg_calib.observability import determined
-from fg_calib.problem import Problem, frames_only, joint_errors, judged_at, lengths, same_rows
-from fg_calib.residuals import single_threaded_blas
+from fg_calib.problem import Problem, check_graph, frames_only, joint_errors, judged_at, lengths, same_rows
 from fg_calib.robust import Weighting
+from fg_calib.threads import one_blas_thread
 from fg_calib.whitening import Adjustment
 
 Floats = NDArray[np.float64]
@@ -69,6 +70,11 @@ class SolverOptions:
 
     max_iterations: int = 200
     decrement: float = 3e-7
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            least, whole = float(f.name == "max_iterations"), f.name.startswith("max_")
+            check_number(f"solver: {f.name}", getattr(self, f.name), least=least, whole=whole)
 
 
 @dataclass(frozen=True)
@@ -137,11 +143,14 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
     leave nothing to go.
 
     Raises:
+        ProblemError: The problem's graph has factors of somebody else.
         SolverError: GTSAM could not solve a step at all.
     """
+    check_graph(problem)
+    check_type("options", options, SolverOptions, "SolverOptions(max_iterations=200)")
     options = options or SolverOptions()
     clock = time.perf_counter()
-    with single_threaded_blas():
+    with one_blas_thread:
         before = problem.start
         frames = frames_only(problem)
         if frames is not None:
@@ -168,7 +177,7 @@ def solve_from(solution: Solution, start: Floats, most: float, options: SolverOp
         SolverError: GTSAM could not solve a step at all.
     """
     clock, options = time.perf_counter(), options or SolverOptions()
-    with single_threaded_blas():
+    with one_blas_thread:
         problem = replace(solution.problem, start=start)
         rough = _Run(problem, replace(options, max_iterations=min(SHORT, options.max_iterations)))
         if not rough.descend(COARSE) or rough.here.cost >= most:

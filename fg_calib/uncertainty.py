@@ -18,13 +18,13 @@ from fg_calib.goodness import OUTLIER_WEIGHT, Goodness, judge_fit
 from fg_calib.identifiability import Identifiability, identify
 from fg_calib.mistakes import SetupCheck, check_problem
 from fg_calib.observability import IdentifiabilityClass, Observability
-from fg_calib.problem import PAIR_KINDS, Problem, eliminated_terms, lengths
+from fg_calib.problem import PAIR_KINDS, Problem, check_graph, eliminated_terms, lengths
 from fg_calib.residual_table import ResidualTable, residual_table
-from fg_calib.residuals import single_threaded_blas
 from fg_calib.robot import Robot
 from fg_calib.robust import effect
 from fg_calib.solver import Solution
 from fg_calib.structure import probability_of_noise
+from fg_calib.threads import one_blas_thread, single_threaded
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -181,6 +181,7 @@ class Uncertainty:
     setup: SetupCheck = field(default_factory=SetupCheck)
     noise_like: float | None = None
 
+    @single_threaded
     def predict(self, function: Callable[[Robot], ArrayLike]) -> Prediction:
         """Value and sigma of any function of the robot: a tool position, a distance, a sum of parameters.
 
@@ -237,8 +238,12 @@ def assess(solution: Solution) -> Uncertainty:
         corrected, and get a small share of parameters that they did not have at nominal. Unknown is what has a share
         in one both at the nominal parameters and at the estimate; the others are known given that the undetermined
         directions are near nominal.
+
+    Raises:
+        ProblemError: The graph of the solution's problem has factors of somebody else.
     """
-    with single_threaded_blas():
+    check_graph(solution.problem)
+    with one_blas_thread:
         return _assess(solution)
 
 

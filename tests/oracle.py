@@ -19,7 +19,10 @@ def translation(axis: int, value: float) -> Floats:
 
 def rotation(axis: int, value: float) -> Floats:
     T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(value * np.eye(3)[axis]).as_matrix()
+    i, j = (axis + 1) % 3, (axis + 2) % 3  # it turns i towards j
+    T[i, i] = T[j, j] = np.cos(value)
+    T[j, i] = np.sin(value)
+    T[i, j] = -T[j, i]
     return T
 
 

@@ -13,7 +13,7 @@ import fg_calib
 
 PACKAGE = Path(fg_calib.__file__).parent
 FLOORS = (
-    *("choices", "errors", "robot", "measurements", "scenario", "files", "kernels", "kinematics"),
+    *("errors", "choices", "robot", "measurements", "scenario", "files", "threads", "kernels", "kinematics"),
     *("inverse", "simulator", "conventions", "residuals", "least_squares", "moments"),
     *(
         "factors",
@@ -102,7 +102,7 @@ def test_upward_imports_would_be_seen():
 
 def test_the_baseline_shares_nothing_with_the_graph_but_residuals():
     """So that agreement of the two says something: neither problem, factors and solver nor what assesses them."""
-    given = {"choices", "errors", "robot", "measurements", "kinematics", "residuals"}
+    given = {"choices", "errors", "robot", "measurements", "kinematics", "residuals", "threads"}
     assert imported(parse(PACKAGE / "least_squares.py")) == given
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from simulated import measure, planar_robot, small_arm, true_robot
+from tolerances import rounding
 
 from fg_calib import Bound, InputError, Pairing, assess, build_problem, cramer_rao, pose, solve
 from fg_calib.comparison import real_errors
@@ -35,18 +36,18 @@ def test_a_length_seen_in_n_positions_has_sigma_over_root_n():
     readings = spread_readings(N)
     bound = cramer_rao(robot, at(robot, readings), model="position", prior=False)
     expected = SIGMA / np.sqrt(N)
-    assert bound.covariance == pytest.approx(np.array([[expected**2]]), rel=1e-9)
-    assert bound.position(readings).rms == pytest.approx(expected, rel=1e-9)
+    assert bound.covariance == pytest.approx(np.array([[expected**2]]), rel=rounding(1, 1e4))
+    assert bound.position(readings).rms == pytest.approx(expected, rel=rounding(1, 1e4))
     # |N(0, 1)| has mean sqrt(2 / pi); 200 samples of the bound: 5 sigma are 0.6 * 5 / sqrt(200) of it.
     assert bound.position(readings).mean == pytest.approx(expected * np.sqrt(2 / np.pi), rel=0.27)
-    assert bound.position(readings).max == pytest.approx(bound.position(readings).mean, rel=1e-9)
+    assert bound.position(readings).max == pytest.approx(bound.position(readings).mean, rel=rounding(1, 1e4))
 
 
 def test_a_prior_adds_its_information():
     robot = planar("a1", tolerance=SIGMA)
     bound = cramer_rao(robot, at(robot, spread_readings(N)), model="position")
-    assert bound.covariance == pytest.approx(np.array([[SIGMA**2 / (N + 1)]]), rel=1e-9)
-    assert bound.claimed == pytest.approx(bound.covariance, rel=1e-9)
+    assert bound.covariance == pytest.approx(np.array([[SIGMA**2 / (N + 1)]]), rel=rounding(1, 1e4))
+    assert bound.claimed == pytest.approx(bound.covariance, rel=rounding(1, 1e4))
 
 
 def test_pairs_of_one_configuration_share_its_error():
@@ -58,7 +59,7 @@ def test_pairs_of_one_configuration_share_its_error():
     variance = SIGMA**2 / 4.0
     # 1e-3 of a formed pair's variance counts as its own (PRIVATE_SHARE).
     assert exact.covariance[0, 0] == pytest.approx(variance * (1.0 + 1.0 / N), rel=2e-3)
-    assert exact.claimed[0, 0] == pytest.approx(exact.covariance[0, 0], rel=1e-9)
+    assert exact.claimed[0, 0] == pytest.approx(exact.covariance[0, 0], rel=rounding(1, 1e4))
     assert independent.covariance[0, 0] == pytest.approx(variance * (1.0 + 1.0 / N), rel=1e-6)
     assert independent.claimed[0, 0] == pytest.approx(variance * 2.0 / N, rel=1e-6)
 
@@ -70,9 +71,9 @@ def test_what_is_held_but_wrong_adds_what_the_kept_do_not_make_up_for():
     stretched = at(robot, [[q, 0.0] for q in np.linspace(-2.0, 2.0, N)])
     bound = cramer_rao(robot, stretched, model="position", prior=False, kept=["a1"])
     seen, folded = stretched.readings, stretched.readings + np.array([0.0, np.pi])
-    assert bound.position(seen).rms == pytest.approx(SIGMA / np.sqrt(N), rel=1e-9)
-    assert bound.position(folded).rms == pytest.approx(np.sqrt(SIGMA**2 / N + 4.0 * TOLERANCE**2), rel=1e-9)
-    assert bound.position(folded, claimed=True).rms == pytest.approx(SIGMA / np.sqrt(N), rel=1e-9)
+    assert bound.position(seen).rms == pytest.approx(SIGMA / np.sqrt(N), rel=rounding(1, 1e4))
+    assert bound.position(folded).rms == pytest.approx(np.sqrt(SIGMA**2 / N + 4.0 * TOLERANCE**2), rel=rounding(1, 1e4))
+    assert bound.position(folded, claimed=True).rms == pytest.approx(SIGMA / np.sqrt(N), rel=rounding(1, 1e4))
     assert bound.rank == 1
 
 
@@ -83,8 +84,8 @@ def test_without_priors_what_nothing_determines_is_shared_out_by_minimum_norm():
     assert bound.rank == 1
     # Each takes half of the sum: a1 - a2 keeps its error, of variance 2 t^2.
     difference = np.array([1.0, -1.0])
-    assert difference @ bound.covariance @ difference == pytest.approx(2.0 * TOLERANCE**2, rel=1e-9)
-    assert bound.position(stretched.readings).rms == pytest.approx(SIGMA / np.sqrt(N), rel=1e-9)
+    assert difference @ bound.covariance @ difference == pytest.approx(2.0 * TOLERANCE**2, rel=rounding(1, 1e4))
+    assert bound.position(stretched.readings).rms == pytest.approx(SIGMA / np.sqrt(N), rel=rounding(1, 1e4))
 
 
 def dense_bound(robot, readings, sigma_joint, pairs, step=1e-6):
@@ -133,7 +134,7 @@ def test_the_frames_own_uncertainty_is_in_the_bound():
     robot = small_arm(tolerance=dict.fromkeys(("a", "alpha", "d", "theta"), 3e-3))
     measurements = at(robot, spread_readings(12, 4))
     known, unknown = (cramer_rao(robot, measurements, model="pose", frame=f) for f in ("known", "unknown"))
-    assert np.linalg.eigvalsh(unknown.covariance - known.covariance).min() > -1e-15
+    assert np.linalg.eigvalsh(unknown.covariance - known.covariance).min() > -rounding(unknown.covariance)
     assert unknown.position(measurements.readings).rms > 1.2 * known.position(measurements.readings).rms
 
 
@@ -153,6 +154,7 @@ def test_after_the_best_rigid_fit_the_bound_is_what_real_errors_are():
 
 
 @pytest.mark.parametrize("pair_errors", ["shared", "independent"])
+@pytest.mark.slow
 def test_fits_of_drawn_errors_and_noise_have_the_bounds_error(pair_errors):
     robot = planar_robot(tolerance={"a": TOLERANCE, "theta": 2e-3})
     readings = spread_readings(8)
@@ -172,7 +174,7 @@ def test_fits_of_drawn_errors_and_noise_have_the_bounds_error(pair_errors):
     if pair_errors == "independent":
         assert np.mean(squares) > 2.0 * np.mean(claims)
     else:
-        assert np.mean(claims) == pytest.approx(np.mean(bounds), rel=1e-9)
+        assert np.mean(claims) == pytest.approx(np.mean(bounds), rel=rounding(1, 1e4))
 
 
 def test_test_rows_say_nothing():
@@ -180,7 +182,7 @@ def test_test_rows_say_nothing():
     measurements = at(robot, spread_readings(N))
     half = replace(measurements, test=np.arange(N) >= 4)
     bound = cramer_rao(robot, half, model="position", prior=False)
-    assert bound.covariance[0, 0] == pytest.approx(SIGMA**2 / 4, rel=1e-9)
+    assert bound.covariance[0, 0] == pytest.approx(SIGMA**2 / 4, rel=rounding(1, 1e4))
 
 
 def test_a_parameter_that_cannot_be_kept_is_an_error():

@@ -9,6 +9,7 @@ import pytest
 from oracle import tool_pose
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
+from tolerances import rounding
 
 from fg_calib import comparison as comparison_module
 from fg_calib.comparison import ESTIMATORS, best_rigid_fit, compare, real_errors
@@ -136,6 +137,7 @@ def test_a_prediction_is_the_trace_of_the_propagated_covariance(simulated_job):
     assert weighted.predicted_rms == pytest.approx(np.sqrt(total / len(readings)), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_predicted_errors_come_true(tmp_path):
     """RMS over 30 simulated calibrations with known noise, poses in the base frame: within a fifth."""
     rng = np.random.default_rng(8)
@@ -253,8 +255,8 @@ def test_the_best_rigid_fit_is_scipys():
         onto = turn.apply(points) + [1.0, 2.0, 3.0] + 0.3 * rng.normal(size=(n, 3))
         R, t = best_rigid_fit(points, onto)
         expected, rssd = Rotation.align_vectors(onto - onto.mean(axis=0), points - points.mean(axis=0))
-        assert R == pytest.approx(expected.as_matrix(), abs=1e-9)
-        assert np.linalg.norm(points @ R.T + t - onto) == pytest.approx(rssd, rel=1e-9)
+        assert R == pytest.approx(expected.as_matrix(), abs=rounding(1, 1e4))
+        assert np.linalg.norm(points @ R.T + t - onto) == pytest.approx(rssd, rel=rounding(1, 1e4))
     mirrored = points * [1.0, 1.0, -1.0]
     assert np.linalg.det(best_rigid_fit(points, mirrored)[0]) == pytest.approx(1.0)
 
@@ -268,9 +270,9 @@ def test_real_errors_are_those_of_the_tool_poses():
     T, T_true = (np.array([tool_pose(r, row) for row in q]) for r in (robot, true))
     distance = np.linalg.norm(T[:, :3, 3] - T_true[:, :3, 3], axis=1)
     angle = Rotation.from_matrix(np.swapaxes(T[:, :3, :3], 1, 2) @ T_true[:, :3, :3]).magnitude()
-    assert found.base.max == pytest.approx(distance.max(), rel=1e-9)
-    assert found.base.mean == pytest.approx(distance.mean(), rel=1e-9)
-    assert found.base.rms == pytest.approx(np.sqrt(np.mean(distance**2)), rel=1e-9)
+    assert found.base.max == pytest.approx(distance.max(), rel=rounding(1, 1e4))
+    assert found.base.mean == pytest.approx(distance.mean(), rel=rounding(1, 1e4))
+    assert found.base.rms == pytest.approx(np.sqrt(np.mean(distance**2)), rel=rounding(1, 1e4))
     assert found.base.orientation_rms == pytest.approx(np.sqrt(np.mean(angle**2)), rel=1e-6)
     points, onto = T[:, :3, 3], T_true[:, :3, 3]
     turn, rssd = Rotation.align_vectors(onto - onto.mean(axis=0), points - points.mean(axis=0))
@@ -286,8 +288,8 @@ def test_an_arm_that_was_only_moved_has_no_error_after_the_fit():
     q = np.random.default_rng(2).uniform(-np.pi, np.pi, (20, 4))
     found = real_errors(moved, robot, q)
     assert found.base.rms > 0.1
-    assert found.fitted.max == pytest.approx(0.0, abs=1e-12)
-    assert found.fitted.orientation_rms == pytest.approx(0.0, abs=1e-12)
+    assert found.fitted.max == pytest.approx(0.0, abs=rounding(10.0))
+    assert found.fitted.orientation_rms == pytest.approx(0.0, abs=rounding(10.0))
     assert real_errors(moved, robot, q[:2]).fitted is None
 
 
@@ -297,7 +299,7 @@ def test_a_correction_goes_the_shorter_way(simulated_job):
     for name, value, expected in (("tool.yaw", 6.0, 6.0 - 2 * np.pi), ("tool.x", 6.0, 6.0), ("theta2", 6.0, 6.0)):
         values = robot.nominal
         values[robot.index(name)] += value
-        assert found.correction(robot.with_values(values), name) == pytest.approx(expected, abs=1e-12)
+        assert found.correction(robot.with_values(values), name) == pytest.approx(expected, abs=rounding(10.0))
 
 
 # --- report, document, command ----------------------------------------------------------------------------------------
@@ -409,7 +411,7 @@ def test_comparing_a_simulated_job_from_files_tells_real_errors(fg_calib, simula
             assert p["true"] == given.truth.nominal[given.truth.index(p["name"])]
         step = pose(given.robot.with_values(values), q).position - pose(given.truth, q).position
         rms = np.sqrt(np.mean(np.sum(step**2, axis=1)))
-        assert e["errors"]["base_frame"]["rms"] == pytest.approx(rms, rel=1e-9)
+        assert e["errors"]["base_frame"]["rms"] == pytest.approx(rms, rel=rounding(1, 1e4))
         assert e["errors"]["best_rigid_fit"]["rms"] < rms
 
 

@@ -154,6 +154,7 @@ def test_derivatives_in_the_true_joint_values_are_those_of_the_rows():
         ("direct", "distance-rotation", {}),
     ],
 )
+@pytest.mark.slow
 def test_both_ways_agree_to_first_order(kind, model, options):
     """Ten times less encoder noise, a hundred times less apart (in sigmas that measurement noise dominates)."""
     apart = []
@@ -192,6 +193,7 @@ def test_without_encoder_noise_there_is_nothing_to_estimate():
     assert np.array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_estimated_joint_values_keep_honest_sigmas():
     n, nees, chi2, dof = 15, [], 0.0, 0.0
     for seed in range(n):

@@ -10,8 +10,11 @@ from types import ModuleType
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tolerances import rounding
 
 EXPERIMENTS = Path(__file__).resolve().parents[1] / "experiments"
+pytestmark = pytest.mark.slow
+
 MM, DEG = 1e-3, 3.141592653589793 / 180.0
 
 
@@ -203,7 +206,7 @@ def test_linearise_quick_measures_every_way(tmp_path, capsys):
     assert [size["n_pairs"] for size in results["sizes"]] == [1_000, 10_000]
     for size in results["sizes"]:
         assert set(size["us_a_pair"]) == {"block", "QR", "Gram", "single", "plain", "tuned", "tuned, pool"}
-        assert size["numpy_difference"] <= 1e-9  # rounding: two formulas of one matrix
+        assert size["numpy_difference"] <= rounding(1, 1e4)  # rounding: two formulas of one matrix
 
 
 @pytest.mark.parametrize("panel", ["plain_panel", "tuned_panel"])
@@ -243,7 +246,7 @@ def test_inverse_quick_reaches_every_pose(tmp_path, capsys):
     for ways in results["arms"].values():
         assert set(ways) == {"own, 1 start", "own, 50 starts", "trf, 1 start", "trf, 50 starts"}
         assert ways["own, 50 starts"]["reached"] == ways["own, 50 starts"]["n_poses"] == 20
-        assert ways["own, 50 starts"]["miss_of_reached_m"] < 1e-11  # rounding of a dozen metres, times ten
+        assert ways["own, 50 starts"]["miss_of_reached_m"] < rounding(12, 10)  # a dozen metres
 
 
 def test_inverse_gives_trf_the_exact_derivative_of_a_rotation_vector():
@@ -251,7 +254,7 @@ def test_inverse_gives_trf_the_exact_derivative_of_a_rotation_vector():
         moved = [(Rotation.from_rotvec(h * axis) * Rotation.from_rotvec(r)).as_rotvec()
                  for axis in np.eye(3) for h in (1e-6, -1e-6)]  # fmt: skip
         differences = (np.array(moved[::2]) - np.array(moved[1::2])).T / 2e-6
-        assert inverse.inverse_left_jacobian(r) == pytest.approx(differences, abs=1e-9)
+        assert inverse.inverse_left_jacobian(r) == pytest.approx(differences, abs=rounding(1, 1e4))
 
 
 def test_identifiability_agrees_with_the_papers_tables_and_with_the_graph(tmp_path, capsys):
@@ -266,7 +269,7 @@ def test_identifiability_agrees_with_the_papers_tables_and_with_the_graph(tmp_pa
     assert kept == {"pose": 6, "distance-rotation": 12, "distance": 14}
     for row in found["graph"].values():
         assert row["largest_ratio_of_the_others"] < 1e-4
-        assert row["largest_angle_to_the_null_space"] < 1e-9
+        assert row["largest_angle_to_the_null_space"] < rounding(1, 1e4)
         assert row["marginals_against_our_covariance"] < 1e-6
     assert "through the graph" in capsys.readouterr().out
     assert (tmp_path / "02_identifiability.json").stat().st_size > 1000
@@ -285,7 +288,7 @@ def test_calibration_residuals_are_kept_where_the_paper_keeps_them(tmp_path, cap
     for model, left in (("distance", "beta2 d3 d4 beta5 beta6 theta7 beta7"), ("pose", "beta2 d3 d4 beta5 beta6")):
         residuals = found["models"][model]["residuals"]
         kept = [names.index(name) for name in left.split()]
-        assert np.array(residuals["unweighted"])[kept] == pytest.approx(before[kept], abs=1e-15)
+        assert np.array(residuals["unweighted"])[kept] == pytest.approx(before[kept], abs=rounding())
         assert found["models"][model]["converged"] == {"unweighted": True, "graph": True}
     # The sums of Eq. (57) and (58) that a model determines lie within 5 sigma of their bounds; in one draw of a known
     # seed that is no more than a check of signs, units and orders.

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, small_arm, true_robot
+from tolerances import rounding
 
 from fg_calib import residuals
 from fg_calib.errors import SolverError
@@ -72,10 +73,10 @@ def test_a_reduced_block_equals_its_rows_in_cost_gradient_and_hessian(model):
     factor = measurement_factor(block, variables)
     r, J = residuals.linearise(block, variables.chain.at(variables.parameters(values)))
     r, J = r.ravel(), J.reshape(-1, variables.n_columns)
-    assert factor.error(values) == pytest.approx(0.5 * r @ r, rel=1e-12)
+    assert factor.error(values) == pytest.approx(0.5 * r @ r, rel=rounding(1, 10))
     A, b = factor.linearize(values).jacobian()
-    assert A.T @ A == pytest.approx(J.T @ J, abs=1e-11 * np.abs(J.T @ J).max())
-    assert A.T @ b == pytest.approx(-J.T @ r, abs=1e-11 * np.abs(J.T @ r).max())
+    assert A.T @ A == pytest.approx(J.T @ J, abs=rounding(np.abs(J.T @ J).max(), 100))
+    assert A.T @ b == pytest.approx(-J.T @ r, abs=rounding(np.abs(J.T @ r).max(), 100))
     assert A.shape == (variables.n_columns + 1, variables.n_columns)
 
 
@@ -92,10 +93,10 @@ def test_single_row_factors_and_the_block_have_the_same_cost_and_gradient(model)
     block, values = problem.blocks[0], problem.initial
     whole, single = measurement_factor(block, problem.variables), one_by_one(block, problem.variables)
     assert single.size() == block.n
-    assert single.error(values) == pytest.approx(whole.error(values), rel=1e-12)
+    assert single.error(values) == pytest.approx(whole.error(values), rel=rounding(1, 10))
     G = whole.linearize(values).augmentedInformation()
     H = single.linearize(values).augmentedHessian()
-    assert H == pytest.approx(G, abs=1e-11 * np.abs(G).max())
+    assert H == pytest.approx(G, abs=rounding(np.abs(G).max(), 100))
 
 
 def test_single_row_factors_and_the_block_have_the_same_optimum():
@@ -115,7 +116,7 @@ def test_single_row_factors_and_the_block_have_the_same_optimum():
         parameters.setRelativeErrorTol(1e-14)
         values = gtsam.LevenbergMarquardtOptimizer(graph, problem.initial, parameters).optimize()
         found.append(problem.variables.parameters(values))
-    assert found[0] == pytest.approx(found[1], abs=1e-9)
+    assert found[0] == pytest.approx(found[1], abs=rounding(1, 1e4))
 
 
 def test_keys_are_joints_tool_and_frame():
@@ -134,7 +135,7 @@ def test_keys_are_joints_tool_and_frame():
 def test_values_and_parameter_vector_are_two_ways_to_write_the_same():
     variables = build_variables(small_arm(estimate=TOOL), frame=True)
     parameters = variables.nominal() + 0.1 * np.random.default_rng(2).normal(size=len(variables.nominal()))
-    assert variables.parameters(variables.values(parameters))[6:] == pytest.approx(parameters[6:], abs=1e-14)
+    assert variables.parameters(variables.values(parameters))[6:] == pytest.approx(parameters[6:], abs=rounding(1.0))
 
 
 def test_pose3_steps_rotation_first_and_in_itself():
@@ -142,7 +143,7 @@ def test_pose3_steps_rotation_first_and_in_itself():
     step = pose.retract(np.array([0, 0, 1e-3, 1e-3, 0, 0]))
     assert step.translation() - pose.translation() == pytest.approx(pose.rotation().matrix()[:, 0] * 1e-3, abs=1e-6)
     turned = pose.rotation().between(step.rotation())
-    assert gtsam.Rot3.Logmap(turned) == pytest.approx([0, 0, 1e-3], abs=1e-12)
+    assert gtsam.Rot3.Logmap(turned) == pytest.approx([0, 0, 1e-3], abs=rounding(10.0))
     assert frame_of(pose) == pytest.approx([1, 2, 3, 0.4, -0.5, 0.6])
 
 
@@ -171,7 +172,7 @@ def test_priors_pull_to_nominal_with_their_tolerance_whatever_the_variable():
     assert len(r) == 4 + 3 + 1
     # of the tool it is the turn about its own z axis that counts, which at this pitch and roll is not that of yaw
     of_yaw = 3 * np.cos(0.4) * np.cos(0.3)
-    assert r == pytest.approx([0, 2, 0, 0, 0, 0, 0, of_yaw], abs=1e-9)
+    assert r == pytest.approx([0, 2, 0, 0, 0, 0, 0, of_yaw], abs=rounding(1, 1e4))
     assert J.shape == (8, variables.n_columns)
     assert J[1, variables.names.index("a2")] == pytest.approx(500)
 
@@ -197,7 +198,7 @@ def test_a_square_root_of_a_singular_gram_matrix_gives_it_back():
     J[:, 5] = 0.0
     G = J.T @ J
     R = square_root(G)
-    assert R.T @ R == pytest.approx(G, abs=1e-13 * np.abs(G).max())
+    assert R.T @ R == pytest.approx(G, abs=rounding(np.abs(G).max()))
 
 
 def test_large_blocks_change_to_the_gram_matrix_only_if_well_conditioned():
@@ -214,7 +215,7 @@ def test_large_blocks_change_to_the_gram_matrix_only_if_well_conditioned():
     first, second = reduce(chain), reduce(chain)
     assert np.allclose(first, np.triu(first))
     assert not np.allclose(second, np.triu(second))
-    assert second.T @ second == pytest.approx(first.T @ first, abs=1e-11 * np.abs(first.T @ first).max())
+    assert second.T @ second == pytest.approx(first.T @ first, abs=rounding(np.abs(first.T @ first).max(), 100))
 
 
 def test_fixed_parameters_have_no_column():

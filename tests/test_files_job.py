@@ -37,6 +37,7 @@ def folder(tmp_path):
     (tmp_path / "robots" / "wrapped.yaml").write_text("urdf: arm.urdf\ntool: {z: 1}\n")
     (tmp_path / "poses.csv").write_text("q1,q2,x,y,z\n0,0,0,0,0\n10,20,1000,0,0\n")
     (tmp_path / "one.csv").write_text("j\n0\n1\n")
+    (tmp_path / "q.csv").write_text("q1\n0\n1\n")
     (tmp_path / "pairs.csv").write_text("a,b,distance,angle\n0,1,2000,90\n")
     return tmp_path
 
@@ -48,6 +49,30 @@ def read(folder, text):
 
 def sha256(path):
     return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@pytest.mark.parametrize("units", ["{length: mm, angle: deg}", "{length: um}", "{angle: mrad}", "{}"])
+def test_a_urdf_in_a_job_has_the_jobs_units(folder, units, caplog):
+    """Its tolerances, base and tool, unless it states units of its own; as a file with a line `units` reads."""
+    rest = "tool: {x: 3}, estimate: [tool.yaw], tolerance: {x: 0.5, yaw: 0.01, tool: 2}"
+    (folder / "arm.yaml").write_text(f"urdf: robots/arm.urdf\nunits: {units}\n" + rest.replace(", est", "\nest")
+                                     .replace(", tol", "\ntol"))  # fmt: skip
+    job = "measurements: one.csv\nmodel: pose\n"
+    in_the_job = read(folder, job + f"units: {units}\nrobot: {{urdf: robots/arm.urdf, {rest}}}\n").robot
+    assert ("robot: base and tool are in " in caplog.text) == (units != "{}")
+    assert in_the_job.parameters == read(folder, job + "robot: arm.yaml\n").robot.parameters
+    own = f"{{urdf: robots/arm.urdf, units: {{length: cm}}, {rest}}}"
+    stated = read(folder, job + f"units: {units}\nrobot: {own}\n").robot
+    tolerance = {p.name: p.tolerance for p in stated.parameters}
+    assert (tolerance["j.x"], tolerance["j.yaw"], tolerance["tool.x"]) == (0.005, 0.01, 0.02)
+
+
+def test_dh_rows_in_a_job_are_a_robot_file_of_their_own(folder):
+    """They have always been in m and rad unless they say otherwise."""
+    robot = "{convention: dh, joints: [{a: 1, alpha: 0, d: 0, theta: 0.5}], tolerance: {theta: 0.01}}"
+    job = read(folder, f"robot: {robot}\nmeasurements: q.csv\nmodel: pose\nunits: {{length: mm, angle: deg}}\n")
+    theta = job.robot.parameters[job.robot.index("theta1")]
+    assert (theta.nominal, theta.tolerance) == (0.5, 0.01)
 
 
 def test_a_short_job_has_the_defaults(folder):
@@ -124,7 +149,7 @@ MISTAKES = [
     (JOB + "measurments: a\n",
      f"calibration.yaml: unknown key 'measurments', expected {KEYS}; did you mean measurements?"),
     (JOB.replace("pose\n", "poses\n"), "calibration.yaml: model: found 'poses', expected one of pose, position, "
-     "orientation, distance, rotation, distance-rotation"),
+     "orientation, distance, rotation, distance-rotation; did you mean pose?"),
     (JOB + "frame: free\n", "calibration.yaml: frame: found 'free', expected one of known, unknown"),
     (JOB + "prior: 1\n", "calibration.yaml: prior: found 1, expected true or false"),
     (JOB + "loss: tukey\n",

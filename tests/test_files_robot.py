@@ -8,6 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from oracle import dh_joint, frame, tool_pose
+from tolerances import rounding
 
 from fg_calib.errors import InputError
 from fg_calib.files.robot_yaml import read_robot, write_robot
@@ -66,7 +67,7 @@ def test_the_chain_is_base_then_joints_then_tool(tmp_path):
         @ dh_joint("mdh-hayati", second, q[1], True)
         @ frame(0, 0, 0.05, 0, 0, 0)
     )
-    assert tool_pose(robot, q) == pytest.approx(expected, abs=1e-15)  # rounding of a few products
+    assert tool_pose(robot, q) == pytest.approx(expected, abs=rounding(1.0))  # rounding of a few products
 
 
 def test_beta_may_be_left_out_and_units_default_to_si(tmp_path):
@@ -199,7 +200,7 @@ MISTAKES = {
     ),
     HEAD + ROW + "zzz: 1\n": f"robot.yaml: unknown key 'zzz', expected {KEYS}",
     f"convention: dhh\njoints:\n{ROW}": (
-        "robot.yaml: convention: found 'dhh', expected one of dh, mdh, mdh-hayati, dh-hayati"
+        "robot.yaml: convention: found 'dhh', expected one of dh, mdh, mdh-hayati, dh-hayati; did you mean dh?"
     ),
     "convention: dh\njoints: []\n": "robot.yaml: joints: found [], expected at least 1 in the list",
     "convention: dh\njoints: 3\n": "robot.yaml: joints: found 3, expected a list",

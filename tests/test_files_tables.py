@@ -9,6 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from oracle import frame
+from tolerances import rounding
 
 from fg_calib.errors import InputError
 from fg_calib.files.tables import read_measurements, write_csv
@@ -99,7 +100,7 @@ def test_noise_fills_what_the_table_does_not_state(write):
 
 def test_a_quaternion_is_normalised(write):
     path = write("q1,q2,q3,qx,qy,qz,qw\n0,0,0,0,0,0.6005,0.8005\n")
-    assert np.linalg.det(read_measurements(path, ARM).rotation[0]) == pytest.approx(1, abs=1e-15)
+    assert np.linalg.det(read_measurements(path, ARM).rotation[0]) == pytest.approx(1, abs=rounding(1.0))
 
 
 def test_columns_may_bear_the_joints_names_in_any_order(write):
@@ -336,8 +337,8 @@ def test_a_missing_or_unknown_file_is_named(write, tmp_path):
     ("joint", "message"),
     [
         ((0.1, 0.2), "noise: joint: 2 figures, expected one for all or 3, one a joint"),
-        (-0.1, "noise: joint: found -0.1, expected finite numbers not below 0"),
-        (math.inf, "noise: joint: found inf, expected finite numbers not below 0"),
+        (-0.1, "noise: joint: found -0.1, expected a finite number not below 0"),
+        (math.inf, "noise: joint: found inf, expected a finite number not below 0"),
     ],
 )
 def test_noise_of_the_joints_must_fit(write, joint, message):

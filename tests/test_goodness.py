@@ -67,6 +67,7 @@ RUNS |= {"pose joint": 60, "star joint": 60, "star independent": 60}
 
 
 @pytest.mark.parametrize(("name", "n_runs"), RUNS.items())
+@pytest.mark.slow
 def test_p_values_are_uniform_and_the_noise_seen_is_the_noise_there_is(name, n_runs):
     """Over calibrations of an arm drawn from its tolerances, at a fixed seed.
 
@@ -91,6 +92,7 @@ def test_p_values_are_uniform_and_the_noise_seen_is_the_noise_there_is(name, n_r
 
 
 @pytest.mark.parametrize("max_shared", [3000, 0])
+@pytest.mark.slow
 def test_the_noise_seen_is_unbiased_where_rows_count_as_independent_but_are_not(max_shared, monkeypatch):
     """All pairs of 12 poses share so much that the sum of squares is far below rows less parameters.
 
@@ -161,9 +163,10 @@ def test_a_configuration_wrong_by_50_sigma_is_the_first_suspect(name, wrong):
     assert wrong in (table.a[worst], table.b[worst])
     text = format_report(solution, uncertainty)
     assert re.search(rf"Suspicious configurations\n +rows +chi-square +expected\n{wrong} ", text)
-    assert re.search(rf"Suspicious rows\n.*\n(\d+ +)?{wrong} ", text)
+    assert re.search(rf"Suspicious rows\n(  pose {wrong} is in .*\n)?.*\n(\d+ +)?{wrong} ", text)
 
 
+@pytest.mark.slow
 def test_clean_tables_seldom_have_a_suspect():
     """1 % of tables have a suspect row, as many a suspect configuration: more than 4 of 60 are unlikely (0.1 %)."""
     rng = np.random.default_rng(5)
@@ -189,6 +192,7 @@ def test_verdicts_tell_outliers_from_noise_stated_wrong():
 
 
 @pytest.mark.parametrize("name", ["pose", "star", "all", "direct joint"])
+@pytest.mark.slow
 def test_noise_stated_wrong_by_two_is_found(name):
     """The mean of its logarithm over some fits, 4 of its own sigmas about the truth."""
     rng = np.random.default_rng(8)

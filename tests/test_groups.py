@@ -12,6 +12,7 @@ from oracle import tool_pose
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 from simulated import small_arm, true_robot
+from tolerances import rounding
 
 from fg_calib import write_robot
 from fg_calib.errors import InputError, ProblemError
@@ -131,7 +132,7 @@ def test_residuals_are_those_of_4x4_products():
         assert problem.terms[g].residual(variables, parameters) == pytest.approx(np.ravel(expected), abs=1e-8 / SIGMA)
     d = np.linalg.norm(points[1] - points[0])
     expected = (d - m.groups.pairs.distance[0]) / 1e-4
-    assert problem.terms[4].residual(variables, parameters) == pytest.approx([expected], rel=1e-12)
+    assert problem.terms[4].residual(variables, parameters) == pytest.approx([expected], rel=rounding(1, 10))
 
 
 def test_derivatives_are_central_differences_up_to_a_turn_of_the_residuals():
@@ -144,7 +145,7 @@ def test_derivatives_are_central_differences_up_to_a_turn_of_the_residuals():
     parameters = variables.parameters(values)
     for term in problem.terms:
         r, J = term.linearise(variables, parameters)
-        assert r == pytest.approx(term.residual(variables, parameters), rel=1e-12)
+        assert r == pytest.approx(term.residual(variables, parameters), rel=rounding(1, 10))
         columns = list(range(variables.n_columns)) if term.on_core else []
         columns += [c for i in term.nuisance for c in range(*variables.nuisance[i].columns.indices(n))]
         assert J.shape == (term.n_rows, len(columns))
@@ -177,7 +178,7 @@ def test_the_graph_holds_a_point_a_group_and_has_the_cost_of_its_rows():
         assert solution.values.atPoint3(gtsam.symbol("L", g)) == pytest.approx(points[g], abs=0.05)
     r = [t.residual(solution.problem.variables, solution.parameters) for t in solution.problem.terms]
     r.append(prior_rows(problem.variables, solution.parameters)[0])
-    assert solution.cost == pytest.approx(0.5 * np.sum(np.concatenate(r) ** 2), rel=1e-10)
+    assert solution.cost == pytest.approx(0.5 * np.sum(np.concatenate(r) ** 2), rel=rounding(1, 1e3))
 
 
 def test_elimination_leaves_what_the_other_columns_do_not_explain():
@@ -188,14 +189,16 @@ def test_elimination_leaves_what_the_other_columns_do_not_explain():
     x = np.linalg.lstsq(A, b, rcond=None)[0]
     x_core = np.linalg.lstsq(left.A, left.b, rcond=None)[0]
     assert np.all(left.A[:, 2] == 0.0)
-    assert np.linalg.norm(left.A @ x_core - left.b) == pytest.approx(np.linalg.norm(A @ x - b), rel=1e-12)
+    assert np.linalg.norm(left.A @ x_core - left.b) == pytest.approx(np.linalg.norm(A @ x - b), rel=rounding(1, 10))
     assert np.hypot(np.linalg.norm(left.own), np.linalg.norm(left.A @ x_core)) == pytest.approx(np.linalg.norm(A @ x))
     keep = [0, 1, 3, 4]
     whole = np.linalg.inv(A[:, [*keep, *range(5, 9)]].T @ A[:, [*keep, *range(5, 9)]])
     core = np.linalg.inv(left.A[:, keep].T @ left.A[:, keep])
     follow = left.follow[:, keep]
-    assert core == pytest.approx(whole[:4, :4], rel=1e-9)
-    assert follow @ core @ follow.T + left.inverse @ left.inverse.T == pytest.approx(whole[4:, 4:], rel=1e-9)
+    assert core == pytest.approx(whole[:4, :4], rel=rounding(1, 1e4))
+    assert follow @ core @ follow.T + left.inverse @ left.inverse.T == pytest.approx(
+        whole[4:, 4:], rel=rounding(1, 1e4)
+    )
 
 
 # --- the optimum ----------------------------------------------------------------------------------------------------
@@ -263,7 +266,7 @@ def test_what_moves_arm_and_points_as_one_body_stays_where_it_is(distances):
     uncertainty = assess(solution)
     by_name = {p.name: p for p in uncertainty.parameters}
     for name in RIGID:
-        assert abs(by_name[name].correction) < 1e-9  # rounding; without holding it they move by 0.1 mm and more
+        assert abs(by_name[name].correction) < rounding(1, 1e4)  # without holding it they move by 0.1 mm and more
         assert by_name[name].sigma is None
         assert by_name[name].identifiability == "ineffective"
     assert all(np.isnan(p.sigma).all() for p in uncertainty.points)
@@ -275,7 +278,7 @@ def test_what_moves_arm_and_points_as_one_body_stays_where_it_is(distances):
     known = [p.sigma is not None for p in uncertainty.parameters]
     assert again.parameters[span][known] == pytest.approx(solution.parameters[span][known], abs=1e-7)
     for name in RIGID:
-        assert abs(again.parameters[robot.index(name)] - robot.nominal[robot.index(name)]) < 1e-9
+        assert abs(again.parameters[robot.index(name)] - robot.nominal[robot.index(name)]) < rounding(1, 1e4)
     assert len(points) == 4
 
 
@@ -310,13 +313,14 @@ def test_joint_noise_widens_each_touch_to_first_order():
     J = pose(robot.with_values(noisy.start[noisy.variables.robot_span]), m.readings[:1]).jacobian[0, 3:, -4:]
     S = SIGMA**2 * np.eye(3) + 1e-6 * J @ J.T
     W = noisy.terms[0].whitening[0]
-    assert W.T @ W == pytest.approx(np.linalg.inv(S), rel=1e-9, abs=1e-3)
-    assert noisy.sigma_point[0] == pytest.approx(np.sqrt(np.diag(S)), rel=1e-9)
+    assert W.T @ W == pytest.approx(np.linalg.inv(S), rel=rounding(1, 1e4), abs=1e-3)
+    assert noisy.sigma_point[0] == pytest.approx(np.sqrt(np.diag(S)), rel=rounding(1, 1e4))
 
 
 # --- what is claimed ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_the_sigmas_say():
     runs, nees, z, z_points, fits = 40, [], [], [], []
     for seed in range(runs):
@@ -368,10 +372,10 @@ def test_test_groups_are_predicted_and_of_mixed_ones_the_train_rows_fitted():
     p = pose(uncertainty.robot, m.readings).position
     means = [p[1:12].mean(axis=0), *(p[12 * g : 12 * (g + 1)].mean(axis=0) for g in (1, 2, 3))]
     expected = np.array([p[k] - means[g] for k, g in enumerate(m.groups.index)])
-    assert table.after[touches] == pytest.approx(expected.ravel(), abs=1e-10)
+    assert table.after[touches] == pytest.approx(expected.ravel(), abs=rounding(1, 1e3))
     d = m.groups.pairs.distance
     miss = [np.linalg.norm(means[g] - means[0]) - d[i] for i, g in enumerate((1, 3))]
-    assert table.after[distances] == pytest.approx(miss, abs=1e-10)
+    assert table.after[distances] == pytest.approx(miss, abs=rounding(1, 1e3))
     rms = table.rms()
     assert rms["test"]["point"]["after"] == pytest.approx(
         np.sqrt(np.mean(np.sum(expected[m.test] ** 2, axis=1))), rel=1e-6

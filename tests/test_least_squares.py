@@ -7,6 +7,7 @@ import pytest
 from oracle import central_differences, tool_pose
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
+from tolerances import NEGLIGIBLE, rounding, sigmas_apart
 
 from fg_calib import least_squares
 from fg_calib.errors import InputError
@@ -20,9 +21,19 @@ from fg_calib.uncertainty import assess
 PAPERS = ["distance", "distance-rotation", "pose"]
 OTHERS = ["rotation", "position", "orientation"]
 TO_THE_END = SolverOptions(decrement=1e-9)
+NOISE = 1e-4
+"""Of every row unless a test says otherwise, [m] and [rad]."""
+
+CREPT = 1e-4
+"""Of a row's noise: what damping may leave of the way where nothing holds some directions; 1e-6 was measured."""
 
 
-def simulated(robot, model, seed=1, *, sigma=1e-4, sigma_joint=0.0, n=80):
+def apart(fit, values):
+    """How far a fit is from other values of the robot, in its own sigma."""
+    return sigmas_apart(fit.robot.nominal, values, [fit.sigma.get(p.name, 0.0) for p in fit.robot.parameters])
+
+
+def simulated(robot, model, seed=1, *, sigma=NOISE, sigma_joint=0.0, n=80):
     """Measurements whose rows all have one weight, metres and radians alike, the pairs' away from kinks."""
     rng = np.random.default_rng(seed)
     measurements = measure(true_robot(robot, rng), n, rng, sigma=(sigma, sigma), sigma_joint=sigma_joint)
@@ -56,7 +67,7 @@ def predicted(robot, model, q):
 
 @pytest.mark.parametrize("model", PAPERS)
 def test_with_equal_weights_and_no_priors_all_estimators_agree(model):
-    """To 1e-9 of an ordinary change of 1 mm or 1 mrad; 2e-10 was measured."""
+    """To a millionth of a sigma: three roads to one optimum."""
     robot = paper_robot()
     measurements = simulated(robot, model)
     problem = build_problem(robot, measurements, model=model, gauge="keep")
@@ -72,21 +83,21 @@ def test_with_equal_weights_and_no_priors_all_estimators_agree(model):
             fit = fit_least_squares(robot, measurements, model=model, names=names, weighted=weighted, method=method)
             assert fit.converged, fit.message
             assert (fit.n_rows, fit.rank) == (problem.n_residuals, len(names))
-            assert fit.robot.nominal == pytest.approx(graph, rel=0, abs=1e-12), (method, weighted)
+            assert apart(fit, graph) < NEGLIGIBLE, (method, weighted)
 
 
 @pytest.mark.parametrize("model", OTHERS)
 def test_the_other_models_agree_too(model):
-    """MINPACK's steps end some 1e-10 short of the optimum, Gauss-Newton's and the graph's do not."""
+    """MINPACK's steps may end a thousandth of a sigma short of the optimum, Gauss-Newton's and the graph's do not."""
     robot = paper_robot()
     measurements = simulated(robot, model)
     problem = build_problem(robot, measurements, model=model, gauge="keep")
     graph = solve(problem, TO_THE_END).parameters[:-6]
     names = [p.name for p in problem.estimated]
     plain = fit_least_squares(robot, measurements, model=model, names=names)
-    assert plain.robot.nominal == pytest.approx(graph, rel=0, abs=1e-12)
+    assert apart(plain, graph) < NEGLIGIBLE
     scipys = fit_least_squares(robot, measurements, model=model, names=names, method="scipy")
-    assert scipys.robot.nominal == pytest.approx(graph, rel=0, abs=1e-8)
+    assert apart(scipys, graph) < 1e-3
 
 
 @pytest.mark.parametrize("model", PAPERS)
@@ -104,7 +115,7 @@ def test_with_everything_estimated_they_agree_in_what_the_measurements_determine
     q = np.random.default_rng(9).uniform(-np.pi, np.pi, (100, 7))
     expected = predicted(everything.robot, model, q)
     for other in (graph, few.robot):
-        assert predicted(other, model, q) == pytest.approx(expected, rel=0, abs=1e-12)
+        assert predicted(other, model, q) == pytest.approx(expected, rel=0, abs=CREPT * NOISE)
     # By parameters: seen from halfway between, two points of a curved surface differ along it up to third order.
     for other in (graph, few.robot):
         difference = other.nominal - everything.robot.nominal
@@ -128,9 +139,8 @@ def test_weighted_by_joint_noise_it_is_the_graph(model, method):
     names = [p.name for p in problem.estimated]
     fit = fit_least_squares(robot, measurements, model=model, names=names, weighted=True, method=method)
     assert fit.converged, fit.message
-    # 1e-10 and 2e-9 were measured: the last fit of each set of weights decides
-    closely = 1e-9 if method == "gauss-newton" else 1e-8
-    assert fit.robot.nominal == pytest.approx(solution.parameters[:-6], rel=0, abs=closely)
+    # The last fit of each set of weights decides.
+    assert apart(fit, solution.parameters[:-6]) < (1e-5 if method == "gauss-newton" else 1e-3)
     covariance = assess(solution).spread.named()  # what was left out counts as known in plain least squares
     assert fit.covariance == pytest.approx(covariance, rel=1e-6, abs=1e-6 * np.abs(covariance).max())
     plain = fit_least_squares(robot, measurements, model=model, names=names)
@@ -148,7 +158,7 @@ def test_a_row_that_was_not_measured_does_not_weigh_on_the_other_of_its_pair():
     names = [p.name for p in problem.estimated]
     fit = fit_least_squares(robot, measurements, model="distance-rotation", names=names, weighted=True)
     assert fit.n_rows == problem.n_residuals == np.isfinite(distance).sum() + np.isfinite(angle).sum()
-    assert fit.robot.nominal == pytest.approx(solution.parameters[:-6], rel=0, abs=1e-9)
+    assert apart(fit, solution.parameters[:-6]) < 1e-5
 
 
 @pytest.mark.parametrize("start", ["graph", "near"])
@@ -170,11 +180,11 @@ def test_an_unknown_frame_is_the_graphs(model, start):
         start=problem.start if start == "graph" else near,
     )
     assert fit.converged, fit.message
-    assert fit.robot.nominal == pytest.approx(solution.parameters[:-6], rel=0, abs=1e-10)
+    assert apart(fit, solution.parameters[:-6]) < 1e-5
     rotation, expected = (Rotation.from_euler("ZYX", f[3:]) for f in (fit.frame, solution.parameters[-6:]))
     assert (rotation.inv() * expected).magnitude() == pytest.approx(0.0, abs=1e-7)  # arccos near 1
     if model != "orientation":
-        assert fit.frame[:3] == pytest.approx(solution.parameters[-6:-3], rel=0, abs=1e-10)
+        assert fit.frame[:3] == pytest.approx(solution.parameters[-6:-3], rel=0, abs=10 * NEGLIGIBLE * NOISE)
     assert np.array_equal(fit.parameters[-6:], fit.frame)
 
 
@@ -187,8 +197,8 @@ def test_the_frame_is_one_frame_whatever_its_pitch(upright):
     )
     start = np.array([*robot.nominal, 1.1, 1.9, 3.1, 0.7, upright, -0.4])
     fit = fit_least_squares(robot, measurements, model="pose", frame="unknown", names=["a1"], start=start)
-    assert fit.frame[:3] == pytest.approx([1.0, 2.0, 3.0], abs=1e-12)
-    assert Rotation.from_euler("ZYX", fit.frame[3:]).as_matrix() == pytest.approx(turn.as_matrix(), abs=1e-12)
+    assert fit.frame[:3] == pytest.approx([1.0, 2.0, 3.0], abs=rounding(10.0))
+    assert Rotation.from_euler("ZYX", fit.frame[3:]).as_matrix() == pytest.approx(turn.as_matrix(), abs=rounding(10.0))
 
 
 def test_an_unknown_tool_is_the_graphs():
@@ -201,7 +211,7 @@ def test_an_unknown_tool_is_the_graphs():
     solution = solve(problem, TO_THE_END)
     for start in (problem.start, None):
         fit = fit_least_squares(robot, measurements, model="pose", names=names, start=start)
-        assert fit.robot.nominal == pytest.approx(solution.parameters[:-6], rel=0, abs=1e-10)
+        assert apart(fit, solution.parameters[:-6]) < 1e-5
 
 
 # --- Eq. (54) and what it claims --------------------------------------------------------------------------------------
@@ -242,11 +252,11 @@ def test_one_step_is_the_pseudoinverse_times_what_is_left(model):
     expected = np.linalg.pinv(J, rcond=1e-6) @ misfit(x)
     step = fit.robot.nominal[columns] - x
     assert np.linalg.norm(expected) > 1e-3
-    assert step == pytest.approx(expected, rel=0, abs=1e-8 * np.linalg.norm(expected) + 1e-10)
+    assert step == pytest.approx(expected, rel=0, abs=1e-8 * np.linalg.norm(expected) + rounding(1, 1e3))
     assert fit.steps == pytest.approx([np.linalg.norm(expected)], rel=1e-6)
     if model != "pose":
         for name in ("a1", "alpha1", "d1", "theta1", "beta6", "theta7", "beta7"):
-            assert step[fit.names.index(name)] == pytest.approx(0.0, abs=1e-12), name
+            assert step[fit.names.index(name)] == pytest.approx(0.0, abs=rounding(10.0)), name
 
 
 def test_what_is_not_estimated_stays_at_its_value():
@@ -281,11 +291,11 @@ def test_unweighted_it_claims_what_the_residuals_say_and_weighted_what_the_noise
     assert plain.n_rows == 60
     # mean of the sum and of the difference of the two: sqrt((s^2 + s^2) / 10) / 2
     expected = {"a1": s / np.sqrt(20), "a2": s / np.sqrt(20), "theta2": s / np.sqrt(20)}
-    assert plain.sigma == pytest.approx(expected, rel=1e-9)
+    assert plain.sigma == pytest.approx(expected, rel=rounding(1, 1e4))
     weighted = fit_least_squares(planar_robot(), measurements, model="position", weighted=True)
-    assert weighted.sigma == pytest.approx(dict.fromkeys(expected, 2e-3 / np.sqrt(20)), rel=1e-9)
-    assert weighted.residuals == pytest.approx(plain.residuals, abs=1e-15)
-    assert np.linalg.norm(plain.residuals) == pytest.approx(np.sqrt(20) * 1e-3, rel=1e-9)
+    assert weighted.sigma == pytest.approx(dict.fromkeys(expected, 2e-3 / np.sqrt(20)), rel=rounding(1, 1e4))
+    assert weighted.residuals == pytest.approx(plain.residuals, abs=rounding(1.0))
+    assert np.linalg.norm(plain.residuals) == pytest.approx(np.sqrt(20) * 1e-3, rel=rounding(1, 1e4))
 
 
 def test_what_the_measurements_leave_open_has_no_sigma():
@@ -386,11 +396,11 @@ def test_scipy_takes_fewer_rows_than_unknowns():
 ROBOT = planar_robot()
 MISTAKES = [
     ({"model": "poses"}, "model: found 'poses', expected one of pose, position, orientation, distance, rotation, "
-     "distance-rotation"),
+     "distance-rotation; did you mean pose?"),
     ({"method": "newton"}, "method: found 'newton', expected one of gauss-newton, scipy"),
     ({"frame": "lost"}, "frame: found 'lost', expected one of known, unknown"),
-    ({"max_iterations": 0}, "max_iterations: found 0, expected 1 or more"),
-    ({"tolerance": float("nan")}, "tolerance: found nan, expected 0 or more"),
+    ({"max_iterations": 0}, "max_iterations: found 0, expected a whole number not below 1"),
+    ({"tolerance": float("nan")}, "tolerance: found nan, expected a number not below 0"),
     ({"start": np.zeros(3)}, "start: shape (3,), expected 20 values of the robot, or 26 with the measurement frame's"),
     ({"start": np.full(20, np.nan)},
      "start: a value that is not finite, expected 20 values of the robot, or 26 with the measurement frame's"),

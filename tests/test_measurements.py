@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from simulated import measure, small_arm
+from tolerances import rounding
 
 from fg_calib.errors import InputError
 from fg_calib.measurements import Pairing, form_pairs, rotation_angle
@@ -87,4 +88,4 @@ def test_pairs_need_measured_poses(measurements):
 def test_rotation_angle_is_exact_from_zero_to_half_a_turn(angle):
     axis = np.array([1.0, -2.0, 0.5]) / np.sqrt(5.25)
     found, _ = rotation_angle(Rotation.from_rotvec(angle * axis).as_matrix()[None])
-    assert found[0] == pytest.approx(angle, abs=1e-15 if angle < 1 else 2e-15)
+    assert found[0] == pytest.approx(angle, abs=rounding(angle if angle > 0.1 else 1e-2))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from simulated import measure, paper_robot, small_arm
+from tolerances import rounding
 
 from fg_calib import residuals
 from fg_calib.measurements import Pairing
@@ -90,7 +91,7 @@ def test_every_relation_moves_no_measurement():
     for group in found.relative:
         for relation in group.relations:
             direction = np.array([relation.get(name, 0.0) for name in problem.variables.names])
-            assert np.abs(J @ direction).max() < 1e-9 * np.abs(J * direction).max()
+            assert np.abs(J @ direction).max() < rounding(J * direction, 1e4)
 
 
 def test_an_unknown_frame_makes_the_base_ineffective():
@@ -115,7 +116,7 @@ def test_the_answer_does_not_depend_on_units():
     metres = analyse(J, parameters, scales=np.full(5, 1e-3), n_measurements=10)
     unit = np.array([1e-3, 1e-3, 1e-3, 1e-3, 1.0])  # columns per millimetre
     millimetres = analyse(J * unit, parameters, scales=1e-3 / unit, n_measurements=10)
-    assert millimetres.singular_values == pytest.approx(metres.singular_values, rel=1e-12, abs=1e-15)
+    assert millimetres.singular_values == pytest.approx(metres.singular_values, rel=rounding(1, 10), abs=rounding(1.0))
     assert millimetres.classes == metres.classes == ("independent",) * 3 + ("relative",) * 2
     assert millimetres.indices == pytest.approx(metres.indices)
     assert metres.relative[0].keep == millimetres.relative[0].keep == ("theta4",)

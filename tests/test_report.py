@@ -4,18 +4,27 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from simulated import measure, small_arm, true_robot
 
 from fg_calib import (
+    Job,
     Measurements,
+    Pairing,
     assess,
     build_problem,
     cli,
+    compare,
+    format_comparison,
+    format_identifiability,
     format_report,
+    observe_configurations,
+    observe_structure,
     read_measurements,
     read_robot,
     solve,
@@ -180,20 +189,73 @@ def test_doubt_stands_first():
     assert "GOOD" not in text
 
 
-@pytest.mark.parametrize("width", [70, 80, 100, 200])
-def test_no_width_cuts_a_figure(width):
-    """Names fold where they are long; a cut figure would be a wrong one."""
-    robot = planar_arm({"d2": 0.001})
-    long = {p.name: f"a_rather_long_name_of_the_joint.{p.name}" for p in robot.parameters}
-    robot = replace(robot, parameters=tuple(replace(p, name=long[p.name]) for p in robot.parameters))
-    solution = solve(build_problem(robot, planar_measurements(), model="position", frame="unknown"))
-    lines = format_report(solution, assess(solution), width=width).splitlines()
-    assert max(map(len, lines)) <= width
-    assert not any("…" in line for line in lines)
-    assert any("1.0000 ineffective" in line for line in lines)
-    assert all(line == line.rstrip() for line in lines)
-    notes = lines[lines.index("Notes") + 1 :]
-    assert all(note.startswith("  ") for note in notes)
+LONG = ("shoulder_pan_joint", "elbow_flexion_joint", "wrist_3_joint")
+
+
+def arm_with_long_names():
+    """Three joints named as URDFs name them."""
+    builder = RobotBuilder("arm", "urdf")
+    builder.add_frame("base", {}, 0, False)
+    for i, (name, axis) in enumerate(zip(LONG, np.eye(3)[[2, 1, 0]], strict=True)):
+        builder.add_urdf_joint(Joint(name), {"x": 0.1 * i, "z": 0.3}, axis)
+    builder.add_frame("tool", {"x": 0.1, "z": 0.2}, 4, False)
+    return builder.build(tolerance={"x": 1e-3, "yaw": 2e-3}, estimate=["tool.x", "tool.y", "tool.z"])
+
+
+@pytest.fixture(scope="module")
+def long_reports(tmp_path_factory):
+    """From a width to the text, of every command."""
+    robot, rng = arm_with_long_names(), np.random.default_rng(5)
+    m = measure(true_robot(robot, rng), 25, rng, sigma_joint=1e-4, n_test=10)
+    m.position[7] += 0.03  # for suspicious rows and configurations
+    solutions = [
+        solve(build_problem(robot, m, model=model, frame="unknown", **options))
+        for model, options in (
+            ("pose", {}),
+            ("distance", {"loss": "huber", "gauge": "none"}),
+        )
+    ]
+    job = Job(tmp_path_factory.mktemp("job") / "job.yaml", robot, m, "distance-rotation", truth=true_robot(robot, rng))
+    return [
+        *(partial(format_report, s, assess(s)) for s in solutions),
+        partial(format_identifiability, observe_structure(robot, "distance-rotation", n_configurations=50)),
+        partial(format_identifiability, observe_configurations(robot, m, "pose")),
+        partial(format_comparison, compare(job)),
+    ]
+
+
+def words(text):
+    """The words of a report but the headings of columns that may be empty."""
+    return set(text.split()) - {"prior", "b"}
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 100, 200])
+def test_no_width_breaks_a_word(long_reports, width):
+    """What was a word on a very wide page is one on every page: names, figures, units."""
+    for text in long_reports:
+        found = text(width=width)
+        assert words(found) == words(text(width=1000))
+        lines = found.splitlines()
+        assert max(map(len, lines)) <= width
+        assert all(line == line.rstrip() for line in lines)
+        assert any(f"{LONG[0]}.roll" in line for line in lines)
+
+
+def test_a_page_narrower_than_a_name_is_as_wide_as_the_name(long_reports):
+    for text in long_reports:
+        found = text(width=10)
+        assert words(found) == words(text(width=1000))
+
+
+def test_a_row_without_room_is_a_paragraph(long_reports):
+    wide, narrow = (long_reports[0](width=width) for width in (200, 50))
+    (row,) = (line for line in sections(wide)["Parameters"].splitlines() if line.startswith("wrist_3_joint.x "))
+    name, estimate, _, sigma, unit, correction, nominal, prior, kind = row.split()
+    found = " ".join(sections(narrow)["Parameters"].split())
+    assert (
+        f"{name} estimate {estimate} ± sigma {sigma} {unit} correction {correction} nominal {nominal} prior {prior} "
+        f"class {kind}" in found
+    )
 
 
 def test_the_six_lines_of_the_readme_print_a_report(tmp_path):
@@ -218,3 +280,43 @@ def test_the_six_lines_of_the_readme_print_a_report(tmp_path):
         "Parameters",
         "Notes",
     ]
+
+
+# --- the poses behind suspicious pairs -------------------------------------------------------------------------------
+
+
+def suspicious_rows(pairing, wrong, *, n=30, **options):
+    """The section of a report on pairs formed from n poses, of which some are measured 20 mm off."""
+    robot, rng = small_arm({"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3}), np.random.default_rng(8)
+    m = measure(true_robot(robot, rng), n, rng)
+    for i in wrong:
+        m.position[i] += 0.02 * np.array([1.0, -1.0, 1.0])
+    solution = solve(build_problem(robot, replace(m, ids=np.array([f"p{i}" for i in range(n)])), model="distance",
+                                   pairing=pairing, **options))  # fmt: skip
+    return sections(format_report(solution, assess(solution)))["Suspicious rows"]
+
+
+def test_a_pose_is_named_before_its_pairs():
+    first, second, *_ = suspicious_rows(Pairing("all"), [17], loss="gnc").splitlines()
+    found = re.fullmatch(r"  pose p17 is in (\d+) of (\d+) suspicious pairs, and in 29 pairs in all", first)
+    assert int(found[1]) > 0.5 * 29
+    assert int(found[1]) >= 0.8 * int(found[2])
+    assert "pose" not in second
+
+
+def test_several_wrong_poses_are_told_apart():
+    text = suspicious_rows(Pairing("all"), [5, 17], loss="gnc")
+    assert set(re.findall(r"pose (p\d+) is in", text)) == {"p5", "p17"}
+
+
+def test_the_hub_of_a_star_is_not_blamed_for_a_wrong_spoke():
+    """It is in every suspicious pair, but in many good ones too; the spoke's only pair stands in the table."""
+    text = suspicious_rows(Pairing("star"), [9], loss="gnc")
+    assert "pose" not in text
+    assert re.search(r"^p0 +p9 +distance", text, flags=re.M)
+
+
+def test_in_a_chain_both_pairs_of_a_pose_are_its():
+    assert suspicious_rows(Pairing("chain"), [9], loss="gnc").startswith(
+        "  pose p9 is in 2 of 2 suspicious pairs, and in 2 pairs in all\n"
+    )

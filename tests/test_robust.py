@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from simulated import measure, small_arm, true_robot
+from tolerances import rounding
 
 from fg_calib import residuals
 from fg_calib.kinematics import pose
@@ -106,7 +107,7 @@ def test_the_optimum_is_that_of_gtsams_robust_noise_on_factors_of_one_measuremen
     away = variables.step(solution.values, found) / variables.scales
     sigma = np.sqrt(np.diag(assess(solution).spread.tangent)) / variables.scales
     assert np.max(np.abs(away) / sigma) < 1e-4
-    assert graph.error(found) == pytest.approx(graph.error(solution.values), rel=1e-9)
+    assert graph.error(found) == pytest.approx(graph.error(solution.values), rel=rounding(1, 1e4))
     gradient = graph.linearize(solution.values).gradientAtZero()
     assert all(np.all(np.isfinite(gradient.at(k))) for k in variables.keys)
 
@@ -144,6 +145,7 @@ def _robust_factor(block, variables, estimator):
     ],
     ids=["pose", "unknown frame", "star", "all"],
 )
+@pytest.mark.slow
 def test_gnc_comes_near_the_clean_fit_where_a_share_of_the_configurations_is_wrong(model, options, share):
     robot = small_arm(tolerance=TOLERANCE)
     test = np.random.default_rng(9).uniform(-np.pi, np.pi, (100, robot.n_joints))
@@ -165,6 +167,7 @@ def test_gnc_comes_near_the_clean_fit_where_a_share_of_the_configurations_is_wro
 
 @pytest.mark.parametrize("loss", ["huber", "gnc"])
 @pytest.mark.parametrize("share", [0.0, 0.2])
+@pytest.mark.slow
 def test_sigmas_and_chi_square_hold_with_a_robust_loss(loss, share):
     robot = small_arm(tolerance=TOLERANCE)
     rng = np.random.default_rng(2)
@@ -193,7 +196,9 @@ def test_the_cost_is_that_before_any_weight():
     assert set(np.unique(weights)) <= {0.0, 1.0}
     table = assess(solution).residuals
     prior = [(p.correction / p.prior_sigma) ** 2 for p in assess(solution).parameters if p.prior_sigma]
-    assert 2 * solution.cost == pytest.approx(np.sum((table.after / table.sigma) ** 2) + sum(prior), rel=1e-9)
+    assert 2 * solution.cost == pytest.approx(
+        np.sum((table.after / table.sigma) ** 2) + sum(prior), rel=rounding(1, 1e4)
+    )
     assert solution.weighted_cost < 0.1 * solution.cost
 
 

@@ -15,6 +15,7 @@ from oracle import random_robot, tool_pose
 from scipy.spatial import SphericalVoronoi
 from scipy.spatial.transform import Rotation
 from simulated import paper_robot, planar_robot
+from tolerances import rounding
 
 import fg_calib
 from fg_calib.cli import EXAMPLES
@@ -69,8 +70,8 @@ def exact(scenario):
 def test_measured_poses_without_noise_are_products_of_4x4_matrices(shipped):
     s = simulate(exact(shipped), 3)
     _, position, turn = measured(s)
-    assert np.abs(position).max() < 1e-12  # a dozen products of lengths up to 15 m
-    assert np.abs(turn).max() < 1e-12
+    assert np.abs(position).max() < rounding(10.0)  # a dozen products of lengths up to 15 m
+    assert np.abs(turn).max() < rounding(10.0)
     assert s.true_readings.tolist() == s.measurements.readings.tolist()
 
 
@@ -86,8 +87,8 @@ def test_any_robot_is_simulated(convention):
     )
     s = simulate(scenario)
     _, position, turn = measured(s)
-    assert np.abs(position).max() < 1e-12
-    assert np.abs(turn).max() < 1e-12
+    assert np.abs(position).max() < rounding(10.0)
+    assert np.abs(turn).max() < rounding(10.0)
     assert s.true_robot.nominal - robot.nominal == pytest.approx(0.01 * np.arange(len(robot.parameters)))
 
 
@@ -96,15 +97,15 @@ def test_written_poses_follow_from_the_written_true_robot(simulation, tmp_path):
     write_simulation(tmp_path / "job", simulation)
     job = read_job(tmp_path / "job" / "calibration.yaml")
     m = job.measurements
-    assert job.truth.nominal == pytest.approx(simulation.true_robot.nominal, abs=1e-15)
+    assert job.truth.nominal == pytest.approx(simulation.true_robot.nominal, abs=rounding(1.0))
     world_T_base = np.eye(4)
     world_T_base[:3, :3], world_T_base[:3, 3] = simulation.frame.rotation, simulation.frame.position
     predicted = (world_T_base @ poses_of(job.truth, m.readings))[:, :3, 3]
     arm = 12.0 * np.deg2rad(0.005) * sqrt(7)  # every joint with its noise at the longest lever
     assert 1e-3 < np.sqrt(np.mean((m.position - predicted) ** 2)) < sqrt(1e-6 + arm**2)
-    assert m.position == pytest.approx(simulation.measurements.position, rel=1e-14)
-    assert m.rotation == pytest.approx(simulation.measurements.rotation, abs=1e-14)
-    assert m.readings == pytest.approx(simulation.measurements.readings, rel=1e-14)
+    assert m.position == pytest.approx(simulation.measurements.position, rel=rounding())
+    assert m.rotation == pytest.approx(simulation.measurements.rotation, abs=rounding(1.0))
+    assert m.readings == pytest.approx(simulation.measurements.readings, rel=rounding())
     assert m.test.tolist() == simulation.measurements.test.tolist()
     assert m.sigma_position == pytest.approx(simulation.measurements.sigma_position)
     assert m.sigma_orientation == pytest.approx(simulation.measurements.sigma_orientation)
@@ -135,7 +136,7 @@ def test_encoder_noise_moves_the_arm_and_the_table_holds_the_reading(shipped):
     still = simulate(exact(shipped), 2)
     assert s.measurements.readings.tolist() == still.measurements.readings.tolist()
     _, position, turn = measured(s)
-    assert max(np.abs(position).max(), np.abs(turn).max()) < 1e-12
+    assert max(np.abs(position).max(), np.abs(turn).max()) < rounding(10.0)
     moved = s.true_readings - s.measurements.readings
     n = len(moved)
     assert moved.std(axis=0) == pytest.approx(noise.joint, rel=5 / sqrt(2 * n))
@@ -160,7 +161,7 @@ def test_uniform_errors_fill_their_bounds_and_spare_fixed_parameters(shipped):
     estimated = np.array([p.estimated for p in shipped.robot.parameters])
     assert (errors[:, ~estimated] == 0.0).all()
     scaled = errors[:, estimated] / bound[estimated]
-    assert np.abs(scaled).max() <= 1.0 + 1e-12
+    assert np.abs(scaled).max() <= 1.0 + rounding(10)
     # Mean and variance of 9000 uniform numbers: sigmas 1 / sqrt(3 n) and 2 / sqrt(45 n).
     n = scaled.size
     assert abs(scaled.mean()) < 5 / sqrt(3 * n)
@@ -194,8 +195,8 @@ def test_the_camera_looks_at_the_centre_from_a_and_from_the_half_sphere(simulati
     T = poses_of(simulation.robot, q)
     p, z = T[:, :3, 3], T[:, :3, 2]
     A = np.array([0.0, 6.5, 3.05])
-    assert p[0] == pytest.approx(A, abs=1e-9)
-    assert np.linalg.norm(p[1:] - A, axis=1) == pytest.approx(0.5, abs=1e-9)
+    assert p[0] == pytest.approx(A, abs=rounding(1, 1e4))
+    assert np.linalg.norm(p[1:] - A, axis=1) == pytest.approx(0.5, abs=rounding(1, 1e4))
     assert (p[1:, 2] > A[2]).all()
     away = BOARD - p
     assert np.abs(np.cross(z, away)).max() < 1e-9
@@ -222,7 +223,7 @@ def test_a_tilted_board_is_seen_from_its_own_side():
     normal = TILTED.rotation[:, 2]
     assert p[0] == pytest.approx(BOARD + 0.7 * normal)
     assert ((p[1:] - p[0]) @ normal > 0).all()
-    assert np.abs(np.cross(R[:, :, 2], BOARD - p)).max() < 1e-12
+    assert np.abs(np.cross(R[:, :, 2], BOARD - p)).max() < rounding(10.0)
     assert np.linalg.det(R) == pytest.approx(1.0)
 
 
@@ -252,9 +253,9 @@ def test_a_range_of_distances_is_kept_within_the_cone():
     assert distance.max() <= 2.0
     assert distance.mean() == pytest.approx(1.15, abs=5 * 1.7 / sqrt(12 * n))
     cosine = away @ TILTED.rotation[:, 2] / distance
-    assert cosine.min() >= np.cos(cone) - 1e-12
+    assert cosine.min() >= np.cos(cone) - rounding(10)
     assert cosine.mean() == pytest.approx((1 + np.cos(cone)) / 2, abs=5 * (1 - np.cos(cone)) / sqrt(12 * n))
-    assert np.abs(np.cross(R[:, :, 2], BOARD - p)).max() < 1e-12
+    assert np.abs(np.cross(R[:, :, 2], BOARD - p)).max() < rounding(10.0)
 
 
 def test_the_arm_sees_the_board_from_03_to_2_m(shipped):
@@ -297,9 +298,9 @@ def test_the_frame_is_the_base_or_any_or_given(shipped):
     given = simulate(replace(exact(shipped), frame=TILTED))
     assert given.frame is TILTED
     for s in (base, given):
-        assert np.abs(measured(s)[1]).max() < 1e-12
+        assert np.abs(measured(s)[1]).max() < rounding(10.0)
     frames = [simulate(shipped, seed).frame for seed in range(20)]
-    assert all(np.abs(f.rotation @ f.rotation.T - np.eye(3)).max() < 1e-12 for f in frames)
+    assert all(np.abs(f.rotation @ f.rotation.T - np.eye(3)).max() < rounding() for f in frames)
     assert all(np.abs(f.position).max() <= FARTHEST_BASE for f in frames)
     turns = [Rotation.from_matrix(f.rotation).magnitude() for f in frames]
     assert np.mean(turns) == pytest.approx(np.pi / 2 + 2 / np.pi, abs=5 * 0.65 / sqrt(20))  # of a uniform rotation
@@ -326,13 +327,13 @@ def test_each_purpose_draws_for_itself(shipped):
     assert noisier.true_robot.nominal.tolist() == errors
     assert noisier.measurements.readings.tolist() == s.measurements.readings.tolist()
     assert noisier.frame.position.tolist() == s.frame.position.tolist()
-    assert measured(noisier)[1] == pytest.approx(2 * measured(s)[1], abs=1e-12)
+    assert measured(noisier)[1] == pytest.approx(2 * measured(s)[1], abs=rounding(10.0))
     untested = simulate(replace(shipped, validation=None, frame="base"))
     assert untested.true_robot.nominal.tolist() == errors
     assert untested.true_readings.tolist() == s.true_readings[:52].tolist()
     # The same noise along the axes of either frame, and about those of the tool: not about the frame's.
     for noise, same in zip(measured(untested)[1:], measured(s)[1:], strict=True):
-        assert noise == pytest.approx(same[:52], abs=1e-12)
+        assert noise == pytest.approx(same[:52], abs=rounding(10.0))
     elsewhere = simulate(replace(shipped, configurations=RandomReadings(52)))
     assert elsewhere.true_robot.nominal.tolist() == errors
     assert elsewhere.measurements.readings[52:].tolist() == s.measurements.readings[52:].tolist()
@@ -380,7 +381,6 @@ def test_one_pose_out_of_reach_is_named_and_no_other(shipped):
         ({"errors": Errors("normal", {"a": -1.0})}, "space-robot: errors: normal: found -1, "
          "expected numbers not below 0"),
         ({"noise": Noise(1e-3, None)}, "space-robot: noise: orientation: found None, expected a number not below 0"),
-        ({"noise": Noise(-1.0, 1.0)}, "space-robot: noise: position: found -1.0, expected a number not below 0"),
         ({"noise": Noise(0.0, 1e-4)}, "space-robot: noise: position: found 0, expected a number above 0; a "
          "calibration takes nothing for exact: tell it what to assume under job: noise: position"),
     ],
@@ -394,7 +394,7 @@ def test_a_scenario_that_makes_no_sense_is_one_line(shipped, change, message):
 def test_a_seed_is_not_negative(shipped):
     with pytest.raises(InputError) as caught:
         simulate(shipped, -1)
-    assert str(caught.value) == "seed: found -1, expected a number not below 0"
+    assert str(caught.value) == "seed: found -1, expected a whole number not below 0"
 
 
 # --- files and the command --------------------------------------------------------------------------------------------
@@ -435,7 +435,7 @@ def test_the_bundled_example_is_the_shipped_scenario_with_seed_0(simulation, tmp
     numbers = [name for name in written.columns if name not in {"id", "split"}]
     assert written.select(numbers).to_numpy() == pytest.approx(bundled.select(numbers).to_numpy(), abs=1e-6)
     truth = read_robot(EXAMPLES / "space-robot" / "robot_true.yaml")
-    assert truth.nominal == pytest.approx(simulation.true_robot.nominal, abs=1e-12)
+    assert truth.nominal == pytest.approx(simulation.true_robot.nominal, abs=rounding(10.0))
 
 
 def test_json_is_all_there_is_on_stdout(fg_calib, tmp_path):
@@ -493,8 +493,8 @@ def test_a_urdf_robot_is_written_with_its_urdf(tmp_path):
     names = write_simulation(tmp_path / "job", s)
     assert names == (*FILES[:2], "robot_nominal.urdf", "robot_nominal.yaml", "robot_true.urdf", "robot_true.yaml")
     job = read_job(tmp_path / "job" / "calibration.yaml")
-    assert job.robot.nominal == pytest.approx(s.robot.nominal, abs=1e-12)
-    assert job.truth.nominal == pytest.approx(s.true_robot.nominal, abs=1e-12)
+    assert job.robot.nominal == pytest.approx(s.robot.nominal, abs=rounding(10.0))
+    assert job.truth.nominal == pytest.approx(s.true_robot.nominal, abs=rounding(10.0))
     assert job.measurements.sigma_joint == pytest.approx([0.01, 0.002])
     assert s.true_robot.nominal[s.robot.index("tool.z")] != 0.1
 
@@ -545,4 +545,4 @@ def test_the_public_names_are_these():
 
 def test_the_shipped_arm_is_the_one_of_the_tests(shipped):
     q = np.random.default_rng(0).uniform(-3, 3, (3, 7))
-    assert poses_of(shipped.robot, q) == pytest.approx(poses_of(paper_robot(), q), abs=1e-12)
+    assert poses_of(shipped.robot, q) == pytest.approx(poses_of(paper_robot(), q), abs=rounding(10.0))

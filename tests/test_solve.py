@@ -8,6 +8,7 @@ import pytest
 import scipy.optimize
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, small_arm, true_robot
+from tolerances import rounding
 
 from fg_calib import residuals
 from fg_calib.errors import SolverError
@@ -72,7 +73,7 @@ def test_the_optimum_is_scipys(model):
     found = scipy.optimize.least_squares(
         stacked, robot.nominal[columns], x_scale=scale, xtol=1e-14, ftol=1e-14, gtol=1e-14
     )
-    assert solution.cost == pytest.approx(found.cost, rel=1e-9)
+    assert solution.cost == pytest.approx(found.cost, rel=rounding(1, 1e4))
     # scipy differentiates by differences: agreement to a thousandth of the tolerances
     assert (solution.parameters[columns] - found.x) / scale == pytest.approx(np.zeros(len(columns)), abs=1e-3)
 
@@ -115,7 +116,7 @@ def test_before_is_the_nominal_arm_with_frame_and_tool_fitted():
     joints = [i for i, p in enumerate(robot.parameters) if 1 <= p.owner <= 4]
     assert np.array_equal(solution.before[joints], robot.nominal[joints])
     assert solution.before[-6:-3] == pytest.approx(FRAME[1], abs=0.05)
-    assert solution.initial_cost == pytest.approx(cost_at(solution.problem, solution.before), rel=1e-9)
+    assert solution.initial_cost == pytest.approx(cost_at(solution.problem, solution.before), rel=rounding(1, 1e4))
     assert solution.cost < solution.initial_cost
 
 
@@ -124,11 +125,11 @@ def test_history_tells_cost_damping_and_step():
     robot = small_arm()
     solution = solve(build_problem(robot, measure(true_robot(robot, rng), 40, rng), model="pose"))
     costs = [i.cost for i in solution.history]
-    assert all(b <= a * (1 + 1e-12) for a, b in pairwise(costs))
+    assert all(b <= a * (1 + rounding(10)) for a, b in pairwise(costs))
     assert solution.history[-1].decrement < 0.1 < solution.history[0].decrement
     assert solution.history[0].step > 1
     assert all(i.damping == 0.0 for i in solution.history)  # no step had to be damped
-    assert solution.cost == pytest.approx(cost_at(solution.problem, solution.parameters), rel=1e-9)
+    assert solution.cost == pytest.approx(cost_at(solution.problem, solution.parameters), rel=rounding(1, 1e4))
 
 
 def test_too_few_iterations_are_said_to_be_too_few():
@@ -167,6 +168,7 @@ def test_rows_are_judged_at_the_estimate():
     )
 
 
+@pytest.mark.slow
 def test_a_hundred_thousand_pairs_reach_the_optimum_with_weak_priors():
     """Where GTSAM's default parameters return the initial values without a word."""
     rng = np.random.default_rng(9)

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
+from tolerances import rounding
 
 from fg_calib.kinematics import pose
 from fg_calib.measurements import Measurements, Pairing
@@ -118,6 +119,7 @@ def test_a_tool_turned_by_a_quarter_has_no_sigma_for_roll_and_yaw():
     assert all(sigma[f"tool.{k}"] is None or sigma[f"tool.{k}"] > 1e-9 for k in ("roll", "yaw"))
 
 
+@pytest.mark.slow
 def test_monte_carlo_agrees_with_the_stated_covariance():
     """NEES and chi-square over repeated calibrations of one arm, joint noise included."""
     rng = np.random.default_rng(4)
@@ -188,7 +190,7 @@ def test_residual_table_holds_every_row_before_and_after(model):
             assert rms[split][kind]["after"] < rms[split][kind]["before"]
     whitened = (table.after / table.sigma)[~table.test]
     if model == "pose":  # pairs of a chain share the errors of their poses
-        assert whitened @ whitened == pytest.approx(2 * solution.cost, rel=1e-9)
+        assert whitened @ whitened == pytest.approx(2 * solution.cost, rel=rounding(1, 1e4))
 
 
 def test_position_rms_is_that_of_the_vectors_length():
@@ -272,6 +274,7 @@ def test_a_sum_is_known_although_its_terms_are_not():
     ).all()  # the base is not known
 
 
+@pytest.mark.slow
 def test_predicted_sigmas_cover_the_truth():
     rng = np.random.default_rng(12)
     robot = small_arm(tolerance={"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3})

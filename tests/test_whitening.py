@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from simulated import measure, small_arm, true_robot
+from tolerances import rounding
 
 from fg_calib import problem as problem_module
 from fg_calib import residuals
@@ -106,8 +107,15 @@ def test_shared_errors_whiten_as_the_dense_covariance(pairing, model, direct):
     tolerance = 1e-5 if direct else 0.02
     scale = np.sqrt(np.outer(np.diag(gram), np.diag(gram)))
     assert np.abs(R.T @ R - gram).max() <= tolerance * scale.max()
-    assert residuals.squared_norm(problem.blocks[0], chain) == pytest.approx(gram[-1, -1], rel=tolerance, abs=1e-12)
-    assert np.allclose(residuals.gram(problem.blocks[0], chain), R.T @ R, rtol=1e-9, atol=1e-9 * np.abs(gram).max())
+    assert residuals.squared_norm(problem.blocks[0], chain) == pytest.approx(
+        gram[-1, -1], rel=tolerance, abs=rounding(10.0)
+    )
+    assert np.allclose(
+        residuals.gram(problem.blocks[0], chain),
+        R.T @ R,
+        rtol=rounding(1, 1e4),
+        atol=rounding(np.abs(gram).max(), 1e4),
+    )
 
 
 def test_chunks_of_a_correlated_block_are_the_same_with_and_without_memory(monkeypatch):
@@ -120,7 +128,7 @@ def test_chunks_of_a_correlated_block_are_the_same_with_and_without_memory(monke
     monkeypatch.setattr(residuals, "_KEPT", 0)
     monkeypatch.setattr(residuals, "SPAN", 7)
     again = residuals.triangle(problem.blocks[0], problem.variables.chain)
-    assert np.allclose(R.T @ R, again.T @ again, rtol=1e-12, atol=1e-9 * np.abs(R.T @ R).max())
+    assert np.allclose(R.T @ R, again.T @ again, rtol=rounding(1, 10), atol=rounding(np.abs(R.T @ R).max(), 1e4))
 
 
 def test_too_many_shared_errors_are_accounted_for_in_the_covariance_alone(monkeypatch):
@@ -160,6 +168,7 @@ def normalised_error(true, uncertainty):
 
 @pytest.mark.parametrize("max_shared", [3000, 0])
 @pytest.mark.parametrize("pairing", ["star", "all"])
+@pytest.mark.slow
 def test_the_covariance_of_pairs_from_poses_is_that_of_the_errors(pairing, max_shared, monkeypatch):
     monkeypatch.setattr(problem_module, "MAX_SHARED", max_shared)
     robot = small_arm(tolerance=TOLERANCE)

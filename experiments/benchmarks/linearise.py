@@ -52,6 +52,7 @@ from fg_calib import residuals
 from fg_calib.factors import Variables, build_variables, measurement_factor
 from fg_calib.kinematics import build_chain, forward, precompute_trig, processors
 from fg_calib.residuals import PairBlock
+from fg_calib.threads import one_blas_thread
 
 Floats = NDArray[np.float64]
 
@@ -330,7 +331,7 @@ def measure(n: int, seed: int, quick: bool) -> dict[str, Any]:
     singles = [measurement_factor(residuals.rows_of(case.block, slice(i, i + 1)), variables) for i in range(n_single)]
     tuned, plain = lay_out(case.block, CHUNK), lay_out(case.block, PLAIN_CHUNK)
     # One thread of BLAS for all: chunks of this size gain nothing from more, and the block's kernels ask for it too.
-    with ThreadPoolExecutor(processors()) as pool, residuals.single_threaded_blas():
+    with ThreadPoolExecutor(processors()) as pool, one_blas_thread:
         difference = max(check_equal(case, tuned_panel, tuned), check_equal(case, plain_panel, plain))
         clock = time.perf_counter()
         factor.linearize(values[0])

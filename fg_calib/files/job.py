@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import astuple, dataclass, field, fields, replace
 from pathlib import Path, PurePath
 from typing import Annotated, Any
 
 from pydantic import Field, StrictBool
 
-from fg_calib.choices import EncoderNoise, FrameKnowledge, Gauge, Loss, Model, PairErrors
+from fg_calib.choices import EncoderNoise, FrameKnowledge, Gauge, Loss, Model, PairErrors, check_names
 from fg_calib.errors import InputError
 from fg_calib.files.robot_yaml import read_robot, robot_from_mapping
 from fg_calib.files.schema import Count, NotNegative, Positive, Schema, read_yaml, shown, validate
 from fg_calib.files.tables import read_measurements
-from fg_calib.files.units import Units
+from fg_calib.files.units import Units, UnitsOfFile
 from fg_calib.measurements import Measurements, Noise, Pairing
-from fg_calib.robot import Robot, known_names, names_of
+from fg_calib.robot import Robot, names_of
+
+_log = logging.getLogger(__name__)
 
 UNSTATED = Noise(position=1e-3, orientation=1e-3, distance=1e-3, angle=1e-3, point=1e-3)
 """Where the noise starts from if it is to be estimated and nothing was stated."""
@@ -96,7 +99,7 @@ class _Job(Schema):
     model: Model
     pairing: Any = "star"  # a strategy's name, or a `_RandomPairing`
     frame: FrameKnowledge = "known"
-    units: Units = Units()
+    units: UnitsOfFile = Units()
     noise: Any = None  # a `_Noise`, or `estimate`
     prior: StrictBool | None = None
     gauge: Gauge = "prior"
@@ -121,7 +124,7 @@ def read_job(path: Path | str) -> Job:
     folder = path.parent
     file = validate(_Job, read_yaml(path), path.name)
     pairing = _pairing(file.pairing, f"{path.name}: pairing")
-    robot, robot_files = robot_of(file.robot, f"{path.name}: robot", folder)
+    robot, robot_files = robot_of(file.robot, f"{path.name}: robot", folder, file.units)
     _check_preferred(file, robot, path.name)
     noise, estimate_noise = _noise(file.noise, file.units, robot, f"{path.name}: noise")
     measurements = read_measurements(
@@ -173,18 +176,18 @@ def check_choices(choices: Mapping[str, Any], robot: Robot, place: str) -> None:
 
 
 def _check_preferred(file: _Job, robot: Robot, place: str) -> None:
-    for name in file.prefer:
-        if name not in names_of(robot.parameters):
-            raise InputError(f"{place}: prefer", f"unknown parameter {name!r}", known_names(names_of(robot.parameters)))
+    check_names(f"{place}: prefer", file.prefer, names_of(robot.parameters))
 
 
-def robot_of(given: object, place: str, folder: Path) -> tuple[Robot, list[str]]:
+def robot_of(given: object, place: str, folder: Path, units: Units) -> tuple[Robot, list[str]]:
     """The robot under a key `robot`, and the files that it was read from.
 
     Args:
         given: A path relative to `folder`, or the mapping of a robot file.
         place: File and key, for messages.
         folder: The folder of the file that names it.
+        units: Of that file; a URDF's `tolerance`, `base` and `tool` that stand in it are in these unless they state
+            their own. A mapping of DH rows is a robot file of its own: m and rad unless it states others.
 
     Returns:
         The robot, and its files relative to `folder`.
@@ -193,6 +196,10 @@ def robot_of(given: object, place: str, folder: Path) -> tuple[Robot, list[str]]
         InputError: It is neither, or does not describe a robot.
     """
     if isinstance(given, dict):
+        if "urdf" in given and "units" not in given:
+            if units != Units() and (given.get("base") or given.get("tool")):
+                _log.warning("%s: base and tool are in %s and %s, as the file's units say", place, *astuple(units))
+            given = {**given, "units": units}
         robot = robot_from_mapping(given, place, folder)
         return robot, [given["urdf"]] if robot.urdf else []
     if not isinstance(given, str):

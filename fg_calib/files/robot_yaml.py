@@ -16,16 +16,18 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import Field
 
+from fg_calib.choices import check_type
 from fg_calib.errors import InputError
 from fg_calib.files.disk import write_text
 from fg_calib.files.schema import Bound, Number, Positive, Schema, read_yaml, shown, validate
-from fg_calib.files.units import Units
+from fg_calib.files.units import Units, UnitsOfFile
 from fg_calib.robot import (
     AXIS_OF_KIND,
     CONVENTIONS,
@@ -58,7 +60,7 @@ class _Robot(Schema):
     """The keys that both forms of a robot file have."""
 
     name: str | None = None
-    units: Units = Units()
+    units: UnitsOfFile = Units()
     base: FrameValues = FrameValues()
     tool: FrameValues = FrameValues()
     fixed: tuple[str, ...] = ()
@@ -199,13 +201,14 @@ def write_robot(path: Path | str, robot: Robot, *, units: Units | None = None, u
     """
     if (robot.urdf is None) != (urdf_name is None):
         raise ValueError("a URDF robot, and no other, is written with urdf_name")
+    check_type("units", units, Units, "Units(length='mm')")
     units = units or Units()
     mapping: dict[str, Any] = {"name": robot.name}
     if robot.urdf is None:
         mapping |= {"convention": robot.convention}
     else:
         mapping |= {"urdf": urdf_name, "base_link": robot.urdf.base_link, "tip_link": robot.urdf.tip_link}
-    mapping |= {"units": _Flow(units.model_dump())}
+    mapping |= {"units": _Flow(asdict(units))}
     if robot.urdf is None:
         mapping |= {"joints": [_row(robot, i, units) for i in range(robot.n_joints)]}
     base, tool = robot.owned_by(0), robot.owned_by(robot.n_joints + 1)

@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -40,16 +40,16 @@ import numpy as np
 import yaml
 from pydantic import Field
 
+from fg_calib.choices import known_names
 from fg_calib.errors import InputError
 from fg_calib.files.disk import fill_folder, write_text
 from fg_calib.files.job import check_choices, joint_noise, robot_of
 from fg_calib.files.robot_yaml import FrameValues, unit_of_key, write_robot
 from fg_calib.files.schema import Count, NotNegative, Number, Positive, Schema, read_yaml, shown, validate
 from fg_calib.files.tables import LIMIT_SLACK, read_measurements, write_csv
-from fg_calib.files.units import Units
+from fg_calib.files.units import Units, UnitsOfFile
 from fg_calib.files.urdf import write_urdf
 from fg_calib.measurements import Noise
-from fg_calib.robot import known_names
 from fg_calib.scenario import (
     BoardViews,
     Configurations,
@@ -117,7 +117,7 @@ class _StatedNoise(Schema):
 class _Scenario(Schema):
     name: str | None = None
     robot: Any  # a path, or the mapping of a robot file
-    units: Units = Units()
+    units: UnitsOfFile = Units()
     errors: _Errors
     configurations: _Configurations
     noise: _Noise
@@ -153,7 +153,7 @@ class _Reader:
         self._folder = path.parent
         self._file = validate(_Scenario, read_yaml(path), source)
         self._units = self._file.units
-        self._robot, _ = robot_of(self._file.robot, f"{source}: robot", self._folder)
+        self._robot, _ = robot_of(self._file.robot, f"{source}: robot", self._folder, self._units)
         self._default_name = Path(source).stem
 
     def read(self) -> Scenario:
@@ -373,7 +373,7 @@ def _job_text(simulation: Simulation, units: Units) -> str:
         "measurements": "poses.csv",
         "truth": "robot_true.yaml",
         **simulation.job,
-        "units": units.model_dump(),
+        "units": asdict(units),
         "noise": {
             "position": units.from_si(m.sigma_position[0, 0], "m"),
             "orientation": units.from_si(m.sigma_orientation[0, 0], "rad"),

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import difflib
 import re
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -12,6 +11,7 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
+from fg_calib.choices import did_you_mean
 from fg_calib.errors import InputError
 from fg_calib.files.disk import read_text
 
@@ -39,6 +39,18 @@ Count = Annotated[int, Field(ge=0, strict=True)]
 """A whole number, 0 or more."""
 
 
+def refuse_unknown_keys(*known: str) -> Callable[[object], object]:
+    """A validator that refuses a mapping with other keys."""
+
+    def refuse(value: object) -> object:
+        for key in value if isinstance(value, Mapping) else ():
+            if key not in known:
+                raise PydanticCustomError("unknown_key", "unknown key", {"key": key, "known": list(known)})
+        return value
+
+    return refuse
+
+
 class Schema(BaseModel):
     """A mapping with known keys and finite numbers; base of all schemas."""
 
@@ -47,10 +59,7 @@ class Schema(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _refuse_unknown_keys(cls, value: object) -> object:
-        for key in value if isinstance(value, Mapping) else ():
-            if key not in cls.model_fields:
-                raise PydanticCustomError("unknown_key", "unknown key", {"key": key, "known": list(cls.model_fields)})
-        return value
+        return refuse_unknown_keys(*cls.model_fields)(value)
 
 
 AnySchema = TypeVar("AnySchema", bound=Schema)
@@ -83,12 +92,13 @@ def _first_misfit(error: ValidationError, place: str) -> InputError:
             *path, key = first["loc"]
             return InputError(_place(place, path), f"missing key {key!r}{more}")
         case "unknown_key":
-            close = difflib.get_close_matches(context["key"], context["known"], 1)
-            hint = f"did you mean {close[0]}?" if close else ""
+            hint = did_you_mean(context["key"], context["known"])
             known = f"one of {', '.join(context['known'])}"
             found = f"unknown key {context['key']!r}"
             return InputError(_place(place, first["loc"]), found, known + more * (not hint), hint + more * bool(hint))
-    return InputError(_place(place, first["loc"]), f"found {shown(first['input'])}", _expected(first) + more)
+    hint = did_you_mean(first["input"], _options(first)) if first["type"] == "literal_error" else ""
+    found = f"found {shown(first['input'])}"
+    return InputError(_place(place, first["loc"]), found, _expected(first) + more, hint)
 
 
 def _place(place: str, path: tuple[int | str, ...] | list[int | str]) -> str:
@@ -102,17 +112,21 @@ def _place(place: str, path: tuple[int | str, ...] | list[int | str]) -> str:
     return ": ".join([place, *words])
 
 
+def _options(misfit: ErrorDetails) -> list[str]:
+    return re.findall("'([^']*)'", misfit.get("ctx", {})["expected"])
+
+
 def _expected(misfit: ErrorDetails) -> str:
     context = misfit.get("ctx", {})
     if misfit["type"] == "literal_error":
-        return "one of " + ", ".join(re.findall("'([^']*)'", context["expected"]))
+        return "one of " + ", ".join(_options(misfit))
     return _EXPECTED.get(misfit["type"], misfit["msg"]).format(**context)
 
 
 _EXPECTED = {
     **dict.fromkeys(("float_type", "float_parsing", "finite_number"), "a finite number"),
     **dict.fromkeys(("list_type", "tuple_type"), "a list"),
-    **dict.fromkeys(("model_type", "dict_type"), "a mapping"),
+    **dict.fromkeys(("model_type", "dict_type", "dataclass_type"), "a mapping"),
     "int_type": "a whole number",
     "string_type": "text",
     "bool_type": "true or false",

@@ -17,13 +17,14 @@ import csv
 import logging
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fg_calib.choices import check_number, check_type
 from fg_calib.errors import InputError
 from fg_calib.files.disk import replacing, require_file
 from fg_calib.files.units import ANGLES, LENGTHS, Units
@@ -68,20 +69,25 @@ def read_measurements(
         robot: Whose configurations they are: names, number and limits of the joints.
         pairs: Table of pairs.
         units: Units of both tables; default m and rad.
-        noise: Sigmas where the tables state none, [m] and [rad].
+        noise: Sigmas where the tables state none, [m] and [rad]; also of what was not measured yet.
 
     Raises:
         InputError: A file is missing, is no table, lacks a column or holds a cell that cannot be used; the message
             names its line and column.
     """
+    check_type("units", units, Units, "Units(length='mm')")
+    check_type("noise", noise, Noise, "Noise(position=1e-3)")
     units, noise = units or Units(), noise or Noise()
+    for f in fields(noise):
+        if f.name != "joint" and (figure := getattr(noise, f.name)) is not None:
+            check_number(f"noise: {f.name}", figure, above=True)  # nothing is measured exactly
     length, angle = units.factor("m"), units.factor("rad")
     header = _Header.read(Path(path))
     joints = _joint_columns(header, robot)
     position = header.group(_POSITION)
     orientation = _orientation_columns(header)
-    sigma_position = header.sigmas("sigma_position", _SIGMA_POSITION) if position else ()
-    sigma_orientation = header.sigmas("sigma_orientation", _SIGMA_ORIENTATION) if orientation else ()
+    sigma_position = header.sigmas("sigma_position", _SIGMA_POSITION)
+    sigma_orientation = header.sigmas("sigma_orientation", _SIGMA_ORIENTATION)
     sigma_point = header.present("sigma_point") if "group" in header.columns else ()
     table = _Table.read(
         header,
@@ -101,8 +107,8 @@ def read_measurements(
         test=test,
         position=table.numbers(position) * length if position else None,
         rotation=_rotation(table, orientation, angle) if orientation else None,
-        sigma_position=_sigma(table, sigma_position, noise.position, length) if position else None,
-        sigma_orientation=_sigma(table, sigma_orientation, noise.orientation, angle) if orientation else None,
+        sigma_position=_sigma(table, sigma_position, noise.position, length),
+        sigma_orientation=_sigma(table, sigma_orientation, noise.orientation, angle),
         sigma_joint=_joint_sigma(noise.joint, robot.n_joints),
         pairs=between,
         source=header.name,
@@ -476,8 +482,6 @@ def _joint_sigma(joint: float | tuple[float, ...], n_joints: int) -> Floats:
     sigma = np.atleast_1d(np.asarray(joint, dtype=np.float64))
     if isinstance(joint, tuple) and len(joint) != n_joints:
         raise InputError("noise: joint", f"{len(joint)} figures", f"one for all or {n_joints}, one a joint")
-    if not (np.isfinite(sigma) & (sigma >= 0.0)).all():
-        raise InputError("noise: joint", f"found {joint!r}", "finite numbers not below 0")
     return np.broadcast_to(sigma, n_joints).copy()
 
 

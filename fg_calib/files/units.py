@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated
 
-from fg_calib.choices import AngleUnit, LengthUnit
-from fg_calib.files.schema import Schema
+from pydantic import BeforeValidator
+
+from fg_calib.choices import AngleUnit, LengthUnit, check
+from fg_calib.files.schema import refuse_unknown_keys
 
 LENGTHS: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 """Metres in one unit of length."""
@@ -15,7 +19,8 @@ ANGLES: Mapping[str, float] = {"rad": 1.0, "deg": math.pi / 180.0, "mrad": 1e-3}
 """Radians in one unit of angle."""
 
 
-class Units(Schema):
+@dataclass(frozen=True)
+class Units:
     """The units in which a file states lengths and angles.
 
     Attributes:
@@ -25,6 +30,10 @@ class Units(Schema):
 
     length: LengthUnit = "m"
     angle: AngleUnit = "rad"
+
+    def __post_init__(self) -> None:
+        check("units: length", self.length, LengthUnit)
+        check("units: angle", self.angle, AngleUnit)
 
     def name(self, unit: str) -> str:
         """The file's unit for what is in `m` or `rad` inside the program."""
@@ -40,3 +49,7 @@ class Units(Schema):
         figure = float(value) / factor
         short = float(f"{figure:.15g}")
         return short if short * factor == value else figure
+
+
+UnitsOfFile = Annotated[Units, BeforeValidator(refuse_unknown_keys("length", "angle"))]
+"""Units under a file's key `units`."""

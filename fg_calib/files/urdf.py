@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fg_calib.choices import NEAR, did_you_mean, known_names
 from fg_calib.errors import InputError
 from fg_calib.files.disk import require_file, write_text
-from fg_calib.robot import FRAME_KINDS, Joint, Robot, RobotBuilder, UrdfSource, known_names
+from fg_calib.robot import FRAME_KINDS, Joint, Robot, RobotBuilder, UrdfSource
 
 if TYPE_CHECKING:  # lxml is imported where it is used: `fg-calib --help` need not wait for it
     from lxml.etree import _Element as Element
@@ -233,7 +234,8 @@ class _Tree:
     def known(self, link: str) -> str:
         """`link`, if there is such a link."""
         if link not in self._links:
-            raise InputError(self._place, f"no link {link!r}", known_names(self._links, 40))
+            hint = did_you_mean(link, self._links, NEAR)
+            raise InputError(self._place, f"no link {link!r}", known_names(self._links, 40), hint)
         return link
 
     def root(self) -> str:
@@ -271,5 +273,8 @@ class _Tree:
     def _only(self, found: list[str], what: str, argument: str) -> str:
         if len(found) != 1:
             listed = ", ".join(found) or "none"
-            raise InputError(self._place, f"{len(found)} {what} links ({listed})", "one", f"name one as {argument}")
+            where = f"{{urdf: {self._place}, {argument}: ...}} in a file, --{argument.replace('_', '-')} of observe"
+            raise InputError(
+                self._place, f"{len(found)} {what} links ({listed})", "one", f"name one as {argument}: {where}"
+            )
         return found[0]

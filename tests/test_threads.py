@@ -1,0 +1,126 @@
+"""The same answer, bit by bit, on any number of threads and processors."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info
+
+from fg_calib.files.job import read_job
+from fg_calib.threads import one_blas_thread, single_threaded
+
+EVERYTHING = """
+import os, sys
+if sys.argv[2] == "1" and hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+import dataclasses, json
+import numpy as np
+import fg_calib as fg
+
+def hexadecimal(found):
+    if isinstance(found, dict):
+        return {k: hexadecimal(v) for k, v in found.items() if k != "seconds"}
+    if isinstance(found, list):
+        return [hexadecimal(v) for v in found]
+    return found.hex() if isinstance(found, float) else found
+
+job = fg.read_job(sys.argv[1])
+found = {}
+for name, change in {
+    "star": {"pairing": fg.Pairing("star")},
+    "all": {"pairing": fg.Pairing("all")},
+    "random, kept": {"pairing": fg.Pairing("random", 400), "gauge": "keep"},
+    "poses": {"model": "pose", "frame": "unknown", "encoder": "estimated"},
+}.items():
+    solution = fg.solve(fg.problem_of(job, **change))
+    found[name] = fg.result_document(solution, fg.assess(solution), {})
+noise = fg.estimate_noise(fg.problem_of(job, pairing=fg.Pairing("chain")))
+found["noise"] = [noise.cost, *noise.parameters.tolist()]
+all_pairs = {"model": job.model, "pairing": fg.Pairing("all")}
+found["compare"] = fg.comparison_document(fg.compare(job))
+bound = fg.cramer_rao(job.robot, job.measurements, **all_pairs)
+found["bound"] = [bound.covariance.tolist(), bound.position(job.measurements.readings, fitted=True).rms]
+plain = fg.fit_least_squares(job.robot, job.measurements, weighted=True, **all_pairs)
+found["plain"] = [plain.robot.nominal.tolist(), plain.covariance.tolist()]
+for name, seen in {
+    "structural": fg.observe_structure(job.robot, job.model),
+    "practical": fg.observe_configurations(job.robot, job.measurements, job.model, pairing=fg.Pairing("all")),
+}.items():
+    found[name] = fg.observability_document(seen)
+simulated = fg.simulate(fg.read_scenario("space-robot"), 3)
+found["simulation"] = [simulated.measurements.readings.tolist(), simulated.measurements.position.tolist()]
+print(json.dumps(hexadecimal(found)))
+"""
+
+
+def everything(job, threads, processors):
+    """What every public computation finds, in a process of its own."""
+    limits = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), threads)
+    ended = subprocess.run([sys.executable, "-c", EVERYTHING, job, processors], capture_output=True, text=True,
+                           env=os.environ | limits, check=False)  # fmt: skip
+    assert ended.returncode == 0, ended.stderr
+    return json.loads(ended.stdout)
+
+
+@pytest.mark.slow
+def test_every_bit_is_the_same_on_one_thread_and_on_several(example):
+    """With joint noise, so that all pairs share errors: the dense algebra that BLAS would spread over its threads."""
+    job = example / "calibration.yaml"
+    job.write_text(re.sub("joint: [0-9.]+", "joint: 0.005", job.read_text()))
+    assert np.all(read_job(job).measurements.sigma_joint > 0.0)
+    one = everything(job, "1", "1")
+    for threads, processors in (("2", "1"), ("1", "all"), ("2", "all"), ("7", "all")):
+        several = everything(job, threads, processors)
+        assert {name for name in one if one[name] != several[name]} == set(), (threads, processors)
+
+
+def blas_threads():
+    return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+
+def test_the_last_to_leave_lifts_the_limit():
+    before = blas_threads()
+    with one_blas_thread:
+        with one_blas_thread:
+            assert blas_threads() == {1}
+        assert blas_threads() == {1}
+    assert blas_threads() == before
+
+
+def test_one_thread_of_python_does_not_lift_the_limit_of_another():
+    before, both_are_in, one_has_left = blas_threads(), Barrier(2), Barrier(2)
+
+    def first():
+        with one_blas_thread:
+            both_are_in.wait(10)
+        one_has_left.wait(10)
+        return {1}
+
+    def second():
+        with one_blas_thread:
+            both_are_in.wait(10)
+            one_has_left.wait(10)
+            return blas_threads()
+
+    with ThreadPoolExecutor(2) as pool:
+        assert [run.result() for run in (pool.submit(first), pool.submit(second))] == [{1}, {1}]
+    assert blas_threads() == before
+
+
+def test_the_limit_is_lifted_after_an_error():
+    before = blas_threads()
+
+    @single_threaded
+    def fails():
+        assert blas_threads() == {1}
+        raise ValueError
+
+    with pytest.raises(ValueError, match=r"^$"):
+        fails()
+    assert blas_threads() == before
