@@ -245,6 +245,10 @@ def forward(chain: Chain, trig: Floats, rows: Integers | None = None) -> Poses:
     return Poses(rotation, position, jacobian)
 
 
+LEAST_TURNING = 0.01
+"""Mean square of sin(half the angle) of rotations, times two, above which they tell base from tool."""
+
+
 def turning_of_base(w: Floats, rotation: Floats) -> Floats:
     """What of the tool's turning is that of the base: the best a in `w_k = a + R_k b`, shape (3, n_columns), [rad/...].
 
@@ -258,10 +262,10 @@ def turning_of_base(w: Floats, rotation: Floats) -> Floats:
         rotation: base_R_tool there, shape (n, 3, 3).
     """
     w_mean, R_mean = w.mean(axis=0), rotation.mean(axis=0)
-    # Normal equations of b about the means; where the rotations leave it open it is zero, and the turn the base's.
+    # Normal equations of b about the means; where the rotations hardly tell it is zero, and the turn the base's.
     values, V = np.linalg.eigh(np.eye(3) - R_mean.T @ R_mean)
     right = np.einsum("nji,njp->ip", rotation, w) / len(w) - R_mean.T @ w_mean
-    inverse = np.divide(1.0, values, out=np.zeros(3), where=values > 1e-9)
+    inverse = np.divide(1.0, values, out=np.zeros(3), where=values > LEAST_TURNING)
     a: Floats = w_mean - R_mean @ ((V * inverse) @ (V.T @ right))
     return a
 

@@ -11,6 +11,9 @@ fall.
 Rows are whitened at the parameters that are estimated (joint noise, errors that pairs share, robust weights), so that
 the optimum is one of frozen whitening only if whitening anew, there, leaves nothing to go. That is how convergence is
 judged: by the decrement of the problem whitened at the estimate itself.
+
+References:
+    Anderson (1965), Iterative procedures for nonlinear integral equations. J. ACM 12(4): the extrapolation.
 """
 
 from __future__ import annotations
@@ -45,6 +48,12 @@ FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-15, 1e12
 
 SHORT = 30
 """Steps after which a descent from another start is given up: it wanders, and was only worth a try."""
+
+SLOW = 0.3
+"""Steps whose decrement falls by less than this factor are extrapolated."""
+
+FARTHEST = 30.0
+"""An extrapolated step is at most so many times as long as the Gauss-Newton step, [sigma over sigma]."""
 
 BACK = 0.1
 """A descent from another start that ends this near to where one has been is back there, [sigma]."""
@@ -269,6 +278,7 @@ class _Run:
         self.message = ""
         self._options = options
         self._damping = FIRST_DAMPING
+        self._last: tuple[_Linearised, Floats] | None = None  # where the last step began, and that step
         self.initial_cost = problem.graph.error(problem.initial)
         if not np.isfinite(self.initial_cost):
             raise SolverError(
@@ -305,9 +315,10 @@ class _Run:
                 path, damping = self._damped(), self._damping
             stuck = not path
             for there in path or [self.here]:
-                step = _step_length(self.here.values, there.values, self.problem.variables)
-                self.history.append(Iteration(there.cost, damping, step, self.here.decrement))
-                self.here = there
+                taken = self.problem.variables.step(self.here.values, there.values)
+                length = float(np.linalg.norm(taken / self.problem.variables.all_scales))
+                self.history.append(Iteration(there.cost, damping, length, self.here.decrement))
+                self._last, self.here = (self.here, taken), there
             self.converged = self.here.at_rounding if stuck else self.here.decrement <= goal
         if self.converged and not stuck:
             self.message = f"converged: less than {goal:.0e} sigma from the optimum"
@@ -339,7 +350,8 @@ class _Run:
         for _ in range(PATIENCE):
             last = there
             try:
-                there = _Linearised(self.problem, self.problem.variables.moved(last.values, last.step))
+                step = last.step if path else self._extrapolated()
+                there = _Linearised(self.problem, self.problem.variables.moved(last.values, step))
             except SolverError:
                 return []  # so far off that the rows have no derivative there
             path.append(there)
@@ -350,6 +362,22 @@ class _Run:
             if len(path) > 1 and there.decrement >= 0.5 * last.decrement:
                 return []
         return []
+
+    def _extrapolated(self) -> Floats:
+        """The Gauss-Newton step, or where steps that hardly get shorter lead together (Anderson 1965, depth 1).
+
+        Where a direction is known by its curvature, Gauss-Newton steps are all too long or too short by the same share.
+        """
+        here = self.here
+        if self._last is None or here.decrement < SLOW * self._last[0].decrement:
+            return here.step
+        last, taken = self._last
+        change = here.step - last.step
+        share = here.product(here.step, change) / max(here.product(change, change), 1e-300)
+        extrapolated: Floats = here.step - share * (taken + change)
+        return (
+            extrapolated if here.product(extrapolated, extrapolated) < (FARTHEST * here.decrement) ** 2 else here.step
+        )
 
     def _damped(self) -> list[_Linearised]:
         """Where GTSAM's next damped step leads, undetermined directions held; nothing if none lowers the cost."""
@@ -405,6 +433,12 @@ class _Linearised:
         self._information = s[:rank, None] * Vt[:rank]
         self._variables = variables
 
+    def product(self, a: Floats, b: Floats) -> float:
+        """Scalar product of two steps of the core, in sigma."""
+        n = len(self._sizes)
+        a, b = (self._information @ (step[:n] / self._sizes) for step in (a, b))
+        return float(a @ b)
+
     def decrement_to(self, values: gtsam.Values) -> float:
         """How far some other values are, in sigma as seen from here."""
         step = self._variables.step(self.values, values)[: len(self._sizes)]
@@ -437,10 +471,6 @@ def _dense(linear: gtsam.GaussianFactorGraph, keys: list[int]) -> tuple[Floats, 
     for key in keys:
         ordering.push_back(key)
     return linear.jacobian(ordering)
-
-
-def _step_length(previous: gtsam.Values, values: gtsam.Values, variables: Variables) -> float:
-    return float(np.linalg.norm(variables.step(previous, values) / variables.all_scales))
 
 
 def _in_words(message: str, variables: Variables) -> str:

@@ -375,23 +375,44 @@ class PairWhitening:
         """Variance in each direction across that the parameters' own gives each vector, shape (n_pairs, 2).
 
         Along the vector it is what is estimated; across it lengthens the vector as noise does, and bends the row. Zero
-        where it does not matter: not even looked at where the largest of some pairs evenly chosen would not.
+        where it does not matter.
+        """
+        spread = self._adjustment.spread
+        if spread is None:
+            return np.zeros((self._pairs.n_pairs, 2))
+        across = self._noticed(spread, LEAST_BEND)
+        return np.minimum(across, MOST_BEND * self._straight())
+
+    def bent_by(self, spread: Floats, sigmas: float) -> Booleans:
+        """Which distances and angles some uncertainty of the parameters bends by so many sigma, shape (n_pairs, 2).
+
+        Args:
+            spread: A square root of the parameters' covariance, shape (n_columns, k).
+            sigmas: By how many sigma at least.
+        """
+        bent: Booleans = self._noticed(spread, sigmas) > 0.0
+        return bent
+
+    def _noticed(self, spread: Floats, sigmas: float) -> Floats:
+        """Variance across where it bends a row by so many sigma, else 0, shape (n_pairs, 2).
+
+        Where four times the largest of some pairs, evenly chosen, would not, it is not even worked out.
         """
         across, train = np.zeros((self._pairs.n_pairs, 2)), np.flatnonzero(~self._pairs.test)
-        spread = self._adjustment.spread
-        if spread is None or not len(train):
+        if not len(train):
             return across
+        least = sigmas * self._straight()
         some = train[np.unique(np.linspace(0, len(train) - 1, 500).astype(np.int64))]
-        rows = np.flatnonzero(self._bends(4.0 * self._spread_across(some, spread).max(axis=0)).any(axis=1))
+        rows = np.flatnonzero(np.any(4.0 * self._spread_across(some, spread).max(axis=0) >= least, axis=1))
         for start in range(0, len(rows), SPAN):
             chunk = rows[start : start + SPAN]
             across[chunk] = self._spread_across(chunk, spread)
-        return np.where(self._bends(across), np.minimum(across, MOST_BEND * self._predicted * np.sqrt(self._own)), 0.0)
+        return np.where(across >= least, across, 0.0)
 
-    def _bends(self, across: Floats, least: float = LEAST_BEND) -> Booleans:
-        """Whether variance across, shape (n_pairs, 2) or (2,), bends each row by so many sigma, shape (n_pairs, 2)."""
-        bends: Booleans = across >= least * self._predicted * np.sqrt(self._own)
-        return bends & self._kinds & (self._own > 0.0)
+    def _straight(self) -> Floats:
+        """Variance across that bends a row by one sigma, shape (n_pairs, 2); infinite where there is none to bend."""
+        one = self._predicted * np.sqrt(self._own)
+        return np.where((self._own > 0.0) & self._kinds, one, np.inf)
 
     def _spread_across(self, rows: Integers, spread: Floats) -> Floats:
         """What `_bending` is about at `rows`, shape (n, 2).
