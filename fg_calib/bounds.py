@@ -31,6 +31,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.accuracy import without_rigid_motion
 from fg_calib.choices import FrameKnowledge, Model, PairErrors, check_flag, check_names
 from fg_calib.errors import InputError
 from fg_calib.kinematics import build_chain, forward, precompute_trig
@@ -98,10 +99,10 @@ class Bound:
         """
         columns = {self.robot.index(name): k for k, name in enumerate(self.names)}
         at = forward(build_chain(self.robot, columns), precompute_trig(self.robot, readings))
-        G = at.jacobian[:, 3:].reshape(-1, len(self.names))  # (3 n, n_names)
+        G = at.jacobian[:, 3:]
         if fitted:
-            Q = _rigid_motions(at.position)
-            G = G - Q @ (Q.T @ G)
+            G, _ = without_rigid_motion(at.position, G)
+        G = G.reshape(-1, len(self.names))  # (3 n, n_names)
         variance, V = np.linalg.eigh(self.claimed if claimed else self.covariance)
         half = G @ (V * np.sqrt(np.maximum(variance, 0.0)))  # (3 n, n_names)
         z = np.random.default_rng(0).normal(size=(half.shape[1], _SAMPLES))
@@ -186,13 +187,3 @@ def cramer_rao(
         back = problem.variables.tangent_derivative(problem.start)
         covariance = covariance + claimed @ (back.T @ added @ back) @ claimed
     return Bound(robot, names, covariance, claimed, rank)
-
-
-def _rigid_motions(points: Floats) -> Floats:
-    """Orthonormal small rigid motions of a set of points, shape (3 n, rank <= 6)."""
-    p = points - points.mean(axis=0)
-    shifts = np.tile(np.eye(3), (len(p), 1))  # (3 n, 3)
-    turns = np.cross(np.eye(3)[None], p[:, None]).transpose(0, 2, 1).reshape(-1, 3)  # axis x p, a column an axis
-    U, s, _ = np.linalg.svd(np.hstack([shifts, turns]), full_matrices=False)
-    Q: Floats = U[:, s > RCOND * s[0]]
-    return Q

@@ -29,6 +29,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.accuracy import errors_at, pose_rms
 from fg_calib.errors import CalibrationError, ProblemError
 from fg_calib.factors import corrections_of
 from fg_calib.files.job import Job
@@ -56,9 +57,6 @@ ESTIMATORS: Mapping[str, str] = {
     "scipy": "scipy.optimize.least_squares of the same parameters and weights",
 }
 """The estimators in the order of a comparison, in words."""
-
-_CHUNK = 64
-"""Configurations whose predicted positions are propagated at once."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +105,7 @@ class Estimate:
         residual_rms: RMS of the residuals by split and kind, before and after, of the rows that the job's graph uses.
         predicted_rms: RMS distance between estimated and true tool point that its covariance predicts, in the base
             frame, [m]; None where the covariance does not tell. Parameters that it did not estimate count as known.
+        predicted_fitted_rms: The same after the best rigid fit, [m].
         errors: Real errors; None where the truth is not known.
     """
 
@@ -119,6 +118,7 @@ class Estimate:
     seconds: float = 0.0
     residual_rms: ResidualRms | None = None
     predicted_rms: float | None = None
+    predicted_fitted_rms: float | None = None
     errors: RealErrors | None = None
 
     @property
@@ -172,6 +172,8 @@ def compare(job: Job) -> Comparison:
     judged_on: Literal["test", "train"] = "test" if test.any() else "train"
     readings = job.measurements.readings[test] if test.any() else job.measurements.readings
     solution = solve_job(job)
+    if solution.problem.settings.evaluated:
+        raise ProblemError(job.measurements.source, "test rows alone", "train rows, for there is nothing to compare")
     uncertainty = assess(solution)
     judge = _Judge(job, readings, solution)
     estimates = [judge.of_graph("graph", solution, uncertainty)]
@@ -280,11 +282,8 @@ class _Judge:
 
     def of_graph(self, name: str, solution: Solution, uncertainty: Uncertainty) -> Estimate:
         """The graph's estimate; like plain least squares it takes here what was held at nominal for known."""
-        spread, variances = uncertainty.spread, []
-        for start in range(0, len(self._readings), _CHUNK):
-            readings = self._readings[start : start + _CHUNK]
-            rows = spread.derivative(partial(_tool_points, readings=readings))
-            variances.append(np.diag(spread.covariance(rows)))
+        spread = uncertainty.spread
+        base, fitted = errors_at(spread, self._readings)
         return Estimate(
             name=name,
             robot=uncertainty.robot,
@@ -294,14 +293,16 @@ class _Judge:
             iterations=solution.iterations,
             seconds=solution.seconds,
             residual_rms=self.residual_rms(solution.parameters),
-            predicted_rms=_rms_of(np.concatenate(variances)),
+            predicted_rms=base.position,
+            predicted_fitted_rms=fitted.position,
             errors=self.errors(uncertainty.robot),
         )
 
     def of_baseline(self, name: str, fit: LeastSquares) -> Estimate:
         """The estimate of plain least squares."""
         chain = build_chain(fit.robot, {fit.robot.index(p): k for k, p in enumerate(fit.names)})
-        J = forward(chain, precompute_trig(fit.robot, self._readings)).jacobian[:, 3:]  # (n, 3, n_names)
+        at = forward(chain, precompute_trig(fit.robot, self._readings))
+        base, fitted = pose_rms(at.position, at.jacobian, lambda rows: np.sum((rows @ fit.covariance) * rows, axis=1))
         return Estimate(
             name=name,
             robot=fit.robot,
@@ -311,7 +312,8 @@ class _Judge:
             iterations=fit.iterations,
             seconds=fit.seconds,
             residual_rms=self.residual_rms(fit.parameters),
-            predicted_rms=_rms_of(np.sum((J @ fit.covariance) * J, axis=2).ravel()),
+            predicted_rms=base.position,
+            predicted_fitted_rms=fitted.position,
             errors=self.errors(fit.robot),
         )
 
@@ -322,14 +324,3 @@ class _Judge:
     def errors(self, robot: Robot) -> RealErrors | None:
         """Real errors of an arm, where the truth is known."""
         return None if self._truth is None else real_errors(robot, self._truth, self._readings)
-
-
-def _tool_points(robot: Robot, readings: Floats) -> Floats:
-    """Tool points in the base frame, shape (n, 3), [m]."""
-    return forward(build_chain(robot), precompute_trig(robot, readings)).position
-
-
-def _rms_of(variance: Floats) -> float | None:
-    """RMS length of vectors from the variances of their coordinates, shape (3 n,); None where one is unknown."""
-    rms = float(np.sqrt(3.0 * np.mean(variance)))
-    return rms if np.isfinite(rms) else None

@@ -35,6 +35,9 @@ Floats = NDArray[np.float64]
 NO_ANGLE = 1.0
 """An angle of a pose with a larger sigma is not known, [rad]: near a pitch of a quarter turn yaw and roll are none."""
 
+_AT_ONCE = 192
+"""Functions whose covariance is formed at once where only variances are wanted."""
+
 
 @dataclass(frozen=True)
 class Spread:
@@ -45,6 +48,7 @@ class Spread:
         parameters: The estimate (see `Variables`).
         tangent: Covariance of the determined part, shape (n_columns, n_columns).
         weighted: The same, were the rows' noise as they are weighted.
+        actual: The same, by the errors that rows share, also where they are asked to count as independent.
         loose: Undetermined directions at the estimate, orthonormal in changes of ordinary size, shape
             (n_loose, n_columns).
         loose_at_nominal: The same at the nominal parameters.
@@ -57,6 +61,7 @@ class Spread:
     parameters: Floats
     tangent: Floats
     weighted: Floats
+    actual: Floats
     loose: Floats
     loose_at_nominal: Floats
     rank: int
@@ -74,6 +79,13 @@ class Spread:
         out[unknown, :] = np.nan
         out[:, unknown] = np.nan
         return out
+
+    def variance(self, rows: Floats) -> Floats:
+        """The diagonal of `covariance` for any number of functions, shape (m,)."""
+        if not len(rows):
+            return np.zeros(0)
+        chunks = (rows[start : start + _AT_ONCE] for start in range(0, len(rows), _AT_ONCE))
+        return np.concatenate([np.diag(self.covariance(chunk)) for chunk in chunks])
 
     def named(self) -> Floats:
         """Covariance of the robot's parameters among the columns, shape (n_robot_columns, n_robot_columns)."""
@@ -131,6 +143,7 @@ def spread_of(solution: Solution) -> Spread:
         parameters=solution.parameters,
         tangent=half @ middle_of_sigma @ half.T,
         weighted=half @ half.T,
+        actual=half @ (np.eye(rank) + middle) @ half.T,
         loose=_orthonormal(directions[rank:], variables.scales),
         loose_at_nominal=_orthonormal(directions_nominal[rank_nominal:], variables.scales),
         rank=rank,
@@ -163,6 +176,7 @@ def with_left_out(solution: Solution, spread: Spread) -> Spread:
         variables=variables,
         tangent=M @ spread.tangent @ M.T + of_left_out @ of_left_out.T,
         weighted=M @ spread.weighted @ M.T + of_left_out @ of_left_out.T,
+        actual=M @ spread.actual @ M.T + of_left_out @ of_left_out.T,
         loose=loose(spread.loose, M, errors),
         loose_at_nominal=loose(spread.loose_at_nominal, M_nominal, errors_nominal),
     )

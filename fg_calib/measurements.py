@@ -180,6 +180,14 @@ class Measurements:
         """Number of configurations, train and test."""
         return len(self.readings)
 
+    @property
+    def end_names(self) -> tuple[str, ...]:
+        """Names of what a row can be of: nothing at all (""), the configurations, then the groups.
+
+        Rows count configurations from 0, then groups, and -1 for nothing, so end k has the name at k + 1.
+        """
+        return ("", *self.ids.tolist(), *(() if self.groups is None else self.groups.names))
+
 
 def no_pairs(source: str) -> Pairs:
     """A table of pairs without any."""

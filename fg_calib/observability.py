@@ -172,7 +172,7 @@ def analyse(
     _, s, Vt = np.linalg.svd(np.vstack([J, np.zeros((n, n))]), full_matrices=False)
     rank = determined(s, floor)
     null = Vt[rank:]
-    dead = np.linalg.norm(J, axis=0) <= max(RANK_TOLERANCE * s[0], floor)
+    dead = np.linalg.norm(J, axis=0) <= max(RANK_TOLERANCE * s.max(initial=0.0), floor)
     relative = (np.linalg.norm(null, axis=0) > SUPPORT_TOLERANCE) & ~dead
     classes: list[IdentifiabilityClass] = [
         "ineffective" if d else "relative" if r else "independent" for d, r in zip(dead, relative, strict=True)

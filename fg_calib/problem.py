@@ -104,6 +104,8 @@ class Settings:
         pair_errors: Whether pairs of one configuration share its errors or count as independent.
         encoder: Whether the noise of joint readings is propagated to the rows or true joint values are estimated.
         loss: What becomes of large residuals.
+        evaluated: Whether there are test rows alone: the arm is taken as it is, and measurement frame, base and tool,
+            where they are estimated, are fitted to these.
     """
 
     model: Model = "distance-rotation"
@@ -114,6 +116,7 @@ class Settings:
     pair_errors: PairErrors = "shared"
     encoder: EncoderNoise = "propagated"
     loss: Loss = "none"
+    evaluated: bool = False
 
     def __post_init__(self) -> None:
         options = {"model": Model, "frame": FrameKnowledge, "gauge": Gauge}
@@ -278,6 +281,9 @@ def build_problem(
 ) -> Problem:
     """The calibration problem of a robot and its measurements.
 
+    Measurements that are all test rows make a problem of evaluation (see `Settings.evaluated`): their rows are those of
+    the fit, of which the arm has no part.
+
     Args:
         robot: The nominal robot.
         measurements: What was measured.
@@ -307,6 +313,8 @@ def build_problem(
     settings = Settings(model, as_pairing(pairing), frame, with_priors, gauge, pair_errors, encoder, loss)
     if not any(p.estimated for p in robot.parameters):
         raise ProblemError(f"robot {robot.name}", "nothing to estimate", "at least one parameter that is not fixed")
+    if _all_test(measurements, settings):
+        robot, measurements, settings = _for_evaluation(robot, measurements, settings)
     unknown_frame = frame == "unknown" and not settings.uses_pairs
     variables = build_variables(robot, unknown_frame, settings.prior)
     points = None if measurements.groups is None else PointGroups(measurements, model)
@@ -326,7 +334,7 @@ def build_problem(
         start = np.concatenate([start, joints.start()])
     problem = _assemble(robot, measurements, settings, variables, start, trig, pairs, None, points, joints)
     _check_enough(problem)
-    if gauge != "keep":
+    if settings.gauge != "keep":
         return problem
     kept = _kept(problem, prefer)
     if not kept and not unknown_frame:
@@ -358,6 +366,36 @@ def _kept(problem: Problem, prefer: Sequence[str]) -> list[str]:
             if len(lacking) == 1 and lacking <= {problem.variables.names[v.columns][k] for k in (3, 5)}:
                 kept += lacking
     return kept
+
+
+def _all_test(measurements: Measurements, settings: Settings) -> bool:
+    """Whether all rows that the model uses are test rows."""
+    m = measurements
+    if not settings.uses_pairs or m.pairs is None:
+        return bool(m.test.all()) and m.n_configurations > 0
+    touches = np.zeros(0, dtype=np.bool_) if m.groups is None else m.test[m.groups.index >= 0]
+    rows = np.concatenate([m.pairs.test, touches])
+    return bool(rows.all()) and len(rows) > 0
+
+
+def _for_evaluation(
+    robot: Robot, measurements: Measurements, settings: Settings
+) -> tuple[Robot, Measurements, Settings]:
+    """A robot whose base and tool alone are estimated, where they were, and test rows that these are fitted to."""
+    m, nothing = measurements, np.zeros(measurements.n_configurations, dtype=np.bool_)
+
+    def fitted(pairs: Pairs) -> Pairs:
+        return replace(pairs, test=np.zeros(pairs.n_pairs, dtype=np.bool_))
+
+    m = replace(
+        m,
+        test=nothing,
+        pairs=None if m.pairs is None else fitted(m.pairs),
+        groups=None if m.groups is None else replace(m.groups, pairs=fitted(m.groups.pairs)),
+    )
+    of_frames = [p.name for p in robot.parameters if p.estimated and not 1 <= p.owner <= robot.n_joints]
+    gauge: Gauge = "none" if settings.gauge == "keep" else settings.gauge
+    return robot.with_estimated(of_frames), m, replace(settings, gauge=gauge, encoder="propagated", evaluated=True)
 
 
 def problem_of(job: Job, **changes: Any) -> Problem:
@@ -510,19 +548,21 @@ def _equal(a: Any, b: Any) -> bool:
     return all(_equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(a)) if is_dataclass(a) else bool(a == b)
 
 
-def lengths(problem: Problem, parameters: Floats) -> tuple[Floats, Integers]:
+def lengths(problem: Problem, parameters: Floats, *, of_test: bool = False) -> tuple[Floats, Integers]:
     """Length of each measurement's residual, whitened by all its noise as stated, and its number of rows.
 
     Args:
         problem: The problem.
         parameters: The parameter vector.
+        of_test: Whether those of the test rows are wanted, instead of the train rows'.
 
     Returns:
-        Shapes (n_pairs,) or (n_configurations,); both are 0 for a measurement that takes no part, as test rows do.
+        Shapes (n_pairs,) or (n_configurations,); both are 0 for a measurement that takes no part.
     """
     length, height = _whitening(problem, parameters).lengths()
     test = problem.measurements.test if problem.pairs is None else problem.pairs.test
-    return np.where(test, 0.0, length), np.where(test, 0, height)
+    wanted = test == of_test
+    return np.where(wanted, length, 0.0), np.where(wanted, height, 0)
 
 
 def joint_errors(problem: Problem, parameters: Floats) -> Floats:
@@ -901,9 +941,9 @@ def _assemble(
         sigma, blocks = of_poses.sigma, of_poses.blocks(joint_noise=joints is None)
     terms: tuple[Term, ...] = ()
     if joints is not None:
-        terms, blocks, sharing = joints.terms(blocks, variables), [], replace(sharing, joints=True)
+        terms, blocks, sharing = joints.terms(blocks, variables), [], replace(sharing, joints=pairs is not None)
     graph = gtsam.NonlinearFactorGraph()
-    for block in blocks:
+    for block in blocks if variables.items else ():
         graph.add(measurement_factor(block, variables))
     sigma_point = np.zeros((0, 3))
     if points is not None:

@@ -9,23 +9,29 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.measure import Measurement
 from rich.padding import Padding
 from rich.table import Column, Table
 from rich.text import Text
 
+from fg_calib.accuracy import ExpectedError
 from fg_calib.choices import check_number
 from fg_calib.comparison import Comparison, Estimate, PoseError
-from fg_calib.goodness import FLAGS, OUTLIER_WEIGHT, VERDICTS
+from fg_calib.goodness import FLAGS, OUTLIER_WEIGHT, PREDICTION_VERDICTS, VERDICTS, SuspectConfiguration
 from fg_calib.identifiability import Identifiability
+from fg_calib.joint_values import JointValues
 from fg_calib.observability import CORRELATED, Observability
 from fg_calib.problem import Problem
 from fg_calib.reasons import LostDirection
 from fg_calib.residual_table import FAMILIES, ROW_KINDS
-from fg_calib.robot import AXIS_OF_KIND, Axis, Robot
+from fg_calib.robot import AXIS_OF_KIND, Axis, Robot, names_of
 from fg_calib.solver import Solution
 from fg_calib.uncertainty import LIKE_NOISE, FrameEstimate, ParameterEstimate, Uncertainty
+from fg_calib.verdict import chi2_in_words, probability
+
+Integers = NDArray[np.int64]
 
 WIDTH = 100
 """Columns of the plain report."""
@@ -34,6 +40,9 @@ _SHOWN = {"m": (1e3, "mm", 4), "rad": (180.0 / np.pi, "deg", 5)}
 """Factor, unit and decimals in which a quantity is shown."""
 
 _WEAK = "sigma above a tenth of the tolerance, or of 1 mrad at the reach"
+
+_UNMOVED = 1e-9
+"""Metres or radians by which an estimate that no step meant to move may differ from where it was."""
 
 _FAMILY_UNIT = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad", "point": "m"}
 
@@ -61,15 +70,16 @@ def build_report(solution: Solution, uncertainty: Uncertainty) -> RenderableType
         *_section(
             f"Goodness of fit (1 sigma of a row{_with_joint_noise(solution)})", *_goodness(solution, uncertainty)
         ),
+        *_test_rows(uncertainty),
+        *_expected_error(uncertainty.expected_error),
         *_section("Residuals (RMS)", _residuals(uncertainty)),
-        *_section("Parameters", _parameters(uncertainty)),
     ]
+    if uncertainty.names or not solution.problem.settings.evaluated:
+        parts += _section("Parameters", _parameters(uncertainty))
     if any(p.stands_for for p in uncertainty.parameters):
         parts += _section("What kept parameters were estimated for", _combinations(uncertainty))
-    if len(uncertainty.goodness.suspects):
-        parts += _section("Suspicious rows", *_poses_behind(solution, uncertainty), _suspects(solution, uncertainty))
-    if uncertainty.goodness.configurations:
-        parts += _section("Suspicious configurations", _suspect_configurations(solution, uncertainty))
+    parts += _suspicious(solution, uncertainty)
+    parts += _joint_values(solution, uncertainty.joint_values)
     if uncertainty.frame is not None:
         parts += _section("Measurement frame (world_T_base)", _frame(uncertainty.frame))
     if uncertainty.identifiability.lost:
@@ -100,10 +110,18 @@ def _verdict(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
     if solution.problem.adjustment.joint_errors is not None or solution.problem.joints is not None:
         what += ", joint values estimated"
     what += "" if settings.loss == "none" else f", loss {settings.loss}"
+    lines = [Text(what), *(Text(f"DOUBTFUL: {finding}", style="bold red") for finding in uncertainty.findings)]
     if uncertainty.trustworthy:
-        return Group(Text(what), Text(f"GOOD: {solution.message}", style="bold green"))
-    doubts = (Text(f"DOUBTFUL: {finding}", style="bold red") for finding in uncertainty.findings)
-    return Group(Text(what), *doubts)
+        lines.append(Text(f"GOOD: {solution.message}", style="bold green"))
+    if settings.evaluated:
+        lines.insert(1, Text("EVALUATED ONLY: all rows are test rows, nothing of the arm was calibrated"))
+        if uncertainty.p_value is not None:
+            figures = chi2_in_words(uncertainty.chi2, uncertainty.expected_chi2, uncertainty.p_value)
+            lines.append(Text(f"test rows: {figures}"))
+    test = uncertainty.goodness.test
+    if test is not None and test.n:
+        lines.append(Text(f"test rows: {chi2_in_words(test.chi2, test.expected, test.p_value)}"))
+    return Group(*lines)
 
 
 class _WholeWords(Table):
@@ -220,12 +238,7 @@ def _statistics(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
 
 
 def _of_p(p: float | None) -> str:
-    return "" if p is None else f", p-value {_probability(p)}"
-
-
-def _probability(p: float) -> str:
-    """A probability with two figures, none beyond a thousandth from 0 and 1."""
-    return "< 0.001" if p < 1e-3 else "> 0.999" if p > 0.999 else f"{p:.2g}" if p < 0.1 else f"{p:.2f}"
+    return "" if p is None else f", p-value {probability(p)}"
 
 
 def _with_joint_noise(solution: Solution) -> str:
@@ -254,7 +267,7 @@ def _goodness(solution: Solution, uncertainty: Uncertainty) -> Iterable[Renderab
             f"{fit.stated_sigma_rms * factor:.{decimals}f}",
             "-" if np.isnan(seen) else f"{seen * fit.stated_sigma_rms * factor:.{decimals}f}",
             "-" if np.isnan(seen) else f"{seen:.3f}",
-            "-" if fit.p_value is None else _probability(fit.p_value),
+            "-" if fit.p_value is None else probability(fit.p_value),
             words,
         )
     yield table
@@ -279,7 +292,9 @@ def _goodness_lines(solution: Solution, uncertainty: Uncertainty) -> Iterable[st
         yield f"no row (|studentised residual| above {goodness.level:.2f}) and no configuration is suspicious"
 
 
-def _poses_behind(solution: Solution, uncertainty: Uncertainty, limit: int = 5) -> Iterable[RenderableType]:
+def _poses_behind(
+    solution: Solution, uncertainty: Uncertainty, suspects: Integers, limit: int = 5
+) -> Iterable[RenderableType]:
     """The poses that suspicious pairs come from: one wrong pose makes all its pairs suspicious.
 
     Those more than half of whose pairs are suspicious, the one in most of them first, each with the pairs that the
@@ -288,8 +303,8 @@ def _poses_behind(solution: Solution, uncertainty: Uncertainty, limit: int = 5) 
     rows, problem = uncertainty.residuals, solution.problem
     if not problem.formed:
         return
-    fitted, suspects = np.flatnonzero(rows.used), uncertainty.goodness.suspects
-    all_pairs, left = ({(int(rows.a[i]), int(rows.b[i])) for i in some} for some in (fitted, suspects))
+    judged = np.flatnonzero((rows.reason_code == 0) & (rows.test == rows.test[suspects[0]]))
+    all_pairs, left = ({(int(rows.a[i]), int(rows.b[i])) for i in some} for some in (judged, suspects))
     n_pairs, n_suspicious = Counter(chain.from_iterable(all_pairs)), len(left)
     lines = []
     while left:
@@ -307,36 +322,122 @@ def _poses_behind(solution: Solution, uncertainty: Uncertainty, limit: int = 5) 
     yield from (Padding(Text(line), (0, 0, 0, _INDENT)) for line in lines)
 
 
-def _suspects(solution: Solution, uncertainty: Uncertainty, limit: int = 5) -> RenderableType:
+def _test_rows(uncertainty: Uncertainty) -> list[RenderableType]:
+    """How well the test rows are predicted, by kind; nothing without any."""
+    fit = uncertainty.goodness.test
+    if fit is None:
+        return []
+    headings = ("rows", "chi-square", "expected", "ratio", "p-value")
+    table = _plain_table(("", "left"), *((heading, "right") for heading in headings), ("", "left"))
+    table.columns[0].no_wrap, table.columns[-1].no_wrap = True, False
+    for kind in fit.kinds:
+        ratio = kind.seen_over_stated / kind.factor
+        table.add_row(
+            kind.kind,
+            f"{kind.n}",
+            f"{kind.chi2:.4g}",
+            f"{kind.expected:.4g}",
+            "-" if np.isnan(ratio) else f"{ratio:.3f}",
+            "-" if kind.p_value is None else probability(kind.p_value),
+            PREDICTION_VERDICTS[kind.verdict],
+        )
+    notes = []
+    if fit.outliers.test:
+        count = f"{fit.outliers.test} of {fit.outliers.of_test} measurements"
+        notes.append(f"{count} count for nothing: the loss would take them for outliers")
+    if fit.n_unknown:
+        notes.append(f"{fit.n_unknown} rows are not judged: they depend on what is not determined")
+    return _section("Prediction of the test rows", table, *(Padding(Text(note), (0, 0, 0, 2)) for note in notes))
+
+
+def _expected_error(expected: ExpectedError | None) -> list[RenderableType]:
+    """How far off the tool is expected to be, by the covariance."""
+    if expected is None:
+        return []
+    table = _plain_table(
+        ("", "left"), ("", "left"), ("in the base frame", "right"), ("after the best rigid fit", "right")
+    )
+    for kind, unit in (("position", "m"), ("orientation", "rad")):
+        factor, shown, decimals = _SHOWN[unit]
+        values = (getattr(rms, kind) for rms in (expected.base, expected.fitted))
+        table.add_row(kind, shown, *("unknown" if v is None else f"{v * factor:.{decimals}f}" for v in values))
+    which = "" if expected.n == expected.of else f" of {expected.of}"
+    return _section(f"Expected tool error (RMS at {expected.n}{which} {expected.at} configurations)", table)
+
+
+def _suspicious(solution: Solution, uncertainty: Uncertainty) -> list[RenderableType]:
+    """Fitted rows and configurations that are too large, then the same of the test rows."""
+    fit = uncertainty.goodness
+    found: list[tuple[str, Integers, tuple[SuspectConfiguration, ...]]] = [("", fit.suspects, fit.configurations)]
+    if fit.test is not None:
+        found.append(("test ", fit.test.suspects, fit.test.configurations))
+    parts: list[RenderableType] = []
+    for split, rows, configurations in found:
+        if len(rows):
+            behind = _poses_behind(solution, uncertainty, rows)
+            parts += _section(f"Suspicious {split}rows", *behind, _suspects(solution, uncertainty, rows))
+        if configurations:
+            parts += _section(f"Suspicious {split}configurations", _suspect_configurations(solution, configurations))
+    return parts
+
+
+def _joint_values(solution: Solution, found: JointValues | None, limit: int = 5) -> list[RenderableType]:
+    """How estimated joint values lie about their readings, joint by joint, and the readings that are suspect."""
+    if found is None:
+        return []
+    table = _plain_table(("", "left"), *((h, "right") for h in ("stated", "", "mean error / stated", "scatter")))
+    joints = solution.problem.robot.joints
+    for k, name in enumerate(found.names):
+        factor, shown, decimals = _SHOWN[joints[found.joints[k]].unit]
+        scatter = "-" if np.isnan(found.scatter[k]) else f"{found.scatter[k]:.3f}"
+        table.add_row(name, f"{found.sigma[k] * factor:.{decimals}f}", shown, _figure(found.mean[k], 3, "+"), scatter)
+    parts = _section("Joint readings (estimate minus reading; scatter is 1 where all is as stated)", table)
+    if not found.suspects:
+        return parts
+    wrong = _plain_table(("", "left"), ("", "left"), ("error", "right"), ("", "left"), ("in its sigma", "right"))
+    names = solution.problem.measurements.end_names
+    for i, k in found.suspects[:limit]:
+        factor, shown, decimals = _SHOWN[joints[found.joints[k]].unit]
+        error = _figure(found.error[i, k] * factor, decimals, "+")
+        wrong.add_row(
+            names[found.configurations[i] + 1], found.names[k], error, shown, f"{found.studentised[i, k]:+.1f}"
+        )
+    if len(found.suspects) > limit:
+        wrong.add_row("", f"and {len(found.suspects) - limit} more")
+    return parts + _section("Suspicious joint readings", wrong)
+
+
+def _suspects(solution: Solution, uncertainty: Uncertainty, suspects: Integers, limit: int = 5) -> RenderableType:
     """The rows least likely, by studentised residual."""
-    rows, goodness, ids = uncertainty.residuals, uncertainty.goodness, solution.problem.measurements.ids
+    rows, goodness, names = uncertainty.residuals, uncertainty.goodness, solution.problem.measurements.end_names
     table = _plain_table(
         *(("a", "left"), ("b", "left"), ("", "left"), ("residual", "right"), ("", "left")),
         *(("in its sigma", "right"), ("", "left")),
     )
-    for i in goodness.suspects[:limit]:
+    for i in suspects[:limit]:
         factor, shown, decimals = _SHOWN[_FAMILY_UNIT[FAMILIES[rows.family[i]]]]
-        b = ids[rows.b[i]] if rows.b[i] >= 0 else ""
         table.add_row(
-            ids[rows.a[i]],
-            b,
+            names[rows.a[i] + 1],
+            names[rows.b[i] + 1],
             ROW_KINDS[rows.kind_code[i]],
             _figure(rows.after[i] * factor, decimals, "+"),
             shown,
             f"{goodness.studentised[i]:+.1f}",
             FLAGS[goodness.flag[i]],
         )
-    if len(goodness.suspects) > limit:
-        table.add_row("", "", f"and {len(goodness.suspects) - limit} more")
+    if len(suspects) > limit:
+        table.add_row("", "", f"and {len(suspects) - limit} more")
     return table
 
 
-def _suspect_configurations(solution: Solution, uncertainty: Uncertainty, limit: int = 3) -> RenderableType:
+def _suspect_configurations(
+    solution: Solution, found: tuple[SuspectConfiguration, ...], limit: int = 3
+) -> RenderableType:
     """The configurations least likely, by all the rows that they take part in."""
-    found, ids = uncertainty.goodness.configurations, solution.problem.measurements.ids
+    names = solution.problem.measurements.end_names
     table = _plain_table(("", "left"), ("rows", "right"), ("chi-square", "right"), ("expected", "right"))
     for c in found[:limit]:
-        table.add_row(ids[c.configuration], f"{c.n}", f"{c.chi2:.4g}", f"{c.expected:.4g}")
+        table.add_row(names[c.configuration + 1], f"{c.n}", f"{c.chi2:.4g}", f"{c.expected:.4g}")
     if len(found) > limit:
         table.add_row(f"and {len(found) - limit} more")
     return table
@@ -366,6 +467,8 @@ def _parameters(uncertainty: Uncertainty) -> RenderableType:
         *headings, ("correction", "right"), ("nominal", "right"), ("prior", "right"), ("class", "left")
     )
     for p in uncertainty.parameters:
+        if p.identifiability == "fixed" and uncertainty.residuals.evaluated:
+            continue
         if p.identifiability == "fixed" and p.name.startswith(("base.", "tool.")) and p.nominal == 0.0:
             continue
         factor, unit, decimals = _SHOWN[p.unit]
@@ -442,18 +545,11 @@ def _notes(solution: Solution, uncertainty: Uncertainty) -> Iterable[str]:
             f"loss {solution.problem.settings.loss}: {n} of {int(np.sum(~test))} {what} lost more than half their"
             " weight and count for nothing in chi-square"
         )
-    held = [p for p in uncertainty.parameters if p.identifiability in ("relative", "ineffective")]
-    if held:
-        with_prior = [p for p in held if p.prior_sigma is not None]
-        without = [p for p in held if p.prior_sigma is None]
-        if with_prior:
-            yield f"what the data leave open of {_listed(with_prior)} is held by their priors"
-        if without:
-            yield f"what the data leave open of {_listed(without)} stays at nominal"
+    yield from _open_notes(solution, uncertainty)
     turned = {p.name.split(".")[0] for p in uncertainty.parameters if _is_a_turn(p)}
     for frame in sorted(turned):
         yield f"{frame} is pitched near a quarter turn: corrections of its angles are its turn about its own axes"
-    if not uncertainty.residuals.test.any():
+    if not uncertainty.residuals.split.any():
         yield "no test rows: how well this predicts new configurations was not checked"
 
 
@@ -461,6 +557,32 @@ def _is_a_turn(parameter: ParameterEstimate) -> bool:
     """Whether a correction is about a frame's own axis, not the difference of an angle (see `corrections_of`)."""
     off = parameter.estimate - parameter.nominal - parameter.correction
     return parameter.unit == "rad" and abs(np.remainder(off + np.pi, 2.0 * np.pi) - np.pi) > 1e-9
+
+
+def _open_notes(solution: Solution, uncertainty: Uncertainty) -> Iterable[str]:
+    """What became of the parameters that the data alone do not determine."""
+    held = [p for p in uncertainty.parameters if p.identifiability in ("relative", "ineffective")]
+    estimated, before = set(uncertainty.names), solution.before[solution.problem.variables.robot_span]
+    at_start = dict(zip(names_of(solution.problem.robot.parameters), before, strict=True))
+
+    def what_became(p: ParameterEstimate) -> str:
+        if p.name in estimated and p.prior_sigma is not None:
+            return "what the data leave open of {} is held by their priors"
+        if abs(p.correction) <= _UNMOVED:
+            return "what the data leave open of {} stays at nominal"
+        if solution.problem.settings.gauge == "keep":
+            return "{} stand for their combinations with what stays at nominal"
+        if p.sigma is not None:
+            return "what the data leave open of {} is held by the priors of others that act with them"
+        if abs(p.estimate - at_start[p.name]) <= _UNMOVED:
+            return "nothing holds {}: they are where the first fit, of frame, base and tool alone, left them"
+        return "nothing holds {} in part: they are where steps of least change left them, which is not nominal"
+
+    became: dict[str, list[ParameterEstimate]] = {}
+    for p in held:
+        became.setdefault(what_became(p), []).append(p)
+    for sentence, parameters in became.items():
+        yield sentence.format(_listed(parameters, with_values=sentence.startswith("nothing")))
 
 
 def _sharing_notes(problem: Problem) -> Iterable[str]:
@@ -480,8 +602,12 @@ def _sharing_notes(problem: Problem) -> Iterable[str]:
         )
 
 
-def _listed(parameters: list[ParameterEstimate], limit: int = 12) -> str:
-    names = [p.name for p in parameters]
+def _listed(parameters: list[ParameterEstimate], *, with_values: bool = False) -> str:
+    names, limit = [p.name for p in parameters], 12
+    if with_values:
+        limit = 6
+        shown = ((p, *_SHOWN[p.unit]) for p in parameters)
+        names = [f"{p.name} ({_figure(p.correction * f, digits, '+')} {unit})" for p, f, unit, digits in shown]
     return ", ".join(names[:limit]) + (f" and {len(names) - limit} more" if len(names) > limit else "")
 
 
@@ -650,6 +776,7 @@ def _accuracy(comparison: Comparison) -> RenderableType:
             row(label, unit, [None if e is None else figure(e) for e in chosen])
     table.add_row(Text("Error predicted by its sigmas", style="bold"))
     row("position, RMS", "m", [None, *(e.predicted_rms for e in estimates)])
+    row("after best rigid fit", "m", [None, *(e.predicted_fitted_rms for e in estimates)])
     before = estimates[0].residual_rms or {}
     for split in ("train", "test"):
         families = [f for f in _FAMILY_UNIT if f in before.get(split, {})]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +55,7 @@ class ResidualTable:
         excess: What noise adds to the measured value on average (see `moments`), at the estimate, shape (n,); the arm's
             own prediction is measured + after - excess.
         sigma: 1 sigma of the residual, shape (n,).
+        evaluated: Whether these are test rows, all of them, by which the arm was evaluated as it is.
     """
 
     kind_code: Codes
@@ -69,6 +70,12 @@ class ResidualTable:
     after: Floats
     excess: Floats
     sigma: Floats
+    evaluated: bool = False
+
+    @property
+    def split(self) -> Codes:
+        """0 for train, 1 for test, shape (n,)."""
+        return (self.test | self.evaluated).astype(np.int8)
 
     @property
     def n(self) -> int:
@@ -100,7 +107,8 @@ class ResidualTable:
         """RMS by split, kind (the norm of three components but for distances and angles), before and after."""
         table: dict[str, dict[str, dict[str, float]]] = {"train": {}, "test": {}}
         family, counted = self.family, self.reason_code == 0
-        for split, of_split in (("train", counted & ~self.test), ("test", counted & self.test)):
+        for code, split in enumerate(("train", "test")):
+            of_split = counted & (self.split == code)
             for name in ("position", "orientation", "distance", "angle", "point"):
                 rows = of_split & (family == FAMILIES.index(name))
                 if rows.any():
@@ -119,15 +127,15 @@ def residual_table(solution: Solution) -> ResidualTable:
     before, after = (
         residuals.residual(all_rows(problem, p), chain.at(p)) for p in (solution.before, solution.parameters)
     )
+    evaluated = problem.settings.evaluated
     if problem.pairs is None:
-        return _pose_table(problem, before, after)
+        return replace(_pose_table(problem, before, after), evaluated=evaluated)
     tables = [_pair_table(problem, before, after, pair_rows(problem, solution.parameters).moments.excess)]
     if problem.points is not None:
         tables += _point_tables(problem, solution.before, solution.parameters)
-    arrays = [f.name for f in fields(ResidualTable) if f.name != "reasons"]
-    return ResidualTable(
-        reasons=tables[0].reasons, **{name: np.concatenate([getattr(t, name) for t in tables]) for name in arrays}
-    )
+    arrays = [f.name for f in fields(ResidualTable) if f.name not in ("reasons", "evaluated")]
+    together = {name: np.concatenate([getattr(t, name) for t in tables]) for name in arrays}
+    return ResidualTable(reasons=tables[0].reasons, evaluated=evaluated, **together)
 
 
 def _pair_table(problem: Problem, before: Floats, after: Floats, excess: Floats) -> ResidualTable:

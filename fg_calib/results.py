@@ -12,15 +12,27 @@ from typing import Any
 import numpy as np
 
 from fg_calib import __version__
+from fg_calib.accuracy import ExpectedError
 from fg_calib.comparison import Comparison, Estimate, RealErrors
 from fg_calib.conventions import WORDS
+from fg_calib.corrections import PriorFit
 from fg_calib.figures import write_figures
 from fg_calib.files.disk import fill_folder, write_text
 from fg_calib.files.robot_yaml import write_robot
 from fg_calib.files.tables import Words, write_csv_parts
 from fg_calib.files.urdf import write_urdf
-from fg_calib.goodness import FLAGS, VERDICTS
+from fg_calib.goodness import (
+    FLAGS,
+    PREDICTION_VERDICTS,
+    VERDICTS,
+    KindFit,
+    OutlierCounts,
+    PredictedFit,
+    SuspectConfiguration,
+)
 from fg_calib.identifiability import Identifiability
+from fg_calib.joint_values import JointValues
+from fg_calib.measurements import Measurements
 from fg_calib.mistakes import SetupCheck
 from fg_calib.residual_table import FAMILIES, FAMILY_OF_KIND, ROW_KINDS
 from fg_calib.robot import Robot
@@ -48,7 +60,6 @@ def result_document(
         inputs: SHA-256 of the files it came from, by path.
     """
     problem, settings = solution.problem, solution.problem.settings
-    ids = problem.measurements.ids
     rms = uncertainty.residuals.rms()
     pairing = None
     if settings.uses_pairs and (problem.measurements.pairs is not None or problem.formed):
@@ -91,25 +102,15 @@ def result_document(
         "dof": uncertainty.dof,
         "reduced_chi2": uncertainty.reduced_chi2,
         "chi2_p_value": uncertainty.p_value,
-        "goodness": {
-            fit.kind: {
-                "n": fit.n,
-                "stated_sigma_rms": fit.stated_sigma_rms,
-                "seen_over_stated": fit.seen_over_stated,
-                "chi2": fit.chi2,
-                "expected": fit.expected,
-                "p_value": fit.p_value,
-                "verdict": VERDICTS[fit.verdict],
-            }
-            for fit in uncertainty.goodness.kinds
-        },
+        "goodness": _goodness_by_kind(uncertainty.goodness.kinds, VERDICTS),
+        "evaluated_only": settings.evaluated,
+        "test": _test_document(uncertainty, problem.measurements.end_names),
+        "priors": _priors_document(uncertainty.priors),
+        "expected_error": _expected_error(uncertainty.expected_error),
         "noise_factors": None
         if solution.estimated_noise is None
         else {fit.kind: fit.factor for fit in uncertainty.goodness.kinds},
-        "suspect_configurations": [
-            {"id": ids[c.configuration], "n": c.n, "chi2": c.chi2, "expected": c.expected}
-            for c in uncertainty.goodness.configurations
-        ],
+        "suspect_configurations": _suspects(uncertainty.goodness.configurations, problem.measurements.end_names),
         "residual_rms": {split: {kind: rms[split].get(kind) for kind in kinds} for split in ("train", "test")},
         "parameters": [
             {
@@ -127,6 +128,7 @@ def result_document(
         ],
         "covariance": {"names": list(uncertainty.names), "matrix": uncertainty.covariance},
         "frame_estimate": None if uncertainty.frame is None else asdict(uncertainty.frame),
+        "joint_values": _joint_values(uncertainty.joint_values, problem.measurements.end_names),
         "groups": [{"name": p.name, "n": p.n, "xyz": p.xyz, "sigma": p.sigma} for p in uncertainty.points],
         "observability": observability_document(uncertainty.identifiability),
         "inputs": dict(inputs or {}),
@@ -140,6 +142,106 @@ def _combination(parameter: ParameterEstimate) -> dict[str, Any]:
     if parameter.stands_for is None:
         return {}
     return {"stands_for": parameter.stands_for, "sigma_of_combination": parameter.sigma_of_combination}
+
+
+def _goodness_by_kind(fits: Sequence[KindFit], words: Mapping[str, str]) -> dict[str, Any]:
+    return {
+        fit.kind: {
+            "n": fit.n,
+            "stated_sigma_rms": fit.stated_sigma_rms,
+            "seen_over_stated": fit.seen_over_stated,
+            "chi2": fit.chi2,
+            "expected": fit.expected,
+            "p_value": fit.p_value,
+            "verdict": words[fit.verdict],
+        }
+        for fit in fits
+    }
+
+
+def _suspects(found: Sequence[SuspectConfiguration], names: Sequence[str]) -> list[dict[str, Any]]:
+    return [{"id": names[c.configuration + 1], "n": c.n, "chi2": c.chi2, "expected": c.expected} for c in found]
+
+
+def _test_document(uncertainty: Uncertainty, names: Sequence[str]) -> dict[str, Any] | None:
+    """How well the test rows are predicted; None without any."""
+    goodness = uncertainty.goodness
+    fit = goodness.test
+    if uncertainty.residuals.evaluated:
+        n = int(np.sum(uncertainty.residuals.used))
+        fit = PredictedFit(
+            kinds=goodness.kinds,
+            n_rows=n,
+            n=n,
+            outliers=OutlierCounts(),
+            n_unknown=0,
+            chi2=uncertainty.chi2,
+            expected=uncertainty.expected_chi2,
+            p_value=np.nan if uncertainty.p_value is None else uncertainty.p_value,
+            suspects=goodness.suspects,
+            configurations=goodness.configurations,
+        )
+    if fit is None:
+        return None
+    return {
+        "n_rows": fit.n_rows,
+        "n": fit.n,
+        "n_outliers": fit.outliers.test,
+        "n_unknown": fit.n_unknown,
+        "chi2": fit.chi2,
+        "expected": fit.expected,
+        "p_value": fit.p_value,
+        "goodness": _goodness_by_kind(fit.kinds, PREDICTION_VERDICTS),
+        "n_suspect_rows": len(fit.suspects),
+        "suspect_configurations": _suspects(fit.configurations, names),
+    }
+
+
+def _expected_error(expected: ExpectedError | None) -> dict[str, Any] | None:
+    """Expected RMS errors of the tool."""
+    if expected is None:
+        return None
+    both = {"base": asdict(expected.base), "fitted": asdict(expected.fitted)}
+    by_kind = {kind: {frame: rms[kind] for frame, rms in both.items()} for kind in ("position", "orientation")}
+    return by_kind | {"at": expected.at, "n": expected.n, "of": expected.of}
+
+
+def _joint_values(found: JointValues | None, names: Sequence[str]) -> dict[str, Any] | None:
+    """How estimated joint values lie about their readings; None where these were not estimated."""
+    if found is None:
+        return None
+    return {
+        "n": len(found.configurations),
+        "joints": [
+            {"name": name, "sigma": sigma, "mean": mean, "scatter": scatter}
+            for name, sigma, mean, scatter in zip(found.names, found.sigma, found.mean, found.scatter, strict=True)
+        ],
+        "suspects": [
+            {
+                "id": names[found.configurations[i] + 1],
+                "joint": found.names[k],
+                "error": found.error[i, k],
+                "studentised": found.studentised[i, k],
+            }
+            for i, k in found.suspects
+        ],
+    }
+
+
+def _priors_document(fit: PriorFit | None) -> dict[str, Any] | None:
+    """Corrections against tolerances; None without priors."""
+    if fit is None:
+        return None
+    return {
+        "n": len(fit.names),
+        "chi2": fit.chi2,
+        "expected": fit.expected,
+        "p_value": fit.p_value,
+        "beyond_tolerance": [
+            {"parameter": fit.names[i], "correction_over_tolerance": fit.z[i], "sigma": fit.sigma[i]}
+            for i in fit.beyond
+        ],
+    }
 
 
 def observability_document(found: Identifiability) -> dict[str, Any]:
@@ -224,7 +326,7 @@ def comparison_document(comparison: Comparison) -> dict[str, Any]:
           "nominal": {"residual_rms": {split: {kind: RMS | null}}, "errors": errors | null},
           "estimates": [{"name": a key of ESTIMATORS, "description", "ran", "converged", "message", "iterations",
                          "seconds", "n_estimated", "residual_rms": as above | null, "predicted_position_rms",
-                         "errors": errors | null,
+                         "predicted_position_rms_fitted", "errors": errors | null,
                          "parameters": [{"name", "unit", "nominal", "true", "estimate", "correction", "sigma",
                                          "held"}]}],
           "inputs": {path: sha256} }
@@ -264,6 +366,7 @@ def comparison_document(comparison: Comparison) -> dict[str, Any]:
                 "n_estimated": len(e.sigma),
                 "residual_rms": _rms(e, "after"),
                 "predicted_position_rms": e.predicted_rms,
+                "predicted_position_rms_fitted": e.predicted_fitted_rms,
                 "errors": _errors(e.errors),
                 "parameters": _estimated(comparison, e),
             }
@@ -325,6 +428,8 @@ def write_results(
 ) -> None:
     """Write `result.json`, `residuals.csv` and the calibrated robot into a folder, all of them or none.
 
+    Where joint values were estimated there is a `joints.csv` too.
+
     A robot from a URDF gives `robot_calibrated.urdf`; where base or tool have values of their own, which a URDF cannot
     hold, a `robot_calibrated.yaml` beside it names them.
 
@@ -339,6 +444,8 @@ def write_results(
         write_text(into / "result.json", document)
         write_calibrated_robot(into, calibrated)
         _write_residuals(into / "residuals.csv", solution, uncertainty)
+        if uncertainty.joint_values is not None:
+            _write_joint_values(into / "joints.csv", uncertainty.joint_values, solution.problem.measurements)
 
     fill_folder(Path(folder), write)
 
@@ -356,8 +463,11 @@ def write_calibrated_robot(folder: Path, robot: Robot) -> None:
 def _write_residuals(path: Path, solution: Solution, uncertainty: Uncertainty) -> None:
     """One line a scalar residual: what it is of, whether it was used, before and after, in [m] and [rad]."""
     table, fit = uncertainty.residuals, uncertainty.goodness
-    m = solution.problem.measurements
-    ids = ["", *m.ids.tolist(), *(() if m.groups is None else m.groups.names)]
+    ends = solution.problem.measurements.end_names
+    suspect = np.zeros(table.n, dtype=np.bool_)
+    suspect[fit.suspects] = True
+    if fit.test is not None:
+        suspect[fit.test.suspects] = True
     kind_in_metres = np.array([FAMILIES[f] not in ("angle", "orientation") for f in FAMILY_OF_KIND])
 
     def columns(rows: slice) -> dict[str, Any]:
@@ -366,9 +476,9 @@ def _write_residuals(path: Path, solution: Solution, uncertainty: Uncertainty) -
         measured = table.measured[rows] - excess  # so that predicted minus measured is 0 on average
         return {
             "kind": Words(ROW_KINDS, kind),
-            "a": Words(ids, table.a[rows] + 1),
-            "b": Words(ids, table.b[rows] + 1),
-            "split": Words(("train", "test"), table.test[rows].astype(np.int8)),
+            "a": Words(ends, table.a[rows] + 1),
+            "b": Words(ends, table.b[rows] + 1),
+            "split": Words(("train", "test"), table.split[rows]),
             "used": table.used[rows],
             "excluded": Words(table.reasons, table.reason_code[rows]),
             "unit": Words(("rad", "m"), kind_in_metres[kind].astype(np.int8)),
@@ -383,10 +493,31 @@ def _write_residuals(path: Path, solution: Solution, uncertainty: Uncertainty) -
             "weight": fit.weight[rows],
             "flag": Words(FLAGS, fit.flag[rows]),
             "noise_adds": excess,
+            "suspect": suspect[rows],
         }
 
     starts = range(0, max(table.n, 1), _ROWS_AT_ONCE)
     write_csv_parts(path, (columns(slice(start, start + _ROWS_AT_ONCE)) for start in starts))
+
+
+def _write_joint_values(path: Path, found: JointValues, measurements: Measurements) -> None:
+    """One line a configuration and joint: reading and estimate, in [rad] (prismatic: [m])."""
+    n, k = found.error.shape
+    suspect = np.zeros((n, k), dtype=np.bool_)
+    for place in found.suspects:
+        suspect[place] = True
+    columns: dict[str, Any] = {
+        "id": Words(measurements.end_names, np.repeat(found.configurations + 1, k)),
+        "joint": Words(found.names, np.tile(np.arange(k), n)),
+        "reading": found.reading.ravel(),
+        "estimate": (found.reading + found.error).ravel(),
+        "error": found.error.ravel(),
+        "sigma": np.tile(found.sigma, n),
+        "error_over_sigma": (found.error / found.sigma).ravel(),
+        "studentised": found.studentised.ravel(),
+        "suspect": suspect.ravel(),
+    }
+    write_csv_parts(path, [columns])
 
 
 def _plain(value: Any) -> Any:

@@ -31,6 +31,7 @@ from fg_calib.errors import SolverError
 from fg_calib.factors import Variables, eliminate
 from fg_calib.observability import determined
 from fg_calib.problem import Problem, check_graph, frames_only, joint_errors, judged_at, lengths, same_rows
+from fg_calib.residuals import squared_norm
 from fg_calib.robust import Weighting
 from fg_calib.threads import one_blas_thread
 from fg_calib.whitening import Adjustment
@@ -166,6 +167,8 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
             found = _fit(frames, replace(options, decrement=max(options.decrement, COARSE))).parameters
             before = np.concatenate([found, problem.start[len(found) :]])
             problem = judged_at(problem, before)
+        if not problem.variables.keys:
+            return _taken_as_it_is(problem, clock)
         run = _fit(problem, options)
         return _solution(run, before, run.initial_cost, clock)
 
@@ -203,6 +206,7 @@ def _solution(run: _Run, before: Floats, initial_cost: float, clock: float) -> S
     if weights is not None:
         stated = judged_at(run.problem, run.parameters, replace(run.problem.adjustment, weights=None))
         cost = stated.graph.error(run.here.values)
+    constant = _constant_cost(run.problem)
     return Solution(
         problem=run.problem,
         values=run.here.values,
@@ -211,9 +215,39 @@ def _solution(run: _Run, before: Floats, initial_cost: float, clock: float) -> S
         converged=run.converged,
         message=run.message,
         history=tuple(run.history),
-        initial_cost=initial_cost,
+        initial_cost=initial_cost + constant,
+        cost=cost + constant,
+        weighted_cost=run.here.cost + constant,
+        seconds=time.perf_counter() - clock,
+    )
+
+
+def _constant_cost(problem: Problem) -> float:
+    """Cost of the rows that depend on no variable: all blocks, where no arm, base, tool or frame is fitted."""
+    if problem.variables.items:
+        return 0.0
+    chain = problem.variables.chain.at(problem.start)
+    return 0.5 * sum(squared_norm(block, chain) for block in problem.blocks)
+
+
+def _taken_as_it_is(problem: Problem, clock: float) -> Solution:
+    """The "solution" of an evaluation that has nothing to fit; robust weights are those of the rows as they are."""
+    weighted, final, weighting = problem, problem.settings.loss == "none", Weighting(problem.settings.loss)
+    while not final:
+        adjustment, final = _learn(problem, problem.start, weighting)
+        weighted = judged_at(problem, problem.start, adjustment)
+    cost = _constant_cost(problem)
+    return Solution(
+        problem=weighted,
+        values=problem.initial,
+        parameters=problem.start,
+        before=problem.start,
+        converged=True,
+        message="nothing to fit",
+        history=(),
+        initial_cost=cost,
         cost=cost,
-        weighted_cost=run.here.cost,
+        weighted_cost=_constant_cost(weighted),
         seconds=time.perf_counter() - clock,
     )
 

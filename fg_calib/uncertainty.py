@@ -11,11 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 from scipy.spatial.transform import Rotation
 
+from fg_calib.accuracy import ExpectedError, expected_error, without_rigid_motion
 from fg_calib.conventions import MissingMotion
+from fg_calib.corrections import PriorFit, judge_priors
 from fg_calib.covariance import Spread, spread_of, with_left_out
 from fg_calib.factors import corrections_of, pose_of
 from fg_calib.goodness import OUTLIER_WEIGHT, Goodness, judge_fit
 from fg_calib.identifiability import Identifiability, identify
+from fg_calib.joint_values import JointValues, joint_values
 from fg_calib.mistakes import SetupCheck, check_problem
 from fg_calib.observability import IdentifiabilityClass, Observability
 from fg_calib.problem import PAIR_KINDS, Problem, check_graph, eliminated_terms, lengths
@@ -25,13 +28,11 @@ from fg_calib.robust import effect
 from fg_calib.solver import Solution
 from fg_calib.structure import probability_of_noise
 from fg_calib.threads import one_blas_thread, single_threaded
+from fg_calib.verdict import Statement, chi2_bounds, of_chi2, of_evaluation, of_priors, of_test
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
 Integers = NDArray[np.int64]
-
-CONFIDENCE = 0.999
-"""A reduced chi-square outside this interval of its distribution, and outside `FACTOR`, is not to be trusted."""
 
 MOST_OUTLIERS = 0.5
 """Share of measurements beyond which they are not outliers but the majority."""
@@ -47,9 +48,6 @@ MOST_ESTIMATED = 2.0
 
 LIKE_NOISE = 1e-3
 """Probability below which residuals follow the arm more than noise does."""
-
-FACTOR = 2.0
-"""A reduced chi-square between 1 / FACTOR and FACTOR is good whatever its distribution: noise is never known better."""
 
 
 @dataclass(frozen=True)
@@ -148,16 +146,19 @@ class Uncertainty:
         p_value: Probability of a chi-square as large, were the noise as stated; None where that is not known.
         residuals: Every residual, before and after.
         goodness: Goodness of fit by kind, by row and by configuration.
+        priors: Corrections against tolerances; None without priors.
+        expected_error: Of the tool, by the covariance; None where the arm was evaluated as it is.
         identifiability: What the data alone determine, at the nominal parameters.
         robot: The calibrated robot.
         spread: The covariance in the tangent space of the variables that were estimated, the others taken as known.
         whole: The same of all parameters, those left out to fix the gauge among them, behind `predict`.
         findings: Why the result is not to be trusted; empty if it is.
-        cautions: Where its sigmas may be somewhat too small although nothing speaks against it.
+        cautions: What its reader should know although nothing speaks against it, such as sigmas somewhat too small.
         points: The points that groups of configurations touched.
         setup: What residuals before the calibration say of its set-up.
         noise_like: Probability that noise alone follows the arm as much as the residuals do; None where that was not
             asked, because they are as small as stated, or cannot be told.
+        joint_values: Estimated joint values beside their readings; None where these were not estimated.
     """
 
     names: tuple[str, ...]
@@ -171,6 +172,8 @@ class Uncertainty:
     p_value: float | None
     residuals: ResidualTable
     goodness: Goodness
+    priors: PriorFit | None
+    expected_error: ExpectedError | None
     identifiability: Identifiability
     robot: Robot
     spread: Spread
@@ -180,22 +183,29 @@ class Uncertainty:
     points: tuple[PointEstimate, ...] = ()
     setup: SetupCheck = field(default_factory=SetupCheck)
     noise_like: float | None = None
+    joint_values: JointValues | None = None
 
     @single_threaded
-    def predict(self, function: Callable[[Robot], ArrayLike]) -> Prediction:
+    def predict(self, function: Callable[[Robot], ArrayLike], *, fitted: bool = False) -> Prediction:
         """Value and sigma of any function of the robot: a tool position, a distance, a sum of parameters.
 
         It may be determined although the parameters it depends on are not; where it is not, its sigma is nan.
 
         Args:
             function: From a robot to a number or an array; smooth, for it is differentiated by central differences.
+            fitted: Whether sigmas are those of points after the rotation and shift that bring them nearest to the true
+                ones, which the base has no part in; the function's values are points, shape (n, 3).
 
         Note:
             Parameters that were left out to fix the gauge (`keep`) count with their tolerance: what depends on one
             without is unknown.
         """
         value = np.atleast_1d(np.asarray(function(self.robot), dtype=np.float64)).ravel()
-        covariance = self.whole.covariance(self.whole.derivative(function))
+        G = self.whole.derivative(function)
+        if fitted:
+            points = value.reshape(-1, 3)
+            G = without_rigid_motion(points, G.reshape(*points.shape, -1))[0].reshape(G.shape)
+        covariance = self.whole.covariance(G)
         return Prediction(value, np.sqrt(np.diag(covariance)), covariance)
 
     @property
@@ -209,6 +219,7 @@ class Uncertainty:
         too_large = [fit for fit in self.goodness.kinds if fit.verdict in ("too small", "both")]
         return (
             not self.points
+            and not self.residuals.evaluated
             and not self.setup.explanations
             and not (too_large and self.identifiability.missing)
             and all(fit.typical <= MOST_ESTIMATED for fit in too_large)
@@ -267,15 +278,26 @@ def _assess(solution: Solution) -> Uncertainty:
     expected = max(0.0, dof - spread.excess - (1.0 - loss_factor) * n_rows)
     independent = _independent_dof(problem, dof, spread.rank)
     bounds = chi2_bounds(dof, expected, independent)
+    p_value = _p_value(solution, chi2, expected, independent)
     table = residual_table(solution)
-    goodness = judge_fit(solution, spread, table)
-    doubts = _findings(solution, chi2, dof, bounds)
-    estimated = max((fit.factor for fit in goodness.kinds), default=1.0) > MOST_ESTIMATED
-    setup = check_problem(problem, solution.before, doubtful=bool(doubts) or estimated)
+    goodness, priors = judge_fit(solution, spread, table), judge_priors(solution, spread)
+    evaluated = problem.settings.evaluated
+    statements = [
+        *_of_solver(solution),
+        *of_chi2(chi2, dof, expected, bounds, p_value, evaluated),
+        *of_evaluation(evaluated, solution.estimated_noise is not None),
+        *of_test(goodness.test, chi2 / expected if expected > 0.0 else 1.0, problem.measurements.end_names),
+        *of_priors(priors),
+    ]
+    doubts = tuple(s.text for s in statements if s.finding)
     too_large = {fit.verdict for fit in goodness.kinds} & {"too small", "both"}
-    asked = too_large or (identified.missing and solution.estimated_noise)
+    asked = not evaluated and (too_large or (identified.missing and solution.estimated_noise))
     noise_like = probability_of_noise(solution) if asked else None
     follow = noise_like is not None and noise_like < LIKE_NOISE
+    estimated = max((fit.factor for fit in goodness.kinds), default=1.0) > MOST_ESTIMATED
+    setup = SetupCheck()
+    if not evaluated:
+        setup = check_problem(problem, solution.before, doubtful=bool(doubts) or estimated)
     fits = not doubts and solution.estimated_noise is None
     findings, cautions = _of_model(setup, identified.missing, fits=fits, high=chi2 > bounds[1] * dof or follow)
     return Uncertainty(
@@ -287,35 +309,22 @@ def _assess(solution: Solution) -> Uncertainty:
         dof=dof,
         expected_chi2=expected,
         chi2_bounds=bounds,
-        p_value=_p_value(solution, chi2, expected, independent),
+        p_value=p_value,
         residuals=table,
         goodness=goodness,
+        priors=priors,
+        expected_error=None if evaluated else expected_error(solution, whole),
         identifiability=identified,
         robot=problem.robot.with_values(solution.parameters[variables.robot_span]),
         spread=spread,
         whole=whole,
         findings=(*findings, *doubts),
-        cautions=(*cautions, *_cautions(problem)),
+        cautions=(*cautions, *(s.text for s in statements if not s.finding), *_cautions(problem)),
         points=_point_estimates(solution, whole),
+        joint_values=joint_values(solution, spread),
         setup=setup,
         noise_like=noise_like,
     )
-
-
-def chi2_bounds(dof: int, expected: float | None = None, independent: int | None = None) -> tuple[float, float]:
-    """Interval of the reduced chi-square taken as good: its central `CONFIDENCE`, widened to `FACTOR` either way.
-
-    Args:
-        dof: Degrees of freedom that chi-square is divided by.
-        expected: Mean of chi-square; `dof` if None.
-        independent: Degrees of freedom of the noise behind it; `dof` if None.
-    """
-    if dof <= 0:
-        return 0.0, np.inf
-    k = max(1, min(dof, independent or dof))
-    ratio = 1.0 if expected is None else expected / dof
-    low, high = (2.0 * special.gammaincinv(k / 2.0, p) / k for p in ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))
-    return ratio * min(float(low), 1.0 / FACTOR), max(1.0, ratio) * max(float(high), FACTOR)
 
 
 def _weighted_chi2(solution: Solution) -> tuple[float, int, float]:
@@ -403,25 +412,21 @@ def _cautions(problem: Problem) -> tuple[str, ...]:
     return ()
 
 
-def _findings(solution: Solution, chi2: float, dof: int, bounds: tuple[float, float]) -> tuple[str, ...]:
-    findings = []
+def _of_solver(solution: Solution) -> list[Statement]:
+    """Whether it arrived, and whether a robust loss left enough."""
+    statements = []
     if not solution.converged:
-        findings.append(solution.message)
-    findings += _other_optima(solution)
+        statements.append(Statement(solution.message, finding=True))
+    statements += [Statement(text, finding=True) for text in _other_optima(solution)]
     weights = solution.problem.adjustment.weights
     if weights is not None:
         _, height = lengths(solution.problem, solution.parameters)
         n, lost = int(np.sum(height > 0)), int(np.sum(weights[height > 0] < OUTLIER_WEIGHT))
         if lost > MOST_OUTLIERS * n:
             loss = solution.problem.settings.loss
-            findings.append(
-                f"loss {loss} takes {lost} of {n} measurements for outliers: more than it can tell from noise"
-            )
-    if dof > 0 and not bounds[0] <= chi2 / dof <= bounds[1]:
-        high = chi2 / dof > 1.0
-        cause = "noise stated too small, effects not modelled, or outliers" if high else "noise stated too large"
-        findings.append(f"reduced chi-square {chi2 / dof:.3g} is outside [{bounds[0]:.2f}, {bounds[1]:.2f}]: {cause}")
-    return tuple(findings)
+            text = f"loss {loss} takes {lost} of {n} measurements for outliers: more than it can tell from noise"
+            statements.append(Statement(text, finding=True))
+    return statements
 
 
 def _of_model(

@@ -1,9 +1,12 @@
 """Robots and simulated measurements that several test files use."""
 
 import numpy as np
+import yaml
 from oracle import random_robot
 from scipy.spatial.transform import Rotation
 
+from fg_calib.files.robot_yaml import write_robot
+from fg_calib.files.tables import write_csv
 from fg_calib.kinematics import pose
 from fg_calib.measurements import Measurements
 from fg_calib.robot import Joint, Robot, RobotBuilder
@@ -82,3 +85,27 @@ def measure(
         sigma_orientation=np.full((total, 3), sigma[1]),
         sigma_joint=np.full(true.n_joints, sigma_joint),
     )
+
+
+def write_job(folder, robot: Robot, m: Measurements, **job):
+    """Robot, poses, pairs between groups and a job in SI as files; the path of the job."""
+    columns = {"id": m.ids} | {f"q{i + 1}": q for i, q in enumerate(m.readings.T)}
+    if m.position is not None:
+        columns |= dict(zip("xyz", m.position.T, strict=True))
+    if m.rotation is not None:
+        quaternion = Rotation.from_matrix(m.rotation).as_quat()
+        columns |= dict(zip(("qx", "qy", "qz", "qw"), quaternion.T, strict=True))
+    if m.groups is not None:
+        columns["group"] = np.array(["", *m.groups.names])[m.groups.index + 1]
+        pairs = m.groups.pairs
+        ends = {end: np.array(m.groups.names)[getattr(pairs, end)] for end in "ab"}
+        write_csv(folder / "pairs.csv", ends | {"distance": pairs.distance, "sigma_distance": pairs.sigma_distance})
+        job |= {"pairs": "pairs.csv"}
+    write_csv(folder / "poses.csv", columns | {"split": np.where(m.test, "test", "train")})
+    write_robot(folder / "robot.yaml", robot)
+    stated = {"position": m.sigma_position, "orientation": m.sigma_orientation, "point": m.sigma_point}
+    noise = {kind: float(np.max(sigma)) for kind, sigma in stated.items() if sigma is not None}
+    noise |= {"joint": float(m.sigma_joint[0])} if m.sigma_joint[0] else {}
+    given = {"robot": "robot.yaml", "measurements": "poses.csv", "noise": noise} | job
+    (folder / "calibration.yaml").write_text(yaml.safe_dump(given))
+    return folder / "calibration.yaml"

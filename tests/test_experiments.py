@@ -170,7 +170,7 @@ def test_panda_groups_are_all_their_pairs_and_alone_have_a_chi_square(panda_run)
         assert groups["rms"]["test"][kind]["after"] == pytest.approx(every["rms"]["test"][kind]["after"], rel=0.03)
     assert groups["trustworthy"]
     assert groups["reduced_chi2"] == pytest.approx(1.0, abs=0.2)
-    assert not every["trustworthy"]
+    assert every["reduced_chi2"] < 0.5
 
 
 @needs_panda

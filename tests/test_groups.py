@@ -560,13 +560,6 @@ def test_a_distance_between_groups_needs_a_sigma():
     assert str(error.value) == "pairs.csv: no sigma for distance, expected noise.distance or a column sigma_distance"
 
 
-def test_touches_of_test_groups_alone_are_nothing_to_fit():
-    robot, _, _, m = case(distances=(), test=(0, 1, 2, 3))
-    with pytest.raises(ProblemError) as error:
-        build(robot, m)
-    assert str(error.value) == "poses.csv: no touch left to fit, expected train rows"
-
-
 def write_job(folder, seed=0, **job):
     """The small arm's case as files."""
     robot, _, _, m = case(seed, distances=((0, 1, 1e-4), (0, 3, 1e-4)), test=(3,))

@@ -78,6 +78,7 @@ def report(robot, measurements, **settings):
 GOLDEN = """\
 two-links: position
 GOOD: converged: less than 3e-07 sigma from the optimum
+test rows: chi-square 1.849 where 6 is expected (p-value 0.93)
 
 Fit statistics
 configurations     6
@@ -91,6 +92,15 @@ Goodness of fit (1 sigma of a row)
             stated   seen ratio p-value
 position mm 1.0000 0.8452 0.845    0.78 as stated
   no row (|studentised residual| above 3.53) and no configuration is suspicious
+
+Prediction of the test rows
+         rows chi-square expected ratio p-value
+position    6      2.012        6 0.579    0.92 as expected
+
+Expected tool error (RMS at 2 test configurations)
+                in the base frame after the best rigid fit
+position    mm             0.6327                   0.4147
+orientation deg           0.00000                  0.00067
 
 Residuals (RMS)
             train before  after test before  after
@@ -140,7 +150,7 @@ def sections(text):
 def test_the_report_of_two_links_is_this_text():
     found = sections(report(planar_arm({"d2": 0.001}), planar_measurements(), model="position"))
     expected = sections(GOLDEN)
-    assert list(found)[:5] == list(expected)
+    assert list(found)[: len(expected)] == list(expected)
     assert {heading: found[heading] for heading in expected} == expected
 
 
@@ -160,6 +170,14 @@ def test_its_figures_are_those_of_linear_least_squares_by_hand():
     leverage = np.sum(J @ np.linalg.inv(J.T @ J) * J) + 6 / 7  # of d2, six times
     seen = np.sqrt(left.item() / (18 - leverage))
     assert f"position mm 1.0000 {seen:.4f} {seen:.3f} " in GOLDEN
+    test = m.readings[6:]
+    ahead = np.array([[f(q[0]), f(q.sum())] for q in test for f in (np.cos, np.sin)])  # of x and y, (4, 2)
+    predicted = ahead @ lengths - 1e3 * m.position[6:, :2].ravel()
+    of_estimate = ahead @ np.linalg.inv(J.T @ J) @ ahead.T
+    # z is 0 where it was measured, and off by d2, which makes both of its rows 0.
+    assert f"chi-square {predicted @ np.linalg.solve(np.eye(4) + of_estimate, predicted):.4g} where 6 is" in GOLDEN
+    assert f"position    6 {np.sum(predicted**2 / (1 + np.diag(of_estimate))):10.4g} " in GOLDEN
+    assert f"position    mm             {np.sqrt(np.trace(of_estimate) / 2 + 1 / 7):.4f} " in GOLDEN
     assert f"3.3943 {np.sqrt(left.item() / 6):.4f} " in GOLDEN
 
 
