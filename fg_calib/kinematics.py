@@ -245,7 +245,7 @@ def forward(chain: Chain, trig: Floats, rows: Integers | None = None) -> Poses:
     return Poses(rotation, position, jacobian)
 
 
-LEAST_TURNING = 0.01
+LEAST_TURNING = 1e-4
 """Mean square of sin(half the angle) of rotations, times two, above which they tell base from tool."""
 
 

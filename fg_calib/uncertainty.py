@@ -21,14 +21,14 @@ from fg_calib.identifiability import Identifiability, identify
 from fg_calib.joint_values import JointValues, joint_values
 from fg_calib.mistakes import SetupCheck, check_problem
 from fg_calib.observability import IdentifiabilityClass, Observability
-from fg_calib.problem import PAIR_KINDS, Problem, check_graph, eliminated_terms, lengths
+from fg_calib.problem import PAIR_KINDS, Problem, check_graph, eliminated_terms, lengths, pair_rows
 from fg_calib.residual_table import ResidualTable, residual_table
 from fg_calib.robot import Robot
 from fg_calib.robust import effect
 from fg_calib.solver import Solution
 from fg_calib.structure import probability_of_noise
 from fg_calib.threads import one_blas_thread, single_threaded
-from fg_calib.verdict import Statement, chi2_bounds, of_chi2, of_evaluation, of_priors, of_test
+from fg_calib.verdict import Statement, chi2_bounds, of_bent, of_chi2, of_evaluation, of_priors, of_test
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -37,11 +37,8 @@ Integers = NDArray[np.int64]
 MOST_OUTLIERS = 0.5
 """Share of measurements beyond which they are not outliers but the majority."""
 
-BENDING = 2.0
-"""Bending of an angle by what the parameters may be off, in its sigma, beyond which its row is not linear enough."""
-
-MANY_NEAR_KINKS = 0.1
-"""Share of measured rows near a kink beyond which noise is large for the motions that were measured."""
+BENT = 0.5
+"""Sigma by which what the parameters may still be off bends a row that is not linear enough."""
 
 MOST_ESTIMATED = 2.0
 """Noise seen over noise stated above which it is more likely that something is not modelled."""
@@ -288,6 +285,7 @@ def _assess(solution: Solution) -> Uncertainty:
         *of_evaluation(evaluated, solution.estimated_noise is not None),
         *of_test(goodness.test, chi2 / expected if expected > 0.0 else 1.0, problem.measurements.end_names),
         *of_priors(priors),
+        *_of_bent_rows(solution, spread, table, goodness),
     ]
     doubts = tuple(s.text for s in statements if s.finding)
     too_large = {fit.verdict for fit in goodness.kinds} & {"too small", "both"}
@@ -319,7 +317,7 @@ def _assess(solution: Solution) -> Uncertainty:
         spread=spread,
         whole=whole,
         findings=(*findings, *doubts),
-        cautions=(*cautions, *(s.text for s in statements if not s.finding), *_cautions(problem)),
+        cautions=(*cautions, *(s.text for s in statements if not s.finding)),
         points=_point_estimates(solution, whole),
         joint_values=joint_values(solution, spread),
         setup=setup,
@@ -407,9 +405,16 @@ def _known(sigma: float) -> float | None:
     return float(sigma) if np.isfinite(sigma) else None
 
 
-def _cautions(problem: Problem) -> tuple[str, ...]:
-    """Where the linear covariance may claim too much."""
-    return ()
+def _of_bent_rows(solution: Solution, spread: Spread, table: ResidualTable, goodness: Goodness) -> list[Statement]:
+    """Whether the result rests on lengths and angles that are far from linear in what is still unknown."""
+    problem = solution.problem
+    if problem.pairs is None:
+        return []
+    values, V = np.linalg.eigh(spread.tangent)
+    bent = pair_rows(problem, solution.parameters).bent_by(V * np.sqrt(np.maximum(values, 0.0)), BENT)
+    rows = np.flatnonzero(table.used & (table.measurement < problem.pairs.n_pairs))
+    those = rows[bent[table.measurement[rows], table.family[rows]]]
+    return of_bent(len(those), len(rows), float(np.nansum(goodness.leverage[those])))
 
 
 def _of_solver(solution: Solution) -> list[Statement]:

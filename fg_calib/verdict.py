@@ -29,6 +29,9 @@ WORTH_SAYING = 1.1
 CERTAIN = 1e-4
 """Probability below which corrections are too large together: tolerances are guesses, more than noise is."""
 
+LEAST_REST, LEAST_SHARE = 0.3, 0.01
+"""Directions that rest on rows far from linear, and share of such rows, below which sigmas are honest."""
+
 _NAMED = 3
 """Configurations or parameters that a statement names."""
 
@@ -154,6 +157,23 @@ def of_priors(fit: PriorFit | None) -> list[Statement]:
         text = f"{what} {fit.chi2:.3g} where {fit.expected:.3g} is expected): {causes}"
         statements.append(Statement(text, fit.chi2 > FACTOR * fit.expected and fit.p_value < CERTAIN))
     return statements
+
+
+def of_bent(n: int, n_rows: int, directions: float) -> list[Statement]:
+    """What it means that rows are not linear in what the parameters may still be off.
+
+    Args:
+        n: How many there are.
+        n_rows: Of so many rows.
+        directions: Sum of their leverage: how many directions of the parameters rest on them.
+    """
+    if directions < LEAST_REST and n < LEAST_SHARE * max(n_rows, 1):
+        return []
+    text = (
+        f"{n} of {n_rows} lengths and angles are small and bent by what the parameters may still be off:"
+        " sigmas of these may be 10 % too small, or there is a second optimum"
+    )
+    return [Statement(text, finding=False)]
 
 
 def chi2_in_words(chi2: float, expected: float, p_value: float) -> str:

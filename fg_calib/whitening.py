@@ -410,9 +410,12 @@ class PairWhitening:
         return np.where(across >= least, across, 0.0)
 
     def _straight(self) -> Floats:
-        """Variance across that bends a row by one sigma, shape (n_pairs, 2); infinite where there is none to bend."""
-        one = self._predicted * np.sqrt(self._own)
-        return np.where((self._own > 0.0) & self._kinds, one, np.inf)
+        """Variance across that bends a row by one sigma, shape (n_pairs, 2); infinite where there is none to bend.
+
+        Nearer to 0 than one sigma it is that of the noise itself.
+        """
+        sigma = np.sqrt(self._own)
+        return np.where((self._own > 0.0) & self._kinds, sigma * np.maximum(self._predicted, sigma), np.inf)
 
     def _spread_across(self, rows: Integers, spread: Floats) -> Floats:
         """What `_bending` is about at `rows`, shape (n, 2).

@@ -275,8 +275,10 @@ def test_what_moves_arm_and_points_as_one_body_stays_where_it_is(distances):
     start[problem.variables.nuisance_span] += 0.01 * np.random.default_rng(4).normal(size=12)
     again = solve(replace(problem, start=start))
     span = problem.variables.robot_span
-    known = [p.sigma is not None for p in uncertainty.parameters]
-    assert again.parameters[span][known] == pytest.approx(solution.parameters[span][known], abs=1e-7)
+    apart = [
+        abs(again.parameters[span][i] - p.estimate) / p.sigma for i, p in enumerate(uncertainty.parameters) if p.sigma
+    ]
+    assert max(apart) < 1e-3  # sigma; 1e-6 are left to go along each path, which turned derivatives make another
     for name in RIGID:
         assert abs(again.parameters[robot.index(name)] - robot.nominal[robot.index(name)]) < rounding(1, 1e4)
     assert len(points) == 4
