@@ -15,6 +15,9 @@ each cell:
 - RMSE of these tool positions over the Cramér-Rao bound with priors, at most 1.05;
 - chi-square against its distribution by Kolmogorov and Smirnov: p at least 0.01 over the number of cells.
 
+Beyond these: chains of steps of 4 to 40 sigma; stars of poses and direct pairs whose distances and angles lie 2 to 10
+sigma from 0, and angles as near to half a turn; and the gauges `keep` and `none`, where what is not known is not asked.
+
 Then where it breaks: the same with tolerances ten times as wide and noise of 1 to 100 times, for poses, for a star and
 for a star of small motions, whose angles and distances come near 0.
 """
@@ -48,7 +51,7 @@ import fg_calib
 from fg_calib import residuals
 from fg_calib.factors import prior_rows
 from fg_calib.kinematics import pose
-from fg_calib.measurements import Measurements, Pairs, rotation_angle
+from fg_calib.measurements import Measurements, Pairing, Pairs, rotation_angle
 from fg_calib.problem import Problem, all_rows, judged_at, predicted_problem, whitened_triangle
 
 Floats = NDArray[np.float64]
@@ -61,11 +64,23 @@ WAYS: dict[str, dict[str, Any]] = {
     "pose, frame unknown": {"model": "pose", "frame": "unknown"},
     "star of poses": {"model": "distance-rotation"},
     "direct pairs": {"model": "distance-rotation"},
+    "distances, chain": {"model": "distance", "pairing": Pairing("chain")},
+    "angles, chain": {"model": "rotation", "pairing": Pairing("chain")},
+    "distances, star": {"model": "distance"},
+    "angles, star": {"model": "rotation"},
+    "distances, direct": {"model": "distance"},
+    "angles, direct": {"model": "rotation"},
+    "pose, keep": {"model": "pose", "gauge": "keep"},
+    "star, keep": {"model": "distance-rotation", "gauge": "keep"},
+    "pose, none": {"model": "pose", "gauge": "none"},
+    "star, none": {"model": "distance-rotation", "gauge": "none"},
 }
 N_CONFIGURATIONS = 40
 N_PAIRS = 60
 N_VALIDATION = 8
 N_COMBINATIONS = 12
+N_STEPS = 150
+N_NEAR = 120
 EVERY = 5
 """The bound is computed at every so many-th truth; it hardly differs between them."""
 
@@ -90,6 +105,8 @@ class Cell:
         noise: Multiple of the arm's noise, its encoders' left out.
         tolerance: Multiple of the arm's tolerances.
         small: Whether the configurations are near the first.
+        where: Near what lengths and angles lie: `0` or `pi`; `steps` of a path; or empty for anywhere.
+        ratio: How many sigma from there, or from one configuration to the next.
     """
 
     arm: str
@@ -98,9 +115,24 @@ class Cell:
     noise: float = 1.0
     tolerance: float = 1.0
     small: bool = False
+    where: str = ""
+    ratio: float = 0.0
 
 
 CELLS = [Cell(arm, way, encoder) for arm in ("space robot", "UR10", "SCARA") for way in WAYS for encoder in (0, 1)]
+CHAINS = [
+    Cell("UR10", way, noise=10.0, where="steps", ratio=ratio)
+    for way in ("distances, chain", "angles, chain")
+    for ratio in (4.0, 10.0, 20.0, 40.0)
+]
+KINKS = [
+    Cell("UR10", f"{what}, {how}", noise=40.0, tolerance=WIDE, where=where, ratio=ratio)
+    for what, where in (("distances", "0"), ("angles", "0"), ("angles", "pi"))
+    for how in ("star", "direct")
+    for ratio in (2.0, 4.0, 6.0, 10.0)
+]
+GAUGES = [Cell(arm, f"{what}, {gauge}") for arm in ("space robot", "UR10") for gauge in ("keep", "none")
+          for what in ("pose", "star")]  # fmt: skip
 BREAKING = {
     "poses, frame known": [Cell("UR10", "pose, frame known", noise=n, tolerance=WIDE) for n in NOISE],
     "star": [Cell("UR10", "star of poses", noise=n, tolerance=WIDE) for n in NOISE],
@@ -129,8 +161,14 @@ def setting_of(cell: Cell, seed: int) -> Setting:
     readings, validation = arm.readings(N_CONFIGURATIONS, rng), arm.readings(N_VALIDATION, rng)
     if cell.small:
         readings = readings[0] + rng.uniform(-SMALL, SMALL, readings.shape)
+    if cell.where == "steps":
+        readings = steps(arm, cell)
+    elif cell.where:
+        readings = near_kink(arm, cell)
     a, b = np.triu_indices(N_CONFIGURATIONS, 1)
     chosen = rng.permutation(len(a))[:N_PAIRS]
+    if cell.where:
+        a, b, chosen = np.zeros(len(readings) - 1, dtype=int), np.arange(1, len(readings)), np.arange(len(readings) - 1)
     sigma_joint = arm.sigma_joint * cell.encoder
     return Setting(
         arm,
@@ -140,6 +178,48 @@ def setting_of(cell: Cell, seed: int) -> Setting:
         rng.normal(size=(N_COMBINATIONS, sum(p.estimated for p in arm.robot.parameters))),
         sigma_joint,
     )
+
+
+def moved(arm: Arm, cell: Cell, first: Floats, readings: Floats) -> Floats:
+    """How far the tool moved or turned from one configuration to others, in sigma of what is measured."""
+    a, b = pose(arm.robot, first[None]), pose(arm.robot, readings)
+    if cell.way.startswith("distances"):
+        return np.linalg.norm(b.position - a.position, axis=1) / (np.sqrt(2.0) * arm.sigma[0])
+    return rotation_angle(np.swapaxes(a.rotation, 1, 2) @ b.rotation)[0] / (np.sqrt(2.0) * arm.sigma[1])
+
+
+def steps(arm: Arm, cell: Cell) -> Floats:
+    """Configurations along a smooth path, one each time the tool has moved or turned by so many sigma."""
+    rng = np.random.default_rng(0)
+    lower, upper = 0.8 * np.clip(arm.robot.limits, -np.pi, np.pi).T
+    waves, phases = rng.normal(size=(3, len(lower))), rng.uniform(0.0, 6.0, (3, len(lower)))
+    unit = arm.sigma[0] if cell.way.startswith("distances") else arm.sigma[1]
+    time_ = np.arange(4000)[:, None, None] * 0.05 * np.sqrt(2.0) * unit * cell.ratio
+    way = np.sum(waves * np.sin(np.array([1.0, 1.7, 2.3])[:, None] * time_ + phases), axis=1)
+    path = 0.5 * (lower + upper) + 0.125 * (upper - lower) * way
+    chosen = [0]
+    while len(chosen) < N_STEPS:
+        rest = np.arange(chosen[-1] + 1, min(chosen[-1] + 400, len(path)))
+        far = rest[moved(arm, cell, path[chosen[-1]], path[rest]) > cell.ratio]
+        if not len(far):
+            break
+        chosen.append(int(far[0]))
+    return path[chosen]
+
+
+def near_kink(arm: Arm, cell: Cell) -> Floats:
+    """A configuration, and others that are the cell's number of sigma, give or take one, from 0 or pi against it."""
+    rng = np.random.default_rng(0)
+    first = arm.readings(1, rng)[0]
+    distances, (sigma_p, sigma_r) = cell.way.startswith("distances"), arm.sigma
+    found = first[None]
+    while len(found) < N_NEAR:
+        aside = rng.normal(size=(4000, len(first))) * (cell.ratio + 1.0) * (sigma_p if distances else 0.5 * sigma_r)
+        readings = arm.readings(4000, rng) if cell.where == "pi" else first + aside
+        sigmas = moved(arm, cell, first, readings)
+        sigmas = np.pi / (np.sqrt(2.0) * sigma_r) - sigmas if cell.where == "pi" else sigmas
+        found = np.concatenate([found, readings[np.abs(sigmas - cell.ratio) < 1.0]])
+    return found[:N_NEAR]
 
 
 def measure(cell: Cell, setting: Setting, true: fg_calib.Robot, rng: np.random.Generator) -> Measurements:
@@ -157,8 +237,10 @@ def measure(cell: Cell, setting: Setting, true: fg_calib.Robot, rng: np.random.G
         "sigma_orientation": np.full((n, 3), sigma_r),
         "sigma_joint": s.sigma_joint,
     }
-    if cell.way == "direct pairs":
+    if "direct" in cell.way:
         a, b = s.pairs
+        if cell.where:
+            sigma_p, sigma_r = np.sqrt(2.0) * sigma_p, np.sqrt(2.0) * sigma_r
         distance = np.linalg.norm(at.position[b] - at.position[a], axis=1) + sigma_p * rng.normal(size=len(a))
         angle = rotation_angle(np.swapaxes(at.rotation[a], 1, 2) @ at.rotation[b])[0] + sigma_r * rng.normal(
             size=len(a)
@@ -193,26 +275,30 @@ def one_draw(cell: Cell, setting: Setting, seed: int, draw: int) -> dict[str, An
     columns = [robot.index(name) for name in found.names]
     error = found.robot.nominal[columns] - true.nominal[columns]
     C = found.covariance
-    scales = np.array([robot.parameters[i].scale for i in columns])
-    null = found.observability.null_space * scales
-    null = np.linalg.qr(null.T)[0].T if len(null) else null
+    known = np.isfinite(np.diag(C))
+    scales = np.array([robot.scale_of(robot.parameters[i].unit) for i in columns])
+    null = found.observability.null_space
     kept = (setting.combinations - setting.combinations @ null.T @ null) / scales
 
     def tool(r: fg_calib.Robot) -> Floats:
         return pose(r, setting.validation).position
 
     off = (tool(found.robot) - tool(true)).ravel()
-    rows = np.zeros((len(off), len(found.spread.tangent)))
+    rows = np.zeros((len(off), len(found.whole.tangent)))
     rows[:, : len(error)] = tool_derivative(setting, found.robot)
-    sigma = np.sqrt(np.diag(found.spread.covariance(rows)))
+    sigma = np.sqrt(np.diag(found.whole.covariance(rows)))
+    combined = np.zeros((len(kept), len(found.whole.tangent)))
+    combined[:, : len(error)] = kept
+    sigma_kept = np.sqrt(np.diag(found.whole.covariance(combined)))
+    told = np.isfinite(sigma)
     if draw % EVERY == 0:  # `predict` takes central differences, which costs as much as the fit: it says the same
         np.testing.assert_allclose(found.predict(tool).sigma, sigma, rtol=1e-4)
     out = {
-        "nees": float(error @ np.linalg.solve(C, error)),
-        "n": len(error),
-        "parameters": float(np.mean(np.abs(error) < Z * np.sqrt(np.diag(C)))),
-        "kept": float(np.mean(np.abs(kept @ error) < Z * np.sqrt(np.einsum("ij,jk,ik->i", kept, C, kept)))),
-        "tool": float(np.mean(np.abs(off) < Z * sigma)),
+        "nees": float(error[known] @ np.linalg.solve(C[np.ix_(known, known)], error[known])),
+        "n": int(known.sum()),
+        "parameters": float(np.mean(np.abs(error[known]) < Z * np.sqrt(np.diag(C)[known]))),
+        "kept": float(np.mean(np.abs(kept @ error) < Z * sigma_kept)),
+        "tool": float(np.mean(np.abs(off[told]) < Z * sigma[told])) if told.any() else np.nan,
         "squared": float(np.mean(off**2)),
         "chi2": found.chi2,
         "dof": found.dof,
@@ -222,7 +308,7 @@ def one_draw(cell: Cell, setting: Setting, seed: int, draw: int) -> dict[str, An
         "excluded": sum(solution.problem.n_excluded.values()),
         "residuals": solution.problem.n_residuals,
     }
-    if draw % EVERY == 0:
+    if draw % EVERY == 0 and solution.problem.settings.prior:
         at_truth = solution.parameters.copy()
         at_truth[solution.problem.variables.robot_span] = true.nominal
         out["bound"] = bound_of_tool(problem, at_truth, setting, true)
@@ -272,7 +358,7 @@ def run_cells(cells: Sequence[Cell], n_draws: int, seed: int, pool: ProcessPoolE
 def summary(cell: Cell, d: dict[str, Floats]) -> dict[str, Any]:
     """A cell's figures from its draws."""
     n_draws, n = len(d["nees"]), int(d["n"][0])
-    k = n_draws * n
+    k = float(np.sum(d["n"]))
     ks = stats.kstest(stats.chi2.cdf(d["chi2"], d["dof"]), "uniform")
     reduced = d["chi2"] / d["dof"]
     return {
@@ -281,9 +367,9 @@ def summary(cell: Cell, d: dict[str, Floats]) -> dict[str, Any]:
         "n_parameters": n,
         "nees": float(d["nees"].sum() / k),
         "nees_bounds": (stats.chi2.ppf([0.005, 0.995], k) / k).tolist(),
-        "coverage": {of: float(d[of].mean()) for of in ("parameters", "kept", "tool")},
+        "coverage": {of: mean_of(d[of]) for of in ("parameters", "kept", "tool")},
         "rmse": float(np.sqrt(d["squared"].mean())),
-        "rmse_over_bound": float(np.sqrt(d["squared"].mean() / d["bound"].mean())),
+        "rmse_over_bound": float(np.sqrt(d["squared"].mean() / d["bound"].mean())) if len(d["bound"]) else None,
         "dof": float(d["dof"].mean()),
         "reduced_chi2": float(reduced.mean()),
         "reduced_chi2_sd": float(reduced.std(ddof=1)) if n_draws > 1 else 0.0,
@@ -296,13 +382,18 @@ def summary(cell: Cell, d: dict[str, Floats]) -> dict[str, Any]:
     }
 
 
+def mean_of(values: Floats) -> float | None:
+    """Mean of what is known; None where nothing is."""
+    return float(np.nanmean(values)) if np.isfinite(values).any() else None
+
+
 def judge(row: dict[str, Any], n_cells: int) -> dict[str, bool]:
     """Which criteria a cell meets."""
     low, high = row["nees_bounds"]
     return {
         "nees": low <= row["nees"] <= high,
-        **{f"coverage of {of}": COVERAGE[0] <= v <= COVERAGE[1] for of, v in row["coverage"].items()},
-        "rmse": row["rmse_over_bound"] <= RMSE_LIMIT,
+        **{f"coverage of {of}": v is None or COVERAGE[0] <= v <= COVERAGE[1] for of, v in row["coverage"].items()},
+        "rmse": (row["rmse_over_bound"] or 0.0) <= RMSE_LIMIT,
         "chi2": row["ks_p"] >= 0.01 / n_cells,
     }
 
@@ -320,6 +411,12 @@ def run(out: Path, seed: int = 0, quick: bool = False, n_draws: int | None = Non
         row["meets"] = judge(row, len(cells))
         found["cells"].append(row)
         print(line(row), flush=True)
+    for name, more in (("chains", CHAINS), ("kinks", KINKS), ("gauges", GAUGES)):
+        found[name] = []
+        for row in run_cells([] if quick else more, max(10, (2 * n_draws) // 5), seed, pool):
+            row["meets"] = judge(row, len(more))
+            found[name].append(row)
+            print(line(row), flush=True)
     found["breaking"] = {}
     print()
     for name, of_name in breaking.items():
@@ -351,12 +448,14 @@ HEADER = (
 def line(row: dict[str, Any]) -> str:
     """A cell as a line of the table."""
     low, high = row["nees_bounds"]
-    c = row["coverage"]
+    c = {of: np.nan if v is None else v for of, v in row["coverage"].items()}
+    bound = np.nan if row["rmse_over_bound"] is None else row["rmse_over_bound"]
+    near = f"{row['where']} {row['ratio']:g}" if row["where"] else "noisy" if row["encoder"] else "exact"
     missed = ", ".join(name for name, met in row["meets"].items() if not met) or "nothing"
     return (
-        f"{row['arm']:12} {row['way']:20} {'noisy' if row['encoder'] else 'exact':7} {row['nees']:6.3f}"
+        f"{row['arm']:12} {row['way']:20} {near:7} {row['nees']:6.3f}"
         f"  ({low:.3f}-{high:.3f}) {c['parameters']:15.3f} {c['kept']:6.3f} {c['tool']:6.3f}"
-        f" {row['rmse_over_bound']:11.3f} {row['reduced_chi2']:9.3f} {row['reduced_chi2_sd']:6.3f}"
+        f" {bound:11.3f} {row['reduced_chi2']:9.3f} {row['reduced_chi2_sd']:6.3f}"
         f" ({row['reduced_chi2_sd_expected']:.3f}) {row['ks_p']:7.4f}  {missed}"
     )
 

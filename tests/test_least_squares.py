@@ -129,7 +129,7 @@ def test_with_everything_estimated_they_agree_in_what_the_measurements_determine
 
 
 SECOND_ORDER = 0.02
-"""Sigma by which the mean of a noisy length moves an estimate here: 0.3 mrad of joint noise, 10 m, 2 m and more apart."""
+"""Sigma by which the mean of a noisy length moves an estimate here: 0.3 mrad of joint noise over 10 m."""
 
 
 @pytest.mark.parametrize("model", PAPERS)
