@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+import yaml
 from scipy.spatial.transform import Rotation
 from tolerances import rounding
 
@@ -160,6 +162,28 @@ def test_panda_sockets_are_predicted_within_the_limits(panda_run, way):
     assert found["n_configurations"] == 253  # test rows took no part
     # 4 * 7 + 6 = 34 for any such arm, less 6 of the base and 3 of the tool's rotation, which touches do not see.
     assert found["rank"] == 25
+
+
+@needs_panda
+@pytest.mark.parametrize("way", ["groups", "all"])
+def test_panda_calibrated_again_from_its_own_result_has_the_same_rank(way, fg_calib, tmp_path):
+    """Residuals turned by a motion of the base made a 26th direction."""
+    data = panda.data_folder()
+    job = panda.write_job(data, panda.read_rows(data, 0, False), tmp_path, way)
+    first = json.loads(fg_calib("calibrate", job, "--out", tmp_path / "first", "--json").out)
+    again = yaml.safe_load(job.read_text())
+    shutil.copy(tmp_path / "first" / "robot_calibrated.urdf", tmp_path / "panda.urdf")
+    again["robot"]["tool"] = {
+        k: next(p["estimate"] for p in first["parameters"] if p["name"] == f"tool.{k}") for k in "xyz"
+    }
+    job.write_text(yaml.safe_dump(again))
+    second = json.loads(fg_calib("calibrate", job, "--json").out)
+    assert first["observability"]["rank"] == second["observability"]["rank"] == 25
+    for result in (first, second):
+        assert result["observability"]["gap"] > 1e3
+    classes = [{p["name"]: p["identifiability"] for p in result["parameters"]} for result in (first, second)]
+    # At the calibrated arm axes are no longer exactly parallel, so more parameters have a share in what is lost.
+    assert all(b in ("relative", a) for a, b in zip(*(c.values() for c in classes), strict=True))
 
 
 @needs_panda
@@ -410,6 +434,13 @@ def test_honesty_quick_finds_errors_where_the_result_says(honesty, tmp_path, cap
         assert cell["ks_p"] > 1e-4
         assert cell["warned"] == cell["not_converged"] == 0.0
     assert (tmp_path / "08_honesty.png").stat().st_size > 10_000
+
+
+def test_chains_kinks_and_gauges_are_honest(honesty):
+    """NEES within 4 sigma; the ledger has 200 draws of each."""
+    for row in honesty.run_cells([*honesty.CHAINS[::3], *honesty.KINKS[::5], *honesty.GAUGES[::3]], 12, 1, None):
+        k = row["n_draws"] * row["n_parameters"]
+        assert row["nees"] == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / k)), row["way"]
 
 
 def test_honesty_notices_noise_that_is_stated_half_as_large(honesty, monkeypatch):
