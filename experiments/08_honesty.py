@@ -119,7 +119,9 @@ class Cell:
     ratio: float = 0.0
 
 
-CELLS = [Cell(arm, way, encoder) for arm in ("space robot", "UR10", "SCARA") for way in WAYS for encoder in (0, 1)]
+CELLS = [
+    Cell(arm, way, encoder) for arm in ("space robot", "UR10", "SCARA") for way in list(WAYS)[:4] for encoder in (0, 1)
+]
 CHAINS = [
     Cell("UR10", way, noise=10.0, where="steps", ratio=ratio)
     for way in ("distances, chain", "angles, chain")

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import astuple, dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from fg_calib import residuals
 from fg_calib.frames import nearest_rotation
-from fg_calib.kinematics import SPAN, Chain, forward, turning_of_base
+from fg_calib.kinematics import SPAN, Chain, Poses, forward, turning_of_base
 from fg_calib.measurements import Measurements, Pairs, rotation_angle
 from fg_calib.moments import Moments, angle_moments, length_moments
 from fg_calib.residuals import AnyBlock, Block, CorrelatedBlock, PairBlock, PoseBlock, SamePointBlock, correlate
@@ -168,7 +169,6 @@ class PairWhitening:
         self._joints_estimated = joints_estimated
         self._joints = np.flatnonzero(measurements.sigma_joint > 0.0)
         factors = np.array(adjustment.factors)
-        self._poses = forward(self._chain, trig)
         # Of the measurement alone, along distance and angle, shape (n_pairs, 2), as it is thought to be.
         stated = self._formed_variance() if formed else np.stack([pairs.sigma_distance, pairs.sigma_angle], axis=1) ** 2
         self._own = np.nan_to_num(stated) * factors**2
@@ -186,6 +186,11 @@ class PairWhitening:
         self._bent = np.sqrt(np.maximum(self.moments.variance - linear, 0.0))
         same = np.all(measurements.readings[pairs.a] == measurements.readings[pairs.b], axis=1)
         self.judgement = self._judge(same)
+
+    @cached_property
+    def _poses(self) -> Poses:
+        """Predicted tool poses of all configurations."""
+        return forward(self._chain, self._trig)
 
     @property
     def sigma(self) -> Floats:
