@@ -37,7 +37,7 @@ Integers = NDArray[np.int64]
 MOST_OUTLIERS = 0.5
 """Share of measurements beyond which they are not outliers but the majority."""
 
-BENT = 0.5
+BENT = 1.0
 """Sigma by which what the parameters may still be off bends a row that is not linear enough."""
 
 MOST_ESTIMATED = 2.0

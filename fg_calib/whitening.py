@@ -43,6 +43,10 @@ PRIVATE_SHARE = 1e-3
 LEAST_BEND = 0.05
 """A row that what the parameters may be off bends by less than this many sigma is straight."""
 
+BEND_MARGIN = 2.0
+"""Factor on the variance that bends a row. The covariance of the parameters counts what bent rows seem to say of them
+by a derivative that is there only at the estimate; with 1 the NEES of a SCARA's star is 1.05, with 2 about 1.02."""
+
 MOST_BEND = 1.0
 """A row is bent by no more sigma: what is off by more than that is for the optimum to find, not to be called noise."""
 
@@ -439,7 +443,7 @@ class PairWhitening:
             np.sum(D**2, axis=(1, 2)) - np.sum(np.einsum("nc,nck->nk", _unit(u), D) ** 2, axis=1)
             for u, D in zip((vector, rotation_angle(Q)[1]), change, strict=True)
         ]
-        across: Floats = np.maximum(np.stack(of_each, axis=1), 0.0) / 2.0
+        across: Floats = BEND_MARGIN * np.maximum(np.stack(of_each, axis=1), 0.0) / 2.0
         return across
 
     def _joint_trace(self) -> Floats:
