@@ -43,6 +43,12 @@ Floats = NDArray[np.float64]
 FAR = 8.5
 """Distance from a kink, in sigma, beyond which the exponentials are rounding."""
 
+WIDE = 0.25
+"""Variance of a rotation error, [rad^2], beyond which it is taken for this: angles go no further than half a turn."""
+
+LEAST_VARIANCE = 0.1
+"""Share of a variance that is left at least, where series for small errors would leave less."""
+
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 
 
@@ -83,18 +89,22 @@ def angle_moments(f: Floats, along: Floats, across: Floats, own: Floats) -> Mome
         across: The same about each axis across.
         own: Variance of the angle's own error.
     """
+    along, across, own = (np.minimum(v, WIDE) for v in (along, across, own))
     vector = _vector_length(f, along, across)
     half = np.clip(0.5 * f, 1e-4, 0.5 * np.pi)
     # What cot(f / 2) / 2 is less than 1 / f: -f / 12 to first order.
     vector = Moments(
         vector.excess + across * (0.5 / np.tan(half) - 0.5 / half),
         vector.slope + across * (0.5 / half**2 - 0.5 / np.sin(half) ** 2) / 2.0,
-        vector.variance + across**2 * (0.25 / np.tan(half) ** 2 - 0.25 / half**2),
+        np.maximum(
+            vector.variance + across**2 * (0.25 / np.tan(half) ** 2 - 0.25 / half**2), LEAST_VARIANCE * vector.variance
+        ),
     )
     near_zero = _folded(f, vector, own)
     x = np.pi - f - near_zero.excess
     fold = _fold(np.maximum(x, 0.0), near_zero.variance)
-    return Moments(near_zero.excess - fold.excess, near_zero.slope * fold.slope, fold.variance)
+    variance = np.maximum(fold.variance, LEAST_VARIANCE * near_zero.slope**2 * (along + own))
+    return Moments(near_zero.excess - fold.excess, near_zero.slope * fold.slope, variance)
 
 
 def _vector_length(f: Floats, along: Floats, across: Floats) -> Moments:

@@ -28,7 +28,7 @@ from fg_calib.robust import effect
 from fg_calib.solver import Solution
 from fg_calib.structure import probability_of_noise
 from fg_calib.threads import one_blas_thread, single_threaded
-from fg_calib.verdict import Statement, chi2_bounds, of_bent, of_chi2, of_evaluation, of_priors, of_test
+from fg_calib.verdict import Statement, chi2_bounds, of_bent, of_chi2, of_evaluation, of_folds, of_priors, of_test
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -410,11 +410,19 @@ def _of_bent_rows(solution: Solution, spread: Spread, table: ResidualTable, good
     problem = solution.problem
     if problem.pairs is None:
         return []
-    values, V = np.linalg.eigh(spread.tangent)
-    bent = pair_rows(problem, solution.parameters).bent_by(V * np.sqrt(np.maximum(values, 0.0)), BENT)
     rows = np.flatnonzero(table.used & (table.measurement < problem.pairs.n_pairs))
-    those = rows[bent[table.measurement[rows], table.family[rows]]]
-    return of_bent(len(those), len(rows), float(np.nansum(goodness.leverage[those])))
+    if not len(rows):
+        return []
+    values, V = np.linalg.eigh(spread.tangent)
+    whitening = pair_rows(problem, solution.parameters)
+    place, leverage = (table.measurement[rows], table.family[rows]), np.nan_to_num(goodness.leverage[rows])
+    bent = whitening.bent_by(V * np.sqrt(np.maximum(values, 0.0)), BENT)[place]
+    folded = whitening.may_fold(np.diag(problem.variables.prior_scales))[place]
+    share = float(leverage[folded].sum() / max(leverage.sum(), 1e-300))
+    return [
+        *of_bent(int(bent.sum()), len(rows), float(leverage[bent].sum())),
+        *of_folds(int(folded.sum()), len(rows), share),
+    ]
 
 
 def _of_solver(solution: Solution) -> list[Statement]:

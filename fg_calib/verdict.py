@@ -32,6 +32,9 @@ CERTAIN = 1e-4
 LEAST_REST, LEAST_SHARE = 0.3, 0.01
 """Directions that rest on rows far from linear, and share of such rows, below which sigmas are honest."""
 
+LEAST_FOLDED, MOST_FOLDED = 0.05, 0.3
+"""Part of what the rows say that may rest on vectors of unknown sign: with a caution, and no more at all."""
+
 _NAMED = 3
 """Configurations or parameters that a statement names."""
 
@@ -174,6 +177,24 @@ def of_bent(n: int, n_rows: int, directions: float) -> list[Statement]:
         " sigmas of these may be 10 % too small, or there is a second optimum"
     )
     return [Statement(text, finding=False)]
+
+
+def of_folds(n: int, n_rows: int, share: float) -> list[Statement]:
+    """What it means that vectors may as well point the other way within what the tolerances allow.
+
+    Args:
+        n: How many lengths and angles there are of that kind.
+        n_rows: Of so many.
+        share: Part of all that the rows say that these say (by leverage).
+    """
+    if share < LEAST_FOLDED:
+        return []
+    text = (
+        f"{n} of {n_rows} lengths and angles are so near 0 or half a turn that tolerances let their vectors point either"
+        f" way, and the result rests on them ({100.0 * share:.0f} % of what the rows say): there may be a better optimum"
+        " far away; start from a better nominal arm, or measure longer and wider motions"
+    )
+    return [Statement(text, share > MOST_FOLDED)]
 
 
 def chi2_in_words(chi2: float, expected: float, p_value: float) -> str:

@@ -50,6 +50,10 @@ by a derivative that is there only at the estimate; with 1 the NEES of a SCARA's
 MOST_BEND = 1.0
 """A row is bent by no more sigma: what is off by more than that is for the optimum to find, not to be called noise."""
 
+REDUNDANT = 10.0
+"""Factor on what is not linear in pairs that are more than the errors they share: they have nothing else to say there,
+and its distribution is not normal."""
+
 LEAST_WEIGHT = 1e-12
 """A robust weight below this is taken for this."""
 
@@ -227,11 +231,20 @@ class PairWhitening:
 
     def size(self, sharing: Sharing) -> int:
         """Size of the dense system that carrying shared errors takes: the number of errors, or of rows if less."""
+        return min(self._counts(sharing))
+
+    def _redundant(self, sharing: Sharing) -> bool:
+        """Whether there are more rows than errors that they share."""
+        n_rows, n_errors = self._counts(sharing)
+        return n_rows > n_errors
+
+    def _counts(self, sharing: Sharing) -> tuple[int, int]:
+        """Number of train rows, and of the errors that they share."""
         judgement, train = self.judgement, self.judgement.used & ~self._pairs.test
         either = (judgement.distance | judgement.angle) & train
         n_rows = sum(self._kinds) * int(either.sum()) + 3 * int((judgement.same_point & train).sum())
         n = len(np.unique(np.concatenate([self._pairs.a[train], self._pairs.b[train]])))
-        return min(n_rows, n * self._width(sharing))
+        return n_rows, n * self._width(sharing)
 
     def blocks(self, sharing: Sharing, joint_noise: bool = True) -> list[AnyBlock]:
         """The train rows, whitened: a block of distances and angles, a block of same points, or both in one.
@@ -349,6 +362,7 @@ class PairWhitening:
             trace = trace + self._joint_trace() * factors**2
         across = np.maximum(trace - along, 0.0) / 2.0 + self._bending()
         f = self._predicted
+        along, across, own = (np.where(self._kinds, v, 0.0) for v in (along, across, own))
         found = [
             of(f[:, k], along[:, k], across[:, k], own[:, k]) for k, of in enumerate((length_moments, angle_moments))
         ]
@@ -402,6 +416,27 @@ class PairWhitening:
         bent: Booleans = self._noticed(spread, sigmas) > 0.0
         return bent
 
+    def may_fold(self, spread: Floats) -> Booleans:
+        """Which distances and angles some uncertainty of the parameters may fold, shape (n_pairs, 2).
+
+        Half the way to 0, or of an angle to half a turn, is then less than that uncertainty (and this more than the
+        noise): the vector may as well point the other way, and a descent may end with the wrong one.
+
+        Args:
+            spread: A square root of the parameters' covariance, shape (n_columns, k).
+        """
+        f, noise, n = self._predicted, 4.0 * self._own, self._pairs.n_pairs
+        folds = np.zeros((n, 2), dtype=np.bool_)
+        for start in range(0, n, SPAN):
+            rows = np.arange(start, min(start + SPAN, n))
+            across, along = self._spread_of(rows, spread)
+            at_zero = across + along > np.maximum(f[rows] ** 2 / 4.0, noise[rows])
+            at_pi = along[:, 1] > np.maximum((np.pi - f[rows, 1]) ** 2 / 4.0, noise[rows, 1])
+            folds[rows] = at_zero
+            folds[rows, 1] |= at_pi
+        out: Booleans = folds & self._kinds
+        return out
+
     def _noticed(self, spread: Floats, sigmas: float) -> Floats:
         """Variance across where it bends a row by so many sigma, else 0, shape (n_pairs, 2).
 
@@ -427,7 +462,11 @@ class PairWhitening:
         return np.where((self._own > 0.0) & self._kinds, sigma * np.maximum(self._predicted, sigma), np.inf)
 
     def _spread_across(self, rows: Integers, spread: Floats) -> Floats:
-        """What `_bending` is about at `rows`, shape (n, 2).
+        """What `_bending` is about at `rows`, shape (n, 2)."""
+        return BEND_MARGIN * self._spread_of(rows, spread)[0]
+
+    def _spread_of(self, rows: Integers, spread: Floats) -> tuple[Floats, Floats]:
+        """Variance that the parameters' own gives vectors: in each direction across, and along, shapes (n, 2).
 
         With Q the rotation from a to b, R_b R_a^T, turns w_a and w_b of the tool turn Q by w_b - Q w_a. Motions of the
         base, and of the tool in itself, carry vector and rotation with them and bend nothing: they are taken out.
@@ -439,12 +478,16 @@ class PairWhitening:
         Q = at.rotation[n:] @ np.swapaxes(at.rotation[:n], 1, 2)
         vector, turn = at.position[n:] - at.position[:n], turn - base
         change = (shift[n:] - shift[:n] - np.cross(base[None], vector[:, :, None], axis=1), turn[n:] - Q @ turn[:n])
-        of_each = [
-            np.sum(D**2, axis=(1, 2)) - np.sum(np.einsum("nc,nck->nk", _unit(u), D) ** 2, axis=1)
-            for u, D in zip((vector, rotation_angle(Q)[1]), change, strict=True)
-        ]
-        across: Floats = BEND_MARGIN * np.maximum(np.stack(of_each, axis=1), 0.0) / 2.0
-        return across
+        directions = (vector, rotation_angle(Q)[1])
+        along = np.stack(
+            [
+                np.sum(np.einsum("nc,nck->nk", _unit(u), D) ** 2, axis=1)
+                for u, D in zip(directions, change, strict=True)
+            ],
+            axis=1,
+        )
+        everything = np.stack([np.sum(D**2, axis=(1, 2)) for D in change], axis=1)
+        return np.maximum(everything - along, 0.0) / 2.0, along
 
     def _joint_trace(self) -> Floats:
         """Variance that joint noise gives each vector, all directions together, shape (n_pairs, 2)."""
@@ -491,7 +534,9 @@ class PairWhitening:
         if sharing.joints or not joint_noise:
             private -= self._linear[rows]
         if sharing.poses and self._formed:
-            private[:, [0, 2]] -= self.moments.slope[rows] ** 2 * self._own[rows] + 0.5 * self._bent[rows] ** 2
+            kept = REDUNDANT if self._redundant(sharing) else 1.0
+            linear = self.moments.slope[rows] ** 2 * self._own[rows]
+            private[:, [0, 2]] += (0.5 * kept - 1.0) * self._bent[rows] ** 2 - linear
         private[:, [0, 2]] = np.maximum(private[:, [0, 2]], PRIVATE_SHARE * stated[:, [0, 2]])
         if self._adjustment.weights is not None:
             # A down-weighted pair has noise of its own on top, so much that it says no more than its weight.
