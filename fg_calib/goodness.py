@@ -99,6 +99,8 @@ class KindFit:
         expected: Its mean, were the noise as taken: the rows' redundancy.
         p_value: Probability of a sum as large, were the noise as taken; None where it is not known.
         typical: Noise seen over noise taken, from the median, which a few rows do not move.
+        largest: The largest |studentised residual|; nan where it is not known.
+        degrees: Degrees of freedom of chi-square.
     """
 
     kind: str
@@ -111,6 +113,8 @@ class KindFit:
     expected: float
     p_value: float | None
     typical: float
+    largest: float
+    degrees: float
 
     @property
     def verdict(self) -> str:
@@ -118,12 +122,17 @@ class KindFit:
         ratio, p = self.seen_over_stated / self.factor, self.p_value
         if not np.isfinite(ratio):
             return "unknown"
-        unlikely = abs(ratio - 1.0) > 0.2 if p is None else min(p, 1.0 - p) < ALARM / 2.0
+        if p is None:  # weights or factors came from the residuals: their spread alone is known
+            unlikely = abs(ratio - 1.0) > max(0.2, -special.ndtri(ALARM / 2.0) / np.sqrt(2.0 * self.degrees))
+        else:
+            unlikely = min(p, 1.0 - p) < ALARM / 2.0
         if not unlikely or abs(ratio - 1.0) < 0.05:
             return "as stated"
         if ratio < 1.0:
             return "too large"
         share = (self.typical**2 - 1.0) / (ratio**2 - 1.0)  # of the excess that rows have in common
+        if not self.largest > suspect_level(self.n) * np.sqrt(max(self.typical, 1.0) * ratio):
+            return "too small"  # the median of few rows varies: none of them is far from the others
         return "outliers" if share < 0.35 else "too small" if share > 0.65 else "both"
 
 
@@ -230,6 +239,11 @@ class Goodness:
     test: PredictedFit | None
 
 
+def suspect_level(n: int) -> float:
+    """|studentised residual| that the largest of n clean rows exceeds with a probability of `ALARM` (Sidak 1967)."""
+    return float(special.ndtri(0.5 + 0.5 * (1.0 - ALARM) ** (1.0 / max(1, n))))
+
+
 def judge_fit(solution: Solution, spread: Spread, table: ResidualTable) -> Goodness:
     """Goodness of fit by kind, by row and by configuration.
 
@@ -240,7 +254,7 @@ def judge_fit(solution: Solution, spread: Spread, table: ResidualTable) -> Goodn
     """
     rows = _Rows(solution, spread, table)
     weight = rows.weight
-    level = float(special.ndtri(0.5 + 0.5 * (1.0 - ALARM) ** (1.0 / max(1, int(np.sum(table.reason_code == 0))))))
+    level = suspect_level(int(np.sum(table.reason_code == 0)))
     with np.errstate(invalid="ignore"):
         suspicious = np.abs(rows.studentised) > level
     flag = np.zeros(table.n, dtype=np.int8)
@@ -486,6 +500,8 @@ class _Rows:
             expected=max(expected, 0.0),
             p_value=part.p_value(chosen, chi2) if enough and known else None,
             typical=float(np.nanmedian(np.abs(self.studentised[rows]))) / _MEDIAN if enough else np.nan,
+            largest=float(np.nanmax(np.abs(self.studentised[rows]))) if enough else np.nan,
+            degrees=part.degrees(chosen),
         )
 
     def _of_touched_points(self, others: list[KindFit]) -> KindFit:
@@ -512,6 +528,8 @@ class _Rows:
             expected=max(expected, 0.0),
             p_value=float(special.gammaincc(expected / 2.0, chi2 / 2.0)) if enough and not self._robust else None,
             typical=float(np.median(np.abs(z))) / _MEDIAN if len(rows) else np.nan,
+            largest=float(np.max(np.abs(z))) if len(rows) else np.nan,
+            degrees=max(expected, 1.0),
         )
 
     def _predict(

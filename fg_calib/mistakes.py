@@ -103,6 +103,7 @@ class SetupCheck:
         first, *others = self.explanations
         after = next(r for r in first.residuals if r.kind == self.worst.kind)
         also = "".join(f", or if {other}" for other in others[:2])
+        also += f", or {len(others) - 2} more (--json has all)" if len(others) > 2 else ""
         return f"{self.worst.kind} residuals fall from {shown(self.worst)} to {shown(after)} if {first}{also}"
 
 

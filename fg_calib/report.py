@@ -283,11 +283,12 @@ def _goodness_lines(solution: Solution, uncertainty: Uncertainty) -> Iterable[st
             f" {len(estimated)} of its degrees of freedom went there"
         )
     elif estimated is None and verdicts & {"too large", "too small", "both"} and uncertainty.noise_may_be_estimated:
-        yield "to take the noise seen for the noise there is: noise: estimate in the job"
+        yield "to take the noise seen for the noise there is: estimate: true beside the figures of noise in the job"
     if uncertainty.noise_like is not None and uncertainty.noise_like < LIKE_NOISE:
         yield "the residuals follow the arm, as noise does not: effects that are not modelled"
     if estimated is None and verdicts & {"outliers", "both"}:
-        yield "look at the suspicious rows below, or let a robust loss weigh them: loss in the job"
+        may_weigh = solution.problem.adjustment.weights is None and not uncertainty.points
+        yield "look at the suspicious rows below" + (", or let a robust loss weigh them: loss in the job" * may_weigh)
     if not len(goodness.suspects) and not goodness.configurations:
         yield f"no row (|studentised residual| above {goodness.level:.2f}) and no configuration is suspicious"
 

@@ -218,6 +218,7 @@ class Uncertainty:
             not self.points
             and not self.residuals.evaluated
             and not self.setup.explanations
+            and not any(fit.verdict in ("outliers", "both") for fit in self.goodness.kinds)  # they are not noise
             and not (too_large and self.identifiability.missing)
             and all(fit.typical <= MOST_ESTIMATED for fit in too_large)
             and (self.noise_like is None or self.noise_like > LIKE_NOISE)

@@ -164,7 +164,7 @@ def test_a_bad_fit_says_first_what_the_convention_lacks(tmp_path, fg_calib, mode
     ended = fg_calib("calibrate", textbook_job(tmp_path, model=model), "--out", tmp_path / "out")
     assert ended.code == 3
     assert words(ended.out).partition("DOUBTFUL: ")[2].startswith(SAID)
-    assert "noise: estimate" not in ended.out
+    assert "the noise there is" not in words(ended.out)
     assert "the residuals follow the arm, as noise does not" in words(ended.out)
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert result["findings"][0] == SAID
@@ -216,7 +216,7 @@ def stated(factor):
 def test_noise_is_offered_to_be_estimated_only_near_what_was_stated(tmp_path, fg_calib, factor, offered):
     m = measure(true_robot(ur5e(tmp_path), np.random.default_rng(0)), 80, np.random.default_rng(1), sigma=(5e-5, 1e-4))
     said = words(fg_calib("calibrate", write_job(tmp_path, m, model="pose", noise=stated(factor))).out)
-    assert ("noise: estimate in the job" in said) == offered
+    assert ("estimate: true beside the figures of noise in the job" in said) == offered
     assert "follow the arm" not in said
 
 
@@ -226,4 +226,18 @@ def test_noise_is_not_offered_to_be_estimated_where_residuals_follow_the_arm(tmp
     readings = m.readings + only(2, 3e-4) * np.sin(m.readings)
     ended = fg_calib("calibrate", write_job(tmp_path, replace(m, readings=readings), model="pose"))
     assert "the residuals follow the arm, as noise does not: effects that are not modelled" in words(ended.out)
-    assert "noise: estimate" not in ended.out
+    assert "the noise there is" not in words(ended.out)
+
+
+def test_a_wrong_encoder_reading_is_not_offered_as_noise(tmp_path, fg_calib):
+    """Noise that is estimated hides it; the loss that is offered beside the suspicious rows does not."""
+    m = measure(true_robot(ur5e(tmp_path), np.random.default_rng(0)), 60, np.random.default_rng(1), sigma=(5e-5, 1e-4))
+    readings = m.readings.copy()
+    readings[7, 3] += 0.02
+    wrong = replace(m, readings=readings)
+    said = words(fg_calib("calibrate", write_job(tmp_path, wrong, model="pose")).out)
+    assert "or let a robust loss weigh them: loss in the job" in said
+    assert "the noise there is" not in said
+    said = words(fg_calib("calibrate", write_job(tmp_path, wrong, model="pose", loss="huber")).out)
+    assert "look at the suspicious rows below" in said
+    assert "let a robust loss weigh them" not in said

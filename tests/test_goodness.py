@@ -12,7 +12,7 @@ from fg_calib import goodness as goodness_module
 from fg_calib import noise, residuals
 from fg_calib import problem as problem_module
 from fg_calib.covariance import spread_of
-from fg_calib.goodness import FLAGS, kind_fits
+from fg_calib.goodness import FLAGS, KindFit, kind_fits
 from fg_calib.kinematics import pose
 from fg_calib.measurements import Pairing, Pairs, rotation_angle
 from fg_calib.noise import estimate_noise
@@ -368,3 +368,27 @@ def test_robust_weights_count_rows_and_flag_outliers():
     assert {FLAGS[f] for f in goodness.flag[table.a == 5]} == {"outlier"}
     assert all(fit.p_value is None for fit in goodness.kinds)
     assert [fit.seen_over_stated for fit in goodness.kinds] == pytest.approx([1.0, 1.0], abs=0.3)
+
+
+def test_noise_too_small_is_not_called_outliers():
+    """The median of few rows varies: only where some row is far from the others may it speak of outliers."""
+    clean = {"seen_over_stated": 1.8, "factor": 1.0, "p_value": 1e-4, "n": 45, "kind": "position", "unit": "m"}
+    fit = {**clean, "stated_sigma_rms": 1e-4, "chi2": 146.0, "expected": 45.0, "degrees": 45.0}
+    assert KindFit(**fit, typical=1.3, largest=4.9).verdict == "too small"
+    assert KindFit(**fit, typical=1.1, largest=20.0).verdict == "outliers"
+
+
+def test_without_a_p_value_noise_is_judged_by_what_its_rows_vary():
+    """Some 12 degrees of freedom see noise within a fifth: 0.75 times the noise stated is no news, 0.3 times is."""
+    fit = {
+        "kind": "angle",
+        "unit": "rad",
+        "n": 59,
+        "stated_sigma_rms": 1e-4,
+        "factor": 1.0,
+        "chi2": 20.0,
+        "largest": 2.0,
+    }
+    known = {**fit, "expected": 40.0, "p_value": None, "typical": 0.7, "degrees": 12.0}
+    assert KindFit(**known, seen_over_stated=0.75).verdict == "as stated"
+    assert KindFit(**known, seen_over_stated=0.3).verdict == "too large"
