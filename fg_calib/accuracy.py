@@ -133,6 +133,9 @@ def without_rigid_motion(points: Floats, derivative: Floats) -> tuple[Floats, Fl
 
 
 def _rms(variance: Floats) -> float | None:
-    """RMS length of vectors from the variances of their coordinates, shape (3 n,); None where one is unknown."""
-    rms = float(np.sqrt(3.0 * np.mean(variance)))
-    return rms if np.isfinite(rms) else None
+    """RMS length of vectors from the variances of their coordinates, shape (3 n,); None where one is unknown.
+
+    A mean below 0 is what rounding leaves of far larger variances that cancel: that is not known either.
+    """
+    mean = float(np.mean(variance))
+    return float(np.sqrt(3.0 * mean)) if 0.0 <= mean < np.inf else None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterable, Sequence
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any, Literal, get_args
 
 from fg_calib.errors import InputError
@@ -92,9 +92,12 @@ def check_number(
     """
     good = isinstance(value, Real) and not isinstance(value, bool)
     if good:
-        x = float(value)  # type: ignore[arg-type]
+        try:
+            x = float(value)  # type: ignore[arg-type]
+        except OverflowError:  # a whole number beyond any float
+            x = math.inf
         good = (x > least if above else x >= least) and (math.isfinite(x) or not finite)
-        good = good and not (whole and (isinstance(value, float) or x != int(x)))
+        good = good and not (whole and not isinstance(value, Integral))
     if not good:
         kind = "a whole number" if whole else "a finite number" if finite else "a number"
         raise InputError(key, f"found {value!r}", f"{kind} {'above' if above else 'not below'} {least:g}")
@@ -112,7 +115,7 @@ def check_names(key: str, names: Iterable[str], known: Sequence[str], what: str 
     Raises:
         InputError: It is one word instead of a list, or a name is not known.
     """
-    if isinstance(names, str):
+    if isinstance(names, str) or not isinstance(names, Iterable) or not getattr(names, "ndim", 1):
         raise InputError(key, f"found {names!r}", "a list of names")
     for name in names:
         if name not in known:

@@ -38,7 +38,7 @@ class Noise:
     def __post_init__(self) -> None:
         for f in fields(self):
             given = getattr(self, f.name)
-            for figure in given if isinstance(given, tuple | list) else (given,):
+            for figure in given if f.name == "joint" and isinstance(given, tuple | list) else (given,):
                 if figure is not None:
                     check_number(f"noise: {f.name}", figure)
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fg_calib.choices import FrameKnowledge, Model
+from fg_calib.choices import FrameKnowledge, Model, check, check_flag
 from fg_calib.factors import pose_of
 from fg_calib.frames import Frame
 from fg_calib.measurements import Measurements
@@ -135,18 +135,24 @@ def check_setup(
 
     Note:
         Pairs are formed anew from some of the rows, whatever the job's pairing.
+
+    Raises:
+        InputError: An option is not one of those possible.
     """
+    check("model", model, Model)
+    check("frame", frame, FrameKnowledge)
+    check_flag("doubtful", doubtful)
     with one_blas_thread:
         setup = setup_of(robot, measurements, model, frame)
         if setup is None:
             return SetupCheck()
-        check = SetupCheck(setup.fit() if fitted is None else setup.at(*fitted))
-        if not check.residuals or not (doubtful or check.far):
-            return check
+        found = SetupCheck(setup.fit() if fitted is None else setup.at(*fitted))
+        if not found.residuals or not (doubtful or found.far):
+            return found
         if fitted is not None:
             closed_form = SetupCheck(setup.fit())
-            check = closed_form if closed_form.excess < check.excess and closed_form.residuals else check
-        return replace(check, explanations=_explanations(setup, check))
+            found = closed_form if closed_form.excess < found.excess and closed_form.residuals else found
+        return replace(found, explanations=_explanations(setup, found))
 
 
 def check_problem(problem: Problem, before: Floats, *, doubtful: bool = False) -> SetupCheck:

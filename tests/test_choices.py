@@ -13,6 +13,7 @@ from fg_calib import (
     SolverOptions,
     Units,
     build_problem,
+    check_setup,
     choices,
     cramer_rao,
     fit_least_squares,
@@ -52,6 +53,10 @@ def structure(model="distance", **options):
 
 def practical(model="distance", **options):
     return observe_configurations(ROBOT, TABLE, model, **options)
+
+
+def setup(model="distance", **options):
+    return check_setup(ROBOT, TABLE, model, **options)
 
 
 def scenario(**changes):
@@ -149,6 +154,19 @@ MISTAKES = {
                           "rad, deg, mrad"),
     "a report's width": (lambda: format_identifiability(structure(), 0), "width: found 0, expected a whole number not "
                          "below 1"),
+    "a model of the set-up": (lambda: setup(model="Pose"), "model: found 'Pose', expected one of pose, position, "
+                              "orientation, distance, rotation, distance-rotation; did you mean pose?"),
+    "a frame of the set-up": (lambda: setup(frame="Unknown"), "frame: found 'Unknown', expected one of known, unknown; "
+                              "did you mean unknown?"),
+    "a doubt that is a word": (lambda: setup(doubtful="no"), "doubtful: found 'no', expected True or False"),
+    "names that are nothing": (lambda: problem(prefer=None), "prefer: found None, expected a list of names"),
+    "names that are a number": (lambda: structure(prefer=3), "prefer: found 3, expected a list of names"),
+    "pairs by numpy's halves": (lambda: Pairing("random", np.float32(2)), "pairing: count: found np.float32(2.0), "
+                                "expected a whole number above 0"),
+    "more noise than a float holds": (lambda: Noise(10**400), f"noise: position: found {10**400}, expected a finite "
+                                      "number not below 0"),
+    "noise by axis": (lambda: Noise((1e-3, 1e-3, 2e-3)), "noise: position: found (0.001, 0.001, 0.002), expected a "
+                      "finite number not below 0"),
 }  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from scipy.stats import chi2, kstest
 from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
 from tolerances import rounding
 
+from fg_calib.accuracy import pose_rms
 from fg_calib.kinematics import pose
 from fg_calib.measurements import Measurements, Pairing
 from fg_calib.problem import build_problem
@@ -312,3 +313,12 @@ def scara(tolerance):
         builder.add_convention_joint(Joint(f"q{i + 1}"), {"alpha": 0.0, "a": a, "d": 0.0, "theta": 0.0, "beta": 0.0})
     builder.add_frame("tool", {"x": 0.1}, 4, False)
     return builder.build(tolerance=tolerance)
+
+
+@pytest.mark.filterwarnings("error")
+def test_an_error_of_which_rounding_leaves_less_than_nothing_is_unknown():
+    """Tolerances of a million metres that cancel after the best rigid fit left variances below 0."""
+    rng = np.random.default_rng(0)
+    points, jacobian = rng.normal(size=(4, 3)), rng.normal(size=(4, 6, 2))
+    base, fitted = pose_rms(points, jacobian, lambda rows: np.full(len(rows), -1e-3))
+    assert (base.position, base.orientation, fitted.position, fitted.orientation) == (None,) * 4
