@@ -41,6 +41,8 @@ WORDS = {
 _TURNS = (Axis.RX, Axis.RY, Axis.RZ)
 _SHIFTS = (Axis.TX, Axis.TY, Axis.TZ)
 _PARALLEL, _NEARLY_PARALLEL = 1e-6, 0.2  # [rad]
+_NEARLY_UPRIGHT = 0.2
+"""Cosine of a pitch below which tilts across need five and more times the change of roll and yaw."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ class MissingMotion:
         convention: The robot's convention.
         use: The convention that has the parameters.
         angle: Largest angle between two neighbours' axes, [rad].
+        frame: The frame whose angles lack it, being pitched by a quarter turn; empty for axes of a convention.
     """
 
     axes: tuple[int, ...]
@@ -60,8 +63,12 @@ class MissingMotion:
     convention: str
     use: str
     angle: float
+    frame: str = ""
 
     def __str__(self) -> str:
+        if self.frame:
+            how = "is pitched by about 90 deg, where its roll and yaw turn about nearly the same axis"
+            return f"{self.frame} {how}: hardly a parameter for a tilt across it; {self.use}"
         axes = f"{', '.join(map(str, self.axes[:-1]))} and {self.axes[-1]}"
         what = " and ".join(WORDS[motion] for motion in self.motions)
         if self.angle > _NEARLY_PARALLEL:
@@ -82,10 +89,32 @@ def end_of_link(robot: Robot, owner: int) -> int:
 
 
 def missing_motions(robot: Robot) -> tuple[MissingMotion, ...]:
-    """What a robot's convention has no parameter for, at its nominal values; what is fixed counts as a parameter."""
+    """What a robot's parameters leave out at its nominal values; what is fixed in a convention counts as there."""
+    return (*_of_convention(robot), *_of_frames(robot))
+
+
+def _of_frames(robot: Robot) -> tuple[MissingMotion, ...]:
+    """Frames whose roll, pitch and yaw are estimated as numbers, pitched by a quarter turn or nearly so."""
+    found = []
+    for owner in range(robot.n_joints + 2):
+        own = [robot.parameters[i] for i in robot.owned_by(owner)]
+        angles = {p.kind: p for p in own if p.kind in ("roll", "pitch", "yaw") and p.estimated}
+        outer = owner in (0, robot.n_joints + 1)
+        as_pose = outer and len(own) == 6 and all(p.estimated for p in own)  # a pose has no such place
+        if len(angles) < 3 or as_pose or abs(np.cos(angles["pitch"].nominal)) > _NEARLY_UPRIGHT:
+            continue
+        name = angles["pitch"].name.removesuffix(".pitch")
+        use = f"estimate all six of {name}" if outer else "describe the arm by mdh-hayati or dh-hayati"
+        frame = f"the frame {name}" if outer else f"the origin of joint {name}"
+        found.append(MissingMotion((owner,), (Axis.RX,), robot.convention, use, 0.0, frame))
+    return tuple(found)
+
+
+def _of_convention(robot: Robot) -> tuple[MissingMotion, ...]:
+    """What parallel axes of a Denavit-Hartenberg convention lack."""
     n = robot.n_joints
     if n < 2 or robot.convention not in CONVENTIONS:
-        return ()  # six parameters a joint leave nothing out
+        return ()  # six parameters a joint leave nothing out between axes
     spans = np.array([1.0 if joint.prismatic else np.pi for joint in robot.joints])
     readings = np.random.default_rng(0).uniform(-spans, spans, (5 * n + 30, n))
     at = pose(robot, readings)

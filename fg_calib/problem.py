@@ -337,7 +337,7 @@ def build_problem(
     if settings.gauge != "keep":
         return problem
     kept = _kept(problem, prefer)
-    if not kept and not unknown_frame:
+    if not kept:
         raise ProblemError(
             measurements.source if pairs is None else pairs.source,
             "the rows determine none of the parameters to estimate",

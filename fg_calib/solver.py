@@ -65,6 +65,9 @@ SPREAD_ROUNDS = 2
 WEAKEST = 0.1
 """Signal-to-noise ratio below which a direction is not taken for weaker: rows are bent by no more than that."""
 
+NEAR_ENOUGH = 1e-3
+"""What may be left to go when all iterations are spent, [sigma]."""
+
 COARSE = 0.3
 """Rows are whitened anew once the optimum with the present ones is nearer than this, [sigma]."""
 
@@ -365,9 +368,10 @@ class _Run:
         return self.converged
 
     def give_up(self) -> None:
-        """Say that all iterations have been spent."""
-        self.converged = False
-        self.message = f"not converged: {self._options.max_iterations} iterations, {self._left} left to go"
+        """Say that all iterations have been spent, and whether that matters."""
+        self.converged = self.here.decrement <= NEAR_ENOUGH
+        arrived = "converged" if self.converged else "not converged"
+        self.message = f"{arrived}: {self._options.max_iterations} iterations, {self._left} left to go"
 
     @property
     def _left(self) -> str:

@@ -22,13 +22,23 @@ from fg_calib.joint_values import JointValues, joint_values
 from fg_calib.mistakes import SetupCheck, check_problem
 from fg_calib.observability import IdentifiabilityClass, Observability
 from fg_calib.problem import PAIR_KINDS, Problem, check_graph, eliminated_terms, lengths, pair_rows
-from fg_calib.residual_table import ResidualTable, residual_table
+from fg_calib.residual_table import FAMILIES, ResidualTable, residual_table
 from fg_calib.robot import Robot
 from fg_calib.robust import effect
 from fg_calib.solver import Solution
 from fg_calib.structure import probability_of_noise
 from fg_calib.threads import one_blas_thread, single_threaded
-from fg_calib.verdict import Statement, chi2_bounds, of_bent, of_chi2, of_evaluation, of_folds, of_priors, of_test
+from fg_calib.verdict import (
+    Statement,
+    chi2_bounds,
+    of_bent,
+    of_chi2,
+    of_estimated_noise,
+    of_evaluation,
+    of_folds,
+    of_priors,
+    of_test,
+)
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -287,6 +297,7 @@ def _assess(solution: Solution) -> Uncertainty:
         *of_test(goodness.test, chi2 / expected if expected > 0.0 else 1.0, problem.measurements.end_names),
         *of_priors(priors),
         *_of_bent_rows(solution, spread, table, goodness),
+        *_of_noise(solution, table, goodness),
     ]
     doubts = tuple(s.text for s in statements if s.finding)
     too_large = {fit.verdict for fit in goodness.kinds} & {"too small", "both"}
@@ -424,6 +435,19 @@ def _of_bent_rows(solution: Solution, spread: Spread, table: ResidualTable, good
         *of_bent(int(bent.sum()), len(rows), float(leverage[bent].sum())),
         *of_folds(int(folded.sum()), len(rows), share),
     ]
+
+
+def _of_noise(solution: Solution, table: ResidualTable, goodness: Goodness) -> list[Statement]:
+    """Whether noise that was estimated is small beside the motions it was estimated of."""
+    found: list[Statement] = []
+    for fit in goodness.kinds:
+        if fit.kind in (solution.estimated_noise or ()):
+            rows = table.used & (table.family == FAMILIES.index(fit.kind))
+            predicted = (table.measured + table.after)[rows]
+            about = 0.0 if fit.kind in ("distance", "angle") else float(np.mean(predicted))
+            motion = 1.0 if fit.kind == "orientation" else float(np.sqrt(np.mean((predicted - about) ** 2)))
+            found += of_estimated_noise(fit.kind, fit.factor * fit.stated_sigma_rms, max(motion, 1e-300))
+    return found
 
 
 def _of_solver(solution: Solution) -> list[Statement]:

@@ -35,6 +35,9 @@ LEAST_REST, LEAST_SHARE = 0.3, 0.01
 LEAST_FOLDED, MOST_FOLDED = 0.05, 0.3
 """Part of what the rows say that may rest on vectors of unknown sign: with a caution, and no more at all."""
 
+LARGE_NOISE = 0.2
+"""Estimated noise over the motions measured, beyond which it is no noise."""
+
 _NAMED = 3
 """Configurations or parameters that a statement names."""
 
@@ -107,6 +110,23 @@ def of_evaluation(evaluated: bool, noise_estimated: bool) -> list[Statement]:
         "the noise was estimated from these test rows: nothing says whether the arm predicts them as well as it should"
     )
     return [Statement(text, finding=False)]
+
+
+def of_estimated_noise(kind: str, sigma: float, motion: float) -> list[Statement]:
+    """What it means that estimated noise is as large as the motions that were measured.
+
+    Args:
+        kind: Kind of noise.
+        sigma: What was estimated, [m] or [rad].
+        motion: Typical size of what the arm predicts, [m] or [rad].
+    """
+    if sigma < LARGE_NOISE * motion:
+        return []
+    text = (
+        f"the noise estimated of {kind} is {sigma / motion:.2g} times as large as what was measured moved:"
+        " the arm explains next to nothing of it, so the table or the job is wrong"
+    )
+    return [Statement(text, finding=True)]
 
 
 def of_test(fit: PredictedFit | None, of_fitted: float, names: Sequence[str]) -> list[Statement]:
@@ -190,9 +210,9 @@ def of_folds(n: int, n_rows: int, share: float) -> list[Statement]:
     if share < LEAST_FOLDED:
         return []
     text = (
-        f"{n} of {n_rows} lengths and angles are so near 0 or half a turn that tolerances let their vectors point either"
-        f" way, and the result rests on them ({100.0 * share:.0f} % of what the rows say): there may be a better optimum"
-        " far away; start from a better nominal arm, or measure longer and wider motions"
+        f"{n} of {n_rows} lengths and angles are so near 0 or half a turn that tolerances let their vectors point"
+        f" either way, and {100.0 * share:.0f} % of what the rows say rests on them: there may be a better optimum far"
+        " away; start from a better nominal arm, or measure longer and wider motions"
     )
     return [Statement(text, share > MOST_FOLDED)]
 

@@ -425,17 +425,20 @@ class PairWhitening:
         Args:
             spread: A square root of the parameters' covariance, shape (n_columns, k).
         """
-        f, noise, n = self._predicted, 4.0 * self._own, self._pairs.n_pairs
-        folds = np.zeros((n, 2), dtype=np.bool_)
-        for start in range(0, n, SPAN):
-            rows = np.arange(start, min(start + SPAN, n))
+        f, noise, train = self._predicted, 4.0 * self._own, np.flatnonzero(~self._pairs.test)
+        folds = np.zeros((self._pairs.n_pairs, 2), dtype=np.bool_)
+        if not len(train):
+            return folds
+        from_kink = np.stack([f[:, 0], np.minimum(f[:, 1], np.pi - f[:, 1])], axis=1)
+        some = train[np.unique(np.linspace(0, len(train) - 1, 500).astype(np.int64))]
+        largest = 4.0 * np.sum(self._spread_of(some, spread), axis=0).max(axis=0)
+        near = np.flatnonzero(np.any((from_kink**2 / 4.0 < largest) & self._kinds, axis=1))
+        for start in range(0, len(near), SPAN):
+            rows = near[start : start + SPAN]
             across, along = self._spread_of(rows, spread)
-            at_zero = across + along > np.maximum(f[rows] ** 2 / 4.0, noise[rows])
-            at_pi = along[:, 1] > np.maximum((np.pi - f[rows, 1]) ** 2 / 4.0, noise[rows, 1])
-            folds[rows] = at_zero
-            folds[rows, 1] |= at_pi
-        out: Booleans = folds & self._kinds
-        return out
+            folds[rows] = across + along > np.maximum(f[rows] ** 2 / 4.0, noise[rows])
+            folds[rows, 1] |= along[:, 1] > np.maximum((np.pi - f[rows, 1]) ** 2 / 4.0, noise[rows, 1])
+        return folds & self._kinds
 
     def _noticed(self, spread: Floats, sigmas: float) -> Floats:
         """Variance across where it bends a row by so many sigma, else 0, shape (n_pairs, 2).

@@ -323,7 +323,11 @@ def test_the_report_shows_the_figures_in_millimetres_and_degrees(simulated_job):
     fitted = [f"{e.fitted.rms * 1e3:.3f}" for e in errors]
     assert figures("position, RMS", "Real error after the best rigid fit") == ["mm", *fitted]
     predicted = [f"{e.predicted_rms * 1e3:.3f}" for e in found.estimates]
-    assert figures("position, RMS", "Error predicted by its sigmas") == ["mm", "-", *predicted]
+    assert figures("position, RMS", "Error predicted by its sigmas") == [
+        "mm",
+        "-",
+        *predicted,
+    ]
     angles = [np.rad2deg(e.residual_rms["test"]["angle"]["after"]) for e in found.estimates]
     assert figures("angle", "Residuals, test rows (RMS)")[2:] == [f"{a:.4f}" for a in angles]
     assert figures("parameters") == ["-", "35", "23", "23", "23", "23"]

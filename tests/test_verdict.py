@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 from simulated import measure, small_arm, true_robot, write_job
@@ -523,3 +524,37 @@ def test_many_configurations_are_looked_at_in_part():
     m = measure(true_robot(robot, rng), 20, rng, n_test=1500)
     said = assess(solve(build_problem(robot, m, model="position"))).expected_error
     assert (said.n, said.of) == (1000, 1500)
+
+
+def test_noise_estimated_as_large_as_the_motions_is_no_noise(fg_calib, example):
+    """Orientations that were never measured, all 0 0 0 1, made 80 degrees of noise and GOOD."""
+    file = example / "calibration.yaml"
+    lines = (example / "poses.csv").read_text().splitlines()
+    header = lines[0].split(",")
+    first = header.index("qx")
+    rows = [line.split(",") for line in lines[1:]]
+    for row in rows:
+        row[first : first + 4] = ["0", "0", "0", "1"]
+    (example / "poses.csv").write_text("\n".join([lines[0], *map(",".join, rows)]) + "\n")
+    job = yaml.safe_load(file.read_text()) | {"model": "pose", "noise": "estimate"}
+    job.pop("pairing", None)
+    file.write_text(yaml.safe_dump(job))
+    ended = fg_calib("calibrate", file, "--json")
+    assert ended.code == 3
+    assert any("the noise estimated of orientation is" in text for text in json.loads(ended.out)["findings"])
+
+
+def test_lengths_that_tolerances_let_point_either_way_are_a_finding():
+    """Stops at one point: every distance is some millimetres, as are the tolerances at the tool."""
+    robot = small_arm(tolerance={"a": 3e-3, "d": 3e-3, "alpha": 3e-3, "theta": 3e-3})
+    rng = np.random.default_rng(2)
+    q = touch(
+        robot, corners(robot, 1, rng), 30, rng, 0.0, ()
+    ).readings  # the nominal arm is at one point in all of them
+    near = measure(true_robot(robot, rng), 30, rng, sigma=(1e-5, 1e-5), readings=q)
+    wide = measure(true_robot(robot, rng), 30, rng, sigma=(1e-5, 1e-5))
+    told = [
+        any("let their vectors point either way" in text for text in (*found.findings, *found.cautions))
+        for found in (assess(solve(build_problem(robot, m, model="distance"))) for m in (near, wide))
+    ]
+    assert told == [True, False]
