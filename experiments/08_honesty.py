@@ -350,6 +350,8 @@ def unmeasured_problem(setting: Setting) -> Problem:
 
 def run_cells(cells: Sequence[Cell], n_draws: int, seed: int, pool: ProcessPoolExecutor | None) -> Iterator[dict]:
     """Every cell's figures."""
+    if not cells:
+        return
     chunks = [range(i, min(i + CHUNK, n_draws)) for i in range(0, n_draws, CHUNK)]
     tasks = [(cell, seed, chunk) for cell in cells for chunk in chunks]
     results = iter((pool.map if pool else map)(run_draws, *zip(*tasks, strict=True)))

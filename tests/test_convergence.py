@@ -50,7 +50,7 @@ def measured(robot, unit, n, rng, *, error=1e-3, sigma=1.0, sigma_joint=0.0):
     ("model", "frame"),
     [("pose", "unknown"), ("position", "unknown"), ("distance", "known"), ("distance-rotation", "known")],
 )
-@pytest.mark.parametrize("sigma_joint", [0.0, 5e-4])
+@pytest.mark.parametrize("sigma_joint", [pytest.param(0.0, marks=pytest.mark.slow), 5e-4])
 def test_the_unit_of_length_changes_nothing(model, frame, gauge, sigma_joint):
     """The same arm a thousand times smaller, a hundred (a crane) and a thousand times larger."""
     found = []
@@ -89,7 +89,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("gauge", ["prior", "none"])
+@pytest.mark.parametrize("gauge", ["prior", pytest.param("none", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", CASES)
 def test_solving_again_from_the_answer_moves_nothing(name, gauge):
     """Rows whitened at the answer have their optimum there: within 1e-6 sigma in any direction."""
@@ -128,6 +128,7 @@ def test_the_last_step_is_taken_although_the_cost_no_longer_shows_it(shift):
         assert np.abs(apart).max() < 3e-7  # 1e-5 when the cost had the last word
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("convention", ["dh", "mdh", "mdh-hayati", "dh-hayati"])
 @pytest.mark.parametrize("tolerance", [None, 1e-3, 0.05])
 def test_random_arms_arrive_in_few_steps(convention, tolerance):
