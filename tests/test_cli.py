@@ -865,7 +865,10 @@ def test_a_job_may_leave_the_noise_to_the_residuals(fg_calib, example, given):
     assert rms["distance"] == pytest.approx(found["residual_rms"]["train"]["distance"]["after"], rel=rounding(1, 1e4))
 
 
-@pytest.mark.parametrize(("columns", "widest"), [(None, 100), ("40", 40), ("60", 60), ("200", 200)])
+@pytest.mark.parametrize(
+    ("columns", "widest"),
+    [(None, 100), ("40", 40), *(pytest.param(str(n), n, marks=pytest.mark.slow) for n in (60, 200))],
+)
 @pytest.mark.parametrize("command", ["calibrate", "compare", "observe"])
 def test_a_report_is_as_wide_as_the_page(fg_calib, example, monkeypatch, command, columns, widest):
     """A pipe has no width: 100 columns, in which all tables of the example have room."""

@@ -135,12 +135,16 @@ CASES = [
 ]
 
 
+EVERY_THIRD = [pytest.param(*case, marks=[pytest.mark.slow] * (i % 3 > 0)) for i, case in enumerate(CASES)]
+"""All cases, most of them for the slow run: they take the same way."""
+
+
 def named(check):
     """What the first explanation says."""
     return str(check.explanations[0]) if check.explanations else ""
 
 
-@pytest.mark.parametrize(("model", "frame", "mistake"), CASES)
+@pytest.mark.parametrize(("model", "frame", "mistake"), EVERY_THIRD)
 def test_a_mistake_in_the_table_is_named(tmp_path, model, frame, mistake):
     robot = ur5e(tmp_path)
     m = measured(robot, placed=PLACED if frame == "unknown" else None)
