@@ -50,7 +50,7 @@ by a derivative that is there only at the estimate; with 1 the NEES of a SCARA's
 MOST_BEND = 1.0
 """A row is bent by no more sigma: what is off by more than that is for the optimum to find, not to be called noise."""
 
-REDUNDANT = 10.0
+REDUNDANT = 100.0
 """Factor on what is not linear in pairs that are more than the errors they share: they have nothing else to say there,
 and its distribution is not normal."""
 

@@ -212,3 +212,27 @@ def test_directly_measured_pairs_without_joint_noise_share_nothing():
     problem = build_problem(robot, m, model="distance")
     assert not problem.approximate
     assert isinstance(problem.blocks[0], residuals.PairBlock)
+
+
+@pytest.mark.slow
+def test_chi_square_of_all_pairs_of_small_motions_is_that_of_the_noise():
+    """More pairs than errors have nothing but what is not linear to say of the rest: it had chi-square 1.5 here."""
+    robot = small_arm(tolerance=TOLERANCE)
+    sigma = np.array([6e-4, 3e-3, 1.2e-3])  # along three axes, [m] and [rad]
+    found = []
+    for draw in range(12):
+        rng = np.random.default_rng(draw)
+        q = rng.uniform(-1.0, 1.0, (1, 4)) + rng.uniform(-0.1, 0.1, (30, 4))
+        m = measure(true_robot(robot, rng), 30, rng, sigma=(0.0, 0.0), readings=q)
+        noise = Rotation.from_rotvec(sigma * rng.normal(size=(30, 3))).as_matrix()
+        m = replace(
+            m,
+            position=m.position + sigma * rng.normal(size=(30, 3)),
+            rotation=m.rotation @ noise,
+            sigma_position=np.tile(sigma, (30, 1)),
+            sigma_orientation=np.tile(sigma, (30, 1)),
+        )
+        uncertainty = assess(solve(build_problem(robot, m, model="distance-rotation", pairing=Pairing("all"))))
+        found.append(uncertainty.reduced_chi2)
+    # Some 150 degrees of freedom: a draw's sd is 0.12 and the mean's 0.035.
+    assert np.mean(found) == pytest.approx(1.0, abs=0.14)
