@@ -109,9 +109,7 @@ def test_solving_again_from_the_answer_moves_nothing(name, gauge):
         step = variables.step(solution.values, again.values)[: variables.n_columns]
         variance, direction = np.linalg.eigh(spread.tangent / np.outer(scales, scales))
         known = variance > 1e-12 * variance.max()  # of the others nothing is known
-        # Robust weights settle by steps that shrink slowly: the last of 3e-7 sigma is not all that is left.
-        most = 1e-6 if options.get("loss", "none") == "none" else 1e-5
-        assert np.linalg.norm((direction.T @ (step / scales))[known] / np.sqrt(variance[known])) < most
+        assert np.linalg.norm((direction.T @ (step / scales))[known] / np.sqrt(variance[known])) < 1e-6
 
 
 @pytest.mark.parametrize("shift", [[0, 0, 0], [70, -30, 20]])
