@@ -53,6 +53,9 @@ SHORT = 30
 SLOW = 0.3
 """Steps whose decrement falls by less than this factor are extrapolated."""
 
+SLOWEST = 0.9
+"""Largest share of what is left to go that whitening anew is taken to leave each time, without end."""
+
 FARTHEST = 30.0
 """An extrapolated step is at most so many times as long as the Gauss-Newton step, [sigma over sigma]."""
 
@@ -263,7 +266,7 @@ def _fit(problem: Problem, options: SolverOptions) -> _Run:
     """
     robust = problem.settings.loss != "none"
     weighting = Weighting(problem.settings.loss)
-    run, goal = _Run(problem, options), COARSE
+    run, goal, was = _Run(problem, options), COARSE, np.inf
     bends = SPREAD_ROUNDS if problem.pairs is not None and problem.adjustment.spread is None else 0
     if robust:
         run.go_on_with(judged_at(problem, problem.start, _learn(problem, problem.start, weighting)[0]))
@@ -275,13 +278,14 @@ def _fit(problem: Problem, options: SolverOptions) -> _Run:
         unchanged = same_rows(anew, run.problem)
         if not unchanged:
             run.go_on_with(anew)
-        if final and (unchanged or (not bends and run.here.decrement <= run.least)):
+        left, was = run.left_after(was), run.here.decrement
+        if final and (goal <= run.least if unchanged else not bends and left <= run.least):
             run.descend(run.least)
             break
         if run.exhausted:
             run.give_up()
             break
-        goal = min(COARSE, max(run.least, 0.1 * run.here.decrement))
+        goal = run.least if unchanged else min(COARSE, max(run.least, 0.1 * left))
     return run
 
 
@@ -338,6 +342,11 @@ class _Run:
         """Whether all iterations have been spent."""
         return len(self.history) >= self._options.max_iterations
 
+    def left_after(self, was: float) -> float:
+        """How far the optimum still is, [sigma], where whitening anew left `was` the last time and changes rows again."""
+        left = self.here.decrement
+        return left if left <= self.here.rounding else left / (1.0 - min(left / was, SLOWEST))
+
     def go_on_with(self, problem: Problem) -> None:
         """The same place with other rows."""
         self.problem = problem
@@ -347,11 +356,11 @@ class _Run:
         """Step until the optimum of these rows is nearer than `goal`, [sigma]; whether it is."""
         self.converged, stuck = self.here.decrement <= goal, False
         while not (self.converged or stuck or self.exhausted):
-            path, damping = self._undamped(), 0.0
+            path, damping = next(filter(None, map(self._undamped, self._first_steps())), []), 0.0
             if not path:
                 path, damping = self._damped(), self._damping
             stuck = not path
-            for there in path or [self.here]:
+            for there in path:
                 taken = self.problem.variables.step(self.here.values, there.values)
                 length = float(np.linalg.norm(taken / self.problem.variables.all_scales))
                 self.history.append(Iteration(there.cost, damping, length, self.here.decrement))
@@ -377,8 +386,8 @@ class _Run:
     def _left(self) -> str:
         return f"{self.here.decrement:.1e} sigma"
 
-    def _undamped(self) -> list[_Linearised]:
-        """Where Gauss-Newton steps lead; nothing if they do not keep what they promise.
+    def _undamped(self, first: Floats) -> list[_Linearised]:
+        """Where Gauss-Newton steps lead after a first one; nothing if they do not keep what they promise.
 
         A valley that is weakly determined may be curved: a step along it leaves it, and the next ones come back. So the
         cost may rise as long as the steps that follow are ever shorter.
@@ -388,7 +397,7 @@ class _Run:
         for _ in range(PATIENCE):
             last = there
             try:
-                step = last.step if path else self._extrapolated()
+                step = last.step if path else first
                 there = _Linearised(self.problem, self.problem.variables.moved(last.values, step))
             except SolverError:
                 return []  # so far off that the rows have no derivative there
@@ -401,21 +410,20 @@ class _Run:
                 return []
         return []
 
-    def _extrapolated(self) -> Floats:
-        """The Gauss-Newton step, or where steps that hardly get shorter lead together (Anderson 1965, depth 1).
+    def _first_steps(self) -> list[Floats]:
+        """The Gauss-Newton step; before it where steps that hardly get shorter lead together (Anderson 1965, depth 1).
 
         Where a direction is known by its curvature, Gauss-Newton steps are all too long or too short by the same share.
         """
         here = self.here
         if self._last is None or here.decrement < SLOW * self._last[0].decrement:
-            return here.step
+            return [here.step]
         last, taken = self._last
         change = here.step - last.step
         share = here.product(here.step, change) / max(here.product(change, change), 1e-300)
         extrapolated: Floats = here.step - share * (taken + change)
-        return (
-            extrapolated if here.product(extrapolated, extrapolated) < (FARTHEST * here.decrement) ** 2 else here.step
-        )
+        far = here.product(extrapolated, extrapolated) >= (FARTHEST * here.decrement) ** 2
+        return [here.step] if far else [extrapolated, here.step]
 
     def _damped(self) -> list[_Linearised]:
         """Where GTSAM's next damped step leads, undetermined directions held; nothing if none lowers the cost."""
