@@ -51,7 +51,7 @@ def predicted_points(
     sigma = table.sigma[rows]
     of_core = of_touch @ J.reshape(-1, J.shape[2])
     P = (np.pad(of_core, ((0, 0), (0, len(error) - J.shape[2]))) + of_mean @ where) @ error
-    L = (of_touch + of_mean @ averaged) @ scipy.sparse.block_diag([scipy.sparse.csr_array(c) for c in noise], format="csr")
+    L = (of_touch + of_mean @ averaged) @ scipy.sparse.block_diag(list(map(scipy.sparse.csr_array, noise)), "csr")
     own = (table.family[rows] == FAMILIES.index("distance")).astype(np.float64)
     return P / sigma[:, None], scipy.sparse.csr_array(scipy.sparse.diags_array(1.0 / sigma) @ L), own
 

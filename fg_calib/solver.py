@@ -343,7 +343,7 @@ class _Run:
         return len(self.history) >= self._options.max_iterations
 
     def left_after(self, was: float) -> float:
-        """How far the optimum still is, [sigma], where whitening anew left `was` the last time and changes rows again."""
+        """How far the optimum still is, [sigma], where whitening anew left `was` the last time, and goes on."""
         left = self.here.decrement
         return left if left <= self.here.rounding else left / (1.0 - min(left / was, SLOWEST))
 
