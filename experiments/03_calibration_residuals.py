@@ -40,7 +40,7 @@ from space_robot import (
 )
 
 from fg_calib import Bound, Simulation, cramer_rao
-from fg_calib.choices import Model
+from fg_calib.options import Model
 
 NAME = "03_calibration_residuals"
 

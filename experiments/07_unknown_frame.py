@@ -38,7 +38,7 @@ from space_robot import (
 )
 
 from fg_calib import Pairing, build_problem, cramer_rao, solve
-from fg_calib.choices import FrameKnowledge, Model, PairErrors, Strategy
+from fg_calib.options import FrameKnowledge, Model, PairErrors, Strategy
 
 NAME = "07_unknown_frame"
 

@@ -49,11 +49,11 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 import fg_calib
-from fg_calib import residuals
-from fg_calib.factors import prior_rows
-from fg_calib.kinematics import pose
-from fg_calib.measurements import Measurements, Pairing, Pairs, rotation_angle
-from fg_calib.problem import Problem, all_rows, judged_at, predicted_problem, whitened_triangle
+from fg_calib.graph.factors import prior_rows
+from fg_calib.graph.problem import Problem, all_rows, judged_at, predicted_problem, whitened_triangle
+from fg_calib.measurements import residuals
+from fg_calib.measurements.dataset import Measurements, Pairing, Pairs, rotation_angle
+from fg_calib.robot.kinematics import pose
 
 Floats = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import fg_calib
-from fg_calib.robot import Joint, Robot, RobotBuilder
+from fg_calib.robot.model import Joint, Robot, RobotBuilder
 
 Floats = NDArray[np.float64]
 

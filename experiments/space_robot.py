@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from fg_calib import Bound, Robot, Scenario, Simulation, build_problem, fit_least_squares, read_scenario, solve
-from fg_calib.choices import Model
-from fg_calib.comparison import real_errors
-from fg_calib.scenario import BoardViews
+from fg_calib.baseline.comparison import real_errors
+from fg_calib.options import Model
+from fg_calib.simulation.scenario import BoardViews
 
 Floats = NDArray[np.float64]
 T, R = TypeVar("T"), TypeVar("R")

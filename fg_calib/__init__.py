@@ -17,24 +17,24 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fg_calib.bounds import Bound, cramer_rao
-    from fg_calib.comparison import Comparison, compare
+    from fg_calib.analysis.bounds import Bound, cramer_rao
+    from fg_calib.analysis.identifiability import Identifiability, observe_configurations, observe_structure
+    from fg_calib.analysis.mistakes import SetupCheck, check_setup
+    from fg_calib.analysis.restarts import look_elsewhere
+    from fg_calib.analysis.uncertainty import Uncertainty, assess
+    from fg_calib.analysis.variance_components import estimate_noise, solve_job
+    from fg_calib.baseline.comparison import Comparison, compare
+    from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
     from fg_calib.files.job import Job, read_job
     from fg_calib.files.robot_yaml import read_robot, write_robot
     from fg_calib.files.scenario import read_scenario, write_simulation
     from fg_calib.files.tables import read_measurements
     from fg_calib.files.units import Units
-    from fg_calib.identifiability import Identifiability, observe_configurations, observe_structure
-    from fg_calib.kinematics import pose
-    from fg_calib.least_squares import LeastSquares, fit_least_squares
-    from fg_calib.measurements import Measurements, Noise, Pairing
-    from fg_calib.mistakes import SetupCheck, check_setup
-    from fg_calib.noise import estimate_noise, solve_job
-    from fg_calib.problem import Problem, build_problem, problem_of
-    from fg_calib.report import format_comparison, format_identifiability, format_report
-    from fg_calib.restarts import look_elsewhere
-    from fg_calib.results import (
+    from fg_calib.graph.problem import Problem, build_problem, problem_of
+    from fg_calib.graph.solver import Solution, SolverOptions, solve
+    from fg_calib.measurements.dataset import Measurements, Noise, Pairing
+    from fg_calib.report.documents import (
         comparison_document,
         observability_document,
         result_document,
@@ -42,41 +42,41 @@ if TYPE_CHECKING:
         write_observability,
         write_results,
     )
-    from fg_calib.robot import Robot
-    from fg_calib.scenario import Scenario, Simulation
-    from fg_calib.simulator import simulate
-    from fg_calib.solver import Solution, SolverOptions, solve
-    from fg_calib.uncertainty import Uncertainty, assess
+    from fg_calib.report.text import format_comparison, format_identifiability, format_report
+    from fg_calib.robot.kinematics import pose
+    from fg_calib.robot.model import Robot
+    from fg_calib.simulation.scenario import Scenario, Simulation
+    from fg_calib.simulation.simulator import simulate
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "fg_calib.bounds": ("Bound", "cramer_rao"),
-    "fg_calib.comparison": ("Comparison", "compare"),
+    "fg_calib.analysis.bounds": ("Bound", "cramer_rao"),
+    "fg_calib.baseline.comparison": ("Comparison", "compare"),
     "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
     "fg_calib.files.job": ("Job", "read_job"),
     "fg_calib.files.robot_yaml": ("read_robot", "write_robot"),
     "fg_calib.files.scenario": ("read_scenario", "write_simulation"),
     "fg_calib.files.tables": ("read_measurements",),
     "fg_calib.files.units": ("Units",),
-    "fg_calib.identifiability": ("Identifiability", "observe_configurations", "observe_structure"),
-    "fg_calib.kinematics": ("pose",),
-    "fg_calib.least_squares": ("LeastSquares", "fit_least_squares"),
-    "fg_calib.measurements": ("Measurements", "Noise", "Pairing"),
-    "fg_calib.mistakes": ("SetupCheck", "check_setup"),
-    "fg_calib.noise": ("estimate_noise", "solve_job"),
-    "fg_calib.problem": ("Problem", "build_problem", "problem_of"),
-    "fg_calib.report": ("format_comparison", "format_identifiability", "format_report"),
-    "fg_calib.results": (
+    "fg_calib.analysis.identifiability": ("Identifiability", "observe_configurations", "observe_structure"),
+    "fg_calib.robot.kinematics": ("pose",),
+    "fg_calib.baseline.least_squares": ("LeastSquares", "fit_least_squares"),
+    "fg_calib.measurements.dataset": ("Measurements", "Noise", "Pairing"),
+    "fg_calib.analysis.mistakes": ("SetupCheck", "check_setup"),
+    "fg_calib.analysis.variance_components": ("estimate_noise", "solve_job"),
+    "fg_calib.graph.problem": ("Problem", "build_problem", "problem_of"),
+    "fg_calib.report.text": ("format_comparison", "format_identifiability", "format_report"),
+    "fg_calib.report.documents": (
         *("comparison_document", "observability_document", "result_document"),
         *("write_comparison", "write_observability", "write_results"),
     ),
-    "fg_calib.robot": ("Robot",),
-    "fg_calib.scenario": ("Scenario", "Simulation"),
-    "fg_calib.simulator": ("simulate",),
-    "fg_calib.restarts": ("look_elsewhere",),
-    "fg_calib.solver": ("Solution", "SolverOptions", "solve"),
-    "fg_calib.uncertainty": ("Uncertainty", "assess"),
+    "fg_calib.robot.model": ("Robot",),
+    "fg_calib.simulation.scenario": ("Scenario", "Simulation"),
+    "fg_calib.simulation.simulator": ("simulate",),
+    "fg_calib.analysis.restarts": ("look_elsewhere",),
+    "fg_calib.graph.solver": ("Solution", "SolverOptions", "solve"),
+    "fg_calib.analysis.uncertainty": ("Uncertainty", "assess"),
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from fg_calib import __version__
-from fg_calib.choices import AngleUnit, FrameKnowledge, LengthUnit, Model
 from fg_calib.errors import CalibrationError, InputError
+from fg_calib.options import AngleUnit, FrameKnowledge, LengthUnit, Model
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -77,11 +77,11 @@ def calibrate(
     as_json: Json = False,
 ) -> None:
     """Estimate a robot's parameters from measurements, with their uncertainties."""
+    from fg_calib.analysis.uncertainty import assess
+    from fg_calib.analysis.variance_components import solve_job
     from fg_calib.files.job import read_job
-    from fg_calib.noise import solve_job
-    from fg_calib.report import build_report
-    from fg_calib.results import result_document, write_results
-    from fg_calib.uncertainty import assess
+    from fg_calib.report.documents import result_document, write_results
+    from fg_calib.report.text import build_report
 
     given = read_job(job)
     solution = solve_job(given)
@@ -102,10 +102,10 @@ def compare_estimators(
     as_json: Json = False,
 ) -> None:
     """Run the factor graph beside plain least squares on the same job: errors, residuals, sigmas, time."""
-    from fg_calib.comparison import compare
+    from fg_calib.baseline.comparison import compare
     from fg_calib.files.job import read_job
-    from fg_calib.report import build_comparison_report
-    from fg_calib.results import comparison_document, write_comparison
+    from fg_calib.report.documents import comparison_document, write_comparison
+    from fg_calib.report.text import build_comparison_report
 
     comparison = compare(read_job(job))
     if out is not None:
@@ -121,7 +121,7 @@ def _show(report: RenderableType) -> None:
     """Print a report as wide as the terminal, or as `COLUMNS` says; a pipe has no width of its own."""
     from rich.console import Console
 
-    from fg_calib.report import WIDTH, width_for
+    from fg_calib.report.text import WIDTH, width_for
 
     given = Console().is_terminal or "COLUMNS" in os.environ
     width = width_for(report, Console().width if given else WIDTH)
@@ -192,13 +192,13 @@ def observe(
     as_json: Json = False,
 ) -> None:
     """Say which parameters measurements can determine, which only together, and why not the others."""
+    from fg_calib.analysis.identifiability import observe_configurations, observe_structure
     from fg_calib.files.robot_yaml import read_robot
     from fg_calib.files.tables import read_measurements
     from fg_calib.files.units import Units
-    from fg_calib.identifiability import observe_configurations, observe_structure
-    from fg_calib.measurements import Noise, Pairing
-    from fg_calib.report import build_identifiability_report
-    from fg_calib.results import observability_document, write_observability
+    from fg_calib.measurements.dataset import Noise, Pairing
+    from fg_calib.report.documents import observability_document, write_observability
+    from fg_calib.report.text import build_identifiability_report
 
     if configurations is None:
         _refuse_idle(context, _OF_A_TABLE, "without --configurations")
@@ -242,7 +242,7 @@ def simulate(
 ) -> None:
     """Simulate a calibration job: the true robot, and what is measured of it, with noise."""
     from fg_calib.files.scenario import read_scenario, write_simulation
-    from fg_calib.simulator import simulate as run
+    from fg_calib.simulation.simulator import simulate as run
 
     simulation = run(read_scenario(scenario), seed)
     names = write_simulation(out, simulation)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fg_calib.robot import CONVENTIONS, Joint, Robot, RobotBuilder
+from fg_calib.robot.model import CONVENTIONS, Joint, Robot, RobotBuilder
 
 Floats = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.files.robot_yaml import write_robot
 from fg_calib.files.tables import write_csv
-from fg_calib.kinematics import pose
-from fg_calib.measurements import Measurements
-from fg_calib.robot import Joint, Robot, RobotBuilder
+from fg_calib.measurements.dataset import Measurements
+from fg_calib.robot.kinematics import pose
+from fg_calib.robot.model import Joint, Robot, RobotBuilder
 
 PAPER_A = [0, 0, 0, 5, 5, 0, 0]
 PAPER_ALPHA = [0, -90, -90, 0, 0, 90, 90]

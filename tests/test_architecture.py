@@ -5,6 +5,7 @@ import importlib
 import inspect
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -12,46 +13,11 @@ import pytest
 import fg_calib
 
 PACKAGE = Path(fg_calib.__file__).parent
-FLOORS = (
-    *("errors", "choices", "robot", "measurements", "scenario", "files", "threads", "kernels", "kinematics"),
-    *("inverse", "simulator", "conventions", "residuals", "least_squares", "moments"),
-    *(
-        "factors",
-        "groups",
-        "encoders",
-        "frames",
-        "observability",
-        "robust",
-        "whitening",
-        "problem",
-        "solver",
-        "setup",
-        "mistakes",
-        "structure",
-        "reasons",
-        "identifiability",
-        "covariance",
-        "restarts",
-        "accuracy",
-        "corrections",
-        "joint_values",
-        "residual_table",
-        "predictions",
-        "goodness",
-        "noise",
-        "verdict",
-        "uncertainty",
-        "bounds",
-        "comparison",
-        "report",
-        "figures",
-        "results",
-    ),
-    "cli",
+FOLDERS = (
+    *("errors", "threads", "options", "robot", "measurements", "simulation", "files"),
+    *("graph", "analysis", "baseline", "report", "cli"),
 )
-"""From the ground up: a module may import from those before it; within `files` see `FILES`."""
-
-FILES = ("disk", "schema", "units", "tables", "urdf", "robot_yaml", "job", "scenario")
+"""From the ground up: a folder (or module of the package itself) imports from those before it."""
 
 MODULES = sorted(p for p in PACKAGE.rglob("*.py") if p.name != "__init__.py" and "examples" not in p.parts)
 NAMES = [p.relative_to(PACKAGE).with_suffix("").as_posix() for p in MODULES]
@@ -83,32 +49,34 @@ def imported(tree):
 
 
 def floor(name):
-    first, _, rest = name.partition("/")
-    return FLOORS.index(first), FILES.index(rest) if rest else -1
+    return FOLDERS.index(name.partition("/")[0])
 
 
-def test_every_module_stands_on_a_floor():
-    assert {name.partition("/")[0] for name in NAMES} == set(FLOORS)
-    assert {name.partition("/")[2] for name in NAMES if name.startswith("files/")} == set(FILES)
+def test_every_module_stands_in_a_folder():
+    assert {name.partition("/")[0] for name in NAMES} == set(FOLDERS)
 
 
 @EVERY_MODULE
-def test_a_module_imports_from_lower_floors_only(name, path):
-    upward = {other for other in imported(parse(path)) if floor(other) >= floor(name)}
-    assert upward == set()
+def test_a_folder_imports_from_lower_ones_only(name, path):
+    assert {other for other in imported(parse(path)) if floor(other) > floor(name)} == set()
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    graph = {name: imported(parse(path)) for name, path in zip(NAMES, MODULES, strict=True)}
+    assert list(TopologicalSorter(graph).static_order())
 
 
 def test_upward_imports_would_be_seen():
     """The check itself: all forms of an import, wherever they stand."""
-    code = "import fg_calib.cli\ndef f():\n from fg_calib import solver, pose\n from fg_calib.files.units import Units"
-    assert imported(ast.parse(code)) == {"cli", "solver", "files/units"}
-    assert floor("files/units") < floor("files/job") < floor("kinematics") < floor("cli")
+    code = "import fg_calib.cli\ndef f():\n from fg_calib.graph import solver\n from fg_calib.files.units import Units"
+    assert imported(ast.parse(code)) == {"cli", "graph/solver", "files/units"}
+    assert floor("files/units") < floor("graph/solver") < floor("cli")
 
 
 def test_the_baseline_shares_nothing_with_the_graph_but_residuals():
     """So that agreement of the two says something: neither problem, factors and solver nor what assesses them."""
-    given = {"choices", "errors", "robot", "measurements", "kinematics", "residuals", "threads"}
-    assert imported(parse(PACKAGE / "least_squares.py")) == given
+    of_folders = {other.partition("/")[0] for other in imported(parse(PACKAGE / "baseline/least_squares.py"))}
+    assert of_folders == {"errors", "options", "robot", "measurements", "threads"}
 
 
 @EVERY_MODULE

@@ -7,7 +7,7 @@ On 200 poses that the paper's arm reaches (of random configurations within +-180
 arm with an elbow whose joints turn +-100 degrees: how many are reached to 1e-9 m and rad within the limits, by how much
 the others are missed, and the time a pose, for
 
-- *own*: `fg_calib.inverse`, all poses at once, damped Newton steps on our derivatives;
+- *own*: `fg_calib.robot.inverse`, all poses at once, damped Newton steps on our derivatives;
 - *trf*: `scipy.optimize.least_squares`, trust region reflective with the limits as bounds, one pose after another, on
   the same derivatives and from the same starts, lengths over the arm's length too; all its tolerances at 1e-15.
 
@@ -28,9 +28,9 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 import fg_calib
-from fg_calib.inverse import N_STARTS, REACHED, random_readings, solve_inverse
-from fg_calib.kinematics import build_chain, forward, precompute_trig
-from fg_calib.robot import Joint, RobotBuilder
+from fg_calib.robot.inverse import N_STARTS, REACHED, random_readings, solve_inverse
+from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.robot.model import Joint, RobotBuilder
 
 ROOT = Path(__file__).resolve().parents[2]
 NAME = "inverse"

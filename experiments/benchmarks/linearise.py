@@ -48,10 +48,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import fg_calib
-from fg_calib import residuals
-from fg_calib.factors import Variables, build_variables, measurement_factor
-from fg_calib.kinematics import build_chain, forward, precompute_trig, processors
-from fg_calib.residuals import PairBlock
+from fg_calib.graph.factors import Variables, build_variables, measurement_factor
+from fg_calib.measurements import residuals
+from fg_calib.measurements.residuals import PairBlock
+from fg_calib.robot.kinematics import build_chain, forward, precompute_trig, processors
 from fg_calib.threads import one_blas_thread
 
 Floats = NDArray[np.float64]

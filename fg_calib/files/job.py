@@ -11,14 +11,14 @@ from typing import Annotated, Any
 
 from pydantic import Field, StrictBool
 
-from fg_calib.choices import EncoderNoise, FrameKnowledge, Gauge, Loss, Model, PairErrors, check_names
 from fg_calib.errors import InputError
 from fg_calib.files.robot_yaml import read_robot, robot_from_mapping
 from fg_calib.files.schema import Count, NotNegative, Positive, Schema, read_yaml, shown, validate
 from fg_calib.files.tables import read_measurements
 from fg_calib.files.units import Units, UnitsOfFile
-from fg_calib.measurements import Measurements, Noise, Pairing
-from fg_calib.robot import Robot, names_of
+from fg_calib.measurements.dataset import Measurements, Noise, Pairing
+from fg_calib.options import EncoderNoise, FrameKnowledge, Gauge, Loss, Model, PairErrors, check_names
+from fg_calib.robot.model import Robot, names_of
 
 _log = logging.getLogger(__name__)
 

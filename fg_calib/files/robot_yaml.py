@@ -23,12 +23,12 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import Field
 
-from fg_calib.choices import check_type
 from fg_calib.errors import InputError
 from fg_calib.files.disk import write_text
 from fg_calib.files.schema import Bound, Number, Positive, Schema, read_yaml, shown, validate
 from fg_calib.files.units import Units, UnitsOfFile
-from fg_calib.robot import (
+from fg_calib.options import check_type
+from fg_calib.robot.model import (
     AXIS_OF_KIND,
     CONVENTIONS,
     FRAME_KINDS,

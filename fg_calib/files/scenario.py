@@ -40,7 +40,6 @@ import numpy as np
 import yaml
 from pydantic import Field
 
-from fg_calib.choices import known_names
 from fg_calib.errors import InputError
 from fg_calib.files.disk import fill_folder, write_text
 from fg_calib.files.job import check_choices, joint_noise, robot_of
@@ -49,8 +48,9 @@ from fg_calib.files.schema import Count, NotNegative, Number, Positive, Schema, 
 from fg_calib.files.tables import LIMIT_SLACK, read_measurements, write_csv
 from fg_calib.files.units import Units, UnitsOfFile
 from fg_calib.files.urdf import write_urdf
-from fg_calib.measurements import Noise
-from fg_calib.scenario import (
+from fg_calib.measurements.dataset import Noise
+from fg_calib.options import known_names
+from fg_calib.simulation.scenario import (
     BoardViews,
     Configurations,
     Errors,

@@ -11,9 +11,9 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from fg_calib.choices import did_you_mean
 from fg_calib.errors import InputError
 from fg_calib.files.disk import read_text
+from fg_calib.options import did_you_mean
 
 
 def _refuse_bool(value: object) -> object:

@@ -24,12 +24,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fg_calib.choices import check_number, check_type
 from fg_calib.errors import InputError
 from fg_calib.files.disk import replacing, require_file
 from fg_calib.files.units import ANGLES, LENGTHS, Units
-from fg_calib.measurements import Booleans, Floats, Groups, Integers, Measurements, Noise, Pairs, no_pairs
-from fg_calib.robot import Robot
+from fg_calib.measurements.dataset import Booleans, Floats, Groups, Integers, Measurements, Noise, Pairs, no_pairs
+from fg_calib.options import check_number, check_type
+from fg_calib.robot.model import Robot
 
 if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it
     import polars as pl

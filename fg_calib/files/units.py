@@ -9,8 +9,8 @@ from typing import Annotated
 
 from pydantic import BeforeValidator
 
-from fg_calib.choices import AngleUnit, LengthUnit, check
 from fg_calib.files.schema import refuse_unknown_keys
+from fg_calib.options import AngleUnit, LengthUnit, check
 
 LENGTHS: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 """Metres in one unit of length."""

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fg_calib.choices import NEAR, did_you_mean, known_names
 from fg_calib.errors import InputError
 from fg_calib.files.disk import require_file, write_text
-from fg_calib.robot import FRAME_KINDS, Joint, Robot, RobotBuilder, UrdfSource
+from fg_calib.options import NEAR, did_you_mean, known_names
+from fg_calib.robot.model import FRAME_KINDS, Joint, Robot, RobotBuilder, UrdfSource
 
 if TYPE_CHECKING:  # lxml is imported where it is used: `fg-calib --help` need not wait for it
     from lxml.etree import _Element as Element

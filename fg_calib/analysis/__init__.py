@@ -1,0 +1,1 @@
+"""What a solution is worth: rank and reasons, covariance, goodness of fit, what may be wrong."""

@@ -1,0 +1,217 @@
+"""The covariance of the estimate, and what nothing determines.
+
+Where parameters were left out to fix the gauge (`keep`) they stay at nominal, but are not known. With K what was
+estimated and L what was left out, J_K and J_L the whitened derivatives of the rows in them, x true minus nominal values
+and n the noise, the estimate of K is, to first order, `J_K^+ (J_K x_K + J_L x_L + n)`. So the errors, estimated minus
+true, are
+
+    e_K = G x_L + J_K^+ n,   e_L = -x_L,   G = J_K^+ J_L,
+
+and with the left-out tolerances T and the covariance C_K of the noise's part
+
+    cov(e_K, e_K) = C_K + G T^2 G^T,   cov(e_K, e_L) = -G T^2,   cov(e_L, e_L) = T^2.
+
+Where one of L has no tolerance its error may be anything: the direction (G, -1) of it is not determined. What an
+estimate is known to be, whatever x_L, is that of the combination `x_K + G x_L`, with the covariance C_K.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fg_calib.graph.factors import Variables, prior_rows
+from fg_calib.graph.observability import RANK_TOLERANCE, SUPPORT_TOLERANCE, determined
+from fg_calib.graph.problem import Problem, correlation, whitened_triangle
+from fg_calib.graph.robust import effect
+from fg_calib.graph.solver import Solution
+from fg_calib.robot.model import Robot
+
+Floats = NDArray[np.float64]
+
+NO_ANGLE = 1.0
+"""An angle of a pose with a larger sigma is not known, [rad]: near a pitch of a quarter turn yaw and roll are none."""
+
+_AT_ONCE = 192
+"""Functions whose covariance is formed at once where only variances are wanted."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """The covariance in the tangent space of the variables, and the directions that nothing determines.
+
+    Attributes:
+        variables: The variables; the columns are theirs.
+        parameters: The estimate (see `Variables`).
+        tangent: Covariance of the determined part, shape (n_columns, n_columns).
+        weighted: The same, were the rows' noise as they are weighted.
+        actual: The same, by the errors that rows share, also where they are asked to count as independent.
+        loose: Undetermined directions at the estimate, orthonormal in changes of ordinary size, shape
+            (n_loose, n_columns).
+        loose_at_nominal: The same at the nominal parameters.
+        rank: Number of directions that data and priors determine.
+        excess: By how much the mean of chi-square is below its degrees of freedom, because rows that share errors are
+            weighted as independent.
+    """
+
+    variables: Variables
+    parameters: Floats
+    tangent: Floats
+    weighted: Floats
+    actual: Floats
+    loose: Floats
+    loose_at_nominal: Floats
+    rank: int
+    excess: float
+
+    def covariance(self, rows: Floats) -> Floats:
+        """Covariance of linear functions of the columns, shape (m, n_columns); nan where undetermined."""
+        scaled = rows * self.variables.scales
+        with np.errstate(invalid="ignore"):  # yaw and roll at a pitch of a quarter turn have no derivative
+            out: Floats = rows @ self.tangent @ rows.T
+            size = np.linalg.norm(scaled, axis=1)
+            unknown = ~np.isfinite(np.diag(out))
+            shares = [np.linalg.norm(scaled @ loose.T, axis=1) for loose in (self.loose, self.loose_at_nominal)]
+            unknown |= (shares[0] > SUPPORT_TOLERANCE * size) & (shares[1] > SUPPORT_TOLERANCE * size)
+        out[unknown, :] = np.nan
+        out[:, unknown] = np.nan
+        return out
+
+    def variance(self, rows: Floats) -> Floats:
+        """The diagonal of `covariance` for any number of functions, shape (m,)."""
+        if not len(rows):
+            return np.zeros(0)
+        chunks = (rows[start : start + _AT_ONCE] for start in range(0, len(rows), _AT_ONCE))
+        return np.concatenate([np.diag(self.covariance(chunk)) for chunk in chunks])
+
+    def named(self) -> Floats:
+        """Covariance of the robot's parameters among the columns, shape (n_robot_columns, n_robot_columns)."""
+        n = self.variables.n_robot_columns
+        out = self.covariance(self.variables.named_derivative(self.parameters)[:n])
+        for v in self.variables.items:
+            if v.is_pose and v.kind != "frame":
+                angles = np.arange(v.columns.start + 3, v.columns.stop)
+                unknown = angles[np.diag(out)[angles] > NO_ANGLE**2]
+                out[unknown, :] = np.nan
+                out[:, unknown] = np.nan
+        return out
+
+    def derivative(self, function: Callable[[Robot], ArrayLike]) -> Floats:
+        """Derivative of a function of the robot in the columns, by central differences, shape (m, n_columns)."""
+        v, steps = self.variables, 1e-2 * np.diag(self.variables.scales)
+
+        def at(step: Floats) -> Floats:
+            robot = v.robot.with_values(v.stepped(self.parameters, step)[v.robot_span])
+            return np.ravel(np.asarray(function(robot), dtype=np.float64))
+
+        columns = [(at(h) - at(-h)) / (2.0 * h.sum()) for h in steps[: v.n_robot_columns]]
+        of_frame = [np.zeros_like(at(np.zeros(v.n_columns)))] * (v.n_columns - v.n_robot_columns)
+        return np.array(columns + of_frame).T
+
+
+def spread_of(solution: Solution) -> Spread:
+    """The covariance: that of the weighted least-squares estimate under the noise as it is taken to be.
+
+    Parameters that were left out to fix the gauge count as known; see `with_left_out`.
+
+    Where rows share errors but are weighted as independent, with H = J^T J and C their covariance, it is
+    H^-1 (J^T C J) H^-1 (priors are rows of their own), unless independence was asked for. The mean of chi-square,
+    tr C - tr(H^-1 J^T C J), is then below the degrees of freedom by tr(H^-1 J^T (C - 1) J). A robust loss loses some of
+    what clean data hold: see `robust.Effect`.
+    """
+    problem, variables = solution.problem, solution.problem.variables
+    scales = variables.prior_scales
+
+    def decomposed(parameters: Floats) -> tuple[Floats, Floats, int]:
+        data = whitened_triangle(problem, parameters) / np.sqrt(effect(problem.settings.loss, problem.height).variance)
+        rows = [data, prior_rows(variables, parameters)[1]]
+        stacked = np.vstack([*rows, np.zeros((variables.n_columns, variables.n_columns))]) * scales
+        _, s, Vt = np.linalg.svd(stacked, full_matrices=False)
+        return s, Vt * scales, determined(s)
+
+    s, directions, rank = decomposed(solution.parameters)
+    _, directions_nominal, rank_nominal = decomposed(solution.before)
+    half = directions[:rank].T / s[:rank]
+    added = correlation(problem, solution.parameters)
+    middle = np.zeros((rank, rank)) if added is None else half.T @ added @ half
+    middle_of_sigma = np.eye(rank) + (middle if problem.approximate else 0.0)
+    return Spread(
+        variables=variables,
+        parameters=solution.parameters,
+        tangent=half @ middle_of_sigma @ half.T,
+        weighted=half @ half.T,
+        actual=half @ (np.eye(rank) + middle) @ half.T,
+        loose=_orthonormal(directions[rank:], variables.scales),
+        loose_at_nominal=_orthonormal(directions_nominal[rank_nominal:], variables.scales),
+        rank=rank,
+        excess=float(np.trace(middle)),
+    )
+
+
+def with_left_out(solution: Solution, spread: Spread) -> Spread:
+    """The covariance of all parameters, those among them that were left out to fix the gauge: see the module's head.
+
+    Args:
+        solution: The solution.
+        spread: That of what was estimated.
+    """
+    problem = solution.problem
+    if problem.whole is None:
+        return spread
+    variables, own_scales = problem.whole.variables, spread.variables.scales
+    tolerances = [p.tolerance for p in problem.whole.estimated if p.name not in spread.variables.names]
+    known = np.array([t is not None for t in tolerances], dtype=np.bool_)
+    M, errors = _errors(problem, solution.parameters)
+    M_nominal, errors_nominal = _errors(problem, solution.before)
+    of_left_out = errors[:, known] * np.array([t for t in tolerances if t is not None])
+
+    def loose(own: Floats, M: Floats, errors: Floats) -> Floats:
+        return _orthonormal(np.vstack([(own * own_scales) @ M.T, errors[:, ~known].T]), variables.scales)
+
+    return replace(
+        spread,
+        variables=variables,
+        tangent=M @ spread.tangent @ M.T + of_left_out @ of_left_out.T,
+        weighted=M @ spread.weighted @ M.T + of_left_out @ of_left_out.T,
+        actual=M @ spread.actual @ M.T + of_left_out @ of_left_out.T,
+        loose=loose(spread.loose, M, errors),
+        loose_at_nominal=loose(spread.loose_at_nominal, M_nominal, errors_nominal),
+    )
+
+
+def _errors(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
+    """How the error of the estimate comes about, in the columns of all parameters, left-out ones among them.
+
+    Args:
+        problem: The problem without the left-out parameters; `problem.whole` has them.
+        parameters: The parameter vector.
+
+    Returns:
+        What each column of the problem is in them, and the error that each left-out parameter's own makes: (G, -1).
+        Shapes (n_all, n_columns) and (n_all, n_left_out).
+    """
+    assert problem.whole is not None
+    own, whole = problem.variables, problem.whole.variables
+    by_name = dict(zip(whole.names, whole.tangent_derivative(parameters).T, strict=True))
+    poses = {v.key: np.eye(whole.n_columns)[v.columns] for v in whole.items if v.is_pose}
+    rows = [poses.get(v.key, np.array([by_name[name] for name in own.names[v.columns]])) for v in own.items]
+    M = np.vstack([np.zeros((0, whole.n_columns)), *rows]).T
+    left_out = [by_name[p.name] for p in problem.whole.estimated if p.name not in own.names]
+    N = np.array(left_out).reshape(-1, whole.n_columns).T
+    J = whitened_triangle(replace(problem, variables=whole), parameters)
+    U, s, Vt = np.linalg.svd((J @ M) * own.scales, full_matrices=False)
+    rank = determined(s)
+    G = own.scales[:, None] * ((Vt[:rank].T / s[:rank]) @ (U[:, :rank].T @ (J @ N)))
+    return M, M @ G - N
+
+
+def _orthonormal(directions: Floats, scales: Floats) -> Floats:
+    """The same span of directions, shape (n, n_columns), orthonormal in changes of ordinary size."""
+    scaled = directions / scales
+    scaled = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1e-300)
+    _, s, Vt = np.linalg.svd(scaled, full_matrices=False)
+    basis: Floats = Vt[s > RANK_TOLERANCE * s.max(initial=0.0)]
+    return basis

@@ -1,0 +1,159 @@
+"""Why directions are lost: each is moved at random configurations, and what it does to the tool tells the cause.
+
+A cause is stated only if it is checked: that the tool does not move, that everything moves as one body, that the tool
+only turns about its own point, and so on. Where no check succeeds the reason is `NO_CAUSE`, never a guess.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.graph.observability import Observability
+from fg_calib.graph.problem import Problem, named_triangle, random_problem
+from fg_calib.options import Model
+from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.robot.model import Parameter
+
+Floats = NDArray[np.float64]
+
+NO_CAUSE = "no simple cause found"
+NOT_EXCITED = "not excited by these configurations"
+
+SEES_POSITION: tuple[Model, ...] = ("pose", "position", "distance", "distance-rotation")
+SEES_ORIENTATION: tuple[Model, ...] = ("pose", "orientation", "rotation", "distance-rotation")
+
+_NOTHING = 1e-7
+"""A motion below this part of what its members do one by one is none: relations are rounded to nine digits."""
+
+
+@dataclass(frozen=True)
+class LostDirection:
+    """A direction that the measurements do not determine.
+
+    Attributes:
+        relation: The change of each parameter, [m] and [rad], the largest being 1 or -1.
+        reason: Why, in words.
+    """
+
+    relation: dict[str, float]
+    reason: str
+
+
+def explain(problem: Problem, observability: Observability, parameters: Floats) -> tuple[LostDirection, ...]:
+    """The reason for every lost direction of an observability found for a problem at a parameter vector."""
+    lost = observability.lost
+    if not lost:
+        return ()
+    settings = problem.settings
+    anywhere = random_problem(
+        problem.robot.with_values(parameters[problem.variables.robot_span]), settings.model, settings.frame
+    )
+    effect = named_triangle(anywhere, anywhere.start)
+    motion = _Motion(anywhere)
+    largest = float(np.linalg.norm(effect, axis=0).max())
+    found = []
+    for relation in lost:
+        direction = np.array([relation.get(name, 0.0) for name in observability.names])
+        if np.linalg.norm(effect @ direction) > 1e-6 * largest * np.abs(direction).max():
+            found.append(LostDirection(relation, NOT_EXCITED))
+        else:
+            found.append(LostDirection(relation, motion.reason(direction)))
+    return tuple(found)
+
+
+class _Motion:
+    """What parameters do to the tool at the random configurations of a problem."""
+
+    def __init__(self, problem: Problem) -> None:
+        robot = problem.robot
+        self._parameters = problem.estimated
+        self._model = problem.settings.model
+        self._relative = problem.settings.uses_pairs or problem.settings.frame == "unknown"
+        self._pairs = problem.settings.uses_pairs
+        columns = {robot.index(p.name): k for k, p in enumerate(self._parameters)}
+        chain = build_chain(robot, columns).with_joint_columns()
+        poses = forward(chain, precompute_trig(robot, problem.measurements.readings[:60]))
+        n = len(self._parameters)
+        self._R, self._p = poses.rotation, poses.position
+        self._J = poses.jacobian[:, :, :n]
+        axes = np.moveaxis(poses.jacobian[:, :3, n:], 2, 1)[:, [not j.prismatic for j in robot.joints]]
+        axes = axes * np.where(np.sum(axes * axes[:1, :1], axis=2, keepdims=True) < 0.0, -1.0, 1.0)
+        self._common_axis = axes[:, 0] if axes.size and self._constant(axes.reshape(-1, 3)) else None
+        last = poses.jacobian[:, 3:, -1]
+        self._on_last_axis = not robot.joints[-1].prismatic and float(np.abs(last).max()) < _NOTHING
+
+    def reason(self, direction: Floats) -> str:  # noqa: PLR0911 - one return a cause
+        """Why a direction, shape (n,), [m] and [rad], has no effect on the measurements."""
+        w = self._J[:, :3] @ direction  # (n_configurations, 3)
+        dp = self._J[:, 3:] @ direction
+        size_w = float(np.abs(self._J[:, :3] * direction).sum(axis=2).max())
+        size_p = float(np.abs(self._J[:, 3:] * direction).sum(axis=2).max())
+        turns = float(np.abs(w).max()) > _NOTHING * max(size_w, 1e-3 * size_p)
+        moves = float(np.abs(dp).max()) > _NOTHING * max(size_p, 1e-3 * size_w)
+        sees_orientation, sees_position = self._model in SEES_ORIENTATION, self._model in SEES_POSITION
+        if not turns and not moves:
+            return self._same_motion(direction)
+        if not sees_orientation and not moves:
+            if self._on_last_axis:
+                return f"the tool point lies on the last axis: the tool only turns about it, unseen by {self._model}"
+            return f"the tool only turns about its own point, unseen by {self._model}"
+        if not sees_position and not turns:
+            if self._all_turn(direction):
+                return f"{self._parallel(direction)}: only the sum of their turns is seen, and no lengths are"
+            return f"the tool only moves without turning, unseen by {self._model}"
+        if self._relative and self._rigid(w, dp, sees_position):
+            return "the measurement is blind to the base: the whole arm moves as one body"
+        if self._pairs and not moves and self._constant(np.einsum("nji,nj->ni", self._R, w)):
+            return self._tool_turned(direction)
+        if self._pairs and not sees_position and self._constant(np.einsum("nji,nj->ni", self._R, w)):
+            return self._tool_turned(direction)
+        if self._pairs and self._common_axis is not None and self._tilts(w, dp, self._common_axis):
+            return "parallel axes, all of them: it only tilts the arm out of its plane, unseen to first order"
+        return NO_CAUSE
+
+    def _tilts(self, w: Floats, dp: Floats, axis: Floats) -> bool:
+        """Whether the tool moves along the common axis of the joints only, and turns across it only."""
+        along = np.sum(w * axis, axis=1)
+        in_plane = dp - np.sum(dp * axis, axis=1, keepdims=True) * axis
+        return bool(np.abs(along).max() < 1e-8 and np.abs(in_plane).max() < 1e-8)
+
+    def _tool_turned(self, direction: Floats) -> str:
+        what = "the tool frame turns by the same in itself everywhere, which no angle between two poses shows"
+        of_the_tool = all(p.name.startswith("tool.") for p in self._members(direction))
+        return f"the tool point lies on the last axis: {what}" if self._on_last_axis and not of_the_tool else what
+
+    def _same_motion(self, direction: Floats) -> str:
+        """The cause where several parameters cancel each other completely."""
+        members = self._members(direction)
+        if all(p.unit == "m" for p in members):
+            return f"{self._parallel(direction)}: only the sum of the shifts along them acts"
+        if all(p.unit == "rad" for p in members):
+            return "only their sum turns about the same axis"
+        return "together they do not move the tool"
+
+    def _members(self, direction: Floats) -> list[Parameter]:
+        return [p for p, v in zip(self._parameters, direction, strict=True) if v != 0.0]
+
+    def _all_turn(self, direction: Floats) -> bool:
+        return all(p.unit == "rad" for p in self._members(direction))
+
+    def _parallel(self, direction: Floats) -> str:
+        """`parallel axes 3, 4`: the joints whose axes the members turn about or shift along; else in general words."""
+        members = self._members(direction)
+        if all(p.kind in ("d", "theta") for p in members):
+            return f"parallel axes {', '.join(str(p.owner) for p in members)}"
+        return "parallel directions"
+
+    def _rigid(self, w: Floats, dp: Floats, sees_position: bool) -> bool:
+        """Whether the tool moves everywhere as if the base alone had moved."""
+        if not sees_position:
+            return self._constant(w)
+        return self._constant(w) and self._constant(dp - np.cross(w, self._p))
+
+    @staticmethod
+    def _constant(values: Floats) -> bool:
+        """Whether rows are all the same."""
+        return float(np.abs(values - values[0]).max()) <= 1e-8 * max(1.0, float(np.abs(values).max()))

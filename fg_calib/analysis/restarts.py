@@ -1,0 +1,128 @@
+"""Other optima: where measurements see a combination only curved, a second arm may explain them as well.
+
+Distances see a small offset across an axis by its square, so that +5 mm and -5 mm predict the same; which of the two a
+descent finds depends on where it starts. A square shows itself: its derivative, and with it what is known of the
+combination, grows with the distance from the vertex. So where a direction is known better at the estimate than at
+nominal, the descent is repeated from the estimate's mirror image about the vertex; and where one is still weak at the
+estimate, from two tolerances away to either side. The best optimum is kept, and one that the data cannot tell from it
+is told of.
+
+This stands behind the front door of jobs (`noise.solve_job`) and not in `solve`: a simulation of a thousand draws asks
+for the optimum that nominal leads to, and would pay for looking elsewhere a thousand times.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.analysis.covariance import spread_of
+from fg_calib.graph.factors import prior_rows
+from fg_calib.graph.observability import SIGNAL_FLOOR
+from fg_calib.graph.problem import Problem, whitened_triangle
+from fg_calib.graph.solver import Solution, SolverOptions, solve_from
+from fg_calib.threads import one_blas_thread
+
+Floats = NDArray[np.float64]
+
+WEAK = 2.0
+"""A direction with a signal-to-noise ratio below this, priors included, is weak: sigma above half a tolerance."""
+
+CURVED = 0.7
+"""A direction whose sigma is below this share of what it is at nominal is seen by a square, or nearly so."""
+
+FAR = 2.0
+"""How far away the other starts are, in tolerances (1 mm and 1 mrad where there are none)."""
+
+APART = 3.0
+"""Optima are two if some parameter differs by more than this many sigma."""
+
+INDISTINCT = 10.8276
+"""The 99.9 % point of chi-square with one degree of freedom: a smaller difference of chi-square decides nothing."""
+
+MAX_ROWS = 20_000
+"""Beyond this many residuals only the mirror image is tried: a descent takes seconds, and so many rows see much."""
+
+
+def look_elsewhere(solution: Solution, options: SolverOptions | None = None) -> Solution:
+    """The best optimum that a solution and descents from other starts find, with the others that are as good.
+
+    Args:
+        solution: What the descent from nominal found.
+        options: Of the solver.
+
+    Returns:
+        The solution with the smallest cost; in its `others` those that data and priors cannot tell from it. The same
+        solution where nothing is weak, where it has not converged, and with a robust loss, whose weights differ from
+        optimum to optimum.
+    """
+    settings = solution.problem.settings
+    if not solution.converged or settings.loss != "none" or settings.evaluated:
+        return solution
+    variables, seconds = solution.problem.variables, solution.seconds
+    with one_blas_thread:
+        steps = _steps(solution)
+    found = [solution]
+    for step in steps:
+        whole = np.concatenate([step, np.zeros(variables.n_nuisance)])
+        start = variables.parameters(variables.moved(solution.values, whole))
+        least = min(one.cost for one in found)
+        # Twice what is asked for below, for the rows are whitened where the first optimum is.
+        other = solve_from(solution, start, least + INDISTINCT, options)
+        if other is None:
+            continue
+        seconds += other.seconds
+        if other.converged and 2.0 * (other.cost - least) < INDISTINCT and all(_apart(other, one) for one in found):
+            found.append(other)
+    best, *rest = sorted(found, key=lambda one: one.cost)
+    others = tuple(one.parameters for one in rest if 2.0 * (one.cost - best.cost) < INDISTINCT)
+    return replace(best, others=others, seconds=seconds)
+
+
+def _steps(solution: Solution) -> list[Floats]:
+    """Steps from the estimate to other starts, shape (n_columns,) each."""
+    problem, variables = solution.problem, solution.problem.variables
+    scales, steps = variables.prior_scales, []
+    nominal = _nominal(solution)
+    s, V = _directions(problem, solution.parameters)
+    s_nominal, V_nominal = _directions(problem, nominal)
+    # What is seen better here than at nominal, by ratio 1 / r: as of a square, with its vertex beyond nominal.
+    spread = np.linalg.norm((V.T @ V_nominal) / np.maximum(s, SIGNAL_FLOOR)[:, None], axis=0)
+    ratio = spread * np.maximum(s_nominal, SIGNAL_FLOOR)
+    moved = V_nominal.T @ (variables.step(variables.values(nominal), solution.values)[: len(scales)] / scales)
+    curved = (ratio < CURVED) & (np.abs(moved) > SIGNAL_FLOOR)
+    if curved.any():
+        steps.append(-2.0 * scales * (V_nominal[:, curved] @ (moved[curved] / (1.0 - ratio[curved]))))
+    weak = V[:, (s < WEAK) & (s > SIGNAL_FLOOR)]
+    if weak.size and problem.n_residuals <= MAX_ROWS:
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], len(scales))
+        aside = FAR * scales * (weak @ (weak.T @ signs))  # the same whatever basis the weak directions have
+        steps += [aside, -aside]
+    return steps
+
+
+def _nominal(solution: Solution) -> Floats:
+    """The parameter vector before the descent, with nominal values wherever a tolerance says how good they are."""
+    nominal, robot = solution.before.copy(), solution.problem.robot
+    for i, parameter in enumerate(robot.parameters):
+        if parameter.tolerance is not None:
+            nominal[i] = parameter.nominal
+    return nominal
+
+
+def _directions(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
+    """Signal-to-noise ratios of data and priors at some parameters, and their unit-free directions as columns."""
+    n = problem.variables.n_columns
+    rows = np.vstack([whitened_triangle(problem, parameters), prior_rows(problem.variables, parameters)[1]])
+    _, s, Vt = np.linalg.svd(np.vstack([rows * problem.variables.prior_scales, np.zeros((n, n))]), full_matrices=False)
+    return s, Vt.T
+
+
+def _apart(a: Solution, b: Solution) -> bool:
+    """Whether the robot of the second differs by more than what is left open at the first, in some column."""
+    variables, spread = a.problem.variables, spread_of(a)
+    sigma = np.sqrt(np.diag(spread.covariance(np.eye(variables.n_columns))))  # nan where nothing determines it
+    apart = np.abs(variables.step(a.values, b.values)[: variables.n_columns]) > APART * sigma
+    return bool(np.any(apart[: variables.n_robot_columns]))

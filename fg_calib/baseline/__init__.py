@@ -1,0 +1,1 @@
+"""Plain least squares, and the comparison with it."""

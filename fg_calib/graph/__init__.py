@@ -1,0 +1,1 @@
+"""The factor graph: variables, factors, whitening, start, problem and solver."""

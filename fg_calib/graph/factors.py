@@ -1,0 +1,681 @@
+"""GTSAM's side: which parameters are which variable, and measurements and priors as factors.
+
+| key | variable |
+|---|---|
+| `K(i)` | estimated parameters of joint i, a vector of just those |
+| `K(0)`, `K(n + 1)` | the same of the base, and of the tool, where not all six of its parameters are estimated |
+| `B(0)`, `T(0)` | the base frame, and the tool frame, as a Pose3 where all six are |
+| `X(0)` | world_T_base as a Pose3, where the measurement frame is unknown |
+| `L(g)` | base_p of the physical point that group g touches, a Point3 |
+| `Q(k)` | the true joint values of configuration k, a vector, where encoder noise is estimated |
+
+The last two are *nuisance* variables: they must be estimated too, but are nobody's question. Their columns follow
+those of the *core* (robot and measurement frame) and are eliminated before anything is said of the core.
+
+Pose3's tangent is rotation first, and a step moves the frame in itself (`pose * Exp(step)`).
+
+Priors are rows (value - nominal) / tolerance. Of a Pose3 they act on x, y and z as they stand, and on its turn away
+from nominal, `Log(R_nominal^T R)`, whose components about the frame's own x, y and z axes take the tolerances of roll,
+pitch and yaw. The angles themselves would not do: at a pitch of a quarter turn they are no coordinates.
+
+GTSAM 4.3 ends the interpreter when a custom factor leaves a Jacobian unset or gets its rows wrong, and returns the
+initial values without a word when it gets the columns wrong. So `custom_factor` alone fills its lists, after checks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, Protocol
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.errors import SolverError
+from fg_calib.measurements import residuals
+from fg_calib.measurements.residuals import AnyBlock
+from fg_calib.robot.kinematics import Chain, build_chain
+from fg_calib.robot.model import FRAME_KINDS, Robot, names_of
+
+Floats = NDArray[np.float64]
+
+GRAM_ROWS = 20_000
+"""Blocks with more rows than this are reduced by their Gram matrix, if their conditioning allows it."""
+
+_ROUNDING = 1e-10
+"""Share of a column's length that elimination may leave of nothing."""
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One GTSAM variable.
+
+    Attributes:
+        key: GTSAM's key.
+        symbol: How it is written: `K(3)`, `T(0)`, `X(0)`.
+        kind: A vector of parameters, the pose of tool, base or measurement frame, a touched point, or joint values.
+        parameters: Indices into the parameter vector of `Variables.parameters`, in the variable's own order;
+            for poses in the order of `FRAME_KINDS`.
+        columns: Its columns in a Jacobian.
+        scales: Of a nuisance variable: a change of ordinary size in each of its columns.
+    """
+
+    key: int
+    symbol: str
+    kind: Literal["vector", "tool", "base", "frame", "point", "joints"]
+    parameters: tuple[int, ...]
+    columns: slice
+    scales: tuple[float, ...] = ()
+
+    @property
+    def is_pose(self) -> bool:
+        """Whether it is a Pose3; else it is a vector."""
+        return self.kind in ("tool", "base", "frame")
+
+
+@dataclass(frozen=True)
+class Variables:
+    """All variables of a problem, and the way between GTSAM's values and the parameter vector.
+
+    The parameter vector has the robot's parameters, then the measurement frame's six in the order of `FRAME_KINDS`,
+    then the values of the nuisance variables.
+
+    Attributes:
+        robot: The robot, nominal.
+        items: The core variables in the order of their columns.
+        names: Name of each estimated scalar, shape (n_columns,): a parameter's, or `frame.x` ... `frame.yaw`. Of a
+            pose the names stand in `FRAME_KINDS`' order although its columns are tangent directions.
+        chain: The kinematic chain with these columns.
+        priors: Whether the robot's tolerances are priors.
+        nuisance: The nuisance variables; their columns follow those of the core.
+    """
+
+    robot: Robot
+    items: tuple[Variable, ...]
+    names: tuple[str, ...]
+    chain: Chain
+    priors: bool
+    nuisance: tuple[Variable, ...] = ()
+
+    @property
+    def n_columns(self) -> int:
+        """Number of columns of the core's Jacobian: the dimension of its tangent space."""
+        return len(self.names)
+
+    @property
+    def n_nuisance(self) -> int:
+        """Number of columns of the nuisance variables."""
+        return sum(len(v.parameters) for v in self.nuisance)
+
+    @property
+    def n_without_prior(self) -> int:
+        """Number of nuisance columns that have no prior of their own, as true joint values have."""
+        return sum(len(v.parameters) for v in self.nuisance if v.kind == "point")
+
+    @property
+    def keys(self) -> list[int]:
+        """GTSAM's keys in the order of the columns, the core's first."""
+        return [v.key for v in self.items + self.nuisance]
+
+    @property
+    def robot_span(self) -> slice:
+        """Where the robot's parameters stand in the parameter vector."""
+        return slice(0, len(self.robot.parameters))
+
+    @property
+    def frame_span(self) -> slice:
+        """Where the measurement frame's six stand in the parameter vector."""
+        return slice(len(self.robot.parameters), len(self.robot.parameters) + 6)
+
+    @property
+    def nuisance_span(self) -> slice:
+        """Where the nuisance values stand in the parameter vector."""
+        return slice(self.frame_span.stop, self.frame_span.stop + self.n_nuisance)
+
+    @property
+    def n_robot_columns(self) -> int:
+        """Number of columns without the measurement frame's, which come last."""
+        return self.n_columns - 6 * any(v.kind == "frame" for v in self.items)
+
+    @property
+    def scales(self) -> Floats:
+        """A change of ordinary size in each column (see `Robot.scale_of`), shape (n_columns,)."""
+        angle, length = self.robot.scale_of("rad"), self.robot.scale_of("m")
+        scales = np.repeat([angle, length], 3)
+        parts = [
+            scales
+            if v.is_pose
+            else np.array([length if self.robot.parameters[i].unit == "m" else angle for i in v.parameters])
+            for v in self.items
+        ]
+        return np.concatenate([np.zeros(0), *parts])
+
+    @property
+    def prior_scales(self) -> Floats:
+        """`scales`, but where there is a prior its sigma: how far each column may be off, shape (n_columns,)."""
+        scales = self.scales
+        for v in self.items if self.priors else ():
+            if v.kind != "frame":
+                order = [v.parameters[i] for i in _ALONG_TANGENT] if v.is_pose else v.parameters
+                tolerance = [self.robot.parameters[i].tolerance for i in order]
+                stated = np.array([t is not None for t in tolerance])
+                scales[v.columns] = np.where(stated, np.array(tolerance, dtype=np.float64), scales[v.columns])
+        return scales
+
+    @property
+    def all_scales(self) -> Floats:
+        """`scales`, then those of the nuisance columns, shape (n_columns + n_nuisance,)."""
+        return np.concatenate([self.scales, *(v.scales for v in self.nuisance)])
+
+    def nominal(self) -> Floats:
+        """The parameter vector at the robot's nominal values, measurement frame and nuisance values zero."""
+        return np.concatenate([self.robot.nominal, np.zeros(6 + self.n_nuisance)])
+
+    def values(self, parameters: Floats) -> gtsam.Values:
+        """GTSAM's values at a parameter vector."""
+        values = gtsam.Values()
+        for v in self.items + self.nuisance:
+            chosen = parameters[list(v.parameters)]
+            values.insert(v.key, pose_of(chosen) if v.is_pose else chosen)
+        return values
+
+    def parameters(self, values: gtsam.Values, only: Sequence[Variable] | None = None) -> Floats:
+        """The parameter vector at GTSAM's values; what is not a variable (or not in `only`) keeps its nominal value."""
+        parameters = self.nominal()
+        for v in self.items + self.nuisance if only is None else only:
+            of_v = list(v.parameters)
+            if v.is_pose:
+                near = None if v.kind == "frame" else parameters[of_v]
+                parameters[of_v] = frame_of(values.atPose3(v.key), near)
+            else:
+                parameters[of_v] = values.atVector(v.key)
+        return parameters
+
+    def stepped(self, parameters: Floats, step: Floats) -> Floats:
+        """The parameter vector after a tangent step of the core, shape (n_columns,)."""
+        after = parameters.copy()
+        for v in self.items:
+            of_v, part = list(v.parameters), step[v.columns]
+            if not v.is_pose:
+                after[of_v] += part
+            elif part.any():
+                after[of_v] = frame_of(pose_of(parameters[of_v]).retract(part), parameters[of_v])
+        return after
+
+    def step(self, start: gtsam.Values, end: gtsam.Values) -> Floats:
+        """The tangent step from some values to others, shape (n_columns + n_nuisance,)."""
+        return np.concatenate(
+            [
+                gtsam.Pose3.Logmap(start.atPose3(v.key).between(end.atPose3(v.key)))
+                if v.is_pose
+                else end.atVector(v.key) - start.atVector(v.key)
+                for v in self.items + self.nuisance
+            ]
+        )
+
+    def moved(self, values: gtsam.Values, step: Floats) -> gtsam.Values:
+        """Some values after a tangent step, shape (n_columns + n_nuisance,)."""
+        delta = gtsam.VectorValues()
+        for v in self.items + self.nuisance:
+            delta.insert(v.key, step[v.columns])
+        return values.retract(delta)
+
+    def with_nuisance(
+        self, kind: Literal["point", "joints"], letter: str, indices: Sequence[int], scales: tuple[float, ...]
+    ) -> Variables:
+        """The same with more nuisance variables: vectors with one figure for each of `scales`.
+
+        Args:
+            kind: What they are.
+            letter: Of their keys.
+            indices: The numbers in their keys, `letter(index)`.
+            scales: A change of ordinary size in each of a variable's columns.
+        """
+        column, place, n = self.n_columns + self.n_nuisance, self.nuisance_span.stop, len(scales)
+        more = tuple(
+            Variable(
+                key=gtsam.symbol(letter, index),
+                symbol=f"{letter}({index})",
+                kind=kind,
+                parameters=tuple(range(place + n * i, place + n * (i + 1))),
+                columns=slice(column + n * i, column + n * (i + 1)),
+                scales=scales,
+            )
+            for i, index in enumerate(indices)
+        )
+        return replace(self, nuisance=self.nuisance + more)
+
+    def named_derivative(self, parameters: Floats) -> Floats:
+        """Derivative of the named scalars in the columns, shape (n_columns, n_columns).
+
+        The identity but for poses, where it maps the tangent (rotation first) to x, y, z, yaw, pitch, roll.
+
+        Note:
+            At a pitch of a quarter turn roll and yaw have no derivative; their rows are then nan.
+        """
+        D = np.eye(self.n_columns)
+        for v in self.items:
+            if v.is_pose:
+                D[v.columns, v.columns] = _frame_derivative(parameters[list(v.parameters)])
+        return D
+
+    def tangent_derivative(self, parameters: Floats) -> Floats:
+        """Derivative of the columns in the named scalars: the inverse of `named_derivative`, finite everywhere.
+
+        At a pitch of a quarter turn it is singular: there roll and yaw turn a frame about the same axis.
+        """
+        E = np.eye(self.n_columns)
+        for v in self.items:
+            if v.is_pose:
+                E[v.columns, v.columns] = _tangent_derivative(parameters[list(v.parameters)])
+        return E
+
+    def describe(self, key: int) -> str:
+        """A key in words: `K(3) (a3, alpha3, d3)`."""
+        for v in self.items + self.nuisance:
+            if v.key == key:
+                return f"{v.symbol} ({', '.join(self.names[v.columns]) or v.kind})"
+        return str(gtsam.Symbol(key))
+
+
+def build_variables(robot: Robot, frame: bool, priors: bool = True) -> Variables:
+    """The variables of a robot's estimated parameters, and of the measurement frame where it is unknown."""
+    items: list[Variable] = []
+    names: list[str] = []
+    columns: dict[int, int] = {}
+    tool_tangent = base_tangent = frame_tangent = None
+    for owner in range(robot.n_joints + 2):
+        owned = robot.owned_by(owner)
+        chosen = [i for i in owned if robot.parameters[i].estimated]
+        if not chosen:
+            continue
+        first = len(names)
+        names += names_of(robot.parameters[i] for i in chosen)
+        span = slice(first, len(names))
+        if owner == robot.n_joints + 1 and len(chosen) == 6:
+            tool_tangent = first
+            items.append(Variable(gtsam.symbol("T", 0), "T(0)", "tool", tuple(chosen), span))
+        elif owner == 0 and len(chosen) == 6:
+            base_tangent = first
+            items.append(Variable(gtsam.symbol("B", 0), "B(0)", "base", tuple(chosen), span))
+        else:
+            columns |= {i: first + k for k, i in enumerate(chosen)}
+            items.append(Variable(gtsam.symbol("K", owner), f"K({owner})", "vector", tuple(chosen), span))
+    if frame:
+        frame_tangent = len(names)
+        names += [f"frame.{kind}" for kind in FRAME_KINDS]
+        parameters = tuple(range(len(robot.parameters), len(robot.parameters) + 6))
+        span = slice(frame_tangent, len(names))
+        items.append(Variable(gtsam.symbol("X", 0), "X(0)", "frame", parameters, span))
+    tangents = {"tool_tangent": tool_tangent, "base_tangent": base_tangent, "frame_tangent": frame_tangent}
+    chain = build_chain(robot, columns, **tangents, frame=frame)
+    return Variables(robot, tuple(items), tuple(names), chain, priors)
+
+
+def pose_of(frame: Floats) -> gtsam.Pose3:
+    """The pose of x, y, z, yaw, pitch, roll, [m] and [rad]."""
+    x, y, z, yaw, pitch, roll = (float(v) for v in frame)
+    return gtsam.Pose3(gtsam.Rot3.Ypr(yaw, pitch, roll), np.array([x, y, z]))
+
+
+def frame_of(pose: gtsam.Pose3, near: Floats | None = None) -> Floats:
+    """x, y, z, yaw, pitch, roll of a pose, [m] and [rad].
+
+    Args:
+        pose: The pose.
+        near: Of the angles that make the same rotation those nearest to the angles of this frame, in the same order,
+            are taken; those within half a turn and a quarter turn of pitch if None.
+    """
+    R = pose.rotation()
+    yaw, pitch, roll = R.ypr()
+    if near is None:
+        return np.concatenate([pose.translation(), [yaw, pitch, roll]])
+    wanted = np.asarray(near)[3:]
+    if np.cos(pitch) < _QUARTER_TURN:  # only the sum or difference of yaw and roll acts: both go half the way
+        M, sign = R.matrix(), -np.sign(np.sin(pitch))
+        off = np.arctan2(-sign * M[0, 1], M[1, 1]) - (wanted[2] + sign * wanted[0])
+        half = 0.5 * np.remainder(off + np.pi, 2.0 * np.pi) - 0.5 * np.pi
+        return np.concatenate([pose.translation(), [wanted[0] + sign * half, pitch, wanted[2] + half]])
+    same = np.array([[yaw, pitch, roll], [yaw + np.pi, np.pi - pitch, roll + np.pi]])
+    same += 2.0 * np.pi * np.round((wanted - same) / (2.0 * np.pi))
+    return np.concatenate([pose.translation(), same[np.argmin(np.sum((same - wanted) ** 2, axis=1))]])
+
+
+def corrections_of(robot: Robot, values: Floats) -> Floats:
+    """Parameter values minus a robot's nominal ones, shape (n_parameters,), [m] and [rad].
+
+    Angles of a frame (base, tool, origins of a URDF's joints) by the shorter way. Near a pitch of a quarter turn yaw
+    and roll change by much where the frame has turned by little; if they change by more than twice what it has turned,
+    its turn about its own z, y and x axes stands in place of the differences of yaw, pitch and roll.
+    """
+    off = values - robot.nominal
+    for owner in range(robot.n_joints + 2):
+        frame = [i for i in robot.owned_by(owner) if robot.parameters[i].kind in FRAME_KINDS]
+        if len(frame) == 6:
+            angles = frame[3:]
+            off[angles] = np.remainder(off[angles] + np.pi, 2.0 * np.pi) - np.pi
+            R = pose_of(robot.nominal[frame]).rotation()
+            turn = gtsam.Rot3.Logmap(R.between(pose_of(values[frame]).rotation()))
+            if np.abs(off[angles]).max() > 2.0 * np.linalg.norm(turn):
+                off[angles] = turn[::-1]
+    return off
+
+
+_ALONG_TANGENT = (5, 4, 3, 0, 1, 2)
+"""Which of `FRAME_KINDS` goes with each direction of a pose's tangent: roll, pitch, yaw with turns about x, y, z."""
+
+_QUARTER_TURN = 1e-9
+"""Cosine of a pitch that counts as a quarter turn: what is missed by that is rounding."""
+
+
+def _frame_derivative(frame: Floats) -> Floats:
+    """Derivative of x, y, z, yaw, pitch, roll in Pose3's tangent (rotation first, in itself), shape (6, 6)."""
+    pitch, roll = frame[4], frame[5]
+    secant = 1.0 / np.cos(pitch) if abs(np.cos(pitch)) > _QUARTER_TURN else np.nan
+    D = np.zeros((6, 6))
+    D[:3, 3:] = pose_of(frame).rotation().matrix()
+    # Body rates of Rz(yaw) Ry(pitch) Rx(roll), solved for the angles' rates.
+    D[3, :3] = [0.0, np.sin(roll) * secant, np.cos(roll) * secant]
+    D[4, :3] = [0.0, np.cos(roll), -np.sin(roll)]
+    D[5, :3] = [1.0, np.sin(roll) * np.sin(pitch) * secant, np.cos(roll) * np.sin(pitch) * secant]
+    return D
+
+
+def _tangent_derivative(frame: Floats) -> Floats:
+    """Derivative of Pose3's tangent (rotation first, in itself) in x, y, z, yaw, pitch, roll, shape (6, 6)."""
+    pitch, roll = frame[4], frame[5]
+    E = np.zeros((6, 6))
+    E[3:, :3] = pose_of(frame).rotation().matrix().T
+    # Body rates of Rz(yaw) Ry(pitch) Rx(roll).
+    E[0, 3:] = [-np.sin(pitch), 0.0, 1.0]
+    E[1, 3:] = [np.cos(pitch) * np.sin(roll), np.cos(roll), 0.0]
+    E[2, 3:] = [np.cos(pitch) * np.cos(roll), -np.sin(roll), 0.0]
+    return E
+
+
+Residual = Callable[[gtsam.Values], Floats]
+Linearised = Callable[[gtsam.Values], tuple[Floats, Floats]]
+
+
+def custom_factor(
+    variables: Sequence[Variable], n_rows: int, residual: Residual, linearise: Linearised
+) -> gtsam.CustomFactor:
+    """A factor over whitened residuals: the one place where GTSAM's Jacobian lists are filled.
+
+    Args:
+        variables: The variables it depends on.
+        n_rows: Number of residuals.
+        residual: Whitened residuals at some values, shape (n_rows,).
+        linearise: The same with their derivatives, shape (n_rows, n_columns), in the variables' columns.
+
+    Raises:
+        SolverError: On linearising, if shapes are wrong or a derivative is not finite.
+    """
+    spans = [v.columns for v in variables]
+    n_columns = max(s.stop for s in spans)
+    symbols = ", ".join(v.symbol for v in variables)
+
+    def evaluate(_: gtsam.CustomFactor, values: gtsam.Values, H: list[Floats] | None) -> Floats:
+        if H is None:
+            r = residual(values)
+            if r.shape != (n_rows,):
+                raise SolverError(f"factor on {symbols}: residual of shape {r.shape}, expected ({n_rows},)")
+            return r
+        r, J = linearise(values)
+        if r.shape != (n_rows,) or J.shape != (n_rows, n_columns):
+            expected = f"({n_rows},), ({n_rows}, {n_columns})"
+            raise SolverError(f"factor on {symbols}: shapes {r.shape}, {J.shape}, expected {expected}")
+        if not (np.isfinite(r).all() and np.isfinite(J).all()):
+            raise SolverError(f"factor on {symbols}: a residual or derivative is not finite")
+        for i, span in enumerate(spans):
+            H[i] = J[:, span]
+        return r
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(n_rows), [v.key for v in variables], evaluate)
+
+
+def measurement_factor(block: AnyBlock, variables: Variables) -> gtsam.CustomFactor:
+    """A block of measurements as one factor; a block of one measurement is that measurement's own factor.
+
+    A block of more rows than the variables have columns is handed to GTSAM as the triangular factor of
+    [J r]: with `[J r] = Q [[R, z], [0, rho]]` the residual (z, rho) and the Jacobian (R, 0) have the same cost,
+    gradient and Gauss-Newton Hessian in n_columns + 1 rows.
+    """
+    n_rows = block.n * block.height
+    n_all = variables.n_columns + 1
+    chain = variables.chain
+
+    def at(values: gtsam.Values) -> Chain:
+        return chain.at(variables.parameters(values))
+
+    if n_rows <= n_all:
+
+        def residual(values: gtsam.Values) -> Floats:
+            return residuals.residual(block, at(values)).ravel()
+
+        def linearise(values: gtsam.Values) -> tuple[Floats, Floats]:
+            r, J = residuals.linearise(block, at(values))
+            return r.ravel(), J.reshape(n_rows, -1)
+
+        return custom_factor(variables.items, n_rows, residual, linearise)
+
+    reduce = Reduction(block)
+
+    def reduced_residual(values: gtsam.Values) -> Floats:
+        r = np.zeros(n_all)
+        r[0] = np.sqrt(residuals.squared_norm(block, at(values)))
+        return r
+
+    def reduced_linearise(values: gtsam.Values) -> tuple[Floats, Floats]:
+        R = reduce(at(values))
+        return R[:, -1], R[:, :-1]
+
+    return custom_factor(variables.items, n_all, reduced_residual, reduced_linearise)
+
+
+class Term(Protocol):
+    """Rows that depend on nuisance variables, and on the core or not."""
+
+    @property
+    def n_rows(self) -> int:
+        """Number of rows."""
+
+    @property
+    def nuisance(self) -> tuple[int, ...]:
+        """Which of `Variables.nuisance` they depend on."""
+
+    @property
+    def on_core(self) -> bool:
+        """Whether they depend on the core."""
+
+    def residual(self, variables: Variables, parameters: Floats) -> Floats:
+        """Whitened residuals, shape (n_rows,)."""
+
+    def linearise(self, variables: Variables, parameters: Floats) -> tuple[Floats, Floats]:
+        """The same with derivatives, shape (n_rows, n): in the core's columns if `on_core`, then in `nuisance`."""
+
+
+def term_factor(term: Term, variables: Variables) -> gtsam.CustomFactor:
+    """A term as one factor; one of more rows than columns as its triangular factor, like `measurement_factor`."""
+    items = (variables.items if term.on_core else ()) + tuple(variables.nuisance[i] for i in term.nuisance)
+    local, column = [], 0
+    for v in items:
+        width = v.columns.stop - v.columns.start
+        local.append(replace(v, columns=slice(column, column + width)))
+        column += width
+    reduced = term.n_rows > column + 1
+    n_rows = column + 1 if reduced else term.n_rows
+
+    def residual(values: gtsam.Values) -> Floats:
+        r = term.residual(variables, variables.parameters(values, items))
+        return np.append(np.linalg.norm(r), np.zeros(n_rows - 1)) if reduced else r
+
+    def linearise(values: gtsam.Values) -> tuple[Floats, Floats]:
+        r, J = term.linearise(variables, variables.parameters(values, items))
+        if reduced:
+            R: Floats = np.linalg.qr(np.column_stack([J, r]), mode="r")  # type: ignore[assignment]
+            r, J = R[:, -1], R[:, :-1]
+        return r, J
+
+    return custom_factor(local, n_rows, residual, linearise)
+
+
+def stacked_terms(terms: Sequence[Term], variables: Variables, parameters: Floats) -> Floats:
+    """Derivatives of all terms' rows in all columns, each term reduced: shape (m, n_columns + n_nuisance)."""
+    n = variables.n_columns
+    stacked = [np.zeros((0, n + variables.n_nuisance))]
+    for term in terms:
+        _, J = term.linearise(variables, parameters)
+        if len(J) > J.shape[1]:
+            J = np.linalg.qr(J, mode="r")  # type: ignore[assignment]
+        wide = np.zeros((len(J), n + variables.n_nuisance))
+        spans = [slice(0, n)] if term.on_core else []
+        spans += [variables.nuisance[i].columns for i in term.nuisance]
+        wide[:, np.concatenate([np.arange(n + variables.n_nuisance)[s] for s in spans])] = J
+        stacked.append(wide)
+    return np.vstack(stacked)
+
+
+@dataclass(frozen=True)
+class Eliminated:
+    """A linear system with its nuisance columns eliminated by QR.
+
+    Attributes:
+        own: What the nuisance columns can explain of the right-hand side, shape (n_nuisance,).
+        A: The core's columns, less what the nuisance columns can explain of them, shape (m, n_columns).
+        b: The right-hand side, less the same, shape (m,).
+        follow: How the nuisance variables follow the core, shape (n_nuisance, n_columns).
+        inverse: S with S S^T their covariance at a given core, shape (n_nuisance, n_nuisance).
+    """
+
+    own: Floats
+    A: Floats
+    b: Floats
+    follow: Floats
+    inverse: Floats
+
+
+def eliminate(A: Floats, b: Floats, n_columns: int) -> Eliminated:
+    """Eliminate all but the first `n_columns` of a linear system |A x - b|^2.
+
+    What is left of a core column that the nuisance columns explain altogether is rounding, and set to zero.
+
+    Note:
+        The nuisance columns must be determined by themselves: every touched point has touches of its own.
+    """
+    core, nuisance = A[:, :n_columns], A[:, n_columns:]
+    k = nuisance.shape[1]
+    if k == 0:
+        return Eliminated(np.zeros(0), core, b, np.zeros((0, n_columns)), np.zeros((0, 0)))
+    Q, R = np.linalg.qr(nuisance)
+    explained = Q.T @ core
+    left = core - Q @ explained
+    left = left - Q @ (Q.T @ left)  # once more: rounding of the first time
+    left[:, np.linalg.norm(left, axis=0) <= _ROUNDING * np.linalg.norm(core, axis=0)] = 0.0
+    own = Q.T @ b
+    inverse: Floats = np.linalg.inv(R)
+    return Eliminated(own, left, b - Q @ own, -inverse @ explained, inverse)
+
+
+class Reduction:
+    """Square root of [J r]^T [J r], chosen by the conditioning met at the first linearisation.
+
+    The QR reduction keeps the conditioning. The Gram matrix takes a third of the time and squares it, which is
+    harmless where every singular value is either that of a dead direction or above 1e-5 of the largest.
+    """
+
+    def __init__(self, block: AnyBlock) -> None:
+        self._block = block
+        self._gram = False
+        self._decided = block.n * block.height <= GRAM_ROWS
+
+    def __call__(self, chain: Chain) -> Floats:
+        """A square matrix R with R^T R = [J r]^T [J r], shape (n_columns + 1, n_columns + 1)."""
+        if self._gram:
+            return square_root(residuals.gram(self._block, chain))
+        R = residuals.triangle(self._block, chain)
+        if not self._decided:
+            self._decided = True
+            self._gram = well_conditioned(R[:, :-1])
+        return R
+
+
+def square_root(gram: Floats) -> Floats:
+    """A square matrix R with R^T R = gram, which may be singular."""
+    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
+    root: Floats = np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] * vectors.T * scale
+    return root
+
+
+def well_conditioned(R: Floats) -> bool:
+    """Whether the singular values of R, columns scaled to length 1, are dead or above 1e-5 of the largest."""
+    lengths = np.linalg.norm(R, axis=0)
+    s = np.linalg.svd(R[:, lengths > 0.0] / lengths[lengths > 0.0], compute_uv=False)
+    return not bool(np.any((s > 1e-12 * s[0]) & (s < 1e-5 * s[0])))
+
+
+def prior_rows(variables: Variables, parameters: Floats, only: Variable | None = None) -> tuple[Floats, Floats]:
+    """Whitened priors and their derivatives, shapes (n_priors,), (n_priors, n_columns): see the module's head.
+
+    Args:
+        variables: The variables.
+        parameters: The parameter vector.
+        only: The variable whose priors are wanted; all if None.
+    """
+    nominal = variables.nominal()
+    r: list[Floats] = [np.zeros(0)]
+    J: list[Floats] = [np.zeros((0, variables.n_columns))]
+    for v in variables.items if only is None else (only,):
+        if v.kind == "frame" or not variables.priors:
+            continue
+        of_v = list(v.parameters)
+        tolerances = [variables.robot.parameters[i].tolerance for i in of_v]
+        stated = [k for k, t in enumerate(tolerances) if t is not None]
+        if v.is_pose:
+            off, D = _off_nominal(parameters[of_v], nominal[of_v])
+        else:
+            off, D = parameters[of_v] - nominal[of_v], np.eye(len(of_v))
+        weight = np.array([1.0 / t for t in tolerances if t is not None])
+        rows = np.zeros((len(stated), variables.n_columns))
+        rows[:, v.columns] = weight[:, None] * D[stated]
+        r.append(weight * off[stated])
+        J.append(rows)
+    return np.concatenate(r), np.vstack(J)
+
+
+def _off_nominal(frame: Floats, nominal: Floats) -> tuple[Floats, Floats]:
+    """How far a frame is from nominal, shape (6,), and the derivative in Pose3's tangent, shape (6, 6).
+
+    x, y, z less their nominal values, then the turn from nominal about its own z, y and x axes, [m] and [rad]. The
+    derivative of the turn r = Log(R_nominal^T R) is the inverse right Jacobian of SO(3) at r.
+    """
+    R = pose_of(frame).rotation()
+    turn = gtsam.Rot3.Logmap(pose_of(nominal).rotation().between(R))
+    D = np.zeros((6, 6))
+    D[:3, 3:] = R.matrix()
+    D[3:, :3] = gtsam.Rot3.LogmapDerivative(turn)[::-1]
+    return np.concatenate([frame[:3] - nominal[:3], turn[::-1]]), D
+
+
+def prior_factors(variables: Variables) -> list[gtsam.CustomFactor]:
+    """One factor for each variable that has parameters with a tolerance."""
+    factors = []
+    for v in variables.items:
+        n_rows = len(prior_rows(variables, variables.nominal(), v)[0])
+        if n_rows:
+            factors.append(_prior_factor(variables, v, n_rows))
+    return factors
+
+
+def _prior_factor(variables: Variables, variable: Variable, n_rows: int) -> gtsam.CustomFactor:
+    local = Variable(
+        variable.key, variable.symbol, variable.kind, variable.parameters, slice(0, len(variable.parameters))
+    )
+
+    def rows(values: gtsam.Values) -> tuple[Floats, Floats]:
+        r, J = prior_rows(variables, variables.parameters(values, [variable]), variable)
+        return r, J[:, variable.columns]
+
+    return custom_factor([local], n_rows, lambda values: rows(values)[0], rows)

@@ -1,0 +1,255 @@
+"""Closed-form starting values of the frames: where the robot stands in the measurement frame, where its tool is.
+
+With X = world_T_base, F = base_T_flange and T = flange_T_tool every measured pose says X F T = measured. The rotations
+come first, from the largest singular vectors of a Kronecker sum (Shah 2013) or by averaging where one of the two is
+known; the translations are then a linear least-squares problem. Positions alone, and distances alone, are made
+linear by lifting. What the data leave open stays at nominal (minimum-norm least squares).
+
+References:
+    Shah (2013), Solving the robot-world/hand-eye calibration problem using the Kronecker product. J. Mechanisms
+    and Robotics 5(3).
+    Umeyama (1991), Least-squares estimation of transformation parameters between two point patterns. IEEE PAMI 13(4).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.measurements.dataset import rotation_angle
+
+Floats = NDArray[np.float64]
+Booleans = NDArray[np.bool_]
+
+MAX_ROWS = 2000
+"""Poses used for a start: more do not make it better."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A rotation, shape (3, 3), and a translation, shape (3,), [m]."""
+
+    rotation: Floats
+    translation: Floats
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """What of the two frames is to be found.
+
+    Attributes:
+        frame: Whether world_T_base is.
+        tool_rotation: Whether the tool's rotation is.
+        tool_translation: Which coordinates of the tool point are, shape (3,).
+    """
+
+    frame: bool
+    tool_rotation: bool
+    tool_translation: Booleans
+
+
+def start_from_poses(
+    flange: tuple[Floats, Floats],
+    measured: tuple[Floats | None, Floats | None],
+    nominal: tuple[Frame, Frame],
+    unknown: Unknown,
+) -> tuple[Frame, Frame]:
+    """World_T_base and flange_T_tool from measured poses, positions or orientations.
+
+    Args:
+        flange: base_T_flange at the nominal parameters: rotations (n, 3, 3), translations (n, 3), [m].
+        measured: world_T_tool: rotations (n, 3, 3) and positions (n, 3), either None where not measured.
+        nominal: world_T_base and flange_T_tool as they are known so far.
+        unknown: What is to be found.
+    """
+    X, T = nominal
+    R_F, p_F = (v[:MAX_ROWS] for v in flange)
+    R_M, p_M = (None if v is None else v[:MAX_ROWS] for v in measured)
+    candidates = [(X.rotation, T.rotation)]
+    if R_M is not None:
+        candidates = _rotations(R_F, R_M, X.rotation, T.rotation, unknown)
+        if len(candidates) > 1 and p_M is not None:
+            aligned = _frame_rotations(R_F, p_F, p_M, T.translation, unknown)
+            candidates += [(R, _tool_rotation(R_F, R_M, R)) for R in aligned]
+    elif unknown.frame and p_M is not None:
+        candidates = [(R, T.rotation) for R in _frame_rotations(R_F, p_F, p_M, T.translation, unknown)]
+    fits = [_translations(R_F, p_F, p_M, R_X, R_T, X, T, unknown) for R_X, R_T in candidates]
+    return min(fits, key=lambda fit: fit[1])[0]
+
+
+def start_from_distances(
+    flange: tuple[Floats, Floats],
+    a: NDArray[np.int64],
+    b: NDArray[np.int64],
+    distance: Floats,
+    tool: Frame,
+    free: Booleans,
+) -> Frame:
+    """The tool point from distances alone.
+
+    `|dp + dR t|^2 = d^2` is linear in t and the six products of its coordinates; a few Gauss-Newton steps on the
+    distances themselves follow, from there and from the nominal tool point, and the better one is taken.
+
+    Args:
+        flange: base_T_flange at the nominal parameters: rotations (n, 3, 3), translations (n, 3), [m].
+        a: First configuration of each pair, shape (m,).
+        b: Second configuration of each pair, shape (m,).
+        distance: Measured distances, shape (m,), [m].
+        tool: The nominal tool frame.
+        free: Which coordinates of the tool point are unknown, shape (3,).
+    """
+    if not free.any() or not len(a):
+        return tool
+    a, b, distance = a[:MAX_ROWS], b[:MAX_ROWS], distance[:MAX_ROWS]
+    dR, dp = flange[0][b] - flange[0][a], flange[1][b] - flange[1][a]  # (m, 3, 3), (m, 3)
+    starts = [tool.translation]
+    if free.all() and len(a) >= 9:
+        Q = np.einsum("mki,mkj->mij", dR, dR)
+        i, j = np.triu_indices(3)
+        A = np.hstack([2.0 * np.einsum("mk,mki->mi", dp, dR), Q[:, i, j] * np.where(i == j, 1.0, 2.0)])
+        starts.append(np.linalg.lstsq(A, distance**2 - np.sum(dp**2, axis=1), rcond=1e-10)[0][:3])
+    fits = [_tool_point_by_distances(dR, dp, distance, t, free) for t in starts]
+    return Frame(tool.rotation, min(fits, key=lambda fit: fit[1])[0])
+
+
+def _tool_point_by_distances(
+    dR: Floats, dp: Floats, distance: Floats, t: Floats, free: Booleans, steps: int = 10
+) -> tuple[Floats, float]:
+    """Gauss-Newton on the distances; the tool point with the least cost met, and that cost."""
+    best, least = t, np.inf
+    for _ in range(steps + 1):
+        v = dp + dR @ t
+        length = np.linalg.norm(v, axis=1)
+        r = length - distance
+        cost = float(r @ r)
+        if cost < least:
+            best, least = t, cost
+        J = np.einsum("mk,mki->mi", v / np.maximum(length, 1e-12)[:, None], dR)[:, free]
+        t = t.copy()
+        t[free] -= np.linalg.lstsq(J, r, rcond=1e-10)[0]
+    return best, least
+
+
+def nearest_rotation(M: Floats) -> Floats:
+    """The rotations nearest to matrices, shape (..., 3, 3) (maximise trace(R^T M))."""
+    U, _, Vt = np.linalg.svd(M)
+    U[..., 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
+    rotation: Floats = U @ Vt
+    return rotation
+
+
+def _rotations(R_F: Floats, R_M: Floats, R_X: Floats, R_T: Floats, unknown: Unknown) -> list[tuple[Floats, Floats]]:
+    """Rotations X and T with X F T = M in the least-squares sense; several where the rotations alone leave a choice."""
+    if not unknown.frame:
+        return [(R_X, _tool_rotation(R_F, R_M, R_X) if unknown.tool_rotation else R_T)]
+    if not unknown.tool_rotation:
+        return [(_frame_rotation(R_F, R_M, R_T), R_T)]
+    # trace(M^T X F T) = x^T (sum of Kronecker products) y: the largest singular vectors.
+    K = np.einsum("nab,ncd->acbd", R_M, R_F).reshape(9, 9)
+    U, s, Vt = np.linalg.svd(K)
+    if s[1] < 0.99 * s[0]:
+        u, v = U[:, 0].reshape(3, 3), Vt[0].reshape(3, 3).T
+        R_X = _frame_rotation(R_F, R_M, nearest_rotation(np.sign(np.linalg.det(u)) * v))
+        return [(R_X, _tool_rotation(R_F, R_M, R_X))]
+    # Every rotation is about one axis: X and T may turn about it against each other. Find one solution, from the
+    # nominal tool or any quarter turn of it, and leave the choice of the turn to the positions.
+    starts = np.array([R_T, *(R_T @ Q for Q in _quarter_turns())])
+    all_X, all_T, reached = _alternate(R_F, R_M, starts, steps=20)
+    best = int(np.argmax(np.round(reached, 9)))
+    R_X, R_T = all_X[best], all_T[best]
+    turns = [_about(_common_axis(R_F), angle) for angle in np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)]
+    return [(R_X @ turn, turn.T @ R_T) for turn in turns]
+
+
+def _frame_rotation(R_F: Floats, R_M: Floats, R_T: Floats) -> Floats:
+    """The best X for a T."""
+    return nearest_rotation(np.einsum("nab,cb,ndc->ad", R_M, R_T, R_F))
+
+
+def _tool_rotation(R_F: Floats, R_M: Floats, R_X: Floats) -> Floats:
+    """The best T for an X."""
+    return nearest_rotation(np.einsum("nba,cb,ncd->ad", R_F, R_X, R_M))
+
+
+def _alternate(R_F: Floats, R_M: Floats, R_T: Floats, steps: int) -> tuple[Floats, Floats, Floats]:
+    """Best X for a T, then best T for that X, and so on; and the mean of trace(M^T X F T) reached.
+
+    Args:
+        R_F: base_R_flange, shape (n, 3, 3).
+        R_M: world_R_tool, shape (n, 3, 3).
+        R_T: Where to start from, shape (k, 3, 3).
+        steps: How often.
+    """
+    K = np.einsum("nab,ncd->acbd", R_M, R_F)
+    for _ in range(steps):
+        R_X = nearest_rotation(np.einsum("acbd,kdb->kac", K, R_T))
+        R_T = nearest_rotation(np.einsum("acbd,kac->kdb", K, R_X))
+    return R_X, R_T, np.einsum("acbd,kac,kdb->k", K, R_X, R_T, optimize=True) / len(R_F)
+
+
+def _common_axis(R_F: Floats) -> Floats:
+    """The axis that takes the first rotation to the others, in the base frame, shape (3,); any if there is none."""
+    _, axes = rotation_angle(R_F @ R_F[0].T)
+    axis: Floats = np.linalg.svd(axes)[2][0]
+    return axis
+
+
+def _about(axis: Floats, angle: float) -> Floats:
+    """The rotation about a unit axis (Rodrigues)."""
+    K = np.cross(np.eye(3), axis)
+    turn: Floats = np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * (K @ K)
+    return turn
+
+
+def _quarter_turns() -> list[Floats]:
+    """The 24 rotations of a cube."""
+    signed = (
+        np.eye(3)[list(p)] * np.array(s)[:, None] for p in permutations(range(3)) for s in product((1, -1), repeat=3)
+    )
+    return [M for M in signed if np.linalg.det(M) > 0]
+
+
+def _frame_rotations(R_F: Floats, p_F: Floats, p_M: Floats, t: Floats, unknown: Unknown) -> list[Floats]:
+    """Candidates for the frame's rotation from positions alone."""
+
+    def align(t: Floats) -> Floats:
+        """Umeyama: the rotation that takes the predicted points to the measured ones, both about their means."""
+        p = p_F + R_F @ t
+        return nearest_rotation((p_M - p_M.mean(axis=0)).T @ (p - p.mean(axis=0)))
+
+    candidates = [align(t)]
+    if unknown.tool_translation.any():
+        # X^T (p_M - t_X) = p_F + R_F t is linear in X^T, X^T t_X and t.
+        n = len(p_F)
+        A = np.zeros((n, 3, 15))
+        for k in range(3):
+            A[:, k, 3 * k : 3 * k + 3] = p_M
+            A[:, k, 9 + k] = 1.0
+        A[:, :, 12:] = -R_F
+        solution: Floats = np.linalg.lstsq(A.reshape(-1, 15), p_F.ravel(), rcond=1e-10)[0].astype(np.float64)
+        candidates += [nearest_rotation(solution[:9].reshape(3, 3).T), align(solution[12:])]
+    return candidates
+
+
+def _translations(
+    R_F: Floats, p_F: Floats, p_M: Floats | None, R_X: Floats, R_T: Floats, X: Frame, T: Frame, unknown: Unknown
+) -> tuple[tuple[Frame, Frame], float]:
+    """Translations for given rotations: linear, from the nominal ones in the minimum-norm sense; and the cost.
+
+    Where frame and tool act together the frame takes it all: the tool is near nominal, the frame may be anywhere.
+    """
+    if p_M is None:
+        return (Frame(R_X, X.translation), Frame(R_T, T.translation)), 0.0
+    rest = p_M - X.translation - (p_F + R_F @ T.translation) @ R_X.T  # what is left to explain, (n, 3)
+    A = np.concatenate([np.broadcast_to(np.eye(3), R_F.shape), R_X @ R_F], axis=2)  # (n, 3, 6)
+    free = np.concatenate([np.full(3, unknown.frame), unknown.tool_translation])
+    step = np.zeros(6)
+    if free.any():
+        reluctance = np.where(np.arange(6) < 3, 1.0, 1e-3)[free]
+        scaled = A.reshape(-1, 6)[:, free] * reluctance
+        step[free] = reluctance * np.linalg.lstsq(scaled, rest.ravel(), rcond=1e-10)[0]
+    left = rest.ravel() - A.reshape(-1, 6) @ step
+    return (Frame(R_X, X.translation + step[:3]), Frame(R_T, T.translation + step[3:])), float(left @ left)

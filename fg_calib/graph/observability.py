@@ -1,0 +1,354 @@
+"""What data determine: rank, null space, the paper's three classes, and observability indices.
+
+Everything is read from one matrix, the Jacobian of the whitened residuals with its columns scaled to changes of
+ordinary size (1 mrad, or what that moves at the arm's reach), so that a singular value is a signal-to-noise ratio: how
+many sigma a change of ordinary size along its direction moves the measurements. Rank, classes and groups are thus a
+matter of geometry and noise. What the parameters may be off, their tolerances, says only which directions are weak.
+
+References:
+    Jia et al. (2019), section 4: independent, relative and ineffective parameters.
+    O1: Menq & Borm (1988); O2: Driels & Pathre (1990); O3, O4: Nahvi & Hollerbach (1994, 1996); O5: Sun & Hollerbach
+    (2008), Observability index selection for robot calibration, ICRA.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.robot.model import Parameter, names_of
+
+Floats = NDArray[np.float64]
+
+IdentifiabilityClass = Literal["independent", "relative", "ineffective"]
+
+RANK_TOLERANCE = 1e-10
+"""Singular values below this part of the largest are those of directions that the data do not determine."""
+
+SIGNAL_FLOOR = 1e-3
+"""Nor are directions with a smaller signal-to-noise ratio: sigma above 1000 ordinary changes, 1 rad or the reach."""
+
+SUPPORT_TOLERANCE = 1e-6
+"""A parameter takes part in a direction if its unit-free share in it is above this."""
+
+KEEP_ORDER = ("theta", "d", "a", "alpha", "beta", "x", "y", "z", "yaw", "pitch", "roll")
+"""Of parameters that only act together the earlier kind is kept, and of one kind the later joint, as in the paper."""
+
+WEAK = 10.0
+"""A direction is weak if its sigma is above one over this of what it may be off: tolerance, else an ordinary change."""
+
+CORRELATED = 0.9
+"""Correlations above this are worth a line."""
+
+
+@dataclass(frozen=True)
+class RelativeGroup:
+    """Parameters of which only combinations are determined.
+
+    Attributes:
+        parameters: Their names.
+        relations: Directions in which they may move together with no effect on any measurement: the change of
+            each, in [m] and [rad], the largest being 1 or -1.
+        keep: Those that the package would estimate; the others stay at nominal.
+    """
+
+    parameters: tuple[str, ...]
+    relations: tuple[dict[str, float], ...]
+    keep: tuple[str, ...]
+
+    @property
+    def lost(self) -> int:
+        """Number of directions that are lost."""
+        return len(self.relations)
+
+    def combinations(self, kept: Sequence[str]) -> dict[str, dict[str, float]]:
+        """What kept members are estimated for where the others are left at nominal: factors by name, by kept member.
+
+        With K the kept and L the others a relation moves `n_K + n_L` with no effect; the estimate of K stays the same
+        in `x_K + G x_L` where G undoes every relation: `n_K + G n_L = 0`.
+        """
+        left_out = [name for name in self.parameters if name not in kept]
+        of_kept = np.array([[relation.get(name, 0.0) for name in kept] for relation in self.relations])
+        of_left_out = np.array([[relation.get(name, 0.0) for name in left_out] for relation in self.relations])
+        G = -np.linalg.lstsq(of_left_out, of_kept, rcond=None)[0].T  # (n_kept, n_left_out)
+        found = {}
+        for name, row in zip(kept, G, strict=True):
+            others = {n: float(f"{g:.9g}") for n, g in zip(left_out, row, strict=True) if abs(g) > SUPPORT_TOLERANCE}
+            if others:
+                found[name] = {name: 1.0} | others
+        return found
+
+
+@dataclass(frozen=True)
+class WeakDirection:
+    """A direction that the data determine, but badly.
+
+    Attributes:
+        signal_to_noise: 1 over its sigma, in what the parameters may be off: tolerance, else a change of ordinary size.
+        members: Its largest members, by name, as shares between -1 and 1.
+    """
+
+    signal_to_noise: float
+    members: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Observability:
+    """What a set of measurements determines of the parameters.
+
+    Attributes:
+        names: The parameters, shape (n,).
+        singular_values: Signal-to-noise ratios, descending, shape (n,).
+        rank: Number of determined directions.
+        gap: The last singular value kept over the first dropped; inf where none is dropped.
+        classes: Class of each parameter, shape (n,).
+        relative: The relative groups.
+        null_space: Orthonormal unit-free directions that are not determined, shape (n - rank, n).
+        indices: O1 to O5.
+        condition_number: Of the determined part.
+        sigma: 1 sigma of the independent and the kept parameters, the others being held at nominal, [m] and [rad].
+            That of a kept parameter is the sigma of the combination it stands for.
+        correlation: Correlations of the same parameters, shape (n_kept, n_kept).
+        correlations: Pairs of those that are correlated by more than `CORRELATED`, strongest first.
+        weak: Directions among those with a signal-to-noise ratio below `WEAK`, weakest first.
+    """
+
+    names: tuple[str, ...]
+    singular_values: Floats
+    rank: int
+    gap: float
+    classes: tuple[IdentifiabilityClass, ...]
+    relative: tuple[RelativeGroup, ...]
+    null_space: Floats
+    indices: dict[str, float]
+    condition_number: float
+    sigma: dict[str, float]
+    correlation: Floats
+    correlations: tuple[tuple[str, str, float], ...]
+    weak: tuple[WeakDirection, ...]
+
+    def named(self, wanted: IdentifiabilityClass) -> list[str]:
+        """Names of the parameters of one class."""
+        return [name for name, c in zip(self.names, self.classes, strict=True) if c == wanted]
+
+    @property
+    def kept(self) -> list[str]:
+        """The parameters that can be estimated together: the independent ones and those kept of each group."""
+        keep = {name for group in self.relative for name in group.keep}
+        return [n for n, c in zip(self.names, self.classes, strict=True) if c == "independent" or n in keep]
+
+    @property
+    def lost(self) -> tuple[dict[str, float], ...]:
+        """Every lost direction by name: ineffective parameters alone, then the relations of the groups."""
+        alone = tuple({name: 1.0} for name in self.named("ineffective"))
+        return alone + tuple(relation for group in self.relative for relation in group.relations)
+
+
+def analyse(
+    jacobian: Floats,
+    parameters: Sequence[Parameter],
+    *,
+    scales: Floats,
+    n_measurements: int,
+    prefer: Sequence[str] = (),
+    floor: float = SIGNAL_FLOOR,
+) -> Observability:
+    """Analyse a whitened Jacobian, or the triangular factor of one.
+
+    Args:
+        jacobian: Shape (m, n).
+        parameters: The n parameters of the columns.
+        scales: A change of ordinary size in each of them, shape (n,), [m] and [rad].
+        n_measurements: Number of configurations or pairs, for O1.
+        prefer: Parameters to keep, first choice first, where only combinations are determined; then `KEEP_ORDER`.
+        floor: Signal-to-noise ratio below which a direction counts as not determined.
+    """
+    n, names = len(parameters), names_of(parameters)
+    J = jacobian * scales
+    _, s, Vt = np.linalg.svd(np.vstack([J, np.zeros((n, n))]), full_matrices=False)
+    rank = determined(s, floor)
+    null = Vt[rank:]
+    dead = np.linalg.norm(J, axis=0) <= max(RANK_TOLERANCE * s.max(initial=0.0), floor)
+    relative = (np.linalg.norm(null, axis=0) > SUPPORT_TOLERANCE) & ~dead
+    classes: list[IdentifiabilityClass] = [
+        "ineffective" if d else "relative" if r else "independent" for d, r in zip(dead, relative, strict=True)
+    ]
+    groups = _groups(null, dead, scales, parameters, prefer)
+    dropped = {name for g in groups for name in g.parameters if name not in g.keep}
+    kept = [i for i in range(n) if not dead[i] and names[i] not in dropped]
+    may_be_off = np.array([s if p.tolerance is None else p.tolerance for p, s in zip(parameters, scales, strict=True)])
+    sigma, correlation, correlations, weak = _spread(
+        jacobian[:, kept] * may_be_off[kept], [names[i] for i in kept], may_be_off[kept]
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        gap = float(s[rank - 1] / s[rank]) if 0 < rank < n else np.inf
+    return Observability(
+        names=tuple(names),
+        singular_values=s,
+        rank=rank,
+        gap=gap,
+        classes=tuple(classes),
+        relative=groups,
+        null_space=null,
+        indices=observability_indices(s[:rank], n_measurements),
+        condition_number=float(s[0] / s[rank - 1]) if rank else np.inf,
+        sigma=sigma,
+        correlation=correlation,
+        correlations=correlations,
+        weak=weak,
+    )
+
+
+def singular_values(matrix: Floats) -> Floats:
+    """Singular values, descending."""
+    return np.linalg.svd(matrix, compute_uv=False).astype(np.float64)
+
+
+def determined(singular_values: Floats, floor: float = SIGNAL_FLOOR) -> int:
+    """Number of directions that are determined: above `RANK_TOLERANCE` of the largest, and above the floor."""
+    return int(np.sum(singular_values > max(RANK_TOLERANCE * singular_values.max(initial=0.0), floor)))
+
+
+def observability_indices(singular_values: Floats, n_measurements: int) -> dict[str, float]:
+    """O1 to O5 of the nonzero singular values s_1 >= ... >= s_L of m measurements.
+
+    O1 = (s_1 ... s_L)^(1/L) / sqrt(m); O2 = s_L / s_1; O3 = s_L; O4 = s_L^2 / s_1; O5 = 1 / (1/s_1 + ... + 1/s_L).
+    """
+    s = singular_values
+    if not len(s):
+        return dict.fromkeys(("O1", "O2", "O3", "O4", "O5"), 0.0)
+    return {
+        "O1": float(np.exp(np.mean(np.log(s))) / np.sqrt(n_measurements)),
+        "O2": float(s[-1] / s[0]),
+        "O3": float(s[-1]),
+        "O4": float(s[-1] ** 2 / s[0]),
+        "O5": float(1.0 / np.sum(1.0 / s)),
+    }
+
+
+def _spread(
+    J: Floats, names: Sequence[str], scales: Floats
+) -> tuple[dict[str, float], Floats, tuple[tuple[str, str, float], ...], tuple[WeakDirection, ...]]:
+    """Sigmas, correlations, strong correlations and weak directions of columns that are determined together."""
+    if not names:
+        return {}, np.zeros((0, 0)), (), ()
+    _, s, Vt = np.linalg.svd(J, full_matrices=False)
+    half = Vt.T / s
+    spread = np.linalg.norm(half, axis=1)
+    correlation = (half @ half.T) / np.outer(spread, spread)
+    above = np.argwhere(np.triu(np.abs(correlation) > CORRELATED, 1))
+    strongest = sorted(above.tolist(), key=lambda ij: -abs(correlation[ij[0], ij[1]]))
+    weak = []
+    for value, direction in zip(s[::-1], Vt[::-1], strict=True):
+        if value >= WEAK:
+            break
+        size = np.round(np.abs(direction), 6)  # so that equal members keep their order whatever the rounding
+        members = sorted(np.flatnonzero(size > 0.3 * size.max()).tolist(), key=lambda i: -size[i])
+        sign = np.sign(direction[members[0]])
+        weak.append(WeakDirection(float(value), {names[i]: float(sign * direction[i]) for i in members}))
+    return (
+        dict(zip(names, (spread * scales).tolist(), strict=True)),
+        correlation,
+        tuple((names[i], names[j], float(correlation[i, j])) for i, j in strongest),
+        tuple(weak),
+    )
+
+
+def _groups(
+    null: Floats,
+    dead: NDArray[np.bool_],
+    scales: Floats,
+    parameters: Sequence[Parameter],
+    prefer: Sequence[str],
+) -> tuple[RelativeGroup, ...]:
+    """Connected relative groups with sparse relations, from an orthonormal basis of the null space."""
+    alive: list[int] = np.flatnonzero(~dead).tolist()
+    n_lost = len(null) - int(dead.sum())
+    if n_lost <= 0:
+        return ()
+    # Eliminate the parameters one would rather give up: each relation then holds one of them and kept ones only.
+    order = sorted(alive, key=lambda i: (-_preference(parameters[i], prefer), i))
+    N = null[:, order]
+    dropped = _first_independent(N, n_lost)
+    relations = np.linalg.lstsq(N[:, dropped].T, np.eye(n_lost), rcond=None)[0].T @ N  # (n_lost, n_alive)
+    relations[np.abs(relations) < SUPPORT_TOLERANCE] = 0.0
+    names = names_of(parameters)
+    found = []
+    for support, rows in _connected(relations):
+        members = sorted(order[i] for i in support)
+        given_up = {order[dropped[r]] for r in rows}
+        rows.sort(key=lambda r: order[dropped[r]])
+        physical = _chained(relations[rows]) * scales[order]
+        found.append(
+            RelativeGroup(
+                parameters=tuple(names[i] for i in members),
+                relations=tuple(_relation(direction, order, names) for direction in physical),
+                keep=tuple(names[i] for i in members if i not in given_up),
+            )
+        )
+    return tuple(sorted(found, key=lambda g: names.index(g.parameters[0])))
+
+
+def _preference(parameter: Parameter, prefer: Sequence[str]) -> int:
+    """Rank in the order of keeping, 0 first: the user's choice, then base and tool, then `KEEP_ORDER`.
+
+    Base and tool are estimated only where the user asks for it, and may be far from nominal.
+    """
+    if parameter.name in prefer:
+        return list(prefer).index(parameter.name)
+    if parameter.name.startswith(("base.", "tool.")):
+        return len(prefer)
+    return len(prefer) + 1 + KEEP_ORDER.index(parameter.kind)
+
+
+def _first_independent(N: Floats, count: int) -> list[int]:
+    """The first columns of N, in order, that are clearly linearly independent."""
+    chosen: list[int] = []
+    basis = np.zeros((len(N), 0))
+    for clearly in (1e-2, SUPPORT_TOLERANCE, 0.0):
+        for i in range(N.shape[1]):
+            if len(chosen) == count:
+                return chosen
+            rest = N[:, i] - basis @ (basis.T @ N[:, i])
+            rest -= basis @ (basis.T @ rest)
+            if i not in chosen and np.linalg.norm(rest) > clearly:
+                chosen.append(i)
+                basis = np.column_stack([basis, rest / np.linalg.norm(rest)])
+    return chosen
+
+
+def _connected(relations: Floats) -> list[tuple[set[int], list[int]]]:
+    """Relations that share a parameter, together: (parameters, relations) of each group."""
+    groups: list[tuple[set[int], list[int]]] = []
+    for r, relation in enumerate(relations):
+        support: set[int] = set(np.flatnonzero(relation).tolist())
+        touching = [g for g in groups if g[0] & support]
+        groups = [g for g in groups if not g[0] & support]
+        groups.append((support.union(*(g[0] for g in touching)), [r, *(k for g in touching for k in g[1])]))
+    return groups
+
+
+def _chained(relations: Floats) -> Floats:
+    """Each relation against the next, where that needs no more parameters: d3 - d4, d4 - d5 for d3 - d5, d4 - d5."""
+    chained = relations.copy()
+    for r in range(len(relations) - 1):
+        shared = np.flatnonzero((relations[r] != 0.0) & (relations[r + 1] != 0.0))
+        if len(shared):
+            ratio = relations[r, shared[-1]] / relations[r + 1, shared[-1]]
+            against = relations[r] - ratio * relations[r + 1]
+            against[np.abs(against) < SUPPORT_TOLERANCE] = 0.0
+            if np.count_nonzero(against) <= np.count_nonzero(relations[r]):
+                chained[r] = against
+    return chained
+
+
+def _relation(direction: Floats, order: Sequence[int], names: Sequence[str]) -> dict[str, float]:
+    """A direction as changes by name, the largest of which is 1 in size and the first positive."""
+    support = sorted((i for i in range(len(order)) if direction[i]), key=lambda i: order[i])
+    largest = max(abs(direction[i]) for i in support)
+    sign = np.sign(direction[support[0]])
+    return {names[order[i]]: float(f"{sign * direction[i] / largest:.9g}") for i in support}

@@ -1,0 +1,185 @@
+r"""Robust losses: the weight of a measurement by how far off it is, and what that does to sigmas and to chi-square.
+
+`e` is the length of a measurement's whitened residual, a vector of h rows (1 for a distance, 2 for a distance with its
+angle, 6 for a pose), so that e^2 of a clean one is chi-square of h degrees of freedom.
+
+| loss | weight | optimum of |
+|---|---|---|
+| `none` | 1 | sum of e^2 / 2 |
+| `huber` | 1 below c, c / e above | sum of e^2 / 2 below, c (e - c / 2) above |
+| `cauchy` | c^2 / (c^2 + e^2) | sum of c^2 / 2 log(1 + e^2 / c^2) |
+| `geman-mcclure` | c^4 / (c^2 + e^2)^2 | sum of c^2 e^2 / (c^2 + e^2) / 2 |
+| `gnc` | 1 below c, 0 above | sum of min(e^2, c^2) / 2, found by graduated non-convexity (Yang et al. 2020) |
+
+The first four are those of GTSAM's robust noise models on a factor of one measurement. c is such that clean Gaussian
+measurements lose 5 % of their efficiency (1.345 and 2.385 for Huber and Cauchy in one dimension); for `gnc` it is what
+99 % of clean measurements stay below.
+
+The surrogates of `gnc` are those of Yang et al. scaled so that a measurement below c always has the weight 1: else the
+priors would outweigh all measurements in the first rounds.
+
+Weights go with least squares in turns: each solution gives new weights until they stay. A weight acts by noise of its
+measurement's own: (1 / weight - 1) times its covariance is added, so that also where measurements share errors one of
+weight 0 says nothing.
+
+References:
+    Holland & Welsch (1977), Robust regression using iteratively reweighted least-squares. Comm. Statistics A 6(9).
+    Huber & Ronchetti (2009), Robust Statistics, 2nd ed., ch. 7: asymptotic covariance of M-estimates.
+    Yang, Antonante, Tzoumas, Carlone (2020), Graduated non-convexity for robust spatial perception. IEEE RA-L 5(2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from fg_calib.options import Loss
+
+Floats = NDArray[np.float64]
+
+EFFICIENCY = 0.95
+"""Of the estimate from clean Gaussian measurements, for the losses that do not reject."""
+
+INLIERS = 0.99
+"""Share of clean measurements that `gnc` keeps."""
+
+HALF_WEIGHT: dict[Loss, float] = {"huber": 2.0, "cauchy": 1.0, "geman-mcclure": (2.0**0.5 - 1.0) ** 0.5, "gnc": 1.0}
+"""Where a loss has the weight 1/2, in its constant c: what is farther off counts as an outlier."""
+
+SCHEDULE = 1.4
+"""Factor by which `gnc` makes its surrogate less convex in each round (Yang et al. 2020)."""
+
+
+def weight(loss: Loss, e: Floats, c: Floats | float) -> Floats:
+    """Weight of measurements, in [0, 1].
+
+    Args:
+        loss: The loss.
+        e: Length of the whitened residual, any shape.
+        c: The loss's constant, of a shape that goes with `e`.
+    """
+    match loss:
+        case "none":
+            return np.ones_like(e)
+        case "huber":
+            return np.minimum(1.0, c / np.maximum(e, 1e-300))
+        case "cauchy":
+            return c**2 / (c**2 + e**2)
+        case "geman-mcclure":
+            return (c**2 / (c**2 + e**2)) ** 2
+        case "gnc":
+            return (e <= c).astype(np.float64)
+
+
+@cache
+def tuning(loss: Loss, height: int) -> float:
+    """The constant c of a loss for measurements of `height` rows; infinite for `none`."""
+    if loss == "none":
+        return np.inf
+    if loss == "gnc":
+        return float(np.sqrt(2.0 * special.gammaincinv(height / 2.0, INLIERS)))
+
+    from scipy import optimize  # here, for it takes as long to import as a small calibration
+
+    def excess(c: float) -> float:
+        _, squared, slope = _moments(loss, c, height)
+        return float(slope**2 / squared) - EFFICIENCY
+
+    return float(optimize.brentq(excess, 0.2, 50.0))
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What a loss does to clean Gaussian measurements.
+
+    Attributes:
+        variance: What the covariance from weighted rows is multiplied by to be that of the estimate.
+        chi2: Mean of weight * e^2 over h of a measurement that keeps at least half its weight.
+    """
+
+    variance: float
+    chi2: float
+
+
+@cache
+def effect(loss: Loss, height: int) -> Effect:
+    """What a loss does to clean Gaussian measurements of `height` rows."""
+    if loss == "none":
+        return Effect(1.0, 1.0)
+    c = tuning(loss, height)
+    mean, squared, slope = _moments(loss, c, height)
+    end = HALF_WEIGHT[loss] * c
+
+    def terms(e: Floats) -> Floats:
+        return np.stack([np.ones_like(e), weight(loss, e, c) * e**2])
+
+    kept, chi2 = _means(terms, height, (0.0, min(c, end), end))
+    return Effect(float(mean * squared / slope**2), float(chi2 / (height * kept)))
+
+
+def _moments(loss: Loss, c: float, height: int) -> Floats:
+    """Means of the weight w, of psi^2 / h and of the slope div(psi) / h of psi = w r, over clean residuals r.
+
+    By parts the mean of div(psi) is that of r . psi.
+    """
+
+    def terms(e: Floats) -> Floats:
+        w = weight(loss, e, c)
+        return np.stack([w, w**2 * e**2 / height, w * e**2 / height])
+
+    return _means(terms, height, (0.0, c, max(c, np.sqrt(height)) + 12.0))
+
+
+def _means(terms: Callable[[Floats], Floats], height: int, ends: tuple[float, ...]) -> Floats:
+    """Integrals over the chi density from the first end to the last, smooth in between, shape (n_terms,)."""
+    x, w = np.polynomial.legendre.leggauss(100)
+    total = np.zeros(())
+    for low, high in pairwise(ends):
+        e = low + (high - low) * (x + 1.0) / 2.0
+        density = e ** (height - 1) * np.exp(-(e**2) / 2.0) / (2.0 ** (height / 2 - 1) * special.gamma(height / 2))
+        total = total + terms(e) @ (w * density) * (high - low) / 2.0
+    return total
+
+
+class Weighting:
+    """The weights of measurements from round to round.
+
+    Args:
+        loss: The loss.
+    """
+
+    def __init__(self, loss: Loss) -> None:
+        self._loss = loss
+        self._mu: float | None = None  # of gnc: from near 0, convex, upwards
+
+    def update(self, e: Floats, height: NDArray[np.int64]) -> tuple[Floats, bool]:
+        """Weights by the residuals of the last solution, and whether the loss has its final form.
+
+        Args:
+            e: Length of each measurement's whitened residual, shape (n,).
+            height: Its number of rows, shape (n,); 0 for one that takes no part.
+        """
+        c = np.array([tuning(self._loss, max(h, 1)) for h in range(height.max(initial=0) + 1)])[height]
+        e = np.where(height > 0, e, 0.0)  # what takes no part keeps its weight
+        if self._loss != "gnc":
+            return weight(self._loss, e, c), True
+        ratio = (e / c) ** 2  # in units of what is still taken for clean
+        if self._mu is None:
+            worst = float(ratio.max(initial=0.0))
+            if worst <= 1.0:
+                return np.ones_like(e), True
+            self._mu = 1.0 / max(2.0 * worst - 1.0, 1e-12)
+        else:
+            self._mu *= SCHEDULE
+        low, high = self._mu / (self._mu + 1.0), (self._mu + 1.0) / self._mu
+        with np.errstate(divide="ignore"):
+            between = np.sqrt(self._mu * (self._mu + 1.0) / ratio) - self._mu
+        at_c = np.sqrt(self._mu * (self._mu + 1.0)) - self._mu
+        weights = np.where(ratio >= high, 0.0, np.clip(between / at_c, 0.0, 1.0))
+        return weights, bool(np.all((ratio <= low) | (ratio >= high)))

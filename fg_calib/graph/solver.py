@@ -1,0 +1,528 @@
+"""Gauss-Newton steps with GTSAM's Levenberg-Marquardt as the safeguard, and a status of our own.
+
+The graph is GTSAM's. Each iteration linearises it and decomposes the dense system once (singular values, nuisance
+columns eliminated, columns in units of the arm's geometry). That gives the Gauss-Newton step along the directions that
+data and priors determine, and the *decrement*: how far, in sigma, the optimum still is along them (the square root of
+the cost decrease that the step promises, times two). Where the cost does not fall by a fair share of what was promised,
+GTSAM takes a damped step instead. Directions that nothing determines stay where they are: every step is a minimum-norm
+step. Near the optimum, where rounding of the cost is larger than what is left to gain, the decrement judges: it must
+fall.
+
+Rows are whitened at the parameters that are estimated (joint noise, errors that pairs share, robust weights), so that
+the optimum is one of frozen whitening only if whitening anew, there, leaves nothing to go. That is how convergence is
+judged: by the decrement of the problem whitened at the estimate itself.
+
+References:
+    Anderson (1965), Iterative procedures for nonlinear integral equations. J. ACM 12(4): the extrapolation.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from dataclasses import dataclass, fields, replace
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.errors import SolverError
+from fg_calib.graph.factors import Variables, eliminate
+from fg_calib.graph.observability import determined
+from fg_calib.graph.problem import Problem, check_graph, frames_only, joint_errors, judged_at, lengths, same_rows
+from fg_calib.graph.robust import Weighting
+from fg_calib.graph.whitening import Adjustment
+from fg_calib.measurements.residuals import squared_norm
+from fg_calib.options import check_number, check_type
+from fg_calib.threads import one_blas_thread
+
+Floats = NDArray[np.float64]
+
+FAIR_SHARE = 0.25
+"""Share of the promised decrease of the cost that an undamped step must bring."""
+
+PATIENCE = 4
+"""Undamped steps in which the cost may rise before it has fallen."""
+
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-15, 1e12
+"""Damping of damped steps, as a share of each column's own curvature: that of the first one, and its bounds."""
+
+SHORT = 30
+"""Steps after which a descent from another start is given up: it wanders, and was only worth a try."""
+
+SLOW = 0.3
+"""Steps whose decrement falls by less than this factor are extrapolated."""
+
+SLOWEST = 0.9
+"""Largest share of what is left to go that whitening anew is taken to leave each time, without end."""
+
+FARTHEST = 30.0
+"""An extrapolated step is at most so many times as long as the Gauss-Newton step, [sigma over sigma]."""
+
+BACK = 0.1
+"""A descent from another start that ends this near to where one has been is back there, [sigma]."""
+
+SPREAD_ROUNDS = 2
+"""Times that rows of pairs are bent by what the parameters may be off there; then that stays as it is."""
+
+WEAKEST = 0.1
+"""Signal-to-noise ratio below which a direction is not taken for weaker: rows are bent by no more than that."""
+
+NEAR_ENOUGH = 1e-3
+"""What may be left to go when all iterations are spent, [sigma]."""
+
+COARSE = 0.3
+"""Rows are whitened anew once the optimum with the present ones is nearer than this, [sigma]."""
+
+
+@dataclass(frozen=True)
+class SolverOptions:
+    """Settings of the solver.
+
+    Attributes:
+        max_iterations: Steps after which it gives up.
+        decrement: Converged when the optimum, with rows whitened at the estimate, is nearer than this, [sigma].
+    """
+
+    max_iterations: int = 200
+    decrement: float = 3e-7
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            least, whole = float(f.name == "max_iterations"), f.name.startswith("max_")
+            check_number(f"solver: {f.name}", getattr(self, f.name), least=least, whole=whole)
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One step of the solver.
+
+    Attributes:
+        cost: Half the sum of squared whitened residuals after the step.
+        damping: Of a step by Levenberg-Marquardt, as a share of each column's own curvature; 0 for an undamped one.
+        step: Length of the step, in changes of ordinary size (tolerances, else 1 mm and 1 mrad).
+        decrement: How far from the optimum it started, [sigma].
+    """
+
+    cost: float
+    damping: float
+    step: float
+    decrement: float
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What the solver found.
+
+    Attributes:
+        problem: The problem solved; its rows are judged at the estimate.
+        values: GTSAM's values at the estimate.
+        parameters: The parameter vector there (see `Variables`).
+        before: The parameter vector with the arm at nominal, and frame, base and tool alone fitted.
+        converged: Whether the optimum was reached.
+        message: Why it stopped.
+        history: Its steps.
+        initial_cost: Cost at `before`.
+        cost: Cost at the estimate, whatever the loss.
+        weighted_cost: The same with every measurement by its robust weight.
+        seconds: Time taken.
+        estimated_noise: Kinds whose noise was estimated (see `noise`); None where it was taken as stated.
+        others: Parameter vectors of other optima that the data cannot tell from this one (see `restarts`).
+    """
+
+    problem: Problem
+    values: gtsam.Values
+    parameters: Floats
+    before: Floats
+    converged: bool
+    message: str
+    history: tuple[Iteration, ...]
+    initial_cost: float
+    cost: float
+    weighted_cost: float
+    seconds: float
+    estimated_noise: tuple[str, ...] | None = None
+    others: tuple[Floats, ...] = ()
+
+    @property
+    def iterations(self) -> int:
+        """Number of steps."""
+        return len(self.history)
+
+
+def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
+    """Estimate the parameters.
+
+    First measurement frame, base and tool alone with the arm at nominal, then everything. Each time that the optimum is
+    near, the rows are judged and whitened at the estimate, robust weights follow from the residuals there and joint
+    errors, where they are estimated, from what the rows say of them; the solver goes on with the new rows until they
+    leave nothing to go.
+
+    Raises:
+        ProblemError: The problem's graph has factors of somebody else.
+        SolverError: GTSAM could not solve a step at all.
+    """
+    check_graph(problem)
+    check_type("options", options, SolverOptions, "SolverOptions(max_iterations=200)")
+    options = options or SolverOptions()
+    clock = time.perf_counter()
+    with one_blas_thread:
+        before = problem.start
+        frames = frames_only(problem)
+        if frames is not None:
+            found = _fit(frames, replace(options, decrement=max(options.decrement, COARSE))).parameters
+            before = np.concatenate([found, problem.start[len(found) :]])
+            problem = judged_at(problem, before)
+        if not problem.variables.keys:
+            return _taken_as_it_is(problem, clock)
+        run = _fit(problem, options)
+        return _solution(run, before, run.initial_cost, clock)
+
+
+def solve_from(solution: Solution, start: Floats, most: float, options: SolverOptions | None = None) -> Solution | None:
+    """The descent on a solution's problem from another start.
+
+    Args:
+        solution: What was found before; `before` and the initial cost stay as they are.
+        start: The parameter vector to start from.
+        most: Cost of an optimum that is of no interest, with the rows whitened as they are in the solution.
+        options: Settings of the solver.
+
+    Returns:
+        None if the descent leads nowhere, above `most` or back to where the solution is.
+
+    Raises:
+        SolverError: GTSAM could not solve a step at all.
+    """
+    clock, options = time.perf_counter(), options or SolverOptions()
+    with one_blas_thread:
+        problem = replace(solution.problem, start=start)
+        rough = _Run(problem, replace(options, max_iterations=min(SHORT, options.max_iterations)))
+        if not rough.descend(COARSE) or rough.here.cost >= most:
+            return None
+        if rough.here.decrement_to(solution.values) < BACK:
+            return None
+        run = _fit(judged_at(problem, rough.parameters), options)
+        found = _solution(run, solution.before, solution.initial_cost, clock)
+        return replace(found, estimated_noise=solution.estimated_noise)
+
+
+def _solution(run: _Run, before: Floats, initial_cost: float, clock: float) -> Solution:
+    cost, weights = run.here.cost, run.problem.adjustment.weights
+    if weights is not None:
+        stated = judged_at(run.problem, run.parameters, replace(run.problem.adjustment, weights=None))
+        cost = stated.graph.error(run.here.values)
+    constant = _constant_cost(run.problem)
+    return Solution(
+        problem=run.problem,
+        values=run.here.values,
+        parameters=run.parameters,
+        before=before,
+        converged=run.converged,
+        message=run.message,
+        history=tuple(run.history),
+        initial_cost=initial_cost + constant,
+        cost=cost + constant,
+        weighted_cost=run.here.cost + constant,
+        seconds=time.perf_counter() - clock,
+    )
+
+
+def _constant_cost(problem: Problem) -> float:
+    """Cost of the rows that depend on no variable: all blocks, where no arm, base, tool or frame is fitted."""
+    if problem.variables.items:
+        return 0.0
+    chain = problem.variables.chain.at(problem.start)
+    return 0.5 * sum(squared_norm(block, chain) for block in problem.blocks)
+
+
+def _taken_as_it_is(problem: Problem, clock: float) -> Solution:
+    """The "solution" of an evaluation that has nothing to fit; robust weights are those of the rows as they are."""
+    weighted, final, weighting = problem, problem.settings.loss == "none", Weighting(problem.settings.loss)
+    while not final:
+        adjustment, final = _learn(problem, problem.start, weighting)
+        weighted = judged_at(problem, problem.start, adjustment)
+    cost = _constant_cost(problem)
+    return Solution(
+        problem=weighted,
+        values=problem.initial,
+        parameters=problem.start,
+        before=problem.start,
+        converged=True,
+        message="nothing to fit",
+        history=(),
+        initial_cost=cost,
+        cost=cost,
+        weighted_cost=_constant_cost(weighted),
+        seconds=time.perf_counter() - clock,
+    )
+
+
+def _fit(problem: Problem, options: SolverOptions) -> _Run:
+    """Least squares from the problem's start, to the optimum of the rows as they are whitened there.
+
+    With a robust loss the first weights are those of the residuals at the start: gross errors would lead least squares
+    astray. Where the weights of a round lead nowhere, those that follow may.
+    """
+    robust = problem.settings.loss != "none"
+    weighting = Weighting(problem.settings.loss)
+    run, goal, was = _Run(problem, options), COARSE, np.inf
+    bends = SPREAD_ROUNDS if problem.pairs is not None and problem.adjustment.spread is None else 0
+    if robust:
+        run.go_on_with(judged_at(problem, problem.start, _learn(problem, problem.start, weighting)[0]))
+    while run.descend(goal) or robust:
+        adjustment, final = _learn(run.problem, run.parameters, weighting)
+        if bends:
+            adjustment, bends = replace(adjustment, spread=run.here.spread), bends - 1
+        anew = judged_at(problem, run.parameters, adjustment)
+        unchanged = same_rows(anew, run.problem)
+        if not unchanged:
+            run.go_on_with(anew)
+        left, was = run.left_after(was), run.here.decrement
+        if final and (goal <= run.least if unchanged else not bends and left <= run.least):
+            run.descend(run.least)
+            break
+        if run.exhausted:
+            run.give_up()
+            break
+        goal = run.least if unchanged else min(COARSE, max(run.least, 0.1 * left))
+    return run
+
+
+def _learn(problem: Problem, parameters: Floats, weighting: Weighting) -> tuple[Adjustment, bool]:
+    """What the residuals at some parameters say of the noise, and whether the loss has its final form."""
+    adjustment, final = problem.adjustment, True
+    if problem.settings.loss != "none":
+        weights, final = weighting.update(*lengths(problem, parameters))
+        adjustment = replace(adjustment, weights=weights)
+    if adjustment.joint_errors is not None:
+        adjustment = replace(adjustment, joint_errors=joint_errors(problem, parameters))
+    return adjustment, final
+
+
+class _Run:
+    """A descent from a problem's start, on one set of whitened rows after the other.
+
+    Attributes:
+        problem: The problem with the rows as they are whitened now.
+        here: The problem linearised where the descent has arrived.
+        history: The steps taken.
+        initial_cost: Cost at the start.
+        converged: Whether the last descent arrived.
+        message: Why it stopped.
+    """
+
+    def __init__(self, problem: Problem, options: SolverOptions) -> None:
+        self.problem = problem
+        self.history: list[Iteration] = []
+        self.converged = False
+        self.message = ""
+        self._options = options
+        self._damping = FIRST_DAMPING
+        self._last: tuple[_Linearised, Floats] | None = None  # where the last step began, and that step
+        self.initial_cost = problem.graph.error(problem.initial)
+        if not np.isfinite(self.initial_cost):
+            raise SolverError(
+                f"the cost at the start is {self.initial_cost}: the measurements or the robot hold absurd numbers"
+            )
+        self.here = _Linearised(problem, problem.initial)
+
+    @property
+    def parameters(self) -> Floats:
+        """The parameter vector where the descent has arrived."""
+        return self.problem.variables.parameters(self.here.values)
+
+    @property
+    def least(self) -> float:
+        """The decrement that counts as arrived, [sigma]: what the options say, or rounding."""
+        return max(self._options.decrement, self.here.rounding)
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether all iterations have been spent."""
+        return len(self.history) >= self._options.max_iterations
+
+    def left_after(self, was: float) -> float:
+        """How far the optimum still is, [sigma], where whitening anew left `was` the last time, and goes on."""
+        left = self.here.decrement
+        return left if left <= self.here.rounding else left / (1.0 - min(left / was, SLOWEST))
+
+    def go_on_with(self, problem: Problem) -> None:
+        """The same place with other rows."""
+        self.problem = problem
+        self.here = _Linearised(problem, self.here.values)
+
+    def descend(self, goal: float) -> bool:
+        """Step until the optimum of these rows is nearer than `goal`, [sigma]; whether it is."""
+        self.converged, stuck = self.here.decrement <= goal, False
+        while not (self.converged or stuck or self.exhausted):
+            path, damping = next(filter(None, map(self._undamped, self._first_steps())), []), 0.0
+            if not path:
+                path, damping = self._damped(), self._damping
+            stuck = not path
+            for there in path:
+                taken = self.problem.variables.step(self.here.values, there.values)
+                length = float(np.linalg.norm(taken / self.problem.variables.all_scales))
+                self.history.append(Iteration(there.cost, damping, length, self.here.decrement))
+                self._last, self.here = (self.here, taken), there
+            self.converged = self.here.at_rounding if stuck else self.here.decrement <= goal
+        if self.converged and not stuck:
+            self.message = f"converged: less than {goal:.0e} sigma from the optimum"
+        elif self.converged:
+            self.message = f"converged to rounding: no step lowers the cost, {self._left} left"
+        elif stuck:
+            self.message = f"not converged: no step lowers the cost although {self._left} are left to go"
+        else:
+            self.give_up()
+        return self.converged
+
+    def give_up(self) -> None:
+        """Say that all iterations have been spent, and whether that matters."""
+        self.converged = self.here.decrement <= NEAR_ENOUGH
+        arrived = "converged" if self.converged else "not converged"
+        self.message = f"{arrived}: {self._options.max_iterations} iterations, {self._left} left to go"
+
+    @property
+    def _left(self) -> str:
+        return f"{self.here.decrement:.1e} sigma"
+
+    def _undamped(self, first: Floats) -> list[_Linearised]:
+        """Where Gauss-Newton steps lead after a first one; nothing if they do not keep what they promise.
+
+        A valley that is weakly determined may be curved: a step along it leaves it, and the next ones come back. So the
+        cost may rise as long as the steps that follow are ever shorter.
+        """
+        path: list[_Linearised] = []
+        here = there = self.here
+        for _ in range(PATIENCE):
+            last = there
+            try:
+                step = last.step if path else first
+                there = _Linearised(self.problem, self.problem.variables.moved(last.values, step))
+            except SolverError:
+                return []  # so far off that the rows have no derivative there
+            path.append(there)
+            if here.at_rounding:
+                return path if there.decrement < here.decrement else []
+            if here.cost - there.cost >= FAIR_SHARE * 0.5 * here.decrement**2:
+                return path
+            if len(path) > 1 and there.decrement >= 0.5 * last.decrement:
+                return []
+        return []
+
+    def _first_steps(self) -> list[Floats]:
+        """The Gauss-Newton step; before it where steps that hardly get shorter lead together (Anderson 1965, depth 1).
+
+        Where a direction is known by its curvature, Gauss-Newton steps are all too long or too short by the same share.
+        """
+        here = self.here
+        if self._last is None or here.decrement < SLOW * self._last[0].decrement:
+            return [here.step]
+        last, taken = self._last
+        change = here.step - last.step
+        share = here.product(here.step, change) / max(here.product(change, change), 1e-300)
+        extrapolated: Floats = here.step - share * (taken + change)
+        far = here.product(extrapolated, extrapolated) >= (FARTHEST * here.decrement) ** 2
+        return [here.step] if far else [extrapolated, here.step]
+
+    def _damped(self) -> list[_Linearised]:
+        """Where GTSAM's next damped step leads, undetermined directions held; nothing if none lowers the cost."""
+        here, graph, variables = self.here, self.problem.graph, self.problem.variables
+        try:
+            optimizer = gtsam.LevenbergMarquardtOptimizer(graph, here.values, _parameters(self._damping))
+            optimizer.iterate()
+        except RuntimeError as error:
+            raise SolverError(_in_words(str(error), variables)) from error
+        if not optimizer.error() < here.cost:
+            return []
+        self._damping = max(optimizer.lambda_(), LEAST_DAMPING)
+        step = variables.step(here.values, optimizer.values())
+        held = variables.moved(here.values, here.held(step))
+        lower = graph.error(held) < here.cost
+        return [_Linearised(self.problem, held if lower else gtsam.Values(optimizer.values()))]
+
+
+class _Linearised:
+    """A problem linearised at some values.
+
+    Attributes:
+        values: GTSAM's values.
+        cost: Half the sum of squared whitened residuals.
+        decrement: Length of the Gauss-Newton step along determined directions, [sigma].
+        step: The step itself, shape (n_columns + n_nuisance,), of minimum norm in units of the arm's geometry.
+        spread: A square root S of the core's covariance S S^T, weak directions cut short, shape (n_columns, rank).
+        rounding: What rounding of the residuals makes of the decrement, [sigma].
+        at_rounding: Whether rounding of the cost is above the decrease that the step promises.
+    """
+
+    def __init__(self, problem: Problem, values: gtsam.Values) -> None:
+        variables = problem.variables
+        try:
+            A, b = _dense(problem.graph.linearize(values), variables.keys)
+            left = eliminate(A, b, variables.n_columns)
+            self._sizes = variables.prior_scales
+            tall = np.vstack([left.A * self._sizes, np.zeros((len(self._sizes),) * 2)])  # so that Vt is square
+            U, s, Vt = np.linalg.svd(tall, full_matrices=False)
+        except (RuntimeError, np.linalg.LinAlgError) as error:
+            raise SolverError(_in_words(str(error), variables)) from error
+        rank = determined(s)
+        along = U[: len(left.b), :rank].T @ left.b
+        core = self._sizes * (Vt[:rank].T @ (along / s[:rank]))
+        self.spread: Floats = self._sizes[:, None] * Vt[:rank].T / np.maximum(s[:rank], WEAKEST)
+        self.values = values
+        self.cost = 0.5 * float(b @ b)
+        self.decrement = float(np.hypot(np.linalg.norm(left.own), np.linalg.norm(along)))
+        self.step: Floats = np.concatenate([core, left.inverse @ left.own + left.follow @ core])
+        self.rounding = 10.0 * float(np.finfo(float).eps) / variables.robot.scale_of("rad") * float(s.max(initial=0.0))
+        self.at_rounding = 0.5 * self.decrement**2 <= 10.0 * self.rounding * np.sqrt(2.0 * self.cost)
+        self._loose, self._follow = Vt[rank:], left.follow
+        self._information = s[:rank, None] * Vt[:rank]
+        self._variables = variables
+
+    def product(self, a: Floats, b: Floats) -> float:
+        """Scalar product of two steps of the core, in sigma."""
+        n = len(self._sizes)
+        a, b = (self._information @ (step[:n] / self._sizes) for step in (a, b))
+        return float(a @ b)
+
+    def decrement_to(self, values: gtsam.Values) -> float:
+        """How far some other values are, in sigma as seen from here."""
+        step = self._variables.step(self.values, values)[: len(self._sizes)]
+        return float(np.linalg.norm(self._information @ (step / self._sizes)))
+
+    def held(self, step: Floats) -> Floats:
+        """A step with the same effect on every row, but none on the core's undetermined directions."""
+        n = len(self._sizes)
+        drift = self._sizes * (self._loose.T @ (self._loose @ (step[:n] / self._sizes)))
+        held: Floats = step - np.concatenate([drift, self._follow @ drift])
+        return held
+
+
+def _parameters(damping: float) -> gtsam.LevenbergMarquardtParams:
+    """GTSAM's options: QR, damping in each column's own unit, and no stopping rule of its own."""
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setLinearSolverType("MULTIFRONTAL_QR")
+    parameters.setDiagonalDamping(True)
+    parameters.setlambdaInitial(damping)
+    parameters.setlambdaFactor(10.0)
+    parameters.setlambdaUpperBound(MOST_DAMPING)
+    parameters.setRelativeErrorTol(1e-13)  # no search for a lambda once the cost's own rounding decides
+    parameters.setAbsoluteErrorTol(0.0)
+    return parameters
+
+
+def _dense(linear: gtsam.GaussianFactorGraph, keys: list[int]) -> tuple[Floats, Floats]:
+    """The linear graph as one matrix in the order of the columns, and its right-hand side."""
+    ordering = gtsam.Ordering()
+    for key in keys:
+        ordering.push_back(key)
+    return linear.jacobian(ordering)
+
+
+def _in_words(message: str, variables: Variables) -> str:
+    """GTSAM's message in one line, with the key it names as our variable and its parameters."""
+    found = re.search(r"Symbol:\s*(\w)(\d+)", message)
+    if "ndetermin" in message and found:
+        key = gtsam.symbol(found.group(1), int(found.group(2)))
+        return f"the linear system has no unique solution near {variables.describe(key)}"
+    return " ".join(message.split())

@@ -1,0 +1,286 @@
+"""What was measured: configurations, poses, pairs, and their noise; and how pairs are formed from poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.errors import InputError
+from fg_calib.options import Strategy, check, check_number, check_type
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Booleans = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Measurement noise, 1 sigma; None where it is not stated.
+
+    Attributes:
+        position: Per axis, [m].
+        orientation: Per axis of a rotation vector, [rad].
+        joint: Of the joint readings: one figure for all joints or one a joint, [rad] (prismatic: [m]).
+        distance: Of a directly measured distance, [m].
+        angle: Of a directly measured rotation angle, [rad].
+        point: Of a touched point, per axis, [m].
+    """
+
+    position: float | None = None
+    orientation: float | None = None
+    joint: float | tuple[float, ...] = 0.0
+    distance: float | None = None
+    angle: float | None = None
+    point: float | None = None
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            given = getattr(self, f.name)
+            for figure in given if f.name == "joint" and isinstance(given, tuple | list) else (given,):
+                if figure is not None:
+                    check_number(f"noise: {f.name}", figure)
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """How pairs are formed from measured poses.
+
+    Attributes:
+        strategy: `star` (the first with each other), `chain` (each with the next), `all`, or `random`
+            (different pairs, each configuration about equally often).
+        count: Number of random pairs.
+        seed: Seed of the random pairs.
+    """
+
+    strategy: Strategy = "star"
+    count: int = 0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check("pairing", self.strategy, Strategy)
+        check_number("pairing: count", self.count, above=self.strategy == "random", whole=True)
+        check_number("pairing: seed", self.seed, whole=True)
+
+    def __str__(self) -> str:
+        return self.strategy if self.strategy != "random" else f"random ({self.count}, seed {self.seed})"
+
+
+def as_pairing(pairing: Pairing | None) -> Pairing:
+    """The pairing given, a star if None.
+
+    Raises:
+        InputError: It is something else, such as a strategy's bare name.
+    """
+    check_type("pairing", pairing, Pairing, "Pairing('chain')")
+    return pairing or Pairing()
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Pairs of configurations measured against each other; nan where not measured.
+
+    Attributes:
+        a: Row of the first configuration, shape (n_pairs,).
+        b: Row of the second configuration, shape (n_pairs,).
+        distance: How far the tool moved from a to b, shape (n_pairs,), [m].
+        angle: How far it turned, in [0, pi], shape (n_pairs,), [rad].
+        sigma_distance: Shape (n_pairs,), [m].
+        sigma_angle: Shape (n_pairs,), [rad].
+        test: True for pairs that are predicted but never fitted, shape (n_pairs,).
+        source: File name, for messages.
+    """
+
+    a: Integers
+    b: Integers
+    distance: Floats
+    angle: Floats
+    sigma_distance: Floats
+    sigma_angle: Floats
+    test: Booleans
+    source: str = "pairs"
+
+    @property
+    def n_pairs(self) -> int:
+        """Number of pairs."""
+        return len(self.a)
+
+    def select(self, rows: Booleans | Integers) -> Pairs:
+        """The pairs at `rows` only."""
+        return replace(
+            self,
+            a=self.a[rows],
+            b=self.b[rows],
+            distance=self.distance[rows],
+            angle=self.angle[rows],
+            sigma_distance=self.sigma_distance[rows],
+            sigma_angle=self.sigma_angle[rows],
+            test=self.test[rows],
+        )
+
+
+@dataclass(frozen=True)
+class Groups:
+    """Configurations in which the tool point touched the same physical point, whose position is unknown.
+
+    Attributes:
+        names: Name of each group, shape (n_groups,).
+        index: Group of each configuration, -1 for none, shape (n_configurations,).
+        pairs: Distances measured between the points of two groups (a and b are groups, angles nan).
+    """
+
+    names: tuple[str, ...]
+    index: Integers
+    pairs: Pairs
+
+    @property
+    def n_groups(self) -> int:
+        """Number of groups."""
+        return len(self.names)
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """Configurations, and what was measured at them or between them.
+
+    Attributes:
+        readings: Joint readings q, shape (n_configurations, n_joints), [rad] (prismatic: [m]).
+        ids: Name of each configuration, shape (n_configurations,).
+        test: True for rows that are predicted but never fitted, shape (n_configurations,).
+        position: world_p_tool, shape (n_configurations, 3), [m]; None where not measured.
+        rotation: world_R_tool, shape (n_configurations, 3, 3); None where not measured.
+        sigma_position: Along the world's axes, shape (n_configurations, 3), [m]; None where it is not stated. It may be
+            stated without a measurement: what one would be like.
+        sigma_orientation: The same of the rotation vector about the tool's axes, shape (n_configurations, 3), [rad].
+        sigma_joint: Of the readings, shape (n_joints,), [rad] (prismatic: [m]).
+        pairs: Directly measured pairs; None if pairs are to be formed from the poses.
+        source: File name, for messages.
+        groups: Which configurations touched the same point; None if none did.
+        sigma_point: Of a touch, per axis, shape (n_configurations,), [m]; nan where it is not stated.
+        roll_pitch_yaw: What `rotation` was read from, shape (n_configurations, 3), [rad]; None for quaternions.
+    """
+
+    readings: Floats
+    ids: NDArray[np.str_]
+    test: Booleans
+    position: Floats | None
+    rotation: Floats | None
+    sigma_position: Floats | None
+    sigma_orientation: Floats | None
+    sigma_joint: Floats
+    pairs: Pairs | None = None
+    source: str = "measurements"
+    groups: Groups | None = None
+    sigma_point: Floats | None = None
+    roll_pitch_yaw: Floats | None = None
+
+    @property
+    def n_configurations(self) -> int:
+        """Number of configurations, train and test."""
+        return len(self.readings)
+
+    @property
+    def end_names(self) -> tuple[str, ...]:
+        """Names of what a row can be of: nothing at all (""), the configurations, then the groups.
+
+        Rows count configurations from 0, then groups, and -1 for nothing, so end k has the name at k + 1.
+        """
+        return ("", *self.ids.tolist(), *(() if self.groups is None else self.groups.names))
+
+
+def no_pairs(source: str) -> Pairs:
+    """A table of pairs without any."""
+    rows, figures = np.empty(0, dtype=np.int64), np.empty(0)
+    return Pairs(rows, rows, figures, figures, figures, figures, np.empty(0, dtype=np.bool_), source)
+
+
+def form_pairs(measurements: Measurements, pairing: Pairing) -> Pairs:
+    """Pairs formed from measured poses, within the train rows and, by the same rule, within the test rows.
+
+    A distance between two measured points has variance u^T (S_a + S_b) u along their direction u, a rotation
+    angle k^T (S_a + S_b) k about its axis k, which has the same coordinates in both tool frames. The pairs are
+    treated as independent although pairs that share a configuration share its error.
+
+    Raises:
+        InputError: Neither positions nor orientations were measured.
+    """
+    if measurements.position is None and measurements.rotation is None:
+        raise InputError(measurements.source, "neither positions nor orientations", "measured poses to form pairs from")
+    generator = np.random.default_rng(pairing.seed)
+    chosen = [_choose(np.flatnonzero(measurements.test == test), pairing, generator) for test in (False, True)]
+    a, b = np.concatenate(chosen).T
+    n = len(a)
+    distance, sigma_distance = np.full(n, np.nan), np.full(n, np.nan)
+    angle, sigma_angle = np.full(n, np.nan), np.full(n, np.nan)
+    if measurements.position is not None:
+        step = measurements.position[b] - measurements.position[a]  # (n, 3)
+        distance = np.linalg.norm(step, axis=1)
+        if measurements.sigma_position is not None:
+            sigma_distance = _sigma_along(measurements.sigma_position, a, b, step)
+    if measurements.rotation is not None:
+        a_R_b = np.swapaxes(measurements.rotation[a], 1, 2) @ measurements.rotation[b]  # (n, 3, 3)
+        angle, axis = rotation_angle(a_R_b)
+        if measurements.sigma_orientation is not None:
+            sigma_angle = _sigma_along(measurements.sigma_orientation, a, b, axis)
+    return Pairs(
+        a, b, distance, angle, sigma_distance, sigma_angle, measurements.test[a], f"pairs from {measurements.source}"
+    )
+
+
+def rotation_angle(rotation: Floats) -> tuple[Floats, Floats]:
+    """Angle in [0, pi] and (unnormalised) axis of rotation matrices, shapes (n,) and (n, 3)."""
+    axis = 0.5 * np.stack(
+        [
+            rotation[:, 2, 1] - rotation[:, 1, 2],
+            rotation[:, 0, 2] - rotation[:, 2, 0],
+            rotation[:, 1, 0] - rotation[:, 0, 1],
+        ],
+        axis=1,
+    )  # sin(angle) times the unit axis
+    cosine = 0.5 * (np.trace(rotation, axis1=1, axis2=2) - 1.0)
+    return np.arctan2(np.linalg.norm(axis, axis=1), cosine), axis
+
+
+def _choose(rows: Integers, pairing: Pairing, generator: np.random.Generator) -> Integers:
+    """Pairs of `rows` by the strategy, shape (n_pairs, 2)."""
+    n = len(rows)
+    if n < 2:
+        return np.empty((0, 2), dtype=np.int64)
+    match pairing.strategy:
+        case "star":
+            first, second = np.zeros(n - 1, dtype=np.int64), np.arange(1, n)
+        case "chain":
+            first, second = np.arange(n - 1), np.arange(1, n)
+        case "all":
+            first, second = np.triu_indices(n, 1)
+        case "random":
+            first, second = _draw_pairs(n, pairing.count, generator)
+    return np.stack([rows[first], rows[second]], axis=1)
+
+
+def _draw_pairs(n: int, count: int, generator: np.random.Generator) -> tuple[Integers, Integers]:
+    """`count` different pairs a < b of n rows (all, if there are no more), each row about equally often.
+
+    A row in many pairs would have its own errors count many times. So the pairs are rounds of a tournament in
+    which each row meets every other once (the circle method), rows and rounds in random order.
+    """
+    m = n - 1 + n % 2  # rounds of the whole tournament; row n - 1 sits in the middle if n is even
+    per_round = n // 2
+    rounds = generator.permutation(m)[: -(-count // per_round), None]
+    step = np.arange(1, (m - 1) // 2 + 1)
+    meetings = np.stack([(rounds + step) % m, (rounds - step) % m], axis=2)  # (rounds, meetings, 2)
+    if n % 2 == 0:
+        middle = np.stack([rounds, np.full_like(rounds, n - 1)], axis=2)
+        meetings = np.concatenate([meetings, middle], axis=1)
+    pairs = np.sort(generator.permutation(n)[meetings.reshape(-1, 2)[:count]], axis=1)
+    first, second = pairs[np.lexsort(pairs.T[::-1])].T
+    return first, second
+
+
+def _sigma_along(sigma: Floats, a: Integers, b: Integers, direction: Floats) -> Floats:
+    """Sigma of a difference along `direction` (any direction where it has none), shape (n,)."""
+    length = np.linalg.norm(direction, axis=1, keepdims=True)
+    unit = np.where(length > 0.0, direction / np.where(length > 0.0, length, 1.0), np.sqrt(1.0 / 3.0))
+    variance: Floats = np.sum(unit**2 * (sigma[a] ** 2 + sigma[b] ** 2), axis=1)
+    return np.sqrt(variance)

@@ -1,0 +1,1 @@
+"""The arm: its parameters and conventions, its chain, forward and inverse kinematics."""

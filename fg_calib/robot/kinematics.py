@@ -1,0 +1,311 @@
+"""Forward kinematics of many configurations, with the derivative of the pose in everything that can move.
+
+A `Chain` is a robot prepared for the compiled walk: arrays that say, element by element, which axis to
+translate along or rotate about, by how much, and which column of a Jacobian belongs to it. The walk keeps the
+three columns of the rotation matrix and the tool point: a rotation combines two columns, a translation adds a
+multiple of one. The derivative of the pose in an element is the element's twist (w, v) in the base frame:
+
+    translation along the axis c:        w = 0,  v = c
+    rotation about c through point o:    w = c,  v = o x c
+
+so that a unit change turns the tool by w and moves the tool point p by w x p + v (Lynch & Park 2017, ch. 5).
+
+The walk itself is compiled, see `kernels`.
+
+References:
+    Lynch & Park (2017), Modern Robotics, Cambridge University Press.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.errors import InputError
+from fg_calib.robot.kernels import walk_all
+from fg_calib.robot.model import AXIS_OF_KIND, FRAME_KINDS, Axis, Element, Robot
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Chain:
+    """A robot prepared for the compiled walk; `at` gives it other parameter values.
+
+    Attributes:
+        axis: `Axis` of each element, shape (n_elements,).
+        constant: Constant part of each element's value, [m] or [rad].
+        sign: +1 or -1, factor of parameter and reading.
+        source: Index into the parameter vector of `at`, -1 where the value is constant.
+        value: Value of each element without its reading, [m] or [rad].
+        joint: Index of the joint whose reading is added, -1 for none.
+        column: Jacobian column of each element's parameter, -1 for none.
+        n_columns: Number of parameter columns.
+        n_joints: Number of moving joints.
+        joint_columns: Whether derivatives in the joints are wanted too; they follow the parameters' columns.
+    """
+
+    axis: NDArray[np.int8]
+    constant: Floats
+    sign: Floats
+    source: Integers
+    value: Floats
+    joint: Integers
+    column: Integers
+    n_columns: int
+    n_joints: int
+    joint_columns: bool = False
+
+    def at(self, parameters: Floats) -> Chain:
+        """The same chain with parameter values, shape (n_parameters,) or (n_parameters + 6,), [m] or [rad].
+
+        The six further values are those of the measurement frame, in the order of `FRAME_KINDS`.
+        """
+        value = self.constant + self.sign * np.where(self.source >= 0, parameters[self.source], 0.0)
+        return replace(self, value=value)
+
+    def without_columns(self) -> Chain:
+        """The same chain with no derivatives."""
+        return replace(self, column=np.full_like(self.column, -1), n_columns=0, joint_columns=False)
+
+    def with_joint_columns(self) -> Chain:
+        """The same chain with the derivatives in the joints as well."""
+        return replace(self, joint_columns=True)
+
+    @property
+    def arguments(self) -> tuple[Any, ...]:
+        """What the kernels take: the arrays, sines and cosines of the values among them."""
+        return (
+            self.axis,
+            self.value,
+            np.cos(self.value),
+            np.sin(self.value),
+            self.sign,
+            self.joint,
+            self.column,
+            self.n_columns,
+            self.n_joints if self.joint_columns else 0,
+        )
+
+    @property
+    def turns(self) -> NDArray[np.bool_]:
+        """For each column, joints included, whether it belongs to a rotation, shape (n_columns + n_joints,)."""
+        turns = np.zeros(self.n_columns + self.n_joints, dtype=np.bool_)
+        rotation = self.axis >= Axis.RX
+        turns[self.column[rotation & (self.column >= 0)]] = True
+        turns[self.n_columns + self.joint[rotation & (self.joint >= 0)]] = True
+        return turns
+
+
+def build_chain(
+    robot: Robot,
+    columns: Mapping[int, int] | None = None,
+    *,
+    tool_tangent: int | None = None,
+    base_tangent: int | None = None,
+    frame_tangent: int | None = None,
+    frame: bool = False,
+) -> Chain:
+    """Prepare a robot for the walk, at its nominal values.
+
+    Only what has a column, base and tool if they have a tangent, and the measurement frame may change through
+    `Chain.at`; the rest is constant, and what does nothing is left out.
+
+    Args:
+        robot: The robot.
+        columns: Jacobian column of each parameter that has one, by the parameter's index.
+        tool_tangent: First of six columns for a small motion of the tool frame in itself, rotation first
+            (GTSAM's tangent of a Pose3); None if there are none.
+        base_tangent: The same for the base frame.
+        frame_tangent: The same for the measurement frame world_T_base.
+        frame: Whether the chain starts in a measurement frame; `Chain.at` then takes six more values, and the
+            frame is the identity until it got them.
+    """
+    columns = dict(columns or {})
+    n_parameters = len(robot.parameters)
+    base, tool = robot.owned_by(0), robot.owned_by(robot.n_joints + 1)
+    end_of_base = max((i for i, e in enumerate(robot.elements) if e.parameter in base), default=-1)
+    elements: list[tuple[Element, int, int]] = []  # element, source, column
+    if frame:
+        elements += [(Element(AXIS_OF_KIND[k]), n_parameters + i, -1) for i, k in enumerate(FRAME_KINDS)]
+        elements += _tangent(frame_tangent)
+    for i, element in enumerate(robot.elements):
+        source = -1 if element.parameter is None else element.parameter
+        elements.append((element, source, columns.get(source, -1)))
+        if i == end_of_base:
+            elements += _tangent(base_tangent)
+    elements += _tangent(tool_tangent)
+    n_columns = len(columns) + 6 * sum(t is not None for t in (tool_tangent, base_tangent, frame_tangent))
+    chain = Chain(
+        axis=np.array([e.axis for e, _, _ in elements], dtype=np.int8),
+        constant=np.array([e.constant for e, _, _ in elements]),
+        sign=np.array([float(e.sign) for e, _, _ in elements]),
+        source=np.array([source for _, source, _ in elements], dtype=np.int64),
+        value=np.zeros(len(elements)),
+        joint=np.array([-1 if e.joint is None else e.joint for e, _, _ in elements], dtype=np.int64),
+        column=np.array([column for _, _, column in elements], dtype=np.int64),
+        n_columns=n_columns,
+        n_joints=robot.n_joints,
+    )
+    changing = set(columns) | set(range(n_parameters, n_parameters + 6))
+    changing |= set(() if tool_tangent is None else tool) | set(() if base_tangent is None else base)
+    return _without_idle(chain.at(np.concatenate([robot.nominal, np.zeros(6)])), changing)
+
+
+def _tangent(first: int | None) -> list[tuple[Element, int, int]]:
+    """Six elements of value zero: the derivative in them is that in a frame's tangent, rotation first."""
+    if first is None:
+        return []
+    # Rotations about and translations along the axes of one frame commute to first order.
+    return [(Element(axis), -1, first + (axis + 3) % 6) for axis in Axis]
+
+
+def _without_idle(chain: Chain, changing: set[int]) -> Chain:
+    """The chain without elements that do nothing: zero, and nothing will ever change them.
+
+    Args:
+        chain: The chain at its nominal values.
+        changing: Indices of the parameters, and of the measurement frame's six, that `Chain.at` may change.
+    """
+    fixed = np.array([source not in changing for source in chain.source])
+    keep = ~(fixed & (chain.value == 0.0) & (chain.joint < 0) & (chain.column < 0))
+    arrays = {
+        name: getattr(chain, name)[keep] for name in ("axis", "constant", "sign", "source", "value", "joint", "column")
+    }
+    return replace(chain, **arrays)
+
+
+def precompute_trig(robot: Robot, readings: Floats) -> Floats:
+    """Cosine and sine of revolute readings (value and 0 for prismatic), shape (n, n_joints, 2).
+
+    Args:
+        robot: The robot.
+        readings: Joint readings, shape (n, n_joints), [rad] (prismatic: [m]).
+
+    Raises:
+        InputError: The readings are of more or fewer joints.
+    """
+    if np.ndim(readings) != 2 or np.shape(readings)[1] != robot.n_joints:
+        raise InputError("readings", f"shape {np.shape(readings)}", f"(n, {robot.n_joints}) for the robot's joints")
+    prismatic = np.array([j.prismatic for j in robot.joints])
+    return np.stack(
+        [np.where(prismatic, readings, np.cos(readings)), np.where(prismatic, 0.0, np.sin(readings))], axis=2
+    )
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Tool poses with their derivatives.
+
+    Attributes:
+        rotation: base_R_tool, shape (n, 3, 3).
+        position: base_p_tool, shape (n, 3), [m].
+        jacobian: Of the pose, rotation first (about the base axes, through the tool point), then position, in
+            the chain's columns and, if the chain has them, in the joints: shape (n, 6, n_columns + n_joints),
+            [rad or m over rad or m].
+    """
+
+    rotation: Floats
+    position: Floats
+    jacobian: Floats
+
+
+def forward(chain: Chain, trig: Floats, rows: Integers | None = None) -> Poses:
+    """Tool poses, and their derivatives in the chain's columns.
+
+    Args:
+        chain: The chain; `without_columns` spares the derivatives.
+        trig: From `precompute_trig`, shape (n, n_joints, 2).
+        rows: Rows of `trig`, shape (m,); all if None.
+
+    Note:
+        The derivatives of n configurations take n * 6 * n_columns numbers; for large data use the residuals of
+        `residuals`, which reduce them as they come.
+    """
+    rows = np.arange(len(trig)) if rows is None else np.asarray(rows, dtype=np.int64)
+    n, n_twists = len(rows), chain.n_columns + (chain.n_joints if chain.joint_columns else 0)
+    rotation, position, jacobian = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 6, n_twists))
+    arguments = chain.arguments
+
+    def run(start: int, stop: int) -> None:
+        walk_all(*arguments, trig, rows, start, stop, rotation, position, jacobian)
+
+    for _ in over_spans(run, n):
+        pass
+    return Poses(rotation, position, jacobian)
+
+
+LEAST_TURNING = 1e-4
+"""Mean square of sin(half the angle) of rotations, times two, above which they tell base from tool."""
+
+
+def turning_of_base(w: Floats, rotation: Floats) -> Floats:
+    """What of the tool's turning is that of the base: the best a in `w_k = a + R_k b`, shape (3, n_columns), [rad/...].
+
+    Points that should coincide are off by some vectors. If the base turns, all of them turn with it, and their lengths
+    stay; if the tool turns about its own point they stay as they are. Which turn of all vectors together belongs to a
+    column is free, as it changes no length. This choice is linear in the columns, so that whatever they do together, if
+    it is a motion of the base and a turn of the tool about its point, has no effect on vectors turned back by it.
+
+    Args:
+        w: Turning of the tool in each column at some configurations, about the base's axes, shape (n, 3, n_columns).
+        rotation: base_R_tool there, shape (n, 3, 3).
+    """
+    w_mean, R_mean = w.mean(axis=0), rotation.mean(axis=0)
+    # Normal equations of b about the means; where the rotations hardly tell it is zero, and the turn the base's.
+    values, V = np.linalg.eigh(np.eye(3) - R_mean.T @ R_mean)
+    right = np.einsum("nji,njp->ip", rotation, w) / len(w) - R_mean.T @ w_mean
+    inverse = np.divide(1.0, values, out=np.zeros(3), where=values > LEAST_TURNING)
+    a: Floats = w_mean - R_mean @ ((V * inverse) @ (V.T @ right))
+    return a
+
+
+def pose(robot: Robot, readings: Floats | Sequence[Sequence[float]]) -> Poses:
+    """Tool poses of a robot in its base frame, and their derivatives in every parameter, then every joint.
+
+    Args:
+        robot: The robot, at its nominal values.
+        readings: Joint readings, shape (n, n_joints), [rad] (prismatic: [m]).
+
+    Raises:
+        InputError: The readings are of more or fewer joints.
+    """
+    q = np.atleast_2d(np.asarray(readings, dtype=np.float64))
+    chain = build_chain(robot, {i: i for i in range(len(robot.parameters))}).with_joint_columns()
+    return forward(chain, precompute_trig(robot, q))
+
+
+SPAN = 8192
+"""Rows of one task of the thread pool; a multiple of `LANES`."""
+
+
+def over_spans(run: Callable[[int, int], T], n: int) -> Iterator[T]:
+    """Results of `run(start, stop)` over fixed spans of `n` rows, in order, on all processors.
+
+    The spans do not depend on the number of processors, so neither do sums over them.
+    """
+    spans = [(start, min(start + SPAN, n)) for start in range(0, n, SPAN)]
+    if len(spans) == 1 or processors() == 1:
+        return (run(*span) for span in spans)
+    return _pool().map(lambda span: run(*span), spans)
+
+
+@cache
+def processors() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(processors(), thread_name_prefix="fg-calib")

@@ -1,0 +1,1 @@
+"""Scenarios, and the measurements that they make."""

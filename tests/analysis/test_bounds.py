@@ -1,0 +1,198 @@
+"""Bounds: closed form on a planar arm, a dense computation of another kind, and fits of drawn errors and noise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from simulated import measure, planar_robot, small_arm, true_robot
+from tolerances import rounding
+
+from fg_calib import Bound, InputError, Pairing, assess, build_problem, cramer_rao, pose, solve
+from fg_calib.baseline.comparison import real_errors
+
+SIGMA, TOLERANCE = 1e-3, 5e-3
+N = 9
+
+
+def at(robot, readings, sigma_joint=0.0):
+    """Measurements at given readings; only readings and sigmas matter."""
+    readings = np.asarray(readings, dtype=float)
+    rng = np.random.default_rng(0)
+    return measure(robot, len(readings), rng, sigma=(SIGMA, 2e-4), sigma_joint=sigma_joint, readings=readings)
+
+
+def planar(*names, tolerance=None):
+    """Links of 2 m and 1 m, of which only `names` may be wrong."""
+    return planar_robot(tolerance={"a": tolerance, "theta": 1e-3} if tolerance else None).with_estimated(names)
+
+
+def spread_readings(n, n_joints=2, seed=1):
+    return np.random.default_rng(seed).uniform(-np.pi, np.pi, (n, n_joints))
+
+
+def test_a_length_seen_in_n_positions_has_sigma_over_root_n():
+    # The tool moves by 1 along the first link when that grows by 1, wherever it points.
+    robot = planar("a1")
+    readings = spread_readings(N)
+    bound = cramer_rao(robot, at(robot, readings), model="position", prior=False)
+    expected = SIGMA / np.sqrt(N)
+    assert bound.covariance == pytest.approx(np.array([[expected**2]]), rel=rounding(1, 1e4))
+    assert bound.position(readings).rms == pytest.approx(expected, rel=rounding(1, 1e4))
+    # |N(0, 1)| has mean sqrt(2 / pi); 200 samples of the bound: 5 sigma are 0.6 * 5 / sqrt(200) of it.
+    assert bound.position(readings).mean == pytest.approx(expected * np.sqrt(2 / np.pi), rel=0.27)
+    assert bound.position(readings).max == pytest.approx(bound.position(readings).mean, rel=rounding(1, 1e4))
+
+
+def test_a_prior_adds_its_information():
+    robot = planar("a1", tolerance=SIGMA)
+    bound = cramer_rao(robot, at(robot, spread_readings(N)), model="position")
+    assert bound.covariance == pytest.approx(np.array([[SIGMA**2 / (N + 1)]]), rel=rounding(1, 1e4))
+    assert bound.claimed == pytest.approx(bound.covariance, rel=rounding(1, 1e4))
+
+
+def test_pairs_of_one_configuration_share_its_error():
+    # From q2 = 0 to q2 = pi the tool moves by 2 a2 in a line; the n distances all have the error of the first point.
+    robot = planar("a2")
+    measurements = at(robot, [[0.0, 0.0], *([[0.0, np.pi]] * N)])
+    exact = cramer_rao(robot, measurements, model="distance", prior=False)
+    independent = cramer_rao(robot, measurements, model="distance", prior=False, pair_errors="independent")
+    variance = SIGMA**2 / 4.0
+    # 1e-3 of a formed pair's variance counts as its own (PRIVATE_SHARE).
+    assert exact.covariance[0, 0] == pytest.approx(variance * (1.0 + 1.0 / N), rel=2e-3)
+    assert exact.claimed[0, 0] == pytest.approx(exact.covariance[0, 0], rel=rounding(1, 1e4))
+    assert independent.covariance[0, 0] == pytest.approx(variance * (1.0 + 1.0 / N), rel=1e-6)
+    assert independent.claimed[0, 0] == pytest.approx(variance * 2.0 / N, rel=1e-6)
+
+
+def test_what_is_held_but_wrong_adds_what_the_kept_do_not_make_up_for():
+    # Stretched out, the data see a1 + a2 alone. Kept a1 takes all of it, right where the arm is stretched; folded the
+    # tool is at a1 - a2, and wrong by twice the error of a2.
+    robot = planar("a1", "a2", tolerance=TOLERANCE)
+    stretched = at(robot, [[q, 0.0] for q in np.linspace(-2.0, 2.0, N)])
+    bound = cramer_rao(robot, stretched, model="position", prior=False, kept=["a1"])
+    seen, folded = stretched.readings, stretched.readings + np.array([0.0, np.pi])
+    assert bound.position(seen).rms == pytest.approx(SIGMA / np.sqrt(N), rel=rounding(1, 1e4))
+    assert bound.position(folded).rms == pytest.approx(np.sqrt(SIGMA**2 / N + 4.0 * TOLERANCE**2), rel=rounding(1, 1e4))
+    assert bound.position(folded, claimed=True).rms == pytest.approx(SIGMA / np.sqrt(N), rel=rounding(1, 1e4))
+    assert bound.rank == 1
+
+
+def test_without_priors_what_nothing_determines_is_shared_out_by_minimum_norm():
+    robot = planar("a1", "a2", tolerance=TOLERANCE)
+    stretched = at(robot, [[q, 0.0] for q in np.linspace(-2.0, 2.0, N)])
+    bound = cramer_rao(robot, stretched, model="position", prior=False)
+    assert bound.rank == 1
+    # Each takes half of the sum: a1 - a2 keeps its error, of variance 2 t^2.
+    difference = np.array([1.0, -1.0])
+    assert difference @ bound.covariance @ difference == pytest.approx(2.0 * TOLERANCE**2, rel=rounding(1, 1e4))
+    assert bound.position(stretched.readings).rms == pytest.approx(SIGMA / np.sqrt(N), rel=rounding(1, 1e4))
+
+
+def dense_bound(robot, readings, sigma_joint, pairs, step=1e-6):
+    """(J^T C^-1 J + P)^-1 of distances, by central differences of the positions alone and a dense C."""
+    i = [k for k, p in enumerate(robot.parameters) if p.estimated]
+    a, b = np.array(pairs).T
+    nominal = robot.nominal
+
+    def distances(values, q):
+        p = pose(robot.with_values(values), q).position
+        return np.linalg.norm(p[b] - p[a], axis=1)
+
+    J = np.empty((len(pairs), len(i)))
+    for column, k in enumerate(i):
+        h = step * np.eye(len(nominal))[k]
+        J[:, column] = (distances(nominal + h, readings) - distances(nominal - h, readings)) / (2 * step)
+    p = pose(robot, readings).position
+    u = (p[b] - p[a]) / np.linalg.norm(p[b] - p[a], axis=1)[:, None]
+    L = np.zeros((len(pairs), readings.size + p.size))
+    for row, (first, second) in enumerate(pairs):
+        L[row, 3 * second : 3 * second + 3] = SIGMA * u[row]
+        L[row, 3 * first : 3 * first + 3] = -SIGMA * u[row]
+    for k in range(readings.size):
+        h = np.zeros(readings.size)
+        h[k] = step
+        h = h.reshape(readings.shape)
+        L[:, p.size + k] = sigma_joint * (distances(nominal, readings + h) - distances(nominal, readings - h))
+    L[:, p.size :] /= 2 * step
+    P = np.diag([1.0 / robot.parameters[k].tolerance ** 2 for k in i])
+    return np.linalg.inv(J.T @ np.linalg.solve(L @ L.T, J) + P)
+
+
+@pytest.mark.parametrize("strategy", ["star", "all"])
+def test_the_bound_is_that_of_a_dense_computation(strategy):
+    robot = small_arm(tolerance=dict.fromkeys(("a", "alpha", "d", "theta"), 3e-3))
+    readings = spread_readings(4, 4)  # six distances: as many as four points have, so that the dense C has an inverse
+    bound = cramer_rao(robot, at(robot, readings, sigma_joint=1e-4), model="distance", pairing=Pairing(strategy))
+    n = len(readings)
+    pairs = [(a, b) for a in range(n) for b in range(a + 1, n) if strategy == "all" or a == 0]
+    expected = dense_bound(robot, readings, 1e-4, pairs)
+    # 1e-3 of a formed pair's variance counts as its own, which moves variances by as much.
+    assert bound.covariance == pytest.approx(expected, rel=3e-3, abs=3e-3 * (3e-3) ** 2)
+
+
+def test_the_frames_own_uncertainty_is_in_the_bound():
+    robot = small_arm(tolerance=dict.fromkeys(("a", "alpha", "d", "theta"), 3e-3))
+    measurements = at(robot, spread_readings(12, 4))
+    known, unknown = (cramer_rao(robot, measurements, model="pose", frame=f) for f in ("known", "unknown"))
+    assert np.linalg.eigvalsh(unknown.covariance - known.covariance).min() > -rounding(unknown.covariance)
+    assert unknown.position(measurements.readings).rms > 1.2 * known.position(measurements.readings).rms
+
+
+def test_after_the_best_rigid_fit_the_bound_is_what_real_errors_are():
+    robot = small_arm(tolerance=dict.fromkeys(("a", "alpha", "d", "theta"), 1e-4))
+    readings = spread_readings(40, 4)
+    names = tuple(p.name for p in robot.parameters if p.estimated)
+    error = 1e-5 * np.random.default_rng(3).normal(size=len(names))
+    values = robot.nominal
+    values[[robot.index(name) for name in names]] += error
+    real = real_errors(robot.with_values(values), robot, readings)
+    bound = Bound(robot, names, np.outer(error, error), np.outer(error, error), len(names))
+    # Errors of 1e-5: what is not linear is of that size.
+    assert bound.position(readings).rms == pytest.approx(real.base.rms, rel=1e-4)
+    assert bound.position(readings, fitted=True).rms == pytest.approx(real.fitted.rms, rel=1e-4)
+    assert real.fitted.rms < 0.95 * real.base.rms
+
+
+@pytest.mark.parametrize("pair_errors", ["shared", "independent"])
+@pytest.mark.slow
+def test_fits_of_drawn_errors_and_noise_have_the_bounds_error(pair_errors):
+    robot = planar_robot(tolerance={"a": TOLERANCE, "theta": 2e-3})
+    readings = spread_readings(8)
+    options = {"model": "distance", "pairing": Pairing("all"), "pair_errors": pair_errors}
+    squares, bounds, claims = [], [], []
+    rng = np.random.default_rng(5)
+    for _ in range(70):
+        true = true_robot(robot, rng)
+        measurements = measure(true, 8, rng, sigma=(SIGMA, 2e-4), sigma_joint=2e-4, readings=readings)
+        fit = assess(solve(build_problem(robot, measurements, **options))).robot
+        squares.append(real_errors(fit, true, readings).base.rms ** 2)
+        bound = cramer_rao(true, measurements, **options)
+        bounds.append(bound.position(readings).rms ** 2)
+        claims.append(bound.position(readings, claimed=True).rms ** 2)
+    # Mean of 120 squares, each of 1 to 3 degrees of freedom: sigma at most sqrt(2 / 120) = 13 %.
+    assert np.mean(squares) == pytest.approx(np.mean(bounds), rel=0.39)
+    if pair_errors == "independent":
+        assert np.mean(squares) > 2.0 * np.mean(claims)
+    else:
+        assert np.mean(claims) == pytest.approx(np.mean(bounds), rel=rounding(1, 1e4))
+
+
+def test_test_rows_say_nothing():
+    robot = planar("a1")
+    measurements = at(robot, spread_readings(N))
+    half = replace(measurements, test=np.arange(N) >= 4)
+    bound = cramer_rao(robot, half, model="position", prior=False)
+    assert bound.covariance[0, 0] == pytest.approx(SIGMA**2 / 4, rel=rounding(1, 1e4))
+
+
+def test_a_parameter_that_cannot_be_kept_is_an_error():
+    robot = planar("a1", "a2")
+    with pytest.raises(InputError, match=r"^kept: unknown or fixed parameter 'd1', expected one of a1, a2$"):
+        cramer_rao(robot, at(robot, spread_readings(N)), model="position", kept=["d1"])
+
+
+def test_an_error_of_unknown_size_that_stays_is_an_error():
+    robot = planar("a1", "a2")
+    measurements = at(robot, [[0.0, 0.0]] * N)
+    with pytest.raises(InputError, match=r"^robot planar: no tolerance for a2, expected one: its own error stays"):
+        cramer_rao(robot, measurements, model="position", prior=False, kept=["a1"])

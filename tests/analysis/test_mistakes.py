@@ -1,0 +1,375 @@
+"""Tables spoilt by one usual mistake, or two, are named by it; healthy ones by none."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from jobs import SIGMA, UR5E, only, ur5e, write_job
+from oracle import random_robot
+from scipy.spatial.transform import Rotation
+from simulated import TOOL, measure, paper_robot, small_arm, true_robot
+
+from fg_calib.analysis import mistakes
+from fg_calib.analysis.mistakes import EXPLAINED, FAR, REDUCTION, check_setup
+from fg_calib.errors import SolverError
+from fg_calib.files.job import read_job
+from fg_calib.files.tables import write_csv
+from fg_calib.graph import solver
+from fg_calib.options import MODELS
+from fg_calib.robot.inverse import solve_inverse
+
+PLACED = (Rotation.from_euler("xyz", [0.3, -0.7, 1.9]), np.array([1.0, -2.0, 0.5]))
+"""World_T_base of a tracker beside the robot."""
+
+
+def measured(robot, seed=0, *, placed=None, n=50):
+    """What is measured of a robot whose errors are those its tolerances say."""
+    rng = np.random.default_rng(seed)
+    return measure(true_robot(robot, rng), n, rng, sigma=SIGMA, frame=placed)
+
+
+def exchanged(m, i, j):
+    order = np.arange(6)
+    order[[i - 1, j - 1]] = j - 1, i - 1
+    return replace(m, readings=m.readings[:, order])
+
+
+def inverted(m):
+    R = np.swapaxes(m.rotation, 1, 2)
+    return replace(m, rotation=R, position=-np.einsum("nij,nj->ni", R, m.position))
+
+
+def wxyz(m):
+    """The scalar first, in the columns of the vector."""
+    quaternion = np.roll(Rotation.from_matrix(m.rotation).as_quat(), 1, axis=1)
+    return replace(m, rotation=Rotation.from_quat(quaternion).as_matrix())
+
+
+SPOILT = {
+    "x, y, z are in mm, not m": lambda m: replace(m, position=m.position * 1e3),
+    "x, y, z are in m, not mm": lambda m: replace(m, position=m.position * 1e-3),
+    "x, y, z are in cm, not m": lambda m: replace(m, position=m.position * 1e2),
+    "joint readings are in deg, not rad": lambda m: replace(m, readings=np.rad2deg(m.readings)),
+    "joint readings are in rad, not deg": lambda m: replace(m, readings=np.deg2rad(m.readings)),
+    "the poses are inverted": inverted,
+    "the orientations are inverted": lambda m: replace(m, rotation=np.swapaxes(m.rotation, 1, 2)),
+    "columns qx, qy, qz, qw hold w, x, y, z": wxyz,
+    "columns x, y, z hold y, z, x": lambda m: replace(m, position=m.position[:, [1, 2, 0]]),
+    "columns x, y, z hold y, x, z": lambda m: replace(m, position=m.position[:, [1, 0, 2]]),
+    "z has the wrong sign": lambda m: replace(m, position=m.position * [1, 1, -1]),
+    "joint 2 turns the other way": lambda m: replace(m, readings=m.readings * only(2, -1, 1)),
+    "joint 6 turns the other way": lambda m: replace(m, readings=m.readings * only(6, -1, 1)),
+    "the readings of joints 2 and 3 are exchanged": lambda m: exchanged(m, 2, 3),
+    "the joints are in the opposite order": lambda m: replace(m, readings=m.readings[:, ::-1]),
+    "the zero of joint 2 is off by 90 deg": lambda m: replace(m, readings=m.readings - only(2, np.pi / 2)),
+    "the zero of joint 3 is off by 180 deg": lambda m: replace(m, readings=m.readings + only(3, np.pi)),
+}
+"""Mistakes in a table: how they are named, and how they are made."""
+
+LENGTHS = [key for key in SPOILT if key.startswith(("x,", "columns x", "z has"))]
+TURNS = ["the orientations are inverted", "columns qx, qy, qz, qw hold w, x, y, z"]
+JOINTS = [key for key in SPOILT if "joint" in key]
+
+CASES = [
+    *[("pose", "known", key) for key in SPOILT],
+    *[("pose", "unknown", key) for key in SPOILT],
+    *[("position", "known", key) for key in SPOILT if key not in TURNS],
+    *[("position", "unknown", key) for key in SPOILT if key in JOINTS],
+    *[("orientation", "known", key) for key in TURNS],
+    *[("orientation", "unknown", key) for key in TURNS],
+    *[("distance-rotation", "known", key) for key in SPOILT if key not in LENGTHS + TURNS or "in mm" in key],
+    *[("distance", "known", key) for key in SPOILT if key not in LENGTHS + TURNS or "in m, not" in key],
+    *[("rotation", "known", key) for key in SPOILT if key in JOINTS and "deg, not" in key],
+]
+
+
+EVERY_THIRD = [pytest.param(*case, marks=[pytest.mark.slow] * (i % 3 > 0)) for i, case in enumerate(CASES)]
+"""All cases, most of them for the slow run: they take the same way."""
+
+
+def named(check):
+    """What the first explanation says."""
+    return str(check.explanations[0]) if check.explanations else ""
+
+
+@pytest.mark.parametrize(("model", "frame", "mistake"), EVERY_THIRD)
+def test_a_mistake_in_the_table_is_named(tmp_path, model, frame, mistake):
+    robot = ur5e(tmp_path)
+    m = measured(robot, placed=PLACED if frame == "unknown" else None)
+    healthy = check_setup(robot, m, model, frame, doubtful=True)
+    assert healthy.excess < 2.0
+    assert healthy.explanations == ()
+    check = check_setup(robot, SPOILT[mistake](m), model, frame)
+    assert mistake in named(check)
+    assert check.explanations[0].excess <= min(EXPLAINED, check.excess / REDUCTION)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("model", "frame", "mistake"), CASES)
+def test_a_mistake_is_the_first_finding_of_a_calibration(tmp_path, fg_calib, model, frame, mistake):
+    m = SPOILT[mistake](measured(ur5e(tmp_path), placed=PLACED if frame == "unknown" else None))
+    ended = fg_calib("calibrate", write_job(tmp_path, m, model=model, frame=frame))
+    assert ended.code == 3
+    first = " ".join(ended.out.split()).partition("DOUBTFUL: ")[2].partition(" DOUBTFUL: ")[0]
+    assert "residuals fall from" in first
+    assert mistake in first
+    assert "the noise there is" not in " ".join(ended.out.split())
+
+
+TWO = [
+    ("x, y, z are in mm, not m", "joint readings are in deg, not rad"),
+    ("x, y, z are in mm, not m", "joint 2 turns the other way"),
+    ("joint readings are in deg, not rad", "the poses are inverted"),
+    ("x, y, z are in mm, not m", "columns qx, qy, qz, qw hold w, x, y, z"),
+]
+
+
+@pytest.mark.parametrize("two", TWO, ids=" and ".join)
+def test_two_mistakes_at_once_are_named(tmp_path, two):
+    robot = ur5e(tmp_path)
+    m = measured(robot, placed=PLACED)
+    check = check_setup(robot, SPOILT[two[1]](SPOILT[two[0]](m)), "pose", "unknown")
+    assert all(mistake in named(check) for mistake in two)
+
+
+ANGLES = {
+    "roll, pitch, yaw are in deg, not rad": lambda R: R.as_euler("xyz", degrees=True),
+    "roll, pitch, yaw turn about the moving axes x, y, z": lambda R: R.as_euler("XYZ"),
+    "columns roll, pitch, yaw hold yaw, pitch, roll": lambda R: R.as_euler("ZYX"),
+    "roll, pitch, yaw are angles about the moving axes z, y, z": lambda R: R.as_euler("ZYZ"),
+    "roll, pitch, yaw are a rotation vector": lambda R: R.as_rotvec(),
+}
+
+
+@pytest.mark.parametrize("mistake", ANGLES)
+def test_other_angles_than_roll_pitch_yaw_are_named(tmp_path, fg_calib, mistake):
+    robot = ur5e(tmp_path)
+    m = measured(robot)
+    job = write_job(tmp_path, m, angles=ANGLES[mistake](Rotation.from_matrix(m.rotation)), model="pose")
+    ended = fg_calib("calibrate", job)
+    assert ended.code == 3
+    assert f"if {mistake}" in " ".join(ended.out.split())
+
+
+CHANGED = {
+    "the tool point is another one (estimate: [tool.x, tool.y, tool.z])": {"tool": {"roll": 20}},
+    "the tool frame is another one (estimate: all of tool.x ... tool.yaw)": {"tool": {}},
+    "the robot's convention is mdh-hayati, not dh-hayati": None,
+    "the robot's angles are in deg, not rad": {"units": {"length": "m", "angle": "rad"}, "tolerance": {"a": 0.0005}},
+    "the robot's lengths are in mm, not m": None,
+}
+
+
+@pytest.mark.parametrize("mistake", CHANGED)
+@pytest.mark.parametrize("model", ["pose", "distance-rotation"])
+def test_a_mistake_in_the_robot_is_named(tmp_path, model, mistake):
+    robot = ur5e(tmp_path)
+    changes = CHANGED[mistake]
+    if "convention" in mistake:
+        robot = ur5e(tmp_path, convention="mdh-hayati")
+        changes = {}
+    elif "lengths" in mistake:
+        joints = [{k: v * 1e3 if k in "ad" else v for k, v in joint.items()} for joint in UR5E["joints"]]
+        changes = {"joints": joints, "tool": {"x": 50, "y": -30, "z": 120, "roll": 20}}
+    m = measured(robot)
+    check = check_setup(ur5e(tmp_path, **changes), m, model)
+    if "frame" in mistake and model != "pose":
+        mistake = "the tool point is another one"  # how it is turned does not show in pairs
+    assert mistake in named(check)
+
+
+@pytest.mark.parametrize("model", ["pose", "position", "orientation"])
+def test_a_forgotten_unknown_frame_is_named(tmp_path, fg_calib, model):
+    job = write_job(tmp_path, measured(ur5e(tmp_path), placed=PLACED), model=model)
+    ended = fg_calib("calibrate", job)
+    assert ended.code == 3
+    assert "if the measurement frame is not the base (frame: unknown)" in " ".join(ended.out.split())
+
+
+def test_a_slide_that_goes_the_other_way_or_in_another_unit_is_named():
+    rng = np.random.default_rng(0)
+    arm = small_arm()
+    m = measure(true_robot(arm, rng), 50, rng)
+    for factor, mistake in (
+        ([1, 1, -1, 1], "joint 3 slides the other way"),
+        ([1, 1, 1e3, 1], "readings of slides are in mm"),
+    ):
+        assert mistake in named(check_setup(arm, replace(m, readings=m.readings * factor), "pose"))
+
+
+def pairs_of(m, length=1.0):
+    """A table of pairs, each with the next."""
+    turned = np.swapaxes(m.rotation[:-1], 1, 2) @ m.rotation[1:]
+    n = len(turned)
+    return {
+        "a": np.arange(n),
+        "b": np.arange(n) + 1,
+        "distance": length * np.linalg.norm(np.diff(m.position, axis=0), axis=1),
+        "angle": np.minimum(Rotation.from_matrix(turned).magnitude(), np.pi),
+    }
+
+
+def test_measured_pairs_in_another_unit_are_named(tmp_path, fg_calib):
+    m = measured(ur5e(tmp_path), n=120)
+    job = write_job(tmp_path, m, pairs=pairs_of(m), model="distance-rotation")
+    assert fg_calib("calibrate", job).code == 0
+    job = write_job(tmp_path, m, pairs=pairs_of(m, 1e3), model="distance-rotation")
+    ended = fg_calib("calibrate", job)
+    assert ended.code == 3
+    assert "distances are in mm, not m" in " ".join(ended.out.split())
+
+
+def touches(folder, seed=0, distance=0.05):
+    """A job of a ball put into two sockets: readings that bring the true tool point to each in many ways."""
+    robot = ur5e(folder, estimate=["tool.x", "tool.y", "tool.z"])
+    rng = np.random.default_rng(seed)
+    true = true_robot(robot, rng)
+    points = np.repeat([[0.4, 0.2, 0.3], [0.45, 0.2, 0.3]], 25, axis=0)
+    down = Rotation.from_euler("x", np.pi)
+    turned = (Rotation.from_rotvec(rng.normal(scale=0.6, size=(50, 3))) * down).as_matrix()
+    found = solve_inverse(true, turned, points, rng)
+    q = found.readings[found.reached]
+    columns = {f"q{i + 1}": v for i, v in enumerate(q.T)}
+    write_csv(folder / "touches.csv", columns | {"group": np.repeat(["one", "two"], 25)[found.reached]})
+    write_csv(folder / "sockets.csv", {"a": ["one"], "b": ["two"], "distance": [distance]})
+    job = {"robot": "robot.yaml", "measurements": "touches.csv", "pairs": "sockets.csv", "model": "distance"}
+    path = folder / "job.yaml"
+    path.write_text(yaml.safe_dump(job | {"noise": {"point": 1e-4, "distance": 5e-5}}))
+    return read_job(path)
+
+
+def test_touched_points_name_a_joint_that_turns_the_other_way(tmp_path):
+    job = touches(tmp_path)
+    assert not check_setup(job.robot, job.measurements, "distance").far
+    spoilt = replace(job.measurements, readings=job.measurements.readings * only(2, -1, 1))
+    assert "joint 2 turns the other way" in named(check_setup(job.robot, spoilt, "distance"))
+
+
+def test_sockets_whose_distance_is_in_another_unit_are_named(tmp_path):
+    job = touches(tmp_path, distance=50.0)
+    assert named(check_setup(job.robot, job.measurements, "distance")) == "distances are in mm, not m"
+
+
+def test_the_mistake_stands_first_in_report_and_result(tmp_path, fg_calib):
+    m = measured(ur5e(tmp_path), placed=PLACED)
+    job = write_job(tmp_path, replace(m, position=m.position * 1e3), model="pose", frame="unknown")
+    ended = fg_calib("calibrate", job, "--out", tmp_path / "result")
+    assert ended.code == 3
+    said = " ".join(ended.out.split("\n\n")[0].split())
+    assert said.startswith("ur5e: pose, measurement frame unknown DOUBTFUL: position residuals fall from")
+    assert said.partition(" DOUBTFUL: ")[2].partition(" DOUBTFUL: ")[0].endswith("mm if x, y, z are in mm, not m")
+    assert "the noise there is" not in " ".join(ended.out.split())
+    result = json.loads((tmp_path / "result" / "result.json").read_text())
+    assert result["findings"][0].endswith("if x, y, z are in mm, not m")
+    (explanation,) = result["setup"]["explanations"]
+    assert explanation["mistakes"] == ["x, y, z are in mm, not m"]
+    before, after = (one["residuals"]["position"]["typical"] for one in (result["setup"], explanation))
+    assert before > 100.0
+    assert after < 0.01
+
+
+def test_what_no_usual_mistake_explains_is_said_plainly(tmp_path, fg_calib):
+    m = measured(ur5e(tmp_path))
+    shuffled = replace(m, position=m.position[::-1], rotation=m.rotation[::-1])
+    ended = fg_calib("calibrate", write_job(tmp_path, shuffled, model="pose"))
+    assert ended.code == 3
+    said = " ".join(ended.out.split())
+    assert "times what noise and tolerances predict: none of the usual mistakes in a set-up explains it" in said
+    assert "the noise there is" not in said
+
+
+def test_a_solver_that_gives_up_names_the_mistake_too(tmp_path, fg_calib, monkeypatch):
+    def gives_up(*_):
+        raise SolverError("no step can be solved")
+
+    m = measured(ur5e(tmp_path))
+    job = write_job(tmp_path, replace(m, position=m.position * 1e3), model="pose")
+    monkeypatch.setattr(solver, "_fit", gives_up)
+    ended = fg_calib("calibrate", job)
+    assert ended.code == 1
+    assert "no step can be solved" in ended.err
+    assert "if x, y, z are in mm, not m" in ended.err
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_a_healthy_job_raises_no_alarm(seed):
+    """With large but stated tolerances; also where it is looked at although its residuals are as predicted."""
+    rng = np.random.default_rng(seed)
+    large = {"a": 0.02, "d": 0.02, "alpha": 0.03, "theta": 0.05}
+    robot = (
+        paper_robot(tolerance={"a": 0.01, "alpha": 1e-3, "d": 0.01, "theta": 1e-3, "beta": 1e-3}),
+        small_arm(tolerance=large, estimate=TOOL),
+        small_arm(),
+        random_robot("urdf", 6, rng),
+        random_robot("dh", 5, rng),
+    )[seed % 5]
+    model = MODELS[seed % len(MODELS)]
+    unknown = bool(rng.random() < 0.5) and model in ("pose", "position", "orientation")
+    m = measure(true_robot(robot, rng), 40 + 10 * seed, rng, sigma=(1e-3, 1e-3), frame=PLACED if unknown else None)
+    check = check_setup(robot, m, model, "unknown" if unknown else "known", doubtful=True)
+    assert check.excess < FAR / 2
+    assert check.explanations == ()
+
+
+def test_a_healthy_job_is_looked_at_once(monkeypatch, tmp_path):
+    """What it costs: the hypotheses are not even made."""
+    robot = ur5e(tmp_path)
+    monkeypatch.setattr(mistakes, "_explanations", lambda *_: pytest.fail("looked for mistakes"))
+    assert check_setup(robot, measured(robot), "pose").excess < 2.0
+
+
+def test_gross_errors_are_no_mistake_in_the_set_up(tmp_path):
+    robot = ur5e(tmp_path)
+    m = measured(robot)
+    position = m.position.copy()
+    position[::5] += 0.5
+    check = check_setup(robot, replace(m, position=position), "pose", doubtful=True)
+    assert not check.far
+    assert check.explanations == ()
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_few_rows_say_nothing(tmp_path, model, n):
+    robot = ur5e(tmp_path)
+    check = check_setup(robot, measured(robot, n=n, placed=PLACED), model, "unknown", doubtful=True)
+    assert check.explanations == ()
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_rows_that_are_not_there_say_nothing(tmp_path, model):
+    """Test rows alone, and a table without what the model uses."""
+    robot = ur5e(tmp_path)
+    m = measured(robot)
+    assert check_setup(robot, replace(m, test=np.ones(50, dtype=bool)), model).residuals == ()
+    bare = replace(m, position=None, rotation=None, sigma_position=None, sigma_orientation=None)
+    assert check_setup(robot, bare, model, doubtful=True).residuals == ()
+
+
+def test_touches_of_test_rows_alone_say_nothing(tmp_path):
+    job = touches(tmp_path)
+    groups = replace(job.measurements.groups, index=np.where(np.arange(job.measurements.n_configurations) > 2, 0, -1))
+    test = np.arange(job.measurements.n_configurations) > 2
+    assert check_setup(job.robot, replace(job.measurements, groups=groups, test=test), "distance").residuals == ()
+
+
+def test_real_poses_raise_no_alarm(data_folder, tmp_path):
+    robot = data_folder / "ur10_tmac" / "robot.yaml"
+    job = {"robot": str(robot), "measurements": str(robot.parent / "series_b.csv"), "frame": "unknown"}
+    path = tmp_path / "job.yaml"
+    for model in ("pose", "distance-rotation"):
+        path.write_text(yaml.safe_dump(job | {"model": model, "noise": {"position": 1e-4, "orientation": 1e-4}}))
+        read = read_job(path)
+        check = check_setup(read.robot, read.measurements, read.model, read.frame, doubtful=True)
+        assert not check.far
+        assert check.explanations == ()
+
+
+def test_more_explanations_than_are_told_are_counted(tmp_path, fg_calib):
+    """In an unknown frame one wrong sign is as good as any exchange of two columns: six explain it, three are told."""
+    m = measured(ur5e(tmp_path))
+    mirrored = replace(m, position=m.position * [-1.0, 1.0, 1.0])
+    said = " ".join(fg_calib("calibrate", write_job(tmp_path, mirrored, model="position", frame="unknown")).out.split())
+    assert ", or 3 more (--json has all)" in said

@@ -1,0 +1,115 @@
+"""A second optimum is looked for where measurements see a combination only curved, and told of."""
+
+import numpy as np
+import pytest
+from simulated import measure, paper_robot, true_robot
+
+from fg_calib.analysis.restarts import look_elsewhere
+from fg_calib.analysis.uncertainty import assess
+from fg_calib.analysis.variance_components import solve_job
+from fg_calib.files.job import read_job
+from fg_calib.files.robot_yaml import read_robot
+from fg_calib.graph import solver
+from fg_calib.graph.problem import build_problem, problem_of
+from fg_calib.measurements.dataset import Pairing
+from fg_calib.robot.kinematics import pose
+
+ROBOT = """\
+name: pointer
+convention: dh
+joints:
+  - {{a: 0.1, alpha: 1.5707963267948966, d: 0, theta: 0}}
+  - {{a: 0, alpha: 0, d: {d}, theta: 0}}
+fixed: [a1, alpha1, d1, theta1, a2, alpha2, theta2]
+tolerance: {{d2: {tolerance}}}
+"""
+JOB = """\
+robot: robot.yaml
+measurements: poses.csv
+model: distance
+pairing: chain
+noise: {position: 1.0e-5}
+gauge: prior
+"""
+
+
+def pointer(folder, *, nominal, true, tolerance=0.02, job=JOB, n=40, seed=0):
+    """A pointer, 100 mm long, its tip `true` aside: distances see its radius, so the square of that."""
+    text = ROBOT.format(d=nominal, tolerance=tolerance)
+    (folder / "robot.yaml").write_text(text)
+    robot = read_robot(folder / "robot.yaml")
+    rng = np.random.default_rng(seed)
+    q = rng.uniform(-np.pi, np.pi, (n, 2))
+    values = robot.nominal
+    values[robot.index("d2")] = true
+    position = pose(robot.with_values(values), q).position
+    position = position + 1e-5 * rng.normal(size=position.shape)
+    rows = [",".join(f"{v:.12g}" for v in (*angle, *p)) for angle, p in zip(q, position, strict=True)]
+    (folder / "poses.csv").write_text("\n".join(["q1,q2,x,y,z", *rows]) + "\n")
+    (folder / "job.yaml").write_text(job)
+    return folder / "job.yaml"
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_two_mirrored_optima_are_told_of_and_not_called_good(fg_calib, tmp_path, side):
+    """20 mm aside with a tolerance of 20 mm, and 1 mm at nominal: chi-square differs by 0.2."""
+    path = pointer(tmp_path, nominal=1e-3, true=side * 0.02)
+    run = fg_calib("calibrate", path)
+    assert run.code == 3
+    text = " ".join(run.out.split())
+    assert "a second optimum that the data cannot tell from this one: d2 +19" in text
+    assert "or -21" in text
+    solution = solve_job(read_job(path))
+    i = solution.problem.robot.index("d2")
+    assert solution.parameters[i] == pytest.approx(0.02, abs=1e-4)  # the one nearer to nominal, by its prior
+    assert [other[i] for other in solution.others] == pytest.approx([-0.02], abs=1e-4)
+
+
+def test_the_best_of_two_optima_is_kept(tmp_path):
+    """One start ends 21 tolerances from nominal, where the mirror image is 19 away."""
+    problem = problem_of(read_job(pointer(tmp_path, nominal=1e-3, true=0.02, tolerance=1e-3)))
+    i = problem.robot.index("d2")
+    far = solver.solve(problem)
+    wrong = solver.solve_from(far, np.where(np.arange(len(problem.start)) == i, -0.02, far.parameters), np.inf)
+    assert wrong.parameters[i] < 0.0
+    best = look_elsewhere(wrong)
+    assert best.cost < wrong.cost - 5.0
+    assert best.parameters[i] == pytest.approx(far.parameters[i], abs=1e-9)
+    assert best.others == ()  # chi-square decides: the other is 80 worse
+
+
+def test_a_start_between_two_optima_is_left(tmp_path):
+    """At nominal 0 the derivative is 0: the descent stays there, with a chi-square of tens of thousands."""
+    problem = problem_of(job := read_job(pointer(tmp_path, nominal=0.0, true=0.02)))
+    assert solver.solve(problem).cost > 1e4
+    solution = solve_job(job)
+    i = problem.robot.index("d2")
+    assert abs(solution.parameters[i]) == pytest.approx(0.02, abs=1e-4)
+    assert len(solution.others) == 1
+    second = "a second optimum that the data cannot tell from this one: d2"
+    assert any(finding.startswith(second) for finding in assess(solution).findings)
+
+
+def test_what_data_see_has_one_optimum_and_costs_nothing_more(tmp_path, monkeypatch):
+    """Positions see which side the tip is on: nothing is weak, nothing is solved again."""
+    path = pointer(tmp_path, nominal=1e-3, true=0.02, job=JOB.replace("distance", "position"))
+
+    def never(*_):
+        raise AssertionError("solved again although nothing is weak")
+
+    monkeypatch.setattr("fg_calib.analysis.restarts.solve_from", never)
+    solution = solve_job(read_job(path))
+    assert solution.others == ()
+    assert assess(solution).trustworthy
+
+
+def test_lost_directions_have_no_second_optimum():
+    """Twelve directions of the paper's arm are held by priors alone: other starts along them come back."""
+    robot = paper_robot(tolerance={"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3})
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        m = measure(true_robot(robot, rng), 40, rng, sigma_joint=1e-4)
+        solution = solver.solve(build_problem(robot, m, model="distance-rotation", pairing=Pairing("chain")))
+        again = look_elsewhere(solution)
+        assert again.others == ()
+        assert 2.0 * (again.cost - solution.cost) == pytest.approx(0.0, abs=1e-6)

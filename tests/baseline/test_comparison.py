@@ -1,0 +1,433 @@
+"""Graph and baselines side by side: errors against other formulas, the report, the document, the command."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from oracle import tool_pose
+from scipy.spatial.transform import Rotation
+from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
+from tolerances import rounding
+
+from fg_calib.analysis.uncertainty import assess
+from fg_calib.baseline import comparison as comparison_module
+from fg_calib.baseline.comparison import ESTIMATORS, best_rigid_fit, compare, real_errors
+from fg_calib.errors import InputError
+from fg_calib.files.job import Job, read_job
+from fg_calib.files.robot_yaml import write_robot
+from fg_calib.files.tables import write_csv
+from fg_calib.files.units import Units
+from fg_calib.graph.problem import build_problem, problem_of
+from fg_calib.graph.solver import solve
+from fg_calib.measurements.dataset import Pairing
+from fg_calib.report.documents import comparison_document
+from fg_calib.report.text import format_comparison
+from fg_calib.robot.kinematics import pose
+
+TOLERANCE = {"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3}
+FRAME = (Rotation.from_rotvec(np.pi * np.array([0.0, 0.6, 0.8])), np.array([7.0, -30.0, 2.0]))
+
+
+def job_of(robot, truth, measurements, model, tmp_path, **settings):
+    """A job that was never on disk."""
+    given = {"pairing": Pairing(), "frame": "known", "prior": None, "gauge": "prior", "prefer": ()} | settings
+    return Job(
+        path=tmp_path / "calibration.yaml",
+        robot=robot,
+        measurements=measurements,
+        model=model,
+        loss="none",
+        units=Units(),
+        truth=truth,
+        inputs={},
+        **given,
+    )
+
+
+@pytest.fixture
+def simulated_job(tmp_path):
+    rng = np.random.default_rng(5)
+    robot = paper_robot(tolerance=TOLERANCE)
+    true = true_robot(robot, rng)
+    measurements = measure(true, 60, rng, sigma=(1e-3, 2e-4), sigma_joint=1e-4, n_test=25)
+    # Plain least squares knows no shared errors; with them the graph has another optimum.
+    return job_of(robot, true, measurements, "distance-rotation", tmp_path, pair_errors="independent")
+
+
+@pytest.fixture
+def simulated_folder(tmp_path):
+    """The same on disk, with the truth."""
+    rng = np.random.default_rng(5)
+    robot = paper_robot(tolerance=TOLERANCE)
+    true = true_robot(robot, rng)
+    m = measure(true, 60, rng, n_test=25)
+    write_robot(tmp_path / "robot.yaml", robot)
+    write_robot(tmp_path / "true.yaml", true)
+    columns = {f"q{i + 1}": m.readings[:, i] for i in range(7)}
+    columns |= dict(zip("xyz", m.position.T, strict=True))
+    columns |= dict(zip(("qx", "qy", "qz", "qw"), Rotation.from_matrix(m.rotation).as_quat().T, strict=True))
+    columns["split"] = np.where(m.test, "test", "train")
+    write_csv(tmp_path / "poses.csv", columns)
+    (tmp_path / "calibration.yaml").write_text(
+        "robot: robot.yaml\nmeasurements: poses.csv\nmodel: distance-rotation\ntruth: true.yaml\n"
+        "noise: {position: 0.001, orientation: 0.0002}\n"
+    )
+    return tmp_path
+
+
+# --- what is compared -------------------------------------------------------------------------------------------------
+
+
+def test_all_estimators_run_on_the_same_job(simulated_job):
+    found = compare(simulated_job)
+    assert [e.name for e in found.estimates] == list(ESTIMATORS)
+    assert (found.judged_on, found.n_judged, found.trustworthy) == ("test", 25, True)
+    graph, keep, plain, weighted, scipys = found.estimates
+    for e in found.estimates:
+        assert e.converged, e.message
+        assert e.iterations > 1
+        assert 0.0 < e.seconds < 60.0
+        assert e.residual_rms["test"]["distance"]["after"] < e.residual_rms["test"]["distance"]["before"]
+        assert e.residual_rms["train"]["angle"]["before"] == graph.residual_rms["train"]["angle"]["before"]
+        assert e.errors.base.rms < found.errors_before.base.rms
+    kept = set(keep.sigma)
+    assert len(kept) == 23
+    assert set(plain.sigma) == set(weighted.sigma) == set(scipys.sigma) == kept
+    assert len(graph.sigma) == 35
+    # One optimum but for the weights, which the graph leaves once they move by less than 0.1 % of a sigma.
+    for name in kept:
+        values = [e.robot.nominal[e.robot.index(name)] for e in (keep, weighted, scipys)]
+        assert values == pytest.approx([values[0]] * 3, rel=0, abs=1e-3 * keep.sigma[name]), name
+        assert weighted.sigma[name] == pytest.approx(keep.sigma[name], rel=2e-3), name
+    assert plain.predicted_rms != pytest.approx(weighted.predicted_rms, rel=0.01)
+    assert weighted.predicted_rms == pytest.approx(keep.predicted_rms, rel=2e-3)
+
+
+def test_the_graph_is_the_one_that_calibrate_shows(simulated_job):
+    job = simulated_job
+    found = compare(job)
+    solution = solve(build_problem(job.robot, job.measurements, model=job.model, pair_errors="independent"))
+    uncertainty = assess(solution)
+    graph = found.estimates[0]
+    assert np.array_equal(graph.robot.nominal, uncertainty.robot.nominal)
+    assert graph.residual_rms == uncertainty.residuals.rms()
+    assert graph.sigma == {p.name: p.sigma for p in uncertainty.parameters if p.name in uncertainty.names}
+    for name, correction in ((p.name, p.correction) for p in uncertainty.parameters):
+        assert found.correction(graph.robot, name) == correction
+
+
+def test_a_prediction_is_the_trace_of_the_propagated_covariance(simulated_job):
+    found = compare(simulated_job)
+    job, weighted = simulated_job, found.estimates[3]
+    readings = job.measurements.readings[job.measurements.test]
+    fit = comparison_module.fit_least_squares(
+        job.robot, job.measurements, model=job.model, names=list(weighted.sigma), weighted=True
+    )
+    total = 0.0
+    for q in readings:
+        G = np.empty((3, len(fit.names)))
+        for k, name in enumerate(fit.names):
+            step = np.zeros(len(fit.robot.nominal))
+            step[fit.robot.index(name)] = 1e-6
+            up, down = (tool_pose(fit.robot.with_values(fit.robot.nominal + h), q)[:3, 3] for h in (step, -step))
+            G[:, k] = (up - down) / 2e-6
+        total += np.trace(G @ fit.covariance @ G.T)
+    assert weighted.predicted_rms == pytest.approx(np.sqrt(total / len(readings)), rel=1e-6)
+
+
+@pytest.mark.slow
+def test_predicted_errors_come_true(tmp_path):
+    """RMS over 30 simulated calibrations with known noise, poses in the base frame: within a fifth."""
+    rng = np.random.default_rng(8)
+    robot = small_arm(tolerance={"a": 5e-3, "d": 5e-3, "alpha": 2e-3, "theta": 2e-3})
+    ratios = {name: [] for name in ESTIMATORS}
+    for _ in range(30):
+        true = true_robot(robot, rng)
+        found = compare(job_of(robot, true, measure(true, 30, rng, n_test=20), "pose", tmp_path))
+        for e in found.estimates:
+            ratios[e.name].append(e.errors.base.rms / e.predicted_rms)
+    for name in ("graph", "graph-keep", "weighted-gauss-newton", "scipy"):
+        # about 16 parameters determine each calibration's error: 30 of them know its mean square to some 15 %
+        assert np.sqrt(np.mean(np.square(ratios[name]))) == pytest.approx(1.0, abs=0.2), name
+
+
+@pytest.mark.parametrize("prefer", [(), ("theta4", "d4")])
+def test_unknown_frame_and_tool_start_where_the_graph_starts(tmp_path, prefer):
+    """What is held of an unknown tool stays at nominal, not where the closed form would start it."""
+    rng = np.random.default_rng(4)
+    robot = small_arm(estimate=TOOL)
+    true = true_robot(robot, rng)
+    measurements = measure(true, 60, rng, frame=FRAME, n_test=10)
+    found = compare(job_of(robot, true, measurements, "pose", tmp_path, frame="unknown", prefer=prefer))
+    assert all(e.converged for e in found.estimates)
+    _, keep, _, weighted, _ = found.estimates
+    held = {p.name for p in robot.parameters if p.estimated} - set(keep.sigma)
+    assert any(name.startswith("tool.") for name in held) == bool(prefer)
+    assert all(weighted.robot.nominal[robot.index(name)] == robot.nominal[robot.index(name)] for name in held)
+    for name, sigma in keep.sigma.items():
+        values = [found.correction(e.robot, name) for e in (keep, weighted)]
+        assert values[1] == pytest.approx(values[0], rel=0, abs=1e-4 * sigma), name
+    assert weighted.residual_rms["test"]["position"]["after"] == pytest.approx(
+        keep.residual_rms["test"]["position"]["after"], rel=1e-4
+    )
+    assert found.errors_before.fitted.rms > keep.errors.fitted.rms
+
+
+def test_a_job_without_test_rows_is_judged_at_its_train_rows(simulated_job):
+    job = replace(
+        simulated_job,
+        truth=None,
+        measurements=replace(simulated_job.measurements, test=np.zeros(85, bool)),
+    )
+    found = compare(job)
+    assert (found.judged_on, found.n_judged, found.errors_before) == ("train", 85, None)
+    assert all(e.errors is None for e in found.estimates)
+    text = format_comparison(found)
+    assert "judged at 85 train configurations" in text
+    assert "  no test rows: judged at the train configurations, which flatters every estimator" in text
+    assert "  the truth is not known: no real errors (key truth of a job)" in text
+    assert "Real error" not in text
+    assert "truth " not in text.partition("Corrections")[2].partition("Estimators")[0]
+
+
+def test_a_baseline_that_cannot_run_or_goes_astray_says_so(simulated_job, monkeypatch):
+    original = comparison_module.fit_least_squares
+
+    def broken(*arguments, method="gauss-newton", weighted=False, **settings):
+        if method == "scipy":
+            raise InputError("poses.csv", "no sigma for distance")
+        return original(*arguments, weighted=weighted, max_iterations=50 if weighted else 1, **settings)
+
+    monkeypatch.setattr(comparison_module, "fit_least_squares", broken)
+    found = compare(simulated_job)
+    *_, plain, _, scipys = found.estimates
+    assert (scipys.robot, scipys.converged, scipys.predicted_rms) == (None, False, None)
+    assert scipys.message == "could not run: poses.csv: no sigma for distance"
+    assert not plain.converged
+    assert found.trustworthy
+    text = format_comparison(found)
+    assert re.search(r"converged +- +yes +yes +NO +yes +NO\n", text)
+    assert re.search(r"iterations +- +\d+ +\d+ +1 +\d+ +-\n", text)
+    assert "could not run: poses.csv: no sigma for distance" in " ".join(text.split())
+    document = comparison_document(found)["estimates"][-1]
+    assert (document["ran"], document["parameters"], document["residual_rms"]) == (False, [], None)
+
+
+def test_where_nothing_is_determined_only_the_graph_with_priors_runs(tmp_path):
+    robot = planar_robot(tolerance={"a": 1e-3}).with_estimated(["a1", "a2"])  # which turn nothing
+    measurements = measure(robot, 20, np.random.default_rng(0))
+    found = compare(job_of(robot, None, measurements, "rotation", tmp_path))
+    graph, *others = found.estimates
+    assert graph.converged
+    assert graph.sigma == pytest.approx({"a1": 1e-3, "a2": 1e-3})
+    for e in others:
+        assert (e.robot, e.converged) == (None, False)
+        assert e.message == (
+            "could not run: pairs from measurements: the rows determine none of the parameters to estimate, "
+            "expected rows that some of them act on"
+        )
+    assert re.search(r"parameters +- +2 +- +- +- +-\n", format_comparison(found))
+
+
+def test_problem_of_takes_the_jobs_settings_but_for_changes(simulated_job):
+    job = replace(simulated_job, model="distance", pairing=Pairing("chain"), prefer=("d3",))
+    problem = problem_of(job)
+    assert (problem.settings.model, problem.settings.pairing.strategy, problem.settings.prior) == (
+        "distance",
+        "chain",
+        True,
+    )
+    changed = problem_of(job, prior=False, gauge="keep")
+    assert (changed.settings.prior, changed.settings.gauge) == (False, "keep")
+    assert "d3" in [p.name for p in changed.estimated]
+
+
+# --- real errors ------------------------------------------------------------------------------------------------------
+
+
+def test_the_best_rigid_fit_is_scipys():
+    rng = np.random.default_rng(0)
+    for n in (3, 4, 50):
+        points = rng.normal(size=(n, 3))
+        turn = Rotation.random(random_state=n)
+        onto = turn.apply(points) + [1.0, 2.0, 3.0] + 0.3 * rng.normal(size=(n, 3))
+        R, t = best_rigid_fit(points, onto)
+        expected, rssd = Rotation.align_vectors(onto - onto.mean(axis=0), points - points.mean(axis=0))
+        assert R == pytest.approx(expected.as_matrix(), abs=rounding(1, 1e4))
+        assert np.linalg.norm(points @ R.T + t - onto) == pytest.approx(rssd, rel=rounding(1, 1e4))
+    mirrored = points * [1.0, 1.0, -1.0]
+    assert np.linalg.det(best_rigid_fit(points, mirrored)[0]) == pytest.approx(1.0)
+
+
+def test_real_errors_are_those_of_the_tool_poses():
+    rng = np.random.default_rng(1)
+    robot = small_arm()
+    true = true_robot(robot, rng)
+    q = rng.uniform(-np.pi, np.pi, (40, 4))
+    found = real_errors(robot, true, q)
+    T, T_true = (np.array([tool_pose(r, row) for row in q]) for r in (robot, true))
+    distance = np.linalg.norm(T[:, :3, 3] - T_true[:, :3, 3], axis=1)
+    angle = Rotation.from_matrix(np.swapaxes(T[:, :3, :3], 1, 2) @ T_true[:, :3, :3]).magnitude()
+    assert found.base.max == pytest.approx(distance.max(), rel=rounding(1, 1e4))
+    assert found.base.mean == pytest.approx(distance.mean(), rel=rounding(1, 1e4))
+    assert found.base.rms == pytest.approx(np.sqrt(np.mean(distance**2)), rel=rounding(1, 1e4))
+    assert found.base.orientation_rms == pytest.approx(np.sqrt(np.mean(angle**2)), rel=1e-6)
+    points, onto = T[:, :3, 3], T_true[:, :3, 3]
+    turn, rssd = Rotation.align_vectors(onto - onto.mean(axis=0), points - points.mean(axis=0))
+    assert found.fitted.rms == pytest.approx(rssd / np.sqrt(40), rel=1e-6)
+    angle = Rotation.from_matrix(np.swapaxes(turn.as_matrix() @ T[:, :3, :3], 1, 2) @ T_true[:, :3, :3]).magnitude()
+    assert found.fitted.orientation_rms == pytest.approx(np.sqrt(np.mean(angle**2)), rel=1e-6)
+    assert found.fitted.rms < found.base.rms
+
+
+def test_an_arm_that_was_only_moved_has_no_error_after_the_fit():
+    robot = small_arm()
+    moved = robot.with_values(robot.nominal + np.array([0.1, -0.2, 0.3, 0.4, 0.1, -0.2] + [0.0] * 22))
+    q = np.random.default_rng(2).uniform(-np.pi, np.pi, (20, 4))
+    found = real_errors(moved, robot, q)
+    assert found.base.rms > 0.1
+    assert found.fitted.max == pytest.approx(0.0, abs=rounding(10.0))
+    assert found.fitted.orientation_rms == pytest.approx(0.0, abs=rounding(10.0))
+    assert real_errors(moved, robot, q[:2]).fitted is None
+
+
+def test_a_correction_goes_the_shorter_way(simulated_job):
+    found = compare(simulated_job)
+    robot = simulated_job.robot
+    for name, value, expected in (("tool.yaw", 6.0, 6.0 - 2 * np.pi), ("tool.x", 6.0, 6.0), ("theta2", 6.0, 6.0)):
+        values = robot.nominal
+        values[robot.index(name)] += value
+        assert found.correction(robot.with_values(values), name) == pytest.approx(expected, abs=rounding(10.0))
+
+
+# --- report, document, command ----------------------------------------------------------------------------------------
+
+
+def test_the_report_shows_the_figures_in_millimetres_and_degrees(simulated_job):
+    found = compare(simulated_job)
+    text = format_comparison(found)
+    lines = text.splitlines()
+    assert lines[0] == "space-robot: distance-rotation, judged at 25 test configurations"
+    assert lines[2].split() == ["nominal", "graph", "graph", "kept", "plain", "GN", "weighted", "GN", "scipy"]
+    errors = [found.errors_before, *(e.errors for e in found.estimates)]
+
+    def figures(label, after="Real error in the base frame"):
+        section = lines[lines.index(after) :]
+        line = next(line for line in section if line.strip().startswith(label))
+        return line.split(label)[1].split()
+
+    assert figures("position, max") == ["mm", *(f"{e.base.max * 1e3:.3f}" for e in errors)]
+    assert figures("orientation, RMS") == ["deg", *(f"{np.rad2deg(e.base.orientation_rms):.4f}" for e in errors)]
+    fitted = [f"{e.fitted.rms * 1e3:.3f}" for e in errors]
+    assert figures("position, RMS", "Real error after the best rigid fit") == ["mm", *fitted]
+    predicted = [f"{e.predicted_rms * 1e3:.3f}" for e in found.estimates]
+    assert figures("position, RMS", "Error predicted by its sigmas") == [
+        "mm",
+        "-",
+        *predicted,
+    ]
+    angles = [np.rad2deg(e.residual_rms["test"]["angle"]["after"]) for e in found.estimates]
+    assert figures("angle", "Residuals, test rows (RMS)")[2:] == [f"{a:.4f}" for a in angles]
+    assert figures("parameters") == ["-", "35", "23", "23", "23", "23"]
+    assert figures("converged") == ["-", "yes", "yes", "yes", "yes", "yes"]
+    a2 = next(line for line in lines if line.startswith("a2 "))
+    shown = [f"{found.correction(e.robot, 'a2') * 1e3:+.3f} ±{e.sigma['a2'] * 1e3:.3f}" for e in found.estimates]
+    truth = f"{found.correction(simulated_job.truth, 'a2') * 1e3:+.3f}"
+    assert a2.split() == ["a2", "mm", truth, *" ".join(shown).split()]
+    a1 = next(line for line in lines if line.startswith("a1 "))
+    assert a1.split()[-4:] == ["held"] * 4
+    assert all(len(line) <= 100 for line in lines)
+    assert "…" not in text
+    assert " -0.000 " not in text
+
+
+def test_figures_that_went_astray_stay_within_the_page(simulated_job):
+    found = compare(simulated_job)
+    astray = found.estimates[2].robot.with_values(found.estimates[2].robot.nominal * 1e7 + 1e6)
+    far = replace(found.estimates[2], robot=astray, predicted_rms=1e9)
+    changed = replace(found, estimates=(*found.estimates[:2], far, *found.estimates[3:]))
+    text = format_comparison(changed)
+    assert all(len(line) <= 100 for line in text.splitlines())
+    assert "1.0e+12" in text
+    assert "e+09" in text.split("\na2 ")[1].split("\nalpha2 ")[0]
+
+
+def test_a_doubtful_graph_is_doubtful_in_the_comparison(simulated_job):
+    m = simulated_job.measurements
+    optimistic = replace(m, sigma_position=m.sigma_position / 20, sigma_orientation=m.sigma_orientation / 20,
+                         sigma_joint=m.sigma_joint / 20)  # fmt: skip
+    found = compare(replace(simulated_job, measurements=optimistic))
+    assert not found.trustworthy
+    assert format_comparison(found).splitlines()[1].startswith("DOUBTFUL: reduced chi-square")
+    assert comparison_document(found)["trustworthy"] is False
+
+
+def _refuse(constant):
+    raise AssertionError(f"{constant} is no JSON")
+
+
+def test_comparing_the_bundled_example(fg_calib, example):
+    job = example / "calibration.yaml"
+    text = job.read_text().replace("truth:", "# truth:")
+    job.write_text(text)
+    ended = fg_calib("compare", job, "--json", "--out", example / "out")
+    assert (ended.code, ended.err) == (0, "")
+    document = json.loads(ended.out, parse_constant=_refuse)
+    written = json.loads((example / "out" / "comparison.json").read_text(), parse_constant=_refuse)
+    assert list(written) == list(document)
+    assert [f.name for f in (example / "out").iterdir()] == ["comparison.json"]
+    assert document["schema"] == "fg-calib/comparison/1"
+    assert (document["robot"], document["model"], document["pairing"]) == ("space-robot", "distance-rotation", "star")
+    assert (document["judged_on"], document["n_judged"], document["truth_known"]) == ("test", 500, False)
+    assert document["nominal"]["errors"] is None
+    assert [e["name"] for e in document["estimates"]] == list(ESTIMATORS)
+    # Without priors the arm is worse than nominal far from where it was seen.
+    rms = [e["residual_rms"]["test"]["distance"] for e in (document["nominal"], *document["estimates"])]
+    assert rms[1] < rms[0] < min(rms[2:])
+    for e in document["estimates"]:
+        assert (e["ran"], e["converged"], e["errors"]) == (True, True, None)
+        assert e["residual_rms"]["test"]["position"] is None
+        assert e["residual_rms"]["test"]["distance"] > 0.0
+        assert len(e["parameters"]) == 30
+        for p in e["parameters"]:
+            assert p["correction"] == p["estimate"] - p["nominal"]
+            assert p["true"] is None
+            assert p["held"] == (p["sigma"] is None) == (p["correction"] == 0.0)
+            assert p["held"] or p["sigma"] > 0.0
+        assert sum(not p["held"] for p in e["parameters"]) == e["n_estimated"]
+    assert "poses.csv" in document["inputs"]
+
+
+def test_comparing_a_simulated_job_from_files_tells_real_errors(fg_calib, simulated_folder):
+    job = simulated_folder / "calibration.yaml"
+    ended = fg_calib("compare", job)
+    assert (ended.code, ended.err) == (0, "")
+    assert "Real error in the base frame" in ended.out
+    document = json.loads(fg_calib("compare", job, "--json").out, parse_constant=_refuse)
+    given = read_job(job)
+    q = given.measurements.readings[given.measurements.test]
+    for e in document["estimates"]:
+        values = given.robot.nominal
+        for p in e["parameters"]:
+            values[given.robot.index(p["name"])] = p["estimate"]
+            assert p["true"] == given.truth.nominal[given.truth.index(p["name"])]
+        step = pose(given.robot.with_values(values), q).position - pose(given.truth, q).position
+        rms = np.sqrt(np.mean(np.sum(step**2, axis=1)))
+        assert e["errors"]["base_frame"]["rms"] == pytest.approx(rms, rel=rounding(1, 1e4))
+        assert e["errors"]["best_rigid_fit"]["rms"] < rms
+
+
+def test_a_comparison_not_to_be_trusted_ends_with_three(fg_calib, example):
+    job = example / "calibration.yaml"
+    job.write_text(re.sub(r"noise:.*", "noise: {position: 0.00001, orientation: 0.0001}", job.read_text()))
+    ended = fg_calib("compare", job)
+    assert ended.code == 3
+    assert ended.err.startswith("not to be trusted: reduced chi-square ")
+
+
+def test_comparing_bad_input_is_one_line(fg_calib, tmp_path):
+    ended = fg_calib("compare", tmp_path / "nowhere.yaml")
+    assert (ended.code, ended.out) == (1, "")
+    assert ended.err == f"error: {tmp_path / 'nowhere.yaml'}: no such file\n"

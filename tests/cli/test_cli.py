@@ -1,0 +1,887 @@
+"""Commands in process: exit codes, files, messages, and what results promise."""
+
+import csv
+import json
+import math
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+import yaml
+from oracle import tool_pose
+from scipy.spatial.transform import Rotation
+from tolerances import rounding
+from typer.testing import CliRunner
+
+from fg_calib import __version__, cli, read_measurements, read_robot, write_robot
+from fg_calib.files.units import Units
+from fg_calib.robot.model import Joint, RobotBuilder
+
+JOB, POSES, ROBOT, TRUTH = "calibration.yaml", "poses.csv", "robot_nominal.yaml", "robot_true.yaml"
+OUTPUTS = {"result.json", "robot_calibrated.yaml", "residuals.csv"}
+NUMBER = (int, float)
+
+
+# --- the bundled example, calibrated once ----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    """A folder with the bundled example, calibrated into `result`, and what the command printed."""
+    folder = Path(shutil.copytree(cli.EXAMPLES / "space-robot", tmp_path_factory.mktemp("cli") / "job"))
+    ended = CliRunner().invoke(cli.app, ["calibrate", str(folder / JOB), "--out", str(folder / "result")])
+    return folder, ended
+
+
+@pytest.fixture(scope="module")
+def result(calibrated):
+    return json.loads((calibrated[0] / "result" / "result.json").read_text(), parse_constant=_refuse)
+
+
+@pytest.fixture(scope="module")
+def residuals(calibrated):
+    with (calibrated[0] / "result" / "residuals.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def _refuse(constant):
+    raise AssertionError(f"{constant} is no JSON")
+
+
+def by_name(result, field="estimate"):
+    return {p["name"]: p[field] for p in result["parameters"]}
+
+
+def calibrate(fg_calib, job, *arguments):
+    """The result of a job that ends well."""
+    ended = fg_calib("calibrate", job, "--json", *arguments)
+    assert (ended.code, ended.err) == (0, "")
+    return json.loads(ended.out, parse_constant=_refuse)
+
+
+def test_calibrating_the_example_ends_well_and_writes_three_files(calibrated):
+    folder, ended = calibrated
+    assert (ended.exit_code, ended.stderr) == (0, "")
+    assert ended.stdout.startswith("space-robot: distance-rotation, pairs: star\nGOOD: converged")
+    assert {f.name for f in (folder / "result").iterdir()} == OUTPUTS
+    assert {f.name for f in folder.iterdir()} == {JOB, POSES, ROBOT, TRUTH, "result"}
+
+
+def test_a_result_has_every_key_of_its_schema(result):
+    rms = {"train": dict, "test": dict}
+    shape = {
+        **{"schema": str, "version": str, "robot": str, "model": str, "frame": str, "pairing": str},
+        **{"n_configurations": int, "n_pairs": int, "n_residuals": int, "n_priors": int, "n_excluded": dict},
+        **{"solver": dict, "trustworthy": bool, "findings": list, "chi2": float, "dof": int, "reduced_chi2": float},
+        **{"residual_rms": dict, "parameters": list, "covariance": dict, "frame_estimate": type(None)},
+        **{"observability": dict, "inputs": dict},
+    }
+    assert {key: type(result[key]) for key in shape} == shape  # more may be added
+    assert result["schema"] == "fg-calib/result/1"
+    assert (result["version"], result["robot"]) == (__version__, "space-robot")
+    assert (result["model"], result["frame"], result["pairing"]) == ("distance-rotation", "unknown", "star")
+    assert {key: type(value) for key, value in result["residual_rms"].items()} == rms
+    solver = {"name": str, "converged": bool, "message": str, "iterations": int, "initial_cost": float, "cost": float}
+    solver |= {"seconds": float, "history": list}
+    assert {key: type(result["solver"][key]) for key in solver} == solver
+    assert result["solver"]["name"] == "gtsam-lm"
+    assert result["solver"]["converged"] is True
+    observability = {
+        **{"schema": str, "model": str, "kind": str, "n_parameters": int, "rank": int, "names": list, "gap": float},
+        **{"singular_values": list, "independent": list, "ineffective": list, "relative": list, "null_space": list},
+        **{"indices": dict, "condition_number": float},
+    }
+    assert {key: type(result["observability"][key]) for key in observability} == observability
+    for p in result["parameters"]:
+        assert list(p) == [
+            "name",
+            "unit",
+            "nominal",
+            "estimate",
+            "correction",
+            "sigma",
+            "prior_sigma",
+            "identifiability",
+        ]
+        assert p["unit"] in {"m", "rad"}
+        assert p["identifiability"] in {"independent", "relative", "ineffective", "fixed"}
+        assert p["correction"] == p["estimate"] - p["nominal"]
+        assert isinstance(p["sigma"], NUMBER)
+        assert isinstance(p["prior_sigma"], NUMBER) == (p["identifiability"] != "fixed")
+
+
+def test_the_covariance_is_symmetric_and_its_diagonal_the_squared_sigmas(result):
+    names, matrix = result["covariance"]["names"], np.array(result["covariance"]["matrix"])
+    sigma = by_name(result, "sigma")
+    assert names == [p["name"] for p in result["parameters"] if p["identifiability"] != "fixed"]
+    assert np.array_equal(matrix, matrix.T)
+    assert np.diag(matrix) == pytest.approx([sigma[name] ** 2 for name in names], rel=rounding(1, 10))
+    assert np.linalg.eigvalsh(matrix / np.sqrt(np.outer(np.diag(matrix), np.diag(matrix)))).min() > 0
+
+
+def test_cost_chi_square_and_degrees_of_freedom_agree(result):
+    prior = [(p["correction"] / p["prior_sigma"]) ** 2 for p in result["parameters"] if p["prior_sigma"]]
+    assert result["chi2"] == 2 * result["solver"]["cost"]
+    assert result["reduced_chi2"] == result["chi2"] / result["dof"]
+    assert result["n_priors"] == len(prior) == 30
+    assert result["dof"] == result["n_residuals"] + 30 - 30  # priors make every one of the 30 unknowns determined
+
+
+def test_chi_square_of_independent_pairs_is_that_of_the_rows(fg_calib, example):
+    """Where pairs share errors, rows do not add up; nor, exactly, where joint noise correlates distance and angle."""
+    (example / JOB).write_text((example / JOB).read_text() + "pair_errors: independent\n")
+    fg_calib("calibrate", example / JOB, "--out", example / "result")
+    result = json.loads((example / "result" / "result.json").read_text())
+    with (example / "result" / "residuals.csv").open() as file:
+        data = sum(float(r["whitened"]) ** 2 for r in csv.DictReader(file) if r["used"] == "true")
+    prior = [(p["correction"] / p["prior_sigma"]) ** 2 for p in result["parameters"] if p["prior_sigma"]]
+    assert result["chi2"] == pytest.approx(data + sum(prior), rel=0.1)
+
+
+def test_residuals_have_a_line_for_each_scalar_residual(result, residuals):
+    with (cli.EXAMPLES / "space-robot" / POSES).open() as file:
+        rows = list(csv.DictReader(file))
+    n = {split: sum(r["split"] == split for r in rows) for split in ("train", "test")}
+    assert sum(r["used"] == "true" for r in residuals) == result["n_residuals"]
+    assert len(residuals) == 2 * (n["train"] - 1) + 2 * (n["test"] - 1)  # a star: distance and angle to the first
+    assert {(r["kind"], r["unit"]) for r in residuals} == {("distance", "m"), ("angle", "rad")}
+    for r in residuals:
+        assert float(r["predicted"]) - float(r["measured"]) == pytest.approx(float(r["residual"]), abs=rounding(1.0))
+        assert float(r["residual"]) / float(r["sigma"]) == pytest.approx(float(r["whitened"]), rel=rounding(1, 10))
+
+
+def test_rms_is_what_the_residuals_say(result, residuals):
+    for split in ("train", "test"):
+        for kind in ("distance", "angle"):
+            rows = [r for r in residuals if (r["split"], r["kind"], r["excluded"]) == (split, kind, "")]
+            for column, when in (("residual_before", "before"), ("residual", "after")):
+                rms = math.sqrt(sum(float(r[column]) ** 2 for r in rows) / len(rows))
+                assert result["residual_rms"][split][kind][when] == pytest.approx(rms, rel=rounding(1, 10))
+        assert result["residual_rms"][split]["position"] is None
+        assert result["residual_rms"][split]["orientation"] is None
+    test = result["residual_rms"]["test"]
+    assert test["distance"]["after"] < 0.5 * test["distance"]["before"]
+
+
+def test_predictions_are_those_of_the_calibrated_robot(calibrated, residuals):
+    """Poses by 4x4 products from robot_calibrated.yaml give the distances and angles of residuals.csv."""
+    robot = read_robot(calibrated[0] / "result" / "robot_calibrated.yaml")
+    given = read_measurements(calibrated[0] / POSES, robot, units=Units(angle="deg"))
+    row = {name: i for i, name in enumerate(given.ids)}
+    for r in residuals[::17]:
+        a, b = (tool_pose(robot, given.readings[row[r[end]]]) for end in ("a", "b"))
+        turn = Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).magnitude()
+        predicted = np.linalg.norm(b[:3, 3] - a[:3, 3]) if r["kind"] == "distance" else turn
+        assert float(r["predicted"]) == pytest.approx(predicted, abs=rounding(10.0))  # rounding over a chain of 10 m
+
+
+def test_the_calibrated_robot_holds_the_estimates(calibrated, result):
+    robot = read_robot(calibrated[0] / "result" / "robot_calibrated.yaml")
+    nominal = read_robot(calibrated[0] / ROBOT)
+    assert {p.name: p.nominal for p in robot.parameters} == by_name(result)
+    assert {p.name: p.nominal for p in nominal.parameters} == by_name(result, "nominal")
+    assert [(p.name, p.estimated, p.tolerance) for p in robot.parameters] == [
+        (p.name, p.estimated, pytest.approx(p.tolerance, rel=rounding()) if p.tolerance else None)
+        for p in nominal.parameters
+    ]
+    assert robot.joints == nominal.joints
+
+
+def test_the_truth_lies_within_four_sigma(calibrated, result):
+    true = {p.name: p.nominal for p in read_robot(calibrated[0] / "robot_true.yaml").parameters}
+    errors = [
+        (p["estimate"] - true[p["name"]]) / p["sigma"] for p in result["parameters"] if p["identifiability"] != "fixed"
+    ]
+    assert len(errors) == 30
+    assert np.max(np.abs(errors)) < 4
+    assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.6  # 30 correlated values of sigma 1: honest, not just wide
+
+
+def test_inputs_are_named_with_their_hashes(calibrated, result):
+    import hashlib
+
+    expected = {
+        name: hashlib.sha256((calibrated[0] / name).read_bytes()).hexdigest() for name in (JOB, ROBOT, POSES, TRUTH)
+    }
+    assert result["inputs"] == expected
+
+
+# --- how the commands end --------------------------------------------------------------------------------------------
+
+
+def test_json_puts_the_result_and_nothing_else_on_stdout(fg_calib, example):
+    printed = calibrate(fg_calib, example / JOB, "--out", example / "result")
+    written = json.loads((example / "result" / "result.json").read_text())
+    for document in (printed, written):
+        assert document["solver"].pop("seconds") > 0
+    assert printed == written
+
+
+def test_without_out_nothing_is_written(fg_calib, example, monkeypatch):
+    monkeypatch.chdir(example)
+    before = sorted(example.iterdir())
+    assert fg_calib("calibrate", JOB).code == 0
+    assert sorted(example.iterdir()) == before
+
+
+def test_the_report_fits_80_columns(fg_calib, example, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    ended = fg_calib("calibrate", example / JOB)
+    assert max(map(len, ended.out.splitlines())) <= 80
+    assert "…" not in ended.out
+
+
+def test_a_nested_folder_is_made_and_a_relative_one_is_relative_to_where_one_stands(fg_calib, example, monkeypatch):
+    elsewhere = example.parent / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    assert fg_calib("calibrate", Path("..") / example.name / JOB, "--out", "a/b/c").code == 0
+    assert {f.name for f in (elsewhere / "a" / "b" / "c").iterdir()} == OUTPUTS
+    assert sorted(f.name for f in elsewhere.rglob("*") if f.is_dir()) == ["a", "b", "c"]
+
+
+def test_an_existing_folder_keeps_its_other_files(fg_calib, example):
+    out = example / "result"
+    out.mkdir()
+    (out / "notes.txt").write_text("mine")
+    (out / "result.json").write_text("old")
+    assert fg_calib("calibrate", example / JOB, "--out", out).code == 0
+    assert {f.name for f in out.iterdir()} == OUTPUTS | {"notes.txt"}
+    assert (out / "notes.txt").read_text() == "mine"
+    assert json.loads((out / "result.json").read_text())["schema"] == "fg-calib/result/1"
+
+
+def test_a_failure_leaves_an_existing_folder_as_it_was(fg_calib, example):
+    out = example / "result"
+    out.mkdir()
+    (out / "result.json").write_text("old")
+    (example / POSES).unlink()
+    assert fg_calib("calibrate", example / JOB, "--out", out).code == 1
+    assert [(f.name, f.read_text()) for f in out.iterdir()] == [("result.json", "old")]
+
+
+def test_a_failure_while_writing_leaves_no_file_behind(fg_calib, example, monkeypatch):
+    from fg_calib.report import documents as results
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(results, "write_csv_parts", fail)
+    before = sorted(example.iterdir())
+    out = example / "result"
+    ended = fg_calib("calibrate", example / JOB, "--out", out)
+    assert ended == (
+        1,
+        "",
+        f"error: {out}: cannot be written: No space left on device, expected a folder that can be\n",
+    )
+    assert sorted(example.iterdir()) == before
+
+
+def test_noise_stated_too_small_by_5_is_exit_code_3_with_the_reason_and_results(fg_calib, example):
+    text = (example / JOB).read_text()
+    (example / JOB).write_text(re.sub("noise: .*", "noise: {position: 0.0002, orientation: 0.002, joint: 0.001}", text))
+    ended = fg_calib("calibrate", example / JOB, "--out", example / "result")
+    finding = "noise stated too small, effects not modelled, or outliers"
+    assert ended.code == 3
+    assert re.fullmatch(rf"not to be trusted: reduced chi-square \S+ is outside \[0.50, 2.00\]: {finding}\n", ended.err)
+    assert ended.out.splitlines()[1].startswith("DOUBTFUL: reduced chi-square")
+    result = json.loads((example / "result" / "result.json").read_text())
+    assert (result["trustworthy"], len(result["findings"])) == (False, 1)
+    assert {f.name for f in (example / "result").iterdir()} == OUTPUTS
+
+
+@pytest.mark.parametrize("factor", [1.3, 5.0])
+def test_noise_stated_too_large_is_a_caution(fg_calib, example, factor):
+    """Sigmas are then larger than they need be, not wrong, however much."""
+    text = (example / JOB).read_text()
+    wrong = f"noise: {{position: {0.001 * factor}, orientation: {0.01 * factor}, joint: {0.005 * factor}}}"
+    (example / JOB).write_text(re.sub("noise: .*", wrong, text))
+    ended = fg_calib("calibrate", example / JOB, "--json")
+    result = json.loads(ended.out)
+    assert (ended.code, result["findings"]) == (0, [])
+    said = [caution for caution in result["cautions"] if "noise stated too large" in caution]
+    assert bool(said) == (result["reduced_chi2"] < 0.5)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("calibrate",),
+        ("calibrate", "job.yaml", "more.yaml"),
+        ("calibrate", "job.yaml", "--out"),
+        ("calibrate", "job.yaml", "--nonsense"),
+        ("recalibrate", "job.yaml"),
+        ("example", "space-robot"),
+        (),
+    ],
+)
+def test_wrong_usage_is_exit_code_2(fg_calib, arguments):
+    ended = fg_calib(*arguments)
+    assert ended.code == 2
+    assert re.search("Usage: fg-calib|requires an argument", ended.err + ended.out)
+    assert "Traceback" not in ended.err
+
+
+def test_the_version_is_printed(fg_calib):
+    assert fg_calib("--version") == (0, f"fg-calib {__version__}\n", "")
+
+
+def test_the_example_is_written_and_its_next_step_named(fg_calib, tmp_path):
+    out = tmp_path / "new" / "demo"
+    ended = fg_calib("example", "space-robot", "--out", out)
+    names = [JOB, POSES, ROBOT, TRUTH]
+    assert (ended.code, ended.out) == (0, "")
+    assert ended.err == (
+        f"wrote {', '.join(names)} to {out}\nnow: fg-calib calibrate {out / JOB} --out {out / 'result'}\n"
+    )
+    assert sorted(f.name for f in out.iterdir()) == names
+    assert all((out / n).read_bytes() == (cli.EXAMPLES / "space-robot" / n).read_bytes() for n in names)
+
+
+def test_the_example_overwrites_nothing(fg_calib, tmp_path):
+    (tmp_path / POSES).write_text("mine")
+    ended = fg_calib("example", "space-robot", "--out", tmp_path)
+    assert ended == (1, "", f"error: {tmp_path / POSES}: is there already, expected a folder without it\n")
+    assert [(f.name, f.read_text()) for f in tmp_path.iterdir()] == [(POSES, "mine")]
+
+
+def test_an_unknown_example_is_one_line(fg_calib, tmp_path):
+    ended = fg_calib("example", "puma", "--out", tmp_path / "demo")
+    assert ended == (1, "", "error: example: found 'puma', expected one of space-robot\n")
+    assert not (tmp_path / "demo").exists()
+
+
+def test_stdout_closed_by_its_reader_is_no_traceback(example):
+    """As in `fg-calib calibrate job.yaml | head -1`."""
+    command = [sys.executable, "-m", "fg_calib.cli", "calibrate", str(example / JOB)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        assert b"Traceback" not in process.stderr.read()
+
+
+# --- bad input: exit code 1, one line, nothing written ---------------------------------------------------------------
+
+
+def sub(file, old, new):
+    """Replace the first match of a pattern in a file."""
+
+    def edit(folder):
+        text, n = re.subn(old, new, (folder / file).read_text(), count=1, flags=re.M)
+        assert n == 1
+        (folder / file).write_text(text)
+
+    return edit
+
+
+def table(change, file=POSES):
+    """Change the cells of a table, header included."""
+
+    def edit(folder):
+        rows = list(csv.reader((folder / file).read_text().splitlines()))
+        rows = change(rows) or rows
+        (folder / file).write_text("".join(",".join(row) + "\n" for row in rows))
+
+    return edit
+
+
+def cell(row, column, value):
+    def change(rows):
+        rows[row][rows[0].index(column)] = value
+
+    return table(change)
+
+
+def without(*columns):
+    def change(rows):
+        kept = [i for i, name in enumerate(rows[0]) if name not in columns]
+        return [[row[i] for i in kept] for row in rows]
+
+    return table(change)
+
+
+def write(file, text):
+    return lambda folder: (folder / file).write_text(text)
+
+
+def pairs(text, *, model="distance-rotation"):
+    """A table of pairs, and the job with it."""
+
+    def edit(folder):
+        (folder / "pairs.csv").write_text(text)
+        sub(JOB, "^model: .*", f"model: {model}\npairs: pairs.csv")(folder)
+        sub(JOB, "joint: 0.005", "joint: 0.005, distance: 0.001, angle: 0.01")(folder)
+
+    return edit
+
+
+ALL_FIXED = ", ".join(f"{kind}{i}" for i in range(1, 8) for kind in ("a", "alpha", "d", "theta", "beta"))
+
+BAD = {
+    "no job": (lambda folder: (folder / JOB).unlink(), "{folder}/calibration.yaml: no such file"),
+    "no robot": (lambda folder: (folder / ROBOT).unlink(), "{folder}/robot_nominal.yaml: no such file"),
+    "no table": (lambda folder: (folder / POSES).unlink(), "{folder}/poses.csv: no such file"),
+    "no column": (without("y"), "poses.csv: no column y, expected x y z together"),
+    "a joint too few": (
+        without("q7"),
+        "poses.csv: 6 joint columns (q1, q2, q3, q4, q5, q6), expected q1 to q7 for the robot's 7 joints; the columns "
+        "are id, q1, q2, q3, q4, q5, q6, x, y, z, qx, qy, qz, qw, split",
+    ),
+    "a joint too many": (
+        table(lambda rows: [[*row, f"q{8}" if not i else "0"] for i, row in enumerate(rows)]),
+        "poses.csv: 8 joint columns (q1, q2, q3, q4, q5, q6, q7, q8), expected q1 to q7 for the robot's 7 joints; "
+        "the columns are id, q1, q2, q3, q4, q5, q6, q7, x, y, z, qx, qy, qz, qw, split, q8",
+    ),
+    "text in a number": (cell(3, "q3", "abc"), "poses.csv:4: q3: found 'abc', expected a finite number"),
+    "NaN": (cell(3, "y", "nan"), "poses.csv:4: y: found 'nan', expected a finite number"),
+    "infinity": (cell(4, "z", "-inf"), "poses.csv:5: z: found '-inf', expected a finite number"),
+    "an empty cell": (cell(3, "q3", ""), "poses.csv:4: q3: found an empty cell, expected a finite number"),
+    "a quaternion that is no unit": (
+        table(lambda rows: rows[3].__setitem__(slice(11, 15), ["0", "0", "0", "1.002"])),
+        "poses.csv:4: quaternion of norm 1.002, expected 1 within 0.001",
+    ),
+    "unknown convention": (
+        sub(ROBOT, "^convention: .*", "convention: hayati"),
+        "robot_nominal.yaml: convention: found 'hayati', expected one of dh, mdh, mdh-hayati, dh-hayati",
+    ),
+    "unknown key in the job": (
+        sub(JOB, "^pairing", "pairng"),
+        "calibration.yaml: unknown key 'pairng', expected one of robot, measurements, pairs, model, pairing, frame, "
+        "units, noise, prior, gauge, prefer, pair_errors, encoder, loss, max_iterations, truth; did you mean pairing?",
+    ),
+    "unknown key in the robot": (
+        sub(ROBOT, "^fixed", "fixd"),
+        "robot_nominal.yaml: unknown key 'fixd', expected one of name, units, base, tool, fixed, estimate, tolerance, "
+        "convention, joints; did you mean fixed?",
+    ),
+    "unknown key in the noise": (
+        sub(JOB, "joint: 0.005", "joints: 0.005"),
+        "calibration.yaml: noise: unknown key 'joints', expected one of position, orientation, joint, distance, angle, "
+        "point, estimate; did you mean joint?",
+    ),
+    "unknown parameter in fixed": (
+        sub(ROBOT, "^fixed: .*", "fixed: [a1, a8]"),
+        "robot_nominal.yaml: fixed: unknown parameter 'a8', expected one of base.x, base.y, base.z, base.yaw, "
+        "base.pitch, base.roll, a1, alpha1, d1, theta1, beta1, a2, ...",
+    ),
+    "unknown id in pairs": (
+        pairs("a,b,distance\np0,p1,1\np0,p999,1\n"),
+        "pairs.csv:3: b = 'p999' is not an id of poses.csv",
+    ),
+    "negative sigma": (
+        sub(JOB, "position: 0.001", "position: -0.001"),
+        "calibration.yaml: noise: position: found -0.001, expected a number above 0",
+    ),
+    "negative sigma of a row": (
+        table(lambda rows: [[*row, "sigma_position" if not i else "-1"] for i, row in enumerate(rows)]),
+        "poses.csv:2: sigma_position: found '-1', expected a number above 0",
+    ),
+    "degrees read as radians": (
+        sub(JOB, "angle: deg", "angle: rad"),
+        "poses.csv:2: q1 = 75.6136 rad is outside [-3.14159, 3.14159]; is the table in deg?",
+    ),
+    "outside the limits": (cell(2, "q1", "181"), "poses.csv:3: q1 = 181 deg is outside [-180, 180]"),
+    "an unusable model": (
+        sub(JOB, "^model: .*", "model: distances"),
+        "calibration.yaml: model: found 'distances', expected one of pose, position, orientation, distance, rotation, "
+        "distance-rotation; did you mean distance?",
+    ),
+    "a model without its orientations": (
+        without("qx", "qy", "qz", "qw"),
+        "poses.csv: no columns qx, qy, qz, qw or roll, pitch, yaw, expected orientations for model distance-rotation",
+    ),
+    "a model without its positions": (
+        without("x", "y", "z"),
+        "poses.csv: no columns x, y, z, expected measured positions for model distance-rotation",
+    ),
+    "no noise": (
+        sub(JOB, "^noise.*", ""),
+        "pairs from poses.csv: no sigma for distance, expected noise.position or a column sigma_position",
+    ),
+    "no noise of the orientation": (
+        sub(JOB, "orientation: 0.01, ", ""),
+        "pairs from poses.csv: no sigma for angle, expected noise.orientation or a column sigma_orientation",
+    ),
+    "one id twice": (
+        cell(2, "id", "p0"),
+        "poses.csv:3: id: found 'p0', expected different ids; the same as poses.csv:2",
+    ),
+    "a cell too many": (
+        cell(4, "split", "train,5"),
+        "poses.csv:5: 17 cells, expected 16 as in the header",
+    ),
+    "no rows": (table(lambda rows: rows[:1]), "poses.csv: no rows, expected at least one"),
+    "a table instead of a job": (
+        lambda folder: (folder / POSES).replace(folder / JOB),
+        "calibration.yaml: found 'id,q1,q2,q3,q4,q5,q6,q7,x,y,z,qx,qy,qz,qw,split p0,75.61..., expected a mapping, "
+        "key: value",
+    ),
+}
+
+
+@pytest.mark.parametrize(("edit", "message"), BAD.values(), ids=BAD)
+def test_bad_input_is_one_line_and_writes_nothing(fg_calib, example, edit, message):
+    edit(example)
+    before = sorted(example.iterdir())
+    ended = fg_calib("calibrate", example / JOB, "--out", example / "result")
+    assert ended == (1, "", f"error: {message.format(folder=example)}\n")
+    assert sorted(example.iterdir()) == before
+
+
+def rows_left(n):
+    return table(lambda rows: rows[: n + 1])
+
+
+def several(*edits):
+    def edit(folder):
+        for change in edits:
+            change(folder)
+
+    return edit
+
+
+UNSOLVABLE = {
+    "only pairs of one configuration": (
+        several(
+            table(lambda rows: [*rows[:2], ["p1", *rows[1][1:]], *rows[3:]]),
+            pairs("a,b,angle\np0,p1,1e-6\n", model="rotation"),
+        ),
+        "pairs.csv: .*1 excluded for same configuration",
+    ),
+    "nothing to estimate": (sub(ROBOT, "^fixed: .*", f"fixed: [{ALL_FIXED}]"), "nothing to estimate"),
+    "too few rows": (
+        several(rows_left(4), sub(JOB, "^model", "prior: false\nmodel")),
+        "pairs from poses.csv: 6 residuals, expected at least 23",  # the rank of Jia et al. (2019), section 4
+    ),
+}
+
+
+@pytest.mark.parametrize(("edit", "pattern"), UNSOLVABLE.values(), ids=UNSOLVABLE)
+def test_an_unsolvable_problem_is_one_line_and_writes_nothing(fg_calib, example, edit, pattern):
+    edit(example)
+    before = sorted(example.iterdir())
+    ended = fg_calib("calibrate", example / JOB, "--out", example / "result")
+    assert (ended.code, ended.out) == (1, "")
+    assert re.fullmatch(rf"error: [^\n]*{pattern}[^\n]*\n", ended.err)
+    assert sorted(example.iterdir()) == before
+
+
+def test_an_output_folder_that_is_a_file_is_one_line_and_the_file_stays(fg_calib, example):
+    (example / "result").write_text("mine")
+    before = sorted(example.iterdir())
+    for out in (example / "result", example / "result" / "below"):
+        ended = fg_calib("calibrate", example / JOB, "--out", out)
+        assert (ended.code, ended.out) == (1, "")
+        assert re.fullmatch(rf"error: {out}: cannot be written: [^\n]+\n", ended.err)
+    assert sorted(example.iterdir()) == before
+    assert (example / "result").read_text() == "mine"
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_may_not_be_written_is_one_line(fg_calib, example):
+    locked = example / "locked"
+    locked.mkdir(mode=0o500)
+    ended = fg_calib("calibrate", example / JOB, "--out", locked / "result")
+    assert (ended.code, ended.out) == (1, "")
+    assert ended.err.startswith(f"error: {locked / 'result'}: cannot be written: ")
+    assert list(locked.iterdir()) == []
+
+
+# --- what must not matter, and other forms of input ------------------------------------------------------------------
+
+
+def simulate(robot, n, rng, *, sigma=1e-4):
+    """Joint readings and measured poses of a robot by 4x4 products: q, xyz, quaternions xyzw."""
+    lower, upper = np.nan_to_num(robot.limits, neginf=-2.5, posinf=2.5).T
+    q = rng.uniform(lower, upper, (n, robot.n_joints))
+    T = np.array([tool_pose(robot, row) for row in q])
+    turn = Rotation.from_matrix(T[:, :3, :3]) * Rotation.from_rotvec(sigma * rng.normal(size=(n, 3)))
+    return q, T[:, :3, 3] + sigma * rng.normal(size=(n, 3)), turn.as_quat()
+
+
+def write_poses(path, q, xyz, quaternion, names=None, **more):
+    names = names or [f"q{i + 1}" for i in range(q.shape[1])]
+    columns = dict(zip(names, q.T, strict=True))
+    columns |= dict(zip("xyz", xyz.T, strict=True))
+    columns |= dict(zip(("qx", "qy", "qz", "qw"), quaternion.T, strict=True))
+    frame = pl.DataFrame(columns | more)
+    frame.write_parquet(path) if path.suffix == ".parquet" else frame.write_csv(path)
+
+
+def test_test_rows_never_touch_the_estimate(fg_calib, example):
+    first = calibrate(fg_calib, example / JOB)
+    table(
+        lambda rows: [
+            row if row[-1] != "test" else [*row[:8], "9", "-7", "5", "1", "0", "0", "0", "test"] for row in rows
+        ]
+    )(example)
+    ended = fg_calib("calibrate", example / JOB, "--json")
+    second = json.loads(ended.out)
+    assert ended.code == 3
+    assert "test rows" in ended.err
+    assert second["residual_rms"]["test"] != first["residual_rms"]["test"]
+    for key in ("parameters", "covariance", "chi2", "dof", "observability"):
+        assert second[key] == first[key]
+    assert second["residual_rms"]["train"] == first["residual_rms"]["train"]
+
+
+UNITS_JOB = """\
+robot: robot.yaml
+measurements: converted.csv
+model: distance-rotation
+units: {{length: {}, angle: {}}}
+noise: {{position: {!r}, orientation: {!r}, joint: {!r}}}
+"""
+
+
+def test_units_of_files_do_not_change_the_result(fg_calib, example):
+    expected = calibrate(fg_calib, example / JOB)
+    robot = read_robot(example / ROBOT)
+    given = read_measurements(example / POSES, robot, units=Units(angle="deg"))
+    for units, length, angle in ((Units(), 1.0, 1.0), (Units(length="mm", angle="deg"), 1e3, 180 / np.pi)):
+        write_robot(example / "robot.yaml", robot, units=units)
+        write_poses(
+            example / "converted.csv",
+            given.readings * angle,
+            given.position * length,
+            Rotation.from_matrix(given.rotation).as_quat(),
+            id=given.ids,
+            split=np.where(given.test, "test", "train"),
+        )
+        figures = (0.001 * length, *(float(figure) * angle for figure in np.deg2rad([0.01, 0.005])))
+        (example / "job.yaml").write_text(UNITS_JOB.format(units.length, units.angle, *figures))
+        result = calibrate(fg_calib, example / "job.yaml")
+        for field in ("nominal", "estimate", "sigma"):
+            assert by_name(result, field) == pytest.approx(
+                by_name(expected, field), abs=rounding(1, 1e4), rel=rounding(1, 1e4)
+            )
+        assert result["chi2"] == pytest.approx(expected["chi2"], rel=1e-6)  # the square of 1e-9 m over 1e-3 m, and more
+        assert result["n_excluded"] == expected["n_excluded"]
+
+
+def test_parquet_tables_give_the_result_of_csv(fg_calib, example):
+    expected = calibrate(fg_calib, example / JOB)
+    pl.read_csv(example / POSES).write_parquet(example / "poses.parquet")
+    sub(JOB, "poses.csv", "poses.parquet")(example)
+    result = calibrate(fg_calib, example / JOB)
+    assert result["parameters"] == expected["parameters"]
+    assert set(result["inputs"]) == {JOB, ROBOT, TRUTH, "poses.parquet"}
+
+
+URDF = """<?xml version="1.0"?>
+<robot name="bent-arm">
+  <!-- kept -->
+  <link name="base"/><link name="upper"/><link name="fore"/><link name="hand"/><link name="flange"/>
+  <joint name="shoulder" type="revolute">
+    <origin xyz="0 0 0.3" rpy="0 0 0"/><parent link="base"/><child link="upper"/><axis xyz="0 0.6 0.8"/>
+    <limit lower="-2.5" upper="2.5" effort="1" velocity="1"/>
+  </joint>
+  <joint name="elbow" type="continuous">
+    <origin xyz="0.4 0 0.1" rpy="0.2 0 0"/><parent link="upper"/><child link="fore"/><axis xyz="1 0 0"/>
+  </joint>
+  <joint name="slide" type="prismatic">
+    <origin xyz="0.3 0.1 0" rpy="0 0.5 0"/><parent link="fore"/><child link="hand"/><axis xyz="0 1 0"/>
+    <limit lower="0" upper="0.4" effort="1" velocity="1"/>
+  </joint>
+  <joint name="mount" type="fixed">
+    <origin xyz="0.05 0 0" rpy="0 0 0.1"/><parent link="hand"/><child link="flange"/>
+  </joint>
+</robot>
+"""
+
+URDF_JOB = """\
+robot: {robot}
+measurements: poses.csv
+model: pose
+frame: known
+noise: {{position: 0.0001, orientation: 0.0001}}
+"""
+
+
+def write_urdf_job(folder, robot, tool=(0.0, 0.0, 0.0)):
+    """A job on a URDF arm whose elbow stands 2 mm and 3 mrad off, with a tool point 'tool' on its flange."""
+    (folder / "arm.urdf").write_text(URDF)
+    (folder / JOB).write_text(URDF_JOB.format(robot=robot))
+    nominal = read_robot(folder / "arm.urdf")
+    error = {"elbow.x": 0.002, "elbow.roll": 0.003, "slide.z": -0.001}
+    error |= {f"tool.{k}": v for k, v in zip("xyz", tool, strict=True)}
+    true = nominal.with_values([p.nominal + error.get(p.name, 0.0) for p in nominal.parameters])
+    q, xyz, quaternion = simulate(true, 40, np.random.default_rng(5))
+    write_poses(folder / POSES, q, xyz, quaternion, names=["shoulder", "elbow", "slide"])
+    return true
+
+
+def test_a_urdf_gives_a_calibrated_urdf_that_reads_back_to_the_estimates(fg_calib, tmp_path):
+    true = write_urdf_job(tmp_path, "arm.urdf")
+    result = calibrate(fg_calib, tmp_path / JOB, "--out", tmp_path / "result")
+    assert {f.name for f in (tmp_path / "result").iterdir()} == {
+        "result.json",
+        "residuals.csv",
+        "robot_calibrated.urdf",
+    }
+    calibrated = read_robot(tmp_path / "result" / "robot_calibrated.urdf")
+    assert {p.name: p.nominal for p in calibrated.parameters} == by_name(result)
+    assert "<!-- kept -->" in (tmp_path / "result" / "robot_calibrated.urdf").read_text()
+    q = np.array([[0.3, -1.0, 0.2], [-2.0, 2.0, 0.35]])
+    for row in q:
+        # 40 poses of 0.1 mm and 0.1 mrad: the fitted poses are good to some 0.1 mm / sqrt(40) times unknowns a row
+        assert tool_pose(calibrated, row) == pytest.approx(tool_pose(true, row), abs=2e-4)
+        assert tool_pose(read_robot(tmp_path / "arm.urdf"), row) != pytest.approx(tool_pose(true, row), abs=1e-3)
+
+
+def test_a_urdf_with_an_estimated_tool_gives_a_yaml_that_names_the_urdf(fg_calib, tmp_path):
+    mapping = "{urdf: arm.urdf, base_link: base, tip_link: flange, estimate: [tool.x, tool.y, tool.z]}"
+    true = write_urdf_job(tmp_path, mapping, tool=(0.02, -0.01, 0.15))
+    result = calibrate(fg_calib, tmp_path / JOB, "--out", tmp_path / "result")
+    assert {f.name for f in (tmp_path / "result").iterdir()} == {
+        *OUTPUTS,
+        "robot_calibrated.urdf",
+    }
+    calibrated = read_robot(tmp_path / "result" / "robot_calibrated.yaml")
+    assert {p.name: p.nominal for p in calibrated.parameters} == by_name(result)
+    assert set(result["inputs"]) == {JOB, "arm.urdf", POSES}
+    row = np.array([0.3, -1.0, 0.2])
+    assert tool_pose(calibrated, row) == pytest.approx(tool_pose(true, row), abs=2e-4)
+
+
+PAIRS_JOB = """\
+robot: robot.yaml
+measurements: poses.csv
+pairs: pairs.csv
+model: {model}
+noise: {{distance: 0.0001, angle: 0.0001}}
+"""
+
+
+@pytest.fixture
+def measured_pairs(tmp_path):
+    """A 3-joint arm with length errors, 60 configurations without poses, and 59 measured pairs as [a, b, d, angle]."""
+    builder = RobotBuilder("three", "dh")
+    builder.add_frame("base", {}, 0, False)
+    for i, (a, alpha, d) in enumerate([(0.1, 1.5, 0.4), (0.5, 0.3, 0.1), (0.4, -1.2, 0.05)]):
+        joint = Joint(f"q{i + 1}", lower=-2.5, upper=2.5)
+        builder.add_convention_joint(joint, {"theta": 0.0, "d": d, "a": a, "alpha": alpha})
+    builder.add_frame("tool", {"x": 0.1, "z": 0.05}, 4, False)
+    robot = builder.build(tolerance={"a": 0.002, "alpha": 0.003, "d": 0.002, "theta": 0.003})
+    rng = np.random.default_rng(8)
+    true = robot.with_values([p.nominal + (p.tolerance or 0.0) * rng.normal() for p in robot.parameters])
+    q, _, _ = simulate(true, 60, rng)
+    T = np.array([tool_pose(true, row) for row in q])
+    rows = []
+    for a, b in zip(range(59), range(1, 60), strict=True):
+        distance = np.linalg.norm(T[b, :3, 3] - T[a, :3, 3]) + 1e-4 * rng.normal()
+        angle = Rotation.from_matrix(T[a, :3, :3].T @ T[b, :3, :3]).magnitude() + 1e-4 * rng.normal()
+        rows.append([a, b, repr(float(distance)), repr(float(angle))])
+    write_robot(tmp_path / "robot.yaml", robot)
+    pl.DataFrame({f"q{i + 1}": q[:, i] for i in range(3)}).write_csv(tmp_path / POSES)
+    return tmp_path, rows, {p.name: p.nominal for p in true.parameters}
+
+
+def _run_pairs(fg_calib, folder, model, header, rows):
+    text = "".join(",".join(map(str, row)) + "\n" for row in [header, *rows])
+    (folder / "pairs.csv").write_text(text)
+    (folder / JOB).write_text(PAIRS_JOB.format(model=model))
+    return calibrate(fg_calib, folder / JOB, "--out", folder / "result")
+
+
+PAIR_TABLES = {
+    # model, header, how rows become cells, measured distances and angles of 59 pairs
+    "distances": ("distance", "a,b,distance", lambda i, r: r[:3], 59, 0),
+    "angles": ("rotation", "a,b,angle", lambda i, r: [r[0], r[1], r[3]], 0, 59),
+    "both": ("distance-rotation", "a,b,distance,angle", lambda i, r: r, 59, 59),
+    "empty cells": (
+        "distance-rotation",
+        "a,b,distance,angle",
+        lambda i, r: [r[0], r[1], "" if i % 3 == 0 else r[2], "" if i % 3 == 1 else r[3]],
+        39,
+        39,
+    ),
+    "more than the model wants": ("distance", "a,b,distance,angle", lambda i, r: r, 59, 0),
+}
+
+
+@pytest.mark.parametrize(("model", "header", "cells", "n_distances", "n_angles"), PAIR_TABLES.values(), ids=PAIR_TABLES)
+def test_measured_pairs_are_fitted(fg_calib, measured_pairs, model, header, cells, n_distances, n_angles):
+    folder, rows, true = measured_pairs
+    result = _run_pairs(fg_calib, folder, model, header.split(","), [cells(i, r) for i, r in enumerate(rows)])
+    written = pl.read_csv(folder / "result" / "residuals.csv")
+    assert result["pairing"] == "measured"
+    assert written.filter(pl.col("kind") == "distance").height == n_distances
+    assert written.filter(pl.col("kind") == "angle").height == n_angles
+    assert result["n_residuals"] + sum(result["n_excluded"].values()) == n_distances + n_angles
+    for p in result["parameters"]:
+        if p["identifiability"] != "fixed":
+            assert abs(p["estimate"] - true[p["name"]]) < 4 * p["sigma"]
+    assert 0.5 < result["reduced_chi2"] < 2
+    determined = [p for p in result["parameters"] if p["identifiability"] == "independent"]
+    assert determined
+    assert min(p["sigma"] / p["prior_sigma"] for p in determined) < 0.1  # the data say more than the priors
+
+
+def test_residuals_say_how_suspicious_each_row_is(residuals, result):
+    """Existing columns keep their places; the new ones follow."""
+    old = "kind a b split used excluded unit measured predicted residual_before residual sigma whitened"
+    assert list(residuals[0]) == [*old.split(), "leverage", "studentised", "weight", "flag", "noise_adds", "suspect"]
+    for row in residuals:
+        assert row["flag"] == ("excluded" if row["excluded"] else "test" if row["split"] == "test" else "")
+        sign = 1.0 if row["split"] == "test" else -1.0
+        own = float(row["sigma"]) * math.sqrt(1.0 + sign * float(row["leverage"]))
+        if not row["excluded"]:
+            assert float(row["studentised"]) == pytest.approx(float(row["residual"]) / own)
+    for kind, fit in result["goodness"].items():
+        rows = [r for r in residuals if r["kind"] == kind and r["used"] == "true"]
+        assert fit["n"] == len(rows)
+        assert fit["chi2"] == pytest.approx(sum(float(r["whitened"]) ** 2 for r in rows))
+        assert fit["expected"] == pytest.approx(sum(1.0 - float(r["leverage"]) for r in rows))
+        assert fit["seen_over_stated"] == pytest.approx(math.sqrt(fit["chi2"] / fit["expected"]))
+        assert 0.001 < fit["p_value"] < 0.999
+    assert 0.001 < result["chi2_p_value"] < 0.999
+    assert result["noise_factors"] is None
+
+
+@pytest.mark.parametrize("given", ["estimate", {"position": 0.004, "orientation": 0.04, "estimate": True}])
+def test_a_job_may_leave_the_noise_to_the_residuals(fg_calib, example, given):
+    """Wherever it starts it ends with the same noise; `compare` takes the same."""
+    file = example / "calibration.yaml"
+    job = yaml.safe_load(file.read_text())
+    stated = json.loads(fg_calib("calibrate", file, "--json").out)["goodness"]
+    file.write_text(yaml.safe_dump(job | {"noise": given}))
+    ended = fg_calib("calibrate", file, "--json")
+    found = json.loads(ended.out)
+    assert ended.code == 0
+    assert found["chi2_p_value"] is None
+    for kind, fit in found["goodness"].items():  # about 30 degrees of freedom: 4 * sqrt(1 / 60) beside the other fit's
+        assert fit["seen_over_stated"] == pytest.approx(found["noise_factors"][kind], rel=2e-3)
+        sigma = fit["stated_sigma_rms"] * found["noise_factors"][kind]
+        assert sigma == pytest.approx(stated[kind]["stated_sigma_rms"], rel=0.5)
+    compared = json.loads(fg_calib("compare", file, "--json").out)
+    rms = compared["estimates"][0]["residual_rms"]["train"]
+    assert rms["distance"] == pytest.approx(found["residual_rms"]["train"]["distance"]["after"], rel=rounding(1, 1e4))
+
+
+@pytest.mark.parametrize(
+    ("columns", "widest"),
+    [(None, 100), ("40", 40), *(pytest.param(str(n), n, marks=pytest.mark.slow) for n in (60, 200))],
+)
+@pytest.mark.parametrize("command", ["calibrate", "compare", "observe"])
+def test_a_report_is_as_wide_as_the_page(fg_calib, example, monkeypatch, command, columns, widest):
+    """A pipe has no width: 100 columns, in which all tables of the example have room."""
+    monkeypatch.delenv("COLUMNS", raising=False)
+    if columns is not None:
+        monkeypatch.setenv("COLUMNS", columns)
+    if command == "observe":
+        ended = fg_calib(command, example / "robot_nominal.yaml", "--configurations", example / POSES, "--angle", "deg")
+    else:
+        ended = fg_calib(command, example / JOB)
+    lines = ended.out.splitlines()
+    assert max(map(len, lines)) <= widest
+    assert all(name in " ".join(lines).replace(",", " ").split() for name in ("a2", "alpha7", "theta4", "beta3"))
+    if command == "calibrate":
+        row = next(line for line in lines[lines.index("Parameters") :] if line.startswith("a2"))
+        assert (row == "a2") is (widest < 80)

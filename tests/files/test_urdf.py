@@ -1,0 +1,308 @@
+"""URDF: chains against yourdfpy's own forward kinematics, origins written back, and one message a mistake."""
+
+import math
+
+import numpy as np
+import pytest
+import yourdfpy
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from lxml import etree
+from oracle import tool_pose
+from tolerances import rounding
+
+from fg_calib.errors import InputError
+from fg_calib.files.robot_yaml import read_robot, write_robot
+from fg_calib.files.urdf import read_urdf, write_urdf
+from fg_calib.robot.model import Joint
+
+TREE = """\
+<?xml version="1.0"?>
+<!-- a torso with two arms -->
+<robot name="torso">
+  <link name="world"/>
+  <link name="left_1"/>
+  <link name="left_2"><visual><geometry><mesh filename="package://nowhere/a.stl"/></geometry></visual></link>
+  <link name="left_tip"/>
+  <link name="right_1"/>
+  <link name="right_2"/>
+  <link name="right_tip"/>
+  <joint name="l1" type="revolute"><origin xyz="0.1 -0.2 0.3" rpy="0.4 -0.5 0.6"/>
+    <parent link="world"/><child link="left_1"/><axis xyz="1 2 -3"/>
+    <limit lower="-1.5" upper="2" effort="1" velocity="1"/></joint>
+  <joint name="l2" type="fixed"><origin xyz="0.3 0 0.1" rpy="-1 0.3 2"/>
+    <parent link="left_1"/><child link="left_2"/></joint>
+  <joint name="l3" type="prismatic"><!-- no axis: x --><origin xyz="0 0.5 0" rpy="0 1.5708 0"/>
+    <parent link="left_2"/><child link="left_tip"/>
+    <limit lower="0" upper="0.7" effort="1" velocity="1"/></joint>
+  <joint name="r1" type="continuous">
+    <parent link="world"/><child link="right_1"/><axis xyz="0 0 -1"/></joint>
+  <joint name="r2" type="revolute"><origin xyz="0 0.05 0.7"/>
+    <parent link="right_1"/><child link="right_2"/><axis xyz="-2 0.5 0.1"/>
+    <limit effort="1" velocity="1"/></joint>
+  <joint name="r3" type="fixed"><origin rpy="0.1 0.2 0.3" xyz="1 2 3"/>
+    <parent link="right_2"/><child link="right_tip"/></joint>
+</robot>
+"""
+LINKS = ["world", "left_1", "left_2", "left_tip", "right_1", "right_2", "right_tip"]
+
+
+@pytest.fixture
+def tree(tmp_path):
+    path = tmp_path / "torso.urdf"
+    path.write_text(TREE)
+    return path
+
+
+def yourdfpy_pose(path, base, tip, q):
+    """base_T_tip by yourdfpy, which turns about axes as they stand in the file: they are normalised here."""
+    model = yourdfpy.URDF.load(str(path), load_meshes=False)
+    for joint in model.robot.joints:
+        joint.axis = joint.axis / np.linalg.norm(joint.axis)
+    model.update_cfg(q)
+    return model.get_transform(tip, base)
+
+
+@pytest.mark.parametrize(
+    ("base", "tip"),
+    [
+        ("world", "left_tip"),
+        ("world", "right_tip"),
+        ("left_1", "left_tip"),
+        ("left_tip", "world"),
+        ("right_tip", "right_1"),
+        ("left_tip", "right_tip"),
+        ("right_2", "left_1"),
+    ],
+)
+def test_any_two_links_span_the_chain_that_yourdfpy_computes(tree, base, tip):
+    robot = read_urdf(tree, base_link=base, tip_link=tip)
+    rng = np.random.default_rng(1)
+    for _ in range(3):
+        q = {name: rng.uniform(-1.4, 1.4) for name in ("l1", "l3", "r1", "r2")}
+        expected = yourdfpy_pose(tree, base, tip, q)
+        assert tool_pose(robot, [q[j.name] for j in robot.joints]) == pytest.approx(expected, abs=rounding(1.0))
+
+
+def test_the_tip_defaults_to_the_only_leaf_below_the_base(tree):
+    robot = read_urdf(tree, base_link="right_1")
+    assert (robot.urdf.base_link, robot.urdf.tip_link) == ("right_1", "right_tip")
+
+
+def test_joints_stand_in_chain_order_with_their_own_parameters_and_limits(tree):
+    robot = read_urdf(tree, base_link="left_tip", tip_link="right_tip")
+    assert robot.joints == (
+        Joint("l3", prismatic=True, lower=0.0, upper=0.7),
+        Joint("l1", lower=-1.5, upper=2.0),
+        Joint("r1"),
+        Joint("r2"),
+    )
+    assert [p.name for p in robot.parameters if p.owner == 1] == [
+        f"l3.{k}" for k in ("x", "y", "z", "yaw", "pitch", "roll")
+    ]
+    assert robot.parameters[robot.index("l3.pitch")].nominal == 1.5708  # as written, beyond a quarter turn
+    assert robot.parameters[robot.index("l1.yaw")].nominal == 0.6
+    assert {p.owner for p in robot.parameters if p.estimated} == {1, 2, 3, 4}
+
+
+@given(
+    rpy=st.tuples(*[st.floats(-3.2, 3.2)] * 3),
+    xyz=st.tuples(*[st.floats(-2, 2)] * 3),
+    axis=st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda a: np.linalg.norm(a) > 1e-3),
+    kind=st.sampled_from(["continuous", "prismatic"]),
+    q=st.floats(-3, 3).filter(lambda q: q == 0.0 or abs(q) > 1e-6),  # yourdfpy rounds smaller ones to 0
+)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+def test_every_joint_and_its_reverse_equal_yourdfpys(tmp_path, rpy, xyz, axis, kind, q):
+    path = tmp_path / "one.urdf"
+    xyz_text, rpy_text, axis_text = (" ".join(map(repr, v)) for v in (xyz, rpy, axis))
+    path.write_text(
+        f'<robot name="one"><link name="a"/><link name="b"/><joint name="j" type="{kind}">'
+        f'<origin xyz="{xyz_text}" rpy="{rpy_text}"/><parent link="a"/><child link="b"/><axis xyz="{axis_text}"/>'
+        '<limit lower="-9" upper="9" effort="1" velocity="1"/></joint></robot>'
+    )
+    expected = yourdfpy_pose(path, "a", "b", {"j": q})
+    assert tool_pose(read_urdf(path), [q]) == pytest.approx(expected, abs=rounding(1.0))
+    reverse = read_urdf(path, base_link="b", tip_link="a")
+    assert tool_pose(reverse, [q]) @ expected == pytest.approx(np.eye(4), abs=rounding(1.0))
+
+
+def test_changed_parameters_of_a_reversed_chain_are_those_of_the_file(tree, tmp_path):
+    robot = read_urdf(tree, base_link="left_tip", tip_link="right_tip")
+    rng = np.random.default_rng(2)
+    own = np.array([1 <= p.owner <= 4 for p in robot.parameters])
+    changed = robot.with_values(robot.nominal + own * rng.uniform(-0.1, 0.1, len(own)))
+    out = tmp_path / "calibrated.urdf"
+    write_urdf(out, changed)
+    q = {"l3": 0.3, "l1": -0.7, "r1": 2.0, "r2": 0.4}
+    expected = yourdfpy_pose(out, "left_tip", "right_tip", q)
+    assert tool_pose(changed, list(q.values())) == pytest.approx(expected, abs=rounding(1.0))
+    back = read_urdf(out, base_link="left_tip", tip_link="right_tip")
+    assert back.parameters == changed.parameters  # exactly
+    assert np.abs(tool_pose(robot, list(q.values())) - expected).max() > 1e-3
+
+
+def test_only_origins_of_moving_joints_are_rewritten(tree, tmp_path):
+    robot = read_urdf(tree, tip_link="right_tip")
+    values = robot.nominal
+    values[robot.index("r1.z")] = 0.1
+    values[robot.index("r2.yaw")] = 1 / 3
+    write_urdf(tmp_path / "out.urdf", robot.with_values(values))
+    expected = (
+        TREE.replace('<joint name="r1" type="continuous">\n    ', '<joint name="r1" type="continuous">\n    '
+                 '<origin xyz="0.0 0.0 0.1" rpy="0.0 0.0 0.0"/>\n    ')
+        .replace('<origin xyz="0 0.05 0.7"/>', '<origin xyz="0.0 0.05 0.7" rpy="0.0 0.0 0.3333333333333333"/>')
+    )  # fmt: skip
+    assert (tmp_path / "out.urdf").read_text() == expected
+
+
+def test_an_unchanged_robot_is_written_as_it_was(tree, tmp_path):
+    write_urdf(tmp_path / "out.urdf", read_urdf(tree, tip_link="left_tip"))
+    written, original = (etree.tostring(etree.parse(p), method="c14n") for p in (tmp_path / "out.urdf", tree))
+    assert written == original
+
+
+def test_other_encodings_survive(tmp_path):
+    text = TREE.replace('"1.0"?>', '"1.0" encoding="ISO-8859-1"?>').replace("a torso", "ein Körper")
+    (tmp_path / "in.urdf").write_bytes(text.encode("latin-1"))
+    robot = read_urdf(tmp_path / "in.urdf", tip_link="left_tip")
+    write_urdf(tmp_path / "out.urdf", robot)
+    assert "ein Körper" in (tmp_path / "out.urdf").read_text(encoding="utf-8")
+    assert read_urdf(tmp_path / "out.urdf", tip_link="left_tip").parameters == robot.parameters
+
+
+def test_a_yaml_gives_a_urdf_links_a_tool_and_tolerances(tree, tmp_path):
+    folder = tmp_path / "robots"
+    folder.mkdir()
+    path = folder / "robot.yaml"
+    path.write_text(
+        "urdf: ../torso.urdf\nbase_link: world\ntip_link: right_tip\nunits: {length: mm, angle: deg}\n"
+        "tool: {z: 100, yaw: 90}\nfixed: [r1.x]\nestimate: [tool.z]\ntolerance: {x: 2, roll: 1, tool: 5, r2.yaw: 3}\n"
+    )
+    robot = read_robot(path)
+    assert (robot.name, robot.urdf.tip_link) == ("torso", "right_tip")
+    by_name = {p.name: p for p in robot.parameters}
+    assert by_name["tool.z"].nominal == pytest.approx(0.1)
+    assert by_name["tool.yaw"].nominal == pytest.approx(math.pi / 2)
+    assert not by_name["r1.x"].estimated
+    assert by_name["tool.z"].estimated
+    assert by_name["r2.x"].tolerance == pytest.approx(2e-3)
+    assert by_name["r2.roll"].tolerance == pytest.approx(math.radians(1))
+    assert by_name["r2.yaw"].tolerance == pytest.approx(math.radians(3))
+    assert read_robot(path, tip_link="right_2").urdf.tip_link == "right_2"
+
+    write_urdf(tmp_path / "calibrated.urdf", robot)
+    write_robot(tmp_path / "calibrated.yaml", robot, urdf_name="calibrated.urdf")
+    back = read_robot(tmp_path / "calibrated.yaml")
+    assert (back.name, back.joints, back.parameters, back.elements) == (
+        robot.name,
+        robot.joints,
+        robot.parameters,
+        robot.elements,
+    )
+
+
+def test_a_urdf_robot_is_written_with_its_urdf(tree, tmp_path):
+    with pytest.raises(ValueError, match="a URDF robot, and no other, is written with urdf_name"):
+        write_robot(tmp_path / "out.yaml", read_urdf(tree, tip_link="left_tip"))
+
+
+def test_mistakes_in_the_yaml_of_a_urdf_are_named_there(tree, tmp_path):
+    path = tmp_path / "robot.yaml"
+    path.write_text("urdf: torso.urdf\ntip_link: right_tip\nfixed: [r9.x]\n")
+    with pytest.raises(InputError) as caught:
+        read_robot(path)
+    assert str(caught.value).startswith("robot.yaml: fixed: unknown parameter 'r9.x', expected one of base.x, base.y")
+    path.write_text("urdf: torso.urdf\nconvention: dh\n")
+    with pytest.raises(InputError) as caught:
+        read_robot(path)
+    assert str(caught.value) == (
+        "robot.yaml: unknown key 'convention', expected one of name, units, base, tool, fixed, estimate, tolerance, "
+        "urdf, base_link, tip_link"
+    )
+
+
+def test_what_is_off_the_chain_does_not_matter(tmp_path):
+    path = tmp_path / "arm.urdf"
+    text = TREE.replace('name="l1" type="revolute"', 'name="l1" type="floating"')
+    path.write_text(text.replace('<axis xyz="1 2 -3"/>', '<mimic joint="r1"/>'))
+    assert read_urdf(path, tip_link="right_tip").n_joints == 2
+
+
+def changed(old, new):
+    assert old in TREE
+    return TREE.replace(old, new)
+
+
+ALL = "one of " + ", ".join(LINKS)
+MISTAKES = [
+    ("<robot name='a'>\n<link>\n</robot>", {},
+     "torso.urdf:3: not XML: Opening and ending tag mismatch: link line 2 and robot, line 3, column 9"),
+    ("", {}, "torso.urdf:1: not XML: Document is empty, line 1, column 1"),
+    ("<html/>", {}, "torso.urdf: root element <html>, expected <robot>"),
+    (TREE, {}, "torso.urdf: 2 leaf links (left_tip, right_tip), expected one; name one as tip_link: {urdf: torso.urdf, "
+     "tip_link: ...} in a file, --tip-link of observe"),
+    (TREE, {"base_link": "nowhere"}, f"torso.urdf: no link 'nowhere', expected {ALL}"),
+    (TREE, {"tip_link": "nowhere"}, f"torso.urdf: no link 'nowhere', expected {ALL}"),
+    (TREE, {"tip_link": "world"},
+     "torso.urdf: no moving joint between links 'world' and 'world', expected at least one"),
+    (TREE, {"base_link": "right_2", "tip_link": "right_tip"},
+     "torso.urdf: no moving joint between links 'right_2' and 'right_tip', expected at least one"),
+    (changed("</robot>", '<link name="island"/></robot>'), {"tip_link": "left_tip"},
+     "torso.urdf: 2 root links (world, island), expected one; name one as base_link: {urdf: torso.urdf, "
+     "base_link: ...} in a file, --base-link of observe"),
+    (changed("</robot>", '<link name="island"/></robot>'), {"base_link": "island", "tip_link": "left_tip"},
+     "torso.urdf: links 'island' and 'left_tip' are not connected, expected two links of one tree"),
+    (changed('<child link="right_1"/>', '<child link="left_1"/>'), {},
+     "torso.urdf: link 'left_1' is the child of joints 'l1' and 'r1', expected one"),
+    (changed('<parent link="world"/><child link="left_1"/>', '<parent link="left_tip"/><child link="left_1"/>'),
+     {"base_link": "left_1", "tip_link": "left_tip"},
+     "torso.urdf: link 'left_1' is above itself, expected a tree of links"),
+    (changed('name="l1" type="revolute"', 'name="l1" type="floating"'), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': type floating, expected revolute, continuous, prismatic or fixed on the chain"),
+    (changed('name="l1" type="revolute"', 'name="l1" type="planar"'), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': type planar, expected revolute, continuous, prismatic or fixed on the chain"),
+    (changed('<axis xyz="1 2 -3"/>', '<mimic joint="r1"/>'), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': mimics joint 'r1', expected joints on the chain that move by themselves"),
+    (changed("1 2 -3", "0 0 0"), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': axis: found '0 0 0', expected a direction of three numbers"),
+    (changed("1 2 -3", "1 2"), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': axis: found '1 2', expected a direction of three numbers"),
+    (changed('upper="2"', 'upper="-2"'), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': limit: lower -1.5, upper -2, expected lower below upper"),
+    (changed("0.1 -0.2 0.3", "0.1 -0.2"), {},
+     "torso.urdf:11: joint 'l1': origin xyz: found '0.1 -0.2', expected three finite numbers"),
+    (changed("0.4 -0.5 0.6", "0.4 nan 0.6"), {},
+     "torso.urdf:11: joint 'l1': origin rpy: found '0.4 nan 0.6', expected three finite numbers"),
+    (changed("0.4 -0.5 0.6", "0.4 zero 0.6"), {},
+     "torso.urdf:11: joint 'l1': origin rpy: found '0.4 zero 0.6', expected three finite numbers"),
+    (changed('<joint name="l1"', "<joint"), {}, "torso.urdf:11: a joint without a name"),
+    (changed('name="l2"', 'name="l1"'), {},
+     "torso.urdf:14: joint 'l1': a second joint of this name, expected different names"),
+    (changed('<parent link="left_2"/>', ""), {},
+     "torso.urdf:16: joint 'l3': no <parent>, expected <parent link=\"...\"/>"),
+    (changed("1 2 -3", "a b c"), {}, "torso.urdf: not a URDF: ValueError: could not convert string to float: 'a'"),
+    (changed("l1", "tool"), {"tip_link": "left_tip"},
+     "torso.urdf: two joints share a name, or one is called base or tool, expected different names"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "links", "message"), MISTAKES, ids=range(len(MISTAKES)))
+def test_a_mistake_is_named_in_one_line(tmp_path, text, links, message):
+    path = tmp_path / "torso.urdf"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_urdf(path, **links)
+    assert str(caught.value) == message
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(InputError) as caught:
+        read_robot(tmp_path / "arm.urdf")
+    assert str(caught.value) == f"{tmp_path / 'arm.urdf'}: no such file"
+
+
+def test_reading_says_nothing_about_meshes(tree, caplog, capsys):
+    read_urdf(tree, tip_link="left_tip")
+    assert caplog.records == []
+    assert capsys.readouterr() == ("", "")

@@ -1,0 +1,586 @@
+"""Touched points: the same optimum as group means, nothing drifts, sigmas hold, and every misuse is one line."""
+
+import csv
+import json
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+import yaml
+from oracle import tool_pose
+from scipy.optimize import least_squares
+from scipy.stats import chi2
+from simulated import small_arm, true_robot
+from tolerances import rounding
+from touches import SIGMA, TOLERANCE, TOOL_POINT, corners, touch
+
+from fg_calib import write_robot
+from fg_calib.analysis.uncertainty import assess
+from fg_calib.errors import InputError, ProblemError
+from fg_calib.files.tables import read_measurements
+from fg_calib.graph.factors import eliminate, prior_rows
+from fg_calib.graph.problem import build_problem, named_triangle, observe, whitened_triangle
+from fg_calib.graph.solver import solve
+from fg_calib.measurements.dataset import Groups, Noise, Pairs, no_pairs
+from fg_calib.report.documents import result_document
+from fg_calib.report.text import format_report
+from fg_calib.robot.kinematics import pose
+
+RIGID = ("a1", "alpha1", "d1", "theta1")
+"""Parameters of the small arm that move it as one body; two more motions of the base are none of its parameters."""
+
+
+def all_pairs(m):
+    """The same touches as pairs: every pair of a group, with sigma sqrt(n) times that of a touch."""
+    index, a, b = m.groups.index, [], []
+    for g in range(m.groups.n_groups):
+        rows = np.flatnonzero((index == g) & ~m.test)
+        i, j = np.triu_indices(len(rows), 1)
+        a.append(rows[i])
+        b.append(rows[j])
+    a, b = np.concatenate(a), np.concatenate(b)
+    n = np.bincount(index[~m.test], minlength=m.groups.n_groups)[index[a]]
+    nothing = np.full(len(a), np.nan)
+    sigma = np.sqrt(n) * m.sigma_point[a]
+    pairs = Pairs(a, b, np.zeros(len(a)), nothing, sigma, nothing, np.zeros(len(a), dtype=bool))
+    return replace(m, groups=None, sigma_point=None, pairs=pairs)
+
+
+def case(seed=0, *, n_points=4, n_each=12, tolerance=TOLERANCE, sigma=SIGMA, distances=((0, 1, 1e-4),), **more):
+    """The nominal arm, the true one, the points, and touches of them."""
+    rng = np.random.default_rng(seed)
+    robot = small_arm(tolerance=tolerance, estimate=TOOL_POINT)
+    true = true_robot(robot, rng)
+    points = corners(true, n_points, rng)
+    return robot, true, points, touch(true, points, n_each, rng, sigma, distances, **more)
+
+
+def build(robot, m, **more):
+    return build_problem(robot, m, model="distance", **more)
+
+
+# --- residuals and derivatives --------------------------------------------------------------------------------------
+
+
+def test_residuals_are_those_of_4x4_products():
+    robot, _, _, m = case()
+    problem = build(robot, m)
+    rng = np.random.default_rng(1)
+    variables, parameters = problem.variables, problem.start + 0.01 * rng.normal(size=len(problem.start))
+    fixed = [i for i, p in enumerate(robot.parameters) if not p.estimated]
+    parameters[fixed] = robot.nominal[fixed]
+    points = parameters[variables.nuisance_span].reshape(-1, 3)
+    there = robot.with_values(parameters[variables.robot_span])
+    for g in range(4):
+        rows = np.flatnonzero(m.groups.index == g)
+        tools = [tool_pose(there, q) for q in m.readings[rows]]
+        expected = [(T[:3, 3] - points[g]) / SIGMA for T in tools]
+        assert problem.terms[g].residual(variables, parameters) == pytest.approx(np.ravel(expected), abs=1e-8 / SIGMA)
+    d = np.linalg.norm(points[1] - points[0])
+    expected = (d - m.groups.pairs.distance[0]) / 1e-4
+    assert problem.terms[4].residual(variables, parameters) == pytest.approx([expected], rel=rounding(1, 10))
+
+
+def test_derivatives_are_central_differences_up_to_a_turn_of_the_residuals():
+    robot, _, _, m = case()
+    problem = build(robot, m)
+    variables = problem.variables
+    rng = np.random.default_rng(2)
+    n = variables.n_columns + variables.n_nuisance
+    values = variables.moved(problem.initial, 1e-2 * rng.normal(size=n))
+    parameters = variables.parameters(values)
+    for term in problem.terms:
+        r, J = term.linearise(variables, parameters)
+        assert r == pytest.approx(term.residual(variables, parameters), rel=rounding(1, 10))
+        columns = list(range(variables.n_columns)) if term.on_core else []
+        columns += [c for i in term.nuisance for c in range(*variables.nuisance[i].columns.indices(n))]
+        assert J.shape == (term.n_rows, len(columns))
+        h, size = 1e-6, np.abs(J).max()
+        for k, column in enumerate(columns):
+            step = np.zeros(n)
+            step[column] = h
+            up, down = (
+                term.residual(variables, variables.parameters(variables.moved(values, s))) for s in (step, -step)
+            )
+            numeric = (up - down) / (2 * h)
+            if column >= variables.n_columns or not term.on_core:
+                assert J[:, k] == pytest.approx(numeric, abs=1e-6 * size)
+            assert r @ J[:, k] == pytest.approx(r @ numeric, abs=1e-6 * size * np.linalg.norm(r))
+            turned, vectors = (v.reshape(-1, 3) for v in (numeric - J[:, k], r)) if term.on_core else ([[0.0] * 3],) * 2
+            M = np.vstack([np.cross(np.eye(3), v).T for v in vectors])  # a x v of each, as columns of a
+            left = np.ravel(turned) - M @ np.linalg.lstsq(M, np.ravel(turned), rcond=None)[0]
+            assert left == pytest.approx(0.0, abs=1e-6 * size)
+
+
+def test_the_graph_holds_a_point_a_group_and_has_the_cost_of_its_rows():
+    robot, _, points, m = case()
+    problem = build(robot, m)
+    keys = set(problem.graph.keys())
+    assert {gtsam.symbol("L", g) for g in range(4)} <= keys
+    assert problem.variables.describe(gtsam.symbol("L", 2)) == "L(2) (point)"
+    solution = solve(problem)
+    # In the base frame, which the noise of the arm's own place (2 mm and mrad priors, 1 m away) blurs.
+    for g in range(4):
+        assert solution.values.atPoint3(gtsam.symbol("L", g)) == pytest.approx(points[g], abs=0.05)
+    r = [t.residual(solution.problem.variables, solution.parameters) for t in solution.problem.terms]
+    r.append(prior_rows(problem.variables, solution.parameters)[0])
+    assert solution.cost == pytest.approx(0.5 * np.sum(np.concatenate(r) ** 2), rel=rounding(1, 1e3))
+
+
+def test_elimination_leaves_what_the_other_columns_do_not_explain():
+    rng = np.random.default_rng(3)
+    A, b = rng.normal(size=(30, 9)), rng.normal(size=30)
+    A[:, 2] = A[:, 5:] @ [1.0, 2.0, 3.0, 4.0]
+    left = eliminate(A, b, 5)
+    x = np.linalg.lstsq(A, b, rcond=None)[0]
+    x_core = np.linalg.lstsq(left.A, left.b, rcond=None)[0]
+    assert np.all(left.A[:, 2] == 0.0)
+    assert np.linalg.norm(left.A @ x_core - left.b) == pytest.approx(np.linalg.norm(A @ x - b), rel=rounding(1, 10))
+    assert np.hypot(np.linalg.norm(left.own), np.linalg.norm(left.A @ x_core)) == pytest.approx(np.linalg.norm(A @ x))
+    keep = [0, 1, 3, 4]
+    whole = np.linalg.inv(A[:, [*keep, *range(5, 9)]].T @ A[:, [*keep, *range(5, 9)]])
+    core = np.linalg.inv(left.A[:, keep].T @ left.A[:, keep])
+    follow = left.follow[:, keep]
+    assert core == pytest.approx(whole[:4, :4], rel=rounding(1, 1e4))
+    assert follow @ core @ follow.T + left.inverse @ left.inverse.T == pytest.approx(
+        whole[4:, 4:], rel=rounding(1, 1e4)
+    )
+
+
+# --- the optimum ----------------------------------------------------------------------------------------------------
+
+
+def test_the_optimum_is_that_of_group_means():
+    robot, _, _, m = case(distances=())
+    solution = solve(build(robot, m))
+    chosen = [i for i, p in enumerate(robot.parameters) if p.estimated]
+    tolerance = np.array([robot.parameters[i].tolerance for i in chosen])
+    index = m.groups.index
+
+    def rows(x):
+        values = robot.nominal.copy()
+        values[chosen] += tolerance * x
+        p = pose(robot.with_values(values), m.readings).position
+        means = np.array([p[index == g].mean(axis=0) for g in range(4)])
+        return np.concatenate([((p - means[index]) / SIGMA).ravel(), x])
+
+    found = least_squares(rows, np.zeros(len(chosen)), "3-point", xtol=1e-15, ftol=1e-15, gtol=1e-12)
+    assert solution.converged
+    # Differences by steps of 1e-5 sigma and rounding leave scipy some 1e-4 sigma from the optimum.
+    assert solution.cost == pytest.approx(found.cost, rel=1e-8)
+    assert solution.parameters[chosen] == pytest.approx(robot.nominal[chosen] + tolerance * found.x, abs=1e-6)
+
+
+@pytest.mark.parametrize("gauge", ["prior", "none"])
+def test_groups_are_all_their_pairs(gauge):
+    robot, _, _, m = case(distances=())
+    problem, by_pairs = build(robot, m, gauge=gauge), build(robot, all_pairs(m), gauge=gauge)
+    solution, other = solve(problem), solve(by_pairs)
+    assert solution.converged
+    assert other.converged
+    one, two = assess(solution), assess(other)
+    assert one.observability.rank == two.observability.rank
+    assert one.observability.classes == two.observability.classes
+    assert one.names == two.names
+    # Residuals of 0.1 mm at lever arms of 1 m: derivatives differ by 1e-4 of themselves where they are turned, which
+    # directions that are weakly determined magnify.
+    known = np.array([p.sigma is not None for p in two.parameters])
+    assert [p.sigma is not None for p in one.parameters] == list(known)
+    a, b = (np.array([p.estimate for p in u.parameters])[known] for u in (one, two))
+    sigma = np.array([p.sigma for p in two.parameters])[known]
+    assert np.abs(a - b).max() <= 1e-2 * sigma.max()
+    assert np.array([p.sigma for p in one.parameters])[known] == pytest.approx(sigma, rel=1e-2)
+
+
+def test_without_noise_the_information_is_that_of_all_pairs():
+    robot, true, _, m = case(sigma=0.0, distances=(), tolerance=None)
+    grams = []
+    for measured in (m, all_pairs(m)):
+        problem = build(true, measured)
+        J = named_triangle(problem, problem.start)
+        grams.append(J.T @ J)
+    assert robot.n_joints == 4
+    assert grams[0] == pytest.approx(grams[1], abs=1e-8 * np.abs(grams[1]).max())
+
+
+@pytest.mark.parametrize("distances", [(), ((0, 1, 1e-4), (2, 3, 1e-4))])
+def test_what_moves_arm_and_points_as_one_body_stays_where_it_is(distances):
+    robot, _, points, m = case(distances=distances, tolerance=None)
+    problem = build(robot, m)
+    solution = solve(problem)
+    assert solution.converged
+    uncertainty = assess(solution)
+    by_name = {p.name: p for p in uncertainty.parameters}
+    for name in RIGID:
+        assert abs(by_name[name].correction) < rounding(1, 1e4)  # without holding it they move by 0.1 mm and more
+        assert by_name[name].sigma is None
+        assert by_name[name].identifiability == "ineffective"
+    assert all(np.isnan(p.sigma).all() for p in uncertainty.points)
+    # Another place to start the points from changes nothing.
+    start = problem.start.copy()
+    start[problem.variables.nuisance_span] += 0.01 * np.random.default_rng(4).normal(size=12)
+    again = solve(replace(problem, start=start))
+    span = problem.variables.robot_span
+    apart = [
+        abs(again.parameters[span][i] - p.estimate) / p.sigma for i, p in enumerate(uncertainty.parameters) if p.sigma
+    ]
+    assert max(apart) < 1e-3  # sigma; 1e-6 are left to go along each path, which turned derivatives make another
+    for name in RIGID:
+        assert abs(again.parameters[robot.index(name)] - robot.nominal[robot.index(name)]) < rounding(1, 1e4)
+    assert len(points) == 4
+
+
+def test_a_point_touched_once_tells_nothing_and_a_distance_holds_the_scale():
+    robot, _, points, m = case(distances=(), tolerance=None)
+    rng = np.random.default_rng(5)
+    alone = touch(robot, np.vstack([points, points[0] + 0.1]), 1, rng)
+    one_more = replace(
+        m,
+        readings=np.vstack([m.readings, alone.readings[-1:]]),
+        ids=np.append(m.ids, "last"),
+        test=np.append(m.test, False),
+        sigma_point=np.append(m.sigma_point, SIGMA),
+        groups=Groups((*m.groups.names, "once"), np.append(m.groups.index, 4), no_pairs("pairs.csv")),
+    )
+    J, K = (named_triangle(p, p.start) for p in (build(robot, x) for x in (m, one_more)))
+    assert K.T @ K == pytest.approx(J.T @ J, abs=1e-7 * np.abs(J.T @ J).max())
+    assert build(robot, one_more).n_residuals == build(robot, m).n_residuals + 3
+    a, b = (assess(solve(build(robot, x, prior=False))) for x in (m, one_more))
+    assert a.dof == b.dof
+    # Lengths of all links shrunk together satisfy any touches of one point: a direction of its own without distances.
+    with_distance = replace(m, groups=replace(m.groups, pairs=case(tolerance=None)[3].groups.pairs))
+    scale = observe(build(robot, m), build(robot, m).start)
+    held = observe(build(robot, with_distance), build(robot, with_distance).start)
+    assert held.rank >= scale.rank
+    assert held.singular_values[: scale.rank].min() >= scale.singular_values[: scale.rank].min()
+
+
+def test_joint_noise_widens_each_touch_to_first_order():
+    robot, _, _, m = case()
+    noisy = build(robot, replace(m, sigma_joint=np.full(4, 1e-3)))
+    J = pose(robot.with_values(noisy.start[noisy.variables.robot_span]), m.readings[:1]).jacobian[0, 3:, -4:]
+    S = SIGMA**2 * np.eye(3) + 1e-6 * J @ J.T
+    W = noisy.terms[0].whitening[0]
+    assert W.T @ W == pytest.approx(np.linalg.inv(S), rel=rounding(1, 1e4), abs=1e-3)
+    assert noisy.sigma_point[0] == pytest.approx(np.sqrt(np.diag(S)), rel=rounding(1, 1e4))
+
+
+# --- what is claimed ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_errors_are_as_large_as_the_sigmas_say():
+    runs, nees, z, z_points, fits = 40, [], [], [], []
+    for seed in range(runs):
+        robot, true, points, m = case(seed + 100, n_points=3, n_each=8)
+        solution = solve(build(robot, m))
+        uncertainty = assess(solution)
+        assert solution.converged
+        error = np.array(
+            [uncertainty.robot.nominal[robot.index(n)] - true.nominal[robot.index(n)] for n in uncertainty.names]
+        )
+        nees.append(error @ np.linalg.solve(uncertainty.covariance, error))
+        z.append(error / np.sqrt(np.diag(uncertainty.covariance)))
+        z_points.append([(p.xyz - truth) / p.sigma for p, truth in zip(uncertainty.points, points, strict=True)])
+        fits.append((uncertainty.chi2, uncertainty.dof))
+    n = len(uncertainty.names)
+    low, high = chi2.ppf([1e-4, 1 - 1e-4], runs * n) / runs
+    assert low <= np.mean(nees) <= high
+    # 760 and 360 figures, those of one run correlated: 68.3 % within 1 sigma, give or take four times 2 and 3 %.
+    assert np.mean(np.abs(z) < 1.0) == pytest.approx(0.683, abs=0.08)
+    assert np.mean(np.abs(z_points) < 1.0) == pytest.approx(0.683, abs=0.12)
+    total, dof = np.sum(fits, axis=0)
+    assert chi2.ppf(1e-4, dof) <= total <= chi2.ppf(1 - 1e-4, dof)
+
+
+def test_degrees_of_freedom_count_the_points():
+    robot, _, _, m = case()
+    problem = build(robot, m)
+    uncertainty = assess(solve(problem))
+    assert problem.n_residuals == 3 * 48 + 1
+    assert uncertainty.dof == 145 + problem.n_priors - problem.variables.n_columns - 12
+    assert whitened_triangle(problem, problem.start).shape[1] == problem.variables.n_columns
+
+
+def test_test_groups_are_predicted_and_of_mixed_ones_the_train_rows_fitted():
+    robot, _, _, m = case(distances=((0, 1, 1e-4), (0, 3, 1e-4)), test=(3,))
+    m.test[0] = True  # of group 0
+    problem = build(robot, m)
+    solution = solve(problem)
+    uncertainty = assess(solution)
+    assert problem.n_residuals == 3 * 35 + 1
+    assert [v.symbol for v in problem.variables.nuisance] == ["L(0)", "L(1)", "L(2)"]
+    assert [(p.name, p.n) for p in uncertainty.points] == [("g0", 11), ("g1", 12), ("g2", 12), ("g3", 0)]
+    assert np.isnan(uncertainty.points[3].sigma).all()
+    table = uncertainty.residuals
+    touches = np.char.startswith(table.kind, "point")
+    assert np.sum(table.test & touches) == 3 * 13
+    distances = np.flatnonzero(table.kind == "distance")
+    assert table.test[distances].tolist() == [False, True]
+    p = pose(uncertainty.robot, m.readings).position
+    means = [p[1:12].mean(axis=0), *(p[12 * g : 12 * (g + 1)].mean(axis=0) for g in (1, 2, 3))]
+    expected = np.array([p[k] - means[g] for k, g in enumerate(m.groups.index)])
+    assert table.after[touches] == pytest.approx(expected.ravel(), abs=rounding(1, 1e3))
+    d = m.groups.pairs.distance
+    miss = [np.linalg.norm(means[g] - means[0]) - d[i] for i, g in enumerate((1, 3))]
+    assert table.after[distances] == pytest.approx(miss, abs=rounding(1, 1e3))
+    rms = table.rms()
+    assert rms["test"]["point"]["after"] == pytest.approx(
+        np.sqrt(np.mean(np.sum(expected[m.test] ** 2, axis=1))), rel=1e-6
+    )
+    assert rms["train"]["point"]["after"] < 0.2 * rms["train"]["point"]["before"]
+    assert "35 of 3 points" in format_report(solution, uncertainty)
+    groups = result_document(solution, uncertainty)["groups"]
+    assert groups[3]["sigma"] == [None, None, None]
+    assert [g["n"] for g in groups] == [11, 12, 12, 0]
+
+
+def test_groups_and_pairs_work_side_by_side():
+    robot, true, _, m = case(distances=())
+    rng = np.random.default_rng(6)
+    a, b = np.arange(0, 12), np.arange(12, 24)
+    p = pose(true, m.readings).position
+    distance = np.linalg.norm(p[b] - p[a], axis=1) + 1e-4 * rng.normal(size=12)
+    nothing = np.full(12, np.nan)
+    pairs = Pairs(a, b, distance, nothing, np.full(12, 1e-4), nothing, np.zeros(12, dtype=bool))
+    both = assess(solve(build(robot, replace(m, pairs=pairs))))
+    alone = assess(solve(build(robot, m)))
+    assert both.dof == alone.dof + 12
+    assert both.trustworthy
+    assert np.linalg.slogdet(both.covariance)[1] < np.linalg.slogdet(alone.covariance)[1]
+
+
+@pytest.mark.parametrize("gauge", ["keep", "none"])
+def test_other_gauges_predict_the_same(gauge):
+    # Tool and arm of ordinary errors; the rows between touches alone are predicted, whatever holds the rest.
+    robot, _, _, m = case(tolerance=None, test=(3,))
+    found = assess(solve(build(robot, m, gauge=gauge)))
+    after = found.residuals.rms()["test"]["point"]["after"]
+    other = assess(solve(build(robot, m, gauge="keep" if gauge == "none" else "none")))
+    assert after == pytest.approx(other.residuals.rms()["test"]["point"]["after"], rel=1e-2)
+
+
+# --- files ----------------------------------------------------------------------------------------------------------
+
+
+POSES = "id,q1,q2,q3,q4,group,split\n"
+
+
+def tables(folder, poses, pairs=None):
+    (folder / "poses.csv").write_text(poses)
+    if pairs is not None:
+        (folder / "pairs.csv").write_text(pairs)
+    return {"pairs": None if pairs is None else folder / "pairs.csv"}
+
+
+ROWS = POSES + "p0,0,0,0,0,left,\np1,1,0,0,0,left,\np2,0,1,0,0,right,\np3,0,0,1,0,right,test\np4,0,0,1,1,,\n"
+
+
+def test_the_column_group_and_pairs_of_groups_are_read(tmp_path):
+    given = tables(tmp_path, ROWS, "a,b,distance\nleft,right,0.05\np0,p4,0.7\n")
+    noise = Noise(distance=1e-3, point=2e-4)
+    m = read_measurements(tmp_path / "poses.csv", small_arm(), noise=noise, **given)
+    assert m.groups.names == ("left", "right")
+    assert m.groups.index.tolist() == [0, 0, 1, 1, -1]
+    assert m.sigma_point.tolist() == [2e-4] * 5
+    assert (m.groups.pairs.a.tolist(), m.groups.pairs.b.tolist()) == ([0], [1])
+    assert m.groups.pairs.distance.tolist() == [0.05]
+    assert not m.groups.pairs.test.any()
+    assert (m.pairs.a.tolist(), m.pairs.b.tolist(), m.pairs.distance.tolist()) == ([0], [4], [0.7])
+
+
+def test_a_distance_to_a_group_of_test_rows_is_a_test_row(tmp_path):
+    rows = ROWS.replace("p2,0,1,0,0,right,", "p2,0,1,0,0,right,test")
+    given = tables(tmp_path, rows, "a,b,distance\nleft,right,0.05\n")
+    m = read_measurements(tmp_path / "poses.csv", small_arm(), noise=Noise(distance=1e-3), **given)
+    assert m.groups.pairs.test.tolist() == [True]
+
+
+def test_sigmas_of_touches_are_read_and_needed_only_of_touches(tmp_path):
+    rows = "q1,q2,q3,q4,group,sigma_point\n0,0,0,0,a,0.1\n1,0,0,0,a,0.2\n1,1,0,0,,\n"
+    tables(tmp_path, rows)
+    m = read_measurements(tmp_path / "poses.csv", small_arm())
+    assert m.sigma_point[:2].tolist() == [0.1, 0.2]
+    m = read_measurements(tmp_path / "poses.csv", small_arm(), noise=Noise(point=0.5))
+    assert m.sigma_point.tolist() == [0.1, 0.2, 0.5]
+
+
+def test_a_table_without_groups_has_none(tmp_path):
+    tables(tmp_path, "q1,q2,q3,q4,group\n0,0,0,0,\n1,0,0,0,\n")
+    m = read_measurements(tmp_path / "poses.csv", small_arm(), noise=Noise(point=1e-3))
+    assert m.groups is None
+    assert m.sigma_point is None
+
+
+@pytest.mark.parametrize(
+    ("rows", "pairs", "message"),
+    [
+        (
+            ROWS.replace("p4", "left"),
+            "a,b,distance\np0,left,0.1\n",
+            "pairs.csv:2: b = 'left' is both an id and a group of poses.csv, expected different names",
+        ),
+        (
+            ROWS.replace("id,", "name,").replace("right", "1"),
+            "a,b,distance\n1,0,0.1\n",
+            "pairs.csv:2: a = '1' is both a row and a group of poses.csv, expected different names",
+        ),
+        (
+            ROWS,
+            "a,b,distance\nleft,p0,0.1\n",
+            "pairs.csv:2: a is a group and b a configuration, expected two configurations or two groups",
+        ),
+        (
+            ROWS,
+            "a,b,distance\np1,p0,0.1\np0,left,0.1\n",
+            "pairs.csv:3: b is a group and a a configuration, expected two configurations or two groups",
+        ),
+        (ROWS, "a,b,distance\nleft,left,0.1\n", "pairs.csv:2: a and b are both 'left', expected two different groups"),
+        (ROWS, "a,b,distance\nleft,middle,0.1\n", "pairs.csv:2: b = 'middle' is not an id or a group of poses.csv"),
+        (
+            ROWS,
+            "a,b,distance,angle\nleft,right,0.1,0.2\n",
+            "pairs.csv:2: angle: found '0.2', expected an empty cell: two points have a distance, but no angle",
+        ),
+        (ROWS, "a,b,angle\nleft,right,\n", "pairs.csv:2: two groups without a distance, expected a column distance"),
+        (
+            ROWS,
+            "a,b,distance\nleft,right,\n",
+            "pairs.csv:2: distance: found an empty cell, expected a number above 0 between two groups;"
+            " one point is one group",
+        ),
+        (
+            ROWS,
+            "a,b,distance\nleft,right,0\n",
+            "pairs.csv:2: distance: found '0', expected a number above 0 between two groups; one point is one group",
+        ),
+        (
+            "q1,q2,q3,q4,group,sigma_point\n0,0,0,0,a,0.1\n1,0,0,0,a,\n",
+            None,
+            "poses.csv:3: sigma_point: found an empty cell, expected a number above 0",
+        ),
+        (
+            "q1,q2,q3,q4,group,sigma_point\n0,0,0,0,a,0.1\n1,0,0,0,a,-1\n",
+            None,
+            "poses.csv:3: sigma_point: found '-1', expected a number above 0",
+        ),
+    ],
+)
+def test_misuse_in_a_table_is_one_line(tmp_path, rows, pairs, message):
+    given = tables(tmp_path, rows, pairs)
+    with pytest.raises(InputError) as error:
+        read_measurements(tmp_path / "poses.csv", small_arm(), **given)
+    assert str(error.value) == message
+
+
+@pytest.mark.parametrize(
+    ("change", "model", "message"),
+    [
+        (
+            {},
+            "pose",
+            "poses.csv: a column group with model pose, expected model distance or distance-rotation",
+        ),
+        (
+            {},
+            "rotation",
+            "poses.csv: a column group with model rotation, expected model distance or distance-rotation",
+        ),
+        (
+            {"sigma_point": None},
+            "distance",
+            "poses.csv: no sigma for touched points, expected noise.point or a column sigma_point",
+        ),
+    ],
+)
+def test_misuse_of_a_model_is_one_line(change, model, message):
+    robot, _, _, m = case()
+    with pytest.raises(ProblemError) as error:
+        build_problem(robot, replace(m, **change), model=model)
+    assert str(error.value) == message
+
+
+def test_a_distance_between_groups_needs_a_sigma():
+    robot, _, _, m = case()
+    pairs = replace(m.groups.pairs, sigma_distance=np.array([np.nan]))
+    with pytest.raises(ProblemError) as error:
+        build(robot, replace(m, groups=replace(m.groups, pairs=pairs)))
+    assert str(error.value) == "pairs.csv: no sigma for distance, expected noise.distance or a column sigma_distance"
+
+
+def write_job(folder, seed=0, **job):
+    """The small arm's case as files."""
+    robot, _, _, m = case(seed, distances=((0, 1, 1e-4), (0, 3, 1e-4)), test=(3,))
+    write_robot(folder / "robot.yaml", robot)
+    names = ("q1", "q2", "q3", "q4")
+    with (folder / "poses.csv").open("w", newline="") as file:
+        out = csv.writer(file)
+        out.writerow(["id", *names, "group", "split"])
+        for k, (q, g, t) in enumerate(zip(m.readings, m.groups.index, m.test, strict=True)):
+            out.writerow([f"p{k}", *map(repr, q.tolist()), f"g{g}", "test" if t else "train"])
+    d = m.groups.pairs.distance
+    (folder / "pairs.csv").write_text(f"a,b,distance\ng0,g1,{d[0]}\ng0,g3,{d[1]}\n")
+    content = {
+        "robot": "robot.yaml",
+        "measurements": "poses.csv",
+        "pairs": "pairs.csv",
+        "model": "distance",
+        "noise": {"point": SIGMA, "distance": 1e-4},
+    }
+    (folder / "job.yaml").write_text(yaml.safe_dump({k: v for k, v in (content | job).items() if v is not None}))
+    return folder / "job.yaml"
+
+
+def test_a_job_with_groups_runs_from_the_command_line(fg_calib, tmp_path):
+    ended = fg_calib("calibrate", write_job(tmp_path), "--out", tmp_path / "out")
+    assert (ended.code, ended.err) == (0, "")
+    assert "3 touched points" in ended.out
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert [g["name"] for g in result["groups"]] == ["g0", "g1", "g2", "g3"]
+    assert all(s > 0 for g in result["groups"][:3] for s in g["sigma"])
+    assert result["residual_rms"]["test"]["point"]["after"] < 4 * SIGMA
+    assert (result["n_pairs"], result["n_configurations"]) == (0, 36)
+    with (tmp_path / "out" / "residuals.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [r["kind"] for r in rows[:3]] == ["point.x", "point.y", "point.z"]
+    assert (rows[0]["a"], rows[0]["b"], rows[0]["unit"]) == ("p0", "", "m")
+    last = rows[-1]
+    assert (last["kind"], last["a"], last["b"], last["split"], last["unit"]) == ("distance", "g0", "g3", "test", "m")
+
+
+def test_a_job_of_touches_alone_needs_no_pairs_and_no_poses(fg_calib, tmp_path):
+    ended = fg_calib("calibrate", write_job(tmp_path, pairs=None), "--json")
+    assert ended.code == 0
+    assert json.loads(ended.out)["pairing"] is None
+
+
+def test_compare_shows_the_graph_and_says_why_the_others_cannot_run(fg_calib, tmp_path):
+    ended = fg_calib("compare", write_job(tmp_path), "--json")
+    estimates = json.loads(ended.out)["estimates"]
+    assert ended.code == 0
+    assert [e["ran"] for e in estimates] == [True, False, False, False, False]
+    assert "poses.csv: a column group, expected pairs or poses: they know no points" in estimates[1]["message"]
+
+
+def test_a_job_without_the_noise_of_touches_is_one_line(fg_calib, tmp_path):
+    ended = fg_calib("calibrate", write_job(tmp_path, noise={"distance": 1e-4}))
+    assert ended.code == 1
+    expected = "poses.csv: no sigma for touched points, expected noise.point or a column sigma_point"
+    assert ended.err.splitlines() == [f"error: {expected}"] or ended.err.splitlines() == [expected]
+
+
+@pytest.mark.parametrize(
+    ("job", "message"),
+    [
+        ({"loss": "gnc"}, "a column group with loss gnc, expected loss none"),
+        ({"encoder": "estimated"}, "a column group with encoder estimated, expected encoder propagated"),
+        ({"noise": "estimate"}, "a column group with noise to be estimated, expected noise as stated"),
+    ],
+)
+def test_what_touched_points_have_not_is_refused_in_one_line(fg_calib, tmp_path, job, message):
+    path = write_job(tmp_path, **job)
+    ended = fg_calib("calibrate", path)
+    assert (ended.code, ended.out) == (1, "")
+    assert ended.err.startswith("error: ")
+    assert ended.err.endswith(f"{message}\n")

@@ -1,0 +1,326 @@
+"""What takes part in a problem, how it is whitened, and what is refused."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
+
+from fg_calib.analysis.uncertainty import assess
+from fg_calib.analysis.variance_components import estimate_noise
+from fg_calib.errors import ProblemError
+from fg_calib.graph.problem import all_rows, build_problem, judged_at
+from fg_calib.graph.solver import solve
+from fg_calib.measurements import residuals
+from fg_calib.measurements.dataset import Measurements, Pairing, Pairs
+from fg_calib.robot.kinematics import build_chain, pose
+
+
+def direct_pairs(distance, angle, sigma=(1e-3, 1e-3), test=None):
+    n = len(distance)
+    rows = np.arange(n)
+    return Pairs(
+        a=2 * rows,
+        b=2 * rows + 1,
+        distance=np.array(distance, dtype=float),
+        angle=np.array(angle, dtype=float),
+        sigma_distance=np.full(n, sigma[0]),
+        sigma_angle=np.full(n, sigma[1]),
+        test=np.zeros(n, dtype=bool) if test is None else np.array(test),
+        source="pairs.csv",
+    )
+
+
+def bare(robot, q, pairs=None, sigma_joint=0.0):
+    n = len(q)
+    return Measurements(
+        q,
+        np.arange(n).astype(str),
+        np.zeros(n, bool),
+        None,
+        None,
+        None,
+        None,
+        np.full(robot.n_joints, sigma_joint),
+        pairs,
+    )
+
+
+def planar_pairs(angles, measured=None, distance=None, sigma=(1e-3, 1e-3)):
+    """Pairs of the planar arm that differ by `angles` in the first joint: the tool turns by just that."""
+    q = np.array([[x, 0.5] for angle in angles for x in (0.0, angle)])
+    p = pose(planar_robot(), q).position
+    d = np.linalg.norm(p[1::2] - p[::2], axis=1)
+    turned = np.abs((np.array(angles) + np.pi) % (2 * np.pi) - np.pi)
+    return bare(
+        planar_robot(),
+        q,
+        direct_pairs(d if distance is None else distance, turned if measured is None else measured, sigma),
+    )
+
+
+def test_rows_near_the_kinks_take_part_and_say_what_they_can():
+    """An angle of sigma s near 0 or pi has the mean and the variance of a folded one, and the slope of that mean."""
+    s, from_kink = 1e-3, np.array([0.0, 1.0, 2.0, 30.0, 30.0, 2.0, 1.0])
+    angles = np.where(np.arange(7) < 4, s * np.maximum(from_kink, 1e-9), np.pi - s * from_kink)
+    problem = build_problem(planar_robot(), planar_pairs(angles, sigma=(1e-5, s)), model="rotation")
+    assert problem.judgement.angle.all()
+    assert problem.n_excluded == {"same_configuration": 0}
+    z = np.random.default_rng(0).normal(size=(200_000, 1))
+    seen = np.abs(from_kink + z)  # from the kink, in sigma; 0.0016 and 0.0022 are 1 sigma of the mean's and sd's errors
+    sign = np.where(np.arange(7) < 4, 1.0, -1.0)
+    residual = residuals.residual(all_rows(problem, problem.start), problem.variables.chain.at(problem.start))[:, 0]
+    assert residual / s == pytest.approx(sign * (seen.mean(axis=0) - from_kink), abs=0.01)
+    assert problem.sigma[:, 1] / s == pytest.approx(seen.std(axis=0), abs=0.01)
+
+
+@pytest.mark.parametrize(("measured", "predicted"), [(0.0, 1.0), (np.pi, 1.0), (1.0, 1e-6), (1.0, np.pi)])
+def test_an_angle_at_a_kink_that_contradicts_the_arm_is_in_chi_square(measured, predicted):
+    problem = build_problem(
+        planar_robot({"a": 0.01, "theta": 0.01}), planar_pairs([predicted, 1.5], [measured, 1.5]), model="rotation"
+    )
+    assert problem.n_residuals == 2
+    assert problem.graph.error(problem.initial) > 0.49 * (1.0 / 1e-3) ** 2
+
+
+def test_only_a_directly_measured_distance_of_zero_becomes_three_coordinates():
+    distance = [0.0, 1e-12, 0.0031, 0.6]
+    problem = build_problem(planar_robot(), planar_pairs([0.2] * 4, distance=distance), model="distance-rotation")
+    assert problem.judgement.same_point.tolist() == [True, False, False, False]
+    assert problem.judgement.distance.tolist() == [False, True, True, True]
+    assert problem.n_residuals == 3 + 3 + 4
+    assert problem.n_pairs == 4
+
+
+def test_a_distance_of_zero_between_measured_poses_is_a_number_like_others():
+    robot = small_arm()
+    m = measure(robot, 10, np.random.default_rng(0))
+    position = m.position.copy()
+    position[3] = position[0]
+    problem = build_problem(robot, replace(m, position=position), model="distance", pairing=Pairing("all"))
+    assert not problem.judgement.same_point.any()
+    assert problem.n_residuals == 45
+
+
+def test_same_points_calibrate_an_arm_without_any_frame():
+    """Two configurations of a planar arm with the same tool point: elbow up, elbow down."""
+    rng = np.random.default_rng(0)
+    robot = planar_robot(tolerance={"a": 0.01, "theta": 0.01})
+    values = robot.nominal
+    values[[p.name for p in robot.parameters].index("theta2")] = 0.008
+    true = robot.with_values(values)
+    q = []
+    for elbow in rng.uniform(0.5, 2.5, 20):
+        shoulder = rng.uniform(-1, 1)
+        up = np.array([shoulder, elbow - 0.008])
+        tip = pose(true, up[None]).position[0]
+        down = np.array([0.0, -elbow - 0.008])
+        down[0] = np.arctan2(tip[1], tip[0]) - np.arctan2(*pose(true, down[None]).position[0][1::-1])
+        q += [up, down]
+    pairs = direct_pairs(np.zeros(20), np.full(20, np.nan), sigma=(1e-5, 1e-3))
+    solution = solve(build_problem(robot, bare(robot, np.array(q), pairs), model="distance"))
+    assert solution.converged
+    assert solution.problem.n_residuals == 60
+    found = dict(zip([p.name for p in robot.parameters], solution.parameters, strict=False))
+    assert found["theta2"] == pytest.approx(0.008, abs=1e-6)
+
+
+def test_rows_are_whitened_anew_elsewhere():
+    robot = planar_robot({"a": 0.01, "theta": 0.01})
+    problem = build_problem(robot, planar_pairs([0.0, 1.0], sigma=(1e-3, 1e-3)), model="distance")
+    elsewhere = problem.start.copy()
+    elsewhere[[p.name for p in robot.parameters].index("a1")] += 0.1
+    again = judged_at(problem, elsewhere)
+    assert again is not problem
+    assert again.start is elsewhere
+    assert judged_at(problem, problem.start).judgement == problem.judgement
+
+
+def test_test_rows_are_counted_nowhere_and_give_no_residual():
+    rng = np.random.default_rng(1)
+    robot = small_arm()
+    for model in ("pose", "distance-rotation"):
+        problem = build_problem(robot, measure(robot, 10, rng, n_test=5), model=model, pairing=Pairing("star"))
+        assert problem.n_configurations == 10
+        assert problem.n_residuals == sum(b.n * b.height for b in problem.blocks) == (60 if model == "pose" else 18)
+        assert all_rows(problem, problem.start).n == (15 if model == "pose" else 9 + 4)
+
+
+@pytest.mark.parametrize("model", ["pose", "position", "orientation", "distance", "rotation", "distance-rotation"])
+def test_whitened_residuals_of_noise_have_unit_covariance(model):
+    """Joint noise, position and orientation noise together: the whitening is what Monte Carlo says."""
+    rng = np.random.default_rng(2)
+    robot = small_arm()
+    n, q = 4000, rng.uniform(-2, 2, (2, robot.n_joints))
+    measurements = measure(robot, 2 * n, rng, sigma=(1e-3, 5e-4), sigma_joint=4e-4, readings=np.tile(q, (n, 1)))
+    rows = np.arange(n)
+    if model in ("pose", "position", "orientation"):
+        problem = build_problem(robot, measurements, model=model)
+    else:
+        noise = np.sqrt(2) * np.array([1e-3, 5e-4])  # of a difference of two poses
+        p, R = measurements.position, Rotation.from_matrix(measurements.rotation)
+        distance, angle = np.linalg.norm(p[1::2] - p[::2], axis=1), (R[::2].inv() * R[1::2]).magnitude()
+        pairs = replace(
+            direct_pairs(distance, angle), sigma_distance=np.full(n, noise[0]), sigma_angle=np.full(n, noise[1])
+        )
+        assert np.array_equal(pairs.a, 2 * rows)
+        problem = build_problem(robot, replace(measurements, pairs=pairs), model=model)
+    w = residuals.residual(problem.blocks[0], problem.variables.chain.at(problem.start))
+    w = w[::2] if problem.pairs is None else w
+    covariance = w.T @ w / len(w)
+    # standard error of a variance from n draws: sqrt(2 / n) = 2.2 % at 4000; bound at 4 of them
+    assert covariance == pytest.approx(np.eye(w.shape[1]), abs=0.09)
+
+
+def test_a_pair_that_lacks_a_measurement_gives_the_other_row_only():
+    measurements = planar_pairs([0.5, 1.0, 1.5])
+    pairs = replace(measurements.pairs, distance=np.array([np.nan, 1.0, np.nan]), angle=np.array([0.5, np.nan, np.nan]))
+    robot = planar_robot({"a": 0.01, "theta": 0.01})
+    problem = build_problem(robot, replace(measurements, pairs=pairs), model="distance-rotation")
+    assert problem.n_residuals == 2
+    assert problem.n_pairs == 2
+    assert all(v == 0 for v in problem.n_excluded.values())
+
+
+def refused(robot, measurements, **options):
+    with pytest.raises(ProblemError) as error:
+        build_problem(robot, measurements, **options)
+    return str(error.value)
+
+
+def test_what_cannot_be_solved_is_refused_in_one_line():
+    rng = np.random.default_rng(3)
+    robot = small_arm()
+    poses = replace(measure(robot, 30, rng), source="poses.csv")
+    fixed = replace(robot, parameters=tuple(replace(p, estimated=False) for p in robot.parameters))
+    assert "nothing to estimate" in refused(fixed, poses, model="pose")
+    assert refused(robot, replace(poses, position=None), model="position") == (
+        "poses.csv: no columns x, y, z, expected measured positions for model position"
+    )
+    assert refused(robot, replace(poses, sigma_orientation=None), model="pose") == (
+        "poses.csv: no sigma for orientation, expected noise.orientation or a column sigma_orientation"
+    )
+    assert refused(robot, replace(poses, rotation=None), model="rotation") == (
+        "poses.csv: no columns qx, qy, qz, qw or roll, pitch, yaw, expected orientations for model rotation"
+    )
+    assert refused(robot, replace(poses, sigma_position=None), model="distance") == (
+        "pairs from poses.csv: no sigma for distance, expected noise.position or a column sigma_position"
+    )
+    still = planar_pairs([0.0, 0.0])
+    assert refused(planar_robot(), still, model="rotation") == (
+        "pairs.csv: no pair left to fit: 2 excluded for same configuration, expected pairs that tell something"
+    )
+    few = replace(measure(paper_robot(), 10, rng), source="poses.csv")
+    assert refused(paper_robot(), few, model="distance-rotation") == (
+        "pairs from poses.csv: 18 residuals, expected at least 23 to determine what model distance-rotation can"
+    )
+
+
+def test_priors_count_as_rows_when_there_are_few():
+    rng = np.random.default_rng(4)
+    robot = paper_robot(tolerance={"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3})
+    problem = build_problem(robot, measure(robot, 3, rng), model="distance")
+    assert (problem.n_residuals, problem.n_priors) == (2, 35)
+    assert build_problem(robot, measure(robot, 60, rng), model="distance", prior=False).n_priors == 0
+
+
+def test_frame_and_tool_start_near_the_truth_from_far_away():
+    rng = np.random.default_rng(5)
+    robot = small_arm(estimate=TOOL)
+    values = robot.nominal
+    values[-6:] = [0.5, -0.3, 0.2, 2.0, 0.9, -2.5]  # x y z yaw pitch roll, far from nominal
+    true = robot.with_values(values)
+    frame = (Rotation.from_rotvec(np.pi * np.array([0.6, 0.8, 0.0])), np.array([30.0, -4.0, 9.0]))
+    measurements = measure(true, 30, rng, frame=frame)
+    problem = build_problem(robot, measurements, model="pose", frame="unknown")
+    chain = problem.variables.chain.at(problem.start)
+    r = residuals.residual(problem.blocks[0], chain)
+    assert np.sqrt(np.mean(r**2)) < 2.0  # the nominal arm is the true one here, so only noise is left
+
+
+def test_frame_of_a_pair_model_does_not_matter():
+    robot = true_robot(small_arm(), np.random.default_rng(6))
+    measurements = measure(robot, 12, np.random.default_rng(7))
+    names = [
+        build_problem(robot, measurements, model="distance", frame=f).variables.names for f in ("known", "unknown")
+    ]
+    assert names[0] == names[1]
+    assert build_chain(robot).n_columns == 0
+
+
+def test_a_configuration_against_itself_says_nothing_of_the_arm():
+    problem = build_problem(
+        planar_robot({"a": 0.01, "theta": 0.01}), planar_pairs([0.0, 1.0]), model="distance-rotation"
+    )
+    assert problem.n_excluded["same_configuration"] == 1
+    assert problem.n_residuals == 2
+
+
+# --- factors of the user's own -------------------------------------------------------------------------------------
+
+
+def with_a_prior_of_ones_own():
+    problem = build_problem(paper_robot({"a": 1e-3, "d": 1e-3, "theta": 1e-3}), pair_table(), model="distance")
+    variable = problem.variables.items[-1]
+    mean = problem.initial.atVector(variable.key)
+    own = gtsam.PriorFactorVector(variable.key, mean, gtsam.noiseModel.Isotropic.Sigma(len(mean), 1e-3))
+    return problem, own
+
+
+def pair_table():
+    return measure(paper_robot(), 30, np.random.default_rng(0))
+
+
+OWN = (
+    "factors not made from this problem's measurements and priors, expected none: solve would leave them out; "
+    "for a graph of your own use GTSAM's optimisers, from problem.initial and with values for its variables"
+)
+
+
+@pytest.mark.parametrize("way", ["in place", "in a copy", "instead of one", "on a variable of one's own"])
+def test_a_factor_that_would_be_left_out_is_refused(way):
+    problem, own = with_a_prior_of_ones_own()
+    graph = problem.graph if way == "in place" else gtsam.NonlinearFactorGraph(problem.graph)
+    match way:
+        case "instead of one":
+            graph.replace(0, own)
+        case "on a variable of one's own":
+            graph.add(gtsam.PriorFactorPoint3(gtsam.symbol("B", 0), np.ones(3), gtsam.noiseModel.Unit.Create(3)))
+        case _:
+            graph.add(own)
+    for use in (solve, estimate_noise):
+        with pytest.raises(ProblemError) as caught:
+            use(replace(problem, graph=graph))
+        assert str(caught.value) == f"problem.graph: 1 of {graph.size()} {OWN}"
+
+
+def test_a_problem_without_one_of_its_factors_is_refused():
+    problem, _ = with_a_prior_of_ones_own()
+    graph, n = gtsam.NonlinearFactorGraph(), problem.graph.size()
+    for i in range(n - 1):
+        graph.add(problem.graph.at(i))
+    with pytest.raises(ProblemError, match=rf"^problem\.graph: {n - 1} of the problem's {n} factors, expected all"):
+        solve(replace(problem, graph=graph))
+
+
+def test_factors_added_to_what_was_solved_are_refused_too():
+    problem, own = with_a_prior_of_ones_own()
+    solution = solve(problem)
+    assess(solution)
+    solution.problem.graph.add(own)
+    with pytest.raises(ProblemError) as caught:
+        assess(solution)
+    assert str(caught.value) == f"problem.graph: 1 of {solution.problem.graph.size()} {OWN}"
+
+
+def test_a_graph_of_ones_own_is_for_gtsam():
+    """As the refusal advises: GTSAM's optimiser honours the factor."""
+    problem, own = with_a_prior_of_ones_own()
+    graph = gtsam.NonlinearFactorGraph(problem.graph)
+    graph.add(own)
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setLinearSolverType("MULTIFRONTAL_QR")
+    values = gtsam.LevenbergMarquardtOptimizer(graph, problem.initial, parameters).optimize()
+    assert graph.error(values) < graph.error(problem.initial)

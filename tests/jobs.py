@@ -1,0 +1,60 @@
+"""A UR5e, and jobs on it as files."""
+
+import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
+
+from fg_calib.files.robot_yaml import read_robot
+from fg_calib.files.tables import write_csv
+
+SIGMA = (5e-5, 1e-4)
+"""1 sigma of a position, [m], and of an orientation, [rad]."""
+
+
+UR5E = {
+    "name": "ur5e",
+    "convention": "dh-hayati",
+    "units": {"length": "m", "angle": "deg"},
+    "joints": [
+        {"theta": 0, "d": 0.1625, "a": 0, "alpha": 90, "beta": 0},
+        {"theta": 0, "d": 0, "a": -0.425, "alpha": 0, "beta": 0},
+        {"theta": 0, "d": 0, "a": -0.3922, "alpha": 0, "beta": 0},
+        {"theta": 0, "d": 0.1333, "a": 0, "alpha": 90, "beta": 0},
+        {"theta": 0, "d": 0.0997, "a": 0, "alpha": -90, "beta": 0},
+        {"theta": 0, "d": 0.0996, "a": 0, "alpha": 0, "beta": 0},
+    ],
+    "tool": {"x": 0.05, "y": -0.03, "z": 0.12, "roll": 20},
+    "tolerance": {"a": 0.0005, "d": 0.0005, "alpha": 0.05, "theta": 0.1, "beta": 0.05},
+}
+
+
+def ur5e(folder, **changes):
+    """The robot in a file of its own, with some keys changed."""
+    path = folder / "robot.yaml"
+    path.write_text(yaml.safe_dump(UR5E | changes))
+    return read_robot(path)
+
+
+def write_job(folder, measurements, *, angles=None, pairs=None, **keys):
+    """A job on what was measured, in m and rad; `angles` are written as roll, pitch, yaw instead of quaternions."""
+    m = measurements
+    columns = {f"q{i + 1}": q for i, q in enumerate(m.readings.T)}
+    columns |= dict(zip("xyz", m.position.T, strict=True))
+    if angles is None:
+        columns |= dict(zip(("qx", "qy", "qz", "qw"), Rotation.from_matrix(m.rotation).as_quat().T, strict=True))
+    else:
+        columns |= dict(zip(("roll", "pitch", "yaw"), angles.T, strict=True))
+    write_csv(folder / "poses.csv", columns)
+    job = {"robot": "robot.yaml", "measurements": "poses.csv", "units": {"length": "m", "angle": "rad"}}
+    job["noise"] = {"position": SIGMA[0], "orientation": SIGMA[1]}
+    if pairs is not None:
+        write_csv(folder / "pairs.csv", pairs)
+        job |= {"pairs": "pairs.csv", "noise": {"distance": SIGMA[0], "angle": SIGMA[1]}}
+    path = folder / "job.yaml"
+    path.write_text(yaml.safe_dump(job | keys))
+    return path
+
+
+def only(joint, figure, other=0.0):
+    """A figure for one joint of six, numbered from 1, and another for the rest."""
+    return np.where(np.arange(6) == joint - 1, figure, other)

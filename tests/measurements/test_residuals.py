@@ -1,0 +1,213 @@
+"""Residuals against scipy's rotations, their derivatives against central differences, and the reductions."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.sparse
+from oracle import central_differences, random_robot, tool_pose
+from scipy.spatial.transform import Rotation
+from tolerances import rounding
+
+from fg_calib.errors import InputError
+from fg_calib.measurements import residuals
+from fg_calib.measurements.residuals import PairBlock, PoseBlock, SamePointBlock
+from fg_calib.robot.kernels import LANES
+from fg_calib.robot.kinematics import SPAN, build_chain, precompute_trig
+
+CONVENTIONS = ["dh", "mdh", "mdh-hayati", "dh-hayati", "urdf"]
+
+
+ROUNDING = 1e-14
+"""Of sums of some products of numbers of size 1 to 10 that cancel."""
+
+
+def chain_of(robot):
+    return build_chain(robot, {i: i for i in range(len(robot.parameters))}).with_joint_columns()
+
+
+def pair_formula(robot, measured):
+    """Distance and angle of a pair minus measured, by 4x4 products; x = parameters, q_a, q_b."""
+    n, m = robot.n_joints, len(robot.parameters)
+
+    def formula(x):
+        A, B = (tool_pose(robot.with_values(x[:m]), q) for q in (x[m : m + n], x[m + n :]))
+        angle = Rotation.from_matrix(A[:3, :3].T @ B[:3, :3]).magnitude()
+        return np.array([np.linalg.norm(B[:3, 3] - A[:3, 3]), angle]) - measured
+
+    return formula
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("kinds", [(True, True), (True, False), (False, True)])
+def test_distance_and_angle_and_their_derivatives(convention, kinds):
+    rng = np.random.default_rng(11)
+    for n_joints in (1, 4, 7, 12):
+        robot = random_robot(convention, n_joints, rng)
+        q = rng.uniform(-3, 3, (2, n_joints))
+        measured = rng.uniform(0, 1, 2)
+        formula = pair_formula(robot, measured)
+        x = np.concatenate([robot.nominal, *q])
+        W = np.array([[2.0, 0.0], [0.7 if all(kinds) else 0.0, 3.0]])
+        block = PairBlock(
+            precompute_trig(robot, q),
+            np.array([0]),
+            np.array([1]),
+            measured[None],
+            np.array([[2.0, W[1, 0], 3.0]]),
+            kinds,
+        )
+        r, J = residuals.linearise(block, chain_of(robot))
+        rows = np.flatnonzero(kinds)
+        angle = formula(x)[1] + measured[1]
+        assert r[0] == pytest.approx((W @ formula(x))[rows], abs=rounding(10, 1 / min(1.0, np.sin(angle) + 1e-4)))
+        if n_joints == 1:  # a single joint turns the tool by its own angle about its own axis, whatever the parameters
+            continue
+        assert 0.05 < angle < 3.1  # away from the kinks, where central differences mean something
+        expected = (W @ central_differences(formula, x))[rows]
+        assert J[0] == pytest.approx(expected, abs=2e-7)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_same_point_residual_and_its_derivatives(convention):
+    rng = np.random.default_rng(12)
+    robot = random_robot(convention, 5, rng)
+    m, n = len(robot.parameters), 5
+    q = rng.uniform(-3, 3, (2, n))
+    W = np.tril(rng.normal(size=(3, 3)))
+
+    def formula(x):
+        A, B = (tool_pose(robot.with_values(x[:m]), q) for q in (x[m : m + n], x[m + n :]))
+        return W @ (B[:3, 3] - A[:3, 3])
+
+    block = SamePointBlock(precompute_trig(robot, q), np.array([0]), np.array([1]), W[None])
+    r, J = residuals.linearise(block, chain_of(robot))
+    x = np.concatenate([robot.nominal, *q])
+    assert r[0] == pytest.approx(formula(x), abs=100 * ROUNDING)
+    expected = central_differences(formula, x)
+    # Parameters: up to a turn of the vector, which leaves its length; joints: as they are.
+    d = np.linalg.solve(W, formula(x))
+    turned = np.linalg.solve(W, J[0] - expected)
+    assert d @ turned == pytest.approx(0.0, abs=1e-7)  # central differences by steps of 1e-6
+    assert turned[:, m:] == pytest.approx(0.0, abs=1e-7)
+    # Base columns, and what of the first joint comes before its reading, move both tools as one body.
+    rigid = np.abs(J[0]).max(axis=0) <= 100 * ROUNDING
+    assert rigid[:6].all()
+    assert rigid.sum() >= 7
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("kinds", [(True, True), (True, False), (False, True)])
+@pytest.mark.parametrize("size", [1e-7, 0.5, 2.9])
+def test_orientation_and_position_and_their_derivatives(convention, kinds, size):
+    rng = np.random.default_rng(13)
+    robot = random_robot(convention, 6, rng)
+    m = len(robot.parameters)
+    q = rng.uniform(-3, 3, 6)
+    T = tool_pose(robot, q)
+    off = rng.normal(size=3)
+    measured_R = T[:3, :3] @ Rotation.from_rotvec(size * off / np.linalg.norm(off)).as_matrix()
+    measured_p = rng.normal(size=3)
+    rows = np.concatenate([[k] * 3 for k in kinds]).astype(bool)
+    W = np.tril(rng.normal(size=(rows.sum(), rows.sum())))
+
+    def formula(x):
+        P = tool_pose(robot.with_values(x[:m]), x[m:])
+        log = Rotation.from_matrix(measured_R.T @ P[:3, :3]).as_rotvec()
+        return W @ np.concatenate([log, P[:3, 3] - measured_p])[rows]
+
+    block = PoseBlock(
+        precompute_trig(robot, q[None]), np.array([0]), measured_R[None], measured_p[None], W[None], kinds
+    )
+    r, J = residuals.linearise(block, chain_of(robot))
+    x = np.concatenate([robot.nominal, q])
+    assert r[0] == pytest.approx(formula(x), abs=rounding(10.0))
+    # the log's higher derivatives grow towards half a turn
+    assert J[0] == pytest.approx(central_differences(formula, x), abs=1e-7 if size < 1 else 1e-5)
+
+
+@pytest.mark.parametrize("angle", [np.pi - 1e-3, np.pi - 1e-9, np.pi])
+def test_orientation_residual_is_exact_up_to_half_a_turn(angle):
+    rng = np.random.default_rng(14)
+    robot = random_robot("mdh", 3, rng)
+    q = rng.uniform(-3, 3, 3)
+    axis = rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    measured = tool_pose(robot, q)[:3, :3] @ Rotation.from_rotvec(-angle * axis).as_matrix()
+    block = PoseBlock(
+        precompute_trig(robot, q[None]), np.array([0]), measured[None], np.zeros((1, 3)), np.eye(3)[None], (True, False)
+    )
+    r = residuals.residual(block, chain_of(robot))[0, :]
+    sign = np.sign(r @ axis) if angle == np.pi else 1.0
+    assert sign * r == pytest.approx(angle * axis, abs=1e-7 if angle > np.pi - 1e-8 else rounding(1, 1e4))
+
+
+def test_residuals_are_predicted_minus_measured():
+    robot = random_robot("dh", 3, np.random.default_rng(15))
+    q = np.random.default_rng(16).uniform(-1, 1, (2, 3))
+    trig = precompute_trig(robot, q)
+    zero = np.zeros((1, 2))
+    pair = PairBlock(trig, np.array([0]), np.array([1]), zero, np.array([[1.0, 0.0, 1.0]]))
+    assert np.all(residuals.residual(pair, build_chain(robot)) > 0)
+
+
+def random_block(kind, n, rng):
+    robot = random_robot("mdh-hayati", 6, rng)
+    trig = precompute_trig(robot, rng.uniform(-3, 3, (n + 1, 6)))
+    a, b = np.arange(n), rng.permutation(n) + 1
+    if kind == "pairs":
+        block = PairBlock(trig, a, b, rng.uniform(0, 2, (n, 2)), rng.uniform(0.5, 1, (n, 3)))
+    elif kind == "points":
+        block = SamePointBlock(trig, a, b, np.tril(rng.normal(size=(n, 3, 3))))
+    else:
+        R = Rotation.random(n, random_state=1).as_matrix()
+        block = PoseBlock(trig, a, R, rng.normal(size=(n, 3)), np.tril(rng.normal(size=(n, 6, 6))))
+    return block, chain_of(robot)
+
+
+@pytest.mark.parametrize("kind", ["pairs", "points", "poses"])
+@pytest.mark.parametrize("n", [1, LANES + 1, 700, 2 * SPAN + 5])
+def test_reductions_keep_cost_gradient_and_hessian(kind, n):
+    block, chain = random_block(kind, n, np.random.default_rng(n))
+    r, J = residuals.linearise(block, chain)
+    stacked = np.concatenate([J.reshape(-1, J.shape[2]), r.reshape(-1, 1)], axis=1)
+    expected = stacked.T @ stacked
+    size = np.abs(expected).max()
+    R = residuals.triangle(block, chain)
+    assert residuals.gram(block, chain) == pytest.approx(expected, abs=rounding(size, 10))
+    assert R.T @ R == pytest.approx(expected, abs=rounding(size, 10))
+    assert residuals.squared_norm(block, chain) == pytest.approx(expected[-1, -1], rel=rounding(1, 10))
+    assert residuals.residual(block, chain) == pytest.approx(r, abs=rounding(10.0))
+
+
+def test_a_row_without_weight_adds_nothing():
+    block, chain = random_block("pairs", 40, np.random.default_rng(17))
+    whitening = block.whitening.copy()
+    whitening[7:, :] = 0.0
+    short = replace(block, a=block.a[:7], b=block.b[:7], measured=block.measured[:7], whitening=whitening[:7])
+    long = replace(block, whitening=whitening)
+    assert residuals.gram(long, chain) == pytest.approx(residuals.gram(short, chain), rel=rounding())
+
+
+def test_the_sum_over_spans_does_not_depend_on_threads(monkeypatch):
+    block, chain = random_block("pairs", 3 * SPAN, np.random.default_rng(18))
+    many = residuals.gram(block, chain)
+    monkeypatch.setattr("fg_calib.robot.kinematics.processors", lambda: 1)
+    assert np.array_equal(residuals.gram(block, chain), many)
+
+
+@pytest.mark.parametrize(("n", "n_shared"), [(6, 3), (6, 30)], ids=["few shared errors", "many"])
+def test_some_rows_of_those_that_share_errors_are_no_block(n, n_shared):
+    """Whitened all together they are one piece; the parts, and the rows that come out, can be divided."""
+    block, chain = random_block("pairs", n, rng := np.random.default_rng(0))
+    loading = scipy.sparse.csr_array(rng.normal(size=(n * block.height, n_shared)))
+    correlated = residuals.correlate((block,), (loading,))
+    with pytest.raises(InputError) as caught:
+        residuals.rows_of(correlated, slice(0, 2))
+    assert str(caught.value) == (
+        "rows_of: a block whose rows share errors, expected one of its parts; linearise and residual give all its "
+        "rows, whitened together"
+    )
+    some = residuals.residual(residuals.rows_of(correlated.parts[0], slice(0, 2)), chain)
+    assert np.array_equal(some, residuals.residual(block, chain)[:2])
+    assert residuals.residual(correlated, chain).shape == (n * block.height, 1)

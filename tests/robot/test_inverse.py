@@ -1,0 +1,166 @@
+"""Inverse kinematics: solutions are held to 4x4 products, to the limits, and to their own poses alone."""
+
+import numpy as np
+import pytest
+from oracle import random_robot, tool_pose
+from simulated import paper_robot, planar_robot, small_arm
+from tolerances import rounding
+
+from fg_calib.robot.inverse import REACHED, random_readings, solve_inverse
+from fg_calib.robot.model import CONVENTIONS, Joint, RobotBuilder
+
+
+def poses_of(robot, q):
+    """base_T_tool of each row, shape (n, 4, 4), by the oracle."""
+    return np.stack([tool_pose(robot, row) for row in q])
+
+
+def require_reached(robot, found, T):
+    """The solutions bring the tool to T within 1e-9 m and rad, and stand within the limits."""
+    assert found.reached.all()
+    there = poses_of(robot, found.readings)
+    assert np.abs(there[:, :3, 3] - T[:, :3, 3]).max() < REACHED
+    assert np.abs(there[:, :3, :3] - T[:, :3, :3]).max() < REACHED
+    lower, upper = robot.limits.T
+    assert (found.readings >= lower).all()
+    assert (found.readings <= upper).all()
+
+
+def elbow_arm(limit):
+    """A six-joint arm with an elbow and a wrist; all joints turn +-limit degrees."""
+    rows = [(0, 0, 0.67), (0, -90, 0.15), (0.43, 0, 0), (0.02, -90, 0.43), (0, 90, 0), (0, -90, 0)]
+    builder = RobotBuilder("elbow", "mdh")
+    builder.add_frame("base", {"x": 0.3, "yaw": 0.4}, 0, False)
+    for i, (a, alpha, d) in enumerate(rows):
+        joint = Joint(f"q{i + 1}", lower=-np.deg2rad(limit), upper=np.deg2rad(limit))
+        builder.add_convention_joint(joint, {"a": a, "alpha": np.deg2rad(alpha), "d": d, "theta": 0.0})
+    builder.add_frame("tool", {"z": 0.1, "pitch": 0.2}, 7, False)
+    return builder.build()
+
+
+ARMS = [
+    *(random_robot(convention, n, np.random.default_rng(n)) for convention in (*CONVENTIONS, "urdf") for n in (5, 7)),
+    *(paper_robot(), small_arm(), elbow_arm(180), elbow_arm(100), elbow_arm(360)),
+]
+
+
+@pytest.mark.parametrize("robot", ARMS, ids=range(len(ARMS)))
+def test_poses_that_can_be_reached_are_reached_within_the_limits(robot):
+    """Any convention, revolute and prismatic, with base and tool, fewer than six joints and more."""
+    rng = np.random.default_rng(1)
+    T = poses_of(robot, random_readings(robot, 40, rng))
+    require_reached(robot, solve_inverse(robot, T[:, :3, :3], T[:, :3, 3], rng), T)
+
+
+def test_limits_that_are_no_whole_turn_about_zero_are_kept():
+    builder = RobotBuilder("shifted", "dh")
+    builder.add_frame("base", {}, 0, False)
+    for i in range(2):
+        joint = Joint(f"q{i + 1}", lower=np.deg2rad(200), upper=np.deg2rad(500))
+        builder.add_convention_joint(joint, {"theta": 0.0, "d": 0.0, "a": 1.0, "alpha": 0.0})
+    builder.add_frame("tool", {}, 3, False)
+    robot, rng = builder.build(), np.random.default_rng(2)
+    T = poses_of(robot, random_readings(robot, 50, rng))
+    require_reached(robot, solve_inverse(robot, T[:, :3, :3], T[:, :3, 3], rng), T)
+
+
+def test_random_starts_give_random_self_motion():
+    robot = paper_robot()
+    T = np.broadcast_to(tool_pose(robot, np.array([0.3, -0.5, 0.4, 1.0, -0.7, 0.9, 0.2])), (30, 4, 4))
+    found = solve_inverse(robot, T[:, :3, :3], T[:, :3, 3], np.random.default_rng(3))
+    require_reached(robot, found, T)
+    assert (np.ptp(found.readings, axis=0) > 0.5).sum() >= 3  # 7 joints for 6 coordinates
+
+
+def test_a_solution_stays_near_where_it_started():
+    robot, rng = paper_robot(), np.random.default_rng(4)
+    near = np.array([0.3, -0.5, 0.4, 1.0, -0.7, 0.9, 0.2])
+    T = poses_of(robot, near + 0.05 * rng.normal(size=(20, 7)))
+    found = solve_inverse(robot, T[:, :3, :3], T[:, :3, 3], rng, near=near)
+    require_reached(robot, found, T)
+    assert np.abs(found.readings - near).max() < 0.6
+    same = tool_pose(robot, near)[None]
+    assert solve_inverse(robot, same[:, :3, :3], same[:, :3, 3], rng, near=near).readings[0] == pytest.approx(
+        near, abs=rounding(10)
+    )
+
+
+def test_steps_are_of_minimum_norm():
+    """A small step's change of the joints has no part in the arm's self-motion, the null space of the derivative."""
+    robot = paper_robot()
+    near = np.array([0.3, -0.5, 0.4, 1.0, -0.7, 0.9, 0.2])
+    T = tool_pose(robot, near)
+    T[:3, 3] += [1e-5, -2e-5, 1e-5]
+    found = solve_inverse(robot, T[None, :3, :3], T[None, :3, 3], np.random.default_rng(0), near=near)
+    h = 1e-6
+    J = np.stack([(tool_pose(robot, near + h * e) - tool_pose(robot, near - h * e))[:3].ravel() for e in np.eye(7)], 1)
+    null = np.linalg.svd(J / (2 * h))[2][-1]
+    change = found.readings[0] - near
+    assert np.linalg.norm(change) > 1e-6
+    assert abs(null @ change) < 1e-4 * np.linalg.norm(change)
+
+
+def test_what_cannot_be_reached_is_told_with_its_miss():
+    robot, rng = elbow_arm(180), np.random.default_rng(5)
+    T = poses_of(robot, random_readings(robot, 3, rng))
+    T[1, :3, 3] = 4.0, 0.0, 0.0  # the arm is 1.8 m long
+    found = solve_inverse(robot, T[:, :3, :3], T[:, :3, 3], rng)
+    assert found.reached.tolist() == [True, False, True]
+    there = tool_pose(robot, found.readings[1])
+    assert found.miss_position[1] == pytest.approx(np.linalg.norm(there[:3, 3] - T[1, :3, 3]))
+    cosine = 0.5 * (np.trace(there[:3, :3].T @ T[1, :3, :3]) - 1)
+    assert found.miss_rotation[1] == pytest.approx(np.arccos(cosine), abs=1e-6)
+    assert 4.0 - 0.3 - 1.8 < found.miss_position[1] < 4.0
+
+
+def test_a_limit_that_is_in_the_way_is_not_passed():
+    """Two links of 2 and 1 m: 2.2 m away needs an elbow of 90 degrees or so, and here it opens by 30 at most."""
+    builder = RobotBuilder("stiff", "dh")
+    builder.add_frame("base", {}, 0, False)
+    for i, (length, limit) in enumerate(((2.0, np.pi), (1.0, np.deg2rad(30)))):
+        joint = Joint(f"q{i + 1}", lower=-limit, upper=limit)
+        builder.add_convention_joint(joint, {"theta": 0.0, "d": 0.0, "a": length, "alpha": 0.0})
+    builder.add_frame("tool", {}, 3, False)
+    robot = builder.build()
+    T = tool_pose(planar_robot(), np.array([0.2, np.deg2rad(90)]))
+    found = solve_inverse(robot, T[None, :3, :3], T[None, :3, 3], np.random.default_rng(6))
+    assert not found.reached[0]
+    assert np.abs(found.readings[0, 1]) <= np.deg2rad(30)
+
+
+def test_a_pose_is_solved_alike_alone_and_among_others():
+    robot = paper_robot()
+    T = poses_of(robot, random_readings(robot, 10, np.random.default_rng(7)))
+    R, p = T[:, :3, :3], T[:, :3, 3]
+    ten = solve_inverse(robot, R, p, np.random.default_rng(8)).readings
+    three = solve_inverse(robot, R[:3], p[:3], np.random.default_rng(8)).readings
+    assert three == pytest.approx(ten[:3], abs=rounding(1, 1e4))  # batched linear algebra may round otherwise
+
+
+def test_no_poses_are_no_work():
+    found = solve_inverse(paper_robot(), np.empty((0, 3, 3)), np.empty((0, 3)), np.random.default_rng(0))
+    assert found.readings.shape == (0, 7)
+    assert found.reached.shape == (0,)
+
+
+def test_random_readings_fill_the_limits():
+    builder = RobotBuilder("slides", "mdh")
+    builder.add_frame("base", {}, 0, False)
+    joints = [
+        Joint("a", lower=-0.5, upper=2.0),
+        Joint("b"),
+        Joint("c", prismatic=True),
+        Joint("d", prismatic=True, lower=3.0),
+        Joint("e", upper=1.0),
+    ]
+    for joint in joints:
+        builder.add_convention_joint(joint, {"theta": 0.0, "d": 0.0, "a": 1.0, "alpha": 0.0})
+    builder.add_frame("tool", {}, 6, False)
+    q = random_readings(builder.build(), 4000, np.random.default_rng(0))
+    low, high = [-0.5, -np.pi, -1, 3, 1 - 2 * np.pi], [2, np.pi, 1, 5, 1]
+    assert (q >= low).all()
+    assert (q <= high).all()
+    span = np.subtract(high, low)
+    # The extremes of 4000 draws are within 10 / 4000 of the ends but for a chance of 5e-5 each.
+    assert (q.min(axis=0) - low < span / 400).all()
+    assert (high - q.max(axis=0) < span / 400).all()

@@ -1,0 +1,236 @@
+"""Every option is checked where it enters the Python API: one line that says what is possible, and what was meant."""
+
+from dataclasses import fields, replace
+from typing import get_args
+
+import numpy as np
+import pytest
+from simulated import measure, planar_robot
+
+from fg_calib import (
+    Noise,
+    Pairing,
+    SolverOptions,
+    Units,
+    build_problem,
+    check_setup,
+    cramer_rao,
+    fit_least_squares,
+    format_identifiability,
+    observe_configurations,
+    observe_structure,
+    options,
+    pose,
+    problem_of,
+    read_job,
+    read_measurements,
+    simulate,
+    solve,
+    write_robot,
+)
+from fg_calib.errors import InputError
+from fg_calib.simulation.scenario import BoardViews, Errors, Placement, RandomReadings, Scenario
+
+ROBOT = planar_robot(tolerance={"a": 1e-3, "theta": 1e-3})
+TABLE = measure(ROBOT, 20, np.random.default_rng(0))
+
+
+def problem(**options):
+    return build_problem(ROBOT, TABLE, **{"model": "distance"} | options)
+
+
+def bound(**options):
+    return cramer_rao(ROBOT, TABLE, **{"model": "distance"} | options)
+
+
+def plain(**options):
+    return fit_least_squares(ROBOT, TABLE, **{"model": "distance"} | options)
+
+
+def structure(model="distance", **options):
+    return observe_structure(ROBOT, model, **options)
+
+
+def practical(model="distance", **options):
+    return observe_configurations(ROBOT, TABLE, model, **options)
+
+
+def setup(model="distance", **options):
+    return check_setup(ROBOT, TABLE, model, **options)
+
+
+def scenario(**changes):
+    return Scenario(**{"robot": ROBOT, "errors": Errors("values", {}), "configurations": RandomReadings(2),
+                       "noise": Noise(1e-3, 1e-3)} | changes)  # fmt: skip
+
+
+BOARD = Placement(np.eye(3), np.zeros(3))
+WORDS = {
+    "model": (options.Model, (problem, bound, plain, structure, practical)),
+    "frame": (options.FrameKnowledge, (problem, bound, plain, structure, practical)),
+    "gauge": (options.Gauge, (problem,)),
+    "pair_errors": (options.PairErrors, (problem, bound)),
+    "encoder": (options.EncoderNoise, (problem,)),
+    "loss": (options.Loss, (problem,)),
+}
+CALLS = [(function, key) for key, (_, functions) in WORDS.items() for function in functions]
+
+
+@pytest.mark.parametrize(("function", "key"), CALLS, ids=[f"{f.__name__} {key}" for f, key in CALLS])
+def test_a_word_in_capitals_is_refused_with_the_word_that_was_meant(function, key):
+    for word in get_args(WORDS[key][0]):
+        with pytest.raises(InputError) as caught:
+            function(**{key: word.capitalize()})
+        possible = ", ".join(get_args(WORDS[key][0]))
+        assert (
+            str(caught.value) == f"{key}: found {word.capitalize()!r}, expected one of {possible}; did you mean {word}?"
+        )
+
+
+@pytest.mark.parametrize(("function", "key"), CALLS, ids=[f"{f.__name__} {key}" for f, key in CALLS])
+@pytest.mark.parametrize("value", [None, True, 1, ["star"], np.array([1.0, 2.0])], ids=repr)
+def test_what_is_no_word_is_refused_too(function, key, value):
+    with pytest.raises(InputError, match=f"^{key}: found "):
+        function(**{key: value})
+
+
+NAN, INF = float("nan"), float("inf")
+MISTAKES = {
+    "a strategy": (lambda: Pairing("Chain"), "pairing: found 'Chain', expected one of star, chain, all, random; "
+                   "did you mean chain?"),
+    "no random pairs": (lambda: Pairing("random"), "pairing: count: found 0, expected a whole number above 0"),
+    "pairs by halves": (lambda: Pairing("random", 2.5), "pairing: count: found 2.5, expected a whole number above 0"),
+    "a seed below 0": (
+        lambda: Pairing("random", 3, -1), "pairing: seed: found -1, expected a whole number not below 0"
+    ),
+    **{f"a bare strategy {f.__name__}": (
+        lambda f=f: f(pairing="chain"), "pairing: found 'chain', expected a Pairing, such as Pairing('chain')"
+    ) for f in (problem, bound, plain, practical)},
+    "a bare noise": (lambda: read_measurements("poses.csv", ROBOT, noise=1e-3), "noise: found 0.001, expected a Noise, "
+                     "such as Noise(position=1e-3)"),
+    "a bare unit": (lambda: read_measurements("poses.csv", ROBOT, units="mm"), "units: found 'mm', expected a Units, "
+                    "such as Units(length='mm')"),
+    "a unit to write in": (lambda: write_robot("robot.yaml", ROBOT, units="mm"), "units: found 'mm', expected a Units, "
+                           "such as Units(length='mm')"),
+    "options as a mapping": (lambda: solve(problem(), {"max_iterations": 5}), "options: found {'max_iterations': 5}, "
+                             "expected a SolverOptions, such as SolverOptions(max_iterations=200)"),
+    "a prior that is a word": (lambda: problem(prior="no"), "prior: found 'no', expected True or False"),
+    "a bound's prior": (lambda: bound(prior="no"), "prior: found 'no', expected True or False"),
+    "weights that are a word": (lambda: plain(weighted="no"), "weighted: found 'no', expected True or False"),
+    **{f"a name to keep {f.__name__}": (
+        lambda f=f: f(prefer=["A2"]), "prefer: unknown parameter 'A2', expected one of base.x, base.y, base.z, "
+        "base.yaw, base.pitch, base.roll, theta1, d1, a1, alpha1, theta2, d2, ...; did you mean a2?"
+    ) for f in (problem, structure, practical)},
+    "one name for a list": (lambda: problem(prefer="a2"), "prefer: found 'a2', expected a list of names"),
+    "a bound's names": (lambda: bound(kept="a2"), "kept: found 'a2', expected a list of names"),
+    "a baseline's names": (lambda: plain(names="a2"), "names: found 'a2', expected a list of names"),
+    "an estimated name": (lambda: ROBOT.with_estimated(["A2"]), "planar: unknown parameter 'A2', expected one of "
+                          "base.x, base.y, base.z, base.yaw, base.pitch, base.roll, theta1, d1, a1, alpha1, theta2, "
+                          "d2, ...; did you mean a2?"),
+    "values of another robot": (lambda: ROBOT.with_values([1.0]), "planar: 1 values, expected 20, one a parameter"),
+    "readings of another robot": (lambda: pose(ROBOT, np.zeros((2, 3))), "readings: shape (2, 3), expected (n, 2) for "
+                                  "the robot's joints"),
+    "a table of another robot": (
+        lambda: build_problem(ROBOT, replace(TABLE, readings=np.zeros((20, 3))), model="distance"),
+        "readings: shape (20, 3), expected (n, 2) for the robot's joints"),
+    "configurations below 0": (lambda: structure(n_configurations=-1), "n_configurations: found -1, expected a whole "
+                               "number not below 0"),
+    "a structural seed": (lambda: structure(seed=0.5), "seed: found 0.5, expected a whole number not below 0"),
+    "a simulation's seed": (lambda: simulate(scenario(), 1.0), "seed: found 1.0, expected a whole number not below 0"),
+    "a unit of length": (lambda: Units(length="MM"), "units: length: found 'MM', expected one of m, cm, mm, um; "
+                         "did you mean mm?"),
+    "a unit of angle": (lambda: Units(angle="degrees"), "units: angle: found 'degrees', expected one of rad, deg, "
+                        "mrad; did you mean deg?"),
+    "a law": (lambda: Errors("Uniform", {}), "errors: law: found 'Uniform', expected one of uniform, normal, values; "
+              "did you mean uniform?"),
+    "a self-motion": (lambda: BoardViews(BOARD, self_motion="Held"), "board: self_motion: found 'Held', expected one "
+                      "of random, held; did you mean held?"),
+    "a board's radius": (lambda: BoardViews(BOARD, radius=-0.5), "board: radius: found -0.5, expected a finite number "
+                         "above 0"),
+    "a number of views": (lambda: RandomReadings(0), "random: count: found 0, expected a whole number above 0"),
+    "a scenario's frame": (lambda: scenario(frame="Base"), "scenario: frame: found 'Base', expected one of base, "
+                           "unknown; did you mean base?"),
+    "a scenario's unit": (lambda: scenario(angle_unit="grad"), "scenario: angle_unit: found 'grad', expected one of "
+                          "rad, deg, mrad"),
+    "a report's width": (lambda: format_identifiability(structure(), 0), "width: found 0, expected a whole number not "
+                         "below 1"),
+    "a model of the set-up": (lambda: setup(model="Pose"), "model: found 'Pose', expected one of pose, position, "
+                              "orientation, distance, rotation, distance-rotation; did you mean pose?"),
+    "a frame of the set-up": (lambda: setup(frame="Unknown"), "frame: found 'Unknown', expected one of known, unknown; "
+                              "did you mean unknown?"),
+    "a doubt that is a word": (lambda: setup(doubtful="no"), "doubtful: found 'no', expected True or False"),
+    "names that are nothing": (lambda: problem(prefer=None), "prefer: found None, expected a list of names"),
+    "names that are a number": (lambda: structure(prefer=3), "prefer: found 3, expected a list of names"),
+    "pairs by numpy's halves": (lambda: Pairing("random", np.float32(2)), "pairing: count: found np.float32(2.0), "
+                                "expected a whole number above 0"),
+    "more noise than a float holds": (lambda: Noise(10**400), f"noise: position: found {10**400}, expected a finite "
+                                      "number not below 0"),
+    "noise by axis": (lambda: Noise((1e-3, 1e-3, 2e-3)), "noise: position: found (0.001, 0.001, 0.002), expected a "
+                      "finite number not below 0"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("call", "message"), MISTAKES.values(), ids=MISTAKES)
+def test_a_mistake_is_named_in_one_line(call, message):
+    with pytest.raises(InputError) as caught:
+        call()
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize("figure", [-1.0, NAN, INF, "1"], ids=repr)
+@pytest.mark.parametrize("key", [f.name for f in fields(Noise)])
+def test_noise_is_a_finite_number_not_below_0(key, figure):
+    with pytest.raises(InputError) as caught:
+        Noise(**{key: figure})
+    assert str(caught.value) == f"noise: {key}: found {figure!r}, expected a finite number not below 0"
+
+
+@pytest.mark.parametrize("key", [f.name for f in fields(Noise) if f.name != "joint"])
+def test_a_calibration_takes_nothing_for_exact(tmp_path, key):
+    (tmp_path / "poses.csv").write_text("q1,q2,x,y,z\n0,0,1,0,0\n")
+    with pytest.raises(InputError, match=f"^noise: {key}: found 0.0, expected a finite number above 0$"):
+        read_measurements(tmp_path / "poses.csv", ROBOT, noise=Noise(**{key: 0.0}))
+
+
+@pytest.mark.parametrize("value", [-1, NAN, INF, "10"], ids=repr)
+@pytest.mark.parametrize("key", [f.name for f in fields(SolverOptions)])
+def test_options_of_the_solver_are_finite_numbers_not_below_0(key, value):
+    with pytest.raises(
+        InputError, match=f"^solver: {key}: found {value!r}, expected a (finite|whole) number not below "
+    ):
+        SolverOptions(**{key: value})
+
+
+@pytest.mark.parametrize("yes", [True, np.True_])
+@pytest.mark.parametrize("no", [False, np.False_])
+def test_a_switch_of_numpys_counts_as_pythons(yes, no):
+    """`np.False_ is False` is false: it used to switch priors on."""
+    assert problem(prior=yes).settings.prior is True
+    assert problem(prior=no).settings.prior is False
+
+
+def test_numbers_of_numpys_are_numbers():
+    assert Pairing("random", np.int64(3), np.int32(1)).count == 3
+    assert Noise(np.float64(1e-3), np.float32(1e-3), (0, np.float64(1.0))).orientation == pytest.approx(1e-3)
+    assert solve(problem(), SolverOptions(max_iterations=np.int64(7))).iterations <= 7
+
+
+def test_a_job_made_by_hand_is_checked_like_a_problem(example):
+    job = replace(read_job(example / "calibration.yaml"), pair_errors="Shared")
+    with pytest.raises(InputError, match=r"^pair_errors: found 'Shared', expected .*; did you mean shared\?$"):
+        problem_of(job)
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [
+        ("Shared", "did you mean shared?"),
+        ("indep", "did you mean independent?"),
+        ("share", "did you mean shared?"),
+        ("mixed", ""),
+        ("", ""),
+        (3, ""),
+    ],
+)
+def test_a_hint_is_given_where_something_is_near(given, meant):
+    assert options.did_you_mean(given, get_args(options.PairErrors)) == meant
