@@ -106,15 +106,7 @@ def write_jobs(data: Path, folder: Path, seed: int, quick: bool) -> dict[str, Pa
 
 def calibrate(job: fg_calib.Job) -> tuple[fg_calib.Solution, fg_calib.Uncertainty]:
     """What `fg-calib calibrate` does."""
-    problem = fg_calib.build_problem(
-        job.robot,
-        job.measurements,
-        model=job.model,
-        pairing=job.pairing,
-        frame=job.frame,
-        prior=job.prior,
-    )
-    solution = fg_calib.solve(problem)
+    solution = fg_calib.solve(fg_calib.problem_of(job))
     return solution, fg_calib.assess(solution)
 
 

@@ -129,7 +129,7 @@ def through_the_graph(
     predicted = random_problem(robot, model, n_configurations=n, seed=seed)
     m: Measurements = predicted.measurements
     measurements = replace(m, sigma_position=np.full_like(m.sigma_position, 1e-3))
-    options: dict[str, Any] = {"model": model, "pairing": predicted.settings.pairing}
+    options: dict[str, Any] = {"model": model, "pairing": predicted.options.pairing}
     problem = fg_calib.build_problem(weak, measurements, **options)
     ordering = gtsam.Ordering()
     for key in problem.variables.keys:

@@ -52,7 +52,8 @@ import fg_calib
 from fg_calib.graph.factors import prior_rows
 from fg_calib.graph.problem import Problem, all_rows, judged_at, predicted_problem, whitened_triangle
 from fg_calib.measurements import residuals
-from fg_calib.measurements.dataset import Measurements, Pairing, Pairs, rotation_angle
+from fg_calib.measurements.dataset import Measurements, Pairs, rotation_angle
+from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 
 Floats = NDArray[np.float64]
@@ -311,7 +312,7 @@ def one_draw(cell: Cell, setting: Setting, seed: int, draw: int) -> dict[str, An
         "excluded": sum(solution.problem.n_excluded.values()),
         "residuals": solution.problem.n_residuals,
     }
-    if draw % EVERY == 0 and solution.problem.settings.prior:
+    if draw % EVERY == 0 and solution.problem.options.has_priors:
         at_truth = solution.parameters.copy()
         at_truth[solution.problem.variables.robot_span] = true.nominal
         out["bound"] = bound_of_tool(problem, at_truth, setting, true)

@@ -40,7 +40,8 @@ from scipy.spatial.transform import Rotation
 
 import fg_calib
 from fg_calib.errors import CalibrationError
-from fg_calib.measurements.dataset import Measurements, Pairing, Pairs, rotation_angle
+from fg_calib.measurements.dataset import Measurements, Pairs, rotation_angle
+from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 
 Floats = NDArray[np.float64]

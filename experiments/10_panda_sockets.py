@@ -217,7 +217,7 @@ def run(data: Path, out: Path, seed: int = 0, quick: bool = False) -> dict[str, 
     for way, words in WAYS.items():
         with TemporaryDirectory() as folder:
             job = fg_calib.read_job(write_job(data, rows, Path(folder), way))
-        problem = fg_calib.build_problem(job.robot, job.measurements, model=job.model, prior=job.prior)
+        problem = fg_calib.build_problem(job.robot, job.measurements, model=job.options.model, gauge=job.options.gauge)
         fg_calib.solve(problem)  # once unseen, so that the seconds below are not those of compiling
         solution = fg_calib.solve(problem)
         uncertainty = fg_calib.assess(solution)

@@ -26,14 +26,16 @@ if TYPE_CHECKING:
     from fg_calib.baseline.comparison import Comparison, compare
     from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
-    from fg_calib.files.job import Job, read_job
+    from fg_calib.files.job import read_job
     from fg_calib.files.robot_yaml import read_robot, write_robot
     from fg_calib.files.scenario import read_scenario, write_simulation
     from fg_calib.files.tables import read_measurements
     from fg_calib.files.units import Units
     from fg_calib.graph.problem import Problem, build_problem, problem_of
     from fg_calib.graph.solver import Solution, SolverOptions, solve
-    from fg_calib.measurements.dataset import Measurements, Noise, Pairing
+    from fg_calib.job import Job
+    from fg_calib.measurements.dataset import Measurements, Noise
+    from fg_calib.options import Options, Pairing
     from fg_calib.report.documents import (
         comparison_document,
         observability_document,
@@ -54,7 +56,8 @@ _HOMES = {
     "fg_calib.analysis.bounds": ("Bound", "cramer_rao"),
     "fg_calib.baseline.comparison": ("Comparison", "compare"),
     "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
-    "fg_calib.files.job": ("Job", "read_job"),
+    "fg_calib.files.job": ("read_job",),
+    "fg_calib.job": ("Job",),
     "fg_calib.files.robot_yaml": ("read_robot", "write_robot"),
     "fg_calib.files.scenario": ("read_scenario", "write_simulation"),
     "fg_calib.files.tables": ("read_measurements",),
@@ -62,10 +65,11 @@ _HOMES = {
     "fg_calib.analysis.identifiability": ("Identifiability", "observe_configurations", "observe_structure"),
     "fg_calib.robot.kinematics": ("pose",),
     "fg_calib.baseline.least_squares": ("LeastSquares", "fit_least_squares"),
-    "fg_calib.measurements.dataset": ("Measurements", "Noise", "Pairing"),
+    "fg_calib.measurements.dataset": ("Measurements", "Noise"),
     "fg_calib.analysis.mistakes": ("SetupCheck", "check_setup"),
     "fg_calib.analysis.variance_components": ("estimate_noise", "solve_job"),
     "fg_calib.graph.problem": ("Problem", "build_problem", "problem_of"),
+    "fg_calib.options": ("Options", "Pairing"),
     "fg_calib.report.text": ("format_comparison", "format_identifiability", "format_report"),
     "fg_calib.report.documents": (
         *("comparison_document", "observability_document", "result_document"),
@@ -90,6 +94,7 @@ __all__ = [
     "LeastSquares",
     "Measurements",
     "Noise",
+    "Options",
     "Pairing",
     "Problem",
     "ProblemError",

@@ -196,7 +196,8 @@ def observe(
     from fg_calib.files.robot_yaml import read_robot
     from fg_calib.files.tables import read_measurements
     from fg_calib.files.units import Units
-    from fg_calib.measurements.dataset import Noise, Pairing
+    from fg_calib.measurements.dataset import Noise
+    from fg_calib.options import Pairing
     from fg_calib.report.documents import observability_document, write_observability
     from fg_calib.report.text import build_identifiability_report
 

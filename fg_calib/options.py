@@ -1,10 +1,11 @@
-"""What a user can choose among, and the checks of it; light enough for the command line's help."""
+"""Every choice of a calibration, and the checks of it; light enough for the command line's help."""
 
 from __future__ import annotations
 
 import difflib
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, fields, replace
 from numbers import Integral, Real
 from typing import Any, Literal, get_args
 
@@ -144,3 +145,138 @@ def known_names(names: Iterable[str], limit: int = 12) -> str:
     listed = list(names)
     shown = ", ".join(listed[:limit])
     return f"one of {shown}{', ...' if len(listed) > limit else ''}"
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """How pairs are formed from measured poses.
+
+    Attributes:
+        strategy: `star` (the first with each other), `chain` (each with the next), `all`, or `random`
+            (different pairs, each configuration about equally often).
+        count: Number of random pairs.
+        seed: Seed of the random pairs.
+    """
+
+    strategy: Strategy = "star"
+    count: int = 0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check("pairing", self.strategy, Strategy)
+        check_number("pairing: count", self.count, above=self.strategy == "random", whole=True)
+        check_number("pairing: seed", self.seed, whole=True)
+
+    def __str__(self) -> str:
+        return self.strategy if self.strategy != "random" else f"random ({self.count}, seed {self.seed})"
+
+
+def as_pairing(pairing: Pairing | None) -> Pairing:
+    """The pairing given, a star if None.
+
+    Raises:
+        InputError: It is something else, such as a strategy's bare name.
+    """
+    check_type("pairing", pairing, Pairing, "Pairing('chain')")
+    return pairing or Pairing()
+
+
+PAIR_MODELS: dict[Model, tuple[bool, bool]] = {
+    "distance": (True, False),
+    "rotation": (False, True),
+    "distance-rotation": (True, True),
+}
+"""Whether a model uses distances and angles of pairs."""
+
+POSE_MODELS: dict[Model, tuple[bool, bool]] = {
+    "orientation": (True, False),
+    "position": (False, True),
+    "pose": (True, True),
+}
+"""Whether a model uses orientations and positions."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Every choice of a calibration, checked.
+
+    Attributes:
+        model: Which measurements take part.
+        pairing: How pairs are formed from poses where none were measured directly.
+        frame: Whether the measurement frame is known to be the base, or world_T_base is estimated too; of no meaning
+            for models of pairs.
+        gauge: What holds the directions that the data do not determine. `prior`: the tolerances. `none`: nothing;
+            everything is estimated by minimum-norm steps, and what is not determined has no sigma. `keep`: only
+            the independent parameters and those kept of each relative group are estimated, without priors, the
+            others stay at nominal (the paper's way); what is said of errors counts them with their tolerance.
+        prefer: For `keep`: parameters to keep, first choice first.
+        pair_errors: Whether pairs share the errors of their configurations or count as independent.
+        encoder: `propagated`: the noise of joint readings is added to that of the rows, to first order. `estimated`:
+            the true joint values of every configuration are estimated too, with the readings as their priors.
+        loss: What becomes of large residuals: `none` or a robust loss (see `graph.robust`).
+        estimate_noise: Whether the sigmas stated are only a start, and scaled to what is seen.
+        max_iterations: Steps after which the solver gives up; None for its default.
+
+    Raises:
+        InputError: A choice is not one of those possible.
+    """
+
+    model: Model = "distance-rotation"
+    pairing: Pairing = field(default_factory=Pairing)
+    frame: FrameKnowledge = "known"
+    gauge: Gauge = "prior"
+    prefer: tuple[str, ...] = ()
+    pair_errors: PairErrors = "shared"
+    encoder: EncoderNoise = "propagated"
+    loss: Loss = "none"
+    estimate_noise: bool = False
+    max_iterations: int | None = None
+
+    def __post_init__(self) -> None:
+        possible = {"model": Model, "frame": FrameKnowledge, "gauge": Gauge}
+        possible |= {"pair_errors": PairErrors, "encoder": EncoderNoise, "loss": Loss}
+        for key, values in possible.items():
+            check(key, getattr(self, key), values)
+        check_type("pairing", self.pairing, Pairing, "Pairing('chain')")
+        check_flag("estimate_noise", self.estimate_noise)
+        if self.max_iterations is not None:
+            check_number("max_iterations", self.max_iterations, above=True, whole=True)
+
+    @classmethod
+    def of(cls, **choices: Any) -> Options:
+        """Options from keywords; no pairing is a star, and `prior=False` is `gauge="none"`.
+
+        Raises:
+            InputError: A keyword is not known, or its value is not one of those possible.
+        """
+        prior = choices.pop("prior", None)
+        check_names("options", choices, [f.name for f in fields(cls)], "option")
+        choices["pairing"] = as_pairing(choices.get("pairing"))
+        if isinstance(choices.get("prefer"), list):
+            choices["prefer"] = tuple(choices["prefer"])
+        options = cls(**choices)
+        return options if prior is None else options.with_prior(prior)
+
+    def with_prior(self, prior: bool) -> Options:
+        """The same with or without the tolerances as priors, what `prior` once said.
+
+        Raises:
+            InputError: It is neither True nor False.
+        """
+        check_flag("prior", prior)
+        return self if prior or self.gauge != "prior" else replace(self, gauge="none")
+
+    @property
+    def has_priors(self) -> bool:
+        """Whether the robot's tolerances are priors."""
+        return self.gauge == "prior"
+
+    @property
+    def uses_pairs(self) -> bool:
+        """Whether the model is one of pairs."""
+        return self.model in PAIR_MODELS
+
+    @property
+    def unknown_frame(self) -> bool:
+        """Whether world_T_base is estimated."""
+        return self.frame == "unknown" and not self.uses_pairs

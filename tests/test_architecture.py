@@ -14,7 +14,7 @@ import fg_calib
 
 PACKAGE = Path(fg_calib.__file__).parent
 FOLDERS = (
-    *("errors", "threads", "options", "robot", "measurements", "simulation", "files"),
+    *("errors", "threads", "options", "robot", "measurements", "job", "simulation", "files"),
     *("graph", "analysis", "baseline", "report", "cli"),
 )
 """From the ground up: a folder (or module of the package itself) imports from those before it."""
@@ -59,6 +59,12 @@ def test_every_module_stands_in_a_folder():
 @EVERY_MODULE
 def test_a_folder_imports_from_lower_ones_only(name, path):
     assert {other for other in imported(parse(path)) if floor(other) > floor(name)} == set()
+
+
+@EVERY_MODULE
+def test_estimation_reads_no_files(name, path):
+    if name.partition("/")[0] in ("graph", "analysis", "baseline"):
+        assert not any(other.startswith("files") for other in imported(parse(path)))
 
 
 def test_no_modules_import_each_other_in_a_circle():

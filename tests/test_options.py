@@ -205,8 +205,8 @@ def test_options_of_the_solver_are_finite_numbers_not_below_0(key, value):
 @pytest.mark.parametrize("no", [False, np.False_])
 def test_a_switch_of_numpys_counts_as_pythons(yes, no):
     """`np.False_ is False` is false: it used to switch priors on."""
-    assert problem(prior=yes).settings.prior is True
-    assert problem(prior=no).settings.prior is False
+    assert problem(prior=yes).options.gauge == "prior"
+    assert problem(prior=no).options.gauge == "none"
 
 
 def test_numbers_of_numpys_are_numbers():
@@ -216,9 +216,9 @@ def test_numbers_of_numpys_are_numbers():
 
 
 def test_a_job_made_by_hand_is_checked_like_a_problem(example):
-    job = replace(read_job(example / "calibration.yaml"), pair_errors="Shared")
+    job = read_job(example / "calibration.yaml")
     with pytest.raises(InputError, match=r"^pair_errors: found 'Shared', expected .*; did you mean shared\?$"):
-        problem_of(job)
+        problem_of(job, pair_errors="Shared")
 
 
 @pytest.mark.parametrize(

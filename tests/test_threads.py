@@ -42,15 +42,15 @@ for name, change in {
     found[name] = fg.result_document(solution, fg.assess(solution), {})
 noise = fg.estimate_noise(fg.problem_of(job, pairing=fg.Pairing("chain")))
 found["noise"] = [noise.cost, *noise.parameters.tolist()]
-all_pairs = {"model": job.model, "pairing": fg.Pairing("all")}
+all_pairs = {"model": job.options.model, "pairing": fg.Pairing("all")}
 found["compare"] = fg.comparison_document(fg.compare(job))
 bound = fg.cramer_rao(job.robot, job.measurements, **all_pairs)
 found["bound"] = [bound.covariance.tolist(), bound.position(job.measurements.readings, fitted=True).rms]
 plain = fg.fit_least_squares(job.robot, job.measurements, weighted=True, **all_pairs)
 found["plain"] = [plain.robot.nominal.tolist(), plain.covariance.tolist()]
 for name, seen in {
-    "structural": fg.observe_structure(job.robot, job.model),
-    "practical": fg.observe_configurations(job.robot, job.measurements, job.model, pairing=fg.Pairing("all")),
+    "structural": fg.observe_structure(job.robot, job.options.model),
+    "practical": fg.observe_configurations(job.robot, job.measurements, job.options.model, pairing=fg.Pairing("all")),
 }.items():
     found[name] = fg.observability_document(seen)
 simulated = fg.simulate(fg.read_scenario("space-robot"), 3)

@@ -60,14 +60,7 @@ def run(out: Path, quick: bool = False) -> dict[str, Any]:
     job = fg_calib.read_job(JOB)
 
     def build() -> fg_calib.Problem:
-        return fg_calib.build_problem(
-            job.robot,
-            job.measurements,
-            model=job.model,
-            pairing=job.pairing,
-            frame=job.frame,
-            prior=job.prior,
-        )
+        return fg_calib.problem_of(job)
 
     problem = build()
     fg_calib.assess(fg_calib.solve(problem))  # compiles, or reads the compiled kernels

@@ -126,7 +126,7 @@ def spread_of(solution: Solution) -> Spread:
     scales = variables.prior_scales
 
     def decomposed(parameters: Floats) -> tuple[Floats, Floats, int]:
-        data = whitened_triangle(problem, parameters) / np.sqrt(effect(problem.settings.loss, problem.height).variance)
+        data = whitened_triangle(problem, parameters) / np.sqrt(effect(problem.options.loss, problem.height).variance)
         rows = [data, prior_rows(variables, parameters)[1]]
         stacked = np.vstack([*rows, np.zeros((variables.n_columns, variables.n_columns))]) * scales
         _, s, Vt = np.linalg.svd(stacked, full_matrices=False)

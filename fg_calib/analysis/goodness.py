@@ -46,12 +46,13 @@ from fg_calib.analysis.covariance import Spread
 from fg_calib.analysis.predictions import predicted_points
 from fg_calib.analysis.residual_table import FAMILIES, ROW_KINDS, ResidualTable
 from fg_calib.graph.factors import prior_rows
-from fg_calib.graph.problem import PAIR_KINDS, POSE_KINDS, Problem, all_rows, lengths, pair_rows
+from fg_calib.graph.problem import Problem, all_rows, lengths, pair_rows
 from fg_calib.graph.robust import tuning, weight
 from fg_calib.graph.solver import Solution
 from fg_calib.graph.whitening import PRIVATE_SHARE, joint_rows
 from fg_calib.measurements import residuals
 from fg_calib.measurements.residuals import Block, PoseBlock
+from fg_calib.options import PAIR_MODELS, POSE_MODELS
 from fg_calib.robot.kinematics import SPAN
 
 Floats = NDArray[np.float64]
@@ -576,7 +577,7 @@ class _Rows:
         problem = self._problem
         if not self._robust or not len(rows):
             return np.ones(len(rows))
-        loss, measurement = problem.settings.loss, self._table.measurement[rows]
+        loss, measurement = problem.options.loss, self._table.measurement[rows]
         e, height = lengths(problem, self._solution.parameters, of_test=True)
         n = len(e)
         more = np.bincount(measurement, self.leverage[rows], n) / np.maximum(np.bincount(measurement, minlength=n), 1)
@@ -723,7 +724,7 @@ def _loadings(problem: Problem, parameters: Floats) -> Callable[[Block], Loading
     if problem.pairs is not None:
         pairs = pair_rows(problem, parameters)
         return lambda part: pairs.loadings(part, problem.common)
-    factors = np.repeat(np.array(problem.adjustment.factors)[list(POSE_KINDS[problem.settings.model])], 3)
+    factors = np.repeat(np.array(problem.adjustment.factors)[list(POSE_MODELS[problem.options.model])], 3)
 
     def of_joints(part: Block) -> scipy.sparse.csr_array:
         assert isinstance(part, PoseBlock)
@@ -744,10 +745,10 @@ def _n_measured(problem: Problem) -> int:
 
 def _first_code(problem: Problem) -> int:
     """Code in `ROW_KINDS` of a measurement's first row."""
-    model = problem.settings.model
+    model = problem.options.model
     if problem.pairs is not None:
-        return 0 if PAIR_KINDS[model][0] else 1
-    return ROW_KINDS.index("orientation.x" if POSE_KINDS[model][0] else "position.x")
+        return 0 if PAIR_MODELS[model][0] else 1
+    return ROW_KINDS.index("orientation.x" if POSE_MODELS[model][0] else "position.x")
 
 
 def _factors(problem: Problem) -> Floats:

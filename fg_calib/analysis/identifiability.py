@@ -19,8 +19,8 @@ from fg_calib.analysis.reasons import LostDirection, explain
 from fg_calib.errors import ProblemError
 from fg_calib.graph.observability import SIGNAL_FLOOR, Observability
 from fg_calib.graph.problem import STRUCTURAL_FLOOR, Problem, observe, predicted_problem, random_problem
-from fg_calib.measurements.dataset import Measurements, Pairing
-from fg_calib.options import FrameKnowledge, Model, check_names, check_number
+from fg_calib.measurements.dataset import Measurements
+from fg_calib.options import FrameKnowledge, Model, Pairing, check_names, check_number
 from fg_calib.robot.model import Robot, names_of
 from fg_calib.threads import single_threaded
 
@@ -157,7 +157,7 @@ def identify(
     observability = observe(problem, parameters, prefer, floor)
     return Identifiability(
         robot=problem.robot.name,
-        model=problem.settings.model,
+        model=problem.options.model,
         kind=kind,
         n_configurations=problem.n_configurations,
         observability=observability,

@@ -20,9 +20,9 @@ from scipy.spatial.transform import Rotation
 from fg_calib.analysis.setup import Setup, TypicalResidual, setup_of
 from fg_calib.graph.factors import pose_of
 from fg_calib.graph.frames import Frame
-from fg_calib.graph.problem import PAIR_KINDS, POSE_KINDS, Problem
+from fg_calib.graph.problem import Problem
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.options import FrameKnowledge, Model, check, check_flag
+from fg_calib.options import PAIR_MODELS, POSE_MODELS, FrameKnowledge, Model, check, check_flag
 from fg_calib.robot.model import CONVENTIONS, Robot
 from fg_calib.threads import one_blas_thread
 
@@ -163,7 +163,7 @@ def check_problem(problem: Problem, before: Floats, *, doubtful: bool = False) -
         before: The parameter vector with base, tool and measurement frame fitted, the arm at nominal.
         doubtful: Look for a mistake even where the residuals are not far from what is predicted.
     """
-    whole, s = problem.whole or problem, problem.settings
+    whole, s = problem.whole or problem, problem.options
     world_T_base = pose_of(before[problem.variables.frame_span])
     frame = Frame(world_T_base.rotation().matrix(), world_T_base.translation())
     robot = whole.robot.with_values(before[problem.variables.robot_span])
@@ -276,9 +276,9 @@ def _measured(setup: Setup, **changes: object) -> Setup:
 
 def _sees(setup: Setup) -> tuple[bool, bool]:
     """Whether the model uses turns and lengths."""
-    if setup.model in POSE_KINDS:
-        return POSE_KINDS[setup.model]
-    with_distance, with_angle = PAIR_KINDS[setup.model]
+    if setup.model in POSE_MODELS:
+        return POSE_MODELS[setup.model]
+    with_distance, with_angle = PAIR_MODELS[setup.model]
     return with_angle, with_distance
 
 
@@ -431,7 +431,7 @@ def _swaps(setup: Setup) -> _Found:
 
 def _frame(setup: Setup) -> _Found:
     """A measurement frame that is not the base."""
-    if setup.model in POSE_KINDS and not setup.frame:
+    if setup.model in POSE_MODELS and not setup.frame:
         yield "the measurement frame is not the base (frame: unknown)", replace(setup, frame=True)
 
 
@@ -442,7 +442,7 @@ def _tool(setup: Setup) -> _Found:
     if sees_lengths and not setup.tool_translation.all():
         words = "the tool point is another one (estimate: [tool.x, tool.y, tool.z])"
         yield words, replace(setup, tool_translation=point)
-    if sees_turns and setup.model in POSE_KINDS and not setup.tool_rotation:
+    if sees_turns and setup.model in POSE_MODELS and not setup.tool_rotation:
         words = "the tool frame is another one (estimate: all of tool.x ... tool.yaw)"
         free = point if sees_lengths else setup.tool_translation
         yield words, replace(setup, tool_rotation=True, tool_translation=free)

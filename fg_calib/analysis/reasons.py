@@ -47,7 +47,7 @@ def explain(problem: Problem, observability: Observability, parameters: Floats) 
     lost = observability.lost
     if not lost:
         return ()
-    settings = problem.settings
+    settings = problem.options
     anywhere = random_problem(
         problem.robot.with_values(parameters[problem.variables.robot_span]), settings.model, settings.frame
     )
@@ -70,9 +70,9 @@ class _Motion:
     def __init__(self, problem: Problem) -> None:
         robot = problem.robot
         self._parameters = problem.estimated
-        self._model = problem.settings.model
-        self._relative = problem.settings.uses_pairs or problem.settings.frame == "unknown"
-        self._pairs = problem.settings.uses_pairs
+        self._model = problem.options.model
+        self._relative = problem.options.uses_pairs or problem.options.frame == "unknown"
+        self._pairs = problem.options.uses_pairs
         columns = {robot.index(p.name): k for k, p in enumerate(self._parameters)}
         chain = build_chain(robot, columns).with_joint_columns()
         poses = forward(chain, precompute_trig(robot, problem.measurements.readings[:60]))

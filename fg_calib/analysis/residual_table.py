@@ -7,9 +7,10 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.graph.problem import PAIR_KINDS, POSE_KINDS, Problem, all_rows, pair_rows
+from fg_calib.graph.problem import Problem, all_rows, pair_rows
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements import residuals
+from fg_calib.options import PAIR_MODELS, POSE_MODELS
 from fg_calib.robot.kinematics import forward
 
 Floats = NDArray[np.float64]
@@ -127,7 +128,7 @@ def residual_table(solution: Solution) -> ResidualTable:
     before, after = (
         residuals.residual(all_rows(problem, p), chain.at(p)) for p in (solution.before, solution.parameters)
     )
-    evaluated = problem.settings.evaluated
+    evaluated = problem.evaluated
     if problem.pairs is None:
         return replace(_pose_table(problem, before, after), evaluated=evaluated)
     tables = [_pair_table(problem, before, after, pair_rows(problem, solution.parameters).moments.excess)]
@@ -142,7 +143,7 @@ def _pair_table(problem: Problem, before: Floats, after: Floats, excess: Floats)
     pairs, judgement = problem.pairs, problem.judgement
     assert pairs is not None
     assert judgement is not None
-    kinds = np.flatnonzero(PAIR_KINDS[problem.settings.model])
+    kinds = np.flatnonzero(PAIR_MODELS[problem.options.model])
     reasons = ("", *judgement.reasons)
     codes = np.zeros((pairs.n_pairs, 2), dtype=np.int8)
     for code, (reason, mask) in enumerate(judgement.reasons.items(), start=1):
@@ -216,7 +217,7 @@ def _point_tables(problem: Problem, before: Floats, after: Floats) -> list[Resid
 
 def _pose_table(problem: Problem, before: Floats, after: Floats) -> ResidualTable:
     m, n = problem.measurements, problem.measurements.n_configurations
-    wanted = np.flatnonzero(np.repeat(POSE_KINDS[problem.settings.model], 3))
+    wanted = np.flatnonzero(np.repeat(POSE_MODELS[problem.options.model], 3))
     measured = np.full((n, 6), np.nan)
     if m.position is not None:
         measured[:, 3:] = m.position

@@ -58,8 +58,8 @@ def look_elsewhere(solution: Solution, options: SolverOptions | None = None) -> 
         solution where nothing is weak, where it has not converged, and with a robust loss, whose weights differ from
         optimum to optimum.
     """
-    settings = solution.problem.settings
-    if not solution.converged or settings.loss != "none" or settings.evaluated:
+    settings = solution.problem.options
+    if not solution.converged or settings.loss != "none" or solution.problem.evaluated:
         return solution
     variables, seconds = solution.problem.variables, solution.seconds
     with one_blas_thread:

@@ -24,9 +24,8 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.graph import frames
 from fg_calib.graph.frames import Frame, Unknown
-from fg_calib.graph.problem import PAIR_KINDS, POSE_KINDS
 from fg_calib.measurements.dataset import Measurements, Pairs, rotation_angle
-from fg_calib.options import FrameKnowledge, Model
+from fg_calib.options import PAIR_MODELS, POSE_MODELS, FrameKnowledge, Model
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
 
@@ -106,7 +105,7 @@ class Setup:
 
     def _with(self, world_T_base: Frame | None) -> tuple[TypicalResidual, ...]:
         flange = _Flange(self.robot, self.measurements)
-        if self.model in POSE_KINDS:
+        if self.model in POSE_MODELS:
             found = list(_pose_residuals(self, flange, world_T_base))
         else:
             found = list(_pair_residuals(self, flange))
@@ -153,7 +152,7 @@ class _Flange:
 
 def _pose_residuals(setup: Setup, flange: _Flange, world_T_base: Frame | None) -> Iterator[TypicalResidual]:
     """Those of measured orientations and positions; frame and tool are fitted unless the frame is given."""
-    m, (with_orientation, with_position) = setup.measurements, POSE_KINDS[setup.model]
+    m, (with_orientation, with_position) = setup.measurements, POSE_MODELS[setup.model]
     R_M = m.rotation if with_orientation else None
     p_M = m.position if with_position else None
     X, T = world_T_base or Frame(np.eye(3), np.zeros(3)), flange.tool
@@ -171,7 +170,7 @@ def _pose_residuals(setup: Setup, flange: _Flange, world_T_base: Frame | None) -
 
 def _pair_residuals(setup: Setup, flange: _Flange) -> Iterator[TypicalResidual]:
     """Those of distances and angles between configurations, and of touched points."""
-    m, (with_distance, with_angle) = setup.measurements, PAIR_KINDS[setup.model]
+    m, (with_distance, with_angle) = setup.measurements, PAIR_MODELS[setup.model]
     pairs = m.pairs if m.pairs is not None else _form_pairs(m)
     free, t = setup.tool_translation, flange.tool.translation
     touched = None if m.groups is None or not np.any(m.groups.index >= 0) else m.groups.index
@@ -288,7 +287,7 @@ def setup_of(robot: Robot, measurements: Measurements, model: Model, frame: Fram
         rows = rows[np.argsort(m.groups.index[rows], kind="stable")]
     chosen = np.sort(rows[np.unique(np.linspace(0, len(rows) - 1, min(ROWS, len(rows))).astype(np.int64))])
     pairs = None
-    if model in PAIR_KINDS and m.pairs is not None:
+    if model in PAIR_MODELS and m.pairs is not None:
         train = np.flatnonzero(~m.pairs.test)
         some = m.pairs.select(train[np.unique(np.linspace(0, len(train) - 1, min(3 * ROWS, len(train))).astype(int))])
         chosen = np.unique(np.concatenate([some.a, some.b, *([] if m.groups is None else [chosen])]))
@@ -301,7 +300,7 @@ def setup_of(robot: Robot, measurements: Measurements, model: Model, frame: Fram
         robot=robot,
         measurements=replace(_rows_of(m, chosen), pairs=pairs),
         model=model,
-        frame=model in POSE_KINDS and (frame == "unknown" or base),
+        frame=model in POSE_MODELS and (frame == "unknown" or base),
         tool_rotation=any(tool[3:]),
         tool_translation=np.array(tool[:3]),
     )

@@ -34,9 +34,10 @@ from fg_calib.analysis.verdict import (
 )
 from fg_calib.graph.factors import corrections_of, pose_of
 from fg_calib.graph.observability import IdentifiabilityClass, Observability
-from fg_calib.graph.problem import PAIR_KINDS, Problem, check_graph, eliminated_terms, lengths, pair_rows
+from fg_calib.graph.problem import Problem, check_graph, eliminated_terms, lengths, pair_rows
 from fg_calib.graph.robust import effect
 from fg_calib.graph.solver import Solution
+from fg_calib.options import PAIR_MODELS
 from fg_calib.robot.model import Robot
 from fg_calib.threads import one_blas_thread, single_threaded
 
@@ -289,7 +290,7 @@ def _assess(solution: Solution) -> Uncertainty:
     p_value = _p_value(solution, chi2, expected, independent)
     table = residual_table(solution)
     goodness, priors = judge_fit(solution, spread, table), judge_priors(solution, spread)
-    evaluated = problem.settings.evaluated
+    evaluated = problem.evaluated
     statements = [
         *_of_solver(solution),
         *of_chi2(chi2, dof, expected, bounds, p_value, evaluated),
@@ -350,7 +351,7 @@ def _weighted_chi2(solution: Solution) -> tuple[float, int, float]:
     outlier = weights < OUTLIER_WEIGHT
     chi2 -= float(np.sum(weights[outlier] * e[outlier] ** 2))
     share = float(np.mean(~outlier[height > 0]))
-    of_loss = effect(problem.settings.loss, problem.height)
+    of_loss = effect(problem.options.loss, problem.height)
     return max(0.0, chi2), round(problem.n_independent * share), of_loss.chi2
 
 
@@ -371,7 +372,7 @@ def _independent_dof(problem: Problem, dof: int, rank: int) -> int:
     """Degrees of freedom of the noise behind the residuals: pairs hold no more than the poses they come from."""
     if not problem.formed or problem.sharing.poses:
         return dof
-    each = 3 * sum(PAIR_KINDS[problem.settings.model])
+    each = 3 * sum(PAIR_MODELS[problem.options.model])
     return min(dof, each * (problem.n_configurations - 1) + problem.n_priors - rank)
 
 
@@ -404,7 +405,7 @@ def _parameter_estimates(
                 estimate=float(solution.parameters[i]),
                 correction=float(corrections[i]),
                 sigma=_known(sigmas.get(p.name, 0.0)),
-                prior_sigma=p.tolerance if p.estimated and problem.settings.prior else None,
+                prior_sigma=p.tolerance if p.estimated and problem.options.has_priors else None,
                 identifiability=classes.get(p.name, "fixed"),
                 stands_for=combinations.get(p.name),
                 sigma_of_combination=_known(of_combinations[p.name]) if p.name in combinations else None,
@@ -461,7 +462,7 @@ def _of_solver(solution: Solution) -> list[Statement]:
         _, height = lengths(solution.problem, solution.parameters)
         n, lost = int(np.sum(height > 0)), int(np.sum(weights[height > 0] < OUTLIER_WEIGHT))
         if lost > MOST_OUTLIERS * n:
-            loss = solution.problem.settings.loss
+            loss = solution.problem.options.loss
             text = f"loss {loss} takes {lost} of {n} measurements for outliers: more than it can tell from noise"
             statements.append(Statement(text, finding=True))
     return statements

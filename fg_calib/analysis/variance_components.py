@@ -27,9 +27,9 @@ from fg_calib.analysis.mistakes import check_setup
 from fg_calib.analysis.residual_table import residual_table
 from fg_calib.analysis.restarts import look_elsewhere
 from fg_calib.errors import ProblemError, SolverError
-from fg_calib.files.job import Job
 from fg_calib.graph.problem import Problem, judged_at, noise_kinds, problem_of
 from fg_calib.graph.solver import Solution, SolverOptions, solve
+from fg_calib.job import Job
 from fg_calib.threads import single_threaded
 
 LEAST_REDUNDANCY = 3.0
@@ -56,15 +56,14 @@ def solve_job(job: Job, problem: Problem | None = None) -> Solution:
         SolverError: GTSAM could not solve a step at all.
     """
     problem = problem or problem_of(job)
-    options = SolverOptions() if job.max_iterations is None else SolverOptions(max_iterations=job.max_iterations)
     try:
-        solution = estimate_noise(problem, options) if job.estimate_noise else solve(problem, options)
+        solution = estimate_noise(problem) if job.options.estimate_noise else solve(problem)
     except SolverError as error:
-        check = check_setup(job.robot, job.measurements, job.model, job.frame, doubtful=True)
+        check = check_setup(job.robot, job.measurements, job.options.model, job.options.frame, doubtful=True)
         if not check.explanations:
             raise
         raise SolverError(f"{error}; {check}") from error
-    return look_elsewhere(solution, options)
+    return look_elsewhere(solution)
 
 
 @single_threaded
@@ -131,7 +130,7 @@ def _redundant(fit: KindFit) -> bool:
 
 def _scaled(problem: Problem, factors: dict[str, float]) -> Problem:
     """The problem from its start, with the stated noise of some kinds multiplied by factors."""
-    before = dict(zip(noise_kinds(problem.settings.model), problem.adjustment.factors, strict=True))
+    before = dict(zip(noise_kinds(problem.options.model), problem.adjustment.factors, strict=True))
     first, second = (before | factors).values()
 
     def anew(p: Problem) -> Problem:

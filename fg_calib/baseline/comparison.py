@@ -35,10 +35,10 @@ from fg_calib.analysis.uncertainty import Uncertainty, assess
 from fg_calib.analysis.variance_components import solve_job
 from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
 from fg_calib.errors import CalibrationError, ProblemError
-from fg_calib.files.job import Job
 from fg_calib.graph.factors import corrections_of
 from fg_calib.graph.problem import problem_of
 from fg_calib.graph.solver import Solution
+from fg_calib.job import Job
 from fg_calib.measurements.dataset import rotation_angle
 from fg_calib.robot.kinematics import Poses, build_chain, forward, precompute_trig
 from fg_calib.robot.model import Robot
@@ -172,7 +172,7 @@ def compare(job: Job) -> Comparison:
     judged_on: Literal["test", "train"] = "test" if test.any() else "train"
     readings = job.measurements.readings[test] if test.any() else job.measurements.readings
     solution = solve_job(job)
-    if solution.problem.settings.evaluated:
+    if solution.problem.evaluated:
         raise ProblemError(job.measurements.source, "test rows alone", "train rows, for there is nothing to compare")
     uncertainty = assess(solution)
     judge = _Judge(job, readings, solution)
@@ -198,7 +198,7 @@ def _without_priors(job: Job, judge: _Judge) -> list[Estimate]:
     """The estimates of the kept parameters: by the graph, and by plain least squares from the same start."""
     if job.measurements.groups is not None:
         raise ProblemError(job.measurements.source, "a column group", "pairs or poses: they know no points")
-    problem = problem_of(job, prior=False, gauge="keep")
+    problem = problem_of(job, gauge="keep")
     kept = [p.name for p in problem.estimated]
     held = [i for i, p in enumerate(job.robot.parameters) if p.name not in kept]
     start = problem.start.copy()
@@ -207,9 +207,9 @@ def _without_priors(job: Job, judge: _Judge) -> list[Estimate]:
         fit_least_squares,
         job.robot,
         job.measurements,
-        model=job.model,
-        pairing=job.pairing,
-        frame=job.frame,
+        model=job.options.model,
+        pairing=job.options.pairing,
+        frame=job.options.frame,
         names=kept,
         start=start,
     )

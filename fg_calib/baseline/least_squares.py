@@ -36,9 +36,9 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.errors import InputError
 from fg_calib.measurements import residuals
-from fg_calib.measurements.dataset import Measurements, Pairing, as_pairing, form_pairs
+from fg_calib.measurements.dataset import Measurements, form_pairs
 from fg_calib.measurements.residuals import Block, PairBlock, PoseBlock
-from fg_calib.options import FrameKnowledge, Model, check, check_flag, check_names, check_number
+from fg_calib.options import FrameKnowledge, Model, Pairing, as_pairing, check, check_flag, check_names, check_number
 from fg_calib.robot.kinematics import Chain, build_chain, precompute_trig
 from fg_calib.robot.model import AXIS_OF_KIND, FRAME_KINDS, Element, Parameter, Robot, names_of
 from fg_calib.threads import single_threaded

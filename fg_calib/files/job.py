@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass, field, fields, replace
+from dataclasses import astuple, fields, replace
 from pathlib import Path, PurePath
 from typing import Annotated, Any
 
@@ -16,57 +16,15 @@ from fg_calib.files.robot_yaml import read_robot, robot_from_mapping
 from fg_calib.files.schema import Count, NotNegative, Positive, Schema, read_yaml, shown, validate
 from fg_calib.files.tables import read_measurements
 from fg_calib.files.units import Units, UnitsOfFile
-from fg_calib.measurements.dataset import Measurements, Noise, Pairing
-from fg_calib.options import EncoderNoise, FrameKnowledge, Gauge, Loss, Model, PairErrors, check_names
+from fg_calib.job import Job
+from fg_calib.measurements.dataset import Noise
+from fg_calib.options import EncoderNoise, FrameKnowledge, Gauge, Loss, Model, Options, PairErrors, Pairing, check_names
 from fg_calib.robot.model import Robot, names_of
 
 _log = logging.getLogger(__name__)
 
 UNSTATED = Noise(position=1e-3, orientation=1e-3, distance=1e-3, angle=1e-3, point=1e-3)
 """Where the noise starts from if it is to be estimated and nothing was stated."""
-
-
-@dataclass(frozen=True)
-class Job:
-    """A calibration job with everything it refers to.
-
-    Attributes:
-        path: The job's file.
-        robot: The robot as it is before the calibration.
-        measurements: What was measured.
-        model: What is compared with the measurements.
-        pairing: How pairs are formed where they come from poses.
-        frame: Whether the measurement frame is the base frame (`known`) or to be estimated.
-        prior: Whether the tolerances are used as priors; None: where the robot has them.
-        gauge: What holds the directions that the data do not determine.
-        prefer: Parameters to keep where only combinations are determined, first choice first.
-        pair_errors: Whether pairs of one configuration share its errors or count as independent.
-        encoder: Whether the noise of joint readings is propagated to the rows or true joint values are estimated.
-        loss: The robust loss; `none` is least squares.
-        estimate_noise: Whether the sigmas stated are only a start, and scaled to what is seen.
-        max_iterations: Steps after which the solver gives up; None for its default.
-        units: The units of the tables and of the noise.
-        truth: The robot as it truly is, known from a simulation; None where it is not.
-        inputs: SHA-256 of every file read, by its path relative to the job.
-    """
-
-    path: Path
-    robot: Robot
-    measurements: Measurements
-    model: Model
-    pairing: Pairing = field(default_factory=Pairing)
-    frame: FrameKnowledge = "known"
-    prior: bool | None = None
-    gauge: Gauge = "prior"
-    prefer: tuple[str, ...] = ()
-    pair_errors: PairErrors = "shared"
-    encoder: EncoderNoise = "propagated"
-    loss: Loss = "none"
-    estimate_noise: bool = False
-    max_iterations: int | None = None
-    units: Units = field(default_factory=Units)
-    truth: Robot | None = None
-    inputs: dict[str, str] = field(default_factory=dict)
 
 
 class _Noise(Schema):
@@ -111,6 +69,10 @@ class _Job(Schema):
     truth: str | None = None
 
 
+_CHOICES = ("model", "frame", "prior", "gauge", "prefer", "pair_errors", "encoder", "loss", "max_iterations")
+"""Keys of a job that are options as they stand."""
+
+
 def read_job(path: Path | str) -> Job:
     """The calibration job in a YAML file, with its robot and its measurements.
 
@@ -123,7 +85,6 @@ def read_job(path: Path | str) -> Job:
     path = Path(path)
     folder = path.parent
     file = validate(_Job, read_yaml(path), path.name)
-    pairing = _pairing(file.pairing, f"{path.name}: pairing")
     robot, robot_files = robot_of(file.robot, f"{path.name}: robot", folder, file.units)
     _check_preferred(file, robot, path.name)
     noise, estimate_noise = _noise(file.noise, file.units, robot, f"{path.name}: noise")
@@ -138,25 +99,14 @@ def read_job(path: Path | str) -> Job:
     others = [name for name in (file.pairs, file.truth) if name is not None]
     names = [path.name, *robot_files, file.measurements, *others]
     inputs = {name: _sha256(folder / name) for name in names}
-    return Job(
-        path=path,
-        robot=robot,
-        measurements=measurements,
-        model=file.model,
-        pairing=pairing,
-        frame=file.frame,
-        prior=file.prior,
-        gauge=file.gauge,
-        prefer=file.prefer,
-        pair_errors=file.pair_errors,
-        encoder=file.encoder,
-        loss=file.loss,
-        estimate_noise=estimate_noise,
-        max_iterations=file.max_iterations,
-        units=file.units,
-        truth=truth,
-        inputs=inputs,
-    )
+    return Job(path, robot, measurements, _options(file, estimate_noise, path.name), truth, inputs)
+
+
+def _options(file: _Job, estimate_noise: bool, place: str) -> Options:
+    """The choices of a job; its old key `prior: false` is `gauge: none`."""
+    choices = {key: getattr(file, key) for key in _CHOICES}
+    pairing = _pairing(file.pairing, f"{place}: pairing")
+    return Options.of(**choices, pairing=pairing, estimate_noise=estimate_noise)
 
 
 def check_choices(choices: Mapping[str, Any], robot: Robot, place: str) -> None:

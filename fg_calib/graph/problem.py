@@ -17,7 +17,6 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from fg_calib.errors import ProblemError
-from fg_calib.files.job import Job
 from fg_calib.graph import frames
 from fg_calib.graph.factors import (
     Eliminated,
@@ -53,19 +52,22 @@ from fg_calib.graph.whitening import (
     Sharing,
     pose_block,
 )
+from fg_calib.job import Job
 from fg_calib.measurements import residuals
-from fg_calib.measurements.dataset import Measurements, Pairing, Pairs, as_pairing, form_pairs, no_pairs
+from fg_calib.measurements.dataset import Measurements, Pairs, form_pairs, no_pairs
 from fg_calib.measurements.residuals import AnyBlock, Block, CorrelatedBlock
 from fg_calib.options import (
-    EncoderNoise,
+    PAIR_MODELS,
+    POSE_MODELS,
     FrameKnowledge,
     Gauge,
-    Loss,
     Model,
+    Options,
     PairErrors,
-    check,
-    check_flag,
+    Pairing,
+    as_pairing,
     check_names,
+    check_type,
 )
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
@@ -78,64 +80,11 @@ Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
 Integers = NDArray[np.int64]
 
-PAIR_KINDS: dict[str, tuple[bool, bool]] = {
-    "distance": (True, False),
-    "rotation": (False, True),
-    "distance-rotation": (True, True),
-}
-"""Whether a model uses distances and angles of pairs."""
-
-POSE_KINDS: dict[str, tuple[bool, bool]] = {
-    "orientation": (True, False),
-    "position": (False, True),
-    "pose": (True, True),
-}
-"""Whether a model uses orientations and positions."""
-
 QUARTER_TURN = 1e-3
 """Cosine of a pitch at which yaw and roll of a frame may be told apart no more."""
 
 STRUCTURAL_FLOOR = 1e-6
 """Signal-to-noise ratio that counts as nothing on random configurations with an assumed noise: rounding alone."""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What is estimated from what.
-
-    Attributes:
-        model: Which measurements take part.
-        pairing: How pairs are formed from poses where none were measured directly.
-        frame: Whether the measurement frame is known to be the base, or world_T_base is estimated too.
-        prior: Whether the robot's tolerances are priors.
-        gauge: What holds the directions that the data do not determine.
-        pair_errors: Whether pairs of one configuration share its errors or count as independent.
-        encoder: Whether the noise of joint readings is propagated to the rows or true joint values are estimated.
-        loss: What becomes of large residuals.
-        evaluated: Whether there are test rows alone: the arm is taken as it is, and measurement frame, base and tool,
-            where they are estimated, are fitted to these.
-    """
-
-    model: Model = "distance-rotation"
-    pairing: Pairing = field(default_factory=Pairing)
-    frame: FrameKnowledge = "known"
-    prior: bool = True
-    gauge: Gauge = "prior"
-    pair_errors: PairErrors = "shared"
-    encoder: EncoderNoise = "propagated"
-    loss: Loss = "none"
-    evaluated: bool = False
-
-    def __post_init__(self) -> None:
-        options = {"model": Model, "frame": FrameKnowledge, "gauge": Gauge}
-        options |= {"pair_errors": PairErrors, "encoder": EncoderNoise, "loss": Loss}
-        for key, possible in options.items():
-            check(key, getattr(self, key), possible)
-
-    @property
-    def uses_pairs(self) -> bool:
-        """Whether the model is one of pairs."""
-        return self.model in PAIR_KINDS
 
 
 @dataclass(frozen=True)
@@ -145,7 +94,7 @@ class Problem:
     Attributes:
         robot: The nominal robot.
         measurements: Everything measured.
-        settings: What is estimated from what.
+        options: What is estimated from what.
         variables: The GTSAM variables and their columns.
         start: Initial parameter vector (see `Variables`).
         trig: Readings for the kernels.
@@ -163,11 +112,13 @@ class Problem:
         sigma_point: 1 sigma of a touch, joint noise included, shape (n_configurations, 3), [m]; empty without groups.
         terms: The whitened train rows that depend on nuisance variables.
         factors: The factors that `graph` was made of.
+        evaluated: Whether there are test rows alone: the arm is taken as it is, and measurement frame, base and tool,
+            where they are estimated, are fitted to these.
     """
 
     robot: Robot
     measurements: Measurements
-    settings: Settings
+    options: Options
     variables: Variables
     start: Floats
     trig: Floats
@@ -184,6 +135,7 @@ class Problem:
     sigma_point: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     terms: tuple[Term, ...] = ()
     factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
+    evaluated: bool = False
 
     @property
     def initial(self) -> gtsam.Values:
@@ -215,9 +167,9 @@ class Problem:
     @property
     def height(self) -> int:
         """Rows of a measurement that has all that the model uses."""
-        if self.settings.uses_pairs:
-            return sum(PAIR_KINDS[self.settings.model])
-        return 3 * sum(POSE_KINDS[self.settings.model])
+        if self.options.uses_pairs:
+            return sum(PAIR_MODELS[self.options.model])
+        return 3 * sum(POSE_MODELS[self.options.model])
 
     @property
     def formed(self) -> bool:
@@ -257,7 +209,7 @@ class Problem:
     @property
     def approximate(self) -> bool:
         """Whether rows share errors but were too many to carry them, and were weighted as if independent."""
-        return self.settings.pair_errors == "shared" and self.sharing != self.common
+        return self.options.pair_errors == "shared" and self.sharing != self.common
 
     @property
     def n_priors(self) -> int:
@@ -273,78 +225,52 @@ class Problem:
 
 
 @single_threaded
-def build_problem(
-    robot: Robot,
-    measurements: Measurements,
-    *,
-    model: Model,
-    pairing: Pairing | None = None,
-    frame: FrameKnowledge = "known",
-    prior: bool | None = None,
-    gauge: Gauge = "prior",
-    prefer: Sequence[str] = (),
-    pair_errors: PairErrors = "shared",
-    encoder: EncoderNoise = "propagated",
-    loss: Loss = "none",
-) -> Problem:
+def build_problem(robot: Robot, measurements: Measurements, options: Options | None = None, **choices: Any) -> Problem:
     """The calibration problem of a robot and its measurements.
 
-    Measurements that are all test rows make a problem of evaluation (see `Settings.evaluated`): their rows are those of
+    Measurements that are all test rows make a problem of evaluation (see `Problem.evaluated`): their rows are those of
     the fit, of which the arm has no part.
 
     Args:
         robot: The nominal robot.
         measurements: What was measured.
-        model: Which measurements take part.
-        pairing: How pairs are formed from poses where none were measured directly; a star if None.
-        frame: `unknown` estimates world_T_base with the parameters; of no meaning for models of pairs.
-        prior: Whether the robot's tolerances are priors; None for yes.
-        gauge: What holds the directions that the data do not determine. `prior`: the tolerances. `none`: nothing;
-            everything is estimated by minimum-norm steps, and what is not determined has no sigma. `keep`: only
-            the independent parameters and those kept of each relative group are estimated, without priors, the
-            others stay at nominal (the paper's way); what is said of errors counts them with their tolerance.
-        prefer: For `keep`: parameters to keep, first choice first.
-        pair_errors: `shared`: pairs carry the errors of their configurations in common, as long as these are not too
-            many (`MAX_SHARED`); then, and with `independent`, they are weighted as if independent.
-        encoder: `propagated`: the noise of joint readings is added to that of the rows, to first order. `estimated`:
-            the true joint values of every configuration are estimated too, with the readings as their priors.
-        loss: What becomes of large residuals: `none` or a robust loss (see `robust`).
+        options: What is estimated from what.
+        choices: Instead of `options`, any of theirs as keywords.
 
     Raises:
         InputError: An option is not one of those possible.
         ProblemError: The measurements lack what the model needs, or do not suffice.
     """
-    if prior is not None:
-        check_flag("prior", prior)
-    check_names("prefer", prefer, names_of(robot.parameters))
-    with_priors = (prior is None or bool(prior)) and gauge == "prior"
-    settings = Settings(model, as_pairing(pairing), frame, with_priors, gauge, pair_errors, encoder, loss)
+    check_type("options", options, Options, "Options(model='pose')")
+    options = options or Options.of(**choices)
+    check_names("prefer", options.prefer, names_of(robot.parameters))
     if not any(p.estimated for p in robot.parameters):
         raise ProblemError(f"robot {robot.name}", "nothing to estimate", "at least one parameter that is not fixed")
-    if _all_test(measurements, settings):
-        robot, measurements, settings = _for_evaluation(robot, measurements, settings)
-    unknown_frame = frame == "unknown" and not settings.uses_pairs
-    variables = build_variables(robot, unknown_frame, settings.prior)
-    points = None if measurements.groups is None else PointGroups(measurements, model)
+    evaluated = _all_test(measurements, options)
+    if evaluated:
+        robot, measurements, options = _for_evaluation(robot, measurements, options)
+    variables = build_variables(robot, options.unknown_frame, options.has_priors)
+    points = None if measurements.groups is None else PointGroups(measurements, options.model)
     if points is not None:
-        _check_points(measurements, settings)
+        _check_points(measurements, options)
         variables = points.add_points(variables)
-    pairs = _usable_pairs(measurements, settings) if settings.uses_pairs else None
+    pairs = _usable_pairs(measurements, options) if options.uses_pairs else None
     if pairs is None:
-        _check_poses(measurements, settings)
+        _check_poses(measurements, options)
         if measurements.pairs is not None:
-            _log.warning("%s: not used, model %s is of poses", measurements.pairs.source, model)
+            _log.warning("%s: not used, model %s is of poses", measurements.pairs.source, options.model)
     trig = precompute_trig(robot, measurements.readings)
-    start = _start(robot, measurements, settings, variables, trig, pairs, points)
-    joints = _true_joints(robot, measurements, settings, pairs)
+    start = _start(robot, measurements, options, variables, trig, pairs, points)
+    joints = _true_joints(robot, measurements, options, pairs)
     if joints is not None:
         variables = joints.add_joints(variables)
         start = np.concatenate([start, joints.start()])
-    problem = _assemble(robot, measurements, settings, variables, start, trig, pairs, None, points, joints)
+    problem = _assemble(robot, measurements, options, variables, start, trig, pairs, None, points, joints)
+    problem = replace(problem, evaluated=evaluated)
     _check_enough(problem)
-    if settings.gauge != "keep":
+    if options.gauge != "keep":
         return problem
-    kept = _kept(problem, prefer)
+    kept = _kept(problem, options.prefer)
     if not kept:
         raise ProblemError(
             measurements.source if pairs is None else pairs.source,
@@ -352,13 +278,13 @@ def build_problem(
             "rows that some of them act on",
         )
     reduced = robot.with_estimated(kept)
-    variables = build_variables(reduced, unknown_frame, False)
+    variables = build_variables(reduced, options.unknown_frame, False)
     if points is not None:
         variables = points.add_points(variables)
     if joints is not None:
         variables = joints.add_joints(variables)
-    anew = _assemble(reduced, measurements, settings, variables, start, trig, pairs, None, points, joints)
-    return replace(anew, whole=problem)
+    anew = _assemble(reduced, measurements, options, variables, start, trig, pairs, None, points, joints)
+    return replace(anew, whole=problem, evaluated=evaluated)
 
 
 def _kept(problem: Problem, prefer: Sequence[str]) -> list[str]:
@@ -376,19 +302,17 @@ def _kept(problem: Problem, prefer: Sequence[str]) -> list[str]:
     return kept
 
 
-def _all_test(measurements: Measurements, settings: Settings) -> bool:
+def _all_test(measurements: Measurements, options: Options) -> bool:
     """Whether all rows that the model uses are test rows."""
     m = measurements
-    if not settings.uses_pairs or m.pairs is None:
+    if not options.uses_pairs or m.pairs is None:
         return bool(m.test.all()) and m.n_configurations > 0
     touches = np.zeros(0, dtype=np.bool_) if m.groups is None else m.test[m.groups.index >= 0]
     rows = np.concatenate([m.pairs.test, touches])
     return bool(rows.all()) and len(rows) > 0
 
 
-def _for_evaluation(
-    robot: Robot, measurements: Measurements, settings: Settings
-) -> tuple[Robot, Measurements, Settings]:
+def _for_evaluation(robot: Robot, measurements: Measurements, options: Options) -> tuple[Robot, Measurements, Options]:
     """A robot whose base and tool alone are estimated, where they were, and test rows that these are fitted to."""
     m, nothing = measurements, np.zeros(measurements.n_configurations, dtype=np.bool_)
 
@@ -402,8 +326,8 @@ def _for_evaluation(
         groups=None if m.groups is None else replace(m.groups, pairs=fitted(m.groups.pairs)),
     )
     of_frames = [p.name for p in robot.parameters if p.estimated and not 1 <= p.owner <= robot.n_joints]
-    gauge: Gauge = "none" if settings.gauge == "keep" else settings.gauge
-    return robot.with_estimated(of_frames), m, replace(settings, gauge=gauge, encoder="propagated", evaluated=True)
+    gauge: Gauge = "none" if options.gauge == "keep" else options.gauge
+    return robot.with_estimated(of_frames), m, replace(options, gauge=gauge, encoder="propagated")
 
 
 def problem_of(job: Job, **changes: Any) -> Problem:
@@ -411,23 +335,12 @@ def problem_of(job: Job, **changes: Any) -> Problem:
 
     Args:
         job: The job.
-        changes: Arguments of `build_problem` that shall differ from the job's.
+        changes: Options that shall differ from the job's.
 
     Raises:
         ProblemError: The measurements lack what the model needs, or do not suffice.
     """
-    settings: dict[str, Any] = {
-        "model": job.model,
-        "pairing": job.pairing,
-        "frame": job.frame,
-        "prior": job.prior,
-        "gauge": job.gauge,
-        "prefer": job.prefer,
-        "pair_errors": job.pair_errors,
-        "encoder": job.encoder,
-        "loss": job.loss,
-    }
-    return build_problem(job.robot, job.measurements, **settings | changes)
+    return build_problem(job.robot, job.measurements, replace(job.options, **changes))
 
 
 @single_threaded
@@ -453,8 +366,8 @@ def predicted_problem(
             (n_joints,); 1 mm, 1 mrad and none where None.
         pair_errors: Whether pairs of one configuration share its errors or count as independent.
     """
-    settings = Settings(model, as_pairing(pairing), frame, prior=False, pair_errors=pair_errors)
-    variables = build_variables(robot, frame == "unknown" and not settings.uses_pairs, priors=False)
+    options = Options(model, as_pairing(pairing), frame, gauge="none", pair_errors=pair_errors)
+    variables = build_variables(robot, options.unknown_frame, priors=False)
     trig = precompute_trig(robot, readings)
     poses = forward(build_chain(robot), trig)
     n = len(readings)
@@ -471,8 +384,8 @@ def predicted_problem(
         sigma_joint=np.zeros(robot.n_joints) if sigma_joint is None else sigma_joint,
         source="predictions",
     )
-    pairs = _usable_pairs(measurements, settings) if settings.uses_pairs else None
-    return _assemble(robot, measurements, settings, variables, variables.nominal(), trig, pairs)
+    pairs = _usable_pairs(measurements, options) if options.uses_pairs else None
+    return _assemble(robot, measurements, options, variables, variables.nominal(), trig, pairs)
 
 
 def random_problem(
@@ -521,7 +434,7 @@ def check_graph(problem: Problem) -> None:
 
 def noise_kinds(model: Model) -> tuple[str, str]:
     """The kinds of noise that an adjustment's factors are of."""
-    return ("distance", "angle") if model in PAIR_KINDS else ("orientation", "position")
+    return ("distance", "angle") if model in PAIR_MODELS else ("orientation", "position")
 
 
 def judged_at(problem: Problem, parameters: Floats, adjustment: Adjustment | None = None) -> Problem:
@@ -533,9 +446,9 @@ def judged_at(problem: Problem, parameters: Floats, adjustment: Adjustment | Non
         adjustment: What has been learned of the noise; None for what the problem has.
     """
     p, a = problem, adjustment or problem.adjustment
-    given = (p.robot, p.measurements, p.settings, p.variables, parameters, p.trig, p.pairs)
+    given = (p.robot, p.measurements, p.options, p.variables, parameters, p.trig, p.pairs)
     anew = _assemble(*given, a, p.points, p.joints)
-    return replace(anew, whole=p.whole)
+    return replace(anew, whole=p.whole, evaluated=p.evaluated)
 
 
 def same_rows(a: Problem, b: Problem) -> bool:
@@ -594,8 +507,8 @@ def _whitening(problem: Problem, parameters: Floats) -> PairWhitening | PoseWhit
     if p.joints is not None:
         trig = precompute_trig(p.robot, p.joints.values(p.variables, parameters))
     if p.pairs is None:
-        return PoseWhitening(trig, chain, p.measurements, POSE_KINDS[p.settings.model], p.adjustment)
-    kinds, estimated = PAIR_KINDS[p.settings.model], p.settings.encoder == "estimated"
+        return PoseWhitening(trig, chain, p.measurements, POSE_MODELS[p.options.model], p.adjustment)
+    kinds, estimated = PAIR_MODELS[p.options.model], p.options.encoder == "estimated"
     return PairWhitening(trig, chain, p.measurements, p.pairs, kinds, p.formed, p.adjustment, estimated)
 
 
@@ -642,15 +555,17 @@ def frames_only(problem: Problem) -> Problem | None:
     n = problem.robot.n_joints
     parameters = tuple(replace(p, estimated=p.estimated and not 1 <= p.owner <= n) for p in problem.robot.parameters)
     robot = replace(problem.robot, parameters=parameters)
-    variables = build_variables(robot, any(v.kind == "frame" for v in problem.variables.items), problem.settings.prior)
+    variables = build_variables(
+        robot, any(v.kind == "frame" for v in problem.variables.items), problem.options.has_priors
+    )
     if not variables.items:
         return None
     p = problem
     if p.points is not None:
         variables = p.points.add_points(variables)
-    settings = replace(p.settings, encoder="propagated", pair_errors="independent")  # good enough for a start
+    options = replace(p.options, encoder="propagated", pair_errors="independent")  # good enough for a start
     start = p.start[: variables.nuisance_span.stop]
-    return _assemble(robot, p.measurements, settings, variables, start, p.trig, p.pairs, points=p.points)
+    return _assemble(robot, p.measurements, options, variables, start, p.trig, p.pairs, points=p.points)
 
 
 def whitened_triangle(problem: Problem, parameters: Floats) -> Floats:
@@ -717,15 +632,15 @@ def all_rows(problem: Problem, parameters: Floats) -> Block:
         problem: The problem.
         parameters: The parameter vector at which the rows are wanted: the mean of a noisy length depends on it.
     """
-    m, model = problem.measurements, problem.settings.model
+    m, model = problem.measurements, problem.options.model
     if problem.pairs is not None:
         return pair_rows(problem, parameters).rows()
-    return pose_block(problem.trig, np.arange(m.n_configurations), m, POSE_KINDS[model])
+    return pose_block(problem.trig, np.arange(m.n_configurations), m, POSE_MODELS[model])
 
 
-def _usable_pairs(measurements: Measurements, settings: Settings) -> Pairs:
+def _usable_pairs(measurements: Measurements, options: Options) -> Pairs:
     """The pairs, with nan where the model does not want a measurement; every wanted one has its sigma."""
-    with_distance, with_angle = PAIR_KINDS[settings.model]
+    with_distance, with_angle = PAIR_MODELS[options.model]
     missing = (with_distance and measurements.position is None) or (with_angle and measurements.rotation is None)
     if measurements.pairs is not None:
         pairs = measurements.pairs
@@ -734,15 +649,15 @@ def _usable_pairs(measurements: Measurements, settings: Settings) -> Pairs:
     else:
         if with_distance and measurements.position is None:
             raise ProblemError(
-                measurements.source, "no columns x, y, z", f"measured positions for model {settings.model}"
+                measurements.source, "no columns x, y, z", f"measured positions for model {options.model}"
             )
         if with_angle and measurements.rotation is None:
             raise ProblemError(
                 measurements.source,
                 "no columns qx, qy, qz, qw or roll, pitch, yaw",
-                f"orientations for model {settings.model}",
+                f"orientations for model {options.model}",
             )
-        pairs = form_pairs(measurements, settings.pairing)
+        pairs = form_pairs(measurements, options.pairing)
     nothing = np.full(pairs.n_pairs, np.nan)
     pairs = replace(
         pairs,
@@ -761,15 +676,15 @@ def _usable_pairs(measurements: Measurements, settings: Settings) -> Pairs:
     return pairs.select(measured)
 
 
-def _check_points(measurements: Measurements, settings: Settings) -> None:
+def _check_points(measurements: Measurements, options: Options) -> None:
     """What has not been made for touched points is refused, rather than done to the other rows alone."""
-    for key, value, only in (("loss", settings.loss, "none"), ("encoder", settings.encoder, "propagated")):
+    for key, value, only in (("loss", options.loss, "none"), ("encoder", options.encoder, "propagated")):
         if value != only:
             raise ProblemError(measurements.source, f"a column group with {key} {value}", f"{key} {only}")
 
 
-def _check_poses(measurements: Measurements, settings: Settings) -> None:
-    with_orientation, with_position = POSE_KINDS[settings.model]
+def _check_poses(measurements: Measurements, options: Options) -> None:
+    with_orientation, with_position = POSE_MODELS[options.model]
     for wanted, values, sigma, columns, noise in (
         (
             with_orientation,
@@ -782,7 +697,7 @@ def _check_poses(measurements: Measurements, settings: Settings) -> None:
     ):
         if wanted and values is None:
             raise ProblemError(
-                measurements.source, f"no columns {columns}", f"measured {noise}s for model {settings.model}"
+                measurements.source, f"no columns {columns}", f"measured {noise}s for model {options.model}"
             )
         if wanted and sigma is None:
             raise ProblemError(measurements.source, f"no sigma for {noise}", f"noise.{noise} or a column sigma_{noise}")
@@ -801,27 +716,25 @@ def _check_enough(problem: Problem) -> None:
         if reasons:
             raise ProblemError(source, f"{found}: {reasons}", f"{unit}s that tell something")
         if problem.pairs is not None and not problem.pairs.n_pairs and not touches_only:
-            raise ProblemError(source, f"{found}: none has a measurement that model {problem.settings.model} uses")
+            raise ProblemError(source, f"{found}: none has a measurement that model {problem.options.model} uses")
         raise ProblemError(source, found, "train rows")
     rows = problem.n_residuals + problem.n_priors - problem.variables.n_without_prior
     if rows >= problem.variables.n_columns:
         return
-    s = problem.settings
+    s = problem.options
     anywhere = random_problem(problem.robot, s.model, s.frame)
     priors = prior_rows(problem.variables, problem.start)[1]
     stacked = np.vstack([whitened_triangle(anywhere, anywhere.start), priors])
     needed = determined(singular_values(stacked * problem.variables.prior_scales), STRUCTURAL_FLOOR)
     if rows < needed:
         raise ProblemError(
-            source, f"{rows} residuals", f"at least {needed} to determine what model {problem.settings.model} can"
+            source, f"{rows} residuals", f"at least {needed} to determine what model {problem.options.model} can"
         )
 
 
-def _true_joints(
-    robot: Robot, measurements: Measurements, settings: Settings, pairs: Pairs | None
-) -> TrueJoints | None:
+def _true_joints(robot: Robot, measurements: Measurements, options: Options, pairs: Pairs | None) -> TrueJoints | None:
     """The true joint values as variables, where they are estimated and not too many for that."""
-    if settings.encoder == "propagated" or not np.any(measurements.sigma_joint > 0.0):
+    if options.encoder == "propagated" or not np.any(measurements.sigma_joint > 0.0):
         return None
     rows = np.flatnonzero(~measurements.test)
     if pairs is not None:
@@ -833,14 +746,14 @@ def _true_joints(
 def _start(
     robot: Robot,
     measurements: Measurements,
-    settings: Settings,
+    options: Options,
     variables: Variables,
     trig: Floats,
     pairs: Pairs | None,
     points: PointGroups | None,
 ) -> Floats:
     """The nominal parameters with the unknown frames from closed form, as a parameter vector; then touched points."""
-    start = _start_of_core(robot, measurements, settings, variables, trig, pairs, points)
+    start = _start_of_core(robot, measurements, options, variables, trig, pairs, points)
     if points is not None:
         start[variables.nuisance_span] = points.start(variables.chain.at(start), trig)
     return start
@@ -849,7 +762,7 @@ def _start(
 def _start_of_core(
     robot: Robot,
     measurements: Measurements,
-    settings: Settings,
+    options: Options,
     variables: Variables,
     trig: Floats,
     pairs: Pairs | None,
@@ -880,7 +793,7 @@ def _start_of_core(
             T = Frame(T.rotation, points.tool_point(poses, nominal_tool.translation, free[:3]))
         X = None
     else:
-        with_orientation, with_position = POSE_KINDS[settings.model]
+        with_orientation, with_position = POSE_MODELS[options.model]
         X, T = frames.start_from_poses(
             (flange.rotation[train], flange.position[train]),
             (
@@ -910,7 +823,7 @@ def _coordinates(frame: Frame, near: Floats | None = None) -> Floats:
 def _assemble(
     robot: Robot,
     measurements: Measurements,
-    settings: Settings,
+    options: Options,
     variables: Variables,
     start: Floats,
     trig: Floats,
@@ -923,7 +836,7 @@ def _assemble(
     chain = variables.chain.at(start)
     adjustment = adjustment or Adjustment()
     joint_noise = bool(np.any(measurements.sigma_joint > 0.0))
-    encoder = settings.encoder == "estimated" and joint_noise and joints is None
+    encoder = options.encoder == "estimated" and joint_noise and joints is None
     if encoder and adjustment.joint_errors is None:
         adjustment = replace(adjustment, joint_errors=np.zeros_like(measurements.readings))
     moved = _trig(robot, measurements, trig, adjustment)
@@ -932,11 +845,11 @@ def _assemble(
     judgement, sharing = None, Sharing()
     if pairs is not None:
         formed = measurements.pairs is None and pairs.n_pairs > 0
-        kinds = PAIR_KINDS[settings.model]
-        estimated = settings.encoder == "estimated"
+        kinds = PAIR_MODELS[options.model]
+        estimated = options.encoder == "estimated"
         of_pairs = PairWhitening(moved, chain, measurements, pairs, kinds, formed, adjustment, estimated)
         judgement, sigma = of_pairs.judgement, of_pairs.sigma
-        wanted = Sharing(poses=formed, joints=joint_noise) if settings.pair_errors == "shared" else Sharing()
+        wanted = Sharing(poses=formed, joints=joint_noise) if options.pair_errors == "shared" else Sharing()
         wanted = replace(wanted, joints=(wanted.joints or encoder) and joints is None)
         if of_pairs.size(wanted) <= MAX_SHARED:
             sharing = wanted
@@ -945,7 +858,7 @@ def _assemble(
             raise ProblemError("encoder: estimated", found, f"at most {MAX_SHARED} for models of pairs", "propagated")
         blocks = of_pairs.blocks(sharing, joint_noise=joints is None)
     else:
-        of_poses = PoseWhitening(moved, chain, measurements, POSE_KINDS[settings.model], adjustment)
+        of_poses = PoseWhitening(moved, chain, measurements, POSE_MODELS[options.model], adjustment)
         sigma, blocks = of_poses.sigma, of_poses.blocks(joint_noise=joints is None)
     terms: tuple[Term, ...] = ()
     if joints is not None:
@@ -965,7 +878,7 @@ def _assemble(
     return Problem(
         robot=robot,
         measurements=measurements,
-        settings=settings,
+        options=options,
         variables=variables,
         start=start,
         trig=trig,

@@ -164,7 +164,7 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
     """
     check_graph(problem)
     check_type("options", options, SolverOptions, "SolverOptions(max_iterations=200)")
-    options = options or SolverOptions()
+    options = options or _options_of(problem)
     clock = time.perf_counter()
     with one_blas_thread:
         before = problem.start
@@ -177,6 +177,11 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
             return _taken_as_it_is(problem, clock)
         run = _fit(problem, options)
         return _solution(run, before, run.initial_cost, clock)
+
+
+def _options_of(problem: Problem) -> SolverOptions:
+    most = problem.options.max_iterations
+    return SolverOptions() if most is None else SolverOptions(max_iterations=most)
 
 
 def solve_from(solution: Solution, start: Floats, most: float, options: SolverOptions | None = None) -> Solution | None:
@@ -194,7 +199,7 @@ def solve_from(solution: Solution, start: Floats, most: float, options: SolverOp
     Raises:
         SolverError: GTSAM could not solve a step at all.
     """
-    clock, options = time.perf_counter(), options or SolverOptions()
+    clock, options = time.perf_counter(), options or _options_of(solution.problem)
     with one_blas_thread:
         problem = replace(solution.problem, start=start)
         rough = _Run(problem, replace(options, max_iterations=min(SHORT, options.max_iterations)))
@@ -238,7 +243,7 @@ def _constant_cost(problem: Problem) -> float:
 
 def _taken_as_it_is(problem: Problem, clock: float) -> Solution:
     """The "solution" of an evaluation that has nothing to fit; robust weights are those of the rows as they are."""
-    weighted, final, weighting = problem, problem.settings.loss == "none", Weighting(problem.settings.loss)
+    weighted, final, weighting = problem, problem.options.loss == "none", Weighting(problem.options.loss)
     while not final:
         adjustment, final = _learn(problem, problem.start, weighting)
         weighted = judged_at(problem, problem.start, adjustment)
@@ -264,8 +269,8 @@ def _fit(problem: Problem, options: SolverOptions) -> _Run:
     With a robust loss the first weights are those of the residuals at the start: gross errors would lead least squares
     astray. Where the weights of a round lead nowhere, those that follow may.
     """
-    robust = problem.settings.loss != "none"
-    weighting = Weighting(problem.settings.loss)
+    robust = problem.options.loss != "none"
+    weighting = Weighting(problem.options.loss)
     run, goal, was = _Run(problem, options), COARSE, np.inf
     bends = SPREAD_ROUNDS if problem.pairs is not None and problem.adjustment.spread is None else 0
     if robust:
@@ -292,7 +297,7 @@ def _fit(problem: Problem, options: SolverOptions) -> _Run:
 def _learn(problem: Problem, parameters: Floats, weighting: Weighting) -> tuple[Adjustment, bool]:
     """What the residuals at some parameters say of the noise, and whether the loss has its final form."""
     adjustment, final = problem.adjustment, True
-    if problem.settings.loss != "none":
+    if problem.options.loss != "none":
         weights, final = weighting.update(*lengths(problem, parameters))
         adjustment = replace(adjustment, weights=weights)
     if adjustment.joint_errors is not None:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.errors import InputError
-from fg_calib.options import Strategy, check, check_number, check_type
+from fg_calib.options import Pairing, check_number
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -41,40 +41,6 @@ class Noise:
             for figure in given if f.name == "joint" and isinstance(given, tuple | list) else (given,):
                 if figure is not None:
                     check_number(f"noise: {f.name}", figure)
-
-
-@dataclass(frozen=True)
-class Pairing:
-    """How pairs are formed from measured poses.
-
-    Attributes:
-        strategy: `star` (the first with each other), `chain` (each with the next), `all`, or `random`
-            (different pairs, each configuration about equally often).
-        count: Number of random pairs.
-        seed: Seed of the random pairs.
-    """
-
-    strategy: Strategy = "star"
-    count: int = 0
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check("pairing", self.strategy, Strategy)
-        check_number("pairing: count", self.count, above=self.strategy == "random", whole=True)
-        check_number("pairing: seed", self.seed, whole=True)
-
-    def __str__(self) -> str:
-        return self.strategy if self.strategy != "random" else f"random ({self.count}, seed {self.seed})"
-
-
-def as_pairing(pairing: Pairing | None) -> Pairing:
-    """The pairing given, a star if None.
-
-    Raises:
-        InputError: It is something else, such as a strategy's bare name.
-    """
-    check_type("pairing", pairing, Pairing, "Pairing('chain')")
-    return pairing or Pairing()
 
 
 @dataclass(frozen=True)

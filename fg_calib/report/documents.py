@@ -59,7 +59,7 @@ def result_document(
         uncertainty: Its assessment.
         inputs: SHA-256 of the files it came from, by path.
     """
-    problem, settings = solution.problem, solution.problem.settings
+    problem, settings = solution.problem, solution.problem.options
     rms = uncertainty.residuals.rms()
     pairing = None
     if settings.uses_pairs and (problem.measurements.pairs is not None or problem.formed):
@@ -103,7 +103,7 @@ def result_document(
         "reduced_chi2": uncertainty.reduced_chi2,
         "chi2_p_value": uncertainty.p_value,
         "goodness": _goodness_by_kind(uncertainty.goodness.kinds, VERDICTS),
-        "evaluated_only": settings.evaluated,
+        "evaluated_only": problem.evaluated,
         "test": _test_document(uncertainty, problem.measurements.end_names),
         "priors": _priors_document(uncertainty.priors),
         "expected_error": _expected_error(uncertainty.expected_error),
@@ -336,14 +336,14 @@ def comparison_document(comparison: Comparison) -> dict[str, Any]:
     thereby known, so their sigma is None. "parameters" is empty where it did not run.
     """
     job, first = comparison.job, comparison.estimates[0]
-    uses_pairs = job.model in ("distance", "rotation", "distance-rotation")
-    pairing = ("measured" if job.measurements.pairs is not None else str(job.pairing)) if uses_pairs else None
+    uses_pairs = job.options.model in ("distance", "rotation", "distance-rotation")
+    pairing = ("measured" if job.measurements.pairs is not None else str(job.options.pairing)) if uses_pairs else None
     document = {
         "schema": COMPARISON_SCHEMA,
         "version": __version__,
         "robot": job.robot.name,
-        "model": job.model,
-        "frame": job.frame,
+        "model": job.options.model,
+        "frame": job.options.frame,
         "pairing": pairing,
         "judged_on": comparison.judged_on,
         "n_judged": comparison.n_judged,

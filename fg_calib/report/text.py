@@ -74,7 +74,7 @@ def build_report(solution: Solution, uncertainty: Uncertainty) -> RenderableType
         *_expected_error(uncertainty.expected_error),
         *_section("Residuals (RMS)", _residuals(uncertainty)),
     ]
-    if uncertainty.names or not solution.problem.settings.evaluated:
+    if uncertainty.names or not solution.problem.evaluated:
         parts += _section("Parameters", _parameters(uncertainty))
     if any(p.stands_for for p in uncertainty.parameters):
         parts += _section("What kept parameters were estimated for", _combinations(uncertainty))
@@ -98,7 +98,7 @@ def _section(title: str, *content: RenderableType) -> list[RenderableType]:
 
 
 def _verdict(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
-    settings = solution.problem.settings
+    settings = solution.problem.options
     what = f"{solution.problem.robot.name}: {settings.model}"
     if settings.uses_pairs:
         points, measured = solution.problem.points, solution.problem.measurements.pairs is not None
@@ -113,7 +113,7 @@ def _verdict(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
     lines = [Text(what), *(Text(f"DOUBTFUL: {finding}", style="bold red") for finding in uncertainty.findings)]
     if uncertainty.trustworthy:
         lines.append(Text(f"GOOD: {solution.message}", style="bold green"))
-    if settings.evaluated:
+    if solution.problem.evaluated:
         lines.insert(1, Text("EVALUATED ONLY: all rows are test rows, nothing of the arm was calibrated"))
         if uncertainty.p_value is not None:
             figures = chi2_in_words(uncertainty.chi2, uncertainty.expected_chi2, uncertainty.p_value)
@@ -206,7 +206,7 @@ def _figure(value: float, decimals: int, sign: str = "") -> str:
 def _statistics(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
     problem = solution.problem
     rows = [("configurations", f"{problem.n_configurations}")]
-    if problem.settings.uses_pairs and (problem.points is None or problem.n_pairs):
+    if problem.options.uses_pairs and (problem.points is None or problem.n_pairs):
         rows.append(("pairs", f"{problem.n_pairs}"))
     if problem.points is not None:
         rows.append(("touches", f"{problem.points.train.sum()} of {len(problem.points.estimated)} points"))
@@ -534,7 +534,7 @@ def _notes(solution: Solution, uncertainty: Uncertainty) -> Iterable[str]:
     if judgement is not None and pairs is not None and (same := int(np.sum(judgement.same_point & ~pairs.test))):
         yield f"{same} train pairs are one point twice: three coordinates each instead of a distance"
     if pairs is None and solution.problem.measurements.pairs is not None:
-        unused, model = solution.problem.measurements.pairs.source, solution.problem.settings.model
+        unused, model = solution.problem.measurements.pairs.source, solution.problem.options.model
         yield f"{unused} is not used: model {model} is of poses, not of pairs"
     yield from _sharing_notes(solution.problem)
     yield from uncertainty.cautions
@@ -543,7 +543,7 @@ def _notes(solution: Solution, uncertainty: Uncertainty) -> Iterable[str]:
         test = solution.problem.measurements.test if pairs is None else pairs.test
         n, what = int(np.sum(weights[~test] < OUTLIER_WEIGHT)), "poses" if pairs is None else "pairs"
         yield (
-            f"loss {solution.problem.settings.loss}: {n} of {int(np.sum(~test))} {what} lost more than half their"
+            f"loss {solution.problem.options.loss}: {n} of {int(np.sum(~test))} {what} lost more than half their"
             " weight and count for nothing in chi-square"
         )
     yield from _open_notes(solution, uncertainty)
@@ -571,7 +571,7 @@ def _open_notes(solution: Solution, uncertainty: Uncertainty) -> Iterable[str]:
             return "what the data leave open of {} is held by their priors"
         if abs(p.correction) <= _UNMOVED:
             return "what the data leave open of {} stays at nominal"
-        if solution.problem.settings.gauge == "keep":
+        if solution.problem.options.gauge == "keep":
             return "{} stand for their combinations with what stays at nominal"
         if p.sigma is not None:
             return "what the data leave open of {} is held by the priors of others that act with them"
@@ -744,7 +744,9 @@ def format_comparison(comparison: Comparison, width: int = WIDTH) -> str:
 def build_comparison_report(comparison: Comparison) -> RenderableType:
     """The estimators side by side: errors, residuals, effort, then the parameters that each found."""
     job = comparison.job
-    title = f"{job.robot.name}: {job.model}, judged at {comparison.n_judged} {comparison.judged_on} configurations"
+    title = (
+        f"{job.robot.name}: {job.options.model}, judged at {comparison.n_judged} {comparison.judged_on} configurations"
+    )
     parts: list[RenderableType] = [Text(title)]
     parts += [Text(f"DOUBTFUL: {finding}", style="bold red") for finding in comparison.findings]
     parts += [Text(""), _accuracy(comparison)]

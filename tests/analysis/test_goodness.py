@@ -20,7 +20,8 @@ from fg_calib.graph.problem import build_problem
 from fg_calib.graph.solver import SolverOptions, solve
 from fg_calib.graph.whitening import Adjustment
 from fg_calib.measurements import residuals
-from fg_calib.measurements.dataset import Pairing, Pairs, rotation_angle
+from fg_calib.measurements.dataset import Pairs, rotation_angle
+from fg_calib.options import Pairing
 from fg_calib.report.documents import result_document
 from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import pose

@@ -12,7 +12,7 @@ from fg_calib.analysis.uncertainty import assess
 from fg_calib.errors import ProblemError
 from fg_calib.graph.problem import build_problem, named_triangle, random_problem
 from fg_calib.graph.solver import solve
-from fg_calib.measurements.dataset import Pairing
+from fg_calib.options import Pairing
 from fg_calib.robot.model import Joint, RobotBuilder
 
 MODELS = ("distance", "rotation", "distance-rotation", "position", "pose")

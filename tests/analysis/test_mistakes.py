@@ -362,7 +362,7 @@ def test_real_poses_raise_no_alarm(data_folder, tmp_path):
     for model in ("pose", "distance-rotation"):
         path.write_text(yaml.safe_dump(job | {"model": model, "noise": {"position": 1e-4, "orientation": 1e-4}}))
         read = read_job(path)
-        check = check_setup(read.robot, read.measurements, read.model, read.frame, doubtful=True)
+        check = check_setup(read.robot, read.measurements, read.options.model, read.options.frame, doubtful=True)
         assert not check.far
         assert check.explanations == ()
 

@@ -11,7 +11,7 @@ from fg_calib.files.job import read_job
 from fg_calib.files.robot_yaml import read_robot
 from fg_calib.graph import solver
 from fg_calib.graph.problem import build_problem, problem_of
-from fg_calib.measurements.dataset import Pairing
+from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 
 ROBOT = """\

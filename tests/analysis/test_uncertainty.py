@@ -14,7 +14,8 @@ from fg_calib.analysis.uncertainty import assess, marginals
 from fg_calib.analysis.verdict import chi2_bounds
 from fg_calib.graph.problem import build_problem
 from fg_calib.graph.solver import SolverOptions, solve
-from fg_calib.measurements.dataset import Measurements, Pairing
+from fg_calib.measurements.dataset import Measurements
+from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Joint, RobotBuilder
 

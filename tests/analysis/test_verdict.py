@@ -19,7 +19,7 @@ from fg_calib.analysis.variance_components import estimate_noise
 from fg_calib.baseline.comparison import real_errors
 from fg_calib.graph.problem import build_problem
 from fg_calib.graph.solver import solve
-from fg_calib.measurements.dataset import Pairing
+from fg_calib.options import Pairing
 from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import pose
 

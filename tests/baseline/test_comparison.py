@@ -15,13 +15,13 @@ from fg_calib.analysis.uncertainty import assess
 from fg_calib.baseline import comparison as comparison_module
 from fg_calib.baseline.comparison import ESTIMATORS, best_rigid_fit, compare, real_errors
 from fg_calib.errors import InputError
-from fg_calib.files.job import Job, read_job
+from fg_calib.files.job import read_job
 from fg_calib.files.robot_yaml import write_robot
 from fg_calib.files.tables import write_csv
-from fg_calib.files.units import Units
 from fg_calib.graph.problem import build_problem, problem_of
 from fg_calib.graph.solver import solve
-from fg_calib.measurements.dataset import Pairing
+from fg_calib.job import Job
+from fg_calib.options import Options, Pairing
 from fg_calib.report.documents import comparison_document
 from fg_calib.report.text import format_comparison
 from fg_calib.robot.kinematics import pose
@@ -32,18 +32,7 @@ FRAME = (Rotation.from_rotvec(np.pi * np.array([0.0, 0.6, 0.8])), np.array([7.0,
 
 def job_of(robot, truth, measurements, model, tmp_path, **settings):
     """A job that was never on disk."""
-    given = {"pairing": Pairing(), "frame": "known", "prior": None, "gauge": "prior", "prefer": ()} | settings
-    return Job(
-        path=tmp_path / "calibration.yaml",
-        robot=robot,
-        measurements=measurements,
-        model=model,
-        loss="none",
-        units=Units(),
-        truth=truth,
-        inputs={},
-        **given,
-    )
+    return Job(tmp_path / "calibration.yaml", robot, measurements, Options(model=model, **settings), truth)
 
 
 @pytest.fixture
@@ -108,7 +97,7 @@ def test_all_estimators_run_on_the_same_job(simulated_job):
 def test_the_graph_is_the_one_that_calibrate_shows(simulated_job):
     job = simulated_job
     found = compare(job)
-    solution = solve(build_problem(job.robot, job.measurements, model=job.model, pair_errors="independent"))
+    solution = solve(build_problem(job.robot, job.measurements, model=job.options.model, pair_errors="independent"))
     uncertainty = assess(solution)
     graph = found.estimates[0]
     assert np.array_equal(graph.robot.nominal, uncertainty.robot.nominal)
@@ -123,7 +112,7 @@ def test_a_prediction_is_the_trace_of_the_propagated_covariance(simulated_job):
     job, weighted = simulated_job, found.estimates[3]
     readings = job.measurements.readings[job.measurements.test]
     fit = comparison_module.fit_least_squares(
-        job.robot, job.measurements, model=job.model, names=list(weighted.sigma), weighted=True
+        job.robot, job.measurements, model=job.options.model, names=list(weighted.sigma), weighted=True
     )
     total = 0.0
     for q in readings:
@@ -232,15 +221,15 @@ def test_where_nothing_is_determined_only_the_graph_with_priors_runs(tmp_path):
 
 
 def test_problem_of_takes_the_jobs_settings_but_for_changes(simulated_job):
-    job = replace(simulated_job, model="distance", pairing=Pairing("chain"), prefer=("d3",))
+    job = replace(simulated_job, options=Options("distance", Pairing("chain"), prefer=("d3",)))
     problem = problem_of(job)
-    assert (problem.settings.model, problem.settings.pairing.strategy, problem.settings.prior) == (
+    assert (problem.options.model, problem.options.pairing.strategy, problem.options.gauge) == (
         "distance",
         "chain",
-        True,
+        "prior",
     )
-    changed = problem_of(job, prior=False, gauge="keep")
-    assert (changed.settings.prior, changed.settings.gauge) == (False, "keep")
+    changed = problem_of(job, gauge="keep")
+    assert changed.options.gauge == "keep"
     assert "d3" in [p.name for p in changed.estimated]
 
 

@@ -8,9 +8,7 @@ import pytest
 
 from fg_calib.errors import InputError
 from fg_calib.files.job import read_job
-from fg_calib.files.units import Units
-from fg_calib.measurements.dataset import Pairing
-from fg_calib.options import MODELS
+from fg_calib.options import MODELS, Options, Pairing
 
 ROBOT = """\
 convention: mdh
@@ -80,9 +78,7 @@ def test_a_short_job_has_the_defaults(folder):
     assert job.path == folder / "calibration.yaml"
     assert (job.robot.name, job.robot.n_joints) == ("robot", 2)
     assert job.measurements.position[1].tolist() == [1000, 0, 0]
-    assert (job.model, job.frame, job.prior, job.loss) == ("pose", "known", None, "none")
-    assert job.pairing == Pairing("star")
-    assert job.units == Units()
+    assert job.options == Options("pose")
     assert job.measurements.sigma_position is None
     assert job.inputs == {
         name: sha256(folder / name) for name in ("calibration.yaml", "robots/robot.yaml", "poses.csv")
@@ -101,8 +97,8 @@ def test_a_full_job_is_converted_to_si(folder):
     assert m.sigma_joint == pytest.approx([math.radians(3), 3e-3])  # the second joint slides
     assert (m.pairs.distance[0], m.pairs.angle[0]) == pytest.approx((2.0, math.pi / 2))
     assert (m.pairs.sigma_distance[0], m.pairs.sigma_angle[0]) == pytest.approx((4e-3, math.radians(5)))
-    assert job.pairing == Pairing("random", 30, 4)
-    assert (job.frame, job.prior) == ("unknown", False)
+    assert job.options.pairing == Pairing("random", 30, 4)
+    assert (job.options.frame, job.options.gauge) == ("unknown", "none")
     assert job.inputs["pairs.csv"] == sha256(folder / "pairs.csv")
 
 
@@ -115,12 +111,12 @@ def test_noise_of_orientations_is_converted_too(folder):
 
 @pytest.mark.parametrize("model", MODELS)
 def test_every_model_is_accepted(folder, model):
-    assert read(folder, JOB.replace("model: pose", f"model: {model}")).model == model
+    assert read(folder, JOB.replace("model: pose", f"model: {model}")).options.model == model
 
 
 @pytest.mark.parametrize("strategy", ["star", "chain", "all"])
 def test_every_strategy_is_accepted(folder, strategy):
-    assert read(folder, JOB + f"pairing: {strategy}\n").pairing == Pairing(strategy)
+    assert read(folder, JOB + f"pairing: {strategy}\n").options.pairing == Pairing(strategy)
 
 
 @pytest.mark.parametrize(
@@ -222,9 +218,9 @@ def test_noise_may_be_left_to_the_data(folder):
     poses = "q1,q2,x,y,z,roll,pitch,yaw\n0,0,0,0,0,0,0,0\n10,20,1000,0,0,0,0,0\n"
     (folder / "poses.csv").write_text(poses)
     given = read(folder, JOB + "noise: {position: 0.5, estimate: true}\n")
-    assert given.estimate_noise
+    assert given.options.estimate_noise
     assert (given.measurements.sigma_position[0, 0], given.measurements.sigma_orientation[0, 0]) == (0.5, 1e-3)
     start = read(folder, JOB + "noise: estimate\n")
-    assert start.estimate_noise
+    assert start.options.estimate_noise
     assert (start.measurements.sigma_position[0, 0], start.measurements.sigma_orientation[0, 0]) == (1e-3, 1e-3)
-    assert not read(folder, JOB + "noise: {position: 0.5}\n").estimate_noise
+    assert not read(folder, JOB + "noise: {position: 0.5}\n").options.estimate_noise

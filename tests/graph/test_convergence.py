@@ -14,7 +14,8 @@ from fg_calib.files.robot_yaml import read_robot
 from fg_calib.files.tables import read_measurements
 from fg_calib.graph.problem import build_problem, judged_at
 from fg_calib.graph.solver import SolverOptions, solve
-from fg_calib.measurements.dataset import Noise, Pairing
+from fg_calib.measurements.dataset import Noise
+from fg_calib.options import Pairing
 from fg_calib.robot.model import Joint, RobotBuilder
 
 MOST = 15

@@ -23,7 +23,7 @@ from fg_calib.graph.factors import (
 )
 from fg_calib.graph.problem import build_problem
 from fg_calib.measurements import residuals
-from fg_calib.measurements.dataset import Pairing
+from fg_calib.options import Pairing
 
 FRAME = (Rotation.from_rotvec([0.5, -1.0, 2.0]), np.array([3.0, -20.0, 1.0]))
 

@@ -14,7 +14,8 @@ from fg_calib.errors import ProblemError
 from fg_calib.graph import problem as problem_module
 from fg_calib.graph.problem import build_problem
 from fg_calib.graph.solver import solve
-from fg_calib.measurements.dataset import Pairing, Pairs, rotation_angle
+from fg_calib.measurements.dataset import Pairs, rotation_angle
+from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}

@@ -10,7 +10,7 @@ from fg_calib.graph.observability import RelativeGroup, analyse, observability_i
 from fg_calib.graph.problem import build_problem, observe
 from fg_calib.graph.solver import solve
 from fg_calib.measurements import residuals
-from fg_calib.measurements.dataset import Pairing
+from fg_calib.options import Pairing
 from fg_calib.robot.model import Parameter
 
 # Ranks and groups recomputed independently for Jia et al. (2019), Tables 3 and 4 and the other four measurements.

@@ -14,7 +14,8 @@ from fg_calib.errors import ProblemError
 from fg_calib.graph.problem import all_rows, build_problem, judged_at
 from fg_calib.graph.solver import solve
 from fg_calib.measurements import residuals
-from fg_calib.measurements.dataset import Measurements, Pairing, Pairs
+from fg_calib.measurements.dataset import Measurements, Pairs
+from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import build_chain, pose
 
 

@@ -14,7 +14,7 @@ from fg_calib.graph.problem import build_problem, judged_at, lengths
 from fg_calib.graph.robust import EFFICIENCY, HALF_WEIGHT, Weighting, effect, tuning, weight
 from fg_calib.graph.solver import solve
 from fg_calib.measurements import residuals
-from fg_calib.measurements.dataset import Pairing
+from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}

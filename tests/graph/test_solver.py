@@ -15,7 +15,7 @@ from fg_calib.graph.factors import prior_rows
 from fg_calib.graph.problem import build_problem
 from fg_calib.graph.solver import SolverOptions, solve
 from fg_calib.measurements import residuals
-from fg_calib.measurements.dataset import Pairing
+from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 
 TOLERANCE = {"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3}

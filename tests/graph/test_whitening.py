@@ -13,7 +13,8 @@ from fg_calib.graph import problem as problem_module
 from fg_calib.graph.problem import build_problem, correlation, whitened_triangle
 from fg_calib.graph.solver import solve
 from fg_calib.measurements import residuals
-from fg_calib.measurements.dataset import Measurements, Pairing, Pairs, rotation_angle
+from fg_calib.measurements.dataset import Measurements, Pairs, rotation_angle
+from fg_calib.options import Pairing
 from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import pose
 

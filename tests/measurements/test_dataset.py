@@ -9,7 +9,8 @@ from simulated import measure, small_arm
 from tolerances import rounding
 
 from fg_calib.errors import InputError
-from fg_calib.measurements.dataset import Pairing, form_pairs, rotation_angle
+from fg_calib.measurements.dataset import form_pairs, rotation_angle
+from fg_calib.options import Pairing
 
 
 @pytest.fixture

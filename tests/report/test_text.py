@@ -32,6 +32,7 @@ from fg_calib import (
 )
 from fg_calib.files.tables import write_csv
 from fg_calib.files.units import Units
+from fg_calib.options import Options
 from fg_calib.robot.model import Joint, Robot, RobotBuilder
 
 README = Path(__file__).resolve().parents[2] / "README.md"
@@ -233,7 +234,7 @@ def long_reports(tmp_path_factory):
             ("distance", {"loss": "huber", "gauge": "none"}),
         )
     ]
-    job = Job(tmp_path_factory.mktemp("job") / "job.yaml", robot, m, "distance-rotation", truth=true_robot(robot, rng))
+    job = Job(tmp_path_factory.mktemp("job") / "job.yaml", robot, m, Options(), truth=true_robot(robot, rng))
     return [
         *(partial(format_report, s, assess(s)) for s in solutions),
         partial(format_identifiability, observe_structure(robot, "distance-rotation", n_configurations=50)),

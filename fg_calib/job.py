@@ -1,0 +1,31 @@
+"""A calibration job: a robot, what was measured of it, and every choice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from fg_calib.measurements.dataset import Measurements
+from fg_calib.options import Options
+from fg_calib.robot.model import Robot
+
+
+@dataclass(frozen=True)
+class Job:
+    """A calibration job with everything it refers to.
+
+    Attributes:
+        path: The job's file.
+        robot: The robot as it is before the calibration.
+        measurements: What was measured.
+        options: Every choice.
+        truth: The robot as it truly is, known from a simulation; None where it is not.
+        inputs: SHA-256 of every file read, by its path relative to the job.
+    """
+
+    path: Path
+    robot: Robot
+    measurements: Measurements
+    options: Options
+    truth: Robot | None = None
+    inputs: dict[str, str] = field(default_factory=dict)
