@@ -80,7 +80,7 @@ def joint_values(solution: Solution, spread: Spread) -> JointValues | None:
     joints = np.flatnonzero(m.sigma_joint > 0.0)
     if problem.joints is not None:
         rows, variance = problem.joints.configurations, _of_variables(solution, spread)
-        q = solution.parameters[problem.variables.nuisance_span].reshape(len(rows), -1)
+        q = problem.joints.values(problem.variables, solution.parameters)[np.ix_(rows, joints)]
         error = q - m.readings[np.ix_(rows, joints)]
     elif problem.adjustment.joint_errors is not None:
         rows, variance = _fitted(problem), _of_eliminated(solution, spread)

@@ -32,9 +32,10 @@ from fg_calib.analysis.verdict import (
     of_priors,
     of_test,
 )
+from fg_calib.graph.extension import check_graph
 from fg_calib.graph.factors import corrections_of, pose_of
 from fg_calib.graph.observability import IdentifiabilityClass, Observability
-from fg_calib.graph.problem import Problem, check_graph, eliminated_terms, lengths, pair_rows
+from fg_calib.graph.problem import Problem, eliminated_terms, lengths, pair_rows
 from fg_calib.graph.robust import effect
 from fg_calib.graph.solver import Solution
 from fg_calib.options import PAIR_MODELS
@@ -283,7 +284,7 @@ def _assess(solution: Solution) -> Uncertainty:
             sigma=np.sqrt(np.diag(whole.covariance(np.eye(len(whole.tangent))[whole.variables.n_robot_columns :]))),
         )
     chi2, n_rows, loss_factor = _weighted_chi2(solution)
-    dof = n_rows + problem.n_priors - spread.rank - variables.n_without_prior
+    dof = n_rows + problem.n_priors + problem.n_added - spread.rank - variables.n_without_prior
     expected = max(0.0, dof - spread.excess - (1.0 - loss_factor) * n_rows)
     independent = _independent_dof(problem, dof, spread.rank)
     bounds = chi2_bounds(dof, expected, independent)
@@ -519,7 +520,7 @@ def _point_estimates(solution: Solution, spread: Spread) -> tuple[PointEstimate,
     if points is None:
         return ()
     xyz = points.means(variables.chain.at(solution.parameters), problem.trig)
-    n = variables.n_without_prior  # the points come first among the nuisance variables
+    n = 3 * len(points.estimated)  # they come first among the nuisance variables
     xyz[points.estimated] = solution.parameters[variables.nuisance_span][:n].reshape(-1, 3)
     sigma = np.full_like(xyz, np.nan)
     left = eliminated_terms(replace(problem, variables=spread.variables), solution.parameters)

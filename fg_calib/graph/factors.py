@@ -9,8 +9,9 @@
 | `L(g)` | base_p of the physical point that group g touches, a Point3 |
 | `Q(k)` | the true joint values of configuration k, a vector, where encoder noise is estimated |
 
-The last two are *nuisance* variables: they must be estimated too, but are nobody's question. Their columns follow
-those of the *core* (robot and measurement frame) and are eliminated before anything is said of the core.
+The last two, and variables that somebody adds to the graph, are *nuisance* variables: they are estimated too, but not
+what a calibration is for. Their columns follow those of the *core* (robot and measurement frame) and are eliminated
+before anything is said of the core.
 
 Pose3's tangent is rotation first, and a step moves the frame in itself (`pose * Exp(step)`).
 
@@ -25,7 +26,7 @@ initial values without a word when it gets the columns wrong. So `custom_factor`
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
 import gtsam
@@ -54,7 +55,8 @@ class Variable:
     Attributes:
         key: GTSAM's key.
         symbol: How it is written: `K(3)`, `T(0)`, `X(0)`.
-        kind: A vector of parameters, the pose of tool, base or measurement frame, a touched point, or joint values.
+        kind: A vector of parameters, the pose of tool, base or measurement frame, a touched point, joint values, or
+            somebody's own: of any of GTSAM's types, its parameters are tangent coordinates at its start.
         parameters: Indices into the parameter vector of `Variables.parameters`, in the variable's own order;
             for poses in the order of `FRAME_KINDS`.
         columns: Its columns in a Jacobian.
@@ -63,7 +65,7 @@ class Variable:
 
     key: int
     symbol: str
-    kind: Literal["vector", "tool", "base", "frame", "point", "joints"]
+    kind: Literal["vector", "tool", "base", "frame", "point", "joints", "own"]
     parameters: tuple[int, ...]
     columns: slice
     scales: tuple[float, ...] = ()
@@ -89,6 +91,7 @@ class Variables:
         chain: The kinematic chain with these columns.
         priors: Whether the robot's tolerances are priors.
         nuisance: The nuisance variables; their columns follow those of the core.
+        own: Start of the variables that somebody added.
     """
 
     robot: Robot
@@ -97,6 +100,7 @@ class Variables:
     chain: Chain
     priors: bool
     nuisance: tuple[Variable, ...] = ()
+    own: gtsam.Values = field(default_factory=gtsam.Values, compare=False)
 
     @property
     def n_columns(self) -> int:
@@ -111,7 +115,7 @@ class Variables:
     @property
     def n_without_prior(self) -> int:
         """Number of nuisance columns that have no prior of their own, as true joint values have."""
-        return sum(len(v.parameters) for v in self.nuisance if v.kind == "point")
+        return sum(len(v.parameters) for v in self.nuisance if v.kind != "joints")
 
     @property
     def keys(self) -> list[int]:
@@ -174,10 +178,15 @@ class Variables:
 
     def values(self, parameters: Floats) -> gtsam.Values:
         """GTSAM's values at a parameter vector."""
-        values = gtsam.Values()
+        values, off = gtsam.Values(), gtsam.VectorValues()
         for v in self.items + self.nuisance:
             chosen = parameters[list(v.parameters)]
-            values.insert(v.key, pose_of(chosen) if v.is_pose else chosen)
+            if v.kind == "own":
+                off.insert(v.key, chosen)
+            else:
+                values.insert(v.key, pose_of(chosen) if v.is_pose else chosen)
+        if off.size():
+            values.insert(self.own.retract(off))
         return values
 
     def parameters(self, values: gtsam.Values, only: Sequence[Variable] | None = None) -> Floats:
@@ -185,7 +194,9 @@ class Variables:
         parameters = self.nominal()
         for v in self.items + self.nuisance if only is None else only:
             of_v = list(v.parameters)
-            if v.is_pose:
+            if v.kind == "own":
+                parameters[of_v] = local_coordinates(self.own, values, v.key)
+            elif v.is_pose:
                 near = None if v.kind == "frame" else parameters[of_v]
                 parameters[of_v] = frame_of(values.atPose3(v.key), near)
             else:
@@ -207,7 +218,9 @@ class Variables:
         """The tangent step from some values to others, shape (n_columns + n_nuisance,)."""
         return np.concatenate(
             [
-                gtsam.Pose3.Logmap(start.atPose3(v.key).between(end.atPose3(v.key)))
+                local_coordinates(start, end, v.key)
+                if v.kind == "own"
+                else gtsam.Pose3.Logmap(start.atPose3(v.key).between(end.atPose3(v.key)))
                 if v.is_pose
                 else end.atVector(v.key) - start.atVector(v.key)
                 for v in self.items + self.nuisance
@@ -245,6 +258,21 @@ class Variables:
             for i, index in enumerate(indices)
         )
         return replace(self, nuisance=self.nuisance + more)
+
+    def without_own(self) -> Variables:
+        """The same without somebody's own variables."""
+        return replace(self, nuisance=tuple(v for v in self.nuisance if v.kind != "own"), own=gtsam.Values())
+
+    def with_own(self, start: gtsam.Values) -> Variables:
+        """The same with somebody's own variables, of any type, by their start."""
+        variables = self
+        for key in list(start.keys()):
+            n, place, symbol = only_key(start, key).dim(), variables.nuisance_span.stop, str(gtsam.Symbol(key)).strip()
+            column = variables.n_columns + variables.n_nuisance
+            parameters, columns = tuple(range(place, place + n)), slice(column, column + n)
+            added = Variable(key, symbol, "own", parameters, columns, scales=(1.0,) * n)
+            variables = replace(variables, nuisance=(*variables.nuisance, added))
+        return replace(variables, own=start)
 
     def named_derivative(self, parameters: Floats) -> Floats:
         """Derivative of the named scalars in the columns, shape (n_columns, n_columns).
@@ -311,6 +339,21 @@ def build_variables(robot: Robot, frame: bool, priors: bool = True) -> Variables
     tangents = {"tool_tangent": tool_tangent, "base_tangent": base_tangent, "frame_tangent": frame_tangent}
     chain = build_chain(robot, columns, **tangents, frame=frame)
     return Variables(robot, tuple(items), tuple(names), chain, priors)
+
+
+def only_key(values: gtsam.Values, key: int) -> gtsam.Values:
+    """The value of one key alone."""
+    one = gtsam.Values(values)
+    for other in list(values.keys()):
+        if other != key:
+            one.erase(other)
+    return one
+
+
+def local_coordinates(start: gtsam.Values, end: gtsam.Values, key: int) -> Floats:
+    """The tangent step from a variable's value to another, whatever its type."""
+    step: Floats = only_key(start, key).localCoordinates(only_key(end, key)).at(key)
+    return step
 
 
 def pose_of(frame: Floats) -> gtsam.Pose3:
@@ -472,6 +515,14 @@ def measurement_factor(block: AnyBlock, variables: Variables) -> gtsam.CustomFac
         return R[:, -1], R[:, :-1]
 
     return custom_factor(variables.items, n_all, reduced_residual, reduced_linearise)
+
+
+def dense(linear: gtsam.GaussianFactorGraph, keys: list[int]) -> tuple[Floats, Floats]:
+    """The linear graph as one matrix in the order of the columns, and its right-hand side."""
+    ordering = gtsam.Ordering()
+    for key in keys:
+        ordering.push_back(key)
+    return linear.jacobian(ordering)
 
 
 class Term(Protocol):

@@ -23,6 +23,7 @@ from fg_calib.graph.factors import (
     Term,
     Variables,
     build_variables,
+    dense,
     eliminate,
     frame_of,
     measurement_factor,
@@ -103,7 +104,8 @@ class Problem:
         sigma: 1 sigma of distance and angle, shape (n_pairs, 2), or of orientation and position components,
             shape (n_configurations, 6): measurement noise and joint noise together, [m] and [rad].
         blocks: The whitened train rows.
-        graph: Factors and priors, for GTSAM's own tools to work on. `solve` and `assess` take no others.
+        graph: Factors and priors, as GTSAM's own tools take them. Factors added to it are solved and assessed with it.
+        initial: GTSAM's initial values; those of variables that added factors bring with them are inserted here.
         sharing: Which errors of configurations the rows carry in common.
         adjustment: What has been learned of the measurements' noise.
         whole: The problem with everything estimated, where this one leaves parameters out to fix the gauge.
@@ -112,6 +114,7 @@ class Problem:
         sigma_point: 1 sigma of a touch, joint noise included, shape (n_configurations, 3), [m]; empty without groups.
         terms: The whitened train rows that depend on nuisance variables.
         factors: The factors that `graph` was made of.
+        added: Those among them that somebody added (see `extension`).
         evaluated: Whether there are test rows alone: the arm is taken as it is, and measurement frame, base and tool,
             where they are estimated, are fitted to these.
     """
@@ -127,6 +130,7 @@ class Problem:
     sigma: Floats
     blocks: tuple[AnyBlock, ...]
     graph: gtsam.NonlinearFactorGraph
+    initial: gtsam.Values
     sharing: Sharing
     adjustment: Adjustment
     whole: Problem | None = None
@@ -135,12 +139,8 @@ class Problem:
     sigma_point: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     terms: tuple[Term, ...] = ()
     factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
+    added: tuple[gtsam.NonlinearFactor, ...] = ()
     evaluated: bool = False
-
-    @property
-    def initial(self) -> gtsam.Values:
-        """GTSAM's initial values, made anew: to change them changes nothing in the problem."""
-        return self.variables.values(self.start)
 
     @property
     def estimated(self) -> list[Parameter]:
@@ -205,6 +205,11 @@ class Problem:
         if not (self.sharing.poses and isinstance(block, CorrelatedBlock)):
             return self.n_residuals
         return self.n_residuals - round(block.n_spare)
+
+    @property
+    def n_added(self) -> int:
+        """Scalar rows of the factors that somebody added."""
+        return sum(factor.dim() for factor in self.added)
 
     @property
     def approximate(self) -> bool:
@@ -412,24 +417,24 @@ def random_problem(
     )
 
 
-def check_graph(problem: Problem) -> None:
-    """Check that the graph has the problem's own factors and no others.
+def added_rows(problem: Problem, parameters: Floats) -> Floats:
+    """Derivatives of the added factors' whitened rows, shape (n_added, n_columns + n_nuisance)."""
+    variables = problem.variables
+    wide = np.zeros((problem.n_added, variables.n_columns + variables.n_nuisance))
+    if problem.added:
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in problem.added:
+            graph.add(factor)
+        present = set(graph.keyVector())
+        chosen = [v for v in variables.items + variables.nuisance if v.key in present]
+        A, _ = dense(graph.linearize(variables.values(parameters)), [v.key for v in chosen])
+        wide[:, np.concatenate([np.arange(wide.shape[1])[v.columns] for v in chosen])] = A
+    return wide
 
-    Rows are judged and whitened anew while a problem is solved, and the graph made anew with them: a factor that
-    somebody added would be lost.
 
-    Raises:
-        ProblemError: Factors were added, replaced or removed.
-    """
-    graph, own = problem.graph, problem.factors
-    n, n_own = graph.size(), own.size()
-    kept = sum(graph.at(i) is own.at(i) for i in range(min(n, n_own)))
-    hint = "for a graph of your own use GTSAM's optimisers, from problem.initial and with values for its variables"
-    if n > kept:
-        found = f"{n - kept} of {n} factors not made from this problem's measurements and priors"
-        raise ProblemError("problem.graph", found, "none: solve would leave them out", hint)
-    if n < n_own:
-        raise ProblemError("problem.graph", f"{n} of the problem's {n_own} factors", "all of them", hint)
+def started_at(problem: Problem, start: Floats) -> Problem:
+    """The same problem, its rows as they are whitened, with another start: a parameter vector."""
+    return replace(problem, start=start, initial=problem.variables.values(start))
 
 
 def noise_kinds(model: Model) -> tuple[str, str]:
@@ -447,7 +452,7 @@ def judged_at(problem: Problem, parameters: Floats, adjustment: Adjustment | Non
     """
     p, a = problem, adjustment or problem.adjustment
     given = (p.robot, p.measurements, p.options, p.variables, parameters, p.trig, p.pairs)
-    anew = _assemble(*given, a, p.points, p.joints)
+    anew = _assemble(*given, a, p.points, p.joints, p.added)
     return replace(anew, whole=p.whole, evaluated=p.evaluated)
 
 
@@ -579,8 +584,9 @@ def whitened_triangle(problem: Problem, parameters: Floats) -> Floats:
 
 
 def eliminated_terms(problem: Problem, parameters: Floats) -> Eliminated:
-    """The rows of the terms at a parameter vector, with the nuisance columns eliminated; zero as right-hand side."""
-    A = stacked_terms(problem.terms, problem.variables, parameters)
+    """Rows of terms and added factors, with the nuisance columns eliminated; zero as right-hand side."""
+    terms = stacked_terms(problem.terms, problem.variables, parameters)
+    A = np.vstack([terms, added_rows(problem, parameters)])
     return eliminate(A, np.zeros(len(A)), problem.variables.n_columns)
 
 
@@ -831,6 +837,7 @@ def _assemble(
     adjustment: Adjustment | None = None,
     points: PointGroups | None = None,
     joints: TrueJoints | None = None,
+    added: tuple[gtsam.NonlinearFactor, ...] = (),
 ) -> Problem:
     """The problem with rows judged and whitened at `start`."""
     chain = variables.chain.at(start)
@@ -873,7 +880,7 @@ def _assemble(
         terms += points.terms(trig, covariance)
     for term in terms:
         graph.add(term_factor(term, variables))
-    for factor in prior_factors(variables):
+    for factor in (*prior_factors(variables), *added):
         graph.add(factor)
     return Problem(
         robot=robot,
@@ -887,6 +894,7 @@ def _assemble(
         sigma=sigma,
         blocks=tuple(blocks),
         graph=graph,
+        initial=variables.values(start),
         sharing=sharing,
         adjustment=adjustment,
         points=points,
@@ -894,4 +902,5 @@ def _assemble(
         sigma_point=sigma_point,
         terms=terms,
         factors=gtsam.NonlinearFactorGraph(graph),
+        added=added,
     )

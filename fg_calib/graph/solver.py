@@ -27,9 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.errors import SolverError
-from fg_calib.graph.factors import Variables, eliminate
+from fg_calib.graph.extension import with_added
+from fg_calib.graph.factors import Variables, dense, eliminate
 from fg_calib.graph.observability import determined
-from fg_calib.graph.problem import Problem, check_graph, frames_only, joint_errors, judged_at, lengths, same_rows
+from fg_calib.graph.problem import Problem, frames_only, joint_errors, judged_at, lengths, same_rows, started_at
 from fg_calib.graph.robust import Weighting
 from fg_calib.graph.whitening import Adjustment
 from fg_calib.measurements.residuals import squared_norm
@@ -159,11 +160,11 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
     leave nothing to go.
 
     Raises:
-        ProblemError: The problem's graph has factors of somebody else.
+        ProblemError: Factors of the problem's graph are missing, or an added variable has no start.
         SolverError: GTSAM could not solve a step at all.
     """
-    check_graph(problem)
     check_type("options", options, SolverOptions, "SolverOptions(max_iterations=200)")
+    problem = with_added(problem)
     options = options or _options_of(problem)
     clock = time.perf_counter()
     with one_blas_thread:
@@ -201,7 +202,7 @@ def solve_from(solution: Solution, start: Floats, most: float, options: SolverOp
     """
     clock, options = time.perf_counter(), options or _options_of(solution.problem)
     with one_blas_thread:
-        problem = replace(solution.problem, start=start)
+        problem = started_at(solution.problem, start)
         rough = _Run(problem, replace(options, max_iterations=min(SHORT, options.max_iterations)))
         if not rough.descend(COARSE) or rough.here.cost >= most:
             return None
@@ -463,7 +464,7 @@ class _Linearised:
     def __init__(self, problem: Problem, values: gtsam.Values) -> None:
         variables = problem.variables
         try:
-            A, b = _dense(problem.graph.linearize(values), variables.keys)
+            A, b = dense(problem.graph.linearize(values), variables.keys)
             left = eliminate(A, b, variables.n_columns)
             self._sizes = variables.prior_scales
             tall = np.vstack([left.A * self._sizes, np.zeros((len(self._sizes),) * 2)])  # so that Vt is square
@@ -514,14 +515,6 @@ def _parameters(damping: float) -> gtsam.LevenbergMarquardtParams:
     parameters.setRelativeErrorTol(1e-13)  # no search for a lambda once the cost's own rounding decides
     parameters.setAbsoluteErrorTol(0.0)
     return parameters
-
-
-def _dense(linear: gtsam.GaussianFactorGraph, keys: list[int]) -> tuple[Floats, Floats]:
-    """The linear graph as one matrix in the order of the columns, and its right-hand side."""
-    ordering = gtsam.Ordering()
-    for key in keys:
-        ordering.push_back(key)
-    return linear.jacobian(ordering)
 
 
 def _in_words(message: str, variables: Variables) -> str:

@@ -20,7 +20,7 @@ from fg_calib.analysis.uncertainty import assess
 from fg_calib.errors import InputError, ProblemError
 from fg_calib.files.tables import read_measurements
 from fg_calib.graph.factors import eliminate, prior_rows
-from fg_calib.graph.problem import build_problem, named_triangle, observe, whitened_triangle
+from fg_calib.graph.problem import build_problem, named_triangle, observe, started_at, whitened_triangle
 from fg_calib.graph.solver import solve
 from fg_calib.measurements.dataset import Groups, Noise, Pairs, no_pairs
 from fg_calib.report.documents import result_document
@@ -220,7 +220,7 @@ def test_what_moves_arm_and_points_as_one_body_stays_where_it_is(distances):
     # Another place to start the points from changes nothing.
     start = problem.start.copy()
     start[problem.variables.nuisance_span] += 0.01 * np.random.default_rng(4).normal(size=12)
-    again = solve(replace(problem, start=start))
+    again = solve(started_at(problem, start))
     span = problem.variables.robot_span
     apart = [
         abs(again.parameters[span][i] - p.estimate) / p.sigma for i, p in enumerate(uncertainty.parameters) if p.sigma

@@ -2,14 +2,11 @@
 
 from dataclasses import replace
 
-import gtsam
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
 
-from fg_calib.analysis.uncertainty import assess
-from fg_calib.analysis.variance_components import estimate_noise
 from fg_calib.errors import ProblemError
 from fg_calib.graph.problem import all_rows, build_problem, judged_at
 from fg_calib.graph.solver import solve
@@ -257,71 +254,3 @@ def test_a_configuration_against_itself_says_nothing_of_the_arm():
     )
     assert problem.n_excluded["same_configuration"] == 1
     assert problem.n_residuals == 2
-
-
-# --- factors of the user's own -------------------------------------------------------------------------------------
-
-
-def with_a_prior_of_ones_own():
-    problem = build_problem(paper_robot({"a": 1e-3, "d": 1e-3, "theta": 1e-3}), pair_table(), model="distance")
-    variable = problem.variables.items[-1]
-    mean = problem.initial.atVector(variable.key)
-    own = gtsam.PriorFactorVector(variable.key, mean, gtsam.noiseModel.Isotropic.Sigma(len(mean), 1e-3))
-    return problem, own
-
-
-def pair_table():
-    return measure(paper_robot(), 30, np.random.default_rng(0))
-
-
-OWN = (
-    "factors not made from this problem's measurements and priors, expected none: solve would leave them out; "
-    "for a graph of your own use GTSAM's optimisers, from problem.initial and with values for its variables"
-)
-
-
-@pytest.mark.parametrize("way", ["in place", "in a copy", "instead of one", "on a variable of one's own"])
-def test_a_factor_that_would_be_left_out_is_refused(way):
-    problem, own = with_a_prior_of_ones_own()
-    graph = problem.graph if way == "in place" else gtsam.NonlinearFactorGraph(problem.graph)
-    match way:
-        case "instead of one":
-            graph.replace(0, own)
-        case "on a variable of one's own":
-            graph.add(gtsam.PriorFactorPoint3(gtsam.symbol("B", 0), np.ones(3), gtsam.noiseModel.Unit.Create(3)))
-        case _:
-            graph.add(own)
-    for use in (solve, estimate_noise):
-        with pytest.raises(ProblemError) as caught:
-            use(replace(problem, graph=graph))
-        assert str(caught.value) == f"problem.graph: 1 of {graph.size()} {OWN}"
-
-
-def test_a_problem_without_one_of_its_factors_is_refused():
-    problem, _ = with_a_prior_of_ones_own()
-    graph, n = gtsam.NonlinearFactorGraph(), problem.graph.size()
-    for i in range(n - 1):
-        graph.add(problem.graph.at(i))
-    with pytest.raises(ProblemError, match=rf"^problem\.graph: {n - 1} of the problem's {n} factors, expected all"):
-        solve(replace(problem, graph=graph))
-
-
-def test_factors_added_to_what_was_solved_are_refused_too():
-    problem, own = with_a_prior_of_ones_own()
-    solution = solve(problem)
-    assess(solution)
-    solution.problem.graph.add(own)
-    with pytest.raises(ProblemError) as caught:
-        assess(solution)
-    assert str(caught.value) == f"problem.graph: 1 of {solution.problem.graph.size()} {OWN}"
-
-
-def test_a_graph_of_ones_own_is_for_gtsam():
-    """As the refusal advises: GTSAM's optimiser honours the factor."""
-    problem, own = with_a_prior_of_ones_own()
-    graph = gtsam.NonlinearFactorGraph(problem.graph)
-    graph.add(own)
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setLinearSolverType("MULTIFRONTAL_QR")
-    values = gtsam.LevenbergMarquardtOptimizer(graph, problem.initial, parameters).optimize()
-    assert graph.error(values) < graph.error(problem.initial)

@@ -1,0 +1,223 @@
+"""Factors and variables that a user adds to the graph are solved, counted, and present in covariance, rank, classes."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from simulated import measure, paper_robot, small_arm, true_robot
+from tolerances import rounding
+
+from fg_calib.analysis.uncertainty import assess
+from fg_calib.analysis.variance_components import estimate_noise
+from fg_calib.errors import ProblemError
+from fg_calib.graph.problem import build_problem
+from fg_calib.graph.solver import solve
+from fg_calib.robot.kinematics import forward, precompute_trig
+
+TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3, "beta": 1e-3}
+ANCHOR = gtsam.symbol("a", 0)
+READINGS = np.array([[0.1, -0.7, 0.3, 0.5, -0.3, 0.9, 0.2], [0.4, -0.3, 1.0, -0.5, 0.7, -0.9, 1.4]])
+
+
+def problem_of(gauge="prior", model="distance", seed=0, robot=None):
+    rng = np.random.default_rng(seed)
+    robot = robot or paper_robot(TOLERANCE)
+    return build_problem(robot, measure(true_robot(robot, rng), 40, rng), model=model, gauge=gauge)
+
+
+def prior_on_k3(problem, sigma=1e-6):
+    """An opinion of somebody's on the parameters of joint 3: a3 is 0.1 mm more than nominal."""
+    key = gtsam.symbol("K", 3)
+    mean = problem.initial.atVector(key) + np.eye(len(problem.initial.atVector(key)))[0] * 1e-4
+    sigmas = np.full(len(mean), 1.0)
+    sigmas[0] = sigma
+    return gtsam.PriorFactorVector(key, mean, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+
+
+def known_distance(problem, extra=2e-3, sigma=1e-5):
+    """The tool moves by 2 mm more than nominal between two configurations."""
+    variables, trig = problem.variables, precompute_trig(problem.robot, READINGS)
+    at = forward(variables.chain.at(problem.start), trig).position
+    length = np.linalg.norm(at[1] - at[0]) + extra
+
+    def error(_, values, H):
+        at = forward(variables.chain.at(variables.parameters(values, variables.items)), trig)
+        step = at.position[1] - at.position[0]
+        if H is not None:
+            J = (step / np.linalg.norm(step) @ (at.jacobian[1, 3:] - at.jacobian[0, 3:]))[None]
+            for i, v in enumerate(variables.items):
+                H[i] = J[:, v.columns]
+        return np.array([np.linalg.norm(step) - length])
+
+    keys = [v.key for v in variables.items]
+    return gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(1, sigma), keys, error)
+
+
+def anchor_distances(problem, point, n=8, sigma=1e-4):
+    """Distances from the tool to a fixed point that nobody knows, as seen at nominal."""
+    variables = problem.variables
+    q = np.random.default_rng(3).uniform(-1.5, 1.5, (n, problem.robot.n_joints))
+    trig = precompute_trig(problem.robot, q)
+    measured = np.linalg.norm(forward(variables.chain.at(problem.start), trig).position - point, axis=1)
+
+    def factor(k):
+        def error(_, values, H):
+            at = forward(variables.chain.at(variables.parameters(values, variables.items)), trig[k : k + 1])
+            step = at.position[0] - values.atPoint3(ANCHOR)
+            u = step / np.linalg.norm(step)
+            if H is not None:
+                J = (u @ at.jacobian[0, 3:])[None]
+                for i, v in enumerate(variables.items):
+                    H[i] = J[:, v.columns]
+                H[len(variables.items)] = -u[None]
+            return np.array([np.linalg.norm(step) - measured[k]])
+
+        keys = [v.key for v in variables.items] + [ANCHOR]
+        return gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(1, sigma), keys, error)
+
+    return [factor(k) for k in range(n)]
+
+
+def dense_covariance(solution, n):
+    """Of the first n columns, from GTSAM's linear system of the whole graph by a pseudo-inverse."""
+    problem = solution.problem
+    ordering = gtsam.Ordering()
+    for key in problem.variables.keys:
+        ordering.push_back(key)
+    A, _ = problem.graph.linearize(solution.values).jacobian(ordering)
+    scales = np.concatenate([problem.variables.prior_scales, np.ones(A.shape[1] - n)])
+    inverse = np.linalg.pinv(A * scales, rcond=1e-10) * scales[:, None]
+    return (inverse @ inverse.T)[:n, :n]
+
+
+@pytest.mark.parametrize("way", ["in place", "in a copy"])
+def test_factors_on_our_variables_are_solved_and_assessed(way):
+    problem = problem_of()
+    graph = problem.graph if way == "in place" else gtsam.NonlinearFactorGraph(problem.graph)
+    own = [prior_on_k3(problem), known_distance(problem)]
+    for factor in own:
+        graph.add(factor)
+    plain, solution = solve(problem_of()), solve(replace(problem, graph=graph))
+    before, after = assess(plain), assess(solution)
+    a3 = next(p for p in after.parameters if p.name == "a3")
+    assert solution.converged
+    assert a3.correction == pytest.approx(1e-4, abs=5e-6)  # five of the prior's sigma
+    assert a3.sigma < 1e-6
+    assert own[1].error(solution.values) < 12.5  # five sigma
+    assert own[1].error(plain.values) > 1e3
+    assert solution.problem.graph.size() == problem_of().graph.size() + 2
+    # One row of the distance and as many of the prior as joint 3 has parameters; no direction more.
+    assert after.dof == before.dof + 1 + len(problem.initial.atVector(gtsam.symbol("K", 3)))
+    assert after.chi2 == pytest.approx(2.0 * solution.problem.graph.error(solution.values), rel=1e-9)
+    C = dense_covariance(solution, problem.variables.n_columns)
+    sigma = np.sqrt(np.diag(after.spread.tangent))
+    assert sigma == pytest.approx(np.sqrt(np.diag(C)), rel=1e-6)  # conditioning of 1e4 squared times rounding
+
+
+def test_the_optimum_is_that_of_gtsams_own_optimiser():
+    problem = problem_of()
+    for factor in (prior_on_k3(problem, 1e-4), known_distance(problem)):
+        problem.graph.add(factor)
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setLinearSolverType("MULTIFRONTAL_QR")
+    parameters.setlambdaUpperBound(1e12)
+    parameters.setRelativeErrorTol(1e-14)
+    graph, initial = gtsam.NonlinearFactorGraph(problem.graph), gtsam.Values(problem.initial)
+    solution = solve(problem)
+    theirs = gtsam.LevenbergMarquardtOptimizer(solution.problem.graph, initial, parameters).optimize()
+    sigma = np.sqrt(np.diag(assess(solution).spread.tangent))
+    assert np.abs(problem.variables.step(solution.values, theirs) / sigma).max() < 1e-4  # where GTSAM stops
+    assert graph.error(solution.values) < graph.error(initial)
+
+
+@pytest.mark.parametrize("gauge", ["prior", "none"])
+def test_a_variable_of_ones_own_is_solved_and_found_again(gauge):
+    point = np.array([3.0, -2.0, 1.0])
+    problem = problem_of(gauge)
+    plain = assess(solve(problem_of(gauge)))
+    for factor in anchor_distances(problem, point):
+        problem.graph.add(factor)
+    problem.initial.insert(ANCHOR, point + np.array([0.3, -0.2, 0.4]))
+    solution = solve(problem)
+    uncertainty = assess(solution)
+    assert solution.converged
+    assert np.linalg.norm(solution.values.atPoint3(ANCHOR) - point) < 0.02  # the arm is off by millimetres
+    gained = uncertainty.spread.rank - plain.spread.rank
+    assert uncertainty.dof == plain.dof + 8 - 3 - gained
+    if gauge == "prior":
+        C = dense_covariance(solution, problem.variables.n_columns)
+        sigma = np.sqrt(np.diag(uncertainty.spread.tangent))
+        assert sigma == pytest.approx(np.sqrt(np.diag(C)), rel=1e-6)  # conditioning of 1e4 squared times rounding
+    # Solving again from there, with the variable in its place, changes nothing.
+    again = solve(solution.problem)
+    assert again.values.atPoint3(ANCHOR) == pytest.approx(solution.values.atPoint3(ANCHOR), abs=1e-7)
+
+
+def test_a_pose_of_ones_own_is_solved():
+    """Of any of GTSAM's types: a frame in which the base stands, known by a prior alone."""
+    problem, key = problem_of(), gtsam.symbol("p", 7)
+    mean = gtsam.Pose3(gtsam.Rot3.Ypr(0.4, -1.2, 2.0), np.array([1.0, 2.0, 3.0]))
+    problem.graph.add(gtsam.PriorFactorPose3(key, mean, gtsam.noiseModel.Isotropic.Sigma(6, 0.1)))
+    problem.initial.insert(key, gtsam.Pose3())
+    solution = solve(problem)
+    assert solution.values.atPose3(key).equals(mean, 1e-9)
+    assert assess(solution).dof == assess(solve(problem_of())).dof
+
+
+def test_what_is_added_determines_what_was_not():
+    """Classes and rank count it: a length along the first axis, which no pair of positions says anything of."""
+    problem, plain = problem_of("none"), assess(solve(problem_of("none")))
+    key = gtsam.symbol("K", 1)
+    prior = gtsam.PriorFactorVector(key, problem.initial.atVector(key), gtsam.noiseModel.Isotropic.Sigma(5, 1e-3))
+    problem.graph.add(prior)
+    found = assess(solve(problem))
+    assert {p.identifiability for p in plain.parameters[6:11]} == {"ineffective", "relative"}
+    assert {p.identifiability for p in found.parameters[6:11]} == {"independent"}
+    assert found.identifiability.observability.rank == plain.identifiability.observability.rank + 5
+    assert [p.sigma for p in found.parameters[6:11]] == pytest.approx([1e-3] * 5, rel=1e-9)
+
+
+@pytest.mark.parametrize("change", ["removed", "replaced"])
+def test_a_graph_without_one_of_its_factors_is_refused(change):
+    problem, graph = problem_of(), gtsam.NonlinearFactorGraph()
+    n = problem.graph.size()
+    for i in range(n - (change == "removed")):
+        graph.add(problem.graph.at(i))
+    if change == "replaced":
+        graph.replace(0, prior_on_k3(problem))
+    for use in (solve, estimate_noise):
+        with pytest.raises(ProblemError, match=rf"^problem\.graph: {n - 1} of the problem's {n} factors, expected all"):
+            use(replace(problem, graph=graph))
+
+
+def test_a_variable_needs_a_start_and_a_factor():
+    problem = problem_of()
+    problem.graph.add(anchor_distances(problem, np.ones(3), n=1)[0])
+    with pytest.raises(ProblemError, match=r"^problem\.initial: no value of a0, expected one for every variable"):
+        solve(problem)
+    problem = problem_of()
+    problem.initial.insert(ANCHOR, np.ones(3))
+    with pytest.raises(ProblemError, match=r"^problem\.initial: a value of a0, expected none without a factor on it"):
+        solve(problem)
+
+
+def test_factors_added_to_what_was_solved_are_to_be_solved_again():
+    problem = problem_of()
+    solution = solve(problem)
+    assess(solution)
+    solution.problem.graph.add(prior_on_k3(problem))
+    with pytest.raises(ProblemError, match=r"^solution\.problem\.graph: 1 factors added since it was solved"):
+        assess(solution)
+    assert assess(solve(solution.problem)).dof == assess(solve(problem)).dof + 5
+
+
+def test_a_start_of_ones_own_is_where_the_solver_begins():
+    robot = small_arm({"a": 1e-3})
+    problem = problem_of(model="pose", robot=robot)
+    key = problem.variables.items[0].key
+    problem.initial.update(key, problem.initial.atVector(key) + 1e-3)
+    moved = solve(problem, None)
+    still = solve(problem_of(model="pose", robot=robot))
+    assert moved.initial_cost != still.initial_cost
+    assert np.abs(moved.parameters - still.parameters).max() < rounding(1, 1e4)
