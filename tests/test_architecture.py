@@ -3,8 +3,10 @@
 import ast
 import importlib
 import inspect
+import re
 import subprocess
 import sys
+import tomllib
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -133,11 +135,26 @@ def test_public_names_come_from_a_fresh_import():
     assert run_python(code) == "[]\n"
 
 
+def test_all_that_is_imported_is_installed_with_the_package():
+    """What the tests need beside, such as yourdfpy, is not."""
+    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    installed = {re.match(r"[\w-]+", line)[0] for line in project["dependencies"]}
+    installed = installed - {"pyyaml"} | {"yaml", "pydantic_core"}  # as imported; pydantic brings its core
+    used = set()
+    for path in MODULES:
+        for node in ast.walk(parse(path)):
+            if isinstance(node, ast.Import):
+                used |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                used.add(node.module.partition(".")[0])
+    assert used - sys.stdlib_module_names - {"fg_calib"} == installed
+
+
 def test_the_command_line_is_there_before_the_heavy_libraries():
     code = "import sys, fg_calib.cli; print(sorted({m.partition('.')[0] for m in sys.modules}))"
     loaded = set(ast.literal_eval(run_python(code)))
     assert "fg_calib" in loaded
-    heavy = {"gtsam", "numba", "polars", "scipy", "numpy", "matplotlib", "yourdfpy", "lxml", "pydantic"}
+    heavy = {"gtsam", "numba", "polars", "scipy", "numpy", "matplotlib", "lxml", "pydantic"}
     assert loaded & heavy == set()
 
 
