@@ -158,6 +158,32 @@ def test_the_command_line_is_there_before_the_heavy_libraries():
     assert loaded & heavy == set()
 
 
+def test_a_calibration_loads_only_what_it_uses(example):
+    """No figures, no URDFs, no baseline, and of scipy not the heaviest."""
+    code = f"""
+import contextlib, io, sys
+from fg_calib import cli
+sys.argv = ["fg-calib", "calibrate", {str(example / "calibration.yaml")!r}]
+with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+    cli.main()
+print(sorted(sys.modules))
+"""
+    loaded = set(ast.literal_eval(run_python(code)))
+    assert {"fg_calib.analysis.uncertainty", "fg_calib.report.text", "gtsam", "numba", "polars"} <= loaded
+    idle = {
+        "matplotlib",
+        "lxml",
+        "pandas",
+        "yourdfpy",
+        "trimesh",
+        "scipy.optimize",
+        "scipy.stats",
+        "scipy.sparse.linalg",
+    }
+    idle |= {"fg_calib.baseline", "fg_calib.report.documents", "fg_calib.report.figures", "fg_calib.files.urdf"}
+    assert loaded & idle == set()
+
+
 def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="module 'fg_calib' has no attribute 'calibrate_all'"):
         _ = fg_calib.calibrate_all
