@@ -5,6 +5,8 @@ Exit codes: 0 good; 1 bad input; 2 wrong usage; 3 solved, but not to be trusted.
 
 from __future__ import annotations
 
+import atexit
+import gc
 import io
 import json
 import logging
@@ -31,13 +33,21 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+_OBJECTS_BEFORE_GARBAGE = 500_000
+"""New objects after which garbage is looked for: twice what a calibration and its imports make."""
+
 EXAMPLES = Path(__file__).parent / "examples"
 
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout, and nothing else there.")]
 
 
 def main() -> None:
-    """Run the command line."""
+    """Run the command line.
+
+    Garbage is looked for seldom, and not at the end: among all that imports keep, it took a quarter of a short command.
+    """
+    gc.set_threshold(_OBJECTS_BEFORE_GARBAGE)
+    atexit.register(gc.freeze)
     logging.basicConfig(stream=sys.stderr, format="%(message)s", level=logging.WARNING)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show a letter gets a question mark
@@ -80,17 +90,21 @@ def calibrate(
     from fg_calib.analysis.uncertainty import assess
     from fg_calib.analysis.variance_components import solve_job
     from fg_calib.files.job import read_job
-    from fg_calib.report.documents import result_document, write_results
-    from fg_calib.report.text import build_report
 
     given = read_job(job)
     solution = solve_job(given)
     uncertainty = assess(solution)
     if out is not None:
+        from fg_calib.report.documents import write_results
+
         write_results(out, solution, uncertainty, given.inputs)
     if as_json:
+        from fg_calib.report.documents import result_document
+
         print(json.dumps(result_document(solution, uncertainty, given.inputs), allow_nan=False))
     else:
+        from fg_calib.report.text import build_report
+
         _show(build_report(solution, uncertainty))
     _end(uncertainty.findings)
 

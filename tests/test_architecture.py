@@ -3,8 +3,10 @@
 import ast
 import importlib
 import inspect
+import re
 import subprocess
 import sys
+import tomllib
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -139,12 +141,45 @@ def test_public_names_come_from_a_fresh_import():
     assert run_python(code) == "[]\n"
 
 
+def test_all_that_is_imported_is_installed_with_the_package():
+    """What the tests need beside, such as yourdfpy, is not."""
+    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    installed = {re.match(r"[\w-]+", line)[0] for line in project["dependencies"]}
+    installed = installed - {"pyyaml"} | {"yaml", "pydantic_core"}  # as imported; pydantic brings its core
+    used = set()
+    for path in MODULES:
+        for node in ast.walk(parse(path)):
+            if isinstance(node, ast.Import):
+                used |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                used.add(node.module.partition(".")[0])
+    assert used - sys.stdlib_module_names - {"fg_calib"} == installed
+
+
 def test_the_command_line_is_there_before_the_heavy_libraries():
     code = "import sys, fg_calib.cli; print(sorted({m.partition('.')[0] for m in sys.modules}))"
     loaded = set(ast.literal_eval(run_python(code)))
     assert "fg_calib" in loaded
-    heavy = {"gtsam", "numba", "polars", "scipy", "numpy", "matplotlib", "yourdfpy", "lxml", "pydantic"}
+    heavy = {"gtsam", "numba", "polars", "scipy", "numpy", "matplotlib", "lxml", "pydantic"}
     assert loaded & heavy == set()
+
+
+def test_a_calibration_loads_only_what_it_uses(example):
+    """No figures, no URDFs, no baseline, and of scipy not the heaviest."""
+    code = f"""
+import contextlib, io, sys
+from fg_calib import cli
+sys.argv = ["fg-calib", "calibrate", {str(example / "calibration.yaml")!r}]
+sys.stderr = io.StringIO()  # which says so if kernels are compiled
+with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+    cli.main()
+print(sorted(sys.modules))
+"""
+    loaded = set(ast.literal_eval(run_python(code)))
+    assert {"fg_calib.analysis.uncertainty", "fg_calib.report.text", "gtsam", "numba", "polars"} <= loaded
+    idle = {"matplotlib", "lxml", "yourdfpy", "scipy.optimize", "scipy.stats", "fg_calib.files.urdf"}
+    idle |= {"fg_calib.baseline", "fg_calib.report.documents", "fg_calib.report.figures"}
+    assert loaded & idle == set()
 
 
 def test_an_unknown_name_is_an_attribute_error():

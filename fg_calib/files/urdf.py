@@ -1,18 +1,18 @@
 """URDF: the chain between any two links of the file, and its calibrated origins written back.
 
-yourdfpy reads links, axes, limits and mimics. The origins are read from the XML, because yourdfpy turns them into
-matrices, from which roll, pitch and yaw cannot be told where pitch is a quarter turn; the calibrated ones are
-written into the same XML, so that everything else stays as it was.
+Of each joint its type, parent, child, origin, axis, limit and mimic are read; meshes, inertias and whatever else a URDF
+may hold are not. Calibrated origins are written into the same XML, so that everything else stays as it was.
 """
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fg_calib.errors import InputError
 from fg_calib.files.disk import require_file, write_text
@@ -24,6 +24,20 @@ if TYPE_CHECKING:  # lxml is imported where it is used: `fg-calib --help` need n
 
 _ORIGIN = {"xyz": ("x", "y", "z"), "rpy": ("roll", "pitch", "yaw")}
 """The attributes of `<origin>` and the kinds of parameters that they hold."""
+
+_NO_ENTITIES = "a URDF without entities: they are not expanded"
+
+
+@dataclass(frozen=True)
+class _UrdfJoint:
+    """A joint as the file has it; its axis, limit and mimic matter only on the chain and are read there."""
+
+    element: Element
+    name: str
+    parent: str
+    child: str
+    origin: Mapping[str, float]
+    """By kind, [m] and [rad]."""
 
 
 def read_urdf(
@@ -64,8 +78,7 @@ def read_urdf(
     require_file(path)
     data = path.read_bytes()
     text, root = _parse(data, path.name)
-    origins = _read_origins(root, path.name)
-    tree = _Tree(_load(data, path.name).joints, [link.get("name", "") for link in root.findall("link")], path.name)
+    tree = _Tree(_read_joints(root, path.name), _read_links(root, path.name), path.name)
     base_link = tree.root() if base_link is None else tree.known(base_link)
     tip_link = tree.leaf(base_link) if tip_link is None else tree.known(tip_link)
 
@@ -73,15 +86,11 @@ def read_urdf(
     builder.add_frame("base", base or {}, 0, False)
     n_joints = 0
     for joint, backwards in tree.chain(base_link, tip_link):
-        here = f"{path.name}: joint {joint.name!r}"
-        if joint.type == "fixed":
-            builder.add_constant_frame(origins[joint.name], backwards=backwards)
+        if joint.element.get("type") == "fixed":
+            builder.add_constant_frame(joint.origin, backwards=backwards)
             continue
-        if joint.type not in {"revolute", "continuous", "prismatic"}:
-            raise InputError(here, f"type {joint.type}", "revolute, continuous, prismatic or fixed on the chain")
-        if joint.mimic is not None:
-            raise InputError(here, f"mimics joint {joint.mimic.joint!r}", "joints on the chain that move by themselves")
-        builder.add_urdf_joint(_moving_joint(joint, here), origins[joint.name], _axis(joint, here), backwards=backwards)
+        here = f"{path.name}: joint {joint.name!r}"
+        builder.add_urdf_joint(_moving_joint(joint, here), joint.origin, _axis(joint, here), backwards=backwards)
         n_joints += 1
     if n_joints == 0:
         raise InputError(path.name, f"no moving joint between links {base_link!r} and {tip_link!r}", "at least one")
@@ -122,59 +131,80 @@ def write_urdf(path: Path | str, robot: Robot) -> None:
 
 
 def _parse(data: bytes, place: str, encoding: str | None = None) -> tuple[str, Element]:
-    """The text and the root element of an XML file."""
+    """The text and the root element of an XML file, which may neither refer to other files nor hold entities."""
     from lxml import etree
 
+    safe = etree.XMLParser(encoding=encoding, resolve_entities=False, load_dtd=False, no_network=True, huge_tree=False)
     try:
-        root = etree.fromstring(data, etree.XMLParser(encoding=encoding))
+        root = etree.fromstring(data, safe)
     except etree.XMLSyntaxError as error:
-        raise InputError(f"{place}:{error.lineno}", f"not XML: {error.msg}") from None
+        expected = _NO_ENTITIES if "entity" in error.msg.lower() else ""
+        raise InputError(f"{place}:{error.lineno}", f"not XML: {error.msg}", expected) from None
+    document = root.getroottree().docinfo
+    types: Any = document.internalDTD
+    if types is not None and (types.system_url or types.entities()):
+        raise InputError(place, "a <!DOCTYPE> with entities or of another file", _NO_ENTITIES)
     if root.tag != "robot":
         raise InputError(place, f"root element <{root.tag}>", "<robot>")
-    return data.decode(root.getroottree().docinfo.encoding or "utf-8").removeprefix("\ufeff"), root
+    return data.decode(document.encoding or "utf-8").removeprefix("\ufeff"), root
 
 
-def _load(data: bytes, place: str) -> Any:
-    """The robot as yourdfpy reads it, without meshes."""
-    import yourdfpy
+def _read_links(root: Element, place: str) -> list[str]:
+    links = []
+    for link in root.findall("link"):
+        if not link.get("name"):
+            raise InputError(f"{place}:{link.sourceline}", "a link without a name")
+        links.append(link.get("name", ""))
+    return links
 
-    try:
-        return yourdfpy.URDF.load(io.BytesIO(data), build_scene_graph=False, load_meshes=False).robot
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise InputError(place, f"not a URDF: {type(error).__name__}: {error}") from None
 
-
-def _read_origins(root: Element, place: str) -> dict[str, dict[str, float]]:
-    """Each joint's origin by kind, [m] and [rad]; and that each has a name, a parent and a child."""
-    origins: dict[str, dict[str, float]] = {}
+def _read_joints(root: Element, place: str) -> list[_UrdfJoint]:
+    """All joints, each with a name of its own, an origin, a parent and a child."""
+    joints: dict[str, _UrdfJoint] = {}
     for joint in root.findall("joint"):
         name = joint.get("name")
         here = f"{place}:{joint.sourceline}: joint {name!r}"
         if not name:
             raise InputError(f"{place}:{joint.sourceline}", "a joint without a name")
-        if name in origins:
+        if name in joints:
             raise InputError(here, "a second joint of this name", "different names")
-        for end in ("parent", "child"):
-            element = joint.find(end)
-            if element is None or not element.get("link"):
-                raise InputError(here, f"no <{end}>", f'<{end} link="..."/>')
-        origins[name] = _origin(joint, here)
-    return origins
+        parent, child = (_link_at(joint, end, here) for end in ("parent", "child"))
+        joints[name] = _UrdfJoint(joint, name, parent, child, _origin(joint, here))
+    return list(joints.values())
+
+
+def _link_at(joint: Element, end: str, place: str) -> str:
+    """The link that a joint has as `end`: parent or child."""
+    element = joint.find(end)
+    link = None if element is None else element.get("link")
+    if not link:
+        raise InputError(place, f"no <{end}>", f'<{end} link="..."/>')
+    return link
 
 
 def _origin(joint: Element, place: str) -> dict[str, float]:
-    element = joint.find("origin")
     values: dict[str, float] = {}
     for attribute, kinds in _ORIGIN.items():
-        text = "0 0 0" if element is None else element.get(attribute, "0 0 0")
-        try:
-            figures = [float(word) for word in text.split()]
-        except ValueError:
-            figures = []
+        text = _attribute(joint, "origin", attribute, "0 0 0")
+        figures = _figures(text)
         if len(figures) != len(kinds) or not np.isfinite(figures).all():
             raise InputError(f"{place}: origin {attribute}", f"found {text!r}", "three finite numbers")
         values |= zip(kinds, figures, strict=True)
     return values
+
+
+def _attribute(joint: Element, child: str, attribute: str, default: str) -> str:
+    """An attribute of a joint's first child of some name; `default` where either is missing."""
+    element = joint.find(child)
+    return default if element is None else element.get(attribute, default)
+
+
+def _figures(text: str) -> list[float]:
+    """The numbers in a text; none if a word of it is none."""
+    try:
+        return [float(word) for word in text.split()]
+    except ValueError:
+        return []
 
 
 def _write_origin(joint: Element, values: Mapping[str, float]) -> None:
@@ -192,37 +222,46 @@ def _write_origin(joint: Element, values: Mapping[str, float]) -> None:
         element.set(attribute, " ".join(repr(float(values[kind])) for kind in kinds))
 
 
-def _moving_joint(joint: Any, place: str) -> Joint:
+def _moving_joint(joint: _UrdfJoint, place: str) -> Joint:
     """The joint with its limits; URDF's missing limit is 0, and two zeros are none at all."""
-    prismatic = joint.type == "prismatic"
-    if joint.type == "continuous" or joint.limit is None:
-        return Joint(joint.name, prismatic)
-    lower, upper = joint.limit.lower or 0.0, joint.limit.upper or 0.0
+    kind, mimic = joint.element.get("type"), joint.element.find("mimic")
+    if kind not in {"revolute", "continuous", "prismatic"}:
+        raise InputError(place, f"type {kind}", "revolute, continuous, prismatic or fixed on the chain")
+    if mimic is not None:
+        raise InputError(place, f"mimics joint {mimic.get('joint')!r}", "joints on the chain that move by themselves")
+    lower, upper = (0.0, 0.0) if kind == "continuous" else (_limit(joint, end, place) for end in ("lower", "upper"))
     if lower == upper == 0.0:
-        return Joint(joint.name, prismatic)
+        return Joint(joint.name, kind == "prismatic")
     if not lower < upper:
         raise InputError(f"{place}: limit", f"lower {lower:g}, upper {upper:g}", "lower below upper")
-    return Joint(joint.name, prismatic, lower, upper)
+    return Joint(joint.name, kind == "prismatic", lower, upper)
 
 
-def _axis(joint: Any, place: str) -> Any:
-    """The joint's unit axis, shape (3,)."""
-    axis = np.asarray(joint.axis, dtype=float)
-    length = np.linalg.norm(axis)
+def _limit(joint: _UrdfJoint, end: str, place: str) -> float:
+    text = _attribute(joint.element, "limit", end, "0")
+    figures = _figures(text)
+    if len(figures) != 1:
+        raise InputError(f"{place}: limit {end}", f"found {text!r}", "a number")
+    return figures[0]
+
+
+def _axis(joint: _UrdfJoint, place: str) -> NDArray[np.float64]:
+    """The joint's unit axis, shape (3,); x where the file says none."""
+    text = _attribute(joint.element, "axis", "xyz", "1 0 0")
+    axis = np.array(_figures(text))
+    length = float(np.linalg.norm(axis))
     if axis.shape != (3,) or not 0.0 < length < np.inf:
-        raise InputError(
-            f"{place}: axis", f"found {' '.join(f'{v:g}' for v in axis)!r}", "a direction of three numbers"
-        )
+        raise InputError(f"{place}: axis", f"found {text!r}", "a direction of three numbers")
     return axis / length
 
 
 class _Tree:
     """The links of a URDF and the joints between them."""
 
-    def __init__(self, joints: Sequence[Any], links: Sequence[str], place: str) -> None:
+    def __init__(self, joints: Sequence[_UrdfJoint], links: Sequence[str], place: str) -> None:
         self._place = place
         self._links = dict.fromkeys([*links, *(link for j in joints for link in (j.parent, j.child))])
-        self._joint_above: dict[str, Any] = {}  # by child link
+        self._joint_above: dict[str, _UrdfJoint] = {}  # by child link
         for joint in joints:
             if joint.child in self._joint_above:
                 first = self._joint_above[joint.child].name
@@ -249,7 +288,7 @@ class _Tree:
         leaves = [link for link in self._links if link not in parents]
         return self._only([leaf for leaf in leaves if base in self._links_up(leaf)], "leaf", "tip_link")
 
-    def chain(self, base: str, tip: str) -> list[tuple[Any, bool]]:
+    def chain(self, base: str, tip: str) -> list[tuple[_UrdfJoint, bool]]:
         """The joints from `base` to `tip`, with whether each is passed from child to parent."""
         up, down = self._links_up(base), self._links_up(tip)
         common = next((link for link in up if link in down), None)

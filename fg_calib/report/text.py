@@ -6,7 +6,7 @@ import io
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import chain
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,18 +18,20 @@ from rich.text import Text
 
 from fg_calib.analysis.accuracy import ExpectedError
 from fg_calib.analysis.goodness import FLAGS, OUTLIER_WEIGHT, PREDICTION_VERDICTS, VERDICTS, SuspectConfiguration
-from fg_calib.analysis.identifiability import Identifiability
 from fg_calib.analysis.joint_values import JointValues
-from fg_calib.analysis.reasons import LostDirection
 from fg_calib.analysis.residual_table import FAMILIES, ROW_KINDS
 from fg_calib.analysis.uncertainty import LIKE_NOISE, FrameEstimate, ParameterEstimate, Uncertainty
 from fg_calib.analysis.verdict import chi2_in_words, probability
-from fg_calib.baseline.comparison import Comparison, Estimate, PoseError
 from fg_calib.graph.observability import CORRELATED, Observability
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
 from fg_calib.options import check_number
 from fg_calib.robot.model import AXIS_OF_KIND, Axis, Robot, names_of
+
+if TYPE_CHECKING:  # a calibration is reported without the baseline
+    from fg_calib.analysis.identifiability import Identifiability
+    from fg_calib.analysis.reasons import LostDirection
+    from fg_calib.baseline.comparison import Comparison, Estimate, PoseError
 
 Integers = NDArray[np.int64]
 

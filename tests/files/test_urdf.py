@@ -1,6 +1,7 @@
 """URDF: chains against yourdfpy's own forward kinematics, origins written back, and one message a mistake."""
 
 import math
+import socket
 
 import numpy as np
 import pytest
@@ -222,11 +223,113 @@ def test_mistakes_in_the_yaml_of_a_urdf_are_named_there(tree, tmp_path):
     )
 
 
-def test_what_is_off_the_chain_does_not_matter(tmp_path):
+@pytest.mark.parametrize(
+    "junk",
+    [
+        '<axis xyz="1 2 -3"/><mimic joint="r1"/>',
+        '<mimic joint="nowhere" multiplier="two"/>',
+        "<axis/><mimic/><dynamics/><safety_controller/>",
+        '<axis xyz="${axis}"/><limit lower="low"/>',
+    ],
+)
+def test_what_is_off_the_chain_does_not_matter(tmp_path, junk):
     path = tmp_path / "arm.urdf"
     text = TREE.replace('name="l1" type="revolute"', 'name="l1" type="floating"')
-    path.write_text(text.replace('<axis xyz="1 2 -3"/>', '<mimic joint="r1"/>'))
+    path.write_text(text.replace('<axis xyz="1 2 -3"/>', junk))
     assert read_urdf(path, tip_link="right_tip").n_joints == 2
+
+
+JUNK = [
+    '<link name="r0"><inertial><mass value="heavy"/></inertial><visual><geometry><mesh/></geometry></visual></link>',
+    '<transmission name="t"><joint name="r1"><mechanicalReduction>100</mechanicalReduction></joint></transmission>',
+    '<gazebo reference="r1"><link name="inside"/><joint name="r1" type="screw"/></gazebo>',
+    '<x:macro xmlns:x="http://www.ros.org/wiki/xacro"><link name="r1"/><joint name="r1"/></x:macro>',
+    '<x:joint xmlns:x="http://www.ros.org/wiki/xacro" name="r1"/>',
+    '<link name="right_1"/><!-- again --><?editor <joint name="r1"/>?><![CDATA[<joint name="r1"/>]]>',
+]
+"""What yourdfpy reads, refuses or skips, and what says nothing of the chain."""
+
+
+@pytest.mark.parametrize("junk", JUNK, ids=range(len(JUNK)))
+def test_only_links_and_joints_of_the_robot_itself_are_read(tree, tmp_path, junk):
+    path = tmp_path / "junk.urdf"
+    path.write_text(TREE.replace('  <joint name="r1"', f'{junk}\n  <joint name="r1"'))
+    robot, plain = (read_urdf(p, base_link="left_1", tip_link="right_tip") for p in (path, tree))
+    assert (robot.joints, robot.parameters, robot.elements) == (plain.joints, plain.parameters, plain.elements)
+
+
+def test_a_robot_without_a_name_is_called_as_its_file(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(TREE.replace('<robot name="torso">', "<robot>"))
+    assert read_urdf(path, tip_link="left_tip").name == "arm"
+
+
+def random_urdf(rng):
+    """A tree of 3 to 12 links in any order, with all that a joint may leave out or state in an odd way."""
+
+    def numbers(scale):
+        return rng.choice(["  ", " \n\t", " "]).join(map(repr, rng.uniform(-scale, scale, 3).tolist()))
+
+    def element(tag, **attributes):
+        given = [f"{name}='{value}'" for name, value in attributes.items() if rng.random() < 0.7]
+        return f"<{tag} {' '.join(given)}/>" if rng.random() < 0.8 else ""
+
+    def joint(child):
+        low, high = np.sort(rng.uniform(-3, 3, 2))
+        mimic = f"<mimic joint='j1' multiplier='{low}'/>" if rng.random() < 0.1 and child > 1 else "<!-- itself -->"
+        parts = [
+            element("origin", xyz=numbers(1), rpy=numbers(4)),
+            element("axis", xyz=numbers(2)),
+            element("limit", lower=min(low, 0.0), upper=max(high, 0.0), effort=1),
+            f"<parent link='L{rng.integers(child)}'/>",
+            f"<child link='L{child}'/>",
+            mimic,
+        ]
+        kind = rng.choice(["revolute", "continuous", "prismatic", "fixed"])
+        return f"<joint name='j{child}' type='{kind}'>{''.join(rng.permutation(parts))}</joint>"
+
+    n = int(rng.integers(3, 13))
+    parts = [*(f"<link name='L{i}'/>" for i in range(n)), *(joint(i) for i in range(1, n))]
+    return n, f"<robot name='r'>{''.join(rng.permutation(parts))}</robot>"
+
+
+def yourdfpy_chain(model, base, tip):
+    """Names of the joints from `base` to `tip` by what yourdfpy says are their parents and children."""
+    above = {joint.child: joint for joint in model.robot.joints}
+
+    def up(link):
+        return [above[link].name, *up(above[link].parent)] if link in above else []
+
+    there, back = up(base), up(tip)
+    return [*(j for j in there if j not in back), *reversed([j for j in back if j not in there])]
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_random_trees_are_the_chains_limits_and_poses_of_yourdfpy(tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    path = tmp_path / "random.urdf"
+    n, text = random_urdf(rng)
+    path.write_text(text)
+    base, tip = (f"L{i}" for i in rng.choice(n, 2, replace=False))
+    model = yourdfpy.URDF.load(str(path), load_meshes=False)
+    chain = [model.joint_map[name] for name in yourdfpy_chain(model, base, tip)]
+    moving = [joint for joint in chain if joint.type != "fixed"]
+    if not moving or any(joint.mimic for joint in moving):
+        with pytest.raises(InputError, match="mimics joint 'j1'" if moving else "no moving joint"):
+            read_urdf(path, base_link=base, tip_link=tip)
+        return
+    robot = read_urdf(path, base_link=base, tip_link=tip)
+    limits = [
+        (j.limit.lower or 0.0, j.limit.upper or 0.0) if j.limit and j.type != "continuous" else (0.0, 0.0)
+        for j in moving
+    ]
+    assert robot.joints == tuple(
+        Joint(joint.name, joint.type == "prismatic", *(limit if any(limit) else ()))
+        for joint, limit in zip(moving, limits, strict=True)
+    )
+    q = rng.uniform(-2, 2, len(moving))
+    expected = yourdfpy_pose(path, base, tip, dict(zip([j.name for j in moving], q, strict=True)))
+    assert tool_pose(robot, q) == pytest.approx(expected, abs=rounding(float(n)))
 
 
 def changed(old, new):
@@ -281,7 +384,25 @@ MISTAKES = [
      "torso.urdf:14: joint 'l1': a second joint of this name, expected different names"),
     (changed('<parent link="left_2"/>', ""), {},
      "torso.urdf:16: joint 'l3': no <parent>, expected <parent link=\"...\"/>"),
-    (changed("1 2 -3", "a b c"), {}, "torso.urdf: not a URDF: ValueError: could not convert string to float: 'a'"),
+    (changed("1 2 -3", "a b c"), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': axis: found 'a b c', expected a direction of three numbers"),
+    (changed("1 2 -3", "${pi} 0 0"), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': axis: found '${pi} 0 0', expected a direction of three numbers"),
+    (changed("1 2 -3", "0 nan 1"), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': axis: found '0 nan 1', expected a direction of three numbers"),
+    (changed('upper="2"', 'upper="2 rad"'), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': limit upper: found '2 rad', expected a number"),
+    (changed('upper="2"', 'upper="nan"'), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': limit: lower -1.5, upper nan, expected lower below upper"),
+    (changed('name="l1" type="revolute"', 'name="l1"'), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': type None, expected revolute, continuous, prismatic or fixed on the chain"),
+    (changed('<child link="left_1"/>', "<child/>"), {},
+     "torso.urdf:11: joint 'l1': no <child>, expected <child link=\"...\"/>"),
+    (changed('<link name="left_1"/>', "<link/>"), {}, "torso.urdf:5: a link without a name"),
+    (changed('<robot name="torso">', '<robot name="torso" xmlns="http://www.ros.org">'), {},
+     "torso.urdf: root element <{http://www.ros.org}robot>, expected <robot>"),
+    (changed("</robot>", "<xacro:arm/></robot>"), {},
+     "torso.urdf:26: not XML: Namespace prefix xacro on arm is not defined, line 26, column 11"),
     (changed("l1", "tool"), {"tip_link": "left_tip"},
      "torso.urdf: two joints share a name, or one is called base or tool, expected different names"),
 ]  # fmt: skip
@@ -294,6 +415,58 @@ def test_a_mistake_is_named_in_one_line(tmp_path, text, links, message):
     with pytest.raises(InputError) as caught:
         read_urdf(path, **links)
     assert str(caught.value) == message
+
+
+LAUGHS = '<!ENTITY a0 "ha">' + "".join(f'<!ENTITY a{i + 1} "{f"&a{i};" * 10}">' for i in range(9))
+NONE = "expected a URDF without entities: they are not expanded"
+ENTITIES = {
+    "laughs in text": (LAUGHS, "&a9;", NONE),
+    "laughs in an attribute": (LAUGHS, '<link name="&a9;"/>', NONE),
+    "one long text a thousand times": (f'<!ENTITY a "{"x" * 10**5}">', f'<link name="{"&a;" * 1000}"/>', NONE),
+    "a circle": ('<!ENTITY a "&b;"><!ENTITY b "&a;">', '<link name="&a;"/>', NONE),
+    "a file in text": ('<!ENTITY a SYSTEM "{secret}">', "&a;", NONE),
+    "a file in an attribute": ('<!ENTITY a SYSTEM "{secret}">', '<link name="&a;"/>', NONE),
+    "a file of entities": ('<!ENTITY % a SYSTEM "{secret}"> %a;', "", NONE),
+    "the net in text": ('<!ENTITY a SYSTEM "{url}">', "&a;", NONE),
+    "the net, for entities": ('<!ENTITY % a SYSTEM "{url}"> %a;', "", NONE),
+    "an entity that would do": ('<!ENTITY a "0.1">', '<link name="&a;"/>', NONE),
+    "none such": ("", "&a;", NONE),
+}
+
+
+@pytest.fixture(scope="module")
+def listening():
+    """A server that waits for somebody to ask it."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(0.0)
+        yield server
+
+
+@pytest.mark.parametrize(("declared", "used", "message"), ENTITIES.values(), ids=ENTITIES)
+def test_entities_are_refused_in_one_line_and_nothing_is_fetched(tmp_path, listening, declared, used, message):
+    (tmp_path / "secret").write_text("<!ENTITY b 'secret'>")
+    declared = declared.format(secret=tmp_path / "secret", url=f"http://127.0.0.1:{listening.getsockname()[1]}/a.dtd")
+    path = tmp_path / "torso.urdf"
+    path.write_text(f"<!DOCTYPE robot [{declared}]>" + TREE.partition("\n")[2].replace("</robot>", f"{used}</robot>"))
+    with pytest.raises(InputError) as caught:
+        read_urdf(path, tip_link="left_tip")
+    assert str(caught.value).startswith("torso.urdf:")
+    assert str(caught.value).endswith(message)
+    assert len(str(caught.value)) < 200
+    with pytest.raises(BlockingIOError):
+        listening.accept()
+
+
+def test_a_document_type_elsewhere_is_refused_and_a_bare_one_says_nothing(tmp_path, listening):
+    path = tmp_path / "torso.urdf"
+    path.write_text(TREE.replace("<robot", "<!DOCTYPE robot>\n<robot", 1))
+    assert read_urdf(path, tip_link="left_tip").n_joints == 2
+    url = f"http://127.0.0.1:{listening.getsockname()[1]}/a.dtd"
+    path.write_text(TREE.replace("<robot", f'<!DOCTYPE robot SYSTEM "{url}">\n<robot', 1))
+    with pytest.raises(InputError, match=r"torso\.urdf: a <!DOCTYPE> with entities or of another file"):
+        read_urdf(path, tip_link="left_tip")
+    with pytest.raises(BlockingIOError):
+        listening.accept()
 
 
 def test_a_missing_file_is_named(tmp_path):
