@@ -28,12 +28,14 @@ if TYPE_CHECKING:
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
     from fg_calib.files.job import Job, read_job
     from fg_calib.files.robot_yaml import read_robot, write_robot
-    from fg_calib.files.scenario import read_scenario, write_simulation
+    from fg_calib.files.scenario import read_scenario
+    from fg_calib.files.simulation import write_simulation
     from fg_calib.files.tables import read_measurements
     from fg_calib.files.units import Units
     from fg_calib.graph.problem import Problem, build_problem, problem_of
     from fg_calib.graph.solver import Solution, SolverOptions, solve
     from fg_calib.measurements.dataset import Measurements, Noise, Pairing
+    from fg_calib.report.comparison import format_comparison
     from fg_calib.report.documents import (
         comparison_document,
         observability_document,
@@ -42,7 +44,8 @@ if TYPE_CHECKING:
         write_observability,
         write_results,
     )
-    from fg_calib.report.text import format_comparison, format_identifiability, format_report
+    from fg_calib.report.identifiability import format_identifiability
+    from fg_calib.report.text import format_report
     from fg_calib.robot.kinematics import pose
     from fg_calib.robot.model import Robot
     from fg_calib.simulation.scenario import Scenario, Simulation
@@ -56,7 +59,8 @@ _HOMES = {
     "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
     "fg_calib.files.job": ("Job", "read_job"),
     "fg_calib.files.robot_yaml": ("read_robot", "write_robot"),
-    "fg_calib.files.scenario": ("read_scenario", "write_simulation"),
+    "fg_calib.files.scenario": ("read_scenario",),
+    "fg_calib.files.simulation": ("write_simulation",),
     "fg_calib.files.tables": ("read_measurements",),
     "fg_calib.files.units": ("Units",),
     "fg_calib.analysis.identifiability": ("Identifiability", "observe_configurations", "observe_structure"),
@@ -66,7 +70,9 @@ _HOMES = {
     "fg_calib.analysis.mistakes": ("SetupCheck", "check_setup"),
     "fg_calib.analysis.variance_components": ("estimate_noise", "solve_job"),
     "fg_calib.graph.problem": ("Problem", "build_problem", "problem_of"),
-    "fg_calib.report.text": ("format_comparison", "format_identifiability", "format_report"),
+    "fg_calib.report.comparison": ("format_comparison",),
+    "fg_calib.report.identifiability": ("format_identifiability",),
+    "fg_calib.report.text": ("format_report",),
     "fg_calib.report.documents": (
         *("comparison_document", "observability_document", "result_document"),
         *("write_comparison", "write_observability", "write_results"),

@@ -15,15 +15,15 @@ from fg_calib.analysis.uncertainty import assess
 from fg_calib.baseline import comparison as comparison_module
 from fg_calib.baseline.comparison import ESTIMATORS, best_rigid_fit, compare, real_errors
 from fg_calib.errors import InputError
+from fg_calib.files.csv_writer import write_csv
 from fg_calib.files.job import Job, read_job
 from fg_calib.files.robot_yaml import write_robot
-from fg_calib.files.tables import write_csv
 from fg_calib.files.units import Units
 from fg_calib.graph.problem import build_problem, problem_of
 from fg_calib.graph.solver import solve
 from fg_calib.measurements.dataset import Pairing
+from fg_calib.report.comparison import format_comparison
 from fg_calib.report.documents import comparison_document
-from fg_calib.report.text import format_comparison
 from fg_calib.robot.kinematics import pose
 
 TOLERANCE = {"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3}

@@ -13,8 +13,8 @@ from simulated import TOOL, measure, paper_robot, small_arm, true_robot
 from fg_calib.analysis.bounds import cramer_rao
 from fg_calib.analysis.covariance import Spread
 from fg_calib.analysis.uncertainty import assess
+from fg_calib.files.csv_writer import write_csv
 from fg_calib.files.robot_yaml import write_robot
-from fg_calib.files.tables import write_csv
 from fg_calib.graph.problem import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.robot.kinematics import pose

@@ -22,7 +22,8 @@ from fg_calib.cli import EXAMPLES
 from fg_calib.errors import InputError
 from fg_calib.files.job import read_job
 from fg_calib.files.robot_yaml import read_robot
-from fg_calib.files.scenario import SCENARIOS, read_scenario, write_simulation
+from fg_calib.files.scenario import SCENARIOS, read_scenario
+from fg_calib.files.simulation import write_simulation
 from fg_calib.measurements.dataset import Noise
 from fg_calib.simulation.scenario import BoardViews, Errors, GivenReadings, Placement, RandomReadings, Scenario
 from fg_calib.simulation.simulator import FARTHEST_BASE, simulate, view_board
