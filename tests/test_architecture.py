@@ -5,6 +5,7 @@ import importlib
 import inspect
 import subprocess
 import sys
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -24,10 +25,12 @@ NAMES = [p.relative_to(PACKAGE).with_suffix("").as_posix() for p in MODULES]
 EVERY_MODULE = pytest.mark.parametrize(("name", "path"), list(zip(NAMES, MODULES, strict=True)), ids=NAMES)
 
 
+@cache
 def parse(path):
     return ast.parse(path.read_text(encoding="utf-8"), str(path))
 
 
+@cache
 def imported(tree):
     """Modules of the package that a module imports anywhere, as paths below the package: `robot`, `files/units`."""
     found = set()
