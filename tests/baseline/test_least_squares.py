@@ -129,7 +129,7 @@ def test_with_everything_estimated_they_agree_in_what_the_measurements_determine
 
 
 SECOND_ORDER = 0.01
-"""Sigma by which the mean of a noisy length moves an estimate here: 0.3 mrad of joint noise over 10 m, 0.004 measured."""
+"""Sigma by which the mean of a noisy length moves an estimate here: 0.3 mrad of joint noise over 10 m (0.004 found)."""
 
 
 @pytest.mark.parametrize("model", PAPERS)
