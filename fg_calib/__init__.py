@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
     from fg_calib.files.job import read_job
     from fg_calib.files.robot_yaml import read_robot, write_robot
-    from fg_calib.files.scenario import read_scenario, write_simulation
+    from fg_calib.files.scenario import read_scenario
+    from fg_calib.files.simulation import write_simulation
     from fg_calib.files.tables import read_measurements
     from fg_calib.files.units import Units
     from fg_calib.graph.problem import Problem, build_problem, problem_of
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from fg_calib.job import Job
     from fg_calib.measurements.dataset import Measurements, Noise
     from fg_calib.options import Options, Pairing
+    from fg_calib.report.comparison import format_comparison
     from fg_calib.report.documents import (
         comparison_document,
         observability_document,
@@ -44,7 +46,8 @@ if TYPE_CHECKING:
         write_observability,
         write_results,
     )
-    from fg_calib.report.text import format_comparison, format_identifiability, format_report
+    from fg_calib.report.identifiability import format_identifiability
+    from fg_calib.report.text import format_report
     from fg_calib.robot.kinematics import pose
     from fg_calib.robot.model import Robot
     from fg_calib.simulation.scenario import Scenario, Simulation
@@ -59,7 +62,8 @@ _HOMES = {
     "fg_calib.files.job": ("read_job",),
     "fg_calib.job": ("Job",),
     "fg_calib.files.robot_yaml": ("read_robot", "write_robot"),
-    "fg_calib.files.scenario": ("read_scenario", "write_simulation"),
+    "fg_calib.files.scenario": ("read_scenario",),
+    "fg_calib.files.simulation": ("write_simulation",),
     "fg_calib.files.tables": ("read_measurements",),
     "fg_calib.files.units": ("Units",),
     "fg_calib.analysis.identifiability": ("Identifiability", "observe_configurations", "observe_structure"),
@@ -70,7 +74,9 @@ _HOMES = {
     "fg_calib.analysis.variance_components": ("estimate_noise", "solve_job"),
     "fg_calib.graph.problem": ("Problem", "build_problem", "problem_of"),
     "fg_calib.options": ("Options", "Pairing"),
-    "fg_calib.report.text": ("format_comparison", "format_identifiability", "format_report"),
+    "fg_calib.report.comparison": ("format_comparison",),
+    "fg_calib.report.identifiability": ("format_identifiability",),
+    "fg_calib.report.text": ("format_report",),
     "fg_calib.report.documents": (
         *("comparison_document", "observability_document", "result_document"),
         *("write_comparison", "write_observability", "write_results"),

@@ -1,72 +1,22 @@
-"""How large residuals are before any calibration, and how large noise and tolerances let them be.
-
-An arm as drawn, its measurement frame and its tool fitted where they are unknown, misses what was measured by
-
-    r = J e + n,    its length on average by the root of tr(J T^2 J^T + N)
-
-with J the derivatives in the arm's estimated parameters, T their tolerances (`USUAL_LENGTH` and `USUAL_ANGLE` where
-there are none) and N the covariance of the noise, that of the joint readings with it. The *excess* is the median length
-over the median of what is expected: medians are not moved by a few gross errors.
-
-Some rows suffice, and frames and tool are fitted in closed form: a look takes a millisecond, and nothing depends on
-whether a calibration gets anywhere.
-"""
+"""The set-up of a job: some rows of its table, and what the job says of them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from fg_calib.graph import frames
-from fg_calib.graph.frames import Frame, Unknown
-from fg_calib.measurements.dataset import Measurements, Pairs, rotation_angle
+from fg_calib.measurements.dataset import Measurements
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, FrameKnowledge, Model
-from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
 Integers = NDArray[np.int64]
 
-USUAL_LENGTH, USUAL_ANGLE = 2e-3, 5e-3
-"""1 sigma of true minus nominal where a parameter has no tolerance: 2 mm and 5 mrad (0.3 degrees)."""
-
 ROWS = 60
 """Train configurations that are looked at, spread over the table."""
-
-_STEPS = (1, 7, 19)
-"""Pairs are formed with the rows that follow at these distances, round the end."""
-
-
-@dataclass(frozen=True)
-class TypicalResidual:
-    """Residuals of one kind of measurement before a calibration.
-
-    Attributes:
-        kind: `position`, `orientation`, `distance`, `angle` or `point`.
-        unit: `m` or `rad`.
-        size: Median of their lengths, [m] or [rad].
-        expected: What noise and tolerances make of it.
-        motion: How far the arm moves between these rows, [m] or [rad]: readings that hardly move it show nothing.
-        n: Number of measurements.
-    """
-
-    kind: str
-    unit: Literal["m", "rad"]
-    size: float
-    expected: float
-    motion: float
-    n: int
-
-    @property
-    def excess(self) -> float:
-        """Size over what is expected."""
-        return self.size / self.expected
 
 
 @dataclass(frozen=True)
@@ -94,193 +44,9 @@ class Setup:
         """Unknowns of the frames."""
         return 6 * self.frame + 3 * self.tool_rotation + int(self.tool_translation.sum())
 
-    def fit(self) -> tuple[TypicalResidual, ...]:
-        """Typical residuals by kind, frame and tool fitted; none if there are too few rows for that."""
-        return self._with(None)
-
-    def at(self, robot: Robot, world_T_base: Frame) -> tuple[TypicalResidual, ...]:
-        """The same with frame and tool as they were fitted elsewhere."""
-        fitted = replace(self, robot=robot, tool_rotation=False, tool_translation=np.zeros(3, dtype=np.bool_))
-        return fitted._with(world_T_base)
-
-    def _with(self, world_T_base: Frame | None) -> tuple[TypicalResidual, ...]:
-        flange = _Flange(self.robot, self.measurements)
-        if self.model in POSE_MODELS:
-            found = list(_pose_residuals(self, flange, world_T_base))
-        else:
-            found = list(_pair_residuals(self, flange))
-        n_rows = sum(r.n * (1 if r.kind in ("distance", "angle") else 3) for r in found)
-        if n_rows < 2 * self.n_free + 6 or not all(np.isfinite([r.size, r.expected]).all() for r in found):
-            return ()
-        return tuple(found)
-
-
-class _Flange:
-    """The flange of the nominal arm at some readings, and how far it may be from there.
-
-    Attributes:
-        rotation: base_R_flange, shape (n, 3, 3).
-        position: base_p_flange, shape (n, 3), [m].
-        tool: The nominal tool frame.
-        turns: Turns of the flange by 1 sigma of each parameter and reading, shape (n, 3, m), [rad].
-        shifts: Its shifts, [m].
-    """
-
-    def __init__(self, robot: Robot, measurements: Measurements) -> None:
-        tool = robot.owned_by(robot.n_joints + 1)  # in the order of FRAME_KINDS
-        bare = robot.nominal
-        x, y, z, yaw, pitch, roll = bare[tool] if tool else np.zeros(6)
-        bare[tool] = 0.0
-        at = pose(robot.with_values(bare), measurements.readings)
-        self.rotation, self.position = at.rotation, at.position
-        self.tool = Frame(Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix(), np.array([x, y, z]))
-        columns, sizes = [], []
-        for i, p in enumerate(robot.parameters):
-            if p.estimated and 1 <= p.owner <= robot.n_joints:
-                columns.append(i)
-                usual = USUAL_LENGTH if p.unit == "m" else USUAL_ANGLE
-                sizes.append(p.tolerance if p.tolerance is not None else usual)
-        columns += range(len(robot.parameters), len(robot.parameters) + robot.n_joints)
-        J = at.jacobian[:, :, columns] * np.concatenate([sizes, measurements.sigma_joint])
-        self.turns, self.shifts = J[:, :3], J[:, 3:]
-
-    def tool_point(self, t: Floats) -> tuple[Floats, Floats]:
-        """base_p of a point of the flange, shape (n, 3), [m], and its shifts, shape (n, 3, m)."""
-        arm = self.rotation @ t
-        return self.position + arm, self.shifts + np.cross(self.turns, arm[:, :, None], axis=1)
-
-
-def _pose_residuals(setup: Setup, flange: _Flange, world_T_base: Frame | None) -> Iterator[TypicalResidual]:
-    """Those of measured orientations and positions; frame and tool are fitted unless the frame is given."""
-    m, (with_orientation, with_position) = setup.measurements, POSE_MODELS[setup.model]
-    R_M = m.rotation if with_orientation else None
-    p_M = m.position if with_position else None
-    X, T = world_T_base or Frame(np.eye(3), np.zeros(3)), flange.tool
-    if world_T_base is None:
-        unknown = Unknown(setup.frame, setup.tool_rotation, setup.tool_translation)
-        X, T = frames.start_from_poses((flange.rotation, flange.position), (R_M, p_M), (X, T), unknown)
-    if R_M is not None:
-        angle, _ = rotation_angle(np.swapaxes(R_M, 1, 2) @ X.rotation @ flange.rotation @ T.rotation)
-        yield _typical("orientation", "rad", angle, flange.turns, m.sigma_orientation, _turn(flange.rotation))
-    if p_M is not None:
-        p, shifts = flange.tool_point(T.translation)
-        off = p @ X.rotation.T + X.translation - p_M
-        yield _typical("position", "m", np.linalg.norm(off, axis=1), shifts, m.sigma_position, _travel(p))
-
-
-def _pair_residuals(setup: Setup, flange: _Flange) -> Iterator[TypicalResidual]:
-    """Those of distances and angles between configurations, and of touched points."""
-    m, (with_distance, with_angle) = setup.measurements, PAIR_MODELS[setup.model]
-    pairs = m.pairs if m.pairs is not None else _form_pairs(m)
-    free, t = setup.tool_translation, flange.tool.translation
-    touched = None if m.groups is None or not np.any(m.groups.index >= 0) else m.groups.index
-    if with_distance and np.isfinite(pairs.distance).any():
-        rows = np.isfinite(pairs.distance)
-        a, b, distance = pairs.a[rows], pairs.b[rows], pairs.distance[rows]
-        poses = (flange.rotation, flange.position)
-        t = frames.start_from_distances(poses, a, b, distance, flange.tool, free).translation
-        p, shifts = flange.tool_point(t)
-        step = p[b] - p[a]
-        length = np.linalg.norm(step, axis=1)
-        along = np.einsum("ni,nim->nm", step / np.maximum(length, 1e-12)[:, None], shifts[b] - shifts[a])
-        sigma = np.nan_to_num(pairs.sigma_distance[rows])
-        yield _typical("distance", "m", np.abs(length - distance), along[:, None], sigma[:, None], _travel(p))
-    elif touched is not None:
-        t = _touching_tool_point(flange, touched, free)
-    if with_angle and np.isfinite(pairs.angle).any():
-        rows = np.isfinite(pairs.angle)
-        a, b = pairs.a[rows], pairs.b[rows]
-        turned = np.swapaxes(flange.rotation[a], 1, 2) @ flange.rotation[b]
-        angle, axis = rotation_angle(turned)
-        axis = axis / np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-12)
-        along = np.einsum("nj,nij,nim->nm", axis, flange.rotation[a], flange.turns[b] - flange.turns[a])
-        sigma = np.nan_to_num(pairs.sigma_angle[rows])
-        off = np.abs(angle - pairs.angle[rows])
-        yield _typical("angle", "rad", off, along[:, None], sigma[:, None], _turn(flange.rotation))
-    if touched is not None and with_distance:
-        yield from _touch_residuals(m, flange, t)
-
-
-def _form_pairs(m: Measurements) -> Pairs:
-    """Pairs of measured poses, short motions and long ones; nan where positions or orientations were not measured."""
-    n = m.n_configurations
-    steps = np.array([step for step in _STEPS if step < n], dtype=np.int64)
-    a = np.tile(np.arange(n), len(steps))
-    b = (a + np.repeat(steps, n)) % n
-    nothing = np.full(len(a), np.nan)
-
-    def sigma(of_rows: Floats | None) -> Floats:
-        return nothing if of_rows is None else np.sqrt(np.mean(of_rows[a] ** 2 + of_rows[b] ** 2, axis=1))
-
-    distance = nothing if m.position is None else np.linalg.norm(m.position[b] - m.position[a], axis=1)
-    angle = nothing if m.rotation is None else rotation_angle(np.swapaxes(m.rotation[a], 1, 2) @ m.rotation[b])[0]
-    train = np.zeros(len(a), dtype=np.bool_)
-    return Pairs(a, b, distance, angle, sigma(m.sigma_position), sigma(m.sigma_orientation), train)
-
-
-def _touching_tool_point(flange: _Flange, index: Integers, free: Booleans) -> Floats:
-    """The tool point that brings the points of each group nearest together, shape (3,), [m]."""
-    t = flange.tool.translation.copy()
-    p, _ = flange.tool_point(t)
-    A, b = (np.concatenate([v[index == g] - v[index == g].mean(axis=0) for g in np.unique(index[index >= 0])])
-            for v in (flange.rotation, p))  # fmt: skip
-    t[free] -= np.linalg.lstsq(A.reshape(-1, 3)[:, free], b.ravel(), rcond=1e-10)[0]
-    return t
-
-
-def _touch_residuals(m: Measurements, flange: _Flange, t: Floats) -> Iterator[TypicalResidual]:
-    """Tool points from the mean of their group, and the distances between these means."""
-    assert m.groups is not None
-    groups, index = m.groups, m.groups.index
-    p, shifts = flange.tool_point(t)
-    there = [g for g in range(groups.n_groups) if np.any(index == g)]
-    means = {g: (p[index == g].mean(axis=0), shifts[index == g].mean(axis=0)) for g in there}
-    rows = np.flatnonzero(index >= 0)
-    off = np.array([p[k] - means[int(index[k])][0] for k in rows])
-    moved = np.array([shifts[k] - means[int(index[k])][1] for k in rows])
-    sigma = np.zeros(len(rows)) if m.sigma_point is None else np.nan_to_num(m.sigma_point[rows])
-    on_axes = np.repeat(sigma[:, None], 3, axis=1)
-    yield _typical("point", "m", np.linalg.norm(off, axis=1), moved, on_axes, _travel(p))
-    pairs = groups.pairs.select(np.isin(groups.pairs.a, there) & np.isin(groups.pairs.b, there) & ~groups.pairs.test)
-    if pairs.n_pairs:
-        steps = [(means[b][0] - means[a][0], means[b][1] - means[a][1]) for a, b in zip(pairs.a, pairs.b, strict=True)]
-        length = np.array([np.linalg.norm(v) for v, _ in steps])
-        along = np.array([v @ s / max(float(np.linalg.norm(v)), 1e-12) for v, s in steps])
-        sigma = np.nan_to_num(pairs.sigma_distance)
-        off_distance = np.abs(length - pairs.distance)
-        yield _typical("distance", "m", off_distance, along[:, None], sigma[:, None], _travel(p))
-
-
-def _travel(p: Floats) -> float:
-    """How far points, shape (n, 3), typically are from their mean."""
-    return float(np.median(np.linalg.norm(p - p.mean(axis=0), axis=1)))
-
-
-def _turn(rotation: Floats) -> float:
-    """How far rotations, shape (n, 3, 3), typically are from the first, [rad]."""
-    return float(np.median(rotation_angle(rotation[0].T @ rotation)[0]))
-
-
-def _typical(
-    kind: str, unit: Literal["m", "rad"], length: Floats, moved: Floats, sigma: Floats | None, motion: float
-) -> TypicalResidual:
-    """The median of lengths, shape (n,), beside that of what is expected.
-
-    Args:
-        kind: Of the measurements.
-        unit: Of the lengths.
-        length: Of each residual.
-        moved: What each parameter's 1 sigma does to it, shape (n, height, m).
-        sigma: Of the noise, shape (n, height); None for none.
-        motion: How far the arm moves.
-    """
-    variance = np.sum(moved**2, axis=(1, 2)) + (0.0 if sigma is None else np.sum(sigma**2, axis=1))
-    expected = max(float(np.median(np.sqrt(variance))), 1e-9)
-    return TypicalResidual(kind, unit, float(np.median(length)), expected, motion, len(length))
-
 
 def setup_of(robot: Robot, measurements: Measurements, model: Model, frame: FrameKnowledge) -> Setup | None:
-    """Some train rows of a table as the job says they are; None if there are none."""
+    """Some train rows of a table as the job says they are; None if the table has no train rows."""
     m = measurements
     rows = np.flatnonzero(~m.test)
     if m.groups is not None:

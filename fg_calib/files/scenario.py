@@ -1,4 +1,4 @@
-"""Scenarios in YAML, and the calibration jobs that their simulations are written as.
+"""Scenarios in YAML: what to simulate. `simulation` writes what comes of them.
 
 ```yaml
 name: space-robot                     # default: the file's name
@@ -30,35 +30,28 @@ job: {model: distance-rotation, pairing: star}   # keys of calibration.yaml; noi
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
-import yaml
 from pydantic import Field
 
 from fg_calib.errors import InputError
-from fg_calib.files.disk import fill_folder, write_text
+from fg_calib.files.board import Board, placement, read_board
 from fg_calib.files.job import check_choices, joint_noise, robot_of
-from fg_calib.files.robot_yaml import FrameValues, unit_of_key, write_robot
+from fg_calib.files.robot_yaml import FrameValues, unit_of_key
 from fg_calib.files.schema import Count, NotNegative, Number, Positive, Schema, read_yaml, shown, validate
-from fg_calib.files.tables import LIMIT_SLACK, read_measurements, write_csv
+from fg_calib.files.tables import read_measurements
 from fg_calib.files.units import Units, UnitsOfFile
-from fg_calib.files.urdf import write_urdf
 from fg_calib.measurements.dataset import Noise
 from fg_calib.options import known_names
 from fg_calib.simulation.scenario import (
-    BoardViews,
     Configurations,
     Errors,
     GivenReadings,
     Placement,
     RandomReadings,
     Scenario,
-    Simulation,
     figures_by_name,
 )
 
@@ -76,28 +69,12 @@ class _Sigmas(Schema):
     normal: dict[str, NotNegative]
 
 
-class _Board(Schema):
-    pose: FrameValues
-    height: Positive | None = None
-    count: Count
-    radius: Positive | None = None
-    distance: Annotated[list[Positive], Field(min_length=2, max_length=2)] | None = None
-    cone: Positive | None = None
-    roll: Any = "random"  # or an `_Angle`
-    self_motion: Literal["random", "held"] = "random"
-    posture: list[Number] | None = None
-
-
-class _Angle(Schema):
-    roll: Number
-
-
 class _Random(Schema):
     count: Annotated[Count, Field(gt=0)]
 
 
 class _Configurations(Schema):
-    board: _Board | None = None
+    board: Board | None = None
     random: _Random | None = None
     table: str | None = None
 
@@ -210,53 +187,12 @@ class _Reader:
         place = f"{self._source}: {key}"
         _only_one(file, place)
         if file.board is not None:
-            return self._board(file.board, f"{place}: board")
+            return read_board(file.board, self._robot, self._units, f"{place}: board")
         drawn = file.random
         if drawn is not None:
             return RandomReadings(drawn.count)
         table = read_measurements(self._folder / str(file.table), self._robot, units=self._units)
         return GivenReadings(table.readings)
-
-    def _board(self, file: _Board, place: str) -> BoardViews:
-        length, angle = self._units.factor("m"), self._units.factor("rad")
-        for key, given, needs in (
-            ("radius", file.radius is not None and file.distance is not None, "none beside distance"),
-            ("cone", file.cone is not None and file.distance is None, "none without distance"),
-            ("posture", file.posture is not None and file.self_motion != "held", "none unless self_motion is held"),
-        ):
-            if given:
-                raise InputError(f"{place}: {key}", f"found {shown(getattr(file, key))}", needs)
-        views = BoardViews(_placement(file.pose, self._units), file.count, self_motion=file.self_motion)
-        if file.height is not None:
-            views = replace(views, height=file.height * length)
-        if file.radius is not None:
-            views = replace(views, radius=file.radius * length)
-        if file.distance is not None:
-            nearest, farthest = file.distance
-            if nearest > farthest:
-                raise InputError(f"{place}: distance", f"found {shown(file.distance)}", "the smaller one first")
-            views = replace(views, distance=(nearest * length, farthest * length))
-        if file.cone is not None:
-            if file.cone * angle > 0.5 * math.pi + 1e-9:
-                raise InputError(f"{place}: cone", f"found {shown(file.cone)}", "at most a quarter turn")
-            views = replace(views, cone=min(file.cone * angle, 0.5 * math.pi))
-        if file.roll != "random":
-            if isinstance(file.roll, str):
-                raise InputError(f"{place}: roll", f"found {shown(file.roll)}", "random, or an angle")
-            views = replace(views, roll=validate(_Angle, {"roll": file.roll}, place).roll * angle)
-        if file.posture is not None:
-            views = replace(views, posture=self._posture(file.posture, f"{place}: posture"))
-        return views
-
-    def _posture(self, given: list[float], place: str) -> tuple[float, ...]:
-        joints = self._robot.joints
-        if len(given) != len(joints):
-            raise InputError(place, f"{len(given)} figures", f"{len(joints)}, one a joint")
-        for i, (figure, joint) in enumerate(zip(given, joints, strict=True)):
-            low, high = (limit / self._units.factor(joint.unit) for limit in (joint.lower, joint.upper))
-            if not low - LIMIT_SLACK <= figure <= high + LIMIT_SLACK:
-                raise InputError(f"{place} {i + 1}", f"found {shown(figure)}", f"within [{low:.6g}, {high:.6g}]")
-        return tuple(f * self._units.factor(j.unit) for f, j in zip(given, joints, strict=True))
 
     def _frame(self) -> Literal["base", "unknown"] | Placement:
         given, place = self._file.frame, f"{self._source}: frame"
@@ -264,7 +200,7 @@ class _Reader:
             case "base" | "unknown":
                 return "base" if given == "base" else "unknown"
             case dict():
-                return _placement(validate(FrameValues, given, place), self._units)
+                return placement(validate(FrameValues, given, place), self._units)
         raise InputError(place, f"found {shown(given)}", "base, unknown, or a mapping of x, y, z, roll, pitch, yaw")
 
     def _job(self, noise: Noise) -> tuple[Noise | None, dict[str, Any]]:
@@ -300,85 +236,3 @@ def _only_one(file: Schema, place: str) -> str:
     if len(given) != 1:
         raise InputError(place, f"found {' and '.join(given) or 'none'}", known_names(keys))
     return given[0]
-
-
-def _placement(values: FrameValues, units: Units) -> Placement:
-    from scipy.spatial.transform import Rotation
-
-    si = values.si(units)
-    turn = Rotation.from_euler("xyz", [si["roll"], si["pitch"], si["yaw"]])  # about fixed axes: Rz(yaw) Ry Rx
-    return Placement(turn.as_matrix(), np.array([si["x"], si["y"], si["z"]]))
-
-
-def write_simulation(folder: Path | str, simulation: Simulation) -> tuple[str, ...]:
-    """Write a simulation as a calibration job that runs as it is, all of its files or none.
-
-    The files are `robot_nominal.yaml`, `robot_true.yaml` (each with its `.urdf` where the robot is from one),
-    `poses.csv` and `calibration.yaml`, which names the true robot as `truth`.
-
-    Args:
-        folder: Where to; existing files of these names are replaced.
-        simulation: What to write.
-
-    Returns:
-        The names of the files.
-
-    Raises:
-        InputError: The folder cannot be written.
-    """
-    scenario = simulation.scenario
-    units = Units(length=scenario.length_unit, angle=scenario.angle_unit)
-    names: list[str] = []
-
-    def write(into: Path) -> None:
-        for name, robot in (("robot_nominal", simulation.robot), ("robot_true", simulation.true_robot)):
-            urdf_name = None if robot.urdf is None else f"{name}.urdf"
-            if urdf_name is not None:
-                write_urdf(into / urdf_name, robot)
-            write_robot(into / f"{name}.yaml", robot, units=units, urdf_name=urdf_name)
-        write_csv(into / "poses.csv", _pose_columns(simulation, units))
-        write_text(into / "calibration.yaml", _job_text(simulation, units))
-        names.extend(sorted(file.name for file in into.iterdir()))
-
-    fill_folder(Path(folder), write)
-    return tuple(names)
-
-
-def _pose_columns(simulation: Simulation, units: Units) -> Mapping[str, Any]:
-    """The table of poses, in the units of the job."""
-    from scipy.spatial.transform import Rotation
-
-    m, robot = simulation.measurements, simulation.robot
-    if m.position is None or m.rotation is None:
-        raise ValueError("a simulation measures positions and orientations")
-    quaternion = Rotation.from_matrix(m.rotation).as_quat(canonical=True)
-    return {
-        "id": m.ids,
-        **{f"q{i + 1}": m.readings[:, i] / units.factor(joint.unit) for i, joint in enumerate(robot.joints)},
-        **{axis: m.position[:, k] / units.factor("m") for k, axis in enumerate("xyz")},
-        **{f"q{axis}": quaternion[:, k] for k, axis in enumerate("xyzw")},
-        "split": np.where(m.test, "test", "train"),
-    }
-
-
-def _job_text(simulation: Simulation, units: Units) -> str:
-    m, scenario = simulation.measurements, simulation.scenario
-    if m.sigma_position is None or m.sigma_orientation is None:
-        raise ValueError("a simulation states its noise")
-    joint = [
-        units.from_si(sigma, joint.unit) for sigma, joint in zip(m.sigma_joint, simulation.robot.joints, strict=True)
-    ]
-    job = {
-        "robot": "robot_nominal.yaml",
-        "measurements": "poses.csv",
-        "truth": "robot_true.yaml",
-        **simulation.job,
-        "units": asdict(units),
-        "noise": {
-            "position": units.from_si(m.sigma_position[0, 0], "m"),
-            "orientation": units.from_si(m.sigma_orientation[0, 0], "rad"),
-            "joint": joint[0] if len(set(joint)) == 1 else joint,
-        },
-    }
-    command = f"# fg-calib simulate {scenario.source} --seed {simulation.seed}\n"
-    return command + yaml.safe_dump(job, sort_keys=False, default_flow_style=None, allow_unicode=True, width=math.inf)

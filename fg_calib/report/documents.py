@@ -28,12 +28,12 @@ from fg_calib.analysis.identifiability import Identifiability
 from fg_calib.analysis.joint_values import JointValues
 from fg_calib.analysis.mistakes import SetupCheck
 from fg_calib.analysis.residual_table import FAMILIES, FAMILY_OF_KIND, ROW_KINDS
-from fg_calib.analysis.setup import TypicalResidual
+from fg_calib.analysis.typical_residuals import TypicalResidual
 from fg_calib.analysis.uncertainty import ParameterEstimate, Uncertainty
 from fg_calib.baseline.comparison import Comparison, Estimate, RealErrors
+from fg_calib.files.csv_writer import Words, write_csv_parts
 from fg_calib.files.disk import fill_folder, write_text
 from fg_calib.files.robot_yaml import write_robot
-from fg_calib.files.tables import Words, write_csv_parts
 from fg_calib.files.urdf import write_urdf
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements.dataset import Measurements

@@ -1,7 +1,7 @@
-"""What to simulate, and what came of it: the robot's true errors, where it goes, how noisily that is measured.
+"""What to simulate (true errors of the robot, configurations, noise), and the result of a simulation.
 
-A `Scenario` is complete without a file: everything in it is SI. `files.scenario` reads one from YAML and writes a
-`Simulation` as a calibration job; `simulator` makes the one of the other.
+A `Scenario` is complete without a file: everything in it is SI. `files.scenario` reads one from YAML,
+`files.simulation` writes a `Simulation` as a calibration job; `simulator` makes a `Simulation` of a `Scenario`.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ Configurations = BoardViews | RandomReadings | GivenReadings
 
 @dataclass(frozen=True)
 class Scenario:
-    """What to simulate.
+    """A simulation to run.
 
     Attributes:
         robot: The nominal robot.
@@ -129,7 +129,7 @@ class Scenario:
         noise: What truly disturbs, 1 sigma; `position` and `orientation` are needed.
         frame: world_T_base, in whose world the poses are measured: `base` is the base itself, `unknown` an arbitrary
             one, drawn.
-        validation: Where it is measured to test the calibration, None for nowhere.
+        validation: Where it is measured to test the calibration; None without test rows.
         stated_noise: The noise that the calibration is told, where that is another one.
         job: Other keys of the calibration job, such as model and pairing.
         length_unit: Unit of length of the job's files.
@@ -160,7 +160,7 @@ class Scenario:
 
 @dataclass(frozen=True)
 class Simulation:
-    """A scenario as it happened once.
+    """One run of a scenario.
 
     Attributes:
         scenario: What was simulated.
@@ -211,7 +211,7 @@ class Simulation:
 
 
 def figures_by_name(robot: Robot, figures: Mapping[str, float], place: str) -> dict[str, float]:
-    """Figures by parameter name or by kind as figures by parameter name.
+    """Turn figures by parameter name or by kind into figures by parameter name.
 
     Args:
         robot: The robot.

@@ -45,7 +45,7 @@ _PURPOSES = ("errors", "configurations", "validation", "frame", "noise", "noise 
 
 @single_threaded
 def simulate(scenario: Scenario, seed: int = 0) -> Simulation:
-    """A scenario as it happens once.
+    """Run a scenario.
 
     Args:
         scenario: What to simulate.

@@ -14,8 +14,8 @@ from simulated import TOOL, measure, paper_robot, small_arm, true_robot
 from fg_calib.analysis import mistakes
 from fg_calib.analysis.mistakes import EXPLAINED, FAR, REDUCTION, check_setup
 from fg_calib.errors import SolverError
+from fg_calib.files.csv_writer import write_csv
 from fg_calib.files.job import read_job
-from fg_calib.files.tables import write_csv
 from fg_calib.graph import solver
 from fg_calib.options import MODELS
 from fg_calib.robot.inverse import solve_inverse

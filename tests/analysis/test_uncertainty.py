@@ -195,7 +195,7 @@ def test_residual_table_holds_every_row_before_and_after(model):
             assert rms[split][kind]["after"] < rms[split][kind]["before"]
     whitened = (table.after / table.sigma)[~table.test]
     if model == "pose":  # pairs of a chain share the errors of their poses
-        assert whitened @ whitened == pytest.approx(2 * solution.cost, rel=rounding(1, 1e4))
+        assert whitened @ whitened == pytest.approx(2 * solution.cost, rel=rounding(1, 10))
 
 
 def test_position_rms_is_that_of_the_vectors_length():

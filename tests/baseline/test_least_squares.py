@@ -25,8 +25,8 @@ TO_THE_END = SolverOptions(decrement=1e-9)
 NOISE = 1e-4
 """Of every row unless a test says otherwise, [m] and [rad]."""
 
-CREPT = 1e-4
-"""Of a row's noise: what damping may leave of the way where nothing holds some directions; 1e-6 was measured."""
+CREPT = 1e-7
+"""Of a row's noise: what damping may leave of the way where nothing holds some directions; 2e-9 was measured."""
 
 
 def apart(fit, values):
@@ -98,7 +98,7 @@ def test_the_other_models_agree_too(model):
     plain = fit_least_squares(robot, measurements, model=model, names=names)
     assert apart(plain, graph) < NEGLIGIBLE
     scipys = fit_least_squares(robot, measurements, model=model, names=names, method="scipy")
-    assert apart(scipys, graph) < 1e-3
+    assert apart(scipys, graph) < 1e-4  # 5e-6 was measured
 
 
 @pytest.mark.parametrize("model", PAPERS)
@@ -123,14 +123,14 @@ def test_with_everything_estimated_they_agree_in_what_the_measurements_determine
         halfway = everything.robot.nominal + 0.5 * difference
         J = central_differences(lambda x: predicted(robot.with_values(x), model, q), halfway, step=1e-5)
         J[:, [i for i, p in enumerate(robot.parameters) if not p.estimated]] = 0.0
-        determined = np.linalg.svd(J)[2][: len(kept)] @ difference
+        determined = np.linalg.svd(J, full_matrices=False)[2][: len(kept)] @ difference
         size = np.linalg.norm(difference)
         assert np.linalg.norm(determined) < max(1e-12, 0.1 * size**3)
     assert size > 1e-3
 
 
-SECOND_ORDER = 0.02
-"""Sigma by which the mean of a noisy length moves an estimate here: 0.3 mrad of joint noise over 10 m."""
+SECOND_ORDER = 0.01
+"""Sigma by which the mean of a noisy length moves an estimate here: 0.3 mrad of joint noise over 10 m (0.004 found)."""
 
 
 @pytest.mark.parametrize("model", PAPERS)
@@ -187,11 +187,11 @@ def test_an_unknown_frame_is_the_graphs(model, start):
         start=problem.start if start == "graph" else near,
     )
     assert fit.converged, fit.message
-    assert apart(fit, solution.parameters[:-6]) < 1e-5
+    assert apart(fit, solution.parameters[:-6]) < NEGLIGIBLE
     rotation, expected = (Rotation.from_euler("ZYX", f[3:]) for f in (fit.frame, solution.parameters[-6:]))
     assert (rotation.inv() * expected).magnitude() == pytest.approx(0.0, abs=1e-7)  # arccos near 1
     if model != "orientation":
-        assert fit.frame[:3] == pytest.approx(solution.parameters[-6:-3], rel=0, abs=10 * NEGLIGIBLE * NOISE)
+        assert fit.frame[:3] == pytest.approx(solution.parameters[-6:-3], rel=0, abs=NEGLIGIBLE * NOISE)
     assert np.array_equal(fit.parameters[-6:], fit.frame)
 
 
@@ -218,7 +218,7 @@ def test_an_unknown_tool_is_the_graphs():
     solution = solve(problem, TO_THE_END)
     for start in (problem.start, None):
         fit = fit_least_squares(robot, measurements, model="pose", names=names, start=start)
-        assert apart(fit, solution.parameters[:-6]) < 1e-5
+        assert apart(fit, solution.parameters[:-6]) < NEGLIGIBLE
 
 
 # --- Eq. (54) and what it claims --------------------------------------------------------------------------------------
@@ -298,11 +298,11 @@ def test_unweighted_it_claims_what_the_residuals_say_and_weighted_what_the_noise
     assert plain.n_rows == 60
     # mean of the sum and of the difference of the two: sqrt((s^2 + s^2) / 10) / 2
     expected = {"a1": s / np.sqrt(20), "a2": s / np.sqrt(20), "theta2": s / np.sqrt(20)}
-    assert plain.sigma == pytest.approx(expected, rel=rounding(1, 1e4))
+    assert plain.sigma == pytest.approx(expected, rel=rounding(1, 10), abs=0)
     weighted = fit_least_squares(planar_robot(), measurements, model="position", weighted=True)
-    assert weighted.sigma == pytest.approx(dict.fromkeys(expected, 2e-3 / np.sqrt(20)), rel=rounding(1, 1e4))
+    assert weighted.sigma == pytest.approx(dict.fromkeys(expected, 2e-3 / np.sqrt(20)), rel=rounding(1, 10), abs=0)
     assert weighted.residuals == pytest.approx(plain.residuals, abs=rounding(1.0))
-    assert np.linalg.norm(plain.residuals) == pytest.approx(np.sqrt(20) * 1e-3, rel=rounding(1, 1e4))
+    assert np.linalg.norm(plain.residuals) == pytest.approx(np.sqrt(20) * 1e-3, rel=rounding(1, 10), abs=0)
 
 
 def test_what_the_measurements_leave_open_has_no_sigma():

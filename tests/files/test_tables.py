@@ -12,7 +12,8 @@ from oracle import frame
 from tolerances import rounding
 
 from fg_calib.errors import InputError
-from fg_calib.files.tables import read_measurements, write_csv
+from fg_calib.files.csv_writer import write_csv
+from fg_calib.files.tables import read_measurements
 from fg_calib.files.units import Units
 from fg_calib.measurements.dataset import Noise
 from fg_calib.robot.model import Joint, RobotBuilder

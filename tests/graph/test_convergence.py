@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from simulated import measure, paper_robot, small_arm, true_robot
 
 from fg_calib import assess
+from fg_calib.analysis.covariance import spread_of
 from fg_calib.baseline.least_squares import fit_least_squares
 from fg_calib.files.robot_yaml import read_robot
 from fg_calib.files.tables import read_measurements
@@ -105,7 +106,7 @@ def test_solving_again_from_the_answer_moves_nothing(name, gauge):
             assert solution.iterations <= MOST
         again = solve(judged_at(solution.problem, solution.parameters))
         assert again.converged, again.message
-        spread, scales = assess(solution).spread, solution.problem.variables.prior_scales
+        spread, scales = spread_of(solution), solution.problem.variables.prior_scales
         variables = solution.problem.variables
         step = variables.step(solution.values, again.values)[: variables.n_columns]
         variance, direction = np.linalg.eigh(spread.tangent / np.outer(scales, scales))
@@ -124,7 +125,7 @@ def test_the_last_step_is_taken_although_the_cost_no_longer_shows_it(shift):
         solution = solve(problem)
         names = [p.name for p in problem.estimated]
         plain = fit_least_squares(robot, m, model="position", frame="unknown", names=names, start=problem.start)
-        sigma = np.sqrt(np.diag(assess(solution).spread.named()))
+        sigma = np.sqrt(np.diag(spread_of(solution).named()))
         apart = (plain.robot.nominal - solution.parameters[:-6])[[robot.index(name) for name in names]] / sigma
         assert np.abs(apart).max() < 3e-7  # 1e-5 when the cost had the last word
 

@@ -116,7 +116,7 @@ def test_single_row_factors_and_the_block_have_the_same_optimum():
         parameters.setRelativeErrorTol(1e-14)
         values = gtsam.LevenbergMarquardtOptimizer(graph, problem.initial, parameters).optimize()
         found.append(problem.variables.parameters(values))
-    assert found[0] == pytest.approx(found[1], abs=rounding(1, 1e4))
+    assert found[0] == pytest.approx(found[1], abs=rounding(1, 10))
 
 
 def test_keys_are_joints_tool_and_frame():
@@ -172,7 +172,7 @@ def test_priors_pull_to_nominal_with_their_tolerance_whatever_the_variable():
     assert len(r) == 4 + 3 + 1
     # of the tool it is the turn about its own z axis that counts, which at this pitch and roll is not that of yaw
     of_yaw = 3 * np.cos(0.4) * np.cos(0.3)
-    assert r == pytest.approx([0, 2, 0, 0, 0, 0, 0, of_yaw], abs=rounding(1, 1e4))
+    assert r == pytest.approx([0, 2, 0, 0, 0, 0, 0, of_yaw], abs=rounding(1, 100))
     assert J.shape == (8, variables.n_columns)
     assert J[1, variables.names.index("a2")] == pytest.approx(500)
 

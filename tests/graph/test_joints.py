@@ -76,12 +76,18 @@ def everything(robot, m, model):
     return values, 2.0 * found.cost
 
 
-@pytest.mark.parametrize("most", [100, 0], ids=["variables", "eliminated"])
-@pytest.mark.parametrize(("kind", "model"), [("poses", "pose"), ("direct", "distance-rotation")])
-def test_estimated_joint_values_give_the_optimum_over_everything(kind, model, most, monkeypatch):
-    monkeypatch.setattr(problem_module, "MAX_JOINT_VARIABLES", most)
+@pytest.fixture(scope="module", params=[("poses", "pose"), ("direct", "distance-rotation")], ids="-".join)
+def optimum(request):
+    """A robot and measurements, a model, and its optimum over everything."""
+    kind, model = request.param
     robot, m = measured(kind, 12, seed=1)
-    values, chi2 = everything(robot, m, model)
+    return robot, m, model, *everything(robot, m, model)
+
+
+@pytest.mark.parametrize("most", [100, 0], ids=["variables", "eliminated"])
+def test_estimated_joint_values_give_the_optimum_over_everything(optimum, most, monkeypatch):
+    monkeypatch.setattr(problem_module, "MAX_JOINT_VARIABLES", most)
+    robot, m, model, values, chi2 = optimum
     problem = build_problem(robot, m, model=model, encoder="estimated")
     keys = {gtsam.symbol("Q", k) for k in range(12)} & set(problem.graph.keyVector())
     assert len(keys) == (12 if most else 0)

@@ -16,8 +16,8 @@ from simulated import TOOL, small_arm
 
 from fg_calib.analysis.identifiability import observe_structure
 from fg_calib.analysis.uncertainty import assess
+from fg_calib.files.csv_writer import write_csv
 from fg_calib.files.robot_yaml import write_robot
-from fg_calib.files.tables import write_csv
 from fg_calib.graph.factors import build_variables, corrections_of, frame_of, pose_of, prior_rows
 from fg_calib.graph.problem import build_problem
 from fg_calib.graph.solver import solve

@@ -142,10 +142,8 @@ def test_elimination_leaves_what_the_other_columns_do_not_explain():
     whole = np.linalg.inv(A[:, [*keep, *range(5, 9)]].T @ A[:, [*keep, *range(5, 9)]])
     core = np.linalg.inv(left.A[:, keep].T @ left.A[:, keep])
     follow = left.follow[:, keep]
-    assert core == pytest.approx(whole[:4, :4], rel=rounding(1, 1e4))
-    assert follow @ core @ follow.T + left.inverse @ left.inverse.T == pytest.approx(
-        whole[4:, 4:], rel=rounding(1, 1e4)
-    )
+    assert core == pytest.approx(whole[:4, :4], rel=rounding(1, 10))
+    assert follow @ core @ follow.T + left.inverse @ left.inverse.T == pytest.approx(whole[4:, 4:], rel=rounding(1, 10))
 
 
 # --- the optimum ----------------------------------------------------------------------------------------------------
@@ -263,7 +261,7 @@ def test_joint_noise_widens_each_touch_to_first_order():
     S = SIGMA**2 * np.eye(3) + 1e-6 * J @ J.T
     W = noisy.terms[0].whitening[0]
     assert W.T @ W == pytest.approx(np.linalg.inv(S), rel=rounding(1, 1e4), abs=1e-3)
-    assert noisy.sigma_point[0] == pytest.approx(np.sqrt(np.diag(S)), rel=rounding(1, 1e4))
+    assert noisy.sigma_point[0] == pytest.approx(np.sqrt(np.diag(S)), rel=rounding(1, 10), abs=0)
 
 
 # --- what is claimed ------------------------------------------------------------------------------------------------

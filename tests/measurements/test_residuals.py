@@ -39,8 +39,7 @@ def pair_formula(robot, measured):
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("kinds", [(True, True), (True, False), (False, True)])
-def test_distance_and_angle_and_their_derivatives(convention, kinds):
+def test_distance_and_angle_and_their_derivatives(convention):
     rng = np.random.default_rng(11)
     for n_joints in (1, 4, 7, 12):
         robot = random_robot(convention, n_joints, rng)
@@ -48,24 +47,26 @@ def test_distance_and_angle_and_their_derivatives(convention, kinds):
         measured = rng.uniform(0, 1, 2)
         formula = pair_formula(robot, measured)
         x = np.concatenate([robot.nominal, *q])
-        W = np.array([[2.0, 0.0], [0.7 if all(kinds) else 0.0, 3.0]])
-        block = PairBlock(
-            precompute_trig(robot, q),
-            np.array([0]),
-            np.array([1]),
-            measured[None],
-            np.array([[2.0, W[1, 0], 3.0]]),
-            kinds,
-        )
-        r, J = residuals.linearise(block, chain_of(robot))
-        rows = np.flatnonzero(kinds)
         angle = formula(x)[1] + measured[1]
-        assert r[0] == pytest.approx((W @ formula(x))[rows], abs=rounding(10, 1 / min(1.0, np.sin(angle) + 1e-4)))
-        if n_joints == 1:  # a single joint turns the tool by its own angle about its own axis, whatever the parameters
-            continue
-        assert 0.05 < angle < 3.1  # away from the kinks, where central differences mean something
-        expected = (W @ central_differences(formula, x))[rows]
-        assert J[0] == pytest.approx(expected, abs=2e-7)
+        differences = None
+        if n_joints > 1:  # a single joint turns the tool by its own angle about its own axis, whatever the parameters
+            assert 0.05 < angle < 3.1  # away from the kinks, where central differences mean something
+            differences = central_differences(formula, x)
+        for kinds in ((True, True), (True, False), (False, True)):
+            W = np.array([[2.0, 0.0], [0.7 if all(kinds) else 0.0, 3.0]])
+            block = PairBlock(
+                precompute_trig(robot, q),
+                np.array([0]),
+                np.array([1]),
+                measured[None],
+                np.array([[2.0, W[1, 0], 3.0]]),
+                kinds,
+            )
+            r, J = residuals.linearise(block, chain_of(robot))
+            rows = np.flatnonzero(kinds)
+            assert r[0] == pytest.approx((W @ formula(x))[rows], abs=rounding(10, 1 / min(1.0, np.sin(angle) + 1e-4)))
+            if differences is not None:
+                assert J[0] == pytest.approx((W @ differences)[rows], abs=2e-7)
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
@@ -139,7 +140,7 @@ def test_orientation_residual_is_exact_up_to_half_a_turn(angle):
     )
     r = residuals.residual(block, chain_of(robot))[0, :]
     sign = np.sign(r @ axis) if angle == np.pi else 1.0
-    assert sign * r == pytest.approx(angle * axis, abs=1e-7 if angle > np.pi - 1e-8 else rounding(1, 1e4))
+    assert sign * r == pytest.approx(angle * axis, abs=1e-7 if angle > np.pi - 1e-8 else rounding(1, 10))
 
 
 def test_residuals_are_predicted_minus_measured():
@@ -177,7 +178,7 @@ def test_reductions_keep_cost_gradient_and_hessian(kind, n):
     assert residuals.gram(block, chain) == pytest.approx(expected, abs=rounding(size, 10))
     assert R.T @ R == pytest.approx(expected, abs=rounding(size, 10))
     assert residuals.squared_norm(block, chain) == pytest.approx(expected[-1, -1], rel=rounding(1, 10))
-    assert residuals.residual(block, chain) == pytest.approx(r, abs=rounding(10.0))
+    np.testing.assert_allclose(residuals.residual(block, chain), r, rtol=0, atol=rounding(10.0), equal_nan=False)
 
 
 def test_a_row_without_weight_adds_nothing():

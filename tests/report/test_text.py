@@ -30,7 +30,7 @@ from fg_calib import (
     solve,
     write_robot,
 )
-from fg_calib.files.tables import write_csv
+from fg_calib.files.csv_writer import write_csv
 from fg_calib.files.units import Units
 from fg_calib.options import Options
 from fg_calib.robot.model import Joint, Robot, RobotBuilder

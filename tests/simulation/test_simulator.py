@@ -22,7 +22,8 @@ from fg_calib.cli import EXAMPLES
 from fg_calib.errors import InputError
 from fg_calib.files.job import read_job
 from fg_calib.files.robot_yaml import read_robot
-from fg_calib.files.scenario import SCENARIOS, read_scenario, write_simulation
+from fg_calib.files.scenario import SCENARIOS, read_scenario
+from fg_calib.files.simulation import write_simulation
 from fg_calib.measurements.dataset import Noise
 from fg_calib.simulation.scenario import BoardViews, Errors, GivenReadings, Placement, RandomReadings, Scenario
 from fg_calib.simulation.simulator import FARTHEST_BASE, simulate, view_board
@@ -195,8 +196,8 @@ def test_the_camera_looks_at_the_centre_from_a_and_from_the_half_sphere(simulati
     T = poses_of(simulation.robot, q)
     p, z = T[:, :3, 3], T[:, :3, 2]
     A = np.array([0.0, 6.5, 3.05])
-    assert p[0] == pytest.approx(A, abs=rounding(1, 1e4))
-    assert np.linalg.norm(p[1:] - A, axis=1) == pytest.approx(0.5, abs=rounding(1, 1e4))
+    assert p[0] == pytest.approx(A, abs=rounding(1, 10))
+    assert np.linalg.norm(p[1:] - A, axis=1) == pytest.approx(0.5, abs=rounding(1, 1e3))
     assert (p[1:, 2] > A[2]).all()
     away = BOARD - p
     assert np.abs(np.cross(z, away)).max() < 1e-9

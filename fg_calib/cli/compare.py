@@ -1,0 +1,31 @@
+"""`fg-calib compare`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fg_calib.cli.output import Json, end, show_json, show_report
+
+
+def compare(
+    job: Annotated[Path, typer.Argument(metavar="JOB", help="The job, such as calibration.yaml.")],
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Write comparison.json there.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Run the factor graph beside plain least squares on the same job: errors, residuals, sigmas, time."""
+    from fg_calib.baseline import comparison
+    from fg_calib.files.job import read_job
+    from fg_calib.report.comparison import build_comparison_report
+    from fg_calib.report.documents import comparison_document, write_comparison
+
+    found = comparison.compare(read_job(job))
+    if out is not None:
+        write_comparison(out, found)
+    if as_json:
+        show_json(comparison_document(found))
+    else:
+        show_report(build_comparison_report(found))
+    end(found.findings)

@@ -1,0 +1,37 @@
+"""`fg-calib example`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fg_calib.cli.output import say_next
+from fg_calib.errors import InputError
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+"""The bundled examples, a folder each."""
+
+
+def example(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="The example: space-robot.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write it to.")],
+) -> None:
+    """Write a ready job to try the package on: robot, measurements and calibration.yaml."""
+    from fg_calib.files.disk import fill_folder
+
+    known = sorted(folder.name for folder in EXAMPLES.iterdir() if folder.is_dir())
+    if name not in known:
+        raise InputError("example", f"found {name!r}", f"one of {', '.join(known)}")
+    files = sorted(file for file in (EXAMPLES / name).iterdir() if file.is_file())
+    for file in files:
+        if (out / file.name).exists():
+            raise InputError(str(out / file.name), "is there already", "a folder without it")
+
+    def write(folder: Path) -> None:
+        for file in files:
+            (folder / file.name).write_bytes(file.read_bytes())
+
+    fill_folder(out, write)
+    say_next([file.name for file in files], out)

@@ -1,0 +1,106 @@
+"""`fg-calib observe`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from fg_calib.cli.output import Json, show_json, show_report
+from fg_calib.options import AngleUnit, FrameKnowledge, LengthUnit, Model
+
+_OF_A_TABLE = ("pairing", "length", "angle", "position_noise", "orientation_noise", "joint_noise")
+"""Options that say something of a table of configurations."""
+
+_Robot = Annotated[Path, typer.Argument(metavar="ROBOT", help="The robot: robot.yaml or a URDF.")]
+_Model = Annotated[Model, typer.Option("--model", help="What is measured.")]
+_Configurations = Annotated[
+    Path | None,
+    typer.Option("--configurations", metavar="TABLE", help="Your configurations; random ones within limits if none."),
+]
+_Out = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Write observability.json and figures there.")]
+_Frame = Annotated[FrameKnowledge, typer.Option("--frame", help="Whether world_T_base is estimated too.")]
+_Pairing = Annotated[
+    Literal["star", "chain", "all"], typer.Option("--pairing", help="Pairs of TABLE's configurations.")
+]
+_BaseLink = Annotated[str | None, typer.Option("--base-link", metavar="LINK", help="Where the chain of a URDF starts.")]
+_TipLink = Annotated[str | None, typer.Option("--tip-link", metavar="LINK", help="Where the chain of a URDF ends.")]
+_Prefer = Annotated[
+    str, typer.Option("--prefer", metavar="NAMES", help="Parameters to keep, first choice first: theta2,d5.")
+]
+_Length = Annotated[LengthUnit, typer.Option("--length", help="Unit of lengths in TABLE and of its noise.")]
+_Angle = Annotated[AngleUnit, typer.Option("--angle", help="Unit of angles in TABLE and of its noise.")]
+_PositionNoise = Annotated[float | None, typer.Option(help="1 sigma of a position in TABLE; 1 mm if not given.")]
+_OrientationNoise = Annotated[
+    float | None, typer.Option(help="1 sigma of an orientation in TABLE; 1 mrad if not given.")
+]
+_JointNoise = Annotated[float, typer.Option(help="1 sigma of a joint reading in TABLE.")]
+_Seed = Annotated[int, typer.Option(help="Of the random configurations, without TABLE.")]
+
+
+def observe(
+    context: typer.Context,
+    robot: _Robot,
+    model: _Model = "distance-rotation",
+    configurations: _Configurations = None,
+    out: _Out = None,
+    frame: _Frame = "known",
+    pairing: _Pairing = "star",
+    base_link: _BaseLink = None,
+    tip_link: _TipLink = None,
+    prefer: _Prefer = "",
+    length: _Length = "m",
+    angle: _Angle = "rad",
+    position_noise: _PositionNoise = None,
+    orientation_noise: _OrientationNoise = None,
+    joint_noise: _JointNoise = 0.0,
+    seed: _Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Say which parameters measurements can determine, which only together, and why not the others."""
+    from fg_calib.analysis.identifiability import observe_configurations, observe_structure
+    from fg_calib.files.robot_yaml import read_robot
+    from fg_calib.files.tables import read_measurements
+    from fg_calib.files.units import Units
+    from fg_calib.measurements.dataset import Noise
+    from fg_calib.options import Pairing
+    from fg_calib.report.documents import observability_document, write_observability
+    from fg_calib.report.identifiability import build_identifiability_report
+
+    if configurations is None:
+        _refuse_idle(context, _OF_A_TABLE, "without --configurations")
+    else:
+        _refuse_idle(context, ("seed",), "with --configurations")
+    arm = read_robot(robot, base_link=base_link, tip_link=tip_link)
+    names = [name.strip() for name in prefer.split(",") if name.strip()]
+    for name in names:
+        arm.index(name)
+    if configurations is None:
+        found = observe_structure(arm, model, frame=frame, prefer=names, seed=seed)
+    else:
+        units = Units(length=length, angle=angle)
+        noise = Noise(
+            position=None if position_noise is None else position_noise * units.factor("m"),
+            orientation=None if orientation_noise is None else orientation_noise * units.factor("rad"),
+            joint=tuple(joint_noise * units.factor(j.unit) for j in arm.joints),
+        )
+        table = read_measurements(configurations, arm, units=units, noise=noise)
+        found = observe_configurations(arm, table, model, frame=frame, pairing=Pairing(pairing), prefer=names)
+    if out is not None:
+        write_observability(out, found)
+    if as_json:
+        show_json(observability_document(found))
+    else:
+        show_report(build_identifiability_report(found))
+
+
+def _refuse_idle(context: typer.Context, names: Sequence[str], circumstance: str) -> None:
+    """Refuse options that were given although they do nothing in such a circumstance."""
+    for name in names:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name != "DEFAULT":
+            print(f"error: --{name.replace('_', '-')} has no effect {circumstance}", file=sys.stderr)
+            raise typer.Exit(2)

@@ -1,0 +1,47 @@
+"""What the commands share: the option `--json`, and how a report or document is shown and a command ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout, and nothing else there.")]
+
+
+def show_json(document: dict[str, Any]) -> None:
+    """Print a document as JSON."""
+    print(json.dumps(document, allow_nan=False))
+
+
+def show_report(report: RenderableType) -> None:
+    """Print a report as wide as the terminal, or as `COLUMNS` says; a pipe has no width of its own."""
+    from rich.console import Console
+
+    from fg_calib.report.tables import WIDTH, width_for
+
+    given = Console().is_terminal or "COLUMNS" in os.environ
+    width = width_for(report, Console().width if given else WIDTH)
+    Console(highlight=False, width=width).print(report)
+
+
+def end(findings: Sequence[str]) -> None:
+    """Say on stderr why a result is not to be trusted, and end with 3 if there is a reason."""
+    for finding in findings:
+        print(f"not to be trusted: {finding}", file=sys.stderr)
+    if findings:
+        raise typer.Exit(3)
+
+
+def say_next(names: Sequence[str], folder: Path) -> None:
+    """Say on stderr which files of a job were written to a folder, and how to calibrate it."""
+    print(f"wrote {', '.join(names)} to {folder}", file=sys.stderr)
+    print(f"now: fg-calib calibrate {folder / 'calibration.yaml'} --out {folder / 'result'}", file=sys.stderr)

@@ -1,0 +1,59 @@
+"""CSV files as they are written."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fg_calib.files.disk import replacing
+
+
+@dataclass(frozen=True)
+class Words:
+    """A column of a few different words, as codes into them: shape (n,)."""
+
+    words: Sequence[str]
+    codes: NDArray[np.integer[Any]]
+
+
+def write_csv(path: Path | str, columns: Mapping[str, ArrayLike | Words]) -> None:
+    """Write a CSV, whole or not at all; floats read back exactly.
+
+    Args:
+        path: The file to write.
+        columns: The columns by name, all of one length.
+
+    Raises:
+        InputError: The folder does not exist or may not be written to.
+    """
+    write_csv_parts(path, [columns])
+
+
+def write_csv_parts(path: Path | str, parts: Iterable[Mapping[str, ArrayLike | Words]]) -> None:
+    """`write_csv` of a long table, some rows at a time.
+
+    Args:
+        path: The file to write.
+        parts: The columns of some rows after the other, at least once.
+
+    Raises:
+        InputError: The folder does not exist or may not be written to.
+    """
+    import polars as pl
+
+    with replacing(Path(path)) as temporary, temporary.open("wb") as file:
+        for i, columns in enumerate(parts):
+            frame = pl.DataFrame(
+                {
+                    name: pl.Series(list(values.words), dtype=pl.String).gather(values.codes)
+                    if isinstance(values, Words)
+                    else np.asarray(values)
+                    for name, values in columns.items()
+                }
+            )
+            frame.write_csv(file, include_header=i == 0)

@@ -1,0 +1,125 @@
+"""What all reports share: plain tables and sections, and the units that figures are shown in."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
+from rich.measure import Measurement
+from rich.padding import Padding
+from rich.table import Column, Table
+from rich.text import Text
+
+from fg_calib.options import check_number
+
+WIDTH = 100
+"""Columns of the plain report."""
+
+SHOWN = {"m": (1e3, "mm", 4), "rad": (180.0 / np.pi, "deg", 5)}
+"""Factor, unit and decimals in which a quantity is shown."""
+
+FAMILY_UNIT = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad", "point": "m"}
+"""Unit of each kind of residual."""
+
+INDENT = 2
+"""Columns by which sentences, and rows without room, are indented."""
+
+_WIDEST = 10_000
+
+
+def plain_text(report: RenderableType, width: int) -> str:
+    """A report as plain text, without blanks at the ends of lines."""
+    check_number("width", width, least=1, whole=True)
+    text = io.StringIO()
+    console = Console(
+        file=text, width=width_for(report, width), color_system=None, highlight=False, legacy_windows=False
+    )
+    console.print(report)
+    return "\n".join(line.rstrip() for line in text.getvalue().splitlines())
+
+
+def width_for(report: RenderableType, width: int) -> int:
+    """`width`, or more where the longest word of a report needs it."""
+    return max(width, Console(width=_WIDEST).measure(report).minimum)
+
+
+def section(title: str, *content: RenderableType) -> list[RenderableType]:
+    """A heading after a blank line, and what stands below it."""
+    return [Text(f"\n{title}", style="bold"), *content]
+
+
+def indented(lines: Iterable[str]) -> list[RenderableType]:
+    """Sentences below a heading or a table."""
+    return [Padding(Text(line), (0, 0, 0, INDENT)) for line in lines]
+
+
+def plain_table(*columns: tuple[str, str], wrap: bool = False) -> Table:
+    """A table without a frame; columns as (heading, justification), which wrap at spaces with `wrap`."""
+    table = _WholeWords(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="italic")
+    for heading, justify in columns:
+        table.add_column(heading, justify=justify, no_wrap=not wrap, overflow="fold")  # type: ignore[arg-type]
+    return table
+
+
+class _WholeWords(Table):
+    """A table without a frame that breaks no word: it wraps at spaces, or gives each row a paragraph of its own."""
+
+    def add_row(self, *cells: RenderableType | None, **options: Any) -> None:
+        """Add a row of cells; text in brackets is no markup."""
+        super().add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in cells), **options)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        widths = self._widths(options.max_width)
+        if widths is None:
+            yield from self._paragraphs()
+            return
+        for column, width in zip(self.columns, widths, strict=True):
+            column.width = width
+        yield from super().__rich_console__(console, options.update_width(options.max_width + 1))  # not one blank less
+
+    def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
+        words = [_longest_word(text) for column in self.columns for text in self._texts(column)]
+        return Measurement(max(words, default=0) + INDENT, options.max_width)
+
+    def _texts(self, column: Column) -> list[str]:
+        """The cells of a column, its heading first."""
+        heading = str(column.header) if self.show_header else ""
+        return [heading, *(str(cell) for cell in column.cells)]
+
+    def _widths(self, most: int) -> list[int] | None:
+        """Widths of the columns, the widest wrapped most; None where `most` is too narrow for their longest words."""
+        texts = [self._texts(column) for column in self.columns]
+        widths = [max(map(len, cells)) for cells in texts]
+        least = [
+            width if column.no_wrap else max(map(_longest_word, cells))
+            for column, width, cells in zip(self.columns, widths, texts, strict=True)
+        ]
+        room = most - len(widths) + 1  # a blank between columns
+        while sum(widths) > room:
+            can = [i for i, width in enumerate(widths) if width > least[i]]
+            if not can:
+                return None
+            widths[max(can, key=lambda i: widths[i])] -= 1
+        return widths
+
+    def _paragraphs(self) -> Iterable[RenderableType]:
+        """The rows one below the other: the first cell, then the others behind their headings."""
+        columns = [self._texts(column) for column in self.columns]
+        for i, row in enumerate(self.rows, start=1):
+            words = [f"{cells[0]} {cells[i]}".strip() for cells in columns if cells[i]]
+            style = row.style or ""
+            yield Text("".join(words[:1]), style=style)
+            if words[1:]:
+                yield Padding(Text("  ".join(words[1:]), style=style), (0, 0, 0, INDENT))
+
+
+def _longest_word(text: str) -> int:
+    return max(map(len, text.split()), default=0)
+
+
+def rounded(value: float, decimals: int, sign: str = "") -> str:
+    """A figure with `decimals`; one that rounds to zero has no minus, which rounding errors alone would decide on."""
+    return f"{value:{sign}z.{decimals}f}"
