@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 import fg_calib
 from fg_calib.analysis.identifiability import observe_structure
 from fg_calib.analysis.uncertainty import marginals
-from fg_calib.graph.problem import random_problem
+from fg_calib.graph.build import random_problem
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.options import MODELS, Model
 from fg_calib.robot.model import CONVENTIONS, Joint, RobotBuilder

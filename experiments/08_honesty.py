@@ -49,8 +49,10 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 import fg_calib
+from fg_calib.graph.build import predicted_problem
 from fg_calib.graph.factors import prior_rows
-from fg_calib.graph.problem import Problem, all_rows, judged_at, predicted_problem, whitened_triangle
+from fg_calib.graph.information import whitened_triangle
+from fg_calib.graph.problem import Problem, reweighted_at
 from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Measurements, Pairs, rotation_angle
 from fg_calib.options import Pairing
@@ -324,7 +326,7 @@ Z = float(stats.norm.ppf(0.975))
 
 def bound_of_tool(problem: Problem, at_truth: Floats, setting: Setting, true: fg_calib.Robot) -> float:
     """Mean variance of the tool's coordinates by the Cramér-Rao bound with priors at the truth, [m^2]."""
-    there = judged_at(problem, at_truth)
+    there = reweighted_at(problem, at_truth)
     rows = np.vstack([whitened_triangle(there, at_truth), prior_rows(there.variables, at_truth)[1]])
     n = there.variables.n_robot_columns
     R = np.linalg.qr(rows * there.variables.scales, mode="r")
@@ -335,8 +337,8 @@ def bound_of_tool(problem: Problem, at_truth: Floats, setting: Setting, true: fg
 def tool_derivative(setting: Setting, robot: fg_calib.Robot) -> Floats:
     """Of the tool's positions at the validation configurations in the estimated parameters, shape (m, n_parameters)."""
     unmeasured = unmeasured_problem(setting)
-    chain = unmeasured.variables.chain.at(robot.nominal)
-    return residuals.linearise(all_rows(unmeasured, unmeasured.start), chain)[1].reshape(-1, chain.n_columns)
+    (chain,), (noise,) = unmeasured.variables.at(robot.nominal).chains, unmeasured.noises
+    return residuals.linearise(noise.rows, chain)[1].reshape(-1, chain.n_columns)
 
 
 _UNMEASURED: dict[int, Problem] = {}

@@ -165,12 +165,10 @@ def one_draw(arm_name: str, way: str, seed: int, draw: int) -> dict[str, dict[st
         found = fg_calib.assess(solution)
         columns = [found.robot.index(name) for name in found.names]
         error = found.robot.nominal[columns] - true.nominal[columns]
-        pairs, weights = solution.problem.pairs, solution.problem.adjustment.weights
-        wrong = bad if pairs is None or m.pairs is not None else bad[pairs.a] | bad[pairs.b]
-        kept = np.ones(len(wrong), dtype=bool) if weights is None else weights >= 0.5
-        used = (
-            np.ones(len(wrong), dtype=bool) if solution.problem.judgement is None else solution.problem.judgement.used
-        )
+        (series,), weights = solution.problem.data.series, solution.problem.state.weights
+        wrong = bad[series.number] if m.pairs is not None else bad[series.ends].any(axis=1)
+        kept = np.ones(len(wrong), dtype=bool) if weights is None else weights[0] >= 0.5
+        used = series.used.any(axis=1)
         return {
             "squared": squared_error(pose(found.robot, unmeasured).position, truth, way != "pose, frame known"),
             "nees": float(error @ np.linalg.solve(found.covariance, error) / len(error)),

@@ -1,11 +1,9 @@
 """fg_calib: robot-arm calibration as a factor graph.
 
-    robot = read_robot("robot.yaml")
-    measurements = read_measurements("poses.csv", robot, noise=Noise(position=1e-3, orientation=2e-4))
-    problem = build_problem(robot, measurements, model="distance-rotation")
-    solution = solve(problem)
-    uncertainty = assess(solution)
-    print(format_report(solution, uncertainty))
+    robot = Robot.from_dh(rows, convention="dh-hayati", tool=[0, 0, 0.1])
+    data = Measurements.from_arrays(q, position=p, sigma_position=1e-4)
+    result = calibrate(robot, data, model="position", frame="unknown")
+    print(result)
 
 Names are imported when they are first used, so that `fg-calib --help` need not wait for GTSAM.
 """
@@ -25,17 +23,23 @@ if TYPE_CHECKING:
     from fg_calib.analysis.variance_components import estimate_noise, solve_job
     from fg_calib.baseline.comparison import Comparison, compare
     from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
+    from fg_calib.calibration import Calibration, calibrate, calibrate_job
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
     from fg_calib.files.job import read_job
+    from fg_calib.files.result import Result, read_result, result_schema
     from fg_calib.files.robot_yaml import read_robot, write_robot
     from fg_calib.files.scenario import read_scenario
     from fg_calib.files.simulation import write_simulation
     from fg_calib.files.tables import read_measurements
     from fg_calib.files.units import Units
-    from fg_calib.graph.problem import Problem, build_problem, problem_of
-    from fg_calib.graph.solver import Solution, SolverOptions, solve
+    from fg_calib.files.urdf import read_urdf
+    from fg_calib.graph.build import build_problem, problem_of
+    from fg_calib.graph.extension import DistanceFactor, RotationAngleFactor, expand
+    from fg_calib.graph.problem import Problem
+    from fg_calib.graph.solver import Solution, SolverOptions, levenberg_marquardt_params, solve
     from fg_calib.job import Job
     from fg_calib.measurements.dataset import Measurements, Noise
+    from fg_calib.measurements.series import Own, Table
     from fg_calib.options import Options, Pairing
     from fg_calib.report.comparison import format_comparison
     from fg_calib.report.documents import (
@@ -48,6 +52,7 @@ if TYPE_CHECKING:
     )
     from fg_calib.report.identifiability import format_identifiability
     from fg_calib.report.text import format_report
+    from fg_calib.robot.inverse import Inverse, solve_inverse
     from fg_calib.robot.kinematics import pose
     from fg_calib.robot.model import Robot
     from fg_calib.simulation.scenario import Scenario, Simulation
@@ -58,9 +63,13 @@ __version__ = "0.1.0"
 _HOMES = {
     "fg_calib.analysis.bounds": ("Bound", "cramer_rao"),
     "fg_calib.baseline.comparison": ("Comparison", "compare"),
+    "fg_calib.calibration": ("Calibration", "calibrate", "calibrate_job"),
     "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
     "fg_calib.files.job": ("read_job",),
     "fg_calib.job": ("Job",),
+    "fg_calib.files.result": ("Result", "read_result", "result_schema"),
+    "fg_calib.files.urdf": ("read_urdf",),
+    "fg_calib.robot.inverse": ("Inverse", "solve_inverse"),
     "fg_calib.files.robot_yaml": ("read_robot", "write_robot"),
     "fg_calib.files.scenario": ("read_scenario",),
     "fg_calib.files.simulation": ("write_simulation",),
@@ -72,7 +81,9 @@ _HOMES = {
     "fg_calib.measurements.dataset": ("Measurements", "Noise"),
     "fg_calib.analysis.mistakes": ("SetupCheck", "check_setup"),
     "fg_calib.analysis.variance_components": ("estimate_noise", "solve_job"),
-    "fg_calib.graph.problem": ("Problem", "build_problem", "problem_of"),
+    "fg_calib.graph.build": ("build_problem", "problem_of"),
+    "fg_calib.graph.problem": ("Problem",),
+    "fg_calib.measurements.series": ("Own", "Table"),
     "fg_calib.options": ("Options", "Pairing"),
     "fg_calib.report.comparison": ("format_comparison",),
     "fg_calib.report.identifiability": ("format_identifiability",),
@@ -85,45 +96,60 @@ _HOMES = {
     "fg_calib.simulation.scenario": ("Scenario", "Simulation"),
     "fg_calib.simulation.simulator": ("simulate",),
     "fg_calib.analysis.restarts": ("look_elsewhere",),
-    "fg_calib.graph.solver": ("Solution", "SolverOptions", "solve"),
+    "fg_calib.graph.extension": ("DistanceFactor", "RotationAngleFactor", "expand"),
+    "fg_calib.graph.solver": ("Solution", "SolverOptions", "levenberg_marquardt_params", "solve"),
     "fg_calib.analysis.uncertainty": ("Uncertainty", "assess"),
 }
+_FROM_FILES = {"Robot": ("from_urdf", "read_urdf"), "Measurements": ("from_frame", "read_measurements")}
+"""Constructors that read files, which the folders of these classes know nothing of: they are attached here."""
+
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
     "Bound",
+    "Calibration",
     "CalibrationError",
     "Comparison",
+    "DistanceFactor",
     "Identifiability",
     "InputError",
+    "Inverse",
     "Job",
     "LeastSquares",
     "Measurements",
     "Noise",
     "Options",
+    "Own",
     "Pairing",
     "Problem",
     "ProblemError",
+    "Result",
     "Robot",
+    "RotationAngleFactor",
     "Scenario",
     "SetupCheck",
     "Simulation",
     "Solution",
     "SolverError",
     "SolverOptions",
+    "Table",
     "Uncertainty",
     "Units",
     "assess",
     "build_problem",
+    "calibrate",
+    "calibrate_job",
     "check_setup",
     "compare",
     "comparison_document",
     "cramer_rao",
     "estimate_noise",
+    "expand",
     "fit_least_squares",
     "format_comparison",
     "format_identifiability",
     "format_report",
+    "levenberg_marquardt_params",
     "look_elsewhere",
     "observability_document",
     "observe_configurations",
@@ -132,11 +158,15 @@ __all__ = [
     "problem_of",
     "read_job",
     "read_measurements",
+    "read_result",
     "read_robot",
     "read_scenario",
+    "read_urdf",
     "result_document",
+    "result_schema",
     "simulate",
     "solve",
+    "solve_inverse",
     "solve_job",
     "write_comparison",
     "write_observability",
@@ -152,7 +182,11 @@ def __getattr__(name: str) -> Any:
     """Import a public name from the module where it lives."""
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_HOME_OF[name]), name)
+    found = getattr(import_module(_HOME_OF[name]), name)
+    if name in _FROM_FILES:
+        constructor, reader = _FROM_FILES[name]
+        setattr(found, constructor, staticmethod(__getattr__(reader)))
+    return found
 
 
 def __dir__() -> list[str]:

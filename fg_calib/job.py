@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from fg_calib.measurements.dataset import Measurements
+from fg_calib.measurements.series import Table
 from fg_calib.options import Options
 from fg_calib.robot.model import Robot
 
@@ -15,17 +16,24 @@ class Job:
     """A calibration job with everything it refers to.
 
     Attributes:
-        path: The job's file.
+        path: The job's file; None of a job that is in none.
         robot: The robot as it is before the calibration.
-        measurements: What was measured.
+        measurements: What was measured: one table, understood as the options say, or several.
         options: Every choice.
         truth: The robot as it truly is, known from a simulation; None where it is not.
         inputs: SHA-256 of every file read, by its path relative to the job.
     """
 
-    path: Path
+    path: Path | None
     robot: Robot
-    measurements: Measurements
+    measurements: Measurements | tuple[Table, ...]
     options: Options
     truth: Robot | None = None
     inputs: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def tables(self) -> tuple[Table, ...]:
+        """What was measured, table by table."""
+        if not isinstance(self.measurements, Measurements):
+            return self.measurements
+        return (Table(self.measurements, self.options.model, self.options.pairing, self.options.frame),)

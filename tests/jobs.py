@@ -41,7 +41,7 @@ def write_job(folder, measurements, *, angles=None, pairs=None, **keys):
     columns = {f"q{i + 1}": q for i, q in enumerate(m.readings.T)}
     columns |= dict(zip("xyz", m.position.T, strict=True))
     if angles is None:
-        columns |= dict(zip(("qx", "qy", "qz", "qw"), Rotation.from_matrix(m.rotation).as_quat().T, strict=True))
+        columns |= dict(zip(("qx", "qy", "qz", "qw"), Rotation.from_matrix(m.rotation.copy()).as_quat().T, strict=True))
     else:
         columns |= dict(zip(("roll", "pitch", "yaw"), angles.T, strict=True))
     write_csv(folder / "poses.csv", columns)

@@ -56,6 +56,13 @@ def true_robot(robot: Robot, rng: np.random.Generator) -> Robot:
     return robot.with_values(robot.nominal + error)
 
 
+def plus(array, rows, amount):
+    """A copy of an array with something added at some rows."""
+    changed = array.copy()
+    changed[rows] += amount
+    return changed
+
+
 def measure(
     true: Robot,
     n: int,
@@ -93,7 +100,7 @@ def write_job(folder, robot: Robot, m: Measurements, **job):
     if m.position is not None:
         columns |= dict(zip("xyz", m.position.T, strict=True))
     if m.rotation is not None:
-        quaternion = Rotation.from_matrix(m.rotation).as_quat()
+        quaternion = Rotation.from_matrix(m.rotation.copy()).as_quat()
         columns |= dict(zip(("qx", "qy", "qz", "qw"), quaternion.T, strict=True))
     if m.groups is not None:
         columns["group"] = np.array(["", *m.groups.names])[m.groups.index + 1]

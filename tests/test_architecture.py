@@ -17,8 +17,8 @@ import fg_calib
 
 PACKAGE = Path(fg_calib.__file__).parent
 FOLDERS = (
-    *("errors", "threads", "options", "robot", "measurements", "job", "simulation", "files"),
-    *("graph", "analysis", "baseline", "report", "cli"),
+    *("errors", "threads", "arrays", "options", "robot", "measurements", "job", "simulation", "files"),
+    *("graph", "analysis", "baseline", "report", "calibration", "cli"),
 )
 """From the ground up: a folder (or module of the package itself) imports from those before it."""
 
@@ -186,7 +186,7 @@ print(sorted(sys.modules))
     loaded = set(ast.literal_eval(run_python(code)))
     assert {"fg_calib.analysis.uncertainty", "fg_calib.report.text", "gtsam", "numba", "polars"} <= loaded
     idle = {"matplotlib", "lxml", "yourdfpy", "scipy.optimize", "scipy.stats", "fg_calib.files.urdf"}
-    idle |= {"fg_calib.baseline", "fg_calib.report.documents", "fg_calib.report.figures"}
+    idle |= {"fg_calib.baseline", "fg_calib.report.figures"}
     assert loaded & idle == set()
 
 

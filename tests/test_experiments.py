@@ -34,8 +34,10 @@ def load(path: str) -> ModuleType:
 
 ur10 = load("01_ur10_real_data.py")
 linearise = load("benchmarks/linearise.py")
+kernels = load("benchmarks/kernels.py")
 calibrate = load("benchmarks/calibrate.py")
 inverse = load("benchmarks/inverse.py")
+sharing = load("benchmarks/sharing.py")
 panda = load("10_panda_sockets.py")
 
 real_data = pytest.mark.skipif(
@@ -231,6 +233,22 @@ def test_linearise_quick_measures_every_way(tmp_path, capsys):
     for size in results["sizes"]:
         assert set(size["us_a_pair"]) == {"block", "QR", "Gram", "single", "plain", "tuned", "tuned, pool"}
         assert size["numpy_difference"] <= rounding(1, 1e4)  # rounding: two formulas of one matrix
+
+
+@pytest.mark.slow
+def test_the_one_kernel_fills_the_panels_of_the_special_ones(tmp_path, capsys):
+    assert kernels.main(["--quick", "--out", str(tmp_path)]) == 0
+    assert "one kernel over special kernel" in capsys.readouterr().out
+    found = json.loads((tmp_path / "kernels.json").read_text())["derivatives"]
+    assert set(found) == {"parameters", "and joints", "none"}
+    assert all(f["difference"] <= 1e-13 for kinds in found.values() for f in kinds.values())
+
+
+def test_sharing_quick_measures_every_graph(tmp_path, capsys):
+    assert sharing.main(["--quick", "--out", str(tmp_path)]) == 0
+    assert "times alone" in capsys.readouterr().out
+    results = json.loads((tmp_path / "sharing.json").read_text())
+    assert [case["n_pairs"] for case in results["cases"]] == [49, 199, 49, 199, 150, 600, 5000, 20_000]
 
 
 @pytest.mark.parametrize("panel", ["plain_panel", "tuned_panel"])

@@ -53,7 +53,7 @@ def elbow_arm() -> fg_calib.Robot:
 
 def own(robot: fg_calib.Robot, rotation: np.ndarray, position: np.ndarray, n_starts: int, seed: int) -> np.ndarray:
     """Configurations by the package, shape (n, n_joints)."""
-    return solve_inverse(robot, rotation, position, np.random.default_rng(seed), n_starts=n_starts).readings
+    return solve_inverse(robot, position, rotation, generator=np.random.default_rng(seed), n_starts=n_starts).readings
 
 
 def inverse_left_jacobian(r: np.ndarray) -> np.ndarray:

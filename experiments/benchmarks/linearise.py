@@ -6,7 +6,7 @@ Takes about three minutes, most of it plain numpy on 10^6 pairs; `--quick` some 
 Compared in one run, repeats taken in turn, on the space robot of Jia et al. (2019), Table 2, random configurations, two
 of their own for each pair:
 
-- block: one factor for all pairs, linearised by GTSAM (`measurement_factor`, `factor.linearize`) after a first time;
+- block: one factor for all pairs, linearised by GTSAM (`row_factor`, `factor.linearize`) after a first time;
   up to 20 000 rows the factor reduces by QR, beyond by the Gram matrix if the conditioning that it met at the first
   linearisation allows it;
 - QR, Gram: the two reductions behind it, without GTSAM;
@@ -44,13 +44,16 @@ from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 import fg_calib
-from fg_calib.graph.factors import Variables, build_variables, measurement_factor
+from fg_calib.graph.factors import Variables, build_variables, row_factor
+from fg_calib.graph.rows import Part, RowSet
 from fg_calib.measurements import residuals
-from fg_calib.measurements.residuals import PairBlock
+from fg_calib.measurements.kinds import Distance, RotationAngle, stack
+from fg_calib.measurements.residuals import Block
 from fg_calib.robot.kinematics import build_chain, forward, precompute_trig, processors
 from fg_calib.threads import one_blas_thread
 
@@ -100,7 +103,7 @@ class Case:
         parameters: Two parameter vectors to take in turn, so that nothing can be remembered.
     """
 
-    block: PairBlock
+    block: Block
     variables: Variables
     parameters: tuple[Floats, Floats]
 
@@ -131,9 +134,14 @@ def build_case(n: int, seed: int) -> Case:
         measured[pairs] = exact + rng.normal(size=exact.shape) * SIGMA
     whitening = np.tile([1.0 / SIGMA[0], 0.0, 1.0 / SIGMA[1]], (n, 1))
     first_of_pair = np.arange(0, 2 * n, 2)
-    block = PairBlock(trig, first_of_pair, first_of_pair + 1, measured, whitening)
-    with_frame = [np.concatenate([e, np.zeros(6)]) for e in estimates]  # the measurement frame, unused by pairs
-    return Case(block, build_variables(robot, frame=False), (with_frame[0], with_frame[1]))
+    ends = np.stack([first_of_pair, first_of_pair + 1], axis=1)
+    block = Block(stack(Distance(), RotationAngle()), trig, ends, measured, whitening)
+    return Case(block, build_variables(robot, [False]), (estimates[0], estimates[1]))
+
+
+def factor_of(block: Block, variables: Variables) -> gtsam.NoiseModelFactor:
+    """The pairs as one factor."""
+    return row_factor(RowSet((Part(block, 0, np.zeros((block.n, 0), dtype=np.int64)),)), variables)
 
 
 def tuned_panel(elements: Floats, cs: Floats, measured: Floats) -> Floats:
@@ -262,13 +270,13 @@ Chunks = list[tuple[Floats, Floats]]
 Panel = Callable[[Floats, Floats, Floats], Floats]
 
 
-def lay_out(block: PairBlock, size: int) -> Chunks:
+def lay_out(block: Block, size: int) -> Chunks:
     """Chunks of a block's data as numpy wants them, `cs` and `measured` of `tuned_panel`: prepared once."""
     chunks = []
     for first in range(0, block.n, size):
         rows = slice(first, first + size)
-        both = np.concatenate([block.trig[block.a[rows]], block.trig[block.b[rows]]])  # (2 n, n_joints, 2)
-        chunks.append((np.ascontiguousarray(both.transpose(2, 1, 0)), np.ascontiguousarray(block.measured[rows].T)))
+        both = np.concatenate([block.trig[end] for end in block.ends[rows].T])  # (2 n, n_joints, 2)
+        chunks.append((np.ascontiguousarray(both.transpose(2, 1, 0)), np.ascontiguousarray(block.data[rows].T)))
     return chunks
 
 
@@ -298,7 +306,7 @@ def check_equal(case: Case, panel: Panel, chunks: Chunks) -> float:
         AssertionError: It is above 1e-9.
     """
     ours = gram_by_numpy(panel, chunks, elements_at(case, case.parameters[0]))
-    kernel = residuals.gram(case.block, case.variables.chain.at(case.parameters[0]))
+    kernel = residuals.gram(case.block, case.variables.at(case.parameters[0]).chains[0])
     lengths = np.sqrt(np.diag(kernel))
     lengths[lengths < 1e-9 * lengths.max()] = lengths.max()  # what moves no measurement is rounding in both
     difference = float(np.max(np.abs(ours - kernel) / np.outer(lengths, lengths)))
@@ -324,11 +332,11 @@ def measure(n: int, seed: int, quick: bool) -> dict[str, Any]:
     case = build_case(n, seed)
     variables = case.variables
     values = [variables.values(p) for p in case.parameters]
-    chains = [variables.chain.at(p) for p in case.parameters]
+    chains = [variables.at(p).chains[0] for p in case.parameters]
     elements = [elements_at(case, p) for p in case.parameters]
-    factor = measurement_factor(case.block, variables)
+    factor = factor_of(case.block, variables)
     n_single = min(n, N_SINGLE)
-    singles = [measurement_factor(residuals.rows_of(case.block, slice(i, i + 1)), variables) for i in range(n_single)]
+    singles = [factor_of(residuals.rows_of(case.block, slice(i, i + 1)), variables) for i in range(n_single)]
     tuned, plain = lay_out(case.block, CHUNK), lay_out(case.block, PLAIN_CHUNK)
     # One thread of BLAS for all: chunks of this size gain nothing from more, and the block's kernels ask for it too.
     with ThreadPoolExecutor(processors()) as pool, one_blas_thread:
@@ -375,16 +383,16 @@ def memory_of(n: int, seed: int) -> dict[str, float]:
     small = build_case(1_000, seed)  # loads what any size needs: kernels, BLAS, threads
     values = small.variables.values(small.parameters[0])
     for reduce in (residuals.gram, residuals.triangle):
-        reduce(small.block, small.variables.chain.at(small.parameters[0]))
-    measurement_factor(small.block, small.variables).linearize(values)
+        reduce(small.block, small.variables.at(small.parameters[0]).chains[0])
+    factor_of(small.block, small.variables).linearize(values)
     loaded = peak_memory()
     case = build_case(n, seed)
-    factor = measurement_factor(case.block, case.variables)
+    factor = factor_of(case.block, case.variables)
     before = peak_memory()
     for parameters in case.parameters:
         factor.linearize(case.variables.values(parameters))
     block = case.block
-    arrays = (block.trig, block.a, block.b, block.measured, block.whitening)
+    arrays = (block.trig, block.ends, block.data, block.whitening)
     return {"loaded": loaded, "before": before, "after": peak_memory(), "input": sum(a.nbytes for a in arrays)}
 
 

@@ -69,13 +69,15 @@ def expected_error(solution: Solution, spread: Spread) -> ExpectedError:
         solution: The solution.
         spread: Its covariance, what was left out to fix the gauge included.
     """
-    problem, m = solution.problem, solution.problem.measurements
-    test = m.test.copy()
-    if problem.pairs is not None:
-        test[problem.pairs.a[problem.pairs.test]] = test[problem.pairs.b[problem.pairs.test]] = True
+    data = solution.problem.data
+    test = np.zeros(data.n_configurations, dtype=np.bool_)
+    for s in data.series:
+        test[data.places[s.table][s.ends[s.test]]] = True
+    for table, place in zip(data.tables, data.places, strict=True):
+        test[place[table.measurements.test]] = True
     there = np.flatnonzero(test if test.any() else ~test)
     chosen = there[np.unique(np.linspace(0, len(there) - 1, MOST).round().astype(np.int64))]
-    base, fitted = errors_at(spread, m.readings[chosen])
+    base, fitted = errors_at(spread, data.readings[chosen])
     return ExpectedError(base, fitted, "test" if test.any() else "train", len(chosen), len(there))
 
 
@@ -87,7 +89,7 @@ def errors_at(spread: Spread, readings: Floats) -> tuple[PoseRms, PoseRms]:
         readings: Shape (n, n_joints), [rad] (prismatic: [m]).
     """
     variables = spread.variables
-    at = forward(variables.chain.at(spread.parameters), precompute_trig(variables.robot, readings))
+    at = forward(variables.chains[0].at(spread.parameters), precompute_trig(variables.robot, readings))
     jacobian = at.jacobian.copy()
     jacobian[:, :, variables.n_robot_columns :] = 0.0  # of where the base stands in the world, not of the arm
     return pose_rms(at.position, jacobian, spread.variance)

@@ -33,7 +33,8 @@ from numpy.typing import NDArray
 
 from fg_calib.analysis.accuracy import without_rigid_motion
 from fg_calib.errors import InputError
-from fg_calib.graph.problem import correlation, named_triangle, predicted_problem
+from fg_calib.graph.build import predicted_problem
+from fg_calib.graph.information import correlation, named_triangle
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.options import FrameKnowledge, Model, PairErrors, Pairing, check_flag, check_names
 from fg_calib.robot.kinematics import build_chain, forward, precompute_trig

@@ -70,7 +70,7 @@ def judge_priors(solution: Solution, spread: Spread) -> PriorFit | None:
         return None
     owned = [variables.robot.parameters[i] for v in variables.items if v.kind != "frame" for i in v.parameters]
     names = tuple(p.name for p in owned if p.tolerance is not None)
-    A = np.eye(len(z)) - P @ (2.0 * spread.weighted - spread.actual) @ P.T
+    A = np.eye(len(z)) - P @ (2.0 * spread.tangent - spread.actual) @ P.T
     sigma = np.sqrt(np.maximum(np.diag(A), 0.0))
     chi2, expected, square = float(z @ z), float(np.trace(A)), float(np.sum(A * A))
     level = special.ndtri(0.5 + 0.5 * (1.0 - ALARM) ** (1.0 / len(z)))

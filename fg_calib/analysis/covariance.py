@@ -23,10 +23,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.factors import Variables, prior_rows
+from fg_calib.graph.information import correlation, whitened_triangle
 from fg_calib.graph.observability import RANK_TOLERANCE, SUPPORT_TOLERANCE, determined
-from fg_calib.graph.problem import Problem, correlation, whitened_triangle
-from fg_calib.graph.robust import effect
+from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
 from fg_calib.robot.model import Robot
 
@@ -40,32 +41,23 @@ _AT_ONCE = 192
 
 
 @dataclass(frozen=True)
-class Spread:
+class TangentCovariance(FrozenArrays):
     """The covariance in the tangent space of the variables, and the directions that nothing determines.
 
     Attributes:
         variables: The variables; the columns are theirs.
         parameters: The estimate (see `Variables`).
-        tangent: Covariance of the determined part, shape (n_columns, n_columns).
-        weighted: The same, were the rows' noise as they are weighted.
-        actual: The same, by the errors that rows share, also where they are asked to count as independent.
+        tangent: Covariance of the determined part, by the noise that rows are weighted by, shape (n_columns,) * 2.
         loose: Undetermined directions at the estimate, orthonormal in changes of ordinary size, shape
             (n_loose, n_columns).
         loose_at_nominal: The same at the nominal parameters.
-        rank: Number of directions that data and priors determine.
-        excess: By how much the mean of chi-square is below its degrees of freedom, because rows that share errors are
-            weighted as independent.
     """
 
     variables: Variables
     parameters: Floats
     tangent: Floats
-    weighted: Floats
-    actual: Floats
     loose: Floats
     loose_at_nominal: Floats
-    rank: int
-    excess: float
 
     def covariance(self, rows: Floats) -> Floats:
         """Covariance of linear functions of the columns, shape (m, n_columns); nan where undetermined."""
@@ -112,21 +104,37 @@ class Spread:
         return np.array(columns + of_frame).T
 
 
+@dataclass(frozen=True)
+class Spread(TangentCovariance):
+    """The covariance of a solution, under the noise as it is taken to be and otherwise.
+
+    Attributes:
+        actual: `tangent` by the errors that rows share, also where they are asked to count as independent.
+        rank: Number of directions that data and priors determine.
+        excess: By how much the mean of chi-square is below its degrees of freedom, because rows that share errors are
+            weighted as independent.
+    """
+
+    actual: Floats
+    rank: int
+    excess: float
+
+
 def spread_of(solution: Solution) -> Spread:
     """The covariance: that of the weighted least-squares estimate under the noise as it is taken to be.
 
     Parameters that were left out to fix the gauge count as known; see `with_left_out`.
 
-    Where rows share errors but are weighted as independent, with H = J^T J and C their covariance, it is
-    H^-1 (J^T C J) H^-1 (priors are rows of their own), unless independence was asked for. The mean of chi-square,
-    tr C - tr(H^-1 J^T C J), is then below the degrees of freedom by tr(H^-1 J^T (C - 1) J). A robust loss loses some of
-    what clean data hold: see `robust.Effect`.
+    Where rows share errors but are asked to count as independent, with H = J^T J and C their covariance, the `actual`
+    one is H^-1 (J^T C J) H^-1 (priors are rows of their own). The mean of chi-square, tr C - tr(H^-1 J^T C J), is then
+    below the degrees of freedom by tr(H^-1 J^T (C - 1) J). A robust loss loses some of what clean data hold: see
+    `robust.Effect`.
     """
     problem, variables = solution.problem, solution.problem.variables
     scales = variables.prior_scales
 
     def decomposed(parameters: Floats) -> tuple[Floats, Floats, int]:
-        data = whitened_triangle(problem, parameters) / np.sqrt(effect(problem.options.loss, problem.height).variance)
+        data = whitened_triangle(problem, parameters, with_loss=True)
         rows = [data, prior_rows(variables, parameters)[1]]
         stacked = np.vstack([*rows, np.zeros((variables.n_columns, variables.n_columns))]) * scales
         _, s, Vt = np.linalg.svd(stacked, full_matrices=False)
@@ -137,12 +145,10 @@ def spread_of(solution: Solution) -> Spread:
     half = directions[:rank].T / s[:rank]
     added = correlation(problem, solution.parameters)
     middle = np.zeros((rank, rank)) if added is None else half.T @ added @ half
-    middle_of_sigma = np.eye(rank) + (middle if problem.approximate else 0.0)
     return Spread(
         variables=variables,
         parameters=solution.parameters,
-        tangent=half @ middle_of_sigma @ half.T,
-        weighted=half @ half.T,
+        tangent=half @ half.T,
         actual=half @ (np.eye(rank) + middle) @ half.T,
         loose=_orthonormal(directions[rank:], variables.scales),
         loose_at_nominal=_orthonormal(directions_nominal[rank_nominal:], variables.scales),
@@ -175,7 +181,6 @@ def with_left_out(solution: Solution, spread: Spread) -> Spread:
         spread,
         variables=variables,
         tangent=M @ spread.tangent @ M.T + of_left_out @ of_left_out.T,
-        weighted=M @ spread.weighted @ M.T + of_left_out @ of_left_out.T,
         actual=M @ spread.actual @ M.T + of_left_out @ of_left_out.T,
         loose=loose(spread.loose, M, errors),
         loose_at_nominal=loose(spread.loose_at_nominal, M_nominal, errors_nominal),

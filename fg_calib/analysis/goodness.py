@@ -21,6 +21,9 @@ Each kind is judged by the sum of its studentised squares. All of them together 
 sees what misses where the arm is well known although it may be off by more elsewhere. Where the noise was estimated,
 this is a ratio of two variances (F); with a robust loss measurements that it would call outliers count for nothing.
 
+A point that test rows alone touched is taken for the mean of what touched it, at B e with e the rows without it. With N
+the derivatives of all rows in such points, `N B e` is what this adds to them, to derivatives and errors alike.
+
 Note:
     Predicted pairs that share the joint noise of a configuration with fitted ones count as independent of these: their
     p-values are then somewhat too large.
@@ -32,8 +35,8 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -43,16 +46,14 @@ from numpy.typing import NDArray
 from scipy import special
 
 from fg_calib.analysis.covariance import Spread
-from fg_calib.analysis.predictions import predicted_points
-from fg_calib.analysis.residual_table import FAMILIES, ROW_KINDS, ResidualTable
-from fg_calib.graph.factors import prior_rows
-from fg_calib.graph.problem import Problem, all_rows, lengths, pair_rows
+from fg_calib.analysis.residual_table import ResidualTable
+from fg_calib.graph.information import eliminated
+from fg_calib.graph.noise import PRIVATE_SHARE, RowNoise
+from fg_calib.graph.problem import Problem, at_parameters, noises_at, says_where
 from fg_calib.graph.robust import tuning, weight
+from fg_calib.graph.rows import ErrorColumns
 from fg_calib.graph.solver import Solution
-from fg_calib.graph.whitening import PRIVATE_SHARE, joint_rows
 from fg_calib.measurements import residuals
-from fg_calib.measurements.residuals import Block, PoseBlock
-from fg_calib.options import PAIR_MODELS, POSE_MODELS
 from fg_calib.robot.kinematics import SPAN
 
 Floats = NDArray[np.float64]
@@ -79,6 +80,9 @@ OUTLIER_WEIGHT = 0.5
 FLAGS = ("", "suspect", "outlier", "excluded", "test")
 """What is said of a row, in the order of the codes."""
 
+LEAST_VARIANCE = 1e-6
+"""Variance of a residual, over that of its noise, below which the row is met whatever was measured."""
+
 _CHUNK = 4 * SPAN
 
 _MEDIAN = 0.6744897501960817
@@ -90,7 +94,7 @@ class KindFit:
     """The fitted rows of one kind of noise.
 
     Attributes:
-        kind: `distance`, `angle`, `orientation`, `position`, or `point` for all that touched points give.
+        kind: `distance`, `angle`, `orientation`, `position`, `point`, or that of a kind of one's own.
         unit: `m` or `rad`.
         n: Number of scalar rows.
         stated_sigma_rms: Root of the mean square of their sigmas as stated.
@@ -102,6 +106,7 @@ class KindFit:
         typical: Noise seen over noise taken, from the median, which a few rows do not move.
         largest: The largest |studentised residual|; nan where it is not known.
         degrees: Degrees of freedom of chi-square.
+        table: Number of its table.
     """
 
     kind: str
@@ -116,6 +121,7 @@ class KindFit:
     typical: float
     largest: float
     degrees: float
+    table: int = 0
 
     @property
     def verdict(self) -> str:
@@ -313,8 +319,8 @@ class _Part:
     behind: Floats
 
     def of_kind(self, code: int) -> Integers:
-        """Places in the part of one of `FAMILIES`."""
-        return np.flatnonzero(self.table.family[self.rows] == code)
+        """Places in the part of one of the table's groups."""
+        return np.flatnonzero(self.table.group[self.rows] == code)
 
     def degrees(self, chosen: Integers) -> float:
         """Degrees of freedom of some rows; where that is not known, no more than one configuration's errors."""
@@ -333,7 +339,7 @@ class _Part:
 
     def degrees_behind(self, chosen: Integers) -> float:
         """Degrees of freedom behind the noise that some rows were divided by."""
-        by_kind = np.bincount(self.table.family[self.rows[chosen]], self.means[chosen], len(FAMILIES))
+        by_kind = np.bincount(self.table.group[self.rows[chosen]], self.means[chosen], len(self.table.groups))
         variance = float(np.sum(by_kind**2 / self.behind))
         return float(np.sum(by_kind)) ** 2 / variance if variance > 0.0 else np.inf
 
@@ -371,7 +377,8 @@ class _Rows:
         leverage: See `Goodness`.
         studentised: See `Goodness`.
         weight: See `Goodness`.
-        fitted: The rows fitted, but for those of touched points.
+        fitted: The rows fitted.
+        predicted: The rows predicted that can be judged.
     """
 
     def __init__(self, solution: Solution, spread: Spread, table: ResidualTable) -> None:
@@ -379,58 +386,47 @@ class _Rows:
         self._table = table
         self._spread = spread
         self._solution = solution
-        self._robust = problem.adjustment.weights is not None
-        weights = problem.adjustment.weights
-        self._of_points = table.measurement >= _n_measured(problem)  # touches, and distances between points
+        self._noises = noises_at(problem, solution.parameters, at_readings=True)
+        self._robust = problem.state.weights is not None
         self.weight = np.ones(table.n)
-        if weights is not None:
-            self.weight[~self._of_points] = weights[table.measurement[~self._of_points]]
-        point = _is_same_point(problem, table)
-        fitted = np.flatnonzero(table.used & ~point & ~self._of_points)
-        test = np.flatnonzero(table.test & (table.reason_code == 0) & ~point)
-        self._shared = problem.common.poses or bool(np.any(problem.measurements.sigma_joint > 0.0))
-        self._carried = problem.sharing == problem.common
+        for number, weights in enumerate(problem.state.weights or ()):
+            mine = table.series == number
+            self.weight[mine] = weights[table.measurement[mine]]
+        fitted, test = np.flatnonzero(table.used), np.flatnonzero(table.test & (table.reason_code == 0))
+        self._shared = any(noise.sources for noise in self._noises)
+        self._carried = not problem.missing_correlation
         most = MAX_KEPT if self._carried and self._shared else MAX_DENSE
         keep = np.zeros(table.n, dtype=np.bool_)
         keep[fitted] = len(fitted) <= most and not self._robust
         keep[test] = len(test) <= MAX_KEPT
-        keep &= ~self._of_points
         of_kept = np.flatnonzero(keep)
-        L, J = self._read(keep)
+        all_kept = self._read(keep)
         w, q = self.weight, self.leverage
         variance = 1.0 + q * (1.0 - 2.0 * np.where(table.used, w, 0.0))
         covariance = None
         if keep[fitted].all():
-            here = np.searchsorted(of_kept, fitted)
-            covariance = self._residual_covariance(fitted, J[here], None if L is None else L[here])
+            covariance = self._residual_covariance(fitted, all_kept.at(np.searchsorted(of_kept, fitted)))
         if isinstance(covariance, _Dense):
             variance[fitted] = covariance.diagonal
         with np.errstate(invalid="ignore", divide="ignore"):
             self.studentised = table.after / (table.sigma * np.sqrt(np.maximum(variance, 1e-12)))
-        self.studentised[variance < 1e-6] = np.nan  # a row that the fit meets whatever was measured
-        # A point measured twice has three coordinates: as unlikely, not as large.
-        squared = (table.after[point] / table.sigma[point]) ** 2
-        self.studentised[point] = -special.ndtri(np.maximum(special.gammaincc(1.5, squared / 2.0), 1e-300) / 2.0)
-        self.leverage[point] = np.nan
-        self.studentised[self._of_points] = (table.after / table.sigma)[self._of_points]
+        self.studentised[variance < LEAST_VARIANCE] = np.nan
         squares = (table.after / table.sigma) ** 2
         self.fitted = self._part(fitted, w[fitted] * squares[fitted], w[fitted] * variance[fitted], covariance)
-        self.predicted, self._outliers, self._n_unknown = self._predict(test, squares, of_kept, J, L)
+        self.predicted, self._outliers, self._n_unknown = self._predict(test, squares, of_kept, all_kept)
 
     def kinds(self) -> tuple[KindFit, ...]:
         """The fit of the fitted rows by kind."""
         part, leverage = self.fitted, self.weight[self.fitted.rows] * self.leverage[self.fitted.rows]
-        excess = np.zeros(len(FAMILIES))
+        groups = range(len(self._table.groups))
+        excess = np.zeros(len(groups))
         if not self._carried and part.covariance is None and np.nansum(leverage) > 0.0:
-            by_kind = [np.nansum(leverage[part.of_kind(code)]) for code in range(len(FAMILIES))]
+            by_kind = [np.nansum(leverage[part.of_kind(code)]) for code in groups]
             excess = self._spread.excess * np.array(by_kind) / np.nansum(leverage)
         known = not self._robust and self._solution.estimated_noise is None
         known &= part.covariance is not None or not self._shared
-        found = [self._kind(part, code, float(excess[code]), known) for code in range(len(FAMILIES))]
-        fits = [fit for fit in found if fit is not None]
-        if np.any(self._of_points):
-            fits.append(self._of_touched_points(fits))
-        return tuple(fits)
+        found = (self._kind(part, code, float(excess[code]), known) for code in groups)
+        return tuple(fit for fit in found if fit is not None)
 
     def predicted_fit(self, suspects: Integers) -> PredictedFit | None:
         """The fit of the predicted rows; None without any that can be judged.
@@ -443,7 +439,7 @@ class _Rows:
             return None
         chi2, expected, nu = self._whitened(part)
         behind = part.degrees_behind(np.arange(len(part.rows)))
-        found = (self._kind(part, code, 0.0, True) for code in range(len(FAMILIES)))
+        found = (self._kind(part, code, 0.0, True) for code in range(len(self._table.groups)))
         return PredictedFit(
             kinds=tuple(fit for fit in found if fit is not None),
             n_rows=len(part.rows),
@@ -478,21 +474,23 @@ class _Rows:
         return float(white @ white), expected, nu
 
     def _part(self, rows: Integers, squares: Floats, means: Floats, covariance: _LowRank | _Dense | None) -> _Part:
-        behind = np.full(len(FAMILIES), np.inf)
-        n_ends = len(self._problem.measurements.end_names) - 1
+        behind = np.full(len(self._table.groups), np.inf)
+        n_ends = len(self._table.names)
         return _Part(self._table, rows, squares, means, covariance, self._shared, not self._robust, n_ends, behind)
 
     def _kind(self, part: _Part, code: int, excess: float, known: bool) -> KindFit | None:
-        """The fit of one of `FAMILIES`, whose chi-square has a mean lower by `excess`; None if it has no rows."""
+        """The fit of one of the table's groups, whose chi-square has a mean lower by `excess`; None without rows."""
         chosen = part.of_kind(code)
         if not len(chosen):
             return None
         chi2, expected = float(np.sum(part.squares[chosen])), float(np.sum(part.means[chosen])) - excess
-        rows, name, factor = part.rows[chosen], FAMILIES[code], float(_factors(self._problem)[code])
+        rows, (table, family) = part.rows[chosen], self._table.groups[code]
+        factor = self._problem.state.factors.get((table, family), 1.0)
         enough = expected >= 1.0
         return KindFit(
-            kind=name,
-            unit="rad" if name in ("angle", "orientation") else "m",
+            kind=family,
+            table=table,
+            unit=self._table.unit(family),
             n=len(rows),
             stated_sigma_rms=float(np.sqrt(np.mean(self._table.sigma[rows] ** 2))) / factor,
             factor=factor,
@@ -505,126 +503,196 @@ class _Rows:
             degrees=part.degrees(chosen),
         )
 
-    def _of_touched_points(self, others: list[KindFit]) -> KindFit:
-        """The fit of touches, and of distances between touched points, together.
-
-        What all fitted rows and priors lose to the fit is its number of unknowns; these lose what the others leave.
-        """
-        table, problem, spread = self._table, self._problem, self._spread
-        rows = np.flatnonzero(table.used & self._of_points)
-        z = table.after[rows] / table.sigma[rows]
-        P = prior_rows(problem.variables, self._solution.parameters)[1]
-        lost = spread.rank + problem.variables.n_without_prior - float(np.sum((P @ spread.tangent) * P))
-        lost -= sum(fit.n - fit.expected for fit in others)
-        chi2, expected = float(z @ z), len(rows) - max(lost, 0.0)
-        enough = expected >= 1.0
-        return KindFit(
-            kind="point",
-            unit="m",
-            n=len(rows),
-            stated_sigma_rms=float(np.sqrt(np.mean(table.sigma[rows] ** 2))) if len(rows) else np.nan,
-            factor=1.0,
-            seen_over_stated=float(np.sqrt(chi2 / expected)) if enough else np.nan,
-            chi2=chi2,
-            expected=max(expected, 0.0),
-            p_value=float(special.gammaincc(expected / 2.0, chi2 / 2.0)) if enough and not self._robust else None,
-            typical=float(np.median(np.abs(z))) / _MEDIAN if len(rows) else np.nan,
-            largest=float(np.max(np.abs(z))) if len(rows) else np.nan,
-            degrees=max(expected, 1.0),
-        )
-
     def _predict(
-        self, test: Integers, squares: Floats, kept: Integers, J: Floats, L: Loadings | None
+        self, test: Integers, squares: Floats, kept: Integers, of_kept: _Errors
     ) -> tuple[_Part, OutlierCounts, int]:
         """The predicted rows that can be judged; `PredictedFit.outliers`, and how many rows are not known.
 
         Args:
             test: Predicted rows of the table.
             squares: Squared residuals over sigma of all rows.
-            kept: Rows of the table that J and L are of.
-            J: Derivatives over sigma.
-            L: Errors that rows share, over sigma; None if there are none.
+            kept: Rows of the table that `of_kept` is of.
+            of_kept: What these follow from.
         """
-        problem, of_points = self._problem, test[self._of_points[test]]
-        others = test[~self._of_points[test]]
-        unknown = ~np.isfinite(self.leverage[others])
-        outlier = self._robust_weights(others) < OUTLIER_WEIGHT
+        unknown = ~np.isfinite(self.leverage[test])
+        outlier = self._robust_weights(test) < OUTLIER_WEIGHT
         outliers = OutlierCounts()
         if self._robust:
             fitted = self.fitted.rows
-            counted = (others[outlier], others, fitted[self.weight[fitted] < OUTLIER_WEIGHT], fitted)
-            outliers = OutlierCounts(*(len(np.unique(self._table.measurement[rows])) for rows in counted))
-        others = others[~unknown & ~outlier]
-        rows = np.concatenate([others, of_points])
-        means, covariance = 1.0 + np.nan_to_num(self.leverage[rows]), None
-        if np.isin(others, kept).all():
-            here, half = np.searchsorted(kept, others), _half(self._spread.actual)
-            covariance = _LowRank(J[here] @ half, None if L is None else L[here])
-            if len(of_points):
-                touched = predicted_points(problem, self._solution.parameters, half, self._table, of_points)
-                covariance = covariance.beside(_LowRank(*touched))
+            counted = (test[outlier], test, fitted[self.weight[fitted] < OUTLIER_WEIGHT], fitted)
+            outliers = OutlierCounts(*(len(np.unique(self._measurement(rows))) for rows in counted))
+        rows = test[~unknown & ~outlier & ~(self.leverage[test] < LEAST_VARIANCE - 1.0)]
+        means, covariance = 1.0 + self.leverage[rows], None
+        if np.isin(rows, kept).all():
+            found = of_kept.at(np.searchsorted(kept, rows))
+            covariance = _LowRank(found.of_estimate(self._spread.actual), found.L, found.private)
             means = covariance.diagonal
             covariance = covariance.over(np.sqrt(means))
-            self.studentised[of_points] /= np.sqrt(means[len(others) :])
+            with np.errstate(invalid="ignore"):
+                size = self._table.sigma[rows] * np.sqrt(means)
+            self.studentised[rows] = self._table.after[rows] / size
         part = self._part(rows, squares[rows] / means, np.ones(len(rows)), covariance)
-        for kind in self._solution.estimated_noise or ():
-            code = FAMILIES.index(kind)
+        for group in self._solution.estimated_noise or ():
+            code = self._table.groups.index(group)
             part.behind[code] = max(1.0, self.fitted.degrees(self.fitted.of_kind(code)))
         return part, outliers, int(np.sum(unknown))
 
-    def _robust_weights(self, rows: Integers) -> Floats:
-        """The weights that the loss would give to predicted rows, shape (n,)."""
-        problem = self._problem
-        if not self._robust or not len(rows):
-            return np.ones(len(rows))
-        loss, measurement = problem.options.loss, self._table.measurement[rows]
-        e, height = lengths(problem, self._solution.parameters, of_test=True)
-        n = len(e)
-        more = np.bincount(measurement, self.leverage[rows], n) / np.maximum(np.bincount(measurement, minlength=n), 1)
-        c = np.array([tuning(loss, max(h, 1)) for h in range(height.max(initial=0) + 1)])[height]
-        out: Floats = weight(loss, e / np.sqrt(1.0 + np.nan_to_num(more)), c)[measurement]
+    def _measurement(self, rows: Integers) -> Integers:
+        """A number for the measurement of each of some rows."""
+        out: Integers = self._table.series[rows].astype(np.int64) * 2**32 + self._table.measurement[rows]
         return out
 
-    def _read(self, keep: Booleans) -> tuple[Loadings | None, Floats]:
-        """Leverage of every row; shared errors (None without any) and derivatives over sigma of the rows to keep."""
-        table, problem = self._table, self._problem
-        parameters = self._solution.parameters
-        block, chain = all_rows(problem, parameters), problem.variables.chain.at(parameters)
-        loadings = _loadings(problem, parameters) if self._shared and keep.any() else None
-        columns = _first_code(problem)
-        self.leverage = np.full(table.n, np.nan)
-        shared, derivatives = [], [np.zeros((0, chain.n_columns))]
-        for start in range(0, block.n, _CHUNK):
-            first, last = np.searchsorted(table.measurement, (start, min(start + _CHUNK, block.n)))
-            rows = slice(int(first), int(last))
-            part = residuals.rows_of(block, slice(start, start + _CHUNK))
-            J = residuals.linearise(part, chain)[1]  # (n, height, n_columns)
-            grid = (table.measurement[rows] - start) * block.height + (table.kind_code[rows] - columns)
-            flat = J.reshape(J.shape[0] * block.height, J.shape[2])[grid] / table.sigma[rows, None]  # (rows, n_columns)
-            leverage = np.einsum("ij,ij->i", flat @ self._spread.tangent, flat)
-            leverage[table.test[rows]] = self._spread.variance(flat[table.test[rows]])
-            self.leverage[rows] = leverage
-            here = keep[rows]
-            derivatives.append(flat[here])
-            if loadings is not None:
-                shared.append(loadings(part)[grid[here]].multiply(1.0 / table.sigma[rows][here, None]).tocsr())
-        self.leverage[~np.isfinite(self.leverage)] = np.nan
-        L = scipy.sparse.csr_array(scipy.sparse.vstack(shared)) if shared else None
-        return L, np.concatenate(derivatives)
+    def _robust_weights(self, rows: Integers) -> Floats:
+        """The weights that the loss would give to predicted rows, shape (n,)."""
+        out, table = np.ones(len(rows)), self._table
+        for number, noise in enumerate(self._noises if self._robust else ()):
+            mine = np.flatnonzero(table.series[rows] == number)
+            measurement = table.measurement[rows[mine]]
+            e, height = noise.lengths()
+            n = len(e)
+            count = np.maximum(np.bincount(measurement, minlength=n), 1)
+            more = np.bincount(measurement, np.nan_to_num(self.leverage[rows[mine]]), n) / count
+            loss = self._problem.options.loss
+            c = np.array([tuning(loss, max(h, 1)) for h in range(height.max(initial=0) + 1)])[height]
+            out[mine] = weight(loss, e / np.sqrt(np.maximum(1.0 + more, LEAST_VARIANCE)), c)[measurement]
+        return out
 
-    def _residual_covariance(self, fitted: Integers, J: Floats, L: Loadings | None) -> _LowRank | _Dense:
-        """Of the fitted rows, from their derivatives and shared errors over sigma."""
-        if self._carried or L is None:
-            return _LowRank(J @ _half(self._spread.tangent), L, sign=-1.0)
-        LLt = (L @ L.T).toarray()
-        C = LLt + np.diag(np.maximum(1.0 - np.diag(LLt), 0.0))
-        measurement = self._table.measurement[fitted]
+    def _read(self, keep: Booleans) -> _Errors:
+        """Leverage of every row; what the rows to keep follow from, over sigma."""
+        table = self._table
+        nuisances = _Nuisances(self._problem, self._solution.parameters, self._noises)
+        self.leverage = np.full(table.n, np.nan)
+        kept = []
+        for number, noise in enumerate(self._noises):
+            of_series = np.flatnonzero(table.series == number)
+            for start in range(0, noise.rows.n, _CHUNK):
+                chunk = np.arange(start, min(start + _CHUNK, noise.rows.n))
+                first, last = np.searchsorted(table.measurement[of_series], (start, start + len(chunk)))
+                rows = of_series[first:last]
+                grid = (table.measurement[rows] - start) * noise.rows.height + table.row[rows]
+                found = nuisances.errors(number, chunk).at(grid).over(table.sigma[rows])
+                leverage = np.einsum("ij,ij->i", found.J @ self._spread.tangent, found.J)
+                leverage[table.test[rows]] = self._spread.variance(found.J[table.test[rows]])
+                self.leverage[rows] = leverage + np.sum(found.own**2, axis=1) + (found.of_noise - 1.0)
+                kept.append(found.at(np.flatnonzero(keep[rows])))
+        self.leverage[~np.isfinite(self.leverage)] = np.nan
+        J, own, private = (np.concatenate([getattr(k, name) for k in kept]) for name in ("J", "own", "private"))
+        return _Errors(J, own, private, scipy.sparse.csr_array(scipy.sparse.vstack([k.L for k in kept])))
+
+    def _residual_covariance(self, fitted: Integers, found: _Errors) -> _LowRank | _Dense:
+        """Of the fitted rows, from what they follow from."""
+        if self._carried:
+            return _LowRank(found.of_estimate(self._spread.tangent), found.L, found.private, sign=-1.0)
+        C = (found.L @ found.L.T).toarray() + np.diag(found.private)
+        measurement = self._measurement(fitted)
         weighted_as = np.where(measurement[:, None] == measurement, C, 0.0)
+        J = np.hstack([found.J, found.own])
         WJ = np.linalg.solve(weighted_as, J)
-        K = self._spread.weighted
+        K = scipy.linalg.block_diag(self._spread.tangent, np.eye(found.own.shape[1]))
         X = J @ (K @ (WJ.T @ C))
         covariance = K + K @ (WJ.T @ ((C - weighted_as) @ WJ)) @ K
         return _Dense(C - X - X.T + J @ covariance @ J.T)
+
+
+@dataclass(frozen=True)
+class _Errors:
+    """What residuals follow from.
+
+    Attributes:
+        J: Derivatives in the core, the nuisances following it, shape (n, n_columns).
+        own: What nuisances are off by themselves, shape (n, n_nuisance): by errors of 1 sigma.
+        private: Variance of each row's private noise, shape (n,).
+        L: How rows follow from other noise, sparse, shape (n, n_errors): from errors of 1 sigma.
+    """
+
+    J: Floats
+    own: Floats
+    private: Floats
+    L: Loadings
+
+    @property
+    def of_noise(self) -> Floats:
+        """Variance of rows by noise alone, shape (n,)."""
+        out: Floats = self.private + np.asarray(self.L.power(2).sum(axis=1)).ravel()
+        return out
+
+    def of_estimate(self, covariance: Floats) -> Floats:
+        """P with P P^T the covariance of rows by what the estimate is off, shape (n, n_columns + n_nuisance).
+
+        Args:
+            covariance: Of the core.
+        """
+        return np.hstack([self.J @ _half(covariance), self.own])
+
+    def at(self, rows: Integers) -> _Errors:
+        """Those of some rows."""
+        return _Errors(self.J[rows], self.own[rows], self.private[rows], self.L[rows])
+
+    def over(self, sigma: Floats) -> _Errors:
+        """Those of rows divided by something, shape (n,)."""
+        by = 1.0 / sigma
+        L = scipy.sparse.csr_array(scipy.sparse.diags_array(by) @ self.L)
+        return _Errors(self.J * by[:, None], self.own * by[:, None], self.private * by**2, L)
+
+
+class _Nuisances:
+    """Which errors rows follow from, nuisances being estimated, or means of what touched them, or known.
+
+    Args:
+        problem: The problem.
+        parameters: The estimate.
+        noises: The rows and their noise at the estimate.
+    """
+
+    def __init__(self, problem: Problem, parameters: Floats, noises: Sequence[RowNoise]) -> None:
+        self._at = at_parameters(problem, parameters)
+        self._noises, self._columns, self._n = noises, ErrorColumns(noises), problem.variables.n_columns
+        there, n = self._at.columns >= 0, len(self._at.columns)
+        self._follow, self._inverse = np.zeros((n, self._n)), np.zeros((n, 0))
+        if there.any():
+            left, of_nuisance = eliminated(problem, parameters), self._at.columns[there] - self._n
+            self._inverse = np.zeros((n, left.rank))
+            self._follow[there], self._inverse[there] = left.follow[of_nuisance], left.inverse[of_nuisance]
+        series = problem.data.series
+        self._apart = [says_where(problem.data, s) & ~there[s.nuisances].any(axis=1) for s in series]
+        reserved = [s.n * s.kind.height * of.any() for s, of in zip(series, self._apart, strict=True)]
+        self._first = self._columns.n_errors + np.cumsum([0, *reserved])
+        self._averaged = scipy.sparse.csr_array((n, int(self._first[-1])))
+        for number, of in enumerate(self._apart):
+            touches = np.flatnonzero(of)
+            if len(touches):
+                found, _ = self._nuisances_known(number, touches)
+                place = series[number].nuisances[touches].ravel()
+                share = 1.0 / np.bincount(place)[place]
+                B = scipy.sparse.csr_array((share, (place, np.arange(len(place)))), shape=(n, len(place)))
+                self._follow += np.asarray(B @ found.J)
+                self._averaged = self._averaged + B @ found.L
+
+    def errors(self, number: int, rows: Integers) -> _Errors:
+        """What rows of a series follow from."""
+        known, N = self._nuisances_known(number, rows)
+        return replace(known, J=known.J + N @ self._follow, own=N @ self._inverse, L=known.L + N @ self._averaged)
+
+    def _nuisances_known(self, number: int, rows: Integers) -> tuple[_Errors, Loadings]:
+        """The same if nuisances were known; derivatives in these, sparse, shape (n height, n_coordinates).
+
+        The noise of touches whose mean a point is stands among L, after the errors of configurations.
+        """
+        noise, width = self._noises[number], int(self._first[-1])
+        J = residuals.linearise(noise.rows_at(rows), self._at.chains[noise.series.table])[1]
+        n, height = J.shape[:2]
+        of_core, in_nuisances = J[:, :, : self._n].reshape(n * height, -1), J[:, :, self._n :]
+        row = np.broadcast_to(np.arange(n * height).reshape(n, height, 1), in_nuisances.shape).ravel()
+        place = np.broadcast_to(noise.series.nuisances[rows][:, None], in_nuisances.shape).ravel()
+        N = scipy.sparse.csr_array((in_nuisances.ravel(), (row, place)), shape=(n * height, len(self._follow)))
+        private = np.maximum(np.einsum("nii->ni", noise.own[rows]), 0.0).ravel()
+        apart = np.flatnonzero(np.repeat(self._apart[number][rows], height))
+        column = self._first[number] + (rows[:, None] * height + np.arange(height)).ravel()[apart]
+        own = scipy.sparse.csr_array((np.sqrt(private[apart]), (apart, column)), shape=(n * height, width))
+        private[apart] = 0.0
+        L = self._columns.loading(noise, rows)
+        L = scipy.sparse.csr_array((L.data, L.indices, L.indptr), shape=own.shape) + own
+        return _Errors(of_core, np.zeros((n * height, 0)), private, L), N
 
 
 class _LowRank:
@@ -632,16 +700,15 @@ class _LowRank:
 
     Args:
         P: Shape (n, n_columns).
-        L: Sparse, shape (n, n_shared); None for zero.
-        own: Diagonal of D, shape (n,); what L leaves of 1 if None.
+        L: Sparse, shape (n, n_errors).
+        own: Diagonal of D, shape (n,).
         sign: 1, or -1 for rows that P was fitted to.
     """
 
-    def __init__(self, P: Floats, L: Loadings | None, own: Floats | None = None, sign: float = 1.0) -> None:
-        self._P, self._L, self._sign = P, L, sign
+    def __init__(self, P: Floats, L: Loadings, own: Floats, sign: float = 1.0) -> None:
+        self._P, self._L, self._d, self._sign = P, L, own, sign
         self._p = sign * np.sum(P * P, axis=1)
-        self._l = np.zeros(len(P)) if L is None else np.asarray(L.multiply(L).sum(axis=1)).ravel()
-        self._d = np.maximum(1.0 - self._l, 0.0) if own is None else own
+        self._l = np.asarray(L.power(2).sum(axis=1)).ravel()
 
     @property
     def diagonal(self) -> Floats:
@@ -652,32 +719,20 @@ class _LowRank:
     def over(self, scale: Floats) -> _LowRank:
         """The same of rows divided by a scale, shape (n,)."""
         by = 1.0 / scale
-        L = None if self._L is None else scipy.sparse.csr_array(scipy.sparse.diags_array(by) @ self._L)
+        L = scipy.sparse.csr_array(scipy.sparse.diags_array(by) @ self._L)
         return _LowRank(self._P * by[:, None], L, self._d * by**2, self._sign)
 
     def dense(self, rows: Integers) -> tuple[Floats, Floats]:
         """The part at `rows`, and what its D lacks to be `PRIVATE_SHARE` of the noise."""
         P, d, of_l = self._P[rows], self._d[rows], self._l[rows]
-        A = np.diag(d) + self._sign * (P @ P.T)
-        if self._L is not None:
-            A += (self._L[rows] @ self._L[rows].T).toarray()
+        A = np.diag(d) + self._sign * (P @ P.T) + (self._L[rows] @ self._L[rows].T).toarray()
         return A, np.maximum(PRIVATE_SHARE * (d + of_l) - d, 0.0)
-
-    def beside(self, other: _LowRank) -> _LowRank:
-        """This one's rows, then those of another that may have further columns of P, and an L of its own."""
-        more = other._P.shape[1] - self._P.shape[1]
-        P = np.vstack([np.pad(self._P, ((0, 0), (0, more))), other._P])
-        parts = (scipy.sparse.csr_array((len(c._P), 0)) if c._L is None else c._L for c in (self, other))
-        L = scipy.sparse.block_diag(list(parts), format="csr")
-        return _LowRank(P, L, np.concatenate([self._d, other._d]), self._sign)
 
     def moments(self, rows: Integers) -> tuple[float, float]:
         """Trace, and trace of the square, of the part at `rows`."""
-        P, p, of_l, d = self._P[rows], self._p[rows], self._l[rows], self._d[rows]
+        P, L, p, of_l, d = self._P[rows], self._L[rows], self._p[rows], self._l[rows], self._d[rows]
         square = np.sum(d * d) + 2.0 * np.sum(d * (of_l + p)) + np.sum((P.T @ P) ** 2)
-        if self._L is not None:
-            L = self._L[rows]
-            square += (L.T @ L).power(2).sum() + 2.0 * self._sign * np.sum((L.T @ P) ** 2)
+        square += (L.T @ L).power(2).sum() + 2.0 * self._sign * np.sum((L.T @ P) ** 2)
         return float(np.sum(d + of_l + p)), float(square)
 
 
@@ -715,55 +770,4 @@ def _half(covariance: Floats) -> Floats:
     """H with H H^T a covariance, shape (n, n)."""
     values, vectors = np.linalg.eigh(covariance)
     out: Floats = vectors * np.sqrt(np.maximum(values, 0.0))
-    return out
-
-
-def _loadings(problem: Problem, parameters: Floats) -> Callable[[Block], Loadings]:
-    """How rows in [m] and [rad] follow from errors of 1 sigma that they share, sparse (n * height, ...)."""
-    m, chain = problem.measurements, problem.variables.chain.at(parameters)
-    if problem.pairs is not None:
-        pairs = pair_rows(problem, parameters)
-        return lambda part: pairs.loadings(part, problem.common)
-    factors = np.repeat(np.array(problem.adjustment.factors)[list(POSE_MODELS[problem.options.model])], 3)
-
-    def of_joints(part: Block) -> scipy.sparse.csr_array:
-        assert isinstance(part, PoseBlock)
-        J = np.concatenate([J for _, J in joint_rows(part, chain, m.sigma_joint)])  # (n, height, n_joints)
-        J = J * factors[:, None]
-        n, height, n_joints = J.shape
-        columns = np.broadcast_to(part.rows[:, None, None] * n_joints + np.arange(n_joints), J.shape)
-        shape = (n * height, m.n_configurations * n_joints)
-        return scipy.sparse.csr_array((J.ravel(), columns.ravel(), np.arange(n * height + 1) * n_joints), shape=shape)
-
-    return of_joints
-
-
-def _n_measured(problem: Problem) -> int:
-    """Number of pairs or poses, train and test: what comes after them in a residual table are touches."""
-    return problem.measurements.n_configurations if problem.pairs is None else problem.pairs.n_pairs
-
-
-def _first_code(problem: Problem) -> int:
-    """Code in `ROW_KINDS` of a measurement's first row."""
-    model = problem.options.model
-    if problem.pairs is not None:
-        return 0 if PAIR_MODELS[model][0] else 1
-    return ROW_KINDS.index("orientation.x" if POSE_MODELS[model][0] else "position.x")
-
-
-def _factors(problem: Problem) -> Floats:
-    """What the stated sigma of each of `FAMILIES` is multiplied by."""
-    factors = problem.adjustment.factors
-    return np.array([*factors, 1.0, 1.0, 1.0] if problem.pairs is not None else [1.0, 1.0, *factors, 1.0])
-
-
-def _is_same_point(problem: Problem, table: ResidualTable) -> Booleans:
-    """Distances that stand for three coordinates of one point, shape (n,)."""
-    if problem.judgement is None or not problem.judgement.same_point.any():
-        return np.zeros(table.n, dtype=np.bool_)
-    same = problem.judgement.same_point
-    out: Booleans = np.zeros(table.n, dtype=np.bool_)
-    of_pairs = table.measurement < len(same)
-    out[of_pairs] = same[table.measurement[of_pairs]]
-    out &= table.family == FAMILIES.index("distance")
     return out

@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 from fg_calib.analysis.conventions import MissingMotion, missing_motions
 from fg_calib.analysis.reasons import LostDirection, explain
 from fg_calib.errors import ProblemError
+from fg_calib.graph.build import STRUCTURAL_FLOOR, predicted_problem, random_problem
+from fg_calib.graph.information import observe
 from fg_calib.graph.observability import SIGNAL_FLOOR, Observability
-from fg_calib.graph.problem import STRUCTURAL_FLOOR, Problem, observe, predicted_problem, random_problem
+from fg_calib.graph.problem import Problem
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.options import FrameKnowledge, Model, Pairing, check_names, check_number
 from fg_calib.robot.model import Robot, names_of
@@ -141,7 +143,7 @@ def observe_configurations(
             measurements.sigma_joint,
         ),
     )
-    if not problem.blocks:
+    if not problem.rows:
         raise ProblemError(measurements.source, "no row takes part", "configurations that differ")
     return identify(problem, problem.start, "practical", prefer)
 

@@ -14,11 +14,8 @@ from numpy.typing import NDArray
 from scipy import special
 
 from fg_calib.analysis.covariance import Spread
-from fg_calib.graph.problem import Problem, eliminated_terms
+from fg_calib.graph.information import eliminated
 from fg_calib.graph.solver import Solution
-from fg_calib.graph.whitening import joint_rows
-from fg_calib.measurements import residuals
-from fg_calib.measurements.residuals import CorrelatedBlock
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -76,18 +73,13 @@ def joint_values(solution: Solution, spread: Spread) -> JointValues | None:
         solution: The solution.
         spread: Its covariance.
     """
-    problem, m = solution.problem, solution.problem.measurements
-    joints = np.flatnonzero(m.sigma_joint > 0.0)
-    if problem.joints is not None:
-        rows, variance = problem.joints.configurations, _of_variables(solution, spread)
-        q = problem.joints.values(problem.variables, solution.parameters)[np.ix_(rows, joints)]
-        error = q - m.readings[np.ix_(rows, joints)]
-    elif problem.adjustment.joint_errors is not None:
-        rows, variance = _fitted(problem), _of_eliminated(solution, spread)
-        error = problem.adjustment.joint_errors[np.ix_(rows, joints)]
-    else:
+    problem, data = solution.problem, solution.problem.data
+    if problem.state.joint_errors is None:
         return None
-    sigma = m.sigma_joint[joints]
+    joints = np.flatnonzero(data.sigma_joint > 0.0)
+    sigma = data.sigma_joint[joints]
+    rows, variance = _variance(solution, spread, sigma)
+    error = problem.state.joint_errors[np.ix_(rows, joints)]
     share = variance / sigma**2
     with np.errstate(invalid="ignore", divide="ignore"):
         studentised = np.where(share > _SEEN, error / np.sqrt(variance), np.nan)
@@ -98,7 +90,7 @@ def joint_values(solution: Solution, spread: Spread) -> JointValues | None:
         configurations=rows,
         joints=joints,
         names=tuple(problem.robot.joints[j].name for j in joints),
-        reading=m.readings[np.ix_(rows, joints)],
+        reading=data.readings[np.ix_(rows, joints)],
         error=error,
         sigma=sigma,
         studentised=studentised,
@@ -106,43 +98,25 @@ def joint_values(solution: Solution, spread: Spread) -> JointValues | None:
     )
 
 
-def _fitted(problem: Problem) -> Integers:
-    """Configurations of the fitted rows, in order."""
-    if problem.pairs is None or problem.judgement is None:
-        return np.flatnonzero(~problem.measurements.test)
-    pairs = problem.pairs.select(problem.judgement.used & ~problem.pairs.test)
-    return np.unique(np.concatenate([pairs.a, pairs.b]))
+def _variance(solution: Solution, spread: Spread, sigma: Floats) -> tuple[Integers, Floats]:
+    """Configurations of the fitted rows, in order, and the variance of their estimated errors, shape (n, k).
 
-
-def _of_variables(solution: Solution, spread: Spread) -> Floats:
-    """Variance of the estimated errors where joint values are variables, shape (n, k)."""
+    With Z = G r it is what r takes off their variance, less G J Cov J^T G^T.
+    """
     problem = solution.problem
-    assert problem.joints is not None
-    left = eliminated_terms(problem, solution.parameters)
-    remaining = spread.variance(left.follow) + np.sum(left.inverse**2, axis=1)
-    sigma = problem.measurements.sigma_joint[problem.joints.joints]
-    out: Floats = sigma**2 - remaining.reshape(-1, len(sigma))
-    return out
-
-
-def _of_eliminated(solution: Solution, spread: Spread) -> Floats:
-    """The same where they are eliminated: with y the whitened rows and z = S^T y, S^T (1 - J Cov J^T) S."""
-    problem = solution.problem
-    block, chain = problem.blocks[0], problem.variables.chain.at(solution.parameters)
-    assert isinstance(block, CorrelatedBlock)
-    rows = _fitted(problem)
-    sigma, values_vectors = problem.measurements.sigma_joint, np.linalg.eigh(spread.tangent)
-    noisy = np.flatnonzero(sigma > 0.0)
-    half = values_vectors[1] * np.sqrt(np.maximum(values_vectors[0], 0.0))
-    if block.loadings:
-        J = np.concatenate(list(block.chunks(chain)))[:, :-1]
-        S = block.whiten(np.vstack([L.toarray() for L in block.loadings]))  # (n_rows, n_shared)
-        of_z = np.sum(S**2, axis=0) - np.sum((S.T @ (J @ half)) ** 2, axis=1)
-        share = of_z.reshape(len(rows), -1)[:, -len(noisy) :]
-    else:
-        (part,) = block.parts
-        J = residuals.linearise(part, chain)[1]  # (n, height, n_columns)
-        S = np.concatenate([J for _, J in joint_rows(part, chain, sigma)])[:, :, noisy]  # (n, height, k)
-        share = np.sum(S**2, axis=1) - np.sum((np.swapaxes(S, 1, 2) @ (J @ half)) ** 2, axis=2)
-    out: Floats = share * sigma[noisy] ** 2
-    return out
+    values, vectors = np.linalg.eigh(spread.tangent)
+    half = vectors * np.sqrt(np.maximum(values, 0.0))
+    left, at = eliminated(problem, solution.parameters), problem.variables.at(solution.parameters)
+    n = problem.variables.n_columns
+    found, shares = [np.zeros(0, dtype=np.int64)], [np.zeros((0, len(sigma)))]
+    for rows in problem.rows:
+        if rows.shared is not None:
+            J = rows.private(at)[:, :-1]
+            J = np.hstack([(J[:, :n] + J[:, n:] @ left.follow) @ half, J[:, n:] @ left.inverse])
+            Z = rows.shared.most_likely(J)
+            of_z = (1.0 - rows.shared.variances - np.sum(Z**2, axis=1)).reshape(len(rows.configurations), -1)
+            found.append(rows.configurations)
+            shares.append(of_z[:, rows.joints : rows.joints + len(sigma)])
+    configurations = np.concatenate(found)
+    order = np.argsort(configurations)
+    return configurations[order], np.concatenate(shares)[order] * sigma**2

@@ -157,12 +157,24 @@ def check_problem(problem: Problem, before: Floats, *, doubtful: bool = False) -
         before: The parameter vector with base, tool and measurement frame fitted, the arm at nominal.
         doubtful: Look for a mistake even where the residuals are not far from what is predicted.
     """
-    whole, s = problem.whole or problem, problem.options
-    world_T_base = pose_of(before[problem.variables.frame_span])
-    frame = Frame(world_T_base.rotation().matrix(), world_T_base.translation())
-    robot = whole.robot.with_values(before[problem.variables.robot_span])
-    given = (whole.robot, problem.measurements, s.model, s.frame)
-    return check_setup(*given, doubtful=doubtful, fitted=(robot, frame))
+    whole, variables = problem.whole or problem, problem.variables
+    robot = whole.robot.with_values(before[variables.robot_span])
+    found = SetupCheck()
+    for number, table in enumerate(problem.data.tables):
+        if table.model is None:
+            continue
+        frame = Frame(np.eye(3), np.zeros(3))
+        for v in variables.frames:
+            if v.symbol == f"X({number})":
+                world_T_base = pose_of(before[list(v.parameters)])
+                frame = Frame(world_T_base.rotation().matrix(), world_T_base.translation())
+        given = (whole.robot, table.measurements, table.model, table.frame)
+        of_table = check_setup(*given, doubtful=doubtful, fitted=(robot, frame))
+        if number == 0 or of_table.explanations or of_table.excess > found.excess:
+            found = of_table
+        if of_table.explanations:
+            return found
+    return found
 
 
 def _excess(residuals: Sequence[TypicalResidual]) -> float:

@@ -11,8 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.graph.build import random_problem
+from fg_calib.graph.information import named_triangle
 from fg_calib.graph.observability import Observability
-from fg_calib.graph.problem import Problem, named_triangle, random_problem
+from fg_calib.graph.problem import Problem
 from fg_calib.options import Model
 from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
 from fg_calib.robot.model import Parameter

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from fg_calib.analysis.covariance import spread_of
 from fg_calib.graph.factors import prior_rows
+from fg_calib.graph.information import whitened_triangle
 from fg_calib.graph.observability import SIGNAL_FLOOR
-from fg_calib.graph.problem import Problem, whitened_triangle
+from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution, SolverOptions, solve_from
 from fg_calib.threads import one_blas_thread
 

@@ -23,9 +23,10 @@ from scipy import special
 from fg_calib.analysis.conventions import end_of_link
 from fg_calib.graph.factors import build_variables, prior_rows
 from fg_calib.graph.problem import Problem
+from fg_calib.graph.rows import RowSet
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements import residuals
-from fg_calib.measurements.residuals import AnyBlock, Block, CorrelatedBlock, PoseBlock
+from fg_calib.measurements.residuals import Block
 from fg_calib.robot.kinematics import Chain
 from fg_calib.robot.model import FRAME_KINDS, Element, Parameter, Robot
 
@@ -50,12 +51,13 @@ def probability_of_noise(solution: Solution) -> float | None:
         The p-value; None where it cannot be told: too few rows or too many, a robust loss, touched points, joint
         values estimated, rows that share errors but are weighted as independent.
     """
-    problem = solution.problem
-    weighted = problem.adjustment.weights is not None or problem.adjustment.joint_errors is not None
-    if problem.terms or weighted or problem.common != problem.sharing or problem.n_residuals > MAX_ROWS:
+    problem, state = solution.problem, solution.problem.state
+    weighted = state.weights is not None or state.joint_errors is not None
+    several = problem.variables.nuisance or problem.added or weighted or problem.missing_correlation
+    if several or problem.n_residuals > MAX_ROWS:
         return None
-    chain, of_model = _chain(problem, solution.parameters)
-    rows = [_rows(block, chain) for block in problem.blocks]
+    chains, of_model = _chains(problem, solution.parameters)
+    rows = [_rows(row_set, chains) for row_set in problem.rows]
     r_prior, J_prior = prior_rows(problem.variables, solution.parameters)
     fitted = np.concatenate([*(J[:, of_model] for J, _ in rows), J_prior])
     rest = np.concatenate([*(J[:, ~of_model] for J, _ in rows), np.zeros((len(r_prior), int(np.sum(~of_model))))])
@@ -71,19 +73,19 @@ def probability_of_noise(solution: Solution) -> float | None:
     return float(special.fdtrc(more.shape[1], n_left, (drop / more.shape[1]) / max(left / n_left, 1e-300)))
 
 
-def _chain(problem: Problem, parameters: Floats) -> tuple[Chain, NDArray[np.bool_]]:
-    """The chain at a parameter vector with columns for the links' small motions too, and which of all are the model's.
+def _chains(problem: Problem, parameters: Floats) -> tuple[tuple[Chain, ...], NDArray[np.bool_]]:
+    """The chains at a parameter vector with columns for the links' small motions too, and which of all are the model's.
 
-    Its joints' columns give as many again for each of `_waves`.
+    Their joints' columns give as many again for each of `_waves`.
     """
     robot = _with_link_motions(problem.robot)
-    variables = build_variables(robot, any(v.kind == "frame" for v in problem.variables.items))
-    n_more = len(robot.parameters) - len(problem.robot.parameters)
-    n = len(problem.robot.parameters)
-    values = np.concatenate([parameters[:n], np.zeros(n_more), parameters[n : n + 6]])
+    variables = build_variables(robot, [table.unknown_frame for table in problem.data.tables])
+    n, n_more = len(problem.robot.parameters), len(robot.parameters) - len(problem.robot.parameters)
+    values = np.concatenate([parameters[:n], np.zeros(n_more), parameters[problem.variables.frame_span]])
     of_model = np.array([not name.startswith(_OWN) for name in variables.names])
     of_joints = np.zeros(_N_WAVES * robot.n_joints, dtype=np.bool_)
-    return variables.chain.at(values).with_joint_columns(), np.concatenate([of_model, of_joints])
+    chains = tuple(chain.at(values).with_joint_columns() for chain in variables.chains)
+    return chains, np.concatenate([of_model, of_joints])
 
 
 def _with_link_motions(robot: Robot) -> Robot:
@@ -98,12 +100,11 @@ def _with_link_motions(robot: Robot) -> Robot:
     return replace(robot, elements=tuple(elements), parameters=tuple(parameters))
 
 
-def _rows(block: AnyBlock, chain: Chain) -> tuple[Floats, Floats]:
-    """Whitened derivatives in the chain's columns and the joints' waves, and residuals, one row a scalar."""
-    parts = block.parts if isinstance(block, CorrelatedBlock) else (block,)
-    rows = np.concatenate([_private_rows(part, chain) for part in parts])
-    if isinstance(block, CorrelatedBlock):
-        rows = block.whiten(rows)
+def _rows(row_set: RowSet, chains: tuple[Chain, ...]) -> tuple[Floats, Floats]:
+    """Whitened derivatives in the chains' columns and the joints' waves, and residuals, one row a scalar."""
+    rows = np.concatenate([_private_rows(part.block, chains[part.table]) for part in row_set.parts])
+    if row_set.shared is not None:
+        rows = row_set.shared.whiten(rows)
     return rows[:, :-1], rows[:, -1]
 
 
@@ -111,11 +112,10 @@ def _private_rows(part: Block, chain: Chain) -> Floats:
     """[J Z r] of a block before what its rows share is taken out, shape (n_rows, n_columns + n_waves + 1)."""
     r, J = residuals.linearise(part, chain)
     own, n = J[:, :, : chain.n_columns], chain.n_joints
-    ends = (part.rows,) if isinstance(part, PoseBlock) else (part.a, part.b)  # type: ignore[attr-defined]
     waves = np.zeros((*r.shape, _N_WAVES * n))
-    for k, rows in enumerate(ends):
+    for k, rows in enumerate(part.ends.T):
         of_end = J[:, :, chain.n_columns + k * n : chain.n_columns + (k + 1) * n]
-        waves += np.concatenate([of_end * wave[:, None] for wave in _waves(part.trig[rows])], axis=2)  # type: ignore[attr-defined]
+        waves += np.concatenate([of_end * wave[:, None] for wave in _waves(part.trig[rows])], axis=2)
     return np.concatenate([own, waves, r[:, :, None]], axis=2).reshape(r.size, -1)
 
 

@@ -19,7 +19,7 @@ from fg_calib.analysis.goodness import OUTLIER_WEIGHT, Goodness, judge_fit
 from fg_calib.analysis.identifiability import Identifiability, identify
 from fg_calib.analysis.joint_values import JointValues, joint_values
 from fg_calib.analysis.mistakes import SetupCheck, check_problem
-from fg_calib.analysis.residual_table import FAMILIES, ResidualTable, residual_table
+from fg_calib.analysis.residual_table import ResidualTable, residual_table
 from fg_calib.analysis.structure import probability_of_noise
 from fg_calib.analysis.verdict import (
     Statement,
@@ -32,13 +32,15 @@ from fg_calib.analysis.verdict import (
     of_priors,
     of_test,
 )
+from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.extension import check_graph
 from fg_calib.graph.factors import corrections_of, pose_of
+from fg_calib.graph.information import eliminated
+from fg_calib.graph.noise import PairNoise
 from fg_calib.graph.observability import IdentifiabilityClass, Observability
-from fg_calib.graph.problem import Problem, eliminated_terms, lengths, pair_rows
+from fg_calib.graph.problem import Problem, at_parameters, mahalanobis_distances, noises_at
 from fg_calib.graph.robust import effect
 from fg_calib.graph.solver import Solution
-from fg_calib.options import PAIR_MODELS
 from fg_calib.robot.model import Robot
 from fg_calib.threads import one_blas_thread, single_threaded
 
@@ -54,6 +56,9 @@ BENT = 1.0
 
 MOST_ESTIMATED = 2.0
 """Noise seen over noise stated above which it is more likely that something is not modelled."""
+
+_WITH_FIGURES = ("distance", "angle", "orientation", "position")
+"""Kinds of noise whose motions are seen in what was measured."""
 
 LIKE_NOISE = 1e-3
 """Probability below which residuals follow the arm more than noise does."""
@@ -91,7 +96,7 @@ class ParameterEstimate:
 
 
 @dataclass(frozen=True)
-class FrameEstimate:
+class FrameEstimate(FrozenArrays):
     """The measurement frame world_T_base.
 
     Attributes:
@@ -107,7 +112,7 @@ class FrameEstimate:
 
 
 @dataclass(frozen=True)
-class PointEstimate:
+class PointEstimate(FrozenArrays):
     """A physical point that a group of configurations touched.
 
     Attributes:
@@ -139,7 +144,7 @@ class Prediction:
 
 
 @dataclass(frozen=True)
-class Uncertainty:
+class Uncertainty(FrozenArrays):
     """What `assess` finds out about a solution.
 
     Attributes:
@@ -163,7 +168,8 @@ class Uncertainty:
         whole: The same of all parameters, those left out to fix the gauge among them, behind `predict`.
         findings: Why the result is not to be trusted; empty if it is.
         cautions: What its reader should know although nothing speaks against it, such as sigmas somewhat too small.
-        points: The points that groups of configurations touched.
+        frames: Every measurement frame that was estimated, table by table.
+        points: The points that groups of configurations touched, and other unknowns of the measurements.
         setup: What residuals before the calibration say of its set-up.
         noise_like: Probability that noise alone follows the arm as much as the residuals do; None where that was not
             asked, because they are as small as stated, or cannot be told.
@@ -189,10 +195,20 @@ class Uncertainty:
     whole: Spread
     findings: tuple[str, ...]
     cautions: tuple[str, ...]
+    frames: tuple[FrameEstimate, ...] = ()
     points: tuple[PointEstimate, ...] = ()
     setup: SetupCheck = field(default_factory=SetupCheck)
     noise_like: float | None = None
     joint_values: JointValues | None = None
+
+    def __repr__(self) -> str:
+        known = sum(p.sigma is not None for p in self.parameters if p.identifiability != "fixed")
+        lines = [
+            f"Uncertainty of {self.robot.name!r}: {known} of {len(self.names)} parameters have a known sigma",
+            f"  chi-square {self.chi2:.6g}, {self.dof} degrees of freedom",
+            *(f"  DOUBTFUL: {finding}" for finding in self.findings[:6]),
+        ]
+        return "\n".join(line if len(line) <= 100 else f"{line[:96]} ..." for line in lines)
 
     @single_threaded
     def predict(self, function: Callable[[Robot], ArrayLike], *, fitted: bool = False) -> Prediction:
@@ -227,8 +243,7 @@ class Uncertainty:
         """Whether the noise seen may be taken for the noise there is: a little larger than stated, and like noise."""
         too_large = [fit for fit in self.goodness.kinds if fit.verdict in ("too small", "both")]
         return (
-            not self.points
-            and not self.residuals.evaluated
+            not self.residuals.evaluated
             and not self.setup.explanations
             and not any(fit.verdict in ("outliers", "both") for fit in self.goodness.kinds)  # they are not noise
             and not (too_large and self.identifiability.missing)
@@ -275,16 +290,9 @@ def _assess(solution: Solution) -> Uncertainty:
     whole = with_left_out(solution, spread)
     identified = identify(problem.whole or problem, solution.before, "practical")
     covariance = whole.named()
-    frame = None
-    if variables.n_robot_columns < variables.n_columns:
-        world_T_base = pose_of(solution.parameters[variables.frame_span])
-        frame = FrameEstimate(
-            xyz=world_T_base.translation(),
-            quaternion_xyzw=Rotation.from_matrix(world_T_base.rotation().matrix()).as_quat(canonical=True),
-            sigma=np.sqrt(np.diag(whole.covariance(np.eye(len(whole.tangent))[whole.variables.n_robot_columns :]))),
-        )
+    frames = _frame_estimates(solution, whole)
     chi2, n_rows, loss_factor = _weighted_chi2(solution)
-    dof = n_rows + problem.n_priors + problem.n_added - spread.rank - variables.n_without_prior
+    dof = n_rows + problem.n_priors + problem.n_added - spread.rank - eliminated(problem, solution.parameters).rank
     expected = max(0.0, dof - spread.excess - (1.0 - loss_factor) * n_rows)
     independent = _independent_dof(problem, dof, spread.rank)
     bounds = chi2_bounds(dof, expected, independent)
@@ -296,7 +304,7 @@ def _assess(solution: Solution) -> Uncertainty:
         *_of_solver(solution),
         *of_chi2(chi2, dof, expected, bounds, p_value, evaluated),
         *of_evaluation(evaluated, solution.estimated_noise is not None),
-        *of_test(goodness.test, chi2 / expected if expected > 0.0 else 1.0, problem.measurements.end_names),
+        *of_test(goodness.test, chi2 / expected if expected > 0.0 else 1.0, problem.end_names),
         *of_priors(priors),
         *_of_bent_rows(solution, spread, table, goodness),
         *_of_noise(solution, table, goodness),
@@ -316,7 +324,8 @@ def _assess(solution: Solution) -> Uncertainty:
         names=whole.variables.names[: whole.variables.n_robot_columns],
         covariance=covariance,
         parameters=_parameter_estimates(solution, np.sqrt(np.diag(covariance)), spread, identified.observability),
-        frame=frame,
+        frame=frames[0] if frames else None,
+        frames=frames,
         chi2=chi2,
         dof=dof,
         expected_chi2=expected,
@@ -345,36 +354,51 @@ def _weighted_chi2(solution: Solution) -> tuple[float, int, float]:
     With a robust loss only measurements count that keep at least half their weight.
     """
     problem = solution.problem
-    weights, chi2 = problem.adjustment.weights, 2.0 * solution.weighted_cost
+    weights, chi2 = problem.state.weights, 2.0 * solution.weighted_cost
     if weights is None:
         return chi2, problem.n_independent, 1.0
-    e, height = lengths(problem, solution.parameters)
-    outlier = weights < OUTLIER_WEIGHT
-    chi2 -= float(np.sum(weights[outlier] * e[outlier] ** 2))
-    share = float(np.mean(~outlier[height > 0]))
-    of_loss = effect(problem.options.loss, problem.height)
-    return max(0.0, chi2), round(problem.n_independent * share), of_loss.chi2
+    n_rows = n_kept = expected = 0.0
+    distances = mahalanobis_distances(problem, solution.parameters)
+    for series, w, (e, height) in zip(problem.data.series, weights, distances, strict=True):
+        train, outlier = (height > 0) & ~series.test, w < OUTLIER_WEIGHT
+        chi2 -= float(np.sum(w[train & outlier] * e[train & outlier] ** 2))
+        kept = float(height[train & ~outlier].sum())
+        n_rows, n_kept = n_rows + float(height[train].sum()), n_kept + kept
+        expected += kept * effect(problem.options.loss, int(height.max(initial=1))).chi2
+    of_loss = expected / n_kept if n_kept else 1.0
+    return max(0.0, chi2), round(problem.n_independent * n_kept / max(n_rows, 1.0)), of_loss
 
 
 def _p_value(solution: Solution, chi2: float, expected: float, independent: int) -> float | None:
     """Upper p-value of chi-square, scaled to its mean; None where weights or noise came from the residuals."""
     problem = solution.problem
-    if (
-        problem.adjustment.weights is not None
-        or solution.estimated_noise is not None
-        or expected <= 0.0
-        or independent <= 0
-    ):
+    if problem.state.weights is not None or solution.estimated_noise is not None or expected <= 0.0 or independent <= 0:
         return None
     return float(special.gammaincc(independent / 2.0, chi2 / expected * independent / 2.0))
 
 
 def _independent_dof(problem: Problem, dof: int, rank: int) -> int:
     """Degrees of freedom of the noise behind the residuals: pairs hold no more than the poses they come from."""
-    if not problem.formed or problem.sharing.poses:
+    if not (problem.formed and problem.missing_correlation) or len(problem.data.series) > 1:
         return dof
-    each = 3 * sum(PAIR_MODELS[problem.options.model])
+    each = 3 * problem.data.series[0].kind.height
     return min(dof, each * (problem.n_configurations - 1) + problem.n_priors - rank)
+
+
+def _frame_estimates(solution: Solution, whole: Spread) -> tuple[FrameEstimate, ...]:
+    """Every measurement frame that was estimated."""
+    found = []
+    for k, v in enumerate(solution.problem.variables.frames):
+        world_T_base = pose_of(solution.parameters[list(v.parameters)])
+        first = whole.variables.n_robot_columns + 6 * k
+        found.append(
+            FrameEstimate(
+                xyz=world_T_base.translation(),
+                quaternion_xyzw=Rotation.from_matrix(world_T_base.rotation().matrix()).as_quat(canonical=True),
+                sigma=np.sqrt(np.diag(whole.covariance(np.eye(len(whole.tangent))[first : first + 6]))),
+            )
+        )
+    return tuple(found)
 
 
 def _parameter_estimates(
@@ -421,30 +445,33 @@ def _known(sigma: float) -> float | None:
 
 def _of_bent_rows(solution: Solution, spread: Spread, table: ResidualTable, goodness: Goodness) -> list[Statement]:
     """Whether the result rests on lengths and angles that are far from linear in what is still unknown."""
-    problem = solution.problem
-    if problem.pairs is None:
-        return []
-    rows = np.flatnonzero(table.used & (table.measurement < problem.pairs.n_pairs))
-    if not len(rows):
-        return []
     values, V = np.linalg.eigh(spread.tangent)
-    whitening = pair_rows(problem, solution.parameters)
-    place, leverage = (table.measurement[rows], table.family[rows]), np.nan_to_num(goodness.leverage[rows])
-    bent = whitening.bent_by(V * np.sqrt(np.maximum(values, 0.0)), BENT)[place]
-    folded = whitening.may_fold(np.diag(problem.variables.prior_scales))[place]
-    share = float(leverage[folded].sum() / max(leverage.sum(), 1e-300))
-    return [
-        *of_bent(int(bent.sum()), len(rows), float(leverage[bent].sum())),
-        *of_folds(int(folded.sum()), len(rows), share),
-    ]
+    half, scales = V * np.sqrt(np.maximum(values, 0.0)), np.diag(solution.problem.variables.prior_scales)
+    noises = noises_at(solution.problem, solution.parameters, at_readings=True)
+    n_rows, n_bent, n_folded, leverage_bent, leverage_folded, leverage = 0, 0, 0, 0.0, 0.0, 0.0
+    for number, noise in enumerate(noises):
+        if isinstance(noise, PairNoise):
+            rows = np.flatnonzero(table.used & (table.series == number))
+            place, own = (table.measurement[rows], table.row[rows]), np.nan_to_num(goodness.leverage[rows])
+            bent, folded = noise.bent_by(half, BENT)[place], noise.may_fold(scales)[place]
+            n_rows, n_bent, n_folded = n_rows + len(rows), n_bent + int(bent.sum()), n_folded + int(folded.sum())
+            leverage += float(own.sum())
+            leverage_bent, leverage_folded = (
+                leverage_bent + float(own[bent].sum()),
+                leverage_folded + float(own[folded].sum()),
+            )
+    if not n_rows:
+        return []
+    share = leverage_folded / max(leverage, 1e-300)
+    return [*of_bent(n_bent, n_rows, leverage_bent), *of_folds(n_folded, n_rows, share)]
 
 
 def _of_noise(solution: Solution, table: ResidualTable, goodness: Goodness) -> list[Statement]:
     """Whether noise that was estimated is small beside the motions it was estimated of."""
     found: list[Statement] = []
     for fit in goodness.kinds:
-        if fit.kind in (solution.estimated_noise or ()):
-            rows = table.used & (table.family == FAMILIES.index(fit.kind))
+        if (fit.table, fit.kind) in (solution.estimated_noise or ()) and fit.kind in _WITH_FIGURES:
+            rows = table.used & (table.group == table.groups.index((fit.table, fit.kind)))
             predicted = (table.measured + table.after)[rows]
             about = 0.0 if fit.kind in ("distance", "angle") else float(np.mean(predicted))
             motion = 1.0 if fit.kind == "orientation" else float(np.sqrt(np.mean((predicted - about) ** 2)))
@@ -458,10 +485,10 @@ def _of_solver(solution: Solution) -> list[Statement]:
     if not solution.converged:
         statements.append(Statement(solution.message, finding=True))
     statements += [Statement(text, finding=True) for text in _other_optima(solution)]
-    weights = solution.problem.adjustment.weights
+    weights, series = solution.problem.state.weights, solution.problem.data.series
     if weights is not None:
-        _, height = lengths(solution.problem, solution.parameters)
-        n, lost = int(np.sum(height > 0)), int(np.sum(weights[height > 0] < OUTLIER_WEIGHT))
+        n = sum(len(s.train) for s in series)
+        lost = sum(int(np.sum(w[s.train] < OUTLIER_WEIGHT)) for s, w in zip(series, weights, strict=True))
         if lost > MOST_OUTLIERS * n:
             loss = solution.problem.options.loss
             text = f"loss {loss} takes {lost} of {n} measurements for outliers: more than it can tell from noise"
@@ -509,28 +536,29 @@ def _other_optima(solution: Solution, most: int = 4) -> list[str]:
 
 
 def _point_estimates(solution: Solution, spread: Spread) -> tuple[PointEstimate, ...]:
-    """Where the groups' points are; sigma from that of the core, which they follow, and from their own touches.
+    """Where touched points and other unknowns are; sigma from the core, which they follow, and from their own rows.
 
     Args:
         solution: The solution.
         spread: The covariance of all parameters.
     """
     problem = solution.problem
-    points, variables = problem.points, problem.variables
-    if points is None:
+    data, unknowns = problem.data, problem.data.unknowns
+    if not unknowns.names:
         return ()
-    xyz = points.means(variables.chain.at(solution.parameters), problem.trig)
-    n = 3 * len(points.estimated)  # they come first among the nuisance variables
-    xyz[points.estimated] = solution.parameters[variables.nuisance_span][:n].reshape(-1, 3)
-    sigma = np.full_like(xyz, np.nan)
-    left = eliminated_terms(replace(problem, variables=spread.variables), solution.parameters)
+    at = at_parameters(problem, solution.parameters)
+    left = eliminated(replace(problem, variables=spread.variables), solution.parameters)
     variance = np.diag(spread.covariance(left.follow)) + np.sum(left.inverse**2, axis=1)
-    sigma[points.estimated] = np.sqrt(variance[:n]).reshape(-1, 3)
-    index = points.groups.index
-    return tuple(
-        PointEstimate(name, int(np.sum(points.train & (index == g))), xyz[g], sigma[g])
-        for g, name in enumerate(points.groups.names)
-    )
+    variance[left.unknown] = np.nan
+    columns = at.columns - problem.variables.n_columns
+    sigma = np.where(columns >= 0, np.sqrt(np.append(variance, np.nan))[np.maximum(columns, -1)], np.nan)
+    counts = np.zeros(len(unknowns.names), dtype=np.int64)
+    for s in data.series:
+        if s.kind.ends and s.kind.n_nuisances:
+            counts += np.bincount(unknowns.owners[s.nuisances[s.train][:, 0]], minlength=len(counts))
+    ends = np.cumsum(unknowns.sizes)[:-1]
+    values, sigmas = np.split(at.coordinates, ends), np.split(sigma, ends)
+    return tuple(map(PointEstimate, unknowns.names, counts.tolist(), values, sigmas))
 
 
 def marginals(solution: Solution) -> gtsam.Marginals:

@@ -144,11 +144,11 @@ def _orientation_columns(setup: Setup) -> _Found:
     if m.rotation is None or m.pairs is not None:
         return
     if m.roll_pitch_yaw is None:
-        wxyz = Rotation.from_matrix(m.rotation).as_quat()
+        wxyz = Rotation.from_matrix(m.rotation.copy()).as_quat()
         rotation = Rotation.from_quat(np.roll(wxyz, -1, axis=1)).as_matrix()
         yield "columns qx, qy, qz, qw hold w, x, y, z", _measured(setup, rotation=rotation)
         return
-    angles = m.roll_pitch_yaw
+    angles = m.roll_pitch_yaw.copy()
     for words, turned in (
         ("roll, pitch, yaw turn about the moving axes x, y, z", Rotation.from_euler("XYZ", angles)),
         ("columns roll, pitch, yaw hold yaw, pitch, roll", Rotation.from_euler("ZYX", angles)),

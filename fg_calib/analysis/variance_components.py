@@ -26,8 +26,9 @@ from fg_calib.analysis.goodness import KindFit, kind_fits
 from fg_calib.analysis.mistakes import check_setup
 from fg_calib.analysis.residual_table import residual_table
 from fg_calib.analysis.restarts import look_elsewhere
-from fg_calib.errors import ProblemError, SolverError
-from fg_calib.graph.problem import Problem, judged_at, noise_kinds, problem_of
+from fg_calib.errors import SolverError
+from fg_calib.graph.build import problem_of
+from fg_calib.graph.problem import Problem, reweighted_at
 from fg_calib.graph.solver import Solution, SolverOptions, solve
 from fg_calib.job import Job
 from fg_calib.threads import single_threaded
@@ -59,10 +60,12 @@ def solve_job(job: Job, problem: Problem | None = None) -> Solution:
     try:
         solution = estimate_noise(problem) if job.options.estimate_noise else solve(problem)
     except SolverError as error:
-        check = check_setup(job.robot, job.measurements, job.options.model, job.options.frame, doubtful=True)
-        if not check.explanations:
-            raise
-        raise SolverError(f"{error}; {check}") from error
+        for table in job.tables:
+            if table.model is not None:
+                check = check_setup(job.robot, table.measurements, table.model, table.frame, doubtful=True)
+                if check.explanations:
+                    raise SolverError(f"{error}; {check}") from error
+        raise
     return look_elsewhere(solution)
 
 
@@ -75,21 +78,18 @@ def estimate_noise(problem: Problem, options: SolverOptions | None = None) -> So
         options: Of the solver.
 
     Returns:
-        The solution with the noise it ends with: the factors are in its problem's `adjustment`, the kinds that they
+        The solution with the noise it ends with: the factors are in its problem's `state`, the kinds that they
         were estimated of in `estimated_noise`. It has not converged if the factors have not settled.
 
     Raises:
-        ProblemError: There are touched points, whose noise cannot be estimated.
         SolverError: GTSAM could not solve a step at all.
     """
-    if problem.points is not None:
-        raise ProblemError(problem.measurements.source, "a column group with noise to be estimated", "noise as stated")
     seconds, last = 0.0, _Steps()
     for _ in range(MAX_ROUNDS):
         solution = solve(problem, options)
         seconds += solution.seconds
         fits = kind_fits(solution, spread_of(solution), residual_table(solution))
-        found = {fit.kind: fit for fit in fits if _redundant(fit)}
+        found = {(fit.table, fit.kind): fit for fit in fits if _redundant(fit)}
         solution = replace(solution, estimated_noise=tuple(found), seconds=seconds)
         last = last.next({kind: float(np.log(fit.seen_over_stated / fit.factor)) for kind, fit in found.items()})
         moves = max(map(abs, last.taken.values()), default=0.0)
@@ -111,12 +111,12 @@ class _Steps:
         taken: The steps taken.
     """
 
-    wanted: Mapping[str, float] = field(default_factory=dict)
-    taken: Mapping[str, float] = field(default_factory=dict)
+    wanted: Mapping[tuple[int, str], float] = field(default_factory=dict)
+    taken: Mapping[tuple[int, str], float] = field(default_factory=dict)
 
-    def next(self, wanted: Mapping[str, float]) -> _Steps:
+    def next(self, wanted: Mapping[tuple[int, str], float]) -> _Steps:
         """The next steps: secant steps, unless what was wanted grew."""
-        taken = {}
+        taken: dict[tuple[int, str], float] = {}
         for kind, step in wanted.items():
             before = self.taken.get(kind, 0.0)
             kept = (self.wanted[kind] - step) / before if before else 1.0  # share of the last step that came true
@@ -128,13 +128,11 @@ def _redundant(fit: KindFit) -> bool:
     return fit.expected >= LEAST_REDUNDANCY and fit.chi2 > 0.0
 
 
-def _scaled(problem: Problem, factors: dict[str, float]) -> Problem:
+def _scaled(problem: Problem, factors: Mapping[tuple[int, str], float]) -> Problem:
     """The problem from its start, with the stated noise of some kinds multiplied by factors."""
-    before = dict(zip(noise_kinds(problem.options.model), problem.adjustment.factors, strict=True))
-    first, second = (before | factors).values()
 
     def anew(p: Problem) -> Problem:
-        return judged_at(replace(p, adjustment=replace(p.adjustment, factors=(first, second))), p.start)
+        return reweighted_at(p, p.start, replace(p.state, factors={**p.state.factors, **factors}))
 
     scaled = anew(problem)
     return scaled if problem.whole is None else replace(scaled, whole=anew(problem.whole))

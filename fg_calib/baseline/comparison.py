@@ -35,11 +35,11 @@ from fg_calib.analysis.uncertainty import Uncertainty, assess
 from fg_calib.analysis.variance_components import solve_job
 from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
 from fg_calib.errors import CalibrationError, ProblemError
+from fg_calib.graph.build import problem_of
 from fg_calib.graph.factors import corrections_of
-from fg_calib.graph.problem import problem_of
 from fg_calib.graph.solver import Solution
 from fg_calib.job import Job
-from fg_calib.measurements.dataset import rotation_angle
+from fg_calib.measurements.dataset import Measurements, rotation_angle
 from fg_calib.robot.kinematics import Poses, build_chain, forward, precompute_trig
 from fg_calib.robot.model import Robot
 from fg_calib.threads import single_threaded
@@ -168,6 +168,8 @@ def compare(job: Job) -> Comparison:
     Raises:
         CalibrationError: The job's own problem cannot be built or solved.
     """
+    if not isinstance(job.measurements, Measurements):
+        raise ProblemError("measurements", "several tables", "one: plain least squares takes no more")
     test = job.measurements.test
     judged_on: Literal["test", "train"] = "test" if test.any() else "train"
     readings = job.measurements.readings[test] if test.any() else job.measurements.readings
@@ -196,6 +198,7 @@ def compare(job: Job) -> Comparison:
 
 def _without_priors(job: Job, judge: _Judge) -> list[Estimate]:
     """The estimates of the kept parameters: by the graph, and by plain least squares from the same start."""
+    assert isinstance(job.measurements, Measurements)
     if job.measurements.groups is not None:
         raise ProblemError(job.measurements.source, "a column group", "pairs or poses: they know no points")
     problem = problem_of(job, gauge="keep")

@@ -36,10 +36,20 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fg_calib.baseline.methods import Fit, Solver, claimed_covariance, gauss_newton, scipy_fit
-from fg_calib.baseline.rows import OF_PAIRS, Rows, evaluate, train_rows, whitening_of, without_kinks
+from fg_calib.baseline.rows import Rows, evaluate, train_rows, whitening_of, without_kinks
 from fg_calib.errors import InputError
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.options import FrameKnowledge, Model, Pairing, as_pairing, check, check_flag, check_names, check_number
+from fg_calib.options import (
+    PAIR_MODELS,
+    FrameKnowledge,
+    Model,
+    Pairing,
+    as_pairing,
+    check,
+    check_flag,
+    check_names,
+    check_number,
+)
 from fg_calib.robot.kinematics import Chain, build_chain
 from fg_calib.robot.model import AXIS_OF_KIND, FRAME_KINDS, Element, Parameter, Robot, names_of
 from fg_calib.threads import single_threaded
@@ -151,7 +161,7 @@ def fit_least_squares(
     check_number("tolerance", tolerance, finite=False)
     pairing = as_pairing(pairing)
     clock = time.perf_counter()
-    unknown = frame == "unknown" and model not in OF_PAIRS
+    unknown = frame == "unknown" and model not in PAIR_MODELS
     system = _system(robot, measurements, (model, pairing, weighted), names, start, unknown)
     solver = partial(gauss_newton if method == "gauss-newton" else scipy_fit, limit=max_iterations, tolerance=tolerance)
     fit, whitening = _solve(system, solver, weighted)
@@ -229,7 +239,7 @@ def _system(
     chosen = _chosen(robot, names)
     columns = np.array([*chosen, *(range(n, n + 6) if frame_unknown else ())], dtype=np.int64)
     # The chain starts in the measurement frame as the fit does; a correction of it is six more parameters.
-    extended = _with_frame(robot.with_values(values), np.zeros(6) if wanted[0] in OF_PAIRS else world_T_base)
+    extended = _with_frame(robot.with_values(values), np.zeros(6) if wanted[0] in PAIR_MODELS else world_T_base)
     chain = build_chain(extended, {int(c): k for k, c in enumerate(columns)})
     rows = without_kinks(train_rows(robot, measurements, *wanted), chain.at(extended.nominal))
     if not rows.use.any():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +11,9 @@ from numpy.typing import NDArray
 from fg_calib.errors import InputError
 from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Measurements, form_pairs
-from fg_calib.measurements.residuals import Block, PairBlock, PoseBlock
-from fg_calib.options import Model, Pairing
+from fg_calib.measurements.kinds import Distance, Orientation, Position, RotationAngle, stack
+from fg_calib.measurements.residuals import Block, unit_whitening
+from fg_calib.options import PAIR_MODELS, POSE_MODELS, Model, Pairing
 from fg_calib.robot.kinematics import Chain, precompute_trig
 from fg_calib.robot.model import Robot
 
@@ -20,19 +22,6 @@ Booleans = NDArray[np.bool_]
 
 KINK = 1e-12
 """A predicted distance below this, or an angle this near to 0 or pi, is exactly there but for rounding, [m], [rad]."""
-
-KINDS: dict[Model, tuple[bool, bool]] = {
-    "distance": (True, False),
-    "rotation": (False, True),
-    "distance-rotation": (True, True),
-    "orientation": (True, False),
-    "position": (False, True),
-    "pose": (True, True),
-}
-"""Whether a model has distances and angles, or orientations and positions."""
-
-OF_PAIRS: tuple[Model, ...] = ("distance", "rotation", "distance-rotation")
-"""Models of pairs, which no measurement frame matters to."""
 
 
 @dataclass(frozen=True)
@@ -55,13 +44,13 @@ class Rows:
 def train_rows(robot: Robot, measurements: Measurements, model: Model, pairing: Pairing, weighted: bool) -> Rows:
     """Every measured train row of a model."""
     trig = precompute_trig(robot, measurements.readings)
-    if model in OF_PAIRS:
+    if model in PAIR_MODELS:
         return _pair_rows(trig, measurements, model, pairing, weighted)
     return _pose_rows(trig, measurements, model, weighted)
 
 
 def _pair_rows(trig: Floats, measurements: Measurements, model: Model, pairing: Pairing, weighted: bool) -> Rows:
-    kinds = np.array(KINDS[model])
+    kinds = np.array(PAIR_MODELS[model])
     if measurements.pairs is None:
         needed = (("distance", "positions", measurements.position), ("angle", "orientations", measurements.rotation))
         for wanted, (_, what, given) in zip(kinds, needed, strict=True):
@@ -76,14 +65,14 @@ def _pair_rows(trig: Floats, measurements: Measurements, model: Model, pairing: 
         for k, kind in enumerate(("distance", "angle")):
             if kinds[k] and np.any(np.isfinite(measured[:, k]) & ~np.isfinite(sigma[:, k])):
                 raise InputError(pairs.source, f"no sigma for {kind}", "the noise of every row, to weight by")
-    unit = np.tile([1.0, 0.0, 1.0], (pairs.n_pairs, 1))
-    both = (bool(kinds[0]), bool(kinds[1]))
-    block = PairBlock(trig, pairs.a, pairs.b, np.nan_to_num(measured), unit, both)
+    ends, unit = np.stack([pairs.a, pairs.b], axis=1), unit_whitening(pairs.n_pairs, int(kinds.sum()))
+    kind_of_pairs = stack(*compress((Distance(), RotationAngle()), kinds))
+    block = Block(kind_of_pairs, trig, ends, np.nan_to_num(measured[:, kinds]), unit)
     return Rows(model, block, use, np.nan_to_num(sigma[:, kinds], nan=1.0) ** 2)
 
 
 def _pose_rows(trig: Floats, measurements: Measurements, model: Model, weighted: bool) -> Rows:
-    kinds = KINDS[model]
+    kinds = POSE_MODELS[model]
     train = np.flatnonzero(~measurements.test)
     n = len(train)
     given = (
@@ -98,19 +87,19 @@ def _pose_rows(trig: Floats, measurements: Measurements, model: Model, weighted:
             raise InputError(measurements.source, f"no sigma for {what}", "the noise of every row, to weight by")
         if wanted:
             variance.append(np.ones((n, 3)) if sigma is None else sigma[train] ** 2)
-    rotation = np.zeros((n, 3, 3)) if measurements.rotation is None else measurements.rotation[train]
-    position = np.zeros((n, 3)) if measurements.position is None else measurements.position[train]
-    height = 3 * sum(kinds)
-    block = PoseBlock(trig, train, rotation, position, np.tile(np.eye(height), (n, 1, 1)), kinds)
-    return Rows(model, block, np.ones((n, height), dtype=np.bool_), np.concatenate(variance, axis=1))
+    kind = stack(*compress((Orientation(), Position()), kinds))
+    wanted_values = [values for values, _, _ in compress(given, kinds) if values is not None]
+    data = [values[train].reshape(n, int(np.prod(values.shape[1:]))) for values in wanted_values]
+    block = Block(kind, trig, train[:, None], np.concatenate(data, axis=1), unit_whitening(n, kind.height))
+    return Rows(model, block, np.ones((n, kind.height), dtype=np.bool_), np.concatenate(variance, axis=1))
 
 
 def without_kinks(rows: Rows, chain: Chain) -> Rows:
     """The rows without those that have no derivative at the start."""
-    if not isinstance(rows.block, PairBlock):
+    if rows.block.kind.ends != 2:
         return rows
-    kinds = list(KINDS[rows.model])
-    predicted = residuals.residual(rows.block, chain) + rows.block.measured[:, kinds]
+    kinds = list(PAIR_MODELS[rows.model])
+    predicted = residuals.residual(rows.block, chain) + rows.block.data
     is_angle = np.array([False, True])[kinds]
     kink = (predicted < KINK) | (is_angle & (predicted > np.pi - KINK))
     return replace(rows, use=rows.use & ~kink)
@@ -133,7 +122,7 @@ def whitening_of(rows: Rows, chain: Chain, sigma_joint: Floats) -> Floats:
     S = rows.variance[:, :, None] * np.eye(rows.block.height)
     if np.any(sigma_joint > 0.0):
         J = residuals.linearise(rows.block, chain.without_columns().with_joint_columns())[1]
-        J = J * np.tile(sigma_joint, rows.block.n_configurations)  # (n, height, n_own)
+        J = J * np.tile(sigma_joint, rows.block.kind.ends)  # (n, height, n_own)
         S = S + J @ np.swapaxes(J, 1, 2)
     S = np.where(rows.use[:, :, None] & rows.use[:, None, :], S, np.eye(rows.block.height))
     try:

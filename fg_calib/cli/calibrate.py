@@ -19,23 +19,15 @@ def calibrate(
     as_json: Json = False,
 ) -> None:
     """Estimate a robot's parameters from measurements, with their uncertainties."""
-    from fg_calib.analysis.uncertainty import assess
-    from fg_calib.analysis.variance_components import solve_job
-    from fg_calib.files.job import read_job
+    from fg_calib.calibration import calibrate_job
 
-    given = read_job(job)
-    solution = solve_job(given)
-    uncertainty = assess(solution)
+    found = calibrate_job(job)
     if out is not None:
-        from fg_calib.report.documents import write_results
-
-        write_results(out, solution, uncertainty, given.inputs)
+        found.save(out)
     if as_json:
-        from fg_calib.report.documents import result_document
-
-        show_json(result_document(solution, uncertainty, given.inputs))
+        show_json(found.result.document())
     else:
         from fg_calib.report.text import build_report
 
-        show_report(build_report(solution, uncertainty))
-    end(uncertainty.findings)
+        show_report(build_report(found.solution, found.uncertainty))
+    end(found.findings)

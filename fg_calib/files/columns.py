@@ -12,6 +12,7 @@ import numpy as np
 
 from fg_calib.errors import InputError
 from fg_calib.files.disk import require_file
+from fg_calib.files.frames import as_polars
 from fg_calib.files.units import ANGLES, LENGTHS, Units
 from fg_calib.measurements.dataset import Booleans, Floats
 
@@ -27,6 +28,7 @@ class Header:
 
     path: Path
     columns: tuple[str, ...]
+    frame: pl.DataFrame | None = None  # what the path only names, where the table is in no file
 
     @property
     def name(self) -> str:
@@ -35,14 +37,24 @@ class Header:
 
     @property
     def is_csv(self) -> bool:
-        """Whether it is a CSV, else a Parquet file."""
-        return self.path.suffix.lower() == ".csv"
+        """Whether it is a CSV, else a Parquet file or a frame."""
+        return self.frame is None and self.path.suffix.lower() == ".csv"
 
-    @classmethod
-    def read(cls, path: Path) -> Header:
-        """Read the header."""
+    def scan(self) -> pl.LazyFrame:
+        """The rows of a Parquet file or a frame."""
         import polars as pl
 
+        return pl.scan_parquet(self.path) if self.frame is None else self.frame.lazy()
+
+    @classmethod
+    def read(cls, table: Path | str | Any, name: str) -> Header:
+        """Read the header of a file, or of a frame by this name."""
+        import polars as pl
+
+        if not isinstance(table, Path | str):
+            frame = as_polars(table, name)
+            return cls(Path(name), tuple(frame.columns), frame)
+        path = Path(table)
         require_file(path)
         header = cls(path, ())
         place = header.name
@@ -154,14 +166,12 @@ class Table:
 
     def _look_up(self, row: int, column: str) -> tuple[str, Any]:
         """Place and original content of a cell, for messages; slow, since it reads the file again."""
-        import polars as pl
-
         wanted = self.frame[_ROW][row]
         name, columns = self.header.name, self.header.columns
         if self.header.is_csv:
             line, cells = next(found for i, found in enumerate(self.header.csv_rows()) if i == wanted + 1)
             return f"{name}:{line}", cells[columns.index(column)].strip()
-        cell = pl.scan_parquet(self.header.path).select(column).slice(wanted, 1).collect().item()
+        cell = self.header.scan().select(column).slice(wanted, 1).collect().item()
         return f"{name}: row {wanted}", cell
 
 
@@ -184,7 +194,7 @@ def _read_csv(header: Header, numbers: Sequence[str], texts: Sequence[str]) -> p
 def _read_parquet(header: Header, numbers: Sequence[str], texts: Sequence[str]) -> pl.DataFrame:
     import polars as pl
 
-    scan = pl.scan_parquet(header.path)
+    scan = header.scan()
     types = scan.collect_schema()
     for column in numbers:
         if not (types[column].is_numeric() or types[column] in (pl.String, pl.Null)):

@@ -18,6 +18,7 @@ from fg_calib.files.tables import read_measurements
 from fg_calib.files.units import Units, UnitsOfFile
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import Noise
+from fg_calib.measurements.series import Table
 from fg_calib.options import EncoderNoise, FrameKnowledge, Gauge, Loss, Model, Options, PairErrors, Pairing, check_names
 from fg_calib.robot.model import Robot, names_of
 
@@ -50,11 +51,11 @@ class _RandomPairing(Schema):
     seed: Count = 0
 
 
-class _Job(Schema):
+class _JobOfTables(Schema):
     robot: Any  # a path, or the mapping of a robot file
-    measurements: str
+    measurements: Any  # the path of a table, or a list of `_Table`
     pairs: str | None = None
-    model: Model
+    model: Model | None = None
     pairing: Any = "star"  # a strategy's name, or a `_RandomPairing`
     frame: FrameKnowledge = "known"
     units: UnitsOfFile = Units()
@@ -67,6 +68,20 @@ class _Job(Schema):
     loss: Loss = "none"
     max_iterations: Annotated[Count, Field(gt=0)] | None = None
     truth: str | None = None
+
+
+class _Job(_JobOfTables):
+    model: Model
+
+
+class _Table(Schema):
+    table: str
+    pairs: str | None = None
+    model: Model | None = None
+    pairing: Any = None
+    frame: FrameKnowledge | None = None
+    units: UnitsOfFile | None = None
+    noise: Any = None
 
 
 _CHOICES = ("model", "frame", "prior", "gauge", "prefer", "pair_errors", "encoder", "loss", "max_iterations")
@@ -84,27 +99,57 @@ def read_job(path: Path | str) -> Job:
     """
     path = Path(path)
     folder = path.parent
-    file = validate(_Job, read_yaml(path), path.name)
+    given = read_yaml(path)
+    several = isinstance(given, dict) and isinstance(given.get("measurements"), list)
+    file: _JobOfTables = validate(_JobOfTables if several else _Job, given, path.name)
     robot, robot_files = robot_of(file.robot, f"{path.name}: robot", folder, file.units)
     _check_preferred(file, robot, path.name)
-    noise, estimate_noise = _noise(file.noise, file.units, robot, f"{path.name}: noise")
-    measurements = read_measurements(
-        folder / file.measurements,
-        robot,
-        pairs=None if file.pairs is None else folder / file.pairs,
-        units=file.units,
-        noise=noise,
-    )
+    _, estimate_noise = _noise(file.noise, file.units, robot, f"{path.name}: noise")
+    tables, table_files = _tables(file, robot, path)
+    alone = tables[0].measurements if isinstance(file.measurements, str) else tuple(tables)
     truth = None if file.truth is None else _truth(folder / file.truth, robot)
-    others = [name for name in (file.pairs, file.truth) if name is not None]
-    names = [path.name, *robot_files, file.measurements, *others]
+    names = [path.name, *robot_files, *table_files, *([] if file.truth is None else [file.truth])]
     inputs = {name: _sha256(folder / name) for name in names}
-    return Job(path, robot, measurements, _options(file, estimate_noise, path.name), truth, inputs)
+    return Job(path, robot, alone, _options(file, estimate_noise, path.name, tables[0]), truth, inputs)
 
 
-def _options(file: _Job, estimate_noise: bool, place: str) -> Options:
+def _tables(file: _JobOfTables, robot: Robot, path: Path) -> tuple[list[Table], list[str]]:
+    """The tables of a job, and their files; what an entry leaves out is as the job says for all."""
+    given, folder = file.measurements, path.parent
+    if not isinstance(given, str) and not (isinstance(given, list) and given):
+        raise InputError(f"{path.name}: measurements", f"found {shown(given)}", "a path, or a list of tables")
+    whole = isinstance(given, str)
+    if not whole and file.pairs is not None:
+        raise InputError(f"{path.name}: pairs", "beside a list of tables", "the key in the table's own entry")
+    entries = [{"table": given, "pairs": file.pairs}] if whole else given
+    tables, files = [], []
+    for number, one in enumerate(entries):
+        place = path.name if whole else f"{path.name}: measurements[{number}]"
+        entry = validate(_Table, one, place)
+        model = entry.model or file.model
+        if model is None:
+            raise InputError(place, "missing key 'model'")
+        units = entry.units or file.units
+        stated, _ = _noise(file.noise, file.units, robot, f"{path.name}: noise")
+        if entry.noise is not None:
+            own, estimate = _noise(entry.noise, units, robot, f"{place}: noise")
+            if estimate or "estimate" in entry.noise:
+                raise InputError(
+                    f"{place}: noise", "estimate in the entry of a table", "the key noise of the whole job"
+                )
+            figures = {key: getattr(own, key) for key in entry.noise}
+            stated = replace(stated, **figures)
+        pairing = _pairing(file.pairing if entry.pairing is None else entry.pairing, f"{place}: pairing")
+        pairs = None if entry.pairs is None else folder / entry.pairs
+        measurements = read_measurements(folder / entry.table, robot, pairs=pairs, units=units, noise=stated)
+        tables.append(Table(measurements, model, pairing, entry.frame or file.frame))
+        files += [entry.table, *([] if entry.pairs is None else [entry.pairs])]
+    return tables, list(dict.fromkeys(files))
+
+
+def _options(file: _JobOfTables, estimate_noise: bool, place: str, first: Table) -> Options:
     """The choices of a job; its old key `prior: false` is `gauge: none`."""
-    choices = {key: getattr(file, key) for key in _CHOICES}
+    choices = {key: getattr(file, key) for key in _CHOICES} | {"model": first.model}
     pairing = _pairing(file.pairing, f"{place}: pairing")
     return Options.of(**choices, pairing=pairing, estimate_noise=estimate_noise)
 
@@ -125,7 +170,7 @@ def check_choices(choices: Mapping[str, Any], robot: Robot, place: str) -> None:
     _check_preferred(file, robot, place)
 
 
-def _check_preferred(file: _Job, robot: Robot, place: str) -> None:
+def _check_preferred(file: _JobOfTables, robot: Robot, place: str) -> None:
     check_names(f"{place}: prefer", file.prefer, names_of(robot.parameters))
 
 

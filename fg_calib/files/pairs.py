@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -48,7 +48,9 @@ class _Ends:
     of_groups: Booleans
 
 
-def read_pairs(path: Path, configurations: Configurations, units: Units, noise: Noise) -> tuple[Pairs, Pairs]:
+def read_pairs(
+    path: Path | str | Any, configurations: Configurations, units: Units, noise: Noise
+) -> tuple[Pairs, Pairs]:
     """Read a table of pairs.
 
     Args:
@@ -63,7 +65,7 @@ def read_pairs(path: Path, configurations: Configurations, units: Units, noise: 
     Raises:
         InputError: The file is missing, is no table, lacks a column or holds a cell that cannot be used.
     """
-    header = Header.read(path)
+    header = Header.read(path, "frame of pairs")
     for column in ("a", "b"):
         if column not in header.columns:
             raise InputError(header.name, f"no column {column}", "a and b, the two configurations of a pair")

@@ -79,10 +79,11 @@ def validate(schema: type[AnySchema], value: object, place: str) -> AnySchema:
     try:
         return schema.model_validate(value)
     except ValidationError as error:
-        raise _first_misfit(error, place) from None
+        raise first_misfit(error, place) from None
 
 
-def _first_misfit(error: ValidationError, place: str) -> InputError:
+def first_misfit(error: ValidationError, place: str) -> InputError:
+    """A validation error as one line: the first misfit is named, others are counted."""
     misfits = error.errors(include_url=False)
     first = misfits[0]
     context = first.get("ctx", {})

@@ -60,7 +60,7 @@ def _pose_columns(simulation: Simulation, units: Units) -> Mapping[str, Any]:
     m, robot = simulation.measurements, simulation.robot
     if m.position is None or m.rotation is None:
         raise ValueError("a simulation measures positions and orientations")
-    quaternion = Rotation.from_matrix(m.rotation).as_quat(canonical=True)
+    quaternion = Rotation.from_matrix(m.rotation.copy()).as_quat(canonical=True)
     return {
         "id": m.ids,
         **{f"q{i + 1}": m.readings[:, i] / units.factor(joint.unit) for i, joint in enumerate(robot.joints)},

@@ -18,7 +18,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -50,19 +50,19 @@ _RESERVED = {*_POSITION, *_QUATERNION, *_ROLL_PITCH_YAW, *_SIGMA_POSITION, *_SIG
 
 
 def read_measurements(
-    path: Path | str,
+    path: Path | str | Any,
     robot: Robot,
     *,
-    pairs: Path | str | None = None,
+    pairs: Path | str | Any | None = None,
     units: Units | None = None,
     noise: Noise | None = None,
 ) -> Measurements:
     """Configurations and what was measured at them and, with a table of pairs, between them.
 
     Args:
-        path: Table of configurations.
+        path: Table of configurations: a file, or a frame of polars or pandas with such columns.
         robot: Whose configurations they are: names, number and limits of the joints.
-        pairs: Table of pairs.
+        pairs: Table of pairs, likewise.
         units: Units of both tables; default m and rad.
         noise: Sigmas where the tables state none, [m] and [rad]; also of what was not measured yet.
 
@@ -74,7 +74,7 @@ def read_measurements(
     check_type("noise", noise, Noise, "Noise(position=1e-3)")
     units, noise = units or Units(), noise or Noise()
     _check_noise(noise)
-    header = Header.read(Path(path))
+    header = Header.read(path, "frame")
     joints = _joint_columns(header, robot)
     position = header.group(_POSITION)
     orientation = _orientation_columns(header)
@@ -93,7 +93,7 @@ def read_measurements(
     between, between_groups = None, no_pairs(header.name)
     if pairs is not None:
         configurations = Configurations(table, ids, test, names, group)
-        between, between_groups = read_pairs(Path(pairs), configurations, units, noise)
+        between, between_groups = read_pairs(pairs, configurations, units, noise)
     return Measurements(
         readings=readings,
         ids=ids.to_numpy().astype(np.str_),
@@ -108,6 +108,7 @@ def read_measurements(
         groups=Groups(names, group, between_groups) if names else None,
         sigma_point=_sigma_point(table, sigma_point, group >= 0, noise.point, length) if names else None,
         roll_pitch_yaw=table.numbers(orientation) * angle if orientation == _ROLL_PITCH_YAW else None,
+        named="id" in header.columns,
     )
 
 

@@ -146,7 +146,10 @@ def _parse(data: bytes, place: str, encoding: str | None = None) -> tuple[str, E
         raise InputError(place, "a <!DOCTYPE> with entities or of another file", _NO_ENTITIES)
     if root.tag != "robot":
         raise InputError(place, f"root element <{root.tag}>", "<robot>")
-    return data.decode(document.encoding or "utf-8").removeprefix("\ufeff"), root
+    try:
+        return data.decode(document.encoding or "utf-8").removeprefix("\ufeff"), root
+    except UnicodeDecodeError as error:
+        raise InputError(place, f"not {document.encoding or 'utf-8'}: {error.reason}", "text in UTF-8") from None
 
 
 def _read_links(root: Element, place: str) -> list[str]:

@@ -2,6 +2,7 @@
 
 A factor is added with `problem.graph.add(factor)`; a variable that it brings with it gets its start with
 `problem.initial.insert(key, value)`. Such a variable is a *nuisance* variable (see `factors`), of any of GTSAM's types.
+`expand` is the other way round: our rows as factors of one measurement each, for GTSAM's own tools.
 """
 
 from __future__ import annotations
@@ -10,9 +11,21 @@ from dataclasses import replace
 from itertools import chain
 
 import gtsam
+import numpy as np
+import scipy.sparse
+from numpy.typing import ArrayLike, NDArray
 
 from fg_calib.errors import ProblemError
-from fg_calib.graph.problem import Problem, judged_at
+from fg_calib.graph.factors import Variable, Variables, custom_factor, factor_columns, prior_factors, row_factor
+from fg_calib.graph.problem import Problem, reweighted_at
+from fg_calib.graph.rows import Part, RowSet
+from fg_calib.measurements.kinds import Distance, Kind, RotationAngle
+from fg_calib.measurements.residuals import Block
+from fg_calib.options import check_number
+from fg_calib.robot.kinematics import precompute_trig
+
+Floats = NDArray[np.float64]
+Sparse = scipy.sparse.csr_array
 
 
 def with_added(problem: Problem) -> Problem:
@@ -39,7 +52,7 @@ def with_added(problem: Problem) -> Problem:
         raise ProblemError("problem.initial", f"a value of {symbol}", "none without a factor on it in problem.graph")
     variables = variables.with_own(own)
     start = variables.parameters(problem.initial)
-    return judged_at(replace(problem, variables=variables, added=added), start)
+    return reweighted_at(replace(problem, variables=variables, added=added), start)
 
 
 def _added_factors(problem: Problem) -> tuple[gtsam.NonlinearFactor, ...]:
@@ -61,3 +74,88 @@ def check_graph(problem: Problem) -> None:
     n = len(_added_factors(problem))
     if n:
         raise ProblemError("solution.problem.graph", f"{n} factors added since it was solved", "to be solved again")
+
+
+def DistanceFactor(  # noqa: N802 -- a factor of GTSAM's, by the name of one
+    variables: Variables, start: ArrayLike, end: ArrayLike, distance: float, sigma: float
+) -> gtsam.CustomFactor:
+    """A distance that the tool point moved between two configurations, on a problem's variables.
+
+    Args:
+        variables: The variables, `problem.variables`.
+        start: Joint readings of the first configuration, shape (n_joints,), [rad] (prismatic: [m]).
+        end: Those of the second.
+        distance: Measured, [m].
+        sigma: Its 1 sigma, [m].
+
+    Raises:
+        InputError: The readings are of other joints, or a figure is none.
+    """
+    return _pair_factor(Distance(), variables, start, end, ("distance", distance), sigma)
+
+
+def RotationAngleFactor(  # noqa: N802 -- a factor of GTSAM's, by the name of one
+    variables: Variables, start: ArrayLike, end: ArrayLike, angle: float, sigma: float
+) -> gtsam.CustomFactor:
+    """An angle in [0, pi] that the tool turned between two configurations, [rad]; otherwise as `DistanceFactor`."""
+    return _pair_factor(RotationAngle(), variables, start, end, ("angle", angle), sigma)
+
+
+def _pair_factor(
+    kind: Kind, variables: Variables, start: ArrayLike, end: ArrayLike, measured: tuple[str, float], sigma: float
+) -> gtsam.CustomFactor:
+    check_number(*measured)
+    check_number("sigma", sigma, above=True)
+    trig = precompute_trig(variables.robot, np.array([start, end], dtype=np.float64))
+    data, whitening = np.array([[float(measured[1])]]), np.array([[1.0 / float(sigma)]])
+    block = Block(kind, trig, np.array([[0, 1]]), data, whitening, np.zeros((1, 0)))
+    return row_factor(RowSet((Part(block, 0, np.zeros((1, 0), dtype=np.int64)),)), variables)
+
+
+def expand(problem: Problem) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """A problem's graph with one factor a measurement, for inspection and for incremental optimisers, and its start.
+
+    Measurements that share errors depend on these: variables `E(k)`, errors of configuration k in units of their
+    sigma, with a prior of their own each. The optimum is the problem's own.
+    """
+    graph, initial = gtsam.NonlinearFactorGraph(), gtsam.Values(problem.initial)
+    for rows in problem.rows:
+        first = 0
+        for part in rows.parts:
+            height = part.block.height
+            for k in range(part.block.n):
+                place = first + k * height
+                L = None if rows.shared is None else rows.shared.loadings[place : place + height]
+                graph.add(_measurement_factor(problem, rows, part.only(k), L))
+            first += part.n_rows
+        width = 0 if rows.shared is None else rows.shared.width
+        for k in rows.configurations.tolist():
+            unit = gtsam.noiseModel.Unit.Create(width)
+            graph.add(gtsam.PriorFactorVector(gtsam.symbol("E", k), np.zeros(width), unit))
+            initial.insert(gtsam.symbol("E", k), np.zeros(width))
+    for factor in (*prior_factors(problem.variables), *problem.added):
+        graph.add(factor)
+    return graph, initial
+
+
+def _measurement_factor(problem: Problem, rows: RowSet, part: Part, L: Sparse | None) -> gtsam.CustomFactor:
+    """One measurement's rows, less what the errors that it shares make of them."""
+    if L is None or not L.nnz:
+        return row_factor(RowSet((part,)), problem.variables)
+    assert rows.shared is not None
+    width, variables = rows.shared.width, problem.variables
+    used = np.unique(L.indices // width)
+    G = L[:, (used[:, None] * width + np.arange(width)).ravel()].toarray()
+    local, chosen, ours = factor_columns(variables, part.nuisances, with_core=part.block.kind.ends > 0)
+    errors = []
+    for i, k in enumerate(rows.configurations[used].tolist()):
+        columns = slice(len(chosen) + i * width, len(chosen) + (i + 1) * width)
+        errors.append(Variable(gtsam.symbol("E", k), f"E({k})", "own", (), columns))
+
+    def linearise(values: gtsam.Values) -> tuple[Floats, Floats]:
+        chunks = list(part.linearise(variables.at(variables.parameters(values, ours))))
+        found = np.concatenate(chunks)
+        z = np.concatenate([values.atVector(v.key) for v in errors])
+        return found[:, -1] - G @ z, np.hstack([found[:, chosen], -G])
+
+    return custom_factor([*local, *errors], part.n_rows, lambda values: linearise(values)[0], linearise)

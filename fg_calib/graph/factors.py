@@ -5,9 +5,9 @@
 | `K(i)` | estimated parameters of joint i, a vector of just those |
 | `K(0)`, `K(n + 1)` | the same of the base, and of the tool, where not all six of its parameters are estimated |
 | `B(0)`, `T(0)` | the base frame, and the tool frame, as a Pose3 where all six are |
-| `X(0)` | world_T_base as a Pose3, where the measurement frame is unknown |
+| `X(t)` | world_T_base of table t as a Pose3, where its measurement frame is unknown |
 | `L(g)` | base_p of the physical point that group g touches, a Point3 |
-| `Q(k)` | the true joint values of configuration k, a vector, where encoder noise is estimated |
+| `N(i)` | an unknown of a kind of measurement of one's own, a vector |
 
 The last two, and variables that somebody adds to the graph, are *nuisance* variables: they are estimated too, but not
 what a calibration is for. Their columns follow those of the *core* (robot and measurement frame) and are eliminated
@@ -27,22 +27,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol
+from typing import Literal
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.errors import SolverError
-from fg_calib.measurements import residuals
-from fg_calib.measurements.residuals import AnyBlock
+from fg_calib.graph.rows import At, RowSet
+from fg_calib.measurements.series import Unknowns
 from fg_calib.robot.kinematics import Chain, build_chain
 from fg_calib.robot.model import FRAME_KINDS, Robot, names_of
 
 Floats = NDArray[np.float64]
 
 GRAM_ROWS = 20_000
-"""Blocks with more rows than this are reduced by their Gram matrix, if their conditioning allows it."""
+"""Sets with more rows than this are reduced by their Gram matrix, if their conditioning allows it."""
+
+_SHARE = 1e-6
+"""Share in an undetermined direction above which a nuisance column is unknown."""
 
 _ROUNDING = 1e-10
 """Share of a column's length that elimination may leave of nothing."""
@@ -55,8 +58,9 @@ class Variable:
     Attributes:
         key: GTSAM's key.
         symbol: How it is written: `K(3)`, `T(0)`, `X(0)`.
-        kind: A vector of parameters, the pose of tool, base or measurement frame, a touched point, joint values, or
-            somebody's own: of any of GTSAM's types, its parameters are tangent coordinates at its start.
+        kind: A vector of parameters, the pose of tool, base or measurement frame, an unknown of the measurements such
+            as a touched point, or somebody's own: of any of GTSAM's types, its parameters are tangent coordinates at
+            its start.
         parameters: Indices into the parameter vector of `Variables.parameters`, in the variable's own order;
             for poses in the order of `FRAME_KINDS`.
         columns: Its columns in a Jacobian.
@@ -65,7 +69,7 @@ class Variable:
 
     key: int
     symbol: str
-    kind: Literal["vector", "tool", "base", "frame", "point", "joints", "own"]
+    kind: Literal["vector", "tool", "base", "frame", "unknown", "own"]
     parameters: tuple[int, ...]
     columns: slice
     scales: tuple[float, ...] = ()
@@ -80,26 +84,30 @@ class Variable:
 class Variables:
     """All variables of a problem, and the way between GTSAM's values and the parameter vector.
 
-    The parameter vector has the robot's parameters, then the measurement frame's six in the order of `FRAME_KINDS`,
-    then the values of the nuisance variables.
+    The parameter vector has the robot's parameters, then six for each unknown measurement frame (at least one) in the
+    order of `FRAME_KINDS`, then the values of the nuisance variables.
 
     Attributes:
         robot: The robot, nominal.
         items: The core variables in the order of their columns.
-        names: Name of each estimated scalar, shape (n_columns,): a parameter's, or `frame.x` ... `frame.yaw`. Of a
-            pose the names stand in `FRAME_KINDS`' order although its columns are tangent directions.
-        chain: The kinematic chain with these columns.
+        names: Name of each estimated scalar, shape (n_columns,): a parameter's, or `frame.x` ... `frame.yaw` (with the
+            table's number, if several frames are unknown). Of a pose the names stand in `FRAME_KINDS`' order although
+            its columns are tangent directions.
+        chains: The kinematic chain with these columns from the measurement frame of each table.
         priors: Whether the robot's tolerances are priors.
         nuisance: The nuisance variables; their columns follow those of the core.
+        coordinates: Of the measurements' unknown coordinates, where each stands in the parameter vector; -1 for those
+            that are not estimated.
         own: Start of the variables that somebody added.
     """
 
     robot: Robot
     items: tuple[Variable, ...]
     names: tuple[str, ...]
-    chain: Chain
+    chains: tuple[Chain, ...]
     priors: bool
     nuisance: tuple[Variable, ...] = ()
+    coordinates: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     own: gtsam.Values = field(default_factory=gtsam.Values, compare=False)
 
     @property
@@ -113,11 +121,6 @@ class Variables:
         return sum(len(v.parameters) for v in self.nuisance)
 
     @property
-    def n_without_prior(self) -> int:
-        """Number of nuisance columns that have no prior of their own, as true joint values have."""
-        return sum(len(v.parameters) for v in self.nuisance if v.kind != "joints")
-
-    @property
     def keys(self) -> list[int]:
         """GTSAM's keys in the order of the columns, the core's first."""
         return [v.key for v in self.items + self.nuisance]
@@ -128,9 +131,15 @@ class Variables:
         return slice(0, len(self.robot.parameters))
 
     @property
+    def frames(self) -> tuple[Variable, ...]:
+        """The unknown measurement frames."""
+        return tuple(v for v in self.items if v.kind == "frame")
+
+    @property
     def frame_span(self) -> slice:
-        """Where the measurement frame's six stand in the parameter vector."""
-        return slice(len(self.robot.parameters), len(self.robot.parameters) + 6)
+        """Where the measurement frames' values stand in the parameter vector."""
+        first = len(self.robot.parameters)
+        return slice(first, first + 6 * max(1, len(self.frames)))
 
     @property
     def nuisance_span(self) -> slice:
@@ -139,8 +148,8 @@ class Variables:
 
     @property
     def n_robot_columns(self) -> int:
-        """Number of columns without the measurement frame's, which come last."""
-        return self.n_columns - 6 * any(v.kind == "frame" for v in self.items)
+        """Number of columns without the measurement frames', which come last."""
+        return self.n_columns - 6 * len(self.frames)
 
     @property
     def scales(self) -> Floats:
@@ -174,7 +183,7 @@ class Variables:
 
     def nominal(self) -> Floats:
         """The parameter vector at the robot's nominal values, measurement frame and nuisance values zero."""
-        return np.concatenate([self.robot.nominal, np.zeros(6 + self.n_nuisance)])
+        return np.concatenate([self.robot.nominal, np.zeros(self.nuisance_span.stop - len(self.robot.parameters))])
 
     def values(self, parameters: Floats) -> gtsam.Values:
         """GTSAM's values at a parameter vector."""
@@ -234,30 +243,37 @@ class Variables:
             delta.insert(v.key, step[v.columns])
         return values.retract(delta)
 
-    def with_nuisance(
-        self, kind: Literal["point", "joints"], letter: str, indices: Sequence[int], scales: tuple[float, ...]
-    ) -> Variables:
-        """The same with more nuisance variables: vectors with one figure for each of `scales`.
+    def with_unknowns(self, unknowns: Unknowns, estimated: NDArray[np.bool_]) -> Variables:
+        """The same with the measurements' unknowns as nuisance variables, those that are estimated."""
+        column, place = self.n_columns + self.n_nuisance, self.nuisance_span.stop
+        coordinates: list[int] = []
+        more: list[Variable] = []
+        for index, (letter, size) in enumerate(zip(unknowns.letters, unknowns.sizes, strict=True)):
+            if not estimated[index]:
+                coordinates += [-1] * size
+                continue
+            parameters = tuple(range(place, place + size))
+            symbol, scales = f"{letter}({index})", size * (self.robot.scale_of("m"),)
+            key, columns = gtsam.symbol(letter, index), slice(column, column + size)
+            more.append(Variable(key, symbol, "unknown", parameters, columns, scales))
+            coordinates += parameters
+            column, place = column + size, place + size
+        found = np.array(coordinates, dtype=np.int64)
+        return replace(self, nuisance=self.nuisance + tuple(more), coordinates=found)
+
+    def at(self, parameters: Floats, fallback: Floats | None = None) -> At:
+        """The arm and the measurements' unknowns at a parameter vector.
 
         Args:
-            kind: What they are.
-            letter: Of their keys.
-            indices: The numbers in their keys, `letter(index)`.
-            scales: A change of ordinary size in each of a variable's columns.
+            parameters: The parameter vector.
+            fallback: Values of the unknown coordinates that are not estimated; zero if None.
         """
-        column, place, n = self.n_columns + self.n_nuisance, self.nuisance_span.stop, len(scales)
-        more = tuple(
-            Variable(
-                key=gtsam.symbol(letter, index),
-                symbol=f"{letter}({index})",
-                kind=kind,
-                parameters=tuple(range(place + n * i, place + n * (i + 1))),
-                columns=slice(column + n * i, column + n * (i + 1)),
-                scales=scales,
-            )
-            for i, index in enumerate(indices)
-        )
-        return replace(self, nuisance=self.nuisance + more)
+        estimated = self.coordinates >= 0
+        others = np.zeros(len(self.coordinates)) if fallback is None else fallback
+        columns = np.where(estimated, self.coordinates - self.nuisance_span.start + self.n_columns, -1)
+        values = np.where(estimated, parameters[self.coordinates], others)
+        chains = tuple(chain.at(parameters) for chain in self.chains)
+        return At(chains, values, columns, self.n_columns, self.n_nuisance)
 
     def without_own(self) -> Variables:
         """The same without somebody's own variables."""
@@ -303,16 +319,23 @@ class Variables:
         """A key in words: `K(3) (a3, alpha3, d3)`."""
         for v in self.items + self.nuisance:
             if v.key == key:
-                return f"{v.symbol} ({', '.join(self.names[v.columns]) or v.kind})"
+                kind = "point" if v.symbol.startswith("L(") else v.kind
+                return f"{v.symbol} ({', '.join(self.names[v.columns]) or kind})"
         return str(gtsam.Symbol(key))
 
 
-def build_variables(robot: Robot, frame: bool, priors: bool = True) -> Variables:
-    """The variables of a robot's estimated parameters, and of the measurement frame where it is unknown."""
+def build_variables(robot: Robot, frames: Sequence[bool], priors: bool = True) -> Variables:
+    """The variables of a robot's estimated parameters, and of the measurement frames that are unknown.
+
+    Args:
+        robot: The robot.
+        frames: Of each table, whether its measurement frame is unknown.
+        priors: Whether the robot's tolerances are priors.
+    """
     items: list[Variable] = []
     names: list[str] = []
     columns: dict[int, int] = {}
-    tool_tangent = base_tangent = frame_tangent = None
+    tool_tangent = base_tangent = None
     for owner in range(robot.n_joints + 2):
         owned = robot.owned_by(owner)
         chosen = [i for i in owned if robot.parameters[i].estimated]
@@ -330,15 +353,31 @@ def build_variables(robot: Robot, frame: bool, priors: bool = True) -> Variables
         else:
             columns |= {i: first + k for k, i in enumerate(chosen)}
             items.append(Variable(gtsam.symbol("K", owner), f"K({owner})", "vector", tuple(chosen), span))
-    if frame:
-        frame_tangent = len(names)
-        names += [f"frame.{kind}" for kind in FRAME_KINDS]
-        parameters = tuple(range(len(robot.parameters), len(robot.parameters) + 6))
-        span = slice(frame_tangent, len(names))
-        items.append(Variable(gtsam.symbol("X", 0), "X(0)", "frame", parameters, span))
-    tangents = {"tool_tangent": tool_tangent, "base_tangent": base_tangent, "frame_tangent": frame_tangent}
-    chain = build_chain(robot, columns, **tangents, frame=frame)
-    return Variables(robot, tuple(items), tuple(names), chain, priors)
+    place, tangents = len(robot.parameters), {}
+    for table in np.flatnonzero(frames).tolist():
+        tangents[table] = (len(names), place)
+        prefix = "frame" if sum(frames) == 1 else f"frame{table + 1}"
+        span = slice(len(names), len(names) + 6)
+        names += [f"{prefix}.{kind}" for kind in FRAME_KINDS]
+        key = gtsam.symbol("X", table)
+        items.append(Variable(key, f"X({table})", "frame", tuple(range(place, place + 6)), span))
+        place += 6
+    chains = []
+    for table in range(len(frames)):
+        tangent, source = tangents.get(table, (None, 0))
+        chain = build_chain(
+            robot,
+            columns,
+            tool_tangent=tool_tangent,
+            base_tangent=base_tangent,
+            frame_tangent=tangent,
+            frame=tangent is not None,
+        )
+        moved = np.where(
+            chain.source >= len(robot.parameters), chain.source - len(robot.parameters) + source, chain.source
+        )
+        chains.append(replace(chain, source=moved, n_columns=len(names)))
+    return Variables(robot, tuple(items), tuple(names), tuple(chains), priors)
 
 
 def only_key(values: gtsam.Values, key: int) -> gtsam.Values:
@@ -478,43 +517,63 @@ def custom_factor(
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(n_rows), [v.key for v in variables], evaluate)
 
 
-def measurement_factor(block: AnyBlock, variables: Variables) -> gtsam.CustomFactor:
-    """A block of measurements as one factor; a block of one measurement is that measurement's own factor.
+def row_factor(rows: RowSet, variables: Variables) -> gtsam.CustomFactor:
+    """Whitened rows as one factor; those of one measurement are that measurement's own factor.
 
-    A block of more rows than the variables have columns is handed to GTSAM as the triangular factor of
+    A set of more rows than the variables have columns is handed to GTSAM as the triangular factor of
     [J r]: with `[J r] = Q [[R, z], [0, rho]]` the residual (z, rho) and the Jacobian (R, 0) have the same cost,
     gradient and Gauss-Newton Hessian in n_columns + 1 rows.
     """
-    n_rows = block.n * block.height
-    n_all = variables.n_columns + 1
-    chain = variables.chain
+    with_core = any(part.block.kind.ends for part in rows.parts)
+    local, chosen, ours = factor_columns(variables, rows.coordinates, with_core=with_core)
+    n_all, n_rows = len(chosen) + 1, rows.n_rows
+    with_right = np.append(chosen, variables.n_columns + variables.n_nuisance)
 
-    def at(values: gtsam.Values) -> Chain:
-        return chain.at(variables.parameters(values))
+    def at(values: gtsam.Values) -> At:
+        return variables.at(variables.parameters(values, ours))
 
     if n_rows <= n_all:
 
-        def residual(values: gtsam.Values) -> Floats:
-            return residuals.residual(block, at(values)).ravel()
-
         def linearise(values: gtsam.Values) -> tuple[Floats, Floats]:
-            r, J = residuals.linearise(block, at(values))
-            return r.ravel(), J.reshape(n_rows, -1)
+            r, J = rows.linearise(at(values))
+            return r, J[:, chosen]
 
-        return custom_factor(variables.items, n_rows, residual, linearise)
+        return custom_factor(local, n_rows, lambda values: rows.linearise(at(values).without_columns())[0], linearise)
 
-    reduce = Reduction(block)
+    reduce = Reduction(rows)
 
     def reduced_residual(values: gtsam.Values) -> Floats:
         r = np.zeros(n_all)
-        r[0] = np.sqrt(residuals.squared_norm(block, at(values)))
+        r[0] = np.sqrt(rows.squared_norm(at(values)))
         return r
 
     def reduced_linearise(values: gtsam.Values) -> tuple[Floats, Floats]:
-        R = reduce(at(values))
+        R = reduce(at(values))[:, with_right]
+        if len(R) > n_all:
+            R = np.linalg.qr(R, mode="r")  # type: ignore[assignment]
         return R[:, -1], R[:, :-1]
 
-    return custom_factor(variables.items, n_all, reduced_residual, reduced_linearise)
+    return custom_factor(local, n_all, reduced_residual, reduced_linearise)
+
+
+def factor_columns(
+    variables: Variables, coordinates: NDArray[np.int64], *, with_core: bool
+) -> tuple[list[Variable], NDArray[np.int64], tuple[Variable, ...]]:
+    """What a factor on the core and some nuisance coordinates depends on.
+
+    Returns:
+        Its variables with columns of their own, one after the other; which of all columns these are; the variables.
+    """
+    there = set(variables.coordinates[coordinates.ravel()].tolist())
+    nuisance = tuple(v for v in variables.nuisance if there.intersection(v.parameters))
+    items = (variables.items if with_core else ()) + nuisance
+    local, chosen, column = [], [np.zeros(0, dtype=np.int64)], 0
+    for v in items:
+        width = v.columns.stop - v.columns.start
+        local.append(replace(v, columns=slice(column, column + width)))
+        chosen.append(np.arange(v.columns.start, v.columns.stop))
+        column += width
+    return local, np.concatenate(chosen), items
 
 
 def dense(linear: gtsam.GaussianFactorGraph, keys: list[int]) -> tuple[Floats, Floats]:
@@ -525,79 +584,17 @@ def dense(linear: gtsam.GaussianFactorGraph, keys: list[int]) -> tuple[Floats, F
     return linear.jacobian(ordering)
 
 
-class Term(Protocol):
-    """Rows that depend on nuisance variables, and on the core or not."""
-
-    @property
-    def n_rows(self) -> int:
-        """Number of rows."""
-
-    @property
-    def nuisance(self) -> tuple[int, ...]:
-        """Which of `Variables.nuisance` they depend on."""
-
-    @property
-    def on_core(self) -> bool:
-        """Whether they depend on the core."""
-
-    def residual(self, variables: Variables, parameters: Floats) -> Floats:
-        """Whitened residuals, shape (n_rows,)."""
-
-    def linearise(self, variables: Variables, parameters: Floats) -> tuple[Floats, Floats]:
-        """The same with derivatives, shape (n_rows, n): in the core's columns if `on_core`, then in `nuisance`."""
-
-
-def term_factor(term: Term, variables: Variables) -> gtsam.CustomFactor:
-    """A term as one factor; one of more rows than columns as its triangular factor, like `measurement_factor`."""
-    items = (variables.items if term.on_core else ()) + tuple(variables.nuisance[i] for i in term.nuisance)
-    local, column = [], 0
-    for v in items:
-        width = v.columns.stop - v.columns.start
-        local.append(replace(v, columns=slice(column, column + width)))
-        column += width
-    reduced = term.n_rows > column + 1
-    n_rows = column + 1 if reduced else term.n_rows
-
-    def residual(values: gtsam.Values) -> Floats:
-        r = term.residual(variables, variables.parameters(values, items))
-        return np.append(np.linalg.norm(r), np.zeros(n_rows - 1)) if reduced else r
-
-    def linearise(values: gtsam.Values) -> tuple[Floats, Floats]:
-        r, J = term.linearise(variables, variables.parameters(values, items))
-        if reduced:
-            R: Floats = np.linalg.qr(np.column_stack([J, r]), mode="r")  # type: ignore[assignment]
-            r, J = R[:, -1], R[:, :-1]
-        return r, J
-
-    return custom_factor(local, n_rows, residual, linearise)
-
-
-def stacked_terms(terms: Sequence[Term], variables: Variables, parameters: Floats) -> Floats:
-    """Derivatives of all terms' rows in all columns, each term reduced: shape (m, n_columns + n_nuisance)."""
-    n = variables.n_columns
-    stacked = [np.zeros((0, n + variables.n_nuisance))]
-    for term in terms:
-        _, J = term.linearise(variables, parameters)
-        if len(J) > J.shape[1]:
-            J = np.linalg.qr(J, mode="r")  # type: ignore[assignment]
-        wide = np.zeros((len(J), n + variables.n_nuisance))
-        spans = [slice(0, n)] if term.on_core else []
-        spans += [variables.nuisance[i].columns for i in term.nuisance]
-        wide[:, np.concatenate([np.arange(n + variables.n_nuisance)[s] for s in spans])] = J
-        stacked.append(wide)
-    return np.vstack(stacked)
-
-
 @dataclass(frozen=True)
 class Eliminated:
     """A linear system with its nuisance columns eliminated by QR.
 
     Attributes:
-        own: What the nuisance columns can explain of the right-hand side, shape (n_nuisance,).
+        own: What the nuisance columns can explain of the right-hand side, shape (rank,).
         A: The core's columns, less what the nuisance columns can explain of them, shape (m, n_columns).
         b: The right-hand side, less the same, shape (m,).
         follow: How the nuisance variables follow the core, shape (n_nuisance, n_columns).
-        inverse: S with S S^T their covariance at a given core, shape (n_nuisance, n_nuisance).
+        inverse: S with S S^T their covariance at a given core, shape (n_nuisance, rank).
+        unknown: Which nuisance columns have a share in a direction that nothing determines, shape (n_nuisance,).
     """
 
     own: Floats
@@ -605,6 +602,12 @@ class Eliminated:
     b: Floats
     follow: Floats
     inverse: Floats
+    unknown: NDArray[np.bool_]
+
+    @property
+    def rank(self) -> int:
+        """Number of directions of the nuisance variables that the system determines."""
+        return len(self.own)
 
 
 def eliminate(A: Floats, b: Floats, n_columns: int) -> Eliminated:
@@ -612,21 +615,34 @@ def eliminate(A: Floats, b: Floats, n_columns: int) -> Eliminated:
 
     What is left of a core column that the nuisance columns explain altogether is rounding, and set to zero.
 
-    Note:
-        The nuisance columns must be determined by themselves: every touched point has touches of its own.
+    Directions of the nuisance columns that nothing determines are left where they are.
     """
     core, nuisance = A[:, :n_columns], A[:, n_columns:]
     k = nuisance.shape[1]
     if k == 0:
-        return Eliminated(np.zeros(0), core, b, np.zeros((0, n_columns)), np.zeros((0, 0)))
-    Q, R = np.linalg.qr(nuisance)
+        return Eliminated(np.zeros(0), core, b, np.zeros((0, n_columns)), np.zeros((0, 0)), np.zeros(0, dtype=np.bool_))
+    Q, inverse, unknown = _basis_of(nuisance)
     explained = Q.T @ core
     left = core - Q @ explained
     left = left - Q @ (Q.T @ left)  # once more: rounding of the first time
     left[:, np.linalg.norm(left, axis=0) <= _ROUNDING * np.linalg.norm(core, axis=0)] = 0.0
     own = Q.T @ b
-    inverse: Floats = np.linalg.inv(R)
-    return Eliminated(own, left, b - Q @ own, -inverse @ explained, inverse)
+    return Eliminated(own, left, b - Q @ own, -inverse @ explained, inverse, unknown)
+
+
+def _basis_of(A: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """An orthonormal basis Q of columns, S with `A S = Q`, and which columns nothing determines by themselves."""
+    size = np.linalg.norm(A, axis=0)
+    size[size == 0.0] = 1.0
+    Q, R = np.linalg.qr(A / size)
+    pivots = np.abs(np.diag(R))
+    if len(Q) >= A.shape[1] and pivots.min() > _ROUNDING * pivots.max():
+        return Q, np.linalg.inv(R) / size[:, None], np.zeros(A.shape[1], dtype=np.bool_)
+    U, s, Vt = np.linalg.svd(A / size, full_matrices=True)
+    kept = np.zeros(len(Vt), dtype=np.bool_)
+    kept[: len(s)] = s > _ROUNDING * s.max(initial=0.0)
+    S = (Vt[kept].T / s[kept[: len(s)]]) / size[:, None]
+    return U[:, : len(s)][:, kept[: len(s)]], S, np.any(np.abs(Vt[~kept]) > _SHARE, axis=0)
 
 
 class Reduction:
@@ -636,16 +652,16 @@ class Reduction:
     harmless where every singular value is either that of a dead direction or above 1e-5 of the largest.
     """
 
-    def __init__(self, block: AnyBlock) -> None:
-        self._block = block
+    def __init__(self, rows: RowSet) -> None:
+        self._rows = rows
         self._gram = False
-        self._decided = block.n * block.height <= GRAM_ROWS
+        self._decided = rows.n_rows <= GRAM_ROWS
 
-    def __call__(self, chain: Chain) -> Floats:
-        """A square matrix R with R^T R = [J r]^T [J r], shape (n_columns + 1, n_columns + 1)."""
+    def __call__(self, at: At) -> Floats:
+        """A square matrix R with R^T R = [J r]^T [J r], shape (n_columns + n_nuisance + 1,) * 2."""
         if self._gram:
-            return square_root(residuals.gram(self._block, chain))
-        R = residuals.triangle(self._block, chain)
+            return square_root(self._rows.gram(at))
+        R = self._rows.triangle(at)
         if not self._decided:
             self._decided = True
             self._gram = well_conditioned(R[:, :-1])

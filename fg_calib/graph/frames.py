@@ -115,6 +115,28 @@ def start_from_distances(
     return Frame(tool.rotation, min(fits, key=lambda fit: fit[1])[0])
 
 
+def start_from_touches(
+    flange: tuple[Floats, Floats], touched: NDArray[np.int64], nominal: Floats, free: Booleans
+) -> Floats:
+    """The tool point that brings touches of each point nearest together, from the nominal one, shape (3,), [m].
+
+    Args:
+        flange: base_T_flange: rotations (n, 3, 3), translations (n, 3), [m].
+        touched: Which point each touched, shape (n,).
+        nominal: The nominal tool point, [m].
+        free: Which of its coordinates are unknown, shape (3,).
+    """
+    A, b = [np.zeros((0, 3))], [np.zeros(0)]
+    for point in np.unique(touched):
+        R, p = (v[touched == point] for v in flange)
+        at = p + R @ nominal
+        A.append((R - R.mean(axis=0)).reshape(-1, 3))
+        b.append(-(at - at.mean(axis=0)).ravel())
+    found = nominal.copy()
+    found[free] += np.linalg.lstsq(np.vstack(A)[:, free], np.concatenate(b), rcond=1e-10)[0]
+    return found
+
+
 def _tool_point_by_distances(
     dR: Floats, dp: Floats, distance: Floats, t: Floats, free: Booleans, steps: int = 10
 ) -> tuple[Floats, float]:

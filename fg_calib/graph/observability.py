@@ -20,6 +20,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.arrays import FrozenArrays
 from fg_calib.robot.model import Parameter, names_of
 
 Floats = NDArray[np.float64]
@@ -97,7 +98,7 @@ class WeakDirection:
 
 
 @dataclass(frozen=True)
-class Observability:
+class Observability(FrozenArrays):
     """What a set of measurements determines of the parameters.
 
     Attributes:

@@ -180,6 +180,6 @@ class Weighting:
         low, high = self._mu / (self._mu + 1.0), (self._mu + 1.0) / self._mu
         with np.errstate(divide="ignore"):
             between = np.sqrt(self._mu * (self._mu + 1.0) / ratio) - self._mu
-        at_c = np.sqrt(self._mu * (self._mu + 1.0)) - self._mu
+        at_c = 1.0 / (np.sqrt(1.0 + 1.0 / self._mu) + 1.0)  # sqrt(mu (mu + 1)) - mu
         weights = np.where(ratio >= high, 0.0, np.clip(between / at_c, 0.0, 1.0))
         return weights, bool(np.all((ratio <= low) | (ratio >= high)))

@@ -26,14 +26,22 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.arrays import FrozenArrays
 from fg_calib.errors import SolverError
 from fg_calib.graph.extension import with_added
 from fg_calib.graph.factors import Variables, dense, eliminate
+from fg_calib.graph.noise import NoiseState
 from fg_calib.graph.observability import determined
-from fg_calib.graph.problem import Problem, frames_only, joint_errors, judged_at, lengths, same_rows, started_at
+from fg_calib.graph.problem import (
+    Problem,
+    frames_only,
+    joint_errors,
+    mahalanobis_distances,
+    reweighted_at,
+    same_rows,
+    started_at,
+)
 from fg_calib.graph.robust import Weighting
-from fg_calib.graph.whitening import Adjustment
-from fg_calib.measurements.residuals import squared_norm
 from fg_calib.options import check_number, check_type
 from fg_calib.threads import one_blas_thread
 
@@ -112,7 +120,7 @@ class Iteration:
 
 
 @dataclass(frozen=True)
-class Solution:
+class Solution(FrozenArrays):
     """What the solver found.
 
     Attributes:
@@ -127,7 +135,7 @@ class Solution:
         cost: Cost at the estimate, whatever the loss.
         weighted_cost: The same with every measurement by its robust weight.
         seconds: Time taken.
-        estimated_noise: Kinds whose noise was estimated (see `noise`); None where it was taken as stated.
+        estimated_noise: Tables and kinds whose noise was estimated (see `noise`); None where it was taken as stated.
         others: Parameter vectors of other optima that the data cannot tell from this one (see `restarts`).
     """
 
@@ -142,8 +150,12 @@ class Solution:
     cost: float
     weighted_cost: float
     seconds: float
-    estimated_noise: tuple[str, ...] | None = None
+    estimated_noise: tuple[tuple[int, str], ...] | None = None
     others: tuple[Floats, ...] = ()
+
+    def __repr__(self) -> str:
+        costs = f"{self.iterations} iterations, cost {self.initial_cost:.6g} -> {self.cost:.6g}"
+        return f"Solution of {self.problem.robot.name!r}: {self.message}\n  {costs}"
 
     @property
     def iterations(self) -> int:
@@ -173,7 +185,7 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
         if frames is not None:
             found = _fit(frames, replace(options, decrement=max(options.decrement, COARSE))).parameters
             before = np.concatenate([found, problem.start[len(found) :]])
-            problem = judged_at(problem, before)
+            problem = reweighted_at(problem, before)
         if not problem.variables.keys:
             return _taken_as_it_is(problem, clock)
         run = _fit(problem, options)
@@ -208,15 +220,15 @@ def solve_from(solution: Solution, start: Floats, most: float, options: SolverOp
             return None
         if rough.here.decrement_to(solution.values) < BACK:
             return None
-        run = _fit(judged_at(problem, rough.parameters), options)
+        run = _fit(reweighted_at(problem, rough.parameters), options)
         found = _solution(run, solution.before, solution.initial_cost, clock)
         return replace(found, estimated_noise=solution.estimated_noise)
 
 
 def _solution(run: _Run, before: Floats, initial_cost: float, clock: float) -> Solution:
-    cost, weights = run.here.cost, run.problem.adjustment.weights
+    cost, weights = run.here.cost, run.problem.state.weights
     if weights is not None:
-        stated = judged_at(run.problem, run.parameters, replace(run.problem.adjustment, weights=None))
+        stated = reweighted_at(run.problem, run.parameters, replace(run.problem.state, weights=None))
         cost = stated.graph.error(run.here.values)
     constant = _constant_cost(run.problem)
     return Solution(
@@ -235,19 +247,19 @@ def _solution(run: _Run, before: Floats, initial_cost: float, clock: float) -> S
 
 
 def _constant_cost(problem: Problem) -> float:
-    """Cost of the rows that depend on no variable: all blocks, where no arm, base, tool or frame is fitted."""
+    """Cost of the rows that depend on no variable, where no arm, base, tool, frame or point is fitted."""
     if problem.variables.items:
         return 0.0
-    chain = problem.variables.chain.at(problem.start)
-    return 0.5 * sum(squared_norm(block, chain) for block in problem.blocks)
+    at = problem.variables.at(problem.start)
+    return 0.5 * sum(rows.squared_norm(at) for rows in problem.rows if not len(rows.coordinates))
 
 
 def _taken_as_it_is(problem: Problem, clock: float) -> Solution:
     """The "solution" of an evaluation that has nothing to fit; robust weights are those of the rows as they are."""
     weighted, final, weighting = problem, problem.options.loss == "none", Weighting(problem.options.loss)
     while not final:
-        adjustment, final = _learn(problem, problem.start, weighting)
-        weighted = judged_at(problem, problem.start, adjustment)
+        state, final = _learn(problem, problem.start, weighting)
+        weighted = reweighted_at(problem, problem.start, state)
     cost = _constant_cost(problem)
     return Solution(
         problem=weighted,
@@ -272,20 +284,22 @@ def _fit(problem: Problem, options: SolverOptions) -> _Run:
     """
     robust = problem.options.loss != "none"
     weighting = Weighting(problem.options.loss)
-    run, goal, was = _Run(problem, options), COARSE, np.inf
-    bends = SPREAD_ROUNDS if problem.pairs is not None and problem.adjustment.spread is None else 0
+    run, goal, was, n_steps = _Run(problem, options), COARSE, np.inf, 0
+    bends = SPREAD_ROUNDS if problem.pair_series and problem.state.spread is None else 0
     if robust:
-        run.go_on_with(judged_at(problem, problem.start, _learn(problem, problem.start, weighting)[0]))
+        run.go_on_with(reweighted_at(problem, problem.start, _learn(problem, problem.start, weighting)[0]))
     while run.descend(goal) or robust:
-        adjustment, final = _learn(run.problem, run.parameters, weighting)
+        state, final = _learn(run.problem, run.parameters, weighting)
         if bends:
-            adjustment, bends = replace(adjustment, spread=run.here.spread), bends - 1
-        anew = judged_at(problem, run.parameters, adjustment)
+            state, bends = replace(state, spread=run.here.spread), bends - 1
+        anew = reweighted_at(problem, run.parameters, state)
         unchanged = same_rows(anew, run.problem)
         if not unchanged:
             run.go_on_with(anew)
-        left, was = run.left_after(was), run.here.decrement
-        if final and (goal <= run.least if unchanged else not bends and left <= run.least):
+        # Where no step could be taken and what is left falls no more, rows whitened anew differ by rounding alone.
+        stands = len(run.history) == n_steps and goal <= run.least and was <= run.here.decrement
+        left, was, n_steps = run.left_after(was), run.here.decrement, len(run.history)
+        if final and (goal <= run.least if unchanged else not bends and (stands or left <= run.least)):
             run.descend(run.least)
             break
         if run.exhausted:
@@ -295,15 +309,19 @@ def _fit(problem: Problem, options: SolverOptions) -> _Run:
     return run
 
 
-def _learn(problem: Problem, parameters: Floats, weighting: Weighting) -> tuple[Adjustment, bool]:
+def _learn(problem: Problem, parameters: Floats, weighting: Weighting) -> tuple[NoiseState, bool]:
     """What the residuals at some parameters say of the noise, and whether the loss has its final form."""
-    adjustment, final = problem.adjustment, True
+    state, final = problem.state, True
     if problem.options.loss != "none":
-        weights, final = weighting.update(*lengths(problem, parameters))
-        adjustment = replace(adjustment, weights=weights)
-    if adjustment.joint_errors is not None:
-        adjustment = replace(adjustment, joint_errors=joint_errors(problem, parameters))
-    return adjustment, final
+        found = mahalanobis_distances(problem, parameters)
+        test = np.concatenate([s.test for s in problem.data.series])
+        e, height = (np.where(test, 0, np.concatenate(each)) for each in zip(*found, strict=True))
+        weights, final = weighting.update(e, height)
+        ends = np.cumsum([s.n for s in problem.data.series])[:-1]
+        state = replace(state, weights=tuple(np.split(weights, ends)))
+    if state.joint_errors is not None:
+        state = replace(state, joint_errors=joint_errors(problem, parameters))
+    return state, final
 
 
 class _Run:
@@ -435,7 +453,7 @@ class _Run:
         """Where GTSAM's next damped step leads, undetermined directions held; nothing if none lowers the cost."""
         here, graph, variables = self.here, self.problem.graph, self.problem.variables
         try:
-            optimizer = gtsam.LevenbergMarquardtOptimizer(graph, here.values, _parameters(self._damping))
+            optimizer = gtsam.LevenbergMarquardtOptimizer(graph, here.values, levenberg_marquardt_params(self._damping))
             optimizer.iterate()
         except RuntimeError as error:
             raise SolverError(_in_words(str(error), variables)) from error
@@ -504,8 +522,14 @@ class _Linearised:
         return held
 
 
-def _parameters(damping: float) -> gtsam.LevenbergMarquardtParams:
-    """GTSAM's options: QR, damping in each column's own unit, and no stopping rule of its own."""
+def levenberg_marquardt_params(damping: float = FIRST_DAMPING) -> gtsam.LevenbergMarquardtParams:
+    """Options for GTSAM's own optimiser that work on these graphs: QR, and damping in each column's own unit.
+
+    With its defaults GTSAM returns the start without a word where weak priors hold directions.
+
+    Args:
+        damping: Of the first step, as a share of each column's own curvature.
+    """
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setLinearSolverType("MULTIFRONTAL_QR")
     parameters.setDiagonalDamping(True)

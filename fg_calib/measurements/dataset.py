@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from fg_calib.arrays import FrozenArrays, as_floats
 from fg_calib.errors import InputError
+from fg_calib.measurements.checks import (
+    checked_groups,
+    checked_ids,
+    checked_joint_sigma,
+    checked_mask,
+    checked_pairs,
+    checked_readings,
+    checked_rotation,
+    checked_sigma,
+)
 from fg_calib.options import Pairing, check_number
 
 Floats = NDArray[np.float64]
@@ -44,7 +57,7 @@ class Noise:
 
 
 @dataclass(frozen=True)
-class Pairs:
+class Pairs(FrozenArrays):
     """Pairs of configurations measured against each other; nan where not measured.
 
     Attributes:
@@ -67,6 +80,8 @@ class Pairs:
     test: Booleans
     source: str = "pairs"
 
+    _left_open = ("a", "b")
+
     @property
     def n_pairs(self) -> int:
         """Number of pairs."""
@@ -87,7 +102,7 @@ class Pairs:
 
 
 @dataclass(frozen=True)
-class Groups:
+class Groups(FrozenArrays):
     """Configurations in which the tool point touched the same physical point, whose position is unknown.
 
     Attributes:
@@ -107,7 +122,7 @@ class Groups:
 
 
 @dataclass(frozen=True)
-class Measurements:
+class Measurements(FrozenArrays):
     """Configurations, and what was measured at them or between them.
 
     Attributes:
@@ -124,6 +139,7 @@ class Measurements:
         source: File name, for messages.
         groups: Which configurations touched the same point; None if none did.
         sigma_point: Of a touch, per axis, shape (n_configurations,), [m]; nan where it is not stated.
+        named: Whether the names were given, so that another table may have the same configurations.
         roll_pitch_yaw: What `rotation` was read from, shape (n_configurations, 3), [rad]; None for quaternions.
     """
 
@@ -140,6 +156,85 @@ class Measurements:
     groups: Groups | None = None
     sigma_point: Floats | None = None
     roll_pitch_yaw: Floats | None = None
+    named: bool = False
+
+    from_frame: ClassVar[Callable[..., Measurements]]
+    """`files.tables.read_measurements`, attached by the package: this folder knows nothing of tables."""
+
+    @classmethod
+    def from_arrays(
+        cls,
+        readings: ArrayLike,
+        *,
+        position: ArrayLike | None = None,
+        rotation: ArrayLike | None = None,
+        quaternion: ArrayLike | None = None,
+        roll_pitch_yaw: ArrayLike | None = None,
+        pairs: Mapping[str, ArrayLike] | None = None,
+        group: ArrayLike | None = None,
+        test: ArrayLike | None = None,
+        ids: ArrayLike | None = None,
+        sigma_position: ArrayLike | None = None,
+        sigma_orientation: ArrayLike | None = None,
+        sigma_joint: ArrayLike = 0.0,
+        sigma_point: ArrayLike | None = None,
+        source: str = "measurements",
+    ) -> Measurements:
+        """Measurements from arrays in [m] and [rad], which are copied; sigmas may be one figure for all.
+
+        Args:
+            readings: Joint readings q, shape (n, n_joints), [rad] (prismatic: [m]).
+            position: world_p_tool, shape (n, 3).
+            rotation: world_R_tool, shape (n, 3, 3); or one of the next two.
+            quaternion: As x y z w, shape (n, 4).
+            roll_pitch_yaw: As angles, Rz(yaw) Ry(pitch) Rx(roll), shape (n, 3).
+            pairs: What was measured between configurations, or between touched points: arrays `a` and `b` (ids, row
+                numbers where there are none, or groups), `distance`, `angle` (nan where not measured),
+                `sigma_distance`, `sigma_angle`, `test`; shape (n_pairs,) each, sigmas and test may be missing.
+            group: Name of the point that a configuration touched, None where it touched none, shape (n,).
+            test: True for rows that are predicted but never fitted, shape (n,).
+            ids: Name of each configuration, shape (n,); its row number if None.
+            sigma_position: 1 sigma: one figure, one an axis (3,), one a row (n,), or shape (n, 3).
+            sigma_orientation: The same, about the tool's axes.
+            sigma_joint: 1 sigma of the readings: one figure, or one a joint.
+            sigma_point: 1 sigma of a touch on each axis: one figure, or one a row.
+            source: Name of the measurements, for messages.
+
+        Raises:
+            InputError: An array cannot be used; the message names it and its row.
+        """
+        n = len(q := checked_readings(readings))
+        names, index = checked_groups(group, n)
+        known, rows = checked_ids(ids, n), checked_mask("test", test, n)
+        R, angles = checked_rotation(n, rotation, quaternion, roll_pitch_yaw)
+        between = None if pairs is None else _pairs_from_arrays(pairs, known, rows, names, index)
+        return cls(
+            readings=q,
+            ids=known,
+            test=rows,
+            position=None if position is None else as_floats("position", position, f"({n}, 3)"),
+            rotation=R,
+            sigma_position=checked_sigma("sigma_position", sigma_position, (n, 3)),
+            sigma_orientation=checked_sigma("sigma_orientation", sigma_orientation, (n, 3)),
+            sigma_joint=checked_joint_sigma(sigma_joint, q.shape[1]),
+            pairs=None if between is None else between[0],
+            source=source,
+            groups=Groups(names, index, no_pairs(source) if between is None else between[1]) if names else None,
+            sigma_point=checked_sigma("sigma_point", sigma_point, (n,)),
+            roll_pitch_yaw=angles,
+            named=ids is not None,
+        )
+
+    def __repr__(self) -> str:
+        kinds = {"position": "positions", "rotation": "orientations"}
+        parts = [words for name, words in kinds.items() if getattr(self, name) is not None]
+        parts += [] if self.pairs is None else [f"{self.pairs.n_pairs} pairs"]
+        parts += [] if self.groups is None else [f"touches of {self.groups.n_groups} points"]
+        n, n_joints = self.readings.shape
+        of_test = f" ({int(self.test.sum())} to test)" if self.test.any() else ""
+        return f"Measurements {self.source!r}, {n} configurations of {n_joints} joints{of_test}: " + (
+            ", ".join(parts) or "nothing measured"
+        )
 
     @property
     def n_configurations(self) -> int:
@@ -153,6 +248,20 @@ class Measurements:
         Rows count configurations from 0, then groups, and -1 for nothing, so end k has the name at k + 1.
         """
         return ("", *self.ids.tolist(), *(() if self.groups is None else self.groups.names))
+
+
+def _pairs_from_arrays(
+    given: Mapping[str, ArrayLike], ids: NDArray[np.str_], test: Booleans, names: tuple[str, ...], group: Integers
+) -> tuple[Pairs, Pairs]:
+    """Pairs of configurations, and pairs of groups; those of test rows alone are test pairs."""
+    columns, of_groups = checked_pairs(given, ids, names)
+    pairs = Pairs(**columns)  # type: ignore[arg-type]
+    only_test = np.array([bool(test[group == g].all()) for g in range(len(names))], dtype=np.bool_)
+    of_rows = pairs.test.copy()
+    for flags, chosen in ((test, ~of_groups), (only_test, of_groups)):
+        of_rows[chosen] |= flags[pairs.a[chosen]] | flags[pairs.b[chosen]]
+    pairs = replace(pairs, test=of_rows)
+    return pairs.select(~of_groups), pairs.select(of_groups)
 
 
 def no_pairs(source: str) -> Pairs:

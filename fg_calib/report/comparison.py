@@ -145,4 +145,4 @@ def _comparison_notes(comparison: Comparison) -> Iterable[str]:
     if any(e.robot is not None and len(e.sigma) < len(comparison.estimates[0].sigma) for e in comparison.estimates):
         yield "where others are held a parameter stands for its combination with them: compare errors, not corrections"
     yield "predicted errors take what was held at nominal for known, so they may be too small in the base frame"
-    yield "residuals are of the rows that the graph uses; plain least squares fits those near kinks too"
+    yield "residuals are of the rows that the graph uses"

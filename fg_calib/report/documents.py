@@ -5,16 +5,17 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fg_calib import __version__
 from fg_calib.analysis.accuracy import ExpectedError
-from fg_calib.analysis.conventions import WORDS
+from fg_calib.analysis.conventions import WORDS, MissingMotion
 from fg_calib.analysis.corrections import PriorFit
+from fg_calib.analysis.covariance import TangentCovariance
 from fg_calib.analysis.goodness import (
     FLAGS,
     PREDICTION_VERDICTS,
@@ -27,20 +28,48 @@ from fg_calib.analysis.goodness import (
 from fg_calib.analysis.identifiability import Identifiability
 from fg_calib.analysis.joint_values import JointValues
 from fg_calib.analysis.mistakes import SetupCheck
-from fg_calib.analysis.residual_table import FAMILIES, FAMILY_OF_KIND, ROW_KINDS
 from fg_calib.analysis.typical_residuals import TypicalResidual
 from fg_calib.analysis.uncertainty import ParameterEstimate, Uncertainty
-from fg_calib.baseline.comparison import Comparison, Estimate, RealErrors
 from fg_calib.files.csv_writer import Words, write_csv_parts
 from fg_calib.files.disk import fill_folder, write_text
+from fg_calib.files.result import (
+    SCHEMA,
+    BeyondTolerance,
+    Correlated,
+    Covariance,
+    Explanation,
+    Frame,
+    InFrames,
+    JointScatter,
+    KindGoodness,
+    Lost,
+    Missing,
+    Observability,
+    Parameter,
+    Posterior,
+    Priors,
+    Relative,
+    Result,
+    Setup,
+    Solver,
+    Step,
+    SuspectReading,
+    TestRows,
+    TouchedPoint,
+    Typical,
+    Weak,
+)
+from fg_calib.files.result import ExpectedError as ExpectedErrorDocument
+from fg_calib.files.result import JointValues as JointValuesDocument
+from fg_calib.files.result import SuspectConfiguration as Suspect
 from fg_calib.files.robot_yaml import write_robot
-from fg_calib.files.urdf import write_urdf
+from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.report.figures import write_figures
 from fg_calib.robot.model import Robot
 
-RESULT_SCHEMA = "fg-calib/result/1"
+if TYPE_CHECKING:  # a calibration is written without the baseline
+    from fg_calib.baseline.comparison import Comparison, Estimate, RealErrors
+
 OBSERVABILITY_SCHEMA = "fg-calib/observability/1"
 COMPARISON_SCHEMA = "fg-calib/comparison/1"
 KINDS = ("position", "orientation", "distance", "angle")
@@ -49,9 +78,7 @@ _ROWS_AT_ONCE = 200_000
 """Rows of `residuals.csv` that are turned into text at once."""
 
 
-def result_document(
-    solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str, str] | None = None
-) -> dict[str, Any]:
+def result_of(solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str, str] | None = None) -> Result:
     """What `result.json` holds: SI, full precision, None for what is unknown or infinite.
 
     Args:
@@ -59,111 +86,144 @@ def result_document(
         uncertainty: Its assessment.
         inputs: SHA-256 of the files it came from, by path.
     """
-    problem, settings = solution.problem, solution.problem.options
-    rms = uncertainty.residuals.rms()
-    pairing = None
-    if settings.uses_pairs and (problem.measurements.pairs is not None or problem.formed):
-        pairing = "measured" if problem.measurements.pairs is not None else str(settings.pairing)
-    kinds = KINDS if problem.points is None else (*KINDS, "point")
-    document = {
-        "schema": RESULT_SCHEMA,
-        "version": __version__,
-        "robot": problem.robot.name,
-        "model": settings.model,
-        "frame": settings.frame,
-        "pairing": pairing,
-        "pair_errors": "approximate" if problem.approximate else settings.pair_errors if settings.uses_pairs else None,
-        "encoder": settings.encoder,
-        "loss": settings.loss,
-        "n_configurations": problem.n_configurations,
-        "n_pairs": problem.n_pairs,
-        "n_residuals": problem.n_residuals,
-        "n_priors": problem.n_priors,
-        "n_excluded": problem.n_excluded,
-        "solver": {
-            "name": "gtsam-lm",
-            "converged": solution.converged,
-            "message": solution.message,
-            "iterations": solution.iterations,
-            "initial_cost": solution.initial_cost,
-            "cost": solution.cost,
-            "seconds": solution.seconds,
-            "history": [
-                {"cost": i.cost, "lambda": i.damping, "step": i.step, "decrement": i.decrement}
-                for i in solution.history
-            ],
-        },
-        "trustworthy": uncertainty.trustworthy,
-        "findings": list(uncertainty.findings),
-        "cautions": list(uncertainty.cautions),
-        "setup": _setup(uncertainty.setup),
-        "probability_of_noise": uncertainty.noise_like,
-        "chi2": uncertainty.chi2,
-        "dof": uncertainty.dof,
-        "reduced_chi2": uncertainty.reduced_chi2,
-        "chi2_p_value": uncertainty.p_value,
-        "goodness": _goodness_by_kind(uncertainty.goodness.kinds, VERDICTS),
-        "evaluated_only": problem.evaluated,
-        "test": _test_document(uncertainty, problem.measurements.end_names),
-        "priors": _priors_document(uncertainty.priors),
-        "expected_error": _expected_error(uncertainty.expected_error),
-        "noise_factors": None
-        if solution.estimated_noise is None
-        else {fit.kind: fit.factor for fit in uncertainty.goodness.kinds},
-        "suspect_configurations": _suspects(uncertainty.goodness.configurations, problem.measurements.end_names),
-        "residual_rms": {split: {kind: rms[split].get(kind) for kind in kinds} for split in ("train", "test")},
-        "parameters": [
-            {
-                "name": p.name,
-                "unit": p.unit,
-                "nominal": p.nominal,
-                "estimate": p.estimate,
-                "correction": p.correction,
-                "sigma": p.sigma,
-                "prior_sigma": p.prior_sigma,
-                "identifiability": p.identifiability,
-                **_combination(p),
-            }
-            for p in uncertainty.parameters
-        ],
-        "covariance": {"names": list(uncertainty.names), "matrix": uncertainty.covariance},
-        "frame_estimate": None if uncertainty.frame is None else asdict(uncertainty.frame),
-        "joint_values": _joint_values(uncertainty.joint_values, problem.measurements.end_names),
-        "groups": [{"name": p.name, "n": p.n, "xyz": p.xyz, "sigma": p.sigma} for p in uncertainty.points],
-        "observability": observability_document(uncertainty.identifiability),
-        "inputs": dict(inputs or {}),
-    }
-    plain: dict[str, Any] = _plain(document)
-    return plain
+    problem, settings, u = solution.problem, solution.problem.options, uncertainty
+    names, goodness = problem.end_names, uncertainty.goodness
+    return Result.make(
+        schema_=SCHEMA,
+        version=__version__,
+        robot=problem.robot.name,
+        model=" + ".join(dict.fromkeys(table.model or "own" for table in problem.data.tables)),
+        frame="unknown" if problem.variables.frames else problem.data.tables[0].frame,
+        pairing=_pairing(problem),
+        pair_errors=settings.pair_errors if problem.pair_series else None,
+        encoder=settings.encoder,
+        loss=settings.loss,
+        n_configurations=problem.n_configurations,
+        n_pairs=problem.n_pairs,
+        n_residuals=problem.n_residuals,
+        n_priors=problem.n_priors,
+        n_excluded=problem.n_excluded,
+        solver=_solver(solution),
+        trustworthy=u.trustworthy,
+        findings=u.findings,
+        cautions=u.cautions,
+        setup=_setup(u.setup),
+        probability_of_noise=u.noise_like,
+        chi2=u.chi2,
+        dof=u.dof,
+        reduced_chi2=u.reduced_chi2,
+        chi2_p_value=u.p_value,
+        goodness=_goodness_by_kind(goodness.kinds, VERDICTS),
+        evaluated_only=problem.evaluated,
+        test=_test_rows(u, names),
+        priors=_priors(u.priors),
+        expected_error=_expected_error(u.expected_error),
+        noise_factors=_noise_factors(solution, goodness.kinds),
+        suspect_configurations=_suspects(goodness.configurations, names),
+        residual_rms=_residual_rms(u),
+        parameters=tuple(map(_parameter, u.parameters)),
+        covariance=Covariance.make(names=u.names, matrix=u.covariance),
+        posterior=_posterior(u.whole),
+        links=None if problem.robot.urdf is None else (problem.robot.urdf.base_link, problem.robot.urdf.tip_link),
+        frame_estimate=None if u.frame is None else Frame.model_validate(u.frame),
+        frames={v.symbol: Frame.model_validate(f) for v, f in zip(problem.variables.frames, u.frames, strict=True)},
+        joint_values=_joint_values(u.joint_values, names),
+        groups=tuple(map(TouchedPoint.model_validate, u.points)),
+        observability=observability_of(u.identifiability),
+        inputs=dict(inputs or {}),
+    )
 
 
-def _combination(parameter: ParameterEstimate) -> dict[str, Any]:
-    """What a kept parameter stands for, where others were left out to fix the gauge."""
-    if parameter.stands_for is None:
-        return {}
-    return {"stands_for": parameter.stands_for, "sigma_of_combination": parameter.sigma_of_combination}
+def result_document(
+    solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str, str] | None = None
+) -> dict[str, Any]:
+    """`result_of` as it is written to `result.json`."""
+    return result_of(solution, uncertainty, inputs).document()
 
 
-def _goodness_by_kind(fits: Sequence[KindFit], words: Mapping[str, str]) -> dict[str, Any]:
+def _pairing(problem: Problem) -> str | None:
+    tables = [table for table in problem.data.tables if table.uses_pairs]
+    if not tables or (tables[0].measurements.pairs is None and not problem.formed):
+        return None
+    return "measured" if tables[0].measurements.pairs is not None else str(tables[0].pairing)
+
+
+def _solver(solution: Solution) -> Solver:
+    return Solver(
+        name="gtsam-lm",
+        converged=solution.converged,
+        message=solution.message,
+        iterations=solution.iterations,
+        initial_cost=solution.initial_cost,
+        cost=solution.cost,
+        seconds=solution.seconds,
+        history=tuple(
+            Step.make(cost=i.cost, damping=i.damping, step=i.step, decrement=i.decrement) for i in solution.history
+        ),
+    )
+
+
+def _residual_rms(uncertainty: Uncertainty) -> dict[str, dict[str, Any]]:
+    table = uncertainty.residuals
+    rms, kinds = table.rms(), list(dict.fromkeys((*KINDS, *table.families)))
+    for number, kind in table.groups:
+        if sum(other == kind for _, other in table.groups) > 1:
+            kinds.append(f"{kind}, table {number + 1}")
+            for split, found in table.rms(number).items():
+                rms[split] |= {kinds[-1]: found[kind]} if kind in found else {}
+    return {split: {kind: rms[split].get(kind) for kind in kinds} for split in ("train", "test")}
+
+
+def _parameter(p: ParameterEstimate) -> Parameter:
+    """A parameter; what it stands for only where others were left out to fix the gauge."""
+    own = {f.name: getattr(p, f.name) for f in fields(p)}
+    if p.stands_for is None:
+        del own["stands_for"], own["sigma_of_combination"]
+    return Parameter(**own)
+
+
+def _posterior(found: TangentCovariance) -> Posterior:
+    v = found.variables
+    return Posterior.make(
+        variables={item.symbol: v.names[item.columns] for item in v.items},
+        covariance=found.tangent,
+        undetermined=found.loose,
+        undetermined_at_nominal=found.loose_at_nominal,
+    )
+
+
+def _noise_factors(solution: Solution, fits: Sequence[KindFit]) -> dict[str, float] | None:
+    if solution.estimated_noise is None:
+        return None
+    return {_key(fit, fits): fit.factor for fit in fits}
+
+
+def _key(fit: KindFit, fits: Sequence[KindFit]) -> str:
+    """The kind of noise, with the number of its table where several have that kind."""
+    alone = sum(other.kind == fit.kind for other in fits) == 1
+    return fit.kind if alone else f"{fit.kind}, table {fit.table + 1}"
+
+
+def _goodness_by_kind(fits: Sequence[KindFit], words: Mapping[str, str]) -> dict[str, KindGoodness]:
     return {
-        fit.kind: {
-            "n": fit.n,
-            "stated_sigma_rms": fit.stated_sigma_rms,
-            "seen_over_stated": fit.seen_over_stated,
-            "chi2": fit.chi2,
-            "expected": fit.expected,
-            "p_value": fit.p_value,
-            "verdict": words[fit.verdict],
-        }
+        _key(fit, fits): KindGoodness(
+            n=fit.n,
+            stated_sigma_rms=fit.stated_sigma_rms,
+            seen_over_stated=fit.seen_over_stated,
+            chi2=fit.chi2,
+            expected=fit.expected,
+            p_value=fit.p_value,
+            verdict=words[fit.verdict],
+        )
         for fit in fits
     }
 
 
-def _suspects(found: Sequence[SuspectConfiguration], names: Sequence[str]) -> list[dict[str, Any]]:
-    return [{"id": names[c.configuration + 1], "n": c.n, "chi2": c.chi2, "expected": c.expected} for c in found]
+def _suspects(found: Sequence[SuspectConfiguration], names: Sequence[str]) -> tuple[Suspect, ...]:
+    return tuple(Suspect(id=names[c.configuration + 1], n=c.n, chi2=c.chi2, expected=c.expected) for c in found)
 
 
-def _test_document(uncertainty: Uncertainty, names: Sequence[str]) -> dict[str, Any] | None:
+def _test_rows(uncertainty: Uncertainty, names: Sequence[str]) -> TestRows | None:
     """How well the test rows are predicted; None without any."""
     goodness = uncertainty.goodness
     fit = goodness.test
@@ -183,124 +243,133 @@ def _test_document(uncertainty: Uncertainty, names: Sequence[str]) -> dict[str, 
         )
     if fit is None:
         return None
-    return {
-        "n_rows": fit.n_rows,
-        "n": fit.n,
-        "n_outliers": fit.outliers.test,
-        "n_unknown": fit.n_unknown,
-        "chi2": fit.chi2,
-        "expected": fit.expected,
-        "p_value": fit.p_value,
-        "goodness": _goodness_by_kind(fit.kinds, PREDICTION_VERDICTS),
-        "n_suspect_rows": len(fit.suspects),
-        "suspect_configurations": _suspects(fit.configurations, names),
-    }
+    return TestRows(
+        n_rows=fit.n_rows,
+        n=fit.n,
+        n_outliers=fit.outliers.test,
+        n_unknown=fit.n_unknown,
+        chi2=fit.chi2,
+        expected=fit.expected,
+        p_value=fit.p_value,
+        goodness=_goodness_by_kind(fit.kinds, PREDICTION_VERDICTS),
+        n_suspect_rows=len(fit.suspects),
+        suspect_configurations=_suspects(fit.configurations, names),
+    )
 
 
-def _expected_error(expected: ExpectedError | None) -> dict[str, Any] | None:
+def _expected_error(expected: ExpectedError | None) -> ExpectedErrorDocument | None:
     """Expected RMS errors of the tool."""
     if expected is None:
         return None
-    both = {"base": asdict(expected.base), "fitted": asdict(expected.fitted)}
-    by_kind = {kind: {frame: rms[kind] for frame, rms in both.items()} for kind in ("position", "orientation")}
-    return by_kind | {"at": expected.at, "n": expected.n, "of": expected.of}
+    base, fitted = expected.base, expected.fitted
+    return ExpectedErrorDocument(
+        position=InFrames(base=base.position, fitted=fitted.position),
+        orientation=InFrames(base=base.orientation, fitted=fitted.orientation),
+        at=expected.at,
+        n=expected.n,
+        of=expected.of,
+    )
 
 
-def _joint_values(found: JointValues | None, names: Sequence[str]) -> dict[str, Any] | None:
+def _joint_values(found: JointValues | None, names: Sequence[str]) -> JointValuesDocument | None:
     """How estimated joint values lie about their readings; None where these were not estimated."""
     if found is None:
         return None
-    return {
-        "n": len(found.configurations),
-        "joints": [
-            {"name": name, "sigma": sigma, "mean": mean, "scatter": scatter}
+    return JointValuesDocument(
+        n=len(found.configurations),
+        joints=tuple(
+            JointScatter(name=name, sigma=sigma, mean=mean, scatter=scatter)
             for name, sigma, mean, scatter in zip(found.names, found.sigma, found.mean, found.scatter, strict=True)
-        ],
-        "suspects": [
-            {
-                "id": names[found.configurations[i] + 1],
-                "joint": found.names[k],
-                "error": found.error[i, k],
-                "studentised": found.studentised[i, k],
-            }
+        ),
+        suspects=tuple(
+            SuspectReading(
+                id=names[found.configurations[i] + 1],
+                joint=found.names[k],
+                error=found.error[i, k],
+                studentised=found.studentised[i, k],
+            )
             for i, k in found.suspects
-        ],
-    }
+        ),
+    )
 
 
-def _priors_document(fit: PriorFit | None) -> dict[str, Any] | None:
+def _priors(fit: PriorFit | None) -> Priors | None:
     """Corrections against tolerances; None without priors."""
     if fit is None:
         return None
-    return {
-        "n": len(fit.names),
-        "chi2": fit.chi2,
-        "expected": fit.expected,
-        "p_value": fit.p_value,
-        "beyond_tolerance": [
-            {"parameter": fit.names[i], "correction_over_tolerance": fit.z[i], "sigma": fit.sigma[i]}
+    return Priors(
+        n=len(fit.names),
+        chi2=fit.chi2,
+        expected=fit.expected,
+        p_value=fit.p_value,
+        beyond_tolerance=tuple(
+            BeyondTolerance(parameter=fit.names[i], correction_over_tolerance=fit.z[i], sigma=fit.sigma[i])
             for i in fit.beyond
-        ],
-    }
+        ),
+    )
+
+
+def _setup(check: SetupCheck) -> Setup:
+    """Residuals before the calibration beside what noise and tolerances predict, and mistakes that explain them."""
+
+    def by_kind(residuals: Sequence[TypicalResidual]) -> dict[str, Typical]:
+        return {r.kind: Typical(typical=r.size, predicted=r.expected) for r in residuals}
+
+    return Setup(
+        residuals=by_kind(check.residuals),
+        explanations=tuple(
+            Explanation(mistakes=e.mistakes, residuals=by_kind(e.residuals)) for e in check.explanations
+        ),
+    )
+
+
+def observability_of(found: Identifiability) -> Observability:
+    """What `observability.json` holds: sigmas, correlations and weak directions only where the noise is the user's."""
+    o, more = found.observability, dict[str, Any]()
+    if found.kind == "practical":
+        more["sigma"] = o.sigma
+        more["correlations"] = tuple(Correlated(parameters=(a, b), correlation=rho) for a, b, rho in o.correlations)
+        more["weak"] = tuple(map(Weak.model_validate, o.weak))
+    if found.with_fixed_known is not None:
+        more["fixed"] = found.fixed
+        more["with_fixed_known"] = observability_of(found.with_fixed_known)
+    return Observability.make(
+        schema_=OBSERVABILITY_SCHEMA,
+        robot=found.robot,
+        model=found.model,
+        kind=found.kind,
+        n_configurations=found.n_configurations,
+        n_parameters=len(o.names),
+        rank=o.rank,
+        names=o.names,
+        singular_values=o.singular_values,
+        gap=o.gap,
+        independent=o.named("independent"),
+        ineffective=o.named("ineffective"),
+        relative=tuple(map(Relative.model_validate, o.relative)),
+        kept=o.kept,
+        lost=tuple(map(Lost.model_validate, found.lost)),
+        missing=tuple(_missing(m) for m in found.missing),
+        null_space=o.null_space,
+        indices=o.indices,
+        condition_number=o.condition_number,
+        **more,
+    )
+
+
+def _missing(m: MissingMotion) -> Missing:
+    return Missing(
+        axes=m.axes,
+        motions=tuple(WORDS[motion] for motion in m.motions),
+        convention=m.convention,
+        use=m.use,
+        message=str(m),
+    )
 
 
 def observability_document(found: Identifiability) -> dict[str, Any]:
-    """What `observability.json` holds: sigmas, correlations and weak directions only where the noise is the user's."""
-    o = found.observability
-    document: dict[str, Any] = {
-        "schema": OBSERVABILITY_SCHEMA,
-        "robot": found.robot,
-        "model": found.model,
-        "kind": found.kind,
-        "n_configurations": found.n_configurations,
-        "n_parameters": len(o.names),
-        "rank": o.rank,
-        "names": list(o.names),
-        "singular_values": o.singular_values,
-        "gap": o.gap,
-        "independent": o.named("independent"),
-        "ineffective": o.named("ineffective"),
-        "relative": [
-            {"parameters": list(g.parameters), "lost": g.lost, "relations": list(g.relations), "keep": list(g.keep)}
-            for g in o.relative
-        ],
-        "kept": o.kept,
-        "lost": [{"relation": direction.relation, "reason": direction.reason} for direction in found.lost],
-        "missing": [
-            {
-                "axes": list(m.axes),
-                "motions": [WORDS[motion] for motion in m.motions],
-                "convention": m.convention,
-                "use": m.use,
-                "message": str(m),
-            }
-            for m in found.missing
-        ],
-        "null_space": o.null_space,
-        "indices": o.indices,
-        "condition_number": o.condition_number,
-    }
-    if found.kind == "practical":
-        document["sigma"] = o.sigma
-        document["correlations"] = [{"parameters": [a, b], "correlation": rho} for a, b, rho in o.correlations]
-        document["weak"] = [{"signal_to_noise": w.signal_to_noise, "members": w.members} for w in o.weak]
-    if found.with_fixed_known is not None:
-        document["fixed"] = list(found.fixed)
-        document["with_fixed_known"] = observability_document(found.with_fixed_known)
-    plain: dict[str, Any] = _plain(document)
-    return plain
-
-
-def _setup(check: SetupCheck) -> dict[str, Any]:
-    """Residuals before the calibration beside what noise and tolerances predict, and mistakes that explain them."""
-
-    def by_kind(residuals: Sequence[TypicalResidual]) -> dict[str, Any]:
-        return {r.kind: {"typical": r.size, "predicted": r.expected} for r in residuals}
-
-    return {
-        "residuals": by_kind(check.residuals),
-        "explanations": [{"mistakes": list(e.mistakes), "residuals": by_kind(e.residuals)} for e in check.explanations],
-    }
+    """`observability_of` as it is written to `observability.json`."""
+    return observability_of(found).document()
 
 
 def write_observability(folder: Path | str, found: Identifiability) -> None:
@@ -310,6 +379,8 @@ def write_observability(folder: Path | str, found: Identifiability) -> None:
         InputError: The folder cannot be written.
     """
     text = json.dumps(observability_document(found), indent=1, allow_nan=False) + "\n"
+
+    from fg_calib.report.figures import write_figures
 
     def write(into: Path) -> None:
         write_text(into / "observability.json", text)
@@ -337,7 +408,8 @@ def comparison_document(comparison: Comparison) -> dict[str, Any]:
     """
     job, first = comparison.job, comparison.estimates[0]
     uses_pairs = job.options.model in ("distance", "rotation", "distance-rotation")
-    pairing = ("measured" if job.measurements.pairs is not None else str(job.options.pairing)) if uses_pairs else None
+    measured = job.tables[0].measurements.pairs is not None
+    pairing = ("measured" if measured else str(job.options.pairing)) if uses_pairs else None
     document = {
         "schema": COMPARISON_SCHEMA,
         "version": __version__,
@@ -445,7 +517,7 @@ def write_results(
         write_calibrated_robot(into, calibrated)
         _write_residuals(into / "residuals.csv", solution, uncertainty)
         if uncertainty.joint_values is not None:
-            _write_joint_values(into / "joints.csv", uncertainty.joint_values, solution.problem.measurements)
+            _write_joint_values(into / "joints.csv", uncertainty.joint_values, solution.problem.end_names)
 
     fill_folder(Path(folder), write)
 
@@ -455,6 +527,8 @@ def write_calibrated_robot(folder: Path, robot: Robot) -> None:
     if robot.urdf is None:
         write_robot(folder / "robot_calibrated.yaml", robot)
         return
+    from fg_calib.files.urdf import write_urdf
+
     write_urdf(folder / "robot_calibrated.urdf", robot)
     if any(p.nominal != 0.0 or p.estimated for p in robot.parameters if p.owner in (0, robot.n_joints + 1)):
         write_robot(folder / "robot_calibrated.yaml", robot, urdf_name="robot_calibrated.urdf")
@@ -463,19 +537,21 @@ def write_calibrated_robot(folder: Path, robot: Robot) -> None:
 def _write_residuals(path: Path, solution: Solution, uncertainty: Uncertainty) -> None:
     """One line a scalar residual: what it is of, whether it was used, before and after, in [m] and [rad]."""
     table, fit = uncertainty.residuals, uncertainty.goodness
-    ends = solution.problem.measurements.end_names
+    ends = solution.problem.end_names
     suspect = np.zeros(table.n, dtype=np.bool_)
     suspect[fit.suspects] = True
     if fit.test is not None:
         suspect[fit.test.suspects] = True
-    kind_in_metres = np.array([FAMILIES[f] not in ("angle", "orientation") for f in FAMILY_OF_KIND])
+    sources = solution.problem.data.labels
+    tables = [kind.table for kind in table.kinds]
+    kind_in_metres = np.array([kind.unit == "m" for kind in table.kinds])
 
     def columns(rows: slice) -> dict[str, Any]:
         kind = table.kind_code[rows]
         excess, after, sigma = table.excess[rows], table.after[rows], table.sigma[rows]
         measured = table.measured[rows] - excess  # so that predicted minus measured is 0 on average
         return {
-            "kind": Words(ROW_KINDS, kind),
+            "kind": Words([kind.name for kind in table.kinds], kind),
             "a": Words(ends, table.a[rows] + 1),
             "b": Words(ends, table.b[rows] + 1),
             "split": Words(("train", "test"), table.split[rows]),
@@ -494,20 +570,21 @@ def _write_residuals(path: Path, solution: Solution, uncertainty: Uncertainty) -
             "flag": Words(FLAGS, fit.flag[rows]),
             "noise_adds": excess,
             "suspect": suspect[rows],
+            **({} if len(sources) == 1 else {"table": Words(sources, np.array(tables, dtype=np.int16)[kind])}),
         }
 
     starts = range(0, max(table.n, 1), _ROWS_AT_ONCE)
     write_csv_parts(path, (columns(slice(start, start + _ROWS_AT_ONCE)) for start in starts))
 
 
-def _write_joint_values(path: Path, found: JointValues, measurements: Measurements) -> None:
+def _write_joint_values(path: Path, found: JointValues, names: Sequence[str]) -> None:
     """One line a configuration and joint: reading and estimate, in [rad] (prismatic: [m])."""
     n, k = found.error.shape
     suspect = np.zeros((n, k), dtype=np.bool_)
     for place in found.suspects:
         suspect[place] = True
     columns: dict[str, Any] = {
-        "id": Words(measurements.end_names, np.repeat(found.configurations + 1, k)),
+        "id": Words(names, np.repeat(found.configurations + 1, k)),
         "joint": Words(found.names, np.tile(np.arange(k), n)),
         "reading": found.reading.ravel(),
         "estimate": (found.reading + found.error).ravel(),

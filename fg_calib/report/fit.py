@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import RenderableType
 
-from fg_calib.analysis.goodness import FLAGS, PREDICTION_VERDICTS, VERDICTS, SuspectConfiguration
-from fg_calib.analysis.residual_table import FAMILIES, ROW_KINDS
+from fg_calib.analysis.goodness import FLAGS, PREDICTION_VERDICTS, VERDICTS, KindFit, SuspectConfiguration
 from fg_calib.analysis.uncertainty import LIKE_NOISE, Uncertainty
 from fg_calib.analysis.verdict import probability
 from fg_calib.graph.solver import Solution
-from fg_calib.report.tables import FAMILY_UNIT, SHOWN, indented, plain_table, rounded, section
+from fg_calib.report.tables import SHOWN, indented, plain_table, rounded, section
 
 Integers = NDArray[np.int64]
 
@@ -34,9 +33,9 @@ def goodness_of_fit(solution: Solution, uncertainty: Uncertainty) -> Iterable[Re
         if estimated is not None:
             seen = fit.factor
             settled = "estimated" if solution.converged else "not settled: the estimate has not converged"
-            words = settled if fit.kind in estimated else "too few rows to estimate it: as stated"
+            words = settled if (fit.table, fit.kind) in estimated else "too few rows to estimate it: as stated"
         table.add_row(
-            fit.kind,
+            _of_table(solution, fit),
             shown,
             f"{fit.stated_sigma_rms * factor:.{decimals}f}",
             "-" if np.isnan(seen) else f"{seen * fit.stated_sigma_rms * factor:.{decimals}f}",
@@ -52,8 +51,9 @@ def _goodness_lines(solution: Solution, uncertainty: Uncertainty) -> Iterable[st
     goodness, estimated = uncertainty.goodness, solution.estimated_noise
     verdicts = {fit.verdict for fit in goodness.kinds}
     if estimated and solution.converged:
+        kinds = " and ".join(dict.fromkeys(kind for _, kind in estimated))
         yield (
-            f"{' and '.join(estimated)} noise was estimated from these residuals: chi-square says nothing about it, and"
+            f"{kinds} noise was estimated from these residuals: chi-square says nothing about it, and"
             f" {len(estimated)} of its degrees of freedom went there"
         )
     elif estimated is None and verdicts & {"too large", "too small", "both"} and uncertainty.noise_may_be_estimated:
@@ -61,7 +61,7 @@ def _goodness_lines(solution: Solution, uncertainty: Uncertainty) -> Iterable[st
     if uncertainty.noise_like is not None and uncertainty.noise_like < LIKE_NOISE:
         yield "the residuals follow the arm, as noise does not: effects that are not modelled"
     if estimated is None and verdicts & {"outliers", "both"}:
-        may_weigh = solution.problem.adjustment.weights is None and not uncertainty.points
+        may_weigh = solution.problem.state.weights is None
         yield "look at the suspicious rows below" + (", or let a robust loss weigh them: loss in the job" * may_weigh)
     if not len(goodness.suspects) and not goodness.configurations:
         yield f"no row (|studentised residual| above {goodness.level:.2f}) and no configuration is suspicious"
@@ -72,7 +72,13 @@ def with_joint_noise(solution: Solution) -> str:
     return ", stated with joint noise" if np.any(solution.problem.measurements.sigma_joint > 0.0) else ""
 
 
-def prediction(uncertainty: Uncertainty) -> list[RenderableType]:
+def _of_table(solution: Solution, fit: KindFit) -> str:
+    """A kind of noise, with its table where there are several."""
+    labels = solution.problem.data.labels
+    return fit.kind if len(labels) == 1 else f"{fit.kind} of {labels[fit.table]}"
+
+
+def prediction(solution: Solution, uncertainty: Uncertainty) -> list[RenderableType]:
     """How well the test rows are predicted, by kind; no section without test rows."""
     fit = uncertainty.goodness.test
     if fit is None:
@@ -83,7 +89,7 @@ def prediction(uncertainty: Uncertainty) -> list[RenderableType]:
     for kind in fit.kinds:
         ratio = kind.seen_over_stated / kind.factor
         table.add_row(
-            kind.kind,
+            _of_table(solution, kind),
             f"{kind.n}",
             f"{kind.chi2:.4g}",
             f"{kind.expected:.4g}",
@@ -138,7 +144,7 @@ def _poses_behind(
             break
         worst = max(wrong, key=lambda pose: (of_pose[pose], -pose))
         n, all_of_it = of_pose[worst], n_pairs[worst]
-        name = problem.measurements.ids[worst]
+        name = problem.data.names[worst]
         lines.append(f"pose {name} is in {n} of {n_suspicious} suspicious pairs, and in {all_of_it} pairs in all")
         left = {pair for pair in left if worst not in pair}
     if len(lines) > limit:
@@ -148,17 +154,17 @@ def _poses_behind(
 
 def _suspects(solution: Solution, uncertainty: Uncertainty, suspects: Integers, limit: int = 5) -> RenderableType:
     """The rows least likely, by studentised residual."""
-    rows, goodness, names = uncertainty.residuals, uncertainty.goodness, solution.problem.measurements.end_names
+    rows, goodness, names = uncertainty.residuals, uncertainty.goodness, solution.problem.end_names
     table = plain_table(
         *(("a", "left"), ("b", "left"), ("", "left"), ("residual", "right"), ("", "left")),
         *(("in its sigma", "right"), ("", "left")),
     )
     for i in suspects[:limit]:
-        factor, shown, decimals = SHOWN[FAMILY_UNIT[FAMILIES[rows.family[i]]]]
+        factor, shown, decimals = SHOWN[rows.kinds[rows.kind_code[i]].unit]
         table.add_row(
             names[rows.a[i] + 1],
             names[rows.b[i] + 1],
-            ROW_KINDS[rows.kind_code[i]],
+            rows.kinds[rows.kind_code[i]].name,
             rounded(rows.after[i] * factor, decimals, "+"),
             shown,
             f"{goodness.studentised[i]:+.1f}",
@@ -173,7 +179,7 @@ def _suspect_configurations(
     solution: Solution, found: tuple[SuspectConfiguration, ...], limit: int = 3
 ) -> RenderableType:
     """The configurations least likely, by all the rows that they take part in."""
-    names = solution.problem.measurements.end_names
+    names = solution.problem.end_names
     table = plain_table(("", "left"), ("rows", "right"), ("chi-square", "right"), ("expected", "right"))
     for c in found[:limit]:
         table.add_row(names[c.configuration + 1], f"{c.n}", f"{c.chi2:.4g}", f"{c.expected:.4g}")

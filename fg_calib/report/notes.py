@@ -10,6 +10,7 @@ from fg_calib.analysis.goodness import OUTLIER_WEIGHT
 from fg_calib.analysis.uncertainty import ParameterEstimate, Uncertainty
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
+from fg_calib.measurements.kinds import SamePoint
 from fg_calib.report.tables import SHOWN, rounded
 from fg_calib.robot.model import names_of
 
@@ -22,21 +23,22 @@ def notes(solution: Solution, uncertainty: Uncertainty) -> Iterable[str]:
     for reason, count in solution.problem.n_excluded.items():
         if count:
             yield f"{count} train rows take no part: {reason.replace('_', ' ')}"
-    judgement, pairs = solution.problem.judgement, solution.problem.pairs
-    if judgement is not None and pairs is not None and (same := int(np.sum(judgement.same_point & ~pairs.test))):
+    if same := solution.problem.data.n_train(SamePoint):
         yield f"{same} train pairs are one point twice: three coordinates each instead of a distance"
-    if pairs is None and solution.problem.measurements.pairs is not None:
-        unused, model = solution.problem.measurements.pairs.source, solution.problem.options.model
-        yield f"{unused} is not used: model {model} is of poses, not of pairs"
+    for table in solution.problem.data.tables:
+        if not table.uses_pairs and table.measurements.pairs is not None:
+            yield f"{table.measurements.pairs.source} is not used: model {table.model} is of poses, not of pairs"
     yield from _sharing_notes(solution.problem)
     yield from uncertainty.cautions
-    weights = solution.problem.adjustment.weights
+    weights, series = solution.problem.state.weights, solution.problem.data.series
     if weights is not None:
-        test = solution.problem.measurements.test if pairs is None else pairs.test
-        n, what = int(np.sum(weights[~test] < OUTLIER_WEIGHT)), "poses" if pairs is None else "pairs"
+        n = sum(int(np.sum(w[s.train] < OUTLIER_WEIGHT)) for s, w in zip(series, weights, strict=True))
+        n_train = sum(len(s.train) for s in series)
+        kinds = {("touches", "poses", "pairs")[s.kind.ends if not s.kind.n_nuisances else 0] for s in series}
+        what = kinds.pop() if len(kinds) == 1 else "measurements"
         yield (
-            f"loss {solution.problem.options.loss}: {n} of {int(np.sum(~test))} {what} lost more than half their"
-            " weight and count for nothing in chi-square"
+            f"loss {solution.problem.options.loss}: {n} of {n_train} {what} lost more than half"
+            " their weight and count for nothing in chi-square"
         )
     yield from _open_notes(solution, uncertainty)
     turned = {p.name.split(".")[0] for p in uncertainty.parameters if _is_a_turn(p)}
@@ -81,14 +83,7 @@ def _open_notes(solution: Solution, uncertainty: Uncertainty) -> Iterable[str]:
 def _sharing_notes(problem: Problem) -> Iterable[str]:
     """How errors that pairs share were dealt with."""
     pairs, configurations = problem.n_pairs, problem.n_configurations
-    if problem.approximate:
-        yield (
-            f"{pairs} pairs share the errors of {configurations} configurations, too many to carry them: pairs are"
-            " weighted as independent, and sigmas account for what they share"
-        )
-        if problem.formed and pairs > 2 * configurations:
-            yield "model pose with frame unknown uses all that these poses hold, at less cost"
-    elif problem.formed and problem.sharing != problem.common and pairs >= configurations:
+    if problem.formed and problem.missing_correlation and pairs >= configurations:
         yield (
             f"{pairs} pairs are formed from {configurations} poses and counted as independent: the sigmas are too"
             " small, by a factor where there are many more pairs than poses"

@@ -22,7 +22,14 @@ SHOWN = {"m": (1e3, "mm", 4), "rad": (180.0 / np.pi, "deg", 5)}
 """Factor, unit and decimals in which a quantity is shown."""
 
 FAMILY_UNIT = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad", "point": "m"}
-"""Unit of each kind of residual."""
+"""Unit of the usual kinds of residual, in the order in which reports show them."""
+
+
+def in_order(families: Iterable[str]) -> list[str]:
+    """Kinds of residual in the order in which reports show them."""
+    there = list(families)
+    return [f for f in FAMILY_UNIT if f in there] + [f for f in there if f not in FAMILY_UNIT]
+
 
 INDENT = 2
 """Columns by which sentences, and rows without room, are indented."""

@@ -13,11 +13,13 @@ from fg_calib.analysis.joint_values import JointValues
 from fg_calib.analysis.uncertainty import FrameEstimate, Uncertainty
 from fg_calib.analysis.verdict import chi2_in_words, probability
 from fg_calib.graph.solver import Solution
+from fg_calib.measurements.kinds import PointDistance, TouchedPoint
+from fg_calib.measurements.series import Table
 from fg_calib.report.fit import goodness_of_fit, prediction, suspicious, with_joint_noise
 from fg_calib.report.identifiability import WEAK, lost_directions, weak_directions
 from fg_calib.report.notes import notes
 from fg_calib.report.parameters import combinations, parameters
-from fg_calib.report.tables import FAMILY_UNIT, SHOWN, WIDTH, indented, plain_table, plain_text, rounded, section
+from fg_calib.report.tables import SHOWN, WIDTH, in_order, indented, plain_table, plain_text, rounded, section
 
 
 def format_report(solution: Solution, uncertainty: Uncertainty, width: int = WIDTH) -> str:
@@ -33,9 +35,9 @@ def build_report(solution: Solution, uncertainty: Uncertainty) -> RenderableType
         *section(
             f"Goodness of fit (1 sigma of a row{with_joint_noise(solution)})", *goodness_of_fit(solution, uncertainty)
         ),
-        *prediction(uncertainty),
+        *prediction(solution, uncertainty),
         *_expected_error(uncertainty.expected_error),
-        *section("Residuals (RMS)", _residuals(uncertainty)),
+        *section("Residuals (RMS)", _residuals(solution, uncertainty)),
     ]
     if uncertainty.names or not solution.problem.evaluated:
         parts += section("Parameters", parameters(uncertainty))
@@ -43,8 +45,10 @@ def build_report(solution: Solution, uncertainty: Uncertainty) -> RenderableType
         parts += section("What kept parameters were estimated for", combinations(uncertainty))
     parts += suspicious(solution, uncertainty)
     parts += _joint_values(solution, uncertainty.joint_values)
-    if uncertainty.frame is not None:
-        parts += section("Measurement frame (world_T_base)", _frame(uncertainty.frame))
+    for frame, variable in zip(uncertainty.frames, solution.problem.variables.frames, strict=True):
+        labels = solution.problem.data.labels
+        which = "" if len(labels) == 1 else f" of {labels[int(variable.symbol[2:-1])]}"
+        parts += section(f"Measurement frame (world_T_base{which})", _frame(frame))
     if uncertainty.identifiability.lost:
         parts += section("What the data do not determine", lost_directions(uncertainty.identifiability.lost))
     weak = weak_directions(uncertainty.observability)
@@ -57,16 +61,15 @@ def build_report(solution: Solution, uncertainty: Uncertainty) -> RenderableType
 
 
 def _verdict(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
-    settings = solution.problem.options
-    what = f"{solution.problem.robot.name}: {settings.model}"
-    if settings.uses_pairs:
-        points, measured = solution.problem.points, solution.problem.measurements.pairs is not None
-        if measured or solution.problem.formed:
-            what += ", measured pairs" if measured else f", pairs: {settings.pairing}"
-        what += "" if points is None else f", {len(points.estimated)} touched points"
-    elif settings.frame == "unknown":
-        what += ", measurement frame unknown"
-    if solution.problem.adjustment.joint_errors is not None or solution.problem.joints is not None:
+    problem, settings = solution.problem, solution.problem.options
+    labels = problem.data.labels
+    tables = [_in_words(table) for table in problem.data.tables]
+    if len(labels) > 1:
+        tables = [f"{label} ({words})" for label, words in zip(labels, tables, strict=True)]
+    what = f"{problem.robot.name}: {'; '.join(tables)}"
+    touched = sum(v.symbol.startswith("L") for v in problem.variables.nuisance)
+    what += f", {touched} touched points" if problem.data.touched else ""
+    if problem.state.joint_errors is not None:
         what += ", joint values estimated"
     what += "" if settings.loss == "none" else f", loss {settings.loss}"
     lines = [Text(what), *(Text(f"DOUBTFUL: {finding}", style="bold red") for finding in uncertainty.findings)]
@@ -83,14 +86,33 @@ def _verdict(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
     return Group(*lines)
 
 
+def _in_words(table: Table) -> str:
+    """What a table is of."""
+    kinds = [type(own.kind).__name__ for own in table.own]
+    if table.model is None:
+        return ", ".join(kinds)
+    words = [table.model, *kinds]
+    if table.uses_pairs and table.measurements.pairs is not None:
+        words.append("measured pairs")
+    elif table.uses_pairs and (table.measurements.position is not None or table.measurements.rotation is not None):
+        words.append(f"pairs: {table.pairing}")
+    elif table.unknown_frame:
+        words.append("measurement frame unknown")
+    return ", ".join(words)
+
+
 def _statistics(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
     problem = solution.problem
     rows = [("configurations", f"{problem.n_configurations}")]
-    if problem.options.uses_pairs and (problem.points is None or problem.n_pairs):
+    if problem.pair_series:
         rows.append(("pairs", f"{problem.n_pairs}"))
-    if problem.points is not None:
-        rows.append(("touches", f"{problem.points.train.sum()} of {len(problem.points.estimated)} points"))
-        rows.append(("distances of points", f"{problem.points.used.sum()}"))
+    if problem.data.touched:
+        n_points = sum(v.symbol.startswith("L") for v in problem.variables.nuisance)
+        touches, between = (problem.data.n_train(kind) for kind in (TouchedPoint, PointDistance))
+        rows += [("touches", f"{touches} of {n_points} points"), ("distances of points", f"{between}")]
+    if problem.added:
+        chi2 = 2.0 * sum(factor.error(solution.values) for factor in problem.added)
+        rows.append(("added factors", f"{len(problem.added)} with {problem.n_added} rows, chi-square {chi2:.6g}"))
     reduced = uncertainty.reduced_chi2
     low, high = uncertainty.chi2_bounds
     determined = uncertainty.spread.rank
@@ -136,21 +158,22 @@ def _expected_error(expected: ExpectedError | None) -> list[RenderableType]:
     return section(f"Expected tool error (RMS at {expected.n}{which} {expected.at} configurations)", table)
 
 
-def _residuals(uncertainty: Uncertainty) -> RenderableType:
-    rms = uncertainty.residuals.rms()
+def _residuals(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
+    residuals, labels = uncertainty.residuals, solution.problem.data.labels
     table = plain_table(
         ("", "left"), ("", "left"), *[(h, "right") for h in ("train before", "after", "test before", "after")]
     )
-    for family, unit in FAMILY_UNIT.items():
+    for number, family in sorted(residuals.groups, key=lambda g: (in_order(residuals.families).index(g[1]), g[0])):
+        rms = residuals.rms(number)
         if family not in rms["train"] and family not in rms["test"]:
             continue
-        factor, shown, _ = SHOWN[unit]
+        factor, shown, _ = SHOWN[residuals.unit(family)]
         figures = [
             f"{rms[split][family][when] * factor:.4f}" if family in rms[split] else "-"
             for split in ("train", "test")
             for when in ("before", "after")
         ]
-        table.add_row(family, shown, *figures)
+        table.add_row(family if len(labels) == 1 else f"{family} of {labels[number]}", shown, *figures)
     return table
 
 
@@ -168,7 +191,7 @@ def _joint_values(solution: Solution, found: JointValues | None, limit: int = 5)
     if not found.suspects:
         return parts
     wrong = plain_table(("", "left"), ("", "left"), ("error", "right"), ("", "left"), ("in its sigma", "right"))
-    names = solution.problem.measurements.end_names
+    names = solution.problem.end_names
     for i, k in found.suspects[:limit]:
         factor, shown, decimals = SHOWN[joints[found.joints[k]].unit]
         error = rounded(found.error[i, k] * factor, decimals, "+")

@@ -18,8 +18,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from fg_calib.arrays import as_floats, as_rotations
+from fg_calib.options import check_number, check_type
 from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
 from fg_calib.robot.model import Robot
 
@@ -75,36 +77,39 @@ def random_readings(robot: Robot, n: int, generator: np.random.Generator) -> Flo
 
 def solve_inverse(
     robot: Robot,
-    rotation: Floats,
-    position: Floats,
-    generator: np.random.Generator,
+    position: ArrayLike,
+    rotation: ArrayLike | None = None,
     *,
-    near: Floats | None = None,
+    near: ArrayLike | None = None,
+    generator: np.random.Generator | None = None,
     n_starts: int = N_STARTS,
 ) -> Inverse:
-    """Configurations within the joint limits that bring the tool to poses.
+    """Configurations within the joint limits that bring the tool to poses, or its point to positions.
 
     Args:
         robot: The robot, at its nominal values.
-        rotation: base_R_tool, shape (n_poses, 3, 3).
-        position: base_p_tool, shape (n_poses, 3), [m].
-        generator: Draws the starts.
+        position: base_p_tool, shape (n_poses, 3), or (3,) of one pose, [m].
+        rotation: base_R_tool, shape (n_poses, 3, 3), or (3, 3) of one pose; any if None.
         near: Configuration to start from, shape (n_joints,) or (n_poses, n_joints), [rad] (prismatic: [m]), for
             solutions that stay near it; further starts are drawn ever wider about it. Random starts if None.
+        generator: Draws the starts; one seeded with 0 if None.
         n_starts: How many starts are tried for each pose.
+
+    Raises:
+        InputError: A target, or where to start, is not of such a shape, not finite, or no rotation.
 
     Note:
         That no start ends at a pose does not prove that none could. The result of one pose does not depend on the
         others but for the starts: these are drawn pose by pose, so the first ones agree.
     """
-    n_poses, n_joints = len(position), robot.n_joints
-    lower, upper = robot.limits.T
-    if near is None:
-        starts = random_readings(robot, n_poses * n_starts, generator).reshape(n_poses, n_starts, n_joints)
-    else:
-        spread = np.linspace(0.0, 1.0, n_starts)[:, None]  # [rad] (prismatic: [m]), 0 for the first start
-        starts = np.atleast_2d(near)[:, None, :] + spread * generator.normal(size=(n_poses, n_starts, n_joints))
-        starts = np.clip(starts, lower, upper)
+    position = as_floats("position", np.atleast_2d(position), "(n, 3)")
+    if rotation is not None:
+        rotation = as_rotations("rotation", rotation if np.ndim(rotation) == 3 else [rotation], len(position))
+    check_type("generator", generator, np.random.Generator, "numpy.random.default_rng(0)")
+    generator = np.random.default_rng(0) if generator is None else generator
+    check_number("n_starts", n_starts, least=1, whole=True)
+    n_poses = len(position)
+    starts = _starts(robot, near, (n_poses, n_starts, robot.n_joints), generator)
     search = _Search(robot, rotation, position)
     pending = np.arange(n_poses)  # rows still to be solved, and where each of them stands
     tried, steps = np.zeros(n_poses, dtype=np.int64), np.zeros(n_poses, dtype=np.int64)
@@ -129,10 +134,24 @@ def solve_inverse(
     return Inverse(best, search.length * np.linalg.norm(missed[:, 3:], axis=1), np.linalg.norm(missed[:, :3], axis=1))
 
 
+def _starts(
+    robot: Robot, near: ArrayLike | None, shape: tuple[int, int, int], generator: np.random.Generator
+) -> Floats:
+    """Configurations to start from, random or ever wider about one, shape (n_poses, n_starts, n_joints)."""
+    n_poses, n_starts, n_joints = shape
+    if near is None:
+        return random_readings(robot, n_poses * n_starts, generator).reshape(shape)
+    middle = as_floats("near", near, f"({n_joints})" if np.ndim(near) == 1 else f"({n_poses}, {n_joints})")
+    spread = np.linspace(0.0, 1.0, n_starts)[:, None]  # [rad] (prismatic: [m]), 0 for the first start
+    starts = np.atleast_2d(middle)[:, None, :] + spread * generator.normal(size=shape)
+    lower, upper = robot.limits.T
+    return np.clip(starts, lower, upper)
+
+
 class _Search:
     """Misses and steps towards poses, lengths over the arm's length so that they weigh like angles."""
 
-    def __init__(self, robot: Robot, rotation: Floats, position: Floats) -> None:
+    def __init__(self, robot: Robot, rotation: Floats | None, position: Floats) -> None:
         self._chain = build_chain(robot).with_joint_columns()
         self._robot = robot
         self._rotation, self._position = rotation, position
@@ -152,11 +171,14 @@ class _Search:
             derivative, each joint in its own unit of step, shape (n, 6, n_joints).
         """
         at = forward(self._chain, precompute_trig(self._robot, q))
-        turn = self._rotation[rows] @ np.swapaxes(at.rotation, 1, 2)  # (n, 3, 3)
-        miss = np.concatenate([_rotation_vector(turn), (self._position[rows] - at.position) / self.length], axis=1)
+        shift = (self._position[rows] - at.position) / self.length
         jacobian = at.jacobian * self._unit
         jacobian[:, 3:] /= self.length
-        return miss, jacobian
+        if self._rotation is None:  # any will do
+            jacobian[:, :3] = 0.0
+            return np.concatenate([np.zeros_like(shift), shift], axis=1), jacobian
+        turn = self._rotation[rows] @ np.swapaxes(at.rotation, 1, 2)  # (n, 3, 3)
+        return np.concatenate([_rotation_vector(turn), shift], axis=1), jacobian
 
     def step(self, q: Floats, miss: Floats, jacobian: Floats) -> Floats:
         """The next configurations, within the limits, shape (n, n_joints)."""

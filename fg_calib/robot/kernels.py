@@ -1,10 +1,15 @@
-"""The compiled loops: the walk down a chain, and the rows of a Jacobian for each kind of measurement.
+"""The compiled loops: the walk down a chain, and the rows of a Jacobian for any kind of measurement.
 
 All of this is compiled by numba and runs on blocks of `LANES` configurations at once: arrays are shaped
 (..., LANES) and the innermost loop runs over configurations, which the compiler turns into vector instructions.
 (Inside the walk rotation and point are flat, so that it sees at which constant distance columns lie and that they do
 not overlap.) Sine and cosine of the readings are taken once a data set (`precompute_trig`) and combined with those of
 the parameters by the addition theorem, so no trigonometry happens inside.
+
+A kind of measurement gives its residual and its wrench rows D: derivatives in a turn w about the base's axes through
+the tool point and in a shift dp of that point (see `measurements.kinds`). A column's twist (w, v) moves the point by
+`w x p + v`, so in its coordinates the rows are `(D_w + p x D_p, D_p)`: six products a row, column and end, three where
+a column only translates. What a kind computes in numpy a *twin* may compute here, `LANES` measurements at once.
 
 All kernels stand in this one file because numba's cache looks at the file of the outermost kernel alone: a change in
 any of them then has all of them compiled anew.
@@ -15,11 +20,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 from numba.core import event
+from numpy.typing import NDArray
 
 logger = logging.getLogger(__name__)
 
@@ -53,32 +59,58 @@ def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]
 
 
 inlined = partial(compiled, forceinline=True)
-"""As `compiled`, for a part of a kernel that must see its caller's constants."""
+"""As `compiled`, for a part of a kernel that must see its caller's constants, or is faster in its place."""
 
 
 event.register("numba:compile", _CompileNotice())
 
 
-@compiled
-def walk(axis, value, cosine, sine, sign, joint, column, n_columns, n_own, trig, rows, start, rotation, point, twist):  # type: ignore[no-untyped-def]
+class ChainArrays(NamedTuple):
+    """What the kernels take of a `kinematics.Chain`: arrays with an entry an element, then the counts.
+
+    Attributes:
+        axis: `model.Axis`.
+        value: Value without the reading, [m] or [rad].
+        cosine: Of the value.
+        sine: Of the value.
+        sign: Factor of parameter and reading.
+        joint: Index of the joint whose reading is added, -1 for none.
+        column: Jacobian column of the parameter, -1 for none.
+        n_columns: Number of parameter columns.
+        n_own: Number of joint columns: that of the joints, or 0.
+        turns: For each column, then each joint, whether it belongs to a rotation.
+        basis: Column of `trig` by which the element's value is multiplied, after those of the joints; -1 for none.
+    """
+
+    axis: NDArray[np.int8]
+    value: NDArray[np.float64]
+    cosine: NDArray[np.float64]
+    sine: NDArray[np.float64]
+    sign: NDArray[np.float64]
+    joint: NDArray[np.int64]
+    column: NDArray[np.int64]
+    n_columns: int
+    n_own: int
+    turns: NDArray[np.bool_]
+    basis: NDArray[np.int64]
+
+
+@inlined
+def walk(chain, trig, row, rotation, point, twist):  # type: ignore[no-untyped-def]
     """Walk `LANES` configurations down the chain.
 
     Args:
-        axis, value, cosine, sine, sign, joint, column, n_columns, n_own: `Chain.arguments`.
+        chain: `ChainArrays`.
         trig: From `precompute_trig`, shape (n, n_joints, 2).
-        rows: Rows of `trig`, shape (m,); positions beyond its end repeat the last.
-        start: Position in `rows` of the first lane.
+        row: Row of `trig` of each lane, shape (LANES,).
         rotation: Filled: rotation matrix, [column, component, lane], shape (3, 3, LANES).
         point: Filled: tool point, shape (3, LANES), [m].
         twist: Filled: (w, v) of each column, then of each joint, shape (n_columns + n_own, 6, LANES): the sum over the
             elements that it belongs to. Must come with w = 0 for columns of translations alone.
     """
-    last = rows.shape[0] - 1
-    row = np.empty(LANES, np.int64)
+    axis, value, cosine, sine, sign, joint, column, n_columns, n_own, _, basis = chain
     reading = np.empty(2 * LANES)
     written = np.zeros(twist.shape[0], np.bool_)
-    for i in range(LANES):
-        row[i] = rows[min(start + i, last)]
     R, p = rotation.reshape(9 * LANES), point.reshape(3 * LANES)
     R[:] = 0.0
     p[:] = 0.0
@@ -88,6 +120,10 @@ def walk(axis, value, cosine, sine, sign, joint, column, n_columns, n_own, trig,
         R[8 * LANES + i] = 1.0
     for e in range(axis.shape[0]):
         k, j = axis[e], joint[e]
+        if basis[e] >= 0:
+            own = n_columns + j if n_own > 0 and j >= 0 else -1
+            _walk_basis(k, value[e], sign[e], trig, row, basis[e], column[e], own, reading, R, p, twist, written)
+            continue
         for target in (column[e], n_columns + j if n_own > 0 and j >= 0 else -1):
             if target < 0:
                 continue
@@ -199,18 +235,45 @@ def _turn_by_reading(reading, R, a, b):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def walk_all(  # type: ignore[no-untyped-def]
-    axis, value, cosine, sine, sign, joint, column, n_columns, n_own, trig, rows, start, stop, out_R, out_p, out_J
-):
+def _walk_basis(k, coefficient, sign, trig, row, basis, column, own, reading, R, p, twist, written):  # type: ignore[no-untyped-def]
+    """An element whose value is a coefficient times a basis function, which `trig` has with its slope."""
+    for target, which in ((column, 0), (own, 1)):
+        if target >= 0:
+            factor = sign if which == 0 else coefficient
+            more = np.zeros((6, LANES))
+            if k >= 3:
+                _write_rotation_twist(factor, R, k - 3, p, more)
+            else:
+                _write_translation_twist(factor, R, k, more)
+            for c in range(6):
+                for i in range(LANES):
+                    known = twist[target, c, i] if written[target] else 0.0
+                    twist[target, c, i] = known + trig[row[i], basis, which] * more[c, i]
+            written[target] = True
+    for i in range(LANES):
+        angle = coefficient * trig[row[i], basis, 0]
+        reading[i] = angle if k < 3 else np.cos(angle)
+        reading[LANES + i] = np.sin(angle)
+    if k < 3:
+        _shift_by_reading(0.0, 1.0, reading, R, k, p)
+    elif k == 3:
+        _turn_by_reading(reading, R, 1, 2)
+    elif k == 4:
+        _turn_by_reading(reading, R, 2, 0)
+    else:
+        _turn_by_reading(reading, R, 0, 1)
+
+
+@compiled
+def walk_all(chain, trig, rows, start, stop, out_R, out_p, out_J):  # type: ignore[no-untyped-def]
     """Rotation (n, 3, 3), point (n, 3) and derivatives (n, 6, n_columns + n_own) of rows start to stop."""
-    n_twists = n_columns + n_own
-    rotation, point = np.empty((3, 3, LANES)), np.empty((3, LANES))
+    n_twists = chain.n_columns + chain.n_own
+    rotation, point, row = np.empty((3, 3, LANES)), np.empty((3, LANES)), np.empty(LANES, np.int64)
     twist = np.zeros((n_twists, 6, LANES))
     for first in range(start, stop, LANES):
-        walk(
-            axis, value, cosine, sine, sign, joint, column, n_columns, n_own,
-            trig, rows, first, rotation, point, twist,
-        )  # fmt: skip
+        for i in range(LANES):
+            row[i] = rows[min(first + i, stop - 1)]
+        walk(chain, trig, row, rotation, point, twist)
         for i in range(min(LANES, stop - first)):
             n = first + i
             for r in range(3):
@@ -227,209 +290,304 @@ def walk_all(  # type: ignore[no-untyped-def]
 
 
 @compiled
-def fill_pairs(  # type: ignore[no-untyped-def]
-    axis, value, cosine, sine, sign, joint, column, n_columns, n_own, turns,
-    trig, a, b, measured, whitening, with_distance, with_angle, start, stop, panel,
-):  # fmt: skip
-    """Distances and rotation angles of pairs start to stop (see `residuals.PairBlock`)."""
-    n_twists = n_columns + n_own
-    R_A, R_B = np.empty((3, 3, LANES)), np.empty((3, 3, LANES))
-    p_A, p_B = np.empty((3, LANES)), np.empty((3, LANES))
-    t_A, t_B = np.zeros((n_twists, 6, LANES)), np.zeros((n_twists, 6, LANES))
-    u, k, m_A, m_B = np.empty((3, LANES)), np.empty((3, LANES)), np.empty((3, LANES)), np.empty((3, LANES))
-    w_dd, w_ad, w_aa = np.empty(LANES), np.empty(LANES), np.empty(LANES)
-    distance, angle = np.empty(LANES), np.empty(LANES)
-    d_A, d_B, a_A, a_B = np.empty(LANES), np.empty(LANES), np.empty(LANES), np.empty(LANES)
-    angle_row = 1 if with_distance else 0
-    last_row = panel.shape[0] - 1
-    for first in range(start, stop, LANES):
-        at = first - start
-        walk(axis, value, cosine, sine, sign, joint, column, n_columns, n_own, trig, a, first, R_A, p_A, t_A)
-        walk(axis, value, cosine, sine, sign, joint, column, n_columns, n_own, trig, b, first, R_B, p_B, t_B)
-        for i in range(LANES):
-            n = first + i
-            w_dd[i], w_ad[i], w_aa[i], distance[i], angle[i] = 0.0, 0.0, 0.0, 0.0, 0.0
-            if n < stop:
-                w_dd[i], w_ad[i], w_aa[i] = whitening[n, 0], whitening[n, 1], whitening[n, 2]
-                distance[i], angle[i] = measured[n, 0], measured[n, 1]
-        for i in range(LANES):
-            x, y, z = p_B[0, i] - p_A[0, i], p_B[1, i] - p_A[1, i], p_B[2, i] - p_A[2, i]
-            length = np.sqrt(x * x + y * y + z * z)
-            inverse = 1.0 / max(length, 1e-300)
-            u[0, i], u[1, i], u[2, i] = x * inverse, y * inverse, z * inverse
-            distance[i] = length - distance[i]
-        for c in range(3):
-            for i in range(LANES):
-                m_A[c, i] = p_A[(c + 1) % 3, i] * u[(c + 2) % 3, i] - p_A[(c + 2) % 3, i] * u[(c + 1) % 3, i]
-                m_B[c, i] = p_B[(c + 1) % 3, i] * u[(c + 2) % 3, i] - p_B[(c + 2) % 3, i] * u[(c + 1) % 3, i]
-        if with_angle:
-            for i in range(LANES):
-                x, y, z, trace = 0.0, 0.0, 0.0, 0.0
-                for c in range(3):
-                    x += R_A[c, 1, i] * R_B[c, 2, i] - R_A[c, 2, i] * R_B[c, 1, i]
-                    y += R_A[c, 2, i] * R_B[c, 0, i] - R_A[c, 0, i] * R_B[c, 2, i]
-                    z += R_A[c, 0, i] * R_B[c, 1, i] - R_A[c, 1, i] * R_B[c, 0, i]
-                    trace += R_A[c, 0, i] * R_B[c, 0, i] + R_A[c, 1, i] * R_B[c, 1, i] + R_A[c, 2, i] * R_B[c, 2, i]
-                twice_sine = np.sqrt(x * x + y * y + z * z)
-                inverse = 1.0 / max(twice_sine, 1e-300)
-                k[0, i], k[1, i], k[2, i] = x * inverse, y * inverse, z * inverse
-                angle[i] = np.arctan2(twice_sine, trace - 1.0) - angle[i]
-        if with_distance:
-            for i in range(LANES):
-                panel[last_row, 0, at + i] = w_dd[i] * distance[i]
-        if with_angle:
-            for i in range(LANES):
-                panel[last_row, angle_row, at + i] = w_ad[i] * distance[i] + w_aa[i] * angle[i]
-        for t in range(n_twists):
-            for i in range(LANES):
-                d_A[i] = u[0, i] * t_A[t, 3, i] + u[1, i] * t_A[t, 4, i] + u[2, i] * t_A[t, 5, i]
-                d_B[i] = u[0, i] * t_B[t, 3, i] + u[1, i] * t_B[t, 4, i] + u[2, i] * t_B[t, 5, i]
-            if turns[t]:
+def fill(chain, trig, ends, data, whitening, twins, given, turning, panel):  # type: ignore[no-untyped-def]
+    """Whitened derivatives and residuals of some measurements of any kind.
+
+    Args:
+        chain: `ChainArrays`.
+        trig: From `precompute_trig`, shape (n_configurations, n_joints, 2).
+        ends: Row of `trig` of each end, shape (n, n_ends).
+        data: What was measured, shape (n, width).
+        whitening: Lower triangles, row by row, shape (n, height * (height + 1) / 2).
+        twins: Of a kind that is computed here, part by part: code, first row, first column of `data`, shape (n_parts,
+            3).
+        given: Of another kind: residuals (n, height) and wrench rows (n, n_ends, height, 6). Of any: derivatives in
+            nuisances, shape (n, height, n_nuisances).
+        turning: Turn of the base in each column that the residual is turned back by, shape (3, n_columns); (3, 0) if
+            it is not.
+        panel: Filled: [column, row, measurement], shape (n_columns + n_ends * n_own + n_nuisances + 1, height, m), m
+            the next multiple of `LANES`; the last column is the residual, lanes without a measurement are zero.
+    """
+    n, n_ends = ends.shape
+    height, n_twists, n_nuisances = panel.shape[1], chain.n_columns + chain.n_own, given[2].shape[2]
+    turned = turning.shape[1] > 0
+    n_wrenches = n_ends + 1 if turned else n_ends  # the base is one more end
+    R, p = np.empty((n_ends, 3, 3, LANES)), np.empty((n_ends, 3, LANES))
+    T, D = np.zeros((n_wrenches, n_twists, 6, LANES)), np.zeros((n_wrenches, height, 6, LANES))
+    width = 6 * LANES if n_twists > 0 else LANES
+    r, weight, row = np.empty((height, LANES)), np.empty((whitening.shape[1], width)), np.empty(LANES, np.int64)
+    if turned:
+        for t in range(chain.n_columns):
+            for c in range(3):
                 for i in range(LANES):
-                    d_A[i] += t_A[t, 0, i] * m_A[0, i] + t_A[t, 1, i] * m_A[1, i] + t_A[t, 2, i] * m_A[2, i]
-                    d_B[i] += t_B[t, 0, i] * m_B[0, i] + t_B[t, 1, i] * m_B[1, i] + t_B[t, 2, i] * m_B[2, i]
-                if with_angle:
-                    for i in range(LANES):
-                        a_A[i] = k[0, i] * t_A[t, 0, i] + k[1, i] * t_A[t, 1, i] + k[2, i] * t_A[t, 2, i]
-                        a_B[i] = k[0, i] * t_B[t, 0, i] + k[1, i] * t_B[t, 1, i] + k[2, i] * t_B[t, 2, i]
-            else:
-                a_A[:] = 0.0
-                a_B[:] = 0.0
-            if t < n_columns:
-                if with_distance:
-                    for i in range(LANES):
-                        panel[t, 0, at + i] = w_dd[i] * (d_B[i] - d_A[i])
-                if with_angle:
-                    for i in range(LANES):
-                        panel[t, angle_row, at + i] = w_ad[i] * (d_B[i] - d_A[i]) + w_aa[i] * (a_B[i] - a_A[i])
-            else:
-                if with_distance:
-                    for i in range(LANES):
-                        panel[t, 0, at + i] = -w_dd[i] * d_A[i]
-                        panel[t + n_own, 0, at + i] = w_dd[i] * d_B[i]
-                if with_angle:
-                    for i in range(LANES):
-                        panel[t, angle_row, at + i] = -w_ad[i] * d_A[i] - w_aa[i] * a_A[i]
-                        panel[t + n_own, angle_row, at + i] = w_ad[i] * d_B[i] + w_aa[i] * a_B[i]
-
-
-@compiled
-def fill_same_points(  # type: ignore[no-untyped-def]
-    axis, value, cosine, sine, sign, joint, column, n_columns, n_own, turns,
-    trig, a, b, whitening, turning, start, stop, panel,
-):  # fmt: skip
-    """Vectors between the points of pairs start to stop (see `residuals.SamePointBlock`)."""
-    n_twists = n_columns + n_own
-    R, p_A, p_B = np.empty((3, 3, LANES)), np.empty((3, LANES)), np.empty((3, LANES))
-    t_A, t_B = np.zeros((n_twists, 6, LANES)), np.zeros((n_twists, 6, LANES))
-    weight, vector, raw = np.empty((3, 3, LANES)), np.empty((3, LANES)), np.empty((3, LANES))
-    last_row = panel.shape[0] - 1
-    for first in range(start, stop, LANES):
-        walk(axis, value, cosine, sine, sign, joint, column, n_columns, n_own, trig, a, first, R, p_A, t_A)
-        walk(axis, value, cosine, sine, sign, joint, column, n_columns, n_own, trig, b, first, R, p_B, t_B)
-        _gather_whitening(whitening, first, stop, weight)
-        for c in range(3):
+                    T[n_ends, t, c, i] = turning[c, t]
+    for first in range(0, n, LANES):
+        for e in range(n_ends):
             for i in range(LANES):
-                vector[c, i] = p_B[c, i] - p_A[c, i]
-        _write_whitened(weight, vector, 3, 1.0, panel[last_row], first - start)
-        for t in range(n_twists):
-            if t < n_columns:
-                _point_derivative(t_A[t], p_A, raw)
-                for c in range(3):
-                    for i in range(LANES):
-                        raw[c, i] = -raw[c, i]
-                _add_point_derivative(t_B[t], p_B, raw)
-                for c in range(3):
-                    d, e = (c + 1) % 3, (c + 2) % 3
-                    for i in range(LANES):
-                        raw[c, i] -= turning[d, t] * vector[e, i] - turning[e, t] * vector[d, i]
-                _write_whitened(weight, raw, 3, 1.0, panel[t], first - start)
-            else:
-                _point_derivative(t_A[t], p_A, raw)
-                _write_whitened(weight, raw, 3, -1.0, panel[t], first - start)
-                _point_derivative(t_B[t], p_B, raw)
-                _write_whitened(weight, raw, 3, 1.0, panel[t + n_own], first - start)
-
-
-@compiled
-def fill_poses(  # type: ignore[no-untyped-def]
-    axis, value, cosine, sine, sign, joint, column, n_columns, n_own, turns,
-    trig, rows, rotation, position, whitening, with_orientation, with_position, start, stop, panel,
-):  # fmt: skip
-    """Orientations and positions of measurements start to stop (see `residuals.PoseBlock`)."""
-    n_twists = n_columns + n_own
-    height = 3 * (with_orientation + with_position)
-    p0 = 3 if with_orientation else 0
-    R, p, twist = np.empty((3, 3, LANES)), np.empty((3, LANES)), np.zeros((n_twists, 6, LANES))
-    weight, raw, back = np.empty((height, height, LANES)), np.empty((height, LANES)), np.empty((3, 3, LANES))
-    last_row = panel.shape[0] - 1
-    for first in range(start, stop, LANES):
-        walk(axis, value, cosine, sine, sign, joint, column, n_columns, n_own, trig, rows, first, R, p, twist)
-        _gather_whitening(whitening, first, stop, weight)
-        if with_orientation:
+                row[i] = ends[min(first + i, n - 1), e]
+            walk(chain, trig, row, R[e], p[e], T[e])
+        _gather_whitening(whitening, first, weight)
+        if twins.shape[0] == 0:
+            _gather(given, first, r, D)
+        for k in range(twins.shape[0]):
+            _run_twin(twins[k], R, p, data, first, n_twists > 0, r, D)
+        if turned:
+            _turn_back(r, D[n_ends])
+        _whiten(weight, r)
+        for h in range(height):
             for i in range(LANES):
-                _orientation_residual(rotation[min(first + i, stop - 1)], R, i, raw, back)
-        if with_position:
-            for i in range(LANES):
-                n = min(first + i, stop - 1)
-                for c in range(3):
-                    raw[p0 + c, i] = p[c, i] - position[n, c]
-        _write_whitened(weight, raw, height, 1.0, panel[last_row], first - start)
-        for t in range(n_twists):
-            if with_orientation:
-                for c in range(3):
-                    for i in range(LANES):
-                        raw[c, i] = (
-                            back[c, 0, i] * twist[t, 0, i]
-                            + back[c, 1, i] * twist[t, 1, i]
-                            + back[c, 2, i] * twist[t, 2, i]
-                        )
-            if with_position:
-                _point_derivative(twist[t], p, raw[p0:])
-            _write_whitened(weight, raw, height, 1.0, panel[t], first - start)
+                panel[panel.shape[0] - 1, h, first + i] = r[h, i]
+        if n_twists > 0:
+            for e in range(n_wrenches):
+                if e < n_ends:
+                    _about_origin(p[e], D[e])
+                _whiten(weight, D[e].reshape(height, 6 * LANES))
+            _contract(chain, n_ends, T, D, panel, first)
+        if n_nuisances > 0:
+            _fill_nuisances(given[2], weight, first, panel)
+
+
+@inlined
+def _gather_whitening(whitening, first, weight):  # type: ignore[no-untyped-def]
+    """Whitening of each lane, zero where there is no measurement, once for each component of a wrench."""
+    n = whitening.shape[0]
+    for k in range(weight.shape[0]):
+        for i in range(LANES):
+            weight[k, i] = whitening[first + i, k] if first + i < n else 0.0
+        for i in range(LANES, weight.shape[1]):
+            weight[k, i] = weight[k, i - LANES]
 
 
 @compiled
-def _gather_whitening(whitening, first, stop, weight):  # type: ignore[no-untyped-def]
-    for i in range(LANES):
-        n = first + i
-        for r in range(weight.shape[0]):
-            for c in range(weight.shape[0]):
-                weight[r, c, i] = whitening[n, r, c] if n < stop else 0.0
+def _gather(given, first, r, D):  # type: ignore[no-untyped-def]
+    """Residuals and wrench rows that numpy computed, lane by lane."""
+    residual, wrenches, _ = given
+    n, n_ends, height, _ = wrenches.shape
+    for h in range(height):
+        for i in range(LANES):
+            r[h, i] = residual[min(first + i, n - 1), h]
+        for e in range(n_ends):
+            for c in range(6):
+                for i in range(LANES):
+                    D[e, h, c, i] = wrenches[min(first + i, n - 1), e, h, c]
 
 
 @compiled
-def _point_derivative(twist, p, out):  # type: ignore[no-untyped-def]
-    out[:3] = 0.0
-    _add_point_derivative(twist, p, out)
-
-
-@compiled
-def _add_point_derivative(twist, p, out):  # type: ignore[no-untyped-def]
+def _turn_back(r, D):  # type: ignore[no-untyped-def]
+    """Wrench rows of a turn a of the base by which a residual of three coordinates is turned back: -a x r."""
     for c in range(3):
         a, b = (c + 1) % 3, (c + 2) % 3
         for i in range(LANES):
-            out[c, i] += twist[a, i] * p[b, i] - twist[b, i] * p[a, i] + twist[3 + c, i]
+            D[c, c, i] = 0.0
+            D[c, a, i] = -r[b, i]
+            D[c, b, i] = r[a, i]
 
 
-@compiled
-def _write_whitened(weight, raw, height, factor, out, at):  # type: ignore[no-untyped-def]
-    """Lower triangular weight times raw, into out[row, at + lane]."""
-    for r in range(height):
-        for i in range(LANES):
-            out[r, at + i] = factor * weight[r, 0, i] * raw[0, i]
-        for c in range(1, r + 1):
-            for i in range(LANES):
-                out[r, at + i] += factor * weight[r, c, i] * raw[c, i]
-
-
-@compiled
-def _orientation_residual(measured, R, i, raw, back):  # type: ignore[no-untyped-def]
-    """Log(measured^T R) of lane i into raw[:3], and Jr^-1 R^T, which maps w to its derivative, into back."""
-    E = np.empty((3, 3))
-    for r in range(3):
+@inlined
+def _about_origin(p, D):  # type: ignore[no-untyped-def]
+    """Wrench rows about the tool point become those about the base's origin: D_w + p x D_p."""
+    for h in range(D.shape[0]):
         for c in range(3):
-            E[r, c] = measured[0, r] * R[c, 0, i] + measured[1, r] * R[c, 1, i] + measured[2, r] * R[c, 2, i]
+            a, b = (c + 1) % 3, (c + 2) % 3
+            for i in range(LANES):
+                D[h, c, i] += p[a, i] * D[h, 3 + b, i] - p[b, i] * D[h, 3 + a, i]
+
+
+@inlined
+def _whiten(weight, rows):  # type: ignore[no-untyped-def]
+    """Rows, [row, as many figures as lanes or six times these], become a lower triangle times them."""
+    height, size = rows.shape
+    for h in range(height - 1, -1, -1):
+        k = h * (h + 1) // 2
+        _scale(weight[k + h, :size], rows[h])
+        for g in range(h):
+            _add_scaled(weight[k + g, :size], rows[g], rows[h])
+
+
+@inlined
+def _scale(factor, row):  # type: ignore[no-untyped-def]
+    for i in range(row.shape[0]):
+        row[i] *= factor[i]
+
+
+@inlined
+def _add_scaled(factor, other, row):  # type: ignore[no-untyped-def]
+    for i in range(row.shape[0]):
+        row[i] += factor[i] * other[i]
+
+
+@inlined
+def _contract(chain, n_ends, T, D, panel, at):  # type: ignore[no-untyped-def]
+    """Wrench rows times twists: in each column the sum over the ends, in the joints each end by itself."""
+    n_wrenches, n_twists, height, size = T.shape[0], T.shape[1], D.shape[1], 6 * LANES
+    T, D = T.reshape(-1), D.reshape(-1)
+    for t in range(n_twists):
+        own = t >= chain.n_columns
+        for e in range(n_ends if own else n_wrenches):
+            column = t + e * chain.n_own if own else t
+            twist = T[(e * n_twists + t) * size : (e * n_twists + t + 1) * size]
+            for h in range(height):
+                wrench = D[(e * height + h) * size : (e * height + h + 1) * size]
+                if own or e == 0:
+                    _write_product(chain.turns[t], wrench, twist, panel[column, h, at : at + LANES])
+                else:
+                    _add_product(chain.turns[t], wrench, twist, panel[column, h, at : at + LANES])
+
+
+@inlined
+def _write_product(turns, D, T, out):  # type: ignore[no-untyped-def]
+    if turns:
+        for i in range(LANES):
+            out[i] = (
+                D[i] * T[i] + D[LANES + i] * T[LANES + i] + D[2 * LANES + i] * T[2 * LANES + i]
+                + D[3 * LANES + i] * T[3 * LANES + i] + D[4 * LANES + i] * T[4 * LANES + i]
+                + D[5 * LANES + i] * T[5 * LANES + i]
+            )  # fmt: skip
+    else:
+        for i in range(LANES):
+            out[i] = (
+                D[3 * LANES + i] * T[3 * LANES + i] + D[4 * LANES + i] * T[4 * LANES + i]
+                + D[5 * LANES + i] * T[5 * LANES + i]
+            )  # fmt: skip
+
+
+@inlined
+def _add_product(turns, D, T, out):  # type: ignore[no-untyped-def]
+    if turns:
+        for i in range(LANES):
+            out[i] += (
+                D[i] * T[i] + D[LANES + i] * T[LANES + i] + D[2 * LANES + i] * T[2 * LANES + i]
+                + D[3 * LANES + i] * T[3 * LANES + i] + D[4 * LANES + i] * T[4 * LANES + i]
+                + D[5 * LANES + i] * T[5 * LANES + i]
+            )  # fmt: skip
+    else:
+        for i in range(LANES):
+            out[i] += (
+                D[3 * LANES + i] * T[3 * LANES + i] + D[4 * LANES + i] * T[4 * LANES + i]
+                + D[5 * LANES + i] * T[5 * LANES + i]
+            )  # fmt: skip
+
+
+@compiled
+def _fill_nuisances(derivatives, weight, first, panel):  # type: ignore[no-untyped-def]
+    """Whitened derivatives in the nuisances, which stand before the residual."""
+    n, height, n_nuisances = derivatives.shape
+    rows = np.empty((height, LANES))
+    for k in range(n_nuisances):
+        for h in range(height):
+            for i in range(LANES):
+                rows[h, i] = derivatives[min(first + i, n - 1), h, k]
+        _whiten(weight, rows)
+        for h in range(height):
+            for i in range(LANES):
+                panel[panel.shape[0] - 1 - n_nuisances + k, h, first + i] = rows[h, i]
+
+
+DISTANCE, ROTATION_ANGLE, POSITION, ORIENTATION, SAME_POINT = range(5)
+"""Codes of the twins."""
+
+
+@inlined
+def _run_twin(twin, R, p, data, first, derived, r, D):  # type: ignore[no-untyped-def]
+    """Residuals of `LANES` measurements of a kind, from its first row and column of data on, and wrench rows."""
+    code, h, column = twin[0], twin[1], twin[2]
+    if code == DISTANCE:
+        _distance(p, data, first, column, derived, r[h], D[0, h], D[1, h])
+    elif code == ROTATION_ANGLE:
+        _rotation_angle(R, data, first, column, derived, r[h], D[0, h], D[1, h])
+    elif code == POSITION:
+        _position(p[0], data, first, column, r[h:], D[0, h:])
+    elif code == ORIENTATION:
+        D[0, h : h + 3] = 0.0
+        for i in range(LANES):
+            _orientation(R[0], data[min(first + i, data.shape[0] - 1), column:], i, derived, r[h:], D[0, h:])
+    elif code == SAME_POINT:
+        _same_point(p, r[h:], D[0, h:], D[1, h:])
+
+
+@inlined
+def _distance(p, data, first, column, derived, r, D_A, D_B):  # type: ignore[no-untyped-def]
+    p, u = p.reshape(-1), D_B.reshape(-1)[3 * LANES :]
+    for i in range(LANES):
+        x, y, z = p[3 * LANES + i] - p[i], p[4 * LANES + i] - p[LANES + i], p[5 * LANES + i] - p[2 * LANES + i]
+        u[i], u[LANES + i], u[2 * LANES + i] = x, y, z
+    _normalise(u, r)
+    if derived:
+        D_B[:3] = 0.0
+        _negate(D_B, D_A)
+    for i in range(LANES):
+        r[i] -= data[min(first + i, data.shape[0] - 1), column]
+
+
+@inlined
+def _rotation_angle(R, data, first, column, derived, r, D_A, D_B):  # type: ignore[no-untyped-def]
+    R, k, cosine = R.reshape(-1), D_B.reshape(-1), np.empty(LANES)
+    B = 9 * LANES
+    for i in range(LANES):
+        x, y, z, trace = 0.0, 0.0, 0.0, 0.0
+        for c in range(3):
+            n = 3 * c * LANES + i
+            x += R[n + LANES] * R[B + n + 2 * LANES] - R[n + 2 * LANES] * R[B + n + LANES]
+            y += R[n + 2 * LANES] * R[B + n] - R[n] * R[B + n + 2 * LANES]
+            z += R[n] * R[B + n + LANES] - R[n + LANES] * R[B + n]
+            trace += R[n] * R[B + n] + R[n + LANES] * R[B + n + LANES] + R[n + 2 * LANES] * R[B + n + 2 * LANES]
+        k[i], k[LANES + i], k[2 * LANES + i] = x, y, z
+        cosine[i] = trace - 1.0
+    _normalise(k, r)
+    if derived:
+        D_B[3:] = 0.0
+        _negate(D_B, D_A)
+    for i in range(LANES):
+        r[i] = np.arctan2(r[i], cosine[i]) - data[min(first + i, data.shape[0] - 1), column]
+
+
+@inlined
+def _normalise(vector, length):  # type: ignore[no-untyped-def]
+    """The vectors, [component, lane] in one row, become directions; zero has none."""
+    for i in range(LANES):
+        x, y, z = vector[i], vector[LANES + i], vector[2 * LANES + i]
+        length[i] = np.sqrt(x * x + y * y + z * z)
+    for i in range(LANES):
+        inverse = 1.0 / max(length[i], 1e-300)
+        vector[i] *= inverse
+        vector[LANES + i] *= inverse
+        vector[2 * LANES + i] *= inverse
+
+
+@inlined
+def _position(p, data, first, column, r, D):  # type: ignore[no-untyped-def]
+    D[:3] = 0.0
+    for c in range(3):
+        for i in range(LANES):
+            r[c, i] = p[c, i] - data[min(first + i, data.shape[0] - 1), column + c]
+            D[c, 3 + c, i] = 1.0
+
+
+@compiled
+def _same_point(p, r, D_A, D_B):  # type: ignore[no-untyped-def]
+    D_A[:3] = 0.0
+    D_B[:3] = 0.0
+    for c in range(3):
+        for i in range(LANES):
+            r[c, i] = p[1, c, i] - p[0, c, i]
+            D_A[c, 3 + c, i] = -1.0
+            D_B[c, 3 + c, i] = 1.0
+
+
+@inlined
+def _negate(D_B, D_A):  # type: ignore[no-untyped-def]
+    for c in range(6):
+        for i in range(LANES):
+            D_A[c, i] = -D_B[c, i]
+
+
+@compiled
+def _orientation(R, data, i, derived, r, D):  # type: ignore[no-untyped-def]
+    """Log(measured^T R) of lane i, and Jr^-1 R^T, which maps w to its derivative; data are measured, row by row."""
+    E = np.empty((3, 3))
+    for a in range(3):
+        for b in range(3):
+            E[a, b] = data[a] * R[b, 0, i] + data[3 + a] * R[b, 1, i] + data[6 + a] * R[b, 2, i]
     x, y, z = 0.5 * (E[2, 1] - E[1, 2]), 0.5 * (E[0, 2] - E[2, 0]), 0.5 * (E[1, 0] - E[0, 1])
     sine = np.sqrt(x * x + y * y + z * z)
     cosine = 0.5 * (E[0, 0] + E[1, 1] + E[2, 2] - 1.0)
@@ -449,7 +607,9 @@ def _orientation_residual(measured, R, i, raw, back):  # type: ignore[no-untyped
         if axis[0] * x + axis[1] * y + axis[2] * z < 0.0:
             norm = -norm
         x, y, z = angle * axis[0] / norm, angle * axis[1] / norm, angle * axis[2] / norm
-    raw[0, i], raw[1, i], raw[2, i] = x, y, z
+    r[0, i], r[1, i], r[2, i] = x, y, z
+    if not derived:
+        return
     # Jr^-1 = I + [r]x / 2 + g [r]x^2,  [r]x^2 = r r^T - angle^2 I
     if angle < 1e-4:
         g = 1.0 / 12.0 + angle * angle / 720.0
@@ -462,7 +622,7 @@ def _orientation_residual(measured, R, i, raw, back):  # type: ignore[no-untyped
         for m in range(3):
             # row a of Jr^-1 times column m of R^T (component m of each column of R)
             diagonal = (1.0 + g * (log[a] * log[a] - angle * angle)) * R[a, m, i]
-            back[a, m, i] = (
+            D[a, m, i] = (
                 diagonal
                 + (g * log[a] * log[b] - 0.5 * log[c]) * R[b, m, i]
                 + (g * log[a] * log[c] + 0.5 * log[b]) * R[c, m, i]

@@ -23,13 +23,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.errors import InputError
-from fg_calib.robot.kernels import walk_all
+from fg_calib.robot.kernels import ChainArrays, walk_all
 from fg_calib.robot.model import AXIS_OF_KIND, FRAME_KINDS, Axis, Element, Robot
 
 Floats = NDArray[np.float64]
@@ -48,7 +48,8 @@ class Chain:
         sign: +1 or -1, factor of parameter and reading.
         source: Index into the parameter vector of `at`, -1 where the value is constant.
         value: Value of each element without its reading, [m] or [rad].
-        joint: Index of the joint whose reading is added, -1 for none.
+        joint: Index of the joint whose reading is added, or is what the basis is a function of; -1 for none.
+        basis: Column of the `trig` of `precompute_trig` by which the value is multiplied, -1 for none.
         column: Jacobian column of each element's parameter, -1 for none.
         n_columns: Number of parameter columns.
         n_joints: Number of moving joints.
@@ -61,6 +62,7 @@ class Chain:
     source: Integers
     value: Floats
     joint: Integers
+    basis: Integers
     column: Integers
     n_columns: int
     n_joints: int
@@ -83,22 +85,23 @@ class Chain:
         return replace(self, joint_columns=True)
 
     @property
-    def arguments(self) -> tuple[Any, ...]:
-        """What the kernels take: the arrays, sines and cosines of the values among them."""
-        return (
-            self.axis,
-            self.value,
-            np.cos(self.value),
-            np.sin(self.value),
-            self.sign,
-            self.joint,
-            self.column,
-            self.n_columns,
-            self.n_joints if self.joint_columns else 0,
+    def arrays(self) -> ChainArrays:
+        """What the kernels take."""
+        return ChainArrays(
+            axis=self.axis,
+            value=self.value,
+            cosine=np.cos(self.value),
+            sine=np.sin(self.value),
+            sign=self.sign,
+            joint=self.joint,
+            column=self.column,
+            n_columns=self.n_columns,
+            n_own=self.n_joints if self.joint_columns else 0,
+            turns=self._turns(),
+            basis=self.basis,
         )
 
-    @property
-    def turns(self) -> NDArray[np.bool_]:
+    def _turns(self) -> NDArray[np.bool_]:
         """For each column, joints included, whether it belongs to a rotation, shape (n_columns + n_joints,)."""
         turns = np.zeros(self.n_columns + self.n_joints, dtype=np.bool_)
         rotation = self.axis >= Axis.RX
@@ -145,6 +148,7 @@ def build_chain(
         if i == end_of_base:
             elements += _tangent(base_tangent)
     elements += _tangent(tool_tangent)
+    places = {basis: robot.n_joints + i for i, basis in enumerate(robot.bases)}
     n_columns = len(columns) + 6 * sum(t is not None for t in (tool_tangent, base_tangent, frame_tangent))
     chain = Chain(
         axis=np.array([e.axis for e, _, _ in elements], dtype=np.int8),
@@ -152,7 +156,8 @@ def build_chain(
         sign=np.array([float(e.sign) for e, _, _ in elements]),
         source=np.array([source for _, source, _ in elements], dtype=np.int64),
         value=np.zeros(len(elements)),
-        joint=np.array([-1 if e.joint is None else e.joint for e, _, _ in elements], dtype=np.int64),
+        joint=np.array([_joint_of(e) for e, _, _ in elements], dtype=np.int64),
+        basis=np.array([-1 if e.basis is None else places[e.basis] for e, _, _ in elements], dtype=np.int64),
         column=np.array([column for _, _, column in elements], dtype=np.int64),
         n_columns=n_columns,
         n_joints=robot.n_joints,
@@ -160,6 +165,12 @@ def build_chain(
     changing = set(columns) | set(range(n_parameters, n_parameters + 6))
     changing |= set(() if tool_tangent is None else tool) | set(() if base_tangent is None else base)
     return _without_idle(chain.at(np.concatenate([robot.nominal, np.zeros(6)])), changing)
+
+
+def _joint_of(element: Element) -> int:
+    """The joint whose reading an element's value depends on, -1 for none."""
+    joint = element.joint if element.basis is None else element.basis.joint
+    return -1 if joint is None else joint
 
 
 def _tangent(first: int | None) -> list[tuple[Element, int, int]]:
@@ -178,19 +189,21 @@ def _without_idle(chain: Chain, changing: set[int]) -> Chain:
         changing: Indices of the parameters, and of the measurement frame's six, that `Chain.at` may change.
     """
     fixed = np.array([source not in changing for source in chain.source])
-    keep = ~(fixed & (chain.value == 0.0) & (chain.joint < 0) & (chain.column < 0))
-    arrays = {
-        name: getattr(chain, name)[keep] for name in ("axis", "constant", "sign", "source", "value", "joint", "column")
-    }
-    return replace(chain, **arrays)
+    moved = (chain.joint >= 0) & (chain.basis < 0)
+    keep = ~(fixed & (chain.value == 0.0) & ~moved & (chain.column < 0))
+    names = ("axis", "constant", "sign", "source", "value", "joint", "basis", "column")
+    return replace(chain, **{name: getattr(chain, name)[keep] for name in names})
 
 
-def precompute_trig(robot: Robot, readings: Floats) -> Floats:
+def precompute_trig(robot: Robot, readings: Floats, given: Floats | None = None) -> Floats:
     """Cosine and sine of revolute readings (value and 0 for prismatic), shape (n, n_joints, 2).
+
+    Where elements have bases, value and slope of each of `robot.bases` follow: shape (n, n_joints + n_bases, 2).
 
     Args:
         robot: The robot.
         readings: Joint readings, shape (n, n_joints), [rad] (prismatic: [m]).
+        given: Values that bases of no joint take, one column each, shape (n, n_given).
 
     Raises:
         InputError: The readings are of more or fewer joints.
@@ -198,9 +211,12 @@ def precompute_trig(robot: Robot, readings: Floats) -> Floats:
     if np.ndim(readings) != 2 or np.shape(readings)[1] != robot.n_joints:
         raise InputError("readings", f"shape {np.shape(readings)}", f"(n, {robot.n_joints}) for the robot's joints")
     prismatic = np.array([j.prismatic for j in robot.joints])
-    return np.stack(
+    trig = np.stack(
         [np.where(prismatic, readings, np.cos(readings)), np.where(prismatic, 0.0, np.sin(readings))], axis=2
     )
+    if not robot.bases:
+        return trig
+    return np.concatenate([trig, np.stack([b.values(readings, given) for b in robot.bases], axis=1)], axis=1)
 
 
 @dataclass(frozen=True)
@@ -235,10 +251,10 @@ def forward(chain: Chain, trig: Floats, rows: Integers | None = None) -> Poses:
     rows = np.arange(len(trig)) if rows is None else np.asarray(rows, dtype=np.int64)
     n, n_twists = len(rows), chain.n_columns + (chain.n_joints if chain.joint_columns else 0)
     rotation, position, jacobian = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 6, n_twists))
-    arguments = chain.arguments
+    arrays = chain.arrays
 
     def run(start: int, stop: int) -> None:
-        walk_all(*arguments, trig, rows, start, stop, rotation, position, jacobian)
+        walk_all(arrays, trig, rows, start, stop, rotation, position, jacobian)
 
     for _ in over_spans(run, n):
         pass
@@ -270,6 +286,33 @@ def turning_of_base(w: Floats, rotation: Floats) -> Floats:
     return a
 
 
+def common_axes(rotation: Floats) -> Floats:
+    """The projection on the axes that all rotations turn about, in the base frame: zero if there is none, shape (3, 3).
+
+    Args:
+        rotation: base_R_tool at some configurations, shape (n, 3, 3).
+    """
+    R_mean = rotation.mean(axis=0)
+    values, V = np.linalg.eigh(np.eye(3) - R_mean.T @ R_mean)
+    axes = R_mean @ V[:, values <= LEAST_TURNING]
+    out: Floats = axes @ axes.T
+    return out
+
+
+def turning_of_points(points: Floats, shifts: Floats) -> Floats:
+    """The turn of some points about their mean that comes nearest to their shifts, shape (3, n_columns).
+
+    Args:
+        points: Shape (n, 3), [m].
+        shifts: In each column, shape (n, 3, n_columns).
+    """
+    p, s = points - points.mean(axis=0), shifts - shifts.mean(axis=0)
+    inertia = np.sum(p * p) * np.eye(3) - p.T @ p
+    moment = np.cross(p[:, :, None], s, axis=1).sum(axis=0)
+    turn: Floats = np.linalg.pinv(inertia, rcond=1e-8, hermitian=True) @ moment
+    return turn
+
+
 def pose(robot: Robot, readings: Floats | Sequence[Sequence[float]]) -> Poses:
     """Tool poses of a robot in its base frame, and their derivatives in every parameter, then every joint.
 
@@ -294,10 +337,14 @@ def over_spans(run: Callable[[int, int], T], n: int) -> Iterator[T]:
 
     The spans do not depend on the number of processors, so neither do sums over them.
     """
-    spans = [(start, min(start + SPAN, n)) for start in range(0, n, SPAN)]
-    if len(spans) == 1 or processors() == 1:
-        return (run(*span) for span in spans)
-    return _pool().map(lambda span: run(*span), spans)
+    return over_processors(lambda k: run(k * SPAN, min((k + 1) * SPAN, n)), -(-n // SPAN))
+
+
+def over_processors(run: Callable[[int], T], n: int) -> Iterator[T]:
+    """Results of `run(k)` for k below n, in order, on all processors."""
+    if n <= 1 or processors() == 1:
+        return (run(k) for k in range(n))
+    return _pool().map(run, range(n))
 
 
 @cache

@@ -8,15 +8,18 @@ A convention is therefore data, `CONVENTIONS`, and nothing behind this module kn
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from functools import cached_property
+from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from fg_calib.arrays import as_floats, require
 from fg_calib.errors import InputError
-from fg_calib.options import NEAR, check_names, did_you_mean, known_names
+from fg_calib.options import NEAR, check, check_names, check_number, did_you_mean, known_names
 
 Floats = NDArray[np.float64]
 
@@ -46,6 +49,11 @@ CONVENTIONS: Mapping[str, tuple[str, ...]] = {
     "dh-hayati": ("theta", "d", "a", "alpha", "beta"),
 }
 """Order of one joint's elementary transforms, left to right (`mdh-hayati`: Jia et al. 2019, Eq. 29)."""
+
+DH_COLUMNS = ("a", "alpha", "d", "theta", "beta")
+"""Order of the figures in a row of `Robot.from_dh`, whatever the convention."""
+
+JointType = Literal["revolute", "prismatic"]
 
 FRAME_KINDS = ("x", "y", "z", "yaw", "pitch", "roll")
 """A frame's elementary transforms, left to right: Txyz Rz(yaw) Ry(pitch) Rx(roll), as in URDF."""
@@ -87,6 +95,48 @@ class Parameter:
         return self.tolerance if self.tolerance is not None else 1e-3
 
 
+BASES: Mapping[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Floats]]] = {
+    "reading": (lambda q: q, np.ones_like),
+    "sin": (np.sin, np.cos),
+    "cos": (np.cos, lambda q: -np.sin(q)),
+    "sin 2": (lambda q: np.sin(2.0 * q), lambda q: 2.0 * np.cos(2.0 * q)),
+    "cos 2": (lambda q: np.cos(2.0 * q), lambda q: -2.0 * np.sin(2.0 * q)),
+}
+"""Functions of a joint's reading and their slopes."""
+
+
+@dataclass(frozen=True)
+class Basis:
+    """What an element's coefficient is multiplied by: a function of a joint's reading, or a column of values given.
+
+    Attributes:
+        function: A key of `BASES`; "given" for values given, one a configuration.
+        index: Of the joint, or of the column.
+    """
+
+    function: str
+    index: int
+
+    @property
+    def joint(self) -> int | None:
+        """The joint whose reading it is a function of; None for values given."""
+        return None if self.function == "given" else self.index
+
+    def values(self, readings: Floats, given: Floats | None) -> Floats:
+        """Values and slopes in the reading, shape (n, 2).
+
+        Raises:
+            InputError: It is of values given, and they are not.
+        """
+        if self.function == "given":
+            if given is None or given.shape[1:] <= (self.index,) or len(given) != len(readings):
+                found = "none" if given is None else f"shape {given.shape}"
+                raise InputError("given", found, f"{len(readings)} rows with a column {self.index}")
+            return np.stack([given[:, self.index], np.zeros(len(given))], axis=1)
+        value, slope = BASES[self.function]
+        return np.stack([value(readings[:, self.index]), slope(readings[:, self.index])], axis=1)
+
+
 @dataclass(frozen=True)
 class Element:
     """One elementary transform of the chain.
@@ -94,6 +144,9 @@ class Element:
     Its value is `constant + sign * (parameter + reading)`: the parameter at index `parameter` and the reading of
     the joint at index `joint`, where there are any. A chain that is walked against a joint's own direction has
     the sign -1 there.
+
+    With a `basis` it is `sign * parameter * basis`, without constant and reading. Values of elements that follow each
+    other on one axis add up, so a value that is a sum of coefficients times bases is such a sequence.
     """
 
     axis: Axis
@@ -101,6 +154,12 @@ class Element:
     parameter: int | None = None
     joint: int | None = None
     sign: int = 1
+    basis: Basis | None = None
+
+    def __post_init__(self) -> None:
+        """Check that a basis has a coefficient and nothing else."""
+        if self.basis is not None and (self.parameter is None or self.joint is not None or self.constant != 0.0):
+            raise InputError("element", "a basis beside a constant or a reading", "a basis and its parameter alone")
 
 
 @dataclass(frozen=True)
@@ -147,10 +206,80 @@ class Robot:
     elements: tuple[Element, ...]
     urdf: UrdfSource | None = field(default=None, repr=False)
 
+    from_urdf: ClassVar[Callable[..., Robot]]
+    """`files.urdf.read_urdf`, attached by the package: this folder knows nothing of files."""
+
+    @classmethod
+    def from_dh(
+        cls,
+        rows: ArrayLike,
+        convention: str = "dh",
+        *,
+        name: str = "robot",
+        types: JointType | Sequence[JointType] = "revolute",
+        limits: Sequence[Sequence[float] | None] | Floats | None = None,
+        names: Sequence[str] | None = None,
+        base: ArrayLike | None = None,
+        tool: ArrayLike | None = None,
+        fixed: Sequence[str] = (),
+        estimate: Sequence[str] = (),
+        tolerance: Mapping[str, float] | None = None,
+    ) -> Robot:
+        """A robot from a table of Denavit-Hartenberg figures, in [m] and [rad].
+
+        Args:
+            rows: a, alpha, d, theta of each joint, shape (n, 4), in this order whatever the convention; of the
+                conventions with Hayati's angle also (n, 5), beta last.
+            convention: A key of `CONVENTIONS`.
+            name: The robot's name.
+            types: `revolute` or `prismatic`, for all joints or for each.
+            limits: Lower and upper of each joint, None for one without, [rad] (prismatic: [m]).
+            names: Of the joints; q1, q2, ... if None.
+            base: Base frame to frame 0: x y z, or x y z roll pitch yaw (as in URDF), or a matrix of shape (4, 4).
+            tool: Last frame to tool frame, in the same ways.
+            fixed: See `RobotBuilder.build`.
+            estimate: See `RobotBuilder.build`.
+            tolerance: See `RobotBuilder.build`.
+
+        Raises:
+            InputError: A figure, name or shape that cannot be used; the message names the joint.
+        """
+        check("convention", convention, tuple(CONVENTIONS))
+        figures = as_floats("rows", rows, "(n, 5)" if np.shape(rows)[1:] == (5,) else "(n, 4)")
+        kinds = CONVENTIONS[convention]
+        if figures.shape[1] > 4 and "beta" not in kinds:
+            raise InputError("rows", f"shape {figures.shape}", f"(n, 4): the convention {convention} has no beta")
+        angles = figures[
+            :, [i for i, kind in enumerate(DH_COLUMNS[: figures.shape[1]]) if AXIS_OF_KIND[kind] >= Axis.RX]
+        ]
+        require(np.abs(angles) <= 2.0 * np.pi, "rows", angles, "angles in rad, a turn at most", "are they in deg?")
+        builder = RobotBuilder(name, convention)
+        builder.add_frame("base", frame_values("base", base), 0, False)
+        for joint, row in zip(_joints(len(figures), types, limits, names), figures, strict=True):
+            builder.add_convention_joint(joint, {"beta": 0.0} | dict(zip(DH_COLUMNS, row, strict=False)))
+        builder.add_frame("tool", frame_values("tool", tool), len(figures) + 1, False)
+        for key, figure in (tolerance or {}).items():
+            check_number(f"tolerance: {key}", figure, above=True)
+        return builder.build(fixed=fixed, estimate=estimate, tolerance=tolerance)
+
+    def __repr__(self) -> str:
+        joints = ", ".join(joint.name for joint in self.joints)
+        estimated = names_of(p for p in self.parameters if p.estimated)
+        lines = [
+            f"Robot {self.name!r}, {self.convention}, {self.n_joints} joints: {joints}",
+            f"  estimated {len(estimated)} of {len(self.parameters)} parameters: {', '.join(estimated) or 'none'}",
+        ]
+        return "\n".join(line if len(line) <= 100 else f"{line[:96]} ..." for line in lines)
+
     @property
     def n_joints(self) -> int:
         """Number of moving joints."""
         return len(self.joints)
+
+    @cached_property
+    def bases(self) -> tuple[Basis, ...]:
+        """What the elements' coefficients are multiplied by, each once."""
+        return tuple(dict.fromkeys(e.basis for e in self.elements if e.basis is not None))
 
     @property
     def nominal(self) -> Floats:
@@ -167,7 +296,7 @@ class Robot:
         """Length of the arm stretched out, base to tool, sliding joints at their limits, [m]; 1 if it has none."""
         nominal, all_limits, base, reach = self.nominal, self.limits, self.owned_by(0), 0.0
         for element in self.elements:
-            if element.axis >= Axis.RX or element.parameter in base:
+            if element.axis >= Axis.RX or element.parameter in base or element.basis is not None:
                 continue
             length = element.constant + (0.0 if element.parameter is None else nominal[element.parameter])
             limits = np.zeros(0) if element.joint is None else all_limits[element.joint]
@@ -330,6 +459,60 @@ class RobotBuilder:
         parameter = Parameter(name, kind, owner, float(nominal), estimated=estimated)
         self._elements.append(Element(parameter.axis, parameter=len(self._parameters), joint=joint))
         self._parameters.append(parameter)
+
+
+def frame_values(name: str, given: ArrayLike | None) -> dict[str, float]:
+    """The values by kind of a frame that is given as x y z, as x y z roll pitch yaw, or as a matrix; zeros if None.
+
+    Args:
+        name: Its name, for messages.
+        given: Shape (3,), (6,) or (4, 4), [m] and [rad].
+
+    Raises:
+        InputError: It is something else.
+    """
+    if given is None:
+        return {}
+    if np.shape(given) != (4, 4):
+        shape = {(3,): "(3)", (6,): "(6)"}.get(np.shape(given), "(3), (6) or (4, 4)")
+        return dict(zip(("x", "y", "z", "roll", "pitch", "yaw"), as_floats(name, given, shape), strict=False))
+    matrix = as_floats(name, given, "(4, 4)")
+    R = matrix[:3, :3]
+    if not np.allclose(matrix[3], [0, 0, 0, 1]) or np.abs(R.T @ R - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0:
+        raise InputError(name, "a matrix that is no pose", "a rotation, a shift, and 0 0 0 1 as the last row")
+    level = np.hypot(R[0, 0], R[1, 0])  # cosine of the pitch
+    roll, yaw = np.arctan2(R[2, 1], R[2, 2]), np.arctan2(R[1, 0], R[0, 0])
+    if level < 1e-9:  # only a sum of roll and yaw acts
+        roll, yaw = 0.0, np.arctan2(-R[0, 1], R[1, 1])
+    angles = {"roll": roll, "pitch": np.arctan2(-R[2, 0], level), "yaw": yaw}
+    return dict(zip("xyz", matrix[:3, 3], strict=True)) | angles
+
+
+def _joints(
+    n: int,
+    types: JointType | Sequence[JointType],
+    limits: Sequence[Sequence[float] | None] | Floats | None,
+    names: Sequence[str] | None,
+) -> list[Joint]:
+    """The joints of a table of n rows, by what was given for all of them or for each."""
+    if not n:
+        raise InputError("rows", "no joints", "at least one")
+    kinds = [types] * n if isinstance(types, str) else list(types)
+    ranges = [None] * n if limits is None else list(limits)
+    called = [f"q{i + 1}" for i in range(n)] if names is None else list(names)
+    for key, count in (("types", len(kinds)), ("limits", len(ranges)), ("names", len(called))):
+        if count != n:
+            raise InputError(key, f"{count} for {n} joints", "one a joint")
+    joints: list[Joint] = []
+    for i, (kind, given, name) in enumerate(zip(kinds, ranges, called, strict=True), start=1):
+        check(f"types: joint {i}", kind, JointType)
+        if name in called[: i - 1]:
+            raise InputError(f"names: joint {i}", f"found {name!r}, as before", "different names")
+        lower, upper = (-np.inf, np.inf) if given is None else given
+        if not lower < upper:
+            raise InputError(f"limits: joint {i}", f"found {lower}, {upper}", "lower below upper, or None")
+        joints.append(Joint(str(name), kind == "prismatic", float(lower), float(upper)))
+    return joints
 
 
 def _inverse(elements: Sequence[Element]) -> list[Element]:

@@ -222,10 +222,12 @@ def _reach(
 ) -> Floats:
     """Configurations that bring the camera to poses, shape (n_poses, n_joints)."""
     if views.self_motion == "random":
-        return _require(solve_inverse(robot, rotation, position, generator), place)
+        return _require(solve_inverse(robot, position, rotation, generator=generator), place)
     near = None if views.posture is None else np.array(views.posture)
-    first = _require(solve_inverse(robot, rotation[:1], position[:1], generator, near=near), place, len(rotation))
-    others = solve_inverse(robot, rotation[1:], position[1:], generator, near=first[0])
+    first = _require(
+        solve_inverse(robot, position[:1], rotation[:1], generator=generator, near=near), place, len(rotation)
+    )
+    others = solve_inverse(robot, position[1:], rotation[1:], generator=generator, near=first[0])
     return np.concatenate([first, _require(others, place, len(rotation), 1)])
 
 

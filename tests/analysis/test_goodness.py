@@ -5,8 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.stats import kstest
-from simulated import measure, small_arm, true_robot
+from simulated import measure, plus, small_arm, true_robot
+from touches import SIGMA, TOOL_POINT, corners, touch
 
 from fg_calib.analysis import goodness as goodness_module
 from fg_calib.analysis import variance_components as noise
@@ -16,11 +18,14 @@ from fg_calib.analysis.residual_table import residual_table
 from fg_calib.analysis.uncertainty import assess
 from fg_calib.analysis.variance_components import estimate_noise
 from fg_calib.graph import problem as problem_module
-from fg_calib.graph.problem import build_problem
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.factors import prior_rows
+from fg_calib.graph.noise import NoiseState
+from fg_calib.graph.rows import ErrorColumns
 from fg_calib.graph.solver import SolverOptions, solve
-from fg_calib.graph.whitening import Adjustment
 from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Pairs, rotation_angle
+from fg_calib.measurements.series import Table
 from fg_calib.options import Pairing
 from fg_calib.report.documents import result_document
 from fg_calib.report.text import format_report
@@ -93,25 +98,30 @@ def test_p_values_are_uniform_and_the_noise_seen_is_the_noise_there_is(name, n_r
         assert np.sqrt(chi2 / expected) == pytest.approx(1.0, abs=4 * np.sqrt(1 / 12 / n_runs))
 
 
-@pytest.mark.parametrize("max_shared", [3000, 0])
+@pytest.mark.parametrize("errors", ["", " independent"])
 @pytest.mark.slow
-def test_the_noise_seen_is_unbiased_where_rows_count_as_independent_but_are_not(max_shared, monkeypatch):
+def test_the_noise_seen_is_unbiased_whether_rows_count_as_independent_or_not(errors):
     """All pairs of 12 poses share so much that the sum of squares is far below rows less parameters.
 
     About 10 degrees of freedom a run and kind: 4 sigma are 4 * sqrt(2 / 10 / 60) / 2 = 0.11.
     """
-    monkeypatch.setattr(problem_module, "MAX_SHARED", max_shared)
     rng = np.random.default_rng(1)
     robot = small_arm(tolerance=TOLERANCE)
     sums = np.zeros((2, 2))
     for _ in range(60):
-        fits = kinds_of(solve(case("all", robot, rng, n=12)))
+        fits = kinds_of(solve(case(f"all{errors}", robot, rng, n=12)))
         sums += [(fit.chi2, fit.expected) for fit in fits]
     assert fits[0].n > 50
     ratio = np.sqrt(sums[:, 0] / sums[:, 1])
     assert ratio == pytest.approx(
         1.0, abs=0.06
     )  # about 10 degrees of freedom a run and kind: 4 * sqrt(1 / 20 / 60) / 2
+
+
+def factors_of(solution):
+    """The factors that noise was estimated with, by kind, of the only table."""
+    assert all(table == 0 for table, _ in solution.problem.state.factors)
+    return {kind: factor for (_, kind), factor in solution.problem.state.factors.items()}
 
 
 def kinds_of(solution):
@@ -125,8 +135,8 @@ def test_leverages_are_those_of_the_hat_matrix():
     solution = solve(build_problem(robot, measure(true_robot(robot, rng), 20, rng, n_test=4), model="pose"))
     uncertainty = assess(solution)
     table, goodness = uncertainty.residuals, uncertainty.goodness
-    chain = solution.problem.variables.chain.at(solution.parameters)
-    J = residuals.linearise(solution.problem.blocks[0], chain)[1].reshape(120, -1)
+    (rows,) = solution.problem.rows
+    J = rows.linearise(solution.problem.variables.at(solution.parameters))[1]
     H = J @ np.linalg.pinv(J, rcond=1e-9)
     assert goodness.leverage[table.used] == pytest.approx(np.diag(H), rel=1e-6)
     assert goodness.leverage[table.used].sum() == pytest.approx(uncertainty.spread.rank)
@@ -155,7 +165,7 @@ def test_a_configuration_wrong_by_50_sigma_is_the_first_suspect(name, wrong):
     rng = np.random.default_rng(4)
     robot = small_arm(tolerance=TOLERANCE)
     m = measure(true_robot(robot, rng), 25, rng, sigma=(1e-3, 5e-4))
-    m.position[wrong] += 50e-3 * np.array([0.6, 0.0, 0.8])
+    m = replace(m, position=plus(m.position, wrong, 50e-3 * np.array([0.6, 0.0, 0.8])))
     settings = {"model": "pose"} if name == "pose" else {"model": "distance-rotation", "pairing": Pairing(name)}
     solution = solve(build_problem(robot, m, **settings))
     uncertainty = assess(solution)
@@ -188,7 +198,7 @@ def test_verdicts_tell_outliers_from_noise_stated_wrong():
         found[what] = {fit.verdict for fit in assess(solve(case("pose", robot, rng, 50, stated))).goodness.kinds}
     assert found == {what: {what} for what in found}
     m = measure(true_robot(robot, rng), 50, rng)
-    m.position[[3, 30], 0] += 0.02
+    m = replace(m, position=plus(m.position, ([3, 30], 0), 0.02))
     fits = assess(solve(build_problem(robot, m, model="pose"))).goodness.kinds
     assert {fit.kind: fit.verdict for fit in fits} == {"orientation": "as stated", "position": "outliers"}
 
@@ -208,7 +218,7 @@ def test_noise_stated_wrong_by_two_is_found(name):
             problem, truth = case(name, robot, rng, n=24, stated=2.0), 0.5
         solution = estimate_noise(problem)
         assert solution.converged
-        factors.append(solution.problem.adjustment.factors)
+        factors.append(list(factors_of(solution).values()))
     logs = np.log(np.array(factors) / truth)
     assert np.all(np.abs(logs.mean(axis=0)) < 4 * logs.std(axis=0) / np.sqrt(n_fits))
     assert np.all(logs.std(axis=0) < 0.35)
@@ -220,14 +230,16 @@ def test_estimated_noise_gives_each_kind_the_sum_of_squares_it_expects():
     solution = estimate_noise(case("all", robot, rng, 20, 2.0))
     uncertainty = assess(solution)
     assert uncertainty.p_value is None
-    for fit, factor in zip(uncertainty.goodness.kinds, solution.problem.adjustment.factors, strict=True):
-        assert fit.factor == factor
+    factors = factors_of(solution)
+    assert tuple(factors) == ("distance", "angle") == tuple(fit.kind for fit in uncertainty.goodness.kinds)
+    for fit in uncertainty.goodness.kinds:
+        assert fit.factor == factors[fit.kind]
         assert fit.chi2 == pytest.approx(fit.expected, rel=3e-3)  # twice SETTLED
         assert fit.p_value is None
     document = result_document(solution, uncertainty)
     assert tuple(document["noise_factors"].items()) == (
-        ("distance", solution.problem.adjustment.factors[0]),
-        ("angle", solution.problem.adjustment.factors[1]),
+        ("distance", factors["distance"]),
+        ("angle", factors["angle"]),
     )
     text = " ".join(format_report(solution, uncertainty).split())
     assert "distance and angle noise was estimated from these residuals: chi-square says nothing about it" in text
@@ -243,9 +255,9 @@ def test_estimated_noise_is_the_same_wherever_it_starts(name, wrong):
         problem = case(name, robot, np.random.default_rng(14), 24, stated)
         m = problem.measurements
         joint = replace(m, sigma_joint=stated * m.sigma_joint)
-        solution = estimate_noise(problem_module.judged_at(replace(problem, measurements=joint), problem.start))
+        solution = estimate_noise(build_problem(robot, joint, problem.options))
         assert solution.converged, solution.message
-        found.append(stated * np.array(solution.problem.adjustment.factors))
+        found.append(stated * np.array(list(factors_of(solution).values())))
     assert found[1] == pytest.approx(found[0], rel=0.01)
 
 
@@ -257,12 +269,12 @@ def test_a_solution_that_has_not_arrived_does_not_end_the_estimate_of_the_noise(
         rounds.append(solve(problem, options if rounds else SolverOptions(max_iterations=1)))
         return rounds[-1]
 
-    expected = estimate_noise(problem).problem.adjustment.factors
+    expected = factors_of(estimate_noise(problem))
     monkeypatch.setattr(noise, "solve", gives_up_at_first)
     solution = estimate_noise(problem)
     assert not rounds[0].converged
     assert solution.converged, solution.message
-    assert solution.problem.adjustment.factors == pytest.approx(expected, rel=1e-4)  # 10 times SETTLED
+    assert factors_of(solution) == pytest.approx(expected, rel=1e-4)  # 10 times SETTLED
 
 
 def test_noise_that_could_not_be_estimated_is_not_called_estimated():
@@ -280,9 +292,11 @@ def test_a_kind_with_too_little_left_keeps_its_stated_noise(monkeypatch):
     monkeypatch.setattr(noise, "LEAST_REDUNDANCY", 11.0)
     rng = np.random.default_rng(10)
     solution = estimate_noise(case("star", small_arm(tolerance=TOLERANCE), rng, 16, 2.0))
-    assert solution.problem.adjustment.factors[0] == 1.0
-    assert solution.problem.adjustment.factors[1] != 1.0
-    assert solution.estimated_noise == ("angle",)
+    assert "distance" not in factors_of(solution)
+    assert factors_of(solution)["angle"] != 1.0
+    distance, angle = assess(solution).goodness.kinds
+    assert (distance.factor, angle.factor) == (1.0, factors_of(solution)["angle"])
+    assert solution.estimated_noise == ((0, "angle"),)
     assert "too few rows to estimate it: as stated" in " ".join(format_report(solution, assess(solution)).split())
 
 
@@ -300,24 +314,33 @@ def test_kept_parameters_are_estimated_with_estimated_noise_too():
     m = measure(true_robot(robot, rng), 40, rng)
     m = replace(m, sigma_position=2 * m.sigma_position, sigma_orientation=2 * m.sigma_orientation)
     solution = estimate_noise(build_problem(robot, m, model="pose", gauge="keep"))
-    assert solution.problem.adjustment.factors == pytest.approx((0.5, 0.5), rel=0.2)
-    assert solution.problem.whole.adjustment == solution.problem.adjustment
+    assert factors_of(solution) == pytest.approx({"orientation": 0.5, "position": 0.5}, rel=0.2)
+    assert solution.problem.whole.state.factors == solution.problem.state.factors
 
 
 def test_a_same_point_that_is_not_is_suspect():
-    """Three coordinates of 1 sigma each: their length is judged by their distribution, not by one coordinate's."""
+    """Each of its three coordinates is a row of 1 sigma; two readings that are nearly the same tell it nothing."""
     rng = np.random.default_rng(13)
     robot = small_arm(tolerance=TOLERANCE)
     a = np.arange(20)
     m = measured_directly(measure(robot, 40, rng), robot, rng, a, a + 20)
-    m.pairs.distance[0], m.readings[20] = 0.0, m.readings[0]
-    m.readings[20, 3] += 1e-9  # the same configuration twice tells nothing
-    solution = solve(build_problem(robot, m, model="distance"))
-    judged = assess(solution)
-    assert solution.problem.judgement.same_point[0]
-    assert np.isnan(judged.goodness.leverage[0])
-    assert abs(judged.goodness.studentised[0]) < 1.0
-    assert judged.goodness.kinds[0].n == 19
+    distance, readings = m.pairs.distance.copy(), m.readings.copy()
+    distance[:2], readings[20:22] = 0.0, readings[:2]
+    readings[20, 3] += 1e-9  # the same configuration twice tells nothing
+    apart = pose(robot, readings[1:2]).jacobian[0, 3:, -1]  # [m] per rad of the last joint
+    readings[21, 3] += 10e-3 / np.linalg.norm(apart)  # 10 sigma
+    m = replace(m, readings=readings, pairs=replace(m.pairs, distance=distance))
+    judged = assess(solve(build_problem(robot, m, model="distance")))
+    table, goodness = judged.residuals, judged.goodness
+    (kind,) = goodness.kinds
+    assert (kind.kind, kind.n) == ("distance", 18 + 2 * 3)
+    same, other = (np.flatnonzero(table.a == k) for k in (0, 1))
+    assert list(table.kind[same]) == ["distance.x", "distance.y", "distance.z"]
+    assert goodness.leverage[same] == pytest.approx(0.0, abs=1e-6)
+    assert np.all(np.abs(goodness.studentised[same]) < 1.0)
+    assert np.linalg.norm(table.after[other] / table.sigma[other]) == pytest.approx(10.0, abs=1.0)
+    assert goodness.suspects[0] in other
+    assert {one.configuration for one in goodness.configurations} == {1, 21}
 
 
 def test_pairs_that_a_model_of_poses_does_not_use_are_named(caplog):
@@ -358,13 +381,11 @@ def test_robust_weights_count_rows_and_flag_outliers():
     rng = np.random.default_rng(17)
     robot = small_arm(tolerance=TOLERANCE)
     m = measure(true_robot(robot, rng), 30, rng)
-    m.position[5] += 0.05
+    m = replace(m, position=plus(m.position, 5, 0.05))
     problem = build_problem(robot, m, model="pose")
-    weights = np.where(np.arange(30) == 5, 0.0, 1.0)
-    adjusted = replace(problem, adjustment=Adjustment(weights=weights))
-    solution = solve(problem_module.judged_at(adjusted, problem.start))
-    if solution.problem.adjustment.weights is None:
-        pytest.skip("the solver chose weights of its own")
+    state = NoiseState(weights=(np.where(np.arange(30) == 5, 0.0, 1.0),))
+    solution = solve(problem_module.reweighted_at(problem, problem.start, state))
+    assert solution.problem.state.weights is not None
     uncertainty = assess(solution)
     table, goodness = uncertainty.residuals, uncertainty.goodness
     assert {FLAGS[f] for f in goodness.flag[table.a == 5]} == {"outlier"}
@@ -394,3 +415,168 @@ def test_without_a_p_value_noise_is_judged_by_what_its_rows_vary():
     known = {**fit, "expected": 40.0, "p_value": None, "typical": 0.7, "degrees": 12.0}
     assert KindFit(**known, seen_over_stated=0.75).verdict == "as stated"
     assert KindFit(**known, seen_over_stated=0.3).verdict == "too large"
+
+
+def touched(robot, rng, n_each=8, sigma_joint=0.0):
+    """Five points touched: of 0, 1 and 2 some touches are test rows, of 3 and 4 all are."""
+    true = true_robot(robot, rng)
+    distances = ((0, 1, 1e-4), (0, 3, 1e-4), (3, 4, 1e-4))
+    m = touch(true, corners(true, 5, rng), n_each, rng, distances=distances, test=(3, 4))
+    noise = sigma_joint * rng.normal(size=m.readings.shape)
+    test = m.test | np.isin(np.arange(len(m.test)), [n_each - 2, n_each - 1, 2 * n_each - 2])
+    return replace(m, readings=m.readings + noise, sigma_joint=np.full(robot.n_joints, sigma_joint), test=test)
+
+
+def predicted(name, rng):
+    """A problem with test rows of a drawn true robot."""
+    sigma_joint = 2e-4 if "joint" in name else 0.0
+    if name.startswith("touches"):
+        robot = small_arm(tolerance=TOLERANCE | {"tool": 5e-3}, estimate=TOOL_POINT)
+        return build_problem(robot, touched(robot, rng, sigma_joint=sigma_joint), model="distance")
+    robot = small_arm(tolerance=TOLERANCE)
+    true = true_robot(robot, rng)
+    m = measure(true, 16, rng, sigma=(1e-3, 5e-4), sigma_joint=sigma_joint, n_test=10)
+    if name.startswith("pose"):
+        return build_problem(robot, m, model="pose")
+    if name.startswith("star"):
+        return build_problem(robot, m, model="distance-rotation", pairing=Pairing("star"))
+    k = np.arange(14)
+    a, b = np.concatenate([k, k]), np.concatenate([np.roll(k, 1), np.roll(k, 3)])
+    direct = measured_directly(measure(true, 14, rng), true, rng, a, b, sigma_joint=sigma_joint)
+    direct = replace(direct, pairs=replace(direct.pairs, test=np.arange(28) >= 20))
+    return build_problem(robot, [Table(m, model="pose"), Table(direct, model="distance")])
+
+
+@pytest.mark.parametrize("name", ["touches", "touches joint", "pose joint", "star joint", "tables", "tables joint"])
+@pytest.mark.slow
+def test_fitted_and_predicted_rows_have_the_sums_of_squares_and_p_values_that_they_are_said_to(name):
+    """Of each table and kind, and all predicted rows together: means within 4 of their own sigma, p-values uniform.
+
+    Kolmogorov-Smirnov at 0.1 %, of kinds whose every run leaves a degree of freedom.
+    """
+    n_runs, rng = 100, np.random.default_rng(21)
+    off, p_values = {}, {}
+    for _ in range(n_runs):
+        goodness = assess(solve(predicted(name, rng))).goodness
+        fits = {("fitted", fit.table, fit.kind): fit for fit in goodness.kinds}
+        fits |= {("predicted", fit.table, fit.kind): fit for fit in goodness.test.kinds}
+        for key, fit in (fits | {"together": goodness.test}).items():
+            off.setdefault(key, []).append(fit.chi2 - fit.expected)
+            p_values.setdefault(key, []).append(fit.p_value)
+    assert len(off) == {"touches": 5, "pose": 5, "star": 5, "tables": 7}[name.split()[0]]
+    for key, found in off.items():
+        assert abs(np.mean(found)) < 4 * np.std(found) / np.sqrt(n_runs), key
+    for key, p in p_values.items():
+        if None not in p:
+            assert kstest(p, "uniform").pvalue > 1e-3, key
+    assert sum(None in p for p in p_values.values()) == name.startswith("touches")  # the one fitted distance
+
+
+def test_touches_of_a_point_that_is_their_mean_share_its_noise():
+    """Leverages by the arm's own derivatives: those of the row less the mean's; of n touches -1 / n for the noise.
+
+    To 1e-3 of it or of the noise: derivatives of rows are less `a x (p - point)`, the noise times an angle's error.
+    """
+    rng = np.random.default_rng(22)
+    robot = small_arm(tolerance=TOLERANCE | {"tool": 5e-3}, estimate=TOOL_POINT)
+    m = touched(robot, rng)
+    solution = solve(build_problem(robot, m, model="distance"))
+    judged = assess(solution)
+    table, goodness, arm = judged.residuals, judged.goodness, judged.robot
+    columns = [arm.index(name) for name in judged.names]
+    at, h = pose(arm, m.readings), 1e-6
+    moved = np.empty((len(m.readings), 3, len(columns)))
+    for k, column in enumerate(columns):
+        step = h * np.eye(len(arm.nominal))[column]
+        up, down = (pose(arm.with_values(arm.nominal + s * step), m.readings).position for s in (1, -1))
+        moved[:, :, k] = (up - down) / (2 * h)
+    means = {
+        g: (moved[m.groups.index == g].mean(axis=0), at.position[m.groups.index == g].mean(axis=0)) for g in (3, 4)
+    }
+    C, n = judged.covariance, 8
+    for g in (3, 4):
+        mine = np.flatnonzero(m.groups.index == g)
+        J = moved[mine] - means[g][0]
+        expected = np.einsum("nij,jk,nik->ni", J, C, J) / SIGMA**2 - 1 / n
+        rows = np.isin(table.a, mine) & (table.family == table.families.index("point"))
+        # The rows are turned; the sum over the three axes is not.
+        assert goodness.leverage[rows].reshape(-1, 3).sum(axis=1) == pytest.approx(
+            expected.sum(axis=1), rel=1e-3, abs=1e-3
+        )
+    (row,) = np.flatnonzero((table.b == len(table.names) - 1) & (table.family == table.families.index("distance")))
+    u = means[4][1] - means[3][1]
+    J = (u / np.linalg.norm(u)) @ (means[4][0] - means[3][0])
+    sigma = table.sigma[row]
+    assert goodness.leverage[row] == pytest.approx((J @ C @ J + 2 * SIGMA**2 / n) / sigma**2, rel=1e-3)
+
+
+def test_the_only_touch_of_a_point_is_met_whatever_was_measured():
+    rng = np.random.default_rng(23)
+    robot = small_arm(tolerance=TOLERANCE | {"tool": 5e-3}, estimate=TOOL_POINT)
+    m = touched(robot, rng)
+    alone = np.flatnonzero(m.groups.index == 4)[1:]
+    index = plus(m.groups.index, alone, -5)  # of no point
+    m = replace(m, groups=replace(m.groups, index=index), sigma_point=plus(m.sigma_point, alone, np.nan))
+    for loss in ("none", "gnc"):
+        judged = assess(solve(build_problem(robot, m, model="distance", loss=loss)))
+        table, goodness = judged.residuals, judged.goodness
+        (first, *_) = met = np.flatnonzero(table.a == alone[0] - 1)
+        assert (len(met), table.kind[first]) == (3, "point.x")
+        assert np.all(np.isnan(goodness.studentised[met]))
+        assert goodness.test.n_unknown == 0
+        assert 1e-4 < goodness.test.p_value < 1.0
+        points = goodness.test.kinds[0]
+        assert (points.kind, points.n) == ("point", 3 * (3 + 8))
+        assert np.isfinite([points.chi2, points.expected, points.p_value, points.largest]).all()
+
+
+def test_rows_that_count_as_independent_but_are_not_have_their_covariance_with_touched_points_too():
+    """Touches, and pairs formed from poses of the same configurations, which share the errors of the readings.
+
+    By dense matrices: with J of core and points, W the weights and C the covariance that there is, residuals of the
+    estimate are (1 - H) e with H = J (J^T W J + priors)^-1 J^T W.
+    """
+    rng = np.random.default_rng(24)
+    robot = small_arm(tolerance=TOLERANCE | {"tool": 5e-3}, estimate=TOOL_POINT)
+    true = true_robot(robot, rng)
+    m = touched(robot, rng, sigma_joint=2e-4)
+    at = pose(true, m.readings)
+    n = len(m.readings)
+    m = replace(
+        m,
+        test=np.zeros(n, dtype=bool),
+        position=at.position + 1e-3 * rng.normal(size=(n, 3)),
+        rotation=at.rotation,
+        sigma_position=np.full((n, 3), 1e-3),
+        sigma_orientation=np.full((n, 3), 5e-4),
+        groups=replace(m.groups, pairs=replace(m.groups.pairs, test=np.zeros(3, dtype=bool))),
+    )
+    solution = solve(build_problem(robot, m, model="distance", pairing=Pairing("chain"), pair_errors="independent"))
+    problem, spread, table = solution.problem, spread_of(solution), residual_table(solution)
+    at, n_core = problem.variables.at(solution.parameters), problem.variables.n_columns
+    J = np.concatenate([rows.linearise(at)[1] for rows in problem.rows])
+    errors, W, C = ErrorColumns(problem.noises), [], []
+    for rows, given in zip(problem.rows, problem.noises, strict=True):
+        (part,), height = rows.parts, rows.parts[0].block.height
+        shaped = [residuals.unpack(block.whitening, height) for block in (part.block, given.rows)]
+        W.append(block_diag(*(shaped[0] @ np.linalg.inv(shaped[1]))))
+        C.append((errors.loading(given, np.arange(given.series.n)).toarray(), block_diag(*given.own)))
+    L, W = np.vstack([L for L, _ in C]), block_diag(*W)
+    C = W @ (L @ L.T + block_diag(*(own for _, own in C))) @ W.T
+    assert np.abs(C - np.diag(np.diag(C))).max() > 0.1  # much is shared
+    prior = np.zeros((J.shape[1],) * 2)
+    P = prior_rows(problem.variables, solution.parameters)[1]
+    prior[:n_core, :n_core] = P.T @ P
+    K = np.linalg.inv(J.T @ J + prior)
+    actual = K @ (J.T @ C @ J + prior) @ K
+    size = np.sqrt(np.diag(actual)[:n_core])
+    assert spread.actual / np.outer(size, size) == pytest.approx(
+        (actual[:n_core, :n_core]) / np.outer(size, size), abs=1e-4
+    )
+    left = np.eye(len(J)) - J @ K @ J.T
+    A = np.linalg.inv(W) @ (left @ C @ left.T + J @ K @ prior @ K @ J.T) @ np.linalg.inv(W).T
+    variance = np.diag(A) / table.sigma**2
+    for fit in kind_fits(solution, spread, table):
+        family = table.family == table.families.index(fit.kind)
+        assert fit.expected == pytest.approx(variance[family].sum(), rel=1e-4), fit.kind
+    assert [fit.kind for fit in kind_fits(solution, spread, table)] == ["distance", "point"]

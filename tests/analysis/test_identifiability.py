@@ -10,8 +10,10 @@ from fg_calib.analysis.identifiability import identify, observe_configurations, 
 from fg_calib.analysis.reasons import NO_CAUSE, NOT_EXCITED
 from fg_calib.analysis.uncertainty import assess
 from fg_calib.errors import ProblemError
-from fg_calib.graph.problem import STRUCTURAL_FLOOR, build_problem, named_triangle, observe, random_problem
+from fg_calib.graph.build import STRUCTURAL_FLOOR, build_problem, random_problem
+from fg_calib.graph.information import named_triangle, observe
 from fg_calib.graph.solver import solve
+from fg_calib.measurements.kinds import SamePoint
 from fg_calib.options import Pairing
 from fg_calib.robot.model import Joint, RobotBuilder
 
@@ -93,7 +95,7 @@ DRAWN = [(robot, ranks) for robot, ranks, _ in RANKS] + [
 
 def rank_at(robot, model, seed):
     problem = random_problem(robot, model, seed=seed)
-    assert not np.any(problem.judgement.same_point if problem.judgement is not None else False)
+    assert not problem.data.n_train(SamePoint)
     return observe(problem, problem.start, (), STRUCTURAL_FLOOR).rank
 
 

@@ -43,7 +43,7 @@ def inverted(m):
 
 def wxyz(m):
     """The scalar first, in the columns of the vector."""
-    quaternion = np.roll(Rotation.from_matrix(m.rotation).as_quat(), 1, axis=1)
+    quaternion = np.roll(Rotation.from_matrix(m.rotation.copy()).as_quat(), 1, axis=1)
     return replace(m, rotation=Rotation.from_quat(quaternion).as_matrix())
 
 
@@ -147,7 +147,7 @@ ANGLES = {
 def test_other_angles_than_roll_pitch_yaw_are_named(tmp_path, fg_calib, mistake):
     robot = ur5e(tmp_path)
     m = measured(robot)
-    job = write_job(tmp_path, m, angles=ANGLES[mistake](Rotation.from_matrix(m.rotation)), model="pose")
+    job = write_job(tmp_path, m, angles=ANGLES[mistake](Rotation.from_matrix(m.rotation.copy())), model="pose")
     ended = fg_calib("calibrate", job)
     assert ended.code == 3
     assert f"if {mistake}" in " ".join(ended.out.split())
@@ -229,7 +229,7 @@ def touches(folder, seed=0, distance=0.05):
     points = np.repeat([[0.4, 0.2, 0.3], [0.45, 0.2, 0.3]], 25, axis=0)
     down = Rotation.from_euler("x", np.pi)
     turned = (Rotation.from_rotvec(rng.normal(scale=0.6, size=(50, 3))) * down).as_matrix()
-    found = solve_inverse(true, turned, points, rng)
+    found = solve_inverse(true, points, turned, generator=rng)
     q = found.readings[found.reached]
     columns = {f"q{i + 1}": v for i, v in enumerate(q.T)}
     write_csv(folder / "touches.csv", columns | {"group": np.repeat(["one", "two"], 25)[found.reached]})

@@ -10,7 +10,7 @@ from fg_calib.analysis.variance_components import solve_job
 from fg_calib.files.job import read_job
 from fg_calib.files.robot_yaml import read_robot
 from fg_calib.graph import solver
-from fg_calib.graph.problem import build_problem, problem_of
+from fg_calib.graph.build import build_problem, problem_of
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 

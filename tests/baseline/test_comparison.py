@@ -18,7 +18,7 @@ from fg_calib.errors import InputError
 from fg_calib.files.csv_writer import write_csv
 from fg_calib.files.job import read_job
 from fg_calib.files.robot_yaml import write_robot
-from fg_calib.graph.problem import build_problem, problem_of
+from fg_calib.graph.build import build_problem, problem_of
 from fg_calib.graph.solver import solve
 from fg_calib.job import Job
 from fg_calib.options import Options, Pairing
@@ -56,7 +56,7 @@ def simulated_folder(tmp_path):
     write_robot(tmp_path / "true.yaml", true)
     columns = {f"q{i + 1}": m.readings[:, i] for i in range(7)}
     columns |= dict(zip("xyz", m.position.T, strict=True))
-    columns |= dict(zip(("qx", "qy", "qz", "qw"), Rotation.from_matrix(m.rotation).as_quat().T, strict=True))
+    columns |= dict(zip(("qx", "qy", "qz", "qw"), Rotation.from_matrix(m.rotation.copy()).as_quat().T, strict=True))
     columns["split"] = np.where(m.test, "test", "train")
     write_csv(tmp_path / "poses.csv", columns)
     (tmp_path / "calibration.yaml").write_text(
@@ -164,7 +164,7 @@ def test_unknown_frame_and_tool_start_where_the_graph_starts(tmp_path, prefer):
     assert found.errors_before.fitted.rms > keep.errors.fitted.rms
 
 
-def test_a_job_without_test_rows_is_judged_at_its_train_rows(simulated_job):
+def test_a_job_without_test_rows_is_reweighted_at_its_train_rows(simulated_job):
     job = replace(
         simulated_job,
         truth=None,

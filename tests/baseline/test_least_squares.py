@@ -13,7 +13,7 @@ from fg_calib.analysis.uncertainty import assess
 from fg_calib.baseline import least_squares
 from fg_calib.baseline.least_squares import fit_least_squares
 from fg_calib.errors import InputError
-from fg_calib.graph.problem import build_problem
+from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import SolverOptions, solve
 from fg_calib.measurements.dataset import Measurements, Pairs, form_pairs, rotation_angle
 from fg_calib.options import Pairing

@@ -83,7 +83,7 @@ def test_a_result_has_every_key_of_its_schema(result):
         **{"observability": dict, "inputs": dict},
     }
     assert {key: type(result[key]) for key in shape} == shape  # more may be added
-    assert result["schema"] == "fg-calib/result/1"
+    assert result["schema"] == "fg-calib/result/2"
     assert (result["version"], result["robot"]) == (__version__, "space-robot")
     assert (result["model"], result["frame"], result["pairing"]) == ("distance-rotation", "unknown", "star")
     assert {key: type(value) for key, value in result["residual_rms"].items()} == rms
@@ -254,7 +254,7 @@ def test_an_existing_folder_keeps_its_other_files(fg_calib, example):
     assert fg_calib("calibrate", example / JOB, "--out", out).code == 0
     assert {f.name for f in out.iterdir()} == OUTPUTS | {"notes.txt"}
     assert (out / "notes.txt").read_text() == "mine"
-    assert json.loads((out / "result.json").read_text())["schema"] == "fg-calib/result/1"
+    assert json.loads((out / "result.json").read_text())["schema"] == "fg-calib/result/2"
 
 
 def test_a_failure_leaves_an_existing_folder_as_it_was(fg_calib, example):

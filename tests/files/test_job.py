@@ -174,7 +174,7 @@ MISTAKES = [
      "calibration.yaml: robot: found [], expected a path, or the mapping of a robot file"),
     (JOB.replace("robots/robot.yaml", "{convention: dh, joints: [{a: 0}]}"),
      "calibration.yaml: robot: joint 1: missing key 'theta'"),
-    (JOB.replace("poses.csv", "1"), "calibration.yaml: measurements: found 1, expected text"),
+    (JOB.replace("poses.csv", "1"), "calibration.yaml: measurements: found 1, expected a path, or a list of tables"),
 ]  # fmt: skip
 
 

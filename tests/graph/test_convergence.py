@@ -13,7 +13,8 @@ from fg_calib.analysis.covariance import spread_of
 from fg_calib.baseline.least_squares import fit_least_squares
 from fg_calib.files.robot_yaml import read_robot
 from fg_calib.files.tables import read_measurements
-from fg_calib.graph.problem import build_problem, judged_at
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.problem import reweighted_at
 from fg_calib.graph.solver import SolverOptions, solve
 from fg_calib.measurements.dataset import Noise
 from fg_calib.options import Pairing
@@ -104,7 +105,7 @@ def test_solving_again_from_the_answer_moves_nothing(name, gauge):
         assert solution.converged, solution.message
         if options.get("loss", "none") == "none":
             assert solution.iterations <= MOST
-        again = solve(judged_at(solution.problem, solution.parameters))
+        again = solve(reweighted_at(solution.problem, solution.parameters))
         assert again.converged, again.message
         spread, scales = spread_of(solution), solution.problem.variables.prior_scales
         variables = solution.problem.variables

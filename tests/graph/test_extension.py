@@ -10,10 +10,14 @@ from tolerances import rounding
 
 from fg_calib.analysis.uncertainty import assess
 from fg_calib.analysis.variance_components import estimate_noise
-from fg_calib.errors import ProblemError
-from fg_calib.graph.problem import build_problem
-from fg_calib.graph.solver import solve
-from fg_calib.robot.kinematics import forward, precompute_trig
+from fg_calib.errors import InputError, ProblemError
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.extension import DistanceFactor, RotationAngleFactor, expand
+from fg_calib.graph.factors import prior_factors
+from fg_calib.graph.solver import levenberg_marquardt_params, solve
+from fg_calib.measurements.dataset import Pairs, rotation_angle
+from fg_calib.options import Pairing
+from fg_calib.robot.kinematics import forward, pose, precompute_trig
 
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3, "beta": 1e-3}
 ANCHOR = gtsam.symbol("a", 0)
@@ -38,11 +42,11 @@ def prior_on_k3(problem, sigma=1e-6):
 def known_distance(problem, extra=2e-3, sigma=1e-5):
     """The tool moves by 2 mm more than nominal between two configurations."""
     variables, trig = problem.variables, precompute_trig(problem.robot, READINGS)
-    at = forward(variables.chain.at(problem.start), trig).position
+    at = forward(variables.chains[0].at(problem.start), trig).position
     length = np.linalg.norm(at[1] - at[0]) + extra
 
     def error(_, values, H):
-        at = forward(variables.chain.at(variables.parameters(values, variables.items)), trig)
+        at = forward(variables.chains[0].at(variables.parameters(values, variables.items)), trig)
         step = at.position[1] - at.position[0]
         if H is not None:
             J = (step / np.linalg.norm(step) @ (at.jacobian[1, 3:] - at.jacobian[0, 3:]))[None]
@@ -59,11 +63,11 @@ def anchor_distances(problem, point, n=8, sigma=1e-4):
     variables = problem.variables
     q = np.random.default_rng(3).uniform(-1.5, 1.5, (n, problem.robot.n_joints))
     trig = precompute_trig(problem.robot, q)
-    measured = np.linalg.norm(forward(variables.chain.at(problem.start), trig).position - point, axis=1)
+    measured = np.linalg.norm(forward(variables.chains[0].at(problem.start), trig).position - point, axis=1)
 
     def factor(k):
         def error(_, values, H):
-            at = forward(variables.chain.at(variables.parameters(values, variables.items)), trig[k : k + 1])
+            at = forward(variables.chains[0].at(variables.parameters(values, variables.items)), trig[k : k + 1])
             step = at.position[0] - values.atPoint3(ANCHOR)
             u = step / np.linalg.norm(step)
             if H is not None:
@@ -221,3 +225,97 @@ def test_a_start_of_ones_own_is_where_the_solver_begins():
     still = solve(problem_of(model="pose", robot=robot))
     assert moved.initial_cost != still.initial_cost
     assert np.abs(moved.parameters - still.parameters).max() < rounding(1, 1e4)
+
+
+# --- our rows as factors of one measurement each ----------------------------------------------------------------------
+
+EXPANDED = {
+    "poses": ({"model": "pose"}, 0.0),
+    "poses, joint noise": ({"model": "pose", "frame": "unknown"}, 5e-4),
+    "star": ({"model": "distance-rotation"}, 0.0),
+    "chain, joint noise": ({"model": "distance", "pairing": Pairing("chain")}, 5e-4),
+    "all pairs as if independent": (
+        {"model": "distance-rotation", "pairing": Pairing("all"), "pair_errors": "independent"},
+        0.0,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", EXPANDED)
+def test_the_expanded_graph_has_the_same_optimum(name):
+    options, sigma_joint = EXPANDED[name]
+    rng = np.random.default_rng(4)
+    robot = paper_robot(TOLERANCE)
+    m = measure(true_robot(robot, rng), 14, rng, sigma_joint=sigma_joint)
+    solution = solve(build_problem(robot, m, **options))
+    problem = solution.problem  # its rows are whitened at the estimate
+    graph, initial = expand(problem)
+    n_measurements = sum(part.block.n for rows in problem.rows for part in rows.parts)
+    shared = [rows for rows in problem.rows if rows.shared is not None]
+    n_errors = sum(len(rows.configurations) for rows in shared)
+    assert bool(shared) == (name in ("star", "chain, joint noise"))
+    assert graph.size() == n_measurements + n_errors + len(prior_factors(problem.variables))
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, initial, levenberg_marquardt_params())
+    values = optimizer.optimize()
+    assert graph.error(values) == pytest.approx(solution.cost, rel=1e-9)
+    sigma = np.sqrt(np.diag(assess(solution).spread.tangent))
+    off = problem.variables.step(solution.values, values) / sigma
+    assert np.abs(off).max() < 1e-4  # where GTSAM stops
+
+
+def test_the_expanded_graph_can_be_solved_incrementally():
+    rng = np.random.default_rng(5)
+    robot = paper_robot(TOLERANCE)
+    solution = solve(build_problem(robot, measure(true_robot(robot, rng), 12, rng), model="distance-rotation"))
+    graph, initial = expand(solution.problem)
+    params = gtsam.ISAM2Params()
+    params.setFactorization("QR")
+    params.relinearizeSkip = 1
+    params.setRelinearizeThreshold(1e-9)
+    isam = gtsam.ISAM2(params)
+    isam.update(graph, initial)
+    for _ in range(8):
+        isam.update()
+    assert graph.error(isam.calculateBestEstimate()) == pytest.approx(solution.cost, rel=1e-6)
+
+
+def test_pair_factors_by_name_are_the_rows_of_a_table():
+    """Against the problem that the same pairs make as a table; and usable with GTSAM's marginals."""
+    rng = np.random.default_rng(6)
+    robot = paper_robot(TOLERANCE)
+    true = true_robot(robot, rng)
+    m = measure(true, 40, rng)
+    at, a, b = pose(true, m.readings), np.arange(39), np.arange(1, 40)
+    distance = np.linalg.norm(at.position[b] - at.position[a], axis=1)
+    angle = rotation_angle(np.swapaxes(at.rotation[a], 1, 2) @ at.rotation[b])[0]
+    sigma = (np.full(39, 1e-3), np.full(39, 2e-4))
+    pairs = Pairs(a, b, distance, angle, *sigma, np.zeros(39, bool))
+    whole = build_problem(robot, replace(m, pairs=pairs), model="distance-rotation")
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in prior_factors(whole.variables):
+        graph.add(factor)
+    for i in range(39):
+        ends = m.readings[a[i]], m.readings[b[i]]
+        graph.add(DistanceFactor(whole.variables, *ends, distance[i], 1e-3))
+        graph.add(RotationAngleFactor(whole.variables, *ends, angle[i], 2e-4))
+    # The rows of a table know that noise lengthens distances near 0: a millionth of their chi-square here.
+    assert graph.error(whole.initial) == pytest.approx(whole.graph.error(whole.initial), rel=1e-5)
+    solution = solve(whole)
+    values = gtsam.LevenbergMarquardtOptimizer(graph, whole.initial, levenberg_marquardt_params()).optimize()
+    sigmas = np.sqrt(np.diag(assess(solution).spread.tangent))
+    assert np.abs(whole.variables.step(solution.values, values) / sigmas).max() < 1e-2
+    key = gtsam.symbol("K", 3)
+    ours = sigmas[next(v.columns for v in whole.variables.items if v.key == key)]
+    theirs = np.sqrt(np.diag(gtsam.Marginals(graph, values).marginalCovariance(key)))
+    assert ours == pytest.approx(theirs, rel=1e-3)
+
+
+@pytest.mark.parametrize("figure", [np.nan, -1.0, "far"])
+def test_a_figure_of_a_factor_is_checked(figure):
+    problem = problem_of()
+    with pytest.raises(InputError, match=r"^distance: found "):
+        DistanceFactor(problem.variables, *READINGS, figure, 1e-3)
+    with pytest.raises(InputError, match=r"^sigma: found 0, "):
+        RotationAngleFactor(problem.variables, *READINGS, 1.0, 0)
+    with pytest.raises(InputError, match=r"^readings: shape \(2, 3\)"):
+        DistanceFactor(problem.variables, [0, 0, 0], [0, 0, 0], 1.0, 1e-3)

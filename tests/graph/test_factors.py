@@ -10,18 +10,19 @@ from simulated import TOOL, measure, paper_robot, small_arm, true_robot
 from tolerances import rounding
 
 from fg_calib.errors import SolverError
+from fg_calib.graph.build import build_problem
 from fg_calib.graph.factors import (
     Reduction,
     build_variables,
     custom_factor,
     frame_of,
-    measurement_factor,
     pose_of,
     prior_rows,
+    row_factor,
     square_root,
     well_conditioned,
 )
-from fg_calib.graph.problem import build_problem
+from fg_calib.graph.rows import RowSet
 from fg_calib.measurements import residuals
 from fg_calib.options import Pairing
 
@@ -46,33 +47,31 @@ def moved(values, variables, step):
 @pytest.mark.parametrize("model", ["pose", "position", "orientation", "distance", "rotation", "distance-rotation"])
 def test_derivatives_of_every_model_are_those_along_gtsams_retraction(model):
     problem = problem_of(model)
-    variables, block = problem.variables, problem.blocks[0]
+    variables, (rows,) = problem.variables, problem.rows
     rng = np.random.default_rng(1)
     values = moved(problem.initial, variables, 1e-2 * rng.normal(size=variables.n_columns))
 
     def residual(step):
-        return residuals.residual(
-            block, variables.chain.at(variables.parameters(moved(values, variables, step)))
-        ).ravel()
+        at = variables.at(variables.parameters(moved(values, variables, step)))
+        return rows.linearise(at.without_columns())[0]
 
-    _, J = residuals.linearise(block, variables.chain.at(variables.parameters(values)))
+    _, J = rows.linearise(variables.at(variables.parameters(values)))
     h = 1e-6
     for k in range(variables.n_columns):
         step = np.zeros(variables.n_columns)
         step[k] = h
         numeric = (residual(step) - residual(-step)) / (2 * h)
         size = max(1.0, np.abs(J).max())
-        assert J[:, :, k].ravel() == pytest.approx(numeric, abs=1e-6 * size), variables.names[k]
+        assert J[:, k] == pytest.approx(numeric, abs=1e-6 * size), variables.names[k]
 
 
 @pytest.mark.parametrize("model", ["pose", "distance-rotation"])
 def test_a_reduced_block_equals_its_rows_in_cost_gradient_and_hessian(model):
     problem = problem_of(model, n=40)
-    variables, block, values = problem.variables, problem.blocks[0], problem.initial
-    assert block.n * block.height > variables.n_columns + 1
-    factor = measurement_factor(block, variables)
-    r, J = residuals.linearise(block, variables.chain.at(variables.parameters(values)))
-    r, J = r.ravel(), J.reshape(-1, variables.n_columns)
+    variables, (rows,), values = problem.variables, problem.rows, problem.initial
+    assert rows.n_rows > variables.n_columns + 1
+    factor = row_factor(rows, variables)
+    r, J = rows.linearise(variables.at(variables.parameters(values)))
     assert factor.error(values) == pytest.approx(0.5 * r @ r, rel=rounding(1, 10))
     A, b = factor.linearize(values).jacobian()
     assert A.T @ A == pytest.approx(J.T @ J, abs=rounding(np.abs(J.T @ J).max(), 100))
@@ -80,19 +79,22 @@ def test_a_reduced_block_equals_its_rows_in_cost_gradient_and_hessian(model):
     assert A.shape == (variables.n_columns + 1, variables.n_columns)
 
 
-def one_by_one(block, variables):
-    graph = gtsam.NonlinearFactorGraph()
-    for i in range(block.n):
-        graph.add(measurement_factor(residuals.rows_of(block, slice(i, i + 1)), variables))
+def one_by_one(rows, variables):
+    """A factor for each measurement of rows that share no errors."""
+    graph, (part,) = gtsam.NonlinearFactorGraph(), rows.parts
+    assert rows.shared is None
+    for i in range(part.block.n):
+        one = replace(part, block=residuals.rows_of(part.block, slice(i, i + 1)), nuisances=part.nuisances[i : i + 1])
+        graph.add(row_factor(RowSet((one,)), variables))
     return graph
 
 
 @pytest.mark.parametrize("model", ["pose", "position", "orientation", "distance", "rotation", "distance-rotation"])
 def test_single_row_factors_and_the_block_have_the_same_cost_and_gradient(model):
     problem = problem_of(model, n=15)
-    block, values = problem.blocks[0], problem.initial
-    whole, single = measurement_factor(block, problem.variables), one_by_one(block, problem.variables)
-    assert single.size() == block.n
+    (rows,), values = problem.rows, problem.initial
+    whole, single = row_factor(rows, problem.variables), one_by_one(rows, problem.variables)
+    assert single.size() == rows.parts[0].block.n
     assert single.error(values) == pytest.approx(whole.error(values), rel=rounding(1, 10))
     G = whole.linearize(values).augmentedInformation()
     H = single.linearize(values).augmentedHessian()
@@ -106,7 +108,7 @@ def test_single_row_factors_and_the_block_have_the_same_optimum():
         estimate=["tool.x"],
         tolerance={"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3, "tool": 1e-3},
     )
-    single = one_by_one(problem.blocks[0], problem.variables)
+    single = one_by_one(problem.rows[0], problem.variables)
     for i in range(1, problem.graph.size()):  # the priors
         single.add(problem.graph.at(i))
     found = []
@@ -121,19 +123,19 @@ def test_single_row_factors_and_the_block_have_the_same_optimum():
 
 def test_keys_are_joints_tool_and_frame():
     robot = small_arm(estimate=TOOL)
-    variables = build_variables(robot, frame=True)
+    variables = build_variables(robot, [True])
     assert [v.symbol for v in variables.items] == ["K(1)", "K(2)", "K(3)", "K(4)", "T(0)", "X(0)"]
     assert variables.names[:4] == ("a1", "alpha1", "d1", "theta1")
     both = small_arm(estimate=[*TOOL, *(name.replace("tool", "base") for name in TOOL)])
-    assert [v.symbol for v in build_variables(both, frame=False).items][::5] == ["B(0)", "T(0)"]
-    partly = build_variables(small_arm(estimate=["tool.z"]), frame=False)
+    assert [v.symbol for v in build_variables(both, [False]).items][::5] == ["B(0)", "T(0)"]
+    partly = build_variables(small_arm(estimate=["tool.z"]), [False])
     assert [v.symbol for v in partly.items] == ["K(1)", "K(2)", "K(3)", "K(4)", "K(5)"]
     assert partly.names[-1] == "tool.z"
     assert variables.describe(gtsam.symbol("K", 2)) == "K(2) (a2, alpha2, d2, theta2)"
 
 
 def test_values_and_parameter_vector_are_two_ways_to_write_the_same():
-    variables = build_variables(small_arm(estimate=TOOL), frame=True)
+    variables = build_variables(small_arm(estimate=TOOL), [True])
     parameters = variables.nominal() + 0.1 * np.random.default_rng(2).normal(size=len(variables.nominal()))
     assert variables.parameters(variables.values(parameters))[6:] == pytest.approx(parameters[6:], abs=rounding(1.0))
 
@@ -148,7 +150,7 @@ def test_pose3_steps_rotation_first_and_in_itself():
 
 
 def test_named_scalars_of_a_pose_follow_its_tangent():
-    variables = build_variables(small_arm(estimate=TOOL), frame=True)
+    variables = build_variables(small_arm(estimate=TOOL), [True])
     parameters = variables.nominal() + 0.3 * np.random.default_rng(3).normal(size=len(variables.nominal()))
     values = variables.values(parameters)
     columns = [list(v.parameters) for v in variables.items]
@@ -163,7 +165,7 @@ def test_named_scalars_of_a_pose_follow_its_tangent():
 
 def test_priors_pull_to_nominal_with_their_tolerance_whatever_the_variable():
     tolerance = {"a": 2e-3, "tool": 5e-3, "tool.yaw": 0.01}
-    variables = build_variables(small_arm(estimate=TOOL, tolerance=tolerance), frame=True)
+    variables = build_variables(small_arm(estimate=TOOL, tolerance=tolerance), [True])
     parameters = variables.nominal()
     names = [p.name for p in variables.robot.parameters]
     parameters[names.index("a2")] += 4e-3
@@ -178,7 +180,7 @@ def test_priors_pull_to_nominal_with_their_tolerance_whatever_the_variable():
 
 
 def test_a_wrong_shape_or_a_number_that_is_none_is_an_error_and_not_the_end_of_the_interpreter():
-    variables = build_variables(small_arm(), frame=False)
+    variables = build_variables(small_arm(), [False])
     values, n = variables.values(variables.nominal()), variables.n_columns
     cases = {
         "shapes": lambda _: (np.zeros(2), np.zeros((3, n))),
@@ -209,10 +211,10 @@ def test_large_blocks_change_to_the_gram_matrix_only_if_well_conditioned():
     assert not well_conditioned(np.hstack([J, J[:, :1] + 1e-7 * rng.normal(size=(30, 1))]))
 
     problem = problem_of("distance-rotation", n=150, frame="known", estimate=())
-    block, chain = problem.blocks[0], problem.variables.chain.at(problem.start)
-    assert block.n * block.height > 20_000
-    reduce = Reduction(block)
-    first, second = reduce(chain), reduce(chain)
+    (rows,), at = problem.rows, problem.variables.at(problem.start)
+    assert rows.n_rows > 20_000
+    reduce = Reduction(rows)
+    first, second = reduce(at), reduce(at)
     assert np.allclose(first, np.triu(first))
     assert not np.allclose(second, np.triu(second))
     assert second.T @ second == pytest.approx(first.T @ first, abs=rounding(np.abs(first.T @ first).max(), 100))
@@ -220,8 +222,8 @@ def test_large_blocks_change_to_the_gram_matrix_only_if_well_conditioned():
 
 def test_fixed_parameters_have_no_column():
     robot = paper_robot(fixed=["a1", "alpha1", "d1", "theta1", "beta1"])
-    variables = build_variables(robot, frame=False)
+    variables = build_variables(robot, [False])
     assert variables.n_columns == 30
     assert "K(1)" not in [v.symbol for v in variables.items]
     changed = replace(robot, name="other")
-    assert build_variables(changed, frame=False).names == variables.names
+    assert build_variables(changed, [False]).names == variables.names

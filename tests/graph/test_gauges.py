@@ -15,7 +15,7 @@ from fg_calib.analysis.covariance import Spread
 from fg_calib.analysis.uncertainty import assess
 from fg_calib.files.csv_writer import write_csv
 from fg_calib.files.robot_yaml import write_robot
-from fg_calib.graph.problem import build_problem
+from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.robot.kinematics import pose
 
@@ -180,7 +180,7 @@ def job_files(folder, robot, gauge):
     write_robot(folder / "robot.yaml", robot)
     columns = {f"q{i + 1}": m.readings[:, i] for i in range(robot.n_joints)}
     columns |= dict(zip("xyz", m.position.T, strict=True))
-    columns |= dict(zip(("qx", "qy", "qz", "qw"), Rotation.from_matrix(m.rotation).as_quat().T, strict=True))
+    columns |= dict(zip(("qx", "qy", "qz", "qw"), Rotation.from_matrix(m.rotation.copy()).as_quat().T, strict=True))
     write_csv(folder / "poses.csv", columns)
     noise = "{position: 0.0002, orientation: 0.0001}"
     (folder / "job.yaml").write_text(

@@ -2,21 +2,22 @@
 
 from dataclasses import replace
 
-import gtsam
 import numpy as np
 import pytest
 import scipy.optimize
 from scipy.spatial.transform import Rotation
-from simulated import measure, small_arm, true_robot
+from simulated import measure, plus, small_arm, true_robot
+from tolerances import sigmas_apart
 
 from fg_calib.analysis.uncertainty import assess
-from fg_calib.errors import ProblemError
-from fg_calib.graph import problem as problem_module
-from fg_calib.graph.problem import build_problem
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.factors import pose_of
+from fg_calib.graph.problem import mahalanobis_distances, noises_at, reweighted_at
 from fg_calib.graph.solver import solve
+from fg_calib.measurements import residuals, sharing
 from fg_calib.measurements.dataset import Pairs, rotation_angle
 from fg_calib.options import Pairing
-from fg_calib.robot.kinematics import pose
+from fg_calib.robot.kinematics import pose, precompute_trig
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 SIGMA, SIGMA_JOINT = (1e-3, 5e-4), 2e-3
@@ -84,14 +85,9 @@ def optimum(request):
     return robot, m, model, *everything(robot, m, model)
 
 
-@pytest.mark.parametrize("most", [100, 0], ids=["variables", "eliminated"])
-def test_estimated_joint_values_give_the_optimum_over_everything(optimum, most, monkeypatch):
-    monkeypatch.setattr(problem_module, "MAX_JOINT_VARIABLES", most)
+def test_estimated_joint_values_give_the_optimum_over_everything(optimum):
     robot, m, model, values, chi2 = optimum
-    problem = build_problem(robot, m, model=model, encoder="estimated")
-    keys = {gtsam.symbol("Q", k) for k in range(12)} & set(problem.graph.keyVector())
-    assert len(keys) == (12 if most else 0)
-    solution = solve(problem)
+    solution = solve(build_problem(robot, m, model=model, encoder="estimated"))
     assert solution.converged
     sigma = np.array([p.sigma or 1.0 for p in assess(solution).parameters])
     away = (solution.parameters[: len(values)] - values) / sigma
@@ -102,6 +98,76 @@ def test_estimated_joint_values_give_the_optimum_over_everything(optimum, most, 
     assert 1e-3 < apart < 0.5  # the same to first order only: 2 mrad of encoder noise bend the arm's paths
 
 
+def everything_given_the_noise(solution):
+    """Optimum over parameters, frame and all joint values at once, by scipy, with weights and other noise as solved.
+
+    Returns:
+        The robot's parameters, chi-square, the covariance of those that are estimated, and the degrees of freedom: of
+        what rows have to themselves for numerical safety alone, a share of none (see `RowSet.n_spare`).
+    """
+    problem = solution.problem
+    robot, (noise,), (series,) = problem.robot, problem.noises, problem.data.series
+    m, train = problem.measurements, series.train
+    scale = np.array([p.scale if p.estimated else 0.0 for p in robot.parameters])
+    columns = np.flatnonzero(scale)
+    n, n_frame, height = len(columns), 6 * len(problem.variables.frames), series.kind.height
+
+    private = noise.own.copy()
+    carried = frozenset(source.name for source in noise.sources)
+    diagonal = np.einsum("nii->ni", private)
+    raised = np.maximum(diagonal + noise.more_if_redundant(carried), noise.least())
+    private += (raised - diagonal)[:, :, None] * np.eye(height)
+    if problem.state.weights is not None:
+        (weights,) = problem.state.weights
+        private += (1.0 / np.maximum(weights, 1e-12) - 1.0)[:, None, None] * noise.total
+    C = np.zeros((len(train), height, len(train), height))
+    for i, k in enumerate(train):
+        C[i, :, i, :] = private[k]
+    of_joints = np.zeros_like(C)
+    for source in noise.sources:
+        G = np.zeros((len(train), height, m.n_configurations, source.loading.shape[3]))
+        for i, k in enumerate(train):
+            for end, place in enumerate(source.ends[k]):
+                G[i, :, place] += source.loading[k, :, end]
+        into = of_joints if source.name == "joints" else C
+        into += np.einsum("ahcw,bkcw->ahbk", G, G)
+    used = series.used[train].ravel()
+    C, of_joints = (S.reshape(used.size, -1)[np.ix_(used, used)] for S in (C, of_joints))
+    W = np.linalg.inv(np.linalg.cholesky(C))
+    spare = (raised[train] - noise.bare(train)).ravel()[used] if carried - {"joints"} else np.zeros(used.sum())
+    n_independent = used.sum() - np.sum(spare * np.diag(np.linalg.inv(C + of_joints)))
+
+    def unwhitened(arm, frame, q):
+        if model_of_poses:
+            at, X = pose(arm, q), pose_of(frame)
+            R, p = X.rotation().matrix() @ at.rotation, at.position @ X.rotation().matrix().T + X.translation()
+            turn = Rotation.from_matrix(np.swapaxes(m.rotation, 1, 2) @ R).as_rotvec()
+            return np.hstack([turn, p - m.position])[train].ravel()[used]
+        values = pair_values(arm, q, *series.ends.T)[:, quantities]
+        slope = np.einsum("nii->ni", residuals.unpack(noise.rows.whitening, height))
+        start = noise.predicted[:, quantities]
+        return (start - series.data + noise.excess + slope * (values - start))[train].ravel()[used]
+
+    model_of_poses = series.kind.ends == 1
+    quantities = [("distance", "angle").index(name) for name in series.kind.names] if not model_of_poses else []
+    start_frame = solution.parameters[len(scale) :][:6]
+
+    def rows(x):
+        values = robot.nominal
+        values[columns] += x[:n] * scale[columns]
+        z = x[n + n_frame :]
+        frame = start_frame + 1e-3 * np.append(x[n : n + n_frame], np.zeros(6 - n_frame))
+        q = m.readings + SIGMA_JOINT * z.reshape(m.readings.shape)
+        return np.concatenate([W @ unwhitened(robot.with_values(values), frame, q), x[:n], z])
+
+    start = np.zeros(n + n_frame + m.readings.size)
+    found = scipy.optimize.least_squares(rows, start, jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-12, max_nfev=25)
+    values = robot.nominal
+    values[columns] += found.x[:n] * scale[columns]
+    covariance = np.linalg.inv(found.jac.T @ found.jac)[:n, :n] * np.outer(scale[columns], scale[columns])
+    return values, 2.0 * found.cost, covariance, round(n_independent) - n_frame  # a prior for each parameter
+
+
 @pytest.mark.parametrize(
     ("kind", "model", "options"),
     [
@@ -109,45 +175,77 @@ def test_estimated_joint_values_give_the_optimum_over_everything(optimum, most, 
         ("poses", "distance-rotation", {"pairing": Pairing("star")}),
         ("poses", "distance-rotation", {"pairing": Pairing("all")}),
         ("poses", "distance", {"pairing": Pairing("chain"), "loss": "huber"}),
+        ("poses", "pose", {"loss": "cauchy"}),
         ("direct", "distance-rotation", {"loss": "gnc"}),
     ],
 )
-def test_joint_values_as_variables_and_eliminated_have_one_optimum(kind, model, options, monkeypatch):
+def test_eliminated_joint_values_have_the_optimum_over_everything(kind, model, options):
+    """Also in unknown frames, where pairs share the errors of poses, and with the weights of robust losses."""
     robot, m = measured(kind, 12, 5)
-    found = []
-    for most in (100, 0):
-        monkeypatch.setattr(problem_module, "MAX_JOINT_VARIABLES", most)
-        found.append(solve(build_problem(robot, m, model=model, encoder="estimated", **options)))
-    a, b = (assess(s) for s in found)
-    assert all(s.converged for s in found)
-    sigma = np.array([p.sigma or 1.0 for p in a.parameters])
-    apart = (found[0].parameters[: len(sigma)] - found[1].parameters[: len(sigma)]) / sigma
-    # With a loss the weights come from residuals at the readings as stated, or at the true joint values.
-    assert np.max(np.abs(apart)) < (0.2 if "loss" in options else 1e-4)
-    assert a.dof == b.dof
-    if "loss" not in options:
-        assert a.chi2 == pytest.approx(b.chi2, rel=1e-5)
-        assert np.allclose(a.covariance, b.covariance, rtol=1e-3, atol=1e-3 * np.abs(b.covariance).max())
+    solution = solve(build_problem(robot, m, model=model, encoder="estimated", **options))
+    assert solution.converged
+    values, chi2, covariance, dof = everything_given_the_noise(solution)
+    of_solution = assess(solution)
+    sigma = np.array([p.sigma or 1.0 for p in of_solution.parameters])
+    assert np.max(np.abs(solution.parameters[: len(values)] - values) / sigma) < 1e-4
+    assert 2.0 * solution.weighted_cost == pytest.approx(chi2, rel=1e-6)
+    if "loss" in options:
+        assert of_solution.dof == assess(solve(build_problem(robot, m, model=model, **options))).dof
+    else:
+        assert of_solution.dof == dof
+        assert np.allclose(of_solution.covariance, covariance, rtol=1e-3, atol=1e-3 * np.abs(covariance).max())
+
+
+@pytest.mark.parametrize(("kind", "model"), [("poses", "pose"), ("poses", "position"), ("direct", "distance-rotation")])
+def test_what_joint_values_explain_is_still_part_of_how_far_off_a_measurement_is(kind, model):
+    """Residuals at joint values that were estimated from them are short; weights go by those at the readings."""
+    robot, m = measured(kind, 40, seed=3)
+    squared = []
+    for encoder in ("propagated", "estimated"):
+        solution = solve(build_problem(robot, m, model=model, encoder=encoder))
+        ((e, height),) = mahalanobis_distances(solution.problem, solution.parameters)
+        squared.append(np.sum(e**2) / height.sum())
+    assert squared[1] == pytest.approx(squared[0], rel=5e-3)
+    assert squared[1] == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / height.sum()))
+
+
+@pytest.mark.parametrize("loss", ["huber", "gnc"])
+def test_gross_errors_are_not_taken_for_joint_errors(loss):
+    robot, m = measured("poses", 40, seed=8)
+    bad = np.arange(0, 40, 10)
+    m = replace(m, position=plus(m.position, bad, np.array([0.03, -0.02, 0.03])))
+    weights = []
+    for encoder in ("propagated", "estimated"):
+        problem = solve(build_problem(robot, m, model="position", encoder=encoder, loss=loss)).problem
+        weights.append(problem.state.weights[0])
+    assert weights[1] == pytest.approx(weights[0], abs=0.02)
+    assert np.max(weights[1][bad]) < 0.6
 
 
 def test_derivatives_in_the_true_joint_values_are_those_of_the_rows():
-    """Every term against central differences, away from the readings."""
+    """Of every end against central differences, away from the readings."""
     robot, m = measured("poses", 6, 6)
     rng = np.random.default_rng(0)
     for model, pairing in (("pose", "star"), ("distance-rotation", "star"), ("distance", "all")):
         problem = build_problem(robot, m, model=model, pairing=Pairing(pairing), encoder="estimated")
-        v = problem.variables
-        at = problem.start.copy()
-        at[v.nuisance_span] += 1e-2 * rng.normal(size=v.n_nuisance)
-        for term in problem.terms:
-            J = term.linearise(v, at)[1]
-            places = [i for k in term.nuisance for i in v.nuisance[k].parameters]
-            J = J[:, len(J[0]) - len(places) :]
-            for column, place in enumerate(places):
-                h = np.zeros(len(at))
-                h[place] = 1e-6
-                numeric = (term.residual(v, at + h) - term.residual(v, at - h)) / 2e-6
-                assert np.allclose(J[:, column], numeric, rtol=1e-5, atol=1e-5 * np.abs(J).max())
+        errors = 1e-2 * rng.normal(size=m.readings.shape)
+        problem = reweighted_at(problem, problem.start, replace(problem.state, joint_errors=errors))
+        (noise,), (chain,) = noises_at(problem, problem.start), problem.variables.at(problem.start).chains
+        (source,) = (s for s in noise.sources if s.name == "joints")
+        J = source.loading / m.sigma_joint
+        found = np.zeros((*J.shape[:2], m.n_configurations, robot.n_joints))
+        for k, ends in enumerate(noise.series.ends):
+            for end, place in enumerate(ends):
+                found[k, :, place] += J[k, :, end]
+
+        def at(q, noise=noise, chain=chain):
+            return residuals.residual(replace(noise.rows, trig=precompute_trig(robot, q)), chain)
+
+        for place in np.ndindex(m.readings.shape):
+            h = np.zeros(m.readings.shape)
+            h[place] = 1e-6
+            numeric = (at(m.readings + errors + h) - at(m.readings + errors - h)) / 2e-6
+            assert np.allclose(found[:, :, *place], numeric, rtol=1e-5, atol=1e-5 * np.abs(J).max())
 
 
 @pytest.mark.parametrize(
@@ -168,7 +266,10 @@ def test_both_ways_agree_to_first_order(kind, model, options):
     for shrink in (1.0, 0.1):
         robot, m = measured(kind, 12, 2, shrink * SIGMA_JOINT)
         if options.get("pair_errors") == "independent" and shrink == 1.0:
-            assert build_problem(robot, m, model=model, encoder="estimated", **options).sharing.joints
+            (rows,) = build_problem(robot, m, model=model, encoder="estimated", **options).rows
+            carried = set((rows.shared.loadings.indices % rows.shared.width).tolist())
+            assert carried
+            assert carried <= set(range(rows.joints, rows.joints + 4))  # none of the poses
         found = [solve(build_problem(robot, m, model=model, encoder=e, **options)) for e in ("propagated", "estimated")]
         assert all(s.converged for s in found)
         if options.get("pair_errors") == "independent":
@@ -182,15 +283,22 @@ def test_both_ways_agree_to_first_order(kind, model, options):
     assert apart[1] < max(0.05 * apart[0], 2e-3)
 
 
-def test_too_many_joint_values_for_pairs_are_refused(monkeypatch):
-    monkeypatch.setattr(problem_module, "MAX_SHARED", 20)
-    monkeypatch.setattr(problem_module, "MAX_JOINT_VARIABLES", 10)
+def test_eliminated_joint_values_of_pairs_are_the_same_whichever_way_they_are_eliminated(monkeypatch):
+    """Values, their sigmas, and those of the parameters: steps end 3e-5 sigma from the dense way at most."""
     robot, m = measured("direct", 12, seed=3)
-    with pytest.raises(ProblemError) as error:
-        build_problem(robot, m, model="distance", encoder="estimated")
-    assert str(error.value) == (
-        "encoder: estimated: 30 rows or errors that they share, expected at most 20 for models of pairs; propagated"
-    )
+    found = []
+    for most, filled in ((sharing.MAX_DENSE, sharing.FILLED), (0, 0)):
+        monkeypatch.setattr(sharing, "MAX_DENSE", most)
+        monkeypatch.setattr(sharing, "FILLED", filled)
+        uncertainty = assess(solve(build_problem(robot, m, model="distance-rotation", encoder="estimated")))
+        values = uncertainty.joint_values
+        found.append([uncertainty.robot.nominal, uncertainty.covariance, values.error, values.sigma])
+    sigma = np.sqrt(np.diag(found[0][1]))
+    estimated = [robot.index(name) for name in uncertainty.names]
+    assert sigmas_apart(found[1][0][estimated], found[0][0][estimated], sigma) < 3e-5
+    assert found[1][1] == pytest.approx(found[0][1], rel=1e-6, abs=1e-6 * np.min(sigma) ** 2)
+    assert np.abs(found[1][2] - found[0][2]).max() < 3e-5 * SIGMA_JOINT
+    assert found[1][3] == pytest.approx(found[0][3], rel=1e-5)
 
 
 def test_without_encoder_noise_there_is_nothing_to_estimate():

@@ -6,10 +6,10 @@ from simulated import measure, paper_robot, small_arm
 from tolerances import rounding
 
 from fg_calib.analysis.uncertainty import assess
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.information import observe
 from fg_calib.graph.observability import RelativeGroup, analyse, observability_indices
-from fg_calib.graph.problem import build_problem, observe
 from fg_calib.graph.solver import solve
-from fg_calib.measurements import residuals
 from fg_calib.options import Pairing
 from fg_calib.robot.model import Parameter
 
@@ -87,7 +87,8 @@ def test_every_relation_moves_no_measurement():
     measurements = measure(robot, 60, np.random.default_rng(1))
     problem = build_problem(robot, measurements, model="distance", prior=False)
     found = observe(problem, problem.variables.nominal())
-    J = residuals.linearise(problem.blocks[0], problem.variables.chain.at(problem.variables.nominal()))[1][:, 0]
+    (rows,) = problem.rows
+    J = rows.linearise(problem.variables.at(problem.variables.nominal()))[1]
     for group in found.relative:
         for relation in group.relations:
             direction = np.array([relation.get(name, 0.0) for name in problem.variables.names])

@@ -18,8 +18,8 @@ from fg_calib.analysis.identifiability import observe_structure
 from fg_calib.analysis.uncertainty import assess
 from fg_calib.files.csv_writer import write_csv
 from fg_calib.files.robot_yaml import write_robot
+from fg_calib.graph.build import build_problem
 from fg_calib.graph.factors import build_variables, corrections_of, frame_of, pose_of, prior_rows
-from fg_calib.graph.problem import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.report.text import format_report
@@ -144,7 +144,7 @@ def test_priors_of_a_pose_act_about_its_own_axes(frame):
         f"{frame}.{k}": t for k, t in zip(("roll", "pitch", "yaw", "y"), (1e-3, 2e-3, 4e-3, 5e-3), strict=True)
     }
     robot = pitched(frame, 90.0, tolerance)
-    variables = build_variables(robot, frame=False)
+    variables = build_variables(robot, [False])
     indices, nominal = nominal_frame(robot, frame)
     parameters = variables.nominal()
     for axis, tolerance_of_axis in enumerate((1e-3, 2e-3, 4e-3)):
@@ -160,7 +160,7 @@ def test_priors_of_a_pose_act_about_its_own_axes(frame):
 
 @pytest.mark.parametrize("frame", ["tool", "base"])
 def test_derivatives_of_priors_are_those_along_the_retraction(frame):
-    variables = build_variables(pitched(frame, 90.0), frame=False)
+    variables = build_variables(pitched(frame, 90.0), [False])
     rng = np.random.default_rng(1)
     away = variables.stepped(variables.nominal(), 0.5 * rng.normal(size=variables.n_columns))
 

@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
 
 from fg_calib.errors import ProblemError
-from fg_calib.graph.problem import all_rows, build_problem, judged_at
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.problem import reweighted_at, same_rows
 from fg_calib.graph.solver import solve
-from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Measurements, Pairs
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import build_chain, pose
@@ -64,14 +64,16 @@ def test_rows_near_the_kinks_take_part_and_say_what_they_can():
     s, from_kink = 1e-3, np.array([0.0, 1.0, 2.0, 30.0, 30.0, 2.0, 1.0])
     angles = np.where(np.arange(7) < 4, s * np.maximum(from_kink, 1e-9), np.pi - s * from_kink)
     problem = build_problem(planar_robot(), planar_pairs(angles, sigma=(1e-5, s)), model="rotation")
-    assert problem.judgement.angle.all()
+    (series,), (noise,) = problem.data.series, problem.noises
+    assert series.kind.names == ("angle",)
+    assert series.used.all()
     assert problem.n_excluded == {"same_configuration": 0}
     z = np.random.default_rng(0).normal(size=(200_000, 1))
     seen = np.abs(from_kink + z)  # from the kink, in sigma; 0.0016 and 0.0022 are 1 sigma of the mean's and sd's errors
     sign = np.where(np.arange(7) < 4, 1.0, -1.0)
-    residual = residuals.residual(all_rows(problem, problem.start), problem.variables.chain.at(problem.start))[:, 0]
+    residual = noise.residual()[:, 0]
     assert residual / s == pytest.approx(sign * (seen.mean(axis=0) - from_kink), abs=0.01)
-    assert problem.sigma[:, 1] / s == pytest.approx(seen.std(axis=0), abs=0.01)
+    assert noise.sigma[:, 0] / s == pytest.approx(seen.std(axis=0), abs=0.01)
 
 
 @pytest.mark.parametrize(("measured", "predicted"), [(0.0, 1.0), (np.pi, 1.0), (1.0, 1e-6), (1.0, np.pi)])
@@ -86,8 +88,12 @@ def test_an_angle_at_a_kink_that_contradicts_the_arm_is_in_chi_square(measured, 
 def test_only_a_directly_measured_distance_of_zero_becomes_three_coordinates():
     distance = [0.0, 1e-12, 0.0031, 0.6]
     problem = build_problem(planar_robot(), planar_pairs([0.2] * 4, distance=distance), model="distance-rotation")
-    assert problem.judgement.same_point.tolist() == [True, False, False, False]
-    assert problem.judgement.distance.tolist() == [False, True, True, True]
+    pairs, same = problem.data.series
+    assert same.kind.names == ("distance.x", "distance.y", "distance.z")
+    assert same.number.tolist() == [0]
+    assert pairs.kind.names == ("distance", "angle")
+    assert pairs.number.tolist() == [0, 1, 2, 3]
+    assert pairs.used[:, 0].tolist() == [False, True, True, True]
     assert problem.n_residuals == 3 + 3 + 4
     assert problem.n_pairs == 4
 
@@ -98,7 +104,7 @@ def test_a_distance_of_zero_between_measured_poses_is_a_number_like_others():
     position = m.position.copy()
     position[3] = position[0]
     problem = build_problem(robot, replace(m, position=position), model="distance", pairing=Pairing("all"))
-    assert not problem.judgement.same_point.any()
+    assert [s.kind.names for s in problem.data.series] == [("distance",)]
     assert problem.n_residuals == 45
 
 
@@ -127,13 +133,16 @@ def test_same_points_calibrate_an_arm_without_any_frame():
 
 def test_rows_are_whitened_anew_elsewhere():
     robot = planar_robot({"a": 0.01, "theta": 0.01})
-    problem = build_problem(robot, planar_pairs([0.0, 1.0], sigma=(1e-3, 1e-3)), model="distance")
+    noisy = replace(planar_pairs([0.0, 1.0], sigma=(1e-3, 1e-3)), sigma_joint=np.full(2, 1e-3))
+    problem = build_problem(robot, noisy, model="distance")
     elsewhere = problem.start.copy()
     elsewhere[[p.name for p in robot.parameters].index("a1")] += 0.1
-    again = judged_at(problem, elsewhere)
+    again = reweighted_at(problem, elsewhere)
     assert again is not problem
-    assert again.start is elsewhere
-    assert judged_at(problem, problem.start).judgement == problem.judgement
+    assert np.array_equal(again.start, elsewhere)
+    assert not same_rows(again, problem)
+    assert same_rows(reweighted_at(problem, problem.start), problem)
+    assert again.noises[0].sigma[0] > 1.01 * problem.noises[0].sigma[0]  # a longer arm moves farther
 
 
 def test_test_rows_are_counted_nowhere_and_give_no_residual():
@@ -142,8 +151,11 @@ def test_test_rows_are_counted_nowhere_and_give_no_residual():
     for model in ("pose", "distance-rotation"):
         problem = build_problem(robot, measure(robot, 10, rng, n_test=5), model=model, pairing=Pairing("star"))
         assert problem.n_configurations == 10
-        assert problem.n_residuals == sum(b.n * b.height for b in problem.blocks) == (60 if model == "pose" else 18)
-        assert all_rows(problem, problem.start).n == (15 if model == "pose" else 9 + 4)
+        assert problem.n_residuals == (60 if model == "pose" else 18)
+        (noise,) = problem.noises
+        assert len(noise.residual()) == (15 if model == "pose" else 9 + 4)
+        (rows,) = problem.rows
+        assert sum(part.n_rows for part in rows.parts) == (60 if model == "pose" else 18)
 
 
 @pytest.mark.parametrize("model", ["pose", "position", "orientation", "distance", "rotation", "distance-rotation"])
@@ -158,15 +170,16 @@ def test_whitened_residuals_of_noise_have_unit_covariance(model):
         problem = build_problem(robot, measurements, model=model)
     else:
         noise = np.sqrt(2) * np.array([1e-3, 5e-4])  # of a difference of two poses
-        p, R = measurements.position, Rotation.from_matrix(measurements.rotation)
+        p, R = measurements.position, Rotation.from_matrix(measurements.rotation.copy())
         distance, angle = np.linalg.norm(p[1::2] - p[::2], axis=1), (R[::2].inv() * R[1::2]).magnitude()
         pairs = replace(
             direct_pairs(distance, angle), sigma_distance=np.full(n, noise[0]), sigma_angle=np.full(n, noise[1])
         )
         assert np.array_equal(pairs.a, 2 * rows)
         problem = build_problem(robot, replace(measurements, pairs=pairs), model=model)
-    w = residuals.residual(problem.blocks[0], problem.variables.chain.at(problem.start))
-    w = w[::2] if problem.pairs is None else w
+    (noise,), (rows,) = problem.noises, problem.rows
+    w = rows.linearise(problem.variables.at(problem.start))[0].reshape(-1, noise.series.kind.height)
+    w = w if problem.pair_series else w[::2]
     covariance = w.T @ w / len(w)
     # standard error of a variance from n draws: sqrt(2 / n) = 2.2 % at 4000; bound at 4 of them
     assert covariance == pytest.approx(np.eye(w.shape[1]), abs=0.09)
@@ -233,8 +246,7 @@ def test_frame_and_tool_start_near_the_truth_from_far_away():
     frame = (Rotation.from_rotvec(np.pi * np.array([0.6, 0.8, 0.0])), np.array([30.0, -4.0, 9.0]))
     measurements = measure(true, 30, rng, frame=frame)
     problem = build_problem(robot, measurements, model="pose", frame="unknown")
-    chain = problem.variables.chain.at(problem.start)
-    r = residuals.residual(problem.blocks[0], chain)
+    r = np.concatenate([rows.linearise(problem.variables.at(problem.start))[0] for rows in problem.rows])
     assert np.sqrt(np.mean(r**2)) < 2.0  # the nominal arm is the true one here, so only noise is left
 
 

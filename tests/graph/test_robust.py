@@ -10,7 +10,8 @@ from simulated import measure, small_arm, true_robot
 from tolerances import rounding
 
 from fg_calib.analysis.uncertainty import assess
-from fg_calib.graph.problem import build_problem, judged_at, lengths
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.problem import mahalanobis_distances, reweighted_at
 from fg_calib.graph.robust import EFFICIENCY, HALF_WEIGHT, Weighting, effect, tuning, weight
 from fg_calib.graph.solver import solve
 from fg_calib.measurements import residuals
@@ -89,9 +90,11 @@ def test_the_optimum_is_that_of_gtsams_robust_noise_on_factors_of_one_measuremen
     solution = solve(build_problem(robot, m, loss=loss, **options))
     assert solution.converged
     # One factor a measurement, its noise model robust, whitened as the plain problem whitens at this estimate.
-    plain = replace(solution.problem.adjustment, weights=None)
-    problem = judged_at(solution.problem, solution.parameters, plain)
-    (block,), variables = problem.blocks, problem.variables
+    plain = replace(solution.problem.state, weights=None)
+    problem = reweighted_at(solution.problem, solution.parameters, plain)
+    (rows,), variables = problem.rows, problem.variables
+    assert rows.shared is None
+    block = rows.parts[0].block
     graph = gtsam.NonlinearFactorGraph()
     for factor in (problem.graph.at(i) for i in range(1, problem.graph.size())):
         graph.add(factor)  # the priors
@@ -114,9 +117,7 @@ def test_the_optimum_is_that_of_gtsams_robust_noise_on_factors_of_one_measuremen
 
 def _height(block):
     """Rows of a block of one measurement that are in use."""
-    if isinstance(block, residuals.PairBlock):
-        return int(np.sum(block.whitening[0, [0, 2]][list(block.kinds)] > 0.0))
-    return block.height
+    return int(np.sum(np.diag(residuals.unpack(block.whitening, block.height)[0]) > 0.0))
 
 
 def _robust_factor(block, variables, estimator):
@@ -124,7 +125,7 @@ def _robust_factor(block, variables, estimator):
     noise = gtsam.noiseModel.Robust.Create(estimator, gtsam.noiseModel.Unit.Create(block.height))
 
     def evaluate(_, values, H):
-        chain = variables.chain.at(variables.parameters(values))
+        chain = variables.at(variables.parameters(values)).chains[0]
         r, J = residuals.linearise(block, chain)
         if H is not None:
             for i, v in enumerate(variables.items):
@@ -190,7 +191,7 @@ def test_the_cost_is_that_before_any_weight():
     robot = small_arm(tolerance=TOLERANCE)
     m, bad = spoil(measure(true_robot(robot, rng), 40, rng), 0.2, rng)
     solution = solve(build_problem(robot, m, model="pose", loss="gnc"))
-    weights = solution.problem.adjustment.weights
+    (weights,) = solution.problem.state.weights
     assert np.all(weights[bad] == 0.0)
     assert np.sum(weights[~bad] == 0.0) <= 3
     assert set(np.unique(weights)) <= {0.0, 1.0}
@@ -206,7 +207,7 @@ def test_clean_measurements_keep_their_weight_under_gnc_up_to_the_one_percent():
     rng = np.random.default_rng(5)
     robot = small_arm(tolerance=TOLERANCE)
     solution = solve(build_problem(robot, measure(true_robot(robot, rng), 300, rng), model="pose", loss="gnc"))
-    assert 0.95 <= np.mean(solution.problem.adjustment.weights) <= 1.0
+    assert 0.95 <= np.mean(solution.problem.state.weights[0]) <= 1.0
 
 
 def test_gnc_starts_convex_and_ends_truncated():
@@ -239,9 +240,9 @@ def test_weights_settle_where_rows_are_excluded(loss):
     m = replace(m, readings=readings)
     solution = solve(build_problem(robot, m, model="distance-rotation", loss=loss))
     assert solution.converged
-    e, height = lengths(solution.problem, solution.parameters)
+    ((e, height),) = mahalanobis_distances(solution.problem, solution.parameters)
     assert np.sum(height == 0) >= 1
-    weights = solution.problem.adjustment.weights
+    (weights,) = solution.problem.state.weights
     assert np.all(np.isfinite(weights))
     used = height > 0
     c = np.array([tuning(loss, int(h)) for h in height[used]])

@@ -11,10 +11,10 @@ from simulated import TOOL, measure, paper_robot, small_arm, true_robot
 from tolerances import rounding
 
 from fg_calib.errors import SolverError
+from fg_calib.graph.build import build_problem
 from fg_calib.graph.factors import prior_rows
-from fg_calib.graph.problem import build_problem
+from fg_calib.graph.problem import reweighted_at
 from fg_calib.graph.solver import SolverOptions, solve
-from fg_calib.measurements import residuals
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 
@@ -23,8 +23,8 @@ FRAME = (Rotation.from_rotvec(np.pi * np.array([0.0, 0.6, 0.8])), np.array([7.0,
 
 
 def cost_at(problem, parameters):
-    chain = problem.variables.chain.at(parameters)
-    data = sum(residuals.squared_norm(b, chain) for b in problem.blocks)
+    at = problem.variables.at(parameters)
+    data = sum(rows.squared_norm(at) for rows in problem.rows)
     return 0.5 * (data + np.sum(prior_rows(problem.variables, parameters)[0] ** 2))
 
 
@@ -57,7 +57,7 @@ def test_the_optimum_is_scipys(model):
     robot = paper_robot(tolerance=TOLERANCE)
     problem = build_problem(robot, measure(true_robot(robot, rng), 60, rng), model=model)
     solution = solve(problem)
-    variables, block = problem.variables, solution.problem.blocks[0]  # whitened at the estimate
+    variables, (rows,) = problem.variables, solution.problem.rows  # whitened at the estimate
     columns = [robot.index(name) for name in variables.names]
 
     def parameters(x):
@@ -66,7 +66,7 @@ def test_the_optimum_is_scipys(model):
         return p
 
     def stacked(x):
-        r = residuals.residual(block, variables.chain.at(parameters(x))).ravel()
+        r = rows.linearise(variables.at(parameters(x)).without_columns())[0]
         return np.concatenate([r, prior_rows(variables, parameters(x))[0]])
 
     scale = np.array([robot.parameters[i].scale for i in columns])
@@ -150,7 +150,7 @@ def test_absurd_numbers_are_an_error_and_not_a_result():
         solve(problem)
 
 
-def test_rows_are_judged_at_the_estimate():
+def test_rows_are_reweighted_at_the_estimate():
     """A pair near a kink by the nominal arm only takes part again once the arm is calibrated."""
     rng = np.random.default_rng(8)
     robot = paper_robot(tolerance={"a": 5e-3, "d": 5e-3, "alpha": 0.01, "theta": 0.01, "beta": 0.01})
@@ -160,12 +160,15 @@ def test_rows_are_judged_at_the_estimate():
     problem = build_problem(robot, measure(true, 101, rng, readings=q), model="distance-rotation")
     solution = solve(problem)
     assert solution.converged
-    assert (
-        solution.problem.judgement
-        == build_problem(
-            robot.with_values(solution.parameters[:-6]), problem.measurements, model="distance-rotation"
-        ).judgement
-    )
+    there = build_problem(robot.with_values(solution.parameters[:-6]), problem.measurements, model="distance-rotation")
+    there = reweighted_at(there, there.start, solution.problem.state)
+    for found, expected in zip(solution.problem.data.series, there.data.series, strict=True):
+        assert np.array_equal(found.used, expected.used)
+    (at_start,), (found,), (expected,) = problem.noises, solution.problem.noises, there.noises
+    # They were whitened where the last step began: less than 3e-7 sigma from its end.
+    assert found.sigma == pytest.approx(expected.sigma, rel=1e-6)
+    assert found.excess == pytest.approx(expected.excess, rel=1e-6, abs=1e-6 * expected.sigma.min())
+    assert np.abs(at_start.sigma / expected.sigma - 1.0).max() > 1e-3
 
 
 @pytest.mark.slow
@@ -181,4 +184,6 @@ def test_a_hundred_thousand_pairs_reach_the_optimum_with_weak_priors():
     )
     solution = solve(problem)
     assert solution.converged
-    assert 2 * solution.cost / problem.n_residuals == pytest.approx(1.0, abs=0.1)  # pairs share 2000 poses
+    # 200 000 distances and angles of 2000 poses, whose errors they share, hold no more than these: 12 000 figures.
+    assert solution.problem.n_independent == pytest.approx(12_000, rel=0.01)
+    assert 2 * solution.cost == pytest.approx(12_000, rel=5 * np.sqrt(2 / 12_000))

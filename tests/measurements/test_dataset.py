@@ -70,7 +70,7 @@ def test_sigmas_of_formed_pairs_are_what_monte_carlo_finds():
     n = 20_000
     p = measured.position[:, None] + sigma_p[:, None] * rng.normal(size=(2, n, 3))
     noise = [Rotation.from_rotvec(s * rng.normal(size=(n, 3))) for s in sigma_o]
-    R = [Rotation.from_matrix(measured.rotation[i]) * noise[i] for i in range(2)]
+    R = [Rotation.from_matrix(measured.rotation[i].copy()) * noise[i] for i in range(2)]
     # standard error of a standard deviation from n draws: 1 / sqrt(2 n) = 0.5 %; bound at 4 of them
     assert np.std(np.linalg.norm(p[1] - p[0], axis=1)) == pytest.approx(pairs.sigma_distance[0], rel=0.02)
     assert np.std((R[0].inv() * R[1]).magnitude()) == pytest.approx(pairs.sigma_angle[0], rel=0.02)

@@ -9,9 +9,11 @@ from oracle import central_differences, random_robot, tool_pose
 from scipy.spatial.transform import Rotation
 from tolerances import rounding
 
-from fg_calib.errors import InputError
+from fg_calib.graph.rows import At, Part, RowSet
 from fg_calib.measurements import residuals
-from fg_calib.measurements.residuals import PairBlock, PoseBlock, SamePointBlock
+from fg_calib.measurements.kinds import Distance, Orientation, Position, RotationAngle, SamePoint, stack
+from fg_calib.measurements.residuals import Block, pack
+from fg_calib.measurements.sharing import SharedErrors
 from fg_calib.robot.kernels import LANES
 from fg_calib.robot.kinematics import SPAN, build_chain, precompute_trig
 
@@ -24,6 +26,26 @@ ROUNDING = 1e-14
 
 def chain_of(robot):
     return build_chain(robot, {i: i for i in range(len(robot.parameters))}).with_joint_columns()
+
+
+def pair_block(trig, a, b, measured, whitening, kinds=(True, True)):
+    """Pairs with distances, angles or both, measured and whitened, shapes (n, 2) and (n, 2, 2), by rows wanted."""
+    rows = np.flatnonzero(kinds)
+    kind = stack(*(each for each, wanted in zip((Distance(), RotationAngle()), kinds, strict=True) if wanted))
+    data, whitening = np.ascontiguousarray(measured[:, rows]), pack(whitening[:, rows][:, :, rows])
+    return Block(kind, trig, np.stack([a, b], axis=1), data, whitening)
+
+
+def pose_block(trig, R, p, whitening, kinds=(True, True)):
+    """Orientations, positions or both, shapes (n, 3, 3) and (n, 3)."""
+    chosen, n = np.flatnonzero(kinds), len(whitening)
+    data = np.hstack([(R.reshape(n, 9), p)[k] for k in chosen])
+    kind = stack(*((Orientation(), Position())[k] for k in chosen))
+    return Block(kind, trig, np.arange(n)[:, None], np.ascontiguousarray(data), pack(whitening))
+
+
+def same_point_block(trig, a, b, whitening):
+    return Block(SamePoint(), trig, np.stack([a, b], axis=1), np.zeros((len(a), 0)), pack(whitening))
 
 
 def pair_formula(robot, measured):
@@ -54,14 +76,7 @@ def test_distance_and_angle_and_their_derivatives(convention):
             differences = central_differences(formula, x)
         for kinds in ((True, True), (True, False), (False, True)):
             W = np.array([[2.0, 0.0], [0.7 if all(kinds) else 0.0, 3.0]])
-            block = PairBlock(
-                precompute_trig(robot, q),
-                np.array([0]),
-                np.array([1]),
-                measured[None],
-                np.array([[2.0, W[1, 0], 3.0]]),
-                kinds,
-            )
+            block = pair_block(precompute_trig(robot, q), np.array([0]), np.array([1]), measured[None], W[None], kinds)
             r, J = residuals.linearise(block, chain_of(robot))
             rows = np.flatnonzero(kinds)
             assert r[0] == pytest.approx((W @ formula(x))[rows], abs=rounding(10, 1 / min(1.0, np.sin(angle) + 1e-4)))
@@ -81,7 +96,7 @@ def test_same_point_residual_and_its_derivatives(convention):
         A, B = (tool_pose(robot.with_values(x[:m]), q) for q in (x[m : m + n], x[m + n :]))
         return W @ (B[:3, 3] - A[:3, 3])
 
-    block = SamePointBlock(precompute_trig(robot, q), np.array([0]), np.array([1]), W[None])
+    block = same_point_block(precompute_trig(robot, q), np.array([0]), np.array([1]), W[None])
     r, J = residuals.linearise(block, chain_of(robot))
     x = np.concatenate([robot.nominal, *q])
     assert r[0] == pytest.approx(formula(x), abs=100 * ROUNDING)
@@ -117,9 +132,7 @@ def test_orientation_and_position_and_their_derivatives(convention, kinds, size)
         log = Rotation.from_matrix(measured_R.T @ P[:3, :3]).as_rotvec()
         return W @ np.concatenate([log, P[:3, 3] - measured_p])[rows]
 
-    block = PoseBlock(
-        precompute_trig(robot, q[None]), np.array([0]), measured_R[None], measured_p[None], W[None], kinds
-    )
+    block = pose_block(precompute_trig(robot, q[None]), measured_R[None], measured_p[None], W[None], kinds)
     r, J = residuals.linearise(block, chain_of(robot))
     x = np.concatenate([robot.nominal, q])
     assert r[0] == pytest.approx(formula(x), abs=rounding(10.0))
@@ -135,9 +148,8 @@ def test_orientation_residual_is_exact_up_to_half_a_turn(angle):
     axis = rng.normal(size=3)
     axis /= np.linalg.norm(axis)
     measured = tool_pose(robot, q)[:3, :3] @ Rotation.from_rotvec(-angle * axis).as_matrix()
-    block = PoseBlock(
-        precompute_trig(robot, q[None]), np.array([0]), measured[None], np.zeros((1, 3)), np.eye(3)[None], (True, False)
-    )
+    trig = precompute_trig(robot, q[None])
+    block = pose_block(trig, measured[None], np.zeros((1, 3)), np.eye(3)[None], (True, False))
     r = residuals.residual(block, chain_of(robot))[0, :]
     sign = np.sign(r @ axis) if angle == np.pi else 1.0
     assert sign * r == pytest.approx(angle * axis, abs=1e-7 if angle > np.pi - 1e-8 else rounding(1, 10))
@@ -147,8 +159,7 @@ def test_residuals_are_predicted_minus_measured():
     robot = random_robot("dh", 3, np.random.default_rng(15))
     q = np.random.default_rng(16).uniform(-1, 1, (2, 3))
     trig = precompute_trig(robot, q)
-    zero = np.zeros((1, 2))
-    pair = PairBlock(trig, np.array([0]), np.array([1]), zero, np.array([[1.0, 0.0, 1.0]]))
+    pair = pair_block(trig, np.array([0]), np.array([1]), np.zeros((1, 2)), np.eye(2)[None])
     assert np.all(residuals.residual(pair, build_chain(robot)) > 0)
 
 
@@ -157,12 +168,12 @@ def random_block(kind, n, rng):
     trig = precompute_trig(robot, rng.uniform(-3, 3, (n + 1, 6)))
     a, b = np.arange(n), rng.permutation(n) + 1
     if kind == "pairs":
-        block = PairBlock(trig, a, b, rng.uniform(0, 2, (n, 2)), rng.uniform(0.5, 1, (n, 3)))
+        block = pair_block(trig, a, b, rng.uniform(0, 2, (n, 2)), np.tril(rng.uniform(0.5, 1, (n, 2, 2))))
     elif kind == "points":
-        block = SamePointBlock(trig, a, b, np.tril(rng.normal(size=(n, 3, 3))))
+        block = same_point_block(trig, a, b, np.tril(rng.normal(size=(n, 3, 3))))
     else:
         R = Rotation.random(n, random_state=1).as_matrix()
-        block = PoseBlock(trig, a, R, rng.normal(size=(n, 3)), np.tril(rng.normal(size=(n, 6, 6))))
+        block = pose_block(trig, R, rng.normal(size=(n, 3)), np.tril(rng.normal(size=(n, 6, 6))))
     return block, chain_of(robot)
 
 
@@ -185,7 +196,9 @@ def test_a_row_without_weight_adds_nothing():
     block, chain = random_block("pairs", 40, np.random.default_rng(17))
     whitening = block.whitening.copy()
     whitening[7:, :] = 0.0
-    short = replace(block, a=block.a[:7], b=block.b[:7], measured=block.measured[:7], whitening=whitening[:7])
+    short = replace(
+        block, ends=block.ends[:7], data=block.data[:7], whitening=whitening[:7], nuisances=np.zeros((7, 0))
+    )
     long = replace(block, whitening=whitening)
     assert residuals.gram(long, chain) == pytest.approx(residuals.gram(short, chain), rel=rounding())
 
@@ -198,17 +211,21 @@ def test_the_sum_over_spans_does_not_depend_on_threads(monkeypatch):
 
 
 @pytest.mark.parametrize(("n", "n_shared"), [(6, 3), (6, 30)], ids=["few shared errors", "many"])
-def test_some_rows_of_those_that_share_errors_are_no_block(n, n_shared):
-    """Whitened all together they are one piece; the parts, and the rows that come out, can be divided."""
+def test_rows_that_share_errors_are_whitened_together_and_their_parts_can_be_divided(n, n_shared):
     block, chain = random_block("pairs", n, rng := np.random.default_rng(0))
+    chain = replace(chain, joint_columns=False)
     loading = scipy.sparse.csr_array(rng.normal(size=(n * block.height, n_shared)))
-    correlated = residuals.correlate((block,), (loading,))
-    with pytest.raises(InputError) as caught:
-        residuals.rows_of(correlated, slice(0, 2))
-    assert str(caught.value) == (
-        "rows_of: a block whose rows share errors, expected one of its parts; linearise and residual give all its "
-        "rows, whitened together"
-    )
-    some = residuals.residual(residuals.rows_of(correlated.parts[0], slice(0, 2)), chain)
+    correlated = RowSet((Part(block, 0, np.zeros((n, 0), dtype=np.int64)),), SharedErrors(loading))
+    some = residuals.residual(residuals.rows_of(correlated.parts[0].block, slice(0, 2)), chain)
     assert np.array_equal(some, residuals.residual(block, chain)[:2])
-    assert residuals.residual(correlated, chain).shape == (n * block.height, 1)
+    at = At((chain,), np.zeros(0), np.zeros(0, dtype=np.int64), chain.n_columns, 0)
+    r, J = correlated.linearise(at)
+    assert (r.shape, J.shape) == ((correlated.n_rows,), (correlated.n_rows, chain.n_columns))
+    plain = residuals.linearise(block, chain)
+    rows = np.column_stack([plain[1].reshape(-1, chain.n_columns), plain[0].ravel()])
+    expected = rows.T @ np.linalg.solve(np.eye(len(rows)) + (loading @ loading.T).toarray(), rows)
+    of_rounding = rounding(rows.T @ rows, 10.0)
+    whitened, R = np.column_stack([J, r]), correlated.triangle(at)
+    for gram in (whitened.T @ whitened, correlated.gram(at), R.T @ R):
+        assert gram == pytest.approx(expected, abs=of_rounding)
+    assert correlated.squared_norm(at) == pytest.approx(expected[-1, -1], abs=of_rounding)

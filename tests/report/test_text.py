@@ -1,4 +1,4 @@
-"""The report: its whole text for a problem one can draw, its width, and the README's six lines."""
+"""The report: its whole text for a problem one can draw, its width, and the README's code."""
 
 import re
 import subprocess
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from simulated import measure, small_arm, true_robot
+from simulated import measure, plus, small_arm, true_robot
 
 from fg_calib import (
     Job,
@@ -18,21 +18,16 @@ from fg_calib import (
     Pairing,
     assess,
     build_problem,
-    cli,
     compare,
     format_comparison,
     format_identifiability,
     format_report,
     observe_configurations,
     observe_structure,
-    read_measurements,
-    read_robot,
     solve,
-    write_robot,
 )
-from fg_calib.files.csv_writer import write_csv
-from fg_calib.files.units import Units
 from fg_calib.options import Options
+from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Joint, Robot, RobotBuilder
 
 README = Path(__file__).resolve().parents[2] / "README.md"
@@ -226,7 +221,7 @@ def long_reports(tmp_path_factory):
     """From a width to the text, of every command."""
     robot, rng = arm_with_long_names(), np.random.default_rng(5)
     m = measure(true_robot(robot, rng), 25, rng, sigma_joint=1e-4, n_test=10)
-    m.position[7] += 0.03  # for suspicious rows and configurations
+    m = replace(m, position=plus(m.position, 7, 0.03))  # for suspicious rows and configurations
     solutions = [
         solve(build_problem(robot, m, model=model, frame="unknown", **options))
         for model, options in (
@@ -277,28 +272,79 @@ def test_a_row_without_room_is_a_paragraph(long_reports):
     )
 
 
-def test_the_six_lines_of_the_readme_print_a_report(tmp_path):
-    """As a user runs them, in an interpreter of its own, on the bundled example in SI."""
-    (code,) = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.S)
-    example = cli.EXAMPLES / "space-robot"
-    robot = read_robot(example / "robot_nominal.yaml")
-    given = read_measurements(example / "poses.csv", robot, units=Units(angle="deg"))
-    write_robot(tmp_path / "robot.yaml", robot)
-    quaternion = Rotation.from_matrix(given.rotation).as_quat()
-    columns = dict(zip([f"q{i}" for i in range(1, 8)], given.readings.T, strict=True))
-    columns |= dict(zip("xyz", given.position.T, strict=True))
-    columns |= dict(zip(("qx", "qy", "qz", "qw"), quaternion.T, strict=True))
-    write_csv(tmp_path / "poses.csv", columns | {"id": given.ids, "split": np.where(given.test, "test", "train")})
+def readme_code(heading):
+    """The first code of a section of the README."""
+    section = README.read_text().split(heading)[1]
+    return re.search(r"```python\n(.*?)```", section, flags=re.S).group(1)
+
+
+def run_in(folder, code):
+    ended = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], cwd=folder, capture_output=True, text=True, check=False
+    )
+    assert (ended.returncode, ended.stderr) == (0, "")
+    return ended.stdout.splitlines()
+
+
+def test_the_readme_has_a_kind_of_ones_own(tmp_path):
+    code = readme_code("### A kind of measurement of your own\n")
+    made = {}
+    exec("from fg_calib import Robot\n" + code[code.index("tolerance = ") : code.index("result = ")], made)
+    rng, post = np.random.default_rng(4), np.array([1.1, 0.4, -0.2])
+    q = rng.uniform(-np.pi, np.pi, (40, 3))
+    p = pose(true_robot(made["robot"], rng), q).position
+    np.save(tmp_path / "q.npy", q)
+    np.save(tmp_path / "lengths.npy", np.linalg.norm(p - post, axis=1) + 2e-4 * rng.normal(size=40))
+    (line,) = run_in(tmp_path, code)
+    found = np.array([float(x) for x in re.findall(r"[-+.e\d]+", line)]).reshape(2, 3)
+    assert np.all(np.abs(found[0] - post) < 6 * found[1])
+    assert np.all(found[1] < 0.01)
+
+
+def test_the_readme_extends_the_graph(tmp_path):
+    code = readme_code("### Extend the graph\n")
+    made = {}
+    exec("from fg_calib import Robot\n" + code[code.index("tolerance = ") : code.index("data = ")], made)
+    rng = np.random.default_rng(5)
+    m = measure(true_robot(made["robot"], rng), 30, rng, sigma=(1e-4, 1e-4))
+    np.save(tmp_path / "q.npy", m.readings)
+    np.save(tmp_path / "p.npy", m.position)
+    message, expanded = run_in(tmp_path, code)
+    assert message.startswith("converged: ")
+    plain = assess(solve(build_problem(made["robot"], replace(m, rotation=None), model="position")))
+    assert int(message.split()[-1]) == plain.dof + 4 + 1  # the prior's rows, and the distance
+    size, error, cost = map(float, expanded.split())
+    assert size == 30 + 3 + 2  # measurements, priors of three joints, what was added
+    assert error == pytest.approx(cost, rel=1e-9)
+
+
+def test_the_readme_calibrates_from_arrays(tmp_path):
+    """As a user runs it, in an interpreter of its own, on a tracker's positions of an arm like its own."""
+    code = readme_code("## In Python\n")
+    made = {}
+    exec(code[: code.index("q, p = ")], made)  # its robot
+    rng = np.random.default_rng(3)
+    frame = (Rotation.from_rotvec([0.1, 0.2, -0.7]), np.array([2.0, 1.0, 0.3]))
+    m = measure(true_robot(made["robot"], rng), 50, rng, sigma=(1e-4, 1e-4), frame=frame)
+    np.save(tmp_path / "q.npy", m.readings)
+    np.save(tmp_path / "p.npy", m.position)
     ended = subprocess.run(
         [sys.executable, "-W", "error", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert (ended.returncode, ended.stderr) == (0, "")
-    assert ended.stdout.startswith("space-robot: distance-rotation, pairs: star\n")
+    assert ended.stdout.startswith("robot: position, measurement frame unknown\nGOOD: ")
     assert [line for line in ended.stdout.splitlines() if line in {"Fit statistics", "Parameters", "Notes"}] == [
         "Fit statistics",
         "Parameters",
         "Notes",
     ]
+    sigma = re.search(r"^-0\.6\d+ (\S+)$", ended.stdout, flags=re.M).group(1)
+    assert ended.stdout.splitlines()[-1] == sigma
+    assert {f.name for f in (tmp_path / "result").iterdir()} == {
+        "result.json",
+        "residuals.csv",
+        "robot_calibrated.yaml",
+    }
 
 
 # --- the poses behind suspicious pairs -------------------------------------------------------------------------------
@@ -308,8 +354,7 @@ def suspicious_rows(pairing, wrong, *, n=30, **options):
     """The section of a report on pairs formed from n poses, of which some are measured 20 mm off."""
     robot, rng = small_arm({"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3}), np.random.default_rng(8)
     m = measure(true_robot(robot, rng), n, rng)
-    for i in wrong:
-        m.position[i] += 0.02 * np.array([1.0, -1.0, 1.0])
+    m = replace(m, position=plus(m.position, wrong, 0.02 * np.array([1.0, -1.0, 1.0])))
     solution = solve(build_problem(robot, replace(m, ids=np.array([f"p{i}" for i in range(n)])), model="distance",
                                    pairing=pairing, **options))  # fmt: skip
     return sections(format_report(solution, assess(solution)))["Suspicious rows"]

@@ -6,7 +6,9 @@ from oracle import random_robot, tool_pose
 from simulated import paper_robot, planar_robot, small_arm
 from tolerances import rounding
 
+from fg_calib.errors import InputError
 from fg_calib.robot.inverse import REACHED, random_readings, solve_inverse
+from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import CONVENTIONS, Joint, RobotBuilder
 
 
@@ -49,7 +51,7 @@ def test_poses_that_can_be_reached_are_reached_within_the_limits(robot):
     """Any convention, revolute and prismatic, with base and tool, fewer than six joints and more."""
     rng = np.random.default_rng(1)
     T = poses_of(robot, random_readings(robot, 40, rng))
-    require_reached(robot, solve_inverse(robot, T[:, :3, :3], T[:, :3, 3], rng), T)
+    require_reached(robot, solve_inverse(robot, T[:, :3, 3], T[:, :3, :3], generator=rng), T)
 
 
 def test_limits_that_are_no_whole_turn_about_zero_are_kept():
@@ -61,13 +63,13 @@ def test_limits_that_are_no_whole_turn_about_zero_are_kept():
     builder.add_frame("tool", {}, 3, False)
     robot, rng = builder.build(), np.random.default_rng(2)
     T = poses_of(robot, random_readings(robot, 50, rng))
-    require_reached(robot, solve_inverse(robot, T[:, :3, :3], T[:, :3, 3], rng), T)
+    require_reached(robot, solve_inverse(robot, T[:, :3, 3], T[:, :3, :3], generator=rng), T)
 
 
 def test_random_starts_give_random_self_motion():
     robot = paper_robot()
     T = np.broadcast_to(tool_pose(robot, np.array([0.3, -0.5, 0.4, 1.0, -0.7, 0.9, 0.2])), (30, 4, 4))
-    found = solve_inverse(robot, T[:, :3, :3], T[:, :3, 3], np.random.default_rng(3))
+    found = solve_inverse(robot, T[:, :3, 3], T[:, :3, :3], generator=np.random.default_rng(3))
     require_reached(robot, found, T)
     assert (np.ptp(found.readings, axis=0) > 0.5).sum() >= 3  # 7 joints for 6 coordinates
 
@@ -76,11 +78,11 @@ def test_a_solution_stays_near_where_it_started():
     robot, rng = paper_robot(), np.random.default_rng(4)
     near = np.array([0.3, -0.5, 0.4, 1.0, -0.7, 0.9, 0.2])
     T = poses_of(robot, near + 0.05 * rng.normal(size=(20, 7)))
-    found = solve_inverse(robot, T[:, :3, :3], T[:, :3, 3], rng, near=near)
+    found = solve_inverse(robot, T[:, :3, 3], T[:, :3, :3], generator=rng, near=near)
     require_reached(robot, found, T)
     assert np.abs(found.readings - near).max() < 0.6
     same = tool_pose(robot, near)[None]
-    assert solve_inverse(robot, same[:, :3, :3], same[:, :3, 3], rng, near=near).readings[0] == pytest.approx(
+    assert solve_inverse(robot, same[:, :3, 3], same[:, :3, :3], generator=rng, near=near).readings[0] == pytest.approx(
         near, abs=rounding(10)
     )
 
@@ -91,7 +93,7 @@ def test_steps_are_of_minimum_norm():
     near = np.array([0.3, -0.5, 0.4, 1.0, -0.7, 0.9, 0.2])
     T = tool_pose(robot, near)
     T[:3, 3] += [1e-5, -2e-5, 1e-5]
-    found = solve_inverse(robot, T[None, :3, :3], T[None, :3, 3], np.random.default_rng(0), near=near)
+    found = solve_inverse(robot, T[None, :3, 3], T[None, :3, :3], generator=np.random.default_rng(0), near=near)
     h = 1e-6
     J = np.stack([(tool_pose(robot, near + h * e) - tool_pose(robot, near - h * e))[:3].ravel() for e in np.eye(7)], 1)
     null = np.linalg.svd(J / (2 * h))[2][-1]
@@ -104,7 +106,7 @@ def test_what_cannot_be_reached_is_told_with_its_miss():
     robot, rng = elbow_arm(180), np.random.default_rng(5)
     T = poses_of(robot, random_readings(robot, 3, rng))
     T[1, :3, 3] = 4.0, 0.0, 0.0  # the arm is 1.8 m long
-    found = solve_inverse(robot, T[:, :3, :3], T[:, :3, 3], rng)
+    found = solve_inverse(robot, T[:, :3, 3], T[:, :3, :3], generator=rng)
     assert found.reached.tolist() == [True, False, True]
     there = tool_pose(robot, found.readings[1])
     assert found.miss_position[1] == pytest.approx(np.linalg.norm(there[:3, 3] - T[1, :3, 3]))
@@ -123,7 +125,7 @@ def test_a_limit_that_is_in_the_way_is_not_passed():
     builder.add_frame("tool", {}, 3, False)
     robot = builder.build()
     T = tool_pose(planar_robot(), np.array([0.2, np.deg2rad(90)]))
-    found = solve_inverse(robot, T[None, :3, :3], T[None, :3, 3], np.random.default_rng(6))
+    found = solve_inverse(robot, T[None, :3, 3], T[None, :3, :3], generator=np.random.default_rng(6))
     assert not found.reached[0]
     assert np.abs(found.readings[0, 1]) <= np.deg2rad(30)
 
@@ -132,13 +134,13 @@ def test_a_pose_is_solved_alike_alone_and_among_others():
     robot = paper_robot()
     T = poses_of(robot, random_readings(robot, 10, np.random.default_rng(7)))
     R, p = T[:, :3, :3], T[:, :3, 3]
-    ten = solve_inverse(robot, R, p, np.random.default_rng(8)).readings
-    three = solve_inverse(robot, R[:3], p[:3], np.random.default_rng(8)).readings
+    ten = solve_inverse(robot, p, R, generator=np.random.default_rng(8)).readings
+    three = solve_inverse(robot, p[:3], R[:3], generator=np.random.default_rng(8)).readings
     assert three == pytest.approx(ten[:3], abs=rounding(1, 100))  # batched linear algebra may round otherwise
 
 
 def test_no_poses_are_no_work():
-    found = solve_inverse(paper_robot(), np.empty((0, 3, 3)), np.empty((0, 3)), np.random.default_rng(0))
+    found = solve_inverse(paper_robot(), np.empty((0, 3)), np.empty((0, 3, 3)))
     assert found.readings.shape == (0, 7)
     assert found.reached.shape == (0,)
 
@@ -164,3 +166,37 @@ def test_random_readings_fill_the_limits():
     # The extremes of 4000 draws are within 10 / 4000 of the ends but for a chance of 5e-5 each.
     assert (q.min(axis=0) - low < span / 400).all()
     assert (high - q.max(axis=0) < span / 400).all()
+
+
+# --- as a user calls it --------------------------------------------------------------------------------------------
+
+
+def test_one_pose_or_position_in_one_call():
+    robot, q = small_arm(), np.array([0.3, -0.5, 0.2, 0.9])
+    at = pose(robot, [q])
+    found = solve_inverse(robot, at.position[0].tolist(), at.rotation[0].tolist())
+    assert found.reached.tolist() == [True]
+    assert pose(robot, found.readings).rotation == pytest.approx(at.rotation, abs=REACHED)
+    point = solve_inverse(robot, at.position[0])
+    assert point.reached.tolist() == [True]
+    assert pose(robot, point.readings).position == pytest.approx(at.position, abs=REACHED)
+    assert np.abs(pose(robot, point.readings).rotation - at.rotation).max() > 1e-3  # any would do
+    near = solve_inverse(robot, at.position[0], at.rotation[0], near=q + 0.01)
+    assert near.readings[0] == pytest.approx(q, abs=1e-8)  # REACHED, by a Jacobian of size 1
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"position": [1, 2]}, r"position: shape \(1, 2\), expected \(n, 3\)"),
+        ({"position": [1, 2, np.nan]}, "position: row 0: found nan"),
+        ({"rotation": np.eye(4)}, r"rotation: shape \(1, 4, 4\), expected \(1, 3, 3\)"),
+        ({"rotation": 2 * np.eye(3)}, "rotation: row 0: found .*, expected a rotation matrix"),
+        ({"near": [0, 0]}, r"near: shape \(2,\), expected \(4\)"),
+        ({"n_starts": 0}, "n_starts: found 0"),
+        ({"generator": 3}, "generator: found 3, expected a Generator"),
+    ],
+)
+def test_targets_are_checked(given, message):
+    with pytest.raises(InputError, match=f"^{message}"):
+        solve_inverse(small_arm(), **{"position": [0.1, 0.2, 0.3]} | given)

@@ -8,9 +8,10 @@ from oracle import central_differences, dh_joint, frame, random_robot, rotation,
 from scipy.spatial.transform import Rotation
 from tolerances import rounding
 
+from fg_calib.errors import InputError
 from fg_calib.robot.kernels import LANES
 from fg_calib.robot.kinematics import SPAN, build_chain, forward, pose, precompute_trig
-from fg_calib.robot.model import CONVENTIONS, Element, Joint, RobotBuilder
+from fg_calib.robot.model import BASES, CONVENTIONS, Axis, Basis, Element, Joint, Parameter, RobotBuilder
 
 CASES = [(c, n) for c in [*CONVENTIONS, "urdf"] for n in (1, 2, 3, 6, 7, 12)]
 
@@ -166,3 +167,80 @@ def test_a_parameter_and_a_joint_of_several_elements_have_the_sum_of_their_deriv
             turning_rate = d_T[:3, :3, k] @ moved(x)[:3, :3].T
             w = [turning_rate[2, 1], turning_rate[0, 2], turning_rate[1, 0]]
             assert poses.jacobian[i, :3, k] == pytest.approx(w, abs=1e-8)
+
+
+# --- values that are sums of coefficients times functions of readings ------------------------------------------------
+
+
+def with_coefficients(robot, rng):
+    """Two further elements behind each, of all axes and functions: coefficients away from zero, some of them shared."""
+    elements, parameters = [], list(robot.parameters)
+    functions = [*BASES, "given"]
+    for i, element in enumerate(robot.elements):
+        elements.append(element)
+        for k in range(2):
+            function = functions[(2 * i + k) % len(functions)]
+            basis = Basis(function, int(rng.integers(3 if function == "given" else robot.n_joints)))
+            axis, shared = Axis(int(rng.integers(6))), k == 1 and i % 4 == 3
+            if not shared:
+                parameters.append(Parameter(f"c{i}.{k}", "x" if axis < 3 else "roll", 1, rng.uniform(0.1, 0.5)))
+            elements.append(Element(axis, parameter=len(parameters) - 1, sign=-1 if i % 5 == 0 else 1, basis=basis))
+    return replace(robot, elements=tuple(elements), parameters=tuple(parameters))
+
+
+def pose_with_coefficients(robot, q, given):
+    """base_T_tool as a product of 4x4 matrices, the functions written out."""
+    T = np.eye(4)
+    of = {"reading": lambda i: q[i], "sin": lambda i: np.sin(q[i]), "cos": lambda i: np.cos(q[i])}
+    of |= {"sin 2": lambda i: np.sin(2 * q[i]), "cos 2": lambda i: np.cos(2 * q[i]), "given": lambda i: given[i]}
+    for e in robot.elements:
+        free = 0.0 if e.parameter is None else robot.nominal[e.parameter]
+        if e.basis is not None:
+            free = free * of[e.basis.function](e.basis.index)
+        value = e.constant + e.sign * (free + (0.0 if e.joint is None else q[e.joint]))
+        T = T @ (translation(e.axis, value) if e.axis < 3 else rotation(e.axis - 3, value))
+    return T
+
+
+@pytest.mark.parametrize("convention", [*CONVENTIONS, "urdf"])
+def test_coefficients_times_functions_of_readings(convention):
+    rng = np.random.default_rng(7)
+    robot = with_coefficients(random_robot(convention, 4, rng), rng)
+    n, (q, given) = len(robot.parameters), (rng.uniform(-3, 3, (40, 4)), rng.normal(size=(40, 3)))
+    chain = build_chain(robot, {i: i for i in range(n)}).with_joint_columns()
+    poses = forward(chain, precompute_trig(robot, q, given))
+    for i in (0, LANES - 1, 39):
+        T = pose_with_coefficients(robot, q[i], given[i])
+        assert poses.rotation[i] == pytest.approx(T[:3, :3], abs=rounding(1.0))
+        assert poses.position[i] == pytest.approx(T[:3, 3], abs=rounding(10.0))
+
+        def formula(x, i=i, T=T):
+            there = pose_with_coefficients(robot.with_values(x[:n]), x[n:], given[i])
+            turn = Rotation.from_matrix(there[:3, :3] @ T[:3, :3].T).as_rotvec()
+            return np.concatenate([turn, there[:3, 3]])
+
+        expected = central_differences(formula, np.concatenate([robot.nominal, q[i]]))
+        # Steps of 1e-6 leave third derivatives times 1e-12 and rounding over 1e-6; columns are sums over elements.
+        assert poses.jacobian[i] == pytest.approx(expected, abs=1e-7 * max(1.0, np.abs(expected).max()))
+
+
+def test_coefficients_that_are_fixed_at_zero_do_nothing():
+    rng = np.random.default_rng(8)
+    robot = random_robot("mdh-hayati", 4, rng)
+    more = with_coefficients(robot, rng)
+    off = more.with_values([*robot.nominal, *np.zeros(len(more.parameters) - len(robot.parameters))])
+    q = rng.uniform(-3, 3, (3, 4))
+    assert len(build_chain(off).axis) == len(build_chain(robot).axis)
+    assert np.array_equal(
+        forward(build_chain(off), precompute_trig(off, q, np.zeros((3, 3)))).position, pose(robot, q).position
+    )
+
+
+def test_bases_that_make_no_sense_are_refused():
+    with pytest.raises(InputError, match="a basis beside a constant or a reading"):
+        Element(Axis.RZ, parameter=0, joint=1, basis=Basis("sin", 1))
+    rng = np.random.default_rng(9)
+    robot = with_coefficients(random_robot("dh", 2, rng), rng)
+    for given in (None, np.zeros((1, 3)), np.zeros((2, 1))):
+        with pytest.raises(InputError, match="given: "):
+            precompute_trig(robot, np.zeros((2, 2)), given)

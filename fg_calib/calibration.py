@@ -1,0 +1,419 @@
+"""The front door: from a robot and its measurements to a calibration that prints, predicts, and is saved and loaded.
+
+    robot = Robot.from_dh(rows, convention="dh-hayati", tool=[0, 0, 0.1])
+    data = Measurements.from_arrays(q, position=p, sigma_position=1e-4)
+    result = calibrate(robot, data, model="position", frame="unknown")
+
+`calibrate_job` does the same of a job, and the command line calls it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fg_calib.analysis.covariance import TangentCovariance
+from fg_calib.analysis.residual_table import ResidualTable
+from fg_calib.analysis.uncertainty import FrameEstimate, Uncertainty, assess
+from fg_calib.analysis.variance_components import solve_job
+from fg_calib.arrays import as_floats
+from fg_calib.errors import InputError
+from fg_calib.files.job import UNSTATED, read_job
+from fg_calib.files.result import KindGoodness, Parameter, Posterior, Result, read_result
+from fg_calib.files.robot_yaml import read_robot
+from fg_calib.graph.factors import Variables, build_variables, frame_of
+from fg_calib.graph.problem import tables_of
+from fg_calib.graph.solver import Solution
+from fg_calib.job import Job
+from fg_calib.measurements.checks import check_readings
+from fg_calib.measurements.dataset import Measurements
+from fg_calib.measurements.series import Table
+from fg_calib.options import NEAR, Options, check_flag, check_names, check_type, did_you_mean
+from fg_calib.report.documents import result_of, write_results
+from fg_calib.report.summary import format_result, html, summary
+from fg_calib.report.text import format_report
+from fg_calib.robot.kinematics import forward, precompute_trig
+from fg_calib.robot.model import Robot
+from fg_calib.threads import single_threaded
+
+Floats = NDArray[np.float64]
+
+SAME = 1e-12
+"""How far the saved robot's values may be from the estimates in `result.json`, [m] and [rad]: rounding in its units."""
+
+
+def calibrate(
+    robot: Robot,
+    measurements: Measurements | Table | Sequence[Measurements | Table],
+    options: Options | None = None,
+    **choices: Any,
+) -> Calibration:
+    """Estimate a robot's parameters from measurements, with their uncertainties.
+
+    It builds the problem, solves it (`estimate_noise=True`: with the noise), looks for other optima, and assesses what
+    it found. For the steps one by one see `build_problem`, `solve`, `look_elsewhere` and `assess`; for jobs in files
+    `calibrate_job`.
+
+    Args:
+        robot: The nominal robot.
+        measurements: What was measured: a table, or several; those that are no `Table` are understood as the options
+            say. With `estimate_noise` sigmas that are not stated start at 1 mm and 1 mrad.
+        options: What is estimated from what.
+        choices: Instead of `options`, any of theirs as keywords: model, frame, pairing, loss, ...
+
+    Raises:
+        InputError: An option is not one of those possible, or readings are not of this robot or outside its limits.
+        ProblemError: The measurements lack what the model needs, or do not suffice.
+        SolverError: GTSAM could not solve a step at all.
+    """
+    for name, given, kind, example in (
+        ("robot", robot, Robot, "Robot.from_dh(...)"),
+        ("options", options, Options, "Options(model='pose')"),
+    ):
+        if given is None and name != "options":
+            raise InputError(name, "found None", f"a {kind.__name__}, such as {example}")
+        check_type(name, given, kind, example)
+    if options is not None and choices:
+        raise InputError("options", f"both options and {next(iter(choices))}=...", "one of the two")
+    options = options or Options.of(**choices)
+    tables = []
+    for table in _tables(measurements, options):
+        check_readings(table.measurements.readings, robot, table.measurements.source)
+        first = _with_first_sigmas(table.measurements) if options.estimate_noise else table.measurements
+        tables.append(replace(table, measurements=first))
+    return calibrate_job(Job(None, robot, tuple(tables), options))
+
+
+def _tables(measurements: Measurements | Table | Sequence[Measurements | Table], options: Options) -> tuple[Table, ...]:
+    """The tables given.
+
+    Raises:
+        InputError: They are something else.
+    """
+    for given in measurements if isinstance(measurements, list | tuple) else [measurements]:
+        if not isinstance(given, Measurements | Table):
+            found = "None" if given is None else repr(given)
+            raise InputError("measurements", f"found {found}", "a Measurements, such as Measurements.from_arrays(...)")
+    return tables_of(measurements, options)
+
+
+def calibrate_job(job: Job | Path | str) -> Calibration:
+    """`calibrate` of a job: what `fg-calib calibrate` does.
+
+    Args:
+        job: The job, or the path of its file.
+
+    Raises:
+        InputError: The job, or a file that it names, cannot be used.
+        ProblemError: The measurements lack what the model needs, or do not suffice.
+        SolverError: GTSAM could not solve a step at all.
+    """
+    given = job if isinstance(job, Job) else read_job(job)
+    solution = solve_job(given)
+    return Calibration.of(solution, assess(solution), given.inputs)
+
+
+def _with_first_sigmas(m: Measurements) -> Measurements:
+    """Sigmas for what was measured without any, as the noise to be estimated starts from."""
+    shape = (m.n_configurations, 3)
+    first: dict[str, Any] = {}
+    for name in ("position", "orientation"):
+        measured = m.position if name == "position" else m.rotation
+        if measured is not None and getattr(m, f"sigma_{name}") is None:
+            first[f"sigma_{name}"] = np.full(shape, getattr(UNSTATED, name))
+    if m.pairs is not None:
+        of_pairs: dict[str, Any] = {
+            f"sigma_{name}": np.where(np.isnan(sigma), getattr(UNSTATED, name), sigma)
+            for name, sigma in (("distance", m.pairs.sigma_distance), ("angle", m.pairs.sigma_angle))
+        }
+        first["pairs"] = replace(m.pairs, **of_pairs)
+    return replace(m, **first)
+
+
+@dataclass(frozen=True)
+class PredictedPoses:
+    """Tool poses that a calibrated robot takes, with what its parameters may be off.
+
+    Attributes:
+        position: Of the tool point, shape (n, 3), [m].
+        rotation: Of the tool, shape (n, 3, 3).
+        covariance: Of position, then of a small turn, both along and about the axes of the frame that the poses are
+            in, shape (n, 6, 6), [m] and [rad]; nan where nothing determines it.
+    """
+
+    position: Floats
+    rotation: Floats
+    covariance: Floats
+
+    @property
+    def sigma_position(self) -> Floats:
+        """1 sigma of the position along the axes, shape (n, 3), [m]."""
+        return self._sigma[:, :3]
+
+    @property
+    def sigma_rotation(self) -> Floats:
+        """1 sigma of a turn about the axes, shape (n, 3), [rad]."""
+        return self._sigma[:, 3:]
+
+    @property
+    def _sigma(self) -> Floats:
+        sigma: Floats = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+        return sigma
+
+    def __repr__(self) -> str:
+        n = len(self.position)
+        rms = np.sqrt(np.mean(np.sum(self.sigma_position**2, axis=1))) * 1e3 if n else np.nan
+        return f"PredictedPoses, {n} poses, expected RMS error of the position {rms:.3g} mm"
+
+
+class Parameters(Mapping[str, Parameter]):
+    """The parameters of a calibration by name, in the robot's order."""
+
+    def __init__(self, parameters: Sequence[Parameter]) -> None:
+        self._by_name = {p.name: p for p in parameters}
+
+    def __getitem__(self, name: str) -> Parameter:
+        if name not in self._by_name:
+            raise KeyError(" ".join(filter(None, (str(name), did_you_mean(name, self._by_name, NEAR)))))
+        return self._by_name[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._by_name)
+
+    def __len__(self) -> int:
+        return len(self._by_name)
+
+    def __repr__(self) -> str:
+        names = ", ".join(self._by_name)
+        return f"Parameters: {names if len(names) <= 80 else names[:80] + ' ...'}"
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Calibration:
+    """What a calibration found; printed it is the report.
+
+    Attributes:
+        robot: The calibrated robot.
+        result: All that `result.json` holds.
+        posterior: The covariance of all parameters in the tangent space of the variables.
+        assessed: The solution and its assessment; None of a calibration that was loaded.
+    """
+
+    robot: Robot
+    result: Result
+    posterior: TangentCovariance
+    assessed: tuple[Solution, Uncertainty] | None = None
+
+    @classmethod
+    def of(cls, solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str, str] | None = None) -> Calibration:
+        """The calibration of a solution and its assessment.
+
+        Args:
+            solution: The solution.
+            uncertainty: Its assessment.
+            inputs: SHA-256 of the files it came from, by path.
+        """
+        result = result_of(solution, uncertainty, inputs)
+        return cls(uncertainty.robot, result, uncertainty.whole, (solution, uncertainty))
+
+    @classmethod
+    def load(cls, path: Path | str) -> Calibration:
+        """The calibration in a folder that `save` or `calibrate --out` wrote, or in its `result.json`.
+
+        It has all but the solution, its assessment and the residuals.
+
+        Raises:
+            InputError: There is none, or it is damaged.
+        """
+        result, folder = read_result(path), Path(path) if Path(path).is_dir() else Path(path).parent
+        robot = _saved_robot(folder, result)
+        nominal = robot.with_values([p.nominal for p in result.parameters])  # by its reach columns are scaled
+        return cls(robot, result, _saved_posterior(nominal, result, f"{folder / 'result.json'}: posterior"))
+
+    def save(self, folder: Path | str) -> None:
+        """Write what `calibrate --out` writes: `result.json`, the calibrated robot and the residuals.
+
+        Raises:
+            InputError: The folder cannot be written, or the calibration was itself loaded from one.
+        """
+        write_results(folder, self.solution, self.uncertainty, self.result.inputs)
+
+    @property
+    def solution(self) -> Solution:
+        """The solution.
+
+        Raises:
+            InputError: The calibration was loaded: a folder does not hold it.
+        """
+        return self._assessed[0]
+
+    @property
+    def uncertainty(self) -> Uncertainty:
+        """The assessment of the solution.
+
+        Raises:
+            InputError: The calibration was loaded: a folder does not hold it.
+        """
+        return self._assessed[1]
+
+    @property
+    def residuals(self) -> ResidualTable:
+        """Every residual, before and after.
+
+        Raises:
+            InputError: The calibration was loaded: its residuals are in `residuals.csv`.
+        """
+        return self.uncertainty.residuals
+
+    @property
+    def _assessed(self) -> tuple[Solution, Uncertainty]:
+        if self.assessed is None:
+            found = "it was loaded from a folder, which holds no solution, assessment or residual table"
+            raise InputError("calibration", found, hint="calibrate again to have them")
+        return self.assessed
+
+    @cached_property
+    def parameters(self) -> Parameters:
+        """Every parameter of the robot by name, with `estimate`, `sigma`, `nominal`, `correction`, ..."""
+        return Parameters(self.result.parameters)
+
+    def covariance(self, names: Sequence[str] | None = None) -> Floats:
+        """Covariance of the errors of parameters, [m] and [rad]; nan where nothing determines them.
+
+        Args:
+            names: The parameters, in the order wanted; those that were estimated if None. What is fixed has no error.
+
+        Raises:
+            InputError: There is no such parameter.
+        """
+        given = self.result.covariance
+        names = given.names if names is None else names if isinstance(names, str) else list(names)
+        check_names("covariance", names, list(self.parameters))
+        every = np.zeros((len(given.names) + 1,) * 2)  # the last one stands for what is fixed
+        every[:-1, :-1] = _array(given.matrix, len(given.names))
+        rows = [given.names.index(name) if name in given.names else len(given.names) for name in names]
+        return every[np.ix_(rows, rows)]
+
+    @property
+    def frame(self) -> FrameEstimate | None:
+        """The measurement frame world_T_base; None where it was not estimated."""
+        f = self.result.frame_estimate
+        return None if f is None else FrameEstimate(*(np.array(v, float) for v in (f.xyz, f.quaternion_xyzw, f.sigma)))
+
+    @property
+    def goodness(self) -> dict[str, KindGoodness]:
+        """Noise stated and noise seen, by kind; more of it in `uncertainty.goodness`."""
+        return self.result.goodness
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """Why it is not to be trusted; empty if it is."""
+        return self.result.findings
+
+    @property
+    def trustworthy(self) -> bool:
+        """Whether nothing speaks against it."""
+        return not self.findings and self.result.solver.converged
+
+    @single_threaded
+    def predict(self, readings: ArrayLike, *, world: bool = False) -> PredictedPoses:
+        """Where the tool truly is at joint readings, and how well that is known.
+
+        Args:
+            readings: Shape (n, n_joints), or (n_joints,) of one configuration, [rad] (prismatic: [m]).
+            world: Whether the poses are wanted in the measurement frame (the first that was estimated), instead of in
+                the base frame.
+
+        Raises:
+            InputError: The readings are of other joints, or there is no measurement frame.
+        """
+        check_flag("world", world)
+        q = as_floats("readings", np.atleast_2d(readings), f"(n, {self.robot.n_joints})")
+        v = self.posterior.variables
+        if world and v.n_robot_columns == v.n_columns:
+            raise InputError("world", "the measurement frame was not estimated, or not saved", "the base frame")
+        known = build_variables(v.robot, [False]).chains[0]
+        chain = v.chains[_tables_with_frame(v)[0]] if world else known
+        at = forward(chain.at(self.posterior.parameters), precompute_trig(v.robot, q))
+        jacobian = np.zeros((len(q), 6, v.n_columns))
+        jacobian[:, :, : at.jacobian.shape[2]] = at.jacobian[:, [3, 4, 5, 0, 1, 2]]
+        covariance = [self.posterior.covariance(rows) for rows in jacobian]
+        return PredictedPoses(at.position, at.rotation, np.array(covariance).reshape(-1, 6, 6))
+
+    def __repr__(self) -> str:
+        return "\n".join(summary(self.result))
+
+    def __str__(self) -> str:
+        return format_result(self.result) if self.assessed is None else format_report(*self.assessed)
+
+    def _repr_html_(self) -> str:
+        return html(self.result)
+
+
+def _tables_with_frame(variables: Variables) -> list[int]:
+    """The tables whose measurement frame was estimated."""
+    return [int(v.symbol[2:-1]) for v in variables.frames]
+
+
+def _array(matrix: Sequence[Sequence[float | None]], width: int) -> Floats:
+    """A matrix of a result, nan for None, shape (n, width)."""
+    return np.array(matrix, dtype=np.float64).reshape(-1, width)
+
+
+def _saved_robot(folder: Path, result: Result) -> Robot:
+    """The calibrated robot beside a result: that which the result is of."""
+    files = [folder / f"robot_calibrated.{ending}" for ending in ("yaml", "urdf")]
+    file = next((file for file in files if file.exists()), None)
+    if file is None:
+        raise InputError(str(folder), "neither robot_calibrated.yaml nor robot_calibrated.urdf beside its result.json")
+    links = result.links or (None, None)
+    robot = read_robot(file, base_link=links[0], tip_link=links[1])
+    names, estimates = [p.name for p in result.parameters], [p.estimate for p in result.parameters]
+    same = [p.name for p in robot.parameters] == names
+    if not same or np.abs(robot.nominal - estimates).max(initial=0.0) > SAME:
+        found = "other values" if same else "other parameters"
+        raise InputError(str(file), f"{found} than in result.json", "the files of one calibration")
+    tolerances = [p.prior_sigma for p in result.parameters]
+    parameters = zip(robot.with_estimated(result.covariance.names).parameters, tolerances, strict=True)
+    return replace(robot, parameters=tuple(replace(p, tolerance=p.tolerance or t) for p, t in parameters))
+
+
+def _saved_posterior(robot: Robot, result: Result, place: str) -> TangentCovariance:
+    """The covariance that was saved, of a nominal robot; of version 1 what that of the parameters says."""
+    estimates = result.frames or ({} if result.frame_estimate is None else {"X(0)": result.frame_estimate})
+    frames = [] if estimates else [np.zeros(6)]
+    for frame in estimates.values():
+        x, y, z, w = map(float, np.array(frame.quaternion_xyzw, float))
+        frames.append(frame_of(gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), np.array(frame.xyz, float))))
+    parameters = np.concatenate([[p.estimate for p in result.parameters], *frames])
+    if result.posterior is None:
+        return _posterior_of_names(robot, parameters, result)
+    unknown = [int(symbol[2:-1]) for symbol in estimates]
+    variables = build_variables(robot, [t in unknown for t in range(max(unknown, default=0) + 1)], False)
+    wanted = {v.symbol: variables.names[v.columns] for v in variables.items}
+    saved: Posterior = result.posterior
+    n = variables.n_columns
+    matrices = (saved.covariance, saved.undetermined, saved.undetermined_at_nominal)
+    if saved.variables != wanted or len(saved.covariance) != n or any(len(row) != n for m in matrices for row in m):
+        raise InputError(place, "other variables than the robot and the covariance have", f"{n} columns of them")
+    return TangentCovariance(variables, parameters, *(_array(matrix, n) for matrix in matrices))
+
+
+def _posterior_of_names(robot: Robot, parameters: Floats, result: Result) -> TangentCovariance:
+    """Of version 1: what the parameters' own covariance says; what has none there counts as undetermined."""
+    variables = build_variables(robot, [False], False)
+    n = variables.n_columns
+    named = _array(result.covariance.matrix, n)
+    unknown = np.isnan(np.diag(named))
+    E = variables.tangent_derivative(parameters)
+    loose = (E @ np.eye(n)[:, unknown]).T / variables.scales
+    loose = loose / np.linalg.norm(loose, axis=1, keepdims=True)
+    known = np.where(unknown[:, None] | unknown, 0.0, named)
+    return TangentCovariance(variables, parameters, E @ known @ E.T, loose, loose)

@@ -1,0 +1,302 @@
+"""From a robot and its tables to a problem: checks, the start, and what is left out to fix the gauge."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.errors import ProblemError
+from fg_calib.graph.factors import Variables, prior_rows
+from fg_calib.graph.information import observe, whitened_triangle
+from fg_calib.graph.observability import determined, singular_values
+from fg_calib.graph.problem import Problem, problem_at, tables_of, variables_of
+from fg_calib.graph.start import start_of
+from fg_calib.job import Job
+from fg_calib.measurements.dataset import Measurements, Pairs
+from fg_calib.measurements.kinds import Frames, check_derivatives
+from fg_calib.measurements.series import Dataset, Table, gather
+from fg_calib.options import (
+    FrameKnowledge,
+    Gauge,
+    Model,
+    Options,
+    PairErrors,
+    Pairing,
+    as_pairing,
+    check_names,
+    check_type,
+)
+from fg_calib.robot.inverse import random_readings
+from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.robot.model import Robot, names_of
+from fg_calib.threads import single_threaded
+
+_log = logging.getLogger(__name__)
+
+Floats = NDArray[np.float64]
+
+QUARTER_TURN = 1e-3
+"""Cosine of a pitch at which yaw and roll of a frame may be told apart no more."""
+
+STRUCTURAL_FLOOR = 1e-6
+"""Signal-to-noise ratio that counts as nothing on random configurations with an assumed noise: rounding alone."""
+
+
+@single_threaded
+def build_problem(
+    robot: Robot,
+    measurements: Measurements | Table | Sequence[Measurements | Table],
+    options: Options | None = None,
+    **choices: Any,
+) -> Problem:
+    """The calibration problem of a robot and its measurements.
+
+    Measurements that are all test rows make a problem of evaluation (see `Problem.evaluated`): their rows are those of
+    the fit, of which the arm has no part.
+
+    Args:
+        robot: The nominal robot.
+        measurements: What was measured: a table, or several; those that are no `Table` are understood as `options` say.
+        options: What is estimated from what.
+        choices: Instead of `options`, any of theirs as keywords.
+
+    Raises:
+        InputError: An option is not one of those possible.
+        ProblemError: The measurements lack what the model needs, or do not suffice.
+    """
+    check_type("options", options, Options, "Options(model='pose')")
+    options = options or Options.of(**choices)
+    check_names("prefer", options.prefer, names_of(robot.parameters))
+    if not any(p.estimated for p in robot.parameters):
+        raise ProblemError(f"robot {robot.name}", "nothing to estimate", "at least one parameter that is not fixed")
+    tables = tables_of(measurements, options)
+    evaluated = all(map(_all_test, tables))
+    if evaluated:
+        robot, options, tables = _for_evaluation(robot, options, tables)
+    for table in tables:
+        if not table.uses_pairs and table.measurements.pairs is not None:
+            source = table.measurements.pairs.source
+            _log.warning("%s: not used, model %s is of poses", source, table.model)
+    data = gather(tables)
+    _check_frames(data)
+    variables = variables_of(robot, data, options)
+    start = start_of(robot, data, variables)
+    _check_own_kinds(robot, data, variables, start)
+    problem = problem_at(robot, data, options, variables, start, evaluated=evaluated)
+    _check_enough(problem)
+    if options.gauge != "keep":
+        return problem
+    kept = _kept(problem, options.prefer)
+    if not kept:
+        found = "the rows determine none of the parameters to estimate"
+        raise ProblemError(_source(problem), found, "rows that some of them act on")
+    reduced = robot.with_estimated(kept)
+    variables = variables_of(reduced, data, options)
+    return problem_at(reduced, data, options, variables, start, whole=problem, evaluated=evaluated)
+
+
+def _kept(problem: Problem, prefer: Sequence[str]) -> list[str]:
+    """The parameters that gauge `keep` estimates.
+
+    At a pitch of a quarter turn yaw and roll of a frame are relative for want of coordinates, not of data: a frame that
+    lacks nothing else is kept whole, as a pose.
+    """
+    kept = observe(problem, problem.start, prefer).kept
+    for v in problem.variables.items:
+        if v.kind in ("base", "tool") and abs(np.cos(problem.start[v.parameters[4]])) < QUARTER_TURN:
+            lacking = set(problem.variables.names[v.columns]).difference(kept)
+            if len(lacking) == 1 and lacking <= {problem.variables.names[v.columns][k] for k in (3, 5)}:
+                kept += lacking
+    return kept
+
+
+def _all_test(table: Table) -> bool:
+    """Whether all rows of a table that take part are test rows."""
+    m = table.measurements
+    own = [np.zeros(len(own.data), np.bool_) if own.test is None else np.asarray(own.test) for own in table.own]
+    if table.model is None:
+        rows = np.concatenate(own) if own else np.zeros(0, dtype=np.bool_)
+    elif table.uses_pairs and m.pairs is not None:
+        touches = np.zeros(0, dtype=np.bool_) if m.groups is None else m.test[m.groups.index >= 0]
+        rows = np.concatenate([m.pairs.test, touches, *own])
+    else:
+        rows = np.concatenate([m.test, *own])
+    return bool(rows.all()) and len(rows) > 0
+
+
+def _for_evaluation(
+    robot: Robot, options: Options, tables: Sequence[Table]
+) -> tuple[Robot, Options, tuple[Table, ...]]:
+    """A robot whose base and tool alone are estimated, where they were, and test rows that these are fitted to."""
+
+    def fitted(pairs: Pairs) -> Pairs:
+        return replace(pairs, test=np.zeros(pairs.n_pairs, dtype=np.bool_))
+
+    def of_fit(table: Table) -> Table:
+        m = table.measurements
+        m = replace(
+            m,
+            test=np.zeros(m.n_configurations, dtype=np.bool_),
+            pairs=None if m.pairs is None else fitted(m.pairs),
+            groups=None if m.groups is None else replace(m.groups, pairs=fitted(m.groups.pairs)),
+        )
+        return replace(table, measurements=m, own=tuple(replace(own, test=None) for own in table.own))
+
+    of_frames = [p.name for p in robot.parameters if p.estimated and not 1 <= p.owner <= robot.n_joints]
+    gauge: Gauge = "none" if options.gauge == "keep" else options.gauge
+    options = replace(options, gauge=gauge, encoder="propagated")
+    return robot.with_estimated(of_frames), options, tuple(map(of_fit, tables))
+
+
+def problem_of(job: Job, **changes: Any) -> Problem:
+    """The calibration problem of a job.
+
+    Args:
+        job: The job.
+        changes: Options that shall differ from the job's.
+
+    Raises:
+        ProblemError: The measurements lack what the model needs, or do not suffice.
+    """
+    return build_problem(job.robot, job.measurements, replace(job.options, **changes))
+
+
+@single_threaded
+def predicted_problem(
+    robot: Robot,
+    readings: Floats,
+    model: Model,
+    *,
+    frame: FrameKnowledge = "known",
+    pairing: Pairing | None = None,
+    sigmas: tuple[Floats | None, Floats | None, Floats | None] = (None, None, None),
+    pair_errors: PairErrors = "shared",
+) -> Problem:
+    """The problem that a robot's own predictions at some configurations make: what could be measured there.
+
+    Args:
+        robot: The robot.
+        readings: Joint readings, shape (n, n_joints), [rad] (prismatic: [m]).
+        model: Which measurements take part.
+        frame: Whether the measurement frame is estimated too.
+        pairing: How pairs are formed; a star if None.
+        sigmas: Of positions, shape (n, 3), [m], of orientations, shape (n, 3), [rad], and of readings, shape
+            (n_joints,); 1 mm, 1 mrad and none where None.
+        pair_errors: Whether pairs of one configuration share its errors or count as independent.
+    """
+    options = Options(model, as_pairing(pairing), frame, gauge="none", pair_errors=pair_errors)
+    trig = precompute_trig(robot, readings)
+    poses = forward(build_chain(robot), trig)
+    n = len(readings)
+    usual = np.full((n, 3), 1e-3)
+    sigma_position, sigma_orientation, sigma_joint = sigmas
+    measurements = Measurements(
+        readings=readings,
+        ids=np.arange(n).astype(str),
+        test=np.zeros(n, dtype=np.bool_),
+        position=poses.position,
+        rotation=poses.rotation,
+        sigma_position=usual if sigma_position is None else sigma_position,
+        sigma_orientation=usual if sigma_orientation is None else sigma_orientation,
+        sigma_joint=np.zeros(robot.n_joints) if sigma_joint is None else sigma_joint,
+        source="predictions",
+    )
+    data = gather(tables_of(measurements, options))
+    variables = variables_of(robot, data, options)
+    return problem_at(robot, data, options, variables, variables.nominal())
+
+
+def random_problem(
+    robot: Robot, model: Model, frame: FrameKnowledge = "known", *, n_configurations: int = 0, seed: int = 0
+) -> Problem:
+    """`predicted_problem` at random configurations: what a model can determine at all.
+
+    Args:
+        robot: The robot; its joints move as `random_readings` says.
+        model: Which measurements take part; pairs are chained. Noise is assumed as `Robot.scale_of` says.
+        frame: Whether the measurement frame is estimated too.
+        n_configurations: How many; 0 for ten for every parameter, 300 at least.
+        seed: Of the random configurations.
+    """
+    n = n_configurations or max(300, 10 * len(robot.parameters))
+    return predicted_problem(
+        robot,
+        random_readings(robot, n, np.random.default_rng(seed)),
+        model,
+        frame=frame,
+        pairing=Pairing("chain"),
+        sigmas=(np.full((n, 3), robot.scale_of("m")), np.full((n, 3), robot.scale_of("rad")), None),
+        pair_errors="independent",
+    )
+
+
+def _check_frames(data: Dataset) -> None:
+    """Whether every table whose measurement frame is unknown has a row that says where it is."""
+    for number, table in enumerate(data.tables):
+        n_train = sum(len(s.train) for s in data.series if s.table == number)
+        if table.unknown_frame and not n_train and len(data.tables) > 1:
+            found = "test rows alone, in a measurement frame of their own"
+            raise ProblemError(table.measurements.source, found, "train rows, or frame known")
+
+
+def _check_own_kinds(robot: Robot, data: Dataset, variables: Variables, start: Floats) -> None:
+    """Compare the derivatives of kinds of one's own with differences at some measurements, where they are started."""
+    at = variables.at(start)
+    for s in data.series:
+        if len(s.kind.twins()) or type(s.kind).__module__.startswith("fg_calib."):
+            continue
+        rows = np.arange(min(s.n, 3))
+        table = data.tables[s.table].measurements
+        poses = forward(
+            at.chains[s.table].without_columns(), precompute_trig(robot, table.readings), s.ends[rows].ravel()
+        )
+        shape = (len(rows), s.kind.ends)
+        frames = Frames(poses.rotation.reshape(*shape, 3, 3), poses.position.reshape(*shape, 3))
+        check_derivatives(s.kind, frames, s.data[rows], at.coordinates[s.nuisances[rows]])
+
+
+def _source(problem: Problem) -> str:
+    """What the rows are called in messages."""
+    series = problem.data.series
+    return ", ".join(dict.fromkeys(s.source for s in series)) if series else problem.data.source
+
+
+def _check_enough(problem: Problem) -> None:
+    """Whether there are rows at all, and as many as unknowns that random configurations could determine."""
+    if problem.n_residuals == 0:
+        _refuse_nothing(problem)
+    n_nuisance = problem.variables.n_nuisance
+    rows = problem.n_residuals + problem.n_priors - n_nuisance
+    table = problem.data.tables[0]
+    if rows >= problem.variables.n_columns or len(problem.data.tables) > 1 or table.model is None:
+        return
+    anywhere = random_problem(problem.robot, table.model, table.frame)
+    priors = prior_rows(problem.variables, problem.start)[1]
+    stacked = np.vstack([whitened_triangle(anywhere, anywhere.start), priors])
+    needed = determined(singular_values(stacked * problem.variables.prior_scales), STRUCTURAL_FLOOR)
+    if rows < needed:
+        found = f"{rows} residuals"
+        raise ProblemError(_source(problem), found, f"at least {needed} to determine what model {table.model} can")
+
+
+def _refuse_nothing(problem: Problem) -> None:
+    table = problem.data.tables[0]
+    touches = table.measurements.groups is not None
+    pairs = table.uses_pairs and not (touches and not problem.pair_series)
+    unit = "pair" if pairs else "touch" if touches else "row"
+    source = table.measurements.source
+    if pairs:
+        measured = table.measurements.pairs
+        source = f"pairs from {source}" if measured is None else measured.source
+    reasons = ", ".join(f"{n} excluded for {reason.replace('_', ' ')}" for reason, n in problem.n_excluded.items() if n)
+    found = f"no {unit} left to fit"
+    if reasons:
+        raise ProblemError(source, f"{found}: {reasons}", f"{unit}s that tell something")
+    if pairs and not problem.pair_series:
+        raise ProblemError(source, f"{found}: none has a measurement that model {table.model} uses")
+    raise ProblemError(source, found, "train rows")

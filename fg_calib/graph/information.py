@@ -1,0 +1,119 @@
+"""What rows say of the core: their whitened Jacobian with the nuisances eliminated, and what follows from it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.graph.factors import Eliminated, dense, eliminate
+from fg_calib.graph.observability import RANK_TOLERANCE, SIGNAL_FLOOR, Observability, analyse
+from fg_calib.graph.problem import Problem
+from fg_calib.graph.robust import effect
+from fg_calib.graph.rows import RowSet, correlation_of
+
+Floats = NDArray[np.float64]
+
+
+def eliminated(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> Eliminated:
+    """The whitened Jacobian of train rows and added factors, nuisances eliminated; zero as right-hand side.
+
+    Args:
+        problem: The problem.
+        parameters: The parameter vector.
+        with_loss: Whether a robust loss counts for what it loses of clean data (see `robust.Effect`).
+    """
+    v = problem.variables
+    at = v.at(parameters)
+    blocks = [np.zeros((0, v.n_columns + v.n_nuisance)), added_rows(problem, parameters)]
+    for rows in problem.rows:
+        R = rows.triangle(at)[:, :-1]
+        blocks.append(R / np.sqrt(_variance_of_loss(problem, rows)) if with_loss else R)
+    A = np.vstack(blocks)
+    return eliminate(A, np.zeros(len(A)), v.n_columns)
+
+
+def _variance_of_loss(problem: Problem, rows: RowSet) -> float:
+    heights = [part.block.height for part in rows.parts for _ in range(part.n_rows)]
+    return effect(problem.options.loss, max(set(heights), key=heights.count)).variance
+
+
+def whitened_triangle(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> Floats:
+    """A square root of what the train rows and added factors say of the core, shape (m, n_columns)."""
+    return eliminated(problem, parameters, with_loss=with_loss).A
+
+
+def added_rows(problem: Problem, parameters: Floats) -> Floats:
+    """Derivatives of the added factors' whitened rows, shape (n_added, n_columns + n_nuisance)."""
+    variables = problem.variables
+    wide = np.zeros((problem.n_added, variables.n_columns + variables.n_nuisance))
+    if problem.added:
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in problem.added:
+            graph.add(factor)
+        present = set(graph.keyVector())
+        chosen = [v for v in variables.items + variables.nuisance if v.key in present]
+        A, _ = dense(graph.linearize(variables.values(parameters)), [v.key for v in chosen])
+        wide[:, np.concatenate([np.arange(wide.shape[1])[v.columns] for v in chosen])] = A
+    return wide
+
+
+def named_triangle(problem: Problem, parameters: Floats) -> Floats:
+    """`whitened_triangle` by named parameters, the measurement frames projected out: shape (m, n_robot_columns).
+
+    At a pitch of a quarter turn of base or tool the columns of yaw and roll are parallel: only their sum acts.
+    """
+    variables = problem.variables
+    n = variables.n_robot_columns
+    J = whitened_triangle(problem, parameters)
+    out: Floats = J @ variables.tangent_derivative(parameters)[:, :n]
+    if n == variables.n_columns:
+        return out
+    length = np.linalg.norm(out, axis=0)
+    U, s, _ = np.linalg.svd(J[:, n:], full_matrices=False)
+    Q = U[:, s > RANK_TOLERANCE * s.max(initial=0.0)]
+    out = out - Q @ (Q.T @ out)
+    # What projecting leaves of a column that was all frame is rounding.
+    out[:, np.linalg.norm(out, axis=0) <= RANK_TOLERANCE * length] = 0.0
+    return out
+
+
+def observe(
+    problem: Problem, parameters: Floats, prefer: Sequence[str] = (), floor: float = SIGNAL_FLOOR
+) -> Observability:
+    """What the train rows, without priors, determine of the robot's parameters around a parameter vector.
+
+    Args:
+        problem: The problem.
+        parameters: The parameter vector (see `Variables`).
+        prefer: Parameters to keep, first choice first, where only combinations are determined.
+        floor: Signal-to-noise ratio below which a direction counts as not determined.
+    """
+    return analyse(
+        named_triangle(problem, parameters),
+        problem.estimated,
+        scales=np.array([problem.robot.scale_of(p.unit) for p in problem.estimated]),
+        n_measurements=sum(len(s.train) for s in problem.data.series),
+        prefer=prefer,
+        floor=floor,
+    )
+
+
+def correlation(problem: Problem, parameters: Floats) -> Floats | None:
+    """J^T (C - 1) J of the train rows where they share errors but count as independent, else None.
+
+    Args:
+        problem: The problem.
+        parameters: The parameter vector.
+
+    Returns:
+        With J the whitened Jacobian, the nuisances eliminated, and C the covariance of the whitened rows, shape
+        (n_columns, n_columns).
+    """
+    if not problem.missing_correlation:
+        return None
+    n, n_nuisance = problem.variables.n_columns, problem.variables.n_nuisance
+    follow = eliminated(problem, parameters).follow if n_nuisance else np.zeros((0, n))
+    return correlation_of(problem.noises, problem.rows, problem.variables.at(parameters), follow)

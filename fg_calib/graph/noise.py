@@ -1,0 +1,512 @@
+"""The noise of rows at some parameters: what is a measurement's own, and what follows from errors that others share.
+
+Three sources of noise reach a row: that of the measurement itself; that of the measured poses where a pair was formed
+from poses; and that of the joint readings, through the row's derivatives in the joints. The last two belong to a
+configuration and are the same in every measurement that it takes part in.
+
+What noise does to a length or an angle is not linear: rows of pairs are `M - measured`, M the mean of what would be
+measured, with its slope and variance (see `moments`). At given parameters that is an ordinary row, scaled and shifted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import astuple, dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.graph.frames import nearest_rotation
+from fg_calib.measurements import residuals
+from fg_calib.measurements.dataset import Measurements, rotation_angle
+from fg_calib.measurements.kinds import Distance, RotationAngle
+from fg_calib.measurements.moments import Moments, angle_moments, length_moments
+from fg_calib.measurements.residuals import Block, pack
+from fg_calib.measurements.series import Series
+from fg_calib.robot.kinematics import SPAN, Chain, Poses, common_axes, forward, turning_of_base, turning_of_points
+
+Floats = NDArray[np.float64]
+Booleans = NDArray[np.bool_]
+Integers = NDArray[np.int64]
+
+LEAST_SLOPE = 1e-3
+"""Slope of a mean, near a kink, that is taken for this at least: such a row says next to nothing."""
+
+PRIVATE_SHARE = 1e-3
+"""Share of a pair's variance that counts as its own at least: shared errors are not all there is."""
+
+LEAST_BEND = 0.05
+"""A row that what the parameters may be off bends by less than this many sigma is straight."""
+
+BEND_MARGIN = 2.0
+"""Factor on the variance that bends a row. The covariance of the parameters counts what bent rows seem to say of them
+by a derivative that is there only at the estimate; with 1 the NEES of a SCARA's star is 1.05, with 2 about 1.02."""
+
+MOST_BEND = 1.0
+"""A row is bent by no more sigma: what is off by more than that is for the optimum to find, not to be called noise."""
+
+REDUNDANT = 100.0
+"""Factor on what is not linear in pairs that are more than the errors they share: they have nothing else to say there,
+and its distribution is not normal."""
+
+
+@dataclass(frozen=True)
+class NoiseState:
+    """What has been learned of the measurements' noise on the way to a solution.
+
+    Attributes:
+        weights: Robust weight of each measurement of each series, in [0, 1]; None for 1.
+        factors: What the stated sigmas are multiplied by, by table and kind of noise; 1 where none is given.
+        joint_errors: True joint values less their readings, where encoder noise is estimated, shape
+            (n_configurations, n_joints), [rad] (prismatic: [m]); None for 0.
+        spread: A square root S of the parameters' covariance S S^T in the chain's columns, shape (n_columns, k), where
+            what they may be off bends a row; None for 0.
+    """
+
+    weights: tuple[Floats, ...] | None = None
+    factors: Mapping[tuple[int, str], float] = field(default_factory=dict)
+    joint_errors: Floats | None = None
+    spread: Floats | None = None
+
+
+class Source(NamedTuple):
+    """How rows follow from errors of 1 sigma that belong to configurations.
+
+    Attributes:
+        name: `joints`, or `poses` of a table.
+        ends: Configuration of each end, among those of all tables, shape (n, ends).
+        loading: The rows per error of each end, shape (n, height, ends, width).
+    """
+
+    name: str
+    ends: Integers
+    loading: Floats
+
+    @property
+    def variance(self) -> Floats:
+        """What the source adds to the covariance of each measurement's rows, shape (n, height, height)."""
+        n, height = self.loading.shape[:2]
+        flat = self.loading.reshape(n, height, -1)
+        out: Floats = flat @ np.swapaxes(flat, 1, 2)
+        return out
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a series stands: its table, that table's configurations, and the arm there.
+
+    Attributes:
+        measurements: The table.
+        configurations: Its configurations among those of all tables, shape (n_configurations,).
+        trig: Its readings, or the joint values that are estimated in their place, for the kernels.
+        chain: The chain from its measurement frame, at the parameters.
+        coordinates: Values of all nuisance coordinates, at the parameters.
+        joints_estimated: Whether true joint values are estimated, so that their errors bend no mean.
+    """
+
+    measurements: Measurements
+    configurations: Integers
+    trig: Floats
+    chain: Chain
+    coordinates: Floats
+    joints_estimated: bool = False
+
+    @cached_property
+    def joints(self) -> Integers:
+        """Joints whose readings have noise."""
+        return np.flatnonzero(self.measurements.sigma_joint > 0.0)
+
+
+class RowNoise:
+    """The rows of a series and their noise, to first order.
+
+    Args:
+        series: The series.
+        place: Where it stands.
+        state: What has been learned of the noise.
+
+    Attributes:
+        rows: All its rows, not whitened, in [m] and [rad].
+        own: Covariance of what is each measurement's alone, shape (n, height, height).
+        sources: What errors of configurations add to it.
+        excess: What noise adds to the measured values on average, shape (n, height), [m] and [rad].
+    """
+
+    def __init__(self, series: Series, place: Place, state: NoiseState) -> None:
+        self.series = series
+        self.place = place
+        families = [name.partition(".")[0] for name in series.kind.names]
+        self.factors: Floats = np.array([state.factors.get((series.table, family), 1.0) for family in families])
+        self.excess: Floats = np.zeros((series.n, series.kind.height))
+        self._prepare(state)
+
+    def _prepare(self, state: NoiseState) -> None:
+        self.rows = self._block(self.series.data)
+        self.own: Floats = self._diagonal((self.series.sigma * self.factors) ** 2)
+        self.sources = self._of_joints(self.rows)
+
+    @cached_property
+    def total(self) -> Floats:
+        """Covariance of each measurement's rows, all noise together, shape (n, height, height)."""
+        out: Floats = self.own + sum(source.variance for source in self.sources)
+        return out
+
+    @property
+    def sigma(self) -> Floats:
+        """1 sigma of each row, all noise together, shape (n, height), [m] and [rad]."""
+        out: Floats = np.sqrt(np.einsum("nii->ni", self.total))
+        return out
+
+    def residual(self) -> Floats:
+        """Of all rows, shape (n, height), [m] and [rad]."""
+        return residuals.residual(self.rows, self.place.chain)
+
+    def lengths(self) -> tuple[Floats, Integers]:
+        """Length of each measurement's residual whitened by all its noise, and its number of rows, shapes (n,).
+
+        For measurements that take no part 0 and 0.
+        """
+        used = self.series.used
+        r = np.where(used, self.residual(), 0.0)
+        W = whitening_of(self.total, used)
+        return np.linalg.norm(W @ r[:, :, None], axis=(1, 2)), used.sum(axis=1)
+
+    def more_if_redundant(self, shared: frozenset[str]) -> Floats | float:
+        """What is added to the diagonal of `own` where there are more rows than errors that they share."""
+        return 0.0
+
+    def least(self) -> Floats | float:
+        """What the diagonal of private noise is at least."""
+        return 0.0
+
+    def bare(self, rows: Integers) -> Floats:
+        """Diagonal of what is private to measurements, but for what is there for numerical safety alone."""
+        out: Floats = np.einsum("nii->ni", self.own[rows])
+        return out
+
+    def rows_at(self, rows: Integers) -> Block:
+        """Some of the rows, not whitened."""
+        return residuals.rows_of(self.rows, rows)
+
+    def _block(self, data: Floats, slope: Floats | None = None) -> Block:
+        s, p = self.series, self.place
+        unit = np.tile(np.eye(s.kind.height), (s.n, 1, 1)) if slope is None else self._diagonal(slope)
+        return Block(s.kind, p.trig, s.ends, data, pack(unit), p.coordinates[s.nuisances])
+
+    def _of_joints(self, rows: Block) -> tuple[Source, ...]:
+        p, s = self.place, self.series
+        if not len(p.joints) or not s.kind.ends:
+            return ()
+        chain = p.chain.without_columns().with_joint_columns()
+        J = residuals.linearise(rows, chain)[1][:, :, : s.kind.ends * p.chain.n_joints]
+        J = J.reshape(s.n, s.kind.height, s.kind.ends, -1)[..., p.joints]
+        loading = J * p.measurements.sigma_joint[p.joints] * self.factors[:, None, None]
+        return (Source("joints", p.configurations[s.ends], np.ascontiguousarray(loading)),)
+
+    @staticmethod
+    def _diagonal(values: Floats) -> Floats:
+        """Diagonal matrices, shape (n, height, height)."""
+        out: Floats = values[:, :, None] * np.eye(values.shape[1])
+        return out
+
+
+class PairNoise(RowNoise):
+    """The same of distances and angles of pairs, whose vectors noise lengthens (see `moments`).
+
+    Attributes:
+        moments: Mean and variance of each distance and angle under the noise of its vector, shapes (n, 2).
+        predicted: Distance and angle as the arm predicts them, shape (n, 2).
+    """
+
+    def _prepare(self, state: NoiseState) -> None:
+        s = self.series
+        self._parts = [_QUANTITY[type(part)] for part in getattr(s.kind, "parts", (s.kind,))]
+        self._wanted = np.isin([0, 1], self._parts)
+        self._spread = state.spread
+        wide = np.ones(2)
+        wide[self._parts] = self.factors
+        self._both = wide  # factors of distance and angle
+        plain = self._block(s.data)
+        self.predicted = np.zeros((s.n, 2))
+        self.predicted[:, self._parts] = residuals.residual(plain, self.place.chain) + s.data
+        stated = np.zeros((s.n, 2))
+        stated[:, self._parts] = s.sigma**2
+        self._own = np.nan_to_num(self._formed_variance() if s.formed else stated) * wide**2
+        joints = self._of_joints(plain)
+        linear = self._wide(sum((source.variance for source in joints), np.zeros((s.n, 1, 1))))
+        self.moments = self._moments(linear)
+        slope = self._narrow(np.maximum(self.moments.slope, LEAST_SLOPE))
+        self.excess = self._narrow(self.moments.excess)
+        predicted = self._narrow(self.predicted)
+        data = s.data + (predicted - s.data) * (1.0 - 1.0 / slope) - self.excess / slope
+        self.rows = self._block(np.ascontiguousarray(data), slope)
+        true = self._narrow(self.moments.slope)[:, :, None, None]
+        self.sources = tuple(source._replace(loading=source.loading * true) for source in joints)
+        of_poses = self._narrow(self.moments.slope**2 * self._own) if s.formed else 0.0
+        of_joints = 0.0 if self.place.joints_estimated else self._diagonals(self.sources)
+        direct = 0.0 if s.formed else self._narrow(self.moments.slope**2 * self._own)
+        variance = self._narrow(self.moments.variance)
+        self._bent_variance = np.maximum(variance - of_poses - direct - of_joints, 0.0)
+        if s.formed:
+            self.sources += (self._of_poses(),)
+        left = variance - of_joints - of_poses - 0.5 * self._bent_variance * s.formed
+        self.own = self._diagonal(left)
+
+    def more_if_redundant(self, shared: frozenset[str]) -> Floats | float:
+        """What is added to the diagonal of `own` where there are more rows than errors that they share."""
+        s = self.series
+        sources = [source for source in self.sources if source.name in shared]
+        if not s.formed or not any(source.name != "joints" for source in sources):
+            return 0.0
+        n_errors = len(np.unique(s.ends[s.train])) * sum(source.loading.shape[3] for source in sources)
+        n_rows = len(s.train) * s.kind.height
+        return 0.5 * (REDUNDANT - 1.0) * self._bent_variance if n_rows > n_errors else 0.0
+
+    def least(self) -> Floats | float:
+        """What the diagonal of private noise is at least."""
+        out: Floats = PRIVATE_SHARE * np.einsum("nii->ni", self.total)
+        return out
+
+    def bare(self, rows: Integers) -> Floats:
+        """Diagonal of what is private to measurements, but for what is there for numerical safety alone."""
+        if not self.series.formed:
+            return super().bare(rows)
+        out: Floats = 0.5 * self._bent_variance[rows]
+        return out
+
+    def bent_by(self, spread: Floats, sigmas: float) -> Booleans:
+        """Which rows some uncertainty of the parameters bends by so many sigma, shape (n, height).
+
+        Args:
+            spread: A square root of the parameters' covariance, shape (n_columns, k).
+            sigmas: By how many sigma at least.
+        """
+        bent: Booleans = self._noticed(spread, sigmas)[:, self._parts] > 0.0
+        return bent
+
+    def may_fold(self, spread: Floats) -> Booleans:
+        """Which rows some uncertainty of the parameters may fold, shape (n, height).
+
+        Half the way to 0, or of an angle to half a turn, is then less than that uncertainty (and this more than the
+        noise): the vector may as well point the other way, and a descent may end with the wrong one.
+
+        Args:
+            spread: A square root of the parameters' covariance, shape (n_columns, k).
+        """
+        f, noise, train = self.predicted, 4.0 * self._own, np.flatnonzero(~self.series.test)
+        folds = np.zeros(f.shape, dtype=np.bool_)
+        if not len(train):
+            return folds[:, self._parts]
+        from_kink = np.stack([f[:, 0], np.minimum(f[:, 1], np.pi - f[:, 1])], axis=1)
+        largest = 4.0 * np.sum(self._spread_of(_evenly(train), spread), axis=0).max(axis=0)
+        near = np.flatnonzero(np.any((from_kink**2 / 4.0 < largest) & self._wanted, axis=1))
+        for start in range(0, len(near), SPAN):
+            rows = near[start : start + SPAN]
+            across, along = self._spread_of(rows, spread)
+            folds[rows] = across + along > np.maximum(f[rows] ** 2 / 4.0, noise[rows])
+            folds[rows, 1] |= along[:, 1] > np.maximum((np.pi - f[rows, 1]) ** 2 / 4.0, noise[rows, 1])
+        return folds[:, self._parts]
+
+    @cached_property
+    def _poses(self) -> Poses:
+        """Predicted tool poses of the table's configurations."""
+        return forward(self.place.chain.without_columns(), self.place.trig)
+
+    def _narrow(self, both: Floats) -> Floats:
+        """Of (distance, angle) those that the kind has."""
+        return np.ascontiguousarray(both[:, self._parts])
+
+    def _wide(self, covariance: Floats) -> Floats:
+        """Variances of (distance, angle) of covariances of those that the kind has, shape (n, 2)."""
+        out = np.zeros((self.series.n, 2))
+        out[:, self._parts] = np.einsum("nii->ni", covariance)
+        return out
+
+    def _diagonals(self, sources: tuple[Source, ...]) -> Floats:
+        zero = np.zeros((self.series.n, self.series.kind.height))
+        return sum((np.einsum("nii->ni", source.variance) for source in sources), zero)
+
+    def _moments(self, of_joints: Floats) -> Moments:
+        """Mean and variance of each distance and angle, shapes (n, 2); of no meaning where not wanted."""
+        s, m, factors = self.series, self.place.measurements, self._both**2
+        along, trace, own = np.zeros((s.n, 2)), np.zeros((s.n, 2)), self._own
+        if s.formed:
+            along, own = self._own, np.zeros_like(self._own)
+            trace = np.stack([_trace(m.sigma_position, s.ends), _trace(m.sigma_orientation, s.ends)], axis=1) * factors
+        if len(self.place.joints) and not self.place.joints_estimated:
+            along = along + of_joints
+            trace = trace + self._joint_trace() * factors
+        across = np.maximum(trace - along, 0.0) / 2.0 + self._bending()
+        along, across, own = (np.where(self._wanted, v, 0.0) for v in (along, across, own))
+        found = [
+            of(self.predicted[:, k], along[:, k], across[:, k], own[:, k])
+            for k, of in enumerate((length_moments, angle_moments))
+        ]
+        return Moments(*(np.stack(pair, axis=1) for pair in zip(*map(astuple, found), strict=True)))
+
+    def _formed_variance(self) -> Floats:
+        """Variance of distances and angles between measured poses, shape (n, 2); nan where not measured."""
+        m, ends, both = self.place.measurements, self.series.ends, np.full((self.series.n, 2), np.nan)
+        for k, sigma in enumerate((m.sigma_position, m.sigma_orientation)):
+            if sigma is not None:
+                both[:, k] = np.sum(self._directions[k] ** 2 * np.sum(sigma[ends] ** 2, axis=1), axis=1)
+        return both
+
+    @cached_property
+    def _directions(self) -> tuple[Floats, Floats]:
+        """Unit vectors from a to b in the measurement frame, and axes of the rotation from a to b in a, shapes (n, 3).
+
+        As predicted: those of measured poses would depend on the very errors that they are to tell the effect of.
+        """
+        p, R, (a, b) = self._poses.position, self._poses.rotation, self.series.ends.T
+        along = _unit(p[b] - p[a]) @ self._base_in_world().T
+        return along, _unit(rotation_angle(np.swapaxes(R[a], 1, 2) @ R[b])[1])
+
+    def _base_in_world(self) -> Floats:
+        """The rotation that brings the predicted points nearest to the measured ones, shape (3, 3)."""
+        m = self.place.measurements
+        if m.position is None or m.test.all():
+            return np.eye(3)
+        measured, p = m.position[~m.test], self._poses.position[~m.test]
+        return nearest_rotation((measured - measured.mean(axis=0)).T @ (p - p.mean(axis=0)))
+
+    def _of_poses(self) -> Source:
+        """How the rows follow from the errors of the measured poses that the pairs were formed from.
+
+        Of each kind a pose has three errors, along the axes, and a fourth, the square of its errors across: the latter
+        lengthen all pairs of the pose. Of what the squares at both ends add to the variance of a pair half is theirs,
+        a quarter at either end, and half that of their product, the pair's own.
+        """
+        m, s, n_parts = self.place.measurements, self.series, len(self._parts)
+        G = np.zeros((s.n, n_parts, 2, n_parts, 4))  # row, quantity, end, its source, (axes, square)
+        sign = np.array([1.0, -1.0])[:, None]  # of predicted minus measured in the error at a, at b
+        bent = np.sqrt(self._bent_variance)
+        for i, k in enumerate(self._parts):
+            sigma = (m.sigma_position, m.sigma_orientation)[k]
+            slope = self.moments.slope[:, k, None, None]
+            if sigma is not None:
+                G[:, i, :, i, :3] = self._both[k] * slope * sign * self._directions[k][:, None] * sigma[s.ends]
+            G[:, i, :, i, 3] = -0.5 * bent[:, i, None]
+        return Source(f"poses of table {s.table}", self.place.configurations[s.ends], G.reshape(s.n, n_parts, 2, -1))
+
+    def _bending(self) -> Floats:
+        """Variance in each direction across that the parameters' own gives each vector, shape (n, 2).
+
+        Along the vector it is what is estimated; across it lengthens the vector as noise does, and bends the row. Zero
+        where it does not matter.
+        """
+        if self._spread is None:
+            return np.zeros((self.series.n, 2))
+        return np.minimum(self._noticed(self._spread, LEAST_BEND), MOST_BEND * self._straight())
+
+    def _noticed(self, spread: Floats, sigmas: float) -> Floats:
+        """Variance across where it bends a row by so many sigma, else 0, shape (n, 2).
+
+        Where four times the largest of some pairs, evenly chosen, would not, it is not even worked out.
+        """
+        across, train = np.zeros((self.series.n, 2)), np.flatnonzero(~self.series.test)
+        if not len(train):
+            return across
+        least = sigmas * self._straight()
+        most = 4.0 * self._spread_across(_evenly(train), spread).max(axis=0)
+        rows = np.flatnonzero(np.any(most >= least, axis=1))
+        for start in range(0, len(rows), SPAN):
+            chunk = rows[start : start + SPAN]
+            across[chunk] = self._spread_across(chunk, spread)
+        return np.where(across >= least, across, 0.0)
+
+    def _straight(self) -> Floats:
+        """Variance across that bends a row by one sigma, shape (n, 2); infinite where there is none to bend.
+
+        Nearer to 0 than one sigma it is that of the noise itself.
+        """
+        sigma = np.sqrt(self._own)
+        return np.where((self._own > 0.0) & self._wanted, sigma * np.maximum(self.predicted, sigma), np.inf)
+
+    def _spread_across(self, rows: Integers, spread: Floats) -> Floats:
+        """What `_bending` is about at `rows`, shape (n, 2)."""
+        return BEND_MARGIN * self._spread_of(rows, spread)[0]
+
+    def _spread_of(self, rows: Integers, spread: Floats) -> tuple[Floats, Floats]:
+        """Variance that the parameters' own gives vectors: in each direction across, and along, shapes (n, 2).
+
+        With Q the rotation from a to b, R_b R_a^T, turns w_a and w_b of the tool turn Q by w_b - Q w_a. Motions of the
+        base, and of the tool in itself, carry vector and rotation with them and bend nothing: they are taken out. About
+        an axis that all rotations have in common orientations cannot tell the two apart: there points do.
+        """
+        n, ends = len(rows), self.series.ends[rows]
+        at = forward(self.place.chain, self.place.trig, np.concatenate([ends[:, 0], ends[:, 1]]))
+        base = turning_of_base(at.jacobian[:, :3], at.rotation) @ spread  # (3, k)
+        of_points = turning_of_points(at.position, at.jacobian[:, 3:]) @ spread
+        carried = base + common_axes(at.rotation) @ (of_points - base)
+        turn, shift = np.split(at.jacobian @ spread, 2, axis=1)  # (2 n, 3, k) each
+        Q = at.rotation[n:] @ np.swapaxes(at.rotation[:n], 1, 2)
+        vector, turn = at.position[n:] - at.position[:n], turn - base
+        change = (shift[n:] - shift[:n] - np.cross(carried[None], vector[:, :, None], axis=1), turn[n:] - Q @ turn[:n])
+        directions = (vector, rotation_angle(Q)[1])
+        along = np.stack(
+            [
+                np.sum(np.einsum("nc,nck->nk", _unit(u), D) ** 2, axis=1)
+                for u, D in zip(directions, change, strict=True)
+            ],
+            axis=1,
+        )
+        everything = np.stack([np.sum(D**2, axis=(1, 2)) for D in change], axis=1)
+        return np.maximum(everything - along, 0.0) / 2.0, along
+
+    def _joint_trace(self) -> Floats:
+        """Variance that joint noise gives each vector, all directions together, shape (n, 2)."""
+        J = forward(self.place.chain.without_columns().with_joint_columns(), self.place.trig).jacobian
+        J = J * self.place.measurements.sigma_joint
+        of_each = np.stack([np.sum(J[:, 3:] ** 2, axis=(1, 2)), np.sum(J[:, :3] ** 2, axis=(1, 2))], axis=1)
+        both: Floats = of_each[self.series.ends].sum(axis=1)
+        return both
+
+
+_QUANTITY: dict[type, int] = {Distance: 0, RotationAngle: 1}
+
+
+def row_noise(series: Series, place: Place, state: NoiseState) -> RowNoise:
+    """The rows of a series and their noise."""
+    parts = getattr(series.kind, "parts", (series.kind,))
+    kind = PairNoise if all(type(part) in _QUANTITY for part in parts) else RowNoise
+    return kind(series, place, state)
+
+
+def whitening_of(covariance: Floats, used: Booleans) -> Floats:
+    """W with W S W^T = 1 for the rows in use of each of many small covariances, lower triangular; zero for the others.
+
+    Args:
+        covariance: S, shape (n, height, height).
+        used: Shape (n, height).
+    """
+    height = used.shape[1]
+    if height == 1:
+        with np.errstate(divide="ignore"):
+            return np.where(used[:, :, None], 1.0 / np.sqrt(covariance), 0.0)
+    if not used.all():
+        both = used[:, :, None] & used[:, None, :]
+        covariance = np.where(both, covariance, np.eye(height))
+    W: Floats = np.tril(np.linalg.inv(np.linalg.cholesky(covariance)))
+    return W if used.all() else W * used[:, :, None]
+
+
+def _evenly(rows: Integers) -> Integers:
+    """Some of many rows, evenly chosen."""
+    return rows[np.unique(np.linspace(0, len(rows) - 1, 500).astype(np.int64))]
+
+
+def _trace(sigma: Floats | None, ends: Integers) -> Floats:
+    """Variance of a difference between two configurations, all directions together, shape (n,)."""
+    if sigma is None:
+        return np.zeros(len(ends))
+    both: Floats = np.sum(sigma**2, axis=1)[ends].sum(axis=1)
+    return both
+
+
+def _unit(vectors: Floats) -> Floats:
+    """Vectors of length 1 along others (zero for zero), shape (n, 3)."""
+    out: Floats = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
+    return out

@@ -1,0 +1,408 @@
+"""Whitened rows: those of one series, or of several whose measurements share errors.
+
+An error that reaches one measurement only is that measurement's own: it is added to its private noise. What is left is
+shared: with `y` the rows whitened by their private noise, and `L` how they follow from errors `z ~ N(0, 1)` of
+configurations, the covariance of y is 1 + L L^T (see `sharing`).
+
+Where true joint values are estimated the rows are linearised about them: with e the errors of the readings taken so far
+and J their derivatives, the rows less J e are those of the readings themselves, and what the rows say of e is the
+posterior mean of their part of z.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from fg_calib.graph.noise import RowNoise, Source, whitening_of
+from fg_calib.measurements import residuals
+from fg_calib.measurements.residuals import Block, pack, unpack
+from fg_calib.measurements.sharing import SharedErrors
+from fg_calib.robot.kinematics import SPAN, Chain
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Booleans = NDArray[np.bool_]
+Sparse = scipy.sparse.csr_array
+
+LEAST_WEIGHT = 1e-12
+"""A robust weight below this is taken for this."""
+
+
+@dataclass(frozen=True)
+class At:
+    """The arm and the nuisance coordinates at some parameters.
+
+    Attributes:
+        chains: The chain from each table's measurement frame, by the table's number.
+        coordinates: Values of all nuisance coordinates.
+        columns: Jacobian column of each of them, -1 for those that are not estimated.
+        n_columns: Number of columns of the core.
+        n_nuisance: Number of columns of the nuisance variables.
+    """
+
+    chains: tuple[Chain, ...]
+    coordinates: Floats
+    columns: Integers
+    n_columns: int
+    n_nuisance: int
+
+    def without_columns(self) -> At:
+        """The same without derivatives."""
+        return replace(self, chains=tuple(chain.without_columns() for chain in self.chains), n_columns=0, n_nuisance=0)
+
+
+@dataclass(frozen=True)
+class Part:
+    """Train rows of one series, whitened by their private noise.
+
+    Attributes:
+        block: The rows.
+        table: Which table they are from.
+        nuisances: Nuisance coordinates of each measurement, shape (n, kind.n_nuisances).
+        offset: Taken from the whitened residuals before anything else, shape (n, height); None for zero.
+    """
+
+    block: Block
+    table: int
+    nuisances: Integers
+    offset: Floats | None = None
+
+    @property
+    def n_rows(self) -> int:
+        """Number of scalar rows."""
+        return self.block.n * self.block.height
+
+    def only(self, k: int) -> Part:
+        """One of its measurements."""
+        chunk = slice(k, k + 1)
+        offset = None if self.offset is None else self.offset[chunk]
+        return Part(residuals.rows_of(self.block, chunk), self.table, self.nuisances[chunk], offset)
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether its rows depend on the core alone, as the kernel computes them."""
+        return self.nuisances.shape[1] == 0 and self.offset is None
+
+    def at(self, at: At) -> Block:
+        """The block with its nuisances' values."""
+        if not self.nuisances.shape[1]:
+            return self.block
+        return replace(self.block, nuisances=at.coordinates[self.nuisances])
+
+    def linearise(self, at: At) -> Iterator[Floats]:
+        """[J r] by all columns, nuisances' among them, chunk by chunk, shape (rows, n_columns + n_nuisance + 1)."""
+        chain, block = at.chains[self.table], self.at(at)
+        wide = at.n_columns + at.n_nuisance
+        for start in range(0, block.n, SPAN):
+            chunk = slice(start, start + SPAN)
+            r, J = residuals.linearise(residuals.rows_of(block, chunk), chain)
+            if self.offset is not None:
+                r = r - self.offset[chunk]
+            out = np.zeros((*r.shape, wide + 1))
+            out[:, :, : at.n_columns], out[:, :, -1] = J[:, :, : at.n_columns], r
+            if at.n_nuisance and self.nuisances.shape[1]:
+                _scatter(out, J[:, :, at.n_columns :], at.columns[self.nuisances[chunk]])
+            yield out.reshape(r.size, -1)
+
+
+def _scatter(out: Floats, N: Floats, columns: Integers) -> None:
+    """Put derivatives in nuisances, shape (n, height, k), in their columns, shape (n, k), of rows."""
+    for k in range(N.shape[2]):
+        there = np.flatnonzero(columns[:, k] >= 0)
+        out[there, :, columns[there, k]] = N[there, :, k]
+
+
+@dataclass(frozen=True)
+class RowSet:
+    """Whitened train rows; every row counts as one measurement where they share errors.
+
+    Attributes:
+        parts: The rows of each series.
+        shared: How all their rows follow from shared errors; None if nothing is shared.
+        configurations: Configurations whose errors are shared, in the order of the errors.
+        joints: Place of the joints' errors among those of a configuration.
+        spare: E with E E^T what of the rows' own noise is there for numerical safety alone; None if nothing is.
+    """
+
+    parts: tuple[Part, ...]
+    shared: SharedErrors | None = None
+    configurations: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    joints: int = 0
+    spare: Sparse | None = None
+
+    @property
+    def n_rows(self) -> int:
+        """Number of rows that `linearise` returns."""
+        return sum(part.n_rows for part in self.parts) if self.shared is None else self.shared.n
+
+    @property
+    def n_spare(self) -> float:
+        """How many degrees of freedom the rows have by `spare` alone: its trace over the rows' covariance."""
+        if self.spare is None:
+            return 0.0
+        return float(self.spare.power(2).sum()) if self.shared is None else self.shared.energy(self.spare)
+
+    @property
+    def coordinates(self) -> Integers:
+        """Nuisance coordinates that the rows depend on."""
+        return np.unique(np.concatenate([part.nuisances.ravel() for part in self.parts]))
+
+    def private(self, at: At) -> Floats:
+        """[J r] before correlation is dealt with, shape (all rows, n_columns + n_nuisance + 1)."""
+        return np.concatenate([chunk for part in self.parts for chunk in part.linearise(at)])
+
+    def linearise(self, at: At) -> tuple[Floats, Floats]:
+        """Whitened residuals, shape (n_rows,), and their derivatives, shape (n_rows, n_columns + n_nuisance)."""
+        rows = self.private(at)
+        if self.shared is not None:
+            rows = self.shared.whiten(rows)
+        return rows[:, -1], rows[:, :-1]
+
+    def squared_norm(self, at: At) -> float:
+        """Sum of squared whitened residuals."""
+        free = at.without_columns()
+        if self._kernel_alone:
+            return residuals.squared_norm(self.parts[0].block, free.chains[self.parts[0].table])
+        r, _ = self.linearise(free)
+        return float(r @ r)
+
+    def triangle(self, at: At) -> Floats:
+        """R of a thin QR of [J r], shape (n_columns + n_nuisance + 1,) * 2."""
+        if self._kernel_alone:
+            return _padded(residuals.triangle(self.parts[0].block, at.chains[self.parts[0].table]), at.n_nuisance)
+        chunks = self.parts[0].linearise(at) if self._one_by_one else iter([self._whitened(at)])
+        R = np.zeros((at.n_columns + at.n_nuisance + 1,) * 2)
+        for chunk in chunks:
+            for start in range(0, len(chunk), 4 * SPAN):
+                R = np.linalg.qr(np.vstack([R, chunk[start : start + 4 * SPAN]]), mode="r")  # type: ignore[assignment]
+        return R
+
+    def gram(self, at: At) -> Floats:
+        """[J r]^T [J r], shape (n_columns + n_nuisance + 1,) * 2."""
+        if self._kernel_alone:
+            return _padded(residuals.gram(self.parts[0].block, at.chains[self.parts[0].table]), at.n_nuisance)
+        rows = self._whitened(at)
+        out: Floats = rows.T @ rows
+        return out
+
+    def most_likely(self, at: At) -> Floats:
+        """What the residuals say of the shared errors, shape (n_configurations, width)."""
+        if self.shared is None:
+            return np.zeros((0, 0))
+        r = self.private(at.without_columns())[:, -1:]
+        return self.shared.most_likely(r)[:, 0].reshape(len(self.configurations), -1)
+
+    def _whitened(self, at: At) -> Floats:
+        rows = self.private(at)
+        return rows if self.shared is None else self.shared.whiten(rows)
+
+    @property
+    def _one_by_one(self) -> bool:
+        return self.shared is None and len(self.parts) == 1
+
+    @property
+    def _kernel_alone(self) -> bool:
+        return self._one_by_one and self.parts[0].is_plain
+
+
+def _padded(R: Floats, n_nuisance: int) -> Floats:
+    """A square matrix of [J r] with columns and rows of zeros for the nuisances before its last."""
+    if not n_nuisance:
+        return R
+    keep = np.append(np.arange(len(R) - 1), len(R) + n_nuisance - 1)
+    out = np.zeros((len(R) + n_nuisance,) * 2)
+    out[np.ix_(keep, keep)] = R
+    return out
+
+
+def whitened_rows(
+    noises: Sequence[RowNoise], *, sharing: bool, joint_errors: Floats | None, weights: Sequence[Floats] | None
+) -> tuple[RowSet, ...]:
+    """The train rows of series, whitened.
+
+    Args:
+        noises: The rows and their noise.
+        sharing: Whether measurements share the errors of their configurations, or each counts as having its own.
+        joint_errors: Errors of the readings that the rows are linearised about, where they are estimated, shape
+            (n_configurations, n_joints); then they count as shared although only one measurement has them.
+        weights: Robust weight of each measurement of each series; None for 1.
+    """
+    shares = ErrorColumns(noises, sharing, joint_errors is not None)
+    gathered = [
+        _part(noise, shares, joint_errors, None if weights is None else weights[i])
+        for i, noise in enumerate(noises)
+        if len(noise.series.train)
+    ]
+    together = [(part, L, E) for part, L, E in gathered if L.nnz]
+    alone = [RowSet((part,)) for part, L, _ in gathered if not L.nnz]
+    return (*alone, shares.row_set(together)) if together else tuple(alone)
+
+
+def share_errors(noises: Sequence[RowNoise]) -> bool:
+    """Whether errors of configurations reach more than one train measurement."""
+    shares = ErrorColumns(noises, sharing=True, estimated=False)
+    return any(shares.mask(source)[noise.series.train].any() for noise in noises for source in noise.sources)
+
+
+def correlation_of(noises: Sequence[RowNoise], rows: Sequence[RowSet], at: At, follow: Floats) -> Floats:
+    """J^T (C - 1) J of rows that share errors but are whitened as if they did not, shape (n_columns, n_columns).
+
+    Args:
+        noises: The rows of all series and their noise.
+        rows: The whitened train rows, a set for each series that has any.
+        at: Where the derivatives J are wanted; C is the covariance of the whitened rows.
+        follow: How the nuisance variables follow the core, shape (n_nuisance, n_columns): in J they do.
+    """
+    shares = ErrorColumns(noises, sharing=True, estimated=False)
+    n, own = at.n_columns, np.zeros((at.n_columns, at.n_columns))
+    common = np.zeros((shares.n_errors, n))
+    with_train = [noise for noise in noises if len(noise.series.train)]
+    for noise, row_set in zip(with_train, rows, strict=True):
+        (part,), train, height = row_set.parts, noise.series.train, noise.series.kind.height
+        wide = np.concatenate(list(part.linearise(at)))
+        J = wide[:, :n] + wide[:, n:-1] @ follow
+        W = unpack(part.block.whitening, height) @ np.linalg.inv(unpack(noise.rows_at(train).whitening, height))
+        masks = {source.name: shares.mask(source)[train] for source in noise.sources}
+        common += shares.loading(noise, train, W, masks).T @ J
+        for source in noise.sources:
+            G = np.einsum("nhk,nkew->nhew", W, source.loading[train] * masks[source.name][:, None, :, None])
+            each = np.einsum("nhew,nhp->newp", G, J.reshape(len(train), height, n)).reshape(-1, n)
+            own += each.T @ each
+    out: Floats = common.T @ common - own
+    return out
+
+
+def _part(
+    noise: RowNoise, shares: ErrorColumns, joint_errors: Floats | None, weights: Floats | None
+) -> tuple[Part, Sparse, Sparse]:
+    """The train rows of a series; how they follow from shared errors; E of `RowSet.spare`."""
+    series, train = noise.series, noise.series.train
+    n, height = len(train), series.kind.height
+    masks = {source.name: shares.mask(source)[train] for source in noise.sources}
+    carried = frozenset(name for name, mask in masks.items() if mask.any())
+    base = noise.own[train].copy()
+    diagonal = np.einsum("nii->ni", base).copy()
+    if carried:
+        raised = np.maximum(diagonal + _at(noise.more_if_redundant(carried), train), _at(noise.least(), train))
+        base += (raised - diagonal)[:, :, None] * np.eye(height)
+        diagonal = raised
+    private = base
+    for source in noise.sources:
+        own = np.where(masks[source.name][:, None, :, None], 0.0, source.loading[train]).reshape(n, height, -1)
+        private = private + own @ np.swapaxes(own, 1, 2)
+    if weights is not None:  # noise of its own on top, so much that a measurement says no more than its weight
+        private = private + (1.0 / np.maximum(weights[train], LEAST_WEIGHT) - 1.0)[:, None, None] * noise.total[train]
+    W = whitening_of(private, series.used[train])
+    rows = noise.rows_at(train)
+    block = replace(rows, whitening=pack(W @ unpack(rows.whitening, height)))
+    offset = None if joint_errors is None else _offset(noise, train, W, joint_errors)
+    E = scipy.sparse.csr_array((n * height, 0))
+    if any(name != "joints" for name in carried):
+        E = _block_diagonal(W * np.sqrt(np.maximum(diagonal - noise.bare(train), 0.0))[:, None])
+    return Part(block, series.table, series.nuisances[train], offset), shares.loading(noise, train, W, masks), E
+
+
+def _at(values: Floats | float, rows: Integers) -> Floats | float:
+    return values if isinstance(values, float) else values[rows]
+
+
+def _offset(noise: RowNoise, train: Integers, W: Floats, joint_errors: Floats) -> Floats:
+    """What the errors of the readings alone make of whitened rows, to first order, shape (n, height)."""
+    out = np.zeros((len(train), noise.series.kind.height))
+    joints, sigma = noise.place.joints, noise.place.measurements.sigma_joint
+    for source in noise.sources:
+        if source.name == "joints":
+            J = source.loading[train] / (sigma[joints] * noise.factors[:, None, None])
+            out += np.einsum("nhew,new->nh", J, joint_errors[source.ends[train]][..., joints])
+    moved: Floats = (W @ out[:, :, None])[:, :, 0]
+    return moved
+
+
+def _block_diagonal(blocks: Floats) -> Sparse:
+    """Small matrices, shape (n, h, k), one after the other along the diagonal: shape (n h, n k)."""
+    n, h, k = blocks.shape
+    columns = np.broadcast_to(np.arange(n)[:, None, None] * k + np.arange(k), blocks.shape)
+    return scipy.sparse.csr_array((blocks.ravel(), columns.ravel(), np.arange(n * h + 1) * k), shape=(n * h, n * k))
+
+
+class ErrorColumns:
+    """The errors of all configurations, those of a configuration side by side, and which are shared.
+
+    Args:
+        noises: The rows of all series and their noise.
+        sharing: Whether errors are shared at all.
+        estimated: Whether those of the joints are estimated, and so count as shared.
+    """
+
+    def __init__(self, noises: Sequence[RowNoise], sharing: bool = True, estimated: bool = False) -> None:
+        self._sharing, self._estimated = sharing, estimated
+        self._first: dict[str, int] = {}
+        self._reached: dict[str, Integers] = {}
+        self.width = 0
+        self._n = 1 + max((int(s.ends.max(initial=-1)) for noise in noises for s in noise.sources), default=-1)
+        for noise in noises:
+            train = noise.series.train
+            for source in noise.sources:
+                if source.name not in self._first:
+                    self._first[source.name] = self.width
+                    self._reached[source.name] = np.zeros(self._n, dtype=np.int64)
+                    self.width += source.loading.shape[3]
+                for end in source.ends[train].T:
+                    self._reached[source.name] += np.bincount(end, minlength=self._n)
+
+    @property
+    def n_errors(self) -> int:
+        """Number of errors of all configurations."""
+        return self._n * self.width
+
+    def mask(self, source: Source) -> Booleans:
+        """Of which ends the errors are shared, shape (n, ends)."""
+        if self._estimated and source.name == "joints":
+            return np.ones(source.ends.shape, dtype=np.bool_)
+        return (self._reached[source.name][source.ends] > 1) & self._sharing
+
+    def loading(
+        self, noise: RowNoise, rows: Integers, W: Floats | None = None, masks: Mapping[str, Booleans] | None = None
+    ) -> Sparse:
+        """How rows of a series follow from all errors, sparse, shape (n height, n_errors).
+
+        Args:
+            noise: The series' rows and their noise.
+            rows: The measurements.
+            W: What their rows are multiplied by, shape (n, height, height); nothing if None.
+            masks: By source, of which ends errors are wanted, shape (n, ends); of all if None.
+        """
+        n, height = len(rows), noise.series.kind.height
+        places, columns, figures = [], [], []
+        for source in noise.sources:
+            ends, w = source.loading.shape[2:]
+            flat = source.loading[rows].reshape(n, height, ends * w)
+            G = (flat if W is None else W @ flat).reshape(n, height, ends, w)
+            chosen = G != 0.0
+            if masks is not None:
+                chosen &= masks[source.name][:, None, :, None]
+            first = source.ends[rows] * self.width + self._first[source.name]  # (n, ends)
+            row = np.arange(n * height).reshape(n, height)
+            places.append(np.broadcast_to(row[:, :, None, None], G.shape)[chosen])
+            columns.append(np.broadcast_to((first[:, :, None] + np.arange(w))[:, None], G.shape)[chosen])
+            figures.append(G[chosen])
+        shape = (n * height, self.n_errors)
+        if not places:
+            return scipy.sparse.csr_array(shape)
+        triple = (np.concatenate(figures), (np.concatenate(places), np.concatenate(columns)))
+        return scipy.sparse.csr_array(scipy.sparse.coo_array(triple, shape=shape))
+
+    def row_set(self, together: Sequence[tuple[Part, Sparse, Sparse]]) -> RowSet:
+        """The rows of several series that share errors."""
+        L = scipy.sparse.csr_array(scipy.sparse.vstack([L for _, L, _ in together], format="csr"))
+        used = np.unique(L.indices // self.width).astype(np.int64)
+        L = scipy.sparse.csr_array(L[:, (used[:, None] * self.width + np.arange(self.width)).ravel()])
+        spares = [E for _, _, E in together]
+        spare = scipy.sparse.csr_array(scipy.sparse.block_diag(spares)) if any(E.nnz for E in spares) else None
+        joints = self._first.get("joints", 0)
+        return RowSet(tuple(part for part, _, _ in together), SharedErrors(L, self.width), used, joints, spare)

@@ -1,0 +1,50 @@
+"""Several kinds of the same ends, measured together."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fg_calib.measurements.kinds.kind import Floats, Frames, Integers, Kind, Rows
+
+
+class Stacked(Kind):
+    """Rows of several kinds of the same ends, one below the other: a pose is an orientation and a position.
+
+    Data: those of the kinds, side by side. Nuisances: none.
+    """
+
+    def __init__(self, *parts: Kind) -> None:
+        self.parts = parts
+        self.names = tuple(name for part in parts for name in part.names)
+        self.units = tuple(unit for part in parts for unit in part.units)
+        self.ends = parts[0].ends
+        self.height = sum(part.height for part in parts)
+        self.width = sum(part.width for part in parts)
+
+    def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
+        """See `Kind.rows`."""
+        columns = np.cumsum([0, *(part.width for part in self.parts)])
+        rows = [
+            part.rows(at, data[:, c : c + part.width], nuisances) for part, c in zip(self.parts, columns, strict=False)
+        ]
+        residual = np.concatenate([r.residual for r in rows], axis=1)
+        return Rows(residual, np.concatenate([r.wrenches for r in rows], axis=2))
+
+    def figures(self, data: Floats) -> Floats:
+        """See `Kind.figures`."""
+        ends = np.cumsum([part.width for part in self.parts])[:-1]
+        columns = np.split(data, ends, axis=1)
+        return np.hstack([part.figures(own) for part, own in zip(self.parts, columns, strict=True)])
+
+    def twins(self) -> Integers:
+        """See `Kind.twins`; none at all if a part has none."""
+        twins, row, column = [], 0, 0
+        for part in self.parts:
+            twins.append(part.twins() + np.array([0, row, column]))
+            row, column = row + part.height, column + part.width
+        return np.concatenate(twins) if all(map(len, twins)) else np.zeros((0, 3), dtype=np.int64)
+
+
+def stack(*parts: Kind) -> Kind:
+    """The kinds measured together; one alone is itself."""
+    return parts[0] if len(parts) == 1 else Stacked(*parts)

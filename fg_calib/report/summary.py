@@ -1,0 +1,97 @@
+"""A saved result in words: a few lines for a screen, a table of parameters as text and for a notebook."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from html import escape
+
+import numpy as np
+
+from fg_calib.files.result import Parameter, Result, Rms
+
+WIDTH = 100
+
+_SHOWN = {"m": (1e3, "mm", 4), "rad": (180.0 / np.pi, "deg", 5)}
+_RMS_UNIT = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad", "point": "m"}
+_HEADINGS = ("", "estimate", "± sigma", "", "correction", "nominal", "prior", "class")
+
+
+def summary(result: Result) -> list[str]:
+    """What was calibrated from what, whether it is to be trusted, and how large residuals are: at most 10 lines."""
+    head = f"{result.robot}: {result.model}"
+    head += "" if result.pairing is None else f", pairs: {result.pairing}"
+    head += ", measurement frame unknown" if result.frame_estimate is not None else ""
+    chi2 = "" if result.reduced_chi2 is None else f", reduced chi-square {result.reduced_chi2:.3g}"
+    verdicts = [f"DOUBTFUL: {finding}" for finding in result.findings] or [f"GOOD: {result.solver.message}"]
+    more = [f"... and {len(verdicts) - 3} more findings"] if len(verdicts) > 3 else []
+    estimated = [p for p in result.parameters if p.identifiability != "fixed"]
+    known = sum(p.sigma is not None for p in estimated)
+    lines = [
+        head,
+        *verdicts[:3],
+        *more,
+        f"{result.n_configurations} configurations, {result.n_residuals} residuals{chi2}",
+        f"{len(estimated)} of {len(result.parameters)} parameters estimated, {known} of them with a known sigma",
+        *(f"{split} residuals, RMS: {text}" for split, text in _rms(result)),
+    ]
+    return [line if len(line) <= WIDTH else f"{line[: WIDTH - 4]} ..." for line in lines]
+
+
+def _rms(result: Result) -> Iterator[tuple[str, str]]:
+    for split, kinds in result.residual_rms.items():
+        found = [_before_and_after(kind, rms) for kind, rms in kinds.items() if rms is not None]
+        if found:
+            yield split, ", ".join(found)
+
+
+def _before_and_after(kind: str, rms: Rms) -> str:
+    factor, unit, _ = _SHOWN[_RMS_UNIT.get(kind.partition(",")[0], "m")]
+    before, after = ("unknown" if v is None else f"{v * factor:.3g}" for v in (rms.before, rms.after))
+    return f"{kind} {before} -> {after} {unit}"
+
+
+def parameter_rows(parameters: Iterable[Parameter]) -> list[tuple[str, ...]]:
+    """The cells of a table of parameters, lengths in mm and angles in degrees, headings first."""
+    rows: list[tuple[str, ...]] = [_HEADINGS]
+    for p in parameters:
+        factor, unit, decimals = _SHOWN[p.unit]
+
+        def figure(value: float | None, none: str = "", sign: str = "", f: float = factor, d: int = decimals) -> str:
+            return none if value is None else f"{round(value * f, d) + 0.0:{sign}.{d}f}"  # no -0.0
+
+        if p.identifiability == "fixed":
+            if p.nominal != 0.0 or not p.name.startswith(("base.", "tool.")):
+                rows.append((p.name, figure(p.estimate), "", unit, "", "", "", "fixed"))
+            continue
+        sigma, prior = figure(p.sigma, "unknown"), figure(p.prior_sigma)
+        correction, nominal = figure(p.correction, sign="+"), figure(p.nominal)
+        rows.append((p.name, figure(p.estimate), sigma, unit, correction, nominal, prior, p.identifiability))
+    return rows
+
+
+def format_result(result: Result) -> str:
+    """A result as plain text: the summary, the parameters, the measurement frame, and what to know of it."""
+    rows = parameter_rows(result.parameters)
+    widths = [max(len(row[i]) for row in rows) for i in range(len(_HEADINGS))]
+    left = {0, 3, 7}
+    cells = (
+        (cell.ljust(w) if i in left else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True)))
+        for row in rows
+    )
+    parts = [*summary(result), "", "Parameters", *("  ".join(row).rstrip() for row in cells)]
+    if result.frame_estimate is not None:
+        xyz = "  ".join("unknown" if v is None else f"{v * 1e3:.4f}" for v in result.frame_estimate.xyz)
+        quaternion = "  ".join("unknown" if v is None else f"{v:.8f}" for v in result.frame_estimate.quaternion_xyzw)
+        parts += ["", "Measurement frame (world_T_base)", f"xyz {xyz} mm", f"quaternion xyzw {quaternion}"]
+    if result.cautions:
+        parts += ["", "Notes", *result.cautions]
+    return "\n".join(parts)
+
+
+def html(result: Result) -> str:
+    """The summary and the parameters as HTML, for a notebook."""
+    head, *rows = parameter_rows(result.parameters)
+    headings = "".join(f"<th>{escape(cell)}</th>" for cell in head)
+    body = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
+    lines = "<br>".join(map(escape, summary(result)))
+    return f"<p>{lines}</p><table><thead><tr>{headings}</tr></thead><tbody>{body}</tbody></table>"

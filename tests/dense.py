@@ -1,0 +1,268 @@
+"""Rows and their dense covariance, written down anew: every error's effect by finite differences of plain formulas."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from fg_calib.measurements import residuals
+from fg_calib.measurements.kinds import (
+    Distance,
+    Orientation,
+    PointDistance,
+    Position,
+    RotationAngle,
+    SamePoint,
+    TouchedPoint,
+)
+from fg_calib.measurements.moments import angle_moments, length_moments
+from fg_calib.measurements.residuals import Block, unit_whitening
+from fg_calib.robot.kinematics import forward, precompute_trig
+
+STEP, WEIGHTS = 5e-3, np.array([45.0, -9.0, 1.0]) / 60.0
+"""Central differences of sixth order: off by some 1e-13 of frames' own size."""
+
+PRIVATE_SHARE, REDUNDANT = 1e-3, 100.0
+"""What pairs have to themselves at least, of their variance; what is not linear counts as, in too many of them."""
+
+
+def predicted(kind, R, p, measured, points):
+    """Rows of a kind, predicted minus measured, from rotations and positions of each end, shapes (ends, n, ...)."""
+    if isinstance(kind, Distance):
+        return np.linalg.norm(p[1] - p[0], axis=1)[:, None] - measured
+    if isinstance(kind, RotationAngle):
+        turn = (Rotation.from_matrix(R[0]).inv() * Rotation.from_matrix(R[1])).magnitude()
+        return turn[:, None] - measured
+    if isinstance(kind, SamePoint):
+        return p[1] - p[0]
+    if isinstance(kind, Position):
+        return p[0] - measured
+    if isinstance(kind, TouchedPoint):
+        return p[0] - points
+    if isinstance(kind, PointDistance):
+        return np.linalg.norm(points[:, 3:] - points[:, :3], axis=1)[:, None] - measured
+    assert isinstance(kind, Orientation)
+    turn = Rotation.from_matrix(measured.reshape(-1, 3, 3)).inv() * Rotation.from_matrix(R[0])
+    return turn.as_rotvec()
+
+
+def change(kind, R, p, still, measured, points):
+    """What has the derivatives of `predicted` where the ends are `still`, and no kink there."""
+    if isinstance(kind, Distance):
+        vector = still[1][1] - still[1][0]
+        return np.sum(vector / np.linalg.norm(vector, axis=1)[:, None] * (p[1] - p[0]), axis=1)[:, None]
+    if isinstance(kind, RotationAngle):
+        Q, was = (Rotation.from_matrix(a).inv() * Rotation.from_matrix(b) for a, b in (R, still[0]))
+        axis = was.as_rotvec() / was.magnitude()[:, None]
+        return np.sum(axis * (was.inv() * Q).as_rotvec(), axis=1)[:, None]
+    return predicted(kind, R, p, measured, points)
+
+
+def parts_of(kind):
+    return getattr(kind, "parts", (kind,))
+
+
+class SeriesRows:
+    """The rows of a series at some parameters, and how they follow from errors of configurations.
+
+    Attributes:
+        r: Residuals, shape (n, height); those of the readings where joint values are estimated.
+        J: Their derivatives in all columns, shape (n, height, n_columns + n_nuisance).
+        sources: Derivatives times sigma by the error's name, shape (n, height, ends, errors), of the rows.
+        own, total: Covariance of what is a measurement's own, and of everything, shape (n, height, height).
+        bent: Variance beyond the first order, shape (n, height).
+    """
+
+    def __init__(self, problem, parameters, number):
+        self.problem, self.series = problem, problem.data.series[number]
+        s, data, state = self.series, problem.data, problem.state
+        self.m, self.place = data.tables[s.table].measurements, data.places[s.table]
+        at = problem.variables.at(parameters)
+        self.chain = at.chains[s.table]
+        self.points = at.coordinates[s.nuisances]
+        self.errors = None if state.joint_errors is None else state.joint_errors[self.place]
+        self.q = self.m.readings + (0.0 if self.errors is None else self.errors)
+        names = [name.split(".")[0] for name in s.kind.names]
+        self.factors = np.array([state.factors.get((s.table, name), 1.0) for name in names])
+        self.r = self._rows(self._ends(self._arm(self.q)))
+        trig, unit = precompute_trig(problem.robot, self.q), unit_whitening(s.n, s.kind.height)
+        J = residuals.linearise(Block(s.kind, trig, s.ends, s.data, unit, self.points), self.chain)[1]
+        self.J = np.zeros((*self.r.shape, at.n_columns + at.n_nuisance))
+        self.J[:, :, : at.n_columns] = J[:, :, : at.n_columns]
+        for k in range(s.kind.n_nuisances):
+            np.put_along_axis(self.J, at.columns[s.nuisances[:, k]][:, None, None], J[:, :, at.n_columns + k, None], 2)
+        scale = self.factors[:, None, None]
+        self.joints = self._sensitivity(lambda k, h: self._arm(self.q + h * np.eye(len(self.q[0]))[k]), len(self.q[0]))
+        self.sources = {"joints": self.joints * self.m.sigma_joint * scale}
+        if all(isinstance(part, Distance | RotationAngle) for part in parts_of(s.kind)):
+            self._pairs()
+        else:
+            self.own = self._diagonal((s.sigma * self.factors) ** 2)
+            self.bent = np.zeros(self.r.shape)
+        if self.errors is not None:
+            self.r = self.r - np.einsum("nhew,new->nh", self.joints, self.errors[s.ends])
+        self.total = self.own + sum(self._variance(G) for G in self.sources.values())
+
+    def _pairs(self):
+        """Mean, slope and variance of lengths and angles under what noise there is along and across their vectors."""
+        s, m = self.series, self.m
+        estimated = self.errors is not None
+        square, zero = (s.sigma * self.factors) ** 2, np.zeros(self.r.shape)
+        of_joints = zero if estimated else np.sum(self.sources["joints"] ** 2, axis=(2, 3))
+        trace, of_poses, poses = zero.copy(), zero, None
+        if s.formed:
+            poses = np.zeros((s.n, s.kind.height, 2, 3 * s.kind.height))
+            for i, part in enumerate(parts_of(s.kind)):
+                move = self._moved if isinstance(part, Distance) else self._turned
+                sigma = m.sigma_position if isinstance(part, Distance) else m.sigma_orientation
+                G = self._sensitivity(move, 3)[:, i] * self.factors[i] * sigma[s.ends]
+                poses[:, i, :, 3 * i : 3 * i + 3] = -G
+                trace[:, i] += self.factors[i] ** 2 * np.sum(sigma[s.ends] ** 2, axis=(1, 2))
+            of_poses = np.sum(poses**2, axis=(2, 3))
+        for i, part in enumerate(parts_of(s.kind)):
+            trace[:, i] += 0.0 if estimated else self.factors[i] ** 2 * self._trace_of_joints(part)
+        value, along = self.r + s.data, of_poses + of_joints
+        across = np.maximum(trace - along, 0.0) / 2.0
+        own = zero if s.formed else square
+        moments = [
+            (length_moments if isinstance(part, Distance) else angle_moments)(
+                value[:, i], along[:, i], across[:, i], own[:, i]
+            )
+            for i, part in enumerate(parts_of(s.kind))
+        ]
+        excess, slope, variance = (
+            np.stack([getattr(one, name) for one in moments], axis=1) for name in ("excess", "slope", "variance")
+        )
+        self.r, self.J = self.r + excess, self.J * slope[:, :, None]
+        self.joints = self.joints * slope[:, :, None, None]
+        self.sources["joints"] = self.sources["joints"] * slope[:, :, None, None]
+        first_order = slope**2 * (of_poses + own + of_joints)
+        self.bent = np.maximum(variance - first_order, 0.0)
+        left = variance - slope**2 * (of_joints + of_poses)
+        if s.formed:  # half of what is not linear is its poses', a quarter either one's
+            squares = np.zeros((s.n, s.kind.height, 2, s.kind.height))
+            for i in range(s.kind.height):
+                squares[:, i, :, i] = np.sqrt(self.bent[:, i, None] / 4.0)
+            poses = poses * slope[:, :, None, None]
+            self.sources[f"poses of {s.table}"] = np.concatenate([poses, squares], axis=3)
+            left = left - self.bent / 2.0
+        self.own = self._diagonal(left)
+
+    def _arm(self, q):
+        at = forward(self.chain.without_columns(), precompute_trig(self.problem.robot, q))
+        return at.rotation, at.position
+
+    def _moved(self, k, h):
+        """The predicted points moved along an axis of the frame that poses were measured in."""
+        R, p = self._arm(self.q)
+        train = ~self.m.test
+        measured = self.m.position[train]
+        to_base = Rotation.align_vectors(p[train] - p[train].mean(axis=0), measured - measured.mean(axis=0))[0]
+        return R, p + to_base.apply(h * np.eye(3)[k])
+
+    def _turned(self, k, h):
+        R, p = self._arm(self.q)
+        return R @ Rotation.from_rotvec(h * np.eye(3)[k]).as_matrix(), p
+
+    def _ends(self, poses):
+        return [array[self.series.ends.T] for array in poses]
+
+    def _rows(self, ends, still=None):
+        rows, column = [], 0
+        for part in parts_of(self.series.kind):
+            measured = self.series.data[:, column : column + part.width]
+            own = (measured, self.points)
+            rows.append(predicted(part, *ends, *own) if still is None else change(part, *ends, still, *own))
+            column += part.width
+        return np.hstack(rows)
+
+    def _sensitivity(self, move, n):
+        """Derivative of all rows in moves of each end, shape (n, height, ends, n)."""
+        out = np.zeros((*self.r.shape, self.series.kind.ends, n))
+        still = self._ends(self._arm(self.q))
+        for k in range(n):
+            for sign in (1.0, -1.0):
+                for times, weight in enumerate(WEIGHTS, 1):
+                    moved = self._ends(move(k, sign * times * STEP))
+                    for end in range(self.series.kind.ends):
+                        ends = [a.copy() for a in still]
+                        for into, source in zip(ends, moved, strict=True):
+                            into[end] = source[end]
+                        out[:, :, end, k] += sign * weight * self._rows(ends, still) / STEP
+        return out
+
+    def _trace_of_joints(self, part):
+        """Variance of the vector behind a distance or an angle from joint noise, along all axes together, (n,)."""
+        total = np.zeros(len(self.q))
+        R0 = Rotation.from_matrix(self._arm(self.q)[0])
+        for k, sigma in enumerate(self.m.sigma_joint):
+            change = np.zeros((len(self.q), 3))
+            for sign in (1.0, -1.0):
+                for times, weight in enumerate(WEIGHTS, 1):
+                    R, p = self._arm(self.q + sign * times * STEP * np.eye(len(self.q[0]))[k])
+                    vector = p if isinstance(part, Distance) else (R0.inv() * Rotation.from_matrix(R)).as_rotvec()
+                    change += sign * weight * vector / STEP
+            total += sigma**2 * np.sum(change**2, axis=1)
+        return total[self.series.ends].sum(axis=1)
+
+    @staticmethod
+    def _variance(G):
+        return np.einsum("nhew,nkew->nhk", G, G)
+
+    @staticmethod
+    def _diagonal(values):
+        return values[:, :, None] * np.eye(values.shape[1])
+
+
+def dense(problem, parameters):
+    """[J r] of all train rows in use, what errors of 1 sigma of the joints do to them, and their covariance.
+
+    Returns:
+        Shapes (n, n_columns + n_nuisance + 1), (n, n_configurations, n_joints) and (n, n).
+    """
+    assert problem.state.spread is None
+    every = [SeriesRows(problem, parameters, i) for i in range(len(problem.data.series))]
+    n_configurations = problem.data.n_configurations
+    reached = {}
+    for rows in every:
+        ends = rows.place[rows.series.ends[rows.series.train]]
+        for name, G in rows.sources.items():
+            if G.any():
+                reached[name] = reached.get(name, 0) + np.bincount(ends.ravel(), minlength=n_configurations)
+    names = {name: G.shape[3] for rows in every for name, G in rows.sources.items()}
+    A, private, loadings, used = [], [], {name: [] for name in names}, []
+    for i, rows in enumerate(every):
+        train, height = rows.series.train, rows.series.kind.height
+        ends = rows.place[rows.series.ends]
+        shared = [name for name in rows.sources if name in reached and (reached[name][ends[train]] > 1).any()]
+        if "joints" in rows.sources and problem.state.joint_errors is not None and "joints" not in shared:
+            shared.append("joints")
+        own = rows.own.copy()
+        if shared and all(isinstance(part, Distance | RotationAngle) for part in parts_of(rows.series.kind)):
+            of_each = sum(rows.sources[name].shape[3] for name in shared)
+            many = len(train) * height > len(np.unique(rows.series.ends[train])) * of_each
+            if rows.series.formed and many and any(name != "joints" for name in shared):
+                own += rows._diagonal(0.5 * (REDUNDANT - 1.0) * rows.bent)
+            diagonal = np.einsum("nii->ni", own)
+            least = PRIVATE_SHARE * np.einsum("nii->ni", rows.total)
+            own += rows._diagonal(np.maximum(least - diagonal, 0.0))
+        weights = problem.state.weights
+        if weights is not None:
+            own += (1.0 / weights[i] - 1.0)[:, None, None] * rows.total
+        A.append(np.concatenate([rows.J, rows.r[:, :, None]], axis=2)[train].reshape(len(train) * height, -1))
+        used.append(rows.series.used[train].ravel())
+        private.append(own[train])
+        for name, width in names.items():
+            L = np.zeros((len(train), height, n_configurations, width))
+            if name in rows.sources:
+                for k, measurement in enumerate(train):
+                    for end in range(rows.series.kind.ends):
+                        L[k, :, ends[measurement, end]] += rows.sources[name][measurement, :, end]
+            loadings[name].append(L.reshape(len(train) * height, n_configurations, width))
+    used = np.concatenate(used)
+    C = np.zeros((len(used), len(used)))
+    first = 0
+    for block in (b for each in private for b in each):
+        C[first : first + len(block), first : first + len(block)] = block
+        first += len(block)
+    L = {name: np.concatenate(each) for name, each in loadings.items()}
+    C += sum(G.reshape(len(used), -1) @ G.reshape(len(used), -1).T for G in L.values())
+    return np.concatenate(A)[used], L["joints"][used], C[np.ix_(used, used)]

@@ -1,0 +1,159 @@
+"""Results read back: version 1 and 2, against their schema, and damaged ones refused in a line."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from simulated import measure, small_arm, true_robot, write_job
+
+import fg_calib.files.result
+from fg_calib import Calibration, InputError, Pairing, calibrate, calibrate_job, read_result, read_urdf, result_schema
+
+TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3}
+
+CASES = {
+    "poses in an unknown frame": {"model": "pose", "frame": "unknown"},
+    "kept parameters of pairs": {"model": "distance-rotation", "gauge": "keep"},
+    "no priors": {"model": "distance", "gauge": "none", "pairing": Pairing("chain")},
+    "joint values and a loss": {"model": "pose", "encoder": "estimated", "loss": "huber"},
+    "estimated noise": {"model": "position", "estimate_noise": True},
+}
+
+PROMISED_IN_VERSION_1 = {
+    *("schema", "version", "robot", "model", "frame", "pairing", "n_configurations", "n_pairs", "n_residuals"),
+    *("n_excluded", "solver", "chi2", "dof", "reduced_chi2", "residual_rms", "parameters", "covariance"),
+    *("frame_estimate", "observability", "inputs"),
+}
+
+
+@pytest.fixture(scope="module")
+def calibrations():
+    def found(settings):
+        rng = np.random.default_rng(5)
+        robot = small_arm(TOLERANCE)
+        m = measure(true_robot(robot, rng), 20, rng, n_test=4, sigma_joint=1e-4)
+        return calibrate(robot, m, **settings)
+
+    return {name: found(settings) for name, settings in CASES.items()}
+
+
+@pytest.fixture
+def folder(calibrations, tmp_path):
+    calibrations["poses in an unknown frame"].save(tmp_path / "result")
+    return tmp_path / "result"
+
+
+def changed(folder, change):
+    """The folder with its result.json changed by a function of the document."""
+    file = folder / "result.json"
+    document = json.loads(file.read_text())
+    change(document)
+    file.write_text(json.dumps(document))
+    return folder
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_is_written_reads_back_the_same(calibrations, tmp_path, name):
+    calibrations[name].save(tmp_path)
+    found = read_result(tmp_path)
+    assert found == calibrations[name].result
+    assert found.document() == json.loads((tmp_path / "result.json").read_text())
+    assert read_result(tmp_path / "result.json") == found
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_is_written_has_the_schema(calibrations, tmp_path, name):
+    """By a validator that knows nothing of the model."""
+    jsonschema = pytest.importorskip("jsonschema")
+    calibrations[name].save(tmp_path)
+    document = json.loads((tmp_path / "result.json").read_text())
+    jsonschema.validate(document, result_schema())
+    with pytest.raises(jsonschema.ValidationError, match="'chi2' is a required property"):
+        jsonschema.validate({k: v for k, v in document.items() if k != "chi2"}, result_schema())
+
+
+def test_the_schema_that_is_shipped_is_the_models():
+    """To write it anew: `json.dumps(result_schema(), indent=1)`."""
+    file = Path(fg_calib.files.result.__file__).with_name("result.schema.json")
+    assert json.loads(file.read_text()) == result_schema()
+
+
+def test_version_1_is_readable_with_no_more_than_it_promised(folder):
+    def to_version_1(document):
+        for key in document.keys() - PROMISED_IN_VERSION_1:
+            del document[key]
+        document |= {"schema": "fg-calib/result/1", "of a later day": 1}
+
+    before = Calibration.load(folder)
+    found = Calibration.load(changed(folder, to_version_1))
+    assert found.result.posterior is None
+    assert found.parameters == before.parameters
+    q = np.random.default_rng(0).uniform(-1, 1, (5, 4))
+    new, old = before.predict(q), found.predict(q)
+    # Nothing is undetermined here, so the parameters' covariance says all: equal to rounding of sums of 16 terms.
+    assert old.covariance == pytest.approx(new.covariance, rel=1e-9, abs=1e-12 * np.abs(new.covariance).max())
+    with pytest.raises(InputError, match="world: the measurement frame was not estimated, or not saved"):
+        found.predict(q, world=True)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda f: (f / "result.json").unlink(), r"result: no result.json in this folder, expected a folder that"),
+        (lambda f: (f / "result.json").write_text('{"schema": "fg-calib/res'), "result.json: not JSON: .*; was it cut"),
+        (lambda f: (f / "result.json").write_text("[" * 100_000), "result.json: not JSON"),
+        (lambda f: (f / "result.json").write_text("[1, 2]"), "result.json: no result of a calibration"),
+        (lambda f: changed(f, lambda d: d.update(schema="fg-calib/comparison/1")), "json: no result of a calibration"),
+        (
+            lambda f: changed(f, lambda d: d.update(schema="fg-calib/result/3")),
+            "json: schema: found 'fg-calib/result/3'",
+        ),
+        (lambda f: changed(f, lambda d: d.pop("dof")), "result.json: missing key 'dof'"),
+        (lambda f: changed(f, lambda d: d["parameters"][2].pop("sigma")), "json: parameter 3: missing key 'sigma'"),
+        (lambda f: changed(f, lambda d: d["parameters"][2].update(nominal=None)), "json: parameter 3: nominal: found"),
+        (lambda f: changed(f, lambda d: d["covariance"]["matrix"].pop()), "covariance: another size than its names"),
+        (lambda f: (f / "robot_calibrated.yaml").unlink(), "neither robot_calibrated.yaml nor robot_calibrated.urdf"),
+        (lambda f: changed(f, lambda d: d["parameters"].pop()), "robot_calibrated.yaml: other parameters than in"),
+        (
+            lambda f: changed(f, lambda d: d["parameters"][8].update(estimate=1.0)),
+            "robot_calibrated.yaml: other values than in result.json, expected the files of one calibration",
+        ),
+        (
+            lambda f: changed(f, lambda d: d["posterior"]["variables"].popitem()),
+            "result.json: posterior: other variables than the robot",
+        ),
+        (
+            lambda f: changed(f, lambda d: d["posterior"]["covariance"][0].pop()),
+            "result.json: posterior: other variables than the robot",
+        ),
+    ],
+)
+def test_a_damaged_folder_is_refused_in_a_line(folder, damage, message):
+    damage(folder)
+    with pytest.raises(InputError, match=message) as error:
+        Calibration.load(folder)
+    assert "\n" not in str(error.value)
+
+
+def test_there_must_be_something_to_read(tmp_path):
+    with pytest.raises(InputError, match="nowhere: no such folder or file, expected what `fg-calib calibrate --out`"):
+        read_result(tmp_path / "nowhere")
+
+
+def test_a_urdf_with_several_tips_is_loaded_by_its_links(tmp_path):
+    joint = '<joint name="{0}" type="{3}"><parent link="{1}"/><child link="{2}"/><origin xyz="0.3 0.1 0.2"/></joint>'
+    joints = [("j1", "base", "a", "continuous"), ("j2", "a", "tip", "continuous"), ("j3", "a", "camera", "fixed")]
+    links = "".join(f'<link name="{name}"/>' for name in ("base", "a", "tip", "camera"))
+    urdf = f'<robot name="arm">{links}{"".join(joint.format(*j) for j in joints)}</robot>'
+    (tmp_path / "arm.urdf").write_text(urdf)
+    robot = read_urdf(tmp_path / "arm.urdf", tip_link="tip", tolerance={"x": 1e-3, "yaw": 1e-3})
+    rng = np.random.default_rng(2)
+    m = measure(true_robot(robot, rng), 30, rng)
+    path = write_job(tmp_path, small_arm(), m, model="pose")
+    path.write_text(path.read_text().replace("robot: robot.yaml", "robot: {urdf: arm.urdf, tip_link: tip}"))
+    calibrate_job(path).save(tmp_path / "result")
+    assert not (tmp_path / "result" / "robot_calibrated.yaml").exists()
+    found = Calibration.load(tmp_path / "result")
+    assert found.robot.urdf.tip_link == "tip"
+    assert found.robot.nominal == pytest.approx([p.estimate for p in found.parameters.values()], abs=1e-15)

@@ -1,0 +1,280 @@
+"""Several tables in one job, each with its kind, frame and noise: one optimum, honest sigmas, tables told apart."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import polars as pl
+import pytest
+import scipy.optimize
+import yaml
+from scipy.spatial.transform import Rotation
+from simulated import measure, paper_robot, small_arm, true_robot
+
+from fg_calib import write_robot
+from fg_calib.analysis.uncertainty import assess
+from fg_calib.analysis.variance_components import estimate_noise
+from fg_calib.errors import ProblemError
+from fg_calib.files.csv_writer import write_csv
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.solver import solve
+from fg_calib.measurements.dataset import Pairs
+from fg_calib.measurements.series import Table
+from fg_calib.options import Pairing
+from fg_calib.robot.kinematics import pose
+
+TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
+PLACED = (Rotation.from_rotvec([0.4, -1.1, 2.0]), np.array([3.0, -1.0, 0.5]))
+ELSEWHERE = (Rotation.from_rotvec([-2.0, 0.3, 0.7]), np.array([-2.0, 4.0, 1.0]))
+SIGMA = (5e-4, 5e-4)
+
+
+def pairs_of(true, q, rng, sigma=2e-4):
+    """Distances measured between each configuration and the next, at the true joint values q."""
+    p = pose(true, q).position
+    n = len(q) - 1
+    d = np.linalg.norm(np.diff(p, axis=0), axis=1) + sigma * rng.normal(size=n)
+    nothing, rows = np.full(n, np.nan), np.arange(n)
+    return Pairs(rows, rows + 1, d, nothing, np.full(n, sigma), nothing, np.zeros(n, bool), "pairs.csv")
+
+
+def mixture(seed, *, n=16, sigma_joint=0.0, shared=True):
+    """Positions by a tracker somewhere, and lengths of a ball bar, at the same configurations or at others."""
+    rng = np.random.default_rng(seed)
+    robot = small_arm(tolerance=TOLERANCE)
+    true = true_robot(robot, rng)
+    stood = rng.uniform(-np.pi, np.pi, (n, 4))
+    read = stood + sigma_joint * rng.normal(size=stood.shape)
+    tracker = measure(true, n, rng, sigma=SIGMA, frame=PLACED, readings=stood)
+    noise = np.full(4, sigma_joint)
+    tracker = replace(tracker, readings=read, sigma_joint=noise, rotation=None, source="tracker.csv", named=True)
+    other = stood if shared else rng.uniform(-np.pi, np.pi, (n, 4))
+    other_read = read if shared else other + sigma_joint * rng.normal(size=other.shape)
+    ids = tracker.ids if shared else np.char.add("b", tracker.ids)
+    bar = replace(
+        tracker, readings=other_read, ids=ids, position=None, sigma_position=None, pairs=pairs_of(true, other, rng),
+        source="bar.csv",
+    )  # fmt: skip
+    return robot, true, [Table(tracker, "position", frame="unknown"), Table(bar, "distance")]
+
+
+def everything(robot, tables, sigma_joint):
+    """Optimum over arm, frame and joint values of shared configurations, by scipy."""
+    tracker, bar = (t.measurements for t in tables)
+    scale = np.array([p.scale if p.estimated else 0.0 for p in robot.parameters])
+    columns = np.flatnonzero(scale)
+    k = len(columns)
+
+    def residuals(x):
+        values = robot.nominal
+        values[columns] += x[:k] * scale[columns]
+        turn, shift = PLACED[0] * Rotation.from_rotvec(x[k : k + 3]), PLACED[1] + x[k + 3 : k + 6]
+        q = tracker.readings + (sigma_joint * x[k + 6 :].reshape(tracker.readings.shape) if sigma_joint else 0.0)
+        p = pose(robot.with_values(values), q).position
+        lengths = np.linalg.norm(np.diff(p, axis=0), axis=1)
+        rows = [(turn.apply(p) + shift - tracker.position) / SIGMA[0], (lengths - bar.pairs.distance) / 2e-4]
+        return np.concatenate([*(r.ravel() for r in rows), x[:k], x[k + 6 :]])
+
+    start = np.zeros(k + 6 + (tracker.readings.size if sigma_joint else 0))
+    found = scipy.optimize.least_squares(residuals, start, jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-12)
+    values = robot.nominal
+    values[columns] += found.x[:k] * scale[columns]
+    return values, 2.0 * found.cost
+
+
+@pytest.mark.parametrize("sigma_joint", [0.0, 1e-3])
+def test_the_optimum_is_that_over_everything(sigma_joint):
+    """Joint errors of a configuration are the same in both tables."""
+    robot, _, tables = mixture(1, sigma_joint=sigma_joint)
+    options = {"encoder": "estimated"} if sigma_joint else {}
+    solution = solve(build_problem(robot, tables, **options))
+    values, least = everything(robot, tables, sigma_joint)
+    uncertainty = assess(solution)
+    sigma = np.array([p.sigma or 1.0 for p in uncertainty.parameters])
+    assert solution.converged
+    assert np.abs((solution.parameters[: len(values)] - values) / sigma).max() < 1e-4  # where scipy stops
+    assert uncertainty.chi2 == pytest.approx(least, rel=1e-6)
+    assert uncertainty.dof == 3 * 16 + 15 - 6
+    propagated = solve(build_problem(robot, tables))
+    apart = np.abs((propagated.parameters[: len(values)] - values) / sigma).max()
+    assert apart < (0.5 if sigma_joint else 1e-4)  # to first order the same
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_sigmas_are_honest(shared):
+    """60 draws: the mean of NEES over its degrees of freedom, within five of its sigmas."""
+    total, n = 0.0, 60
+    for seed in range(n):
+        robot, true, tables = mixture(200 + seed, sigma_joint=5e-4, shared=shared)
+        uncertainty = assess(solve(build_problem(robot, tables)))
+        names = list(uncertainty.names)
+        off = np.array([uncertainty.robot.nominal[robot.index(x)] - true.nominal[robot.index(x)] for x in names])
+        total += float(off @ np.linalg.solve(uncertainty.covariance, off)) / len(names) / n
+    assert total == pytest.approx(1.0, abs=5 * np.sqrt(2.0 / (n * len(names))))
+
+
+def test_each_table_has_its_own_frame():
+    rng = np.random.default_rng(5)
+    robot = paper_robot({"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3})
+    true = true_robot(robot, rng)
+    first, second = (measure(true, 25, rng, sigma=SIGMA, frame=frame) for frame in (PLACED, ELSEWHERE))
+    tables = [Table(first, "pose", frame="unknown"), Table(second, "position", frame="unknown")]
+    uncertainty = assess(solve(build_problem(robot, tables)))
+    assert len(uncertainty.frames) == 2
+    for found, (turn, shift) in zip(uncertainty.frames, (PLACED, ELSEWHERE), strict=True):
+        off = np.concatenate([(turn.inv() * Rotation.from_quat(found.quaternion_xyzw)).as_rotvec(), found.xyz - shift])
+        assert np.all(np.abs(off[:3]) < 6 * found.sigma[:3])
+        assert np.linalg.norm(off[3:]) < 6 * np.linalg.norm(found.sigma[3:])
+    together = np.sqrt(np.diag(uncertainty.covariance))
+    alone = np.sqrt(np.diag(assess(solve(build_problem(robot, tables[0]))).covariance))
+    assert np.all(together <= alone * (1 + 1e-9))
+
+
+def test_order_of_tables_and_one_table_in_parts_change_nothing():
+    rng = np.random.default_rng(6)
+    robot = small_arm(tolerance=TOLERANCE)
+    m = measure(true_robot(robot, rng), 30, rng, sigma=SIGMA, sigma_joint=3e-4)
+    parts = [
+        replace(m, readings=m.readings[rows], ids=m.ids[rows], test=m.test[rows], position=m.position[rows],
+                rotation=m.rotation[rows], sigma_position=m.sigma_position[rows],
+                sigma_orientation=m.sigma_orientation[rows])
+        for rows in (slice(0, 12), slice(12, 30))
+    ]  # fmt: skip
+    whole = assess(solve(build_problem(robot, m, model="pose")))
+    for tables in (parts, parts[::-1]):
+        found = assess(solve(build_problem(robot, tables, model="pose")))
+        assert np.array([p.estimate for p in found.parameters]) == pytest.approx(
+            np.array([p.estimate for p in whole.parameters]),
+            abs=1e-6 * np.nanmin([p.sigma or 1 for p in whole.parameters]),
+        )
+        assert found.chi2 == pytest.approx(whole.chi2, rel=1e-9)
+        assert found.dof == whole.dof
+
+
+def test_noise_is_estimated_table_by_table():
+    rng = np.random.default_rng(7)
+    robot = paper_robot({"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3})
+    true = true_robot(robot, rng)
+    coarse, fine = (measure(true, 80, rng, sigma=(s, 2e-4)) for s in (2e-3, 2e-4))
+    stated = [replace(m, sigma_position=np.full((80, 3), 1e-3)) for m in (coarse, fine)]
+    tables = [Table(m, "position") for m in stated]
+    found = estimate_noise(build_problem(robot, tables))
+    assert found.converged
+    factors = found.problem.state.factors
+    assert factors[0, "position"] == pytest.approx(2.0, rel=0.2)  # 80 rows of three: 5 % each, four sigma
+    assert factors[1, "position"] == pytest.approx(0.2, rel=0.2)
+    kinds = assess(found).goodness.kinds
+    assert [(kind.table, kind.kind) for kind in kinds] == [(0, "position"), (1, "position")]
+
+
+def test_a_gross_error_in_one_table_is_left_out():
+    robot, _, tables = mixture(8, n=40)
+    wrong = tables[1].measurements.pairs.distance.copy()
+    wrong[3] += 0.05
+    m = replace(tables[1].measurements, pairs=replace(tables[1].measurements.pairs, distance=wrong))
+    solution = solve(build_problem(robot, [tables[0], replace(tables[1], measurements=m)], loss="cauchy"))
+    weights = solution.problem.state.weights
+    assert solution.converged
+    assert weights[1][3] < 0.01
+    assert weights[0].min() > 0.1
+    rows = assess(solution)
+    worst = rows.goodness.suspects[0]
+    assert (rows.residuals.series[worst], rows.residuals.measurement[worst]) == (1, 3)
+
+
+# --- through files ----------------------------------------------------------------------------------------------------
+
+
+def write_tables(folder, robot, tables, **keys):
+    write_robot(folder / "robot.yaml", robot)
+    tracker, bar = (t.measurements for t in tables)
+    q = {f"q{i + 1}": x for i, x in enumerate(tracker.readings.T)}
+    write_csv(folder / "tracker.csv", {"id": tracker.ids, **q, **dict(zip("xyz", tracker.position.T, strict=True))})
+    other = {f"q{i + 1}": x for i, x in enumerate(bar.readings.T)}
+    write_csv(folder / "bar.csv", {"id": bar.ids, **other})
+    p = bar.pairs
+    write_csv(folder / "lengths.csv", {"a": bar.ids[p.a], "b": bar.ids[p.b], "distance": p.distance})
+    job = {
+        "robot": "robot.yaml",
+        "units": {"length": "m", "angle": "rad"},
+        "noise": {"joint": 5e-4, "position": 1.0},
+        "measurements": [
+            {"table": "tracker.csv", "model": "position", "frame": "unknown", "noise": {"position": SIGMA[0]}},
+            {"table": "bar.csv", "pairs": "lengths.csv", "model": "distance", "noise": {"distance": 2e-4}},
+        ],
+    }
+    path = folder / "job.yaml"
+    path.write_text(yaml.safe_dump(job | keys))
+    return path
+
+
+def test_a_job_of_several_tables_runs(fg_calib, tmp_path):
+    robot, _, tables = mixture(11, sigma_joint=5e-4)
+    ended = fg_calib("calibrate", write_tables(tmp_path, robot, tables), "--out", tmp_path / "result")
+    expected = assess(solve(build_problem(robot, tables)))
+    document = json.loads((tmp_path / "result" / "result.json").read_text())
+    assert (ended.code, ended.err) == (0, "")
+    assert "position of tracker.csv" in ended.out
+    assert "distance of bar.csv" in ended.out
+    assert document["chi2"] == pytest.approx(expected.chi2, rel=1e-6)
+    assert document["model"] == "position + distance"
+    assert sorted(document["inputs"]) == ["bar.csv", "job.yaml", "lengths.csv", "robot.yaml", "tracker.csv"]
+    rows = pl.read_csv(tmp_path / "result" / "residuals.csv")
+    assert rows.group_by("table").len().sort("table").rows() == [("bar.csv", 15), ("tracker.csv", 48)]
+
+
+def test_two_tables_that_contradict_each_other_are_refused():
+    robot, _, tables = mixture(12)
+    moved = tables[1].measurements.readings.copy()
+    moved[2, 1] += 1e-6
+    other = replace(tables[1], measurements=replace(tables[1].measurements, readings=moved))
+    expected = r"^bar\.csv: other joint readings at id 2, expected those of tracker\.csv, or another id$"
+    with pytest.raises(ProblemError, match=expected):
+        build_problem(robot, [tables[0], other])
+    noisy = replace(tables[1], measurements=replace(tables[1].measurements, sigma_joint=np.full(4, 1e-3)))
+    with pytest.raises(ProblemError, match=r"^bar\.csv: another noise\.joint, expected that of tracker\.csv: "):
+        build_problem(robot, [tables[0], noisy])
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ({"measurements": []}, "job.yaml: measurements: found [], expected a path, or a list of tables"),
+        ({"measurements": [{"table": "tracker.csv"}]}, "job.yaml: measurements[0]: missing key 'model'"),
+        ({"measurements": [{"model": "position"}]}, "job.yaml: measurements[0]: missing key 'table'"),
+        (
+            {"pairs": "lengths.csv"},
+            "job.yaml: pairs: beside a list of tables, expected the key in the table's own entry",
+        ),
+        (
+            {"measurements": [{"table": "tracker.csv", "model": "position", "loss": "huber"}]},
+            "job.yaml: measurements[0]: unknown key 'loss'",
+        ),
+    ],
+)
+def test_a_mistake_in_the_list_of_tables_is_named(fg_calib, tmp_path, keys, said):
+    robot, _, tables = mixture(13)
+    ended = fg_calib("calibrate", write_tables(tmp_path, robot, tables, **keys))
+    assert ended.code == 1
+    assert ended.err.startswith(f"error: {said}")
+    assert ended.err.count("\n") == 1
+
+
+def test_pairs_formed_of_one_table_are_mixed_with_poses_of_another():
+    """Star pairs share the errors of their poses; the other table none of these."""
+    rng = np.random.default_rng(14)
+    robot = paper_robot({"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3})
+    true = true_robot(robot, rng)
+    first, second = measure(true, 30, rng, sigma=(1e-3, 2e-4)), measure(true, 20, rng, sigma=(5e-4, 2e-4))
+    alone = [
+        build_problem(robot, first, model="distance-rotation", pairing=Pairing("star")),
+        build_problem(robot, second, model="pose"),
+    ]
+    tables = [Table(first, "distance-rotation", Pairing("star")), Table(second, "pose")]
+    both = build_problem(robot, tables)
+    at = both.start
+    cost = [p.graph.error(p.initial) for p in (*alone, both)]
+    # Priors are zero at nominal, where all of them start.
+    assert cost[2] == pytest.approx(cost[0] + cost[1], rel=1e-12)
+    assert both.n_residuals == alone[0].n_residuals + alone[1].n_residuals
+    assert np.array_equal(at, alone[0].start)

@@ -1,0 +1,236 @@
+"""A kind of one's own, in ten lines: distances from the tool to a fixed point that nobody knows."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.optimize
+from scipy.stats import chi2
+from simulated import small_arm, true_robot
+
+from fg_calib.analysis.uncertainty import assess
+from fg_calib.errors import InputError
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.solver import solve
+from fg_calib.measurements.dataset import Measurements
+from fg_calib.measurements.kinds import Kind, Rows
+from fg_calib.measurements.series import Own, Table
+from fg_calib.report.documents import result_document
+from fg_calib.report.text import format_report
+from fg_calib.robot.kinematics import pose
+
+
+class AnchorDistance(Kind):
+    """`|p - anchor| - measured`."""
+
+    names, units = ("anchor",), ("m",)
+    ends, height, width, n_nuisances = 1, 1, 1, 3
+
+    def rows(self, at, data, nuisances):
+        """See `Kind.rows`."""
+        step = at.position[:, 0] - nuisances
+        length = np.linalg.norm(step, axis=1)
+        D = np.zeros((len(step), 1, 1, 6))
+        D[:, 0, 0, 3:] = u = step / length[:, None]
+        return Rows(length[:, None] - data, D, -u[:, None])
+
+
+TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
+ANCHORS = np.array([[1.5, -0.8, 0.6], [-1.2, 1.4, 0.3], [0.2, 0.5, -1.8]])
+SIGMA = 2e-4
+
+
+def measured(seed, *, n=60, sigma_joint=0.0, gross=0, n_test=0):
+    rng = np.random.default_rng(seed)
+    robot = small_arm(tolerance=TOLERANCE)
+    true = true_robot(robot, rng)
+    q = rng.uniform(-np.pi, np.pi, (n + n_test, 4))
+    which = np.arange(len(q)) % len(ANCHORS)
+    lengths = np.linalg.norm(pose(true, q).position - ANCHORS[which], axis=1) + SIGMA * rng.normal(size=len(q))
+    lengths[:gross] += 0.05
+    m = Measurements(
+        q + sigma_joint * rng.normal(size=q.shape), np.arange(len(q)).astype(str), np.zeros(len(q), bool),
+        *4 * (None,), np.full(4, sigma_joint), source="lengths",
+    )  # fmt: skip
+    starts = ANCHORS + 0.05 * rng.normal(size=ANCHORS.shape)
+    test = np.arange(len(q)) >= n
+    own = Own(AnchorDistance(), lengths, SIGMA, unknowns=starts, which=which[:, None], names=("A", "B", "C"), test=test)
+    return robot, true, Table(m, model=None, own=(own,))
+
+
+def everything(robot, table, sigma_joint):
+    """Optimum over arm, anchors and (with joint noise) joint values, by scipy."""
+    own, m = table.own[0], table.measurements
+    scale = np.array([p.scale if p.estimated else 0.0 for p in robot.parameters])
+    columns = np.flatnonzero(scale)
+    k = len(columns)
+
+    def residuals(x):
+        values = robot.nominal
+        values[columns] += x[:k] * scale[columns]
+        q = m.readings + (sigma_joint * x[k + 9 :].reshape(m.readings.shape) if sigma_joint else 0.0)
+        anchors = own.unknowns + 0.1 * x[k : k + 9].reshape(3, 3)
+        length = np.linalg.norm(pose(robot.with_values(values), q).position - anchors[own.which[:, 0]], axis=1)
+        return np.concatenate([(length - own.data[:, 0]) / SIGMA, x[:k], x[k + 9 :]])
+
+    start = np.zeros(k + 9 + (m.readings.size if sigma_joint else 0))
+    found = scipy.optimize.least_squares(residuals, start, jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-12)
+    values = robot.nominal
+    values[columns] += found.x[:k] * scale[columns]
+    return values, own.unknowns + 0.1 * found.x[k : k + 9].reshape(3, 3), 2.0 * found.cost
+
+
+@pytest.mark.parametrize("sigma_joint", [0.0, 1e-3])
+def test_it_is_solved_to_the_optimum_over_everything(sigma_joint):
+    robot, _, table = measured(1, n=24, sigma_joint=sigma_joint)
+    options = {"encoder": "estimated"} if sigma_joint else {}
+    solution = solve(build_problem(robot, table, **options))
+    values, anchors, least = everything(robot, table, sigma_joint)
+    uncertainty = assess(solution)
+    sigma = np.array([p.sigma or 1.0 for p in uncertainty.parameters])
+    assert solution.converged
+    assert np.abs((solution.parameters[: len(values)] - values) / sigma).max() < 1e-4  # where scipy stops
+    for point, anchor in zip(uncertainty.points, anchors, strict=True):
+        assert np.abs((point.xyz - anchor) / point.sigma).max() < 1e-4
+    assert uncertainty.chi2 == pytest.approx(least, rel=1e-6)
+    assert uncertainty.dof == 24 - 9  # as many priors as unknowns of the arm
+    assert [p.name for p in uncertainty.points] == ["A", "B", "C"]
+    assert [p.n for p in uncertainty.points] == [8, 8, 8]
+
+
+def test_sigmas_and_chi_square_are_honest():
+    """40 draws: NEES and chi-square over their degrees of freedom, within five of their sigmas."""
+    nees, fit, dof = 0.0, 0.0, 0
+    for seed in range(40):
+        robot, true, table = measured(100 + seed, sigma_joint=3e-4)
+        uncertainty = assess(solve(build_problem(robot, table)))
+        names = list(uncertainty.names)
+        off = np.array([uncertainty.robot.nominal[robot.index(n)] - true.nominal[robot.index(n)] for n in names])
+        nees += float(off @ np.linalg.solve(uncertainty.covariance, off)) / len(names) / 40
+        fit, dof = fit + uncertainty.chi2, dof + uncertainty.dof
+    assert nees == pytest.approx(1.0, abs=5 * np.sqrt(2.0 / (40 * len(names))))
+    assert 1e-6 < chi2.sf(fit, dof) < 1 - 1e-6
+
+
+def test_it_has_residuals_goodness_and_predictions():
+    robot, _, table = measured(3, n_test=30)
+    solution = solve(build_problem(robot, table))
+    uncertainty = assess(solution)
+    rows, fit = uncertainty.residuals, uncertainty.goodness
+    assert set(rows.kind) == {"anchor"}
+    assert (int(rows.used.sum()), int(rows.test.sum())) == (60, 30)
+    (kind,) = fit.kinds
+    assert (kind.kind, kind.unit, kind.n) == ("anchor", "m", 60)
+    assert kind.chi2 == pytest.approx(np.sum((rows.after[rows.used] / SIGMA) ** 2), rel=1e-9)
+    assert kind.p_value > 1e-4
+    assert fit.test.p_value > 1e-4
+    assert rows.rms()["test"]["anchor"]["after"] < 3 * SIGMA
+    assert "anchor" in format_report(solution, uncertainty)
+    document = result_document(solution, uncertainty)
+    assert document["residual_rms"]["train"]["anchor"]["after"] < document["residual_rms"]["train"]["anchor"]["before"]
+    assert document["goodness"]["anchor"]["n"] == 60
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy", "geman-mcclure", "gnc"])
+def test_robust_losses_leave_gross_errors_out(loss):
+    robot, _, table = measured(4, gross=4)
+    clean = replace(table, own=(replace(table.own[0], test=np.arange(60) < 4),))
+    without = assess(solve(build_problem(robot, clean)))
+    robust = solve(build_problem(robot, table, loss=loss))
+    uncertainty = assess(robust)
+    sigma = np.array([p.sigma or 1.0 for p in without.parameters])
+    apart = np.abs([a.estimate - b.estimate for a, b in zip(uncertainty.parameters, without.parameters, strict=True)])
+    assert robust.converged
+    assert (apart / sigma).max() < (2.0 if loss == "huber" else 1.0)  # least squares is off by tens of sigma
+    assert np.all(robust.problem.state.weights[0][:4] < 0.1)
+    if loss == "gnc":
+        assert (apart / sigma).max() < 0.6  # but for clean ones beyond its 99 %
+        assert {int(i) for i in uncertainty.residuals.measurement[uncertainty.goodness.suspects]} >= {0, 1, 2, 3}
+
+
+# --- what is wrong is named -------------------------------------------------------------------------------------------
+
+
+class WrongDerivative(AnchorDistance):
+    """Half as long again."""
+
+    def rows(self, at, data, nuisances):
+        """See `Kind.rows`."""
+        found = super().rows(at, data, nuisances)
+        return Rows(found.residual, 1.5 * found.wrenches, found.nuisances)
+
+
+class WrongShape(AnchorDistance):
+    """Without the turns."""
+
+    def rows(self, at, data, nuisances):
+        """See `Kind.rows`."""
+        found = super().rows(at, data, nuisances)
+        return Rows(found.residual, found.wrenches[..., 3:], found.nuisances)
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        (
+            WrongDerivative(),
+            r"^kind WrongDerivative: wrenches: \S+ where a small change gives \S+, expected ",
+        ),
+        (WrongShape(), r"^kind WrongShape: wrenches: shape \(3, 1, 1, 3\), expected \(3, 1, 1, 6\)$"),
+    ],
+)
+def test_a_kind_that_is_wrong_about_itself_is_refused(kind, said):
+    robot, _, table = measured(5)
+    with pytest.raises(InputError, match=said):
+        build_problem(robot, replace(table, own=(replace(table.own[0], kind=kind),)))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"data": "far"}, "own: data: found no array of numbers, expected finite numbers"),
+        ({"data": np.full(60, np.nan)}, "own: data: found nan or infinity, expected finite numbers"),
+        ({"data": np.zeros((60, 2))}, r"own: data: shape \(60, 2\), expected \(60, 1\)"),
+        ({"sigma": -1.0}, "own: sigma: found -1.0, expected figures above 0"),
+        ({"which": np.full((60, 1), 3)}, "own: which: found 3, expected 0 to 2"),
+        ({"ends": np.full((60, 1), -1)}, "own: ends: found -1, expected 0 and above"),
+        ({"names": ("A", "A", "B")}, r"own: names: found \('A', 'A', 'B'\), expected 3 different names"),
+        ({"unknowns": np.zeros((0, 0))}, r"own: unknowns: shape \(0, 0\), expected a start for each unknown; "),
+        ({"test": [True]}, r"own: test: shape \(1,\), expected \(60,\)"),
+        ({"kind": AnchorDistance}, "own: kind: found <class .*>, expected an object of a class derived from Kind"),
+    ],
+)
+def test_a_mistake_in_what_was_measured_is_named(change, said):
+    _, _, table = measured(5)
+    with pytest.raises(InputError, match=f"^{said}"):
+        replace(table.own[0], **change)
+
+
+def test_configurations_out_of_range_are_named():
+    robot, _, table = measured(5)
+    own = replace(table.own[0], ends=np.full((60, 1), 60))
+    with pytest.raises(InputError, match=r"^own: ends: found 60, expected one a measurement, 0 to 59$"):
+        build_problem(robot, replace(table, own=(own,)))
+    for change, said in (
+        ({"model": "posiiton"}, "table: model: found 'posiiton'"),
+        ({"frame": "unkown"}, "table: frame: found 'unkown'"),
+        ({"pairing": "chain"}, "table: pairing: found 'chain'"),
+        ({"own": own}, "table: own: found "),
+    ):
+        with pytest.raises(InputError, match=f"^{said}"):
+            replace(table, **change)
+
+
+def test_an_anchor_that_too_few_lengths_see_is_unknown_and_harms_nothing():
+    """Two lengths to the third anchor: one direction of it stays where it was started, without a sigma."""
+    robot, _, table = measured(6)
+    own = table.own[0]
+    keep = np.flatnonzero((own.which[:, 0] != 2) | (np.arange(60) < 6))
+    ends = np.arange(60)[keep, None]
+    few = replace(own, data=own.data[keep], which=own.which[keep], ends=ends, test=own.test[keep])
+    solution = solve(build_problem(robot, replace(table, own=(few,))))
+    uncertainty = assess(solution)
+    assert solution.converged
+    assert np.isnan(uncertainty.points[2].sigma).any()
+    assert np.isfinite(uncertainty.points[0].sigma).all()
+    assert uncertainty.dof == len(keep) - 3 - 3 - 2

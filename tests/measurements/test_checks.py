@@ -1,0 +1,214 @@
+"""Measurements from arrays: the same as from tables, and every mistake named with array and row."""
+
+import numpy as np
+import polars as pl
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fg_calib import InputError, Measurements, Noise, Robot, Units, read_measurements
+from fg_calib.files.csv_writer import write_csv
+from fg_calib.measurements.checks import check_readings
+
+RNG = np.random.default_rng(3)
+N = 7
+Q = RNG.uniform(-1, 1, (N, 2))
+P = RNG.normal(size=(N, 3))
+ROTATION = Rotation.from_quat(RNG.normal(size=(N, 4)))
+ROBOT = Robot.from_dh([[0.5, 0, 0, 0], [0.3, 1.0, 0, 0]], limits=[[-3, 3], None])
+
+
+def table():
+    """The columns of a table, and the arrays that say the same."""
+    roll_pitch_yaw = ROTATION.as_euler("xyz")
+    columns = {"q1": Q[:, 0], "q2": Q[:, 1]} | dict(zip("xyz", P.T, strict=True))
+    columns |= dict(zip(("roll", "pitch", "yaw"), roll_pitch_yaw.T, strict=True))
+    columns |= {"id": [f"p{i}" for i in range(N)], "split": ["train"] * 5 + ["test"] * 2}
+    columns |= {"group": ["left", "left", "right", "right", None, "bar", "bar"]}
+    columns |= {"sigma_position": np.linspace(1e-4, 2e-4, N), "sigma_point": np.full(N, 1e-5)}
+    pairs = {"a": ["p0", "p1", "left", "left"], "b": ["p2", "p6", "right", "bar"], "distance": [0.5, 0.25, 0.1, 0.2]}
+    pairs |= {"angle": [1.0, np.nan, np.nan, np.nan], "sigma_distance": [1e-4, 2e-4, 3e-4, 4e-4]}
+    arrays = {"position": P, "roll_pitch_yaw": roll_pitch_yaw, "ids": columns["id"], "group": columns["group"]}
+    arrays |= {"test": np.arange(N) >= 5, "sigma_position": columns["sigma_position"], "sigma_point": 1e-5}
+    arrays |= {"sigma_orientation": 2e-4, "sigma_joint": 1e-5, "pairs": pairs | {"sigma_angle": 3e-4}}
+    return columns, pairs, arrays
+
+
+def same(a, b):
+    if isinstance(a, np.ndarray):
+        return np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+    if isinstance(a, tuple) or not hasattr(a, "__dataclass_fields__"):
+        return a == b
+    return all(same(getattr(a, f), getattr(b, f)) for f in a.__dataclass_fields__ if f != "source")
+
+
+class Pandas:
+    """What is used of a frame of pandas: nan and NaT-like marks for empty cells, `columns` and `to_dict`."""
+
+    class NAType:
+        pass
+
+    def __init__(self, columns):
+        empty = {"group": self.NAType(), "angle": float("nan")}
+        self._columns = {
+            k: [empty.get(k) if v is None else v for v in np.asarray(c).tolist()] for k, c in columns.items()
+        }
+        self.columns = list(columns)
+
+    def to_dict(self, orient):
+        assert orient == "list"
+        return self._columns
+
+
+@pytest.mark.parametrize("frame", ["polars", "lazy", "pandas", "mapping", "arrays"])
+def test_every_way_in_gives_what_a_csv_gives(tmp_path, frame):
+    columns, pairs, arrays = table()
+    noise = Noise(orientation=2e-4, joint=1e-5, angle=3e-4)
+    empty = {"group": ["" if v is None else v for v in columns["group"]]}
+    write_csv(tmp_path / "poses.csv", columns | empty)
+    write_csv(tmp_path / "pairs.csv", pairs | {"angle": ["1.0", "", "", ""]})
+    of_file = read_measurements(tmp_path / "poses.csv", ROBOT, pairs=tmp_path / "pairs.csv", noise=noise)
+    if frame == "arrays":
+        found = Measurements.from_arrays(Q, **arrays)
+    else:
+        made = {"polars": pl.DataFrame, "lazy": pl.LazyFrame, "pandas": Pandas, "mapping": dict}[frame]
+        found = Measurements.from_frame(made(columns), ROBOT, pairs=made(pairs), noise=noise)
+    assert same(found, of_file)
+
+
+def test_a_frame_has_units_and_its_cells_are_named():
+    frame = {"q1": [10.0, 20.0], "q2": [1.0, 2.0], "x": [1.0, np.nan], "y": [1.0, 2.0], "z": [1.0, 2.0]}
+    with pytest.raises(InputError, match=r"^frame: row 1: x: found an empty cell, expected a finite number$"):
+        Measurements.from_frame(frame, ROBOT, units=Units(angle="deg"))
+    with pytest.raises(InputError, match=r"^frame: row 0: q1 = 10 rad is outside .*; is the table in deg\?$"):
+        Measurements.from_frame(frame | {"x": [1.0, 2.0]}, ROBOT)
+    found = Measurements.from_frame(frame | {"x": [1.0, 2.0]}, ROBOT, units=Units(angle="deg", length="mm"))
+    assert found.readings[1, 0] == pytest.approx(np.deg2rad(20.0), rel=1e-15)
+    assert found.position[1, 0] == pytest.approx(2e-3, rel=1e-15)
+    for wrong, message in (
+        (3, "found a int, expected a path, or a frame"),
+        ({}, "a frame without columns"),
+        ({"q1": [1.0], "q2": [1.0, 2.0]}, "no table"),
+        ({"q1": [1.0]}, "1 joint columns"),
+    ):
+        with pytest.raises(InputError, match=f"^frame: {message}"):
+            Measurements.from_frame(wrong, ROBOT)
+
+
+def test_orientations_in_three_ways():
+    ways = [{"rotation": ROTATION.as_matrix()}, {"quaternion": ROTATION.as_quat()}]
+    ways.append({"roll_pitch_yaw": ROTATION.as_euler("xyz")})
+    for way in ways:
+        # Conversions round numbers of size 1 a few times.
+        assert Measurements.from_arrays(Q, **way).rotation == pytest.approx(ROTATION.as_matrix(), abs=1e-15)
+    rounded = Measurements.from_arrays(Q, rotation=ROTATION.as_matrix().round(5)).rotation
+    assert np.swapaxes(rounded, 1, 2) @ rounded == pytest.approx(np.broadcast_to(np.eye(3), (N, 3, 3)), abs=1e-14)
+    assert rounded == pytest.approx(ROTATION.as_matrix(), abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("given", "rows"),
+    [
+        (1e-3, np.full((N, 3), 1e-3)),
+        ([1e-3, 2e-3, 3e-3], np.tile([1e-3, 2e-3, 3e-3], (N, 1))),
+        (np.linspace(1, 2, N), np.tile(np.linspace(1, 2, N)[:, None], 3)),
+        (np.ones((N, 3)), np.ones((N, 3))),
+    ],
+)
+def test_sigmas_are_spread_over_the_rows(given, rows):
+    assert np.array_equal(Measurements.from_arrays(Q, position=P, sigma_position=given).sigma_position, rows)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"readings": Q[:, 0]}, r"readings: shape \(7,\), expected \(n, n_joints\)"),
+        ({"readings": [[1, 2], [3]]}, r"readings: found \[\[1, 2\], \[3\]\], expected numbers of shape"),
+        ({"readings": Q[:0]}, r"readings: shape \(0, 2\), expected .* at least one row"),
+        ({"readings": Q + 1j}, "readings: found .*, expected numbers"),
+        ({"position": P[:5]}, r"position: shape \(5, 3\), expected \(7, 3\)"),
+        (
+            {"position": np.where(np.arange(N)[:, None] == 4, np.inf, P)},
+            "position: row 4: found inf, expected a finite",
+        ),
+        ({"position": P.astype(str)}, "position: found .*, expected numbers"),
+        ({"quaternion": np.ones((N, 4))}, r"quaternion: row 0: found \[1.0, .*\], expected x y z w of length 1"),
+        ({"rotation": np.tile(np.diag([1.0, 1, -1]), (N, 1, 1))}, "rotation: row 0: found .*, expected a rotation"),
+        ({"rotation": np.tile(2 * np.eye(3), (N, 1, 1))}, "rotation: row 0: "),
+        ({"rotation": ROTATION.as_matrix(), "quaternion": ROTATION.as_quat()}, "rotation and quaternion: both"),
+        ({"sigma_position": 0.0}, "sigma_position: found 0, expected a number above 0"),
+        ({"sigma_position": [1, 2]}, r"sigma_position: shape \(2,\), expected one of \(\), \(3,\), \(7,\), \(7, 3\)"),
+        ({"sigma_orientation": [1, -1, 1]}, "sigma_orientation: row 1: found -1, expected a number above 0"),
+        ({"sigma_orientation": np.nan}, "sigma_orientation: found nan, expected a finite number"),
+        ({"sigma_joint": -1.0}, "sigma_joint: found -1, expected a number not below 0"),
+        ({"sigma_joint": [1.0, 1.0, 1.0]}, r"sigma_joint: shape \(3,\), expected \(2\)"),
+        ({"ids": ["a"] * N}, "ids: row 1: found 'a', expected different ids"),
+        ({"ids": ["a"]}, r"ids: shape \(1,\), expected \(7,\)"),
+        ({"test": np.arange(N)}, "test: found .*, expected True or False for each of 7 rows"),
+        ({"test": [True]}, r"test: shape \(1,\), expected \(7,\)"),
+        ({"group": ["a"]}, r"group: shape \(1,\), expected \(7,\)"),
+        ({"pairs": {"a": [0], "distance": [1]}}, "pairs: no b, expected a and b"),
+        ({"pairs": {"a": [0], "b": [1]}}, "pairs: neither distance nor angle"),
+        ({"pairs": {"a": [0], "b": [1], "distanze": [1]}}, "pairs: unknown key 'distanze', .*did you mean distance?"),
+        ({"pairs": {"a": [0], "b": [9], "distance": [1]}}, "pairs: b: row 0: found 9, expected an id"),
+        ({"pairs": {"a": [0, 3], "b": [1, 3], "distance": [1, 1]}}, "pairs: b: row 1: found 3, expected another"),
+        ({"pairs": {"a": [0], "b": [1, 2], "distance": [1]}}, r"pairs: b: shape \(2,\), expected"),
+        ({"pairs": {"a": [0], "b": [1], "distance": [-1]}}, "pairs: distance: row 0: found -1, expected a number not"),
+        ({"pairs": {"a": [0], "b": [1], "angle": [3.2]}}, "pairs: angle: row 0: found 3.2, expected 0 to pi"),
+        ({"pairs": {"a": [0], "b": [1], "angle": [1], "sigma_angle": 0}}, "pairs: sigma_angle: found 0, expected"),
+        (
+            {"group": [0] * N, "pairs": {"a": [0], "b": [1], "distance": [1]}},
+            "pairs: a: row 0: found 0, expected dif",
+        ),
+        (
+            {"group": ["l"] * 3 + ["r"] * 4, "pairs": {"a": ["l"], "b": ["r"], "angle": [1]}},
+            "pairs: angle: row 0: found 1, expected nan",
+        ),
+        (
+            {"group": ["l"] * 3 + ["r"] * 4, "pairs": {"a": ["l"], "b": ["1"], "distance": [1]}},
+            "pairs: b: row 0: found '1', expected two configurations or two groups",
+        ),
+    ],
+)
+def test_mistakes_are_named(given, message):
+    with pytest.raises(InputError, match=f"^{message}"):
+        Measurements.from_arrays(**{"readings": Q} | given)
+
+
+def test_what_is_kept_is_read_only_and_nobody_elses():
+    position, mask = P.copy(), np.zeros(N, dtype=bool)
+    found = Measurements.from_arrays(Q, position=position, test=mask, sigma_position=1e-3)
+    position[0], mask[0] = 99.0, True
+    assert np.array_equal(found.position, P)
+    assert not found.test.any()
+    for array in (found.readings, found.position, found.test, found.sigma_position, found.sigma_joint):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1
+
+
+def test_what_is_made_of_arrays_directly_copies_none_and_locks_none():
+    position = P.copy()
+    found = Measurements(Q, np.arange(N).astype(str), np.zeros(N, bool), position, None, None, None, np.zeros(2))
+    assert np.shares_memory(found.position, position)
+    assert position.flags.writeable
+    assert not found.position.flags.writeable
+
+
+def test_readings_are_those_of_the_robot():
+    with pytest.raises(InputError, match=r"^m: readings of 3 joints, expected 2, as robot has$"):
+        check_readings(np.zeros((4, 3)), ROBOT, "m")
+    with pytest.raises(InputError, match=r"^m: row 1: q1 = 90 rad is outside \[-3, 3\]; is it in deg\?$"):
+        check_readings(np.array([[0.0, 0.0], [90.0, 0.0]]), ROBOT, "m")
+
+
+def test_readings_that_look_like_degrees_are_told(caplog):
+    check_readings(np.array([[0.0, 90.0], [1.0, -120.0], [2.0, 45.0]]), ROBOT, "m")
+    assert caplog.messages == ["m: most readings of q2 are more than two turns; are they in deg?"]
+
+
+def test_measurements_fit_a_screen():
+    _, _, arrays = table()
+    text = repr(Measurements.from_arrays(Q, **arrays))
+    assert text == (
+        "Measurements 'measurements', 7 configurations of 2 joints (2 to test): "
+        "positions, orientations, 2 pairs, touches of 3 points"
+    )

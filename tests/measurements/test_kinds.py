@@ -1,0 +1,181 @@
+"""Each kind of measurement: derivatives by central differences, compiled twins against numpy, a kind of one's own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from oracle import central_differences, random_robot, tool_pose
+from scipy.spatial.transform import Rotation
+from tolerances import rounding
+
+from fg_calib.measurements import residuals
+from fg_calib.measurements.kinds import (
+    Distance,
+    Frames,
+    Kind,
+    Orientation,
+    PointDistance,
+    Position,
+    RotationAngle,
+    Rows,
+    SamePoint,
+    Stacked,
+    TouchedPoint,
+)
+from fg_calib.measurements.residuals import Block, pack, unit_whitening, unpack
+from fg_calib.robot.kernels import LANES
+from fg_calib.robot.kinematics import build_chain, precompute_trig
+
+CONVENTIONS = ["dh", "mdh", "mdh-hayati", "dh-hayati", "urdf"]
+COMPILED = [
+    *(Distance(), RotationAngle(), Position(), Orientation(), SamePoint()),
+    *(Stacked(Distance(), RotationAngle()), Stacked(Orientation(), Position()), Stacked(Position(), Orientation())),
+]
+KINDS = [*COMPILED, TouchedPoint(), PointDistance()]
+
+
+def name_of(kind):
+    return "+".join(map(name_of, kind.parts)) if isinstance(kind, Stacked) else type(kind).__name__
+
+
+EVERY_KIND = pytest.mark.parametrize("kind", KINDS, ids=name_of)
+
+
+def in_numpy(kind):
+    """The kind without its twin."""
+    kind = type(kind)(*getattr(kind, "parts", ()))
+    kind.twins = lambda: np.zeros((0, 3), dtype=np.int64)
+    return kind
+
+
+def data_of(kind, n, rng):
+    """Measured values that are far from what is predicted."""
+    if isinstance(kind, Stacked):
+        return np.concatenate([data_of(part, n, rng) for part in kind.parts], axis=1)
+    if isinstance(kind, Orientation):
+        return Rotation.random(n, random_state=rng.integers(1000)).as_matrix().reshape(n, 9)
+    return rng.uniform(0.0, 1.0, (n, kind.width))
+
+
+def random_block(kind, robot, n, rng):
+    h = kind.height
+    trig = precompute_trig(robot, rng.uniform(-3, 3, (2 * n + 1, robot.n_joints)))
+    ends = rng.permutation(2 * n + 1)[: n * kind.ends].reshape(n, kind.ends)
+    whitening = pack(np.tril(rng.normal(size=(n, h, h))) + 3 * np.eye(h))
+    return Block(kind, trig, ends, data_of(kind, n, rng), whitening, rng.normal(size=(n, kind.n_nuisances)))
+
+
+def chain_of(robot):
+    return build_chain(robot, {i: i for i in range(len(robot.parameters))}).with_joint_columns()
+
+
+@EVERY_KIND
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_derivatives_are_those_of_central_differences(kind, convention):
+    """In every parameter, in the joints of each end and in the nuisances, sliding joints among them."""
+    rng = np.random.default_rng(CONVENTIONS.index(convention))
+    robot = random_robot(convention, 5, rng)
+    q, data = rng.uniform(-3, 3, (kind.ends, 5)), data_of(kind, 1, rng)
+    nuisances = rng.normal(size=(1, kind.n_nuisances))
+    W = np.tril(rng.normal(size=(kind.height, kind.height)))
+    n_parameters = len(robot.parameters)
+
+    def formula(x):
+        T = np.array([tool_pose(robot.with_values(x[:n_parameters]), q) for q in joints_of(x)]).reshape(1, -1, 4, 4)
+        at = Frames(T[:, :, :3, :3], T[:, :, :3, 3])
+        return W @ kind.rows(at, data, x[None, n_parameters + q.size :]).residual[0]
+
+    def joints_of(x):
+        return x[n_parameters : n_parameters + q.size].reshape(kind.ends, 5)
+
+    x = np.concatenate([robot.nominal, q.ravel(), nuisances.ravel()])
+    trig, ends = precompute_trig(robot, q.reshape(-1, 5)), np.arange(kind.ends)[None]
+    block = Block(kind, trig, ends, data, pack(W[None]), nuisances)
+    r, J = residuals.linearise(block, chain_of(robot))
+    size = np.abs(J).max()
+    assert r[0] == pytest.approx(formula(x), abs=rounding(10.0))
+    found, expected = J[0], central_differences(formula, x)
+    if kind.turned_back:  # a turn of the residual by each parameter is free: it changes no length
+        off = np.linalg.solve(W, formula(x))
+        turned = np.linalg.solve(W, found - expected)
+        assert off @ turned == pytest.approx(0.0, abs=1e-6)
+        found, expected = found[:, n_parameters:], expected[:, n_parameters:]
+    # Steps of 1e-6 leave third derivatives times 1e-12 and rounding over 1e-6, here of rows of size 1 to 10.
+    assert found == pytest.approx(expected, abs=1e-7 * max(1.0, size))
+
+
+@pytest.mark.parametrize("kind", COMPILED, ids=name_of)
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_compiled_twins_compute_what_numpy_does(kind, convention):
+    rng = np.random.default_rng(10 + CONVENTIONS.index(convention))
+    robot = random_robot(convention, 6, rng)
+    block = random_block(kind, robot, 2 * LANES + 5, rng)
+    assert len(kind.twins())
+    r, J = residuals.linearise(block, chain_of(robot))
+    expected_r, expected_J = residuals.linearise(replace(block, kind=in_numpy(kind)), chain_of(robot))
+    for found, expected in ((r, expected_r), (J, expected_J)):
+        assert np.abs(found - expected).max() <= 1e-13 * np.abs(expected).max()
+
+
+@EVERY_KIND
+def test_the_reductions_are_those_of_the_rows(kind):
+    rng = np.random.default_rng(20)
+    robot = random_robot("mdh-hayati", 6, rng)
+    block, chain = random_block(kind, robot, 700, rng), chain_of(robot)
+    r, J = residuals.linearise(block, chain)
+    rows = np.concatenate([J.reshape(r.size, -1), r.reshape(-1, 1)], axis=1)
+    expected = rows.T @ rows
+    R = residuals.triangle(block, chain)
+    assert residuals.gram(block, chain) == pytest.approx(expected, abs=rounding(expected, 10))
+    assert R.T @ R == pytest.approx(expected, abs=rounding(expected, 10))
+    assert residuals.squared_norm(block, chain) == pytest.approx(expected[-1, -1], rel=rounding(1, 10))
+
+
+class FixedPoint(Kind):
+    """Distance from the tool point to a fixed point: data x, y, z of the point and the distance, [m]."""
+
+    names, units = ("ball",), ("m",)
+    ends, height, width = 1, 1, 4
+
+    def rows(self, at, data, nuisances):
+        away = at.position[:, 0] - data[:, :3]
+        length = np.linalg.norm(away, axis=1)[:, None]
+        D = np.zeros((len(data), 1, 1, 6))
+        D[:, 0, 0, 3:] = away / length
+        return Rows(length - data[:, 3:], D)
+
+
+def test_a_kind_of_ones_own_takes_ten_lines():
+    test_derivatives_are_those_of_central_differences(FixedPoint(), "mdh-hayati")
+    test_the_reductions_are_those_of_the_rows(FixedPoint())
+    test_the_reductions_are_those_of_the_rows(Stacked(FixedPoint(), Position(), FixedPoint()))
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, np.pi - 1e-9, np.pi])
+def test_orientations_in_numpy_are_right_at_no_turn_and_half_a_turn(angle):
+    rng = np.random.default_rng(21)
+    robot = random_robot("urdf", 4, rng)
+    block = random_block(Orientation(), robot, 1, rng)
+    k = rng.normal(size=3)
+    at = tool_pose(robot, q := rng.uniform(-1, 1, 4))[:3, :3]
+    measured = at @ Rotation.from_rotvec(angle * k / np.linalg.norm(k)).as_matrix()
+    block = replace(block, trig=precompute_trig(robot, q[None]), ends=np.array([[0]]), data=measured.reshape(1, 9))
+    J = residuals.linearise(block, chain_of(robot))[1]
+    in_plain_numpy = residuals.linearise(replace(block, kind=in_numpy(block.kind)), chain_of(robot))[1]
+    # At half a turn the axis has either sign, and its own derivative with it; rounding of the angle is over its sine.
+    assert np.isfinite(J).all()
+    if angle != np.pi:
+        assert J == pytest.approx(in_plain_numpy, abs=rounding(J) if angle < 1.0 else 1e-6)
+
+
+def test_kinds_are_equal_by_what_they_are():
+    """Rows whitened anew are compared with those before: a problem is at its optimum where both are the same."""
+    assert Distance() == Distance() != RotationAngle()
+    assert Stacked(Distance(), RotationAngle()) == Stacked(Distance(), RotationAngle()) != Stacked(Distance())
+    assert len({Distance(), Distance(), SamePoint()}) == 2
+
+
+def test_pack_keeps_lower_triangles():
+    W = np.tril(np.random.default_rng(22).normal(size=(4, 3, 3)))
+    assert np.array_equal(unpack(pack(W), 3), W)
+    assert np.array_equal(unpack(unit_whitening(2, 3), 3), np.tile(np.eye(3), (2, 1, 1)))

@@ -1,0 +1,104 @@
+"""Robots from a table in Python: the same as from a file, and every mistake named."""
+
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+from fg_calib import InputError, Robot, pose, read_robot, read_urdf, write_robot
+from fg_calib.robot.model import CONVENTIONS
+
+ROWS = [[0.0, -1.5, 0.34, 0.1, 0.01], [0.6, 0.0, 0.02, -0.2, 0.02], [0.1, 1.2, 0.0, 0.3, -0.03]]  # a alpha d theta beta
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_a_table_is_the_robot_of_a_file_with_its_figures(tmp_path, convention):
+    kinds = ("a", "alpha", "d", "theta", "beta")[: 5 if "hayati" in convention else 4]
+    rows = [dict(zip(kinds, row, strict=False)) for row in ROWS]
+    rows[1] |= {"type": "prismatic", "limits": [0.0, 0.5]}
+    rows[2] |= {"name": "wrist"}
+    more = {"fixed": ["a1"], "estimate": ["tool.x"], "tolerance": {"a": 1e-3, "theta2": 2e-3, "tool": 1e-2}}
+    file = {"convention": convention, "joints": rows, "base": {"z": 0.5}, "tool": {"x": 0.1, "yaw": 0.7}} | more
+    (tmp_path / "arm.yaml").write_text(yaml.safe_dump(file))
+    robot = Robot.from_dh(
+        [row[: len(kinds)] for row in ROWS],
+        convention,
+        name="arm",
+        types=["revolute", "prismatic", "revolute"],
+        limits=[None, (0.0, 0.5), None],
+        names=["q1", "q2", "wrist"],
+        base=[0, 0, 0.5],
+        tool=[0.1, 0, 0, 0, 0, 0.7],
+        **more,
+    )
+    assert robot == read_robot(tmp_path / "arm.yaml")
+    write_robot(tmp_path / "again.yaml", robot)
+    assert read_robot(tmp_path / "again.yaml") == robot
+
+
+def test_beta_is_zero_where_no_column_states_it():
+    four = [row[:4] for row in ROWS]
+    assert Robot.from_dh(four, "mdh-hayati") == Robot.from_dh([[*row, 0.0] for row in four], "mdh-hayati")
+    assert [p.nominal for p in Robot.from_dh(four, "mdh-hayati").parameters if p.kind == "beta"] == [0.0] * 3
+
+
+@pytest.mark.parametrize("rpy", [[0.3, -0.4, 2.5], [0.0, 0.5 * np.pi, 0.7], [0.2, -0.5 * np.pi, 0.7]])
+def test_a_tool_is_a_matrix_too(rpy):
+    """Also where pitch is a quarter turn and only a sum of roll and yaw acts."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = Rotation.from_euler("xyz", rpy).as_matrix(), [0.1, 0.2, 0.3]
+    q = [[0.4, -0.3, 1.0]]
+    robot = Robot.from_dh([row[:4] for row in ROWS], tool=matrix, base=matrix)
+    other = Robot.from_dh([row[:4] for row in ROWS], tool=[0.1, 0.2, 0.3, *rpy], base=[0.1, 0.2, 0.3, *rpy])
+    # The arctangent of a pitch whose cosine is 1e-16 is exact to a few roundings of numbers of size 1.
+    assert pose(robot, q).rotation == pytest.approx(pose(other, q).rotation, abs=1e-15 * 20)
+    assert pose(robot, q).position == pytest.approx(pose(other, q).position, abs=1e-15 * 20)
+
+
+FOUR = [row[:4] for row in ROWS]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"rows": [[0, 1, 2]]}, r"rows: shape \(1, 3\), expected \(n, 4\)"),
+        ({"rows": []}, r"rows: shape \(0,\), expected \(n, 4\)"),
+        ({"rows": np.zeros((0, 4))}, "rows: no joints, expected at least one"),
+        ({"rows": [[0, 1, 2, np.nan]]}, "rows: row 0: found nan, expected a finite number"),
+        ({"rows": [[0, 1, 2, "x"]]}, "rows: found .*, expected numbers of shape"),
+        ({"rows": [[0, 90, 2, 0]]}, "rows: row 0: found 90, expected angles in rad, a turn at most; are they in deg?"),
+        ({"rows": ROWS}, r"rows: shape \(3, 5\), expected \(n, 4\): the convention dh has no beta"),
+        ({"convention": "DH"}, "convention: found 'DH', expected one of dh, .* did you mean dh?"),
+        ({"types": "sliding"}, "types: joint 1: found 'sliding', expected one of revolute, prismatic"),
+        ({"types": ["revolute"]}, "types: 1 for 3 joints, expected one a joint"),
+        ({"limits": [[0, 1]]}, "limits: 1 for 3 joints"),
+        ({"limits": [[0, 1], [1, 0], None]}, "limits: joint 2: found 1, 0, expected lower below upper"),
+        ({"names": ["a", "a", "b"]}, "names: joint 2: found 'a', as before, expected different names"),
+        ({"tool": [1, 2]}, r"tool: shape \(2,\), expected \(3\), \(6\) or \(4, 4\)"),
+        ({"base": np.ones((4, 4))}, "base: a matrix that is no pose"),
+        ({"base": np.diag([1, 1, -1, 1])}, "base: a matrix that is no pose"),
+        ({"tolerance": {"a": 0.0}}, "tolerance: a: found 0.0, expected a finite number above 0"),
+        ({"tolerance": {"b": 1.0}}, "robot: tolerance: unknown parameter or kind 'b'"),
+        ({"fixed": ["a9"]}, "robot: fixed: unknown parameter 'a9'"),
+    ],
+)
+def test_mistakes_are_named(given, message):
+    with pytest.raises(InputError, match=message):
+        Robot.from_dh(**{"rows": FOUR} | given)
+
+
+def test_a_robot_of_a_urdf(tmp_path):
+    (tmp_path / "arm.urdf").write_text(
+        '<robot name="arm"><link name="a"/><link name="b"/><joint name="j" type="revolute"><parent link="a"/>'
+        '<child link="b"/><axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>'
+    )
+    assert Robot.from_urdf(tmp_path / "arm.urdf", estimate=["tool.x"]) == read_urdf(
+        tmp_path / "arm.urdf", estimate=["tool.x"]
+    )
+
+
+def test_a_robot_of_many_joints_fits_a_screen():
+    lines = repr(Robot.from_dh(FOUR * 10, "dh")).splitlines()
+    assert len(lines) <= 10
+    assert max(map(len, lines)) <= 100
+    assert lines[0].startswith("Robot 'robot', dh, 30 joints: q1, q2")

@@ -1,0 +1,287 @@
+"""The front door: one call does the steps, and what it found prints, predicts, and is saved and loaded."""
+
+import copy
+import json
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from simulated import TOOL, measure, small_arm, true_robot, write_job
+
+from fg_calib import (
+    Calibration,
+    InputError,
+    Measurements,
+    Options,
+    Pairing,
+    ProblemError,
+    assess,
+    build_problem,
+    calibrate,
+    calibrate_job,
+    look_elsewhere,
+    pose,
+    read_job,
+    solve,
+)
+
+TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3, "tool": 2e-3}
+FRAME = (Rotation.from_rotvec([0.3, -0.2, 1.0]), np.array([0.5, 1.0, -0.3]))
+
+CASES = {
+    "unknown frame and tool": ({"model": "pose", "frame": "unknown"}, {"tolerance": TOLERANCE, "estimate": TOOL}),
+    "priors": ({"model": "distance-rotation"}, {"tolerance": TOLERANCE}),
+    "nothing holds what is lost": ({"model": "distance-rotation", "gauge": "none"}, {}),
+    "nothing holds base and tool": (
+        {"model": "pose", "gauge": "none"},
+        {"estimate": [*TOOL, *(name.replace("tool", "base") for name in TOOL)]},
+    ),
+    "some are kept": ({"model": "position", "gauge": "keep"}, {"tolerance": TOLERANCE}),
+}
+
+
+def given(name, n=25):
+    settings, of_robot = CASES[name]
+    rng = np.random.default_rng(7)
+    robot = small_arm(**of_robot)
+    frame = FRAME if "frame" in name else None
+    return robot, measure(true_robot(robot, rng), n, rng, frame=frame, n_test=5), settings
+
+
+@pytest.fixture(scope="module")
+def found():
+    """Every case's calibration."""
+    return {name: calibrate(robot, m, **settings) for name, (robot, m, settings) in ((c, given(c)) for c in CASES)}
+
+
+Q = np.random.default_rng(1).uniform(-1.5, 1.5, (4, 4))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_one_call_does_the_steps(found, name):
+    robot, m, settings = given(name)
+    solution = look_elsewhere(solve(build_problem(robot, m, **settings)))
+    uncertainty = assess(solution)
+    assert np.array_equal(found[name].solution.parameters, solution.parameters)
+    assert np.array_equal(found[name].uncertainty.covariance, uncertainty.covariance, equal_nan=True)
+    assert found[name].findings == uncertainty.findings
+    assert found[name].robot == uncertainty.robot
+    assert found[name].trustworthy == uncertainty.trustworthy
+    assert found[name].residuals.n == uncertainty.residuals.n
+    assert {k: g.p_value for k, g in found[name].goodness.items()} == {
+        fit.kind: fit.p_value for fit in uncertainty.goodness.kinds
+    }
+
+
+def test_options_come_as_one_or_as_keywords():
+    robot, m, _ = given("priors")
+    one = calibrate(robot, m, Options(model="distance", pairing=Pairing("chain")))
+    other = calibrate(robot, m, model="distance", pairing=Pairing("chain"))
+    assert np.array_equal(one.solution.parameters, other.solution.parameters)
+
+
+def test_parameters_are_found_by_name(found):
+    result = found["priors"]
+    assert list(result.parameters) == [p.name for p in result.robot.parameters]
+    a2 = result.parameters["a2"]
+    i = result.uncertainty.names.index("a2")
+    assert a2.estimate == result.robot.parameters[result.robot.index("a2")].nominal
+    assert a2.sigma == pytest.approx(np.sqrt(result.uncertainty.covariance[i, i]), rel=1e-15)
+    assert "a9" not in result.parameters
+    with pytest.raises(KeyError, match=r"A2 did you mean a2\?"):
+        result.parameters["A2"]
+
+
+def test_covariance_is_in_the_order_asked_for(found):
+    result = found["priors"]
+    u = result.uncertainty
+    assert np.array_equal(result.covariance(), u.covariance, equal_nan=True)
+    i, j = (u.names.index(name) for name in ("d3", "a2"))
+    assert np.array_equal(result.covariance(["d3", "a2"]), u.covariance[np.ix_([i, j], [i, j])])
+    with_fixed = result.covariance(["tool.x", "a2"])  # the tool is fixed here
+    assert np.array_equal(with_fixed, [[0.0, 0.0], [0.0, u.covariance[j, j]]])
+    with pytest.raises(InputError, match="covariance: unknown parameter 'a9'"):
+        result.covariance(["a9"])
+    with pytest.raises(InputError, match="covariance: found 'a2', expected a list of names"):
+        result.covariance("a2")
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_predictions_agree_with_differences(found, name):
+    """`Uncertainty.predict` differentiates any function of the robot by central differences.
+
+    With steps of 1e-5 rad, rounding of positions of some metres leaves 1e-10 of each derivative; two more digits are
+    for derivatives that cancel in a sum.
+    """
+    result = found[name]
+    predicted = result.predict(Q)
+    for k, q in enumerate(Q):
+        at = pose(result.robot, [q])
+        assert predicted.position[k] == pytest.approx(at.position[0], abs=1e-14)
+        assert predicted.rotation[k] == pytest.approx(at.rotation[0], abs=1e-14)
+
+        def moved(robot, q=q, R=at.rotation[0]):
+            there = pose(robot, [q])
+            return np.concatenate([there.position[0], Rotation.from_matrix(there.rotation[0] @ R.T).as_rotvec()])
+
+        expected = result.uncertainty.predict(moved)
+        scale = np.outer(expected.sigma, expected.sigma)
+        assert np.array_equal(np.isnan(predicted.covariance[k]), np.isnan(expected.covariance))
+        assert predicted.covariance[k] / scale == pytest.approx(expected.covariance / scale, abs=1e-8, nan_ok=True)
+    if name == "nothing holds base and tool":
+        assert np.isfinite(predicted.covariance).all()  # although base, tool and some of the arm are not known
+        assert any(p.sigma is None for p in result.parameters.values())
+    if name == "nothing holds what is lost":
+        assert np.isnan(predicted.sigma_position).all()  # distances tell nothing of the base
+
+
+def test_predictions_in_the_measurement_frame(found):
+    """What was measured there is predicted within its noise; the base frame alone is known far worse."""
+    result, (_, m, _) = found["unknown frame and tool"], given("unknown frame and tool")
+    world = result.predict(m.readings, world=True)
+    off = (world.position - m.position)[m.test] / 1e-3  # sigma of a measured position
+    assert np.sum(off**2) < 2.0 * off.size
+    turn, shift = Rotation.from_quat(result.frame.quaternion_xyzw), result.frame.xyz
+    base = result.predict(m.readings)
+    assert world.position == pytest.approx(turn.apply(base.position) + shift, abs=1e-12)
+    assert np.all(world.sigma_position.max(axis=1) < base.sigma_position.max(axis=1))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_is_loaded_says_what_was_saved(found, tmp_path, name):
+    result = found[name]
+    result.save(tmp_path)
+    again = Calibration.load(tmp_path)
+    assert again.result == result.result
+    assert again.parameters == result.parameters
+    assert np.array_equal(again.covariance(), result.covariance(), equal_nan=True)
+    assert again.robot.nominal == pytest.approx(result.robot.nominal, abs=1e-15)
+    assert (again.trustworthy, again.findings, again.goodness) == (
+        result.trustworthy,
+        result.findings,
+        result.goodness,
+    )
+    for world in (False, True)[: 1 + (result.frame is not None)]:
+        before, after = result.predict(Q, world=world), again.predict(Q, world=world)
+        # The frame goes through a quaternion; all else is the same figures.
+        assert after.position == pytest.approx(before.position, abs=1e-14)
+        size = np.nanmax(np.abs(before.covariance), initial=0.0)
+        assert after.covariance == pytest.approx(before.covariance, rel=1e-10, abs=1e-13 * size, nan_ok=True)
+    assert repr(again) == repr(result)
+    assert str(again).startswith(repr(result))
+    for nothing in ("solution", "uncertainty", "residuals"):
+        with pytest.raises(InputError, match="it was loaded from a folder"):
+            getattr(again, nothing)
+    with pytest.raises(InputError, match="it was loaded from a folder"):
+        again.save(tmp_path / "elsewhere")
+
+
+def test_the_command_writes_and_prints_the_same(fg_calib, tmp_path):
+    robot, m, settings = given("priors")
+    path = write_job(tmp_path, robot, m, **settings)
+    ended = fg_calib("calibrate", path, "--out", tmp_path / "by command", "--json")
+    result = calibrate_job(path)
+    result.save(tmp_path / "in python")
+
+    def without_time(document):
+        document["solver"].pop("seconds")
+        return document
+
+    assert ended.code == 0
+    assert without_time(json.loads(ended.out)) == without_time(result.result.document())
+    names = sorted(f.name for f in (tmp_path / "in python").iterdir())
+    assert names == sorted(f.name for f in (tmp_path / "by command").iterdir())
+    for name in set(names) - {"result.json"}:
+        assert (tmp_path / "in python" / name).read_text() == (tmp_path / "by command" / name).read_text()
+    assert calibrate_job(read_job(path)).result.inputs.keys() == {"calibration.yaml", "robot.yaml", "poses.csv"}
+
+
+def test_noise_is_estimated_from_nothing_stated():
+    robot, m, _ = given("priors", n=40)
+    stated = calibrate(robot, m, model="pose", estimate_noise=True)
+    bare = replace(m, sigma_position=None, sigma_orientation=None)
+    free = calibrate(robot, bare, model="pose", estimate_noise=True)
+    # The factors settle to 1e-5 wherever they start (see `variance_components`).
+    for kind, true in (("position", 1e-3), ("orientation", 2e-4)):
+        seen, seen_too = (r.goodness[kind].stated_sigma_rms * r.goodness[kind].seen_over_stated for r in (free, stated))
+        assert seen == pytest.approx(seen_too, rel=1e-4)
+        assert seen == pytest.approx(true, rel=0.3)  # 120 residuals: 1 sigma of their RMS is 7 %
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_everything_fits_a_screen(found, name):
+    result = found[name]
+    robot, m, _ = given(name)
+    for shown in (robot, m, result.solution.problem, result.solution, result.uncertainty, result):
+        lines = repr(shown).splitlines()
+        assert len(lines) <= 10
+        assert max(map(len, lines)) <= 100
+        assert "array(" not in repr(shown)
+    assert str(result).startswith(f"{robot.name}: {result.result.model}")
+    assert "Fit statistics" in str(result)
+
+
+def test_a_doubtful_result_says_so_in_a_few_lines():
+    robot, m, _ = given("priors")
+    result = calibrate(robot, replace(m, position=m.position * 1.05), model="pose")
+    assert not result.trustworthy
+    assert repr(result).splitlines()[1].startswith("DOUBTFUL: ")
+    assert len(repr(result).splitlines()) <= 10
+    assert all(len(line) <= 100 for line in repr(result).splitlines())
+
+
+def test_a_notebook_gets_a_table(found):
+    robot, m, settings = given("priors")
+    text = calibrate(replace(robot, name="<b>arm</b>"), m, **settings)._repr_html_()
+    assert "<b>arm</b>" not in text
+    assert "&lt;b&gt;arm&lt;/b&gt;: distance-rotation" in text
+    assert text.count("<tr>") == 1 + sum(p.estimated or p.owner == 5 for p in robot.parameters)
+    assert "<td>a2</td>" in text
+
+
+def test_a_calibration_goes_to_other_processes(found):
+    result = found["unknown frame and tool"]
+    for again in (copy.deepcopy(result), pickle.loads(pickle.dumps(result))):
+        assert np.array_equal(again.predict(Q).covariance, result.predict(Q).covariance)
+        assert str(again) == str(result)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "error", "message"),
+    [
+        ({"model": "positon"}, InputError, "model: found 'positon', .*did you mean position?"),
+        ({"modle": "position"}, InputError, "options: unknown option 'modle'"),
+        ({"options": Options("pose"), "frame": "unknown"}, InputError, "options: both options and frame=..."),
+        ({"options": "pose"}, InputError, "options: found 'pose', expected a Options"),
+        ({"robot": None}, InputError, "robot: found None, expected a Robot, such as"),
+        ({"robot": "robot.yaml"}, InputError, "robot: found 'robot.yaml', expected a Robot, such as Robot.from_dh"),
+        ({"measurements": Q}, InputError, "measurements: found array.*expected a Measurements, such as"),
+        (
+            {"measurements": Measurements.from_arrays(Q[:, :3], position=np.zeros((4, 3)))},
+            InputError,
+            "measurements: readings of 3 joints, expected 4",
+        ),
+        (
+            {"measurements": Measurements.from_arrays(Q, position=np.zeros((4, 3)), source="mine")},
+            ProblemError,
+            "mine: no sigma for position",
+        ),
+    ],
+)
+def test_mistakes_are_named(wrong, error, message):
+    robot, m, _ = given("priors")
+    arguments = {"robot": robot, "measurements": m} | ({} if "options" in wrong else {"model": "position"}) | wrong
+    with pytest.raises(error, match=message):
+        calibrate(**arguments)
+
+
+def test_predictions_are_of_this_robot(found):
+    with pytest.raises(InputError, match=r"readings: shape \(4, 3\), expected \(n, 4\)"):
+        found["priors"].predict(Q[:, :3])
+    with pytest.raises(InputError, match="world: the measurement frame was not estimated"):
+        found["priors"].predict(Q, world=True)
+    with pytest.raises(InputError, match="world: found 'yes'"):
+        found["priors"].predict(Q, world="yes")
+    assert found["priors"].predict(Q[0]).position.shape == (1, 3)
