@@ -151,7 +151,7 @@ def test_public_names_come_from_a_fresh_import():
 
 def test_all_that_is_imported_is_installed_with_the_package():
     """What the tests need beside, such as yourdfpy, is not."""
-    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     installed = {re.match(r"[\w-]+", line)[0] for line in project["dependencies"]}
     installed = installed - {"pyyaml"} | {"yaml", "pydantic_core"}  # as imported; pydantic brings its core
     used = set()
