@@ -549,6 +549,7 @@ def test_noise_estimated_as_large_as_the_motions_is_no_noise(fg_calib, example):
     assert any("the noise estimated of orientation is" in text for text in json.loads(ended.out)["findings"])
 
 
+@pytest.mark.slow
 def test_lengths_that_tolerances_let_point_either_way_are_a_finding():
     """Stops at one point: every distance is some millimetres, as are the tolerances at the tool."""
     robot = small_arm(tolerance={"a": 3e-3, "d": 3e-3, "alpha": 3e-3, "theta": 3e-3})

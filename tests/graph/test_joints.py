@@ -283,6 +283,7 @@ def test_both_ways_agree_to_first_order(kind, model, options):
     assert apart[1] < max(0.05 * apart[0], 2e-3)
 
 
+@pytest.mark.slow
 def test_eliminated_joint_values_of_pairs_are_the_same_whichever_way_they_are_eliminated(monkeypatch):
     """Values, their sigmas, and those of the parameters: steps end 3e-5 sigma from the dense way at most."""
     robot, m = measured("direct", 12, seed=3)

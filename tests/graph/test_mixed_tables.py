@@ -100,6 +100,7 @@ def test_the_optimum_is_that_over_everything(sigma_joint):
     assert apart < (0.5 if sigma_joint else 1e-4)  # to first order the same
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shared", [True, False])
 def test_sigmas_are_honest(shared):
     """60 draws: the mean of NEES over its degrees of freedom, within five of its sigmas."""

@@ -98,6 +98,7 @@ def test_it_is_solved_to_the_optimum_over_everything(sigma_joint):
     assert [p.n for p in uncertainty.points] == [8, 8, 8]
 
 
+@pytest.mark.slow
 def test_sigmas_and_chi_square_are_honest():
     """40 draws: NEES and chi-square over their degrees of freedom, within five of their sigmas."""
     nees, fit, dof = 0.0, 0.0, 0

@@ -41,6 +41,7 @@ def write(folder, columns, job, pairs=None):
     return folder / "job.yaml"
 
 
+@pytest.mark.slow
 def test_lengths_from_a_chain_of_short_steps_are_as_good_as_their_sigmas(fg_calib, tmp_path):
     """Steps of 14 mm, points to 1 mm: as plain numbers, distances made both links 5 and 7 sigma too short or long."""
     q, squares = path(0.014), []

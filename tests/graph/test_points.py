@@ -423,6 +423,7 @@ def test_gnc_drops_wrong_touches_and_comes_near_the_clean_fit():
     assert np.max(np.abs(off[0] / by)) < 5.0 < np.max(np.abs(off[1] / by))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distances", [(), ((0, 1, 1e-4), (2, 3, 1e-4))])
 def test_estimated_joint_values_give_the_optimum_over_arm_points_and_joint_values(distances):
     robot, _, _, m = case(n_each=5, distances=distances)
