@@ -11,8 +11,8 @@ from pydantic import Field
 from fg_calib.errors import InputError
 from fg_calib.files.robot_yaml import FrameValues
 from fg_calib.files.schema import Count, Number, Positive, Schema, shown, validate
-from fg_calib.files.tables import LIMIT_SLACK
 from fg_calib.files.units import Units
+from fg_calib.measurements.checks import LIMIT_SLACK
 from fg_calib.robot.model import Robot
 from fg_calib.simulation.scenario import BoardViews, Placement
 

@@ -11,13 +11,11 @@ import numpy as np
 from fg_calib.errors import InputError
 from fg_calib.files.columns import Header, Table, unit_hint
 from fg_calib.files.units import Units
+from fg_calib.measurements.checks import ANGLE_SLACK
 from fg_calib.measurements.dataset import Booleans, Floats, Integers, Noise, Pairs
 
 if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it
     import polars as pl
-
-ANGLE_SLACK = 1e-5
-"""How far a rotation angle may exceed pi, [rad]: half a turn, rounded to six figures."""
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fg_calib.arrays import NORM_TOLERANCE
 from fg_calib.errors import InputError
 from fg_calib.files.columns import Header, Table, unit_hint
 from fg_calib.files.pairs import Configurations, read_pairs
 from fg_calib.files.units import Units
+from fg_calib.measurements.checks import LIMIT_SLACK
 from fg_calib.measurements.dataset import Booleans, Floats, Groups, Integers, Measurements, Noise, no_pairs
 from fg_calib.options import check_number, check_type
 from fg_calib.robot.model import Robot
@@ -34,12 +36,6 @@ if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need
     import polars as pl
 
 _log = logging.getLogger(__name__)
-
-LIMIT_SLACK = 1e-3
-"""How far a reading may be beyond its joint's limits, [rad] or [m]: encoders say so of a joint that stands at one."""
-
-NORM_TOLERANCE = 1e-3
-"""How far the norm of a quaternion may be from 1: more is not rounding."""
 
 _POSITION = ("x", "y", "z")
 _QUATERNION = ("qx", "qy", "qz", "qw")
