@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic_core import PydanticCustomError
 
+from fg_calib.arrays import NORM_TOLERANCE
 from fg_calib.errors import InputError
 from fg_calib.files.disk import read_text
 from fg_calib.files.schema import first_misfit
@@ -31,11 +33,43 @@ def _listed(value: object) -> object:
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 
+def _of_errors(matrix: tuple[tuple[float | None, ...], ...]) -> tuple[tuple[float | None, ...], ...]:
+    """The matrix, which must be one that errors can have; for what is None anything would do."""
+    expected = PydanticCustomError("covariance", "a symmetric matrix of variances and covariances of errors")
+    if any(len(row) != len(matrix) for row in matrix):
+        raise expected
+    C = np.array(matrix, float).reshape(len(matrix), len(matrix))
+    variance = C.diagonal()
+    with np.errstate(invalid="ignore"):
+        most = np.sqrt(np.outer(variance, variance))
+        if (variance < 0.0).any() or (np.abs(C - C.T) > ROUNDING * most).any():
+            raise expected
+        if (np.abs(C) > (1.0 + ROUNDING) * most).any():
+            raise expected
+    return matrix
+
+
+def _unit(quaternion: tuple[float, ...]) -> tuple[float, ...]:
+    if abs(math.hypot(*quaternion) - 1.0) > NORM_TOLERANCE:
+        raise PydanticCustomError("quaternion", "x y z w of length 1")
+    return quaternion
+
+
+ROUNDING = 1e-6
+"""How far a covariance may be from symmetric, in products of sigmas: a matrix summed in another order is not."""
+
 Figure = Annotated[float | None, BeforeValidator(_known)]
 """A number, None where it is unknown or infinite."""
 
+Sigma = Annotated[Annotated[float, Field(ge=0)] | None, BeforeValidator(_known)]
+"""A standard deviation, None where it is unknown or infinite."""
+
 Row = Annotated[tuple[Figure, ...], BeforeValidator(_listed)]
 Matrix = Annotated[tuple[Row, ...], BeforeValidator(_listed)]
+CovarianceMatrix = Annotated[Matrix, AfterValidator(_of_errors)]
+Sigmas = Annotated[tuple[Sigma, ...], BeforeValidator(_listed)]
+Position = Annotated[tuple[float, float, float], BeforeValidator(_listed)]
+Quaternion = Annotated[tuple[float, float, float, float], BeforeValidator(_listed), AfterValidator(_unit)]
 
 
 class Section(BaseModel):
@@ -179,18 +213,18 @@ class Parameter(Section):
     nominal: float
     estimate: float
     correction: float
-    sigma: Figure
-    prior_sigma: Figure
+    sigma: Sigma
+    prior_sigma: Sigma
     identifiability: str
     stands_for: dict[str, float] | None = None
-    sigma_of_combination: Figure = None
+    sigma_of_combination: Sigma = None
 
 
 class Covariance(Section):
     """Covariance of the errors of parameters."""
 
     names: tuple[str, ...]
-    matrix: Matrix
+    matrix: CovarianceMatrix
 
 
 class Posterior(Section):
@@ -201,7 +235,7 @@ class Posterior(Section):
     """
 
     variables: dict[str, tuple[str, ...]]
-    covariance: Matrix
+    covariance: CovarianceMatrix
     undetermined: Matrix
     undetermined_at_nominal: Matrix
 
@@ -209,16 +243,16 @@ class Posterior(Section):
 class Frame(Section):
     """The measurement frame world_T_base."""
 
-    xyz: Row
-    quaternion_xyzw: Row
-    sigma: Row
+    xyz: Position
+    quaternion_xyzw: Quaternion
+    sigma: Sigmas
 
 
 class JointScatter(Section):
     """How one joint's estimated values lie about its readings."""
 
     name: str
-    sigma: Figure
+    sigma: Sigma
     mean: Figure
     scatter: Figure
 
@@ -245,8 +279,8 @@ class TouchedPoint(Section):
 
     name: str
     n: int
-    xyz: Row
-    sigma: Row
+    xyz: Position
+    sigma: Sigmas
 
 
 class Rms(Section):

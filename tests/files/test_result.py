@@ -53,6 +53,12 @@ def changed(folder, change):
     return folder
 
 
+def enlarge_one_covariance(document):
+    """One that is above the product of its sigmas, on both sides of the diagonal."""
+    C = document["posterior"]["covariance"]
+    C[0][1] = C[1][0] = 2.0 * (C[0][0] * C[1][1]) ** 0.5
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_written_reads_back_the_same(calibrations, tmp_path, name):
     calibrations[name].save(tmp_path)
@@ -112,7 +118,39 @@ def test_version_1_is_readable_with_no_more_than_it_promised(folder):
         (lambda f: changed(f, lambda d: d.pop("dof")), "result.json: missing key 'dof'"),
         (lambda f: changed(f, lambda d: d["parameters"][2].pop("sigma")), "json: parameter 3: missing key 'sigma'"),
         (lambda f: changed(f, lambda d: d["parameters"][2].update(nominal=None)), "json: parameter 3: nominal: found"),
-        (lambda f: changed(f, lambda d: d["covariance"]["matrix"].pop()), "covariance: another size than its names"),
+        (lambda f: changed(f, lambda d: d["covariance"]["names"].pop()), "covariance: another size than its names"),
+        (
+            lambda f: changed(f, lambda d: d["covariance"]["matrix"].pop()),
+            "covariance: matrix: found .*, expected a sym",
+        ),
+        (
+            lambda f: changed(f, lambda d: d["covariance"]["matrix"][1].__setitem__(1, -1e-9)),
+            "covariance: matrix: found .*, expected a symmetric matrix of variances and covariances of errors",
+        ),
+        (
+            lambda f: changed(f, lambda d: d["posterior"]["covariance"][0].__setitem__(1, 1.0)),
+            "posterior: covariance: found .*, expected a symmetric matrix",
+        ),
+        (
+            lambda f: changed(f, enlarge_one_covariance),
+            "posterior: covariance: found .*, expected a symmetric matrix",
+        ),
+        (
+            lambda f: changed(f, lambda d: d["parameters"][2].update(sigma=-1e-4)),
+            "parameter 3: sigma: found -0.0001, expected a number not below 0",
+        ),
+        (
+            lambda f: changed(f, lambda d: d["frame_estimate"]["quaternion_xyzw"].pop()),
+            "frame_estimate: quaternion_xyzw: missing key 3",
+        ),
+        (
+            lambda f: changed(f, lambda d: d["frame_estimate"].update(quaternion_xyzw=[0, 0, 0, 2])),
+            r"frame_estimate: quaternion_xyzw: found .*, expected x y z w of length 1",
+        ),
+        (
+            lambda f: changed(f, lambda d: d["frame_estimate"].update(xyz=[0, None, 0])),
+            "frame_estimate: xyz 2: found nothing, expected a finite number",
+        ),
         (lambda f: (f / "robot_calibrated.yaml").unlink(), "neither robot_calibrated.yaml nor robot_calibrated.urdf"),
         (lambda f: changed(f, lambda d: d["parameters"].pop()), "robot_calibrated.yaml: other parameters than in"),
         (
@@ -124,7 +162,7 @@ def test_version_1_is_readable_with_no_more_than_it_promised(folder):
             "result.json: posterior: other variables than the robot",
         ),
         (
-            lambda f: changed(f, lambda d: d["posterior"]["covariance"][0].pop()),
+            lambda f: changed(f, lambda d: d["posterior"]["undetermined"].append([1.0])),
             "result.json: posterior: other variables than the robot",
         ),
     ],
