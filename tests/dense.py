@@ -64,11 +64,11 @@ class SeriesRows:
     """The rows of a series at some parameters, and how they follow from errors of configurations.
 
     Attributes:
-        r: Residuals, shape (n, height); those of the readings where joint values are estimated.
-        J: Their derivatives in all columns, shape (n, height, n_columns + n_nuisance).
-        sources: Derivatives times sigma by the error's name, shape (n, height, ends, errors), of the rows.
-        own, total: Covariance of what is a measurement's own, and of everything, shape (n, height, height).
-        bent: Variance beyond the first order, shape (n, height).
+        r: Residuals, shape (n, residual_dim); those of the readings where joint values are estimated.
+        J: Their derivatives in all columns, shape (n, residual_dim, n_columns + n_nuisance).
+        sources: Derivatives times sigma by the error's name, shape (n, residual_dim, ends, errors), of the rows.
+        own, total: Covariance of what is a measurement's own, and of everything, shape (n, residual_dim, residual_dim).
+        bent: Variance beyond the first order, shape (n, residual_dim).
     """
 
     def __init__(self, problem, parameters, number):
@@ -83,7 +83,7 @@ class SeriesRows:
         names = [name.split(".")[0] for name in s.kind.names]
         self.factors = np.array([state.factors.get((s.table, name), 1.0) for name in names])
         self.r = self._rows(self._ends(self._arm(self.q)))
-        trig, unit = precompute_trig(problem.robot, self.q), unit_whitening(s.n, s.kind.height)
+        trig, unit = precompute_trig(problem.robot, self.q), unit_whitening(s.n, s.kind.residual_dim)
         J = residuals.linearise(Block(s.kind, trig, s.ends, s.data, unit, self.points), self.chain)[1]
         self.J = np.zeros((*self.r.shape, at.n_columns + at.n_nuisance))
         self.J[:, :, : at.n_columns] = J[:, :, : at.n_columns]
@@ -109,7 +109,7 @@ class SeriesRows:
         of_joints = zero if estimated else np.sum(self.sources["joints"] ** 2, axis=(2, 3))
         trace, of_poses, poses = zero.copy(), zero, None
         if s.formed:
-            poses = np.zeros((s.n, s.kind.height, 2, 3 * s.kind.height))
+            poses = np.zeros((s.n, s.kind.residual_dim, 2, 3 * s.kind.residual_dim))
             for i, part in enumerate(parts_of(s.kind)):
                 move = self._moved if isinstance(part, Distance) else self._turned
                 sigma = m.sigma_position if isinstance(part, Distance) else m.sigma_orientation
@@ -138,8 +138,8 @@ class SeriesRows:
         self.bent = np.maximum(variance - first_order, 0.0)
         left = variance - slope**2 * (of_joints + of_poses)
         if s.formed:  # half of what is not linear is its poses', a quarter either one's
-            squares = np.zeros((s.n, s.kind.height, 2, s.kind.height))
-            for i in range(s.kind.height):
+            squares = np.zeros((s.n, s.kind.residual_dim, 2, s.kind.residual_dim))
+            for i in range(s.kind.residual_dim):
                 squares[:, i, :, i] = np.sqrt(self.bent[:, i, None] / 4.0)
             poses = poses * slope[:, :, None, None]
             self.sources[f"poses of {s.table}"] = np.concatenate([poses, squares], axis=3)
@@ -175,7 +175,7 @@ class SeriesRows:
         return np.hstack(rows)
 
     def _sensitivity(self, move, n):
-        """Derivative of all rows in moves of each end, shape (n, height, ends, n)."""
+        """Derivative of all rows in moves of each end, shape (n, residual_dim, ends, n)."""
         out = np.zeros((*self.r.shape, self.series.kind.ends, n))
         still = self._ends(self._arm(self.q))
         for k in range(n):
@@ -230,7 +230,7 @@ def dense(problem, parameters):
     names = {name: G.shape[3] for rows in every for name, G in rows.sources.items()}
     A, private, loadings, used = [], [], {name: [] for name in names}, []
     for i, rows in enumerate(every):
-        train, height = rows.series.train, rows.series.kind.height
+        train, residual_dim = rows.series.train, rows.series.kind.residual_dim
         ends = rows.place[rows.series.ends]
         shared = [name for name in rows.sources if name in reached and (reached[name][ends[train]] > 1).any()]
         if "joints" in rows.sources and problem.state.joint_errors is not None and "joints" not in shared:
@@ -238,7 +238,7 @@ def dense(problem, parameters):
         own = rows.own.copy()
         if shared and all(isinstance(part, Distance | RotationAngle) for part in parts_of(rows.series.kind)):
             of_each = sum(rows.sources[name].shape[3] for name in shared)
-            many = len(train) * height > len(np.unique(rows.series.ends[train])) * of_each
+            many = len(train) * residual_dim > len(np.unique(rows.series.ends[train])) * of_each
             if rows.series.formed and many and any(name != "joints" for name in shared):
                 own += rows._diagonal(0.5 * (REDUNDANT - 1.0) * rows.bent)
             diagonal = np.einsum("nii->ni", own)
@@ -247,16 +247,16 @@ def dense(problem, parameters):
         weights = problem.state.weights
         if weights is not None:
             own += (1.0 / weights[i] - 1.0)[:, None, None] * rows.total
-        A.append(np.concatenate([rows.J, rows.r[:, :, None]], axis=2)[train].reshape(len(train) * height, -1))
+        A.append(np.concatenate([rows.J, rows.r[:, :, None]], axis=2)[train].reshape(len(train) * residual_dim, -1))
         used.append(rows.series.used[train].ravel())
         private.append(own[train])
         for name, width in names.items():
-            L = np.zeros((len(train), height, n_configurations, width))
+            L = np.zeros((len(train), residual_dim, n_configurations, width))
             if name in rows.sources:
                 for k, measurement in enumerate(train):
                     for end in range(rows.series.kind.ends):
                         L[k, :, ends[measurement, end]] += rows.sources[name][measurement, :, end]
-            loadings[name].append(L.reshape(len(train) * height, n_configurations, width))
+            loadings[name].append(L.reshape(len(train) * residual_dim, n_configurations, width))
     used = np.concatenate(used)
     C = np.zeros((len(used), len(used)))
     first = 0

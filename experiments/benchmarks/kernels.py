@@ -61,10 +61,10 @@ def ways(name: str, chain: Chain, n: int, seed: int) -> tuple[Callable[[], Any],
         given = (trig, a, b, block.data, W, *wanted)
     else:
         kind = stack(*compress((Orientation(), Position()), wanted))
-        W = np.tril(rng.normal(size=(n, kind.height, kind.height)))
+        W = np.tril(rng.normal(size=(n, kind.residual_dim, kind.residual_dim)))
         packed, data = pack(W), np.concatenate(list(compress((R.reshape(n, 9), p), wanted)), axis=1)
         given, special = (trig, a, R, p, W, *wanted), special_kernels.fill_poses
-    panels = np.zeros((2, arrays.n_columns + ends.shape[1] * arrays.n_own + 1, kind.height, CHUNK))
+    panels = np.zeros((2, arrays.n_columns + ends.shape[1] * arrays.n_own + 1, kind.residual_dim, CHUNK))
     twins, nothing = kind.twins(), np.zeros((3, 0))
 
     def by_special() -> Any:

@@ -548,12 +548,12 @@ class _Rows:
         for number, noise in enumerate(self._noises if self._robust else ()):
             mine = np.flatnonzero(table.series[rows] == number)
             measurement = table.measurement[rows[mine]]
-            e, height = noise.lengths()
+            e, residual_dim = noise.lengths()
             n = len(e)
             count = np.maximum(np.bincount(measurement, minlength=n), 1)
             more = np.bincount(measurement, np.nan_to_num(self.leverage[rows[mine]]), n) / count
             loss = self._problem.options.loss
-            c = np.array([tuning(loss, max(h, 1)) for h in range(height.max(initial=0) + 1)])[height]
+            c = np.array([tuning(loss, max(h, 1)) for h in range(residual_dim.max(initial=0) + 1)])[residual_dim]
             out[mine] = weight(loss, e / np.sqrt(np.maximum(1.0 + more, LEAST_VARIANCE)), c)[measurement]
         return out
 
@@ -569,7 +569,7 @@ class _Rows:
                 chunk = np.arange(start, min(start + _CHUNK, noise.rows.n))
                 first, last = np.searchsorted(table.measurement[of_series], (start, start + len(chunk)))
                 rows = of_series[first:last]
-                grid = (table.measurement[rows] - start) * noise.rows.height + table.row[rows]
+                grid = (table.measurement[rows] - start) * noise.rows.residual_dim + table.row[rows]
                 found = nuisances.errors(number, chunk).at(grid).over(table.sigma[rows])
                 leverage = np.einsum("ij,ij->i", found.J @ self._spread.tangent, found.J)
                 leverage[table.test[rows]] = self._spread.variance(found.J[table.test[rows]])
@@ -655,7 +655,7 @@ class _Nuisances:
             self._follow[there], self._inverse[there] = left.follow[of_nuisance], left.inverse[of_nuisance]
         series = problem.data.series
         self._apart = [says_where(problem.data, s) & ~there[s.nuisances].any(axis=1) for s in series]
-        reserved = [s.n * s.kind.height * of.any() for s, of in zip(series, self._apart, strict=True)]
+        reserved = [s.n * s.kind.residual_dim * of.any() for s, of in zip(series, self._apart, strict=True)]
         self._first = self._columns.n_errors + np.cumsum([0, *reserved])
         self._averaged = scipy.sparse.csr_array((n, int(self._first[-1])))
         for number, of in enumerate(self._apart):
@@ -674,25 +674,25 @@ class _Nuisances:
         return replace(known, J=known.J + N @ self._follow, own=N @ self._inverse, L=known.L + N @ self._averaged)
 
     def _nuisances_known(self, number: int, rows: Integers) -> tuple[_Errors, Loadings]:
-        """The same if nuisances were known; derivatives in these, sparse, shape (n height, n_coordinates).
+        """The same if nuisances were known; derivatives in these, sparse, shape (n residual_dim, n_coordinates).
 
         The noise of touches whose mean a point is stands among L, after the errors of configurations.
         """
         noise, width = self._noises[number], int(self._first[-1])
         J = residuals.linearise(noise.rows_at(rows), self._at.chains[noise.series.table])[1]
-        n, height = J.shape[:2]
-        of_core, in_nuisances = J[:, :, : self._n].reshape(n * height, -1), J[:, :, self._n :]
-        row = np.broadcast_to(np.arange(n * height).reshape(n, height, 1), in_nuisances.shape).ravel()
+        n, residual_dim = J.shape[:2]
+        of_core, in_nuisances = J[:, :, : self._n].reshape(n * residual_dim, -1), J[:, :, self._n :]
+        row = np.broadcast_to(np.arange(n * residual_dim).reshape(n, residual_dim, 1), in_nuisances.shape).ravel()
         place = np.broadcast_to(noise.series.nuisances[rows][:, None], in_nuisances.shape).ravel()
-        N = scipy.sparse.csr_array((in_nuisances.ravel(), (row, place)), shape=(n * height, len(self._follow)))
+        N = scipy.sparse.csr_array((in_nuisances.ravel(), (row, place)), shape=(n * residual_dim, len(self._follow)))
         private = np.maximum(np.einsum("nii->ni", noise.own[rows]), 0.0).ravel()
-        apart = np.flatnonzero(np.repeat(self._apart[number][rows], height))
-        column = self._first[number] + (rows[:, None] * height + np.arange(height)).ravel()[apart]
-        own = scipy.sparse.csr_array((np.sqrt(private[apart]), (apart, column)), shape=(n * height, width))
+        apart = np.flatnonzero(np.repeat(self._apart[number][rows], residual_dim))
+        column = self._first[number] + (rows[:, None] * residual_dim + np.arange(residual_dim)).ravel()[apart]
+        own = scipy.sparse.csr_array((np.sqrt(private[apart]), (apart, column)), shape=(n * residual_dim, width))
         private[apart] = 0.0
         L = self._columns.loading(noise, rows)
         L = scipy.sparse.csr_array((L.data, L.indices, L.indptr), shape=own.shape) + own
-        return _Errors(of_core, np.zeros((n * height, 0)), private, L), N
+        return _Errors(of_core, np.zeros((n * residual_dim, 0)), private, L), N
 
 
 class _LowRank:

@@ -18,7 +18,7 @@ from fg_calib.analysis.conventions import MissingMotion, missing_motions
 from fg_calib.analysis.reasons import LostDirection, explain
 from fg_calib.errors import ProblemError
 from fg_calib.graph.build import STRUCTURAL_FLOOR, predicted_problem, random_problem
-from fg_calib.graph.information import observe
+from fg_calib.graph.information import observability_of
 from fg_calib.graph.observability import SIGNAL_FLOOR, Observability
 from fg_calib.graph.problem import Problem
 from fg_calib.measurements.dataset import Measurements
@@ -93,7 +93,7 @@ def observe_structure(
         problem = random_problem(
             robot.with_estimated(names), model, frame, n_configurations=n_configurations, seed=seed
         )
-        return identify(problem, problem.start, "structural", prefer)
+        return identifiability_of(problem, problem.start, "structural", prefer)
 
     whole = look(names_of(everything))
     fixed = tuple(p.name for p in everything if not p.estimated)
@@ -145,10 +145,10 @@ def observe_configurations(
     )
     if not problem.rows:
         raise ProblemError(measurements.source, "no row takes part", "configurations that differ")
-    return identify(problem, problem.start, "practical", prefer)
+    return identifiability_of(problem, problem.start, "practical", prefer)
 
 
-def identify(
+def identifiability_of(
     problem: Problem,
     parameters: Floats,
     kind: Literal["structural", "practical"],
@@ -156,7 +156,7 @@ def identify(
 ) -> Identifiability:
     """What the train rows of a problem, without priors, determine around a parameter vector."""
     floor = STRUCTURAL_FLOOR if kind == "structural" else SIGNAL_FLOOR
-    observability = observe(problem, parameters, prefer, floor)
+    observability = observability_of(problem, parameters, prefer, floor)
     return Identifiability(
         robot=problem.robot.name,
         model=problem.options.model,

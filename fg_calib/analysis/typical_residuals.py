@@ -252,8 +252,8 @@ def _typical(
         kind: Of the measurements.
         unit: Of the lengths.
         length: Of each residual.
-        moved: What each parameter's 1 sigma does to it, shape (n, height, m).
-        sigma: Of the noise, shape (n, height); None for none.
+        moved: What each parameter's 1 sigma does to it, shape (n, residual_dim, m).
+        sigma: Of the noise, shape (n, residual_dim); None for none.
         motion: How far the arm moves.
     """
     variance = np.sum(moved**2, axis=(1, 2)) + (0.0 if sigma is None else np.sum(sigma**2, axis=1))

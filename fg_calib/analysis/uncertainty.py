@@ -16,7 +16,7 @@ from fg_calib.analysis.conventions import MissingMotion
 from fg_calib.analysis.corrections import PriorFit, judge_priors
 from fg_calib.analysis.covariance import Spread, spread_of, with_left_out
 from fg_calib.analysis.goodness import OUTLIER_WEIGHT, Goodness, judge_fit
-from fg_calib.analysis.identifiability import Identifiability, identify
+from fg_calib.analysis.identifiability import Identifiability, identifiability_of
 from fg_calib.analysis.joint_values import JointValues, joint_values
 from fg_calib.analysis.mistakes import SetupCheck, check_problem
 from fg_calib.analysis.residual_table import ResidualTable, residual_table
@@ -288,7 +288,7 @@ def _assess(solution: Solution) -> Uncertainty:
     variables = problem.variables
     spread = spread_of(solution)
     whole = with_left_out(solution, spread)
-    identified = identify(problem.whole or problem, solution.before, "practical")
+    identifiability = identifiability_of(problem.whole or problem, solution.before, "practical")
     covariance = whole.named()
     frames = _frame_estimates(solution, whole)
     chi2, n_rows, loss_factor = _weighted_chi2(solution)
@@ -311,7 +311,7 @@ def _assess(solution: Solution) -> Uncertainty:
     ]
     doubts = tuple(s.text for s in statements if s.finding)
     too_large = {fit.verdict for fit in goodness.kinds} & {"too small", "both"}
-    asked = not evaluated and (too_large or (identified.missing and solution.estimated_noise))
+    asked = not evaluated and (too_large or (identifiability.missing and solution.estimated_noise))
     noise_like = probability_of_noise(solution) if asked else None
     follow = noise_like is not None and noise_like < LIKE_NOISE
     estimated = max((fit.factor for fit in goodness.kinds), default=1.0) > MOST_ESTIMATED
@@ -319,11 +319,11 @@ def _assess(solution: Solution) -> Uncertainty:
     if not evaluated:
         setup = check_problem(problem, solution.before, doubtful=bool(doubts) or estimated)
     fits = not doubts and solution.estimated_noise is None
-    findings, cautions = _of_model(setup, identified.missing, fits=fits, high=chi2 > bounds[1] * dof or follow)
+    findings, cautions = _of_model(setup, identifiability.missing, fits=fits, high=chi2 > bounds[1] * dof or follow)
     return Uncertainty(
         names=whole.variables.names[: whole.variables.n_robot_columns],
         covariance=covariance,
-        parameters=_parameter_estimates(solution, np.sqrt(np.diag(covariance)), spread, identified.observability),
+        parameters=_parameter_estimates(solution, np.sqrt(np.diag(covariance)), spread, identifiability.observability),
         frame=frames[0] if frames else None,
         frames=frames,
         chi2=chi2,
@@ -335,7 +335,7 @@ def _assess(solution: Solution) -> Uncertainty:
         goodness=goodness,
         priors=priors,
         expected_error=None if evaluated else expected_error(solution, whole),
-        identifiability=identified,
+        identifiability=identifiability,
         robot=problem.robot.with_values(solution.parameters[variables.robot_span]),
         spread=spread,
         whole=whole,
@@ -359,12 +359,12 @@ def _weighted_chi2(solution: Solution) -> tuple[float, int, float]:
         return chi2, problem.n_independent, 1.0
     n_rows = n_kept = expected = 0.0
     distances = mahalanobis_distances(problem, solution.parameters)
-    for series, w, (e, height) in zip(problem.data.series, weights, distances, strict=True):
-        train, outlier = (height > 0) & ~series.test, w < OUTLIER_WEIGHT
+    for series, w, (e, residual_dim) in zip(problem.data.series, weights, distances, strict=True):
+        train, outlier = (residual_dim > 0) & ~series.test, w < OUTLIER_WEIGHT
         chi2 -= float(np.sum(w[train & outlier] * e[train & outlier] ** 2))
-        kept = float(height[train & ~outlier].sum())
-        n_rows, n_kept = n_rows + float(height[train].sum()), n_kept + kept
-        expected += kept * effect(problem.options.loss, int(height.max(initial=1))).chi2
+        kept = float(residual_dim[train & ~outlier].sum())
+        n_rows, n_kept = n_rows + float(residual_dim[train].sum()), n_kept + kept
+        expected += kept * effect(problem.options.loss, int(residual_dim.max(initial=1))).chi2
     of_loss = expected / n_kept if n_kept else 1.0
     return max(0.0, chi2), round(problem.n_independent * n_kept / max(n_rows, 1.0)), of_loss
 
@@ -381,7 +381,7 @@ def _independent_dof(problem: Problem, dof: int, rank: int) -> int:
     """Degrees of freedom of the noise behind the residuals: pairs hold no more than the poses they come from."""
     if not (problem.formed and problem.missing_correlation) or len(problem.data.series) > 1:
         return dof
-    each = 3 * problem.data.series[0].kind.height
+    each = 3 * problem.data.series[0].kind.residual_dim
     return min(dof, each * (problem.n_configurations - 1) + problem.n_priors - rank)
 
 

@@ -31,8 +31,8 @@ class Rows:
     Attributes:
         model: Which measurements take part.
         block: The measurements.
-        use: Which of their scalars take part, shape (n, height).
-        variance: Of the measurement noise, shape (n, height), [m^2] and [rad^2]; any number where not used.
+        use: Which of their scalars take part, shape (n, residual_dim).
+        variance: Of the measurement noise, shape (n, residual_dim), [m^2] and [rad^2]; any number where not used.
     """
 
     model: Model
@@ -90,8 +90,8 @@ def _pose_rows(trig: Floats, measurements: Measurements, model: Model, weighted:
     kind = stack(*compress((Orientation(), Position()), kinds))
     wanted_values = [values for values, _, _ in compress(given, kinds) if values is not None]
     data = [values[train].reshape(n, int(np.prod(values.shape[1:]))) for values in wanted_values]
-    block = Block(kind, trig, train[:, None], np.concatenate(data, axis=1), unit_whitening(n, kind.height))
-    return Rows(model, block, np.ones((n, kind.height), dtype=np.bool_), np.concatenate(variance, axis=1))
+    block = Block(kind, trig, train[:, None], np.concatenate(data, axis=1), unit_whitening(n, kind.residual_dim))
+    return Rows(model, block, np.ones((n, kind.residual_dim), dtype=np.bool_), np.concatenate(variance, axis=1))
 
 
 def without_kinks(rows: Rows, chain: Chain) -> Rows:
@@ -114,17 +114,17 @@ def evaluate(rows: Rows, chain: Chain, whitening: Floats | None) -> tuple[Floats
 
 
 def whitening_of(rows: Rows, chain: Chain, sigma_joint: Floats) -> Floats:
-    """W with W S W^T = 1 of each measurement, lower triangular, shape (n, height, height).
+    """W with W S W^T = 1 of each measurement, lower triangular, shape (n, residual_dim, residual_dim).
 
     S has the variances of the measurement and what the readings' noise adds to first order; a scalar that takes no part
     has unit variance and no correlation with the others.
     """
-    S = rows.variance[:, :, None] * np.eye(rows.block.height)
+    S = rows.variance[:, :, None] * np.eye(rows.block.residual_dim)
     if np.any(sigma_joint > 0.0):
         J = residuals.linearise(rows.block, chain.without_columns().with_joint_columns())[1]
-        J = J * np.tile(sigma_joint, rows.block.kind.ends)  # (n, height, n_own)
+        J = J * np.tile(sigma_joint, rows.block.kind.ends)  # (n, residual_dim, n_own)
         S = S + J @ np.swapaxes(J, 1, 2)
-    S = np.where(rows.use[:, :, None] & rows.use[:, None, :], S, np.eye(rows.block.height))
+    S = np.where(rows.use[:, :, None] & rows.use[:, None, :], S, np.eye(rows.block.residual_dim))
     try:
         W: Floats = np.tril(np.linalg.inv(np.linalg.cholesky(S)))
     except np.linalg.LinAlgError:

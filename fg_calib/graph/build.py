@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fg_calib.errors import ProblemError
 from fg_calib.graph.factors import Variables, prior_rows
-from fg_calib.graph.information import observe, whitened_triangle
+from fg_calib.graph.information import observability_of, whitened_triangle
 from fg_calib.graph.observability import determined, singular_values
 from fg_calib.graph.problem import Problem, problem_at, tables_of, variables_of
 from fg_calib.graph.start import start_of
@@ -106,7 +106,7 @@ def _kept(problem: Problem, prefer: Sequence[str]) -> list[str]:
     At a pitch of a quarter turn yaw and roll of a frame are relative for want of coordinates, not of data: a frame that
     lacks nothing else is kept whole, as a pose.
     """
-    kept = observe(problem, problem.start, prefer).kept
+    kept = observability_of(problem, problem.start, prefer).kept
     for v in problem.variables.items:
         if v.kind in ("base", "tool") and abs(np.cos(problem.start[v.parameters[4]])) < QUARTER_TURN:
             lacking = set(problem.variables.names[v.columns]).difference(kept)

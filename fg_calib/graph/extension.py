@@ -122,10 +122,10 @@ def expand(problem: Problem) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     for rows in problem.rows:
         first = 0
         for part in rows.parts:
-            height = part.block.height
+            residual_dim = part.block.residual_dim
             for k in range(part.block.n):
-                place = first + k * height
-                L = None if rows.shared is None else rows.shared.loadings[place : place + height]
+                place = first + k * residual_dim
+                L = None if rows.shared is None else rows.shared.loadings[place : place + residual_dim]
                 graph.add(_measurement_factor(problem, rows, part.only(k), L))
             first += part.n_rows
         width = 0 if rows.shared is None else rows.shared.width

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.graph.factors import Eliminated, dense, eliminate
-from fg_calib.graph.observability import RANK_TOLERANCE, SIGNAL_FLOOR, Observability, analyse
+from fg_calib.graph.observability import RANK_TOLERANCE, SIGNAL_FLOOR, Observability, observability_of_rows
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.robust import effect
 from fg_calib.graph.rows import RowSet, correlation_of
@@ -36,7 +36,7 @@ def eliminated(problem: Problem, parameters: Floats, *, with_loss: bool = False)
 
 
 def _variance_of_loss(problem: Problem, rows: RowSet) -> float:
-    heights = [part.block.height for part in rows.parts for _ in range(part.n_rows)]
+    heights = [part.block.residual_dim for part in rows.parts for _ in range(part.n_rows)]
     return effect(problem.options.loss, max(set(heights), key=heights.count)).variance
 
 
@@ -80,7 +80,7 @@ def named_triangle(problem: Problem, parameters: Floats) -> Floats:
     return out
 
 
-def observe(
+def observability_of(
     problem: Problem, parameters: Floats, prefer: Sequence[str] = (), floor: float = SIGNAL_FLOOR
 ) -> Observability:
     """What the train rows, without priors, determine of the robot's parameters around a parameter vector.
@@ -91,7 +91,7 @@ def observe(
         prefer: Parameters to keep, first choice first, where only combinations are determined.
         floor: Signal-to-noise ratio below which a direction counts as not determined.
     """
-    return analyse(
+    return observability_of_rows(
         named_triangle(problem, parameters),
         problem.estimated,
         scales=np.array([problem.robot.scale_of(p.unit) for p in problem.estimated]),

@@ -77,7 +77,7 @@ class Source(NamedTuple):
     Attributes:
         name: `joints`, or `poses` of a table.
         ends: Configuration of each end, among those of all tables, shape (n, ends).
-        loading: The rows per error of each end, shape (n, height, ends, width).
+        loading: The rows per error of each end, shape (n, residual_dim, ends, width).
     """
 
     name: str
@@ -86,9 +86,9 @@ class Source(NamedTuple):
 
     @property
     def variance(self) -> Floats:
-        """What the source adds to the covariance of each measurement's rows, shape (n, height, height)."""
-        n, height = self.loading.shape[:2]
-        flat = self.loading.reshape(n, height, -1)
+        """What the source adds to the covariance of each measurement's rows, shape (n, residual_dim, residual_dim)."""
+        n, residual_dim = self.loading.shape[:2]
+        flat = self.loading.reshape(n, residual_dim, -1)
         out: Floats = flat @ np.swapaxes(flat, 1, 2)
         return out
 
@@ -129,9 +129,9 @@ class RowNoise:
 
     Attributes:
         rows: All its rows, not whitened, in [m] and [rad].
-        own: Covariance of what is each measurement's alone, shape (n, height, height).
+        own: Covariance of what is each measurement's alone, shape (n, residual_dim, residual_dim).
         sources: What errors of configurations add to it.
-        excess: What noise adds to the measured values on average, shape (n, height), [m] and [rad].
+        excess: What noise adds to the measured values on average, shape (n, residual_dim), [m] and [rad].
     """
 
     def __init__(self, series: Series, place: Place, state: NoiseState) -> None:
@@ -139,7 +139,7 @@ class RowNoise:
         self.place = place
         families = [name.partition(".")[0] for name in series.kind.names]
         self.factors: Floats = np.array([state.factors.get((series.table, family), 1.0) for family in families])
-        self.excess: Floats = np.zeros((series.n, series.kind.height))
+        self.excess: Floats = np.zeros((series.n, series.kind.residual_dim))
         self._prepare(state)
 
     def _prepare(self, state: NoiseState) -> None:
@@ -149,18 +149,18 @@ class RowNoise:
 
     @cached_property
     def total(self) -> Floats:
-        """Covariance of each measurement's rows, all noise together, shape (n, height, height)."""
+        """Covariance of each measurement's rows, all noise together, shape (n, residual_dim, residual_dim)."""
         out: Floats = self.own + sum(source.variance for source in self.sources)
         return out
 
     @property
     def sigma(self) -> Floats:
-        """1 sigma of each row, all noise together, shape (n, height), [m] and [rad]."""
+        """1 sigma of each row, all noise together, shape (n, residual_dim), [m] and [rad]."""
         out: Floats = np.sqrt(np.einsum("nii->ni", self.total))
         return out
 
     def residual(self) -> Floats:
-        """Of all rows, shape (n, height), [m] and [rad]."""
+        """Of all rows, shape (n, residual_dim), [m] and [rad]."""
         return residuals.residual(self.rows, self.place.chain)
 
     def lengths(self) -> tuple[Floats, Integers]:
@@ -192,7 +192,7 @@ class RowNoise:
 
     def _block(self, data: Floats, slope: Floats | None = None) -> Block:
         s, p = self.series, self.place
-        unit = np.tile(np.eye(s.kind.height), (s.n, 1, 1)) if slope is None else self._diagonal(slope)
+        unit = np.tile(np.eye(s.kind.residual_dim), (s.n, 1, 1)) if slope is None else self._diagonal(slope)
         return Block(s.kind, p.trig, s.ends, data, pack(unit), p.coordinates[s.nuisances])
 
     def _of_joints(self, rows: Block) -> tuple[Source, ...]:
@@ -201,13 +201,13 @@ class RowNoise:
             return ()
         chain = p.chain.without_columns().with_joint_columns()
         J = residuals.linearise(rows, chain)[1][:, :, : s.kind.ends * p.chain.n_joints]
-        J = J.reshape(s.n, s.kind.height, s.kind.ends, -1)[..., p.joints]
+        J = J.reshape(s.n, s.kind.residual_dim, s.kind.ends, -1)[..., p.joints]
         loading = J * p.measurements.sigma_joint[p.joints] * self.factors[:, None, None]
         return (Source("joints", p.configurations[s.ends], np.ascontiguousarray(loading)),)
 
     @staticmethod
     def _diagonal(values: Floats) -> Floats:
-        """Diagonal matrices, shape (n, height, height)."""
+        """Diagonal matrices, shape (n, residual_dim, residual_dim)."""
         out: Floats = values[:, :, None] * np.eye(values.shape[1])
         return out
 
@@ -261,7 +261,7 @@ class PairNoise(RowNoise):
         if not s.formed or not any(source.name != "joints" for source in sources):
             return 0.0
         n_errors = len(np.unique(s.ends[s.train])) * sum(source.loading.shape[3] for source in sources)
-        n_rows = len(s.train) * s.kind.height
+        n_rows = len(s.train) * s.kind.residual_dim
         return 0.5 * (REDUNDANT - 1.0) * self._bent_variance if n_rows > n_errors else 0.0
 
     def least(self) -> Floats | float:
@@ -277,7 +277,7 @@ class PairNoise(RowNoise):
         return out
 
     def bent_by(self, spread: Floats, sigmas: float) -> Booleans:
-        """Which rows some uncertainty of the parameters bends by so many sigma, shape (n, height).
+        """Which rows some uncertainty of the parameters bends by so many sigma, shape (n, residual_dim).
 
         Args:
             spread: A square root of the parameters' covariance, shape (n_columns, k).
@@ -287,7 +287,7 @@ class PairNoise(RowNoise):
         return bent
 
     def may_fold(self, spread: Floats) -> Booleans:
-        """Which rows some uncertainty of the parameters may fold, shape (n, height).
+        """Which rows some uncertainty of the parameters may fold, shape (n, residual_dim).
 
         Half the way to 0, or of an angle to half a turn, is then less than that uncertainty (and this more than the
         noise): the vector may as well point the other way, and a descent may end with the wrong one.
@@ -325,7 +325,7 @@ class PairNoise(RowNoise):
         return out
 
     def _diagonals(self, sources: tuple[Source, ...]) -> Floats:
-        zero = np.zeros((self.series.n, self.series.kind.height))
+        zero = np.zeros((self.series.n, self.series.kind.residual_dim))
         return sum((np.einsum("nii->ni", source.variance) for source in sources), zero)
 
     def _moments(self, of_joints: Floats) -> Moments:
@@ -479,16 +479,16 @@ def whitening_of(covariance: Floats, used: Booleans) -> Floats:
     """W with W S W^T = 1 for the rows in use of each of many small covariances, lower triangular; zero for the others.
 
     Args:
-        covariance: S, shape (n, height, height).
-        used: Shape (n, height).
+        covariance: S, shape (n, residual_dim, residual_dim).
+        used: Shape (n, residual_dim).
     """
-    height = used.shape[1]
-    if height == 1:
+    residual_dim = used.shape[1]
+    if residual_dim == 1:
         with np.errstate(divide="ignore"):
             return np.where(used[:, :, None], 1.0 / np.sqrt(covariance), 0.0)
     if not used.all():
         both = used[:, :, None] & used[:, None, :]
-        covariance = np.where(both, covariance, np.eye(height))
+        covariance = np.where(both, covariance, np.eye(residual_dim))
     W: Floats = np.tril(np.linalg.inv(np.linalg.cholesky(covariance)))
     return W if used.all() else W * used[:, :, None]
 

@@ -149,7 +149,7 @@ class Observability(FrozenArrays):
         return alone + tuple(relation for group in self.relative for relation in group.relations)
 
 
-def analyse(
+def observability_of_rows(
     jacobian: Floats,
     parameters: Sequence[Parameter],
     *,

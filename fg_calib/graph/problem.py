@@ -257,10 +257,10 @@ def at_parameters(problem: Problem, parameters: Floats, trigs: Sequence[Floats] 
     if np.all(at.columns >= 0):
         return at
     trigs = trigs or [precompute_trig(problem.robot, t.measurements.readings) for t in problem.data.tables]
-    return problem.variables.at(parameters, means_of_touches(problem.data, at.chains, trigs))
+    return problem.variables.at(parameters, contact_points(problem.data, at.chains, trigs))
 
 
-def means_of_touches(data: Dataset, chains: Sequence[Chain], trigs: Sequence[Floats]) -> Floats:
+def contact_points(data: Dataset, chains: Sequence[Chain], trigs: Sequence[Floats]) -> Floats:
     """Of each unknown coordinate of a touched point the mean of what touched it, of others the start as given."""
     found: Floats = np.concatenate([np.zeros(0), *data.unknowns.starts])
     for s in data.series:

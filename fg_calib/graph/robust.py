@@ -78,17 +78,17 @@ def weight(loss: Loss, e: Floats, c: Floats | float) -> Floats:
 
 
 @cache
-def tuning(loss: Loss, height: int) -> float:
-    """The constant c of a loss for measurements of `height` rows; infinite for `none`."""
+def tuning(loss: Loss, dim: int) -> float:
+    """The constant c of a loss for measurements of `dim` rows; infinite for `none`."""
     if loss == "none":
         return np.inf
     if loss == "gnc":
-        return float(np.sqrt(2.0 * special.gammaincinv(height / 2.0, INLIERS)))
+        return float(np.sqrt(2.0 * special.gammaincinv(dim / 2.0, INLIERS)))
 
     from scipy import optimize  # here, for it takes as long to import as a small calibration
 
     def excess(c: float) -> float:
-        _, squared, slope = _moments(loss, c, height)
+        _, squared, slope = _moments(loss, c, dim)
         return float(slope**2 / squared) - EFFICIENCY
 
     return float(optimize.brentq(excess, 0.2, 50.0))
@@ -108,22 +108,22 @@ class Effect:
 
 
 @cache
-def effect(loss: Loss, height: int) -> Effect:
-    """What a loss does to clean Gaussian measurements of `height` rows."""
+def effect(loss: Loss, dim: int) -> Effect:
+    """What a loss does to clean Gaussian measurements of `dim` rows."""
     if loss == "none":
         return Effect(1.0, 1.0)
-    c = tuning(loss, height)
-    mean, squared, slope = _moments(loss, c, height)
+    c = tuning(loss, dim)
+    mean, squared, slope = _moments(loss, c, dim)
     end = HALF_WEIGHT[loss] * c
 
     def terms(e: Floats) -> Floats:
         return np.stack([np.ones_like(e), weight(loss, e, c) * e**2])
 
-    kept, chi2 = _means(terms, height, (0.0, min(c, end), end))
-    return Effect(float(mean * squared / slope**2), float(chi2 / (height * kept)))
+    kept, chi2 = _means(terms, dim, (0.0, min(c, end), end))
+    return Effect(float(mean * squared / slope**2), float(chi2 / (dim * kept)))
 
 
-def _moments(loss: Loss, c: float, height: int) -> Floats:
+def _moments(loss: Loss, c: float, dim: int) -> Floats:
     """Means of the weight w, of psi^2 / h and of the slope div(psi) / h of psi = w r, over clean residuals r.
 
     By parts the mean of div(psi) is that of r . psi.
@@ -131,18 +131,18 @@ def _moments(loss: Loss, c: float, height: int) -> Floats:
 
     def terms(e: Floats) -> Floats:
         w = weight(loss, e, c)
-        return np.stack([w, w**2 * e**2 / height, w * e**2 / height])
+        return np.stack([w, w**2 * e**2 / dim, w * e**2 / dim])
 
-    return _means(terms, height, (0.0, c, max(c, np.sqrt(height)) + 12.0))
+    return _means(terms, dim, (0.0, c, max(c, np.sqrt(dim)) + 12.0))
 
 
-def _means(terms: Callable[[Floats], Floats], height: int, ends: tuple[float, ...]) -> Floats:
+def _means(terms: Callable[[Floats], Floats], dim: int, ends: tuple[float, ...]) -> Floats:
     """Integrals over the chi density from the first end to the last, smooth in between, shape (n_terms,)."""
     x, w = np.polynomial.legendre.leggauss(100)
     total = np.zeros(())
     for low, high in pairwise(ends):
         e = low + (high - low) * (x + 1.0) / 2.0
-        density = e ** (height - 1) * np.exp(-(e**2) / 2.0) / (2.0 ** (height / 2 - 1) * special.gamma(height / 2))
+        density = e ** (dim - 1) * np.exp(-(e**2) / 2.0) / (2.0 ** (dim / 2 - 1) * special.gamma(dim / 2))
         total = total + terms(e) @ (w * density) * (high - low) / 2.0
     return total
 
@@ -158,15 +158,15 @@ class Weighting:
         self._loss = loss
         self._mu: float | None = None  # of gnc: from near 0, convex, upwards
 
-    def update(self, e: Floats, height: NDArray[np.int64]) -> tuple[Floats, bool]:
+    def update(self, e: Floats, residual_dim: NDArray[np.int64]) -> tuple[Floats, bool]:
         """Weights by the residuals of the last solution, and whether the loss has its final form.
 
         Args:
             e: Length of each measurement's whitened residual, shape (n,).
-            height: Its number of rows, shape (n,); 0 for one that takes no part.
+            residual_dim: Its number of rows, shape (n,); 0 for one that takes no part.
         """
-        c = np.array([tuning(self._loss, max(h, 1)) for h in range(height.max(initial=0) + 1)])[height]
-        e = np.where(height > 0, e, 0.0)  # what takes no part keeps its weight
+        c = np.array([tuning(self._loss, max(h, 1)) for h in range(residual_dim.max(initial=0) + 1)])[residual_dim]
+        e = np.where(residual_dim > 0, e, 0.0)  # what takes no part keeps its weight
         if self._loss != "gnc":
             return weight(self._loss, e, c), True
         ratio = (e / c) ** 2  # in units of what is still taken for clean

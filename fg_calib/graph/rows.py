@@ -64,7 +64,7 @@ class Part:
         block: The rows.
         table: Which table they are from.
         nuisances: Nuisance coordinates of each measurement, shape (n, kind.n_nuisances).
-        offset: Taken from the whitened residuals before anything else, shape (n, height); None for zero.
+        offset: Taken from the whitened residuals before anything else, shape (n, residual_dim); None for zero.
     """
 
     block: Block
@@ -75,7 +75,7 @@ class Part:
     @property
     def n_rows(self) -> int:
         """Number of scalar rows."""
-        return self.block.n * self.block.height
+        return self.block.n * self.block.residual_dim
 
     def only(self, k: int) -> Part:
         """One of its measurements."""
@@ -111,7 +111,7 @@ class Part:
 
 
 def _scatter(out: Floats, N: Floats, columns: Integers) -> None:
-    """Put derivatives in nuisances, shape (n, height, k), in their columns, shape (n, k), of rows."""
+    """Put derivatives in nuisances, shape (n, residual_dim, k), in their columns, shape (n, k), of rows."""
     for k in range(N.shape[2]):
         there = np.flatnonzero(columns[:, k] >= 0)
         out[there, :, columns[there, k]] = N[there, :, k]
@@ -263,15 +263,17 @@ def correlation_of(noises: Sequence[RowNoise], rows: Sequence[RowSet], at: At, f
     common = np.zeros((shares.n_errors, n))
     with_train = [noise for noise in noises if len(noise.series.train)]
     for noise, row_set in zip(with_train, rows, strict=True):
-        (part,), train, height = row_set.parts, noise.series.train, noise.series.kind.height
+        (part,), train, residual_dim = row_set.parts, noise.series.train, noise.series.kind.residual_dim
         wide = np.concatenate(list(part.linearise(at)))
         J = wide[:, :n] + wide[:, n:-1] @ follow
-        W = unpack(part.block.whitening, height) @ np.linalg.inv(unpack(noise.rows_at(train).whitening, height))
+        W = unpack(part.block.whitening, residual_dim) @ np.linalg.inv(
+            unpack(noise.rows_at(train).whitening, residual_dim)
+        )
         masks = {source.name: shares.mask(source)[train] for source in noise.sources}
         common += shares.loading(noise, train, W, masks).T @ J
         for source in noise.sources:
             G = np.einsum("nhk,nkew->nhew", W, source.loading[train] * masks[source.name][:, None, :, None])
-            each = np.einsum("nhew,nhp->newp", G, J.reshape(len(train), height, n)).reshape(-1, n)
+            each = np.einsum("nhew,nhp->newp", G, J.reshape(len(train), residual_dim, n)).reshape(-1, n)
             own += each.T @ each
     out: Floats = common.T @ common - own
     return out
@@ -282,26 +284,26 @@ def _part(
 ) -> tuple[Part, Sparse, Sparse]:
     """The train rows of a series; how they follow from shared errors; E of `RowSet.spare`."""
     series, train = noise.series, noise.series.train
-    n, height = len(train), series.kind.height
+    n, residual_dim = len(train), series.kind.residual_dim
     masks = {source.name: shares.mask(source)[train] for source in noise.sources}
     carried = frozenset(name for name, mask in masks.items() if mask.any())
     base = noise.own[train].copy()
     diagonal = np.einsum("nii->ni", base).copy()
     if carried:
         raised = np.maximum(diagonal + _at(noise.more_if_redundant(carried), train), _at(noise.least(), train))
-        base += (raised - diagonal)[:, :, None] * np.eye(height)
+        base += (raised - diagonal)[:, :, None] * np.eye(residual_dim)
         diagonal = raised
     private = base
     for source in noise.sources:
-        own = np.where(masks[source.name][:, None, :, None], 0.0, source.loading[train]).reshape(n, height, -1)
+        own = np.where(masks[source.name][:, None, :, None], 0.0, source.loading[train]).reshape(n, residual_dim, -1)
         private = private + own @ np.swapaxes(own, 1, 2)
     if weights is not None:  # noise of its own on top, so much that a measurement says no more than its weight
         private = private + (1.0 / np.maximum(weights[train], LEAST_WEIGHT) - 1.0)[:, None, None] * noise.total[train]
     W = whitening_of(private, series.used[train])
     rows = noise.rows_at(train)
-    block = replace(rows, whitening=pack(W @ unpack(rows.whitening, height)))
+    block = replace(rows, whitening=pack(W @ unpack(rows.whitening, residual_dim)))
     offset = None if joint_errors is None else _offset(noise, train, W, joint_errors)
-    E = scipy.sparse.csr_array((n * height, 0))
+    E = scipy.sparse.csr_array((n * residual_dim, 0))
     if any(name != "joints" for name in carried):
         E = _block_diagonal(W * np.sqrt(np.maximum(diagonal - noise.bare(train), 0.0))[:, None])
     return Part(block, series.table, series.nuisances[train], offset), shares.loading(noise, train, W, masks), E
@@ -312,8 +314,8 @@ def _at(values: Floats | float, rows: Integers) -> Floats | float:
 
 
 def _offset(noise: RowNoise, train: Integers, W: Floats, joint_errors: Floats) -> Floats:
-    """What the errors of the readings alone make of whitened rows, to first order, shape (n, height)."""
-    out = np.zeros((len(train), noise.series.kind.height))
+    """What the errors of the readings alone make of whitened rows, to first order, shape (n, residual_dim)."""
+    out = np.zeros((len(train), noise.series.kind.residual_dim))
     joints, sigma = noise.place.joints, noise.place.measurements.sigma_joint
     for source in noise.sources:
         if source.name == "joints":
@@ -369,29 +371,29 @@ class ErrorColumns:
     def loading(
         self, noise: RowNoise, rows: Integers, W: Floats | None = None, masks: Mapping[str, Booleans] | None = None
     ) -> Sparse:
-        """How rows of a series follow from all errors, sparse, shape (n height, n_errors).
+        """How rows of a series follow from all errors, sparse, shape (n residual_dim, n_errors).
 
         Args:
             noise: The series' rows and their noise.
             rows: The measurements.
-            W: What their rows are multiplied by, shape (n, height, height); nothing if None.
+            W: What their rows are multiplied by, shape (n, residual_dim, residual_dim); nothing if None.
             masks: By source, of which ends errors are wanted, shape (n, ends); of all if None.
         """
-        n, height = len(rows), noise.series.kind.height
+        n, residual_dim = len(rows), noise.series.kind.residual_dim
         places, columns, figures = [], [], []
         for source in noise.sources:
             ends, w = source.loading.shape[2:]
-            flat = source.loading[rows].reshape(n, height, ends * w)
-            G = (flat if W is None else W @ flat).reshape(n, height, ends, w)
+            flat = source.loading[rows].reshape(n, residual_dim, ends * w)
+            G = (flat if W is None else W @ flat).reshape(n, residual_dim, ends, w)
             chosen = G != 0.0
             if masks is not None:
                 chosen &= masks[source.name][:, None, :, None]
             first = source.ends[rows] * self.width + self._first[source.name]  # (n, ends)
-            row = np.arange(n * height).reshape(n, height)
+            row = np.arange(n * residual_dim).reshape(n, residual_dim)
             places.append(np.broadcast_to(row[:, :, None, None], G.shape)[chosen])
             columns.append(np.broadcast_to((first[:, :, None] + np.arange(w))[:, None], G.shape)[chosen])
             figures.append(G[chosen])
-        shape = (n * height, self.n_errors)
+        shape = (n * residual_dim, self.n_errors)
         if not places:
             return scipy.sparse.csr_array(shape)
         triple = (np.concatenate(figures), (np.concatenate(places), np.concatenate(columns)))

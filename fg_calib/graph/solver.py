@@ -315,8 +315,8 @@ def _learn(problem: Problem, parameters: Floats, weighting: Weighting) -> tuple[
     if problem.options.loss != "none":
         found = mahalanobis_distances(problem, parameters)
         test = np.concatenate([s.test for s in problem.data.series])
-        e, height = (np.where(test, 0, np.concatenate(each)) for each in zip(*found, strict=True))
-        weights, final = weighting.update(e, height)
+        e, residual_dim = (np.where(test, 0, np.concatenate(each)) for each in zip(*found, strict=True))
+        weights, final = weighting.update(e, residual_dim)
         ends = np.cumsum([s.n for s in problem.data.series])[:-1]
         state = replace(state, weights=tuple(np.split(weights, ends)))
     if state.joint_errors is not None:
@@ -461,7 +461,7 @@ class _Run:
             return []
         self._damping = max(optimizer.lambda_(), LEAST_DAMPING)
         step = variables.step(here.values, optimizer.values())
-        held = variables.moved(here.values, here.held(step))
+        held = variables.moved(here.values, here.remove_gauge_drift(step))
         lower = graph.error(held) < here.cost
         return [_Linearised(self.problem, held if lower else gtsam.Values(optimizer.values()))]
 
@@ -514,7 +514,7 @@ class _Linearised:
         step = self._variables.step(self.values, values)[: len(self._sizes)]
         return float(np.linalg.norm(self._information @ (step / self._sizes)))
 
-    def held(self, step: Floats) -> Floats:
+    def remove_gauge_drift(self, step: Floats) -> Floats:
         """A step with the same effect on every row, but none on the core's undetermined directions."""
         n = len(self._sizes)
         drift = self._sizes * (self._loose.T @ (self._loose @ (step[:n] / self._sizes)))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from fg_calib.graph import frames
 from fg_calib.graph.factors import Variable, Variables, frame_of, pose_of
 from fg_calib.graph.frames import Frame, Unknown
-from fg_calib.graph.problem import means_of_touches
+from fg_calib.graph.problem import contact_points
 from fg_calib.measurements.kinds import TouchedPoint
 from fg_calib.measurements.series import Dataset, Table
 from fg_calib.options import POSE_MODELS
@@ -30,7 +30,7 @@ def start_of(robot: Robot, data: Dataset, variables: Variables) -> Floats:
         _start_frames(robot, data, variables, trigs, start, free)
     if variables.nuisance:
         at = variables.at(start)
-        means = means_of_touches(data, at.chains, trigs)
+        means = contact_points(data, at.chains, trigs)
         there = variables.coordinates >= 0
         start[variables.coordinates[there]] = means[there]
     return start

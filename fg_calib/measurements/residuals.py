@@ -45,8 +45,8 @@ class Block:
         trig: Readings, from `kinematics.precompute_trig`, shape (n_configurations, n_joints, 2).
         ends: Row in `trig` of each end, shape (n, kind.ends).
         data: What was measured, as the kind has it, shape (n, kind.width); any number in a row without weight.
-        whitening: Lower triangle, row by row, of a matrix that whitens a measurement's rows, shape (n, height *
-            (height + 1) / 2); zero for a row that is not measured. See `pack`.
+        whitening: Lower triangle, row by row, of a matrix that whitens a measurement's rows, shape (n, residual_dim *
+            (residual_dim + 1) / 2); zero for a row that is not measured. See `pack`.
         nuisances: Values of the kind's nuisances, shape (n, kind.n_nuisances).
     """
 
@@ -63,28 +63,28 @@ class Block:
         return len(self.ends)
 
     @property
-    def height(self) -> int:
+    def residual_dim(self) -> int:
         """Rows of one measurement."""
-        return self.kind.height
+        return self.kind.residual_dim
 
 
 def pack(whitening: Floats) -> Floats:
-    """Lower triangles, shape (n, height, height), row by row: shape (n, height * (height + 1) / 2)."""
+    """Lower triangles, shape (n, d, d) with d the residual_dim, row by row: shape (n, d * (d + 1) / 2)."""
     rows, columns = np.tril_indices(whitening.shape[1])
     return np.ascontiguousarray(whitening[:, rows, columns])
 
 
-def unpack(whitening: Floats, height: int) -> Floats:
-    """What `pack` packed, shape (n, height, height)."""
-    rows, columns = np.tril_indices(height)
-    out = np.zeros((len(whitening), height, height))
+def unpack(whitening: Floats, residual_dim: int) -> Floats:
+    """What `pack` packed, shape (n, residual_dim, residual_dim)."""
+    rows, columns = np.tril_indices(residual_dim)
+    out = np.zeros((len(whitening), residual_dim, residual_dim))
     out[:, rows, columns] = whitening
     return out
 
 
-def unit_whitening(n: int, height: int) -> Floats:
+def unit_whitening(n: int, residual_dim: int) -> Floats:
     """For rows that are not whitened."""
-    return pack(np.tile(np.eye(height), (n, 1, 1)))
+    return pack(np.tile(np.eye(residual_dim), (n, 1, 1)))
 
 
 def rows_of(block: Block, rows: slice | Integers) -> Block:
@@ -93,7 +93,7 @@ def rows_of(block: Block, rows: slice | Integers) -> Block:
 
 
 def residual(block: Block, chain: Chain) -> Floats:
-    """Whitened residuals, shape (n, height)."""
+    """Whitened residuals, shape (n, residual_dim)."""
     return linearise(block, chain.without_columns())[0]
 
 
@@ -101,12 +101,12 @@ def linearise(block: Block, chain: Chain) -> tuple[Floats, Floats]:
     """Whitened residuals and their derivatives, row by row.
 
     Returns:
-        The residuals, shape (n, height), and the derivatives, shape (n, height, n_columns + n_own): first in the
-        chain's columns, then, if the chain has joint columns, in the joints of the measurement's first end, then of its
-        second, then in its nuisances.
+        Residuals, shape (n, residual_dim), and derivatives, shape (n, residual_dim, n_columns + n_own): first in
+        the chain's columns, then, if the chain has joint columns, in the joints of the measurement's first end, then of
+        its second, then in its nuisances.
     """
     n_all = _n_columns(block, chain) + 1
-    out = np.empty((block.n, block.height, n_all))
+    out = np.empty((block.n, block.residual_dim, n_all))
 
     def run(start: int, stop: int) -> None:
         for first, last, panel in _panels(block, chain, start, stop):
@@ -173,7 +173,7 @@ def _panels(block: Block, chain: Chain, start: int, stop: int) -> Iterator[tuple
     arrays, twins = chain.arrays, block.kind.twins()
     free = chain.without_columns()
     size = min(CHUNK, -(-(stop - start) // LANES) * LANES)
-    whole = np.zeros((_n_columns(block, chain) + 1, block.height, size))
+    whole = np.zeros((_n_columns(block, chain) + 1, block.residual_dim, size))
     for first in range(start, stop, size):
         last = min(first + size, stop)
         width = -(-(last - first) // LANES) * LANES

@@ -52,8 +52,8 @@ class Series:
         table: Which table they are from.
         ends: Configurations of each, rows of that table, shape (n, kind.ends).
         data: What was measured, shape (n, kind.width); any number where not measured.
-        sigma: 1 sigma of each row's own noise, shape (n, kind.height); 0 where it comes from measured poses alone.
-        measured: Which rows were measured, shape (n, kind.height).
+        sigma: 1 sigma of each row's own noise, shape (n, kind.residual_dim); 0 where measured poses alone say it.
+        measured: Which rows were measured, shape (n, kind.residual_dim).
         test: Which are predicted but never fitted, shape (n,).
         number: Number of each in its table, shape (n,).
         nuisances: Coordinates of nuisances that each depends on, in the problem's list, shape (n, kind.n_nuisances).
@@ -82,7 +82,7 @@ class Series:
 
     @property
     def used(self) -> Booleans:
-        """Rows that take part in fit or prediction, shape (n, height)."""
+        """Rows that take part in fit or prediction, shape (n, residual_dim)."""
         used = self.measured.copy()
         for mask in self.excluded.values():
             used[mask] = False
@@ -95,8 +95,8 @@ class Series:
 
     def __post_init__(self) -> None:
         n, kind = len(self.test), self.kind
-        shapes = {"ends": (n, kind.ends), "data": (n, kind.width), "sigma": (n, kind.height)}
-        shapes |= {"measured": (n, kind.height), "nuisances": (n, kind.n_nuisances)}
+        shapes = {"ends": (n, kind.ends), "data": (n, kind.width), "sigma": (n, kind.residual_dim)}
+        shapes |= {"measured": (n, kind.residual_dim), "nuisances": (n, kind.n_nuisances)}
         for name, shape in shapes.items():
             found = np.shape(getattr(self, name))
             if found != shape:
@@ -110,7 +110,7 @@ class Own:
     Attributes:
         kind: What they are.
         data: What was measured, shape (n, kind.width).
-        sigma: 1 sigma of each row, a figure or an array that broadcasts to (n, kind.height).
+        sigma: 1 sigma of each row, a figure or an array that broadcasts to (n, kind.residual_dim).
         ends: Configurations of each, shape (n, kind.ends); the table's, one after the other, if None.
         unknowns: Start of each unknown that the kind depends on, shape (n_unknowns, dimension).
         which: Unknowns of each measurement, shape (n, kind.n_nuisances / dimension); the first for all if None.
@@ -310,7 +310,7 @@ def _pose_series(m: Measurements, table: Table, number: int) -> Series:
         ends=np.arange(n)[:, None],
         data=np.ascontiguousarray(np.hstack([values for _, values, _ in parts])),
         sigma=np.hstack([sigma for _, _, sigma in parts]),
-        measured=np.ones((n, kind.height), dtype=np.bool_),
+        measured=np.ones((n, kind.residual_dim), dtype=np.bool_),
         test=m.test,
         number=np.arange(n),
         nuisances=np.zeros((n, 0), dtype=np.int64),
@@ -456,8 +456,8 @@ def _own_series(own: Own, m: Measurements, number: int, unknowns: Unknowns) -> S
         table=number,
         ends=ends,
         data=np.ascontiguousarray(data),
-        sigma=np.broadcast_to(own.sigma, (n, kind.height)),
-        measured=np.ones((n, kind.height), dtype=np.bool_),
+        sigma=np.broadcast_to(own.sigma, (n, kind.residual_dim)),
+        measured=np.ones((n, kind.residual_dim), dtype=np.bool_),
         test=np.zeros(n, dtype=np.bool_) if own.test is None else np.asarray(own.test, dtype=np.bool_),
         number=np.arange(n),
         nuisances=nuisances,

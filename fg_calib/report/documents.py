@@ -129,7 +129,7 @@ def result_of(solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str,
         frames={v.symbol: Frame.model_validate(f) for v, f in zip(problem.variables.frames, u.frames, strict=True)},
         joint_values=_joint_values(u.joint_values, names),
         groups=tuple(map(TouchedPoint.model_validate, u.points)),
-        observability=observability_of(u.identifiability),
+        observability=_observability(u.identifiability),
         inputs=dict(inputs or {}),
     )
 
@@ -323,7 +323,7 @@ def _setup(check: SetupCheck) -> Setup:
     )
 
 
-def observability_of(found: Identifiability) -> Observability:
+def _observability(found: Identifiability) -> Observability:
     """What `observability.json` holds: sigmas, correlations and weak directions only where the noise is the user's."""
     o, more = found.observability, dict[str, Any]()
     if found.kind == "practical":
@@ -332,7 +332,7 @@ def observability_of(found: Identifiability) -> Observability:
         more["weak"] = tuple(map(Weak.model_validate, o.weak))
     if found.with_fixed_known is not None:
         more["fixed"] = found.fixed
-        more["with_fixed_known"] = observability_of(found.with_fixed_known)
+        more["with_fixed_known"] = _observability(found.with_fixed_known)
     return Observability.make(
         schema_=OBSERVABILITY_SCHEMA,
         robot=found.robot,
@@ -368,8 +368,8 @@ def _missing(m: MissingMotion) -> Missing:
 
 
 def observability_document(found: Identifiability) -> dict[str, Any]:
-    """`observability_of` as it is written to `observability.json`."""
-    return observability_of(found).document()
+    """`_observability` as it is written to `observability.json`."""
+    return _observability(found).document()
 
 
 def write_observability(folder: Path | str, found: Identifiability) -> None:

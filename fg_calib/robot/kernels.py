@@ -298,24 +298,24 @@ def fill(chain, trig, ends, data, whitening, twins, given, turning, panel):  # t
         trig: From `precompute_trig`, shape (n_configurations, n_joints, 2).
         ends: Row of `trig` of each end, shape (n, n_ends).
         data: What was measured, shape (n, width).
-        whitening: Lower triangles, row by row, shape (n, height * (height + 1) / 2).
+        whitening: Lower triangles, row by row, shape (n, d * (d + 1) / 2), d the `residual_dim`.
         twins: Of a kind that is computed here, part by part: code, first row, first column of `data`, shape (n_parts,
             3).
-        given: Of another kind: residuals (n, height) and wrench rows (n, n_ends, height, 6). Of any: derivatives in
-            nuisances, shape (n, height, n_nuisances).
+        given: Of another kind: residuals (n, d) and wrench rows (n, n_ends, d, 6). Of any: derivatives in nuisances,
+            shape (n, d, n_nuisances).
         turning: Turn of the base in each column that the residual is turned back by, shape (3, n_columns); (3, 0) if
             it is not.
-        panel: Filled: [column, row, measurement], shape (n_columns + n_ends * n_own + n_nuisances + 1, height, m), m
-            the next multiple of `LANES`; the last column is the residual, lanes without a measurement are zero.
+        panel: Filled: [column, row, measurement], shape (n_columns + n_ends * n_own + n_nuisances + 1, d, m), m the
+            next multiple of `LANES`; the last column is the residual, lanes without a measurement are zero.
     """
     n, n_ends = ends.shape
-    height, n_twists, n_nuisances = panel.shape[1], chain.n_columns + chain.n_own, given[2].shape[2]
+    residual_dim, n_twists, n_nuisances = panel.shape[1], chain.n_columns + chain.n_own, given[2].shape[2]
     turned = turning.shape[1] > 0
     n_wrenches = n_ends + 1 if turned else n_ends  # the base is one more end
     R, p = np.empty((n_ends, 3, 3, LANES)), np.empty((n_ends, 3, LANES))
-    T, D = np.zeros((n_wrenches, n_twists, 6, LANES)), np.zeros((n_wrenches, height, 6, LANES))
+    T, D = np.zeros((n_wrenches, n_twists, 6, LANES)), np.zeros((n_wrenches, residual_dim, 6, LANES))
     width = 6 * LANES if n_twists > 0 else LANES
-    r, weight, row = np.empty((height, LANES)), np.empty((whitening.shape[1], width)), np.empty(LANES, np.int64)
+    r, weight, row = np.empty((residual_dim, LANES)), np.empty((whitening.shape[1], width)), np.empty(LANES, np.int64)
     if turned:
         for t in range(chain.n_columns):
             for c in range(3):
@@ -334,14 +334,14 @@ def fill(chain, trig, ends, data, whitening, twins, given, turning, panel):  # t
         if turned:
             _turn_back(r, D[n_ends])
         _whiten(weight, r)
-        for h in range(height):
+        for h in range(residual_dim):
             for i in range(LANES):
                 panel[panel.shape[0] - 1, h, first + i] = r[h, i]
         if n_twists > 0:
             for e in range(n_wrenches):
                 if e < n_ends:
                     _about_origin(p[e], D[e])
-                _whiten(weight, D[e].reshape(height, 6 * LANES))
+                _whiten(weight, D[e].reshape(residual_dim, 6 * LANES))
             _contract(chain, n_ends, T, D, panel, first)
         if n_nuisances > 0:
             _fill_nuisances(given[2], weight, first, panel)
@@ -362,8 +362,8 @@ def _gather_whitening(whitening, first, weight):  # type: ignore[no-untyped-def]
 def _gather(given, first, r, D):  # type: ignore[no-untyped-def]
     """Residuals and wrench rows that numpy computed, lane by lane."""
     residual, wrenches, _ = given
-    n, n_ends, height, _ = wrenches.shape
-    for h in range(height):
+    n, n_ends, residual_dim, _ = wrenches.shape
+    for h in range(residual_dim):
         for i in range(LANES):
             r[h, i] = residual[min(first + i, n - 1), h]
         for e in range(n_ends):
@@ -396,8 +396,8 @@ def _about_origin(p, D):  # type: ignore[no-untyped-def]
 @inlined
 def _whiten(weight, rows):  # type: ignore[no-untyped-def]
     """Rows, [row, as many figures as lanes or six times these], become a lower triangle times them."""
-    height, size = rows.shape
-    for h in range(height - 1, -1, -1):
+    residual_dim, size = rows.shape
+    for h in range(residual_dim - 1, -1, -1):
         k = h * (h + 1) // 2
         _scale(weight[k + h, :size], rows[h])
         for g in range(h):
@@ -419,15 +419,15 @@ def _add_scaled(factor, other, row):  # type: ignore[no-untyped-def]
 @inlined
 def _contract(chain, n_ends, T, D, panel, at):  # type: ignore[no-untyped-def]
     """Wrench rows times twists: in each column the sum over the ends, in the joints each end by itself."""
-    n_wrenches, n_twists, height, size = T.shape[0], T.shape[1], D.shape[1], 6 * LANES
+    n_wrenches, n_twists, residual_dim, size = T.shape[0], T.shape[1], D.shape[1], 6 * LANES
     T, D = T.reshape(-1), D.reshape(-1)
     for t in range(n_twists):
         own = t >= chain.n_columns
         for e in range(n_ends if own else n_wrenches):
             column = t + e * chain.n_own if own else t
             twist = T[(e * n_twists + t) * size : (e * n_twists + t + 1) * size]
-            for h in range(height):
-                wrench = D[(e * height + h) * size : (e * height + h + 1) * size]
+            for h in range(residual_dim):
+                wrench = D[(e * residual_dim + h) * size : (e * residual_dim + h + 1) * size]
                 if own or e == 0:
                     _write_product(chain.turns[t], wrench, twist, panel[column, h, at : at + LANES])
                 else:
@@ -471,14 +471,14 @@ def _add_product(turns, D, T, out):  # type: ignore[no-untyped-def]
 @compiled
 def _fill_nuisances(derivatives, weight, first, panel):  # type: ignore[no-untyped-def]
     """Whitened derivatives in the nuisances, which stand before the residual."""
-    n, height, n_nuisances = derivatives.shape
-    rows = np.empty((height, LANES))
+    n, residual_dim, n_nuisances = derivatives.shape
+    rows = np.empty((residual_dim, LANES))
     for k in range(n_nuisances):
-        for h in range(height):
+        for h in range(residual_dim):
             for i in range(LANES):
                 rows[h, i] = derivatives[min(first + i, n - 1), h, k]
         _whiten(weight, rows)
-        for h in range(height):
+        for h in range(residual_dim):
             for i in range(LANES):
                 panel[panel.shape[0] - 1 - n_nuisances + k, h, first + i] = rows[h, i]
 

@@ -558,8 +558,8 @@ def test_rows_that_count_as_independent_but_are_not_have_their_covariance_with_t
     J = np.concatenate([rows.linearise(at)[1] for rows in problem.rows])
     errors, W, C = ErrorColumns(problem.noises), [], []
     for rows, given in zip(problem.rows, problem.noises, strict=True):
-        (part,), height = rows.parts, rows.parts[0].block.height
-        shaped = [residuals.unpack(block.whitening, height) for block in (part.block, given.rows)]
+        (part,), residual_dim = rows.parts, rows.parts[0].block.residual_dim
+        shaped = [residuals.unpack(block.whitening, residual_dim) for block in (part.block, given.rows)]
         W.append(block_diag(*(shaped[0] @ np.linalg.inv(shaped[1]))))
         C.append((errors.loading(given, np.arange(given.series.n)).toarray(), block_diag(*given.own)))
     L, W = np.vstack([L for L, _ in C]), block_diag(*W)

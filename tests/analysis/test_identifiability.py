@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from simulated import measure, paper_robot, planar_robot, small_arm
 
-from fg_calib.analysis.identifiability import identify, observe_configurations, observe_structure
+from fg_calib.analysis.identifiability import identifiability_of, observe_configurations, observe_structure
 from fg_calib.analysis.reasons import NO_CAUSE, NOT_EXCITED
 from fg_calib.analysis.uncertainty import assess
 from fg_calib.errors import ProblemError
 from fg_calib.graph.build import STRUCTURAL_FLOOR, build_problem, random_problem
-from fg_calib.graph.information import named_triangle, observe
+from fg_calib.graph.information import named_triangle, observability_of
 from fg_calib.graph.solver import solve
 from fg_calib.measurements.kinds import SamePoint
 from fg_calib.options import Pairing
@@ -96,7 +96,7 @@ DRAWN = [(robot, ranks) for robot, ranks, _ in RANKS] + [
 def rank_at(robot, model, seed):
     problem = random_problem(robot, model, seed=seed)
     assert not problem.data.n_train(SamePoint)
-    return observe(problem, problem.start, (), STRUCTURAL_FLOOR).rank
+    return observability_of(problem, problem.start, (), STRUCTURAL_FLOOR).rank
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -299,7 +299,7 @@ def test_random_configurations_stay_within_limits_and_repeat_with_their_seed():
 
 def test_structure_and_problem_agree():
     problem = random_problem(paper_robot(), "distance")
-    found = identify(problem, problem.start, "structural")
+    found = identifiability_of(problem, problem.start, "structural")
     assert found.observability.rank == observe_structure(paper_robot(), "distance").observability.rank == 21
 
 

@@ -110,22 +110,22 @@ def everything_given_the_noise(solution):
     m, train = problem.measurements, series.train
     scale = np.array([p.scale if p.estimated else 0.0 for p in robot.parameters])
     columns = np.flatnonzero(scale)
-    n, n_frame, height = len(columns), 6 * len(problem.variables.frames), series.kind.height
+    n, n_frame, residual_dim = len(columns), 6 * len(problem.variables.frames), series.kind.residual_dim
 
     private = noise.own.copy()
     carried = frozenset(source.name for source in noise.sources)
     diagonal = np.einsum("nii->ni", private)
     raised = np.maximum(diagonal + noise.more_if_redundant(carried), noise.least())
-    private += (raised - diagonal)[:, :, None] * np.eye(height)
+    private += (raised - diagonal)[:, :, None] * np.eye(residual_dim)
     if problem.state.weights is not None:
         (weights,) = problem.state.weights
         private += (1.0 / np.maximum(weights, 1e-12) - 1.0)[:, None, None] * noise.total
-    C = np.zeros((len(train), height, len(train), height))
+    C = np.zeros((len(train), residual_dim, len(train), residual_dim))
     for i, k in enumerate(train):
         C[i, :, i, :] = private[k]
     of_joints = np.zeros_like(C)
     for source in noise.sources:
-        G = np.zeros((len(train), height, m.n_configurations, source.loading.shape[3]))
+        G = np.zeros((len(train), residual_dim, m.n_configurations, source.loading.shape[3]))
         for i, k in enumerate(train):
             for end, place in enumerate(source.ends[k]):
                 G[i, :, place] += source.loading[k, :, end]
@@ -144,7 +144,7 @@ def everything_given_the_noise(solution):
             turn = Rotation.from_matrix(np.swapaxes(m.rotation, 1, 2) @ R).as_rotvec()
             return np.hstack([turn, p - m.position])[train].ravel()[used]
         values = pair_values(arm, q, *series.ends.T)[:, quantities]
-        slope = np.einsum("nii->ni", residuals.unpack(noise.rows.whitening, height))
+        slope = np.einsum("nii->ni", residuals.unpack(noise.rows.whitening, residual_dim))
         start = noise.predicted[:, quantities]
         return (start - series.data + noise.excess + slope * (values - start))[train].ravel()[used]
 
@@ -203,10 +203,10 @@ def test_what_joint_values_explain_is_still_part_of_how_far_off_a_measurement_is
     squared = []
     for encoder in ("propagated", "estimated"):
         solution = solve(build_problem(robot, m, model=model, encoder=encoder))
-        ((e, height),) = mahalanobis_distances(solution.problem, solution.parameters)
-        squared.append(np.sum(e**2) / height.sum())
+        ((e, residual_dim),) = mahalanobis_distances(solution.problem, solution.parameters)
+        squared.append(np.sum(e**2) / residual_dim.sum())
     assert squared[1] == pytest.approx(squared[0], rel=5e-3)
-    assert squared[1] == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / height.sum()))
+    assert squared[1] == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / residual_dim.sum()))
 
 
 @pytest.mark.parametrize("loss", ["huber", "gnc"])

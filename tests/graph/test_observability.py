@@ -7,8 +7,8 @@ from tolerances import rounding
 
 from fg_calib.analysis.uncertainty import assess
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.information import observe
-from fg_calib.graph.observability import RelativeGroup, analyse, observability_indices
+from fg_calib.graph.information import observability_of
+from fg_calib.graph.observability import RelativeGroup, observability_indices, observability_of_rows
 from fg_calib.graph.solver import solve
 from fg_calib.options import Pairing
 from fg_calib.robot.model import Parameter
@@ -52,7 +52,7 @@ TABLE = {
 def observed(robot, model, frame="known", n=300, seed=0):
     measurements = measure(robot, n, np.random.default_rng(seed))
     problem = build_problem(robot, measurements, model=model, pairing=Pairing("random", n), frame=frame, prior=False)
-    return observe(problem, problem.variables.nominal())
+    return observability_of(problem, problem.variables.nominal())
 
 
 @pytest.mark.parametrize("model", TABLE)
@@ -86,7 +86,7 @@ def test_every_relation_moves_no_measurement():
     robot = paper_robot()
     measurements = measure(robot, 60, np.random.default_rng(1))
     problem = build_problem(robot, measurements, model="distance", prior=False)
-    found = observe(problem, problem.variables.nominal())
+    found = observability_of(problem, problem.variables.nominal())
     (rows,) = problem.rows
     J = rows.linearise(problem.variables.at(problem.variables.nominal()))[1]
     for group in found.relative:
@@ -114,9 +114,9 @@ def test_the_answer_does_not_depend_on_units():
     J[:, 4] = 2 * J[:, 3]
     kinds = ["a", "a", "d", "d", "theta"]
     parameters = [Parameter(f"{k}{i}", k, i, 0.0) for i, k in enumerate(kinds)]
-    metres = analyse(J, parameters, scales=np.full(5, 1e-3), n_measurements=10)
+    metres = observability_of_rows(J, parameters, scales=np.full(5, 1e-3), n_measurements=10)
     unit = np.array([1e-3, 1e-3, 1e-3, 1e-3, 1.0])  # columns per millimetre
-    millimetres = analyse(J * unit, parameters, scales=1e-3 / unit, n_measurements=10)
+    millimetres = observability_of_rows(J * unit, parameters, scales=1e-3 / unit, n_measurements=10)
     assert millimetres.singular_values == pytest.approx(metres.singular_values, rel=rounding(1, 10), abs=rounding(1.0))
     assert millimetres.classes == metres.classes == ("independent",) * 3 + ("relative",) * 2
     assert millimetres.indices == pytest.approx(metres.indices)
@@ -160,7 +160,7 @@ def test_classes_do_not_depend_on_tolerances(model):
     found = []
     for tolerance in (None, {"a3": 1e-7}, {"a": 1.0, "d": 1e-6, "alpha": 1e-6}, wild):
         problem = build_problem(paper_robot(tolerance=tolerance), measurements, model=model)
-        found.append(observe(problem, problem.start))
+        found.append(observability_of(problem, problem.start))
     for other in found[1:]:
         assert (other.rank, other.classes, other.relative) == (found[0].rank, found[0].classes, found[0].relative)
         assert np.array_equal(other.singular_values, found[0].singular_values)
@@ -171,7 +171,7 @@ def test_classes_do_not_depend_on_tolerances(model):
 def test_a_tolerance_says_what_is_weak():
     """A sigma of 1 um is weak against a tolerance of 2 um, and not against one of 2 mm."""
     parameters = [Parameter("a1", "a", 1, 0.0), Parameter("a2", "a", 2, 0.0, 2e-6), Parameter("a3", "a", 3, 0.0, 2e-3)]
-    found = analyse(np.eye(3) / 1e-6, parameters, scales=np.full(3, 1e-3), n_measurements=3)
+    found = observability_of_rows(np.eye(3) / 1e-6, parameters, scales=np.full(3, 1e-3), n_measurements=3)
     assert [weak.members for weak in found.weak] == [{"a2": 1.0}]
     assert found.weak[0].signal_to_noise == pytest.approx(2.0)
     assert found.sigma == pytest.approx(dict.fromkeys(("a1", "a2", "a3"), 1e-6))

@@ -24,7 +24,7 @@ class AnchorDistance(Kind):
     """`|p - anchor| - measured`."""
 
     names, units = ("anchor",), ("m",)
-    ends, height, width, n_nuisances = 1, 1, 1, 3
+    ends, residual_dim, width, n_nuisances = 1, 1, 1, 3
 
     def rows(self, at, data, nuisances):
         """See `Kind.rows`."""

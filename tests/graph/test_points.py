@@ -22,7 +22,7 @@ from fg_calib.errors import InputError, ProblemError
 from fg_calib.files.tables import read_measurements
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.factors import eliminate, prior_rows
-from fg_calib.graph.information import named_triangle, observe, whitened_triangle
+from fg_calib.graph.information import named_triangle, observability_of, whitened_triangle
 from fg_calib.graph.problem import started_at
 from fg_calib.graph.robust import tuning, weight
 from fg_calib.graph.solver import solve
@@ -274,8 +274,8 @@ def test_a_point_touched_once_tells_nothing_and_a_distance_holds_the_scale():
     assert max(apart) < NEGLIGIBLE
     # Lengths of all links shrunk together satisfy any touches of one point: a direction of its own without distances.
     with_distance = replace(m, groups=replace(m.groups, pairs=case(tolerance=None)[3].groups.pairs))
-    scale = observe(build(robot, m), build(robot, m).start)
-    held = observe(build(robot, with_distance), build(robot, with_distance).start)
+    scale = observability_of(build(robot, m), build(robot, m).start)
+    held = observability_of(build(robot, with_distance), build(robot, with_distance).start)
     assert held.rank >= scale.rank
     assert held.singular_values[: scale.rank].min() >= scale.singular_values[: scale.rank].min()
 
@@ -503,7 +503,7 @@ def test_touches_and_pairs_share_the_joint_noise_of_their_configurations():
 
     r, L = rows(np.zeros(192)), central_differences(rows, np.zeros(192), 1e-3)
     C = SIGMA**2 * np.eye(156) + L @ L.T
-    by_kind = {n.series.kind.height: n for n in problem.noises}
+    by_kind = {n.series.kind.residual_dim: n for n in problem.noises}
     assert len(problem.rows) == 1
     found = problem.rows[0].squared_norm(variables.at(problem.start))
     # Noise also lengthens pairs, which changes their residuals and, in the second order, their variance.

@@ -178,7 +178,7 @@ def test_whitened_residuals_of_noise_have_unit_covariance(model):
         assert np.array_equal(pairs.a, 2 * rows)
         problem = build_problem(robot, replace(measurements, pairs=pairs), model=model)
     (noise,), (rows,) = problem.noises, problem.rows
-    w = rows.linearise(problem.variables.at(problem.start))[0].reshape(-1, noise.series.kind.height)
+    w = rows.linearise(problem.variables.at(problem.start))[0].reshape(-1, noise.series.kind.residual_dim)
     w = w if problem.pair_series else w[::2]
     covariance = w.T @ w / len(w)
     # standard error of a variance from n draws: sqrt(2 / n) = 2.2 % at 4000; bound at 4 of them

@@ -47,24 +47,24 @@ def test_constants_in_one_dimension_are_those_of_the_books():
     assert tuning("none", 3) == np.inf
 
 
-@pytest.mark.parametrize("height", [1, 2, 6])
+@pytest.mark.parametrize("residual_dim", [1, 2, 6])
 @pytest.mark.parametrize("loss", SMOOTH)
-def test_clean_measurements_lose_five_percent(loss, height):
+def test_clean_measurements_lose_five_percent(loss, residual_dim):
     """The location of a cloud of Gaussian vectors, by reweighting, against its mean: Monte Carlo."""
     rng = np.random.default_rng(1)
-    c, n, draws = tuning(loss, height), 200, 400
-    r = rng.normal(size=(draws, n, height))
-    centre = np.zeros((draws, 1, height))
+    c, n, draws = tuning(loss, residual_dim), 200, 400
+    r = rng.normal(size=(draws, n, residual_dim))
+    centre = np.zeros((draws, 1, residual_dim))
     for _ in range(30):
         w = weight(loss, np.linalg.norm(r - centre, axis=2), c)[:, :, None]
         centre = np.sum(w * r, axis=1, keepdims=True) / np.sum(w, axis=1, keepdims=True)
     variance = np.mean(centre**2) * n
-    slack = 4.0 * np.sqrt(2.0 / (draws * height))
+    slack = 4.0 * np.sqrt(2.0 / (draws * residual_dim))
     assert variance == pytest.approx(1.0 / EFFICIENCY, rel=slack)
-    assert effect(loss, height).variance == pytest.approx(variance * np.mean(w), rel=slack)
+    assert effect(loss, residual_dim).variance == pytest.approx(variance * np.mean(w), rel=slack)
     e = np.linalg.norm(r - centre, axis=2)
     kept = w[:, :, 0] >= 0.5
-    assert effect(loss, height).chi2 == pytest.approx(np.mean((w[:, :, 0] * e**2)[kept]) / height, rel=0.02)
+    assert effect(loss, residual_dim).chi2 == pytest.approx(np.mean((w[:, :, 0] * e**2)[kept]) / residual_dim, rel=0.02)
 
 
 @pytest.mark.parametrize("loss", LOSSES)
@@ -117,12 +117,12 @@ def test_the_optimum_is_that_of_gtsams_robust_noise_on_factors_of_one_measuremen
 
 def _height(block):
     """Rows of a block of one measurement that are in use."""
-    return int(np.sum(np.diag(residuals.unpack(block.whitening, block.height)[0]) > 0.0))
+    return int(np.sum(np.diag(residuals.unpack(block.whitening, block.residual_dim)[0]) > 0.0))
 
 
 def _robust_factor(block, variables, estimator):
     """A factor of one measurement with GTSAM's own robust noise model."""
-    noise = gtsam.noiseModel.Robust.Create(estimator, gtsam.noiseModel.Unit.Create(block.height))
+    noise = gtsam.noiseModel.Robust.Create(estimator, gtsam.noiseModel.Unit.Create(block.residual_dim))
 
     def evaluate(_, values, H):
         chain = variables.at(variables.parameters(values)).chains[0]
@@ -212,12 +212,12 @@ def test_clean_measurements_keep_their_weight_under_gnc_up_to_the_one_percent():
 
 def test_gnc_starts_convex_and_ends_truncated():
     weighting = Weighting("gnc")
-    e, height = np.array([0.5, 2.0, 100.0]), np.array([1, 1, 1])
-    first, final = weighting.update(e, height)
+    e, residual_dim = np.array([0.5, 2.0, 100.0]), np.array([1, 1, 1])
+    first, final = weighting.update(e, residual_dim)
     assert not final
     assert np.all(first[:2] == 1.0)
     while not final:
-        last, final = weighting.update(e, height)
+        last, final = weighting.update(e, residual_dim)
     assert last.tolist() == [1.0, 1.0, 0.0]
     assert Weighting("gnc").update(np.array([0.5, 1.0]), np.array([1, 1]))[1]
 
@@ -240,10 +240,10 @@ def test_weights_settle_where_rows_are_excluded(loss):
     m = replace(m, readings=readings)
     solution = solve(build_problem(robot, m, model="distance-rotation", loss=loss))
     assert solution.converged
-    ((e, height),) = mahalanobis_distances(solution.problem, solution.parameters)
-    assert np.sum(height == 0) >= 1
+    ((e, residual_dim),) = mahalanobis_distances(solution.problem, solution.parameters)
+    assert np.sum(residual_dim == 0) >= 1
     (weights,) = solution.problem.state.weights
     assert np.all(np.isfinite(weights))
-    used = height > 0
-    c = np.array([tuning(loss, int(h)) for h in height[used]])
+    used = residual_dim > 0
+    c = np.array([tuning(loss, int(h)) for h in residual_dim[used]])
     assert weights[used] == pytest.approx(weight(loss, e[used], c), abs=1e-5)

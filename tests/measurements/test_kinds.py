@@ -58,7 +58,7 @@ def data_of(kind, n, rng):
 
 
 def random_block(kind, robot, n, rng):
-    h = kind.height
+    h = kind.residual_dim
     trig = precompute_trig(robot, rng.uniform(-3, 3, (2 * n + 1, robot.n_joints)))
     ends = rng.permutation(2 * n + 1)[: n * kind.ends].reshape(n, kind.ends)
     whitening = pack(np.tril(rng.normal(size=(n, h, h))) + 3 * np.eye(h))
@@ -77,7 +77,7 @@ def test_derivatives_are_those_of_central_differences(kind, convention):
     robot = random_robot(convention, 5, rng)
     q, data = rng.uniform(-3, 3, (kind.ends, 5)), data_of(kind, 1, rng)
     nuisances = rng.normal(size=(1, kind.n_nuisances))
-    W = np.tril(rng.normal(size=(kind.height, kind.height)))
+    W = np.tril(rng.normal(size=(kind.residual_dim, kind.residual_dim)))
     n_parameters = len(robot.parameters)
 
     def formula(x):
@@ -135,7 +135,7 @@ class FixedPoint(Kind):
     """Distance from the tool point to a fixed point: data x, y, z of the point and the distance, [m]."""
 
     names, units = ("ball",), ("m",)
-    ends, height, width = 1, 1, 4
+    ends, residual_dim, width = 1, 1, 4
 
     def rows(self, at, data, nuisances):
         away = at.position[:, 0] - data[:, :3]

@@ -33,16 +33,16 @@ def graph(name, n, rng):
     return a, (a + rng.integers(1, n, 3 * n)) % n
 
 
-def random_loadings(name, n, rng, size=30.0, height=2):
+def random_loadings(name, n, rng, size=30.0, residual_dim=2):
     """Rows of pairs, each of a direction of its own at either end."""
     a, b = graph(name, n, rng)
-    directions = rng.normal(size=(len(a), height, 2, WIDTH)) * size / np.sqrt(2.0 * WIDTH)
+    directions = rng.normal(size=(len(a), residual_dim, 2, WIDTH)) * size / np.sqrt(2.0 * WIDTH)
     directions[..., 0, :] *= rng.random(directions[..., 0, :].shape) < 0.8  # some zeros
     columns = np.stack([a, b], axis=1)[:, None, :, None] * WIDTH + np.arange(WIDTH)
     columns = np.broadcast_to(columns, directions.shape)
-    rows = np.broadcast_to(np.arange(len(a) * height).reshape(-1, height, 1, 1), directions.shape)
+    rows = np.broadcast_to(np.arange(len(a) * residual_dim).reshape(-1, residual_dim, 1, 1), directions.shape)
     where = (rows.ravel(), columns.ravel())
-    return scipy.sparse.csr_array((directions.ravel(), where), shape=(len(a) * height, n * WIDTH))
+    return scipy.sparse.csr_array((directions.ravel(), where), shape=(len(a) * residual_dim, n * WIDTH))
 
 
 def missed(found, expected):

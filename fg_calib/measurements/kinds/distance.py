@@ -15,7 +15,7 @@ class Distance(Kind):
     """
 
     names, units = ("distance",), ("m",)
-    ends, height, width = 2, 1, 1
+    ends, residual_dim, width = 2, 1, 1
     code = kernels.DISTANCE
 
     def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:

@@ -37,9 +37,9 @@ class Rows(NamedTuple):
     """Residuals of n measurements and their derivatives.
 
     Attributes:
-        residual: Predicted minus measured, shape (n, height).
-        wrenches: D, in (w, dp) of each end, shape (n, ends, height, 6).
-        nuisances: N, shape (n, height, n_nuisances); None if there are none.
+        residual: Predicted minus measured, shape (n, residual_dim).
+        wrenches: D, in (w, dp) of each end, shape (n, ends, residual_dim, 6).
+        nuisances: N, shape (n, residual_dim, n_nuisances); None if there are none.
     """
 
     residual: Floats
@@ -54,7 +54,7 @@ class Kind(ABC):
         names: What its rows are called, such as `position.x`: kind of noise, then component.
         units: Unit of each row, `m` or `rad`.
         ends: Configurations of one measurement: 1, 2, or 0 if it is of nuisances alone.
-        height: Rows of residual.
+        residual_dim: Rows of residual.
         width: Columns of data that it reads.
         n_nuisances: Coordinates of nuisances.
         turned_back: Whether only the length of its residual, a vector in the base frame, counts: derivatives in the
@@ -65,7 +65,7 @@ class Kind(ABC):
     names: tuple[str, ...]
     units: tuple[str, ...]
     ends: int
-    height: int
+    residual_dim: int
     width: int
     n_nuisances: int = 0
     turned_back: bool = False
@@ -82,8 +82,12 @@ class Kind(ABC):
         """
 
     def figures(self, data: Floats) -> Floats:
-        """Measured value of each row as tables show it, shape (n, height); nan where that is no figure of its own."""
-        return data[:, : self.height] if self.width == self.height else np.full((len(data), self.height), np.nan)
+        """Each row's measured value as tables show it, shape (n, residual_dim); nan where that is no figure."""
+        return (
+            data[:, : self.residual_dim]
+            if self.width == self.residual_dim
+            else np.full((len(data), self.residual_dim), np.nan)
+        )
 
     def twins(self) -> Integers:
         """Twins that compute it, part by part: code, first row, first column of data; shape (n_parts, 3)."""
@@ -107,8 +111,8 @@ def checked_rows(kind: Kind, at: Frames, data: Floats, nuisances: Floats) -> tup
     """
     n = len(at.position)
     found = kind.rows(at, data.copy(), nuisances)
-    none = np.zeros((n, kind.height, 0)) if kind.n_nuisances == 0 else np.zeros(0)
-    shapes = ((n, kind.height), (n, kind.ends, kind.height, 6), (n, kind.height, kind.n_nuisances))
+    none = np.zeros((n, kind.residual_dim, 0)) if kind.n_nuisances == 0 else np.zeros(0)
+    shapes = ((n, kind.residual_dim), (n, kind.ends, kind.residual_dim, 6), (n, kind.residual_dim, kind.n_nuisances))
     arrays = []
     for name, given, shape in zip(Rows._fields, found, shapes, strict=True):
         array = np.ascontiguousarray(none if given is None else given, dtype=np.float64)

@@ -18,7 +18,7 @@ class Orientation(Kind):
     """
 
     names, units = ("orientation.x", "orientation.y", "orientation.z"), ("rad", "rad", "rad")
-    ends, height, width = 1, 3, 9
+    ends, residual_dim, width = 1, 3, 9
     code = kernels.ORIENTATION
 
     def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:

@@ -14,7 +14,7 @@ class PointDistance(Kind):
     """
 
     names, units = ("distance",), ("m",)
-    ends, height, width, n_nuisances = 0, 1, 1, 6
+    ends, residual_dim, width, n_nuisances = 0, 1, 1, 6
 
     def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
         """See `Kind.rows`."""

@@ -15,7 +15,7 @@ class Position(Kind):
     """
 
     names, units = ("position.x", "position.y", "position.z"), ("m", "m", "m")
-    ends, height, width = 1, 3, 3
+    ends, residual_dim, width = 1, 3, 3
     code = kernels.POSITION
 
     def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:

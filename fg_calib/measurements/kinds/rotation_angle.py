@@ -17,7 +17,7 @@ class RotationAngle(Kind):
     """
 
     names, units = ("angle",), ("rad",)
-    ends, height, width = 2, 1, 1
+    ends, residual_dim, width = 2, 1, 1
     code = kernels.ROTATION_ANGLE
 
     def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:

@@ -18,7 +18,7 @@ class SamePoint(Kind):
     """
 
     names, units = ("distance.x", "distance.y", "distance.z"), ("m", "m", "m")
-    ends, height, width = 2, 3, 0
+    ends, residual_dim, width = 2, 3, 0
     turned_back = True
     code = kernels.SAME_POINT
 

@@ -18,7 +18,7 @@ class Stacked(Kind):
         self.names = tuple(name for part in parts for name in part.names)
         self.units = tuple(unit for part in parts for unit in part.units)
         self.ends = parts[0].ends
-        self.height = sum(part.height for part in parts)
+        self.residual_dim = sum(part.residual_dim for part in parts)
         self.width = sum(part.width for part in parts)
 
     def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
@@ -41,7 +41,7 @@ class Stacked(Kind):
         twins, row, column = [], 0, 0
         for part in self.parts:
             twins.append(part.twins() + np.array([0, row, column]))
-            row, column = row + part.height, column + part.width
+            row, column = row + part.residual_dim, column + part.width
         return np.concatenate(twins) if all(map(len, twins)) else np.zeros((0, 3), dtype=np.int64)
 
 

@@ -16,7 +16,7 @@ class TouchedPoint(Kind):
     """
 
     names, units = ("point.x", "point.y", "point.z"), ("m", "m", "m")
-    ends, height, width, n_nuisances = 1, 3, 0, 3
+    ends, residual_dim, width, n_nuisances = 1, 3, 0, 3
     turned_back = True
 
     def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
