@@ -156,6 +156,7 @@ def panda_run(tmp_path_factory):
 @pytest.mark.parametrize("way", ["groups", "all", "chain", "star"])
 def test_panda_sockets_are_predicted_within_the_limits(panda_run, way):
     found = panda_run[0]["ways"][way]
+    assert not found["findings"]  # half of the lengths are short beside the tolerances, but most is said by touches
     test = found["rms"]["test"]
     assert test["spread"]["after"] <= 0.23 * MM
     assert test["distance"]["after"] <= 0.05 * MM

@@ -448,22 +448,22 @@ def _of_bent_rows(solution: Solution, spread: Spread, table: ResidualTable, good
     values, V = np.linalg.eigh(spread.tangent)
     half, scales = V * np.sqrt(np.maximum(values, 0.0)), np.diag(solution.problem.variables.prior_scales)
     noises = noises_at(solution.problem, solution.parameters, at_readings=True)
-    n_rows, n_bent, n_folded, leverage_bent, leverage_folded, leverage = 0, 0, 0, 0.0, 0.0, 0.0
+    leverage = np.nan_to_num(goodness.leverage)
+    bent, folded, lengths = (np.zeros(table.n, dtype=np.bool_) for _ in range(3))
     for number, noise in enumerate(noises):
         if isinstance(noise, PairNoise):
             rows = np.flatnonzero(table.used & (table.series == number))
-            place, own = (table.measurement[rows], table.row[rows]), np.nan_to_num(goodness.leverage[rows])
-            bent, folded = noise.bent_by(half, BENT)[place], noise.may_fold(scales)[place]
-            n_rows, n_bent, n_folded = n_rows + len(rows), n_bent + int(bent.sum()), n_folded + int(folded.sum())
-            leverage += float(own.sum())
-            leverage_bent, leverage_folded = (
-                leverage_bent + float(own[bent].sum()),
-                leverage_folded + float(own[folded].sum()),
-            )
-    if not n_rows:
+            place = (table.measurement[rows], table.row[rows])
+            lengths[rows] = True
+            bent[rows], folded[rows] = noise.bent_by(half, BENT)[place], noise.may_fold(scales)[place]
+    if not lengths.any():
         return []
-    share = leverage_folded / max(leverage, 1e-300)
-    return [*of_bent(n_bent, n_rows, leverage_bent), *of_folds(n_folded, n_rows, share)]
+    n_rows = int(lengths.sum())
+    share = float(leverage[folded].sum() / max(leverage[table.used].sum(), 1e-300))
+    return [
+        *of_bent(int(bent.sum()), n_rows, float(leverage[bent].sum())),
+        *of_folds(int(folded.sum()), n_rows, share),
+    ]
 
 
 def _of_noise(solution: Solution, table: ResidualTable, goodness: Goodness) -> list[Statement]:

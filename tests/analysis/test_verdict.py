@@ -19,6 +19,7 @@ from fg_calib.analysis.variance_components import estimate_noise
 from fg_calib.baseline.comparison import real_errors
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
+from fg_calib.measurements.series import Table
 from fg_calib.options import Pairing
 from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import pose
@@ -557,10 +558,14 @@ def test_lengths_that_tolerances_let_point_either_way_are_a_finding():
     q = touch(
         robot, corners(robot, 1, rng), 30, rng, 0.0, ()
     ).readings  # the nominal arm is at one point in all of them
-    near = measure(true_robot(robot, rng), 30, rng, sigma=(1e-5, 1e-5), readings=q)
-    wide = measure(true_robot(robot, rng), 30, rng, sigma=(1e-5, 1e-5))
+    true = true_robot(robot, rng)
+    near = measure(true, 30, rng, sigma=(1e-5, 1e-5), readings=q)
+    wide = measure(true, 30, rng, sigma=(1e-5, 1e-5))
+    beside_poses = (Table(wide, "pose"), Table(near, "distance"))
     told = [
-        any("let their vectors point either way" in text for text in (*found.findings, *found.cautions))
-        for found in (assess(solve(build_problem(robot, m, model="distance"))) for m in (near, wide))
+        any("let their vectors point either way" in text for text in found.findings)
+        for found in (
+            assess(solve(build_problem(robot, given, model="distance"))) for given in (near, wide, beside_poses)
+        )
     ]
-    assert told == [True, False]
+    assert told == [True, False, False]  # poses say nearly all where there are some
