@@ -347,7 +347,8 @@ _UNMEASURED: dict[int, Problem] = {}
 def unmeasured_problem(setting: Setting) -> Problem:
     """The problem of the validation configurations, made once for a setting."""
     if id(setting) not in _UNMEASURED:
-        _UNMEASURED[id(setting)] = predicted_problem(setting.arm.robot, setting.validation, "position")
+        anywhere = Measurements.from_arrays(setting.validation)
+        _UNMEASURED[id(setting)] = predicted_problem(setting.arm.robot, anywhere, "position")
     return _UNMEASURED[id(setting)]
 
 

@@ -42,6 +42,7 @@ from fg_calib.robot.model import Robot
 from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
+Booleans = NDArray[np.bool_]
 
 RCOND = 1e-10
 """Singular values below this share of the largest belong to directions that nothing determines."""
@@ -105,7 +106,7 @@ class Bound:
             G, _ = without_rigid_motion(at.position, G)
         G = G.reshape(-1, len(self.names))  # (3 n, n_names)
         variance, V = np.linalg.eigh(self.claimed if claimed else self.covariance)
-        half = G @ (V * np.sqrt(np.maximum(variance, 0.0)))  # (3 n, n_names)
+        half = G @ (V * np.sqrt(np.maximum(variance, 0.0))) @ V.T  # (3 n, n_names); the symmetric root: signs of V vary
         z = np.random.default_rng(0).normal(size=(half.shape[1], _SAMPLES))
         distance = np.linalg.norm((half @ z).reshape(len(readings), 3, -1), axis=1)  # (n, samples)
         return PositionBound(
@@ -151,40 +152,39 @@ def cramer_rao(
     check_names("kept", () if kept is None else kept, names, "or fixed parameter")
     check_flag("prior", prior)
     k = np.array([kept is None or name in kept for name in names])
-    train = ~measurements.test
-    sigmas = tuple(
-        None if s is None else s[train] for s in (measurements.sigma_position, measurements.sigma_orientation)
-    )
-    problem = predicted_problem(
-        robot,
-        measurements.readings[train],
-        model,
-        frame=frame,
-        pairing=pairing,
-        sigmas=(sigmas[0], sigmas[1], measurements.sigma_joint),
-        pair_errors=pair_errors,
-    )
+    problem = predicted_problem(robot, measurements, model, frame=frame, pairing=pairing, pair_errors=pair_errors)
     J = named_triangle(problem, problem.start)  # (m, n_names)
-    tolerance = [p.tolerance for p in robot.parameters if p.estimated]
-    sigma = np.array([np.inf if t is None else t for t in tolerance])
-    P = np.diag(1.0 / sigma)[:, k] if prior else np.zeros((0, int(k.sum())))
-    U, s, Vt = np.linalg.svd(np.vstack([J[:, k], P]), full_matrices=False)
-    rank = int(np.sum(s > RCOND * s.max(initial=0.0)))
-    half = Vt[:rank].T / s[:rank]  # (n_kept, rank)
-    gain = np.zeros((len(names), len(J)))
-    gain[k] = half @ U[: len(J), :rank].T  # S+_J
+    sigma = np.array([np.inf if p.tolerance is None else p.tolerance for p in robot.parameters if p.estimated])
+    gain, claimed, rank = _linear_estimate(J, np.diag(1.0 / sigma) if prior else np.zeros((0, len(names))), k)
     left = gain @ J - np.eye(len(names))
     enters = np.abs(left).max(axis=0, initial=0.0) > _ENTERS
-    for name, t, matters in zip(names, tolerance, enters, strict=True):
-        # With priors every parameter that has one enters by it; the others are determined or not.
-        if t is None and matters:
-            raise InputError(f"robot {robot.name}", f"no tolerance for {name}", "one: its own error stays in part")
+    # With priors every parameter that has one enters by it; the others are determined or not.
+    for i in np.flatnonzero(np.isinf(sigma) & enters):
+        raise InputError(f"robot {robot.name}", f"no tolerance for {names[i]}", "one: its own error stays in part")
     of_errors = left * np.where(np.isfinite(sigma), sigma, 0.0)
-    claimed = np.zeros((len(names), len(names)))
-    claimed[np.ix_(k, k)] = half @ half.T
     covariance = gain @ gain.T + of_errors @ of_errors.T
     added = correlation(problem, problem.start) if pair_errors == "independent" else None
     if added is not None:
         back = problem.variables.tangent_derivative(problem.start)
         covariance = covariance + claimed @ (back.T @ added @ back) @ claimed
     return Bound(robot, names, covariance, claimed, rank)
+
+
+def _linear_estimate(J: Floats, P: Floats, k: Booleans) -> tuple[Floats, Floats, int]:
+    """Least squares with rows of data and of priors for some of the parameters, the others at nominal.
+
+    Args:
+        J: Whitened rows of the data, shape (m, n).
+        P: Whitened rows of the priors, shape (n_priors, n).
+        k: Which parameters are estimated, shape (n,).
+
+    Returns:
+        Estimate per residual of the data, shape (n, m); the covariance that it takes for its own, shape (n, n); rank.
+    """
+    U, s, Vt = np.linalg.svd(np.vstack([J[:, k], P[:, k]]), full_matrices=False)
+    rank = int(np.sum(s > RCOND * s.max(initial=0.0)))
+    half = Vt[:rank].T / s[:rank]  # (n_kept, rank)
+    gain, claimed = np.zeros((len(k), len(J))), np.zeros((len(k), len(k)))
+    gain[k] = half @ U[: len(J), :rank].T
+    claimed[np.ix_(k, k)] = half @ half.T
+    return gain, claimed, rank

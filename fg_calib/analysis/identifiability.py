@@ -130,19 +130,7 @@ def observe_configurations(
     check_names("prefer", prefer, names_of(robot.parameters))
     if not any(p.estimated for p in robot.parameters):
         raise ProblemError(f"robot {robot.name}", "nothing to estimate", "at least one parameter that is not fixed")
-    train = ~measurements.test
-    problem = predicted_problem(
-        robot,
-        measurements.readings[train],
-        model,
-        frame=frame,
-        pairing=pairing,
-        sigmas=(
-            None if measurements.sigma_position is None else measurements.sigma_position[train],
-            None if measurements.sigma_orientation is None else measurements.sigma_orientation[train],
-            measurements.sigma_joint,
-        ),
-    )
+    problem = predicted_problem(robot, measurements, model, frame=frame, pairing=pairing)
     if not problem.rows:
         raise ProblemError(measurements.source, "no row takes part", "configurations that differ")
     return identifiability_of(problem, problem.start, "practical", prefer)

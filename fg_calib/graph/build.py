@@ -169,44 +169,44 @@ def problem_of(job: Job, **changes: Any) -> Problem:
 @single_threaded
 def predicted_problem(
     robot: Robot,
-    readings: Floats,
+    measurements: Measurements,
     model: Model,
     *,
     frame: FrameKnowledge = "known",
     pairing: Pairing | None = None,
-    sigmas: tuple[Floats | None, Floats | None, Floats | None] = (None, None, None),
     pair_errors: PairErrors = "shared",
 ) -> Problem:
     """The problem that a robot's own predictions at some configurations make: what could be measured there.
 
     Args:
         robot: The robot.
-        readings: Joint readings, shape (n, n_joints), [rad] (prismatic: [m]).
+        measurements: The configurations (train rows) and their noise, 1 mm and 1 mrad where it is not stated; measured
+            values are not looked at.
         model: Which measurements take part.
         frame: Whether the measurement frame is estimated too.
         pairing: How pairs are formed; a star if None.
-        sigmas: Of positions, shape (n, 3), [m], of orientations, shape (n, 3), [rad], and of readings, shape
-            (n_joints,); 1 mm, 1 mrad and none where None.
         pair_errors: Whether pairs of one configuration share its errors or count as independent.
     """
     options = Options(model, as_pairing(pairing), frame, gauge="none", pair_errors=pair_errors)
-    trig = precompute_trig(robot, readings)
-    poses = forward(build_chain(robot), trig)
-    n = len(readings)
-    usual = np.full((n, 3), 1e-3)
-    sigma_position, sigma_orientation, sigma_joint = sigmas
-    measurements = Measurements(
+    train = ~measurements.test
+    readings = measurements.readings[train]
+    poses = forward(build_chain(robot), precompute_trig(robot, readings))
+
+    def stated(sigma: Floats | None) -> Floats:
+        return np.full((len(readings), 3), 1e-3) if sigma is None else sigma[train]
+
+    predictions = Measurements(
         readings=readings,
-        ids=np.arange(n).astype(str),
-        test=np.zeros(n, dtype=np.bool_),
+        ids=np.arange(len(readings)).astype(str),
+        test=np.zeros(len(readings), dtype=np.bool_),
         position=poses.position,
         rotation=poses.rotation,
-        sigma_position=usual if sigma_position is None else sigma_position,
-        sigma_orientation=usual if sigma_orientation is None else sigma_orientation,
-        sigma_joint=np.zeros(robot.n_joints) if sigma_joint is None else sigma_joint,
+        sigma_position=stated(measurements.sigma_position),
+        sigma_orientation=stated(measurements.sigma_orientation),
+        sigma_joint=measurements.sigma_joint,
         source="predictions",
     )
-    data = gather(tables_of(measurements, options))
+    data = gather(tables_of(predictions, options))
     variables = variables_of(robot, data, options)
     return problem_at(robot, data, options, variables, variables.nominal())
 
@@ -224,15 +224,12 @@ def random_problem(
         seed: Of the random configurations.
     """
     n = n_configurations or max(300, 10 * len(robot.parameters))
-    return predicted_problem(
-        robot,
+    somewhere = Measurements.from_arrays(
         random_readings(robot, n, np.random.default_rng(seed)),
-        model,
-        frame=frame,
-        pairing=Pairing("chain"),
-        sigmas=(np.full((n, 3), robot.scale_of("m")), np.full((n, 3), robot.scale_of("rad")), None),
-        pair_errors="independent",
+        sigma_position=robot.scale_of("m"),
+        sigma_orientation=robot.scale_of("rad"),
     )
+    return predicted_problem(robot, somewhere, model, frame=frame, pairing=Pairing("chain"), pair_errors="independent")
 
 
 def _check_frames(data: Dataset) -> None:
