@@ -2,66 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import special
 from scipy.spatial.transform import Rotation
 
 from fg_calib.analysis.accuracy import ExpectedError, expected_error, without_rigid_motion
-from fg_calib.analysis.conventions import MissingMotion
+from fg_calib.analysis.chi_square import chi_square
 from fg_calib.analysis.corrections import PriorFit, judge_priors
 from fg_calib.analysis.covariance import Spread, spread_of, with_left_out
-from fg_calib.analysis.goodness import OUTLIER_WEIGHT, Goodness, judge_fit
+from fg_calib.analysis.findings import LIKE_NOISE, MOST_ESTIMATED, Fit, judge
+from fg_calib.analysis.goodness import Goodness, judge_fit
 from fg_calib.analysis.identifiability import Identifiability, identifiability_of
 from fg_calib.analysis.joint_values import JointValues, joint_values
-from fg_calib.analysis.mistakes import SetupCheck, check_problem
+from fg_calib.analysis.mistakes import SetupCheck
 from fg_calib.analysis.residual_table import ResidualTable, residual_table
-from fg_calib.analysis.structure import probability_of_noise
-from fg_calib.analysis.verdict import (
-    Statement,
-    chi2_bounds,
-    of_bent,
-    of_chi2,
-    of_estimated_noise,
-    of_evaluation,
-    of_folds,
-    of_priors,
-    of_test,
-)
 from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.extension import check_graph
 from fg_calib.graph.factors import corrections_of, pose_of
 from fg_calib.graph.information import eliminated
-from fg_calib.graph.noise import PairNoise
 from fg_calib.graph.observability import IdentifiabilityClass, Observability
-from fg_calib.graph.problem import Problem, at_parameters, mahalanobis_distances, noises_at
-from fg_calib.graph.robust import effect
+from fg_calib.graph.problem import at_parameters
 from fg_calib.graph.solver import Solution
 from fg_calib.robot.model import Robot
 from fg_calib.threads import one_blas_thread, single_threaded
 
 Floats = NDArray[np.float64]
-Booleans = NDArray[np.bool_]
-Integers = NDArray[np.int64]
-
-MOST_OUTLIERS = 0.5
-"""Share of measurements beyond which they are not outliers but the majority."""
-
-BENT = 1.0
-"""Sigma by which what the parameters may still be off bends a row that is not linear enough."""
-
-MOST_ESTIMATED = 2.0
-"""Noise seen over noise stated above which it is more likely that something is not modelled."""
-
-_WITH_FIGURES = ("distance", "angle", "orientation", "position")
-"""Kinds of noise whose motions are seen in what was measured."""
-
-LIKE_NOISE = 1e-3
-"""Probability below which residuals follow the arm more than noise does."""
 
 
 @dataclass(frozen=True)
@@ -291,98 +260,35 @@ def _assess(solution: Solution) -> Uncertainty:
     identifiability = identifiability_of(problem.whole or problem, solution.before, "practical")
     covariance = whole.named()
     frames = _frame_estimates(solution, whole)
-    chi2, n_rows, loss_factor = _weighted_chi2(solution)
-    dof = n_rows + problem.n_priors + problem.n_added - spread.rank - eliminated(problem, solution.parameters).rank
-    expected = max(0.0, dof - spread.excess - (1.0 - loss_factor) * n_rows)
-    independent = _independent_dof(problem, dof, spread.rank)
-    bounds = chi2_bounds(dof, expected, independent)
-    p_value = _p_value(solution, chi2, expected, independent)
-    table = residual_table(solution)
-    goodness, priors = judge_fit(solution, spread, table), judge_priors(solution, spread)
-    evaluated = problem.evaluated
-    statements = [
-        *_of_solver(solution),
-        *of_chi2(chi2, dof, expected, bounds, p_value, evaluated),
-        *of_evaluation(evaluated, solution.estimated_noise is not None),
-        *of_test(goodness.test, chi2 / expected if expected > 0.0 else 1.0, problem.end_names),
-        *of_priors(priors),
-        *_of_bent_rows(solution, spread, table, goodness),
-        *_of_noise(solution, table, goodness),
-    ]
-    doubts = tuple(s.text for s in statements if s.finding)
-    too_large = {fit.verdict for fit in goodness.kinds} & {"too small", "both"}
-    asked = not evaluated and (too_large or (identifiability.missing and solution.estimated_noise))
-    noise_like = probability_of_noise(solution) if asked else None
-    follow = noise_like is not None and noise_like < LIKE_NOISE
-    estimated = max((fit.factor for fit in goodness.kinds), default=1.0) > MOST_ESTIMATED
-    setup = SetupCheck()
-    if not evaluated:
-        setup = check_problem(problem, solution.before, doubtful=bool(doubts) or estimated)
-    fits = not doubts and solution.estimated_noise is None
-    findings, cautions = _of_model(setup, identifiability.missing, fits=fits, high=chi2 > bounds[1] * dof or follow)
+    chi2, table = chi_square(solution, spread), residual_table(solution)
+    fit = Fit(chi2, table, judge_fit(solution, spread, table), judge_priors(solution, spread))
+    verdict = judge(solution, spread, fit, identifiability.missing)
     return Uncertainty(
         names=whole.variables.names[: whole.variables.n_robot_columns],
         covariance=covariance,
         parameters=_parameter_estimates(solution, np.sqrt(np.diag(covariance)), spread, identifiability.observability),
         frame=frames[0] if frames else None,
         frames=frames,
-        chi2=chi2,
-        dof=dof,
-        expected_chi2=expected,
-        chi2_bounds=bounds,
-        p_value=p_value,
+        chi2=chi2.value,
+        dof=chi2.dof,
+        expected_chi2=chi2.expected,
+        chi2_bounds=chi2.bounds,
+        p_value=chi2.p_value,
         residuals=table,
-        goodness=goodness,
-        priors=priors,
-        expected_error=None if evaluated else expected_error(solution, whole),
+        goodness=fit.goodness,
+        priors=fit.priors,
+        expected_error=None if problem.evaluated else expected_error(solution, whole),
         identifiability=identifiability,
         robot=problem.robot.with_values(solution.parameters[variables.robot_span]),
         spread=spread,
         whole=whole,
-        findings=(*findings, *doubts),
-        cautions=(*cautions, *(s.text for s in statements if not s.finding)),
+        findings=verdict.findings,
+        cautions=verdict.cautions,
         points=_point_estimates(solution, whole),
         joint_values=joint_values(solution, spread),
-        setup=setup,
-        noise_like=noise_like,
+        setup=verdict.setup,
+        noise_like=verdict.noise_like,
     )
-
-
-def _weighted_chi2(solution: Solution) -> tuple[float, int, float]:
-    """Chi-square, the independent residuals in it, and what a robust loss makes of the mean of one of them.
-
-    With a robust loss only measurements count that keep at least half their weight.
-    """
-    problem = solution.problem
-    weights, chi2 = problem.state.weights, 2.0 * solution.weighted_cost
-    if weights is None:
-        return chi2, problem.n_independent, 1.0
-    n_rows = n_kept = expected = 0.0
-    distances = mahalanobis_distances(problem, solution.parameters)
-    for series, w, (e, residual_dim) in zip(problem.data.series, weights, distances, strict=True):
-        train, outlier = (residual_dim > 0) & ~series.test, w < OUTLIER_WEIGHT
-        chi2 -= float(np.sum(w[train & outlier] * e[train & outlier] ** 2))
-        kept = float(residual_dim[train & ~outlier].sum())
-        n_rows, n_kept = n_rows + float(residual_dim[train].sum()), n_kept + kept
-        expected += kept * effect(problem.options.loss, int(residual_dim.max(initial=1))).chi2
-    of_loss = expected / n_kept if n_kept else 1.0
-    return max(0.0, chi2), round(problem.n_independent * n_kept / max(n_rows, 1.0)), of_loss
-
-
-def _p_value(solution: Solution, chi2: float, expected: float, independent: int) -> float | None:
-    """Upper p-value of chi-square, scaled to its mean; None where weights or noise came from the residuals."""
-    problem = solution.problem
-    if problem.state.weights is not None or solution.estimated_noise is not None or expected <= 0.0 or independent <= 0:
-        return None
-    return float(special.gammaincc(independent / 2.0, chi2 / expected * independent / 2.0))
-
-
-def _independent_dof(problem: Problem, dof: int, rank: int) -> int:
-    """Degrees of freedom of the noise behind the residuals: pairs hold no more than the poses they come from."""
-    if not (problem.formed and problem.missing_correlation) or len(problem.data.series) > 1:
-        return dof
-    each = 3 * problem.data.series[0].kind.residual_dim
-    return min(dof, each * (problem.n_configurations - 1) + problem.n_priors - rank)
 
 
 def _frame_estimates(solution: Solution, whole: Spread) -> tuple[FrameEstimate, ...]:
@@ -441,98 +347,6 @@ def _parameter_estimates(
 
 def _known(sigma: float) -> float | None:
     return float(sigma) if np.isfinite(sigma) else None
-
-
-def _of_bent_rows(solution: Solution, spread: Spread, table: ResidualTable, goodness: Goodness) -> list[Statement]:
-    """Whether the result rests on lengths and angles that are far from linear in what is still unknown."""
-    values, V = np.linalg.eigh(spread.tangent)
-    half, scales = V * np.sqrt(np.maximum(values, 0.0)), np.diag(solution.problem.variables.prior_scales)
-    noises = noises_at(solution.problem, solution.parameters, at_readings=True)
-    leverage = np.nan_to_num(goodness.leverage)
-    bent, folded, lengths = (np.zeros(table.n, dtype=np.bool_) for _ in range(3))
-    for number, noise in enumerate(noises):
-        if isinstance(noise, PairNoise):
-            rows = np.flatnonzero(table.used & (table.series == number))
-            place = (table.measurement[rows], table.row[rows])
-            lengths[rows] = True
-            bent[rows], folded[rows] = noise.bent_by(half, BENT)[place], noise.may_fold(scales)[place]
-    if not lengths.any():
-        return []
-    n_rows = int(lengths.sum())
-    share = float(leverage[folded].sum() / max(leverage[table.used].sum(), 1e-300))
-    return [
-        *of_bent(int(bent.sum()), n_rows, float(leverage[bent].sum())),
-        *of_folds(int(folded.sum()), n_rows, share),
-    ]
-
-
-def _of_noise(solution: Solution, table: ResidualTable, goodness: Goodness) -> list[Statement]:
-    """Whether noise that was estimated is small beside the motions it was estimated of."""
-    found: list[Statement] = []
-    for fit in goodness.kinds:
-        if (fit.table, fit.kind) in (solution.estimated_noise or ()) and fit.kind in _WITH_FIGURES:
-            rows = table.used & (table.group == table.groups.index((fit.table, fit.kind)))
-            predicted = (table.measured + table.after)[rows]
-            about = 0.0 if fit.kind in ("distance", "angle") else float(np.mean(predicted))
-            motion = 1.0 if fit.kind == "orientation" else float(np.sqrt(np.mean((predicted - about) ** 2)))
-            found += of_estimated_noise(fit.kind, fit.factor * fit.stated_sigma_rms, max(motion, 1e-300))
-    return found
-
-
-def _of_solver(solution: Solution) -> list[Statement]:
-    """Whether it arrived, and whether a robust loss left enough."""
-    statements = []
-    if not solution.converged:
-        statements.append(Statement(solution.message, finding=True))
-    statements += [Statement(text, finding=True) for text in _other_optima(solution)]
-    weights, series = solution.problem.state.weights, solution.problem.data.series
-    if weights is not None:
-        n = sum(len(s.train) for s in series)
-        lost = sum(int(np.sum(w[s.train] < OUTLIER_WEIGHT)) for s, w in zip(series, weights, strict=True))
-        if lost > MOST_OUTLIERS * n:
-            loss = solution.problem.options.loss
-            text = f"loss {loss} takes {lost} of {n} measurements for outliers: more than it can tell from noise"
-            statements.append(Statement(text, finding=True))
-    return statements
-
-
-def _of_model(
-    setup: SetupCheck, missing: Sequence[MissingMotion], *, fits: bool, high: bool
-) -> tuple[list[str], list[str]]:
-    """Findings and cautions that come before all others: the set-up or the model is wrong, so no figure can be right.
-
-    Args:
-        setup: What residuals before the calibration say of the set-up.
-        missing: What the robot's convention has no parameter for.
-        fits: Whether nothing speaks against the calibration although the noise was as stated.
-        high: Whether the residuals are larger than the noise, or follow the arm.
-    """
-    findings: list[str] = []
-    cautions: list[str] = []
-    if setup.explanations:
-        (cautions if fits else findings).append(str(setup))
-    elif setup.far and high:
-        findings.append(str(setup))
-    for motion in missing:
-        (findings if high and not setup.explanations else cautions).append(str(motion))
-    return findings, cautions
-
-
-def _other_optima(solution: Solution, most: int = 4) -> list[str]:
-    """A line for each other optimum: the parameters that differ most, in their tolerances, with both corrections."""
-    robot, found = solution.problem.robot, []
-    for other in solution.others:
-        apart = {p.name: abs(other[i] - solution.parameters[i]) / p.scale for i, p in enumerate(robot.parameters)}
-        largest = max(apart.values())
-        named = sorted((name for name in apart if apart[name] > 0.3 * largest), key=lambda name: -apart[name])[:most]
-        words = []
-        for i in map(robot.index, named):
-            p = robot.parameters[i]
-            factor, unit = (1e3, "mm") if p.unit == "m" else (180.0 / np.pi, "deg")
-            here, there = (factor * (at[i] - p.nominal) for at in (solution.parameters, other))
-            words.append(f"{p.name} {here:+.3g} or {there:+.3g} {unit}")
-        found.append(f"a second optimum that the data cannot tell from this one: {', '.join(words)} from nominal")
-    return found
 
 
 def _point_estimates(solution: Solution, spread: Spread) -> tuple[PointEstimate, ...]:

@@ -14,14 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
+from fg_calib.analysis.chi_square import CONFIDENCE, FACTOR, ChiSquare
 from fg_calib.analysis.corrections import PriorFit
 from fg_calib.analysis.goodness import PredictedFit
-
-CONFIDENCE = 0.999
-"""A sum of squares outside this central interval of its distribution is not by chance."""
-
-FACTOR = 2.0
-"""A reduced chi-square between 1 / FACTOR and FACTOR is good whatever its distribution: noise is never known better."""
 
 WORTH_SAYING = 1.1
 """Noise seen over noise stated, or the inverse, below which a difference that is not by chance is not worth a word."""
@@ -55,38 +50,16 @@ class Statement:
     finding: bool
 
 
-def chi2_bounds(dof: int, expected: float | None = None, independent: int | None = None) -> tuple[float, float]:
-    """Interval of the reduced chi-square taken as good: its central `CONFIDENCE`, widened to `FACTOR` either way.
-
-    Args:
-        dof: Degrees of freedom that chi-square is divided by.
-        expected: Mean of chi-square; `dof` if None.
-        independent: Degrees of freedom of the noise behind it; `dof` if None.
-    """
-    if dof <= 0:
-        return 0.0, np.inf
-    k = max(1, min(dof, independent or dof))
-    ratio = 1.0 if expected is None else expected / dof
-    low, high = (2.0 * special.gammaincinv(k / 2.0, p) / k for p in ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))
-    return ratio * min(float(low), 1.0 / FACTOR), max(1.0, ratio) * max(float(high), FACTOR)
-
-
-def of_chi2(
-    chi2: float, dof: int, expected: float, bounds: tuple[float, float], p_value: float | None, evaluated: bool = False
-) -> list[Statement]:
+def of_chi2(found: ChiSquare, evaluated: bool = False) -> list[Statement]:
     """What chi-square of the fitted rows and priors says.
 
     Args:
-        chi2: Sum of squared whitened residuals.
-        dof: Degrees of freedom.
-        expected: Mean of chi-square.
-        bounds: Interval of the reduced chi-square taken as good (see `chi2_bounds`).
-        p_value: Upper one; None where that is not known.
+        found: It.
         evaluated: Whether the arm was taken as it is.
     """
-    if dof <= 0:
+    if found.dof <= 0:
         return []
-    reduced, (low, high) = chi2 / dof, bounds
+    reduced, (low, high) = found.value / found.dof, found.bounds
     outside = f"reduced chi-square {reduced:.3g} is outside [{low:.2f}, {high:.2f}]"
     if reduced > high:
         cause = "noise stated too small, effects not modelled, or outliers"
@@ -95,8 +68,8 @@ def of_chi2(
         return [Statement(f"{outside}: {cause}", finding=True)]
     if reduced < low:
         return [Statement(f"{outside}: noise stated too large; sigmas are larger than they need be", finding=False)]
-    seen = float(np.sqrt(chi2 / expected)) if expected > 0.0 else 1.0
-    if p_value is not None and p_value < (1.0 - CONFIDENCE) / 2.0 and seen > WORTH_SAYING:
+    seen = float(np.sqrt(found.ratio))
+    if found.p_value is not None and found.p_value < (1.0 - CONFIDENCE) / 2.0 and seen > WORTH_SAYING:
         text = f"reduced chi-square {reduced:.3g}: residuals are {seen:.2f} times the noise stated, not by chance"
         return [Statement(f"{text}; sigmas may be too small by as much", finding=False)]
     return []

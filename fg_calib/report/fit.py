@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import RenderableType
 
+from fg_calib.analysis.findings import LIKE_NOISE
 from fg_calib.analysis.goodness import FLAGS, PREDICTION_VERDICTS, VERDICTS, KindFit, SuspectConfiguration
-from fg_calib.analysis.uncertainty import LIKE_NOISE, Uncertainty
+from fg_calib.analysis.uncertainty import Uncertainty
 from fg_calib.analysis.verdict import probability
 from fg_calib.graph.solver import Solution
 from fg_calib.report.tables import SHOWN, indented, plain_table, rounded, section

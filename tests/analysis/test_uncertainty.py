@@ -10,8 +10,8 @@ from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_
 from tolerances import rounding
 
 from fg_calib.analysis.accuracy import pose_rms
+from fg_calib.analysis.chi_square import chi2_bounds
 from fg_calib.analysis.uncertainty import assess, marginals
-from fg_calib.analysis.verdict import chi2_bounds
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import SolverOptions, solve
 from fg_calib.measurements.dataset import Measurements
