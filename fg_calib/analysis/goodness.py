@@ -35,8 +35,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -46,14 +45,11 @@ from numpy.typing import NDArray
 from scipy import special
 
 from fg_calib.analysis.covariance import Spread
+from fg_calib.analysis.residual_covariance import Dense, Errors, LowRank, Nuisances
 from fg_calib.analysis.residual_table import ResidualTable
-from fg_calib.graph.information import eliminated
-from fg_calib.graph.noise import PRIVATE_SHARE, RowNoise
-from fg_calib.graph.problem import Problem, at_parameters, noises_at, says_where
+from fg_calib.graph.problem import noises_at
 from fg_calib.graph.robust import tuning, weight
-from fg_calib.graph.rows import ErrorColumns
 from fg_calib.graph.solver import Solution
-from fg_calib.measurements import residuals
 from fg_calib.robot.kinematics import SPAN
 
 Floats = NDArray[np.float64]
@@ -312,7 +308,7 @@ class _Part:
     rows: Integers
     squares: Floats
     means: Floats
-    covariance: _LowRank | _Dense | None
+    covariance: LowRank | Dense | None
     shared: bool
     judged: bool
     n_ends: int
@@ -406,7 +402,7 @@ class _Rows:
         covariance = None
         if keep[fitted].all():
             covariance = self._residual_covariance(fitted, all_kept.at(np.searchsorted(of_kept, fitted)))
-        if isinstance(covariance, _Dense):
+        if isinstance(covariance, Dense):
             variance[fitted] = covariance.diagonal
         with np.errstate(invalid="ignore", divide="ignore"):
             self.studentised = table.after / (table.sigma * np.sqrt(np.maximum(variance, 1e-12)))
@@ -459,7 +455,7 @@ class _Rows:
         What pairs formed from poses do not share counts as `PRIVATE_SHARE` of their variance at least, as in the fit.
         """
         chosen = np.unique(np.linspace(0, len(part.rows) - 1, MAX_WHITENED).round().astype(np.int64))
-        if not isinstance(part.covariance, _LowRank) or not len(part.rows):
+        if not isinstance(part.covariance, LowRank) or not len(part.rows):
             return float(np.sum(part.squares)), float(np.sum(part.means)), part.degrees(np.arange(len(part.rows)))
         A, floor = part.covariance.dense(chosen)
         z = np.sign(self._table.after[part.rows[chosen]]) * np.sqrt(part.squares[chosen])
@@ -473,7 +469,7 @@ class _Rows:
             nu = expected**2 / square
         return float(white @ white), expected, nu
 
-    def _part(self, rows: Integers, squares: Floats, means: Floats, covariance: _LowRank | _Dense | None) -> _Part:
+    def _part(self, rows: Integers, squares: Floats, means: Floats, covariance: LowRank | Dense | None) -> _Part:
         behind = np.full(len(self._table.groups), np.inf)
         n_ends = len(self._table.names)
         return _Part(self._table, rows, squares, means, covariance, self._shared, not self._robust, n_ends, behind)
@@ -504,7 +500,7 @@ class _Rows:
         )
 
     def _predict(
-        self, test: Integers, squares: Floats, kept: Integers, of_kept: _Errors
+        self, test: Integers, squares: Floats, kept: Integers, of_kept: Errors
     ) -> tuple[_Part, OutlierCounts, int]:
         """The predicted rows that can be judged; `PredictedFit.outliers`, and how many rows are not known.
 
@@ -525,7 +521,7 @@ class _Rows:
         means, covariance = 1.0 + self.leverage[rows], None
         if np.isin(rows, kept).all():
             found = of_kept.at(np.searchsorted(kept, rows))
-            covariance = _LowRank(found.of_estimate(self._spread.actual), found.L, found.private)
+            covariance = LowRank(found.of_estimate(self._spread.actual), found.L, found.private)
             means = covariance.diagonal
             covariance = covariance.over(np.sqrt(means))
             with np.errstate(invalid="ignore"):
@@ -557,10 +553,10 @@ class _Rows:
             out[mine] = weight(loss, e / np.sqrt(np.maximum(1.0 + more, LEAST_VARIANCE)), c)[measurement]
         return out
 
-    def _read(self, keep: Booleans) -> _Errors:
+    def _read(self, keep: Booleans) -> Errors:
         """Leverage of every row; what the rows to keep follow from, over sigma."""
         table = self._table
-        nuisances = _Nuisances(self._problem, self._solution.parameters, self._noises)
+        nuisances = Nuisances(self._problem, self._solution.parameters, self._noises)
         self.leverage = np.full(table.n, np.nan)
         kept = []
         for number, noise in enumerate(self._noises):
@@ -577,12 +573,12 @@ class _Rows:
                 kept.append(found.at(np.flatnonzero(keep[rows])))
         self.leverage[~np.isfinite(self.leverage)] = np.nan
         J, own, private = (np.concatenate([getattr(k, name) for k in kept]) for name in ("J", "own", "private"))
-        return _Errors(J, own, private, scipy.sparse.csr_array(scipy.sparse.vstack([k.L for k in kept])))
+        return Errors(J, own, private, scipy.sparse.csr_array(scipy.sparse.vstack([k.L for k in kept])))
 
-    def _residual_covariance(self, fitted: Integers, found: _Errors) -> _LowRank | _Dense:
+    def _residual_covariance(self, fitted: Integers, found: Errors) -> LowRank | Dense:
         """Of the fitted rows, from what they follow from."""
         if self._carried:
-            return _LowRank(found.of_estimate(self._spread.tangent), found.L, found.private, sign=-1.0)
+            return LowRank(found.of_estimate(self._spread.tangent), found.L, found.private, sign=-1.0)
         C = (found.L @ found.L.T).toarray() + np.diag(found.private)
         measurement = self._measurement(fitted)
         weighted_as = np.where(measurement[:, None] == measurement, C, 0.0)
@@ -591,166 +587,7 @@ class _Rows:
         K = scipy.linalg.block_diag(self._spread.tangent, np.eye(found.own.shape[1]))
         X = J @ (K @ (WJ.T @ C))
         covariance = K + K @ (WJ.T @ ((C - weighted_as) @ WJ)) @ K
-        return _Dense(C - X - X.T + J @ covariance @ J.T)
-
-
-@dataclass(frozen=True)
-class _Errors:
-    """What residuals follow from.
-
-    Attributes:
-        J: Derivatives in the core, the nuisances following it, shape (n, n_columns).
-        own: What nuisances are off by themselves, shape (n, n_nuisance): by errors of 1 sigma.
-        private: Variance of each row's private noise, shape (n,).
-        L: How rows follow from other noise, sparse, shape (n, n_errors): from errors of 1 sigma.
-    """
-
-    J: Floats
-    own: Floats
-    private: Floats
-    L: Loadings
-
-    @property
-    def of_noise(self) -> Floats:
-        """Variance of rows by noise alone, shape (n,)."""
-        out: Floats = self.private + np.asarray(self.L.power(2).sum(axis=1)).ravel()
-        return out
-
-    def of_estimate(self, covariance: Floats) -> Floats:
-        """P with P P^T the covariance of rows by what the estimate is off, shape (n, n_columns + n_nuisance).
-
-        Args:
-            covariance: Of the core.
-        """
-        return np.hstack([self.J @ _half(covariance), self.own])
-
-    def at(self, rows: Integers) -> _Errors:
-        """Those of some rows."""
-        return _Errors(self.J[rows], self.own[rows], self.private[rows], self.L[rows])
-
-    def over(self, sigma: Floats) -> _Errors:
-        """Those of rows divided by something, shape (n,)."""
-        by = 1.0 / sigma
-        L = scipy.sparse.csr_array(scipy.sparse.diags_array(by) @ self.L)
-        return _Errors(self.J * by[:, None], self.own * by[:, None], self.private * by**2, L)
-
-
-class _Nuisances:
-    """Which errors rows follow from, nuisances being estimated, or means of what touched them, or known.
-
-    Args:
-        problem: The problem.
-        parameters: The estimate.
-        noises: The rows and their noise at the estimate.
-    """
-
-    def __init__(self, problem: Problem, parameters: Floats, noises: Sequence[RowNoise]) -> None:
-        self._at = at_parameters(problem, parameters)
-        self._noises, self._columns, self._n = noises, ErrorColumns(noises), problem.variables.n_columns
-        there, n = self._at.columns >= 0, len(self._at.columns)
-        self._follow, self._inverse = np.zeros((n, self._n)), np.zeros((n, 0))
-        if there.any():
-            left, of_nuisance = eliminated(problem, parameters), self._at.columns[there] - self._n
-            self._inverse = np.zeros((n, left.rank))
-            self._follow[there], self._inverse[there] = left.follow[of_nuisance], left.inverse[of_nuisance]
-        series = problem.data.series
-        self._apart = [says_where(problem.data, s) & ~there[s.nuisances].any(axis=1) for s in series]
-        reserved = [s.n * s.kind.residual_dim * of.any() for s, of in zip(series, self._apart, strict=True)]
-        self._first = self._columns.n_errors + np.cumsum([0, *reserved])
-        self._averaged = scipy.sparse.csr_array((n, int(self._first[-1])))
-        for number, of in enumerate(self._apart):
-            touches = np.flatnonzero(of)
-            if len(touches):
-                found, _ = self._nuisances_known(number, touches)
-                place = series[number].nuisances[touches].ravel()
-                share = 1.0 / np.bincount(place)[place]
-                B = scipy.sparse.csr_array((share, (place, np.arange(len(place)))), shape=(n, len(place)))
-                self._follow += np.asarray(B @ found.J)
-                self._averaged = self._averaged + B @ found.L
-
-    def errors(self, number: int, rows: Integers) -> _Errors:
-        """What rows of a series follow from."""
-        known, N = self._nuisances_known(number, rows)
-        return replace(known, J=known.J + N @ self._follow, own=N @ self._inverse, L=known.L + N @ self._averaged)
-
-    def _nuisances_known(self, number: int, rows: Integers) -> tuple[_Errors, Loadings]:
-        """The same if nuisances were known; derivatives in these, sparse, shape (n residual_dim, n_coordinates).
-
-        The noise of touches whose mean a point is stands among L, after the errors of configurations.
-        """
-        noise, width = self._noises[number], int(self._first[-1])
-        J = residuals.linearise(noise.rows_at(rows), self._at.chains[noise.series.table])[1]
-        n, residual_dim = J.shape[:2]
-        of_core, in_nuisances = J[:, :, : self._n].reshape(n * residual_dim, -1), J[:, :, self._n :]
-        row = np.broadcast_to(np.arange(n * residual_dim).reshape(n, residual_dim, 1), in_nuisances.shape).ravel()
-        place = np.broadcast_to(noise.series.nuisances[rows][:, None], in_nuisances.shape).ravel()
-        N = scipy.sparse.csr_array((in_nuisances.ravel(), (row, place)), shape=(n * residual_dim, len(self._follow)))
-        private = np.maximum(np.einsum("nii->ni", noise.own[rows]), 0.0).ravel()
-        apart = np.flatnonzero(np.repeat(self._apart[number][rows], residual_dim))
-        column = self._first[number] + (rows[:, None] * residual_dim + np.arange(residual_dim)).ravel()[apart]
-        own = scipy.sparse.csr_array((np.sqrt(private[apart]), (apart, column)), shape=(n * residual_dim, width))
-        private[apart] = 0.0
-        L = self._columns.loading(noise, rows)
-        L = scipy.sparse.csr_array((L.data, L.indices, L.indptr), shape=own.shape) + own
-        return _Errors(of_core, np.zeros((n * residual_dim, 0)), private, L), N
-
-
-class _LowRank:
-    """Covariance `D + L L^T + sign P P^T` of standardised residuals.
-
-    Args:
-        P: Shape (n, n_columns).
-        L: Sparse, shape (n, n_errors).
-        own: Diagonal of D, shape (n,).
-        sign: 1, or -1 for rows that P was fitted to.
-    """
-
-    def __init__(self, P: Floats, L: Loadings, own: Floats, sign: float = 1.0) -> None:
-        self._P, self._L, self._d, self._sign = P, L, own, sign
-        self._p = sign * np.sum(P * P, axis=1)
-        self._l = np.asarray(L.power(2).sum(axis=1)).ravel()
-
-    @property
-    def diagonal(self) -> Floats:
-        """Variances, shape (n,)."""
-        out: Floats = self._d + self._l + self._p
-        return out
-
-    def over(self, scale: Floats) -> _LowRank:
-        """The same of rows divided by a scale, shape (n,)."""
-        by = 1.0 / scale
-        L = scipy.sparse.csr_array(scipy.sparse.diags_array(by) @ self._L)
-        return _LowRank(self._P * by[:, None], L, self._d * by**2, self._sign)
-
-    def dense(self, rows: Integers) -> tuple[Floats, Floats]:
-        """The part at `rows`, and what its D lacks to be `PRIVATE_SHARE` of the noise."""
-        P, d, of_l = self._P[rows], self._d[rows], self._l[rows]
-        A = np.diag(d) + self._sign * (P @ P.T) + (self._L[rows] @ self._L[rows].T).toarray()
-        return A, np.maximum(PRIVATE_SHARE * (d + of_l) - d, 0.0)
-
-    def moments(self, rows: Integers) -> tuple[float, float]:
-        """Trace, and trace of the square, of the part at `rows`."""
-        P, L, p, of_l, d = self._P[rows], self._L[rows], self._p[rows], self._l[rows], self._d[rows]
-        square = np.sum(d * d) + 2.0 * np.sum(d * (of_l + p)) + np.sum((P.T @ P) ** 2)
-        square += (L.T @ L).power(2).sum() + 2.0 * self._sign * np.sum((L.T @ P) ** 2)
-        return float(np.sum(d + of_l + p)), float(square)
-
-
-class _Dense:
-    """Covariance of standardised residuals, shape (n, n)."""
-
-    def __init__(self, A: Floats) -> None:
-        self._A = A
-
-    @property
-    def diagonal(self) -> Floats:
-        """Variances, shape (n,)."""
-        return np.diag(self._A).copy()
-
-    def moments(self, rows: Integers) -> tuple[float, float]:
-        """Trace, and trace of the square, of the part at `rows`."""
-        A = self._A[np.ix_(rows, rows)]
-        return float(np.trace(A)), float(np.sum(A * A))
+        return Dense(C - X - X.T + J @ covariance @ J.T)
 
 
 def upper_probability(ratio: float, nu: float, behind: float = np.inf) -> float:
@@ -764,10 +601,3 @@ def upper_probability(ratio: float, nu: float, behind: float = np.inf) -> float:
     if np.isfinite(behind):
         return float(special.fdtrc(nu, behind, ratio))
     return float(special.gammaincc(nu / 2.0, nu / 2.0 * ratio))
-
-
-def _half(covariance: Floats) -> Floats:
-    """H with H H^T a covariance, shape (n, n)."""
-    values, vectors = np.linalg.eigh(covariance)
-    out: Floats = vectors * np.sqrt(np.maximum(values, 0.0))
-    return out

@@ -83,7 +83,6 @@ def read_measurements(
         texts=header.present("id", "split", "group"),
     )
     length, angle = units.factor("m"), units.factor("rad")
-    readings = _readings(table, joints, robot, units)
     ids, test = _ids(table), table.test_rows()
     names, group = _groups(table)
     between, between_groups = None, no_pairs(header.name)
@@ -91,7 +90,7 @@ def read_measurements(
         configurations = Configurations(table, ids, test, names, group)
         between, between_groups = read_pairs(pairs, configurations, units, noise)
     return Measurements(
-        readings=readings,
+        readings=_readings(table, joints, robot, units),
         ids=ids.to_numpy().astype(np.str_),
         test=test,
         position=table.numbers(position) * length if position else None,

@@ -6,7 +6,7 @@ may hold are not. Calibrated origins are written into the same XML, so that ever
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -84,14 +84,7 @@ def read_urdf(
 
     builder = RobotBuilder(name or root.get("name") or path.stem, "urdf")
     builder.add_frame("base", base or {}, 0, False)
-    n_joints = 0
-    for joint, backwards in tree.chain(base_link, tip_link):
-        if joint.element.get("type") == "fixed":
-            builder.add_constant_frame(joint.origin, backwards=backwards)
-            continue
-        here = f"{path.name}: joint {joint.name!r}"
-        builder.add_urdf_joint(_moving_joint(joint, here), joint.origin, _axis(joint, here), backwards=backwards)
-        n_joints += 1
+    n_joints = _add_chain(builder, tree.chain(base_link, tip_link), path.name)
     if n_joints == 0:
         raise InputError(path.name, f"no moving joint between links {base_link!r} and {tip_link!r}", "at least one")
     builder.add_frame("tool", tool or {}, n_joints + 1, False)
@@ -102,6 +95,19 @@ def read_urdf(
         urdf=UrdfSource(text, base_link, tip_link),
         place=place or path.name,
     )
+
+
+def _add_chain(builder: RobotBuilder, chain: Iterable[tuple[_UrdfJoint, bool]], place: str) -> int:
+    """Add the joints of a chain, each with whether it is passed backwards; the number of those that move."""
+    n_joints = 0
+    for joint, backwards in chain:
+        if joint.element.get("type") == "fixed":
+            builder.add_constant_frame(joint.origin, backwards=backwards)
+            continue
+        here = f"{place}: joint {joint.name!r}"
+        builder.add_urdf_joint(_moving_joint(joint, here), joint.origin, _axis(joint, here), backwards=backwards)
+        n_joints += 1
+    return n_joints
 
 
 def write_urdf(path: Path | str, robot: Robot) -> None:

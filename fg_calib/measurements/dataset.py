@@ -188,9 +188,8 @@ class Measurements(FrozenArrays):
             rotation: world_R_tool, shape (n, 3, 3); or one of the next two.
             quaternion: As x y z w, shape (n, 4).
             roll_pitch_yaw: As angles, Rz(yaw) Ry(pitch) Rx(roll), shape (n, 3).
-            pairs: What was measured between configurations, or between touched points: arrays `a` and `b` (ids, row
-                numbers where there are none, or groups), `distance`, `angle` (nan where not measured),
-                `sigma_distance`, `sigma_angle`, `test`; shape (n_pairs,) each, sigmas and test may be missing.
+            pairs: Between configurations or touched points, arrays of shape (n_pairs,): `a` and `b` (ids, row numbers
+                where there are none, or groups); `distance`, `angle` (nan: not measured), `sigma_...` each, `test`.
             group: Name of the point that a configuration touched, None where it touched none, shape (n,).
             test: True for rows that are predicted but never fitted, shape (n,).
             ids: Name of each configuration, shape (n,); its row number if None.

@@ -146,18 +146,9 @@ def walk(chain, trig, row, rotation, point, twist):  # type: ignore[no-untyped-d
                 _shift(value[e], R, k, p)
         elif j >= 0:
             _add_angles(cosine[e], sine[e], reading)
-            if k == 3:
-                _turn_by_reading(reading, R, 1, 2)
-            elif k == 4:
-                _turn_by_reading(reading, R, 2, 0)
-            else:
-                _turn_by_reading(reading, R, 0, 1)
-        elif k == 3:
-            _turn(cosine[e], sine[e], R, 1, 2)
-        elif k == 4:
-            _turn(cosine[e], sine[e], R, 2, 0)
+            _turn_about_by_reading(k, reading, R)
         else:
-            _turn(cosine[e], sine[e], R, 0, 1)
+            _turn_about(k, cosine[e], sine[e], R)
 
 
 @inlined
@@ -217,6 +208,16 @@ def _turn(cosine, sine, R, a, b):  # type: ignore[no-untyped-def]
 
 
 @inlined
+def _turn_about(k, cosine, sine, R):  # type: ignore[no-untyped-def]
+    if k == 3:
+        _turn(cosine, sine, R, 1, 2)
+    elif k == 4:
+        _turn(cosine, sine, R, 2, 0)
+    else:
+        _turn(cosine, sine, R, 0, 1)
+
+
+@inlined
 def _add_angles(cosine, sine, reading):  # type: ignore[no-untyped-def]
     """Cosine and sine of the reading become those of its sum with a value."""
     for i in range(LANES):
@@ -232,6 +233,16 @@ def _turn_by_reading(reading, R, a, b):  # type: ignore[no-untyped-def]
             x, y = R[(3 * a + c) * LANES + i], R[(3 * b + c) * LANES + i]
             R[(3 * a + c) * LANES + i] = reading[i] * x + reading[LANES + i] * y
             R[(3 * b + c) * LANES + i] = reading[i] * y - reading[LANES + i] * x
+
+
+@inlined
+def _turn_about_by_reading(k, reading, R):  # type: ignore[no-untyped-def]
+    if k == 3:
+        _turn_by_reading(reading, R, 1, 2)
+    elif k == 4:
+        _turn_by_reading(reading, R, 2, 0)
+    else:
+        _turn_by_reading(reading, R, 0, 1)
 
 
 @compiled
@@ -256,12 +267,8 @@ def _walk_basis(k, coefficient, sign, trig, row, basis, column, own, reading, R,
         reading[LANES + i] = np.sin(angle)
     if k < 3:
         _shift_by_reading(0.0, 1.0, reading, R, k, p)
-    elif k == 3:
-        _turn_by_reading(reading, R, 1, 2)
-    elif k == 4:
-        _turn_by_reading(reading, R, 2, 0)
     else:
-        _turn_by_reading(reading, R, 0, 1)
+        _turn_about_by_reading(k, reading, R)
 
 
 @compiled

@@ -1,0 +1,189 @@
+"""What residuals follow from at the estimate: noise, parameters, nuisances; and their covariance, in low rank.
+
+See `goodness` for what is made of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from fg_calib.graph.information import eliminated
+from fg_calib.graph.noise import PRIVATE_SHARE, RowNoise
+from fg_calib.graph.problem import Problem, at_parameters, says_where
+from fg_calib.graph.rows import ErrorColumns
+from fg_calib.measurements import residuals
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Loadings = scipy.sparse.csr_array
+
+
+@dataclass(frozen=True)
+class Errors:
+    """What residuals follow from.
+
+    Attributes:
+        J: Derivatives in the core, the nuisances following it, shape (n, n_columns).
+        own: What nuisances are off by themselves, shape (n, n_nuisance): by errors of 1 sigma.
+        private: Variance of each row's private noise, shape (n,).
+        L: How rows follow from other noise, sparse, shape (n, n_errors): from errors of 1 sigma.
+    """
+
+    J: Floats
+    own: Floats
+    private: Floats
+    L: Loadings
+
+    @property
+    def of_noise(self) -> Floats:
+        """Variance of rows by noise alone, shape (n,)."""
+        out: Floats = self.private + np.asarray(self.L.power(2).sum(axis=1)).ravel()
+        return out
+
+    def of_estimate(self, covariance: Floats) -> Floats:
+        """P with P P^T the covariance of rows by what the estimate is off, shape (n, n_columns + n_nuisance).
+
+        Args:
+            covariance: Of the core.
+        """
+        return np.hstack([self.J @ _half(covariance), self.own])
+
+    def at(self, rows: Integers) -> Errors:
+        """Those of some rows."""
+        return Errors(self.J[rows], self.own[rows], self.private[rows], self.L[rows])
+
+    def over(self, sigma: Floats) -> Errors:
+        """Those of rows divided by something, shape (n,)."""
+        by = 1.0 / sigma
+        L = scipy.sparse.csr_array(scipy.sparse.diags_array(by) @ self.L)
+        return Errors(self.J * by[:, None], self.own * by[:, None], self.private * by**2, L)
+
+
+class Nuisances:
+    """Which errors rows follow from, nuisances being estimated, or means of what touched them, or known.
+
+    Args:
+        problem: The problem.
+        parameters: The estimate.
+        noises: The rows and their noise at the estimate.
+    """
+
+    def __init__(self, problem: Problem, parameters: Floats, noises: Sequence[RowNoise]) -> None:
+        self._at = at_parameters(problem, parameters)
+        self._noises, self._columns, self._n = noises, ErrorColumns(noises), problem.variables.n_columns
+        there, n = self._at.columns >= 0, len(self._at.columns)
+        self._follow, self._inverse = np.zeros((n, self._n)), np.zeros((n, 0))
+        if there.any():
+            left, of_nuisance = eliminated(problem, parameters), self._at.columns[there] - self._n
+            self._inverse = np.zeros((n, left.rank))
+            self._follow[there], self._inverse[there] = left.follow[of_nuisance], left.inverse[of_nuisance]
+        series = problem.data.series
+        self._apart = [says_where(problem.data, s) & ~there[s.nuisances].any(axis=1) for s in series]
+        reserved = [s.n * s.kind.residual_dim * of.any() for s, of in zip(series, self._apart, strict=True)]
+        self._first = self._columns.n_errors + np.cumsum([0, *reserved])
+        self._averaged = scipy.sparse.csr_array((n, int(self._first[-1])))
+        for number, of in enumerate(self._apart):
+            touches = np.flatnonzero(of)
+            if len(touches):
+                found, _ = self._nuisances_known(number, touches)
+                place = series[number].nuisances[touches].ravel()
+                share = 1.0 / np.bincount(place)[place]
+                B = scipy.sparse.csr_array((share, (place, np.arange(len(place)))), shape=(n, len(place)))
+                self._follow += np.asarray(B @ found.J)
+                self._averaged = self._averaged + B @ found.L
+
+    def errors(self, number: int, rows: Integers) -> Errors:
+        """What rows of a series follow from."""
+        known, N = self._nuisances_known(number, rows)
+        return replace(known, J=known.J + N @ self._follow, own=N @ self._inverse, L=known.L + N @ self._averaged)
+
+    def _nuisances_known(self, number: int, rows: Integers) -> tuple[Errors, Loadings]:
+        """The same if nuisances were known; derivatives in these, sparse, shape (n residual_dim, n_coordinates).
+
+        The noise of touches whose mean a point is stands among L, after the errors of configurations.
+        """
+        noise, width = self._noises[number], int(self._first[-1])
+        J = residuals.linearise(noise.rows_at(rows), self._at.chains[noise.series.table])[1]
+        n, residual_dim = J.shape[:2]
+        of_core, in_nuisances = J[:, :, : self._n].reshape(n * residual_dim, -1), J[:, :, self._n :]
+        row = np.broadcast_to(np.arange(n * residual_dim).reshape(n, residual_dim, 1), in_nuisances.shape).ravel()
+        place = np.broadcast_to(noise.series.nuisances[rows][:, None], in_nuisances.shape).ravel()
+        N = scipy.sparse.csr_array((in_nuisances.ravel(), (row, place)), shape=(n * residual_dim, len(self._follow)))
+        private = np.maximum(np.einsum("nii->ni", noise.own[rows]), 0.0).ravel()
+        apart = np.flatnonzero(np.repeat(self._apart[number][rows], residual_dim))
+        column = self._first[number] + (rows[:, None] * residual_dim + np.arange(residual_dim)).ravel()[apart]
+        own = scipy.sparse.csr_array((np.sqrt(private[apart]), (apart, column)), shape=(n * residual_dim, width))
+        private[apart] = 0.0
+        L = self._columns.loading(noise, rows)
+        L = scipy.sparse.csr_array((L.data, L.indices, L.indptr), shape=own.shape) + own
+        return Errors(of_core, np.zeros((n * residual_dim, 0)), private, L), N
+
+
+class LowRank:
+    """Covariance `D + L L^T + sign P P^T` of standardised residuals.
+
+    Args:
+        P: Shape (n, n_columns).
+        L: Sparse, shape (n, n_errors).
+        own: Diagonal of D, shape (n,).
+        sign: 1, or -1 for rows that P was fitted to.
+    """
+
+    def __init__(self, P: Floats, L: Loadings, own: Floats, sign: float = 1.0) -> None:
+        self._P, self._L, self._d, self._sign = P, L, own, sign
+        self._p = sign * np.sum(P * P, axis=1)
+        self._l = np.asarray(L.power(2).sum(axis=1)).ravel()
+
+    @property
+    def diagonal(self) -> Floats:
+        """Variances, shape (n,)."""
+        out: Floats = self._d + self._l + self._p
+        return out
+
+    def over(self, scale: Floats) -> LowRank:
+        """The same of rows divided by a scale, shape (n,)."""
+        by = 1.0 / scale
+        L = scipy.sparse.csr_array(scipy.sparse.diags_array(by) @ self._L)
+        return LowRank(self._P * by[:, None], L, self._d * by**2, self._sign)
+
+    def dense(self, rows: Integers) -> tuple[Floats, Floats]:
+        """The part at `rows`, and what its D lacks to be `PRIVATE_SHARE` of the noise."""
+        P, d, of_l = self._P[rows], self._d[rows], self._l[rows]
+        A = np.diag(d) + self._sign * (P @ P.T) + (self._L[rows] @ self._L[rows].T).toarray()
+        return A, np.maximum(PRIVATE_SHARE * (d + of_l) - d, 0.0)
+
+    def moments(self, rows: Integers) -> tuple[float, float]:
+        """Trace, and trace of the square, of the part at `rows`."""
+        P, L, p, of_l, d = self._P[rows], self._L[rows], self._p[rows], self._l[rows], self._d[rows]
+        square = np.sum(d * d) + 2.0 * np.sum(d * (of_l + p)) + np.sum((P.T @ P) ** 2)
+        square += (L.T @ L).power(2).sum() + 2.0 * self._sign * np.sum((L.T @ P) ** 2)
+        return float(np.sum(d + of_l + p)), float(square)
+
+
+class Dense:
+    """Covariance of standardised residuals, shape (n, n)."""
+
+    def __init__(self, A: Floats) -> None:
+        self._A = A
+
+    @property
+    def diagonal(self) -> Floats:
+        """Variances, shape (n,)."""
+        return np.diag(self._A).copy()
+
+    def moments(self, rows: Integers) -> tuple[float, float]:
+        """Trace, and trace of the square, of the part at `rows`."""
+        A = self._A[np.ix_(rows, rows)]
+        return float(np.trace(A)), float(np.sum(A * A))
+
+
+def _half(covariance: Floats) -> Floats:
+    """H with H H^T a covariance, shape (n, n)."""
+    values, vectors = np.linalg.eigh(covariance)
+    out: Floats = vectors * np.sqrt(np.maximum(values, 0.0))
+    return out
