@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -232,7 +232,6 @@ class Unknowns:
         names: What each is called.
         sizes: Number of coordinates of each.
         starts: Where each is started; nan where the measurements say.
-        tables: Table of each.
     """
 
     def __init__(self) -> None:
@@ -240,7 +239,8 @@ class Unknowns:
         self.names: list[str] = []
         self.sizes: list[int] = []
         self.starts: list[Floats] = []
-        self.tables: list[int] = []
+        self._named: dict[tuple[str, str], int] = {}
+        self._first: list[int] = []
 
     @property
     def n_coordinates(self) -> int:
@@ -252,16 +252,38 @@ class Unknowns:
         """Which unknown each coordinate is of, shape (n_coordinates,)."""
         return np.repeat(np.arange(len(self.sizes)), self.sizes)
 
-    def add(self, letter: str, names: Sequence[str], starts: Floats, table: int) -> Integers:
-        """Add unknowns of one dimension; their coordinates' places, shape (n, dimension)."""
-        n, size = starts.shape
-        first = self.n_coordinates
-        self.letters += [letter] * n
-        self.names += list(names)
-        self.sizes += [size] * n
-        self.starts += list(starts)
-        self.tables += [table] * n
-        return first + np.arange(n * size).reshape(n, size)
+    def add(self, letter: str, names: Sequence[str], starts: Floats, place: str) -> Integers:
+        """Add unknowns of one dimension; those of a name that is there are the same, whatever table they are from.
+
+        Args:
+            letter: Letter of their keys.
+            names: What they are called; none have names of their own if empty.
+            starts: Where they are started, shape (n, dimension).
+            place: The table, for messages.
+
+        Returns:
+            Their coordinates' places, shape (n, dimension).
+
+        Raises:
+            ProblemError: Two of one name are started at different places.
+        """
+        found = np.empty(starts.shape, dtype=np.int64)
+        for k, start in enumerate(starts):
+            name = names[k] if names else str(k)
+            i = self._named.get((letter, name), len(self.names)) if names else len(self.names)
+            if i == len(self.names):
+                self._first.append(self._first[-1] + self.sizes[-1] if self.sizes else 0)
+                self.letters.append(letter)
+                self.names.append(name)
+                self.sizes.append(len(start))
+                self.starts.append(start)
+            elif not np.array_equal(self.starts[i], start, equal_nan=True):
+                expected = f"that of the other {name}: {self.starts[i].tolist()}"
+                raise ProblemError(place, f"start {start.tolist()} of unknown {name}", expected)
+            if names:
+                self._named[letter, name] = i
+            found[k] = self._first[i] + np.arange(len(start))
+        return found
 
 
 def series_of(table: Table, number: int, unknowns: Unknowns) -> list[Series]:
@@ -406,7 +428,7 @@ def _touch_series(m: Measurements, table: Table, number: int, unknowns: Unknowns
     pairs = groups.pairs
     if not np.isfinite(pairs.sigma_distance).all():
         raise ProblemError(pairs.source, "no sigma for distance", "noise.distance or a column sigma_distance")
-    place = unknowns.add("L", groups.names, np.full((groups.n_groups, 3), np.nan), number)
+    place = unknowns.add("L", groups.names, np.full((groups.n_groups, 3), np.nan), m.source)
     touches = Series(
         kind=TouchedPoint(),
         table=number,
@@ -421,7 +443,6 @@ def _touch_series(m: Measurements, table: Table, number: int, unknowns: Unknowns
     )
     if not pairs.n_pairs:
         return [touches]
-    known = np.isin(np.arange(groups.n_groups), groups.index[rows[~m.test[rows]]])  # the others are of test rows alone
     between = Series(
         kind=PointDistance(),
         table=number,
@@ -429,7 +450,7 @@ def _touch_series(m: Measurements, table: Table, number: int, unknowns: Unknowns
         data=np.ascontiguousarray(pairs.distance[:, None]),
         sigma=pairs.sigma_distance[:, None],
         measured=np.ones((pairs.n_pairs, 1), dtype=np.bool_),
-        test=pairs.test | ~known[pairs.a] | ~known[pairs.b],
+        test=pairs.test,
         number=np.arange(pairs.n_pairs),
         nuisances=np.hstack([place[pairs.a], place[pairs.b]]),
         source=pairs.source,
@@ -447,8 +468,7 @@ def _own_series(own: Own, m: Measurements, number: int, unknowns: Unknowns) -> S
     nuisances = np.zeros((n, 0), dtype=np.int64)
     if kind.n_nuisances:
         starts = np.atleast_2d(np.asarray(own.unknowns, dtype=np.float64))
-        names = own.names or tuple(map(str, range(len(starts))))
-        place = unknowns.add("N", names, starts, number)
+        place = unknowns.add("N", own.names, starts, m.source)
         which = np.zeros((n, 1), dtype=np.int64) if own.which is None else np.asarray(own.which).reshape(n, -1)
         nuisances = place[which].reshape(n, -1)
     return Series(
@@ -566,4 +586,17 @@ def gather(tables: Sequence[Table]) -> Dataset:
             )
         places.append(place)
         series += series_of(table, number, unknowns)
+    series = _without_untouched(series, unknowns.n_coordinates)
     return Dataset(tuple(tables), tuple(series), unknowns, tuple(places), (*names, *unknowns.names))
+
+
+def _without_untouched(series: Sequence[Series], n_coordinates: int) -> list[Series]:
+    """The series; distances of a point that no train row touched are there to be predicted alone."""
+    touched = np.zeros(n_coordinates, dtype=np.bool_)
+    for s in series:
+        if isinstance(s.kind, TouchedPoint):
+            touched[s.nuisances[~s.test]] = True
+    return [
+        replace(s, test=s.test | ~touched[s.nuisances].all(axis=1)) if isinstance(s.kind, PointDistance) else s
+        for s in series
+    ]

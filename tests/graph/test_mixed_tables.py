@@ -10,6 +10,8 @@ import scipy.optimize
 import yaml
 from scipy.spatial.transform import Rotation
 from simulated import measure, paper_robot, small_arm, true_robot
+from test_own_kind import measured
+from touches import corners, touch
 
 from fg_calib import write_robot
 from fg_calib.analysis.uncertainty import assess
@@ -18,7 +20,7 @@ from fg_calib.errors import ProblemError
 from fg_calib.files.csv_writer import write_csv
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
-from fg_calib.measurements.dataset import Pairs
+from fg_calib.measurements.dataset import Groups, Pairs, no_pairs
 from fg_calib.measurements.series import Table
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
@@ -150,6 +152,46 @@ def test_order_of_tables_and_one_table_in_parts_change_nothing():
         )
         assert found.chi2 == pytest.approx(whole.chi2, rel=1e-9)
         assert found.dof == whole.dof
+
+
+def test_a_point_of_one_name_in_two_tables_is_one_point():
+    """Touches of three sockets, the last of them and the distances in a second table: the same as one table."""
+    rng = np.random.default_rng(7)
+    robot = small_arm(tolerance=TOLERANCE)
+    true = true_robot(robot, rng)
+    m = touch(true, corners(robot, 3, rng), 8, rng, distances=((1, 2, 1e-5),))
+    of_first = np.arange(24) < 13  # the second socket has touches in both
+    none = no_pairs("first.csv")
+
+    def part(rows, pairs, source):
+        names = tuple(np.array(m.groups.names)[np.unique(m.groups.index[rows])])
+        index = np.searchsorted(names, np.array(m.groups.names)[m.groups.index[rows]])
+        place = np.searchsorted(names, np.array(m.groups.names)) if pairs.n_pairs else None
+        pairs = replace(pairs, a=place[pairs.a], b=place[pairs.b]) if pairs.n_pairs else pairs
+        return replace(
+            m, readings=m.readings[rows], ids=m.ids[rows], test=m.test[rows], sigma_point=m.sigma_point[rows],
+            groups=Groups(names, index, pairs), source=source,
+        )  # fmt: skip
+
+    first, second = part(of_first, none, "first.csv"), part(~of_first, m.groups.pairs, "second.csv")
+    one, two = (assess(solve(build_problem(robot, given, model="distance"))) for given in (m, [first, second]))
+    assert [p.name for p in two.points] == [p.name for p in one.points] == ["g0", "g1", "g2"]
+    assert [p.n for p in two.points] == [8, 8, 8]
+    sigma = np.array([p.sigma or np.inf for p in one.parameters])
+    off = (np.array([p.estimate for p in two.parameters]) - [p.estimate for p in one.parameters]) / sigma
+    # Both are solved until a step is 1e-9 sigma; sums in another order.
+    assert np.abs(off).max() < 1e-6
+    assert (two.dof, two.chi2) == (one.dof, pytest.approx(one.chi2, rel=1e-9))
+
+
+def test_an_unknown_of_one_name_started_at_two_places_is_refused():
+    robot, _, table = measured(0, n=20)
+    (own,) = table.own
+    again = replace(own, unknowns=own.unknowns + 0.01)
+    with pytest.raises(ProblemError, match=r"start \[.*\] of unknown A, expected that of the other A: \["):
+        build_problem(robot, replace(table, own=(own, again)))
+    both = build_problem(robot, replace(table, own=(own, own)))
+    assert len(both.data.unknowns.names) == 3
 
 
 def test_noise_is_estimated_table_by_table():
