@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sized
+from dataclasses import fields
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,7 +17,37 @@ NORM_TOLERANCE = 1e-3
 """How far a quaternion or a rotation matrix may be from length 1: more is not rounding."""
 
 
-class FrozenArrays:
+class Brief:
+    """Base of dataclasses that hold arrays: a repr fits a screen, with shapes for arrays and types for long values."""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "__repr__" not in vars(cls):
+            cls.__repr__ = _brief  # type: ignore[method-assign] # dataclass makes none where there is one
+
+
+def _brief(of: object) -> str:
+    """`Series(kind=Distance, ends=int64 (12, 2), ...)`, a line each where it is long."""
+    parts = [f"{f.name}={_in_brief(getattr(of, f.name))}" for f in fields(of) if f.repr]  # type: ignore[arg-type]
+    line = f"{type(of).__name__}({', '.join(parts)})"
+    return line if len(line) <= _WIDTH else "\n  ".join([f"{type(of).__name__}:", *parts])
+
+
+def _in_brief(value: object) -> str:
+    if isinstance(value, np.ndarray) and value.size <= _FEW:
+        return np.array2string(value, precision=6, separator=", ")
+    if hasattr(value, "dtype") and hasattr(value, "shape"):  # scipy's sparse arrays too
+        return f"{value.dtype} {value.shape}"
+    text = repr(value)
+    if len(text) <= _WIDTH - 40 and "\n" not in text:
+        return text
+    return f"{type(value).__name__} of {len(value)}" if isinstance(value, Sized) else type(value).__name__
+
+
+_WIDTH, _FEW = 100, 4
+
+
+class FrozenArrays(Brief):
     """Base of frozen dataclasses: arrays among their fields are read-only views.
 
     Nothing is copied, and an array that was passed in stays as writable as it was. It is for types that others are

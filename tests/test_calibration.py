@@ -3,7 +3,7 @@
 import copy
 import json
 import pickle
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 import pytest
@@ -26,6 +26,7 @@ from fg_calib import (
     read_job,
     solve,
 )
+from fg_calib.arrays import Brief
 
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3, "tool": 2e-3}
 FRAME = (Rotation.from_rotvec([0.3, -0.2, 1.0]), np.array([0.5, 1.0, -0.3]))
@@ -210,6 +211,17 @@ def test_noise_is_estimated_from_nothing_stated():
         assert seen == pytest.approx(true, rel=0.3)  # 120 residuals: 1 sigma of their RMS is 7 %
 
 
+def of_dataclasses(value):
+    """The dataclasses with arrays in a value, at any depth."""
+    for field in fields(value):
+        of_field = getattr(value, field.name)
+        for one in of_field if isinstance(of_field, tuple) else (of_field,):
+            if is_dataclass(one):
+                yield from of_dataclasses(one)
+    if isinstance(value, Brief):
+        yield value
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_everything_fits_a_screen(found, name):
     result = found[name]
@@ -219,6 +231,12 @@ def test_everything_fits_a_screen(found, name):
         assert len(lines) <= 10
         assert max(map(len, lines)) <= 100
         assert "array(" not in repr(shown)
+    for part in (of_dataclasses(result.uncertainty), of_dataclasses(result.solution.problem)):
+        for shown in part:
+            lines = repr(shown).splitlines()
+            assert len(lines) <= 30, type(shown)
+            assert max(map(len, lines)) <= 240, type(shown)  # findings and reasons are sentences
+            assert "array(" not in repr(shown), type(shown)
     assert str(result).startswith(f"{robot.name}: {result.result.model}")
     assert "Fit statistics" in str(result)
 

@@ -47,6 +47,7 @@ from scipy import special
 from fg_calib.analysis.covariance import Spread
 from fg_calib.analysis.residual_covariance import Dense, Errors, LowRank, Nuisances
 from fg_calib.analysis.residual_table import ResidualTable
+from fg_calib.arrays import Brief
 from fg_calib.graph.problem import noises_at
 from fg_calib.graph.robust import tuning, weight
 from fg_calib.graph.solver import Solution
@@ -186,7 +187,7 @@ class OutlierCounts(NamedTuple):
 
 
 @dataclass(frozen=True)
-class PredictedFit:
+class PredictedFit(Brief):
     """How well the calibrated arm predicts the test rows.
 
     Attributes:
@@ -216,7 +217,7 @@ class PredictedFit:
 
 
 @dataclass(frozen=True)
-class Goodness:
+class Goodness(Brief):
     """How well residuals and stated noise agree; arrays are in the order of the residual table, shape (n,).
 
     Attributes:

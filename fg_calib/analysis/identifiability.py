@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from fg_calib.analysis.conventions import MissingMotion, missing_motions
 from fg_calib.analysis.reasons import LostDirection, explain
+from fg_calib.arrays import Brief
 from fg_calib.errors import ProblemError
 from fg_calib.graph.build import STRUCTURAL_FLOOR, predicted_problem, random_problem
 from fg_calib.graph.information import observability_of
@@ -30,7 +31,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Identifiability:
+class Identifiability(Brief):
     """What measurements determine of a robot's parameters, and why not the rest.
 
     Attributes:

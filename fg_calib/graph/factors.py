@@ -33,6 +33,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.arrays import Brief
 from fg_calib.errors import SolverError
 from fg_calib.graph.rows import At, RowSet
 from fg_calib.measurements.series import Unknowns
@@ -81,7 +82,7 @@ class Variable:
 
 
 @dataclass(frozen=True)
-class Variables:
+class Variables(Brief):
     """All variables of a problem, and the way between GTSAM's values and the parameter vector.
 
     The parameter vector has the robot's parameters, then six for each unknown measurement frame (at least one) in the
@@ -585,7 +586,7 @@ def dense(linear: gtsam.GaussianFactorGraph, keys: list[int]) -> tuple[Floats, F
 
 
 @dataclass(frozen=True)
-class Eliminated:
+class Eliminated(Brief):
     """A linear system with its nuisance columns eliminated by QR.
 
     Attributes:

@@ -18,6 +18,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from fg_calib.arrays import Brief
 from fg_calib.graph.noise import RowNoise, Source, whitening_of
 from fg_calib.measurements import residuals
 from fg_calib.measurements.residuals import Block, pack, unpack
@@ -34,7 +35,7 @@ LEAST_WEIGHT = 1e-12
 
 
 @dataclass(frozen=True)
-class At:
+class At(Brief):
     """The arm and the nuisance coordinates at some parameters.
 
     Attributes:
@@ -57,7 +58,7 @@ class At:
 
 
 @dataclass(frozen=True)
-class Part:
+class Part(Brief):
     """Train rows of one series, whitened by their private noise.
 
     Attributes:
@@ -118,7 +119,7 @@ def _scatter(out: Floats, N: Floats, columns: Integers) -> None:
 
 
 @dataclass(frozen=True)
-class RowSet:
+class RowSet(Brief):
     """Whitened train rows; every row counts as one measurement where they share errors.
 
     Attributes:

@@ -21,6 +21,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.arrays import Brief
 from fg_calib.measurements.kinds import Frames, Kind, checked_rows
 from fg_calib.robot.kernels import LANES, fill
 from fg_calib.robot.kinematics import Chain, forward, over_spans, turning_of_base
@@ -37,7 +38,7 @@ _NOTHING = np.zeros((0, 0)), np.zeros((0, 0, 0, 0)), np.zeros((0, 0, 0))
 
 
 @dataclass(frozen=True)
-class Block:
+class Block(Brief):
     """Measurements of one kind.
 
     Attributes:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.arrays import Brief
 from fg_calib.errors import InputError, ProblemError
 from fg_calib.measurements.dataset import Measurements, Pairs, form_pairs, no_pairs
 from fg_calib.measurements.kinds import (
@@ -44,7 +45,7 @@ POINT_MODELS: tuple[Model, ...] = ("distance", "distance-rotation")
 
 
 @dataclass(frozen=True)
-class Series:
+class Series(Brief):
     """Measurements of one kind from one table.
 
     Attributes:
@@ -104,7 +105,7 @@ class Series:
 
 
 @dataclass(frozen=True)
-class Own:
+class Own(Brief):
     """Measurements of a kind of one's own, at the configurations of a table.
 
     Attributes:
@@ -186,7 +187,7 @@ def _check_indices(name: str, given: Any, n: int, top: int | None) -> None:
 
 
 @dataclass(frozen=True)
-class Table:
+class Table(Brief):
     """A table of measurements, and how it is to be understood.
 
     Attributes:
@@ -486,7 +487,7 @@ def _own_series(own: Own, m: Measurements, number: int, unknowns: Unknowns) -> S
 
 
 @dataclass(frozen=True)
-class Dataset:
+class Dataset(Brief):
     """All tables of a calibration, as estimation takes them.
 
     Attributes:

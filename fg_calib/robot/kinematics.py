@@ -28,6 +28,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.arrays import Brief
 from fg_calib.errors import InputError
 from fg_calib.robot.kernels import ChainArrays, walk_all
 from fg_calib.robot.model import AXIS_OF_KIND, FRAME_KINDS, Axis, Element, Robot
@@ -39,7 +40,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Chain:
+class Chain(Brief):
     """A robot prepared for the compiled walk; `at` gives it other parameter values.
 
     Attributes:
@@ -220,7 +221,7 @@ def precompute_trig(robot: Robot, readings: Floats, given: Floats | None = None)
 
 
 @dataclass(frozen=True)
-class Poses:
+class Poses(Brief):
     """Tool poses with their derivatives.
 
     Attributes:
