@@ -6,6 +6,7 @@ only turns about its own point, and so on. Where no check succeeds the reason is
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,8 @@ from fg_calib.graph.build import random_problem
 from fg_calib.graph.information import named_triangle
 from fg_calib.graph.observability import Observability
 from fg_calib.graph.problem import Problem
-from fg_calib.options import Model
+from fg_calib.measurements.series import Table
+from fg_calib.options import PAIR_MODELS, FrameKnowledge, Model
 from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
 from fg_calib.robot.model import Parameter
 
@@ -49,12 +51,12 @@ def explain(problem: Problem, observability: Observability, parameters: Floats) 
     lost = observability.lost
     if not lost:
         return ()
-    settings = problem.options
-    anywhere = random_problem(
-        problem.robot.with_values(parameters[problem.variables.robot_span]), settings.model, settings.frame
-    )
-    effect = named_triangle(anywhere, anywhere.start)
-    motion = _Motion(anywhere)
+    robot, seen = problem.robot.with_values(parameters[problem.variables.robot_span]), _Seen.by(problem.data.tables)
+    anywhere = [random_problem(robot, *view) for view in seen.views or (("pose", "known"),)]
+    effect = np.vstack([named_triangle(p, p.start) for p in anywhere])
+    if not seen.views:
+        effect = 0.0 * effect  # what another kind would show elsewhere is not known
+    motion = _Motion(anywhere[0], seen)
     largest = float(np.linalg.norm(effect, axis=0).max())
     found = []
     for relation in lost:
@@ -66,15 +68,50 @@ def explain(problem: Problem, observability: Observability, parameters: Floats) 
     return tuple(found)
 
 
+@dataclass(frozen=True)
+class _Seen:
+    """What tables together see of the tool's motion; other kinds may see anything, in any frame.
+
+    Attributes:
+        views: Models with the knowledge of their frames, each once.
+        own: Whether there are measurements of other kinds.
+    """
+
+    views: tuple[tuple[Model, FrameKnowledge], ...]
+    own: bool
+
+    @classmethod
+    def by(cls, tables: Sequence[Table]) -> _Seen:
+        """By tables."""
+        views = [(t.model, "unknown" if t.unknown_frame else "known") for t in tables if t.model is not None]
+        return cls(tuple(dict.fromkeys(views)), any(t.own for t in tables))  # type: ignore[arg-type]
+
+    def any_of(self, models: Sequence[Model]) -> bool:
+        """Whether a model is among these, or might be."""
+        return self.own or any(model in models for model, _ in self.views)
+
+    @property
+    def pairs(self) -> bool:
+        """Whether all that is measured is between configurations."""
+        return not self.own and all(model in PAIR_MODELS for model, _ in self.views)
+
+    def relative(self, models: Sequence[Model]) -> bool:
+        """Whether what tables of these models see does not say where the base is."""
+        return all(
+            model in PAIR_MODELS or frame == "unknown" for model, frame in self.views if self.own or model in models
+        )
+
+    def __str__(self) -> str:
+        return " and ".join(dict.fromkeys(model for model, _ in self.views))
+
+
 class _Motion:
     """What parameters do to the tool at the random configurations of a problem."""
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, seen: _Seen) -> None:
         robot = problem.robot
         self._parameters = problem.estimated
-        self._model = problem.options.model
-        self._relative = problem.options.uses_pairs or problem.options.frame == "unknown"
-        self._pairs = problem.options.uses_pairs
+        self._seen = seen
         columns = {robot.index(p.name): k for k, p in enumerate(self._parameters)}
         chain = build_chain(robot, columns).with_joint_columns()
         poses = forward(chain, precompute_trig(robot, problem.measurements.readings[:60]))
@@ -95,24 +132,25 @@ class _Motion:
         size_p = float(np.abs(self._J[:, 3:] * direction).sum(axis=2).max())
         turns = float(np.abs(w).max()) > _NOTHING * max(size_w, 1e-3 * size_p)
         moves = float(np.abs(dp).max()) > _NOTHING * max(size_p, 1e-3 * size_w)
-        sees_orientation, sees_position = self._model in SEES_ORIENTATION, self._model in SEES_POSITION
+        sees_orientation, sees_position = map(self._seen.any_of, (SEES_ORIENTATION, SEES_POSITION))
         if not turns and not moves:
             return self._same_motion(direction)
         if not sees_orientation and not moves:
             if self._on_last_axis:
-                return f"the tool point lies on the last axis: the tool only turns about it, unseen by {self._model}"
-            return f"the tool only turns about its own point, unseen by {self._model}"
+                return f"the tool point lies on the last axis: the tool only turns about it, unseen by {self._seen}"
+            return f"the tool only turns about its own point, unseen by {self._seen}"
         if not sees_position and not turns:
             if self._all_turn(direction):
                 return f"{self._parallel(direction)}: only the sum of their turns is seen, and no lengths are"
-            return f"the tool only moves without turning, unseen by {self._model}"
-        if self._relative and self._rigid(w, dp, sees_position):
+            return f"the tool only moves without turning, unseen by {self._seen}"
+        relative = self._seen.relative(SEES_POSITION) and (not turns or self._seen.relative(SEES_ORIENTATION))
+        if relative and self._rigid(w, dp, sees_position):
             return "the measurement is blind to the base: the whole arm moves as one body"
-        if self._pairs and not moves and self._constant(np.einsum("nji,nj->ni", self._R, w)):
+        if self._seen.pairs and not moves and self._constant(np.einsum("nji,nj->ni", self._R, w)):
             return self._tool_turned(direction)
-        if self._pairs and not sees_position and self._constant(np.einsum("nji,nj->ni", self._R, w)):
+        if self._seen.pairs and not sees_position and self._constant(np.einsum("nji,nj->ni", self._R, w)):
             return self._tool_turned(direction)
-        if self._pairs and self._common_axis is not None and self._tilts(w, dp, self._common_axis):
+        if self._seen.pairs and self._common_axis is not None and self._tilts(w, dp, self._common_axis):
             return "parallel axes, all of them: it only tilts the arm out of its plane, unseen to first order"
         return NO_CAUSE
 

@@ -566,6 +566,8 @@ def gather(tables: Sequence[Table]) -> Dataset:
     found: dict[str, tuple[int, int]] = {}
     for number, table in enumerate(tables):
         m = table.measurements
+        for before in tables[:number]:
+            _check_once(table, before)
         place = np.empty(m.n_configurations, dtype=np.int64)
         for k, name in enumerate(m.ids.tolist()):
             other = found.get(name) if m.named else None
@@ -589,6 +591,31 @@ def gather(tables: Sequence[Table]) -> Dataset:
         series += series_of(table, number, unknowns)
     series = _without_untouched(series, unknowns.n_coordinates)
     return Dataset(tuple(tables), tuple(series), unknowns, tuple(places), (*names, *unknowns.names))
+
+
+def _check_once(table: Table, other: Table) -> None:
+    """Raise where two tables hold the same measurements: counted twice, they would look better than they are."""
+    a, b = table.measurements, other.measurements
+    if not np.array_equal(a.readings, b.readings):
+        return
+    mine, others = _measured_by(table), _measured_by(other)
+    for words in mine.keys() & others.keys():
+        if np.array_equal(mine[words], others[words], equal_nan=True):
+            raise ProblemError(a.source, f"the same {words} as in {b.source}", "every measurement once")
+
+
+def _measured_by(table: Table) -> dict[str, Floats | Integers]:
+    """What takes part of a table, by what it is called."""
+    m, pairs, groups = table.measurements, table.measurements.pairs, table.measurements.groups
+    distance, angle = PAIR_MODELS.get(table.model, (False, False))  # type: ignore[arg-type]
+    turned, placed = POSE_MODELS.get(table.model, (angle, distance))  # type: ignore[arg-type] # of which pairs are formed
+    found: dict[str, Floats | Integers | None] = {"touches": None if groups is None else groups.index}
+    if pairs is None or not table.uses_pairs:
+        found |= {"orientations": m.rotation if turned else None, "positions": m.position if placed else None}
+    else:
+        of_pairs = {"distances": pairs.distance if distance else None, "angles": pairs.angle if angle else None}
+        found |= {name: None if v is None else np.stack([pairs.a, pairs.b, v]) for name, v in of_pairs.items()}
+    return {name: v for name, v in found.items() if v is not None and not np.isnan(v[-1]).all()}
 
 
 def _without_untouched(series: Sequence[Series], n_coordinates: int) -> list[Series]:

@@ -14,6 +14,7 @@ from fg_calib.graph.build import STRUCTURAL_FLOOR, build_problem, random_problem
 from fg_calib.graph.information import named_triangle, observability_of
 from fg_calib.graph.solver import solve
 from fg_calib.measurements.kinds import SamePoint
+from fg_calib.measurements.series import Table
 from fg_calib.options import Pairing
 from fg_calib.robot.model import Joint, RobotBuilder
 
@@ -315,3 +316,20 @@ def test_reasons_are_found_where_the_tool_turned_out_to_be(model):
     assert found.lost
     assert NOT_EXCITED not in {lost.reason for lost in found.lost}
     assert not any("last axis" in lost.reason for lost in found.lost)
+
+
+def test_reasons_of_a_mixture_are_those_of_what_all_its_tables_see():
+    """Positions and orientations in two frames of their own, and what `options.model` alone would have said."""
+    rng = np.random.default_rng(8)
+    robot = paper_robot()
+    m = measure(robot, 150, rng)
+    tables = (Table(m, "position", frame="unknown"), Table(m, "orientation"))
+    found = assess(solve(build_problem(robot, tables))).identifiability
+    reasons = {name: lost.reason for lost in found.lost for name in lost.relation}
+    # Angles of the first link are seen by orientations in the base's frame, its lengths by nothing.
+    assert set(reasons) & {"a1", "d1"}
+    assert "alpha1" not in reasons
+    assert "blind to the base" in reasons["a1"]
+    alone = assess(solve(build_problem(robot, Table(m, "orientation")))).identifiability
+    reasons = {name: lost.reason for lost in alone.lost for name in lost.relation}
+    assert reasons["a2"] == "the tool only moves without turning, unseen by orientation"

@@ -280,6 +280,39 @@ def test_two_tables_that_contradict_each_other_are_refused():
 
 
 @pytest.mark.parametrize(
+    ("models", "said"),
+    [
+        (("pose", "pose"), "the same (orientations|positions) as in measurements"),
+        (("pose", "position"), "the same positions as in measurements"),
+        (("distance", "position"), "the same positions as in measurements"),
+        (("rotation", "position"), None),
+        (("orientation", "position"), None),
+    ],
+)
+def test_a_table_that_is_there_twice_is_refused(models, said):
+    rng = np.random.default_rng(9)
+    robot = small_arm(tolerance=TOLERANCE)
+    m = measure(true_robot(robot, rng), 12, rng, sigma=SIGMA)
+    tables = [Table(m, model) for model in models]
+    if said is None:
+        assert build_problem(robot, tables).n_residuals
+        return
+    with pytest.raises(ProblemError, match=said):
+        build_problem(robot, tables)
+
+
+def test_other_pairs_of_the_same_poses_are_not_the_same():
+    rng = np.random.default_rng(9)
+    q = rng.uniform(-np.pi, np.pi, (10, 4))
+    robot = small_arm(tolerance=TOLERANCE)
+    m = replace(measure(robot, 10, rng, readings=q), pairs=pairs_of(robot, q, rng))
+    other = replace(m, pairs=replace(m.pairs, a=m.pairs.b, b=m.pairs.a))
+    assert build_problem(robot, [Table(m, "distance"), Table(other, "distance")]).n_residuals == 18
+    with pytest.raises(ProblemError, match="the same distances as in"):
+        build_problem(robot, [Table(m, "distance"), Table(m, "distance-rotation")])
+
+
+@pytest.mark.parametrize(
     ("keys", "said"),
     [
         ({"measurements": []}, "job.yaml: measurements: found [], expected a path, or a list of tables"),

@@ -8,6 +8,7 @@ import scipy.optimize
 from scipy.stats import chi2
 from simulated import small_arm, true_robot
 
+from fg_calib.analysis.reasons import NOT_EXCITED
 from fg_calib.analysis.uncertainty import assess
 from fg_calib.errors import InputError
 from fg_calib.graph.build import build_problem
@@ -235,3 +236,11 @@ def test_an_anchor_that_too_few_lengths_see_is_unknown_and_harms_nothing():
     assert np.isnan(uncertainty.points[2].sigma).any()
     assert np.isfinite(uncertainty.points[0].sigma).all()
     assert uncertainty.dof == len(keep) - 3 - 3 - 2
+
+
+def test_reasons_beside_a_kind_of_ones_own_do_not_say_what_it_cannot_see():
+    robot, _, table = measured(0, n=60)
+    found = assess(solve(build_problem(robot, table))).identifiability
+    reasons = {name: lost.reason for lost in found.lost for name in lost.relation}
+    assert "blind to the base" in reasons["d1"]  # the anchors move with it
+    assert not any("unseen by" in reason or reason == NOT_EXCITED for reason in reasons.values())
