@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from rich.console import Group, RenderableType
@@ -10,7 +10,7 @@ from rich.text import Text
 
 from fg_calib.analysis.accuracy import ExpectedError
 from fg_calib.analysis.joint_values import JointValues
-from fg_calib.analysis.uncertainty import FrameEstimate, Uncertainty
+from fg_calib.analysis.uncertainty import FrameEstimate, PointEstimate, Uncertainty
 from fg_calib.analysis.verdict import chi2_in_words, probability
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements.kinds import PointDistance, TouchedPoint
@@ -49,6 +49,7 @@ def build_report(solution: Solution, uncertainty: Uncertainty) -> RenderableType
         labels = solution.problem.data.labels
         which = "" if len(labels) == 1 else f" of {labels[int(variable.symbol[2:-1])]}"
         parts += section(f"Measurement frame (world_T_base{which})", _frame(frame))
+    parts += _points(solution, uncertainty.points)
     if uncertainty.identifiability.lost:
         parts += section("What the data do not determine", lost_directions(uncertainty.identifiability.lost))
     weak = weak_directions(uncertainty.observability)
@@ -201,6 +202,24 @@ def _joint_values(solution: Solution, found: JointValues | None, limit: int = 5)
     if len(found.suspects) > limit:
         wrong.add_row("", f"and {len(found.suspects) - limit} more")
     return parts + section("Suspicious joint readings", wrong)
+
+
+def _points(solution: Solution, points: Sequence[PointEstimate], limit: int = 8) -> list[RenderableType]:
+    """Where touched points and other unknowns of the measurements are; of many the first, `result.json` has all."""
+    parts: list[RenderableType] = []
+    letters = solution.problem.data.unknowns.letters
+    for letter, title, unit in (("L", "Touched points (from the base)", "mm"), ("N", "Other unknowns", "")):
+        chosen = [p for p, of in zip(points, letters, strict=True) if of == letter]
+        factor, decimals = (1e3, 4) if unit else (1.0, 7)
+        table = plain_table(("", "left"), ("rows", "right"), ("estimate", "right"), ("", "left"), ("sigma", "right"))
+        for p in chosen[:limit]:
+            xyz = "  ".join(rounded(v * factor, decimals) for v in p.xyz)
+            sigma = "  ".join(f"{v * factor:.{decimals}f}" if np.isfinite(v) else "unknown" for v in p.sigma)
+            table.add_row(p.name, f"{p.n}", xyz, "±", sigma)
+        if len(chosen) > limit:
+            table.add_row(f"and {len(chosen) - limit} more", "", "", "", "")
+        parts += section(f"{title}, {unit}" if unit else f"{title}, [m] and [rad]", table) if chosen else []
+    return parts
 
 
 def _frame(frame: FrameEstimate) -> RenderableType:
