@@ -12,7 +12,7 @@ from fg_calib.graph.factors import Eliminated, dense, eliminate
 from fg_calib.graph.observability import RANK_TOLERANCE, SIGNAL_FLOOR, Observability, observability_of_rows
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.robust import effect
-from fg_calib.graph.rows import RowSet, correlation_of
+from fg_calib.graph.rows import RowSet, correlation_of, whitened_rows
 
 Floats = NDArray[np.float64]
 
@@ -28,16 +28,33 @@ def eliminated(problem: Problem, parameters: Floats, *, with_loss: bool = False)
     v = problem.variables
     at = v.at(parameters)
     blocks = [np.zeros((0, v.n_columns + v.n_nuisance)), added_rows(problem, parameters)]
-    for rows in problem.rows:
-        R = rows.triangle(at)[:, :-1]
-        blocks.append(R / np.sqrt(_variance_of_loss(problem, rows)) if with_loss else R)
+    row_sets, variance = _with_loss(problem) if with_loss else (problem.rows, 1.0)
+    blocks += [rows.triangle(at)[:, :-1] / np.sqrt(variance) for rows in row_sets]
     A = np.vstack(blocks)
     return eliminate(A, np.zeros(len(A)), v.n_columns)
 
 
-def _variance_of_loss(problem: Problem, rows: RowSet) -> float:
-    heights = [part.block.residual_dim for part in rows.parts for _ in range(part.n_rows)]
-    return effect(problem.options.loss, max(set(heights), key=heights.count)).variance
+def _with_loss(problem: Problem) -> tuple[tuple[RowSet, ...], float]:
+    """The rows, and by what factor a robust loss makes the variance of the estimate larger.
+
+    Measurements of fewer rows lose less or more than others; beside the usual ones they count by that much.
+    """
+    state, loss = problem.state, problem.options.loss
+    if state.weights is None:
+        return problem.rows, 1.0
+    dims = [s.used.sum(axis=1) for s in problem.data.series]
+    of_dim = np.array(
+        [effect(loss, max(dim, 1)).variance for dim in range(max(int(d.max(initial=0)) for d in dims) + 1)]
+    )
+    of_train = np.concatenate([d[s.train] for d, s in zip(dims, problem.data.series, strict=True)])
+    usual = int(np.bincount(of_train, minlength=1).argmax())
+    variance = float(of_dim[usual])
+    if all(np.isin(d, (0, usual)).all() for d in dims):
+        return problem.rows, variance
+    weights = [w * variance / of_dim[d] for w, d in zip(state.weights, dims, strict=True)]
+    sharing = problem.options.pair_errors == "shared"
+    rows = whitened_rows(problem.noises, sharing=sharing, joint_errors=state.joint_errors, weights=weights)
+    return rows, variance
 
 
 def whitened_triangle(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> Floats:
