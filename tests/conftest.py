@@ -8,6 +8,9 @@ from typing import NamedTuple
 
 import pytest
 
+if "PYTEST_XDIST_WORKER" in os.environ:  # one worker a processor: threads of BLAS would only wait for each other
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read once, when numpy is loaded
+
 from fg_calib import cli
 
 REPOSITORY = Path(__file__).resolve().parents[1]

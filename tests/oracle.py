@@ -68,9 +68,10 @@ def _random_frame(rng: np.random.Generator) -> dict[str, float]:
     return {k: rng.uniform(-1, 1) for k in ("x", "y", "z")} | {k: rng.uniform(-3, 3) for k in ("roll", "pitch", "yaw")}
 
 
-def tool_pose(robot: Robot, q: Floats) -> Floats:
-    """base_T_tool as a product of 4x4 matrices, one an element."""
-    values = robot.nominal
+def tool_pose(robot: Robot, q: Floats, values: Floats | None = None) -> Floats:
+    """base_T_tool as a product of 4x4 matrices, one an element; at other values of the parameters than nominal ones."""
+    if values is None:
+        values = robot.nominal
     T = np.eye(4)
     for e in robot.elements:
         free = (0.0 if e.parameter is None else values[e.parameter]) + (0.0 if e.joint is None else q[e.joint])

@@ -226,7 +226,7 @@ def test_an_unknown_tool_is_the_graphs():
 
 def oracles_misfit(robot, measurements, model, values):
     """Psi* - f by 4x4 products, metres and radians side by side."""
-    T = np.array([tool_pose(robot.with_values(values), q) for q in measurements.readings])
+    T = np.array([tool_pose(robot, q, values) for q in measurements.readings])
     if model == "pose":
         turned = Rotation.from_matrix(np.swapaxes(T[:, :3, :3], 1, 2) @ measurements.rotation).as_rotvec()
         return np.concatenate([turned, measurements.position - T[:, :3, 3]], axis=1).ravel()

@@ -67,8 +67,8 @@ EVERY_CELL = pytest.mark.parametrize(("robot", "model", "gauge", "options"), CEL
 
 @EVERY_CELL
 def test_intervals_hold_the_truth(robot, model, gauge, options):
-    """Roughly: 8 draws, the intervals of one of which depend on each other. Sigmas half as large hold 67 %."""
-    for of, (share, n) in coverage(robot, model, gauge, 8, seed=1, **options).items():
+    """Roughly: 4 draws, the intervals of one of which depend on each other. Sigmas half as large hold 67 %."""
+    for of, (share, n) in coverage(robot, model, gauge, 4, seed=1, **options).items():
         assert share > 0.8, (of, n)
 
 
@@ -76,7 +76,7 @@ def test_intervals_hold_the_truth(robot, model, gauge, options):
 @EVERY_CELL
 def test_intervals_hold_the_truth_95_times_in_100(robot, model, gauge, options):
     """Were the intervals of a draw one and the same, the share would be within the bounds in 99.9 % of all runs."""
-    n_draws = 300
+    n_draws = 150
     low, high = binom.ppf([0.0005, 0.9995], n_draws, 0.95) / n_draws
     for of, (share, n) in coverage(robot, model, gauge, n_draws, seed=2, **options).items():
         assert low < share < high, (of, n)

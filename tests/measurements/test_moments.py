@@ -1,5 +1,7 @@
 """Means and variances of noisy lengths and angles against independent integrals and drawn noise."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy import integrate, stats
@@ -60,16 +62,20 @@ def test_the_slope_of_a_length_is_that_of_its_mean(f, errors):
     assert of_length(f, *squared)[1] == pytest.approx((up - down) / (2 * h), abs=1e-7)
 
 
+@cache
+def small_turns(sigma, n):
+    """The same draws for every angle."""
+    return Rotation.from_rotvec(sigma * np.random.default_rng(7).normal(size=(n, 3)))
+
+
 @pytest.mark.parametrize("sigma", [1e-4, 0.02])
 @pytest.mark.parametrize("from_kink", [0.0, 0.5, 1.0, 2.0, 5.0, 20.0])
 @pytest.mark.parametrize("pi", [False, True])
 def test_moments_are_those_of_drawn_rotations(from_kink, pi, sigma):
-    rng = np.random.default_rng(7)
     n = 200_000
     f = np.pi - from_kink * sigma if pi else from_kink * sigma
     axis = np.array([0.6, 0.0, 0.8])
-    noise = Rotation.from_rotvec(sigma * rng.normal(size=(n, 3)))
-    drawn = (Rotation.from_rotvec(f * axis) * noise).magnitude()
+    drawn = (Rotation.from_rotvec(f * axis) * small_turns(sigma, n)).magnitude()
     excess, _, variance = of_angle(f, sigma**2, sigma**2)
     assert f + excess == pytest.approx(drawn.mean(), abs=5.0 * sigma / np.sqrt(n))
     assert np.sqrt(variance) == pytest.approx(drawn.std(), rel=0.01)

@@ -53,7 +53,7 @@ def pair_formula(robot, measured):
     n, m = robot.n_joints, len(robot.parameters)
 
     def formula(x):
-        A, B = (tool_pose(robot.with_values(x[:m]), q) for q in (x[m : m + n], x[m + n :]))
+        A, B = (tool_pose(robot, q, x[:m]) for q in (x[m : m + n], x[m + n :]))
         angle = Rotation.from_matrix(A[:3, :3].T @ B[:3, :3]).magnitude()
         return np.array([np.linalg.norm(B[:3, 3] - A[:3, 3]), angle]) - measured
 
@@ -93,7 +93,7 @@ def test_same_point_residual_and_its_derivatives(convention):
     W = np.tril(rng.normal(size=(3, 3)))
 
     def formula(x):
-        A, B = (tool_pose(robot.with_values(x[:m]), q) for q in (x[m : m + n], x[m + n :]))
+        A, B = (tool_pose(robot, q, x[:m]) for q in (x[m : m + n], x[m + n :]))
         return W @ (B[:3, 3] - A[:3, 3])
 
     block = same_point_block(precompute_trig(robot, q), np.array([0]), np.array([1]), W[None])
@@ -128,7 +128,7 @@ def test_orientation_and_position_and_their_derivatives(convention, kinds, size)
     W = np.tril(rng.normal(size=(rows.sum(), rows.sum())))
 
     def formula(x):
-        P = tool_pose(robot.with_values(x[:m]), x[m:])
+        P = tool_pose(robot, x[m:], x[:m])
         log = Rotation.from_matrix(measured_R.T @ P[:3, :3]).as_rotvec()
         return W @ np.concatenate([log, P[:3, 3] - measured_p])[rows]
 

@@ -75,7 +75,7 @@ def test_derivatives_equal_central_differences(convention, n):
     n_parameters = len(robot.parameters)
 
     def moved(x):
-        return tool_pose(robot.with_values(x[:n_parameters]), x[n_parameters:])
+        return tool_pose(robot, x[n_parameters:], x[:n_parameters])
 
     x = np.concatenate([robot.nominal, q])
     d_T = central_differences(moved, x)  # (4, 4, n_parameters + n)
@@ -158,7 +158,7 @@ def test_a_parameter_and_a_joint_of_several_elements_have_the_sum_of_their_deriv
     for i in (0, LANES + 1):  # a second batch writes over the first one's twists
 
         def moved(x):
-            return tool_pose(robot.with_values(x[:n]), x[n:])
+            return tool_pose(robot, x[n:], x[:n])
 
         x = np.concatenate([robot.nominal, q[i]])
         d_T = central_differences(moved, x)
@@ -188,13 +188,13 @@ def with_coefficients(robot, rng):
     return replace(robot, elements=tuple(elements), parameters=tuple(parameters))
 
 
-def pose_with_coefficients(robot, q, given):
+def pose_with_coefficients(robot, values, q, given):
     """base_T_tool as a product of 4x4 matrices, the functions written out."""
     T = np.eye(4)
     of = {"reading": lambda i: q[i], "sin": lambda i: np.sin(q[i]), "cos": lambda i: np.cos(q[i])}
     of |= {"sin 2": lambda i: np.sin(2 * q[i]), "cos 2": lambda i: np.cos(2 * q[i]), "given": lambda i: given[i]}
     for e in robot.elements:
-        free = 0.0 if e.parameter is None else robot.nominal[e.parameter]
+        free = 0.0 if e.parameter is None else values[e.parameter]
         if e.basis is not None:
             free = free * of[e.basis.function](e.basis.index)
         value = e.constant + e.sign * (free + (0.0 if e.joint is None else q[e.joint]))
@@ -210,12 +210,12 @@ def test_coefficients_times_functions_of_readings(convention):
     chain = build_chain(robot, {i: i for i in range(n)}).with_joint_columns()
     poses = forward(chain, precompute_trig(robot, q, given))
     for i in (0, LANES - 1, 39):
-        T = pose_with_coefficients(robot, q[i], given[i])
+        T = pose_with_coefficients(robot, robot.nominal, q[i], given[i])
         assert poses.rotation[i] == pytest.approx(T[:3, :3], abs=rounding(1.0))
         assert poses.position[i] == pytest.approx(T[:3, 3], abs=rounding(10.0))
 
         def formula(x, i=i, T=T):
-            there = pose_with_coefficients(robot.with_values(x[:n]), x[n:], given[i])
+            there = pose_with_coefficients(robot, x[:n], x[n:], given[i])
             turn = Rotation.from_matrix(there[:3, :3] @ T[:3, :3].T).as_rotvec()
             return np.concatenate([turn, there[:3, 3]])
 
