@@ -21,6 +21,7 @@ A covariance depends on second moments alone, so tolerances serve for uniform er
 
 References:
     Van Trees (1968), Detection, Estimation, and Modulation Theory, Part I. Wiley.
+    Sobol (1967), The distribution of points in a cube and the approximate evaluation of integrals. USSR Comp. Math. 7.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import qmc
 
 from fg_calib.analysis.accuracy import without_rigid_motion
 from fg_calib.errors import InputError
@@ -50,8 +52,8 @@ RCOND = 1e-10
 _ENTERS = 1e-6
 """Share of an error above which it counts as entering the estimate's error."""
 
-_SAMPLES = 200
-"""Draws from the bound for the expected mean and maximum: their error is a few percent."""
+_SAMPLES = 512
+"""Draws from the bound for the expected mean and maximum, evenly spread: their error is below a percent."""
 
 
 @dataclass(frozen=True)
@@ -106,14 +108,21 @@ class Bound:
             G, _ = without_rigid_motion(at.position, G)
         G = G.reshape(-1, len(self.names))  # (3 n, n_names)
         variance, V = np.linalg.eigh(self.claimed if claimed else self.covariance)
-        half = G @ (V * np.sqrt(np.maximum(variance, 0.0))) @ V.T  # (3 n, n_names); the symmetric root: signs of V vary
-        z = np.random.default_rng(0).normal(size=(half.shape[1], _SAMPLES))
+        V = V * np.sign(V[np.argmax(np.abs(V), axis=0), np.arange(len(variance))])  # its signs are anyone's choice
+        half = (G @ (V * np.sqrt(np.maximum(variance, 0.0))))[:, ::-1]  # (3 n, n_names), the largest first
+        z = _normal(half.shape[1]).T
         distance = np.linalg.norm((half @ z).reshape(len(readings), 3, -1), axis=1)  # (n, samples)
         return PositionBound(
             rms=float(np.sqrt(np.sum(half**2) / len(readings))),
             mean=float(distance.mean()),
             max=float(distance.max(axis=0).mean()),
         )
+
+
+def _normal(n: int) -> Floats:
+    """Normal figures, evenly spread (Sobol 1967), most evenly the first of them: shape (_SAMPLES, n)."""
+    figures: Floats = qmc.MultivariateNormalQMC(np.zeros(n), engine=qmc.Sobol(n, seed=0)).random(_SAMPLES)
+    return figures
 
 
 @single_threaded
