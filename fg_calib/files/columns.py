@@ -3,32 +3,49 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+import logging
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from io import BytesIO, TextIOWrapper
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from fg_calib.errors import InputError
-from fg_calib.files.disk import require_file
+from fg_calib.files.disk import decoded, read_bytes, silent_stderr
 from fg_calib.files.frames import as_polars
+from fg_calib.files.schema import shown
 from fg_calib.files.units import ANGLES, LENGTHS, Units
 from fg_calib.measurements.dataset import Booleans, Floats
+from fg_calib.options import did_you_mean
 
 if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it
     import polars as pl
 
-_ROW, _SHORT = "row of the file", "last cell is empty"  # columns of our own beside those of the file
+_log = logging.getLogger(__name__)
+
+_ROW = "row of the file"  # a column of our own beside those of the file
+
+_ENDINGS = (".csv", ".parquet", ".pq")
 
 
 @dataclass(frozen=True)
 class Header:
-    """A table's file and the names of its columns."""
+    """A table's content and the names of its columns.
+
+    Attributes:
+        path: Its file; what it is called where it is in none.
+        columns: Names of the columns.
+        content: The bytes of the file.
+        frame: The table, where it is in no file.
+    """
 
     path: Path
     columns: tuple[str, ...]
-    frame: pl.DataFrame | None = None  # what the path only names, where the table is in no file
+    content: bytes = field(default=b"", repr=False)
+    frame: pl.DataFrame | None = None
 
     @property
     def name(self) -> str:
@@ -40,11 +57,20 @@ class Header:
         """Whether it is a CSV, else a Parquet file or a frame."""
         return self.frame is None and self.path.suffix.lower() == ".csv"
 
-    def scan(self) -> pl.LazyFrame:
-        """The rows of a Parquet file or a frame."""
+    def parquet(self, columns: Sequence[str]) -> pl.DataFrame:
+        """Columns of a Parquet file or a frame.
+
+        Raises:
+            InputError: It cannot be read.
+        """
         import polars as pl
 
-        return pl.scan_parquet(self.path) if self.frame is None else self.frame.lazy()
+        if self.frame is not None:
+            return self.frame.select(columns)
+        chosen = sorted(self.columns.index(c) for c in columns)
+        frame = _of_polars(self.name, lambda: pl.read_parquet(BytesIO(self.content), columns=chosen))
+        frame.columns = [self.columns[i] for i in chosen]  # without blanks around them
+        return frame.select(columns)
 
     @classmethod
     def read(cls, table: Path | str | Any, name: str) -> Header:
@@ -53,38 +79,62 @@ class Header:
 
         if not isinstance(table, Path | str):
             frame = as_polars(table, name)
-            return cls(Path(name), tuple(frame.columns), frame)
+            return cls(Path(name), tuple(frame.columns), frame=frame)
         path = Path(table)
-        require_file(path)
-        header = cls(path, ())
+        if path.suffix.lower() not in _ENDINGS:
+            read_bytes(path)
+            raise InputError(path.name, f"ending {path.suffix!r}", f"one of {', '.join(_ENDINGS)}")
+        header = cls(path, (), read_bytes(path))
         place = header.name
         if header.is_csv:
+            header = replace(header, content=_with_newlines(header.content))
+            decoded(header.content, header.name)
             line, columns = next(header.csv_rows(), (1, []))
             place = f"{place}:{line}"
-        elif path.suffix.lower() in {".parquet", ".pq"}:
-            try:
-                columns = list(pl.read_parquet_schema(path))
-            except (pl.exceptions.PolarsError, OSError) as error:
-                raise InputError(place, f"not a Parquet file: {_first_line(error)}") from None
         else:
-            raise InputError(place, f"ending {path.suffix!r}", "one of .csv, .parquet, .pq")
+            columns = list(_of_polars(place, lambda: pl.read_parquet_schema(BytesIO(header.content))))
         columns = [column.strip() for column in columns]
         if not columns:
             raise InputError(place, "an empty file", "a header and rows")
-        for column in columns:
-            if columns.count(column) > 1:
+        for column, n in Counter(columns).items():
+            if n > 1:
                 raise InputError(place, f"two columns called {column!r}", "different names")
-        return cls(path, tuple(columns))
+        return replace(header, columns=tuple(columns))
 
     def csv_rows(self) -> Iterator[tuple[int, list[str]]]:
         """Line number and cells of the header and of each row; blank lines count from the header on, as in polars."""
-        with self.path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
-            reader = csv.reader(file)
-            started = False
+        file = TextIOWrapper(BytesIO(self.content), encoding="utf-8-sig", errors="replace", newline="")
+        csv.field_size_limit(max(len(self.content), csv.field_size_limit()))
+        reader = csv.reader(file)
+        started = False
+        try:
             for cells in reader:
                 started = started or bool(cells)
                 if started:
                     yield reader.line_num, cells
+        except csv.Error as error:
+            raise InputError(f"{self.name}:{reader.line_num}", f"not a CSV: {error}") from None
+
+    def understood(self, known: Iterable[str], others: Iterable[str] = ()) -> Header:
+        """The same with the columns that are known by another case called as they are known.
+
+        A column that is neither known nor one of the others, but nearly reads like a known one, is warned of.
+
+        Args:
+            known: Columns that mean something.
+            others: Names that somebody else has given.
+        """
+        known, others = set(known), set(others)
+        names = list(self.columns)
+        for i, name in enumerate(names):
+            if name in known or name in others:
+                continue
+            if name.lower() in known and name.lower() not in names:
+                names[i] = name.lower()
+            elif hint := did_you_mean(name, known - set(names), 0.85):
+                _log.warning("%s: column %r is not used; %s", self.name, name, hint)
+        frame = None if self.frame is None else self.frame.rename(dict(zip(self.columns, names, strict=True)))
+        return replace(self, columns=tuple(names), frame=frame)
 
     def present(self, *columns: str) -> tuple[str, ...]:
         """Those of `columns` that the table has."""
@@ -157,7 +207,7 @@ class Table:
         """Raise for the first cell of `column` that is not `good`, shape (n_rows,)."""
         if not good.all():
             place, cell = self._look_up(int(np.argmin(good)), column)
-            found = "an empty cell" if cell in {None, ""} else repr(cell)
+            found = "an empty cell" if cell in {None, ""} else shown(cell)
             raise InputError(f"{place}: {column}", f"found {found}", expected, hint)
 
     def place(self, row: int) -> str:
@@ -171,39 +221,82 @@ class Table:
         if self.header.is_csv:
             line, cells = next(found for i, found in enumerate(self.header.csv_rows()) if i == wanted + 1)
             return f"{name}:{line}", cells[columns.index(column)].strip()
-        cell = self.header.scan().select(column).slice(wanted, 1).collect().item()
-        return f"{name}: row {wanted}", cell
+        return f"{name}: row {wanted}", self.header.parquet([column])[column][wanted]
 
 
 def _read_csv(header: Header, numbers: Sequence[str], texts: Sequence[str]) -> pl.DataFrame:
     import polars as pl
 
-    scan = pl.scan_csv(header.path, infer_schema=False, with_column_names=lambda _: list(header.columns))
-    rows = scan.with_row_index(_ROW).filter(~pl.all_horizontal(pl.col(header.columns).is_null()))  # no blank lines
-    short = pl.col(header.columns[-1]).is_null().alias(_SHORT)
+    last = header.columns[-1]
+    wanted = list(dict.fromkeys((*numbers, *texts, last)))
+    chosen = sorted(header.columns.index(c) for c in wanted)
+    start = _start_of_header(header.content)
     try:
-        frame = rows.select(_ROW, short, *map(_number, numbers), *map(_text, texts)).collect(engine="streaming")
-    except (pl.exceptions.PolarsError, OSError) as error:
+        frame = _of_polars(
+            header.name,
+            lambda: pl.read_csv(BytesIO(header.content[start:]), columns=chosen, infer_schema=False),
+        )
+    except InputError:
         _check_lengths(header)
-        raise InputError(header.name, f"not a CSV: {_first_line(error)}") from None
-    if frame[_SHORT].any():  # polars takes a cell that is missing at the end for an empty one
+        raise
+    frame.columns = [header.columns[i] for i in chosen]  # without blanks around them
+    rows = frame.with_row_index(_ROW)
+    nothing = rows.select(pl.all_horizontal(pl.col(wanted).is_null())).to_series().to_numpy()
+    if nothing.any():  # lines that are blank, and rows whose cells of use are empty
+        blank = np.array([not any(cells) for _, cells in header.csv_rows()][1:], dtype=np.bool_)
+        rows = rows.filter(~(nothing & blank[: len(nothing)]))
+    if rows[last].is_null().any():  # polars takes a cell that is missing at the end for an empty one
         _check_lengths(header)
-    return frame
+    return rows.select(_ROW, *map(_number, numbers), *map(_text, texts))
 
 
 def _read_parquet(header: Header, numbers: Sequence[str], texts: Sequence[str]) -> pl.DataFrame:
     import polars as pl
 
-    scan = header.scan()
-    types = scan.collect_schema()
+    frame = header.parquet(list(dict.fromkeys((*numbers, *texts))))
+    types = frame.schema
     for column in numbers:
         if not (types[column].is_numeric() or types[column] in (pl.String, pl.Null)):
             raise InputError(f"{header.name}: {column}", f"type {types[column]}", "numbers")
     read = [_number(c) if types[c] == pl.String else pl.col(c).cast(pl.Float64) for c in numbers]
+    rows = frame.with_row_index(_ROW)
+    return _of_polars(header.name, lambda: rows.select(_ROW, *read, *map(_text, texts)))
+
+
+_Found = TypeVar("_Found")
+
+
+def _of_polars(name: str, read: Callable[[], _Found]) -> _Found:
+    """What polars makes of a table; its errors, and panics of its Rust, become one line.
+
+    Raises:
+        InputError: It makes nothing of it.
+    """
+    import polars as pl
+
+    what = "CSV" if name.lower().endswith(".csv") else "Parquet file"
     try:
-        return scan.with_row_index(_ROW).select(_ROW, *read, *map(_text, texts)).collect()
-    except (pl.exceptions.PolarsError, OSError) as error:
-        raise InputError(header.name, f"not a Parquet file: {_first_line(error)}") from None
+        with silent_stderr():
+            return read()
+    except (pl.exceptions.PolarsError, OSError, ValueError, TypeError) as error:
+        raise InputError(name, f"not a {what}: {_first_line(error)}") from None
+    except BaseException as error:
+        if type(error).__name__ != "PanicException":
+            raise
+        raise InputError(name, f"not a {what}: polars cannot read it", hint="write it anew") from None
+
+
+def _with_newlines(content: bytes) -> bytes:
+    """Lines end with a newline; those of old Macs with a carriage return alone."""
+    return content if b"\n" in content else content.replace(b"\r", b"\n")
+
+
+def _start_of_header(content: bytes) -> int:
+    """Where the first line begins that is not blank, behind a byte order mark."""
+    start = 3 if content.startswith(b"\xef\xbb\xbf") else 0
+    while content[start : start + 1] in (b"\n", b"\r") and start < len(content):
+        start += 1
+    return start
 
 
 def _text(column: str) -> pl.Expr:

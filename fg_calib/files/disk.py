@@ -2,28 +2,95 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from tempfile import mkdtemp
 
 from fg_calib.errors import InputError
 
+_noted: ContextVar[dict[Path, str] | None] = ContextVar("_noted", default=None)
 
-def require_file(path: Path) -> None:
-    """Check that there is a readable file at `path`.
+
+@contextmanager
+def noting_reads() -> Iterator[dict[Path, str]]:
+    """The SHA-256 of the bytes of every file that is read in the block, by its path."""
+    found: dict[Path, str] = {}
+    token = _noted.set(found)
+    try:
+        yield found
+    finally:
+        _noted.reset(token)
+
+
+def read_bytes(path: Path) -> bytes:
+    """The content of a file.
 
     Raises:
-        InputError: There is not.
+        InputError: There is no such file, it may not be read, or it is a folder, a pipe or a device.
     """
-    if path.is_dir():
-        raise InputError(str(path), "is a folder", "a file")
-    if not path.exists():
-        raise InputError(str(path), "no such file")
-    if not os.access(path, os.R_OK):
-        raise InputError(str(path), "may not be read", hint="check the file's permissions")
+    try:
+        if path.is_dir():
+            raise InputError(str(path), "is a folder", "a file")
+        if path.exists() and not path.is_file():
+            raise InputError(str(path), "is a pipe or a device", "a file")
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(str(path), "no such file") from None
+    except PermissionError:
+        raise InputError(str(path), "may not be read", hint="check the permissions of file and folder") from None
+    except (OSError, ValueError) as error:  # ValueError: a path with a null character
+        found = f"cannot be read: {getattr(error, 'strerror', None) or error}"
+        raise InputError(_short(str(path)), found, "a file") from None
+    noted = _noted.get()
+    if noted is not None:
+        noted[path] = hashlib.sha256(content).hexdigest()
+    return content
+
+
+@contextmanager
+def silent_stderr() -> Iterator[None]:
+    """Nothing is written to the process's stderr in the block, by libraries in C or Rust either."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # there is no stderr
+        yield
+        return
+    try:
+        with Path(os.devnull).open("wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+            yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= _LONGEST_PATH else f"{text[: _LONGEST_PATH - 3]}..."
+
+
+_LONGEST_PATH = 120
+
+
+def decoded(content: bytes, name: str) -> str:
+    """UTF-8 text, without a byte order mark.
+
+    Raises:
+        InputError: It is something else; the message names line and byte.
+    """
+    for mark, encoding in ((b"\xff\xfe", "UTF-16"), (b"\xfe\xff", "UTF-16")):
+        if content.startswith(mark):
+            raise InputError(name, f"{encoding} text", "UTF-8 text", "save it as UTF-8")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        hint = "is it Latin-1 or Windows text? save it as UTF-8"
+        raise InputError(f"{name}:{line}", f"byte {content[error.start]:#04x}", "UTF-8 text", hint) from None
 
 
 def read_text(path: Path) -> str:
@@ -32,12 +99,7 @@ def read_text(path: Path) -> str:
     Raises:
         InputError: There is no such file, or it is not UTF-8.
     """
-    require_file(path)
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = error.object[: error.start].count(b"\n") + 1
-        raise InputError(f"{path.name}:{line}", f"byte {error.object[error.start]:#04x}", "UTF-8 text") from None
+    return decoded(read_bytes(path), path.name)
 
 
 @contextmanager

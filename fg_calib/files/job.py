@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Mapping
 from dataclasses import astuple, fields, replace
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field, StrictBool
 
 from fg_calib.errors import InputError
+from fg_calib.files.disk import noting_reads
 from fg_calib.files.robot_yaml import read_robot, robot_from_mapping
 from fg_calib.files.schema import Count, NotNegative, Positive, Schema, read_yaml, shown, validate
 from fg_calib.files.tables import read_measurements
@@ -98,23 +98,32 @@ def read_job(path: Path | str) -> Job:
         InputError: It or a file that it names is missing or cannot be used.
     """
     path = Path(path)
+    with noting_reads() as files:
+        job = _job(path)
+    return replace(job, inputs={_relative(file, path.parent): digest for file, digest in files.items()})
+
+
+def _relative(file: Path, folder: Path) -> str:
+    """A file's path as a job in this folder names it."""
+    return str(file.relative_to(folder)) if file.is_relative_to(folder) else str(file)
+
+
+def _job(path: Path) -> Job:
     folder = path.parent
     given = read_yaml(path)
     several = isinstance(given, dict) and isinstance(given.get("measurements"), list)
     file: _JobOfTables = validate(_JobOfTables if several else _Job, given, path.name)
-    robot, robot_files = robot_of(file.robot, f"{path.name}: robot", folder, file.units)
+    robot = robot_of(file.robot, f"{path.name}: robot", folder, file.units)
     _check_preferred(file, robot, path.name)
     _, estimate_noise = _noise(file.noise, file.units, robot, f"{path.name}: noise")
-    tables, table_files = _tables(file, robot, path)
+    tables = _tables(file, robot, path)
     alone = tables[0].measurements if isinstance(file.measurements, str) else tuple(tables)
     truth = None if file.truth is None else _truth(folder / file.truth, robot)
-    names = [path.name, *robot_files, *table_files, *([] if file.truth is None else [file.truth])]
-    inputs = {name: _sha256(folder / name) for name in names}
-    return Job(path, robot, alone, _options(file, estimate_noise, path.name, tables[0]), truth, inputs)
+    return Job(path, robot, alone, _options(file, estimate_noise, path.name, tables[0]), truth)
 
 
-def _tables(file: _JobOfTables, robot: Robot, path: Path) -> tuple[list[Table], list[str]]:
-    """The tables of a job, and their files; what an entry leaves out is as the job says for all."""
+def _tables(file: _JobOfTables, robot: Robot, path: Path) -> list[Table]:
+    """The tables of a job; what an entry leaves out is as the job says for all."""
     given, folder = file.measurements, path.parent
     if not isinstance(given, str) and not (isinstance(given, list) and given):
         raise InputError(f"{path.name}: measurements", f"found {shown(given)}", "a path, or a list of tables")
@@ -122,7 +131,7 @@ def _tables(file: _JobOfTables, robot: Robot, path: Path) -> tuple[list[Table], 
     if not whole and file.pairs is not None:
         raise InputError(f"{path.name}: pairs", "beside a list of tables", "the key in the table's own entry")
     entries = [{"table": given, "pairs": file.pairs}] if whole else given
-    tables, files = [], []
+    tables = []
     for number, one in enumerate(entries):
         place = path.name if whole else f"{path.name}: measurements[{number}]"
         entry = validate(_Table, one, place)
@@ -143,8 +152,7 @@ def _tables(file: _JobOfTables, robot: Robot, path: Path) -> tuple[list[Table], 
         pairs = None if entry.pairs is None else folder / entry.pairs
         measurements = read_measurements(folder / entry.table, robot, pairs=pairs, units=units, noise=stated)
         tables.append(Table(measurements, model, pairing, entry.frame or file.frame))
-        files += [entry.table, *([] if entry.pairs is None else [entry.pairs])]
-    return tables, list(dict.fromkeys(files))
+    return tables
 
 
 def _options(file: _JobOfTables, estimate_noise: bool, place: str, first: Table) -> Options:
@@ -174,8 +182,8 @@ def _check_preferred(file: _JobOfTables, robot: Robot, place: str) -> None:
     check_names(f"{place}: prefer", file.prefer, names_of(robot.parameters))
 
 
-def robot_of(given: object, place: str, folder: Path, units: Units) -> tuple[Robot, list[str]]:
-    """The robot under a key `robot`, and the files that it was read from.
+def robot_of(given: object, place: str, folder: Path, units: Units) -> Robot:
+    """The robot under a key `robot`.
 
     Args:
         given: A path relative to `folder`, or the mapping of a robot file.
@@ -183,9 +191,6 @@ def robot_of(given: object, place: str, folder: Path, units: Units) -> tuple[Rob
         folder: The folder of the file that names it.
         units: Of that file; a URDF's `tolerance`, `base` and `tool` that stand in it are in these unless they state
             their own. A mapping of DH rows is a robot file of its own: m and rad unless it states others.
-
-    Returns:
-        The robot, and its files relative to `folder`.
 
     Raises:
         InputError: It is neither, or does not describe a robot.
@@ -195,14 +200,10 @@ def robot_of(given: object, place: str, folder: Path, units: Units) -> tuple[Rob
             if units != Units() and (given.get("base") or given.get("tool")):
                 _log.warning("%s: base and tool are in %s and %s, as the file's units say", place, *astuple(units))
             given = {**given, "units": units}
-        robot = robot_from_mapping(given, place, folder)
-        return robot, [given["urdf"]] if robot.urdf else []
+        return robot_from_mapping(given, place, folder)
     if not isinstance(given, str):
         raise InputError(place, f"found {shown(given)}", "a path, or the mapping of a robot file")
-    robot = read_robot(folder / given)
-    if robot.urdf is None or given.lower().endswith(".urdf"):
-        return robot, [given]
-    return robot, [given, str(PurePath(given).parent / read_yaml(folder / given)["urdf"])]
+    return read_robot(folder / given)
 
 
 def _truth(path: Path, robot: Robot) -> Robot:
@@ -262,8 +263,3 @@ def joint_noise(given: object, units: Units, robot: Robot, place: str) -> tuple[
     else:
         figures = (validate(_OneFigure, {"joint": given}, place).joint,) * robot.n_joints
     return tuple(f * units.factor(j.unit) for f, j in zip(figures, robot.joints, strict=True))
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -18,6 +18,10 @@ if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need
     import polars as pl
 
 
+_KNOWN = ("a", "b", "distance", "angle", "sigma_distance", "sigma_angle", "split")
+"""Columns that mean something."""
+
+
 @dataclass(frozen=True)
 class Configurations:
     """What pairs refer to: the rows of a table of configurations.
@@ -63,7 +67,7 @@ def read_pairs(
     Raises:
         InputError: The file is missing, is no table, lacks a column or holds a cell that cannot be used.
     """
-    header = Header.read(path, "frame of pairs")
+    header = Header.read(path, "frame of pairs").understood(_KNOWN)
     for column in ("a", "b"):
         if column not in header.columns:
             raise InputError(header.name, f"no column {column}", "a and b, the two configurations of a pair")

@@ -130,7 +130,7 @@ class _Reader:
         self._folder = path.parent
         self._file = validate(_Scenario, read_yaml(path), source)
         self._units = self._file.units
-        self._robot, _ = robot_of(self._file.robot, f"{source}: robot", self._folder, self._units)
+        self._robot = robot_of(self._file.robot, f"{source}: robot", self._folder, self._units)
         self._default_name = Path(source).stem
 
     def read(self) -> Scenario:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from reprlib import Repr
+from typing import Annotated, Any, NoReturn, TypeVar
 
 import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
@@ -140,9 +141,19 @@ _EXPECTED = {
 
 
 def shown(value: object) -> str:
-    """A found value for a message: its repr, cut to 60 characters."""
-    text = "nothing" if value is None else repr(value)
+    """A found value for a message: its repr, cut to 60 characters; of what is nested or long only the beginning."""
+    if value is None:
+        return "nothing"
+    try:
+        text = repr(value[:100]) if isinstance(value, str) else _REPR.repr(value)
+    except ValueError:  # Python shows no whole number of more than 4300 digits
+        return "a number of thousands of digits"
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+_REPR = Repr()
+_REPR.maxstring = _REPR.maxlong = _REPR.maxother = 100
+_REPR.maxlist = _REPR.maxdict = _REPR.maxtuple = 20
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -154,32 +165,82 @@ def read_yaml(path: Path) -> dict[str, Any]:
     text = read_text(path)
     try:
         mapping = yaml.load(text, _Loader)
+    except RecursionError:
+        raise InputError(path.name, "nested too deeply", "a mapping, key: value") from None
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         raise InputError(f"{path.name}:{mark.line + 1}" if mark else path.name, error.problem or "not YAML") from None
     except yaml.reader.ReaderError as error:
         line = text[: error.position].count("\n") + 1
         raise InputError(f"{path.name}:{line}", f"character {error.character:#04x}", "printable text") from None
-    except (ValueError, RecursionError) as error:  # a date or number of YAML's that Python cannot make
-        raise InputError(path.name, f"not YAML: {error}") from None
     if not isinstance(mapping, dict):
         found = "an empty file" if mapping is None else f"found {shown(mapping)}"
         raise InputError(path.name, found, "a mapping, key: value")
     return mapping
 
 
+MOST_VALUES = 1_000_000
+"""Values that a file may hold, what its aliases stand for counted each time."""
+
+
 class _Loader(yaml.SafeLoader):
     """The safe loader, which by itself would let the later of two equal keys win, and take any scalar for a key."""
+
+    def get_single_node(self) -> yaml.Node | None:
+        """The document's node, which is of a size that can be looked at."""
+        node: yaml.Node | None = super().get_single_node()
+        if node is not None:
+            self._size(node, {})
+        return node
+
+    def _size(self, node: yaml.Node, known: dict[int, int]) -> int:
+        """Number of values in a node, aliases expanded."""
+        if id(node) in known:
+            if not known[id(node)]:
+                self._refuse(node, "an alias of what it stands in")
+            return known[id(node)]
+        known[id(node)] = 0  # within
+        size = 1
+        if not isinstance(node, yaml.ScalarNode):
+            for child in node.value:
+                size += sum(self._size(one, known) for one in (child if isinstance(child, tuple) else (child,)))
+        if size > MOST_VALUES:
+            self._refuse(node, f"aliases that stand for more than {MOST_VALUES} values")
+        known[id(node)] = size
+        return size
+
+    @staticmethod
+    def _refuse(node: yaml.Node, problem: str) -> NoReturn:
+        raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
+
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        """The value of a node.
+
+        Raises:
+            yaml.MarkedYAMLError: Python cannot make it: no such date, too many digits.
+        """
+        try:
+            return super().construct_object(node, deep)
+        except (ValueError, LookupError, AttributeError, TypeError, OverflowError):
+            tag = node.tag.removeprefix("tag:yaml.org,2002:")
+            self._refuse(node, f"{shown(getattr(node, 'value', None))} is no YAML of type {tag}")
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         """Construct a mapping of different words."""
         seen = set()
-        for key_node, _ in node.value:
+        for key_node, value_node in node.value:
             key = key_node.value if isinstance(key_node, yaml.ScalarNode) else None
             if key is None or key_node.tag not in {"tag:yaml.org,2002:str", "tag:yaml.org,2002:merge"}:
-                found = f"key {key if key is not None else 'that is no word'}"
-                raise yaml.MarkedYAMLError(problem=f"{found}, expected a word", problem_mark=key_node.start_mark)
+                found = f"key {shown_word(key) if key is not None else 'that is no word'}"
+                comma = key is not None and key.isdigit() and value_node.value == ""
+                hint = "; is it a decimal comma? numbers have a decimal point" * comma
+                self._refuse(key_node, f"{found}, expected a word{hint}")
             if key in seen:
-                raise yaml.MarkedYAMLError(problem=f"key {key!r} stands here twice", problem_mark=key_node.start_mark)
+                self._refuse(key_node, f"key {shown(key)} stands here twice")
             seen.add(key)
         return super().construct_mapping(node, deep)
+
+
+def shown_word(text: str) -> str:
+    """A word as it stands, cut to 60 characters."""
+    return text if len(text) <= 60 else f"{text[:57]}..."

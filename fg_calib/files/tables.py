@@ -44,6 +44,9 @@ _SIGMA_POSITION = ("sigma_x", "sigma_y", "sigma_z")
 _SIGMA_ORIENTATION = ("sigma_rx", "sigma_ry", "sigma_rz")
 _RESERVED = {*_POSITION, *_QUATERNION, *_ROLL_PITCH_YAW, *_SIGMA_POSITION, *_SIGMA_ORIENTATION, "id", "split", "group"}
 
+_KNOWN = {*_RESERVED, "sigma_position", "sigma_orientation", "sigma_point"}
+"""Columns that mean something, beside the joints'."""
+
 
 def read_measurements(
     path: Path | str | Any,
@@ -70,7 +73,7 @@ def read_measurements(
     check_type("noise", noise, Noise, "Noise(position=1e-3)")
     units, noise = units or Units(), noise or Noise()
     _check_noise(noise)
-    header = Header.read(path, "frame")
+    header = Header.read(path, "frame").understood(_KNOWN, (joint.name for joint in robot.joints))
     joints = _joint_columns(header, robot)
     position = header.group(_POSITION)
     orientation = _orientation_columns(header)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.errors import InputError
-from fg_calib.files.disk import require_file, write_text
+from fg_calib.files.disk import read_bytes, write_text
 from fg_calib.options import NEAR, did_you_mean, known_names
 from fg_calib.robot.model import FRAME_KINDS, Joint, Robot, RobotBuilder, UrdfSource
 
@@ -75,8 +75,7 @@ def read_urdf(
             prismatic and fixed joints.
     """
     path = Path(path)
-    require_file(path)
-    data = path.read_bytes()
+    data = read_bytes(path)
     text, root = _parse(data, path.name)
     tree = _Tree(_read_joints(root, path.name), _read_links(root, path.name), path.name)
     base_link = tree.root() if base_link is None else tree.known(base_link)

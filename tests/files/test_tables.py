@@ -234,7 +234,10 @@ MISTAKES = [
     (changed("p2,", ""), "poses.csv:3: 12 cells, expected 13 as in the header"),
     (changed("first", "first,2"), "poses.csv:2: 14 cells, expected 13 as in the header"),
     ('q1,q2,q3\n"0,0,0\n', "poses.csv:2: 1 cells, expected 3 as in the header"),
-    (b"q1,q2,q3\n0,0,\xe9\n", "poses.csv: not a CSV: invalid utf-8 sequence"),
+    (
+        b"q1,q2,q3\n0,0,\xe9\n",
+        "poses.csv:2: byte 0xe9, expected UTF-8 text; is it Latin-1 or Windows text? save it as UTF-8",
+    ),
     (changed("1e-3", "2.092"), "poses.csv:3: q1 = 2.092 rad is outside [-2.09, 2.09]; is the table in deg?"),
     (changed("1e-3", "4.71"), "poses.csv:3: q1 = 4.71 rad is outside [-2.09, 2.09]; is the table in deg?"),
     (changed("1e-3", "200"), "poses.csv:3: q1 = 200 rad is outside [-2.09, 2.09]"),
