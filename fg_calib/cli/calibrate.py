@@ -20,14 +20,22 @@ def calibrate(
 ) -> None:
     """Estimate a robot's parameters from measurements, with their uncertainties."""
     from fg_calib.calibration import calibrate_job
+    from fg_calib.files.disk import require_writable
+    from fg_calib.files.job import read_job
+    from fg_calib.report.documents import require_no_input
 
-    found = calibrate_job(job)
     if out is not None:
-        found.save(out)
+        require_writable(out)
+    given = read_job(job)
+    if out is not None:
+        require_no_input(out, given)
+    found = calibrate_job(given)
     if as_json:
         show_json(found.result.document())
     else:
         from fg_calib.report.text import build_report
 
         show_report(build_report(found.solution, found.uncertainty))
+    if out is not None:
+        found.save(out)  # after the report, which a full disk then does not take along
     end(found.findings)

@@ -17,15 +17,18 @@ def compare(
 ) -> None:
     """Run the factor graph beside plain least squares on the same job: errors, residuals, sigmas, time."""
     from fg_calib.baseline import comparison
+    from fg_calib.files.disk import require_writable
     from fg_calib.files.job import read_job
     from fg_calib.report.comparison import build_comparison_report
     from fg_calib.report.documents import comparison_document, write_comparison
 
-    found = comparison.compare(read_job(job))
     if out is not None:
-        write_comparison(out, found)
+        require_writable(out)
+    found = comparison.compare(read_job(job))
     if as_json:
         show_json(comparison_document(found))
     else:
         show_report(build_comparison_report(found))
+    if out is not None:
+        write_comparison(out, found)
     end(found.findings)

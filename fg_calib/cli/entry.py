@@ -6,11 +6,13 @@ Exit codes: 0 good; 1 bad input; 2 wrong usage; 3 solved, but not to be trusted.
 from __future__ import annotations
 
 import atexit
+import errno
 import gc
 import io
 import logging
+import os
 import sys
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -49,13 +51,28 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show a letter gets a question mark
             stream.reconfigure(errors="replace")
     try:
-        app(prog_name="fg-calib")
+        try:
+            app(prog_name="fg-calib")
+        finally:
+            sys.stdout.flush()
     except CalibrationError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(1)
+        _fail(str(error))
     except BrokenPipeError:  # the reader of our output has gone
         sys.stderr.close()
         sys.exit(1)
+    except MemoryError:
+        _fail("there is not enough memory for this")
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - what could not be printed is not tried again at exit
+        _fail(f"the output cannot be written: {error.strerror}")
+
+
+def _fail(message: str) -> NoReturn:
+    """Say in one line why there is no result; control characters from files are none of the terminal's."""
+    print("error: " + "".join(c if c.isprintable() else "?" for c in message), file=sys.stderr)
+    sys.exit(1)
 
 
 def _show_version(wanted: bool) -> None:

@@ -19,15 +19,13 @@ def example(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write it to.")],
 ) -> None:
     """Write a ready job to try the package on: robot, measurements and calibration.yaml."""
-    from fg_calib.files.disk import fill_folder
+    from fg_calib.files.disk import fill_folder, require_absent
 
     known = sorted(folder.name for folder in EXAMPLES.iterdir() if folder.is_dir())
     if name not in known:
         raise InputError("example", f"found {name!r}", f"one of {', '.join(known)}")
     files = sorted(file for file in (EXAMPLES / name).iterdir() if file.is_file())
-    for file in files:
-        if (out / file.name).exists():
-            raise InputError(str(out / file.name), "is there already", "a folder without it")
+    require_absent(out, [file.name for file in files])
 
     def write(folder: Path) -> None:
         for file in files:

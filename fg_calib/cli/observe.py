@@ -89,12 +89,12 @@ def observe(
         )
         table = read_measurements(configurations, arm, units=units, noise=noise)
         found = observe_configurations(arm, table, model, frame=frame, pairing=Pairing(pairing), prefer=names)
-    if out is not None:
-        write_observability(out, found)
     if as_json:
         show_json(observability_document(found))
     else:
         show_report(build_identifiability_report(found))
+    if out is not None:
+        write_observability(out, found)
 
 
 def _refuse_idle(context: typer.Context, names: Sequence[str], circumstance: str) -> None:

@@ -20,10 +20,11 @@ def simulate(
 ) -> None:
     """Simulate a calibration job: the true robot, and what is measured of it, with noise."""
     from fg_calib.files.scenario import read_scenario
-    from fg_calib.files.simulation import write_simulation
+    from fg_calib.files.simulation import require_no_other_job, write_simulation
     from fg_calib.simulation import simulator
 
     simulation = simulator.simulate(read_scenario(scenario), seed)
+    require_no_other_job(out, simulation)
     names = write_simulation(out, simulation)
     if as_json:
         show_json({"files": [str(out / name) for name in names], **simulation.summary()})

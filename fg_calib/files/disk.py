@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import socket
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
 from tempfile import mkdtemp
@@ -131,23 +133,41 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_bytes(text.encode())
 
 
+_WRITING, _WRITTEN = ".fg-calib-writing-", ".fg-calib-written"
+"""Folders within a folder that is filled: while files are written, and when all are there but not yet moved."""
+
+
 def fill_folder(folder: Path, write: Callable[[Path], None]) -> None:
-    """Let `write` fill a new folder, and move its files into `folder` once all of them are there.
+    """Let `write` write files that then appear in a folder, all of them or none.
+
+    They are written to a folder within it, which is renamed when all of them are there: from then on they count as
+    written. Only then they are moved to their places; what interrupts that is made good by `finish` (see there), which
+    everything that reads from such a folder or writes to it calls first. Renaming within one folder is atomic on local
+    disks and network mounts, also where the folder itself is a mount or its parent may not be written.
 
     Raises:
         InputError: The folder cannot be written.
     """
+    missing = [f for f in (folder, *folder.parents) if not f.exists()]
     temporary = None
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        folder.mkdir(parents=True, exist_ok=True)
+        _clear_dead(folder)
+        temporary = Path(mkdtemp(prefix=f"{_WRITING}{_here()}-", dir=folder))
         write(temporary)
-        if not folder.exists():
-            temporary.chmod(0o777 & ~_umask())
-            temporary.rename(folder)
-        else:
-            for file in sorted(temporary.iterdir()):
-                file.replace(folder / file.name)
+        for file in temporary.iterdir():
+            if (folder / file.name).is_dir():
+                raise InputError(str(folder / file.name), "is a folder", "a place for a file")
+        while True:
+            finish(folder)
+            try:
+                temporary.rename(folder / _WRITTEN)
+                break
+            except OSError as error:  # another writer's files came between
+                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                    raise
+        temporary = None
+        finish(folder)
     except OSError as error:
         raise InputError(
             str(folder), f"cannot be written: {error.strerror or error}", "a folder that can be"
@@ -155,9 +175,68 @@ def fill_folder(folder: Path, write: Callable[[Path], None]) -> None:
     finally:
         if temporary is not None:
             shutil.rmtree(temporary, ignore_errors=True)
+            _remove_empty(missing)
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def require_writable(folder: Path) -> None:
+    """Check that files can be written to a folder, which need not exist.
+
+    Raises:
+        InputError: They cannot.
+    """
+    missing = [f for f in (folder, *folder.parents) if not f.exists()]
+    fill_folder(folder, lambda _: None)
+    _remove_empty(missing)
+
+
+def _remove_empty(folders: Iterable[Path]) -> None:
+    for folder in folders:
+        with suppress(OSError):
+            folder.rmdir()
+
+
+def require_absent(folder: Path, names: Iterable[str]) -> None:
+    """Check that files that would be replaced are not there.
+
+    Raises:
+        InputError: One is.
+    """
+    for name in names:
+        if (folder / name).exists():
+            raise InputError(str(folder / name), "is there already", "a folder without it")
+
+
+def finish(folder: Path) -> None:
+    """Move files to their places that were written to a folder by a process that ended before it had moved them."""
+    written = folder / _WRITTEN
+    try:
+        files = sorted(written.iterdir())
+    except OSError:
+        return
+    for file in files:
+        with suppress(FileNotFoundError):  # another process moves them too
+            file.replace(folder / file.name)
+    with suppress(OSError):
+        written.rmdir()
+
+
+def _clear_dead(folder: Path) -> None:
+    """Remove what processes of this machine left half written when they were killed."""
+    for left in folder.glob(f"{_WRITING}{socket.gethostname()}-*"):
+        process = left.name.rpartition("-")[0].rpartition("-")[2]
+        if process.isdigit() and not _runs(int(process)):
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def _here() -> str:
+    return f"{socket.gethostname()}-{os.getpid()}"
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True

@@ -17,7 +17,7 @@ from pydantic_core import PydanticCustomError
 
 from fg_calib.arrays import NORM_TOLERANCE
 from fg_calib.errors import InputError
-from fg_calib.files.disk import read_text
+from fg_calib.files.disk import finish, read_text
 from fg_calib.files.schema import first_misfit
 
 SCHEMA: Literal["fg-calib/result/2"] = "fg-calib/result/2"
@@ -423,6 +423,7 @@ def read_result(path: Path | str) -> Result:
     path = Path(path)
     if not path.exists():
         raise InputError(str(path), "no such folder or file", "what `fg-calib calibrate --out` wrote")
+    finish(path if path.is_dir() else path.parent)
     file = path / "result.json" if path.is_dir() else path
     if path.is_dir() and not file.exists():
         raise InputError(str(path), "no result.json in this folder", "a folder that `fg-calib calibrate --out` wrote")

@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 from fg_calib.files.csv_writer import write_csv
-from fg_calib.files.disk import fill_folder, write_text
+from fg_calib.files.disk import fill_folder, require_absent, write_text
 from fg_calib.files.robot_yaml import write_robot
 from fg_calib.files.units import Units
 from fg_calib.files.urdf import write_urdf
@@ -37,7 +37,6 @@ def write_simulation(folder: Path | str, simulation: Simulation) -> tuple[str, .
     """
     scenario = simulation.scenario
     units = Units(length=scenario.length_unit, angle=scenario.angle_unit)
-    names: list[str] = []
 
     def write(into: Path) -> None:
         for name, robot in (("robot_nominal", simulation.robot), ("robot_true", simulation.true_robot)):
@@ -47,10 +46,33 @@ def write_simulation(folder: Path | str, simulation: Simulation) -> tuple[str, .
             write_robot(into / f"{name}.yaml", robot, units=units, urdf_name=urdf_name)
         write_csv(into / "poses.csv", _pose_columns(simulation, units))
         write_text(into / "calibration.yaml", _job_text(simulation, units))
-        names.extend(sorted(file.name for file in into.iterdir()))
 
     fill_folder(Path(folder), write)
-    return tuple(names)
+    return simulation_files(simulation)
+
+
+def require_no_other_job(folder: Path, simulation: Simulation) -> None:
+    """Check that a folder holds no files that a simulation would replace, but for those of another simulation.
+
+    Raises:
+        InputError: It does.
+    """
+    try:
+        if (folder / "calibration.yaml").read_text(encoding="utf-8", errors="replace").startswith(_FIRST_WORDS):
+            return
+    except OSError:
+        pass
+    require_absent(folder, simulation_files(simulation))
+
+
+_FIRST_WORDS = "# fg-calib simulate "
+"""How the job of a simulation begins."""
+
+
+def simulation_files(simulation: Simulation) -> tuple[str, ...]:
+    """The names of the files of a simulation."""
+    urdfs = ("robot_nominal.urdf", "robot_true.urdf") if simulation.robot.urdf is not None else ()
+    return tuple(sorted(("calibration.yaml", "poses.csv", "robot_nominal.yaml", "robot_true.yaml", *urdfs)))
 
 
 def _pose_columns(simulation: Simulation, units: Units) -> Mapping[str, Any]:
@@ -89,5 +111,5 @@ def _job_text(simulation: Simulation, units: Units) -> str:
             "joint": joint[0] if len(set(joint)) == 1 else joint,
         },
     }
-    command = f"# fg-calib simulate {scenario.source} --seed {simulation.seed}\n"
+    command = f"{_FIRST_WORDS}{scenario.source} --seed {simulation.seed}\n"
     return command + yaml.safe_dump(job, sort_keys=False, default_flow_style=None, allow_unicode=True, width=math.inf)

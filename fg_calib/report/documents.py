@@ -30,6 +30,7 @@ from fg_calib.analysis.joint_values import JointValues
 from fg_calib.analysis.mistakes import SetupCheck
 from fg_calib.analysis.typical_residuals import TypicalResidual
 from fg_calib.analysis.uncertainty import ParameterEstimate, Uncertainty
+from fg_calib.errors import InputError
 from fg_calib.files.csv_writer import Words, write_csv_parts
 from fg_calib.files.disk import fill_folder, write_text
 from fg_calib.files.result import (
@@ -65,6 +66,7 @@ from fg_calib.files.result import SuspectConfiguration as Suspect
 from fg_calib.files.robot_yaml import write_robot
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
+from fg_calib.job import Job
 from fg_calib.robot.model import Robot
 
 if TYPE_CHECKING:  # a calibration is written without the baseline
@@ -520,6 +522,18 @@ def write_results(
             _write_joint_values(into / "joints.csv", uncertainty.joint_values, solution.problem.end_names)
 
     fill_folder(Path(folder), write)
+
+
+def require_no_input(folder: Path, job: Job) -> None:
+    """Check that results written to a folder would not replace what a job was read from.
+
+    Raises:
+        InputError: They would.
+    """
+    inputs = set() if job.path is None else {(job.path.parent / name).resolve() for name in job.inputs}
+    for name in ("result.json", "residuals.csv", "joints.csv", "robot_calibrated.yaml", "robot_calibrated.urdf"):
+        if (folder / name).resolve() in inputs:
+            raise InputError(str(folder / name), "the job was read from it", "another folder for the results")
 
 
 def write_calibrated_robot(folder: Path, robot: Robot) -> None:

@@ -1,0 +1,161 @@
+"""Folders that are filled: all files or none, whatever interrupts, and the next one makes it good."""
+
+import os
+import signal
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from fg_calib import Calibration, InputError, calibrate_job
+from fg_calib.files import disk
+from fg_calib.files.disk import fill_folder, finish, require_writable
+
+FILES = ("one", "two", "three")
+
+
+def write(text):
+    def fill(into):
+        for name in FILES:
+            (into / name).write_text(text)
+
+    return fill
+
+
+def content(folder):
+    """What visible files hold, and how many hidden ones there are."""
+    files = [file for file in folder.iterdir() if not file.name.startswith(".")]
+    return {file.name: file.read_text() for file in files}, len([*folder.iterdir()]) - len(files)
+
+
+def killed_at(folder, moment, text):
+    """Fill a folder in a process that is killed at its n-th call of the functions by which files appear."""
+    code = f"""
+import os, signal
+from pathlib import Path
+from fg_calib.files.disk import fill_folder
+left = {moment}
+def counted(original):
+    def call(*a, **k):
+        global left
+        left -= 1
+        if left < 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return original(*a, **k)
+    return call
+for name in ("rename", "replace", "rmdir", "write_text", "iterdir", "mkdir"):
+    setattr(Path, name, counted(getattr(Path, name)))
+def write(into):
+    for name in {FILES!r}:
+        (into / name).write_text({text!r})
+fill_folder(Path({str(folder)!r}), write)
+"""
+    return subprocess.run([sys.executable, "-c", code], check=False).returncode
+
+
+@pytest.mark.parametrize("moment", range(0, 14))
+def test_a_kill_at_any_moment_leaves_the_old_or_the_new_for_the_next_reader(tmp_path, moment):
+    fill_folder(tmp_path, write("old"))
+    ended = killed_at(tmp_path, moment, "new")
+    assert ended in (0, -signal.SIGKILL)
+    finish(tmp_path)
+    found, _ = content(tmp_path)
+    assert found in (dict.fromkeys(FILES, "old"), dict.fromkeys(FILES, "new"))
+    if ended == 0:
+        assert found["one"] == "new"
+    fill_folder(tmp_path, write("newer"))  # and what a killed process left is cleared away
+    assert content(tmp_path) == (dict.fromkeys(FILES, "newer"), 0)
+
+
+def test_some_moment_is_a_kill_and_some_is_not(tmp_path):
+    """That the test above looks at both."""
+    assert killed_at(tmp_path, 0, "new") == -signal.SIGKILL
+    assert killed_at(tmp_path, 10_000, "new") == 0
+
+
+def test_many_writers_at_once_leave_the_files_of_one(tmp_path):
+    folder = tmp_path / "new"
+    with ThreadPoolExecutor(8) as pool:
+        [*pool.map(lambda k: fill_folder(folder, write(str(k))), range(40))]
+    found, hidden = content(folder)
+    assert len(set(found.values())) == 1
+    assert hidden == 0
+
+
+def test_a_failure_leaves_nothing_and_no_folder(tmp_path):
+    def fail(into):
+        (into / "one").write_text("new")
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(InputError, match="cannot be written: No space left on device"):
+        fill_folder(tmp_path / "a" / "b", fail)
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_a_folder_in_the_way_is_named_before_anything_is_replaced(tmp_path):
+    fill_folder(tmp_path, write("old"))
+    (tmp_path / "two").unlink()
+    (tmp_path / "two").mkdir()
+    with pytest.raises(InputError, match="two: is a folder, expected a place for a file"):
+        fill_folder(tmp_path, write("new"))
+    assert (tmp_path / "one").read_text() == "old"
+
+
+def test_asking_whether_a_folder_can_be_written_leaves_no_trace(tmp_path):
+    require_writable(tmp_path / "a" / "b")
+    assert [*tmp_path.iterdir()] == []
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="file: cannot be written: File exists, expected a folder that can be"):
+        require_writable(tmp_path / "file")
+
+
+def test_what_another_machine_is_writing_is_left_alone(tmp_path):
+    others = tmp_path / ".fg-calib-writing-another-machine-1-x"
+    others.mkdir()
+    fill_folder(tmp_path, write("new"))
+    assert others.is_dir()
+
+
+def test_a_result_that_was_written_but_not_moved_is_read(example):
+    calibration = calibrate_job(example / "calibration.yaml")
+    folder = example / "result"
+    calibration.save(folder)
+    within = folder / disk._WRITTEN
+    within.mkdir()
+    for file in [*folder.iterdir()]:
+        if file.is_file():
+            file.rename(within / file.name)
+    assert Calibration.load(folder).parameters == calibration.parameters
+    assert not within.exists()
+
+
+def test_results_do_not_replace_what_they_are_of(example, fg_calib):
+    job = example / "calibration.yaml"
+    (example / "robot_nominal.yaml").rename(example / "robot_calibrated.yaml")
+    job.write_text(job.read_text().replace("robot_nominal.yaml", "robot_calibrated.yaml"))
+    before = {file.name: file.read_bytes() for file in example.iterdir()}
+    ended = fg_calib("calibrate", job, "--out", example)
+    name = example / "robot_calibrated.yaml"
+    expected = f"error: {name}: the job was read from it, expected another folder for the results\n"
+    assert ended == (1, "", expected)
+    assert {file.name: file.read_bytes() for file in example.iterdir()} == before
+
+
+def test_a_simulation_replaces_a_simulation_and_nothing_else(fg_calib, tmp_path):
+    assert fg_calib("simulate", "space-robot", "--out", tmp_path).code == 0
+    assert fg_calib("simulate", "space-robot", "--out", tmp_path, "--seed", 3).code == 0
+    (tmp_path / "calibration.yaml").write_text("model: pose\n")
+    ended = fg_calib("simulate", "space-robot", "--out", tmp_path, "--seed", 4)
+    expected = f"error: {tmp_path / 'calibration.yaml'}: is there already, expected a folder without it\n"
+    assert ended == (1, "", expected)
+    assert (tmp_path / "calibration.yaml").read_text() == "model: pose\n"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
+def test_a_full_disk_behind_stdout_is_one_line(example):
+    command = [sys.executable, "-m", "fg_calib.cli", "calibrate", str(example / "calibration.yaml")]
+    with Path("/dev/full").open("w") as full:
+        ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, check=False, env=dict(os.environ))
+    assert (ended.returncode, ended.stderr) == (1, b"error: the output cannot be written: No space left on device\n")
