@@ -89,7 +89,7 @@ def as_floats(name: str, given: object, shape: str, *, missing: bool = False) ->
     array = as_array(name, given, "iufO", f"numbers of shape {shape}")
     try:
         floats = np.array(array, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(name, f"found {_shown(given)}", f"numbers of shape {shape}") from None
     wanted = [word.strip() for word in shape.strip("()").split(",") if word.strip()]
     fits = floats.ndim == len(wanted) and all(
@@ -125,6 +125,8 @@ def as_array(name: str, given: object, kinds: str, expected: str) -> NDArray[Any
     Raises:
         InputError: It is none.
     """
+    if isinstance(given, np.ma.MaskedArray):
+        raise InputError(name, "found a masked array", f"{expected}; nan where something was not measured")
     try:
         array = np.asarray(given)
     except ValueError:  # rows of different lengths

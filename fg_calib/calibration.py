@@ -323,13 +323,13 @@ class Calibration:
         return not self.findings and self.result.solver.converged
 
     @single_threaded
-    def predict(self, readings: ArrayLike, *, world: bool = False) -> PredictedPoses:
+    def predict(self, readings: ArrayLike, *, world: bool = False, table: int | None = None) -> PredictedPoses:
         """Where the tool truly is at joint readings, and how well that is known.
 
         Args:
             readings: Shape (n, n_joints), or (n_joints,) of one configuration, [rad] (prismatic: [m]).
-            world: Whether the poses are wanted in the measurement frame (the first that was estimated), instead of in
-                the base frame.
+            world: Whether the poses are wanted in the measurement frame, instead of in the base frame.
+            table: Number of the table whose measurement frame it is, from 0; there must be one if there are several.
 
         Raises:
             InputError: The readings are of other joints, or there is no measurement frame.
@@ -340,12 +340,22 @@ class Calibration:
         if world and v.n_robot_columns == v.n_columns:
             raise InputError("world", "the measurement frame was not estimated, or not saved", "the base frame")
         known = build_variables(v.robot, [False]).chains[0]
-        chain = v.chains[_tables_with_frame(v)[0]] if world else known
+        chain = v.chains[self._table_of(table)] if world else known
         at = forward(chain.at(self.posterior.parameters), precompute_trig(v.robot, q))
         jacobian = np.zeros((len(q), 6, v.n_columns))
         jacobian[:, :, : at.jacobian.shape[2]] = at.jacobian[:, [3, 4, 5, 0, 1, 2]]
         covariance = [self.posterior.covariance(rows) for rows in jacobian]
         return PredictedPoses(at.position, at.rotation, np.array(covariance).reshape(-1, 6, 6))
+
+    def _table_of(self, number: int | None) -> int:
+        """The table whose measurement frame is meant."""
+        there = _tables_with_frame(self.posterior.variables)
+        if number is None and len(there) == 1:
+            return there[0]
+        if number not in there:
+            found = "several measurement frames" if number is None else f"found {number!r}"
+            raise InputError("table", found, f"one of {', '.join(map(str, there))}: the table whose frame is meant")
+        return number
 
     def __repr__(self) -> str:
         return "\n".join(summary(self.result))

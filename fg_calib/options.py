@@ -140,6 +140,20 @@ def did_you_mean(value: object, options: Iterable[object], likeness: float = 0.6
     return f"did you mean {words[close[0]]}?" if close else ""
 
 
+def listed(key: str, names: Iterable[Any]) -> tuple[Any, ...]:
+    """Names as a tuple: what can be gone through only once would be empty the second time.
+
+    Raises:
+        InputError: They are nothing to go through.
+    """
+    if isinstance(names, str):
+        return (names,)
+    try:
+        return tuple(names)
+    except TypeError:
+        raise InputError(key, f"found {names!r}", "a list of names") from None
+
+
 def known_names(names: Iterable[str], limit: int = 12) -> str:
     """`one of a, b, c` for an error message, cut after `limit` names."""
     listed = list(names)
@@ -252,8 +266,8 @@ class Options:
         prior = choices.pop("prior", None)
         check_names("options", choices, [f.name for f in fields(cls)], "option")
         choices["pairing"] = as_pairing(choices.get("pairing"))
-        if isinstance(choices.get("prefer"), list):
-            choices["prefer"] = tuple(choices["prefer"])
+        if not isinstance(choices.get("prefer", ()), str):
+            choices["prefer"] = listed("prefer", choices.get("prefer", ()))
         options = cls(**choices)
         return options if prior is None else options.with_prior(prior)
 

@@ -303,3 +303,19 @@ def test_predictions_are_of_this_robot(found):
     with pytest.raises(InputError, match="world: found 'yes'"):
         found["priors"].predict(Q, world="yes")
     assert found["priors"].predict(Q[0]).position.shape == (1, 3)
+
+
+def test_the_frame_of_several_is_named():
+    rng = np.random.default_rng(0)
+    robot = small_arm(TOLERANCE)
+    tables = [measure(robot, 20, rng, sigma=(1e-4, 1e-4), frame=FRAME) for _ in range(2)]
+    other = (Rotation.from_rotvec([0.0, 0.0, 1.0]), np.array([5.0, 0.0, 0.0]))
+    tables[1] = replace(measure(robot, 20, rng, sigma=(1e-4, 1e-4), frame=other), source="other")
+    found = calibrate(robot, tables, model="pose", frame="unknown")
+    q = np.zeros(4)
+    with pytest.raises(InputError, match="table: several measurement frames, expected one of 0, 1: the table whose"):
+        found.predict(q, world=True)
+    at = [found.predict(q, world=True, table=k).position[0] for k in range(2)]
+    p = pose(robot, q[None]).position[0]
+    for k, (rotation, shift) in enumerate((FRAME, other)):
+        assert at[k] == pytest.approx(rotation.apply(p) + shift, abs=5e-3)

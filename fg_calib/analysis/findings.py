@@ -94,9 +94,10 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
     """
     problem, kinds = solution.problem, fit.goodness.kinds
     estimated_noise = solution.estimated_noise is not None
+    of_priors_alone = fit.priors is not None and fit.chi2.too_large and not _too_large(fit)
     statements = [
         *_of_solver(solution),
-        *of_chi2(fit.chi2, problem.evaluated),
+        *(() if of_priors_alone else of_chi2(fit.chi2, problem.evaluated)),
         *of_evaluation(problem.evaluated, estimated_noise),
         *of_test(fit.goodness.test, fit.chi2.ratio, problem.end_names),
         *of_priors(fit.priors),
@@ -116,6 +117,16 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
     fits = not (doubts or estimated_noise)
     first = _of_model(setup, missing, fits=fits, high=fit.chi2.too_large or follow)
     return Verdict((*first[0], *doubts), (*first[1], *cautions), setup, noise_like)
+
+
+def _too_large(fit: Fit) -> bool:
+    """Whether chi-square is too large without the corrections, which are judged by themselves."""
+    if fit.priors is None:
+        return fit.chi2.too_large
+    rest, dof = fit.chi2.value - fit.priors.chi2, fit.chi2.dof - len(fit.priors.names)
+    return rest > max(fit.chi2.bounds[1] * dof, 0.0) or any(
+        kind.verdict in ("too small", "both") for kind in fit.goodness.kinds
+    )
 
 
 def _of_bent_rows(solution: Solution, spread: Spread, table: ResidualTable, goodness: Goodness) -> list[Statement]:
@@ -161,13 +172,13 @@ def _of_solver(solution: Solution) -> list[Statement]:
         statements.append(Statement(solution.message, finding=True))
     statements += [Statement(text, finding=True) for text in _other_optima(solution)]
     weights, series = solution.problem.state.weights, solution.problem.data.series
-    if weights is not None:
-        n = sum(len(s.train) for s in series)
-        lost = sum(int(np.sum(w[s.train] < OUTLIER_WEIGHT)) for s, w in zip(series, weights, strict=True))
+    labels = solution.problem.data.labels
+    for s, w in zip(series, weights or (), strict=False):
+        n, lost = len(s.train), int(np.sum(w[s.train] < OUTLIER_WEIGHT))
         if lost > MOST_OUTLIERS * n:
-            loss = solution.problem.options.loss
-            text = f"loss {loss} takes {lost} of {n} measurements for outliers: more than it can tell from noise"
-            statements.append(Statement(text, finding=True))
+            of = f" of {labels[s.table]}" if len(labels) > 1 else ""
+            text = f"loss {solution.problem.options.loss} takes {lost} of {n} measurements{of} for outliers"
+            statements.append(Statement(f"{text}: more than it can tell from noise", finding=True))
     return statements
 
 

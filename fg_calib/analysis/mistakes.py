@@ -41,6 +41,10 @@ _BEST = 4
 """The best single mistakes are combined with any other; those after them not with mistakes about one joint."""
 
 
+OTHER_TOOL = "tool or base are others here than in the other tables (another target on the tool, another frame)"
+"""What a table of several may say that fits with a tool and a base of its own alone."""
+
+
 @dataclass(frozen=True)
 class Explanation:
     """A mistake in the set-up that explains a table, or two together.
@@ -69,10 +73,12 @@ class SetupCheck:
     Attributes:
         residuals: As the job says, by kind; empty where there are too few rows to tell.
         explanations: Mistakes that explain them where they are too large, the simplest first.
+        table: Which of several tables they are of; empty of one alone.
     """
 
     residuals: tuple[TypicalResidual, ...] = ()
     explanations: tuple[Explanation, ...] = ()
+    table: str = ""
 
     @property
     def excess(self) -> float:
@@ -90,6 +96,9 @@ class SetupCheck:
         return self.excess > FAR
 
     def __str__(self) -> str:
+        return f"{self.table}: {self._words()}" if self.table else self._words()
+
+    def _words(self) -> str:
         if not self.explanations:
             times = f"{self.excess:.3g} times what noise and tolerances predict"
             found = f"{self.worst.kind} residuals before calibration are {shown(self.worst)}, {times}"
@@ -116,6 +125,7 @@ def check_setup(
     *,
     doubtful: bool = False,
     fitted: tuple[Robot, Frame] | None = None,
+    alone: bool = True,
 ) -> SetupCheck:
     """Compare residuals before a calibration with what noise and tolerances predict, and look for a mistake.
 
@@ -126,6 +136,7 @@ def check_setup(
         frame: Whether the measurement frame is known.
         doubtful: Look for a mistake even where the residuals are not far from what is predicted.
         fitted: The robot with base and tool fitted, and world_T_base, where they are known already.
+        alone: Whether base and tool are for this table to say; where others say too, its own are none.
 
     Note:
         Pairs are formed anew from some of the rows, whatever the job's pairing.
@@ -145,7 +156,10 @@ def check_setup(
             return found
         if fitted is not None:
             closed_form = SetupCheck(fitted_residuals(setup))
-            found = closed_form if closed_form.excess < found.excess and closed_form.residuals else found
+            better = bool(closed_form.residuals) and closed_form.excess < found.excess
+            if better and not alone and found.far and closed_form.excess <= min(EXPLAINED, found.excess / REDUCTION):
+                return replace(found, explanations=(Explanation((OTHER_TOOL,), closed_form.residuals),))
+            found = closed_form if better else found
         return replace(found, explanations=_explanations(setup, found))
 
 
@@ -159,7 +173,7 @@ def check_problem(problem: Problem, before: Floats, *, doubtful: bool = False) -
     """
     whole, variables = problem.whole or problem, problem.variables
     robot = whole.robot.with_values(before[variables.robot_span])
-    found = SetupCheck()
+    found, names = SetupCheck(), problem.data.labels
     for number, table in enumerate(problem.data.tables):
         if table.model is None:
             continue
@@ -169,7 +183,8 @@ def check_problem(problem: Problem, before: Floats, *, doubtful: bool = False) -
                 world_T_base = pose_of(before[list(v.parameters)])
                 frame = Frame(world_T_base.rotation().matrix(), world_T_base.translation())
         given = (whole.robot, table.measurements, table.model, table.frame)
-        of_table = check_setup(*given, doubtful=doubtful, fitted=(robot, frame))
+        of_table = check_setup(*given, doubtful=doubtful, fitted=(robot, frame), alone=len(names) == 1)
+        of_table = replace(of_table, table=names[number] if len(names) > 1 else "")
         if number == 0 or of_table.explanations or of_table.excess > found.excess:
             found = of_table
         if of_table.explanations:

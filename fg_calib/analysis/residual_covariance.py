@@ -19,6 +19,7 @@ from fg_calib.graph.rows import ErrorColumns
 from fg_calib.measurements import residuals
 
 Floats = NDArray[np.float64]
+Booleans = NDArray[np.bool_]
 Integers = NDArray[np.int64]
 Loadings = scipy.sparse.csr_array
 
@@ -85,6 +86,10 @@ class Nuisances:
         series = problem.data.series
         self._apart = [says_where(problem.data, s) & ~there[s.nuisances].any(axis=1) for s in series]
         reserved = [s.n * s.kind.residual_dim * of.any() for s, of in zip(series, self._apart, strict=True)]
+        said: Booleans = np.array(there, dtype=np.bool_)
+        for s, of in zip(series, self._apart, strict=True):
+            said[s.nuisances[of].ravel()] = True
+        self._unsaid: list[Booleans] = [np.any(~said[s.nuisances], axis=1) for s in series]
         self._first = self._columns.n_errors + np.cumsum([0, *reserved])
         self._averaged = scipy.sparse.csr_array((n, int(self._first[-1])))
         for number, of in enumerate(self._apart):
@@ -100,7 +105,11 @@ class Nuisances:
     def errors(self, number: int, rows: Integers) -> Errors:
         """What rows of a series follow from."""
         known, N = self._nuisances_known(number, rows)
-        return replace(known, J=known.J + N @ self._follow, own=N @ self._inverse, L=known.L + N @ self._averaged)
+        unsaid = np.repeat(self._unsaid[number][rows], len(known.J) // max(len(rows), 1))
+        anywhere = np.where(unsaid, np.nan, 0.0)[:, None]  # a point that no row says anything of
+        return replace(
+            known, J=known.J + anywhere + N @ self._follow, own=N @ self._inverse, L=known.L + N @ self._averaged
+        )
 
     def _nuisances_known(self, number: int, rows: Integers) -> tuple[Errors, Loadings]:
         """The same if nuisances were known; derivatives in these, sparse, shape (n residual_dim, n_coordinates).

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -96,7 +97,7 @@ class ResidualTable(FrozenArrays):
         """`distance`, `angle`, `position.x`, ... of each row, shape (n,)."""
         return np.array([kind.name for kind in self.kinds] or [""])[self.kind_code]
 
-    @property
+    @cached_property
     def families(self) -> tuple[str, ...]:
         """Kinds of noise, in the order in which they first stand in the table."""
         return tuple(dict.fromkeys(kind.family for kind in self.kinds))
@@ -104,10 +105,11 @@ class ResidualTable(FrozenArrays):
     @property
     def family(self) -> Codes:
         """Kind of noise of each row, in `families`, shape (n,)."""
-        codes = [self.families.index(kind.family) for kind in self.kinds]
+        place = {family: i for i, family in enumerate(self.families)}
+        codes = [place[kind.family] for kind in self.kinds]
         return np.array(codes or [0], dtype=np.int16)[self.kind_code]
 
-    @property
+    @cached_property
     def groups(self) -> tuple[tuple[int, str], ...]:
         """Tables and kinds of noise, in the order in which they first stand in the table."""
         return tuple(dict.fromkeys((kind.table, kind.family) for kind in self.kinds))
@@ -115,7 +117,8 @@ class ResidualTable(FrozenArrays):
     @property
     def group(self) -> Codes:
         """Table and kind of noise of each row, in `groups`, shape (n,)."""
-        codes = [self.groups.index((kind.table, kind.family)) for kind in self.kinds]
+        place = {group: i for i, group in enumerate(self.groups)}
+        codes = [place[kind.table, kind.family] for kind in self.kinds]
         return np.array(codes or [0], dtype=np.int16)[self.kind_code]
 
     @property

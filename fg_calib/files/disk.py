@@ -42,7 +42,7 @@ def read_bytes(path: Path) -> bytes:
             raise InputError(str(path), "is a pipe or a device", "a file")
         content = path.read_bytes()
     except FileNotFoundError:
-        raise InputError(str(path), "no such file") from None
+        raise InputError(_short(str(path)), "no such file") from None
     except PermissionError:
         raise InputError(str(path), "may not be read", hint="check the permissions of file and folder") from None
     except (OSError, ValueError) as error:  # ValueError: a path with a null character

@@ -262,4 +262,8 @@ def joint_noise(given: object, units: Units, robot: Robot, place: str) -> tuple[
             raise InputError(f"{place}: joint", f"{len(figures)} figures", expected)
     else:
         figures = (validate(_OneFigure, {"joint": given}, place).joint,) * robot.n_joints
+        kinds = {joint.unit: joint.name for joint in reversed(robot.joints)}
+        if figures[0] > 0.0 and len(kinds) > 1:
+            words = " and ".join(f"{given} {units.name(unit)} for {name}" for unit, name in sorted(kinds.items()))
+            _log.warning("%s: joint: %s is %s; a list has one figure a joint", place, given, words)
     return tuple(f * units.factor(j.unit) for f, j in zip(figures, robot.joints, strict=True))

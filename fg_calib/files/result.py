@@ -41,7 +41,8 @@ def _of_errors(matrix: tuple[tuple[float | None, ...], ...]) -> tuple[tuple[floa
     C = np.array(matrix, float).reshape(len(matrix), len(matrix))
     variance = C.diagonal()
     with np.errstate(invalid="ignore"):
-        most = np.sqrt(np.outer(variance, variance))
+        sigma = np.sqrt(variance)
+        most = np.outer(sigma, sigma)
         if (variance < 0.0).any() or (np.abs(C - C.T) > ROUNDING * most).any():
             raise expected
         if (np.abs(C) > (1.0 + ROUNDING) * most).any():
@@ -199,8 +200,9 @@ class Explanation(Section):
 
 
 class Setup(Section):
-    """What residuals before the calibration say of its set-up."""
+    """What residuals before the calibration say of its set-up; `table` names the one of several that they are of."""
 
+    table: str = ""
     residuals: dict[str, Typical]
     explanations: tuple[Explanation, ...]
 
@@ -275,11 +277,11 @@ class JointValues(Section):
 
 
 class TouchedPoint(Section):
-    """A point that a group of configurations touched."""
+    """A point that a group of configurations touched, or another unknown, of any number of coordinates."""
 
     name: str
     n: int
-    xyz: Position
+    xyz: Annotated[tuple[float, ...], BeforeValidator(_listed)]
     sigma: Sigmas
 
 
@@ -399,7 +401,7 @@ class Result(Section):
     posterior: Posterior | None = None
     links: tuple[str, str] | None = None
     frame_estimate: Frame | None
-    frames: dict[str, Frame] = {}
+    frames: dict[Annotated[str, Field(pattern=r"^X\(\d{1,4}\)$")], Frame] = {}
     joint_values: JointValues | None = None
     groups: tuple[TouchedPoint, ...] = ()
     observability: Observability

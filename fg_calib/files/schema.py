@@ -122,7 +122,8 @@ def _expected(misfit: ErrorDetails) -> str:
     context = misfit.get("ctx", {})
     if misfit["type"] == "literal_error":
         return "one of " + ", ".join(_options(misfit))
-    return _EXPECTED.get(misfit["type"], misfit["msg"]).format(**context)
+    words = _EXPECTED.get(misfit["type"])
+    return misfit["msg"] if words is None else words.format(**context)
 
 
 _EXPECTED = {

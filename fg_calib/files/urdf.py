@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from fg_calib.errors import InputError
 from fg_calib.files.disk import read_bytes, write_text
 from fg_calib.options import NEAR, did_you_mean, known_names
-from fg_calib.robot.model import FRAME_KINDS, Joint, Robot, RobotBuilder, UrdfSource
+from fg_calib.robot.model import FRAME_KINDS, Joint, Robot, RobotBuilder, UrdfSource, frame_values
 
 if TYPE_CHECKING:  # lxml is imported where it is used: `fg-calib --help` need not wait for it
     from lxml.etree import _Element as Element
@@ -46,8 +46,8 @@ def read_urdf(
     base_link: str | None = None,
     tip_link: str | None = None,
     name: str | None = None,
-    base: Mapping[str, float] | None = None,
-    tool: Mapping[str, float] | None = None,
+    base: Mapping[str, float] | ArrayLike | None = None,
+    tool: Mapping[str, float] | ArrayLike | None = None,
     fixed: Sequence[str] = (),
     estimate: Sequence[str] = (),
     tolerance: Mapping[str, float] | None = None,
@@ -63,8 +63,8 @@ def read_urdf(
         base_link: Where the chain starts; default: the root link.
         tip_link: Where it ends; default: the only leaf link below the start.
         name: The robot's name; default: the URDF's.
-        base: Values of the frame before `base_link`, by kind, [m] and [rad].
-        tool: Values of the frame behind `tip_link`, by kind, [m] and [rad].
+        base: The frame before `base_link`: values by kind, or as in `Robot.from_dh`, [m] and [rad].
+        tool: The frame behind `tip_link`, likewise.
         fixed: See `RobotBuilder.build`.
         estimate: See `RobotBuilder.build`.
         tolerance: See `RobotBuilder.build`, [m] or [rad].
@@ -82,11 +82,11 @@ def read_urdf(
     tip_link = tree.leaf(base_link) if tip_link is None else tree.known(tip_link)
 
     builder = RobotBuilder(name or root.get("name") or path.stem, "urdf")
-    builder.add_frame("base", base or {}, 0, False)
+    builder.add_frame("base", _frame("base", base), 0, False)
     n_joints = _add_chain(builder, tree.chain(base_link, tip_link), path.name)
     if n_joints == 0:
         raise InputError(path.name, f"no moving joint between links {base_link!r} and {tip_link!r}", "at least one")
-    builder.add_frame("tool", tool or {}, n_joints + 1, False)
+    builder.add_frame("tool", _frame("tool", tool), n_joints + 1, False)
     return builder.build(
         fixed=fixed,
         estimate=estimate,
@@ -94,6 +94,10 @@ def read_urdf(
         urdf=UrdfSource(text, base_link, tip_link),
         place=place or path.name,
     )
+
+
+def _frame(name: str, given: Mapping[str, float] | ArrayLike | None) -> Mapping[str, float]:
+    return given if isinstance(given, Mapping) else frame_values(name, given)
 
 
 def _add_chain(builder: RobotBuilder, chain: Iterable[tuple[_UrdfJoint, bool]], place: str) -> int:

@@ -39,6 +39,8 @@ def with_added(problem: Problem) -> Problem:
         return problem
     if more and problem.whole is not None:
         raise ProblemError("problem.graph", "added factors with gauge keep", "gauge prior or none")
+    for factor in more:
+        _check_noise(factor)
     added = problem.added + more
     variables = problem.variables.without_own()
     own = gtsam.Values(problem.initial)
@@ -63,6 +65,21 @@ def _added_factors(problem: Problem) -> tuple[gtsam.NonlinearFactor, ...]:
     if kept < n_own:
         raise ProblemError("problem.graph", f"{kept} of the problem's {n_own} factors", "all of them, in their places")
     return tuple(graph.at(i) for i in range(n_own, n))
+
+
+def _check_noise(factor: gtsam.NonlinearFactor | None) -> None:
+    """Raise for an added factor whose rows have no finite weight: nothing could be counted or whitened by them."""
+    if factor is None:
+        raise ProblemError("problem.graph", "None among its factors", "factors")
+    model = factor.noiseModel() if isinstance(factor, gtsam.NoiseModelFactor) else None
+    if model is None:
+        expected = "one with a noise model, such as PriorFactorVector, BetweenFactorPose3 or CustomFactor"
+        raise ProblemError("problem.graph", f"an added {type(factor).__name__}", expected)
+    if model.isConstrained():
+        expected = "sigmas above 0: a thousandth of what matters is as good as 0"
+        raise ProblemError(
+            "problem.graph", f"an added {type(factor).__name__} with a constrained noise model", expected
+        )
 
 
 def check_graph(problem: Problem) -> None:

@@ -37,7 +37,7 @@ def eliminated(problem: Problem, parameters: Floats, *, with_loss: bool = False)
 def _with_loss(problem: Problem) -> tuple[tuple[RowSet, ...], float]:
     """The rows, and by what factor a robust loss makes the variance of the estimate larger.
 
-    Measurements of fewer rows lose less or more than others; beside the usual ones they count by that much.
+    Measurements of fewer rows lose less or more than others; beside those that lose least they count by that much.
     """
     state, loss = problem.state, problem.options.loss
     if state.weights is None:
@@ -47,11 +47,12 @@ def _with_loss(problem: Problem) -> tuple[tuple[RowSet, ...], float]:
         [effect(loss, max(dim, 1)).variance for dim in range(max(int(d.max(initial=0)) for d in dims) + 1)]
     )
     of_train = np.concatenate([d[s.train] for d, s in zip(dims, problem.data.series, strict=True)])
-    usual = int(np.bincount(of_train, minlength=1).argmax())
-    variance = float(of_dim[usual])
-    if all(np.isin(d, (0, usual)).all() for d in dims):
+    present = np.unique(of_train[of_train > 0])
+    variance = float(of_dim[present].min(initial=np.inf)) if len(present) else 1.0
+    if len(present) <= 1:
         return problem.rows, variance
-    weights = [w * variance / of_dim[d] for w, d in zip(state.weights, dims, strict=True)]
+    share = np.minimum(variance / of_dim, 1.0)
+    weights = [w * share[d] for w, d in zip(state.weights, dims, strict=True)]
     sharing = problem.options.pair_errors == "shared"
     rows = whitened_rows(problem.noises, sharing=sharing, joint_errors=state.joint_errors, weights=weights)
     return rows, variance

@@ -371,7 +371,7 @@ def frames_only(problem: Problem) -> Problem | None:
         return None
     options = replace(problem.options, encoder="propagated", pair_errors="independent")  # good enough for a start
     start = problem.start[: variables.nuisance_span.stop]
-    state = replace(problem.state, joint_errors=None)
+    state = replace(problem.state, joint_errors=None, spread=None)  # of other columns
     return assembled(problem, start, state, robot=robot, variables=variables, options=options, added=(), whole=None)
 
 

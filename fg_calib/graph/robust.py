@@ -147,6 +147,10 @@ def _means(terms: Callable[[Floats], Floats], dim: int, ends: tuple[float, ...])
     return total
 
 
+_LAST = 1e9
+"""Where the schedule of gnc ends: weights are 0 or 1 but for what lies on the line to nine figures."""
+
+
 class Weighting:
     """The weights of measurements from round to round.
 
@@ -176,10 +180,10 @@ class Weighting:
                 return np.ones_like(e), True
             self._mu = 1.0 / max(2.0 * worst - 1.0, 1e-12)
         else:
-            self._mu *= SCHEDULE
+            self._mu = min(self._mu * SCHEDULE, _LAST)
         low, high = self._mu / (self._mu + 1.0), (self._mu + 1.0) / self._mu
         with np.errstate(divide="ignore"):
             between = np.sqrt(self._mu * (self._mu + 1.0) / ratio) - self._mu
         at_c = 1.0 / (np.sqrt(1.0 + 1.0 / self._mu) + 1.0)  # sqrt(mu (mu + 1)) - mu
         weights = np.where(ratio >= high, 0.0, np.clip(between / at_c, 0.0, 1.0))
-        return weights, bool(np.all((ratio <= low) | (ratio >= high)))
+        return weights, bool(np.all((ratio <= low) | (ratio >= high))) or self._mu >= _LAST

@@ -297,8 +297,11 @@ def _fit(problem: Problem, options: SolverOptions) -> _Run:
         if not unchanged:
             run.go_on_with(anew)
         # Where no step could be taken and what is left falls no more, rows whitened anew differ by rounding alone.
-        stands = len(run.history) == n_steps and goal <= run.least and was <= run.here.decrement
-        left, was, n_steps = run.left_after(was), run.here.decrement, len(run.history)
+        moved = len(run.history) > n_steps
+        stands = not moved and goal <= run.least and was <= run.here.decrement
+        # Where nothing moved what whitening anew leaves tells nothing: the next goal is to be nearer than here.
+        left = run.left_after(was) if moved else run.here.decrement
+        was, n_steps = run.here.decrement, len(run.history)
         if final and (goal <= run.least if unchanged else not bends and (stands or left <= run.least)):
             run.descend(run.least)
             break
@@ -306,6 +309,7 @@ def _fit(problem: Problem, options: SolverOptions) -> _Run:
             run.give_up()
             break
         goal = run.least if unchanged else min(COARSE, max(run.least, 0.1 * left))
+    run.judge_rounding()
     return run
 
 
@@ -399,6 +403,13 @@ class _Run:
         else:
             self.give_up()
         return self.converged
+
+    def judge_rounding(self) -> None:
+        """Not converged is also where rounding hides the optimum by more than may be left."""
+        if self.converged and self.here.rounding > NEAR_ENOUGH:
+            self.converged = False
+            hidden = f"rounding hides the optimum, by {self.here.rounding:.0e} sigma"
+            self.message = f"not converged: {hidden}: noise, tolerances or lengths are out of all proportion"
 
     def give_up(self) -> None:
         """Say that all iterations have been spent, and whether that matters."""

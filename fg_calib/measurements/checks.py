@@ -66,9 +66,12 @@ def checked_sigma(name: str, given: ArrayLike | None, shape: tuple[int, ...]) ->
     """Sigmas of n rows, shape (n,) or (n, 3), from one figure, one an axis, one a row, or all; None if None."""
     if given is None:
         return None
-    possible = ((), *({shape[1:]} - {()}), shape[:1], shape)
+    possible = ((), *({shape[1:]} - {()}), shape[:1], *([(shape[0], 1), (1, *shape[1:])] if shape[1:] else []), shape)
     if np.shape(given) not in possible:
         raise InputError(name, f"shape {np.shape(given)}", f"one of {', '.join(map(str, dict.fromkeys(possible)))}")
+    if len(shape) == 2 and shape[0] == shape[1] > 1 and np.shape(given) == shape[:1]:
+        expected = f"({shape[0]}, 1) for one a row, (1, {shape[0]}) for one an axis"
+        raise InputError(name, f"shape {shape[:1]} of {shape[0]} rows", expected)
     sigma = as_floats(name, given, str(np.shape(given)))
     require(sigma > 0.0, name, sigma, "a number above 0")
     if sigma.shape == shape[:1] != shape[1:]:

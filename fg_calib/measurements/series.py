@@ -136,10 +136,7 @@ class Own(Brief):
         data = data.reshape(n, -1) if n else data
         if not n or data.shape[1] != kind.width:
             raise InputError("own: data", f"shape {np.shape(self.data)}", f"({n or 'n'}, {kind.width})")
-        sigma = _figures("own: sigma", self.sigma)
-        sigma = sigma[:, None] if sigma.shape == (n,) and n > 1 else sigma
-        if not np.all(sigma > 0.0):
-            raise InputError("own: sigma", f"found {float(sigma.min())!r}", "figures above 0")
+        sigma = _own_sigma(self.sigma, n, kind.residual_dim)
         names = (self.names,) if isinstance(self.names, str) else tuple(self.names)
         starts = np.atleast_2d(_figures("own: unknowns", self.unknowns))
         if kind.n_nuisances and (not starts.size or kind.n_nuisances % starts.shape[1]):
@@ -150,11 +147,36 @@ class Own(Brief):
         for name, given, top in (("ends", self.ends, None), ("which", self.which, len(starts))):
             if given is not None:
                 _check_indices(f"own: {name}", given, n, top)
-        if self.test is not None and np.shape(self.test) != (n,):
-            raise InputError("own: test", f"shape {np.shape(self.test)}", f"({n},)")
+        if self.test is not None:
+            test = np.array(self.test)
+            if test.shape != (n,) or test.dtype != np.bool_:
+                raise InputError("own: test", f"{test.dtype} of shape {test.shape}", f"True or False for each of {n}")
+            object.__setattr__(self, "test", test)
+        for name in ("ends", "which"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, np.array(getattr(self, name)))
+        object.__setattr__(self, "unknowns", starts)
         object.__setattr__(self, "data", data)
         object.__setattr__(self, "sigma", sigma)
         object.__setattr__(self, "names", names)
+
+
+def _own_sigma(given: Any, n: int, residual_dim: int) -> Floats:
+    """Sigmas that broadcast to (n, residual_dim), all above 0."""
+    sigma = _figures("own: sigma", given)
+    if sigma.shape == (n,) and n > 1:
+        if n == residual_dim:
+            expected = f"({n}, 1) for one a measurement, (1, {n}) for one a row of each"
+            raise InputError("own: sigma", f"shape ({n},) of {n} measurements of {n} rows", expected)
+        sigma = sigma[:, None]
+    try:
+        np.broadcast_to(sigma, (n, residual_dim))
+    except ValueError:
+        expected = f"one that broadcasts to ({n}, {residual_dim})"
+        raise InputError("own: sigma", f"shape {sigma.shape}", expected) from None
+    if not np.all(sigma > 0.0):
+        raise InputError("own: sigma", f"found {float(sigma.min())!r}", "figures above 0")
+    return sigma
 
 
 def _figures(name: str, given: Any) -> Floats:
@@ -213,6 +235,10 @@ class Table(Brief):
         check_type("table: pairing", self.pairing, Pairing, "Pairing('chain')")
         if not isinstance(self.own, tuple) or not all(isinstance(own, Own) for own in self.own):
             raise InputError("table: own", f"found {self.own!r}", "a tuple of Own, such as (Own(...),)")
+        if self.model is None and self.frame == "unknown":
+            raise InputError(
+                "table: frame", "unknown, without a model", "a kind with unknowns of its own for the frame"
+            )
 
     @property
     def uses_pairs(self) -> bool:
@@ -240,7 +266,7 @@ class Unknowns:
         self.names: list[str] = []
         self.sizes: list[int] = []
         self.starts: list[Floats] = []
-        self._named: dict[tuple[str, str], int] = {}
+        self._named: dict[tuple[str, str, int], int] = {}
         self._first: list[int] = []
 
     @property
@@ -253,7 +279,7 @@ class Unknowns:
         """Which unknown each coordinate is of, shape (n_coordinates,)."""
         return np.repeat(np.arange(len(self.sizes)), self.sizes)
 
-    def add(self, letter: str, names: Sequence[str], starts: Floats, place: str) -> Integers:
+    def add(self, letter: str, names: Sequence[str], starts: Floats, place: str, frame: int = -1) -> Integers:
         """Add unknowns of one dimension; those of a name that is there are the same, whatever table they are from.
 
         Args:
@@ -261,6 +287,7 @@ class Unknowns:
             names: What they are called; none have names of their own if empty.
             starts: Where they are started, shape (n, dimension).
             place: The table, for messages.
+            frame: The table in whose own measurement frame they are, -1 for the base: elsewhere a name is another.
 
         Returns:
             Their coordinates' places, shape (n, dimension).
@@ -271,7 +298,7 @@ class Unknowns:
         found = np.empty(starts.shape, dtype=np.int64)
         for k, start in enumerate(starts):
             name = names[k] if names else str(k)
-            i = self._named.get((letter, name), len(self.names)) if names else len(self.names)
+            i = self._named.get((letter, name, frame), len(self.names)) if names else len(self.names)
             if i == len(self.names):
                 self._first.append(self._first[-1] + self.sizes[-1] if self.sizes else 0)
                 self.letters.append(letter)
@@ -282,7 +309,7 @@ class Unknowns:
                 expected = f"that of the other {name}: {self.starts[i].tolist()}"
                 raise ProblemError(place, f"start {start.tolist()} of unknown {name}", expected)
             if names:
-                self._named[letter, name] = i
+                self._named[letter, name, frame] = i
             found[k] = self._first[i] + np.arange(len(start))
         return found
 
@@ -301,7 +328,10 @@ def series_of(table: Table, number: int, unknowns: Unknowns) -> list[Series]:
     m = table.measurements
     if m.groups is not None and table.model not in POINT_MODELS:
         raise ProblemError(m.source, f"a column group with model {table.model}", f"model {' or '.join(POINT_MODELS)}")
-    found = [_own_series(own, m, number, unknowns) for own in table.own]
+    for k, own in enumerate(table.own):
+        if any(own is before for before in table.own[:k]):
+            raise ProblemError(m.source, "the same Own twice", "every measurement once")
+    found = [_own_series(own, m, number, unknowns, number if table.unknown_frame else -1) for own in table.own]
     if table.uses_pairs:
         pairs = usable_pairs(m, table)
         found += _pair_series(pairs, m, table, number)
@@ -459,7 +489,7 @@ def _touch_series(m: Measurements, table: Table, number: int, unknowns: Unknowns
     return [touches, between]
 
 
-def _own_series(own: Own, m: Measurements, number: int, unknowns: Unknowns) -> Series:
+def _own_series(own: Own, m: Measurements, number: int, unknowns: Unknowns, frame: int) -> Series:
     kind, data = own.kind, own.data
     n = len(data)
     ends = np.arange(m.n_configurations)[:, None] if own.ends is None else np.asarray(own.ends).reshape(n, -1)
@@ -469,7 +499,7 @@ def _own_series(own: Own, m: Measurements, number: int, unknowns: Unknowns) -> S
     nuisances = np.zeros((n, 0), dtype=np.int64)
     if kind.n_nuisances:
         starts = np.atleast_2d(np.asarray(own.unknowns, dtype=np.float64))
-        place = unknowns.add("N", own.names, starts, m.source)
+        place = unknowns.add("N", own.names, starts, m.source, frame)
         which = np.zeros((n, 1), dtype=np.int64) if own.which is None else np.asarray(own.which).reshape(n, -1)
         nuisances = place[which].reshape(n, -1)
     return Series(
@@ -594,28 +624,45 @@ def gather(tables: Sequence[Table]) -> Dataset:
 
 
 def _check_once(table: Table, other: Table) -> None:
-    """Raise where two tables hold the same measurements: counted twice, they would look better than they are."""
-    a, b = table.measurements, other.measurements
-    if not np.array_equal(a.readings, b.readings):
-        return
+    """Raise where two tables hold the same measurements: counted twice, they would look better than they are.
+
+    They do where most figures of the smaller one stand in the other at the same readings, in whatever order. A few may
+    do so by chance, where instruments round.
+    """
     mine, others = _measured_by(table), _measured_by(other)
     for words in mine.keys() & others.keys():
-        if np.array_equal(mine[words], others[words], equal_nan=True):
-            raise ProblemError(a.source, f"the same {words} as in {b.source}", "every measurement once")
+        a, b = ({row.tobytes() for row in np.round(rows, 9) + 0.0} for rows in (mine[words], others[words]))
+        if 2 * len(a & b) > min(len(a), len(b)):
+            a_source, b_source = table.measurements.source, other.measurements.source
+            raise ProblemError(a_source, f"the same {words} as in {b_source}", "every measurement once")
 
 
-def _measured_by(table: Table) -> dict[str, Floats | Integers]:
-    """What takes part of a table, by what it is called."""
+def _measured_by(table: Table) -> dict[str, Floats]:
+    """What takes part of a table, with the readings that it is of, a row each, by what it is called."""
     m, pairs, groups = table.measurements, table.measurements.pairs, table.measurements.groups
     distance, angle = PAIR_MODELS.get(table.model, (False, False))  # type: ignore[arg-type]
     turned, placed = POSE_MODELS.get(table.model, (angle, distance))  # type: ignore[arg-type] # of which pairs are formed
-    found: dict[str, Floats | Integers | None] = {"touches": None if groups is None else groups.index}
+    found: dict[str, tuple[Floats, ...]] = {}
+    if groups is not None:
+        touches = groups.index >= 0
+        found["touches"] = (m.readings[touches],)
     if pairs is None or not table.uses_pairs:
-        found |= {"orientations": m.rotation if turned else None, "positions": m.position if placed else None}
+        figures = {"orientations": m.rotation if turned else None, "positions": m.position if placed else None}
+        for name, v in figures.items():
+            if v is not None:
+                found[name] = (m.readings, v.reshape(len(v), -1))
     else:
-        of_pairs = {"distances": pairs.distance if distance else None, "angles": pairs.angle if angle else None}
-        found |= {name: None if v is None else np.stack([pairs.a, pairs.b, v]) for name, v in of_pairs.items()}
-    return {name: v for name, v in found.items() if v is not None and not np.isnan(v[-1]).all()}
+        ends = (m.readings[pairs.a], m.readings[pairs.b])
+        for name, wanted, v in (("distances", distance, pairs.distance), ("angles", angle, pairs.angle)):
+            if wanted and np.isfinite(v).any():
+                there = np.isfinite(v)
+                found[name] = (ends[0][there], ends[1][there], v[there, None])
+    for own in table.own:
+        ends_of = np.arange(m.n_configurations)[:, None] if own.ends is None else own.ends.reshape(len(own.data), -1)
+        if len(ends_of) == len(own.data) and ends_of.max(initial=0) < m.n_configurations:
+            at = m.readings[ends_of].reshape(len(own.data), -1)
+            found[f"measurements of {type(own.kind).__name__}"] = (at, own.data)
+    return {name: np.hstack(columns) for name, columns in found.items()}
 
 
 def _without_untouched(series: Sequence[Series], n_coordinates: int) -> list[Series]:

@@ -318,6 +318,7 @@ def _setup(check: SetupCheck) -> Setup:
         return {r.kind: Typical(typical=r.size, predicted=r.expected) for r in residuals}
 
     return Setup(
+        **({"table": check.table} if check.table else {}),
         residuals=by_kind(check.residuals),
         explanations=tuple(
             Explanation(mistakes=e.mistakes, residuals=by_kind(e.residuals)) for e in check.explanations
@@ -519,7 +520,8 @@ def write_results(
         write_calibrated_robot(into, calibrated)
         _write_residuals(into / "residuals.csv", solution, uncertainty)
         if uncertainty.joint_values is not None:
-            _write_joint_values(into / "joints.csv", uncertainty.joint_values, solution.problem.end_names)
+            units = [robot.joints[j].unit for j in uncertainty.joint_values.joints]
+            _write_joint_values(into / "joints.csv", uncertainty.joint_values, solution.problem.end_names, units)
 
     fill_folder(Path(folder), write)
 
@@ -591,7 +593,7 @@ def _write_residuals(path: Path, solution: Solution, uncertainty: Uncertainty) -
     write_csv_parts(path, (columns(slice(start, start + _ROWS_AT_ONCE)) for start in starts))
 
 
-def _write_joint_values(path: Path, found: JointValues, names: Sequence[str]) -> None:
+def _write_joint_values(path: Path, found: JointValues, names: Sequence[str], units: Sequence[str]) -> None:
     """One line a configuration and joint: reading and estimate, in [rad] (prismatic: [m])."""
     n, k = found.error.shape
     suspect = np.zeros((n, k), dtype=np.bool_)
@@ -600,6 +602,7 @@ def _write_joint_values(path: Path, found: JointValues, names: Sequence[str]) ->
     columns: dict[str, Any] = {
         "id": Words(names, np.repeat(found.configurations + 1, k)),
         "joint": Words(found.names, np.tile(np.arange(k), n)),
+        "unit": Words(units, np.tile(np.arange(k), n)),
         "reading": found.reading.ravel(),
         "estimate": (found.reading + found.error).ravel(),
         "error": found.error.ravel(),

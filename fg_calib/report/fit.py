@@ -58,6 +58,13 @@ def _goodness_lines(solution: Solution, uncertainty: Uncertainty) -> Iterable[st
             f" {len(estimated)} of its degrees of freedom went there"
         )
     elif estimated is None and verdicts & {"too large", "too small", "both"} and uncertainty.noise_may_be_estimated:
+        joint_noise = bool(np.any(solution.problem.measurements.sigma_joint > 0.0))
+        if joint_noise and "too large" in verdicts:
+            yield (
+                "the joint noise stated may be what is too large (one figure a joint: noise: {joint: [...]}); estimate:"
+                " true would make all noise smaller by the same"
+            )
+            return
         yield "to take the noise seen for the noise there is: estimate: true beside the figures of noise in the job"
     if uncertainty.noise_like is not None and uncertainty.noise_like < LIKE_NOISE:
         yield "the residuals follow the arm, as noise does not: effects that are not modelled"

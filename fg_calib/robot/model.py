@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fg_calib.arrays import as_floats, require
 from fg_calib.errors import InputError
-from fg_calib.options import NEAR, check, check_names, check_number, did_you_mean, known_names
+from fg_calib.options import NEAR, check, check_names, check_number, did_you_mean, known_names, listed
 
 Floats = NDArray[np.float64]
 
@@ -428,11 +428,12 @@ class RobotBuilder:
         Raises:
             InputError: A name that is neither a parameter nor, for tolerances, a kind.
         """
+        fixed, estimate = listed("fixed", fixed), listed("estimate", estimate)
         names = {p.name for p in self._parameters}
         if len(names) < len(self._parameters):
             raise InputError(place, "two joints share a name, or one is called base or tool", "different names")
-        for key, listed in (("fixed", fixed), ("estimate", estimate)):
-            check_names(f"{place}: {key}", listed, names_of(self._parameters))
+        for key, chosen in (("fixed", fixed), ("estimate", estimate)):
+            check_names(f"{place}: {key}", chosen, names_of(self._parameters))
         both = sorted(set(fixed) & set(estimate))
         if both:
             raise InputError(f"{place}: estimate", f"{both[0]!r} stands under fixed too", "it under one of the two")
@@ -440,9 +441,9 @@ class RobotBuilder:
         kinds = {tolerance_kind(p) for p in self._parameters} - {None}
         for name in tolerance:
             if name not in names and name not in kinds:
-                listed = sorted(str(k) for k in kinds)
-                found, hint = f"unknown parameter or kind {name!r}", did_you_mean(name, [*listed, *names], NEAR)
-                raise InputError(f"{place}: tolerance", found, known_names(listed), hint)
+                named = sorted(str(k) for k in kinds)
+                found, hint = f"unknown parameter or kind {name!r}", did_you_mean(name, [*named, *names], NEAR)
+                raise InputError(f"{place}: tolerance", found, known_names(named), hint)
         parameters = tuple(
             replace(
                 p,

@@ -132,6 +132,10 @@ def test_version_1_is_readable_with_no_more_than_it_promised(folder):
             "posterior: covariance: found .*, expected a symmetric matrix",
         ),
         (
+            lambda f: changed(f, lambda d: d["frames"].update({"X(999999999)": d["frames"]["X(0)"]})),
+            r"frames: X\(999999999\).*: found 'X\(999999999\)', expected String should match pattern",
+        ),
+        (
             lambda f: changed(f, enlarge_one_covariance),
             "posterior: covariance: found .*, expected a symmetric matrix",
         ),

@@ -479,3 +479,13 @@ def test_reading_says_nothing_about_meshes(tree, caplog, capsys):
     read_urdf(tree, tip_link="left_tip")
     assert caplog.records == []
     assert capsys.readouterr() == ("", "")
+
+
+def test_tool_and_base_may_be_given_as_for_a_table_of_dh(tmp_path):
+    file = tmp_path / "arm.urdf"
+    joint = '<joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint>'
+    file.write_text(f'<robot name="arm"><link name="a"/><link name="b"/>{joint}</robot>')
+    listed, named = read_urdf(file, tool=[0.02, 0, 0.15]), read_urdf(file, tool={"x": 0.02, "z": 0.15})
+    assert listed.nominal.tolist() == named.nominal.tolist()
+    with pytest.raises(InputError, match=r"tool: shape \(2,\)"):
+        read_urdf(file, tool=[0.02, 0])

@@ -319,3 +319,41 @@ def test_a_figure_of_a_factor_is_checked(figure):
         RotationAngleFactor(problem.variables, *READINGS, 1.0, 0)
     with pytest.raises(InputError, match=r"^readings: shape \(2, 3\)"):
         DistanceFactor(problem.variables, [0, 0, 0], [0, 0, 0], 1.0, 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("factor", "found"),
+    [
+        (lambda p: prior_on_k3(p, sigma=0.0), "an added PriorFactorVector with a constrained noise model"),
+        (
+            lambda p: gtsam.PriorFactorVector(
+                gtsam.symbol("K", 3), np.zeros(5), gtsam.noiseModel.Constrained.All(5, 1e8)
+            ),
+            "an added PriorFactorVector with a constrained noise model",
+        ),
+        (
+            lambda p: gtsam.LinearContainerFactor(
+                gtsam.HessianFactor(gtsam.symbol("K", 3), np.eye(5), np.zeros(5), 0.0)
+            ),
+            "an added LinearContainerFactor",
+        ),
+    ],
+    ids=["a sigma of 0", "all exact", "no rows"],
+)
+def test_a_factor_whose_rows_have_no_weight_is_refused(factor, found):
+    """GTSAM counts exact rows in its own optimiser; as weighted rows they would say next to nothing."""
+    problem = problem_of()
+    problem.graph.add(factor(problem))
+    with pytest.raises(ProblemError, match=found):
+        solve(problem)
+
+
+def test_what_was_solved_with_pairs_and_a_tool_can_be_solved_again():
+    """Noise that was learned of all columns is not that of frames and tool alone, which are fitted first."""
+    rng = np.random.default_rng(0)
+    robot = small_arm({"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3, "tool": 2e-3}, estimate=("tool.x",))
+    m = measure(true_robot(robot, rng), 40, rng, sigma=(1e-3, 1e-3))
+    first = solve(build_problem(robot, m, model="distance"))
+    again = solve(first.problem)
+    sigma = np.array([p.sigma or np.inf for p in assess(first).parameters])
+    assert np.abs((again.parameters - first.parameters)[: len(sigma)] / sigma).max() < 1e-6

@@ -213,8 +213,21 @@ def test_an_unknown_of_one_name_started_at_two_places_is_refused():
     again = replace(own, unknowns=own.unknowns + 0.01)
     with pytest.raises(ProblemError, match=r"start \[.*\] of unknown A, expected that of the other A: \["):
         build_problem(robot, replace(table, own=(own, again)))
-    both = build_problem(robot, replace(table, own=(own, own)))
-    assert len(both.data.unknowns.names) == 3
+    parts = [replace(own, data=own.data[rows], ends=np.arange(20)[rows, None], which=own.which[rows], test=None)
+             for rows in (slice(0, 12), slice(12, 20))]  # fmt: skip
+    both = build_problem(robot, replace(table, own=tuple(parts)))
+    assert both.data.unknowns.names == ["A", "B", "C"]
+    with pytest.raises(ProblemError, match="lengths: the same Own twice, expected every measurement once"):
+        build_problem(robot, replace(table, own=(own, own)))
+
+
+def test_an_unknown_of_one_name_in_another_frame_is_another():
+    """In a table with a frame of its own the tool, and so the anchor, is seen in that frame."""
+    robot, _, table = measured(0, n=20)
+    rng = np.random.default_rng(0)
+    m = measure(robot, 20, rng, sigma=SIGMA, frame=PLACED, readings=table.measurements.readings)
+    elsewhere = Table(m, "position", frame="unknown", own=(replace(table.own[0], data=table.own[0].data + 0.1),))
+    assert len(build_problem(robot, [table, elsewhere]).data.unknowns.names) == 6
 
 
 def test_noise_is_estimated_table_by_table():
@@ -306,6 +319,8 @@ def test_two_tables_that_contradict_each_other_are_refused():
     ("models", "said"),
     [
         (("pose", "pose"), "the same (orientations|positions) as in measurements"),
+        (("pose", "reversed"), "the same (orientations|positions) as in measurements"),
+        (("pose", "a part"), "the same (orientations|positions) as in measurements"),
         (("pose", "position"), "the same positions as in measurements"),
         (("distance", "position"), "the same positions as in measurements"),
         (("rotation", "position"), None),
@@ -316,7 +331,15 @@ def test_a_table_that_is_there_twice_is_refused(models, said):
     rng = np.random.default_rng(9)
     robot = small_arm(tolerance=TOLERANCE)
     m = measure(true_robot(robot, rng), 12, rng, sigma=SIGMA)
-    tables = [Table(m, model) for model in models]
+    places = {"reversed": np.arange(12)[::-1], "a part": np.arange(5)}
+
+    def table(model):
+        rows = places.get(model, np.arange(12))
+        part = {name: getattr(m, name)[rows] for name in ("readings", "ids", "test", "position", "rotation")}
+        sigmas = {name: getattr(m, name)[rows] for name in ("sigma_position", "sigma_orientation")}
+        return Table(replace(m, **part, **sigmas), "pose" if model in places else model)
+
+    tables = [table(model) for model in models]
     if said is None:
         assert build_problem(robot, tables).n_residuals
         return
@@ -377,3 +400,67 @@ def test_pairs_formed_of_one_table_are_mixed_with_poses_of_another():
     assert cost[2] == pytest.approx(cost[0] + cost[1], rel=1e-12)
     assert both.n_residuals == alone[0].n_residuals + alone[1].n_residuals
     assert np.array_equal(at, alone[0].start)
+
+
+@pytest.mark.parametrize("loss", ["cauchy", "gnc"])
+@pytest.mark.parametrize("encoder", ["propagated", "estimated"])
+def test_a_loss_weighs_more_pairs_than_positions_that_share_joint_noise(loss, encoder):
+    """Lengths lose less than positions: no measurement may count for more than it is by that."""
+    rng = np.random.default_rng(0)
+    robot = small_arm(tolerance=TOLERANCE)
+    true = true_robot(robot, rng)
+    stood = rng.uniform(-np.pi, np.pi, (20, 4))
+    m = measure(true, 20, rng, sigma=(1e-4, 1e-4), readings=stood)
+    read = stood + 3e-4 * rng.normal(size=stood.shape)
+    m = replace(m, readings=read, sigma_joint=np.full(4, 3e-4), named=True)
+    a, b = np.triu_indices(20, 1)
+    a, b = a[::4], b[::4]
+    p = pose(true, stood).position
+    d = np.linalg.norm(p[a] - p[b], axis=1) + 1e-4 * rng.normal(size=len(a))
+    d[::20] += 0.02
+    nothing = np.full(len(a), np.nan)
+    pairs = Pairs(a, b, d, nothing, np.full(len(a), 1e-4), nothing, np.zeros(len(a), bool), "pairs.csv")
+    tables = [Table(m, "position"), Table(replace(m, position=None, pairs=pairs, source="bar"), "distance")]
+    found = assess(solve(build_problem(robot, tables, loss=loss, encoder=encoder)))
+    z = [(p.estimate - t) / p.sigma for p, t in zip(found.parameters, true.nominal, strict=True) if p.sigma]
+    assert np.abs(z).max() < 4.5  # of 16 parameters
+    assert not found.findings
+
+
+def test_a_loss_that_drops_a_whole_table_is_a_finding():
+    rng = np.random.default_rng(3)
+    robot = small_arm(tolerance=TOLERANCE)
+    true = true_robot(robot, rng)
+    good = measure(true, 20, rng, sigma=(1e-4, 1e-4))
+    bad = measure(true, 8, rng, sigma=(1e-4, 1e-4))
+    bad = replace(bad, position=bad.position + 0.3 * rng.normal(size=(8, 3)), source="bad.csv")
+    found = assess(solve(build_problem(robot, [good, bad], model="position", loss="gnc")))
+    assert (
+        "loss gnc takes 8 of 8 measurements of bad.csv for outliers: more than it can tell from noise" in found.findings
+    )
+
+
+def test_a_mistake_in_one_table_names_the_table():
+    rng = np.random.default_rng(4)
+    robot = small_arm(tolerance=TOLERANCE)
+    true = true_robot(robot, rng)
+    first, second = (measure(true, 30, rng, sigma=(1e-4, 1e-4)) for _ in range(2))
+    second = replace(second, position=second.position * 1e3, source="second.csv")
+    found = assess(solve(build_problem(robot, [first, second], model="position")))
+    assert found.setup.table == "second.csv"
+    assert found.findings[0].startswith("second.csv: position residuals fall from ")
+    assert "if x, y, z are in mm" in found.findings[0]
+
+
+def test_another_target_on_the_tool_in_one_table_is_named():
+    rng = np.random.default_rng(5)
+    robot = small_arm(
+        tolerance=dict.fromkeys(TOLERANCE, 2e-4) | {"tool": 2e-3}, estimate=("tool.x", "tool.y", "tool.z")
+    )
+    true = true_robot(robot, rng)
+    values = true.nominal
+    values[[true.index(f"tool.{k}") for k in "xyz"]] += [0.06, -0.02, 0.03]
+    first = measure(true, 30, rng, sigma=(1e-4, 1e-4))
+    second = replace(measure(true.with_values(values), 30, rng, sigma=(1e-4, 1e-4)), source="second.csv")
+    found = assess(solve(build_problem(robot, [first, second], model="position")))
+    assert any("tool or base are others here than in the other tables" in text for text in found.findings)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import scipy.optimize
 from scipy.stats import chi2
-from simulated import small_arm, true_robot
+from simulated import measure, small_arm, true_robot
 
+from fg_calib import Calibration, calibrate
 from fg_calib.analysis.reasons import NOT_EXCITED
 from fg_calib.analysis.uncertainty import assess
 from fg_calib.errors import InputError
@@ -97,6 +98,58 @@ def test_it_is_solved_to_the_optimum_over_everything(sigma_joint):
     assert uncertainty.dof == 24 - 9  # as many priors as unknowns of the arm
     assert [p.name for p in uncertainty.points] == ["A", "B", "C"]
     assert [p.n for p in uncertainty.points] == [8, 8, 8]
+
+
+class Offset(Kind):
+    """Height of the tool by a gauge with an offset that nobody knows."""
+
+    names, units = ("height",), ("m",)
+    ends, residual_dim, width, n_nuisances = 1, 1, 1, 1
+
+    def rows(self, at, data, nuisances):
+        """See `Kind.rows`."""
+        D = np.zeros((len(data), 1, 1, 6))
+        D[:, 0, 0, 5] = 1.0
+        return Rows(at.position[:, 0, 2:] + nuisances - data, D, np.ones((len(data), 1, 1)))
+
+
+def test_an_unknown_may_have_any_number_of_coordinates(tmp_path):
+    robot, _, table = measured(1, n=40)
+    q = table.measurements.readings
+    heights = pose(robot, q).position[:, 2] + 0.01 + SIGMA * np.random.default_rng(0).normal(size=len(q))
+    own = Own(Offset(), heights, SIGMA, unknowns=[[0.0]], names=("offset",))
+    found = calibrate(robot, replace(table, own=(own,)))
+    found.save(tmp_path)
+    (offset,) = Calibration.load(tmp_path).result.groups
+    assert abs(offset.xyz[0] - 0.01) < 5.0 * offset.sigma[0]
+
+
+def test_test_rows_of_an_unknown_that_nothing_else_says_are_not_judged():
+    robot, _, table = measured(1, n=40)
+    (own,) = table.own
+    m = measure(robot, 40, np.random.default_rng(0), sigma=(1e-4, 1e-4), readings=table.measurements.readings)
+    beside = Table(m, "position", own=(replace(own, test=np.ones(40, bool), unknowns=own.unknowns + 0.05),))
+    found = assess(solve(build_problem(robot, beside)))
+    assert found.goodness.test is None or found.goodness.test.n_rows == 0
+    assert not any("test rows" in text for text in found.findings)
+
+
+def test_a_sigma_that_may_mean_two_things_is_refused():
+    class Three(Offset):
+        residual_dim, names, units = 3, ("x", "y", "z"), ("m", "m", "m")
+
+    with pytest.raises(InputError, match=r"own: sigma: shape \(3,\) of 3 measurements of 3 rows, expected \(3, 1\)"):
+        Own(Three(), [[1.0], [2.0], [3.0]], sigma=[1e-3, 2e-3, 3e-3], unknowns=[[0.0]])
+    with pytest.raises(InputError, match=r"own: sigma: shape \(7,\), expected one that broadcasts to \(3, 3\)"):
+        Own(Three(), [[1.0], [2.0], [3.0]], sigma=np.full(7, 1e-3), unknowns=[[0.0]])
+
+
+def test_what_was_given_stays_as_it_was_when_the_giver_changes_it():
+    ends, test = np.arange(4)[:, None], np.zeros(4, bool)
+    own = Own(Offset(), np.ones(4), SIGMA, unknowns=[[0.0]], ends=ends, test=test)
+    ends[:], test[:] = 0, True
+    assert own.ends.ravel().tolist() == [0, 1, 2, 3]
+    assert not own.test.any()
 
 
 @pytest.mark.slow
@@ -198,7 +251,7 @@ def test_a_kind_that_is_wrong_about_itself_is_refused(kind, said):
         ({"ends": np.full((60, 1), -1)}, "own: ends: found -1, expected 0 and above"),
         ({"names": ("A", "A", "B")}, r"own: names: found \('A', 'A', 'B'\), expected 3 different names"),
         ({"unknowns": np.zeros((0, 0))}, r"own: unknowns: shape \(0, 0\), expected a start for each unknown; "),
-        ({"test": [True]}, r"own: test: shape \(1,\), expected \(60,\)"),
+        ({"test": [True]}, r"own: test: bool of shape \(1,\), expected True or False for each of 60"),
         ({"kind": AnchorDistance}, "own: kind: found <class .*>, expected an object of a class derived from Kind"),
     ],
 )

@@ -187,3 +187,13 @@ def test_a_hundred_thousand_pairs_reach_the_optimum_with_weak_priors():
     # 200 000 distances and angles of 2000 poses, whose errors they share, hold no more than these: 12 000 figures.
     assert solution.problem.n_independent == pytest.approx(12_000, rel=0.01)
     assert 2 * solution.cost == pytest.approx(12_000, rel=5 * np.sqrt(2 / 12_000))
+
+
+def test_where_rounding_hides_the_optimum_nothing_has_converged():
+    """Tolerances of 1e9 m beside noise of a tenth of a millimetre: no figure of 64 bits holds both."""
+    rng = np.random.default_rng(0)
+    robot = small_arm(tolerance={"a": 2e-3, "d": 1e9, "alpha": 2e-3, "theta": 2e-3})
+    measured = measure(small_arm({"a": 2e-3}), 20, rng, sigma=(1e-4, 1e-4))
+    solution = solve(build_problem(robot, measured, model="position"))
+    assert not solution.converged
+    assert solution.message.startswith("not converged: rounding hides the optimum, by ")

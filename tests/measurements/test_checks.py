@@ -5,7 +5,7 @@ import polars as pl
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fg_calib import InputError, Measurements, Noise, Robot, Units, read_measurements
+from fg_calib import InputError, Measurements, Noise, Options, Robot, Units, read_measurements
 from fg_calib.files.csv_writer import write_csv
 from fg_calib.measurements.checks import check_readings
 
@@ -136,7 +136,7 @@ def test_sigmas_are_spread_over_the_rows(given, rows):
         ({"rotation": np.tile(2 * np.eye(3), (N, 1, 1))}, "rotation: row 0: "),
         ({"rotation": ROTATION.as_matrix(), "quaternion": ROTATION.as_quat()}, "rotation and quaternion: both"),
         ({"sigma_position": 0.0}, "sigma_position: found 0, expected a number above 0"),
-        ({"sigma_position": [1, 2]}, r"sigma_position: shape \(2,\), expected one of \(\), \(3,\), \(7,\), \(7, 3\)"),
+        ({"sigma_position": [1, 2]}, r"sigma_position: shape \(2,\), expected one of \(\), \(3,\), \(7,\), "),
         ({"sigma_orientation": [1, -1, 1]}, "sigma_orientation: row 1: found -1, expected a number above 0"),
         ({"sigma_orientation": np.nan}, "sigma_orientation: found nan, expected a finite number"),
         ({"sigma_joint": -1.0}, "sigma_joint: found -1, expected a number not below 0"),
@@ -212,3 +212,29 @@ def test_measurements_fit_a_screen():
         "Measurements 'measurements', 7 configurations of 2 joints (2 to test): "
         "positions, orientations, 2 pairs, touches of 3 points"
     )
+
+
+def test_what_can_be_gone_through_once_is_not_lost_in_a_check():
+    rows = [[0.4, 0.3, 0.2, 0.0], [0.3, 0.1, 0.1, 0.0]]
+    robot = Robot.from_dh(rows, "dh", fixed=(name for name in ["a1"]), estimate=(name for name in ["tool.x"]))
+    estimated = [p.name for p in robot.parameters if p.estimated]
+    assert "a1" not in estimated
+    assert "tool.x" in estimated
+    assert Options.of(prefer=(name for name in ["a1"])).prefer == ("a1",)
+
+
+@pytest.mark.parametrize("name", ["position", "sigma_position"])
+def test_a_masked_array_is_refused(name):
+    """Its mask would be lost: what was said not to be measured would be fitted."""
+    given = {"position": P, "sigma_position": 1e-3} | {name: np.ma.masked_array(np.ones((7, 3)), np.eye(7, 3))}
+    with pytest.raises(InputError, match=f"{name}: found a masked array, expected .*; nan where something was not"):
+        Measurements.from_arrays(Q, **given)
+
+
+def test_three_sigmas_of_three_rows_may_mean_two_things():
+    with pytest.raises(InputError, match=r"sigma_position: shape \(3,\) of 3 rows, expected \(3, 1\) for one a row"):
+        Measurements.from_arrays(Q[:3], position=P[:3], sigma_position=[1e-3, 2e-3, 3e-3])
+    for shape in ((3, 1), (1, 3)):
+        sigma = np.reshape([1e-3, 2e-3, 3e-3], shape)
+        found = Measurements.from_arrays(Q[:3], position=P[:3], sigma_position=sigma).sigma_position
+        assert found.tolist() == np.broadcast_to(sigma, (3, 3)).tolist()
