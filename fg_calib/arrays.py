@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.errors import InputError
+from fg_calib.sizes import MOST_SIZE, ORDINARY
 
 Floats = NDArray[np.float64]
 
@@ -99,6 +100,7 @@ def as_floats(name: str, given: object, shape: str, *, missing: bool = False) ->
         raise InputError(name, f"shape {floats.shape}", shape)
     good = np.isfinite(floats) | (missing & np.isnan(floats))
     require(good, name, floats, "a finite number")
+    require(~(np.abs(floats) > MOST_SIZE), name, floats, ORDINARY)
     return floats
 
 

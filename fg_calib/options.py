@@ -10,6 +10,7 @@ from numbers import Integral, Real
 from typing import Any, Literal, get_args
 
 from fg_calib.errors import InputError
+from fg_calib.sizes import LEAST_SIZE, MOST_SIZE, ORDINARY
 
 Model = Literal["pose", "position", "orientation", "distance", "rotation", "distance-rotation"]
 """What a calibration compares with the measurements: each pose, or part of it, or what lies between two poses."""
@@ -99,6 +100,8 @@ def check_number(
             x = math.inf
         good = (x > least if above else x >= least) and (math.isfinite(x) or not finite)
         good = good and not (whole and not isinstance(value, Integral))
+        if good and math.isfinite(x) and (x > MOST_SIZE or (above and x < LEAST_SIZE)):
+            raise InputError(key, f"found {value!r}", ORDINARY)
     if not good:
         kind = "a whole number" if whole else "a finite number" if finite else "a number"
         raise InputError(key, f"found {value!r}", f"{kind} {'above' if above else 'not below'} {least:g}")

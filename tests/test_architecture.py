@@ -17,7 +17,7 @@ import fg_calib
 
 PACKAGE = Path(fg_calib.__file__).parent
 FOLDERS = (
-    *("errors", "threads", "arrays", "options", "robot", "measurements", "job", "simulation", "files"),
+    *("errors", "sizes", "threads", "arrays", "options", "robot", "measurements", "job", "simulation", "files"),
     *("graph", "analysis", "baseline", "report", "calibration", "cli"),
 )
 """From the ground up: a folder (or module of the package itself) imports from those before it."""
@@ -143,6 +143,7 @@ def run_python(code):
     return ended.stdout
 
 
+@pytest.mark.slow
 def test_public_names_come_from_a_fresh_import():
     code = "from fg_calib import *; import fg_calib, types; "
     code += "print([n for n in fg_calib.__all__ if isinstance(globals()[n], types.ModuleType)])"
@@ -172,6 +173,7 @@ def test_the_command_line_is_there_before_the_heavy_libraries():
     assert loaded & heavy == set()
 
 
+@pytest.mark.slow
 def test_a_calibration_loads_only_what_it_uses(example):
     """No figures, no URDFs, no baseline, and of scipy not the heaviest."""
     code = f"""

@@ -41,6 +41,9 @@ _BEST = 4
 """The best single mistakes are combined with any other; those after them not with mistakes about one joint."""
 
 
+NOTHING = 1e-6
+"""Residuals over what is predicted below which there is nothing to explain: each unknown takes its own row up."""
+
 OTHER_TOOL = "tool or base are others here than in the other tables (another target on the tool, another frame)"
 """What a table of several may say that fits with a tool and a base of its own alone."""
 
@@ -152,7 +155,7 @@ def check_setup(
         if setup is None:
             return SetupCheck()
         found = SetupCheck(fitted_residuals(setup) if fitted is None else residuals_at(setup, *fitted))
-        if not found.residuals or not (doubtful or found.far):
+        if not found.residuals or not (doubtful or found.far) or found.excess < NOTHING:
             return found
         if fitted is not None:
             closed_form = SetupCheck(fitted_residuals(setup))

@@ -58,7 +58,8 @@ def of_chi2(found: ChiSquare, evaluated: bool = False) -> list[Statement]:
         evaluated: Whether the arm was taken as it is.
     """
     if found.dof <= 0:
-        return []
+        text = "no degree of freedom is left: nothing says whether the fit is right, or the noise; measure more"
+        return [Statement(text, finding=True)]
     reduced, (low, high) = found.value / found.dof, found.bounds
     outside = f"reduced chi-square {reduced:.3g} is outside [{low:.2f}, {high:.2f}]"
     if reduced > high:

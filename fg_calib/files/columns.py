@@ -20,6 +20,7 @@ from fg_calib.files.schema import shown
 from fg_calib.files.units import ANGLES, LENGTHS, Units
 from fg_calib.measurements.dataset import Booleans, Floats
 from fg_calib.options import did_you_mean
+from fg_calib.sizes import LEAST_SIZE, MOST_SIZE, ORDINARY
 
 if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it
     import polars as pl
@@ -180,13 +181,18 @@ class Table:
         for column in columns:
             good = self.frame[column].is_finite().fill_null(optional)
             self.require(good.to_numpy(), column, "a finite number")
-        return self.frame.select(columns).to_numpy(order="c")
+        values = self.frame.select(columns).to_numpy(order="c")
+        size = np.abs(values)
+        for column, good in zip(columns, ((size <= MOST_SIZE) | np.isnan(values)).T, strict=True):
+            self.require(good, column, ORDINARY)
+        return values
 
     def positive(self, columns: Sequence[str], default: float | None, factor: float) -> Floats:
         """Columns of positive figures, times `factor`; an empty cell is `default`, an error if that is None."""
         values = self.numbers(columns, optional=default is not None)
         for column, value in zip(columns, values.T, strict=True):
             self.require(~(value <= 0.0), column, "a number above 0")
+            self.require(~(value < LEAST_SIZE), column, ORDINARY)
         return values * factor if default is None else np.where(np.isnan(values), default, values * factor)
 
     def texts(self, column: str, expected: str) -> pl.Series:

@@ -207,15 +207,24 @@ def require_absent(folder: Path, names: Iterable[str]) -> None:
 
 
 def finish(folder: Path) -> None:
-    """Move files to their places that were written to a folder by a process that ended before it had moved them."""
+    """Move files to their places that were written to a folder by a process that ended before it had moved them.
+
+    Raises:
+        InputError: They cannot be moved.
+    """
     written = folder / _WRITTEN
     try:
         files = sorted(written.iterdir())
     except OSError:
         return
     for file in files:
-        with suppress(FileNotFoundError):  # another process moves them too
+        try:
             file.replace(folder / file.name)
+        except FileNotFoundError:  # another process moves them too
+            continue
+        except OSError as error:
+            found = f"holds files that could not be moved to their places: {error.strerror or error}"
+            raise InputError(str(folder), found, f"those of {_WRITTEN} in it") from None
     with suppress(OSError):
         written.rmdir()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
@@ -9,12 +10,13 @@ from reprlib import Repr
 from typing import Annotated, Any, NoReturn, TypeVar
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from fg_calib.errors import InputError
 from fg_calib.files.disk import read_text
 from fg_calib.options import did_you_mean
+from fg_calib.sizes import LEAST_SIZE, MOST_SIZE, ORDINARY
 
 
 def _refuse_bool(value: object) -> object:
@@ -24,16 +26,28 @@ def _refuse_bool(value: object) -> object:
     return value
 
 
-Number = Annotated[float, BeforeValidator(_refuse_bool)]
+def _refuse_huge(value: float) -> float:
+    if math.isfinite(value) and abs(value) > MOST_SIZE:
+        raise PydanticCustomError("absurd", "absurd")
+    return value
+
+
+def _refuse_absurd(value: float) -> float:
+    if 0.0 < value < LEAST_SIZE:
+        raise PydanticCustomError("absurd", "absurd")
+    return _refuse_huge(value)
+
+
+Number = Annotated[float, BeforeValidator(_refuse_bool), AfterValidator(_refuse_huge)]
 """A finite number, or text that reads as one: PyYAML takes `1e-3` for text."""
 
-Bound = Annotated[float, Field(allow_inf_nan=True), BeforeValidator(_refuse_bool)]
+Bound = Annotated[float, Field(allow_inf_nan=True), BeforeValidator(_refuse_bool), AfterValidator(_refuse_huge)]
 """A number, or infinity."""
 
-Positive = Annotated[float, Field(gt=0), BeforeValidator(_refuse_bool)]
+Positive = Annotated[float, Field(gt=0), BeforeValidator(_refuse_bool), AfterValidator(_refuse_absurd)]
 """A finite number above 0."""
 
-NotNegative = Annotated[float, Field(ge=0), BeforeValidator(_refuse_bool)]
+NotNegative = Annotated[float, Field(ge=0), BeforeValidator(_refuse_bool), AfterValidator(_refuse_absurd)]
 """A finite number, 0 or more."""
 
 Count = Annotated[int, Field(ge=0, strict=True)]
@@ -130,6 +144,7 @@ _EXPECTED = {
     **dict.fromkeys(("float_type", "float_parsing", "finite_number"), "a finite number"),
     **dict.fromkeys(("list_type", "tuple_type"), "a list"),
     **dict.fromkeys(("model_type", "dict_type", "dataclass_type"), "a mapping"),
+    "absurd": ORDINARY,
     "int_type": "a whole number",
     "string_type": "text",
     "bool_type": "true or false",

@@ -16,6 +16,7 @@ from fg_calib.arrays import NORM_TOLERANCE, Floats, as_array, as_floats, as_rota
 from fg_calib.errors import InputError
 from fg_calib.options import check_names
 from fg_calib.robot.model import Robot
+from fg_calib.sizes import LEAST_SIZE, ORDINARY
 
 _log = logging.getLogger(__name__)
 
@@ -74,6 +75,7 @@ def checked_sigma(name: str, given: ArrayLike | None, shape: tuple[int, ...]) ->
         raise InputError(name, f"shape {shape[:1]} of {shape[0]} rows", expected)
     sigma = as_floats(name, given, str(np.shape(given)))
     require(sigma > 0.0, name, sigma, "a number above 0")
+    require(sigma >= LEAST_SIZE, name, sigma, ORDINARY)
     if sigma.shape == shape[:1] != shape[1:]:
         sigma = sigma.reshape(shape[:1] + (1,) * (len(shape) - 1))
     return np.ascontiguousarray(np.broadcast_to(sigma, shape))

@@ -146,6 +146,7 @@ def test_leverages_are_those_of_the_hat_matrix():
     assert {FLAGS[f] for f in goodness.flag[table.test]} == {"test"}
 
 
+@pytest.mark.slow
 def test_studentised_residuals_of_fitted_and_predicted_rows_have_a_variance_of_one():
     rng = np.random.default_rng(3)
     robot = small_arm(tolerance=TOLERANCE)

@@ -220,6 +220,7 @@ def pairs_of(m, length=1.0):
     }
 
 
+@pytest.mark.slow
 def test_measured_pairs_in_another_unit_are_named(tmp_path, fg_calib):
     m = measured(ur5e(tmp_path), n=120)
     job = write_job(tmp_path, m, pairs=pairs_of(m), model="distance-rotation")

@@ -532,6 +532,7 @@ def test_many_configurations_are_looked_at_in_part():
     assert (said.n, said.of) == (1000, 1500)
 
 
+@pytest.mark.slow
 def test_noise_estimated_as_large_as_the_motions_is_no_noise(fg_calib, example):
     """Orientations that were never measured, all 0 0 0 1, made 80 degrees of noise and GOOD."""
     file = example / "calibration.yaml"

@@ -408,6 +408,7 @@ def test_comparing_a_simulated_job_from_files_tells_real_errors(fg_calib, simula
         assert e["errors"]["best_rigid_fit"]["rms"] < rms
 
 
+@pytest.mark.slow
 def test_a_comparison_not_to_be_trusted_ends_with_three(fg_calib, example):
     job = example / "calibration.yaml"
     job.write_text(re.sub(r"noise:.*", "noise: {position: 0.00001, orientation: 0.0001}", job.read_text()))

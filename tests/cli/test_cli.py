@@ -356,6 +356,7 @@ def test_an_unknown_example_is_one_line(fg_calib, tmp_path):
     assert not (tmp_path / "demo").exists()
 
 
+@pytest.mark.slow
 def test_stdout_closed_by_its_reader_is_no_traceback(example):
     """As in `fg-calib calibrate job.yaml | head -1`."""
     command = [sys.executable, "-m", "fg_calib.cli", "calibrate", str(example / JOB)]
@@ -843,6 +844,7 @@ def test_residuals_say_how_suspicious_each_row_is(residuals, result):
     assert result["noise_factors"] is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", ["estimate", {"position": 0.004, "orientation": 0.04, "estimate": True}])
 def test_a_job_may_leave_the_noise_to_the_residuals(fg_calib, example, given):
     """Wherever it starts it ends with the same noise; `compare` takes the same."""

@@ -131,6 +131,14 @@ def test_a_result_that_was_written_but_not_moved_is_read(example):
     assert not within.exists()
 
 
+def test_what_cannot_be_moved_is_said(tmp_path):
+    (tmp_path / disk._WRITTEN).mkdir()
+    (tmp_path / disk._WRITTEN / "one").write_text("new")
+    (tmp_path / "one").mkdir()
+    with pytest.raises(InputError, match="holds files that could not be moved to their places: Is a directory"):
+        finish(tmp_path)
+
+
 def test_results_do_not_replace_what_they_are_of(example, fg_calib):
     job = example / "calibration.yaml"
     (example / "robot_nominal.yaml").rename(example / "robot_calibrated.yaml")
@@ -153,6 +161,7 @@ def test_a_simulation_replaces_a_simulation_and_nothing_else(fg_calib, tmp_path)
     assert (tmp_path / "calibration.yaml").read_text() == "model: pose\n"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
 def test_a_full_disk_behind_stdout_is_one_line(example):
     command = [sys.executable, "-m", "fg_calib.cli", "calibrate", str(example / "calibration.yaml")]

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -14,8 +15,10 @@ import pytest
 from fg_calib import InputError, Robot, read_job, read_measurements
 from fg_calib.files.disk import read_bytes
 from fg_calib.files.schema import read_yaml
+from fg_calib.sizes import ORDINARY
 
-ARM = Robot.from_dh([[0.5, 0.1, 0.2, 0.0], [0.4, 0.2, 0.1, 0.0], [0.3, 0.0, 0.1, 0.0]], convention="dh")
+ROWS_OF_DH = [[0.5, 0.1, 0.2, 0.0], [0.4, 0.2, 0.1, 0.0], [0.3, 0.0, 0.1, 0.0]]
+ARM = Robot.from_dh(ROWS_OF_DH, convention="dh")
 ROWS = "q1,q2,q3,x,y,z\n0.1,0.2,0.3,1,2,3\n0.4,0.5,0.6,4,5,6\n"
 LAUGHS = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"a{i + 1}: &a{i + 1} [{', '.join([f'*a{i}'] * 9)}]\n" for i in range(24)
@@ -51,6 +54,7 @@ TABLES = {
     ROWS.replace("0.2", "9" * 200_000): f"poses.csv:2: q2: found '{'9' * 56}..., expected a finite number",
     ROWS.replace("0.2", '"0.2'): "poses.csv:3: 2 cells, expected 6 as in the header",
     "\n\n" + ROWS.replace("0.2", ""): "poses.csv:4: q2: found an empty cell, expected a finite number",
+    ROWS.replace("0.2", "1e200"): f"poses.csv:2: q2: found '1e200', expected {ORDINARY}",
     ROWS + ",,,,,7\n": "poses.csv:4: q1: found an empty cell, expected a finite number",
     ROWS.replace("\n", "\r").replace("0.2", "?"): "poses.csv:2: q2: found '?', expected a finite number",
 }
@@ -140,6 +144,7 @@ def test_what_is_no_file_is_one_line(tmp_path, make, message):
     assert len(str(error.value)) < 300
 
 
+@pytest.mark.slow
 def test_a_path_need_not_be_utf_8(example):
     odd = os.fsencode(example.parent) + b"/r\xff"
     os.rename(os.fsencode(example), odd)
@@ -147,3 +152,31 @@ def test_a_path_need_not_be_utf_8(example):
     ended = subprocess.run(command, capture_output=True, check=False)
     assert (ended.returncode, ended.stderr) == (0, b"")
     assert np.isfinite(json.loads(ended.stdout)["chi2"])
+
+
+@pytest.mark.parametrize("figure", ["1.0e-200", "1.0e+300"])
+@pytest.mark.parametrize("place", ["noise", "robot"])
+def test_figures_that_no_arithmetic_holds_are_named(example, fg_calib, place, figure):
+    file = example / {"noise": "calibration.yaml", "robot": "robot_nominal.yaml"}[place]
+    text = file.read_text()
+    key = {"noise": r"position: [0-9.e-]+", "robot": r"tolerance: \{a: [0-9.e-]+"}[place]
+    assert re.search(key, text)
+    file.write_text(re.sub(key, lambda found: found[0].rpartition(" ")[0] + f" {figure}", text, count=1))
+    ended = fg_calib("calibrate", example / "calibration.yaml")
+    assert (ended.code, ended.out) == (1, "")
+    assert ended.err.endswith(f": found {float(figure)!r}, expected {ORDINARY}\n")
+
+
+def test_nothing_left_to_check_the_fit_by_is_not_good(example, fg_calib):
+    """Every point touched once: as many unknowns as residuals."""
+    table = pl.read_csv(example / "poses.csv").head(40).select("id", *(f"q{i}" for i in range(1, 8)))
+    table.with_columns(group="g" + pl.col("id")).write_csv(example / "poses.csv")
+    job = example / "calibration.yaml"
+    job.write_text(
+        re.sub("model: .*", "model: distance", job.read_text()).replace("noise: {", "noise: {point: 0.001, ")
+    )
+    ended = fg_calib("calibrate", job, "--json")
+    result = json.loads(ended.out)
+    assert (ended.code, result["dof"]) == (3, 0)
+    expected = "no degree of freedom is left: nothing says whether the fit is right, or the noise; measure more"
+    assert result["findings"] == [expected]

@@ -108,6 +108,7 @@ def robots(draw):
     )
 
 
+@pytest.mark.slow
 @given(robot=robots())
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 def test_a_robot_written_in_si_reads_back_the_same(tmp_path, robot):
@@ -115,6 +116,7 @@ def test_a_robot_written_in_si_reads_back_the_same(tmp_path, robot):
     assert read_robot(tmp_path / "robot.yaml") == robot
 
 
+@pytest.mark.slow
 @given(robot=robots(), length=st.sampled_from(["m", "cm", "mm", "um"]), angle=st.sampled_from(["rad", "deg", "mrad"]))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 def test_a_robot_written_in_other_units_reads_back_to_rounding(tmp_path, robot, length, angle):

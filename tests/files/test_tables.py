@@ -140,7 +140,7 @@ def test_parquet_and_csv_read_the_same(write):
 
 
 @given(
-    rows=st.lists(st.tuples(*[st.floats(-1e300, 1e300)] * 3), min_size=1, max_size=5),
+    rows=st.lists(st.tuples(*[st.floats(-1e15, 1e15)] * 3), min_size=1, max_size=5),
     units=st.sampled_from([Units(), Units(length="mm", angle="deg")]),
 )
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)

@@ -162,6 +162,7 @@ def test_sixty_real_poses_without_priors_arrive_in_few_steps(model, data_folder)
     assert solution.iterations <= MOST + 1  # one more round: near their kinks rows change with the estimate
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("allowed", "code"), [(1, 3), (50, 0)])
 def test_the_job_says_how_many_iterations(fg_calib, example, allowed, code):
     job = example / "calibration.yaml"

@@ -440,6 +440,7 @@ def test_a_loss_that_drops_a_whole_table_is_a_finding():
     )
 
 
+@pytest.mark.slow
 def test_a_mistake_in_one_table_names_the_table():
     rng = np.random.default_rng(4)
     robot = small_arm(tolerance=TOLERANCE)

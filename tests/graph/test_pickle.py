@@ -103,6 +103,7 @@ print({"readonly" in str(argument) for f in compiled for signature in f.signatur
 """
 
 
+@pytest.mark.slow
 def test_kernels_are_not_compiled_again_for_read_only_arrays():
     """Which would take seconds."""
     here = Path(__file__).parent
@@ -110,6 +111,7 @@ def test_kernels_are_not_compiled_again_for_read_only_arrays():
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "{False}\n"
 
 
+@pytest.mark.slow
 def test_a_worker_process_returns_solutions():
     """Spawned, not forked: a process of its own that has only what was sent to it."""
     problems = [problem("pose in an unknown frame"), problem("star with shared errors")]

@@ -394,6 +394,7 @@ def test_descents_end_where_rounding_alone_changes_weights_and_joint_values():
     assert solution.iterations < 50
 
 
+@pytest.mark.slow
 def test_gnc_drops_wrong_touches_and_comes_near_the_clean_fit():
     robot, true, _, m = case()
     rng, wrong = np.random.default_rng(8), np.arange(0, 48, 6)

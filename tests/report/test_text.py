@@ -286,6 +286,7 @@ def run_in(folder, code):
     return ended.stdout.splitlines()
 
 
+@pytest.mark.slow
 def test_the_readme_has_a_kind_of_ones_own(tmp_path):
     code = readme_code("### A kind of measurement of your own\n")
     made = {}
@@ -301,6 +302,7 @@ def test_the_readme_has_a_kind_of_ones_own(tmp_path):
     assert np.all(found[1] < 0.01)
 
 
+@pytest.mark.slow
 def test_the_readme_extends_the_graph(tmp_path):
     code = readme_code("### Extend the graph\n")
     made = {}
@@ -318,6 +320,7 @@ def test_the_readme_extends_the_graph(tmp_path):
     assert error == pytest.approx(cost, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_the_readme_calibrates_from_arrays(tmp_path):
     """As a user runs it, in an interpreter of its own, on a tracker's positions of an arm like its own."""
     code = readme_code("## In Python\n")

@@ -361,6 +361,7 @@ def test_a_board_out_of_reach_is_reported_with_what_misses(shipped):
     assert 35.0 < float(found[1]) <= float(found[2]) < 42.0
 
 
+@pytest.mark.slow
 def test_one_pose_out_of_reach_is_named_and_no_other(shipped):
     """A is where the paper has it, and the only other view 30 m away."""
     views = BoardViews(PLACE, 1, radius=30.0)
@@ -500,6 +501,7 @@ def test_a_urdf_robot_is_written_with_its_urdf(tmp_path):
     assert s.true_robot.nominal[s.robot.index("tool.z")] != 0.1
 
 
+@pytest.mark.slow
 def test_a_failure_leaves_an_existing_folder_as_it_was(fg_calib, tmp_path):
     assert fg_calib("simulate", "space-robot", "--out", tmp_path / "demo").code == 0
     (tmp_path / "demo" / "mine.txt").write_text("mine")
