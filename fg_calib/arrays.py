@@ -138,6 +138,15 @@ def as_array(name: str, given: object, kinds: str, expected: str) -> NDArray[Any
     return array
 
 
+def shape_of(name: str, given: object, expected: str) -> tuple[int, ...]:
+    """The shape of something from outside.
+
+    Raises:
+        InputError: It has none: its rows are of different lengths.
+    """
+    return as_array(name, given, "iufObUS", expected).shape
+
+
 def require(good: NDArray[np.bool_], name: str, values: NDArray[Any], expected: str, hint: str = "") -> None:
     """Raise for the first of the values that is not good, named by its row.
 

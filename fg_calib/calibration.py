@@ -23,7 +23,7 @@ from fg_calib.analysis.covariance import TangentCovariance
 from fg_calib.analysis.residual_table import ResidualTable
 from fg_calib.analysis.uncertainty import FrameEstimate, Uncertainty, assess
 from fg_calib.analysis.variance_components import solve_job
-from fg_calib.arrays import as_floats
+from fg_calib.arrays import as_floats, shape_of
 from fg_calib.errors import InputError
 from fg_calib.files.job import UNSTATED, read_job
 from fg_calib.files.result import KindGoodness, Parameter, Posterior, Result, read_result
@@ -335,6 +335,7 @@ class Calibration:
             InputError: The readings are of other joints, or there is no measurement frame.
         """
         check_flag("world", world)
+        shape_of("readings", readings, f"(n, {self.robot.n_joints})")
         q = as_floats("readings", np.atleast_2d(readings), f"(n, {self.robot.n_joints})")
         v = self.posterior.variables
         if world and v.n_robot_columns == v.n_columns:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.errors import ProblemError
+from fg_calib.errors import InputError, ProblemError
 from fg_calib.graph.factors import Variables, prior_rows
 from fg_calib.graph.information import observability_of, whitened_triangle
 from fg_calib.graph.observability import determined, singular_values
@@ -69,6 +69,8 @@ def build_problem(
         InputError: An option is not one of those possible.
         ProblemError: The measurements lack what the model needs, or do not suffice.
     """
+    if not isinstance(robot, Robot):
+        raise InputError("robot", f"found {robot!r}", "a Robot, such as read_robot('robot.yaml')")
     check_type("options", options, Options, "Options(model='pose')")
     options = options or Options.of(**choices)
     check_names("prefer", options.prefer, names_of(robot.parameters))

@@ -15,6 +15,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
+from fg_calib.arrays import as_floats
 from fg_calib.errors import ProblemError
 from fg_calib.graph.factors import Variable, Variables, custom_factor, factor_columns, prior_factors, row_factor
 from fg_calib.graph.problem import Problem, reweighted_at
@@ -123,7 +124,9 @@ def _pair_factor(
 ) -> gtsam.CustomFactor:
     check_number(*measured)
     check_number("sigma", sigma, above=True)
-    trig = precompute_trig(variables.robot, np.array([start, end], dtype=np.float64))
+    n = variables.robot.n_joints
+    readings = [as_floats(name, q, f"({n})") for name, q in (("start", start), ("end", end))]
+    trig = precompute_trig(variables.robot, np.array(readings))
     data, whitening = np.array([[float(measured[1])]]), np.array([[1.0 / float(sigma)]])
     block = Block(kind, trig, np.array([[0, 1]]), data, whitening, np.zeros((1, 0)))
     return row_factor(RowSet((Part(block, 0, np.zeros((1, 0), dtype=np.int64)),)), variables)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fg_calib.arrays import NORM_TOLERANCE, Floats, as_array, as_floats, as_rotations, require
+from fg_calib.arrays import NORM_TOLERANCE, Floats, as_array, as_floats, as_rotations, require, shape_of
 from fg_calib.errors import InputError
 from fg_calib.options import check_names
 from fg_calib.robot.model import Robot
@@ -68,12 +68,14 @@ def checked_sigma(name: str, given: ArrayLike | None, shape: tuple[int, ...]) ->
     if given is None:
         return None
     possible = ((), *({shape[1:]} - {()}), shape[:1], *([(shape[0], 1), (1, *shape[1:])] if shape[1:] else []), shape)
-    if np.shape(given) not in possible:
-        raise InputError(name, f"shape {np.shape(given)}", f"one of {', '.join(map(str, dict.fromkeys(possible)))}")
-    if len(shape) == 2 and shape[0] == shape[1] > 1 and np.shape(given) == shape[:1]:
+    expected = f"one of {', '.join(map(str, dict.fromkeys(possible)))}"
+    found = shape_of(name, given, f"figures of shape {expected}")
+    if found not in possible:
+        raise InputError(name, f"shape {found}", expected)
+    if len(shape) == 2 and shape[0] == shape[1] > 1 and found == shape[:1]:
         expected = f"({shape[0]}, 1) for one a row, (1, {shape[0]}) for one an axis"
         raise InputError(name, f"shape {shape[:1]} of {shape[0]} rows", expected)
-    sigma = as_floats(name, given, str(np.shape(given)))
+    sigma = as_floats(name, given, str(found))
     require(sigma > 0.0, name, sigma, "a number above 0")
     require(sigma >= LEAST_SIZE, name, sigma, ORDINARY)
     if sigma.shape == shape[:1] != shape[1:]:
@@ -83,7 +85,8 @@ def checked_sigma(name: str, given: ArrayLike | None, shape: tuple[int, ...]) ->
 
 def checked_joint_sigma(given: ArrayLike, n_joints: int) -> Floats:
     """Sigma of the readings of each joint, shape (n_joints,), from one figure for all or one a joint."""
-    sigma = as_floats("sigma_joint", given, "()" if np.shape(given) == () else f"({n_joints})")
+    one = shape_of("sigma_joint", given, f"one figure, or {n_joints}") == ()
+    sigma = as_floats("sigma_joint", given, "()" if one else f"({n_joints})")
     require(sigma >= 0.0, "sigma_joint", sigma, "a number not below 0")
     return np.ascontiguousarray(np.broadcast_to(sigma, n_joints))
 

@@ -28,7 +28,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.arrays import Brief
+from fg_calib.arrays import Brief, shape_of
 from fg_calib.errors import InputError
 from fg_calib.robot.kernels import ChainArrays, walk_all
 from fg_calib.robot.model import AXIS_OF_KIND, FRAME_KINDS, Axis, Element, Robot
@@ -209,8 +209,10 @@ def precompute_trig(robot: Robot, readings: Floats, given: Floats | None = None)
     Raises:
         InputError: The readings are of more or fewer joints.
     """
-    if np.ndim(readings) != 2 or np.shape(readings)[1] != robot.n_joints:
-        raise InputError("readings", f"shape {np.shape(readings)}", f"(n, {robot.n_joints}) for the robot's joints")
+    expected = f"(n, {robot.n_joints}) for the robot's joints"
+    shape = shape_of("readings", readings, expected)
+    if len(shape) != 2 or shape[1] != robot.n_joints:
+        raise InputError("readings", f"shape {shape}", expected)
     prismatic = np.array([j.prismatic for j in robot.joints])
     trig = np.stack(
         [np.where(prismatic, readings, np.cos(readings)), np.where(prismatic, 0.0, np.sin(readings))], axis=2
@@ -324,6 +326,7 @@ def pose(robot: Robot, readings: Floats | Sequence[Sequence[float]]) -> Poses:
     Raises:
         InputError: The readings are of more or fewer joints.
     """
+    shape_of("readings", readings, f"(n, {robot.n_joints})")
     q = np.atleast_2d(np.asarray(readings, dtype=np.float64))
     chain = build_chain(robot, {i: i for i in range(len(robot.parameters))}).with_joint_columns()
     return forward(chain, precompute_trig(robot, q))

@@ -17,7 +17,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fg_calib.arrays import as_floats, require
+from fg_calib.arrays import as_floats, require, shape_of
 from fg_calib.errors import InputError
 from fg_calib.options import NEAR, check, check_names, check_number, did_you_mean, known_names, listed
 
@@ -245,7 +245,8 @@ class Robot:
             InputError: A figure, name or shape that cannot be used; the message names the joint.
         """
         check("convention", convention, tuple(CONVENTIONS))
-        figures = as_floats("rows", rows, "(n, 5)" if np.shape(rows)[1:] == (5,) else "(n, 4)")
+        five = shape_of("rows", rows, "numbers of shape (n, 4)")[1:] == (5,)
+        figures = as_floats("rows", rows, "(n, 5)" if five else "(n, 4)")
         kinds = CONVENTIONS[convention]
         if figures.shape[1] > 4 and "beta" not in kinds:
             raise InputError("rows", f"shape {figures.shape}", f"(n, 4): the convention {convention} has no beta")
@@ -474,8 +475,9 @@ def frame_values(name: str, given: ArrayLike | None) -> dict[str, float]:
     """
     if given is None:
         return {}
-    if np.shape(given) != (4, 4):
-        shape = {(3,): "(3)", (6,): "(6)"}.get(np.shape(given), "(3), (6) or (4, 4)")
+    found = shape_of(name, given, "numbers of shape (3), (6) or (4, 4)")
+    if found != (4, 4):
+        shape = f"({found[0]})" if found in ((3,), (6,)) else "(3), (6) or (4, 4)"
         return dict(zip(("x", "y", "z", "roll", "pitch", "yaw"), as_floats(name, given, shape), strict=False))
     matrix = as_floats(name, given, "(4, 4)")
     R = matrix[:3, :3]

@@ -317,7 +317,7 @@ def test_a_figure_of_a_factor_is_checked(figure):
         DistanceFactor(problem.variables, *READINGS, figure, 1e-3)
     with pytest.raises(InputError, match=r"^sigma: found 0, "):
         RotationAngleFactor(problem.variables, *READINGS, 1.0, 0)
-    with pytest.raises(InputError, match=r"^readings: shape \(2, 3\)"):
+    with pytest.raises(InputError, match=r"^start: shape \(3,\)"):
         DistanceFactor(problem.variables, [0, 0, 0], [0, 0, 0], 1.0, 1e-3)
 
 

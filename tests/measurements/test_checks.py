@@ -5,7 +5,7 @@ import polars as pl
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fg_calib import InputError, Measurements, Noise, Options, Robot, Units, read_measurements
+from fg_calib import InputError, Measurements, Noise, Options, Robot, Units, build_problem, pose, read_measurements
 from fg_calib.files.csv_writer import write_csv
 from fg_calib.measurements.checks import check_readings
 
@@ -238,3 +238,24 @@ def test_three_sigmas_of_three_rows_may_mean_two_things():
         sigma = np.reshape([1e-3, 2e-3, 3e-3], shape)
         found = Measurements.from_arrays(Q[:3], position=P[:3], sigma_position=sigma).sigma_position
         assert found.tolist() == np.broadcast_to(sigma, (3, 3)).tolist()
+
+
+RAGGED = [[1.0], [1.0, 2.0]]
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: Measurements.from_arrays(Q, position=P, sigma_position=RAGGED), "sigma_position: found "),
+        (lambda: Measurements.from_arrays(Q, sigma_joint=RAGGED), "sigma_joint: found "),
+        (lambda: Robot.from_dh([[1, 2, 3, 4], [1]], "dh"), "rows: found "),
+        (lambda: Robot.from_dh([[0.1, 0.2, 0.3, 0.4]], "dh", tool=RAGGED), "tool: found "),
+        (lambda: pose(Robot.from_dh([[0.1, 0.2, 0.3, 0.4]], "dh"), RAGGED), "readings: found "),
+        (lambda: build_problem("robot", Measurements.from_arrays(Q)), "robot: found 'robot', expected a Robot"),
+        (lambda: Measurements.from_arrays([[10**400, 1, 1]]), "readings: found "),
+    ],
+)
+def test_what_numpy_makes_no_array_of_is_one_line(call, message):
+    with pytest.raises(InputError, match=f"^{message}") as error:
+        call()
+    assert "\n" not in str(error.value)

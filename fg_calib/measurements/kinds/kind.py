@@ -111,6 +111,10 @@ def checked_rows(kind: Kind, at: Frames, data: Floats, nuisances: Floats) -> tup
     """
     n = len(at.position)
     found = kind.rows(at, data.copy(), nuisances)
+    if not isinstance(found, tuple) or len(found) != len(Rows._fields):
+        raise InputError(
+            f"kind {type(kind).__name__}: rows", f"returned a {type(found).__name__}", "Rows(residual, D, N)"
+        )
     none = np.zeros((n, kind.residual_dim, 0)) if kind.n_nuisances == 0 else np.zeros(0)
     shapes = ((n, kind.residual_dim), (n, kind.ends, kind.residual_dim, 6), (n, kind.residual_dim, kind.n_nuisances))
     arrays = []
