@@ -177,7 +177,8 @@ def _of_solver(solution: Solution) -> list[Statement]:
         n, lost = len(s.train), int(np.sum(w[s.train] < OUTLIER_WEIGHT))
         if lost > MOST_OUTLIERS * n:
             of = f" of {labels[s.table]}" if len(labels) > 1 else ""
-            text = f"loss {solution.problem.options.loss} takes {lost} of {n} measurements{of} for outliers"
+            what = f"loss {solution.problem.options.loss} takes {lost} of {n} measurements"
+            text = f"{what} of {s.kind.names[0].partition('.')[0]}{of} for outliers"
             statements.append(Statement(f"{text}: more than it can tell from noise", finding=True))
     return statements
 

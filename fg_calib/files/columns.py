@@ -6,6 +6,7 @@ import csv
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from io import BytesIO, TextIOWrapper
 from pathlib import Path
@@ -280,9 +281,10 @@ def _of_polars(name: str, read: Callable[[], _Found]) -> _Found:
     """
     import polars as pl
 
-    what = "CSV" if name.lower().endswith(".csv") else "Parquet file"
+    what = {".csv": "CSV", ".parquet": "Parquet file", ".pq": "Parquet file"}.get(Path(name).suffix.lower(), "table")
     try:
-        with silent_stderr():
+        # Only what reads Parquet panics, and says so on the process's stderr, which is everybody's.
+        with silent_stderr() if what == "Parquet file" else nullcontext():
             return read()
     except (pl.exceptions.PolarsError, OSError, ValueError, TypeError) as error:
         raise InputError(name, f"not a {what}: {_first_line(error)}") from None

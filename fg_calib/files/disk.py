@@ -7,7 +7,7 @@ import hashlib
 import os
 import shutil
 import socket
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
@@ -137,13 +137,18 @@ _WRITING, _WRITTEN = ".fg-calib-writing-", ".fg-calib-written"
 """Folders within a folder that is filled: while files are written, and when all are there but not yet moved."""
 
 
-def fill_folder(folder: Path, write: Callable[[Path], None]) -> None:
+def fill_folder(folder: Path, write: Callable[[Path], None], together: Sequence[str] = ()) -> None:
     """Let `write` write files that then appear in a folder, all of them or none.
 
     They are written to a folder within it, which is renamed when all of them are there: from then on they count as
     written. Only then they are moved to their places; what interrupts that is made good by `finish` (see there), which
     everything that reads from such a folder or writes to it calls first. Renaming within one folder is atomic on local
     disks and network mounts, also where the folder itself is a mount or its parent may not be written.
+
+    Args:
+        folder: Where the files appear.
+        write: Writes them to the folder that it is given.
+        together: Files that belong together: those of an earlier time that are not written now are removed.
 
     Raises:
         InputError: The folder cannot be written.
@@ -155,6 +160,7 @@ def fill_folder(folder: Path, write: Callable[[Path], None]) -> None:
         _clear_dead(folder)
         temporary = Path(mkdtemp(prefix=f"{_WRITING}{_here()}-", dir=folder))
         write(temporary)
+        names = [file.name for file in temporary.iterdir()]
         for file in temporary.iterdir():
             if (folder / file.name).is_dir():
                 raise InputError(str(folder / file.name), "is a folder", "a place for a file")
@@ -168,6 +174,8 @@ def fill_folder(folder: Path, write: Callable[[Path], None]) -> None:
                     raise
         temporary = None
         finish(folder)
+        for name in set(together).difference(names):
+            (folder / name).unlink(missing_ok=True)
     except OSError as error:
         raise InputError(
             str(folder), f"cannot be written: {error.strerror or error}", "a folder that can be"

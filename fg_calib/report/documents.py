@@ -498,6 +498,10 @@ def write_comparison(folder: Path | str, comparison: Comparison) -> None:
     fill_folder(Path(folder), lambda into: write_text(into / "comparison.json", text))
 
 
+RESULT_FILES = ("result.json", "residuals.csv", "joints.csv", "robot_calibrated.yaml", "robot_calibrated.urdf")
+"""What a calibration may write; of one result all are of the same calibration."""
+
+
 def write_results(
     folder: Path | str, solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str, str] | None = None
 ) -> None:
@@ -523,7 +527,7 @@ def write_results(
             units = [robot.joints[j].unit for j in uncertainty.joint_values.joints]
             _write_joint_values(into / "joints.csv", uncertainty.joint_values, solution.problem.end_names, units)
 
-    fill_folder(Path(folder), write)
+    fill_folder(Path(folder), write, RESULT_FILES)
 
 
 def require_no_input(folder: Path, job: Job) -> None:
@@ -533,7 +537,7 @@ def require_no_input(folder: Path, job: Job) -> None:
         InputError: They would.
     """
     inputs = set() if job.path is None else {(job.path.parent / name).resolve() for name in job.inputs}
-    for name in ("result.json", "residuals.csv", "joints.csv", "robot_calibrated.yaml", "robot_calibrated.urdf"):
+    for name in RESULT_FILES:
         if (folder / name).resolve() in inputs:
             raise InputError(str(folder / name), "the job was read from it", "another folder for the results")
 

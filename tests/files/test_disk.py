@@ -139,6 +139,16 @@ def test_what_cannot_be_moved_is_said(tmp_path):
         finish(tmp_path)
 
 
+def test_no_file_of_an_earlier_result_stays_beside_a_new_one(example):
+    job, folder = example / "calibration.yaml", example / "result"
+    (folder).mkdir()
+    for name in ("joints.csv", "robot_calibrated.urdf", "mine.txt"):
+        (folder / name).write_text("old")
+    calibrate_job(job).save(folder)
+    names = sorted(file.name for file in folder.iterdir())
+    assert names == ["mine.txt", "residuals.csv", "result.json", "robot_calibrated.yaml"]
+
+
 def test_results_do_not_replace_what_they_are_of(example, fg_calib):
     job = example / "calibration.yaml"
     (example / "robot_nominal.yaml").rename(example / "robot_calibrated.yaml")
