@@ -33,7 +33,7 @@ from fg_calib.analysis.identifiability import observe_structure
 from fg_calib.analysis.uncertainty import marginals
 from fg_calib.graph.build import random_problem
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.options import MODELS, Model
+from fg_calib.options import PAIR_MODELS, POSE_MODELS, Model
 from fg_calib.robot.model import CONVENTIONS, Joint, RobotBuilder
 
 Floats = NDArray[np.float64]
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     robot = robot.with_estimated(names)
 
     found: dict[str, Any] = {"seed": given.seed, "n_configurations": n, "tables": {}, "graph": {}}
-    for model in MODELS:
+    for model in (*POSE_MODELS, *PAIR_MODELS):
         found["tables"][model] = table(robot, model, n, given.seed)
     found["seconds"] = {str(n): structural_seconds(n, given.seed) for n in (7, 12)}
     spectra = {}

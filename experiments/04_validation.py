@@ -42,7 +42,7 @@ from space_robot import (
 
 from fg_calib import Robot, Simulation, cramer_rao, pose
 from fg_calib.options import Model
-from fg_calib.simulation.scenario import BoardViews
+from fg_calib.simulation.configurations import BoardViews
 
 NAME = "04_validation"
 SHOWN = {"unweighted": "plain least squares", "graph": "graph, tolerances as priors"}

@@ -43,7 +43,7 @@ from space_robot import (
 )
 
 from fg_calib import cramer_rao
-from fg_calib.simulation.scenario import Placement
+from fg_calib.simulation.configurations import Placement
 
 NAME = "06_sensitivity"
 

@@ -2,7 +2,7 @@
 
 Command: python experiments/08_honesty.py [--quick] [--draws N] [--seed N] [--only TEXT] [--out FOLDER]
 Takes 45 minutes on two cores that have other work too. --only runs the cells whose arm and way hold the text, such as
-"SCARA, star", and puts them in the place of those of an earlier run.
+"SCARA, star" or "instruments:", and puts them in the place of those of an earlier run.
 
 Calibrations of three arms {the paper's robot, UR10-like 6R, SCARA} by {pose with known frame, pose with unknown frame,
 distance + rotation of a star of poses, distance + rotation measured directly}, with encoder noise {off, on}: 24 cells.
@@ -19,6 +19,9 @@ each cell:
 Beyond these: chains of steps of 4 to 40 sigma; stars of poses and direct pairs whose distances and angles lie 2 to 10
 sigma from 0, and angles as near to half a turn; and the gauges `keep` and `none`, where what is not known is not asked.
 
+And instruments (`simulate` draws what they measure): targets from two stations, wires with an offset, planes, a board
+and its corners seen by a camera on the tool, sockets; each with encoder noise off and on.
+
 Then where it breaks: the same with tolerances ten times as wide and noise of 1 to 100 times, for poses, for a star and
 for a star of small motions, whose angles and distances come near 0.
 """
@@ -31,7 +34,7 @@ import os
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
@@ -54,15 +57,28 @@ from fg_calib.graph.factors import prior_rows
 from fg_calib.graph.information import whitened_triangle
 from fg_calib.graph.problem import Problem, reweighted_at
 from fg_calib.measurements import residuals
-from fg_calib.measurements.dataset import Measurements, Pairs, rotation_angle
+from fg_calib.measurements.dataset import Measurements, Noise, Pairs, rotation_angle
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
+from fg_calib.simulation.configurations import BoardViews, GivenReadings, Placement
+from fg_calib.simulation.instruments import (
+    BoardCamera,
+    Corners,
+    Indicator,
+    Instrument,
+    LengthGauge,
+    Sockets,
+    Tracker,
+)
+from fg_calib.simulation.scenario import Errors
 
 Floats = NDArray[np.float64]
 
 ROOT = Path(__file__).resolve().parents[1]
 NAME = "08_honesty"
 
+N_CONFIGURATIONS = 40
+N_VIEWS = 30
 WAYS: dict[str, dict[str, Any]] = {
     "pose, frame known": {"model": "pose", "frame": "known"},
     "pose, frame unknown": {"model": "pose", "frame": "unknown"},
@@ -79,7 +95,21 @@ WAYS: dict[str, dict[str, Any]] = {
     "pose, none": {"model": "pose", "gauge": "none"},
     "star, none": {"model": "distance-rotation", "gauge": "none"},
 }
-N_CONFIGURATIONS = 40
+LOOKED_AT = Placement(np.eye(3), np.array([0.6, -0.4, -0.5]))
+"""base_T_board of the views of a camera on the tool: 0.3 to 0.55 m away, within 45 degrees of its normal."""
+
+VIEWS = BoardViews(LOOKED_AT, count=N_VIEWS - 1, height=0.4, distance=(0.3, 0.55), cone=np.deg2rad(45.0))
+CAMERA = fg_calib.Camera(fx=1200, fy=1200, cx=960, cy=600, k1=-0.05, k2=0.01)
+INSTRUMENTS: dict[str, Instrument] = {
+    "targets": Tracker(model="position", name="tracker", targets=3, stations=2),
+    "wires": LengthGauge(name="wire", anchors=3, offset=0.12),
+    "planes": Indicator(name="indicator", planes=3),
+    "board": BoardCamera(model="board", name="camera", configurations=VIEWS),
+    "pixels": BoardCamera(model="pixels", name="camera", configurations=VIEWS, camera=CAMERA,
+                          corners=Corners(8, 6, 0.03)),
+    "sockets": Sockets(name="ball", sockets=4),
+}  # fmt: skip
+NOISE_OF_INSTRUMENTS = Noise(5e-5, np.deg2rad(0.01), distance=5e-5, point=1e-4, pixel=0.1)
 N_PAIRS = 60
 N_VALIDATION = 8
 N_COMBINATIONS = 12
@@ -139,6 +169,8 @@ KINKS = [
 ]
 GAUGES = [Cell(arm, f"{what}, {gauge}") for arm in ("space robot", "UR10") for gauge in ("keep", "none")
           for what in ("pose", "star")]  # fmt: skip
+OF_INSTRUMENTS = [Cell("UR10", way, encoder) for way in INSTRUMENTS for encoder in (False, True)]
+OTHERS = {"chains": CHAINS, "kinks": KINKS, "gauges": GAUGES, "instruments": OF_INSTRUMENTS}
 BREAKING = {
     "poses, frame known": [Cell("UR10", "pose, frame known", noise=n, tolerance=WIDE) for n in NOISE],
     "star": [Cell("UR10", "star of poses", noise=n, tolerance=WIDE) for n in NOISE],
@@ -263,6 +295,19 @@ def measure(cell: Cell, setting: Setting, true: fg_calib.Robot, rng: np.random.G
     return Measurements(**given)
 
 
+def scenario_of(cell: Cell, setting: Setting) -> fg_calib.Scenario:
+    """What an instrument measures: errors drawn from the priors, its places and noise anew for each seed."""
+    robot = setting.arm.robot
+    return fg_calib.Scenario(
+        robot=robot,
+        errors=Errors("normal", {p.name: p.tolerance for p in robot.parameters if p.tolerance is not None}),
+        configurations=GivenReadings(setting.readings),
+        noise=replace(NOISE_OF_INSTRUMENTS, joint=tuple(setting.sigma_joint.tolist())),
+        instruments=(INSTRUMENTS[cell.way],),
+        job={},
+    )
+
+
 def run_draws(cell: Cell, seed: int, draws: Sequence[int]) -> dict[str, Any]:
     """Some draws of a cell: counts and sums."""
     setting = setting_of(cell, seed)
@@ -274,8 +319,12 @@ def one_draw(cell: Cell, setting: Setting, seed: int, draw: int) -> dict[str, An
     """One simulated calibration and how its errors compare with what it says of them."""
     robot, key = setting.arm.robot, json.dumps(asdict(cell), sort_keys=True)
     rng = np.random.default_rng([seed, draw, *key.encode()])
-    true = setting.arm.true_robot(rng)
-    problem = fg_calib.build_problem(robot, measure(cell, setting, true, rng), **WAYS[cell.way])
+    if cell.way in INSTRUMENTS:
+        simulation = fg_calib.simulate(scenario_of(cell, setting), int(rng.integers(2**40)))
+        true, problem = simulation.true_robot, fg_calib.build_problem(robot, simulation.tables)
+    else:
+        true = setting.arm.true_robot(rng)
+        problem = fg_calib.build_problem(robot, measure(cell, setting, true, rng), **WAYS[cell.way])
     solution = fg_calib.solve(problem)
     found = fg_calib.assess(solution)
     columns = [robot.index(name) for name in found.names]
@@ -420,7 +469,7 @@ def run(out: Path, seed: int = 0, quick: bool = False, n_draws: int | None = Non
         row["meets"] = judge(row, len(cells))
         found["cells"].append(row)
         print(line(row), flush=True)
-    for name, more in (("chains", CHAINS), ("kinks", KINKS), ("gauges", GAUGES)):
+    for name, more in OTHERS.items():
         found[name] = []
         for row in run_cells([] if quick else more, max(10, (2 * n_draws) // 5), seed, pool):
             row["meets"] = judge(row, len(more))
@@ -452,17 +501,21 @@ def run_only(out: Path, text: str, seed: int = 0, n_draws: int = 500, workers: i
     """Some cells again, in the place of those of an earlier run."""
     file = out / f"{NAME}.json"
     found = json.loads(file.read_text())
-    chosen = {name: [c for c in of_name if text in f"{c.arm}, {c.way}"] for name, of_name in
-              {"cells": CELLS, "chains": CHAINS, "kinks": KINKS, "gauges": GAUGES}.items()}  # fmt: skip
+    chosen = {name: [c for c in of_name if text in f"{name}: {c.arm}, {c.way}"] for name, of_name in
+              {"cells": CELLS, **OTHERS}.items()}  # fmt: skip
     pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
     print(HEADER)
     for name, cells in chosen.items():
+        found.setdefault(name, [])
         draws = n_draws if name == "cells" else max(10, (2 * n_draws) // 5)
         for cell, row in zip(cells, run_cells(cells, draws, seed, pool), strict=True):
-            row["meets"] = judge(row, len(found[name]))
+            row["meets"] = judge(row, len({"cells": CELLS, **OTHERS}[name]))
             print(line(row), flush=True)
             same = [{**asdict(cell), **old} == {**old, **asdict(cell)} for old in found[name]]
-            found[name][same.index(True)] = row
+            if any(same):
+                found[name][same.index(True)] = row
+            else:
+                found[name].append(row)
     pool.shutdown()
     file.write_text(json.dumps(found, indent=1) + "\n")
     draw(found).savefig(out / f"{NAME}.png", dpi=120)

@@ -13,6 +13,7 @@ unseen locations, [mm]:
 | nominal arm, ball centre fitted | 2.97 | 0.87 |
 | pairs table, every pair of a group | 0.210 | 0.024 |
 | column `group` | 0.210 | 0.024 |
+| touches and distances as two tables | 0.210 | 0.024 |
 
 Data: `panda_sockets` in the folder FG_CALIB_DATA (default: ../shared/data beside the repository); where it is missing,
 the experiment says so and ends. Results hold summary numbers and a figure, no measured rows.
@@ -59,6 +60,7 @@ PRIOR = {"xyz": 0.005, "rpy": 0.010}
 
 WAYS = {
     "groups": "column group",
+    "mixed": "touches and distances as two tables",
     "all": "pairs table, every pair of a group",
     "chain": "pairs table, each with the next",
     "star": "pairs table, the first with each",
@@ -118,13 +120,13 @@ def groups_of(rows: list[dict[str, str]]) -> dict[tuple[str, str], list[int]]:
 
 
 def pairs_of(groups: dict[tuple[str, str], list[int]], way: str) -> list[tuple[object, object, float, float]]:
-    """(a, b, distance, sigma) of a pairs table, in configurations; in groups if `way` is `groups`.
+    """(a, b, distance, sigma) of a pairs table, in configurations; in groups if `way` has these.
 
     With every pair of a group of n, sum over pairs of |p_i - p_j|^2 = n sum |p_i - mean|^2: a sigma sqrt(n) times that
     of a touch gives each touch its own weight. The pairs of two sockets, n by m, likewise share one measured distance.
     """
     locations = sorted({location for location, _ in groups})
-    if way == "groups":
+    if way in ("groups", "mixed"):
         return [(f"{p}/0", f"{p}/1", SOCKET_DISTANCE, SIGMA_DISTANCE) for p in locations]
     table: list[tuple[object, object, float, float]] = []
     for rows in groups.values():
@@ -161,24 +163,24 @@ def write_job(data: Path, rows: list[dict[str, str]], folder: Path, way: str) ->
         "estimate": ["tool.x", "tool.y", "tool.z"],
         "tolerance": {f"{j['name']}.{k}": PRIOR[kinds[k]] for j in nominal["joints"] for k in kinds},
     }
-    joints = [f"q{k}" for k in range(1, 8)]
+    joints, grouped = [f"q{k}" for k in range(1, 8)], way in ("groups", "mixed")
     with (folder / f"{way}.csv").open("w", newline="") as file:
         out = csv.writer(file)
-        out.writerow([*joints, "split", *(["group"] if way == "groups" else [])])
+        out.writerow([*joints, "split", *(["group"] if grouped else [])])
         for row in rows:
-            group = [f"{row['location']}/{row['socket']}"] if way == "groups" else []
+            group = [f"{row['location']}/{row['socket']}"] if grouped else []
             out.writerow([*(row[q] for q in joints), row["split"], *group])
     with (folder / f"{way}_pairs.csv").open("w", newline="") as file:
         out = csv.writer(file)
         out.writerow(["a", "b", "distance", "sigma_distance"])
         out.writerows(pairs_of(groups_of(rows), way))
-    job = {
-        "robot": robot,
-        "measurements": f"{way}.csv",
-        "pairs": f"{way}_pairs.csv",
-        "model": "distance",
-        "noise": {"point": SIGMA_POINT},
-    }
+    job = {"robot": robot, "model": "distance", "noise": {"point": SIGMA_POINT}, "measurements": f"{way}.csv"}
+    if way == "mixed":  # the calipers' table has a stop of its own, at which nothing was touched
+        with (folder / "calipers.csv").open("w", newline="") as file:
+            csv.writer(file).writerows([joints, [rows[0][q] for q in joints]])
+        job["measurements"] = [{"table": "mixed.csv"}, {"table": "calipers.csv", "pairs": "mixed_pairs.csv"}]
+    else:
+        job["pairs"] = f"{way}_pairs.csv"
     (folder / f"{way}.yaml").write_text(yaml.safe_dump(job))
     return folder / f"{way}.yaml"
 
@@ -224,7 +226,7 @@ def run(data: Path, out: Path, seed: int = 0, quick: bool = False) -> dict[str, 
         document = fg_calib.result_document(solution, uncertainty)
         n = len(job.robot.parameters)
         robots = {"before": job.robot.with_values(solution.before[:n]), "after": uncertainty.robot}
-        judged = {when: judge(robot, job.measurements.readings, rows) for when, robot in robots.items()}
+        judged = {when: judge(robot, job.tables[0].measurements.readings, rows) for when, robot in robots.items()}
         keys = ("n_configurations", "n_pairs", "n_residuals", "dof", "reduced_chi2", "trustworthy", "findings")
         tool = [p["estimate"] for p in document["parameters"] if p["name"] in ("tool.x", "tool.y", "tool.z")]
         results["ways"][way] = {

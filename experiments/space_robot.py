@@ -25,7 +25,7 @@ from threadpoolctl import threadpool_limits
 from fg_calib import Bound, Robot, Scenario, Simulation, build_problem, fit_least_squares, read_scenario, solve
 from fg_calib.baseline.comparison import real_errors
 from fg_calib.options import Model
-from fg_calib.simulation.scenario import BoardViews
+from fg_calib.simulation.configurations import BoardViews
 
 Floats = NDArray[np.float64]
 T, R = TypeVar("T"), TypeVar("R")

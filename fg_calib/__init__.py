@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
     from fg_calib.calibration import Calibration, calibrate, calibrate_job
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
+    from fg_calib.files.columns import Column
     from fg_calib.files.job import read_job
     from fg_calib.files.result import Result, read_result, result_schema
     from fg_calib.files.robot_yaml import read_robot, write_robot
@@ -39,7 +40,8 @@ if TYPE_CHECKING:
     from fg_calib.graph.solver import Solution, SolverOptions, levenberg_marquardt_params, solve
     from fg_calib.job import Job
     from fg_calib.measurements.dataset import Measurements, Noise
-    from fg_calib.measurements.series import Own, Table
+    from fg_calib.measurements.kinds.pixel import Camera
+    from fg_calib.measurements.series import KnownPoint, Own, Table
     from fg_calib.options import Options, Pairing
     from fg_calib.report.comparison import format_comparison
     from fg_calib.report.documents import (
@@ -65,6 +67,7 @@ _HOMES = {
     "fg_calib.baseline.comparison": ("Comparison", "compare"),
     "fg_calib.calibration": ("Calibration", "calibrate", "calibrate_job"),
     "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
+    "fg_calib.files.columns": ("Column",),
     "fg_calib.files.job": ("read_job",),
     "fg_calib.job": ("Job",),
     "fg_calib.files.result": ("Result", "read_result", "result_schema"),
@@ -83,7 +86,8 @@ _HOMES = {
     "fg_calib.analysis.variance_components": ("estimate_noise", "solve_job"),
     "fg_calib.graph.build": ("build_problem", "problem_of"),
     "fg_calib.graph.problem": ("Problem",),
-    "fg_calib.measurements.series": ("Own", "Table"),
+    "fg_calib.measurements.kinds.pixel": ("Camera",),
+    "fg_calib.measurements.series": ("KnownPoint", "Own", "Table"),
     "fg_calib.options": ("Options", "Pairing"),
     "fg_calib.report.comparison": ("format_comparison",),
     "fg_calib.report.identifiability": ("format_identifiability",),
@@ -109,12 +113,15 @@ __all__ = [
     "Bound",
     "Calibration",
     "CalibrationError",
+    "Camera",
+    "Column",
     "Comparison",
     "DistanceFactor",
     "Identifiability",
     "InputError",
     "Inverse",
     "Job",
+    "KnownPoint",
     "LeastSquares",
     "Measurements",
     "Noise",

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sized
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sized
 from dataclasses import fields
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.errors import InputError
+from fg_calib.errors import InputError, shown
 from fg_calib.sizes import MOST_SIZE, ORDINARY
 
 Floats = NDArray[np.float64]
@@ -87,21 +88,54 @@ def as_floats(name: str, given: object, shape: str, *, missing: bool = False) ->
     Raises:
         InputError: They are no numbers, of another shape, or not finite.
     """
-    array = as_array(name, given, "iufO", f"numbers of shape {shape}")
-    try:
-        floats = np.array(array, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(name, f"found {_shown(given)}", f"numbers of shape {shape}") from None
+    floats = as_figures(name, given, f"numbers of shape {shape}")
     wanted = [word.strip() for word in shape.strip("()").split(",") if word.strip()]
     fits = floats.ndim == len(wanted) and all(
         not word.isdigit() or int(word) == n for word, n in zip(wanted, floats.shape, strict=True)
     )
     if not fits:
         raise InputError(name, f"shape {floats.shape}", shape)
-    good = np.isfinite(floats) | (missing & np.isnan(floats))
-    require(good, name, floats, "a finite number")
-    require(~(np.abs(floats) > MOST_SIZE), name, floats, ORDINARY)
+    check_sizes(name, floats, missing=missing)
     return floats
+
+
+def as_figures(name: str, given: object, expected: str) -> Floats:
+    """Numbers from outside as an array of any shape, a copy; text that reads as a number is none.
+
+    Raises:
+        InputError: They are no numbers.
+    """
+    array = as_array(name, given, "iufO", expected)
+    words = array.dtype.kind == "O" and any(isinstance(value, str | bytes | bool | np.bool_) for value in array.ravel())
+    try:
+        if not words and not _holds_flags(given):
+            return np.array(array, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise InputError(name, f"found {_shown(given)}", expected)
+
+
+def _holds_masks(given: object) -> bool:
+    return isinstance(given, list | tuple) and any(
+        isinstance(one, np.ma.MaskedArray) or one is np.ma.masked or _holds_masks(one) for one in given
+    )
+
+
+def _holds_flags(given: object) -> bool:
+    """Whether True or False stands among the numbers of a list, where numpy makes 1 or 0 of it."""
+    return isinstance(given, list | tuple) and any(
+        isinstance(one, bool | np.bool_) or _holds_flags(one) for one in given
+    )
+
+
+def check_sizes(name: str, floats: Floats, *, missing: bool = False) -> None:
+    """Check that numbers are finite and of a size that arithmetic holds.
+
+    Raises:
+        InputError: One is not.
+    """
+    require(np.isfinite(floats) | (missing & np.isnan(floats)), name, floats, "a finite number")
+    require(~(np.abs(floats) > MOST_SIZE), name, floats, ORDINARY)
 
 
 def as_rotations(name: str, given: object, n: int) -> Floats:
@@ -127,15 +161,95 @@ def as_array(name: str, given: object, kinds: str, expected: str) -> NDArray[Any
     Raises:
         InputError: It is none.
     """
-    if isinstance(given, np.ma.MaskedArray):
+    if isinstance(given, np.ma.MaskedArray) or _holds_masks(given):
         raise InputError(name, "found a masked array", f"{expected}; nan where something was not measured")
+    if isinstance(given, Iterator):
+        raise InputError(name, f"found a {type(given).__name__}", expected, "list(...) makes a list of it")
     try:
         array = np.asarray(given)
-    except ValueError:  # rows of different lengths
+    except (ValueError, TypeError, RecursionError):  # rows of different lengths, objects that are no arrays
         raise InputError(name, f"found {_shown(given)}", expected) from None
     if array.dtype.kind not in kinds and array.size:
-        raise InputError(name, f"found {_shown(given)}", expected)
+        kind = f", {array.dtype}" if isinstance(given, np.ndarray) else ""
+        raise InputError(name, f"found {_shown(given)}{kind}", expected)
     return array
+
+
+def as_columns(name: str, given: Any, expected: str) -> Mapping[str, Any]:
+    """Columns by name: those of a mapping as they are, those of a frame of polars or pandas as arrays.
+
+    Raises:
+        InputError: It is neither, or a name stands there twice.
+    """
+    if isinstance(given, Mapping):
+        return given
+    frame = as_frame(name, given)
+    if frame is None:
+        raise InputError(name, f"found {shown(given)}", expected)
+    return {column: frame[column].to_numpy() for column in frame.columns}
+
+
+def as_frame(name: str, given: Any) -> Any | None:
+    """A frame of polars or pandas whose names are different without blanks around them; None of what is no frame.
+
+    Raises:
+        InputError: A name stands there twice, or a lazy frame cannot be collected.
+    """
+    lazy = hasattr(type(given), "collect")
+    if not lazy and not hasattr(given, "columns"):
+        return None
+    if lazy:
+        try:
+            given = given.collect()
+        except BaseException as error:  # a panic of polars' Rust is no Exception
+            if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+                raise
+            first = str(error).strip().partition("\n")[0]
+            raise InputError(name, f"a lazy frame that cannot be collected: {first}") from None
+    check_different(name, list(given.columns))
+    return given
+
+
+def check_different(name: str, columns: Iterable[object]) -> None:
+    """Check that names of columns differ without the blanks around them.
+
+    Raises:
+        InputError: Two are the same.
+    """
+    for column, n in Counter(str(column).strip() for column in columns).items():
+        if n > 1:
+            found = f"two columns called {column!r}" if column else "two columns without a name"
+            raise InputError(name, found, "different names")
+
+
+NOTHING = ("na", "n/a", "<na>", "nan", "none", "null", "-", "--")
+"""Words that stand for nothing and are no names, in small letters: R writes NA, Python nan or None."""
+
+
+def as_names(name: str, given: object, *, missing: bool = False) -> list[str | None]:
+    """Names from outside: words, or whole numbers as words.
+
+    Args:
+        name: What they are, for messages.
+        given: The names.
+        missing: Whether None, nan or an empty word may stand for none, which is None then.
+
+    Raises:
+        InputError: They are something else.
+    """
+    found: list[str | None] = []
+    listed = given if isinstance(given, list | tuple) else as_array(name, given, "iufUO", "names").tolist()
+    for row, one in enumerate(listed):  # numpy would make words of what stands beside words in a list, even of None
+        whole = missing and isinstance(one, float) and one.is_integer()  # so pandas has whole numbers beside nan
+        cell: Any = int(one) if whole else one
+        word = isinstance(cell, str | int | np.integer) and not isinstance(cell, bool) and cell != ""
+        word = word and str(cell).strip().lower() not in NOTHING
+        none = missing and (cell is None or type(cell).__name__ == "NAType" or cell == "" or cell != cell)  # noqa: PLR0124
+        if not word and not none:
+            expected = f"a name{', or None for none' * missing}: a word or a whole number"
+            raise InputError(f"{name}: row {row}", f"found {_shown(cell)}", expected)
+        found.append(str(cell) if word else None)
+    return found
 
 
 def shape_of(name: str, given: object, expected: str) -> tuple[int, ...]:
@@ -160,6 +274,5 @@ def require(good: NDArray[np.bool_], name: str, values: NDArray[Any], expected: 
 
 
 def _shown(value: object) -> str:
-    plain = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
-    text = f"{plain:g}" if isinstance(plain, float) else " ".join(repr(plain).split())
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    plain = value.item() if isinstance(value, np.ndarray | np.generic) and value.ndim == 0 else value
+    return f"{plain:g}" if isinstance(plain, float) else shown(plain)

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,10 @@ from fg_calib.analysis.covariance import TangentCovariance
 from fg_calib.analysis.residual_table import ResidualTable
 from fg_calib.analysis.uncertainty import FrameEstimate, Uncertainty, assess
 from fg_calib.analysis.variance_components import solve_job
+from fg_calib.arguments import checked
 from fg_calib.arrays import as_floats, shape_of
-from fg_calib.errors import InputError
+from fg_calib.errors import InputError, escaped, shown
+from fg_calib.files.disk import exists, is_folder
 from fg_calib.files.job import UNSTATED, read_job
 from fg_calib.files.result import KindGoodness, Parameter, Posterior, Result, read_result
 from fg_calib.files.robot_yaml import read_robot
@@ -35,7 +38,7 @@ from fg_calib.job import Job
 from fg_calib.measurements.checks import check_readings
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.series import Table
-from fg_calib.options import NEAR, Options, check_flag, check_names, check_type, did_you_mean
+from fg_calib.options import NEAR, Options, check_flag, check_names, did_you_mean, listed
 from fg_calib.report.documents import result_of, write_results
 from fg_calib.report.summary import format_result, html, summary
 from fg_calib.report.text import format_report
@@ -49,6 +52,7 @@ SAME = 1e-12
 """How far the saved robot's values may be from the estimates in `result.json`, [m] and [rad]: rounding in its units."""
 
 
+@checked
 def calibrate(
     robot: Robot,
     measurements: Measurements | Table | Sequence[Measurements | Table],
@@ -73,37 +77,16 @@ def calibrate(
         ProblemError: The measurements lack what the model needs, or do not suffice.
         SolverError: GTSAM could not solve a step at all.
     """
-    for name, given, kind, example in (
-        ("robot", robot, Robot, "Robot.from_dh(...)"),
-        ("options", options, Options, "Options(model='pose')"),
-    ):
-        if given is None and name != "options":
-            raise InputError(name, "found None", f"a {kind.__name__}, such as {example}")
-        check_type(name, given, kind, example)
-    if options is not None and choices:
-        raise InputError("options", f"both options and {next(iter(choices))}=...", "one of the two")
-    options = options or Options.of(**choices)
+    options = Options.given(options, choices)
     tables = []
-    for table in _tables(measurements, options):
+    for table in tables_of(measurements, options):
         check_readings(table.measurements.readings, robot, table.measurements.source)
         first = _with_first_sigmas(table.measurements) if options.estimate_noise else table.measurements
         tables.append(replace(table, measurements=first))
     return calibrate_job(Job(None, robot, tuple(tables), options))
 
 
-def _tables(measurements: Measurements | Table | Sequence[Measurements | Table], options: Options) -> tuple[Table, ...]:
-    """The tables given.
-
-    Raises:
-        InputError: They are something else.
-    """
-    for given in measurements if isinstance(measurements, list | tuple) else [measurements]:
-        if not isinstance(given, Measurements | Table):
-            found = "None" if given is None else repr(given)
-            raise InputError("measurements", f"found {found}", "a Measurements, such as Measurements.from_arrays(...)")
-    return tables_of(measurements, options)
-
-
+@checked
 def calibrate_job(job: Job | Path | str) -> Calibration:
     """`calibrate` of a job: what `fg-calib calibrate` does.
 
@@ -191,7 +174,7 @@ class Parameters(Mapping[str, Parameter]):
         return len(self._by_name)
 
     def __repr__(self) -> str:
-        names = ", ".join(self._by_name)
+        names = escaped(", ".join(self._by_name))
         return f"Parameters: {names if len(names) <= 80 else names[:80] + ' ...'}"
 
 
@@ -212,6 +195,7 @@ class Calibration:
     assessed: tuple[Solution, Uncertainty] | None = None
 
     @classmethod
+    @checked
     def of(cls, solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str, str] | None = None) -> Calibration:
         """The calibration of a solution and its assessment.
 
@@ -224,6 +208,7 @@ class Calibration:
         return cls(uncertainty.robot, result, uncertainty.whole, (solution, uncertainty))
 
     @classmethod
+    @checked
     def load(cls, path: Path | str) -> Calibration:
         """The calibration in a folder that `save` or `calibrate --out` wrote, or in its `result.json`.
 
@@ -232,11 +217,12 @@ class Calibration:
         Raises:
             InputError: There is none, or it is damaged.
         """
-        result, folder = read_result(path), Path(path) if Path(path).is_dir() else Path(path).parent
+        result, folder = read_result(path), Path(path) if is_folder(Path(path)) else Path(path).parent
         robot = _saved_robot(folder, result)
         nominal = robot.with_values([p.nominal for p in result.parameters])  # by its reach columns are scaled
         return cls(robot, result, _saved_posterior(nominal, result, f"{folder / 'result.json'}: posterior"))
 
+    @checked
     def save(self, folder: Path | str) -> None:
         """Write what `calibrate --out` writes: `result.json`, the calibrated robot and the residuals.
 
@@ -294,7 +280,7 @@ class Calibration:
             InputError: There is no such parameter.
         """
         given = self.result.covariance
-        names = given.names if names is None else names if isinstance(names, str) else list(names)
+        names = given.names if names is None else names if isinstance(names, str) else listed("covariance", names)
         check_names("covariance", names, list(self.parameters))
         every = np.zeros((len(given.names) + 1,) * 2)  # the last one stands for what is fixed
         every[:-1, :-1] = _array(given.matrix, len(given.names))
@@ -353,10 +339,10 @@ class Calibration:
         there = _tables_with_frame(self.posterior.variables)
         if number is None and len(there) == 1:
             return there[0]
-        if number not in there:
-            found = "several measurement frames" if number is None else f"found {number!r}"
+        if not isinstance(number, Integral) or number not in there:
+            found = "several measurement frames" if number is None else f"found {shown(number)}"
             raise InputError("table", found, f"one of {', '.join(map(str, there))}: the table whose frame is meant")
-        return number
+        return int(number)
 
     def __repr__(self) -> str:
         return "\n".join(summary(self.result))
@@ -381,7 +367,7 @@ def _array(matrix: Sequence[Sequence[float | None]], width: int) -> Floats:
 def _saved_robot(folder: Path, result: Result) -> Robot:
     """The calibrated robot beside a result: that which the result is of."""
     files = [folder / f"robot_calibrated.{ending}" for ending in ("yaml", "urdf")]
-    file = next((file for file in files if file.exists()), None)
+    file = next((file for file in files if exists(file)), None)
     if file is None:
         raise InputError(str(folder), "neither robot_calibrated.yaml nor robot_calibrated.urdf beside its result.json")
     links = result.links or (None, None)

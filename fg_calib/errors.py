@@ -1,5 +1,26 @@
 """The exceptions of the package: each message is one line that a user can act on."""
 
+from reprlib import Repr
+
+
+def escaped(text: str) -> str:
+    """Text from files as a terminal may get it: what would steer it, end the line or turn the reading is escaped."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def printable(text: str) -> str:
+    """`escaped` as one line in which blanks are single."""
+    return escaped(" ".join(text.split()))
+
+
+_LONGEST = 400
+
+
+def _part(text: str) -> str:
+    """A part of a message, cut where it would fill the screen."""
+    line = printable(text)
+    return line if len(line) <= _LONGEST else f"{line[: _LONGEST - 3]}..."
+
 
 class CalibrationError(Exception):
     """Base of every error the package raises on purpose."""
@@ -9,7 +30,7 @@ class InputError(CalibrationError):
     """What the user gave cannot be used as it is.
 
     The message is one line in a fixed order, so that every module words it alike:
-    `place: found, expected; hint`.
+    `place: found, expected; hint`. It is printable whatever stands in the file.
 
     Args:
         place: File, with row or key where there is one: `poses.csv:17`, `robot.yaml: joints[2].a`.
@@ -23,12 +44,12 @@ class InputError(CalibrationError):
         self.found = found
         self.expected = expected
         self.hint = hint
-        message = f"{place}: {found}"
+        message = f"{_part(place)}: {_part(found)}"
         if expected:
-            message += f", expected {expected}"
+            message += f", expected {_part(expected)}"
         if hint:
-            message += f"; {hint}"
-        super().__init__(" ".join(message.split()))
+            message += f"; {_part(hint)}"
+        super().__init__(message)
 
 
 class ProblemError(InputError):
@@ -37,3 +58,17 @@ class ProblemError(InputError):
 
 class SolverError(CalibrationError):
     """The solver could not do its work at all (a doubtful result is a `Status`, not this)."""
+
+
+def shown(value: object) -> str:
+    """Something that was found, for a message: its repr, cut to 60 characters; of an array its type and shape."""
+    shape = getattr(value, "shape", None)
+    plain = value.tolist() if isinstance(shape, tuple) and len(shape) < 2 and hasattr(value, "tolist") else value
+    if plain is value and isinstance(shape, tuple):
+        return f"{type(value).__name__} of shape {shape}"
+    text = " ".join(_REPR.repr(plain).split())
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+_REPR = Repr()
+_REPR.maxstring = _REPR.maxlong = _REPR.maxother = 100

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from fg_calib.arguments import check_fields
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.series import Table
 from fg_calib.options import Options
@@ -30,6 +31,9 @@ class Job:
     options: Options
     truth: Robot | None = None
     inputs: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_fields(self, "job")
 
     @property
     def tables(self) -> tuple[Table, ...]:

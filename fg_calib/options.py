@@ -9,11 +9,24 @@ from dataclasses import dataclass, field, fields, replace
 from numbers import Integral, Real
 from typing import Any, Literal, get_args
 
-from fg_calib.errors import InputError
+from fg_calib.arguments import as_hinted
+from fg_calib.errors import InputError, shown
 from fg_calib.sizes import LEAST_SIZE, MOST_SIZE, ORDINARY
 
-Model = Literal["pose", "position", "orientation", "distance", "rotation", "distance-rotation"]
-"""What a calibration compares with the measurements: each pose, or part of it, or what lies between two poses."""
+Model = Literal[
+    "pose",
+    "position",
+    "orientation",
+    "distance",
+    "rotation",
+    "distance-rotation",
+    "anchor",
+    "plane",
+    "board",
+    "pixels",
+]
+"""What a calibration compares with the measurements: each pose, or part of it; what lies between two poses; lengths to
+anchors, distances from planes; boards as a camera sees them, as poses or corner by corner."""
 
 FrameKnowledge = Literal["known", "unknown"]
 """Whether the measurement frame is the base, or world_T_base is estimated too."""
@@ -39,8 +52,8 @@ AngleUnit = Literal["rad", "deg", "mrad"]
 MODELS: tuple[Model, ...] = get_args(Model)
 
 
-def check(key: str, value: object, possible: Any) -> None:
-    """Check that an option is one of those possible.
+def check(key: str, value: object, possible: Any) -> Any:
+    """The option that was given, one of those possible.
 
     Args:
         key: Its name, for the message.
@@ -51,9 +64,26 @@ def check(key: str, value: object, possible: Any) -> None:
         InputError: It is none of them.
     """
     options = get_args(possible) or tuple(possible)
-    if not any(value is option or (type(value) is type(option) and value == option) for option in options):
-        words = ", ".join(map(str, options))
-        raise InputError(key, f"found {value!r}", f"one of {words}", did_you_mean(value, options))
+    for option in options:
+        if value is option or (isinstance(value, type(option)) and value == option):  # numpy's text is text too
+            return option
+    words = ", ".join(map(str, options))
+    raise InputError(key, f"found {shown(value)}", f"one of {words}", did_you_mean(value, options))
+
+
+def set_checked(of: object, place: str = "", **possible: Any) -> None:
+    """Check choices among the fields of a frozen dataclass, and set each to the option that it is.
+
+    Args:
+        of: The object.
+        place: What stands before a field's name in messages.
+        possible: A `Literal` for each field.
+
+    Raises:
+        InputError: One is none of those possible.
+    """
+    for key, options in possible.items():
+        object.__setattr__(of, key, check(f"{place}{key}", getattr(of, key), options))
 
 
 def check_flag(key: str, value: object) -> None:
@@ -63,21 +93,18 @@ def check_flag(key: str, value: object) -> None:
         InputError: It is neither.
     """
     if type(value).__name__ not in ("bool", "bool_"):  # Python's and numpy's
-        raise InputError(key, f"found {value!r}", "True or False")
-
-
-def check_type(key: str, value: object, kind: type, example: str) -> None:
-    """Check that an option is an object of a class, such as `Pairing` and no strategy's bare name; None is left alone.
-
-    Raises:
-        InputError: It is something else.
-    """
-    if value is not None and not isinstance(value, kind):
-        raise InputError(key, f"found {value!r}", f"a {kind.__name__}, such as {example}")
+        raise InputError(key, f"found {shown(value)}", "True or False")
 
 
 def check_number(
-    key: str, value: object, *, least: float = 0.0, above: bool = False, whole: bool = False, finite: bool = True
+    key: str,
+    value: object,
+    *,
+    least: float = 0.0,
+    above: bool = False,
+    whole: bool = False,
+    finite: bool = True,
+    most: int | None = None,
 ) -> None:
     """Check that an option is a number of the right kind and size.
 
@@ -88,6 +115,7 @@ def check_number(
         above: Whether it must be above that.
         whole: Whether it must be a whole number.
         finite: Whether it must be finite.
+        most: The largest number possible.
 
     Raises:
         InputError: It is no number, nan, or not of this kind and size.
@@ -101,10 +129,12 @@ def check_number(
         good = (x > least if above else x >= least) and (math.isfinite(x) or not finite)
         good = good and not (whole and not isinstance(value, Integral))
         if good and math.isfinite(x) and (x > MOST_SIZE or (above and x < LEAST_SIZE)):
-            raise InputError(key, f"found {value!r}", ORDINARY)
+            raise InputError(key, f"found {shown(value)}", ORDINARY)
+        if good and most is not None and x > most:
+            raise InputError(key, f"found {shown(value)}", f"at most {most}")
     if not good:
         kind = "a whole number" if whole else "a finite number" if finite else "a number"
-        raise InputError(key, f"found {value!r}", f"{kind} {'above' if above else 'not below'} {least:g}")
+        raise InputError(key, f"found {shown(value)}", f"{kind} {'above' if above else 'not below'} {least:g}")
 
 
 def check_names(key: str, names: Iterable[str], known: Sequence[str], what: str = "parameter") -> None:
@@ -120,10 +150,10 @@ def check_names(key: str, names: Iterable[str], known: Sequence[str], what: str 
         InputError: It is one word instead of a list, or a name is not known.
     """
     if isinstance(names, str) or not isinstance(names, Iterable) or not getattr(names, "ndim", 1):
-        raise InputError(key, f"found {names!r}", "a list of names")
+        raise InputError(key, f"found {shown(names)}", "a list of names")
     for name in names:
-        if name not in known:
-            raise InputError(key, f"unknown {what} {name!r}", known_names(known), did_you_mean(name, known, NEAR))
+        if not isinstance(name, str) or name not in known:
+            raise InputError(key, f"unknown {what} {shown(name)}", known_names(known), did_you_mean(name, known, NEAR))
 
 
 NEAR = 0.87
@@ -143,7 +173,7 @@ def did_you_mean(value: object, options: Iterable[object], likeness: float = 0.6
     return f"did you mean {words[close[0]]}?" if close else ""
 
 
-def listed(key: str, names: Iterable[Any]) -> tuple[Any, ...]:
+def listed(key: str, names: Iterable[Any], expected: str = "a list of names") -> tuple[Any, ...]:
     """Names as a tuple: what can be gone through only once would be empty the second time.
 
     Raises:
@@ -154,7 +184,7 @@ def listed(key: str, names: Iterable[Any]) -> tuple[Any, ...]:
     try:
         return tuple(names)
     except TypeError:
-        raise InputError(key, f"found {names!r}", "a list of names") from None
+        raise InputError(key, f"found {shown(names)}", expected) from None
 
 
 def known_names(names: Iterable[str], limit: int = 12) -> str:
@@ -180,7 +210,7 @@ class Pairing:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check("pairing", self.strategy, Strategy)
+        object.__setattr__(self, "strategy", check("pairing", self.strategy, Strategy))
         check_number("pairing: count", self.count, above=self.strategy == "random", whole=True)
         check_number("pairing: seed", self.seed, whole=True)
 
@@ -194,7 +224,7 @@ def as_pairing(pairing: Pairing | None) -> Pairing:
     Raises:
         InputError: It is something else, such as a strategy's bare name.
     """
-    check_type("pairing", pairing, Pairing, "Pairing('chain')")
+    as_hinted("pairing", pairing, Pairing | None)
     return pairing or Pairing()
 
 
@@ -206,9 +236,9 @@ PAIR_MODELS: dict[Model, tuple[bool, bool]] = {
 """Whether a model uses distances and angles of pairs."""
 
 POSE_MODELS: dict[Model, tuple[bool, bool]] = {
-    "orientation": (True, False),
-    "position": (False, True),
     "pose": (True, True),
+    "position": (False, True),
+    "orientation": (True, False),
 }
 """Whether a model uses orientations and positions."""
 
@@ -250,14 +280,23 @@ class Options:
     max_iterations: int | None = None
 
     def __post_init__(self) -> None:
-        possible = {"model": Model, "frame": FrameKnowledge, "gauge": Gauge}
-        possible |= {"pair_errors": PairErrors, "encoder": EncoderNoise, "loss": Loss}
-        for key, values in possible.items():
-            check(key, getattr(self, key), values)
-        check_type("pairing", self.pairing, Pairing, "Pairing('chain')")
+        set_checked(self, model=Model, frame=FrameKnowledge, gauge=Gauge)
+        set_checked(self, pair_errors=PairErrors, encoder=EncoderNoise, loss=Loss)
+        as_hinted("pairing", self.pairing, Pairing)
         check_flag("estimate_noise", self.estimate_noise)
         if self.max_iterations is not None:
             check_number("max_iterations", self.max_iterations, above=True, whole=True)
+
+    @classmethod
+    def given(cls, options: Options | None, choices: dict[str, Any]) -> Options:
+        """The options given, as such or as keywords.
+
+        Raises:
+            InputError: Both were given, a keyword is not known, or its value is not one of those possible.
+        """
+        if options is not None and choices:
+            raise InputError("options", f"both options and {next(iter(choices))}=...", "one of the two")
+        return options or cls.of(**choices)
 
     @classmethod
     def of(cls, **choices: Any) -> Options:
@@ -272,7 +311,11 @@ class Options:
         if not isinstance(choices.get("prefer", ()), str):
             choices["prefer"] = listed("prefer", choices.get("prefer", ()))
         options = cls(**choices)
-        return options if prior is None else options.with_prior(prior)
+        if prior is None:
+            return options
+        if "gauge" in choices and (options.with_prior(prior) != options or prior != options.has_priors):
+            raise InputError("prior", f"found {prior} beside gauge: {options.gauge}", "gauge alone")
+        return options.with_prior(prior)
 
     def with_prior(self, prior: bool) -> Options:
         """The same with or without the tolerances as priors, what `prior` once said.

@@ -5,3 +5,12 @@ LEAST_SIZE, MOST_SIZE = 1e-30, 1e15
 
 ORDINARY = f"a number no larger than {MOST_SIZE:g}; sigmas and tolerances no less than {LEAST_SIZE:g}"
 """What is expected, for messages."""
+
+MOST_JOINTS = 200
+"""Moving joints of a robot: the work grows with their third power."""
+
+MOST_DRAWN = 1_000_000
+"""Configurations that a simulation draws."""
+
+MOST_PAIRS = 10_000_000
+"""Pairs that are formed of poses."""

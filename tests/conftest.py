@@ -10,8 +10,19 @@ import pytest
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # one worker a processor: threads of BLAS would only wait for each other
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read once, when numpy is loaded
+os.environ["PYTHONSAFEPATH"] = "1"  # subprocesses have the package that is tested, compiled once, wherever they run
 
 from fg_calib import cli
+from fg_calib.analysis import identifiability
+
+
+@pytest.hookimpl(tryfirst=True)  # before tests are chosen by their marks
+def pytest_collection_modifyitems(items):
+    """Long tests are slow ones."""
+    for item in items:
+        if item.get_closest_marker("long"):
+            item.add_marker("slow")
+
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -29,6 +40,12 @@ def data_folder():
 def example(tmp_path):
     """A copy of the bundled example's folder, to be changed at will."""
     return Path(shutil.copytree(cli.EXAMPLES / "space-robot", tmp_path / "space-robot"))
+
+
+@pytest.fixture
+def without_reasons(monkeypatch):
+    """Leave out why directions are lost: two fifths of `assess`, and no part of what repeated calibrations look at."""
+    monkeypatch.setattr(identifiability, "explain", lambda *_: ())
 
 
 class Ended(NamedTuple):

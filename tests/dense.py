@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from fg_calib.graph.noise import JOINT_NOISE
 from fg_calib.measurements import residuals
 from fg_calib.measurements.kinds import (
     Distance,
@@ -89,9 +90,9 @@ class SeriesRows:
         self.J[:, :, : at.n_columns] = J[:, :, : at.n_columns]
         for k in range(s.kind.n_nuisances):
             np.put_along_axis(self.J, at.columns[s.nuisances[:, k]][:, None, None], J[:, :, at.n_columns + k, None], 2)
-        scale = self.factors[:, None, None]
+        self.joint_factor = state.factors.get(JOINT_NOISE, 1.0)
         self.joints = self._sensitivity(lambda k, h: self._arm(self.q + h * np.eye(len(self.q[0]))[k]), len(self.q[0]))
-        self.sources = {"joints": self.joints * self.m.sigma_joint * scale}
+        self.sources = {"joints": self.joints * self.m.sigma_joint * self.joint_factor}
         if all(isinstance(part, Distance | RotationAngle) for part in parts_of(s.kind)):
             self._pairs()
         else:
@@ -118,7 +119,7 @@ class SeriesRows:
                 trace[:, i] += self.factors[i] ** 2 * np.sum(sigma[s.ends] ** 2, axis=(1, 2))
             of_poses = np.sum(poses**2, axis=(2, 3))
         for i, part in enumerate(parts_of(s.kind)):
-            trace[:, i] += 0.0 if estimated else self.factors[i] ** 2 * self._trace_of_joints(part)
+            trace[:, i] += 0.0 if estimated else self.joint_factor**2 * self._trace_of_joints(part)
         value, along = self.r + s.data, of_poses + of_joints
         across = np.maximum(trace - along, 0.0) / 2.0
         own = zero if s.formed else square

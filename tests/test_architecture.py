@@ -17,8 +17,8 @@ import fg_calib
 
 PACKAGE = Path(fg_calib.__file__).parent
 FOLDERS = (
-    *("errors", "sizes", "threads", "arrays", "options", "robot", "measurements", "job", "simulation", "files"),
-    *("graph", "analysis", "baseline", "report", "calibration", "cli"),
+    *("errors", "libraries", "arguments", "sizes", "threads", "arrays", "options", "robot", "measurements", "job"),
+    *("camera", "simulation", "files", "graph", "analysis", "baseline", "report", "calibration", "cli"),
 )
 """From the ground up: a folder (or module of the package itself) imports from those before it."""
 
@@ -92,7 +92,7 @@ def test_the_baseline_shares_nothing_with_the_graph_but_residuals():
         used |= more
     others = {other for name in used for other in imported(parse(PACKAGE / f"{name}.py"))} - used
     of_folders = {other.partition("/")[0] for other in others}
-    assert of_folders == {"errors", "options", "robot", "measurements", "threads"}
+    assert of_folders == {"errors", "arguments", "options", "robot", "measurements", "threads"}
 
 
 @EVERY_MODULE
@@ -100,6 +100,22 @@ def test_only_the_command_line_prints(name, path):
     calls = [node for node in ast.walk(parse(path)) if isinstance(node, ast.Call)]
     printing = [c for c in calls if isinstance(c.func, ast.Name) and c.func.id == "print"]
     assert name.startswith("cli/") or printing == []
+
+
+@EVERY_MODULE
+def test_no_input_can_run_code_or_reach_a_network(name, path):
+    """What `docs/security.md` says: pickles are those of numba's cache alone, YAML goes through one safe loader."""
+    calls = {ast.unparse(node.func) for node in ast.walk(parse(path)) if isinstance(node, ast.Call)}
+    assert calls & {"eval", "exec", "compile", "__import__", "os.system", "yaml.unsafe_load", "yaml.full_load"} == set()
+    assert "yaml.load" not in calls or name == "files/schema"
+    used = {alias.name.partition(".")[0] for node in ast.walk(parse(path)) if isinstance(node, ast.Import)
+            for alias in node.names}  # fmt: skip
+    used |= {
+        (node.module or "").partition(".")[0] for node in ast.walk(parse(path)) if isinstance(node, ast.ImportFrom)
+    }
+    forbidden = {"pickle", "marshal", "shelve", "subprocess", "urllib", "http", "requests", "ctypes", "multiprocessing"}
+    allowed = {"robot/cache": {"pickle"}, "files/parquet": {"subprocess"}}  # the latter starts this Python alone
+    assert used & forbidden == allowed.get(name, set())
 
 
 @EVERY_MODULE
@@ -151,18 +167,24 @@ def test_public_names_come_from_a_fresh_import():
 
 
 def test_all_that_is_imported_is_installed_with_the_package():
-    """What the tests need beside, such as yourdfpy, is not."""
+    """What the tests need beside, such as yourdfpy, is not; an extra is imported by one module."""
     project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     installed = {re.match(r"[\w-]+", line)[0] for line in project["dependencies"]}
     installed = installed - {"pyyaml"} | {"yaml", "pydantic_core"}  # as imported; pydantic brings its core
-    used = set()
-    for path in MODULES:
+    used = {}
+    for name, path in zip(NAMES, MODULES, strict=True):
         for node in ast.walk(parse(path)):
             if isinstance(node, ast.Import):
-                used |= {alias.name.partition(".")[0] for alias in node.names}
-            elif isinstance(node, ast.ImportFrom):
-                used.add(node.module.partition(".")[0])
-    assert used - sys.stdlib_module_names - {"fg_calib"} == installed
+                modules = [alias.name for alias in node.names]
+            else:
+                modules = [node.module] if isinstance(node, ast.ImportFrom) else []
+            for module in modules:
+                used.setdefault(module.partition(".")[0], set()).add(name)
+    extras = {"camera": ("opencv-python-headless", "cv2", "camera/opencv"), "ros": ("rosbags", "rosbags", "files/bag")}
+    for extra, (distribution, module, name) in extras.items():
+        assert [re.match(r"[\w-]+", line)[0] for line in project["optional-dependencies"][extra]] == [distribution]
+        assert used.pop(module) == {name}
+    assert set(used) - sys.stdlib_module_names - {"fg_calib"} == installed
 
 
 def test_the_command_line_is_there_before_the_heavy_libraries():

@@ -29,7 +29,8 @@ from fg_calib import (
     write_robot,
 )
 from fg_calib.errors import InputError
-from fg_calib.simulation.scenario import BoardViews, Errors, Placement, RandomReadings, Scenario
+from fg_calib.simulation.configurations import BoardViews, Placement, RandomReadings
+from fg_calib.simulation.scenario import Errors, Scenario
 
 ROBOT = planar_robot(tolerance={"a": 1e-3, "theta": 1e-3})
 TABLE = measure(ROBOT, 20, np.random.default_rng(0))
@@ -155,16 +156,17 @@ MISTAKES = {
     "a report's width": (lambda: format_identifiability(structure(), 0), "width: found 0, expected a whole number not "
                          "below 1"),
     "a model of the set-up": (lambda: setup(model="Pose"), "model: found 'Pose', expected one of pose, position, "
-                              "orientation, distance, rotation, distance-rotation; did you mean pose?"),
+                              "orientation, distance, rotation, distance-rotation, anchor, plane, board, pixels; "
+                              "did you mean pose?"),
     "a frame of the set-up": (lambda: setup(frame="Unknown"), "frame: found 'Unknown', expected one of known, unknown; "
                               "did you mean unknown?"),
     "a doubt that is a word": (lambda: setup(doubtful="no"), "doubtful: found 'no', expected True or False"),
     "names that are nothing": (lambda: problem(prefer=None), "prefer: found None, expected a list of names"),
     "names that are a number": (lambda: structure(prefer=3), "prefer: found 3, expected a list of names"),
-    "pairs by numpy's halves": (lambda: Pairing("random", np.float32(2)), "pairing: count: found np.float32(2.0), "
+    "pairs by numpy's halves": (lambda: Pairing("random", np.float32(2)), "pairing: count: found 2.0, "
                                 "expected a whole number above 0"),
-    "more noise than a float holds": (lambda: Noise(10**400), f"noise: position: found {10**400}, expected a finite "
-                                      "number not below 0"),
+    "more noise than a float holds": (lambda: Noise(10**400), f"noise: position: found 1{'0' * 47}...000000..., "
+                                      "expected a finite number not below 0"),
     "noise by axis": (lambda: Noise((1e-3, 1e-3, 2e-3)), "noise: position: found (0.001, 0.001, 0.002), expected a "
                       "finite number not below 0"),
 }  # fmt: skip

@@ -13,6 +13,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from fg_calib.files.job import read_job
+from fg_calib.robot.kinematics import SPAN
 from fg_calib.threads import one_blas_thread, single_threaded
 
 EVERYTHING = """
@@ -31,15 +32,34 @@ def hexadecimal(found):
     return found.hex() if isinstance(found, float) else found
 
 job = fg.read_job(sys.argv[1])
+m = job.measurements
+many = dataclasses.replace(job, measurements=dataclasses.replace(m, test=np.zeros(len(m.ids), dtype=bool)))
 found = {}
 for name, change in {
     "star": {"pairing": fg.Pairing("star")},
     "all": {"pairing": fg.Pairing("all")},
     "random, kept": {"pairing": fg.Pairing("random", 400), "gauge": "keep"},
     "poses": {"model": "pose", "frame": "unknown", "encoder": "estimated"},
+    "readings of pairs": {"encoder": "estimated"},
+    "independent": {"pair_errors": "independent", "pairing": fg.Pairing("all")},
+    "independent, of many": {"pair_errors": "independent", "pairing": fg.Pairing("all")},
+    **{loss: {"loss": loss} for loss in ("huber", "cauchy", "geman-mcclure", "gnc")},
 }.items():
-    solution = fg.solve(fg.problem_of(job, **change))
+    solution = fg.solve(fg.problem_of(many if "many" in name else job, **change))
     found[name] = fg.result_document(solution, fg.assess(solution), {})
+half, given = len(m.ids) // 2, {"sigma_joint": 1e-4}
+points = fg.Measurements.from_arrays(m.readings[:60], group=[f"g{i % 6}" for i in range(60)], sigma_point=1.0, **given)
+first = {"position": m.position[:half], "sigma_position": 1e-3}
+last = {"position": m.position[half:], "quaternion": np.tile([0, 0, 0, 1.0], (len(m.ids) - half, 1))}
+tables = [
+    fg.Table(fg.Measurements.from_arrays(m.readings[:half], **first, **given), "position", frame="unknown"),
+    fg.Table(
+        fg.Measurements.from_arrays(m.readings[half:], sigma_position=1e-3, sigma_orientation=9.0, **last, **given),
+        "distance-rotation",
+    ),
+]
+for name, given in {"touches": fg.Table(points, "distance"), "several tables": tables}.items():
+    found[name] = fg.calibrate(job.robot, given).result.document()
 noise = fg.estimate_noise(fg.problem_of(job, pairing=fg.Pairing("chain")))
 found["noise"] = [noise.cost, *noise.parameters.tolist()]
 all_pairs = {"model": job.options.model, "pairing": fg.Pairing("all")}
@@ -59,25 +79,53 @@ print(json.dumps(hexadecimal(found)))
 """
 
 
-def everything(job, threads, processors):
+LIMITS = ("OPENBLAS", "OMP", "MKL", "NUMBA")
+
+
+def everything(job, threads, processors, seed="0"):
     """What every public computation finds, in a process of its own."""
-    limits = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), threads)
+    limits = {f"{library}_NUM_THREADS": threads for library in LIMITS}
+    limits |= {"POLARS_MAX_THREADS": threads, "PYTHONHASHSEED": seed}
     ended = subprocess.run([sys.executable, "-c", EVERYTHING, job, processors], capture_output=True, text=True,
                            env=os.environ | limits, check=False)  # fmt: skip
     assert ended.returncode == 0, ended.stderr
     return json.loads(ended.stdout)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_bit_is_the_same_on_one_thread_and_on_several(example):
-    """With joint noise, so that all pairs share errors: the dense algebra that BLAS would spread over its threads."""
-    job = example / "calibration.yaml"
+    """With joint noise, so that all pairs share errors: the dense algebra that BLAS would spread over its threads.
+
+    All pairs of 162 poses, where they count as independent, are more than one task of the pool.
+    """
+    job, table = example / "calibration.yaml", example / "poses.csv"
+    table.write_text("".join(table.read_text().splitlines(keepends=True)[:163]))
     job.write_text(re.sub("joint: [0-9.]+", "joint: 0.005", job.read_text()))
-    assert np.all(read_job(job).measurements.sigma_joint > 0.0)
+    m = read_job(job).measurements
+    assert np.all(m.sigma_joint > 0.0)
+    assert (~m.test).sum() == 52
+    assert len(m.ids) * (len(m.ids) - 1) // 2 > SPAN
     one = everything(job, "1", "1")
-    for threads, processors in (("2", "all"), ("7", "all")):
-        several = everything(job, threads, processors)
-        assert {name for name in one if one[name] != several[name]} == set(), (threads, processors)
+    assert len(one) > 15
+    for other in (("2", "all", "1"), ("7", "all", "random")):  # more threads, other hashes
+        found = everything(job, *other)
+        assert {name for name in one if one[name] != found[name]} == set(), other
+
+
+@pytest.mark.slow
+def test_every_byte_of_the_files_is_the_same_again(example):
+    """But for the seconds that the solver took."""
+    written = []
+    for threads, seed in (("1", "0"), ("4", "1"), ("2", "random")):
+        limits = {f"{library}_NUM_THREADS": threads for library in LIMITS}
+        limits |= {"POLARS_MAX_THREADS": threads, "PYTHONHASHSEED": seed}
+        command = [sys.executable, "-m", "fg_calib.cli", "calibrate", "calibration.yaml", "--out", f"out{len(written)}"]
+        subprocess.run(command, cwd=example, check=True, capture_output=True, env=os.environ | limits)
+        files = {file.name: file.read_bytes() for file in (example / command[-1]).iterdir()}
+        files["result.json"] = re.sub(rb'"seconds": [0-9.e-]+', b'"seconds": 0', files["result.json"])
+        written.append(files)
+    assert len(written[0]) == 3
+    assert written[0] == written[1] == written[2]
 
 
 def blas_threads():

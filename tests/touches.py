@@ -33,6 +33,25 @@ def reach(robot, targets, rng):
     raise AssertionError("points out of reach")
 
 
+def reach_faces(robot, normals, heights, rng):
+    """Readings that bring the tool point to `n . p = height`, from random ones: the shortest Newton steps."""
+    q = np.zeros((len(normals), robot.n_joints))
+    left = np.arange(len(normals))
+    for _ in range(50):
+        x = rng.uniform(-2.0, 2.0, (len(left), robot.n_joints))
+        for _ in range(30):
+            at = pose(robot, x)
+            off = heights[left] - np.einsum("ni,ni->n", normals[left], at.position)
+            slope = np.einsum("ni,nij->nj", normals[left], at.jacobian[:, 3:, -robot.n_joints :])
+            step = slope * (off / np.maximum(np.sum(slope**2, axis=1), 1e-6))[:, None]
+            x = x + np.clip(step, -0.5, 0.5)
+        q[left] = x
+        left = left[np.abs(np.einsum("ni,ni->n", normals[left], pose(robot, x).position) - heights[left]) > 1e-11]
+        if not len(left):
+            return q
+    raise AssertionError("faces out of reach")
+
+
 def corners(robot, n, rng):
     """Points that the nominal arm reaches far from its limits of reach, some decimetres from each other."""
     return pose(robot, 0.4 + 0.15 * rng.normal(size=(n, robot.n_joints))).position

@@ -141,7 +141,7 @@ def build_case(n: int, seed: int) -> Case:
 
 def factor_of(block: Block, variables: Variables) -> gtsam.NoiseModelFactor:
     """The pairs as one factor."""
-    return row_factor(RowSet((Part(block, 0, np.zeros((block.n, 0), dtype=np.int64)),)), variables)
+    return row_factor(RowSet((Part(block, 0, 0, np.zeros((block.n, 0), dtype=np.int64)),)), variables)
 
 
 def tuned_panel(elements: Floats, cs: Floats, measured: Floats) -> Floats:

@@ -34,11 +34,13 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from fg_calib.analysis.accuracy import without_rigid_motion
-from fg_calib.errors import InputError
-from fg_calib.graph.build import predicted_problem
+from fg_calib.arguments import checked
+from fg_calib.errors import InputError, shown
+from fg_calib.graph.build import predicted_problem, true_problem
 from fg_calib.graph.information import correlation, named_triangle
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.options import FrameKnowledge, Model, PairErrors, Pairing, check_flag, check_names
+from fg_calib.measurements.series import Table
+from fg_calib.options import FrameKnowledge, Model, Options, PairErrors, Pairing, check, check_flag, check_names
 from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
 from fg_calib.robot.model import Robot
 from fg_calib.threads import single_threaded
@@ -91,6 +93,7 @@ class Bound:
     claimed: Floats
     rank: int
 
+    @checked
     @single_threaded
     def position(self, readings: Floats, *, fitted: bool = False, claimed: bool = False) -> PositionBound:
         """The bound on the tool point at joint readings.
@@ -125,12 +128,13 @@ def _normal(n: int) -> Floats:
     return figures
 
 
+@checked
 @single_threaded
 def cramer_rao(
     robot: Robot,
-    measurements: Measurements,
+    measurements: Measurements | Table | Sequence[Table],
     *,
-    model: Model,
+    model: Model | None = None,
     pairing: Pairing | None = None,
     frame: FrameKnowledge = "known",
     prior: bool = True,
@@ -139,29 +143,45 @@ def cramer_rao(
 ) -> Bound:
     """The Cramér-Rao bound of a robot's parameters from what could be measured at some configurations.
 
-    The measurements are predicted without noise, at the true parameters; only the readings of train rows and their
-    sigmas are used.
+    Of measurements only the readings of train rows, their sigmas and names are used: what a model would measure there
+    is predicted without noise, at the true parameters. Tables are used as they were measured or simulated: the arm is
+    where the true parameters have it, and what else is unknown (frames, targets, anchors, planes, boards) is where
+    their rows then put it.
 
     Args:
         robot: The true robot. The parameters that may be wrong are those it lets be estimated; their tolerances are
             the sigmas of true minus nominal values, and of the priors.
-        measurements: Readings and sigmas.
-        model: Which measurements take part.
-        pairing: How pairs are formed; a star if None.
-        frame: `unknown` estimates world_T_base with the parameters; of no meaning for models of pairs.
+        measurements: Readings and sigmas; or tables, such as those of a simulation.
+        model: Which measurements take part; each table has its own.
+        pairing: How pairs are formed, a star if None; each table has its own.
+        frame: `unknown` estimates world_T_base with the parameters; each table has its own. Of no meaning for models of
+            pairs.
         prior: Whether the tolerances are priors.
         kept: The parameters that are estimated, all if None; the others stay at nominal and keep their errors.
             Directions that nothing determines are left where they are, by minimum norm, metres beside radians.
         pair_errors: `shared`: the exact noise of pairs; `independent`: pairs are weighted as if independent.
 
     Raises:
-        InputError: An unknown parameter, or one without tolerance whose error enters the estimate's.
+        InputError: An unknown parameter, or one without tolerance whose error enters the estimate's; a choice that
+            tables make themselves.
+        ProblemError: A table lacks what its model needs.
     """
     names = tuple(p.name for p in robot.parameters if p.estimated)
     check_names("kept", () if kept is None else kept, names, "or fixed parameter")
     check_flag("prior", prior)
     k = np.array([kept is None or name in kept for name in names])
-    problem = predicted_problem(robot, measurements, model, frame=frame, pairing=pairing, pair_errors=pair_errors)
+    if isinstance(measurements, Measurements):
+        problem = predicted_problem(
+            *(robot, measurements, check("model", model, Model)),
+            frame=frame,
+            pairing=pairing,
+            pair_errors=pair_errors,
+        )
+    else:
+        for key, given, default in (("model", model, None), ("pairing", pairing, None), ("frame", frame, "known")):
+            if given is not default and given != default:
+                raise InputError(key, f"found {shown(given)} with tables", "none: each table has its own")
+        problem = true_problem(robot, measurements, Options("pose", gauge="none", pair_errors=pair_errors))
     J = named_triangle(problem, problem.start)  # (m, n_names)
     sigma = np.array([np.inf if p.tolerance is None else p.tolerance for p in robot.parameters if p.estimated])
     gain, claimed, rank = _linear_estimate(J, np.diag(1.0 / sigma) if prior else np.zeros((0, len(names))), k)

@@ -94,10 +94,11 @@ class TangentCovariance(FrozenArrays):
     def derivative(self, function: Callable[[Robot], ArrayLike]) -> Floats:
         """Derivative of a function of the robot in the columns, by central differences, shape (m, n_columns)."""
         v, steps = self.variables, 1e-2 * np.diag(self.variables.scales)
+        robot = v.robot.with_values(self.parameters[v.robot_span])
 
         def at(step: Floats) -> Floats:
-            robot = v.robot.with_values(v.stepped(self.parameters, step)[v.robot_span])
-            return np.ravel(np.asarray(function(robot), dtype=np.float64))
+            moved = robot.with_values(v.stepped(self.parameters, step)[v.robot_span])
+            return np.ravel(np.asarray(function(moved), dtype=np.float64))
 
         columns = [(at(h) - at(-h)) / (2.0 * h.sum()) for h in steps[: v.n_robot_columns]]
         of_frame = [np.zeros_like(at(np.zeros(v.n_columns)))] * (v.n_columns - v.n_robot_columns)

@@ -8,27 +8,38 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.analysis.changes import Change, find_change
 from fg_calib.analysis.chi_square import ChiSquare
 from fg_calib.analysis.conventions import MissingMotion
 from fg_calib.analysis.corrections import PriorFit
 from fg_calib.analysis.covariance import Spread
 from fg_calib.analysis.goodness import OUTLIER_WEIGHT, Goodness
-from fg_calib.analysis.mistakes import SetupCheck, check_problem
+from fg_calib.analysis.mistakes import SetupCheck
+from fg_calib.analysis.noise_components import has_joint_noise
+from fg_calib.analysis.offsets import forgotten_offsets
 from fg_calib.analysis.residual_table import ResidualTable
-from fg_calib.analysis.structure import probability_of_noise
+from fg_calib.analysis.structure import excess_left, probability_of_noise
+from fg_calib.analysis.table_setups import check_problem
 from fg_calib.analysis.verdict import (
+    LIKE_NOISE,
     Statement,
     of_bent,
+    of_change,
     of_chi2,
     of_estimated_noise,
     of_evaluation,
     of_folds,
+    of_kept_noise,
+    of_offset,
     of_priors,
+    of_structure,
     of_test,
 )
-from fg_calib.graph.noise import PairNoise
-from fg_calib.graph.problem import noises_at
+from fg_calib.graph.noise import JOINT_NOISE, PairNoise
+from fg_calib.graph.problem import at_parameters, noises_at
 from fg_calib.graph.solver import Solution
+from fg_calib.measurements.kinds import AnchorContact
+from fg_calib.robot.kinematics import forward, precompute_trig
 
 Floats = NDArray[np.float64]
 
@@ -38,14 +49,16 @@ MOST_OUTLIERS = 0.5
 BENT = 1.0
 """Sigma by which what the parameters may still be off bends a row that is not linear enough."""
 
+EXPLAINED = 0.8
+"""Part of the excess of chi-square left with what a convention has no parameter for, up to which that is the cause.
+
+Where the fit went far astray what is linear of it is but a part: up to 0.7 were left of textbook tables."""
+
 MOST_ESTIMATED = 2.0
 """Noise seen over noise stated above which it is more likely that something is not modelled."""
 
-_WITH_FIGURES = ("distance", "angle", "orientation", "position")
-"""Kinds of noise whose motions are seen in what was measured."""
-
-LIKE_NOISE = 1e-3
-"""Probability below which residuals follow the arm more than noise does."""
+_WITH_MOTION = ("distance", "angle", "orientation", "position")
+"""Kinds of noise whose motions are told from what the arm predicts."""
 
 
 @dataclass(frozen=True)
@@ -75,12 +88,16 @@ class Verdict:
         setup: What residuals before the calibration say of its set-up.
         noise_like: Probability that noise alone follows the arm as much as the residuals do; None where that was not
             asked, because they are as small as stated, or cannot be told.
+        reservations: Those of the cautions that say that sigmas are too small.
+        change: What moved while a table was measured; None if nothing did.
     """
 
     findings: tuple[str, ...]
     cautions: tuple[str, ...]
     setup: SetupCheck = field(default_factory=SetupCheck)
     noise_like: float | None = None
+    reservations: tuple[str, ...] = ()
+    change: Change | None = None
 
 
 def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[MissingMotion]) -> Verdict:
@@ -95,28 +112,41 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
     problem, kinds = solution.problem, fit.goodness.kinds
     estimated_noise = solution.estimated_noise is not None
     of_priors_alone = fit.priors is not None and fit.chi2.too_large and not _too_large(fit)
+    too_large = {kind.verdict for kind in kinds} & {"too small", "both", "many"}
+    asked = not problem.evaluated and (too_large or estimated_noise)
+    may_change = asked or (any(kind.verdict == "outliers" for kind in kinds) and not problem.evaluated)
+    change = find_change(solution) if may_change else None
+    gross = fit.goodness.gross if fit.goodness.spoilt and change is None else None
+    noise_like = probability_of_noise(solution) if asked and change is None else None
+    follow = noise_like is not None and noise_like < LIKE_NOISE
     statements = [
         *_of_solver(solution),
-        *(() if of_priors_alone else of_chi2(fit.chi2, problem.evaluated)),
+        *of_change(change, problem.end_names),
+        *(() if of_priors_alone else of_chi2(fit.chi2, problem.evaluated, follow=follow, gross=gross)),
         *of_evaluation(problem.evaluated, estimated_noise),
+        *_of_kept_noise(solution, fit.goodness),
         *of_test(fit.goodness.test, fit.chi2.ratio, problem.end_names),
         *of_priors(fit.priors),
         *_of_bent_rows(solution, spread, fit.table, fit.goodness),
         *_of_noise(solution, fit.table, fit.goodness),
     ]
-    doubts = tuple(s.text for s in statements if s.finding)
-    cautions = tuple(s.text for s in statements if not s.finding)
-    too_large = {kind.verdict for kind in kinds} & {"too small", "both"}
-    asked = not problem.evaluated and (too_large or (missing and estimated_noise))
-    noise_like = probability_of_noise(solution) if asked else None
-    follow = noise_like is not None and noise_like < LIKE_NOISE
-    setup = SetupCheck()
+    setup, structure = SetupCheck(), of_structure(noise_like)
+    doubts = any(s.finding for s in (*statements, *structure))
     if not problem.evaluated:
-        doubtful = bool(doubts) or max((kind.factor for kind in kinds), default=1.0) > MOST_ESTIMATED
+        doubtful = doubts or max((kind.factor for kind in kinds), default=1.0) > MOST_ESTIMATED
         setup = check_problem(problem, solution.before, doubtful=doubtful)
+    if not (setup.explanations or gross is not None):
+        labels = problem.data.labels
+        statements += [s for found in forgotten_offsets(solution) for s in of_offset(found, labels, fit.chi2.too_large)]
     fits = not (doubts or estimated_noise)
-    first = _of_model(setup, missing, fits=fits, high=fit.chi2.too_large or follow)
-    return Verdict((*first[0], *doubts), (*first[1], *cautions), setup, noise_like)
+    high = gross is None and (fit.chi2.too_large or follow)
+    certain = high and bool(missing) and not setup.explanations and excess_left(solution, missing) <= EXPLAINED
+    findings, cautions = _of_model(setup, missing, fits=fits, high=high, certain=certain)
+    statements += [] if setup.explanations else structure  # of a wrong set-up they are the consequence
+    findings += [s.text for s in statements if s.finding]
+    cautions += [s.text for s in statements if not s.finding]
+    reservations = tuple(s.text for s in statements if s.reservation)
+    return Verdict(tuple(findings), tuple(cautions), setup, noise_like, reservations, change)
 
 
 def _too_large(fit: Fit) -> bool:
@@ -125,7 +155,7 @@ def _too_large(fit: Fit) -> bool:
         return fit.chi2.too_large
     rest, dof = fit.chi2.value - fit.priors.chi2, fit.chi2.dof - len(fit.priors.names)
     return rest > max(fit.chi2.bounds[1] * dof, 0.0) or any(
-        kind.verdict in ("too small", "both") for kind in fit.goodness.kinds
+        kind.verdict in ("too small", "both", "many") for kind in fit.goodness.kinds
     )
 
 
@@ -156,13 +186,47 @@ def _of_noise(solution: Solution, table: ResidualTable, goodness: Goodness) -> l
     """Whether noise that was estimated is small beside the motions it was estimated of."""
     found: list[Statement] = []
     for fit in goodness.kinds:
-        if (fit.table, fit.kind) in (solution.estimated_noise or ()) and fit.kind in _WITH_FIGURES:
-            rows = table.used & (table.group == table.groups.index((fit.table, fit.kind)))
-            predicted = (table.measured + table.after)[rows]
-            about = 0.0 if fit.kind in ("distance", "angle") else float(np.mean(predicted))
-            motion = 1.0 if fit.kind == "orientation" else float(np.sqrt(np.mean((predicted - about) ** 2)))
+        if (fit.table, fit.kind) in (solution.estimated_noise or ()) and fit.kind in _WITH_MOTION:
+            motion = 1.0 if fit.kind == "orientation" else _motion(solution, table, fit.table, fit.kind)
             found += of_estimated_noise(fit.kind, fit.factor * fit.stated_sigma_rms, max(motion, 1e-300))
     return found
+
+
+def _motion(solution: Solution, table: ResidualTable, number: int, kind: str) -> float:
+    """How far the arm says that what was measured of a kind moved, by the series that moved most.
+
+    Lengths and angles between two ends move by as much as they are. What has one end moves as the tool point does along
+    an axis, also where figures do not: on a face, about an anchor, before a board; in contact as the anchors are apart.
+    At a single one the tool point stays, and the arm moves by its reach.
+    """
+    problem, motions = solution.problem, [0.0]
+    at = at_parameters(problem, solution.parameters)
+    for k, s in enumerate(problem.data.series):
+        if s.table != number or all(name.partition(".")[0] != kind for name in s.kind.names):
+            continue
+        if s.kind.ends == 1:
+            trig = precompute_trig(problem.robot, problem.data.tables[number].measurements.readings)
+            there = forward(at.chains[number].without_columns(), trig, s.ends[s.train, 0]).position
+            if isinstance(s.kind, AnchorContact):
+                there = at.coordinates[s.nuisances[s.train]]
+            stays = not np.ptp(there, axis=0).any()
+            motions.append(problem.robot.reach if stays else float(np.sqrt(np.mean(np.var(there, axis=0)))))
+        else:
+            group = table.groups.index((number, kind))
+            predicted = (table.measured + table.after)[table.used & (table.series == k) & (table.group == group)]
+            motions.append(float(np.sqrt(np.mean(predicted**2))) if len(predicted) else 0.0)
+    return max(motions)
+
+
+def _of_kept_noise(solution: Solution, goodness: Goodness) -> list[Statement]:
+    """Noise that was to be estimated and stayed as stated."""
+    estimated = solution.estimated_noise
+    if estimated is None:
+        return []
+    kept = [kind.kind for kind in goodness.kinds if (kind.table, kind.kind) not in estimated]
+    if has_joint_noise(solution.problem) and JOINT_NOISE not in estimated:
+        kept.append("the joint readings")
+    return of_kept_noise(list(dict.fromkeys(kept)), not estimated)
 
 
 def _of_solver(solution: Solution) -> list[Statement]:
@@ -184,7 +248,7 @@ def _of_solver(solution: Solution) -> list[Statement]:
 
 
 def _of_model(
-    setup: SetupCheck, missing: Sequence[MissingMotion], *, fits: bool, high: bool
+    setup: SetupCheck, missing: Sequence[MissingMotion], *, fits: bool, high: bool, certain: bool
 ) -> tuple[list[str], list[str]]:
     """Findings and cautions that come before all others: the set-up or the model is wrong, so no figure can be right.
 
@@ -193,15 +257,22 @@ def _of_model(
         missing: What the robot's convention has no parameter for.
         fits: Whether nothing speaks against the calibration although the noise was as stated.
         high: Whether the residuals are larger than the noise, or follow the arm.
+        certain: Whether they are because of what the convention has no parameter for.
     """
     findings: list[str] = []
     cautions: list[str] = []
-    if setup.explanations:
-        (cautions if fits else findings).append(str(setup))
-    elif setup.far and high:
-        findings.append(str(setup))
+    for check in (setup, *setup.others):
+        if check.explanations:
+            (cautions if fits else findings).append(str(check))
+        elif check.far and high:
+            findings.append(str(check))
+    if high and setup.unchecked:
+        what = (
+            f"the set-up of {', '.join(setup.unchecked)} was not checked for the usual mistakes (units, signs, columns)"
+        )
+        cautions.append(f"{what}: too few rows to place what is unknown, or kinds of measurement of your own")
     for motion in missing:
-        (findings if high and not setup.explanations else cautions).append(str(motion))
+        (findings if certain else cautions).append(str(motion))
     return findings, cautions
 
 

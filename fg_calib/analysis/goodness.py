@@ -16,17 +16,14 @@ that the mean is that of all rows, shared among the kinds by leverage, and there
 
 A row with robust weight w counts as w rows. There is no p-value where weights or noise came from the residuals.
 
-Rows that were predicted, never fitted, miss by their own noise and by what the estimate is off: `A = C + J Cov J^T`.
+Rows that were predicted, never fitted, miss by their own noise and by what the estimate is off: `A = C + J Cov J^T`,
+less what both have from errors of configurations that fitted rows took part in as well (`Errors.of_prediction`).
 Each kind is judged by the sum of its studentised squares. All of them together are judged by `r^T A^-1 r`, which
 sees what misses where the arm is well known although it may be off by more elsewhere. Where the noise was estimated,
 this is a ratio of two variances (F); with a robust loss measurements that it would call outliers count for nothing.
 
 A point that test rows alone touched is taken for the mean of what touched it, at B e with e the rows without it. With N
 the derivatives of all rows in such points, `N B e` is what this adds to them, to derivatives and errors alike.
-
-Note:
-    Predicted pairs that share the joint noise of a configuration with fitted ones count as independent of these: their
-    p-values are then somewhat too large.
 
 References:
     Satterthwaite (1946), An approximate distribution of estimates of variance components. Biometrics Bulletin 2(6).
@@ -35,7 +32,8 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -45,9 +43,12 @@ from numpy.typing import NDArray
 from scipy import special
 
 from fg_calib.analysis.covariance import Spread
+from fg_calib.analysis.gross_errors import MOST_FEW, find_gross_errors
 from fg_calib.analysis.residual_covariance import Dense, Errors, LowRank, Nuisances
 from fg_calib.analysis.residual_table import ResidualTable
 from fg_calib.arrays import Brief
+from fg_calib.graph.factors import prior_rows
+from fg_calib.graph.noise import JOINT_NOISE, NoiseName
 from fg_calib.graph.problem import noises_at
 from fg_calib.graph.robust import tuning, weight
 from fg_calib.graph.solver import Solution
@@ -80,6 +81,12 @@ FLAGS = ("", "suspect", "outlier", "excluded", "test")
 LEAST_VARIANCE = 1e-6
 """Variance of a residual, over that of its noise, below which the row is met whatever was measured."""
 
+MAX_TOGETHER = 200
+"""Rows of one configuration up to which they may be one gross error."""
+
+LEAST_GAIN = 0.3
+"""Part of the excess of chi-square that is left at most without outliers, where more than these is wrong."""
+
 _CHUNK = 4 * SPAN
 
 _MEDIAN = 0.6744897501960817
@@ -92,10 +99,10 @@ class KindFit:
 
     Attributes:
         kind: `distance`, `angle`, `orientation`, `position`, `point`, or that of a kind of one's own.
-        unit: `m` or `rad`.
+        unit: `m`, `rad` or `px`.
         n: Number of scalar rows.
         stated_sigma_rms: Root of the mean square of their sigmas as stated.
-        factor: What they were multiplied by: 1 unless the noise was estimated.
+        factor: What they were multiplied by, all noise together: 1 unless the noise was estimated.
         seen_over_stated: Noise seen over noise stated; nan where the fit leaves less than one degree of freedom.
         chi2: Sum of squared residuals over sigma, as it was taken.
         expected: Its mean, were the noise as taken: the rows' redundancy.
@@ -104,6 +111,11 @@ class KindFit:
         largest: The largest |studentised residual|; nan where it is not known.
         degrees: Degrees of freedom of chi-square.
         table: Number of its table.
+        n_beyond: Rows with a |studentised residual| that none of a clean table has (`suspect_level`).
+        spoilt: Whether rows of this kind are among the gross errors themselves.
+        rest: The same of the rows without gross errors; None where there are none, or not few.
+        own_sigma_rms: Root of the mean square of the sigmas as stated without the joints' noise; nan if not asked for.
+        own_factor: What these were multiplied by.
     """
 
     kind: str
@@ -119,6 +131,11 @@ class KindFit:
     largest: float
     degrees: float
     table: int = 0
+    n_beyond: int = 0
+    spoilt: bool = False
+    rest: KindFit | None = None
+    own_sigma_rms: float = np.nan
+    own_factor: float = 1.0
 
     @property
     def verdict(self) -> str:
@@ -135,9 +152,20 @@ class KindFit:
         if ratio < 1.0:
             return "too large"
         share = (self.typical**2 - 1.0) / (ratio**2 - 1.0)  # of the excess that rows have in common
-        if not self.largest > suspect_level(self.n) * np.sqrt(max(self.typical, 1.0) * ratio):
-            return "too small"  # the median of few rows varies: none of them is far from the others
-        return "outliers" if share < 0.35 else "too small" if share > 0.65 else "both"
+        if self.rest is not None and (without := self._without_gross_errors(self.rest)):
+            return without
+        far = self.largest > suspect_level(self.n) * np.sqrt(max(self.typical, 1.0) * ratio)
+        if share > 0.65 or not far:
+            return "too small"  # the median of few rows varies: perhaps none of them is far from the others
+        many = self.n_beyond > MOST_FEW * self.n
+        return "many" if many else "outliers" if share < 0.35 else "both"
+
+    def _without_gross_errors(self, rest: KindFit) -> str:
+        """What is said where gross errors are known; empty if they are not what is wrong."""
+        if rest.verdict in ("as stated", "too large"):
+            return "outliers" if self.spoilt else "others"
+        gain = (self.seen_over_stated**2 - 1.0) * LEAST_GAIN
+        return "both" if rest.seen_over_stated**2 - 1.0 < gain else ""
 
 
 VERDICTS = {
@@ -145,7 +173,9 @@ VERDICTS = {
     "too large": "noise stated too large",
     "too small": "most rows too large: noise stated too small, or effects not modelled",
     "outliers": "few rows far too large: outliers",
+    "others": "as stated once the outliers are left out",
     "both": "noise stated too small or effects not modelled, and outliers",
+    "many": "many rows far too large: something changed between them, or effects not modelled",
     "unknown": "too few rows to tell",
 }
 """What a fit by kind means, in words."""
@@ -155,7 +185,9 @@ PREDICTION_VERDICTS = VERDICTS | {
     "too large": "smaller than expected",
     "too small": "most rows too large",
     "outliers": "few rows far too large",
+    "others": "too large because of outliers of another kind",
     "both": "many rows too large, and few far too large",
+    "many": "many rows far too large",
 }
 """The same of predicted rows."""
 
@@ -175,6 +207,21 @@ class SuspectConfiguration:
     n: int
     chi2: float
     expected: float
+
+
+@dataclass(frozen=True)
+class GrossErrors:
+    """The few measurements that spoil a fit.
+
+    Attributes:
+        n: How many there are.
+        names: Of their configurations and groups, or of the pairs' two, the worst first.
+        ratio: Reduced chi-square without them.
+    """
+
+    n: int
+    names: tuple[str, ...]
+    ratio: float
 
 
 class OutlierCounts(NamedTuple):
@@ -230,6 +277,7 @@ class Goodness(Brief):
         suspects: Fitted rows that are suspect or outliers, the largest |studentised| first.
         configurations: Suspect configurations among the fitted rows, the worst first.
         test: The predicted rows; None without any that can be judged.
+        gross: The few gross errors that spoil the fit; None if there are none, or it cannot be told.
     """
 
     kinds: tuple[KindFit, ...]
@@ -241,6 +289,13 @@ class Goodness(Brief):
     suspects: Integers
     configurations: tuple[SuspectConfiguration, ...]
     test: PredictedFit | None
+    gross: GrossErrors | None = None
+
+    @property
+    def spoilt(self) -> bool:
+        """Whether a few gross errors are all that is wrong with the fit."""
+        fine = ("as stated", "too large", "outliers", "others", "unknown")
+        return self.gross is not None and all(kind.verdict in fine for kind in self.kinds)
 
 
 def suspect_level(n: int) -> float:
@@ -282,6 +337,17 @@ def judge_fit(solution: Solution, spread: Spread, table: ResidualTable) -> Goodn
         configurations=rows.fitted.configurations(),
         test=rows.predicted_fit(worst_first(suspicious & (flag == FLAGS.index("test")))),
     )
+
+
+def gross_errors(solution: Solution, spread: Spread, table: ResidualTable) -> Booleans | None:
+    """Rows of the table that spoil the fit, few of it, shape (n,); None if there are none, or it cannot be told.
+
+    Args:
+        solution: The solution, or parameters near which the problem is linear.
+        spread: The covariance there.
+        table: The residuals there.
+    """
+    return _Rows(solution, spread, table).gross_errors()
 
 
 def kind_fits(solution: Solution, spread: Spread, table: ResidualTable) -> tuple[KindFit, ...]:
@@ -400,9 +466,10 @@ class _Rows:
         all_kept = self._read(keep)
         w, q = self.weight, self.leverage
         variance = 1.0 + q * (1.0 - 2.0 * np.where(table.used, w, 0.0))
-        covariance = None
+        covariance, self._errors = None, None
         if keep[fitted].all():
-            covariance = self._residual_covariance(fitted, all_kept.at(np.searchsorted(of_kept, fitted)))
+            self._errors = all_kept.at(np.searchsorted(of_kept, fitted))
+            covariance = self._residual_covariance(fitted, self._errors)
         if isinstance(covariance, Dense):
             variance[fitted] = covariance.diagonal
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -424,6 +491,43 @@ class _Rows:
         known &= part.covariance is not None or not self._shared
         found = (self._kind(part, code, float(excess[code]), known) for code in groups)
         return tuple(fit for fit in found if fit is not None)
+
+    def gross_errors(self) -> Booleans | None:
+        """Rows of the table that spoil the fit, few of it; None if there are none, or it cannot be told."""
+        problem, rows = self._problem, self.fitted.rows
+        if self._robust or not self._carried or self._errors is None:
+            return None
+        unknowns = self._spread.rank + self._errors.own.shape[1]
+        dof = problem.n_independent + problem.n_priors + problem.n_added - unknowns
+        z = self._table.after[rows] / self._table.sigma[rows]
+        found = find_gross_errors(
+            z,
+            self._errors,
+            self._spread.tangent,
+            self._units(),
+            dof,
+            prior_rows(problem.variables, self._solution.parameters),
+        )
+        if found is None:
+            return None
+        out = np.zeros(self._table.n, dtype=np.bool_)
+        out[rows[found]] = True
+        return out
+
+    def _units(self) -> list[Integers]:
+        """Places among the fitted rows of what may be one gross error: a measurement, all of one configuration."""
+        rows = self.fitted.rows
+        _, of = np.unique(self._measurement(rows), return_inverse=True)
+        order = np.argsort(of, kind="stable")
+        units = np.split(order, np.flatnonzero(np.diff(of[order])) + 1)
+        ends = np.concatenate([self._table.a[rows], self._table.b[rows]])
+        place = np.tile(np.arange(len(rows)), 2)[ends >= 0]
+        ends = ends[ends >= 0]
+        order = np.argsort(ends, kind="stable")
+        of_ends = np.split(place[order], np.flatnonzero(np.diff(ends[order])) + 1)
+        most = min(MAX_TOGETHER, MOST_FEW * len(rows))
+        several = [those for those in of_ends if len(those) <= most and len(np.unique(of[those])) > 1]
+        return [*units, *(np.unique(those) for those in several)]
 
     def predicted_fit(self, suspects: Integers) -> PredictedFit | None:
         """The fit of the predicted rows; None without any that can be judged.
@@ -482,8 +586,9 @@ class _Rows:
             return None
         chi2, expected = float(np.sum(part.squares[chosen])), float(np.sum(part.means[chosen])) - excess
         rows, (table, family) = part.rows[chosen], self._table.groups[code]
-        factor = self._problem.state.factors.get((table, family), 1.0)
+        factor = self._factor(rows, (table, family))
         enough = expected >= 1.0
+        size = np.abs(self.studentised[rows])
         return KindFit(
             kind=family,
             table=table,
@@ -495,10 +600,47 @@ class _Rows:
             chi2=chi2,
             expected=max(expected, 0.0),
             p_value=part.p_value(chosen, chi2) if enough and known else None,
-            typical=float(np.nanmedian(np.abs(self.studentised[rows]))) / _MEDIAN if enough else np.nan,
-            largest=float(np.nanmax(np.abs(self.studentised[rows]))) if enough else np.nan,
+            typical=float(np.nanmedian(size)) / _MEDIAN if enough else np.nan,
+            largest=float(np.nanmax(size)) if enough else np.nan,
             degrees=part.degrees(chosen),
+            n_beyond=int(np.sum(size > suspect_level(len(rows)))),
+            own_sigma_rms=float(np.sqrt(np.mean(self._stated[1][rows]))),
+            own_factor=self._problem.state.factors.get((table, family), 1.0),
         )
+
+    def _factor(self, rows: Integers, group: NoiseName) -> float:
+        """What the sigmas of rows of one group were multiplied by: RMS sigma as taken over RMS sigma as stated."""
+        if group not in self._with_joint_noise:
+            return self._problem.state.factors.get(group, 1.0)
+        as_taken, as_stated = (float(np.mean(v[rows])) for v in (self._table.sigma**2, self._stated[0]))
+        return float(np.sqrt(as_taken / as_stated))
+
+    @cached_property
+    def _with_joint_noise(self) -> frozenset[NoiseName]:
+        """Groups of rows that have noise of the joint readings."""
+        return frozenset(
+            (noise.series.table, name.partition(".")[0])
+            for noise in self._noises
+            if any(source.name == "joints" and source.loading.any() for source in noise.sources)
+            for name in noise.series.kind.names
+        )
+
+    @cached_property
+    def _stated(self) -> tuple[Floats, Floats]:
+        """Variance of each row of the table with all noise as stated, and that without the joints', shapes (n,)."""
+        problem, table, noises = self._problem, self._table, self._noises
+        if problem.state.factors:
+            as_stated = replace(problem, state=replace(problem.state, factors={}))
+            noises = noises_at(as_stated, self._solution.parameters, at_readings=True)
+        total, of_joints = np.zeros(table.n), np.zeros(table.n)
+        for number, noise in enumerate(noises):
+            mine = table.series == number
+            place = (table.measurement[mine], table.row[mine])
+            total[mine] = noise.sigma[place] ** 2
+            for source in noise.sources:
+                if source.name == "joints":
+                    of_joints[mine] += np.einsum("nii->ni", source.variance)[place]
+        return total, np.maximum(total - of_joints, 0.0)
 
     def _predict(
         self, test: Integers, squares: Floats, kept: Integers, of_kept: Errors
@@ -522,16 +664,17 @@ class _Rows:
         means, covariance = 1.0 + self.leverage[rows], None
         if np.isin(rows, kept).all():
             found = of_kept.at(np.searchsorted(kept, rows))
-            covariance = LowRank(found.of_estimate(self._spread.actual), found.L, found.private)
+            covariance = found.of_prediction(self._spread.tangent, self._spread.actual)
             means = covariance.diagonal
             covariance = covariance.over(np.sqrt(means))
             with np.errstate(invalid="ignore"):
                 size = self._table.sigma[rows] * np.sqrt(means)
             self.studentised[rows] = self._table.after[rows] / size
         part = self._part(rows, squares[rows] / means, np.ones(len(rows)), covariance)
-        for group in self._solution.estimated_noise or ():
-            code = self._table.groups.index(group)
-            part.behind[code] = max(1.0, self.fitted.degrees(self.fitted.of_kind(code)))
+        estimated = set(self._solution.estimated_noise or ())
+        for code, group in enumerate(self._table.groups):
+            if group in estimated or (JOINT_NOISE in estimated and group in self._with_joint_noise):
+                part.behind[code] = max(1.0, self.fitted.degrees(self.fitted.of_kind(code)))
         return part, outliers, int(np.sum(unknown))
 
     def _measurement(self, rows: Integers) -> Integers:
@@ -573,13 +716,12 @@ class _Rows:
                 self.leverage[rows] = leverage + np.sum(found.own**2, axis=1) + (found.of_noise - 1.0)
                 kept.append(found.at(np.flatnonzero(keep[rows])))
         self.leverage[~np.isfinite(self.leverage)] = np.nan
-        J, own, private = (np.concatenate([getattr(k, name) for k in kept]) for name in ("J", "own", "private"))
-        return Errors(J, own, private, scipy.sparse.csr_array(scipy.sparse.vstack([k.L for k in kept])))
+        return Errors.of_all(kept)
 
     def _residual_covariance(self, fitted: Integers, found: Errors) -> LowRank | Dense:
         """Of the fitted rows, from what they follow from."""
         if self._carried:
-            return LowRank(found.of_estimate(self._spread.tangent), found.L, found.private, sign=-1.0)
+            return found.of_fit(self._spread.tangent)
         C = (found.L @ found.L.T).toarray() + np.diag(found.private)
         measurement = self._measurement(fitted)
         weighted_as = np.where(measurement[:, None] == measurement, C, 0.0)

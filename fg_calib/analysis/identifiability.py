@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from fg_calib.analysis.conventions import MissingMotion, missing_motions
 from fg_calib.analysis.reasons import LostDirection, explain
+from fg_calib.arguments import checked
 from fg_calib.arrays import Brief
 from fg_calib.errors import ProblemError
 from fg_calib.graph.build import STRUCTURAL_FLOOR, predicted_problem, random_problem
@@ -36,7 +37,7 @@ class Identifiability(Brief):
 
     Attributes:
         robot: The robot's name.
-        model: What is measured.
+        model: What is measured; of `pixels` it is looked at what the boards' poses would say.
         kind: On random configurations, or on the user's.
         n_configurations: How many.
         observability: Rank, classes, groups, indices.
@@ -58,6 +59,7 @@ class Identifiability(Brief):
     missing: tuple[MissingMotion, ...] = ()
 
 
+@checked
 @single_threaded
 def observe_structure(
     robot: Robot,
@@ -94,7 +96,7 @@ def observe_structure(
         problem = random_problem(
             robot.with_estimated(names), model, frame, n_configurations=n_configurations, seed=seed
         )
-        return identifiability_of(problem, problem.start, "structural", prefer)
+        return replace(identifiability_of(problem, problem.start, "structural", prefer), model=model)
 
     whole = look(names_of(everything))
     fixed = tuple(p.name for p in everything if not p.estimated)
@@ -104,6 +106,7 @@ def observe_structure(
     return replace(whole, with_fixed_known=known, fixed=fixed)
 
 
+@checked
 @single_threaded
 def observe_configurations(
     robot: Robot,
@@ -133,8 +136,10 @@ def observe_configurations(
         raise ProblemError(f"robot {robot.name}", "nothing to estimate", "at least one parameter that is not fixed")
     problem = predicted_problem(robot, measurements, model, frame=frame, pairing=pairing)
     if not problem.rows:
+        if measurements.test.all():
+            raise ProblemError(measurements.source, "test rows alone", "train rows: test rows are never fitted")
         raise ProblemError(measurements.source, "no row takes part", "configurations that differ")
-    return identifiability_of(problem, problem.start, "practical", prefer)
+    return replace(identifiability_of(problem, problem.start, "practical", prefer), model=model)
 
 
 def identifiability_of(

@@ -38,7 +38,7 @@ class JointValues(Brief):
         names: Their names.
         reading: Shape (n, k), [rad] (prismatic: [m]).
         error: Estimate minus reading, in the same units, shape (n, k).
-        sigma: 1 sigma of a reading as stated, shape (k,).
+        sigma: 1 sigma of a reading as it is taken to be: as stated, or estimated, shape (k,).
         studentised: Error over its own 1 sigma, shape (n, k); nan where the measurements say nothing of it.
         suspects: (row, column) of errors that are too large, the worst first.
     """
@@ -78,7 +78,7 @@ def joint_values(solution: Solution, spread: Spread) -> JointValues | None:
     if problem.state.joint_errors is None:
         return None
     joints = np.flatnonzero(data.sigma_joint > 0.0)
-    sigma = data.sigma_joint[joints]
+    sigma = problem.sigma_joint[joints]
     rows, variance = _variance(solution, spread, sigma)
     error = problem.state.joint_errors[np.ix_(rows, joints)]
     share = variance / sigma**2

@@ -15,13 +15,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.analysis.setup import Setup, setup_of
+from fg_calib.analysis.placed_residuals import residuals_of
+from fg_calib.analysis.setup import Setup, has_places, setup_of, setup_of_table
 from fg_calib.analysis.typical_residuals import TypicalResidual, fitted_residuals, residuals_at
-from fg_calib.analysis.usual_mistakes import About, Mistake, usual_mistakes
-from fg_calib.graph.factors import pose_of
-from fg_calib.graph.frames import Frame
-from fg_calib.graph.problem import Problem
+from fg_calib.analysis.usual_mistakes import About, Mistake, still_joints, usual_mistakes
+from fg_calib.arguments import checked
 from fg_calib.measurements.dataset import Measurements
+from fg_calib.measurements.frames import Frame
+from fg_calib.measurements.series import Table
 from fg_calib.options import FrameKnowledge, Model, check, check_flag
 from fg_calib.robot.model import Robot
 from fg_calib.threads import one_blas_thread
@@ -37,15 +38,16 @@ EXPLAINED = 4.0
 REDUCTION = 5.0
 """Undoing a mistake divides the excess by this at least; undoing two, the excess that either alone leaves."""
 
+REST = 1.5
+"""Excess left by a joint that stands still, over that left by another unit of its readings, from which it is the unit.
+"""
+
 _BEST = 4
 """The best single mistakes are combined with any other; those after them not with mistakes about one joint."""
 
 
 NOTHING = 1e-6
 """Residuals over what is predicted below which there is nothing to explain: each unknown takes its own row up."""
-
-OTHER_TOOL = "tool or base are others here than in the other tables (another target on the tool, another frame)"
-"""What a table of several may say that fits with a tool and a base of its own alone."""
 
 
 @dataclass(frozen=True)
@@ -77,11 +79,15 @@ class SetupCheck:
         residuals: As the job says, by kind; empty where there are too few rows to tell.
         explanations: Mistakes that explain them where they are too large, the simplest first.
         table: Which of several tables they are of; empty of one alone.
+        others: The same of others of several tables that have something to say too.
+        unchecked: Tables of which it could not be asked: too few rows, or kinds of somebody else.
     """
 
     residuals: tuple[TypicalResidual, ...] = ()
     explanations: tuple[Explanation, ...] = ()
     table: str = ""
+    others: tuple[SetupCheck, ...] = ()
+    unchecked: tuple[str, ...] = ()
 
     @property
     def excess(self) -> float:
@@ -104,22 +110,25 @@ class SetupCheck:
     def _words(self) -> str:
         if not self.explanations:
             times = f"{self.excess:.3g} times what noise and tolerances predict"
-            found = f"{self.worst.kind} residuals before calibration are {shown(self.worst)}, {times}"
+            found = f"{self.worst.kind} residuals before calibration are {shown(self.worst)} in the median, {times}"
             return f"{found}: none of the usual mistakes in a set-up explains it"
         first, *others = self.explanations
         after = next(r for r in first.residuals if r.kind == self.worst.kind)
         also = "".join(f", or if {other}" for other in others[:2])
         also += f", or {len(others) - 2} more (--json has all)" if len(others) > 2 else ""
-        return f"{self.worst.kind} residuals fall from {shown(self.worst)} to {shown(after)} if {first}{also}"
+        fall = f"{self.worst.kind} residuals fall from {shown(self.worst)} to {shown(after)} in the median"
+        return f"{fall} if {first}{also}"
 
 
 def shown(residual: TypicalResidual) -> str:
-    """A typical size with its unit, in mm or degrees: `812 mm`."""
-    factor, unit = (1e3, "mm") if residual.unit == "m" else (180.0 / np.pi, "deg")
+    """A typical size with its unit, in mm, degrees or pixels: `812 mm`."""
+    factor, unit = {"m": (1e3, "mm"), "rad": (180.0 / np.pi, "deg"), "px": (1.0, "px")}[residual.unit]
     figure = f"{residual.size * factor:.3g}"
-    return f"{float(figure):.0f} {unit}" if "e" in figure and residual.size * factor > 1.0 else f"{figure} {unit}"
+    plain = "e" in figure and 1.0 < residual.size * factor < 1e9
+    return f"{float(figure):.0f} {unit}" if plain else f"{figure} {unit}"
 
 
+@checked
 def check_setup(
     robot: Robot,
     measurements: Measurements,
@@ -128,7 +137,7 @@ def check_setup(
     *,
     doubtful: bool = False,
     fitted: tuple[Robot, Frame] | None = None,
-    alone: bool = True,
+    table: Table | None = None,
 ) -> SetupCheck:
     """Compare residuals before a calibration with what noise and tolerances predict, and look for a mistake.
 
@@ -138,11 +147,14 @@ def check_setup(
         model: Which measurements take part.
         frame: Whether the measurement frame is known.
         doubtful: Look for a mistake even where the residuals are not far from what is predicted.
-        fitted: The robot with base and tool fitted, and world_T_base, where they are known already.
-        alone: Whether base and tool are for this table to say; where others say too, its own are none.
+        fitted: The robot with base and tool fitted, and world_T_base, where they are known already; where the table
+            alone says better ones, these are taken.
+        table: What else is said of the table: known targets and anchors, an offset, a camera.
 
     Note:
-        Pairs are formed anew from some of the rows, whatever the job's pairing.
+        Pairs are formed anew from some of the rows, whatever the job's pairing. Models of places (anchors, planes,
+        boards) and targets are looked at only where `doubtful`: these have to be placed first, a hundred times in all,
+        and two mistakes at once are not looked for there.
 
     Raises:
         InputError: An option is not one of those possible.
@@ -150,6 +162,9 @@ def check_setup(
     check("model", model, Model)
     check("frame", frame, FrameKnowledge)
     check_flag("doubtful", doubtful)
+    if has_places(measurements, model):
+        given = Table(measurements, model, frame=frame) if table is None else table
+        return _check_placed(robot, given) if doubtful else SetupCheck()
     with one_blas_thread:
         setup = setup_of(robot, measurements, model, frame)
         if setup is None:
@@ -159,40 +174,18 @@ def check_setup(
             return found
         if fitted is not None:
             closed_form = SetupCheck(fitted_residuals(setup))
-            better = bool(closed_form.residuals) and closed_form.excess < found.excess
-            if better and not alone and found.far and closed_form.excess <= min(EXPLAINED, found.excess / REDUCTION):
-                return replace(found, explanations=(Explanation((OTHER_TOOL,), closed_form.residuals),))
-            found = closed_form if better else found
+            found = min((found, closed_form), key=lambda check: check.excess) if closed_form.residuals else found
         return replace(found, explanations=_explanations(setup, found))
 
 
-def check_problem(problem: Problem, before: Floats, *, doubtful: bool = False) -> SetupCheck:
-    """`check_setup` of a problem.
-
-    Args:
-        problem: The problem.
-        before: The parameter vector with base, tool and measurement frame fitted, the arm at nominal.
-        doubtful: Look for a mistake even where the residuals are not far from what is predicted.
-    """
-    whole, variables = problem.whole or problem, problem.variables
-    robot = whole.robot.with_values(before[variables.robot_span])
-    found, names = SetupCheck(), problem.data.labels
-    for number, table in enumerate(problem.data.tables):
-        if table.model is None:
-            continue
-        frame = Frame(np.eye(3), np.zeros(3))
-        for v in variables.frames:
-            if v.symbol == f"X({number})":
-                world_T_base = pose_of(before[list(v.parameters)])
-                frame = Frame(world_T_base.rotation().matrix(), world_T_base.translation())
-        given = (whole.robot, table.measurements, table.model, table.frame)
-        of_table = check_setup(*given, doubtful=doubtful, fitted=(robot, frame), alone=len(names) == 1)
-        of_table = replace(of_table, table=names[number] if len(names) > 1 else "")
-        if number == 0 or of_table.explanations or of_table.excess > found.excess:
-            found = of_table
-        if of_table.explanations:
+def _check_placed(robot: Robot, table: Table) -> SetupCheck:
+    """The check of a table with targets, anchors, planes or boards."""
+    with one_blas_thread:
+        setup = setup_of_table(robot, table)
+        found = SetupCheck() if setup is None else SetupCheck(residuals_of(setup))
+        if setup is None or not found.far:
             return found
-    return found
+        return replace(found, explanations=_explanations(setup, found))
 
 
 def _excess(residuals: Sequence[TypicalResidual]) -> float:
@@ -220,9 +213,29 @@ def _explanations(setup: Setup, stated: SetupCheck) -> tuple[Explanation, ...]:
     """Mistakes that explain residuals, the simplest first; two together where no single one does."""
     # Where residuals are no larger than predicted only what has unknowns of its own can make them much smaller.
     least = About.FRAME if stated.excess < 1.0 else About.UNIT
-    single = [_Trial((m,), fitted_residuals(m.without)) for m in usual_mistakes(setup) if m.about >= least]
-    found = _accepted(single, stated.excess / REDUCTION)
-    return found if found or not stated.far else _accepted(_doubles(single, stated.excess), np.inf)
+    single = [_Trial((m,), residuals_of(m.without)) for m in usual_mistakes(setup) if m.about >= least]
+    most = stated.excess / REDUCTION
+    found = _accepted(single, most)
+    if stated.far and (not found or any(_is_of_readings_unit(e) for e in found)):
+        still = _accepted([_Trial((m,), residuals_of(m.without)) for m in still_joints(setup)], most)
+        found = _unless_still(found, still)
+    return (
+        found
+        if found or not stated.far or setup.table is not None
+        else _accepted(_doubles(single, stated.excess), np.inf)
+    )
+
+
+def _is_of_readings_unit(explanation: Explanation) -> bool:
+    """Whether it is that joints' readings are in another unit."""
+    return any("readings" in words and " are in " in words for words in explanation.mistakes)
+
+
+def _unless_still(found: tuple[Explanation, ...], still: tuple[Explanation, ...]) -> tuple[Explanation, ...]:
+    """Explanations beside those of a joint that does not move: another unit may but null its readings."""
+    least = min((e.excess for e in still), default=np.inf)
+    others = tuple(e for e in found if not _is_of_readings_unit(e) or REST * e.excess < least)
+    return (*others, *still) if still and least <= 2.0 * min((e.excess for e in others), default=np.inf) else others
 
 
 def _doubles(single: Sequence[_Trial], stated: float) -> list[_Trial]:
@@ -236,10 +249,11 @@ def _doubles(single: Sequence[_Trial], stated: float) -> list[_Trial]:
             continue
         for two in usual_mistakes(one.without):
             words = frozenset((one.words, two.words))
-            if words in tried or len(words) < 2 or (i >= _BEST and two.about == About.JOINT):
+            twice = one.figures == two.figures != ""
+            if words in tried or len(words) < 2 or twice or (i >= _BEST and two.about == About.JOINT):
                 continue
             tried.add(words)
-            trial = _Trial((one, two), fitted_residuals(two.without))
+            trial = _Trial((one, two), residuals_of(two.without))
             if trial.excess <= min(stated, *(alone.get(w, np.inf) for w in words)) / REDUCTION:
                 good.append(trial)
     return good

@@ -1,7 +1,8 @@
 """Why directions are lost: each is moved at random configurations, and what it does to the tool tells the cause.
 
 A cause is stated only if it is checked: that the tool does not move, that everything moves as one body, that the tool
-only turns about its own point, and so on. Where no check succeeds the reason is `NO_CAUSE`, never a guess.
+only turns about its own point, that unknowns of the measurements take the direction up (see `absorbed`), and so on.
+Where no check succeeds the reason is `NO_CAUSE`, never a guess.
 """
 
 from __future__ import annotations
@@ -12,12 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.graph.build import random_problem
+from fg_calib.analysis.absorbed import Absorbed
+from fg_calib.graph.elsewhere import elsewhere
 from fg_calib.graph.information import named_triangle
 from fg_calib.graph.observability import Observability
 from fg_calib.graph.problem import Problem
 from fg_calib.measurements.series import Table
 from fg_calib.options import PAIR_MODELS, FrameKnowledge, Model
+from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
 from fg_calib.robot.model import Parameter
 
@@ -25,9 +28,11 @@ Floats = NDArray[np.float64]
 
 NO_CAUSE = "no simple cause found"
 NOT_EXCITED = "not excited by these configurations"
+BASE = "the measurement is blind to the base: the whole arm moves as one body"
 
-SEES_POSITION: tuple[Model, ...] = ("pose", "position", "distance", "distance-rotation")
-SEES_ORIENTATION: tuple[Model, ...] = ("pose", "orientation", "rotation", "distance-rotation")
+PLACES: tuple[Model, ...] = ("anchor", "plane", "board", "pixels")
+SEES_POSITION: tuple[Model, ...] = ("pose", "position", "distance", "distance-rotation", *PLACES)
+SEES_ORIENTATION: tuple[Model, ...] = ("pose", "orientation", "rotation", "distance-rotation", "board", "pixels")
 
 _NOTHING = 1e-7
 """A motion below this part of what its members do one by one is none: relations are rounded to nine digits."""
@@ -51,21 +56,25 @@ def explain(problem: Problem, observability: Observability, parameters: Floats) 
     lost = observability.lost
     if not lost:
         return ()
-    robot, seen = problem.robot.with_values(parameters[problem.variables.robot_span]), _Seen.by(problem.data.tables)
-    anywhere = [random_problem(robot, *view) for view in seen.views or (("pose", "known"),)]
-    effect = np.vstack([named_triangle(p, p.start) for p in anywhere])
-    if not seen.views:
-        effect = 0.0 * effect  # what another kind would show elsewhere is not known
-    motion = _Motion(anywhere[0], seen)
+    tables = problem.data.tables
+    motion = _Motion(problem, parameters, _Seen.by(tables))
+    directions = np.array([[relation.get(name, 0.0) for name in observability.names] for relation in lost]).T
+    absorbed, anywhere = Absorbed(problem, parameters, directions), elsewhere(problem, parameters)
+    # What kinds of one's own would show elsewhere is not known.
+    effect = np.zeros((1, len(directions))) if anywhere is None else named_triangle(anywhere, anywhere.start)
     largest = float(np.linalg.norm(effect, axis=0).max())
-    found = []
-    for relation in lost:
-        direction = np.array([relation.get(name, 0.0) for name in observability.names])
-        if np.linalg.norm(effect @ direction) > 1e-6 * largest * np.abs(direction).max():
-            found.append(LostDirection(relation, NOT_EXCITED))
-        else:
-            found.append(LostDirection(relation, motion.reason(direction)))
-    return tuple(found)
+    seen = np.linalg.norm(effect @ directions, axis=0) > 1e-6 * largest * np.abs(directions).max(axis=0)
+    touched = any(table.measurements.groups is not None for table in tables)
+
+    def reason(k: int, direction: Floats) -> str:
+        by = absorbed.by(k)
+        if seen[k] and not (by and touched):  # nor what touches of the same points would
+            return NOT_EXCITED
+        if by == ():
+            return motion.reason(direction)
+        return NO_CAUSE if by is None else BASE if motion.of_base(direction) else absorbed.words(k)
+
+    return tuple(LostDirection(relation, reason(k, directions[:, k])) for k, relation in enumerate(lost))
 
 
 @dataclass(frozen=True)
@@ -83,7 +92,11 @@ class _Seen:
     @classmethod
     def by(cls, tables: Sequence[Table]) -> _Seen:
         """By tables."""
-        views = [(t.model, "unknown" if t.unknown_frame else "known") for t in tables if t.model is not None]
+        views = [
+            (t.model, "unknown" if t.unknown_frame or (t.model in PLACES and not t.known) else "known")
+            for t in tables
+            if t.model is not None
+        ]
         return cls(tuple(dict.fromkeys(views)), any(t.own for t in tables))  # type: ignore[arg-type]
 
     def any_of(self, models: Sequence[Model]) -> bool:
@@ -106,15 +119,15 @@ class _Seen:
 
 
 class _Motion:
-    """What parameters do to the tool at the random configurations of a problem."""
+    """What a problem's parameters do to the tool at random configurations."""
 
-    def __init__(self, problem: Problem, seen: _Seen) -> None:
-        robot = problem.robot
+    def __init__(self, problem: Problem, parameters: Floats, seen: _Seen) -> None:
+        robot = problem.robot.with_values(parameters[problem.variables.robot_span])
         self._parameters = problem.estimated
         self._seen = seen
         columns = {robot.index(p.name): k for k, p in enumerate(self._parameters)}
         chain = build_chain(robot, columns).with_joint_columns()
-        poses = forward(chain, precompute_trig(robot, problem.measurements.readings[:60]))
+        poses = forward(chain, precompute_trig(robot, random_readings(robot, 60, np.random.default_rng(0))))
         n = len(self._parameters)
         self._R, self._p = poses.rotation, poses.position
         self._J = poses.jacobian[:, :, :n]
@@ -126,12 +139,7 @@ class _Motion:
 
     def reason(self, direction: Floats) -> str:  # noqa: PLR0911 - one return a cause
         """Why a direction, shape (n,), [m] and [rad], has no effect on the measurements."""
-        w = self._J[:, :3] @ direction  # (n_configurations, 3)
-        dp = self._J[:, 3:] @ direction
-        size_w = float(np.abs(self._J[:, :3] * direction).sum(axis=2).max())
-        size_p = float(np.abs(self._J[:, 3:] * direction).sum(axis=2).max())
-        turns = float(np.abs(w).max()) > _NOTHING * max(size_w, 1e-3 * size_p)
-        moves = float(np.abs(dp).max()) > _NOTHING * max(size_p, 1e-3 * size_w)
+        w, dp, turns, moves = self._of_tool(direction)
         sees_orientation, sees_position = map(self._seen.any_of, (SEES_ORIENTATION, SEES_POSITION))
         if not turns and not moves:
             return self._same_motion(direction)
@@ -143,9 +151,8 @@ class _Motion:
             if self._all_turn(direction):
                 return f"{self._parallel(direction)}: only the sum of their turns is seen, and no lengths are"
             return f"the tool only moves without turning, unseen by {self._seen}"
-        relative = self._seen.relative(SEES_POSITION) and (not turns or self._seen.relative(SEES_ORIENTATION))
-        if relative and self._rigid(w, dp, sees_position):
-            return "the measurement is blind to the base: the whole arm moves as one body"
+        if self.of_base(direction):
+            return BASE
         if self._seen.pairs and not moves and self._constant(np.einsum("nji,nj->ni", self._R, w)):
             return self._tool_turned(direction)
         if self._seen.pairs and not sees_position and self._constant(np.einsum("nji,nj->ni", self._R, w)):
@@ -153,6 +160,23 @@ class _Motion:
         if self._seen.pairs and self._common_axis is not None and self._tilts(w, dp, self._common_axis):
             return "parallel axes, all of them: it only tilts the arm out of its plane, unseen to first order"
         return NO_CAUSE
+
+    def of_base(self, direction: Floats) -> bool:
+        """Whether a direction moves the arm as if the base alone had moved, and nothing seen says where the base is."""
+        w, dp, turns, _ = self._of_tool(direction)
+        if not self._seen.relative(SEES_POSITION) or (turns and not self._seen.relative(SEES_ORIENTATION)):
+            return False
+        return self._rigid(w, dp, self._seen.any_of(SEES_POSITION))
+
+    def _of_tool(self, direction: Floats) -> tuple[Floats, Floats, bool, bool]:
+        """Turns and shifts of the tool, shape (n_configurations, 3), and whether these are any."""
+        w = self._J[:, :3] @ direction
+        dp = self._J[:, 3:] @ direction
+        size_w = float(np.abs(self._J[:, :3] * direction).sum(axis=2).max())
+        size_p = float(np.abs(self._J[:, 3:] * direction).sum(axis=2).max())
+        turns = float(np.abs(w).max()) > _NOTHING * max(size_w, 1e-3 * size_p)
+        moves = float(np.abs(dp).max()) > _NOTHING * max(size_p, 1e-3 * size_w)
+        return w, dp, turns, moves
 
     def _tilts(self, w: Floats, dp: Floats, axis: Floats) -> bool:
         """Whether the tool moves along the common axis of the joints only, and turns across it only."""

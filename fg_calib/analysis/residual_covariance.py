@@ -6,13 +6,13 @@ See `goodness` for what is made of it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from fg_calib.graph.information import eliminated
+from fg_calib.graph.information import eliminated, felt
 from fg_calib.graph.noise import PRIVATE_SHARE, RowNoise
 from fg_calib.graph.problem import Problem, at_parameters, says_where
 from fg_calib.graph.rows import ErrorColumns
@@ -33,12 +33,15 @@ class Errors:
         own: What nuisances are off by themselves, shape (n, n_nuisance): by errors of 1 sigma.
         private: Variance of each row's private noise, shape (n,).
         L: How rows follow from other noise, sparse, shape (n, n_errors): from errors of 1 sigma.
+        felt: `L M^T`, M what the fit made of those errors (see `information.felt`), shape (n, n_columns + n_nuisance);
+            no columns where fitted and predicted rows share none.
     """
 
     J: Floats
     own: Floats
     private: Floats
     L: Loadings
+    felt: Floats
 
     @property
     def of_noise(self) -> Floats:
@@ -54,15 +57,51 @@ class Errors:
         """
         return np.hstack([self.J @ _half(covariance), self.own])
 
+    def of_prediction(self, tangent: Floats, actual: Floats) -> LowRank:
+        """Covariance of predicted rows, whose noise the estimate may have felt: `C + J K J^T - J Q^T - Q J^T`.
+
+        With K what the estimate is off and e errors of rows, their covariance is -T M, so that Q = L M^T T; and
+        `-P R^T - R P^T = ((P - R) (P - R)^T - (P + R) (P + R)^T) / 2`.
+
+        Args:
+            tangent: T, the covariance of the core by the noise that rows are weighted by.
+            actual: K, its covariance.
+        """
+        P = self.of_estimate(actual)
+        sign = np.ones(P.shape[1])
+        if self.felt.shape[1]:
+            half, n = _half(tangent), len(tangent)
+            A, B = self.of_estimate(tangent), np.hstack([self.felt[:, :n] @ half, self.felt[:, n:]])
+            P = np.hstack([P, (A - B) / np.sqrt(2.0), (A + B) / np.sqrt(2.0)])
+            sign = np.concatenate([sign, np.ones(A.shape[1]), -np.ones(A.shape[1])])
+        return LowRank(P, self.L, self.private, sign)
+
+    def of_fit(self, tangent: Floats) -> LowRank:
+        """Covariance of fitted rows: `C - J T J^T`.
+
+        Args:
+            tangent: T, the covariance of the core.
+        """
+        P = self.of_estimate(tangent)
+        return LowRank(P, self.L, self.private, -np.ones(P.shape[1]))
+
     def at(self, rows: Integers) -> Errors:
         """Those of some rows."""
-        return Errors(self.J[rows], self.own[rows], self.private[rows], self.L[rows])
+        return Errors(self.J[rows], self.own[rows], self.private[rows], self.L[rows], self.felt[rows])
 
     def over(self, sigma: Floats) -> Errors:
         """Those of rows divided by something, shape (n,)."""
         by = 1.0 / sigma
         L = scipy.sparse.csr_array(scipy.sparse.diags_array(by) @ self.L)
-        return Errors(self.J * by[:, None], self.own * by[:, None], self.private * by**2, L)
+        return Errors(self.J * by[:, None], self.own * by[:, None], self.private * by**2, L, self.felt * by[:, None])
+
+    @classmethod
+    def of_all(cls, parts: Sequence[Errors]) -> Errors:
+        """Those of several rows, one after the other."""
+        J, own, private, felt = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("J", "own", "private", "felt")
+        )
+        return cls(J, own, private, Loadings(scipy.sparse.vstack([part.L for part in parts])), felt)
 
 
 class Nuisances:
@@ -79,14 +118,19 @@ class Nuisances:
         self._noises, self._columns, self._n = noises, ErrorColumns(noises), problem.variables.n_columns
         there, n = self._at.columns >= 0, len(self._at.columns)
         self._follow, self._inverse = np.zeros((n, self._n)), np.zeros((n, 0))
+        self._wanted = self._columns.predicted(noises)
+        self._felt = felt(problem, parameters, self._columns, self._wanted)
         if there.any():
             left, of_nuisance = eliminated(problem, parameters), self._at.columns[there] - self._n
             self._inverse = np.zeros((n, left.rank))
+            core, others = np.split(self._felt, [self._n])
+            self._felt = np.vstack([core + left.follow.T @ others, left.inverse.T @ others])
             self._follow[there], self._inverse[there] = left.follow[of_nuisance], left.inverse[of_nuisance]
         series = problem.data.series
         self._apart = [says_where(problem.data, s) & ~there[s.nuisances].any(axis=1) for s in series]
         reserved = [s.n * s.kind.residual_dim * of.any() for s, of in zip(series, self._apart, strict=True)]
-        said: Booleans = np.array(there, dtype=np.bool_)
+        unknowns = problem.data.unknowns
+        said: Booleans = there | np.repeat(np.array(unknowns.known, dtype=np.bool_), unknowns.sizes)
         for s, of in zip(series, self._apart, strict=True):
             said[s.nuisances[of].ravel()] = True
         self._unsaid: list[Booleans] = [np.any(~said[s.nuisances], axis=1) for s in series]
@@ -107,9 +151,9 @@ class Nuisances:
         known, N = self._nuisances_known(number, rows)
         unsaid = np.repeat(self._unsaid[number][rows], len(known.J) // max(len(rows), 1))
         anywhere = np.where(unsaid, np.nan, 0.0)[:, None]  # a point that no row says anything of
-        return replace(
-            known, J=known.J + anywhere + N @ self._follow, own=N @ self._inverse, L=known.L + N @ self._averaged
-        )
+        L = known.L + N @ self._averaged
+        of_fit = L[:, self._wanted] @ self._felt.T if len(self._wanted) else known.felt
+        return Errors(known.J + anywhere + N @ self._follow, N @ self._inverse, known.private, L, of_fit)
 
     def _nuisances_known(self, number: int, rows: Integers) -> tuple[Errors, Loadings]:
         """The same if nuisances were known; derivatives in these, sparse, shape (n residual_dim, n_coordinates).
@@ -130,22 +174,23 @@ class Nuisances:
         private[apart] = 0.0
         L = self._columns.loading(noise, rows)
         L = scipy.sparse.csr_array((L.data, L.indices, L.indptr), shape=own.shape) + own
-        return Errors(of_core, np.zeros((n * residual_dim, 0)), private, L), N
+        none = np.zeros((n * residual_dim, 0))
+        return Errors(of_core, none, private, L, none), N
 
 
 class LowRank:
-    """Covariance `D + L L^T + sign P P^T` of standardised residuals.
+    """Covariance `D + L L^T + P S P^T` of standardised residuals.
 
     Args:
         P: Shape (n, n_columns).
         L: Sparse, shape (n, n_errors).
         own: Diagonal of D, shape (n,).
-        sign: 1, or -1 for rows that P was fitted to.
+        sign: Diagonal of S, 1 or -1, shape (n_columns,).
     """
 
-    def __init__(self, P: Floats, L: Loadings, own: Floats, sign: float = 1.0) -> None:
+    def __init__(self, P: Floats, L: Loadings, own: Floats, sign: Floats) -> None:
         self._P, self._L, self._d, self._sign = P, L, own, sign
-        self._p = sign * np.sum(P * P, axis=1)
+        self._p = (P * P) @ sign
         self._l = np.asarray(L.power(2).sum(axis=1)).ravel()
 
     @property
@@ -163,14 +208,14 @@ class LowRank:
     def dense(self, rows: Integers) -> tuple[Floats, Floats]:
         """The part at `rows`, and what its D lacks to be `PRIVATE_SHARE` of the noise."""
         P, d, of_l = self._P[rows], self._d[rows], self._l[rows]
-        A = np.diag(d) + self._sign * (P @ P.T) + (self._L[rows] @ self._L[rows].T).toarray()
+        A = np.diag(d) + (P * self._sign) @ P.T + (self._L[rows] @ self._L[rows].T).toarray()
         return A, np.maximum(PRIVATE_SHARE * (d + of_l) - d, 0.0)
 
     def moments(self, rows: Integers) -> tuple[float, float]:
         """Trace, and trace of the square, of the part at `rows`."""
         P, L, p, of_l, d = self._P[rows], self._L[rows], self._p[rows], self._l[rows], self._d[rows]
-        square = np.sum(d * d) + 2.0 * np.sum(d * (of_l + p)) + np.sum((P.T @ P) ** 2)
-        square += (L.T @ L).power(2).sum() + 2.0 * self._sign * np.sum((L.T @ P) ** 2)
+        square = np.sum(d * d) + 2.0 * np.sum(d * (of_l + p)) + self._sign @ (P.T @ P) ** 2 @ self._sign
+        square += (L.T @ L).power(2).sum() + 2.0 * np.sum((L.T @ P) ** 2 @ self._sign)
         return float(np.sum(d + of_l + p)), float(square)
 
 

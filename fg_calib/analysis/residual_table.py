@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.problem import noises_at
 from fg_calib.graph.solver import Solution
+from fg_calib.measurements.dataset import Labels
+from fg_calib.measurements.kinds import checked_figures
+from fg_calib.measurements.series import Series
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -25,7 +28,7 @@ class RowKind:
 
     Attributes:
         name: `distance`, `angle`, `position.x`, `orientation.z`, `point.y`, ...
-        unit: `m` or `rad`.
+        unit: `m`, `rad` or `px`.
         table: Number of its table.
     """
 
@@ -41,7 +44,7 @@ class RowKind:
 
 @dataclass(frozen=True)
 class ResidualTable(FrozenArrays):
-    """Every scalar residual, train and test, before and after; [m] and [rad]. Words are codes: a table is long.
+    """Every scalar residual, train and test, before and after, in its kind's unit. Words are codes: a table is long.
 
     Attributes:
         kinds: What rows are of, by code.
@@ -52,6 +55,9 @@ class ResidualTable(FrozenArrays):
         a: The (first) configuration, in `names`, or the (first) unknown where there is none, shape (n,).
         b: The second, -1 where there is none, shape (n,).
         names: Name of each configuration, then of each unknown.
+        label_code: What each row is of by name, in `labels`; 0 where its table says nothing of it, shape (n,).
+        labels: Names of targets, anchors, planes, boards, corners and touched points by code; the first is empty.
+        table_row: Row of its table that each row is from, counted from 0; -1 where it is of a pair, shape (n,).
         test: Predicted only, shape (n,).
         reason_code: Why a row takes no part, in `reasons`; 0 where it does, shape (n,).
         reasons: Reasons by code; the first is empty.
@@ -72,6 +78,9 @@ class ResidualTable(FrozenArrays):
     a: Indices
     b: Indices
     names: tuple[str, ...]
+    label_code: Indices
+    labels: tuple[str, ...]
+    table_row: Indices
     test: Booleans
     reason_code: Codes
     reasons: tuple[str, ...]
@@ -122,6 +131,11 @@ class ResidualTable(FrozenArrays):
         return np.array(codes or [0], dtype=np.int16)[self.kind_code]
 
     @property
+    def of(self) -> NDArray[np.str_]:
+        """What each row is of by name, such as its target, anchor or corner; empty where nothing says, shape (n,)."""
+        return np.array(self.labels)[self.label_code]
+
+    @property
     def reason(self) -> NDArray[np.str_]:
         """Why a row takes no part, empty where it does, shape (n,)."""
         return np.array(self.reasons)[self.reason_code]
@@ -133,7 +147,7 @@ class ResidualTable(FrozenArrays):
         return used
 
     def unit(self, family: str) -> str:
-        """The unit of a kind of noise, `m` or `rad`."""
+        """The unit of a kind of noise, `m`, `rad` or `px`."""
         return next(kind.unit for kind in self.kinds if kind.family == family)
 
     def rms(self, table: int | None = None) -> dict[str, dict[str, dict[str, float]]]:
@@ -175,7 +189,7 @@ def residual_table(solution: Solution) -> ResidualTable:
     before = noises_at(problem, solution.before, at_readings=True)
     after = noises_at(problem, solution.parameters, at_readings=True)
     kinds: dict[RowKind, int] = {}
-    reasons = [""]
+    reasons, labels = [""], {"": 0}
     columns: list[dict[str, NDArray[Any]]] = []
     for number, (s, old, new) in enumerate(zip(problem.data.series, before, after, strict=True)):
         names = zip(s.kind.names, s.kind.units, strict=True)
@@ -187,6 +201,8 @@ def residual_table(solution: Solution) -> ResidualTable:
         of, row = np.nonzero(s.measured)
         place = problem.data.places[s.table]
         a, b = _ends(place[s.ends], problem.data.unknowns.owners[s.nuisances], problem.data.n_configurations)
+        label = _codes(s.of, labels, s.n)
+        table_row = _table_rows(s, problem.data.tables[s.table].measurements.part)
         columns.append(
             {
                 "kind_code": codes[row].astype(np.int16),
@@ -195,9 +211,11 @@ def residual_table(solution: Solution) -> ResidualTable:
                 "row": row.astype(np.int16),
                 "a": a[of],
                 "b": b[of],
+                "label_code": label[of],
+                "table_row": table_row[of],
                 "test": s.test[of],
                 "reason_code": excluded[of],
-                "measured": s.kind.figures(s.data)[of, row],
+                "measured": checked_figures(s.kind, s.data, s.source)[of, row],
                 "before": old.residual()[of, row],
                 "after": new.residual()[of, row],
                 "excess": new.excess[of, row],
@@ -206,8 +224,34 @@ def residual_table(solution: Solution) -> ResidualTable:
         )
     together = {name: np.concatenate([c[name] for c in columns]) for name in columns[0]}
     return ResidualTable(
-        kinds=tuple(kinds), names=problem.data.names, reasons=tuple(reasons), evaluated=problem.evaluated, **together
+        kinds=tuple(kinds),
+        names=problem.data.names,
+        labels=tuple(labels),
+        reasons=tuple(reasons),
+        evaluated=problem.evaluated,
+        **together,
     )
+
+
+def _codes(of: Labels | None, codes: dict[str, int], n: int) -> Indices:
+    """What each of n measurements is of, as codes; names that have none yet get one."""
+    if of is None:
+        return np.zeros(n, dtype=np.int32)
+    known = [codes.setdefault(name, len(codes)) for name in of.names]
+    return np.array([*known, 0], dtype=np.int32)[of.index]  # -1, no name, is the last
+
+
+def _table_rows(series: Series, part: NDArray[np.int64] | None) -> Indices:
+    """Row of its table that each measurement is from, -1 where it is from none or two.
+
+    Args:
+        series: The measurements.
+        part: Which rows of a table theirs is made of; all if None.
+    """
+    if series.kind.ends != 1:
+        return np.full(series.n, -1, dtype=np.int32)
+    rows = series.ends[:, 0]
+    return (rows if part is None else part[rows]).astype(np.int32)
 
 
 def _ends(ends: NDArray[np.int64], unknowns: NDArray[np.int64], n: int) -> tuple[Indices, Indices]:

@@ -7,6 +7,11 @@ nominal, the descent is repeated from the estimate's mirror image about the vert
 estimate, from two tolerances away to either side. The best optimum is kept, and one that the data cannot tell from it
 is told of.
 
+Distances and angles near 0, and angles near half a turn, fold: where nominal has a pair on the other side, the descent
+may end there, bending the whole arm. So it is repeated from the optimum of all rows but those that tolerances may fold.
+
+Planes and anchors are tried at their mirror images (see `mirrored`), one after the other from the best optimum so far.
+
 This stands behind the front door of jobs (`noise.solve_job`) and not in `solve`: a simulation of a thousand draws asks
 for the optimum that nominal leads to, and would pay for looking elsewhere a thousand times.
 """
@@ -19,11 +24,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.analysis.covariance import spread_of
+from fg_calib.analysis.mirrored import mirror_images
+from fg_calib.arguments import checked
 from fg_calib.graph.factors import prior_rows
 from fg_calib.graph.information import whitened_triangle
+from fg_calib.graph.noise import NoiseState, PairNoise
 from fg_calib.graph.observability import SIGNAL_FLOOR
-from fg_calib.graph.problem import Problem
-from fg_calib.graph.solver import Solution, SolverOptions, solve_from
+from fg_calib.graph.problem import Problem, noises_at, reweighted_at
+from fg_calib.graph.solver import Solution, SolverOptions, solve, solve_from, solve_image
 from fg_calib.threads import one_blas_thread
 
 Floats = NDArray[np.float64]
@@ -43,10 +51,18 @@ APART = 3.0
 INDISTINCT = 10.8276
 """The 99.9 % point of chi-square with one degree of freedom: a smaller difference of chi-square decides nothing."""
 
+LEAST_GAIN = 0.01
+"""Cost by which a mirror image must be better to be taken: as good ones stay on the side that the start chose."""
+
 MAX_ROWS = 20_000
 """Beyond this many residuals only the mirror image is tried: a descent takes seconds, and so many rows see much."""
 
 
+MANY_ROWS, MUCH = 2000, 1.2
+"""Beyond so many residuals rows that may fold are left out only where chi-square is so much above their number."""
+
+
+@checked
 def look_elsewhere(solution: Solution, options: SolverOptions | None = None) -> Solution:
     """The best optimum that a solution and descents from other starts find, with the others that are as good.
 
@@ -65,21 +81,43 @@ def look_elsewhere(solution: Solution, options: SolverOptions | None = None) -> 
     variables, seconds = solution.problem.variables, solution.seconds
     with one_blas_thread:
         steps = _steps(solution)
-    found = [solution]
+        unfolded = _without_folds(solution, options)
+    found, starts = [solution], [(unfolded, reweighted_at(solution.problem, unfolded))] if unfolded is not None else []
     for step in steps:
         whole = np.concatenate([step, np.zeros(variables.n_nuisance)])
-        start = variables.parameters(variables.moved(solution.values, whole))
+        starts.append((variables.parameters(variables.moved(solution.values, whole)), solution.problem))
+    for start, rows in starts:
         least = min(one.cost for one in found)
         # Twice what is asked for below, for the rows are whitened where the first optimum is.
-        other = solve_from(solution, start, least + INDISTINCT, options)
+        other = solve_from(replace(solution, problem=rows), start, least + INDISTINCT, options)
         if other is None:
             continue
         seconds += other.seconds
         if other.converged and 2.0 * (other.cost - least) < INDISTINCT and all(_apart(other, one) for one in found):
             found.append(other)
+    found, seconds = _with_images(found, seconds, options)
     best, *rest = sorted(found, key=lambda one: one.cost)
     others = tuple(one.parameters for one in rest if 2.0 * (one.cost - best.cost) < INDISTINCT)
     return replace(best, others=others, seconds=seconds)
+
+
+def _with_images(found: list[Solution], seconds: float, options: SolverOptions | None) -> tuple[list[Solution], float]:
+    """The optima found, and those of mirror images, one after the other from the best so far; time taken by all."""
+    best, better = min(found, key=lambda one: one.cost), True
+    while better:
+        better = False
+        for image in mirror_images(best):
+            other = solve_image(best, image.problem, image.before, best.cost + 0.5 * INDISTINCT, options)
+            if other is None or not other.converged:
+                continue
+            seconds += other.seconds
+            better = other.cost < best.cost - LEAST_GAIN
+            if better or all(_apart(other, one) for one in found):
+                found = [*found, other]
+            if better:
+                best = other
+                break
+    return found, seconds
 
 
 def _steps(solution: Solution) -> list[Floats]:
@@ -102,6 +140,32 @@ def _steps(solution: Solution) -> list[Floats]:
         aside = FAR * scales * (weak @ (weak.T @ signs))  # the same whatever basis the weak directions have
         steps += [aside, -aside]
     return steps
+
+
+def _without_folds(solution: Solution, options: SolverOptions | None) -> Floats | None:
+    """The optimum of all rows but those that tolerances may fold at nominal; None if there are none, or no others.
+
+    Of very many rows no single one bends an arm: then only where chi-square is too large.
+    """
+    problem, nominal = solution.problem, _nominal(solution)
+    many = problem.n_residuals > MANY_ROWS
+    if not problem.pair_series or (many and 2.0 * solution.cost < MUCH * problem.n_residuals):
+        return None
+    state = NoiseState(factors=problem.state.factors)
+    spread = FAR * np.diag(problem.variables.prior_scales)
+    series, n_folded = [], 0
+    for noise in noises_at(replace(problem, state=state), nominal):
+        s = noise.series
+        folds = noise.may_fold(spread) & s.used if isinstance(noise, PairNoise) else np.zeros_like(s.measured)
+        folds[s.test] = False
+        n_folded += int(np.sum(folds))
+        series.append(replace(s, measured=s.measured & ~folds))
+    if not n_folded or 2 * n_folded > problem.n_residuals:
+        return None
+    if problem.state.joint_errors is not None:
+        state = replace(state, joint_errors=np.zeros_like(problem.state.joint_errors))
+    without = replace(problem, data=replace(problem.data, series=tuple(series)))
+    return solve(reweighted_at(without, solution.before, state), options).parameters
 
 
 def _nominal(solution: Solution) -> Floats:

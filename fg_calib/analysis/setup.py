@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.measurements.dataset import Measurements
+from fg_calib.measurements.series import Table
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, FrameKnowledge, Model
 from fg_calib.robot.model import Robot
 
@@ -17,6 +18,10 @@ Integers = NDArray[np.int64]
 
 ROWS = 60
 """Train configurations that are looked at, spread over the table."""
+
+
+IMAGES, CORNERS = 20, 8
+"""Images that are looked at, and corners of each."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +35,8 @@ class Setup:
         frame: Whether world_T_base is fitted.
         tool_rotation: Whether the tool's rotation is.
         tool_translation: Which coordinates of the tool point are, shape (3,).
+        of_base: Whether what is fitted as world_T_base is the base, which all tables share.
+        table: The table itself where targets, anchors, planes or boards have to be placed; None of poses and pairs.
     """
 
     robot: Robot
@@ -38,6 +45,8 @@ class Setup:
     frame: bool
     tool_rotation: bool
     tool_translation: Booleans
+    of_base: bool = False
+    table: Table | None = None
 
     @property
     def n_free(self) -> int:
@@ -69,7 +78,35 @@ def setup_of(robot: Robot, measurements: Measurements, model: Model, frame: Fram
         frame=model in POSE_MODELS and (frame == "unknown" or base),
         tool_rotation=any(tool[3:]),
         tool_translation=np.array(tool[:3]),
+        of_base=frame == "known",
     )
+
+
+def has_places(measurements: Measurements, model: Model) -> bool:
+    """Whether targets, anchors, planes or boards have to be placed before anything can be said of a table."""
+    return model not in (*POSE_MODELS, *PAIR_MODELS) or "target" in measurements.labels
+
+
+def setup_of_table(robot: Robot, table: Table) -> Setup | None:
+    """Some train rows of a table with targets, anchors, planes or boards; None if there are none.
+
+    Configurations are drawn at random, for rows in turn may be of one target or anchor.
+    """
+    m, rng = table.measurements, np.random.default_rng(0)
+    train = np.flatnonzero(~m.test)
+    if not len(train) or table.model is None:
+        return None
+    ids = np.unique(m.ids[train])
+    most = max(10, ROWS * len(ids) // len(train)) if table.model != "pixels" else IMAGES
+    rows = rng.permutation(train[np.isin(m.ids[train], rng.permutation(ids)[:most])])
+    if table.model == "pixels":  # some corners of each image
+        _, of = np.unique(m.ids[rows], return_inverse=True)
+        order = np.argsort(of, kind="stable")
+        first = np.searchsorted(of[order], np.arange(of.max() + 1))
+        rows = rows[order[np.arange(len(rows)) - first[of[order]] < CORNERS]]
+    setup = setup_of(robot, replace(m, pairs=None, groups=None), table.model, table.frame)
+    assert setup is not None
+    return replace(setup, measurements=m.select(np.sort(rows)), table=table)
 
 
 def _rows_of(m: Measurements, rows: Integers) -> Measurements:

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fg_calib.analysis.setup import Setup
-from fg_calib.graph import frames
-from fg_calib.graph.frames import Frame, Unknown
+from fg_calib.measurements import frames
 from fg_calib.measurements.dataset import Measurements, Pairs, rotation_angle
+from fg_calib.measurements.frames import Frame, Unknown
 from fg_calib.options import PAIR_MODELS, POSE_MODELS
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
@@ -46,8 +46,8 @@ class TypicalResidual:
     """Residuals of one kind of measurement before a calibration.
 
     Attributes:
-        kind: `position`, `orientation`, `distance`, `angle` or `point`.
-        unit: `m` or `rad`.
+        kind: `position`, `orientation`, `distance`, `angle`, `point` or `pixel`.
+        unit: `m`, `rad` or `px`.
         size: Median of their lengths, [m] or [rad].
         expected: What noise and tolerances make of it.
         motion: How far the arm moves between these rows, [m] or [rad]: readings that hardly move it show nothing.
@@ -55,7 +55,7 @@ class TypicalResidual:
     """
 
     kind: str
-    unit: Literal["m", "rad"]
+    unit: Literal["m", "rad", "px"]
     size: float
     expected: float
     motion: float
@@ -76,6 +76,32 @@ def residuals_at(setup: Setup, robot: Robot, world_T_base: Frame) -> tuple[Typic
     """Typical residuals by kind at a robot and frame that were fitted elsewhere."""
     held = replace(setup, robot=robot, tool_rotation=False, tool_translation=np.zeros(3, dtype=np.bool_))
     return _typical_residuals(held, world_T_base)
+
+
+def residuals_beside(setup: Setup, other: Setup) -> tuple[TypicalResidual, ...]:
+    """Typical residuals by kind with tool and base as another table of the job alone says them."""
+    flange = _Flange(other.robot, other.measurements)
+    X, T = _frames_of(other, flange)
+    robot = setup.robot
+    values, tool = robot.nominal, robot.owned_by(robot.n_joints + 1)
+    if tool:
+        yaw, pitch, roll = Rotation.from_matrix(T.rotation).as_euler("ZYX")
+        values[tool] = [*T.translation, yaw, pitch, roll]
+    held = replace(setup, robot=robot.with_values(values), tool_rotation=False, tool_translation=np.zeros(3, np.bool_))
+    of_base = setup.of_base and other.of_base and other.model in POSE_MODELS
+    return _typical_residuals(held, X if of_base else None)
+
+
+def _frames_of(setup: Setup, flange: _Flange) -> tuple[Frame, Frame]:
+    """World_T_base and flange_T_tool that a table alone says."""
+    m, free = setup.measurements, setup.tool_translation
+    X, T = Frame(np.eye(3), np.zeros(3)), flange.tool
+    if setup.model in POSE_MODELS:
+        with_orientation, with_position = POSE_MODELS[setup.model]
+        measured = (m.rotation if with_orientation else None, m.position if with_position else None)
+        unknown = Unknown(setup.frame, setup.tool_rotation, free)
+        return frames.start_from_poses((flange.rotation, flange.position), measured, (X, T), unknown)
+    return X, Frame(T.rotation, _tool_point(setup, flange))
 
 
 def _typical_residuals(setup: Setup, world_T_base: Frame | None) -> tuple[TypicalResidual, ...]:
@@ -130,10 +156,7 @@ def _pose_residuals(setup: Setup, flange: _Flange, world_T_base: Frame | None) -
     m, (with_orientation, with_position) = setup.measurements, POSE_MODELS[setup.model]
     R_M = m.rotation if with_orientation else None
     p_M = m.position if with_position else None
-    X, T = world_T_base or Frame(np.eye(3), np.zeros(3)), flange.tool
-    if world_T_base is None:
-        unknown = Unknown(setup.frame, setup.tool_rotation, setup.tool_translation)
-        X, T = frames.start_from_poses((flange.rotation, flange.position), (R_M, p_M), (X, T), unknown)
+    X, T = _frames_of(setup, flange) if world_T_base is None else (world_T_base, flange.tool)
     if R_M is not None:
         angle, _ = rotation_angle(np.swapaxes(R_M, 1, 2) @ X.rotation @ flange.rotation @ T.rotation)
         yield _typical("orientation", "rad", angle, flange.turns, m.sigma_orientation, _turn(flange.rotation))
@@ -146,20 +169,34 @@ def _pose_residuals(setup: Setup, flange: _Flange, world_T_base: Frame | None) -
 def _pair_residuals(setup: Setup, flange: _Flange) -> Iterator[TypicalResidual]:
     """Those of distances and angles between configurations, and of touched points."""
     m, (with_distance, with_angle) = setup.measurements, PAIR_MODELS[setup.model]
-    pairs = m.pairs if m.pairs is not None else _form_pairs(m)
+    pairs, t = _pairs_of(m), _tool_point(setup, flange)
     distances, angles = pairs.select(np.isfinite(pairs.distance)), pairs.select(np.isfinite(pairs.angle))
-    free, t = setup.tool_translation, flange.tool.translation
-    touched = None if m.groups is None or not np.any(m.groups.index >= 0) else m.groups.index
     if with_distance and distances.n_pairs:
-        ends = (distances.a, distances.b, distances.distance)
-        t = frames.start_from_distances((flange.rotation, flange.position), *ends, flange.tool, free).translation
         yield _distance_residual(distances, flange, t)
-    elif touched is not None:
-        t = _touching_tool_point(flange, touched, free)
     if with_angle and angles.n_pairs:
         yield _angle_residual(angles, flange)
-    if touched is not None and with_distance:
+    if _touched(m) is not None and with_distance:
         yield from _touch_residuals(m, flange, t)
+
+
+def _tool_point(setup: Setup, flange: _Flange) -> Floats:
+    """The tool point that distances say, or touches where there are none, shape (3,), [m]."""
+    m, free, pairs = setup.measurements, setup.tool_translation, _pairs_of(setup.measurements)
+    distances, touched = pairs.select(np.isfinite(pairs.distance)), _touched(m)
+    if PAIR_MODELS[setup.model][0] and distances.n_pairs:
+        ends = (distances.a, distances.b, distances.distance)
+        return frames.start_from_distances((flange.rotation, flange.position), *ends, flange.tool, free).translation
+    return flange.tool.translation if touched is None else _touching_tool_point(flange, touched, free)
+
+
+def _pairs_of(m: Measurements) -> Pairs:
+    """The pairs measured, or some of poses."""
+    return m.pairs if m.pairs is not None else _form_pairs(m)
+
+
+def _touched(m: Measurements) -> Integers | None:
+    """Which point each configuration touched; None where none touched any."""
+    return None if m.groups is None or not np.any(m.groups.index >= 0) else m.groups.index
 
 
 def _distance_residual(pairs: Pairs, flange: _Flange, t: Floats) -> TypicalResidual:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
@@ -11,21 +11,25 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from fg_calib.analysis.accuracy import ExpectedError, expected_error, without_rigid_motion
+from fg_calib.analysis.changes import Change
 from fg_calib.analysis.chi_square import chi_square
 from fg_calib.analysis.corrections import PriorFit, judge_priors
 from fg_calib.analysis.covariance import Spread, spread_of, with_left_out
-from fg_calib.analysis.findings import LIKE_NOISE, MOST_ESTIMATED, Fit, judge
+from fg_calib.analysis.findings import MOST_ESTIMATED, Fit, judge
 from fg_calib.analysis.goodness import Goodness, judge_fit
 from fg_calib.analysis.identifiability import Identifiability, identifiability_of
 from fg_calib.analysis.joint_values import JointValues, joint_values
 from fg_calib.analysis.mistakes import SetupCheck
+from fg_calib.analysis.outliers import judged_without_gross_errors
 from fg_calib.analysis.residual_table import ResidualTable, residual_table
-from fg_calib.arrays import FrozenArrays
+from fg_calib.analysis.unknowns import PointEstimate, point_estimates
+from fg_calib.analysis.verdict import LIKE_NOISE
+from fg_calib.arguments import checked
+from fg_calib.arrays import FrozenArrays, as_figures
+from fg_calib.errors import InputError, escaped
 from fg_calib.graph.extension import check_graph
 from fg_calib.graph.factors import corrections_of, pose_of
-from fg_calib.graph.information import eliminated
 from fg_calib.graph.observability import IdentifiabilityClass, Observability
-from fg_calib.graph.problem import at_parameters
 from fg_calib.graph.solver import Solution
 from fg_calib.robot.model import Robot
 from fg_calib.threads import one_blas_thread, single_threaded
@@ -81,23 +85,6 @@ class FrameEstimate(FrozenArrays):
 
 
 @dataclass(frozen=True)
-class PointEstimate(FrozenArrays):
-    """A physical point that a group of configurations touched.
-
-    Attributes:
-        name: The group's name.
-        n: Train rows that touched it.
-        xyz: base_p of the point, [m]; of a group without train rows the mean of the predicted tool points.
-        sigma: 1 sigma along the base's axes, shape (3,), [m]; nan where it is not determined, or not estimated.
-    """
-
-    name: str
-    n: int
-    xyz: Floats
-    sigma: Floats
-
-
-@dataclass(frozen=True)
 class Prediction:
     """A function of the parameters at the estimate.
 
@@ -143,6 +130,8 @@ class Uncertainty(FrozenArrays):
         noise_like: Probability that noise alone follows the arm as much as the residuals do; None where that was not
             asked, because they are as small as stated, or cannot be told.
         joint_values: Estimated joint values beside their readings; None where these were not estimated.
+        reservations: Those of the cautions that say that sigmas are too small.
+        change: What moved while a table was measured; None if nothing did.
     """
 
     names: tuple[str, ...]
@@ -169,6 +158,8 @@ class Uncertainty(FrozenArrays):
     setup: SetupCheck = field(default_factory=SetupCheck)
     noise_like: float | None = None
     joint_values: JointValues | None = None
+    reservations: tuple[str, ...] = ()
+    change: Change | None = None
 
     def __repr__(self) -> str:
         known = sum(p.sigma is not None for p in self.parameters if p.identifiability != "fixed")
@@ -177,8 +168,9 @@ class Uncertainty(FrozenArrays):
             f"  chi-square {self.chi2:.6g}, {self.dof} degrees of freedom",
             *(f"  DOUBTFUL: {finding}" for finding in self.findings[:6]),
         ]
-        return "\n".join(line if len(line) <= 100 else f"{line[:96]} ..." for line in lines)
+        return "\n".join(escaped(line if len(line) <= 100 else f"{line[:96]} ...") for line in lines)
 
+    @checked
     @single_threaded
     def predict(self, function: Callable[[Robot], ArrayLike], *, fitted: bool = False) -> Prediction:
         """Value and sigma of any function of the robot: a tool position, a distance, a sum of parameters.
@@ -193,10 +185,16 @@ class Uncertainty(FrozenArrays):
         Note:
             Parameters that were left out to fix the gauge (`keep`) count with their tolerance: what depends on one
             without is unknown.
+
+        Raises:
+            InputError: The function raised something, or returned no figures, or not as many of every robot.
         """
-        value = np.atleast_1d(np.asarray(function(self.robot), dtype=np.float64)).ravel()
-        G = self.whole.derivative(function)
+        figures = _Figures(function)
+        value = figures(self.robot)
+        G = self.whole.derivative(figures)
         if fitted:
+            if len(value) % 3:
+                raise InputError("function", f"{len(value)} figures", "points, shape (n, 3), where errors are fitted")
             points = value.reshape(-1, 3)
             G = without_rigid_motion(points, G.reshape(*points.shape, -1))[0].reshape(G.shape)
         covariance = self.whole.covariance(G)
@@ -210,14 +208,18 @@ class Uncertainty(FrozenArrays):
     @property
     def noise_may_be_estimated(self) -> bool:
         """Whether the noise seen may be taken for the noise there is: a little larger than stated, and like noise."""
-        too_large = [fit for fit in self.goodness.kinds if fit.verdict in ("too small", "both")]
+        too_large = [fit for fit in self.goodness.kinds if fit.verdict in ("too small", "both", "many")]
         return (
             not self.residuals.evaluated
             and not self.setup.explanations
-            and not any(fit.verdict in ("outliers", "both") for fit in self.goodness.kinds)  # they are not noise
+            and self.change is None
+            and not any(
+                fit.verdict in ("outliers", "others", "both", "many") for fit in self.goodness.kinds
+            )  # they are not noise
             and not (too_large and self.identifiability.missing)
             and all(fit.typical <= MOST_ESTIMATED for fit in too_large)
             and (self.noise_like is None or self.noise_like > LIKE_NOISE)
+            and (self.goodness.test is None or self.goodness.test.p_value > LIKE_NOISE)
         )
 
     @property
@@ -231,6 +233,32 @@ class Uncertainty(FrozenArrays):
         return not self.findings
 
 
+class _Figures:
+    """A function of somebody else's, of a robot: what it raises, or returns that are no figures, becomes one line."""
+
+    def __init__(self, function: Callable[[Robot], ArrayLike]) -> None:
+        self._function = function
+        self._n: int | None = None
+
+    def __call__(self, robot: Robot) -> Floats:
+        """Its value, shape (n,).
+
+        Raises:
+            InputError: It raised something, or its value is no figures, or more or fewer than before.
+        """
+        try:
+            found = self._function(robot)
+        except Exception as error:
+            message = f"{type(error).__name__}: {error}".rstrip(": ")
+            raise InputError("function", f"raised {message}", "figures of any robot") from error
+        figures = as_figures("function", found, "a number or an array of them").ravel()
+        self._n = figures.size if self._n is None else self._n
+        if figures.size != self._n:
+            raise InputError("function", f"{figures.size} figures, {self._n} before", "as many of every robot")
+        return figures
+
+
+@checked
 def assess(solution: Solution) -> Uncertainty:
     """Covariance, goodness of fit, residuals and identifiability of a solution.
 
@@ -261,7 +289,8 @@ def _assess(solution: Solution) -> Uncertainty:
     covariance = whole.named()
     frames = _frame_estimates(solution, whole)
     chi2, table = chi_square(solution, spread), residual_table(solution)
-    fit = Fit(chi2, table, judge_fit(solution, spread, table), judge_priors(solution, spread))
+    goodness = judged_without_gross_errors(solution, spread, table, judge_fit(solution, spread, table))
+    fit = Fit(chi2, table, goodness, judge_priors(solution, spread))
     verdict = judge(solution, spread, fit, identifiability.missing)
     return Uncertainty(
         names=whole.variables.names[: whole.variables.n_robot_columns],
@@ -284,10 +313,12 @@ def _assess(solution: Solution) -> Uncertainty:
         whole=whole,
         findings=verdict.findings,
         cautions=verdict.cautions,
-        points=_point_estimates(solution, whole),
+        points=point_estimates(solution, whole),
         joint_values=joint_values(solution, spread),
         setup=verdict.setup,
         noise_like=verdict.noise_like,
+        reservations=verdict.reservations,
+        change=verdict.change,
     )
 
 
@@ -347,32 +378,6 @@ def _parameter_estimates(
 
 def _known(sigma: float) -> float | None:
     return float(sigma) if np.isfinite(sigma) else None
-
-
-def _point_estimates(solution: Solution, spread: Spread) -> tuple[PointEstimate, ...]:
-    """Where touched points and other unknowns are; sigma from the core, which they follow, and from their own rows.
-
-    Args:
-        solution: The solution.
-        spread: The covariance of all parameters.
-    """
-    problem = solution.problem
-    data, unknowns = problem.data, problem.data.unknowns
-    if not unknowns.names:
-        return ()
-    at = at_parameters(problem, solution.parameters)
-    left = eliminated(replace(problem, variables=spread.variables), solution.parameters)
-    variance = np.diag(spread.covariance(left.follow)) + np.sum(left.inverse**2, axis=1)
-    variance[left.unknown] = np.nan
-    columns = at.columns - problem.variables.n_columns
-    sigma = np.where(columns >= 0, np.sqrt(np.append(variance, np.nan))[np.maximum(columns, -1)], np.nan)
-    counts = np.zeros(len(unknowns.names), dtype=np.int64)
-    for s in data.series:
-        if s.kind.ends and s.kind.n_nuisances:
-            counts += np.bincount(unknowns.owners[s.nuisances[s.train][:, 0]], minlength=len(counts))
-    ends = np.cumsum(unknowns.sizes)[:-1]
-    values, sigmas = np.split(at.coordinates, ends), np.split(sigma, ends)
-    return tuple(map(PointEstimate, unknowns.names, counts.tolist(), values, sigmas))
 
 
 def marginals(solution: Solution) -> gtsam.Marginals:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from itertools import combinations, permutations
@@ -11,16 +11,32 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from fg_calib.analysis.placed_residuals import residuals_of
 from fg_calib.analysis.setup import Setup
 from fg_calib.options import PAIR_MODELS, POSE_MODELS
 from fg_calib.robot.model import CONVENTIONS
 
 Floats = NDArray[np.float64]
+Booleans = NDArray[np.bool_]
 
 _LARGEST, _SMALLEST = 50.0, 0.02
 """Reach of an arm beyond which its own lengths are taken for the mistake, [m]."""
 
-_LENGTHS = {1e-3: "mm, not m", 1e3: "m, not mm", 1e-2: "cm, not m", 1e2: "m, not cm"}
+_LENGTHS = {
+    1e-3: "mm, not m",
+    1e3: "m, not mm",
+    1e-2: "cm, not m",
+    1e2: "m, not cm",
+    1e-1: "mm, not cm",
+    1e1: "cm, not mm",
+}
+
+STILL_TURN, STILL_SLIDE = 0.1, 0.01
+"""Range of a joint's readings, [rad] and [m], below which another unit is no explanation but a joint that stands still:
+nobody measures so."""
+
+_PLACES = 16
+"""Places at which a joint may stand still that are tried first, evenly spaced over its readings' range or a turn."""
 
 _ANGLES = {np.pi / 180.0: "deg, not rad", 180.0 / np.pi: "rad, not deg"}
 
@@ -37,24 +53,34 @@ class About(IntEnum):
 
 @dataclass(frozen=True)
 class Mistake:
-    """A usual mistake, as the end of a sentence "residuals fall if ...", and the set-up with it undone."""
+    """A usual mistake, undone.
+
+    Attributes:
+        about: What it is about.
+        words: The end of a sentence "residuals fall if ...".
+        without: The set-up with it undone.
+        figures: The figures that it is the unit of, which cannot be in another unit as well; empty of other mistakes.
+    """
 
     about: About
     words: str
     without: Setup
+    figures: str = ""
 
 
 def usual_mistakes(setup: Setup) -> Iterator[Mistake]:
     """Every usual mistake, undone in a set-up."""
     for about, mistakes in (
         (About.UNIT, (_robot_units, _lengths, _angles)),
-        (About.COLUMNS, (_inverted, _axis_orders, _orientation_columns, _conventions)),
-        (About.JOINT, (_signs, _offsets, _swaps)),
+        (About.COLUMNS, (_inverted, _axis_orders, _image_columns, _orientation_columns, _conventions)),
+        (About.JOINT, (_joint_units, _signs, _offsets, _swaps)),
         (About.FRAME, (_frame,)),
-        (About.TOOL, (_tool,)),
+        (About.TOOL, (_tool, _targets_of_flange)),
     ):
         for mistake in mistakes:
-            yield from (Mistake(about, words, without) for words, without in mistake(setup))
+            for words, without in mistake(setup):
+                figures = words.partition(" are in ")[0] if mistake in _UNITS else ""
+                yield Mistake(about, words, without, figures)
 
 
 _Found = Iterator[tuple[str, Setup]]
@@ -83,13 +109,17 @@ def _lengths(setup: Setup) -> _Found:
     for factor, unit in _LENGTHS.items():
         if _sees(setup)[1]:
             pairs = None if m.pairs is None else replace(m.pairs, distance=m.pairs.distance * factor)
-            groups = m.groups
+            groups, length = m.groups, None if m.length is None else m.length * factor
             if groups is not None:
                 groups = replace(groups, pairs=replace(groups.pairs, distance=groups.pairs.distance * factor))
             what = "distances" if pairs is not None or m.position is None else "x, y, z"
             position = None if m.position is None else m.position * factor
-            yield f"{what} are in {unit}", _measured(setup, position=position, pairs=pairs, groups=groups)
-        if slides.any():
+            changed = _measured(setup, position=position, pairs=pairs, groups=groups, length=length)
+            yield f"{what} are in {unit}", changed
+        if setup.model == "pixels" and m.image is not None:
+            corners = replace(m, image=m.image * [1.0, 1.0, factor, factor])
+            yield f"corner_x, corner_y are in {unit}", replace(setup, measurements=corners)
+        if slides.any() and _moves(setup, slides, factor):
             readings = np.where(slides, m.readings * factor, m.readings)
             yield f"readings of slides are in {unit}", _measured(setup, readings=readings)
 
@@ -99,14 +129,67 @@ def _angles(setup: Setup) -> _Found:
     m = setup.measurements
     slides = np.array([joint.prismatic for joint in setup.robot.joints])
     for factor, unit in _ANGLES.items():
-        if not slides.all():
+        if not slides.all() and _moves(setup, ~slides, factor):
             readings = np.where(slides, m.readings, m.readings * factor)
             yield f"joint readings are in {unit}", _measured(setup, readings=readings)
         if m.pairs is not None and np.isfinite(m.pairs.angle).any():
             pairs = replace(m.pairs, angle=m.pairs.angle * factor)
             yield f"angles of pairs are in {unit}", _measured(setup, pairs=pairs)
+        if m.rotation is not None and m.roll_pitch_yaw is None and factor > 1.0 and _sees(setup)[0]:
+            vector = Rotation.from_matrix(m.rotation.copy()).as_rotvec() * factor
+            rotation = Rotation.from_rotvec(vector).as_matrix()
+            yield f"rx, ry, rz are in {unit}", _measured(setup, rotation=rotation)
         if m.roll_pitch_yaw is not None:
             yield f"roll, pitch, yaw are in {unit}", _turned(setup, m.roll_pitch_yaw * factor)
+
+
+def _joint_units(setup: Setup) -> _Found:
+    """The readings of one joint in another unit than those of the others."""
+    m, joints = setup.measurements, setup.robot.joints
+    for i, joint in enumerate(joints):
+        if sum(other.prismatic == joint.prismatic for other in joints) < 2:
+            continue  # those of all its kind
+        for factor, unit in (_LENGTHS if joint.prismatic else _ANGLES).items():
+            if not _moves(setup, np.arange(len(joints)) == i, factor):
+                continue
+            readings = m.readings * np.where(np.arange(len(joints)) == i, factor, 1.0)
+            yield f"readings of joint {i + 1} are in {unit}", _measured(setup, readings=readings)
+
+
+def _moves(setup: Setup, joints: Booleans, factor: float) -> bool:
+    """Whether some of the joints still move if their readings are multiplied by a factor: else it but nulls them."""
+    least = np.where([joint.prismatic for joint in setup.robot.joints], STILL_SLIDE, STILL_TURN)
+    return factor >= 1.0 or bool(np.any((np.ptp(setup.measurements.readings, axis=0) * factor > least)[joints]))
+
+
+def still_joints(setup: Setup) -> Iterator[Mistake]:
+    """Every joint whose readings change, standing still where that explains most."""
+    m = setup.measurements
+    for i, joint in enumerate(setup.robot.joints):
+        low, high = float(np.min(m.readings[:, i])), float(np.max(m.readings[:, i]))
+        if high - low <= (STILL_SLIDE if joint.prismatic else STILL_TURN):
+            continue
+
+        def at(place: float, i: int = i) -> Setup:
+            readings = m.readings.copy()
+            readings[:, i] = place
+            return _measured(setup, readings=readings)
+
+        def left(place: float, at: Callable[[float], Setup] = at) -> float:
+            residuals = residuals_of(at(place))
+            return max((residual.excess for residual in residuals), default=np.inf)
+
+        places = np.linspace(low, high, _PLACES) if joint.prismatic else np.linspace(-np.pi, np.pi, _PLACES)
+        best, step = min(places, key=left), places[1] - places[0]
+        for _ in range(2):
+            best, step = min(best + step * np.linspace(-0.8, 0.8, 9), key=left), 0.2 * step
+        words = (
+            f"joint {i + 1} does not move: its readings change, but the arm does not follow (joint or encoder stuck)"
+        )
+        yield Mistake(About.JOINT, words, at(float(best)))
+
+
+_UNITS = (_robot_units, _lengths, _angles, _joint_units)
 
 
 def _inverted(setup: Setup) -> _Found:
@@ -118,7 +201,9 @@ def _inverted(setup: Setup) -> _Found:
     sees_turns, sees_lengths = _sees(setup)
     if m.position is not None and sees_lengths:
         position = -np.einsum("nij,nj->ni", inverse, m.position)
-        words = "the poses are inverted (tool_T_world instead of world_T_tool)"
+        of_board = setup.model == "board"
+        which = "board_T_camera instead of camera_T_board" if of_board else "tool_T_world instead of world_T_tool"
+        words = f"the poses are inverted ({which})"
         yield words, _measured(setup, rotation=inverse, position=position)
     if sees_turns:
         yield "the orientations are inverted", _measured(setup, rotation=inverse)
@@ -136,6 +221,14 @@ def _axis_orders(setup: Setup) -> _Found:
     for k in range(3):
         position = m.position * np.where(np.arange(3) == k, -1.0, 1.0)
         yield f"{'xyz'[k]} has the wrong sign", _measured(setup, position=position)
+
+
+def _image_columns(setup: Setup) -> _Found:
+    """Columns of an image, or of its corners, exchanged."""
+    image = setup.measurements.image
+    if setup.model == "pixels" and image is not None:
+        yield "columns u, v hold v, u", _measured(setup, image=image[:, [1, 0, 2, 3]])
+        yield "columns corner_x, corner_y hold y, x", _measured(setup, image=image[:, [0, 1, 3, 2]])
 
 
 def _orientation_columns(setup: Setup) -> _Found:
@@ -222,6 +315,20 @@ def _tool(setup: Setup) -> _Found:
         yield words, replace(setup, tool_rotation=True, tool_translation=free)
 
 
+def _targets_of_flange(setup: Setup) -> _Found:
+    """Known targets whose coordinates are those in the flange's frame, not the tool's; or the other way."""
+    table, robot = setup.table, setup.robot
+    tool = robot.owned_by(robot.n_joints + 1)
+    if table is None or setup.model not in POSE_MODELS or not table.known or not tool or setup.tool_rotation:
+        return
+    x, y, z, yaw, pitch, roll = robot.nominal[tool]
+    R, t = Rotation.from_euler("xyz", [roll, pitch, yaw]), np.array([x, y, z])
+    if np.any(t) or R.magnitude() > 0.0:
+        known = {name: replace(point, xyz=R.inv().apply(point.xyz - t)) for name, point in table.known.items()}
+        words = "the targets' coordinates are in the frame of the flange, not of the tool"
+        yield words, replace(setup, table=replace(table, known=known))
+
+
 def _measured(setup: Setup, **changes: object) -> Setup:
     """The set-up with other measurements."""
     return replace(setup, measurements=replace(setup.measurements, **changes))  # type: ignore[arg-type]
@@ -231,6 +338,8 @@ def _sees(setup: Setup) -> tuple[bool, bool]:
     """Whether the model uses turns and lengths."""
     if setup.model in POSE_MODELS:
         return POSE_MODELS[setup.model]
+    if setup.model not in PAIR_MODELS:
+        return setup.model == "board", setup.model != "pixels"
     with_distance, with_angle = PAIR_MODELS[setup.model]
     return with_angle, with_distance
 

@@ -14,9 +14,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
+from fg_calib.analysis.changes import Change
 from fg_calib.analysis.chi_square import CONFIDENCE, FACTOR, ChiSquare
 from fg_calib.analysis.corrections import PriorFit
-from fg_calib.analysis.goodness import PredictedFit
+from fg_calib.analysis.goodness import GrossErrors, PredictedFit
+from fg_calib.analysis.offsets import Offset
+
+LIKE_NOISE, NOT_NOISE = 1e-3, 1e-6
+"""Probability below which residuals follow the arm more than noise does, and below which true errors are several times
+those that sigmas claim; between the two they may be twice as large (`tests/analysis/test_structure.py`)."""
 
 WORTH_SAYING = 1.1
 """Noise seen over noise stated, or the inverse, below which a difference that is not by chance is not worth a word."""
@@ -33,6 +39,9 @@ LEAST_FOLDED, MOST_FOLDED = 0.05, 0.3
 LARGE_NOISE = 0.2
 """Estimated noise over the motions measured, beyond which it is no noise."""
 
+LEAST_REDUNDANCY = 3.0
+"""Degrees of freedom that a kind must have left for its noise to be estimated."""
+
 _NAMED = 3
 """Configurations or parameters that a statement names."""
 
@@ -44,18 +53,24 @@ class Statement:
     Attributes:
         text: One line.
         finding: Whether the result is not to be trusted because of it; else it is a caution.
+        reservation: Whether a caution says that sigmas are too small, so that the verdict has to mention it.
     """
 
     text: str
     finding: bool
+    reservation: bool = False
 
 
-def of_chi2(found: ChiSquare, evaluated: bool = False) -> list[Statement]:
+def of_chi2(
+    found: ChiSquare, evaluated: bool = False, *, follow: bool = False, gross: GrossErrors | None = None
+) -> list[Statement]:
     """What chi-square of the fitted rows and priors says.
 
     Args:
         found: It.
         evaluated: Whether the arm was taken as it is.
+        follow: Whether residuals follow the arm: sigmas are then too small by more than residuals are too large.
+        gross: The gross errors that are all that is wrong; None if there are none, or more than these is.
     """
     if found.dof <= 0:
         text = "no degree of freedom is left: nothing says whether the fit is right, or the noise; measure more"
@@ -64,6 +79,10 @@ def of_chi2(found: ChiSquare, evaluated: bool = False) -> list[Statement]:
     outside = f"reduced chi-square {reduced:.3g} is outside [{low:.2f}, {high:.2f}]"
     if reduced > high:
         cause = "noise stated too small, effects not modelled, or outliers"
+        if gross is not None:
+            who = f"{'outlier' if gross.n == 1 else f'{gross.n} outliers'} ({_listed(gross.names)})"
+            them = "it" if gross.n == 1 else "them"
+            cause = f"{who}, {gross.ratio:.3g} without {them}: look at {them}, or let a robust loss do so (loss: gnc)"
         if evaluated:
             cause = "the arm does not predict these test rows, noise stated too small, or outliers"
         return [Statement(f"{outside}: {cause}", finding=True)]
@@ -72,8 +91,53 @@ def of_chi2(found: ChiSquare, evaluated: bool = False) -> list[Statement]:
     seen = float(np.sqrt(found.ratio))
     if found.p_value is not None and found.p_value < (1.0 - CONFIDENCE) / 2.0 and seen > WORTH_SAYING:
         text = f"reduced chi-square {reduced:.3g}: residuals are {seen:.2f} times the noise stated, not by chance"
-        return [Statement(f"{text}; sigmas may be too small by as much", finding=False)]
+        return [Statement(text + "; sigmas may be too small by as much" * (not follow), finding=False)]
     return []
+
+
+def of_structure(noise_like: float | None) -> list[Statement]:
+    """What it means that residuals follow the arm.
+
+    Args:
+        noise_like: Probability that noise alone follows it as much; None if that is not known.
+    """
+    if noise_like is None or noise_like >= LIKE_NOISE:
+        return []
+    certain = noise_like < NOT_NOISE
+    text = "the residuals follow the arm, as noise does not: effects that are not modelled"
+    several = "true errors may be several times those claimed: believe the test rows"
+    errors = several if certain else "true errors may be twice those claimed"
+    return [Statement(f"{text}; {errors}", finding=False, reservation=True)]
+
+
+def of_change(found: Change | None, names: Sequence[str]) -> list[Statement]:
+    """What it means that something moved while a table was measured.
+
+    Args:
+        found: What moved; None if nothing did.
+        names: Of configurations and groups (see `Measurements.end_names`).
+    """
+    if found is None:
+        return []
+    where = f"from configuration {names[found.configuration + 1]} on the {found.what} is not where it was before"
+    gain = f"chi-square falls to {100.0 * found.left:.2g} % with a {found.what} of its own from there"
+    return [Statement(f"{where} ({gain}): a target, a base or an instrument that moved", finding=True)]
+
+
+def of_offset(found: Offset, labels: Sequence[str], high: bool) -> list[Statement]:
+    """What it means that all lengths to anchors are off by the same.
+
+    Args:
+        found: By how much.
+        labels: Of the tables.
+        high: Whether residuals are too large for the noise: else it is a reservation.
+    """
+    of = f" of {labels[found.table]}" if len(labels) > 1 else ""
+    text = (
+        f"the lengths{of} fit better if the instrument adds {1e3 * found.size:+.3g} mm to each (sigma"
+        f" {1e3 * found.sigma:.2g} mm), which was not estimated: offset: estimate, or calibrate the instrument"
+    )
+    return [Statement(text, finding=high, reservation=not high)]
 
 
 def of_evaluation(evaluated: bool, noise_estimated: bool) -> list[Statement]:
@@ -103,6 +167,22 @@ def of_estimated_noise(kind: str, sigma: float, motion: float) -> list[Statement
     return [Statement(text, finding=True)]
 
 
+def of_kept_noise(kept: Sequence[str], every: bool) -> list[Statement]:
+    """What it means that noise was to be estimated, but too few degrees of freedom were left for that.
+
+    Args:
+        kept: What noise stayed as stated.
+        every: Whether these are all there are.
+    """
+    if not kept:
+        return []
+    text = (
+        f"the noise of {', '.join(kept)} could not be estimated, for fewer than {LEAST_REDUNDANCY:g} degrees of"
+        " freedom are left to it: it is as stated, or 1 mm and 1 mrad where nothing was"
+    )
+    return [Statement(text + "; nothing says whether it is right: measure more" * every, finding=every)]
+
+
 def of_test(fit: PredictedFit | None, of_fitted: float, names: Sequence[str]) -> list[Statement]:
     """What the predicted rows say, if they were predicted worse than they should be, and worse than others were fitted.
 
@@ -128,7 +208,9 @@ def of_test(fit: PredictedFit | None, of_fitted: float, names: Sequence[str]) ->
     claim = "the arm does not predict them as well as it claims"
     return [
         Statement(
-            f"test rows: {chi2_in_words(fit.chi2, fit.expected, fit.p_value)}: {claim}{suspicious}", ratio > FACTOR
+            f"test rows: {chi2_in_words(fit.chi2, fit.expected, fit.p_value)}: {claim}{suspicious}",
+            finding=ratio > FACTOR,
+            reservation=ratio <= FACTOR,
         )
     ]
 
@@ -143,12 +225,15 @@ def of_priors(fit: PriorFit | None) -> list[Statement]:
         return []
     statements = []
     causes = "tolerances stated too small, or the measurements are not what the job says"
-    if fit.beyond:
-        worst = [f"{fit.names[i]} {fit.z[i]:+.1f}" for i in fit.beyond]
-        statements.append(
-            Statement(f"corrections beyond their tolerances (in sigma of these: {_listed(worst)}): {causes}", True)
-        )
-    elif fit.p_value is not None and fit.p_value < (1.0 - CONFIDENCE) / 2.0:
+    for one in fit.beyond:
+        if one.is_place:
+            text = f"{one.name} lies {one.z:.1f} of its tolerances from where it was said to be"
+            statements.append(Statement(f"{text}: {causes}", True))
+    worst = [f"{one.name} {one.z:+.1f}" for one in fit.beyond if not one.is_place]
+    if worst:
+        text = f"corrections beyond their tolerances (in sigma of these: {_listed(worst)}): {causes}"
+        statements.append(Statement(text, True))
+    if not statements and fit.p_value is not None and fit.p_value < (1.0 - CONFIDENCE) / 2.0:
         largest = [f"{fit.names[i]} {fit.z[i]:+.1f}" for i in np.argsort(-np.abs(fit.z))]
         what = f"corrections are too large for their tolerances (in sigma of these: {_listed(largest)}; sum of squares"
         text = f"{what} {fit.chi2:.3g} where {fit.expected:.3g} is expected): {causes}"

@@ -33,6 +33,7 @@ from fg_calib.analysis.accuracy import errors_at, pose_rms
 from fg_calib.analysis.residual_table import residual_table
 from fg_calib.analysis.uncertainty import Uncertainty, assess
 from fg_calib.analysis.variance_components import solve_job
+from fg_calib.arguments import checked
 from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
 from fg_calib.errors import CalibrationError, ProblemError
 from fg_calib.graph.build import problem_of
@@ -40,6 +41,7 @@ from fg_calib.graph.factors import corrections_of
 from fg_calib.graph.solver import Solution
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import Measurements, rotation_angle
+from fg_calib.options import PAIR_MODELS, POSE_MODELS
 from fg_calib.robot.kinematics import Poses, build_chain, forward, precompute_trig
 from fg_calib.robot.model import Robot
 from fg_calib.threads import single_threaded
@@ -159,6 +161,7 @@ class Comparison:
         return float(corrections_of(self.job.robot, robot.nominal)[self.job.robot.index(name)])
 
 
+@checked
 @single_threaded
 def compare(job: Job) -> Comparison:
     """Run the factor graph and the plain estimators on one job.
@@ -168,8 +171,18 @@ def compare(job: Job) -> Comparison:
     Raises:
         CalibrationError: The job's own problem cannot be built or solved.
     """
+    place = "" if job.path is None else f"{job.path.name}: "
+    for table in job.tables:
+        if table.model not in (*POSE_MODELS, *PAIR_MODELS) or "target" in table.measurements.labels:
+            found = "targets" if table.model in POSE_MODELS else f"model {table.model}"
+            expected = (
+                "poses of the tool, or pairs: plain least squares, which the graph is compared with, knows no more"
+            )
+            raise ProblemError(f"{place}measurements", found, expected)
     if not isinstance(job.measurements, Measurements):
-        raise ProblemError("measurements", "several tables", "one: plain least squares takes no more")
+        found = f"{len(job.measurements)} tables ({', '.join(t.measurements.source for t in job.measurements)})"
+        expected = "one: plain least squares, which the graph is compared with, takes no more"
+        raise ProblemError(f"{place}measurements", found, expected, "give one of them as the path of a table")
     test = job.measurements.test
     judged_on: Literal["test", "train"] = "test" if test.any() else "train"
     readings = job.measurements.readings[test] if test.any() else job.measurements.readings

@@ -35,12 +35,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from fg_calib.arguments import checked
 from fg_calib.baseline.methods import Fit, Solver, claimed_covariance, gauss_newton, scipy_fit
 from fg_calib.baseline.rows import Rows, evaluate, train_rows, whitening_of, without_kinks
 from fg_calib.errors import InputError
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.options import (
     PAIR_MODELS,
+    POSE_MODELS,
     FrameKnowledge,
     Model,
     Pairing,
@@ -114,6 +116,7 @@ class LeastSquares:
         return np.concatenate([self.robot.nominal, self.frame])
 
 
+@checked
 @single_threaded
 def fit_least_squares(
     robot: Robot,
@@ -154,6 +157,8 @@ def fit_least_squares(
         InputError: An argument is not one of those possible, or the measurements lack what the model needs.
     """
     check("model", model, Model)
+    if model not in (*POSE_MODELS, *PAIR_MODELS):
+        raise InputError("model", f"found {model!r}", f"one of {', '.join((*POSE_MODELS, *PAIR_MODELS))} here")
     check("method", method, Method)
     check("frame", frame, FrameKnowledge)
     check_flag("weighted", weighted)

@@ -1,6 +1,24 @@
 """The command line, one module a command: the only place that prints."""
 
-from fg_calib.cli.entry import app, main
-from fg_calib.cli.example import EXAMPLES
+import signal
+from pathlib import Path
 
-__all__ = ["EXAMPLES", "app", "main"]
+EXAMPLES = Path(__file__).parents[1] / "examples"
+"""The bundled examples, a folder each."""
+
+
+def main() -> None:
+    """Run the command line.
+
+    An interrupt (Ctrl-C) ends the process at once: an exception would be lost, or a traceback, while libraries in C
+    are loaded. What it leaves half written, the next command that writes there clears away.
+    """
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.default_int_handler:  # not where the caller has interrupts ignored
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        from fg_calib.cli.entry import run
+
+        run()
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -11,10 +11,15 @@ from fg_calib.cli.output import Json, end, show_json, show_report
 
 
 def calibrate(
-    job: Annotated[Path, typer.Argument(metavar="JOB", help="The job, such as calibration.yaml.")],
+    job: Annotated[Path, typer.Argument(metavar="JOB", readable=False, help="The job, such as calibration.yaml.")],
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="DIR", help="Write result.json, the calibrated robot and residuals.csv there."),
+        typer.Option(
+            "--out",
+            metavar="DIR",
+            readable=False,
+            help="Write result.json, the calibrated robot and residuals.csv there.",
+        ),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -30,12 +35,14 @@ def calibrate(
     if out is not None:
         require_no_input(out, given)
     found = calibrate_job(given)
-    if as_json:
-        show_json(found.result.document())
-    else:
-        from fg_calib.report.text import build_report
+    try:
+        if as_json:
+            show_json(found.result.document())
+        else:
+            from fg_calib.report.text import build_report
 
-        show_report(build_report(found.solution, found.uncertainty))
-    if out is not None:
-        found.save(out)  # after the report, which a full disk then does not take along
+            show_report(build_report(found.solution, found.uncertainty))
+    finally:  # also where nobody takes the report
+        if out is not None:
+            found.save(out)
     end(found.findings)

@@ -11,8 +11,10 @@ from fg_calib.cli.output import Json, end, show_json, show_report
 
 
 def compare(
-    job: Annotated[Path, typer.Argument(metavar="JOB", help="The job, such as calibration.yaml.")],
-    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Write comparison.json there.")] = None,
+    job: Annotated[Path, typer.Argument(metavar="JOB", readable=False, help="The job, such as calibration.yaml.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", readable=False, help="Write comparison.json there.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Run the factor graph beside plain least squares on the same job: errors, residuals, sigmas, time."""
@@ -25,10 +27,12 @@ def compare(
     if out is not None:
         require_writable(out)
     found = comparison.compare(read_job(job))
-    if as_json:
-        show_json(comparison_document(found))
-    else:
-        show_report(build_comparison_report(found))
-    if out is not None:
-        write_comparison(out, found)
+    try:
+        if as_json:
+            show_json(comparison_document(found))
+        else:
+            show_report(build_comparison_report(found))
+    finally:  # also where nobody takes the report
+        if out is not None:
+            write_comparison(out, found)
     end(found.findings)

@@ -6,23 +6,28 @@ Exit codes: 0 good; 1 bad input; 2 wrong usage; 3 solved, but not to be trusted.
 from __future__ import annotations
 
 import atexit
-import errno
 import gc
 import io
 import logging
 import os
+import re
+import resource
 import sys
+from collections.abc import Sequence
 from typing import Annotated, NoReturn
 
 import typer
 
 from fg_calib import __version__
+from fg_calib.cli.bag import bag
+from fg_calib.cli.board import board
 from fg_calib.cli.calibrate import calibrate
 from fg_calib.cli.compare import compare
 from fg_calib.cli.example import example
 from fg_calib.cli.observe import observe
+from fg_calib.cli.output import say
 from fg_calib.cli.simulate import simulate
-from fg_calib.errors import CalibrationError
+from fg_calib.errors import CalibrationError, InputError, printable
 
 app = typer.Typer(
     name="fg-calib",
@@ -31,7 +36,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (calibrate, compare, observe, simulate, example):
+for command in (calibrate, compare, observe, simulate, example, bag, board):
     app.command()(command)
 
 
@@ -39,39 +44,120 @@ _OBJECTS_BEFORE_GARBAGE = 500_000
 """New objects after which garbage is looked for: twice what a calibration and its imports make."""
 
 
-def main() -> None:
+def run() -> None:
     """Run the command line.
 
     Garbage is looked for seldom, and not at the end: among all that imports keep, it took a quarter of a short command.
     """
     gc.set_threshold(_OBJECTS_BEFORE_GARBAGE)
     atexit.register(gc.freeze)
-    logging.basicConfig(stream=sys.stderr, format="%(message)s", level=logging.WARNING)
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show a letter gets a question mark
-            stream.reconfigure(errors="replace")
+    os.environ["MPLBACKEND"] = "agg"  # figures are only written, and what Jupyter asks for need not be installed here
+    _open_streams()
+    _show_log()
+    _limit_widths()
     try:
         try:
+            _require_words(sys.argv[1:])
+            _require_resources()
             app(prog_name="fg-calib")
         finally:
             sys.stdout.flush()
     except CalibrationError as error:
         _fail(str(error))
-    except BrokenPipeError:  # the reader of our output has gone
-        sys.stderr.close()
-        sys.exit(1)
     except MemoryError:
         _fail("there is not enough memory for this")
+    except BrokenPipeError:  # the reader of our output has gone
+        _close_stdout()
+        sys.exit(1)
     except OSError as error:
-        if error.errno != errno.ENOSPC:
-            raise
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - what could not be printed is not tried again at exit
-        _fail(f"the output cannot be written: {error.strerror}")
+        _close_stdout()
+        what = "the output cannot be written" if error.filename is None else error.filename
+        _fail(f"{what}: {error.strerror or error}")
+
+
+def _open_streams() -> None:
+    """Give streams that the caller closed to nobody: files that are opened would take their places.
+
+    A terminal that cannot show a letter gets a question mark.
+    """
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w"))  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+
+
+class _Line(logging.Formatter):
+    """A message of the log as the one line it is."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record))
+
+
+def _show_log() -> None:
+    """Show warnings of the package on stderr; that matplotlib has no folder for its cache is none of them."""
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    shown = logging.StreamHandler(sys.stderr)
+    shown.setFormatter(_Line())
+    logging.basicConfig(handlers=[shown], level=logging.WARNING)
+
+
+def _require_words(arguments: Sequence[str]) -> None:
+    """End with 2 where an argument is empty, as a shell's unset variable is: a path would be the current folder."""
+    for before, argument in zip(["", *arguments], arguments, strict=False):
+        if not argument or re.fullmatch("--[a-z-]+=", argument):
+            what = argument[:-1] or (before if before.startswith("--") else "an argument")
+            say(f"error: {what} is empty; is a variable of the shell not set?")
+            sys.exit(2)
+
+
+def _limit_widths() -> None:
+    """Keep what the environment says of the terminal's size within what a page can have; words say nothing."""
+    for name in ("COLUMNS", "LINES", "TERMINAL_WIDTH"):  # the last is typer's, for its help
+        given = os.environ.get(name)
+        if given is None:
+            continue
+        if given.isdecimal():
+            os.environ[name] = str(min(max(int(given[:9]), _WIDTHS[0]), _WIDTHS[1]))
+        else:
+            del os.environ[name]
+
+
+_WIDTHS = (20, 1000)
+"""Narrowest and widest page."""
+
+_LEAST_FILES = 32
+"""Files that are open at once, at most: numba, polars and GTSAM bring libraries."""
+
+_LEAST_ADDRESS_SPACE = 2 * 1024**3
+"""Bytes with which a small job can be calibrated: libraries of whom one finds no memory abort instead of saying so."""
+
+
+def _require_resources() -> None:
+    """Check limits on the process's memory (`ulimit -v` or `-d`) and on its open files, if there are any.
+
+    Raises:
+        InputError: It is so low that libraries could not even be loaded.
+    """
+    for kind, option in ((resource.RLIMIT_AS, "-v"), (resource.RLIMIT_DATA, "-d")):
+        limit, _ = resource.getrlimit(kind)
+        if limit != resource.RLIM_INFINITY and limit < _LEAST_ADDRESS_SPACE:
+            least = f"at least {_LEAST_ADDRESS_SPACE // 1024**2} MB"
+            raise InputError("memory", f"limited to {limit // 1024**2} MB", least, f"see `ulimit {option}`")
+    files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if files != resource.RLIM_INFINITY and files < _LEAST_FILES:
+        raise InputError("open files", f"limited to {files}", f"at least {_LEAST_FILES}", "see `ulimit -n`")
+
+
+def _close_stdout() -> None:
+    """Give up what could not be printed: it is not tried again at exit."""
+    sys.stdout = open(os.devnull, "w")  # noqa: SIM115
 
 
 def _fail(message: str) -> NoReturn:
-    """Say in one line why there is no result; control characters from files are none of the terminal's."""
-    print("error: " + "".join(c if c.isprintable() else "?" for c in message), file=sys.stderr)
+    """Say in one line why there is no result."""
+    say(f"error: {message}")
     sys.exit(1)
 
 

@@ -7,16 +7,14 @@ from typing import Annotated
 
 import typer
 
+from fg_calib.cli import EXAMPLES
 from fg_calib.cli.output import say_next
 from fg_calib.errors import InputError
-
-EXAMPLES = Path(__file__).parents[1] / "examples"
-"""The bundled examples, a folder each."""
 
 
 def example(
     name: Annotated[str, typer.Argument(metavar="NAME", help="The example: space-robot.")],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write it to.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", readable=False, help="Folder to write it to.")],
 ) -> None:
     """Write a ready job to try the package on: robot, measurements and calibration.yaml."""
     from fg_calib.files.disk import fill_folder, require_absent

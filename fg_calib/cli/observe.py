@@ -2,26 +2,35 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from fg_calib.cli.output import Json, show_json, show_report
-from fg_calib.options import AngleUnit, FrameKnowledge, LengthUnit, Model
+from fg_calib.cli.output import Json, say, show_json, show_report
+from fg_calib.options import AngleUnit, FrameKnowledge, LengthUnit, Model, check_number
 
-_OF_A_TABLE = ("pairing", "length", "angle", "position_noise", "orientation_noise", "joint_noise")
+_NOISES = ("position_noise", "orientation_noise", "joint_noise")
+
+_OF_A_TABLE = ("pairing", "length", "angle", *_NOISES)
 """Options that say something of a table of configurations."""
 
-_Robot = Annotated[Path, typer.Argument(metavar="ROBOT", help="The robot: robot.yaml or a URDF.")]
+_Robot = Annotated[Path, typer.Argument(metavar="ROBOT", readable=False, help="The robot: robot.yaml or a URDF.")]
 _Model = Annotated[Model, typer.Option("--model", help="What is measured.")]
 _Configurations = Annotated[
     Path | None,
-    typer.Option("--configurations", metavar="TABLE", help="Your configurations; random ones within limits if none."),
+    typer.Option(
+        "--configurations",
+        metavar="TABLE",
+        readable=False,
+        help="Your configurations; random ones within limits if none.",
+    ),
 ]
-_Out = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Write observability.json and figures there.")]
+_Out = Annotated[
+    Path | None,
+    typer.Option("--out", metavar="DIR", readable=False, help="Write observability.json and figures there."),
+]
 _Frame = Annotated[FrameKnowledge, typer.Option("--frame", help="Whether world_T_base is estimated too.")]
 _Pairing = Annotated[
     Literal["star", "chain", "all"], typer.Option("--pairing", help="Pairs of TABLE's configurations.")
@@ -74,6 +83,9 @@ def observe(
         _refuse_idle(context, _OF_A_TABLE, "without --configurations")
     else:
         _refuse_idle(context, ("seed",), "with --configurations")
+    for option, figure in zip(_NOISES, (position_noise, orientation_noise, joint_noise), strict=True):
+        if figure is not None:
+            check_number(f"--{option.replace('_', '-')}", figure, above=option != "joint_noise")
     arm = read_robot(robot, base_link=base_link, tip_link=tip_link)
     names = [name.strip() for name in prefer.split(",") if name.strip()]
     for name in names:
@@ -89,12 +101,14 @@ def observe(
         )
         table = read_measurements(configurations, arm, units=units, noise=noise)
         found = observe_configurations(arm, table, model, frame=frame, pairing=Pairing(pairing), prefer=names)
-    if as_json:
-        show_json(observability_document(found))
-    else:
-        show_report(build_identifiability_report(found))
-    if out is not None:
-        write_observability(out, found)
+    try:
+        if as_json:
+            show_json(observability_document(found))
+        else:
+            show_report(build_identifiability_report(found))
+    finally:  # also where nobody takes the report
+        if out is not None:
+            write_observability(out, found)
 
 
 def _refuse_idle(context: typer.Context, names: Sequence[str], circumstance: str) -> None:
@@ -102,5 +116,5 @@ def _refuse_idle(context: typer.Context, names: Sequence[str], circumstance: str
     for name in names:
         source = context.get_parameter_source(name)
         if source is not None and source.name != "DEFAULT":
-            print(f"error: --{name.replace('_', '-')} has no effect {circumstance}", file=sys.stderr)
+            say(f"error: --{name.replace('_', '-')} has no effect {circumstance}")
             raise typer.Exit(2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,10 +12,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from fg_calib.errors import printable
+
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout, and nothing else there.")]
+
+
+def say(text: str) -> None:
+    """Print a line on stderr; what names from files and of folders hold steers no terminal."""
+    print(printable(text), file=sys.stderr)
 
 
 def show_json(document: dict[str, Any]) -> None:
@@ -36,12 +44,13 @@ def show_report(report: RenderableType) -> None:
 def end(findings: Sequence[str]) -> None:
     """Say on stderr why a result is not to be trusted, and end with 3 if there is a reason."""
     for finding in findings:
-        print(f"not to be trusted: {finding}", file=sys.stderr)
+        say(f"not to be trusted: {finding}")
     if findings:
         raise typer.Exit(3)
 
 
 def say_next(names: Sequence[str], folder: Path) -> None:
     """Say on stderr which files of a job were written to a folder, and how to calibrate it."""
-    print(f"wrote {', '.join(names)} to {folder}", file=sys.stderr)
-    print(f"now: fg-calib calibrate {folder / 'calibration.yaml'} --out {folder / 'result'}", file=sys.stderr)
+    say(f"wrote {', '.join(names)} to {folder}")
+    job, result = (shlex.quote(str(folder / name)) for name in ("calibration.yaml", "result"))
+    say(f"now: fg-calib calibrate {job} --out {result}")

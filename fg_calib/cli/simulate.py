@@ -8,27 +8,32 @@ from typing import Annotated
 import typer
 
 from fg_calib.cli.output import Json, say_next, show_json
+from fg_calib.errors import printable
 
 
 def simulate(
     scenario: Annotated[
         str, typer.Argument(metavar="SCENARIO", help="The scenario: a YAML file, or a shipped one: space-robot.")
     ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write the job to.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", readable=False, help="Folder to write the job to.")],
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of all that is drawn.")] = 0,
     as_json: Json = False,
 ) -> None:
     """Simulate a calibration job: the true robot, and what is measured of it, with noise."""
     from fg_calib.files.scenario import read_scenario
-    from fg_calib.files.simulation import require_no_other_job, write_simulation
+    from fg_calib.files.simulation import write_simulation
     from fg_calib.simulation import simulator
 
     simulation = simulator.simulate(read_scenario(scenario), seed)
-    require_no_other_job(out, simulation)
     names = write_simulation(out, simulation)
     if as_json:
         show_json({"files": [str(out / name) for name in names], **simulation.summary()})
     else:
-        test = simulation.measurements.test
-        print(f"{simulation.scenario.name}, seed {seed}: {sum(~test)} configurations to calibrate, {sum(test)} to test")
+        n_train, n_test = (simulation.n_configurations(test=test) for test in (False, True))
+        counts = f"{n_train} configurations to calibrate, {n_test} to test"
+        print(printable(f"{simulation.scenario.name}, seed {seed}: {counts}"))
+        for table in simulation.tables if simulation.scenario.instruments else ():
+            m = table.measurements
+            rows = f"{sum(~m.test)} rows to calibrate, {sum(m.test)} to test"
+            print(printable(f"{m.source}: model {table.model}, {rows}"))
     say_next(names, out)

@@ -12,9 +12,10 @@ from fg_calib.errors import InputError
 from fg_calib.files.robot_yaml import FrameValues
 from fg_calib.files.schema import Count, Number, Positive, Schema, shown, validate
 from fg_calib.files.units import Units
-from fg_calib.measurements.checks import LIMIT_SLACK
+from fg_calib.measurements.limits import LIMIT_SLACK
 from fg_calib.robot.model import Robot
-from fg_calib.simulation.scenario import BoardViews, Placement
+from fg_calib.simulation.configurations import BoardViews, Placement
+from fg_calib.sizes import MOST_DRAWN
 
 
 class Board(Schema):
@@ -22,7 +23,7 @@ class Board(Schema):
 
     pose: FrameValues
     height: Positive | None = None
-    count: Count
+    count: Annotated[Count, Field(le=MOST_DRAWN)]
     radius: Positive | None = None
     distance: Annotated[list[Positive], Field(min_length=2, max_length=2)] | None = None
     cone: Positive | None = None
@@ -65,7 +66,7 @@ def read_board(file: Board, robot: Robot, units: Units, place: str) -> BoardView
         given["roll"] = _roll(file.roll, units, place)
     if file.posture is not None:
         given["posture"] = _posture(file.posture, robot, units, f"{place}: posture")
-    return BoardViews(placement(file.pose, units), file.count, self_motion=file.self_motion, **given)
+    return BoardViews(placement(file.pose, units, f"{place}: pose"), file.count, self_motion=file.self_motion, **given)
 
 
 def _check_keys(file: Board, place: str) -> None:
@@ -103,10 +104,14 @@ def _posture(given: list[float], robot: Robot, units: Units, place: str) -> tupl
     return tuple(f * units.factor(j.unit) for f, j in zip(given, joints, strict=True))
 
 
-def placement(values: FrameValues, units: Units) -> Placement:
-    """A frame in SI."""
+def placement(values: FrameValues, units: Units, place: str) -> Placement:
+    """A frame in SI.
+
+    Raises:
+        InputError: An angle in rad is one in deg.
+    """
     from scipy.spatial.transform import Rotation
 
-    si = values.si(units)
+    si = values.si(units, place)
     turn = Rotation.from_euler("xyz", [si["roll"], si["pitch"], si["yaw"]])  # about fixed axes: Rz(yaw) Ry Rx
     return Placement(turn.as_matrix(), np.array([si["x"], si["y"], si["z"]]))

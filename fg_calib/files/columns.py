@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import csv
 import logging
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import nullcontext
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from io import BytesIO, TextIOWrapper
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fg_calib.arrays import NOTHING, as_figures, check_different
 from fg_calib.errors import InputError
-from fg_calib.files.disk import decoded, read_bytes, silent_stderr
-from fg_calib.files.frames import as_polars
-from fg_calib.files.schema import shown
+from fg_calib.files.disk import decoded, read_bytes
+from fg_calib.files.frames import as_polars, cells, of_polars, select
+from fg_calib.files.parquet import parquet_columns, read_parquet
+from fg_calib.files.schema import number_hint, shown
 from fg_calib.files.units import ANGLES, LENGTHS, Units
-from fg_calib.measurements.dataset import Booleans, Floats
-from fg_calib.options import did_you_mean
+from fg_calib.measurements.dataset import Booleans, Floats, Integers
+from fg_calib.options import check_names, did_you_mean
 from fg_calib.sizes import LEAST_SIZE, MOST_SIZE, ORDINARY
 
 if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it
@@ -28,9 +30,34 @@ if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need
 
 _log = logging.getLogger(__name__)
 
-_ROW = "row of the file"  # a column of our own beside those of the file
-
 _ENDINGS = (".csv", ".parquet", ".pq")
+
+
+@dataclass(frozen=True)
+class Column:
+    """What a table calls a column, and how its figures are meant: (figure - zero) * scale, as counts of an encoder are.
+
+    Attributes:
+        name: In the table's header.
+        scale: What one of its units is in those of the table.
+        zero: The figure that means 0.
+
+    Raises:
+        InputError: The name is empty, or a figure is not finite; a scale of 0 is none.
+    """
+
+    name: str
+    scale: float = 1.0
+    zero: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name.strip():
+            raise InputError("columns: name", f"found {shown(self.name)}", "the name of a column")
+        for key in ("scale", "zero"):
+            figure = as_figures(f"columns: {self.name}: {key}", getattr(self, key), "a number")
+            if figure.shape or not np.isfinite(figure) or (key == "scale" and figure == 0.0):
+                expected = "a finite number" if key == "zero" else "a finite number other than 0"
+                raise InputError(f"columns: {self.name}: {key}", f"found {shown(getattr(self, key))}", expected)
 
 
 @dataclass(frozen=True)
@@ -42,12 +69,16 @@ class Header:
         columns: Names of the columns.
         content: The bytes of the file.
         frame: The table, where it is in no file.
+        separator: What stands between the cells of a CSV. Where it is no comma, numbers may have decimal commas.
+        meant: By column, how its figures are meant, where that is not as they stand.
     """
 
     path: Path
     columns: tuple[str, ...]
     content: bytes = field(default=b"", repr=False)
     frame: pl.DataFrame | None = None
+    separator: str = ","
+    meant: Mapping[str, Column] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -65,21 +96,19 @@ class Header:
         Raises:
             InputError: It cannot be read.
         """
-        import polars as pl
-
         if self.frame is not None:
-            return self.frame.select(columns)
+            return select(self.frame, columns)
         chosen = sorted(self.columns.index(c) for c in columns)
-        frame = _of_polars(self.name, lambda: pl.read_parquet(BytesIO(self.content), columns=chosen))
+        frame = read_parquet(self.content, chosen, self.name)
         frame.columns = [self.columns[i] for i in chosen]  # without blanks around them
-        return frame.select(columns)
+        return select(frame, columns)
 
     @classmethod
     def read(cls, table: Path | str | Any, name: str) -> Header:
         """Read the header of a file, or of a frame by this name."""
-        import polars as pl
-
-        if not isinstance(table, Path | str):
+        if isinstance(table, str) and not table:
+            raise InputError(name, "found ''", "a path, or a frame of polars or pandas")
+        if not isinstance(table, os.PathLike | str):
             frame = as_polars(table, name)
             return cls(Path(name), tuple(frame.columns), frame=frame)
         path = Path(table)
@@ -90,53 +119,92 @@ class Header:
         place = header.name
         if header.is_csv:
             header = replace(header, content=_with_newlines(header.content))
-            decoded(header.content, header.name)
+            header = replace(header, separator=_separator(decoded(header.content, header.name)))
             line, columns = next(header.csv_rows(), (1, []))
             place = f"{place}:{line}"
         else:
-            columns = list(_of_polars(place, lambda: pl.read_parquet_schema(BytesIO(header.content))))
+            columns = parquet_columns(header.content, place)
         columns = [column.strip() for column in columns]
-        if not columns:
-            raise InputError(place, "an empty file", "a header and rows")
-        for column, n in Counter(columns).items():
-            if n > 1:
-                raise InputError(place, f"two columns called {column!r}", "different names")
+        if not any(columns):
+            raise InputError(place, "no names of columns" if columns else "an empty file", "a header and rows")
+        if len(columns) == 1 and "|" in columns[0]:
+            raise InputError(place, f"one column {shown(columns[0])}", "columns with , ; or tab between", "not '|'")
+        check_different(place, columns)
         return replace(header, columns=tuple(columns))
 
     def csv_rows(self) -> Iterator[tuple[int, list[str]]]:
-        """Line number and cells of the header and of each row; blank lines count from the header on, as in polars."""
+        """Cells of the header and of each row, with the line where it begins.
+
+        Blank lines count from the header on, as in polars.
+        """
         file = TextIOWrapper(BytesIO(self.content), encoding="utf-8-sig", errors="replace", newline="")
         csv.field_size_limit(max(len(self.content), csv.field_size_limit()))
-        reader = csv.reader(file)
-        started = False
+        reader = csv.reader(file, delimiter=self.separator)
+        started, line = False, 1
         try:
             for cells in reader:
                 started = started or bool(cells)
                 if started:
-                    yield reader.line_num, cells
+                    yield line, cells
+                line = reader.line_num + 1
         except csv.Error as error:
             raise InputError(f"{self.name}:{reader.line_num}", f"not a CSV: {error}") from None
+
+    def renamed(self, columns: Mapping[str, Column], known: Iterable[str]) -> Header:
+        """The same with columns called as they are known.
+
+        Args:
+            columns: By known name, what the table calls it; a column that has that name already is not used.
+            known: Columns that mean something.
+
+        Raises:
+            InputError: A name is not known, or the table has no such column.
+        """
+        place = f"{self.name}: columns"
+        check_names(place, columns, sorted(known), "column")
+        names = list(self.columns)
+        places = {}
+        for name, column in columns.items():
+            check_names(f"{place}: {name}", [column.name.strip()], self.columns, "column")
+            places[name] = self.columns.index(column.name.strip())
+        check_different(f"{place}: the table's", [column.name.strip() for column in columns.values()])
+        for name, i in places.items():
+            if name in names and names.index(name) not in places.values():
+                names[names.index(name)] = f"{name} (the table's)"
+            names[i] = name
+        return replace(self._with_names(names), meant=dict(columns))
+
+    def _with_names(self, names: Sequence[str]) -> Header:
+        frame = self.frame
+        if frame is not None:
+            frame = frame.clone()
+            frame.columns = list(names)
+        return replace(self, columns=tuple(names), frame=frame)
 
     def understood(self, known: Iterable[str], others: Iterable[str] = ()) -> Header:
         """The same with the columns that are known by another case called as they are known.
 
-        A column that is neither known nor one of the others, but nearly reads like a known one, is warned of.
+        What looks as if it was to mean something, but does not, is warned of.
 
         Args:
             known: Columns that mean something.
             others: Names that somebody else has given.
+
+        Raises:
+            InputError: A known name stands behind a #, as if the header were a comment.
         """
         known, others = set(known), set(others)
-        names = list(self.columns)
+        names, given = list(self.columns), set(self.columns)
         for i, name in enumerate(names):
             if name in known or name in others:
                 continue
-            if name.lower() in known and name.lower() not in names:
+            if name.startswith("#") and (bare := name.lstrip("# ").lower()) in known:
+                raise InputError(self.name, f"column {shown(name)}", f"{bare}, or another name")
+            if name.lower() in known and name.lower() not in given:
                 names[i] = name.lower()
-            elif hint := did_you_mean(name, known - set(names), 0.85):
+            elif hint := _meaning(name, known, given):
                 _log.warning("%s: column %r is not used; %s", self.name, name, hint)
-        frame = None if self.frame is None else self.frame.rename(dict(zip(self.columns, names, strict=True)))
-        return replace(self, columns=tuple(names), frame=frame)
+        return self._with_names(names)
 
     def present(self, *columns: str) -> tuple[str, ...]:
         """Those of `columns` that the table has."""
@@ -159,18 +227,25 @@ class Header:
 
 @dataclass(frozen=True)
 class Table:
-    """The columns of use: numbers as floats, texts without blanks around them; empty cells are null."""
+    """The columns of use: numbers as floats, texts without blanks around them; empty cells are null.
+
+    Attributes:
+        header: The table's content.
+        frame: Its columns of use, without blank rows.
+        rows: Where each row stands in the table, 0-based, shape (n_rows,).
+    """
 
     header: Header
     frame: pl.DataFrame
+    rows: Integers
 
     @classmethod
     def read(cls, header: Header, numbers: Sequence[str], texts: Sequence[str]) -> Table:
         """Read the columns of `numbers` and `texts`."""
-        frame = (_read_csv if header.is_csv else _read_parquet)(header, numbers, texts)
+        frame, rows = (_read_csv if header.is_csv else _read_parquet)(header, numbers, texts)
         if frame.height == 0:
             raise InputError(header.name, "no rows", "at least one")
-        return cls(header, frame)
+        return cls(header, frame, rows)
 
     @property
     def n_rows(self) -> int:
@@ -180,9 +255,12 @@ class Table:
     def numbers(self, columns: Sequence[str], *, optional: bool = False) -> Floats:
         """The columns, shape (n_rows, n_columns); an empty cell is nan if `optional`, else an error."""
         for column in columns:
-            good = self.frame[column].is_finite().fill_null(optional)
+            good = cells(self.frame, column).is_finite().fill_null(optional)
             self.require(good.to_numpy(), column, "a finite number")
-        values = self.frame.select(columns).to_numpy(order="c")
+        values = select(self.frame, columns).to_numpy(order="c").copy()
+        for i, name in enumerate(columns):
+            if (meant := self.header.meant.get(name)) is not None:
+                values[:, i] = (values[:, i] - meant.zero) * meant.scale
         size = np.abs(values)
         for column, good in zip(columns, ((size <= MOST_SIZE) | np.isnan(values)).T, strict=True):
             self.require(good, column, ORDINARY)
@@ -202,6 +280,13 @@ class Table:
         self.require(texts.is_not_null().to_numpy(), column, expected)
         return texts
 
+    def names(self, column: str, expected: str) -> pl.Series:
+        """The column, null where it is empty, without a word that stands for nothing elsewhere."""
+        names = self.frame[column]
+        nothing = names.str.to_lowercase().is_in(NOTHING).fill_null(False)
+        self.require(~nothing.to_numpy(), column, expected)
+        return names
+
     def test_rows(self) -> Booleans:
         """True where `split` says test, shape (n_rows,)."""
         if "split" not in self.header.columns:
@@ -215,7 +300,7 @@ class Table:
         if not good.all():
             place, cell = self._look_up(int(np.argmin(good)), column)
             found = "an empty cell" if cell in {None, ""} else shown(cell)
-            raise InputError(f"{place}: {column}", f"found {found}", expected, hint)
+            raise InputError(f"{place}: {column}", f"found {found}", expected, hint or number_hint(cell))
 
     def place(self, row: int) -> str:
         """File and line of a row (the header is line 1); of a Parquet file the 0-based row."""
@@ -223,15 +308,30 @@ class Table:
 
     def _look_up(self, row: int, column: str) -> tuple[str, Any]:
         """Place and original content of a cell, for messages; slow, since it reads the file again."""
-        wanted = self.frame[_ROW][row]
+        wanted = int(self.rows[row])
         name, columns = self.header.name, self.header.columns
         if self.header.is_csv:
-            line, cells = next(found for i, found in enumerate(self.header.csv_rows()) if i == wanted + 1)
-            return f"{name}:{line}", cells[columns.index(column)].strip()
+            line, row_of_file = next(found for i, found in enumerate(self.header.csv_rows()) if i == wanted + 1)
+            return f"{name}:{line}", row_of_file[columns.index(column)].strip()
         return f"{name}: row {wanted}", self.header.parquet([column])[column][wanted]
 
 
-def _read_csv(header: Header, numbers: Sequence[str], texts: Sequence[str]) -> pl.DataFrame:
+_SIGMA = "sigma_"
+
+
+def _meaning(name: str, known: set[str], given: set[str]) -> str:
+    """What a column may have been meant to be, by its name; else nothing."""
+    if name.lower() in known:
+        return f"{name.lower()} is"
+    sigmas = sorted(column for column in known if column.startswith(_SIGMA))
+    if not name.lower().startswith("sigma"):
+        return did_you_mean(name, known - given, 0.85)
+    rest = name.lower().removeprefix(_SIGMA)  # else every sigma would be much like every other
+    like = did_you_mean(rest, [column.removeprefix(_SIGMA) for column in sigmas if column not in given], 0.85)
+    return like.replace("mean ", f"mean {_SIGMA}") or f"sigmas are {', '.join(sigmas)}"
+
+
+def _read_csv(header: Header, numbers: Sequence[str], texts: Sequence[str]) -> tuple[pl.DataFrame, Integers]:
     import polars as pl
 
     last = header.columns[-1]
@@ -239,64 +339,60 @@ def _read_csv(header: Header, numbers: Sequence[str], texts: Sequence[str]) -> p
     chosen = sorted(header.columns.index(c) for c in wanted)
     start = _start_of_header(header.content)
     try:
-        frame = _of_polars(
+        frame = of_polars(
             header.name,
-            lambda: pl.read_csv(BytesIO(header.content[start:]), columns=chosen, infer_schema=False),
+            lambda: pl.read_csv(
+                BytesIO(header.content[start:]), columns=chosen, infer_schema=False, separator=header.separator
+            ),
         )
     except InputError:
         _check_lengths(header)
+        _check_quotes(header)
         raise
     frame.columns = [header.columns[i] for i in chosen]  # without blanks around them
-    rows = frame.with_row_index(_ROW)
-    nothing = rows.select(pl.all_horizontal(pl.col(wanted).is_null())).to_series().to_numpy()
+    _check_same_rows(header, frame.height)
+    rows = np.arange(frame.height)
+    nothing = np.logical_and.reduce([cells(frame, column).is_null().to_numpy() for column in wanted])
     if nothing.any():  # lines that are blank, and rows whose cells of use are empty
         blank = np.array([not any(cells) for _, cells in header.csv_rows()][1:], dtype=np.bool_)
-        rows = rows.filter(~(nothing & blank[: len(nothing)]))
-    if rows[last].is_null().any():  # polars takes a cell that is missing at the end for an empty one
+        rows = rows[~(nothing & blank)]
+        frame = frame[rows]
+    if cells(frame, last).is_null().any():  # polars takes a cell that is missing at the end for an empty one
         _check_lengths(header)
-    return rows.select(_ROW, *map(_number, numbers), *map(_text, texts))
+    return _columns(frame, numbers, texts, decimal_comma=header.separator != ","), rows
 
 
-def _read_parquet(header: Header, numbers: Sequence[str], texts: Sequence[str]) -> pl.DataFrame:
-    import polars as pl
-
+def _read_parquet(header: Header, numbers: Sequence[str], texts: Sequence[str]) -> tuple[pl.DataFrame, Integers]:
     frame = header.parquet(list(dict.fromkeys((*numbers, *texts))))
-    types = frame.schema
-    for column in numbers:
-        if not (types[column].is_numeric() or types[column] in (pl.String, pl.Null)):
-            raise InputError(f"{header.name}: {column}", f"type {types[column]}", "numbers")
-    read = [_number(c) if types[c] == pl.String else pl.col(c).cast(pl.Float64) for c in numbers]
-    rows = frame.with_row_index(_ROW)
-    return _of_polars(header.name, lambda: rows.select(_ROW, *read, *map(_text, texts)))
+    for column, kind in frame.schema.items():
+        if column in numbers and not (kind.is_numeric() or str(kind) in ("String", "Null")):
+            raise InputError(f"{header.name}: {column}", f"type {kind}", "numbers")
+        if kind.is_nested() or str(kind) == "Object":
+            raise InputError(f"{header.name}: {column}", f"type {kind}", "text")
+    return of_polars(header.name, lambda: _columns(frame, numbers, texts)), np.arange(frame.height)
 
 
-_Found = TypeVar("_Found")
-
-
-def _of_polars(name: str, read: Callable[[], _Found]) -> _Found:
-    """What polars makes of a table; its errors, and panics of its Rust, become one line.
-
-    Raises:
-        InputError: It makes nothing of it.
-    """
+def _columns(
+    frame: pl.DataFrame, numbers: Sequence[str], texts: Sequence[str], *, decimal_comma: bool = False
+) -> pl.DataFrame:
+    """Columns of numbers, and of texts."""
     import polars as pl
 
-    what = {".csv": "CSV", ".parquet": "Parquet file", ".pq": "Parquet file"}.get(Path(name).suffix.lower(), "table")
-    try:
-        # Only what reads Parquet panics, and says so on the process's stderr, which is everybody's.
-        with silent_stderr() if what == "Parquet file" else nullcontext():
-            return read()
-    except (pl.exceptions.PolarsError, OSError, ValueError, TypeError) as error:
-        raise InputError(name, f"not a {what}: {_first_line(error)}") from None
-    except BaseException as error:
-        if type(error).__name__ != "PanicException":
-            raise
-        raise InputError(name, f"not a {what}: polars cannot read it", hint="write it anew") from None
+    read = {c: _number(cells(frame, c), decimal_comma) for c in numbers} | {c: _text(cells(frame, c)) for c in texts}
+    return pl.DataFrame(read)
 
 
 def _with_newlines(content: bytes) -> bytes:
-    """Lines end with a newline; those of old Macs with a carriage return alone."""
-    return content if b"\n" in content else content.replace(b"\r", b"\n")
+    """Every line ends with a newline alone, whatever mixture of ends it had: readers do not take others alike."""
+    for end in (b"\r\r\n", b"\r\n", b"\r"):
+        content = content.replace(end, b"\n")
+    return content
+
+
+def _separator(text: str) -> str:
+    """What stands between the cells of a CSV: a comma, unless its header has more semicolons or tabs."""
+    header = re.sub(r'"[^"]*"?', "", text.lstrip("\n").partition("\n")[0])
+    return max(",;\t", key=header.count)
 
 
 def _start_of_header(content: bytes) -> int:
@@ -307,32 +403,50 @@ def _start_of_header(content: bytes) -> int:
     return start
 
 
-def _text(column: str) -> pl.Expr:
-    """Text without blanks around it; null if nothing is left."""
+def _text(cells: pl.Series) -> pl.Series:
+    """Text without blanks around it, whole numbers without a fraction; null if nothing is left."""
     import polars as pl
 
-    text = pl.col(column).cast(pl.String).str.strip_chars()
-    return pl.when(text != "").then(text)
+    if cells.dtype.is_float() and bool(((cells % 1 == 0) & (cells.abs() <= MOST_SIZE)).all()):
+        cells = cells.cast(pl.Int64)  # pandas has floats beside nan
+    return cells.cast(pl.String).str.strip_chars().replace("", None)
 
 
-def _number(column: str) -> pl.Expr:
-    """Text as a number: nan where it is not one, null where it is empty."""
+def _number(cells: pl.Series, decimal_comma: bool) -> pl.Series:
+    """Numbers, also from text: nan where it is none, null where it is empty."""
     import polars as pl
 
-    text = pl.col(column).str.strip_chars()
-    return text.cast(pl.Float64, strict=False).fill_null(pl.when(text != "").then(float("nan")))
+    if cells.dtype != pl.String:
+        return cells.cast(pl.Float64)
+    texts = _text(cells)
+    if decimal_comma:  # in a text with a point too one of them groups thousands, or it is no number
+        texts = texts.str.replace(r"^([^.,]*),([^.,]*)$", "$1.$2")
+    return texts.cast(pl.Float64, strict=False).fill_null(float("nan")).set(texts.is_null(), None)
+
+
+def _check_same_rows(header: Header, n_rows: int) -> None:
+    """Raise where polars and the standard library do not read the same rows, which only quotes can make them do."""
+    if b'"' in header.content and sum(1 for _ in header.csv_rows()) != n_rows + 1:
+        _check_lengths(header)
+        _check_quotes(header)
+        raise InputError(header.name, "quotes within cells", "whole cells in quotes, or none")
 
 
 def _check_lengths(header: Header) -> None:
     """Raise for the first row of a CSV that has more or fewer cells than the header."""
-    for line, cells in header.csv_rows():
-        if cells and len(cells) != len(header.columns):
-            expected = f"{len(header.columns)} as in the header"
-            raise InputError(f"{header.name}:{line}", f"{len(cells)} cells", expected)
+    for line, row in header.csv_rows():
+        if row and len(row) != len(header.columns):
+            goes_on = any("\n" in cell for cell in row)
+            hint = "a quote joins it with lines below: is one missing?" if goes_on else ""
+            found = f"{len(row)} cell{'s' * (len(row) != 1)}"
+            raise InputError(f"{header.name}:{line}", found, f"{len(header.columns)} as in the header", hint)
 
 
-def _first_line(error: Exception) -> str:
-    return str(error).strip().partition("\n")[0]
+def _check_quotes(header: Header) -> None:
+    """Raise for the first line of a CSV with a quote that is not closed in it."""
+    for line, text in enumerate(header.content.split(b"\n"), start=1):
+        if text.count(b'"') % 2:
+            raise InputError(f"{header.name}:{line}", "a quote that is not closed", "whole cells in quotes, or none")
 
 
 def unit_hint(figure: float, unit: str, units: Units, limits: tuple[float, float]) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fg_calib.files.disk import replacing
+from fg_calib.libraries import require_polars
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,7 @@ def write_csv_parts(path: Path | str, parts: Iterable[Mapping[str, ArrayLike | W
     Raises:
         InputError: The folder does not exist or may not be written to.
     """
+    require_polars(str(path))
     import polars as pl
 
     with replacing(Path(path)) as temporary, temporary.open("wb") as file:

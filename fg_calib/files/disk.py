@@ -7,7 +7,9 @@ import hashlib
 import os
 import shutil
 import socket
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import stat
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
@@ -36,15 +38,13 @@ def read_bytes(path: Path) -> bytes:
         InputError: There is no such file, it may not be read, or it is a folder, a pipe or a device.
     """
     try:
-        if path.is_dir():
-            raise InputError(str(path), "is a folder", "a file")
-        if path.exists() and not path.is_file():
-            raise InputError(str(path), "is a pipe or a device", "a file")
-        content = path.read_bytes()
+        content = _content(_newest(path), path)
     except FileNotFoundError:
         raise InputError(_short(str(path)), "no such file") from None
     except PermissionError:
         raise InputError(str(path), "may not be read", hint="check the permissions of file and folder") from None
+    except MemoryError:
+        raise InputError(_short(str(path)), "there is not enough memory for it") from None
     except (OSError, ValueError) as error:  # ValueError: a path with a null character
         found = f"cannot be read: {getattr(error, 'strerror', None) or error}"
         raise InputError(_short(str(path)), found, "a file") from None
@@ -54,21 +54,19 @@ def read_bytes(path: Path) -> bytes:
     return content
 
 
-@contextmanager
-def silent_stderr() -> Iterator[None]:
-    """Nothing is written to the process's stderr in the block, by libraries in C or Rust either."""
+def _content(found: Path, path: Path) -> bytes:
+    """The bytes of what stands for a path."""
     try:
-        kept = os.dup(2)
-    except OSError:  # there is no stderr
-        yield
-        return
-    try:
-        with Path(os.devnull).open("wb") as nowhere:
-            os.dup2(nowhere.fileno(), 2)
-            yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        mode = found.stat().st_mode
+        if stat.S_ISDIR(mode):
+            raise InputError(str(path), "is a folder", "a file")
+        if not stat.S_ISREG(mode):
+            raise InputError(str(path), "is a pipe or a device", "a file")
+        return found.read_bytes()
+    except FileNotFoundError:
+        if found.parent.name != _WRITTEN:
+            raise
+        return path.read_bytes()  # it was moved to its place in the meantime
 
 
 def _short(text: str) -> str:
@@ -84,15 +82,23 @@ def decoded(content: bytes, name: str) -> str:
     Raises:
         InputError: It is something else; the message names line and byte.
     """
-    for mark, encoding in ((b"\xff\xfe", "UTF-16"), (b"\xfe\xff", "UTF-16")):
-        if content.startswith(mark):
+    for encoding, marks in _WIDE.items():
+        if content.startswith(marks):
             raise InputError(name, f"{encoding} text", "UTF-8 text", "save it as UTF-8")
+    if b"\0" in content:
+        line = content.partition(b"\0")[0].count(b"\n") + 1
+        hint = "is it UTF-16, or no text at all? save it as UTF-8"
+        raise InputError(f"{name}:{line}", "a null character", "UTF-8 text", hint)
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1
         hint = "is it Latin-1 or Windows text? save it as UTF-8"
         raise InputError(f"{name}:{line}", f"byte {content[error.start]:#04x}", "UTF-8 text", hint) from None
+
+
+_WIDE = {"UTF-32": (b"\xff\xfe\0\0", b"\0\0\xfe\xff"), "UTF-16": (b"\xff\xfe", b"\xfe\xff")}
+"""Encodings and the marks with which their texts begin."""
 
 
 def read_text(path: Path) -> str:
@@ -113,7 +119,7 @@ def replacing(path: Path) -> Iterator[Path]:
     """
     if not path.parent.is_dir():
         raise InputError(str(path), f"there is no folder {path.parent}")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}.tmp")
     try:
         yield temporary
         temporary.replace(path)
@@ -133,27 +139,29 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_bytes(text.encode())
 
 
-_WRITING, _WRITTEN = ".fg-calib-writing-", ".fg-calib-written"
-"""Folders within a folder that is filled: while files are written, and when all are there but not yet moved."""
+_WRITING, _WRITTEN, _REMOVED = ".fg-calib-writing-", ".fg-calib-written", ".fg-calib-removed"
+"""Folders within a folder that is filled: while files are written, and when all are there but not yet moved; and in the
+latter the list of files that are to be removed."""
 
 
-def fill_folder(folder: Path, write: Callable[[Path], None], together: Sequence[str] = ()) -> None:
+def fill_folder(folder: Path, write: Callable[[Path], None], own: Mapping[str, bytes] | None = None) -> None:
     """Let `write` write files that then appear in a folder, all of them or none.
 
     They are written to a folder within it, which is renamed when all of them are there: from then on they count as
-    written. Only then they are moved to their places; what interrupts that is made good by `finish` (see there), which
-    everything that reads from such a folder or writes to it calls first. Renaming within one folder is atomic on local
-    disks and network mounts, also where the folder itself is a mount or its parent may not be written.
+    written, and `read_bytes` reads them there. Only then they are moved to their places, and files of an earlier time
+    removed; what interrupts that, the next that fills the folder makes good. Renaming within one folder is atomic on
+    local disks and network mounts, also where the folder itself is a mount or its parent may not be written.
 
     Args:
         folder: Where the files appear.
         write: Writes them to the folder that it is given.
-        together: Files that belong together: those of an earlier time that are not written now are removed.
+        own: What may be written, and replaced: see `require_own`. What is not written now is removed.
 
     Raises:
-        InputError: The folder cannot be written.
+        InputError: The folder cannot be written, or holds other files in their places.
     """
-    missing = [f for f in (folder, *folder.parents) if not f.exists()]
+    own = own or {}
+    missing = _missing(folder)
     temporary = None
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -161,11 +169,14 @@ def fill_folder(folder: Path, write: Callable[[Path], None], together: Sequence[
         temporary = Path(mkdtemp(prefix=f"{_WRITING}{_here()}-", dir=folder))
         write(temporary)
         names = [file.name for file in temporary.iterdir()]
-        for file in temporary.iterdir():
-            if (folder / file.name).is_dir():
-                raise InputError(str(folder / file.name), "is a folder", "a place for a file")
+        for name in names:
+            if (folder / name).is_dir():
+                raise InputError(str(folder / name), "is a folder", "a place for a file")
+        if left := sorted(set(own).difference(names)):
+            (temporary / _REMOVED).write_text("\n".join(left))
         while True:
-            finish(folder)
+            _finish(folder)
+            require_own(folder, own)
             try:
                 temporary.rename(folder / _WRITTEN)
                 break
@@ -173,9 +184,10 @@ def fill_folder(folder: Path, write: Callable[[Path], None], together: Sequence[
                 if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                     raise
         temporary = None
-        finish(folder)
-        for name in set(together).difference(names):
-            (folder / name).unlink(missing_ok=True)
+        _finish(folder)
+    except InputError as error:  # of a file, where it was to appear
+        place = error.place.replace(str(temporary), str(folder))
+        raise InputError(place, error.found, error.expected, error.hint) from error
     except OSError as error:
         raise InputError(
             str(folder), f"cannot be written: {error.strerror or error}", "a folder that can be"
@@ -192,9 +204,22 @@ def require_writable(folder: Path) -> None:
     Raises:
         InputError: They cannot.
     """
-    missing = [f for f in (folder, *folder.parents) if not f.exists()]
+    missing = _missing(folder)
     fill_folder(folder, lambda _: None)
     _remove_empty(missing)
+
+
+def _missing(folder: Path) -> list[Path]:
+    """The folder and those above it that are not there.
+
+    Raises:
+        InputError: It has a name that no folder can have.
+    """
+    try:
+        return [f for f in (folder, *folder.parents) if not f.exists()]
+    except (OSError, ValueError) as error:
+        found = f"cannot be written: {getattr(error, 'strerror', None) or error}"
+        raise InputError(_short(str(folder)), found, "a folder that can be") from None
 
 
 def _remove_empty(folders: Iterable[Path]) -> None:
@@ -214,39 +239,185 @@ def require_absent(folder: Path, names: Iterable[str]) -> None:
             raise InputError(str(folder / name), "is there already", "a folder without it")
 
 
-def finish(folder: Path) -> None:
-    """Move files to their places that were written to a folder by a process that ended before it had moved them.
+def require_own(folder: Path, own: Mapping[str, bytes]) -> None:
+    """Check that files that would be replaced or removed were written by the same command.
+
+    Args:
+        folder: Where they are.
+        own: Names of what the command writes, and how each begins. The first says of all others whose they are, as some
+            begin as anybody's may.
 
     Raises:
-        InputError: They cannot be moved.
+        InputError: One was not, or it cannot be read.
+    """
+    first = next(iter(own), "")
+    for name, beginning in own.items():
+        found = _beginning(folder / name, len(beginning))
+        if found is None:
+            continue
+        # The first is looked at after it: other writers may have come between.
+        if found != beginning or _beginning(folder / first, len(own[first])) != own[first]:
+            raise InputError(str(folder / name), "is there already, not written by this command", "another folder")
+
+
+def _beginning(path: Path, size: int) -> bytes | None:
+    """How a file begins; None where there is none.
+
+    Raises:
+        InputError: It is a folder, a pipe or a device.
+    """
+    for found in (_newest(path), path):  # again: it may have been moved to its place in the meantime
+        try:
+            if not stat.S_ISREG(found.stat().st_mode):
+                raise InputError(str(path), "is no file", "a place for a file")
+            with found.open("rb") as file:
+                return file.read(size)
+        except FileNotFoundError:
+            continue
+        except OSError:
+            return b""
+    return None
+
+
+def exists(path: Path) -> bool:
+    """Whether there is a file or folder; in a folder that was filled, what counts as written."""
+    try:
+        return _newest(path).exists()
+    except (OSError, ValueError):  # a name that no file can have
+        return False
+
+
+def is_folder(path: Path) -> bool:
+    """Whether there is a folder; none has a name that no file can have."""
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False
+
+
+def _newest(path: Path) -> Path:
+    """Where a file stands that was written but not yet moved to its place; else the path.
+
+    Nothing is moved to read it, as the folder may be another's.
+
+    Raises:
+        InputError: Somebody else wrote it than the folder's owner or this user, or it may not be read.
+    """
+    written = path.parent / _WRITTEN
+    foreign = InputError(str(written), "files of another user", "none", "have them moved to their places, or removed")
+    try:
+        with _opened(written) as journal:
+            if os.fstat(journal).st_uid not in (os.geteuid(), path.parent.stat().st_uid):
+                raise foreign
+            if path.name in os.listdir(journal):
+                return written / path.name
+            return path.parent / _REMOVED / path.name if path.name in _removed(journal) else path
+    except PermissionError:
+        if os.access(path.parent, os.X_OK):
+            raise foreign from None
+        return path
+    except (OSError, ValueError):  # none, or none of ours: a file or link; ValueError: a path with a null character
+        return path
+
+
+@contextmanager
+def _opened(folder: Path) -> Iterator[int]:
+    """A descriptor of a folder, not of what a link leads to."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def _removed(journal: int) -> list[str]:
+    """Names of files that are to be removed from the folder in which a folder of written files is."""
+    try:
+        descriptor = os.open(_REMOVED, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=journal)
+    except FileNotFoundError:
+        return []
+    with os.fdopen(descriptor, encoding="utf-8", errors="replace") as file:
+        return [name for name in file.read().split("\n") if name and Path(name).name == name]
+
+
+def _finish(folder: Path) -> None:
+    """Move files to their places that were written to a folder and are not yet there, and remove earlier ones.
+
+    All of it goes through a descriptor of the folder that holds them: when another process is done with that, it is
+    gone, and nothing more is moved out of it or, which is how files are removed, into it.
+
+    Raises:
+        InputError: They cannot be moved, or this user has not written them.
     """
     written = folder / _WRITTEN
     try:
-        files = sorted(written.iterdir())
-    except OSError:
+        with _opened(written) as journal:
+            _require_mine(written, journal)
+            names = sorted(set(os.listdir(journal)) - {_REMOVED})
+            for name in _removed(journal):
+                _rename(folder / name, name + _REMOVED, None, journal)
+            for name in names:
+                if name.endswith(_REMOVED):
+                    continue
+                _rename(name, folder / name, journal, None)
+            for name in os.listdir(journal):
+                if name.endswith(_REMOVED) and name != _REMOVED:
+                    _unlink(name, journal)
+            _unlink(_REMOVED, journal)
+    except FileNotFoundError:
         return
-    for file in files:
-        try:
-            file.replace(folder / file.name)
-        except FileNotFoundError:  # another process moves them too
-            continue
-        except OSError as error:
-            found = f"holds files that could not be moved to their places: {error.strerror or error}"
-            raise InputError(str(folder), found, f"those of {_WRITTEN} in it") from None
+    except OSError as error:
+        if error.errno in (errno.ENOTDIR, errno.ELOOP):
+            raise InputError(str(written), "is no folder of written files", "none", "remove it") from None
+        found = f"holds files that could not be moved to their places: {error.strerror or error}"
+        raise InputError(str(folder), found, f"those of {_WRITTEN} in it") from None
     with suppress(OSError):
         written.rmdir()
 
 
+def _require_mine(written: Path, journal: int) -> None:
+    """Check that this user wrote a folder of written files, and that it holds nothing but files.
+
+    Raises:
+        InputError: It is not so.
+    """
+    hint = "move them to their places, or remove it"
+    if os.fstat(journal).st_uid != os.geteuid():
+        raise InputError(str(written), "files of another user", "none", hint)
+    for name in os.listdir(journal):
+        with suppress(FileNotFoundError):  # another process moves them too
+            if not stat.S_ISREG(os.stat(name, dir_fd=journal, follow_symlinks=False).st_mode):
+                raise InputError(str(written / name), "is no file", "files alone", "remove it")
+
+
+def _rename(source: Path | str, target: Path | str, source_in: int | None, target_in: int | None) -> None:
+    with suppress(FileNotFoundError):  # another process did it
+        os.replace(source, target, src_dir_fd=source_in, dst_dir_fd=target_in)
+
+
+def _unlink(name: str, folder: int) -> None:
+    with suppress(FileNotFoundError):
+        os.unlink(name, dir_fd=folder)
+
+
 def _clear_dead(folder: Path) -> None:
-    """Remove what processes of this machine left half written when they were killed."""
-    for left in folder.glob(f"{_WRITING}{socket.gethostname()}-*"):
+    """Remove what processes of this machine, or container, left half written when they were killed."""
+    for left in folder.glob(f"{_WRITING}{_host()}-*"):
         process = left.name.rpartition("-")[0].rpartition("-")[2]
         if process.isdigit() and not _runs(int(process)):
             shutil.rmtree(left, ignore_errors=True)
 
 
 def _here() -> str:
-    return f"{socket.gethostname()}-{os.getpid()}"
+    return f"{_host()}-{os.getpid()}"
+
+
+def _host() -> str:
+    """Within what a process has its number: the machine's name, and the namespace of numbers where there are such."""
+    try:
+        return f"{socket.gethostname()}-{os.stat('/proc/self/ns/pid').st_ino}"
+    except OSError:
+        return socket.gethostname()
 
 
 def _runs(process: int) -> bool:

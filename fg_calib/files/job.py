@@ -3,28 +3,56 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import astuple, fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import Field, StrictBool
 
+from fg_calib.arguments import checked
 from fg_calib.errors import InputError
+from fg_calib.files.columns import Column
 from fg_calib.files.disk import noting_reads
+from fg_calib.files.instruments import camera_of, read_camera
 from fg_calib.files.robot_yaml import read_robot, robot_from_mapping
-from fg_calib.files.schema import Count, NotNegative, Positive, Schema, read_yaml, shown, validate
-from fg_calib.files.tables import read_measurements
+from fg_calib.files.schema import (
+    Count,
+    FilePath,
+    NotNegative,
+    Number,
+    Positive,
+    Schema,
+    Seed,
+    read_yaml,
+    shown,
+    validate,
+)
+from fg_calib.files.tables import read_measurements, read_points
 from fg_calib.files.units import Units, UnitsOfFile
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import Noise
-from fg_calib.measurements.series import Table
-from fg_calib.options import EncoderNoise, FrameKnowledge, Gauge, Loss, Model, Options, PairErrors, Pairing, check_names
+from fg_calib.measurements.kinds import Camera
+from fg_calib.measurements.series import KnownPoint, Table
+from fg_calib.options import (
+    POSE_MODELS,
+    EncoderNoise,
+    FrameKnowledge,
+    Gauge,
+    Loss,
+    Model,
+    Options,
+    PairErrors,
+    Pairing,
+    check_names,
+    did_you_mean,
+)
 from fg_calib.robot.model import Robot, names_of
 
 _log = logging.getLogger(__name__)
 
-UNSTATED = Noise(position=1e-3, orientation=1e-3, distance=1e-3, angle=1e-3, point=1e-3)
+UNSTATED = Noise(position=1e-3, orientation=1e-3, distance=1e-3, angle=1e-3, point=1e-3, pixel=1.0)
 """Where the noise starts from if it is to be estimated and nothing was stated."""
 
 
@@ -35,6 +63,7 @@ class _Noise(Schema):
     distance: Positive | None = None
     angle: Positive | None = None
     point: Positive | None = None
+    pixel: Positive | None = None
     estimate: StrictBool = False
 
 
@@ -48,13 +77,13 @@ class _FigureEach(Schema):
 
 class _RandomPairing(Schema):
     random: Annotated[Count, Field(gt=0)]
-    seed: Count = 0
+    seed: Seed = 0
 
 
 class _JobOfTables(Schema):
     robot: Any  # a path, or the mapping of a robot file
     measurements: Any  # the path of a table, or a list of `_Table`
-    pairs: str | None = None
+    pairs: FilePath | None = None
     model: Model | None = None
     pairing: Any = "star"  # a strategy's name, or a `_RandomPairing`
     frame: FrameKnowledge = "known"
@@ -67,7 +96,13 @@ class _JobOfTables(Schema):
     encoder: EncoderNoise = "propagated"
     loss: Loss = "none"
     max_iterations: Annotated[Count, Field(gt=0)] | None = None
-    truth: str | None = None
+    truth: FilePath | None = None
+    targets: dict[str, Any] = Field(default_factory=dict)  # by name a `_Point`
+    anchors: dict[str, Any] = Field(default_factory=dict)
+    tolerance: Any = None  # a `_Tolerances`
+    offset: Literal["estimate"] | None = None
+    camera: Any = None  # a path, or a camera's mapping
+    columns: dict[str, Any] | None = None  # by known name a column's own name, or a `_Column`
 
 
 class _Job(_JobOfTables):
@@ -75,19 +110,45 @@ class _Job(_JobOfTables):
 
 
 class _Table(Schema):
-    table: str
-    pairs: str | None = None
+    table: FilePath
+    pairs: FilePath | None = None
     model: Model | None = None
     pairing: Any = None
     frame: FrameKnowledge | None = None
     units: UnitsOfFile | None = None
     noise: Any = None
+    offset: Literal["estimate"] | None = None
+    camera: Any = None
+    columns: dict[str, Any] | None = None
+
+
+class _Column(Schema):
+    name: str
+    scale: Number = 1.0
+    zero: Number = 0.0
+
+
+class _Point(Schema):
+    x: Number
+    y: Number
+    z: Number
+    tolerance: Positive | None = None
+
+
+class _Fixed(Schema):
+    fixed: StrictBool
+
+
+class _Tolerances(Schema):
+    targets: Positive | None = None
+    anchors: Positive | None = None
 
 
 _CHOICES = ("model", "frame", "prior", "gauge", "prefer", "pair_errors", "encoder", "loss", "max_iterations")
 """Keys of a job that are options as they stand."""
 
 
+@checked
 def read_job(path: Path | str) -> Job:
     """The calibration job in a YAML file, with its robot and its measurements.
 
@@ -117,7 +178,8 @@ def _job(path: Path) -> Job:
     _check_preferred(file, robot, path.name)
     _, estimate_noise = _noise(file.noise, file.units, robot, f"{path.name}: noise")
     tables = _tables(file, robot, path)
-    alone = tables[0].measurements if isinstance(file.measurements, str) else tuple(tables)
+    plain = isinstance(file.measurements, str) and tables[0].is_plain
+    alone = tables[0].measurements if plain else tuple(tables)
     truth = None if file.truth is None else _truth(folder / file.truth, robot)
     return Job(path, robot, alone, _options(file, estimate_noise, path.name, tables[0]), truth)
 
@@ -125,16 +187,25 @@ def _job(path: Path) -> Job:
 def _tables(file: _JobOfTables, robot: Robot, path: Path) -> list[Table]:
     """The tables of a job; what an entry leaves out is as the job says for all."""
     given, folder = file.measurements, path.parent
-    if not isinstance(given, str) and not (isinstance(given, list) and given):
+    if not given or not isinstance(given, str | list):
         raise InputError(f"{path.name}: measurements", f"found {shown(given)}", "a path, or a list of tables")
     whole = isinstance(given, str)
     if not whole and file.pairs is not None:
         raise InputError(f"{path.name}: pairs", "beside a list of tables", "the key in the table's own entry")
     entries = [{"table": given, "pairs": file.pairs}] if whole else given
+    places = [path.name if whole else f"{path.name}: measurement {i}" for i in range(1, len(entries) + 1)]
+    read = [validate(_Table, one, place) for one, place in zip(entries, places, strict=True)]
+    between = len(read) > 1 and any(entry.pairs is not None for entry in read)
+    columns = [
+        _columns(file.columns, f"{path.name}: columns")
+        if entry.columns is None
+        else _columns(entry.columns, f"{place}: columns")
+        for entry, place in zip(read, places, strict=True)
+    ]
+    touched = [read_points(folder / entry.table, c) for entry, c in zip(read, columns, strict=True)] if between else []
+    points = [name for names in touched for name in names]
     tables = []
-    for number, one in enumerate(entries):
-        place = path.name if whole else f"{path.name}: measurements[{number}]"
-        entry = validate(_Table, one, place)
+    for entry, place, called in zip(read, places, columns, strict=True):
         model = entry.model or file.model
         if model is None:
             raise InputError(place, "missing key 'model'")
@@ -148,17 +219,100 @@ def _tables(file: _JobOfTables, robot: Robot, path: Path) -> list[Table]:
                 )
             figures = {key: getattr(own, key) for key in entry.noise}
             stated = replace(stated, **figures)
-        pairing = _pairing(file.pairing if entry.pairing is None else entry.pairing, f"{place}: pairing")
+        pairing = pairing_of(file.pairing if entry.pairing is None else entry.pairing, f"{place}: pairing")
         pairs = None if entry.pairs is None else folder / entry.pairs
-        measurements = read_measurements(folder / entry.table, robot, pairs=pairs, units=units, noise=stated)
-        tables.append(Table(measurements, model, pairing, entry.frame or file.frame))
+        measurements = read_measurements(
+            *(folder / entry.table, robot), pairs=pairs, units=units, noise=stated, points=points, model=model,
+            columns=called,
+        )  # fmt: skip
+        camera, fixed_camera = _camera(file.camera, entry.camera, place, folder)
+        table = Table(
+            *(measurements, model, pairing, entry.frame or file.frame),
+            known=_known_points(file, model, path.name),
+            offset=model == "anchor" and (entry.offset or file.offset) == "estimate",
+            camera=camera if model == "pixels" else None,
+            fixed_camera=model == "pixels" and fixed_camera,
+        )
+        tables.append(table)
+    _tell_of_idle_keys(file, tables, path.name)
     return tables
+
+
+_USED_BY: dict[str, tuple[Model, ...]] = {
+    "targets": tuple(POSE_MODELS),
+    "anchors": ("anchor",),
+    "offset": ("anchor",),
+    "camera": ("pixels",),
+}
+
+
+def _tell_of_idle_keys(file: _JobOfTables, tables: Sequence[Table], place: str) -> None:
+    """Warn of keys that say something of instruments that no table is of."""
+    for key, models in _USED_BY.items():
+        if getattr(file, key) and not any(table.model in models for table in tables):
+            _log.warning("%s: %s is not used: no table is of model %s", place, key, " or ".join(models))
+
+
+def _columns(given: Mapping[str, Any] | None, place: str) -> dict[str, Column]:
+    """What a table calls its columns: by the name that is known here."""
+    found = {}
+    for name, one in (given or {}).items():
+        file = validate(_Column, {"name": one} if isinstance(one, str) else one, f"{place}: {name}")
+        try:
+            found[name] = Column(file.name, file.scale, file.zero)
+        except InputError as error:
+            raise InputError(f"{place}: {name}", error.found, error.expected) from None
+    return found
+
+
+def _known_points(file: _JobOfTables, model: Model, place: str) -> dict[str, KnownPoint]:
+    """Targets or anchors, whatever a model has, that the job says something of."""
+    what = {"anchor": "anchors"} | dict.fromkeys(POSE_MODELS, "targets")
+    if model not in what:
+        return {}
+    key = what[model]
+    for_all = validate(_Tolerances, {} if file.tolerance is None else file.tolerance, f"{place}: tolerance")
+    factor, found = file.units.factor("m"), {}
+    for name, one in getattr(file, key).items():
+        point = validate(_Point, one, f"{place}: {key}: {name}")
+        tolerance = getattr(for_all, key) if point.tolerance is None else point.tolerance
+        xyz = np.array([point.x, point.y, point.z]) * factor
+        found[name] = KnownPoint(xyz, None if tolerance is None else tolerance * factor)
+    return found
+
+
+def _camera(for_all: object, own: object, place: str, folder: Path) -> tuple[Camera | None, bool]:
+    """The camera of a table, and whether it stands in the room; `fixed` in an entry is the job's camera, fixed."""
+    given = for_all if own in (None, "fixed") else own
+    camera, fixed = camera_in(given, f"{place}: camera", folder)
+    return camera, fixed or "fixed" in (own, for_all)
+
+
+def camera_in(given: object, place: str, folder: Path) -> tuple[Camera | None, bool]:
+    """A camera, and whether it stands in the room.
+
+    Args:
+        given: A path, or the camera's mapping, or `file` with the path; a mapping may say `fixed`.
+        place: File and key, for messages.
+        folder: Where the path starts.
+
+    Raises:
+        InputError: It is no camera.
+    """
+    fixed = False
+    if isinstance(given, dict) and "fixed" in given:
+        fixed = validate(_Fixed, {"fixed": given["fixed"]}, place).fixed
+        given = {key: value for key, value in given.items() if key != "fixed"}
+        given = given["file"] if set(given) == {"file"} else given
+    if given in (None, "fixed"):
+        return None, fixed
+    return (read_camera(folder / given) if isinstance(given, str) else camera_of(given, place)), fixed
 
 
 def _options(file: _JobOfTables, estimate_noise: bool, place: str, first: Table) -> Options:
     """The choices of a job; its old key `prior: false` is `gauge: none`."""
-    choices = {key: getattr(file, key) for key in _CHOICES} | {"model": first.model}
-    pairing = _pairing(file.pairing, f"{place}: pairing")
+    choices = {key: getattr(file, key) for key in _CHOICES if key in file.model_fields_set} | {"model": first.model}
+    pairing = pairing_of(file.pairing, f"{place}: pairing")
     return Options.of(**choices, pairing=pairing, estimate_noise=estimate_noise)
 
 
@@ -173,8 +327,8 @@ def check_choices(choices: Mapping[str, Any], robot: Robot, place: str) -> None:
     Raises:
         InputError: A job with these keys could not be read.
     """
-    file = validate(_Job, {"robot": "", "measurements": "", **choices}, place)
-    _pairing(file.pairing, f"{place}: pairing")
+    file = validate(_Job, {"robot": ".", "measurements": ".", **choices}, place)
+    pairing_of(file.pairing, f"{place}: pairing")
     _check_preferred(file, robot, place)
 
 
@@ -201,7 +355,7 @@ def robot_of(given: object, place: str, folder: Path, units: Units) -> Robot:
                 _log.warning("%s: base and tool are in %s and %s, as the file's units say", place, *astuple(units))
             given = {**given, "units": units}
         return robot_from_mapping(given, place, folder)
-    if not isinstance(given, str):
+    if not isinstance(given, str) or not given:
         raise InputError(place, f"found {shown(given)}", "a path, or the mapping of a robot file")
     return read_robot(folder / given)
 
@@ -214,14 +368,20 @@ def _truth(path: Path, robot: Robot) -> Robot:
     return truth
 
 
-def _pairing(given: object, place: str) -> Pairing:
+def pairing_of(given: object, place: str) -> Pairing:
+    """A pairing: a strategy, or how many random pairs.
+
+    Raises:
+        InputError: It is neither.
+    """
     match given:
         case "star" | "chain" | "all":
             return Pairing(given)
         case dict():
             file = validate(_RandomPairing, given, place)
             return Pairing("random", file.random, file.seed)
-    raise InputError(place, f"found {shown(given)}", "one of star, chain, all, {random: N, seed: S}")
+    hint = did_you_mean(given, ("star", "chain", "all"))
+    raise InputError(place, f"found {shown(given)}", "one of star, chain, all, {random: N, seed: S}", hint)
 
 
 def _noise(given: object, units: Units, robot: Robot, place: str) -> tuple[Noise, bool]:
@@ -242,6 +402,7 @@ def _noise(given: object, units: Units, robot: Robot, place: str) -> tuple[Noise
         distance=si(file.distance, "m"),
         angle=si(file.angle, "rad"),
         point=si(file.point, "m"),
+        pixel=file.pixel,
     )
     if not file.estimate:
         return noise, False

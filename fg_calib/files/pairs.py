@@ -10,6 +10,7 @@ import numpy as np
 
 from fg_calib.errors import InputError
 from fg_calib.files.columns import Header, Table, unit_hint
+from fg_calib.files.schema import shown
 from fg_calib.files.units import Units
 from fg_calib.measurements.checks import ANGLE_SLACK
 from fg_calib.measurements.dataset import Booleans, Floats, Integers, Noise, Pairs
@@ -125,7 +126,8 @@ def _sigma(table: Table, column: str, default: float | None, factor: float) -> F
 def _has_test_end(ends: _Ends, configurations: Configurations) -> Booleans:
     """Pairs of a test row, or of a group that was touched in test rows only, shape (n_pairs,)."""
     test, group = configurations.test, configurations.group
-    only_test = np.array([test[group == g].all() for g in range(len(configurations.group_names))], dtype=np.bool_)
+    touches = [test[group == g] for g in range(len(configurations.group_names))]
+    only_test = np.array([len(here) > 0 and here.all() for here in touches], dtype=np.bool_)
     found = np.zeros(len(ends.a), dtype=np.bool_)
     for flags, chosen in ((test, ~ends.of_groups), (only_test, ends.of_groups)):
         found[chosen] = flags[ends.a[chosen]] | flags[ends.b[chosen]]
@@ -147,7 +149,7 @@ def _ends(table: Table, configurations: Configurations) -> _Ends:
     if (a == b).any():
         row = int(np.argmax(a == b))
         what = "groups" if a_is_group[row] else "configurations"
-        raise InputError(table.place(row), f"a and b are both {table.frame['a'][row]!r}", f"two different {what}")
+        raise InputError(table.place(row), f"a and b are both {shown(table.frame['a'][row])}", f"two different {what}")
     return _Ends(a, b, a_is_group)
 
 
@@ -163,16 +165,18 @@ def _rows_named(table: Table, column: str, configurations: Configurations) -> tu
         return names.replace_strict(known, pl.int_range(len(known), eager=True), default=None, return_dtype=pl.Int64)
 
     names = table.texts(column, "a configuration")
+    if not by_id:
+        names = names.str.replace(r"^(\d+)\.0+$", "$1")  # so pandas writes whole numbers that were beside an empty cell
     row_of, group_of = look_up(ids), look_up(pl.Series(group_names, dtype=pl.String))
     both, neither = row_of.is_not_null() & group_of.is_not_null(), row_of.is_null() & group_of.is_null()
     if both.any():
         row = both.arg_true()[0]
-        found = f"{column} = {names[row]!r} is both {kind} and a group of {place.name}"
+        found = f"{column} = {shown(names[row])} is both {kind} and a group of {place.name}"
         raise InputError(table.place(row), found, "different names")
     if neither.any():
         row = neither.arg_true()[0]
         either = f"{kind} or a group" if group_names else kind
-        found = f"{column} = {names[row]!r} is not {either} of {place.name}"
+        found = f"{column} = {shown(names[row])} is not {either} of {place.name}"
         raise InputError(table.place(row), found, "" if by_id else f"a number from 0 to {len(ids) - 1}")
     is_group = group_of.is_not_null().to_numpy()
     return np.where(is_group, group_of.fill_null(-1).to_numpy(), row_of.fill_null(-1).to_numpy()), is_group

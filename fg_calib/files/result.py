@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -15,10 +17,17 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic_core import PydanticCustomError
 
+from fg_calib.arguments import checked
 from fg_calib.arrays import NORM_TOLERANCE
 from fg_calib.errors import InputError
-from fg_calib.files.disk import finish, read_text
+from fg_calib.files.disk import exists, is_folder, read_text
 from fg_calib.files.schema import first_misfit
+
+MOST_WHOLE = 10**15
+"""The most of anything that a result counts: far more than is ever counted, and exact as a float."""
+
+Whole = Annotated[int, Field(ge=0, le=MOST_WHOLE)]
+"""A count."""
 
 SCHEMA: Literal["fg-calib/result/2"] = "fg-calib/result/2"
 
@@ -58,6 +67,9 @@ def _unit(quaternion: tuple[float, ...]) -> tuple[float, ...]:
 
 ROUNDING = 1e-6
 """How far a covariance may be from symmetric, in products of sigmas: a matrix summed in another order is not."""
+
+NEAR_NOTHING = 1e-9
+"""How far a correction may be from estimate less nominal, [m] and [rad]: rounding, and no error of a robot."""
 
 Figure = Annotated[float | None, BeforeValidator(_known)]
 """A number, None where it is unknown or infinite."""
@@ -105,7 +117,7 @@ class Solver(Section):
     name: str
     converged: bool
     message: str
-    iterations: int
+    iterations: Whole
     initial_cost: Figure
     cost: Figure
     seconds: Figure
@@ -115,7 +127,7 @@ class Solver(Section):
 class KindGoodness(Section):
     """Noise stated and noise seen of one kind of residuals."""
 
-    n: int
+    n: Whole
     stated_sigma_rms: Figure
     seen_over_stated: Figure
     chi2: Figure
@@ -128,7 +140,7 @@ class SuspectConfiguration(Section):
     """A configuration whose residuals are together larger than noise."""
 
     id: str
-    n: int
+    n: Whole
     chi2: Figure
     expected: Figure
 
@@ -138,15 +150,15 @@ class TestRows(Section):
 
     __test__ = False  # no test of pytest's
 
-    n_rows: int
-    n: int
-    n_outliers: int
-    n_unknown: int
+    n_rows: Whole
+    n: Whole
+    n_outliers: Whole
+    n_unknown: Whole
     chi2: Figure
     expected: Figure
     p_value: Figure
     goodness: dict[str, KindGoodness]
-    n_suspect_rows: int
+    n_suspect_rows: Whole
     suspect_configurations: tuple[SuspectConfiguration, ...]
 
 
@@ -161,7 +173,7 @@ class BeyondTolerance(Section):
 class Priors(Section):
     """Corrections against tolerances."""
 
-    n: int
+    n: Whole
     chi2: Figure
     expected: Figure
     p_value: Figure
@@ -181,8 +193,8 @@ class ExpectedError(Section):
     position: InFrames
     orientation: InFrames
     at: str
-    n: int
-    of: int
+    n: Whole
+    of: Whole
 
 
 class Typical(Section):
@@ -200,11 +212,15 @@ class Explanation(Section):
 
 
 class Setup(Section):
-    """What residuals before the calibration say of its set-up; `table` names the one of several that they are of."""
+    """What residuals before the calibration say of its set-up; `table` names the one of several that they are of.
+
+    `others` has the same of other tables that have something to say.
+    """
 
     table: str = ""
     residuals: dict[str, Typical]
     explanations: tuple[Explanation, ...]
+    others: tuple[Setup, ...] = ()
 
 
 class Parameter(Section):
@@ -217,7 +233,7 @@ class Parameter(Section):
     correction: float
     sigma: Sigma
     prior_sigma: Sigma
-    identifiability: str
+    identifiability: Literal["independent", "relative", "ineffective", "fixed"]
     stands_for: dict[str, float] | None = None
     sigma_of_combination: Sigma = None
 
@@ -271,7 +287,7 @@ class SuspectReading(Section):
 class JointValues(Section):
     """Estimated joint values about their readings."""
 
-    n: int
+    n: Whole
     joints: tuple[JointScatter, ...]
     suspects: tuple[SuspectReading, ...]
 
@@ -280,23 +296,26 @@ class TouchedPoint(Section):
     """A point that a group of configurations touched, or another unknown, of any number of coordinates."""
 
     name: str
-    n: int
+    n: Whole
     xyz: Annotated[tuple[float, ...], BeforeValidator(_listed)]
     sigma: Sigmas
+    kind: str = "point"
+    units: tuple[str, ...] = ("m", "m", "m")
 
 
 class Rms(Section):
-    """Root mean square of residuals before and after."""
+    """Root mean square of residuals before and after; of a kind of one's own with its unit."""
 
     before: Figure
     after: Figure
+    unit: Literal["m", "rad", "px"] | None = None
 
 
 class Relative(Section):
     """Parameters that are determined only together."""
 
     parameters: tuple[str, ...]
-    lost: int
+    lost: Whole
     relations: tuple[dict[str, float], ...]
     keep: tuple[str, ...]
 
@@ -339,9 +358,9 @@ class Observability(Section):
     robot: str = ""
     model: str
     kind: str
-    n_configurations: int = 0
-    n_parameters: int
-    rank: int
+    n_configurations: Whole = 0
+    n_parameters: Whole
+    rank: Whole
     names: tuple[str, ...]
     singular_values: Row
     gap: Figure
@@ -373,19 +392,20 @@ class Result(Section):
     pair_errors: str | None = None
     encoder: str = "propagated"
     loss: str = "none"
-    n_configurations: int
-    n_pairs: int
-    n_residuals: int
-    n_priors: int = 0
-    n_excluded: dict[str, int]
+    n_configurations: Whole
+    n_pairs: Whole
+    n_residuals: Whole
+    n_priors: Whole = 0
+    n_excluded: dict[str, Whole]
     solver: Solver
     trustworthy: bool | None = None
     findings: tuple[str, ...] = ()
     cautions: tuple[str, ...] = ()
+    reservations: tuple[str, ...] = ()
     setup: Setup | None = None
     probability_of_noise: Figure = None
     chi2: Figure
-    dof: int
+    dof: Annotated[int, Field(ge=-MOST_WHOLE, le=MOST_WHOLE)]
     reduced_chi2: Figure
     chi2_p_value: Figure = None
     goodness: dict[str, KindGoodness] = {}
@@ -394,6 +414,7 @@ class Result(Section):
     priors: Priors | None = None
     expected_error: ExpectedError | None = None
     noise_factors: dict[str, float] | None = None
+    noise_kept: tuple[str, ...] = ()
     suspect_configurations: tuple[SuspectConfiguration, ...] = ()
     residual_rms: dict[str, dict[str, Rms | None]]
     parameters: tuple[Parameter, ...]
@@ -413,6 +434,7 @@ def result_schema() -> dict[str, Any]:
     return Result.model_json_schema(by_alias=True)
 
 
+@checked
 def read_result(path: Path | str) -> Result:
     """The result in a folder that `calibrate --out` wrote, or in its `result.json`.
 
@@ -423,23 +445,82 @@ def read_result(path: Path | str) -> Result:
         InputError: There is none, or it is damaged; the message says where.
     """
     path = Path(path)
-    if not path.exists():
+    if not exists(path):
         raise InputError(str(path), "no such folder or file", "what `fg-calib calibrate --out` wrote")
-    finish(path if path.is_dir() else path.parent)
-    file = path / "result.json" if path.is_dir() else path
-    if path.is_dir() and not file.exists():
+    file = path / "result.json" if is_folder(path) else path
+    if is_folder(path) and not exists(file):
         raise InputError(str(path), "no result.json in this folder", "a folder that `fg-calib calibrate --out` wrote")
     try:
-        document = json.loads(read_text(file))
-    except (ValueError, RecursionError) as error:
-        raise InputError(str(file), f"not JSON: {error}", hint="was it cut off?") from None
+        document = json.loads(read_text(file), object_pairs_hook=lambda pairs: _unrepeated(pairs, str(file)))
+    except RecursionError:
+        raise InputError(str(file), "nested too deeply", "a result.json") from None
+    except ValueError as error:
+        raise InputError(str(file), f"not JSON: {str(error).partition(';')[0]}", hint="was it cut off?") from None
     if not isinstance(document, dict) or not str(document.get("schema")).startswith("fg-calib/result/"):
         raise InputError(str(file), "no result of a calibration", f"a result.json of schema {SCHEMA}")
     try:
         result = Result.model_validate(document)
     except ValidationError as error:
         raise first_misfit(error, str(file)) from None
-    n = len(result.covariance.names)
-    if len(result.covariance.matrix) != n or any(len(row) != n for row in result.covariance.matrix):
-        raise InputError(f"{file}: covariance", "another size than its names", f"{n} rows of {n}")
+    for key, found, expected in contradictions(result):
+        raise InputError(f"{file}: {key}", found, expected, "was the file changed?")
     return result
+
+
+def _unrepeated(pairs: list[tuple[str, Any]], place: str) -> dict[str, Any]:
+    """A mapping of JSON, where Python would silently take the last of two values of one key."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        (key, _), *_ = Counter(key for key, _ in pairs).most_common(1)
+        raise InputError(f"{place}: {key}", "the key is there twice", "once")
+    return found
+
+
+def contradictions(result: Result) -> Iterator[tuple[str, str, str]]:
+    """What in a result contradicts the rest by definition: the key, what was found and what was expected."""
+    yield from _of_names(result)
+    yield from _of_parameters(result)
+    if result.reduced_chi2 is not None and result.chi2 is not None:
+        expected = result.chi2 / result.dof if result.dof > 0 else math.inf
+        if not math.isclose(result.reduced_chi2, expected, rel_tol=ROUNDING):
+            yield "reduced_chi2", f"found {result.reduced_chi2:.6g}", f"{expected:.6g}, as chi2 and dof say"
+    n_rows = sum(kind.n for kind in result.goodness.values())
+    if result.goodness and n_rows != result.n_residuals:
+        yield "n_residuals", f"found {result.n_residuals}", f"{n_rows}, as goodness says"
+    if result.trustworthy and not result.solver.converged:
+        yield "trustworthy", "true of a solver that has not converged", "false"
+    if result.trustworthy is not None and result.trustworthy == bool(result.findings):
+        found = f"{str(result.trustworthy).lower()} with {len(result.findings)} findings"
+        yield "trustworthy", found, "true without findings, else false"
+    sized = {f"frames: {symbol}": (frame.sigma, 6) for symbol, frame in result.frames.items()}
+    sized |= {"frame_estimate": (result.frame_estimate.sigma, 6)} if result.frame_estimate else {}
+    sized |= {f"group {i}": (group.sigma, len(group.xyz)) for i, group in enumerate(result.groups, start=1)}
+    for key, (sigma, n) in sized.items():
+        if len(sigma) != n:
+            yield f"{key}: sigma", f"{len(sigma)} figures", str(n)
+
+
+def _of_names(result: Result) -> Iterator[tuple[str, str, str]]:
+    names, known = result.covariance.names, [p.name for p in result.parameters]
+    if len(result.covariance.matrix) != len(names):
+        yield "covariance", "another size than its names", f"{len(names)} rows of {len(names)}"
+    for key, given in (("parameters", known), ("covariance: names", list(names))):
+        if len(set(given)) < len(given):
+            yield key, f"{max(given, key=given.count)!r} twice", "different names"
+    for name in set(names).difference(known):
+        yield "covariance: names", f"{name!r}, which is no parameter", "names of parameters"
+
+
+def _of_parameters(result: Result) -> Iterator[tuple[str, str, str]]:
+    names, matrix = result.covariance.names, result.covariance.matrix
+    variances = {name: row[i] for i, (name, row) in enumerate(zip(names, matrix, strict=True))}
+    for i, p in enumerate(result.parameters, start=1):
+        variance = variances.get(p.name, 0.0)
+        sigma = None if variance is None else math.sqrt(variance)
+        if (p.sigma is None) != (sigma is None) or not math.isclose(p.sigma or 0.0, sigma or 0.0, rel_tol=ROUNDING):
+            yield f"parameter {i}: sigma", f"found {p.sigma} of {p.name}", f"{sigma}, as the covariance says"
+        off = p.estimate - p.nominal - p.correction
+        off -= 2.0 * math.pi * round(off / (2.0 * math.pi)) if p.unit == "rad" else 0.0
+        if abs(off) > NEAR_NOTHING:
+            expected = f"{p.estimate - p.nominal:.6g}, estimate less nominal"
+            yield f"parameter {i}: correction", f"found {p.correction:.6g} of {p.name}", expected

@@ -23,15 +23,17 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import Field
 
+from fg_calib.arguments import checked
 from fg_calib.errors import InputError
 from fg_calib.files.disk import write_text
-from fg_calib.files.schema import Bound, Number, Positive, Schema, read_yaml, shown, validate
+from fg_calib.files.schema import Bound, FilePath, Number, Positive, Schema, read_yaml, shown, validate
 from fg_calib.files.units import Units, UnitsOfFile
-from fg_calib.options import check_type
 from fg_calib.robot.model import (
     AXIS_OF_KIND,
     CONVENTIONS,
     FRAME_KINDS,
+    IN_RAD,
+    MOST_ANGLE,
     Axis,
     Joint,
     Parameter,
@@ -51,8 +53,15 @@ class FrameValues(Schema):
     pitch: Number = 0.0
     yaw: Number = 0.0
 
-    def si(self, units: Units) -> dict[str, float]:
-        """The six values by kind, [m] and [rad]."""
+    def si(self, units: Units, place: str) -> dict[str, float]:
+        """The six values by kind, [m] and [rad].
+
+        Raises:
+            InputError: An angle in rad is one in deg.
+        """
+        for kind in ("roll", "pitch", "yaw"):
+            if units.angle == "rad" and abs(value := getattr(self, kind)) > MOST_ANGLE:
+                raise InputError(f"{place}: {kind}", f"found {value:g}", IN_RAD, "units: {angle: deg} are deg")
         return {kind: getattr(self, kind) * units.factor(_unit_of_kind(kind)) for kind in FRAME_KINDS}
 
 
@@ -93,11 +102,12 @@ class _DhRobot(_Robot):
 
 
 class _UrdfRobot(_Robot):
-    urdf: str
+    urdf: FilePath
     base_link: str | None = None
     tip_link: str | None = None
 
 
+@checked
 def read_robot(path: Path | str, *, base_link: str | None = None, tip_link: str | None = None) -> Robot:
     """The robot in a YAML file or a URDF, told apart by the ending `.urdf`.
 
@@ -114,6 +124,9 @@ def read_robot(path: Path | str, *, base_link: str | None = None, tip_link: str 
         from fg_calib.files.urdf import read_urdf
 
         return read_urdf(path, base_link=base_link, tip_link=tip_link)
+    if path.suffix.lower() == ".xacro":
+        hint = f"`xacro {path.name} > {path.name.removesuffix(path.suffix).removesuffix('.urdf')}.urdf` writes one"
+        raise InputError(path.name, "a file of xacro", "a URDF", hint)
     mapping = read_yaml(path)
     if "urdf" in mapping:
         links = {"base_link": base_link, "tip_link": tip_link}
@@ -147,8 +160,8 @@ def _build_urdf(file: _UrdfRobot, place: str, folder: Path) -> Robot:
         base_link=file.base_link,
         tip_link=file.tip_link,
         name=file.name,
-        base=file.base.si(file.units),
-        tool=file.tool.si(file.units),
+        base=file.base.si(file.units, f"{place}: base"),
+        tool=file.tool.si(file.units, f"{place}: tool"),
         place=place,
         **file.choices(),
     )
@@ -156,7 +169,7 @@ def _build_urdf(file: _UrdfRobot, place: str, folder: Path) -> Robot:
 
 def _build_dh(file: _DhRobot, place: str) -> Robot:
     builder = RobotBuilder(file.name or "robot", file.convention)
-    builder.add_frame("base", file.base.si(file.units), 0, False)
+    builder.add_frame("base", file.base.si(file.units, f"{place}: base"), 0, False)
     names = [row.name or f"q{i}" for i, row in enumerate(file.joints, start=1)]
     for i, (row, name) in enumerate(zip(file.joints, names, strict=True), start=1):
         here = f"{place}: joint {i}"
@@ -167,7 +180,10 @@ def _build_dh(file: _DhRobot, place: str) -> Robot:
             value = getattr(row, kind)
             if value is None:
                 raise InputError(here, f"missing key {kind!r}")
-            values[kind] = value * file.units.factor(_unit_of_kind(kind))
+            unit = _unit_of_kind(kind)
+            if file.units.name(unit) == "rad" and abs(value) > MOST_ANGLE:
+                raise InputError(f"{here}: {kind}", f"found {value:g}", IN_RAD, "units: {angle: deg} are deg")
+            values[kind] = value * file.units.factor(unit)
         if row.beta != 0.0 and "beta" not in values:
             raise InputError(
                 f"{here}: beta",
@@ -181,10 +197,11 @@ def _build_dh(file: _DhRobot, place: str) -> Robot:
         joint = Joint(name, prismatic=row.type == "prismatic")
         factor = file.units.factor(joint.unit)
         builder.add_convention_joint(Joint(name, joint.prismatic, lower * factor, upper * factor), values)
-    builder.add_frame("tool", file.tool.si(file.units), len(file.joints) + 1, False)
+    builder.add_frame("tool", file.tool.si(file.units, f"{place}: tool"), len(file.joints) + 1, False)
     return builder.build(place=place, **file.choices())
 
 
+@checked
 def write_robot(path: Path | str, robot: Robot, *, units: Units | None = None, urdf_name: str | None = None) -> None:
     """Write a robot YAML that `read_robot` reads back to the same robot.
 
@@ -201,7 +218,6 @@ def write_robot(path: Path | str, robot: Robot, *, units: Units | None = None, u
     """
     if (robot.urdf is None) != (urdf_name is None):
         raise ValueError("a URDF robot, and no other, is written with urdf_name")
-    check_type("units", units, Units, "Units(length='mm')")
     units = units or Units()
     mapping: dict[str, Any] = {"name": robot.name}
     if robot.urdf is None:

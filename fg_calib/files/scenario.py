@@ -25,7 +25,9 @@ noise: {position: 0.001, orientation: 0.01, joint: 0.005}   # 1 sigma; joint noi
 frame: unknown                        # world_T_base: base, unknown (default, drawn), or x y z roll pitch yaw
 validation: {random: {count: 500}}    # the same choice as configurations, for test rows; default: none
 job: {model: distance-rotation, pairing: star}   # keys of calibration.yaml; noise: {...} there states another noise
+instruments: [{model: anchor, anchors: 3}]       # what measures, instead of poses: see `scenario_instruments`
 ```
+With `instruments` the figures of `noise` are those that they need, and `job` has no model or pairing of its own.
 """
 
 from __future__ import annotations
@@ -36,24 +38,22 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from fg_calib.arguments import checked
 from fg_calib.errors import InputError
 from fg_calib.files.board import Board, placement, read_board
+from fg_calib.files.disk import exists, is_folder
 from fg_calib.files.job import check_choices, joint_noise, robot_of
 from fg_calib.files.robot_yaml import FrameValues, unit_of_key
-from fg_calib.files.schema import Count, NotNegative, Number, Positive, Schema, read_yaml, shown, validate
+from fg_calib.files.scenario_instruments import InstrumentReader, noise_figures
+from fg_calib.files.schema import Count, FilePath, NotNegative, Number, Positive, Schema, read_yaml, shown, validate
 from fg_calib.files.tables import read_measurements
 from fg_calib.files.units import Units, UnitsOfFile
 from fg_calib.measurements.dataset import Noise
 from fg_calib.options import known_names
-from fg_calib.simulation.scenario import (
-    Configurations,
-    Errors,
-    GivenReadings,
-    Placement,
-    RandomReadings,
-    Scenario,
-    figures_by_name,
-)
+from fg_calib.simulation.configurations import Configurations, GivenReadings, Placement, RandomReadings
+from fg_calib.simulation.instruments import Instrument
+from fg_calib.simulation.scenario import Errors, Scenario, figures_by_name
+from fg_calib.sizes import MOST_DRAWN
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 """The shipped scenarios, a folder each."""
@@ -70,19 +70,23 @@ class _Sigmas(Schema):
 
 
 class _Random(Schema):
-    count: Annotated[Count, Field(gt=0)]
+    count: Annotated[Count, Field(gt=0, le=MOST_DRAWN)]
 
 
 class _Configurations(Schema):
     board: Board | None = None
     random: _Random | None = None
-    table: str | None = None
+    table: FilePath | None = None
 
 
 class _Noise(Schema):
     position: NotNegative
     orientation: NotNegative
     joint: Any = 0.0  # one figure, or one a joint
+
+
+class _JointNoise(Schema):
+    joint: Any = 0.0
 
 
 class _StatedNoise(Schema):
@@ -97,12 +101,14 @@ class _Scenario(Schema):
     units: UnitsOfFile = Units()
     errors: _Errors
     configurations: _Configurations
-    noise: _Noise
+    noise: Any  # a `_Noise`; with instruments the figures that these need
     frame: Any = "unknown"  # `base`, or `FrameValues`
     validation: _Configurations | None = None
-    job: dict[str, Any] = Field(default_factory=lambda: {"model": "distance-rotation"})
+    job: dict[str, Any] | None = None
+    instruments: Any = None  # see `scenario_instruments`
 
 
+@checked
 def read_scenario(path: Path | str) -> Scenario:
     """The scenario in a YAML file, or a shipped one.
 
@@ -115,9 +121,9 @@ def read_scenario(path: Path | str) -> Scenario:
     path = Path(path)
     known = sorted(folder.name for folder in SCENARIOS.iterdir() if folder.is_dir())
     source = path.name
-    if str(path) in known and not path.is_file():
+    if str(path) in known and (is_folder(path) or not exists(path)):
         path = SCENARIOS / path / "scenario.yaml"
-    elif not path.exists() and path.suffix not in {".yaml", ".yml"}:
+    elif not exists(path) and path.suffix not in {".yaml", ".yml"}:
         raise InputError("scenario", f"found {str(path)!r}", f"a file, or one of {', '.join(known)}")
     return _Reader(path, source).read()
 
@@ -135,27 +141,63 @@ class _Reader:
 
     def read(self) -> Scenario:
         file, units, source = self._file, self._units, self._source
-        noise = Noise(
-            position=file.noise.position * units.factor("m"),
-            orientation=file.noise.orientation * units.factor("rad"),
-            joint=joint_noise(file.noise.joint, units, self._robot, f"{source}: noise"),
-        )
-        stated, job = self._job(noise)
+        place, instruments = f"{source}: noise", tuple[Instrument, ...]()
+        if file.instruments is None:
+            figures = validate(_Noise, file.noise, place)
+            noise = Noise(
+                position=figures.position * units.factor("m"),
+                orientation=figures.orientation * units.factor("rad"),
+                joint=joint_noise(figures.joint, units, self._robot, place),
+            )
+            stated, job = self._job(noise)
+        else:
+            noise, stated, job, instruments = self._instruments()
         validation = file.validation
         return Scenario(
             robot=self._robot,
             errors=self._errors(),
-            configurations=self._configurations(file.configurations, "configurations"),
+            configurations=self._configurations(file.configurations, f"{source}: configurations"),
             noise=noise,
-            frame=self._frame(),
-            validation=None if validation is None else self._configurations(validation, "validation"),
+            frame=self._frame(file.frame, f"{source}: frame"),
+            validation=None if validation is None else self._configurations(validation, f"{source}: validation"),
             stated_noise=stated,
             job=job,
             length_unit=units.length,
             angle_unit=units.angle,
             name=file.name or self._default_name,
             source=source,
+            instruments=instruments,
         )
+
+    def _instruments(self) -> tuple[Noise, Noise | None, dict[str, Any], tuple[Instrument, ...]]:
+        """The noise and what is stated of it, the job's other keys, and the instruments."""
+        file, units, place = self._file, self._units, f"{self._source}: noise"
+        noise = self._noise(file.noise, place)
+        job = self._job_keys()
+        for key in ("model", "pairing", "targets", "anchors", "tolerance", "offset", "camera"):
+            if key in job:
+                raise InputError(f"{self._source}: job", f"found key {key!r}", "none", "each instrument has its own")
+        stated = job.pop("noise", None)
+        given = self._noise(stated, f"{self._source}: job: noise", stated=True)
+        reader = InstrumentReader(
+            self._source,
+            self._folder,
+            units,
+            replace(given, joint=0.0),
+            lambda one, at: self._configurations(validate(_Configurations, one, at), at),
+            self._frame,
+        )
+        found = reader.read(file.instruments)
+        check_choices({**job, "model": found[0].model}, self._robot, f"{self._source}: job")
+        joint = given.joint if isinstance(stated, dict) and "joint" in stated else noise.joint
+        return noise, replace(noise, joint=joint), job, found
+
+    def _noise(self, given: object, place: str, *, stated: bool = False) -> Noise:
+        """Figures of noise, those of the joints too."""
+        own = {key: value for key, value in given.items() if key == "joint"} if isinstance(given, dict) else {}
+        others = {key: v for key, v in given.items() if key != "joint"} if isinstance(given, dict) else given
+        joint = joint_noise(validate(_JointNoise, own, place).joint, self._units, self._robot, place)
+        return replace(noise_figures(others, self._units, place, stated=stated), joint=joint)
 
     def _errors(self) -> Errors:
         place, file, robot = f"{self._source}: errors", self._file.errors, self._robot
@@ -183,8 +225,7 @@ class _Reader:
                 return Errors("normal", by_name)
         return Errors("values", by_name)
 
-    def _configurations(self, file: _Configurations, key: str) -> Configurations:
-        place = f"{self._source}: {key}"
+    def _configurations(self, file: _Configurations, place: str) -> Configurations:
         _only_one(file, place)
         if file.board is not None:
             return read_board(file.board, self._robot, self._units, f"{place}: board")
@@ -194,23 +235,18 @@ class _Reader:
         table = read_measurements(self._folder / str(file.table), self._robot, units=self._units)
         return GivenReadings(table.readings)
 
-    def _frame(self) -> Literal["base", "unknown"] | Placement:
-        given, place = self._file.frame, f"{self._source}: frame"
+    def _frame(self, given: object, place: str) -> Literal["base", "unknown"] | Placement:
         match given:
             case "base" | "unknown":
                 return "base" if given == "base" else "unknown"
             case dict():
-                return placement(validate(FrameValues, given, place), self._units)
+                return placement(validate(FrameValues, given, place), self._units, place)
         raise InputError(place, f"found {shown(given)}", "base, unknown, or a mapping of x, y, z, roll, pitch, yaw")
 
     def _job(self, noise: Noise) -> tuple[Noise | None, dict[str, Any]]:
         """The noise that the job states, None where it is the true one, and the job's other keys."""
         place, units = f"{self._source}: job", self._units
-        given = dict(self._file.job)
-        for key in ("robot", "measurements", "pairs", "frame", "units", "truth"):
-            if key in given:
-                hint = "it follows from the scenario" if key in {"frame", "units"} else "the simulation writes it"
-                raise InputError(place, f"found key {key!r}", "none", hint)
+        given = self._job_keys()
         file = given.pop("noise", None)
         check_choices(given, self._robot, place)
         if file is None:
@@ -223,6 +259,19 @@ class _Reader:
         if stated.joint is not None:
             noise = replace(noise, joint=joint_noise(stated.joint, units, self._robot, f"{place}: noise"))
         return noise, given
+
+    def _job_keys(self) -> dict[str, Any]:
+        """The job's keys, none that the simulation writes."""
+        place, by_default = f"{self._source}: job", {"model": "distance-rotation"}
+        if self._file.job is not None:
+            given = dict(self._file.job)
+        else:
+            given = by_default if self._file.instruments is None else {}
+        for key in ("robot", "measurements", "pairs", "frame", "units", "truth"):
+            if key in given:
+                hint = "it follows from the scenario" if key in {"frame", "units"} else "the simulation writes it"
+                raise InputError(place, f"found key {key!r}", "none", hint)
+        return given
 
 
 def _only_one(file: Schema, place: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Hashable, Mapping
+from datetime import date
 from pathlib import Path
 from reprlib import Repr
 from typing import Annotated, Any, NoReturn, TypeVar
@@ -23,6 +24,14 @@ def _refuse_bool(value: object) -> object:
     """YAML's `yes` and `true` are no numbers, although Python's are."""
     if isinstance(value, bool):
         raise PydanticCustomError("float_type", "a bool")
+    if isinstance(value, str) and "_" in value:  # Python's own way of writing digits
+        raise PydanticCustomError("float_parsing", "a number")
+    return value
+
+
+def _refuse_no_path(value: object) -> object:
+    if not isinstance(value, str) or not value:
+        raise PydanticCustomError("path", "no path")
     return value
 
 
@@ -50,8 +59,17 @@ Positive = Annotated[float, Field(gt=0), BeforeValidator(_refuse_bool), AfterVal
 NotNegative = Annotated[float, Field(ge=0), BeforeValidator(_refuse_bool), AfterValidator(_refuse_absurd)]
 """A finite number, 0 or more."""
 
-Count = Annotated[int, Field(ge=0, strict=True)]
+FilePath = Annotated[str, BeforeValidator(_refuse_no_path)]
+"""The path of a file."""
+
+MOST = 10_000_000
+"""The most of anything that is drawn or formed: more fills disks and days."""
+
+Count = Annotated[int, Field(ge=0, le=MOST, strict=True)]
 """A whole number, 0 or more."""
+
+Seed = Annotated[int, Field(ge=0, lt=2**63, strict=True)]
+"""What random numbers begin with."""
 
 
 def refuse_unknown_keys(*known: str) -> Callable[[object], object]:
@@ -106,6 +124,8 @@ def first_misfit(error: ValidationError, place: str) -> InputError:
     match first["type"]:
         case "missing":
             *path, key = first["loc"]
+            if isinstance(key, int):
+                return InputError(_place(place, path), f"found {shown(first['input'])}", f"more than {key} in the list")
             return InputError(_place(place, path), f"missing key {key!r}{more}")
         case "unknown_key":
             hint = did_you_mean(context["key"], context["known"])
@@ -113,8 +133,23 @@ def first_misfit(error: ValidationError, place: str) -> InputError:
             found = f"unknown key {context['key']!r}"
             return InputError(_place(place, first["loc"]), found, known + more * (not hint), hint + more * bool(hint))
     hint = did_you_mean(first["input"], _options(first)) if first["type"] == "literal_error" else ""
+    if first["type"] == "string_type" and isinstance(first["input"], bool):
+        hint = "text such as no, on or true stands in quotes"
+    if first["type"] == "float_parsing":
+        hint = number_hint(first["input"])
     found = f"found {shown(first['input'])}"
     return InputError(_place(place, first["loc"]), found, _expected(first) + more, hint)
+
+
+def number_hint(found: object) -> str:
+    """What to do about a text that is no number although people read it as one; else nothing."""
+    text = str(found).strip()
+    if re.fullmatch(r"[-+]?\d*,\d+", text):
+        return _DECIMAL_COMMA
+    return "its minus is another character, a dash; write -" if re.fullmatch(r"[\u2010-\u2015\u2212]\d.*", text) else ""
+
+
+_DECIMAL_COMMA = "is it a decimal comma? numbers have a decimal point"
 
 
 def _place(place: str, path: tuple[int | str, ...] | list[int | str]) -> str:
@@ -123,7 +158,7 @@ def _place(place: str, path: tuple[int | str, ...] | list[int | str]) -> str:
     for part in path:
         if isinstance(part, int):
             words[-1] = f"{words[-1].removesuffix('s')} {part + 1}"
-        else:
+        elif part != "[key]":  # pydantic's word for the key itself
             words.append(part)
     return ": ".join([place, *words])
 
@@ -143,13 +178,17 @@ def _expected(misfit: ErrorDetails) -> str:
 _EXPECTED = {
     **dict.fromkeys(("float_type", "float_parsing", "finite_number"), "a finite number"),
     **dict.fromkeys(("list_type", "tuple_type"), "a list"),
-    **dict.fromkeys(("model_type", "dict_type", "dataclass_type"), "a mapping"),
+    **dict.fromkeys(("model_type", "dict_type", "dataclass_type", "model_attributes_type"), "a mapping"),
     "absurd": ORDINARY,
-    "int_type": "a whole number",
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "a whole number"),
     "string_type": "text",
-    "bool_type": "true or false",
+    **dict.fromkeys(("bool_type", "bool_parsing"), "true or false"),
+    "string_pattern_mismatch": "a name of the pattern {pattern}",
     "greater_than": "a number above {gt:g}",
+    "less_than": "a number below {lt:g}",
+    "less_than_equal": "a number not above {le:g}",
     "greater_than_equal": "a number not below {ge:g}",
+    "path": "a path",
     "too_short": "at least {min_length} in the list",
     "too_long": "at most {max_length} in the list",
 }
@@ -160,6 +199,8 @@ def shown(value: object) -> str:
     """A found value for a message: its repr, cut to 60 characters; of what is nested or long only the beginning."""
     if value is None:
         return "nothing"
+    if isinstance(value, date):
+        return str(value)
     try:
         text = repr(value[:100]) if isinstance(value, str) else _REPR.repr(value)
     except ValueError:  # Python shows no whole number of more than 4300 digits
@@ -184,15 +225,26 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except RecursionError:
         raise InputError(path.name, "nested too deeply", "a mapping, key: value") from None
     except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark
-        raise InputError(f"{path.name}:{mark.line + 1}" if mark else path.name, error.problem or "not YAML") from None
+        raise _of_yaml(error, path.name) from None
     except yaml.reader.ReaderError as error:
         line = text[: error.position].count("\n") + 1
         raise InputError(f"{path.name}:{line}", f"character {error.character:#04x}", "printable text") from None
     if not isinstance(mapping, dict):
         found = "an empty file" if mapping is None else f"found {shown(mapping)}"
-        raise InputError(path.name, found, "a mapping, key: value")
+        hint = "is it a URDF? its name ends in .urdf" if text.lstrip().startswith("<") else ""
+        raise InputError(path.name, found, "a mapping, key: value", hint)
     return mapping
+
+
+def _of_yaml(error: yaml.MarkedYAMLError, name: str) -> InputError:
+    """What the parser says, with the line, and the line where what it could not finish begins."""
+    mark, start = error.problem_mark, error.context_mark
+    found, hint = error.problem or "not YAML", ""
+    if found.startswith("but ") and error.context:
+        found = f"{error.context}, {found}"
+    elif error.context and start and mark and start.line < mark.line:
+        hint = f"{error.context} from line {start.line + 1} on"
+    return InputError(f"{name}:{mark.line + 1}" if mark else name, found, hint=hint)
 
 
 MOST_VALUES = 1_000_000
@@ -241,20 +293,57 @@ class _Loader(yaml.SafeLoader):
             tag = node.tag.removeprefix("tag:yaml.org,2002:")
             self._refuse(node, f"{shown(getattr(node, 'value', None))} is no YAML of type {tag}")
 
+    def construct_number(self, node: yaml.ScalarNode) -> float:
+        """A number of base 10, or with a prefix that says another: YAML 1.1 reads 045 as 37, and 1:30 as 90."""
+        other = re.fullmatch(r"[-+]?0(?P<base>[xb])?[0-9a-f_]+", node.value, re.IGNORECASE)
+        if "_" in node.value:
+            self._refuse(node, f"{shown_word(node.value)} has an underscore, expected a number without it")
+        if ":" in node.value or other:
+            base = "60" if other is None else {"x": "16", "b": "2"}.get((other["base"] or "").lower(), "8")
+            self._refuse(node, f"{shown_word(node.value)} is a number of base {base} in YAML, expected one of base 10")
+        return self.construct_yaml_int(node) if node.tag.endswith(":int") else self.construct_yaml_float(node)
+
+    def construct_scalar(self, node: yaml.ScalarNode | yaml.MappingNode) -> Any:
+        """The text of a scalar, which is one of Unicode: half of a pair of surrogates is none."""
+        text = super().construct_scalar(node)
+        if isinstance(text, str) and not text.isascii():
+            try:
+                text.encode()
+            except UnicodeEncodeError:
+                self._refuse(node, f"{shown(text)} is no text of Unicode")
+        return text
+
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         """Construct a mapping of different words."""
+        if not isinstance(node, yaml.MappingNode):
+            self._refuse(node, "a tag of a mapping, expected a mapping behind it")
         seen = set()
         for key_node, value_node in node.value:
             key = key_node.value if isinstance(key_node, yaml.ScalarNode) else None
             if key is None or key_node.tag not in {"tag:yaml.org,2002:str", "tag:yaml.org,2002:merge"}:
                 found = f"key {shown_word(key) if key is not None else 'that is no word'}"
-                comma = key is not None and key.isdigit() and value_node.value == ""
-                hint = "; is it a decimal comma? numbers have a decimal point" * comma
-                self._refuse(key_node, f"{found}, expected a word{hint}")
+                self._refuse(key_node, f"{found}, expected a word{_of_comma(key, value_node)}")
+            if hint := _of_comma(key, value_node):
+                self._refuse(key_node, f"key {shown(key)}{hint}")
             if key in seen:
                 self._refuse(key_node, f"key {shown(key)} stands here twice")
             seen.add(key)
         return super().construct_mapping(node, deep)
+
+
+def _refuse_tag(loader: _Loader, node: yaml.Node) -> NoReturn:
+    loader._refuse(node, f"tag {shown(node.tag)}, expected a value without it")
+
+
+_Loader.add_constructor(None, _refuse_tag)
+for _tag in ("int", "float"):
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_tag}", _Loader.construct_number)
+
+
+def _of_comma(key: str | None, value: yaml.Node) -> str:
+    """A hint where `{a: 0,5}` made the fraction a key: it is a number in a flow mapping, and nothing stands for it."""
+    fraction = key is not None and re.fullmatch(r"\d+([eE][-+]?\d+)?", key) and value.value == ""
+    return f"; {_DECIMAL_COMMA}" if fraction else ""
 
 
 def shown_word(text: str) -> str:

@@ -8,28 +8,31 @@
 An orientation is `qx qy qz qw` or `roll pitch yaw`. Sigmas of a row: `sigma_position` or `sigma_x sigma_y sigma_z`;
 `sigma_orientation` or `sigma_rx sigma_ry sigma_rz`; `sigma_point`. An empty cell means not measured under `distance`
 and `angle`, no touched point under `group`, the noise's default under `sigma_*`, and train under `split`; elsewhere it
-is an error. Any other column is ignored.
+is an error. Any other column is ignored. Cells of a CSV have commas, semicolons or tabs between them, and with the
+last two numbers may have decimal commas.
 """
 
 from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fg_calib.arguments import checked
 from fg_calib.arrays import NORM_TOLERANCE
 from fg_calib.errors import InputError
-from fg_calib.files.columns import Header, Table, unit_hint
+from fg_calib.files.columns import Column, Header, Table
+from fg_calib.files.instruments import COLUMNS, InstrumentColumns
 from fg_calib.files.pairs import Configurations, read_pairs
 from fg_calib.files.units import Units
-from fg_calib.measurements.checks import LIMIT_SLACK
 from fg_calib.measurements.dataset import Booleans, Floats, Groups, Integers, Measurements, Noise, no_pairs
-from fg_calib.options import check_number, check_type
+from fg_calib.measurements.limits import limit_hint, outside_limits
+from fg_calib.options import PAIR_MODELS, Model, check_number
 from fg_calib.robot.model import Robot
 
 if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it
@@ -40,14 +43,18 @@ _log = logging.getLogger(__name__)
 _POSITION = ("x", "y", "z")
 _QUATERNION = ("qx", "qy", "qz", "qw")
 _ROLL_PITCH_YAW = ("roll", "pitch", "yaw")
+_ROTATION_VECTOR = ("rx", "ry", "rz")
 _SIGMA_POSITION = ("sigma_x", "sigma_y", "sigma_z")
 _SIGMA_ORIENTATION = ("sigma_rx", "sigma_ry", "sigma_rz")
 _RESERVED = {*_POSITION, *_QUATERNION, *_ROLL_PITCH_YAW, *_SIGMA_POSITION, *_SIGMA_ORIENTATION, "id", "split", "group"}
 
-_KNOWN = {*_RESERVED, "sigma_position", "sigma_orientation", "sigma_point"}
+_POINT = "the name of a point, or an empty cell"
+
+KNOWN = {*_RESERVED, *COLUMNS, "sigma_position", "sigma_orientation", "sigma_point"}
 """Columns that mean something, beside the joints'."""
 
 
+@checked
 def read_measurements(
     path: Path | str | Any,
     robot: Robot,
@@ -55,6 +62,9 @@ def read_measurements(
     pairs: Path | str | Any | None = None,
     units: Units | None = None,
     noise: Noise | None = None,
+    points: Sequence[str] = (),
+    model: Model | None = None,
+    columns: Mapping[str, Column] | None = None,
 ) -> Measurements:
     """Configurations and what was measured at them and, with a table of pairs, between them.
 
@@ -64,34 +74,43 @@ def read_measurements(
         pairs: Table of pairs, likewise.
         units: Units of both tables; default m and rad.
         noise: Sigmas where the tables state none, [m] and [rad]; also of what was not measured yet.
+        points: Names of points that other tables touch: pairs may say how far apart they are.
+        model: The model whose columns are read; those of all models if None.
+        columns: By name as above, what the table of configurations calls a column.
 
     Raises:
         InputError: A file is missing, is no table, lacks a column or holds a cell that cannot be used; the message
             names its line and column.
     """
-    check_type("units", units, Units, "Units(length='mm')")
-    check_type("noise", noise, Noise, "Noise(position=1e-3)")
     units, noise = units or Units(), noise or Noise()
     _check_noise(noise)
-    header = Header.read(path, "frame").understood(_KNOWN, (joint.name for joint in robot.joints))
+    meant = {*KNOWN, *(f"q{i + 1}" for i in range(robot.n_joints))}
+    called = {joint.name for joint in robot.joints}
+    header = Header.read(path, "frame").renamed(columns or {}, meant | called).understood(meant, called)
     joints = _joint_columns(header, robot)
     position = header.group(_POSITION)
     orientation = _orientation_columns(header)
     sigma_position = header.sigmas("sigma_position", _SIGMA_POSITION)
     sigma_orientation = header.sigmas("sigma_orientation", _SIGMA_ORIENTATION)
     sigma_point = header.present("sigma_point") if "group" in header.columns else ()
+    of_instrument = InstrumentColumns.of(header, model)
+    if model in PAIR_MODELS and "target" in header.columns:
+        _log.warning("%s: column target is not used: model %s is of one point of the tool", header.name, model)
+    numbers = (*joints, *position, *orientation, *sigma_position, *sigma_orientation, *sigma_point)
     table = Table.read(
         header,
-        numbers=(*joints, *position, *orientation, *sigma_position, *sigma_orientation, *sigma_point),
-        texts=header.present("id", "split", "group"),
+        numbers=(*numbers, *of_instrument.numbers),
+        texts=(*header.present("id", "split", "group"), *of_instrument.labels),
     )
     length, angle = units.factor("m"), units.factor("rad")
-    ids, test = _ids(table), table.test_rows()
+    ids, test = _ids(table, repeated=of_instrument.several_rows), table.test_rows()
     names, group = _groups(table)
     between, between_groups = None, no_pairs(header.name)
     if pairs is not None:
-        configurations = Configurations(table, ids, test, names, group)
+        known = tuple(dict.fromkeys((*names, *points)))
+        configurations = Configurations(table, ids, test, known, group)
         between, between_groups = read_pairs(pairs, configurations, units, noise)
+        names = known if between_groups.n_pairs else names
     return Measurements(
         readings=_readings(table, joints, robot, units),
         ids=ids.to_numpy().astype(np.str_),
@@ -107,6 +126,7 @@ def read_measurements(
         sigma_point=_sigma_point(table, sigma_point, group >= 0, noise.point, length) if names else None,
         roll_pitch_yaw=table.numbers(orientation) * angle if orientation == _ROLL_PITCH_YAW else None,
         named="id" in header.columns,
+        **of_instrument.read(table, units, noise),
     )
 
 
@@ -115,6 +135,17 @@ def _check_noise(noise: Noise) -> None:
     for f in fields(noise):
         if f.name != "joint" and (figure := getattr(noise, f.name)) is not None:
             check_number(f"noise: {f.name}", figure, above=True)
+
+
+def joint_columns(robot: Robot) -> tuple[str, ...]:
+    """The columns under which a table is to hold joint readings: the joints' names, or `q1 ... qn`.
+
+    The latter where a name means something else in a table, or would not be read as it is.
+    """
+    names = tuple(joint.name for joint in robot.joints)
+    plain = all(name == name.strip() and re.fullmatch(r"[^\W\d][^,;\t|\"]*", name) for name in names)
+    clashing = {*KNOWN, "begin", "seconds", "samples"}.intersection(name.lower() for name in names)
+    return names if plain and not clashing else tuple(f"q{i + 1}" for i in range(robot.n_joints))
 
 
 def _joint_columns(header: Header, robot: Robot) -> tuple[str, ...]:
@@ -144,20 +175,23 @@ def _orientation_columns(header: Header) -> tuple[str, ...]:
     quaternion, roll_pitch_yaw = header.group(_QUATERNION), header.group(_ROLL_PITCH_YAW)
     if quaternion and roll_pitch_yaw:
         raise InputError(header.name, "both qx qy qz qw and roll pitch yaw", "one of the two")
-    return quaternion or roll_pitch_yaw
+    rotation_vector = header.present(*_ROTATION_VECTOR) == _ROTATION_VECTOR
+    return quaternion or roll_pitch_yaw or (_ROTATION_VECTOR if rotation_vector else ())
 
 
 def _readings(table: Table, columns: Sequence[str], robot: Robot, units: Units) -> Floats:
     """Joint readings within the joints' limits, shape (n_rows, n_joints), [rad] or [m]."""
     readings = table.numbers(columns) * [units.factor(joint.unit) for joint in robot.joints]
     lower, upper = robot.limits.T
-    outside = (readings < lower - LIMIT_SLACK) | (readings > upper + LIMIT_SLACK)  # (n_configurations, n_joints)
+    outside = outside_limits(readings, robot)  # (n_configurations, n_joints)
     if outside.any():
         row, j = divmod(int(np.argmax(outside)), robot.n_joints)
         unit = robot.joints[j].unit
         reading, low, high = (v / units.factor(unit) for v in (readings[row, j], lower[j], upper[j]))
         found = f"{columns[j]} = {reading:.6g} {units.name(unit)} is outside [{low:.6g}, {high:.6g}]"
-        raise InputError(table.place(row), found, hint=unit_hint(reading, unit, units, (lower[j], upper[j])))
+        raise InputError(
+            table.place(row), found, hint=limit_hint(readings, robot, j, (columns[j], "the table"), units.name(unit))
+        )
     _warn_of_degrees(table, columns, robot, units, readings)
     return readings
 
@@ -172,15 +206,18 @@ def _warn_of_degrees(table: Table, columns: Sequence[str], robot: Robot, units: 
         _log.warning("%s: most of %s are more than two turns; is the table in deg?", name, column)
 
 
-def _ids(table: Table) -> pl.Series:
-    """The configurations' names: their ids, or else their 0-based row numbers."""
+def _ids(table: Table, *, repeated: bool) -> pl.Series:
+    """The configurations' names, different ones unless `repeated`: their ids, or else their 0-based row numbers."""
     import polars as pl
 
     if "id" not in table.header.columns:
         return pl.int_range(table.n_rows, eager=True).cast(pl.String)
+    table.names("id", "an id")
     ids = table.texts("id", "an id")
+    commented = ids.str.starts_with("#").to_numpy()
+    table.require(~commented | commented.all(), "id", "ids with # all or none", "# does not comment a row out")
     is_first = ids.is_first_distinct().to_numpy()
-    if not is_first.all():
+    if not repeated and not is_first.all():
         first = int(ids.index_of(ids[int(np.argmin(is_first))]) or 0)
         table.require(is_first, "id", "different ids", f"the same as {table.place(first)}")
     return ids
@@ -190,10 +227,25 @@ def _groups(table: Table) -> tuple[tuple[str, ...], Integers]:
     """Names of the groups in the order met, and each row's group, -1 for none, shape (n_rows,)."""
     if "group" not in table.header.columns:
         return (), np.full(table.n_rows, -1, dtype=np.int64)
-    cells = table.frame["group"].to_list()
+    cells = table.names("group", _POINT).to_list()
     names = list(dict.fromkeys(c for c in cells if c is not None))
     place = {name: i for i, name in enumerate(names)}
     return tuple(names), np.array([-1 if c is None else place[c] for c in cells], dtype=np.int64)
+
+
+def read_points(path: Path | str, columns: Mapping[str, Column] | None = None) -> tuple[str, ...]:
+    """The names of the points that a table of configurations touches; `columns` as in `read_measurements`.
+
+    Raises:
+        InputError: The file is missing, or is no table.
+    """
+    header = Header.read(path, "frame")
+    if columns and "group" in columns:
+        header = header.renamed({"group": columns["group"]}, {"group"})
+    column = next((c for c in header.columns if c.lower() == "group"), None)
+    if column is None:
+        return ()
+    return tuple(Table.read(header, (), (column,)).names(column, _POINT).drop_nulls().unique(maintain_order=True))
 
 
 def _sigma_point(
@@ -215,6 +267,8 @@ def _rotation(table: Table, columns: tuple[str, ...], angle: float) -> Floats:
     values = table.numbers(columns)
     if columns == _ROLL_PITCH_YAW:
         return Rotation.from_euler("xyz", values * angle).as_matrix()  # about fixed axes: Rz(yaw) Ry(pitch) Rx(roll)
+    if columns == _ROTATION_VECTOR:
+        return Rotation.from_rotvec(values * angle).as_matrix()
     norm = np.linalg.norm(values, axis=1)
     good = np.abs(norm - 1.0) <= NORM_TOLERANCE
     if not good.all():

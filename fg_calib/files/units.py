@@ -10,7 +10,7 @@ from typing import Annotated
 from pydantic import BeforeValidator
 
 from fg_calib.files.schema import refuse_unknown_keys
-from fg_calib.options import AngleUnit, LengthUnit, check
+from fg_calib.options import AngleUnit, LengthUnit, set_checked
 
 LENGTHS: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 """Metres in one unit of length."""
@@ -32,8 +32,7 @@ class Units:
     angle: AngleUnit = "rad"
 
     def __post_init__(self) -> None:
-        check("units: length", self.length, LengthUnit)
-        check("units: angle", self.angle, AngleUnit)
+        set_checked(self, "units: ", length=LengthUnit, angle=AngleUnit)
 
     def name(self, unit: str) -> str:
         """The file's unit for what is in `m` or `rad` inside the program."""

@@ -6,7 +6,11 @@ may hold are not. Calibrated origins are written into the same XML, so that ever
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import logging
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,16 +18,29 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fg_calib.arguments import checked
 from fg_calib.errors import InputError
-from fg_calib.files.disk import read_bytes, write_text
+from fg_calib.files.disk import decoded, read_bytes, write_text
+from fg_calib.files.schema import shown, shown_word
 from fg_calib.options import NEAR, did_you_mean, known_names
-from fg_calib.robot.model import FRAME_KINDS, Joint, Robot, RobotBuilder, UrdfSource, frame_values
+from fg_calib.robot.model import FRAME_KINDS, IN_RAD, MOST_ANGLE, Joint, Robot, RobotBuilder, UrdfSource, frame_values
+from fg_calib.sizes import LEAST_SIZE, MOST_SIZE, ORDINARY
 
 if TYPE_CHECKING:  # lxml is imported where it is used: `fg-calib --help` need not wait for it
     from lxml.etree import _Element as Element
 
+_log = logging.getLogger(__name__)
+
 _ORIGIN = {"xyz": ("x", "y", "z"), "rpy": ("roll", "pitch", "yaw")}
 """The attributes of `<origin>` and the kinds of parameters that they hold."""
+
+_ATTRIBUTES = {"origin": ("xyz", "rpy"), "axis": ("xyz",), "limit": ("lower", "upper", "effort", "velocity")}
+"""What is read of a joint on the chain, and the attributes that it may have."""
+
+_OTHERS = ("parent", "child", "mimic", "calibration", "dynamics", "safety_controller", "comment")
+"""Other elements of a joint."""
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?inf(inity)?", re.ASCII | re.IGNORECASE)
 
 _NO_ENTITIES = "a URDF without entities: they are not expanded"
 
@@ -40,6 +57,7 @@ class _UrdfJoint:
     """By kind, [m] and [rad]."""
 
 
+@checked
 def read_urdf(
     path: Path | str,
     *,
@@ -74,19 +92,21 @@ def read_urdf(
         InputError: There is no such file, it is not a URDF, or the chain is not one of revolute, continuous,
             prismatic and fixed joints.
     """
+    if str(path).lstrip().startswith("<"):
+        raise InputError("path", "found XML text", "the path of a URDF", "write the text to a file")
     path = Path(path)
     data = read_bytes(path)
     text, root = _parse(data, path.name)
-    tree = _Tree(_read_joints(root, path.name), _read_links(root, path.name), path.name)
-    base_link = tree.root() if base_link is None else tree.known(base_link)
-    tip_link = tree.leaf(base_link) if tip_link is None else tree.known(tip_link)
-
     builder = RobotBuilder(name or root.get("name") or path.stem, "urdf")
-    builder.add_frame("base", _frame("base", base), 0, False)
-    n_joints = _add_chain(builder, tree.chain(base_link, tip_link), path.name)
-    if n_joints == 0:
-        raise InputError(path.name, f"no moving joint between links {base_link!r} and {tip_link!r}", "at least one")
-    builder.add_frame("tool", _frame("tool", tool), n_joints + 1, False)
+    builder.add_frame("base", frame_values("base", base), 0, False)
+    with _hinting_at_xacro(root):
+        tree = _Tree(_read_joints(root, path.name), _read_links(root, path.name), path.name)
+        base_link = tree.root() if base_link is None else tree.known(base_link)
+        tip_link = tree.leaf(base_link) if tip_link is None else tree.known(tip_link)
+        n_joints = _add_chain(builder, tree.chain(base_link, tip_link), path.name)
+        if n_joints == 0:
+            raise InputError(path.name, f"no moving joint between links {base_link!r} and {tip_link!r}", "at least one")
+    builder.add_frame("tool", frame_values("tool", tool), n_joints + 1, False)
     return builder.build(
         fixed=fixed,
         estimate=estimate,
@@ -96,14 +116,25 @@ def read_urdf(
     )
 
 
-def _frame(name: str, given: Mapping[str, float] | ArrayLike | None) -> Mapping[str, float]:
-    return given if isinstance(given, Mapping) else frame_values(name, given)
+@contextmanager
+def _hinting_at_xacro(root: Element) -> Iterator[None]:
+    """Say of a mistake in a file with elements of xacro that it was not expanded: they may hold what is missing."""
+    try:
+        yield
+    except InputError as error:
+        if not any("xacro" in str(element.tag) for element in root.iter()):
+            raise
+        raise InputError(error.place, error.found, error.expected, _XACRO) from None
+
+
+_XACRO = "it holds elements of xacro: expand them by `xacro arm.urdf.xacro > arm.urdf`"
 
 
 def _add_chain(builder: RobotBuilder, chain: Iterable[tuple[_UrdfJoint, bool]], place: str) -> int:
     """Add the joints of a chain, each with whether it is passed backwards; the number of those that move."""
     n_joints = 0
     for joint, backwards in chain:
+        _check_spelling(joint, f"{place}:{joint.element.sourceline}: joint {joint.name!r}")
         if joint.element.get("type") == "fixed":
             builder.add_constant_frame(joint.origin, backwards=backwards)
             continue
@@ -111,6 +142,36 @@ def _add_chain(builder: RobotBuilder, chain: Iterable[tuple[_UrdfJoint, bool]], 
         builder.add_urdf_joint(_moving_joint(joint, here), joint.origin, _axis(joint, here), backwards=backwards)
         n_joints += 1
     return n_joints
+
+
+def _check_spelling(joint: _UrdfJoint, place: str) -> None:
+    """Check what on the chain would silently be replaced by a default.
+
+    Raises:
+        InputError: An element is there twice; a name is of another case; angles are of many turns.
+    """
+    read: dict[str, Element] = {}
+    for child in joint.element:
+        tag = child.tag if isinstance(child.tag, str) else "comment"
+        if tag in _ATTRIBUTES and tag in read:
+            raise InputError(place, f"two elements <{tag}>", "one")
+        if tag in _ATTRIBUTES:
+            read[tag] = child
+        elif tag.lower() in _ATTRIBUTES:
+            raise InputError(place, f"element <{tag}>", f"<{tag.lower()}>")
+        elif tag not in _OTHERS and (hint := did_you_mean(tag, _ATTRIBUTES)):
+            _log.warning("%s: element <%s> is not used; %s", place, tag, hint)
+    for tag, element in read.items():
+        for name in map(str, element.attrib):
+            if name not in _ATTRIBUTES[tag] and name.lower() in _ATTRIBUTES[tag]:
+                raise InputError(f"{place}: {tag}", f"attribute {shown_word(name)}", name.lower())
+            if name not in _ATTRIBUTES[tag]:
+                known = ", ".join(_ATTRIBUTES[tag])
+                _log.warning("%s: attribute %s of <%s> is not used; known are %s", place, name, tag, known)
+    angles = [joint.origin[kind] for kind in _ORIGIN["rpy"]]
+    if max(map(abs, angles)) > MOST_ANGLE:
+        found = f"found {' '.join(f'{angle:g}' for angle in angles)}"
+        raise InputError(f"{place}: origin rpy", found, IN_RAD, "are they in deg?")
 
 
 def write_urdf(path: Path | str, robot: Robot) -> None:
@@ -148,7 +209,11 @@ def _parse(data: bytes, place: str, encoding: str | None = None) -> tuple[str, E
         root = etree.fromstring(data, safe)
     except etree.XMLSyntaxError as error:
         expected = _NO_ENTITIES if "entity" in error.msg.lower() else ""
-        raise InputError(f"{place}:{error.lineno}", f"not XML: {error.msg}", expected) from None
+        hint = _XACRO if "xacro" in error.msg else ""
+        if b"encoding" not in data[:100]:
+            decoded(data, place)  # says of other encodings what they are
+        found = f"not XML: {error.msg.replace(', use XML_PARSE_HUGE option', '')}"
+        raise InputError(f"{place}:{error.lineno}", found, expected, hint) from None
     document = root.getroottree().docinfo
     types: Any = document.internalDTD
     if types is not None and (types.system_url or types.entities()):
@@ -159,6 +224,8 @@ def _parse(data: bytes, place: str, encoding: str | None = None) -> tuple[str, E
         return data.decode(document.encoding or "utf-8").removeprefix("\ufeff"), root
     except UnicodeDecodeError as error:
         raise InputError(place, f"not {document.encoding or 'utf-8'}: {error.reason}", "text in UTF-8") from None
+    except LookupError:  # libxml2 knows more encodings than Python
+        raise InputError(place, f"text in {document.encoding}", "text in UTF-8", "save it as UTF-8") from None
 
 
 def _read_links(root: Element, place: str) -> list[str]:
@@ -200,7 +267,9 @@ def _origin(joint: Element, place: str) -> dict[str, float]:
         text = _attribute(joint, "origin", attribute, "0 0 0")
         figures = _figures(text)
         if len(figures) != len(kinds) or not np.isfinite(figures).all():
-            raise InputError(f"{place}: origin {attribute}", f"found {text!r}", "three finite numbers")
+            raise InputError(f"{place}: origin {attribute}", f"found {shown(text)}", "three finite numbers")
+        if max(map(abs, figures)) > MOST_SIZE:
+            raise InputError(f"{place}: origin {attribute}", f"found {shown(text)}", ORDINARY)
         values |= zip(kinds, figures, strict=True)
     return values
 
@@ -212,11 +281,9 @@ def _attribute(joint: Element, child: str, attribute: str, default: str) -> str:
 
 
 def _figures(text: str) -> list[float]:
-    """The numbers in a text; none if a word of it is none."""
-    try:
-        return [float(word) for word in text.split()]
-    except ValueError:
-        return []
+    """The numbers in a text; none if a word of it is none as other readers have them (`1_000` is Python's alone)."""
+    words = text.split()
+    return [float(word) for word in words] if all(_NUMBER.fullmatch(word) for word in words) else []
 
 
 def _write_origin(joint: Element, values: Mapping[str, float]) -> None:
@@ -238,9 +305,11 @@ def _moving_joint(joint: _UrdfJoint, place: str) -> Joint:
     """The joint with its limits; URDF's missing limit is 0, and two zeros are none at all."""
     kind, mimic = joint.element.get("type"), joint.element.find("mimic")
     if kind not in {"revolute", "continuous", "prismatic"}:
-        raise InputError(place, f"type {kind}", "revolute, continuous, prismatic or fixed on the chain")
+        found = f"type {shown_word(kind)}" if kind else "no type"
+        raise InputError(place, found, "revolute, continuous, prismatic or fixed on the chain")
     if mimic is not None:
-        raise InputError(place, f"mimics joint {mimic.get('joint')!r}", "joints on the chain that move by themselves")
+        found = f"mimics joint {shown(mimic.get('joint', ''))}"
+        raise InputError(place, found, "joints on the chain that move by themselves")
     lower, upper = (0.0, 0.0) if kind == "continuous" else (_limit(joint, end, place) for end in ("lower", "upper"))
     if lower == upper == 0.0:
         return Joint(joint.name, kind == "prismatic")
@@ -253,7 +322,9 @@ def _limit(joint: _UrdfJoint, end: str, place: str) -> float:
     text = _attribute(joint.element, "limit", end, "0")
     figures = _figures(text)
     if len(figures) != 1:
-        raise InputError(f"{place}: limit {end}", f"found {text!r}", "a number")
+        raise InputError(f"{place}: limit {end}", f"found {shown(text)}", "a number")
+    if MOST_SIZE < abs(figures[0]) < np.inf:
+        raise InputError(f"{place}: limit {end}", f"found {shown(text)}", ORDINARY)
     return figures[0]
 
 
@@ -261,9 +332,9 @@ def _axis(joint: _UrdfJoint, place: str) -> NDArray[np.float64]:
     """The joint's unit axis, shape (3,); x where the file says none."""
     text = _attribute(joint.element, "axis", "xyz", "1 0 0")
     axis = np.array(_figures(text))
-    length = float(np.linalg.norm(axis))
-    if axis.shape != (3,) or not 0.0 < length < np.inf:
-        raise InputError(f"{place}: axis", f"found {text!r}", "a direction of three numbers")
+    length = math.hypot(*axis)
+    if axis.shape != (3,) or not LEAST_SIZE <= length <= MOST_SIZE:
+        raise InputError(f"{place}: axis", f"found {shown(text)}", "a direction of three numbers")
     return axis / length
 
 
@@ -281,6 +352,22 @@ class _Tree:
                     place, f"link {joint.child!r} is the child of joints {first!r} and {joint.name!r}", "one"
                 )
             self._joint_above[joint.child] = joint
+        self._check_circles()
+
+    def _check_circles(self) -> None:
+        """Raise where links are below themselves."""
+        seen: set[str] = set()
+        for link in self._links:
+            up: dict[str, None] = {}  # a set would forget their order
+            at: str | None = link
+            while at is not None and at not in seen:
+                seen.add(at)
+                up[at] = None
+                at = self._joint_above[at].parent if at in self._joint_above else None
+            if at in up:
+                circle = [*up][[*up].index(at) :]
+                found = f"links in a circle: {' below '.join(shown_word(one) for one in (*circle, circle[0]))}"
+                raise InputError(self._place, found, "a tree of links")
 
     def known(self, link: str) -> str:
         """`link`, if there is such a link."""
@@ -292,18 +379,25 @@ class _Tree:
     def root(self) -> str:
         """The only link without a parent."""
         roots = [link for link in self._links if link not in self._joint_above]
+        if not self._links:
+            raise InputError(self._place, "no links and joints", "<link> and <joint> within <robot>")
         return self._only(roots, "root", "base_link")
 
     def leaf(self, base: str) -> str:
         """The only link without a child at or below `base`."""
-        parents = {joint.parent for joint in self._joint_above.values()}
-        leaves = [link for link in self._links if link not in parents]
-        return self._only([leaf for leaf in leaves if base in self._links_up(leaf)], "leaf", "tip_link")
+        below: dict[str, list[str]] = {}
+        for joint in self._joint_above.values():
+            below.setdefault(joint.parent, []).append(joint.child)
+        reached = [base]
+        for link in reached:
+            reached += below.get(link, ())
+        return self._only([link for link in reached if link not in below], "leaf", "tip_link")
 
     def chain(self, base: str, tip: str) -> list[tuple[_UrdfJoint, bool]]:
         """The joints from `base` to `tip`, with whether each is passed from child to parent."""
         up, down = self._links_up(base), self._links_up(tip)
-        common = next((link for link in up if link in down), None)
+        all_down = set(down)
+        common = next((link for link in up if link in all_down), None)
         if common is None:
             raise InputError(self._place, f"links {base!r} and {tip!r} are not connected", "two links of one tree")
         above = self._joint_above
@@ -317,13 +411,11 @@ class _Tree:
         links = [link]
         while links[-1] in self._joint_above:
             links.append(self._joint_above[links[-1]].parent)
-            if links[-1] in links[:-1]:
-                raise InputError(self._place, f"link {links[-1]!r} is above itself", "a tree of links")
         return links
 
     def _only(self, found: list[str], what: str, argument: str) -> str:
         if len(found) != 1:
-            listed = ", ".join(found) or "none"
+            listed = ", ".join(shown_word(link) for link in found[:12]) + ", ..." * (len(found) > 12)
             where = f"{{urdf: {self._place}, {argument}: ...}} in a file, --{argument.replace('_', '-')} of observe"
             raise InputError(
                 self._place, f"{len(found)} {what} links ({listed})", "one", f"name one as {argument}: {where}"

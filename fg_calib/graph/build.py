@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.errors import InputError, ProblemError
+from fg_calib.arguments import checked
+from fg_calib.errors import ProblemError
 from fg_calib.graph.factors import Variables, prior_rows
 from fg_calib.graph.information import observability_of, whitened_triangle
 from fg_calib.graph.observability import determined, singular_values
@@ -18,8 +19,10 @@ from fg_calib.graph.problem import Problem, problem_at, tables_of, variables_of
 from fg_calib.graph.start import start_of
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import Measurements, Pairs
-from fg_calib.measurements.kinds import Frames, check_derivatives
-from fg_calib.measurements.series import Dataset, Table, gather
+from fg_calib.measurements.gathering import Dataset, check_repeats, gather
+from fg_calib.measurements.kinds import Frames, check_derivatives, check_start, is_ours
+from fg_calib.measurements.models.predictions import predictions
+from fg_calib.measurements.series import Table
 from fg_calib.options import (
     FrameKnowledge,
     Gauge,
@@ -29,10 +32,9 @@ from fg_calib.options import (
     Pairing,
     as_pairing,
     check_names,
-    check_type,
 )
 from fg_calib.robot.inverse import random_readings
-from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.robot.kinematics import forward, precompute_trig
 from fg_calib.robot.model import Robot, names_of
 from fg_calib.threads import single_threaded
 
@@ -47,6 +49,7 @@ STRUCTURAL_FLOOR = 1e-6
 """Signal-to-noise ratio that counts as nothing on random configurations with an assumed noise: rounding alone."""
 
 
+@checked
 @single_threaded
 def build_problem(
     robot: Robot,
@@ -69,10 +72,7 @@ def build_problem(
         InputError: An option is not one of those possible.
         ProblemError: The measurements lack what the model needs, or do not suffice.
     """
-    if not isinstance(robot, Robot):
-        raise InputError("robot", f"found {robot!r}", "a Robot, such as read_robot('robot.yaml')")
-    check_type("options", options, Options, "Options(model='pose')")
-    options = options or Options.of(**choices)
+    options = Options.given(options, choices)
     check_names("prefer", options.prefer, names_of(robot.parameters))
     if not any(p.estimated for p in robot.parameters):
         raise ProblemError(f"robot {robot.name}", "nothing to estimate", "at least one parameter that is not fixed")
@@ -84,7 +84,8 @@ def build_problem(
         if not table.uses_pairs and table.measurements.pairs is not None:
             source = table.measurements.pairs.source
             _log.warning("%s: not used, model %s is of poses", source, table.model)
-    data = gather(tables)
+        check_repeats(table)
+    data = gather(robot, tables)
     _check_frames(data)
     variables = variables_of(robot, data, options)
     start = start_of(robot, data, variables)
@@ -155,6 +156,7 @@ def _for_evaluation(
     return robot.with_estimated(of_frames), options, tuple(map(of_fit, tables))
 
 
+@checked
 def problem_of(job: Job, **changes: Any) -> Problem:
     """The calibration problem of a job.
 
@@ -190,27 +192,25 @@ def predicted_problem(
         pair_errors: Whether pairs of one configuration share its errors or count as independent.
     """
     options = Options(model, as_pairing(pairing), frame, gauge="none", pair_errors=pair_errors)
-    train = ~measurements.test
-    readings = measurements.readings[train]
-    poses = forward(build_chain(robot), precompute_trig(robot, readings))
+    if options.model == "pixels":
+        options = replace(options, model="board")
+    table = Table(predictions(robot, measurements, options.model), options.model, options.pairing, options.frame)
+    return true_problem(robot, table, options)
 
-    def stated(sigma: Floats | None) -> Floats:
-        return np.full((len(readings), 3), 1e-3) if sigma is None else sigma[train]
 
-    predictions = Measurements(
-        readings=readings,
-        ids=np.arange(len(readings)).astype(str),
-        test=np.zeros(len(readings), dtype=np.bool_),
-        position=poses.position,
-        rotation=poses.rotation,
-        sigma_position=stated(measurements.sigma_position),
-        sigma_orientation=stated(measurements.sigma_orientation),
-        sigma_joint=measurements.sigma_joint,
-        source="predictions",
-    )
-    data = gather(tables_of(predictions, options))
+@single_threaded
+def true_problem(robot: Robot, tables: Table | Sequence[Table], options: Options) -> Problem:
+    """The problem of tables at a robot that is the true one: its unknowns alone are where the tables put them.
+
+    Args:
+        robot: The robot.
+        tables: What was measured.
+        options: Whether pairs share errors; the tables' own choices count for the rest.
+    """
+    data = gather(robot, tables_of(tables, options))
     variables = variables_of(robot, data, options)
-    return problem_at(robot, data, options, variables, variables.nominal())
+    start = start_of(robot.with_estimated([]), data, variables)  # the arm as it is, what it measures where it is
+    return problem_at(robot, data, options, variables, start)
 
 
 def random_problem(
@@ -247,16 +247,14 @@ def _check_own_kinds(robot: Robot, data: Dataset, variables: Variables, start: F
     """Compare the derivatives of kinds of one's own with differences at some measurements, where they are started."""
     at = variables.at(start)
     for s in data.series:
-        if len(s.kind.twins()) or type(s.kind).__module__.startswith("fg_calib."):
+        if is_ours(s.kind):
             continue
-        rows = np.arange(min(s.n, 3))
         table = data.tables[s.table].measurements
-        poses = forward(
-            at.chains[s.table].without_columns(), precompute_trig(robot, table.readings), s.ends[rows].ravel()
-        )
-        shape = (len(rows), s.kind.ends)
-        frames = Frames(poses.rotation.reshape(*shape, 3, 3), poses.position.reshape(*shape, 3))
-        check_derivatives(s.kind, frames, s.data[rows], at.coordinates[s.nuisances[rows]])
+        poses = forward(at.chains[s.table].without_columns(), precompute_trig(robot, table.readings), s.ends.ravel())
+        rotation, position = poses.rotation.reshape(*s.ends.shape, 3, 3), poses.position.reshape(*s.ends.shape, 3)
+        nuisances = at.coordinates[s.nuisances]
+        check_start(s.kind, Frames(rotation, position), s.data, nuisances, s.source)
+        check_derivatives(s.kind, Frames(rotation[:3], position[:3]), s.data[:3], nuisances[:3], s.source)
 
 
 def _source(problem: Problem) -> str:
@@ -279,8 +277,9 @@ def _check_enough(problem: Problem) -> None:
     stacked = np.vstack([whitened_triangle(anywhere, anywhere.start), priors])
     needed = determined(singular_values(stacked * problem.variables.prior_scales), STRUCTURAL_FLOOR)
     if rows < needed:
-        found = f"{rows} residuals"
-        raise ProblemError(_source(problem), found, f"at least {needed} to determine what model {table.model} can")
+        found = f"{rows + n_nuisance} residuals{' and priors' * (problem.n_priors > 0)}"
+        expected = f"at least {needed + n_nuisance} to determine what model {table.model} can"
+        raise ProblemError(_source(problem), found, expected)
 
 
 def _refuse_nothing(problem: Problem) -> None:

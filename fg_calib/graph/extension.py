@@ -9,14 +9,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import chain
+from numbers import Real
 
 import gtsam
 import numpy as np
 import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
+from fg_calib.arguments import checked
 from fg_calib.arrays import as_floats
-from fg_calib.errors import ProblemError
+from fg_calib.errors import CalibrationError, InputError, ProblemError, shown
 from fg_calib.graph.factors import Variable, Variables, custom_factor, factor_columns, prior_factors, row_factor
 from fg_calib.graph.problem import Problem, reweighted_at
 from fg_calib.graph.rows import Part, RowSet
@@ -36,6 +38,7 @@ def with_added(problem: Problem) -> Problem:
         ProblemError: Factors were removed or replaced, an added variable has no start, or there is no factor of it.
     """
     more = _added_factors(problem)
+    _check_initial(problem)
     if not more and problem.initial.equals(problem.variables.values(problem.start), 0.0):
         return problem
     if more and problem.whole is not None:
@@ -53,9 +56,42 @@ def with_added(problem: Problem) -> Problem:
         if key in theirs:
             raise ProblemError("problem.initial", f"no value of {symbol}", "one for every variable of an added factor")
         raise ProblemError("problem.initial", f"a value of {symbol}", "none without a factor on it in problem.graph")
+    for factor in more:
+        _check_start(factor, problem.initial)
     variables = variables.with_own(own)
     start = variables.parameters(problem.initial)
     return reweighted_at(replace(problem, variables=variables, added=added), start)
+
+
+def _check_initial(problem: Problem) -> None:
+    """Check that every variable of the problem has an initial value, of its own type and size."""
+    for v in problem.variables.without_own().items + problem.variables.without_own().nuisance:
+        if not problem.initial.exists(v.key):
+            raise ProblemError("problem.initial", f"no value of {v.symbol}", "one for every variable of the problem")
+        expected = "a gtsam.Pose3" if v.is_pose else f"{len(v.parameters)} finite numbers"
+        try:
+            value = problem.initial.atPose3(v.key).matrix() if v.is_pose else problem.initial.atVector(v.key)
+        except RuntimeError:
+            raise ProblemError(f"problem.initial: {v.symbol}", "a value of another type", expected) from None
+        if not v.is_pose and len(value) != len(v.parameters):
+            raise ProblemError(f"problem.initial: {v.symbol}", f"{len(value)} numbers", expected)
+        if not np.isfinite(value).all():
+            raise ProblemError(f"problem.initial: {v.symbol}", "a number that is not finite", expected)
+
+
+def _check_start(factor: gtsam.NonlinearFactor, initial: gtsam.Values) -> None:
+    """Check that an added factor has an error where it starts, and a derivative that fits its variables."""
+    symbols = ", ".join(str(gtsam.Symbol(key)).strip() for key in list(factor.keys()))
+    place = f"problem.graph: added {type(factor).__name__} on {symbols}"
+    try:
+        error = factor.error(initial)
+        factor.linearize(initial)
+    except CalibrationError:
+        raise
+    except Exception as raised:
+        raise ProblemError(place, f"raised {type(raised).__name__}: {raised}") from raised
+    if not np.isfinite(error):
+        raise ProblemError(place, f"an error of {error:g} at the initial values", "a finite one")
 
 
 def _added_factors(problem: Problem) -> tuple[gtsam.NonlinearFactor, ...]:
@@ -94,6 +130,7 @@ def check_graph(problem: Problem) -> None:
         raise ProblemError("solution.problem.graph", f"{n} factors added since it was solved", "to be solved again")
 
 
+@checked
 def DistanceFactor(  # noqa: N802 -- a factor of GTSAM's, by the name of one
     variables: Variables, start: ArrayLike, end: ArrayLike, distance: float, sigma: float
 ) -> gtsam.CustomFactor:
@@ -112,10 +149,13 @@ def DistanceFactor(  # noqa: N802 -- a factor of GTSAM's, by the name of one
     return _pair_factor(Distance(), variables, start, end, ("distance", distance), sigma)
 
 
+@checked
 def RotationAngleFactor(  # noqa: N802 -- a factor of GTSAM's, by the name of one
     variables: Variables, start: ArrayLike, end: ArrayLike, angle: float, sigma: float
 ) -> gtsam.CustomFactor:
     """An angle in [0, pi] that the tool turned between two configurations, [rad]; otherwise as `DistanceFactor`."""
+    if isinstance(angle, Real) and angle > np.pi:
+        raise InputError("angle", f"found {shown(angle)}", "0 to pi, in rad")
     return _pair_factor(RotationAngle(), variables, start, end, ("angle", angle), sigma)
 
 
@@ -129,15 +169,20 @@ def _pair_factor(
     trig = precompute_trig(variables.robot, np.array(readings))
     data, whitening = np.array([[float(measured[1])]]), np.array([[1.0 / float(sigma)]])
     block = Block(kind, trig, np.array([[0, 1]]), data, whitening, np.zeros((1, 0)))
-    return row_factor(RowSet((Part(block, 0, np.zeros((1, 0), dtype=np.int64)),)), variables)
+    return row_factor(RowSet((Part(block, 0, 0, np.zeros((1, 0), dtype=np.int64)),)), variables)
 
 
+@checked
 def expand(problem: Problem) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """A problem's graph with one factor a measurement, for inspection and for incremental optimisers, and its start.
 
     Measurements that share errors depend on these: variables `E(k)`, errors of configuration k in units of their
-    sigma, with a prior of their own each. The optimum is the problem's own.
+    sigma, with a prior of their own each. The optimum is the problem's own. What somebody added to the graph is there.
+
+    Raises:
+        ProblemError: Factors of the problem's graph are missing, or a variable has no start.
     """
+    problem = with_added(problem)
     graph, initial = gtsam.NonlinearFactorGraph(), gtsam.Values(problem.initial)
     for rows in problem.rows:
         first = 0

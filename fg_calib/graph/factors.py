@@ -66,6 +66,7 @@ class Variable:
             for poses in the order of `FRAME_KINDS`.
         columns: Its columns in a Jacobian.
         scales: Of a nuisance variable: a change of ordinary size in each of its columns.
+        prior: Of a nuisance variable: where it was said to be, and 1 sigma of that; None where nothing was.
     """
 
     key: int
@@ -74,6 +75,7 @@ class Variable:
     parameters: tuple[int, ...]
     columns: slice
     scales: tuple[float, ...] = ()
+    prior: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     @property
     def is_pose(self) -> bool:
@@ -109,6 +111,7 @@ class Variables(Brief):
     priors: bool
     nuisance: tuple[Variable, ...] = ()
     coordinates: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    others: Floats = field(default_factory=lambda: np.zeros(0))
     own: gtsam.Values = field(default_factory=gtsam.Values, compare=False)
 
     @property
@@ -249,28 +252,34 @@ class Variables(Brief):
         column, place = self.n_columns + self.n_nuisance, self.nuisance_span.stop
         coordinates: list[int] = []
         more: list[Variable] = []
+        taken = {v.symbol for v in self.items}  # the base has the letter of boards
         for index, (letter, size) in enumerate(zip(unknowns.letters, unknowns.sizes, strict=True)):
             if not estimated[index]:
                 coordinates += [-1] * size
                 continue
             parameters = tuple(range(place, place + size))
-            symbol, scales = f"{letter}({index})", size * (self.robot.scale_of("m"),)
-            key, columns = gtsam.symbol(letter, index), slice(column, column + size)
-            more.append(Variable(key, symbol, "unknown", parameters, columns, scales))
+            number = len(unknowns.letters) if f"{letter}({index})" in taken else index
+            symbol, scales = f"{letter}({number})", tuple(map(self.robot.scale_of, unknowns.units[index]))
+            key, columns = gtsam.symbol(letter, number), slice(column, column + size)
+            tolerance, prior = unknowns.tolerances[index], None
+            if tolerance is not None:
+                prior = (tuple(unknowns.starts[index].tolist()), size * (tolerance,))
+            more.append(Variable(key, symbol, "unknown", parameters, columns, scales, prior))
             coordinates += parameters
             column, place = column + size, place + size
+        others = np.nan_to_num(np.concatenate([np.zeros(0), *unknowns.starts]))
         found = np.array(coordinates, dtype=np.int64)
-        return replace(self, nuisance=self.nuisance + tuple(more), coordinates=found)
+        return replace(self, nuisance=self.nuisance + tuple(more), coordinates=found, others=others)
 
     def at(self, parameters: Floats, fallback: Floats | None = None) -> At:
         """The arm and the measurements' unknowns at a parameter vector.
 
         Args:
             parameters: The parameter vector.
-            fallback: Values of the unknown coordinates that are not estimated; zero if None.
+            fallback: Values of the unknown coordinates that are not estimated; `others` if None.
         """
         estimated = self.coordinates >= 0
-        others = np.zeros(len(self.coordinates)) if fallback is None else fallback
+        others = self.others if fallback is None else fallback
         columns = np.where(estimated, self.coordinates - self.nuisance_span.start + self.n_columns, -1)
         values = np.where(estimated, parameters[self.coordinates], others)
         chains = tuple(chain.at(parameters) for chain in self.chains)
@@ -727,14 +736,31 @@ def _off_nominal(frame: Floats, nominal: Floats) -> tuple[Floats, Floats]:
     return np.concatenate([frame[:3] - nominal[:3], turn[::-1]]), D
 
 
-def prior_factors(variables: Variables) -> list[gtsam.CustomFactor]:
-    """One factor for each variable that has parameters with a tolerance."""
-    factors = []
+def prior_factors(variables: Variables) -> list[gtsam.NonlinearFactor]:
+    """One factor for each variable that has parameters with a tolerance, or that was said to be somewhere."""
+    factors: list[gtsam.NonlinearFactor] = []
     for v in variables.items:
         n_rows = len(prior_rows(variables, variables.nominal(), v)[0])
         if n_rows:
             factors.append(_prior_factor(variables, v, n_rows))
+    for v in variables.nuisance:
+        if v.prior is not None:
+            mean, sigma = (np.array(figures) for figures in v.prior)
+            factors.append(gtsam.PriorFactorVector(v.key, mean, gtsam.noiseModel.Diagonal.Sigmas(sigma)))
     return factors
+
+
+def unknown_prior_rows(variables: Variables, parameters: Floats) -> tuple[Floats, Floats]:
+    """Whitened priors of the measurements' unknowns and their derivatives, shapes (n,), (n, n_columns + n_nuisance)."""
+    r, J = [np.zeros(0)], [np.zeros((0, variables.n_columns + variables.n_nuisance))]
+    for v in variables.nuisance:
+        if v.prior is not None:
+            mean, sigma = (np.array(figures) for figures in v.prior)
+            rows = np.zeros((len(sigma), variables.n_columns + variables.n_nuisance))
+            rows[:, v.columns] = np.diag(1.0 / sigma)
+            r.append((parameters[list(v.parameters)] - mean) / sigma)
+            J.append(rows)
+    return np.concatenate(r), np.vstack(J)
 
 
 def _prior_factor(variables: Variables, variable: Variable, n_rows: int) -> gtsam.CustomFactor:

@@ -8,17 +8,30 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.graph.factors import Eliminated, dense, eliminate
+from fg_calib.graph.factors import Eliminated, dense, eliminate, unknown_prior_rows
 from fg_calib.graph.observability import RANK_TOLERANCE, SIGNAL_FLOOR, Observability, observability_of_rows
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.robust import effect
-from fg_calib.graph.rows import RowSet, correlation_of, whitened_rows
+from fg_calib.graph.rows import ErrorColumns, RowSet, correlation_of, felt_errors, whitened_rows
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
 
 def eliminated(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> Eliminated:
-    """The whitened Jacobian of train rows and added factors, nuisances eliminated; zero as right-hand side.
+    """The whitened Jacobian of train rows, nuisances' priors and added factors, these eliminated; zero right-hand side.
+
+    Args:
+        problem: The problem.
+        parameters: The parameter vector.
+        with_loss: Whether a robust loss counts for what it loses of clean data (see `robust.Effect`).
+    """
+    A = whitened_jacobian(problem, parameters, with_loss=with_loss)
+    return eliminate(A, np.zeros(len(A)), problem.variables.n_columns)
+
+
+def whitened_jacobian(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> Floats:
+    """A square root of what train rows, nuisances' priors and added factors say: shape (m, n_columns + n_nuisance).
 
     Args:
         problem: The problem.
@@ -27,11 +40,10 @@ def eliminated(problem: Problem, parameters: Floats, *, with_loss: bool = False)
     """
     v = problem.variables
     at = v.at(parameters)
-    blocks = [np.zeros((0, v.n_columns + v.n_nuisance)), added_rows(problem, parameters)]
+    blocks = [unknown_prior_rows(v, parameters)[1], added_rows(problem, parameters)]
     row_sets, variance = _with_loss(problem) if with_loss else (problem.rows, 1.0)
     blocks += [rows.triangle(at)[:, :-1] / np.sqrt(variance) for rows in row_sets]
-    A = np.vstack(blocks)
-    return eliminate(A, np.zeros(len(A)), v.n_columns)
+    return np.vstack(blocks)
 
 
 def _with_loss(problem: Problem) -> tuple[tuple[RowSet, ...], float]:
@@ -135,3 +147,21 @@ def correlation(problem: Problem, parameters: Floats) -> Floats | None:
     n, n_nuisance = problem.variables.n_columns, problem.variables.n_nuisance
     follow = eliminated(problem, parameters).follow if n_nuisance else np.zeros((0, n))
     return correlation_of(problem.noises, problem.rows, problem.variables.at(parameters), follow)
+
+
+def felt(problem: Problem, parameters: Floats, errors: ErrorColumns, wanted: Integers) -> Floats:
+    """M: the estimate is off by `-K M e` because of errors e of configurations, K its covariance.
+
+    Args:
+        problem: The problem.
+        parameters: The parameter vector.
+        errors: The errors of all configurations.
+        wanted: Numbers of those that are asked for.
+
+    Returns:
+        M by core and nuisance variables, these not eliminated, shape (n_columns + n_nuisance, len(wanted)).
+    """
+    if not len(wanted):
+        return np.zeros((problem.variables.n_columns + problem.variables.n_nuisance, 0))
+    row_sets, variance = _with_loss(problem)
+    return felt_errors(problem.noises, row_sets, problem.variables.at(parameters), errors, wanted) / variance

@@ -18,9 +18,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.graph.frames import nearest_rotation
 from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Measurements, rotation_angle
+from fg_calib.measurements.frames import nearest_rotation
 from fg_calib.measurements.kinds import Distance, RotationAngle
 from fg_calib.measurements.moments import Moments, angle_moments, length_moments
 from fg_calib.measurements.residuals import Block, pack
@@ -30,6 +30,12 @@ from fg_calib.robot.kinematics import SPAN, Chain, Poses, common_axes, forward, 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
 Integers = NDArray[np.int64]
+
+NoiseName = tuple[int, str]
+"""A noise that is known up to a factor: its table and kind, or `JOINT_NOISE`."""
+
+JOINT_NOISE: NoiseName = (-1, "joint")
+"""That of the joint readings, which is one for all tables and kinds."""
 
 LEAST_SLOPE = 1e-3
 """Slope of a mean, near a kink, that is taken for this at least: such a row says next to nothing."""
@@ -58,7 +64,8 @@ class NoiseState:
 
     Attributes:
         weights: Robust weight of each measurement of each series, in [0, 1]; None for 1.
-        factors: What the stated sigmas are multiplied by, by table and kind of noise; 1 where none is given.
+        factors: What the stated sigmas are multiplied by, by table and kind those of the measurement itself (or of the
+            measured poses that pairs were formed from), and those of the joint readings; 1 where none is given.
         joint_errors: True joint values less their readings, where encoder noise is estimated, shape
             (n_configurations, n_joints), [rad] (prismatic: [m]); None for 0.
         spread: A square root S of the parameters' covariance S S^T in the chain's columns, shape (n_columns, k), where
@@ -66,7 +73,7 @@ class NoiseState:
     """
 
     weights: tuple[Floats, ...] | None = None
-    factors: Mapping[tuple[int, str], float] = field(default_factory=dict)
+    factors: Mapping[NoiseName, float] = field(default_factory=dict)
     joint_errors: Floats | None = None
     spread: Floats | None = None
 
@@ -132,6 +139,8 @@ class RowNoise:
         own: Covariance of what is each measurement's alone, shape (n, residual_dim, residual_dim).
         sources: What errors of configurations add to it.
         excess: What noise adds to the measured values on average, shape (n, residual_dim), [m] and [rad].
+        factors: What the stated noise of each row's own kind is multiplied by, shape (residual_dim,).
+        joint_factor: What that of the joint readings is multiplied by.
     """
 
     def __init__(self, series: Series, place: Place, state: NoiseState) -> None:
@@ -139,12 +148,15 @@ class RowNoise:
         self.place = place
         families = [name.partition(".")[0] for name in series.kind.names]
         self.factors: Floats = np.array([state.factors.get((series.table, family), 1.0) for family in families])
+        self.joint_factor = state.factors.get(JOINT_NOISE, 1.0)
         self.excess: Floats = np.zeros((series.n, series.kind.residual_dim))
         self._prepare(state)
 
     def _prepare(self, state: NoiseState) -> None:
         self.rows = self._block(self.series.data)
         self.own: Floats = self._diagonal((self.series.sigma * self.factors) ** 2)
+        if self.series.covariance is not None:
+            self.own = self.series.covariance * np.outer(self.factors, self.factors)
         self.sources = self._of_joints(self.rows)
 
     @cached_property
@@ -193,7 +205,7 @@ class RowNoise:
     def _block(self, data: Floats, slope: Floats | None = None) -> Block:
         s, p = self.series, self.place
         unit = np.tile(np.eye(s.kind.residual_dim), (s.n, 1, 1)) if slope is None else self._diagonal(slope)
-        return Block(s.kind, p.trig, s.ends, data, pack(unit), p.coordinates[s.nuisances])
+        return Block(s.kind, p.trig, s.ends, data, pack(unit), p.coordinates[s.nuisances], s.source)
 
     def _of_joints(self, rows: Block) -> tuple[Source, ...]:
         p, s = self.place, self.series
@@ -202,7 +214,7 @@ class RowNoise:
         chain = p.chain.without_columns().with_joint_columns()
         J = residuals.linearise(rows, chain)[1][:, :, : s.kind.ends * p.chain.n_joints]
         J = J.reshape(s.n, s.kind.residual_dim, s.kind.ends, -1)[..., p.joints]
-        loading = J * p.measurements.sigma_joint[p.joints] * self.factors[:, None, None]
+        loading = J * p.measurements.sigma_joint[p.joints] * self.joint_factor
         return (Source("joints", p.configurations[s.ends], np.ascontiguousarray(loading)),)
 
     @staticmethod
@@ -337,7 +349,7 @@ class PairNoise(RowNoise):
             trace = np.stack([_trace(m.sigma_position, s.ends), _trace(m.sigma_orientation, s.ends)], axis=1) * factors
         if len(self.place.joints) and not self.place.joints_estimated:
             along = along + of_joints
-            trace = trace + self._joint_trace() * factors
+            trace = trace + self._joint_trace() * self.joint_factor**2
         across = np.maximum(trace - along, 0.0) / 2.0 + self._bending()
         along, across, own = (np.where(self._wanted, v, 0.0) for v in (along, across, own))
         found = [

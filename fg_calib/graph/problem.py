@@ -16,13 +16,21 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from fg_calib.arrays import FrozenArrays
-from fg_calib.errors import ProblemError
-from fg_calib.graph.factors import Variables, build_variables, prior_factors, prior_rows, row_factor
-from fg_calib.graph.noise import NoiseState, PairNoise, Place, RowNoise, row_noise
+from fg_calib.errors import ProblemError, shown
+from fg_calib.graph.factors import (
+    Variables,
+    build_variables,
+    prior_factors,
+    prior_rows,
+    row_factor,
+    unknown_prior_rows,
+)
+from fg_calib.graph.noise import JOINT_NOISE, NoiseState, PairNoise, Place, RowNoise, row_noise
 from fg_calib.graph.rows import At, RowSet, share_errors, whitened_rows
 from fg_calib.measurements.dataset import Measurements
+from fg_calib.measurements.gathering import Dataset
 from fg_calib.measurements.kinds import TouchedPoint
-from fg_calib.measurements.series import Dataset, Series, Table
+from fg_calib.measurements.series import Series, Table, by_station
 from fg_calib.options import Options
 from fg_calib.robot.kinematics import Chain, forward, precompute_trig
 from fg_calib.robot.model import Parameter, Robot
@@ -116,10 +124,11 @@ class Problem(FrozenArrays):
             ProblemError: There is no such variable.
         """
         for v in self.variables.items:
-            if v.key == key:
+            if isinstance(key, int) and v.key == key:
                 return self.variables.names[v.columns]
         known = ", ".join(v.symbol for v in self.variables.items)
-        raise ProblemError("key", f"no variable {str(gtsam.Symbol(key)).strip()} of the arm", f"one of {known}")
+        symbol = str(gtsam.Symbol(key)).strip() if isinstance(key, int) and 0 <= key < 2**64 else shown(key)
+        raise ProblemError("key", f"no variable {symbol} of the arm", f"one of {known}")
 
     @property
     def estimated(self) -> list[Parameter]:
@@ -164,7 +173,8 @@ class Problem(FrozenArrays):
     @property
     def n_priors(self) -> int:
         """Scalar priors."""
-        return len(prior_rows(self.variables, self.start)[0])
+        of_unknowns = unknown_prior_rows(self.variables, self.start)[0]
+        return len(prior_rows(self.variables, self.start)[0]) + len(of_unknowns)
 
     @property
     def n_added(self) -> int:
@@ -180,6 +190,11 @@ class Problem(FrozenArrays):
                 pairs = s.number[mask & ~s.test].tolist()
                 found.setdefault(reason, set()).update((s.table, pair) for pair in pairs)
         return {reason: len(pairs) for reason, pairs in found.items()}
+
+    @property
+    def sigma_joint(self) -> Floats:
+        """1 sigma of the joint readings as it is taken to be, shape (n_joints,), [rad] (prismatic: [m])."""
+        return self.data.sigma_joint * self.state.factors.get(JOINT_NOISE, 1.0)
 
     @property
     def missing_correlation(self) -> bool:
@@ -345,7 +360,7 @@ def joint_errors(problem: Problem, parameters: Floats) -> Floats:
     Returns:
         Shape (n_configurations, n_joints), [rad] (prismatic: [m]); about the joint values that the problem has.
     """
-    sigma = problem.data.sigma_joint
+    sigma = problem.sigma_joint
     joints = np.flatnonzero(sigma > 0.0)
     found = np.zeros((problem.data.n_configurations, len(sigma)))
     at = problem.variables.at(parameters)
@@ -393,7 +408,8 @@ def tables_of(
     if not given:
         raise ProblemError("measurements", "no table", "at least one")
     o = options
-    return tuple(t if isinstance(t, Table) else Table(t, o.model, o.pairing, o.frame) for t in given)
+    tables = [t if isinstance(t, Table) else Table(t, o.model, o.pairing, o.frame) for t in given]
+    return tuple(part for table in tables for part in by_station(table))
 
 
 def problem_at(

@@ -64,12 +64,14 @@ class Part(Brief):
     Attributes:
         block: The rows.
         table: Which table they are from.
+        series: Which series.
         nuisances: Nuisance coordinates of each measurement, shape (n, kind.n_nuisances).
         offset: Taken from the whitened residuals before anything else, shape (n, residual_dim); None for zero.
     """
 
     block: Block
     table: int
+    series: int
     nuisances: Integers
     offset: Floats | None = None
 
@@ -82,7 +84,7 @@ class Part(Brief):
         """One of its measurements."""
         chunk = slice(k, k + 1)
         offset = None if self.offset is None else self.offset[chunk]
-        return Part(residuals.rows_of(self.block, chunk), self.table, self.nuisances[chunk], offset)
+        return Part(residuals.rows_of(self.block, chunk), self.table, self.series, self.nuisances[chunk], offset)
 
     @property
     def is_plain(self) -> bool:
@@ -198,6 +200,11 @@ class RowSet(Brief):
         r = self.private(at.without_columns())[:, -1:]
         return self.shared.most_likely(r)[:, 0].reshape(len(self.configurations), -1)
 
+    def weighed(self, at: At) -> Floats:
+        """C^-1 J, C the covariance of all rows whitened by their private noise, shape (all rows, n_all_columns)."""
+        J = self.private(at)[:, :-1]
+        return J if self.shared is None else J - self.shared.loadings @ self.shared.most_likely(J)
+
     def _whitened(self, at: At) -> Floats:
         rows = self.private(at)
         return rows if self.shared is None else self.shared.whiten(rows)
@@ -235,7 +242,7 @@ def whitened_rows(
     """
     shares = ErrorColumns(noises, sharing, joint_errors is not None)
     gathered = [
-        _part(noise, shares, joint_errors, None if weights is None else weights[i])
+        _part(i, noise, shares, joint_errors, None if weights is None else weights[i])
         for i, noise in enumerate(noises)
         if len(noise.series.train)
     ]
@@ -267,9 +274,7 @@ def correlation_of(noises: Sequence[RowNoise], rows: Sequence[RowSet], at: At, f
         (part,), train, residual_dim = row_set.parts, noise.series.train, noise.series.kind.residual_dim
         wide = np.concatenate(list(part.linearise(at)))
         J = wide[:, :n] + wide[:, n:-1] @ follow
-        W = unpack(part.block.whitening, residual_dim) @ np.linalg.inv(
-            unpack(noise.rows_at(train).whitening, residual_dim)
-        )
+        W = whitener_of(noise, part)
         masks = {source.name: shares.mask(source)[train] for source in noise.sources}
         common += shares.loading(noise, train, W, masks).T @ J
         for source in noise.sources:
@@ -280,8 +285,38 @@ def correlation_of(noises: Sequence[RowNoise], rows: Sequence[RowSet], at: At, f
     return out
 
 
+def felt_errors(
+    noises: Sequence[RowNoise], rows: Sequence[RowSet], at: At, errors: ErrorColumns, wanted: Integers
+) -> Floats:
+    """J^T C^-1 L: what errors of 1 sigma make of the right-hand side, shape (n_columns + n_nuisance, len(wanted)).
+
+    Args:
+        noises: The rows of all series and their noise.
+        rows: The whitened train rows.
+        at: Where the derivatives J are wanted; C is the covariance that the rows are weighted by.
+        errors: The errors of all configurations.
+        wanted: Numbers of those that are asked for.
+    """
+    out = np.zeros((at.n_columns + at.n_nuisance, len(wanted)))
+    for row_set in rows:
+        J, start = row_set.weighed(at), 0
+        for part in row_set.parts:
+            noise = noises[part.series]
+            L = errors.loading(noise, noise.series.train, whitener_of(noise, part))[:, wanted]
+            out += (L.T @ J[start : start + part.n_rows]).T
+            start += part.n_rows
+    return out
+
+
+def whitener_of(noise: RowNoise, part: Part) -> Floats:
+    """What the train rows of a series were multiplied by to be whitened, shape (n, residual_dim, residual_dim)."""
+    h, plain = part.block.residual_dim, noise.rows_at(noise.series.train)
+    out: Floats = unpack(part.block.whitening, h) @ np.linalg.inv(unpack(plain.whitening, h))
+    return out
+
+
 def _part(
-    noise: RowNoise, shares: ErrorColumns, joint_errors: Floats | None, weights: Floats | None
+    number: int, noise: RowNoise, shares: ErrorColumns, joint_errors: Floats | None, weights: Floats | None
 ) -> tuple[Part, Sparse, Sparse]:
     """The train rows of a series; how they follow from shared errors; E of `RowSet.spare`."""
     series, train = noise.series, noise.series.train
@@ -306,8 +341,8 @@ def _part(
     offset = None if joint_errors is None else _offset(noise, train, W, joint_errors)
     E = scipy.sparse.csr_array((n * residual_dim, 0))
     if any(name != "joints" for name in carried):
-        E = _block_diagonal(W * np.sqrt(np.maximum(diagonal - noise.bare(train), 0.0))[:, None])
-    return Part(block, series.table, series.nuisances[train], offset), shares.loading(noise, train, W, masks), E
+        E = block_diagonal(W * np.sqrt(np.maximum(diagonal - noise.bare(train), 0.0))[:, None])
+    return Part(block, series.table, number, series.nuisances[train], offset), shares.loading(noise, train, W, masks), E
 
 
 def _at(values: Floats | float, rows: Integers) -> Floats | float:
@@ -317,16 +352,16 @@ def _at(values: Floats | float, rows: Integers) -> Floats | float:
 def _offset(noise: RowNoise, train: Integers, W: Floats, joint_errors: Floats) -> Floats:
     """What the errors of the readings alone make of whitened rows, to first order, shape (n, residual_dim)."""
     out = np.zeros((len(train), noise.series.kind.residual_dim))
-    joints, sigma = noise.place.joints, noise.place.measurements.sigma_joint
+    joints, sigma = noise.place.joints, noise.place.measurements.sigma_joint * noise.joint_factor
     for source in noise.sources:
         if source.name == "joints":
-            J = source.loading[train] / (sigma[joints] * noise.factors[:, None, None])
+            J = source.loading[train] / sigma[joints]
             out += np.einsum("nhew,new->nh", J, joint_errors[source.ends[train]][..., joints])
     moved: Floats = (W @ out[:, :, None])[:, :, 0]
     return moved
 
 
-def _block_diagonal(blocks: Floats) -> Sparse:
+def block_diagonal(blocks: Floats) -> Sparse:
     """Small matrices, shape (n, h, k), one after the other along the diagonal: shape (n h, n k)."""
     n, h, k = blocks.shape
     columns = np.broadcast_to(np.arange(n)[:, None, None] * k + np.arange(k), blocks.shape)
@@ -369,8 +404,24 @@ class ErrorColumns:
             return np.ones(source.ends.shape, dtype=np.bool_)
         return (self._reached[source.name][source.ends] > 1) & self._sharing
 
+    def predicted(self, noises: Sequence[RowNoise]) -> Integers:
+        """Numbers of the errors that reach both train and test measurements."""
+        found = [np.zeros(0, dtype=np.int64)]
+        for noise in noises:
+            for source in noise.sources:
+                ends = np.unique(source.ends[noise.series.test])
+                ends = ends[self._reached[source.name][ends] > 0]
+                first = ends * self.width + self._first[source.name]
+                found.append((first[:, None] + np.arange(source.loading.shape[3])).ravel())
+        return np.unique(np.concatenate(found))
+
     def loading(
-        self, noise: RowNoise, rows: Integers, W: Floats | None = None, masks: Mapping[str, Booleans] | None = None
+        self,
+        noise: RowNoise,
+        rows: Integers,
+        W: Floats | None = None,
+        masks: Mapping[str, Booleans] | None = None,
+        sources: Sequence[Source] | None = None,
     ) -> Sparse:
         """How rows of a series follow from all errors, sparse, shape (n residual_dim, n_errors).
 
@@ -379,10 +430,11 @@ class ErrorColumns:
             rows: The measurements.
             W: What their rows are multiplied by, shape (n, residual_dim, residual_dim); nothing if None.
             masks: By source, of which ends errors are wanted, shape (n, ends); of all if None.
+            sources: Those of the noise's sources that are wanted, of some of the rows perhaps; all if None.
         """
         n, residual_dim = len(rows), noise.series.kind.residual_dim
         places, columns, figures = [], [], []
-        for source in noise.sources:
+        for source in noise.sources if sources is None else sources:
             ends, w = source.loading.shape[2:]
             flat = source.loading[rows].reshape(n, residual_dim, ends * w)
             G = (flat if W is None else W @ flat).reshape(n, residual_dim, ends, w)

@@ -20,14 +20,17 @@ from __future__ import annotations
 
 import re
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.arguments import checked
 from fg_calib.arrays import FrozenArrays
-from fg_calib.errors import SolverError
+from fg_calib.errors import CalibrationError, SolverError
 from fg_calib.graph.extension import with_added
 from fg_calib.graph.factors import Variables, dense, eliminate
 from fg_calib.graph.noise import NoiseState
@@ -42,13 +45,16 @@ from fg_calib.graph.problem import (
     started_at,
 )
 from fg_calib.graph.robust import Weighting
-from fg_calib.options import check_number, check_type
+from fg_calib.options import check_number
 from fg_calib.threads import one_blas_thread
 
 Floats = NDArray[np.float64]
 
 FAIR_SHARE = 0.25
 """Share of the promised decrease of the cost that an undamped step must bring."""
+
+SHORTER = 0.5
+"""Share of a step that the next one may be, where the cost does not judge."""
 
 PATIENCE = 4
 """Undamped steps in which the cost may rise before it has fallen."""
@@ -163,6 +169,7 @@ class Solution(FrozenArrays):
         return len(self.history)
 
 
+@checked
 def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
     """Estimate the parameters.
 
@@ -175,21 +182,26 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
         ProblemError: Factors of the problem's graph are missing, or an added variable has no start.
         SolverError: GTSAM could not solve a step at all.
     """
-    check_type("options", options, SolverOptions, "SolverOptions(max_iterations=200)")
     problem = with_added(problem)
     options = options or _options_of(problem)
     clock = time.perf_counter()
     with one_blas_thread:
-        before = problem.start
-        frames = frames_only(problem)
-        if frames is not None:
-            found = _fit(frames, replace(options, decrement=max(options.decrement, COARSE))).parameters
-            before = np.concatenate([found, problem.start[len(found) :]])
+        before = _before(problem, options)
+        if before is not problem.start:
             problem = reweighted_at(problem, before)
         if not problem.variables.keys:
             return _taken_as_it_is(problem, clock)
         run = _fit(problem, options)
         return _solution(run, before, run.initial_cost, clock)
+
+
+def _before(problem: Problem, options: SolverOptions) -> Floats:
+    """The parameter vector with measurement frame, base, tool and unknowns fitted, the arm as it is at the start."""
+    frames = frames_only(problem)
+    if frames is None:
+        return problem.start
+    found = _fit(frames, replace(options, decrement=max(options.decrement, COARSE))).parameters
+    return np.concatenate([found, problem.start[len(found) :]])
 
 
 def _options_of(problem: Problem) -> SolverOptions:
@@ -223,6 +235,38 @@ def solve_from(solution: Solution, start: Floats, most: float, options: SolverOp
         run = _fit(reweighted_at(problem, rough.parameters), options)
         found = _solution(run, solution.before, solution.initial_cost, clock)
         return replace(found, estimated_noise=solution.estimated_noise)
+
+
+def solve_image(
+    solution: Solution, problem: Problem, before: Floats, most: float, options: SolverOptions | None = None
+) -> Solution | None:
+    """The descent on another problem of the same measurements, if its first step promises to be worth it.
+
+    Args:
+        solution: What was found before.
+        problem: The other problem, started near to where that is.
+        before: Its parameter vector with the arm at nominal, to fit measurement frame, base and tool from.
+        most: Cost of an optimum that is of no interest.
+        options: Settings of the solver.
+
+    Returns:
+        None if the descent leads nowhere, or above `most`.
+
+    Raises:
+        SolverError: GTSAM could not solve a step at all.
+    """
+    clock, options = time.perf_counter(), options or _options_of(problem)
+    with one_blas_thread:
+        rough = _Run(problem, replace(options, max_iterations=min(SHORT, options.max_iterations)))
+        if rough.here.cost - 0.5 * rough.here.decrement**2 >= most:
+            return None
+        if not rough.descend(COARSE) or rough.here.cost >= most:
+            return None
+        run = _fit(reweighted_at(problem, rough.parameters), options)
+        first = reweighted_at(problem, before)
+        before = _before(first, options)
+        initial_cost = reweighted_at(first, before).graph.error(first.variables.values(before))
+        return replace(_solution(run, before, initial_cost, clock), estimated_noise=solution.estimated_noise)
 
 
 def _solution(run: _Run, before: Floats, initial_cost: float, clock: float) -> Solution:
@@ -348,7 +392,8 @@ class _Run:
         self._options = options
         self._damping = FIRST_DAMPING
         self._last: tuple[_Linearised, Floats] | None = None  # where the last step began, and that step
-        self.initial_cost = problem.graph.error(problem.initial)
+        with _in_one_line(problem.variables):
+            self.initial_cost = problem.graph.error(problem.initial)
         if not np.isfinite(self.initial_cost):
             raise SolverError(
                 f"the cost at the start is {self.initial_cost}: the measurements or the robot hold absurd numbers"
@@ -441,7 +486,9 @@ class _Run:
                 return path if there.decrement < here.decrement else []
             if here.cost - there.cost >= FAIR_SHARE * 0.5 * here.decrement**2:
                 return path
-            if len(path) > 1 and there.decrement >= 0.5 * last.decrement:
+            if here.decrement <= COARSE and there.decrement <= SHORTER * here.decrement:
+                return path  # so near, the whitening of these rows is not exact enough for the cost to judge
+            if len(path) > 1 and there.decrement >= SHORTER * last.decrement:
                 return []
         return []
 
@@ -463,17 +510,16 @@ class _Run:
     def _damped(self) -> list[_Linearised]:
         """Where GTSAM's next damped step leads, undetermined directions held; nothing if none lowers the cost."""
         here, graph, variables = self.here, self.problem.graph, self.problem.variables
-        try:
+        with _in_one_line(variables):
             optimizer = gtsam.LevenbergMarquardtOptimizer(graph, here.values, levenberg_marquardt_params(self._damping))
             optimizer.iterate()
-        except RuntimeError as error:
-            raise SolverError(_in_words(str(error), variables)) from error
-        if not optimizer.error() < here.cost:
+        if not optimizer.error() < here.cost or optimizer.lambda_() >= MOST_DAMPING:
             return []
         self._damping = max(optimizer.lambda_(), LEAST_DAMPING)
         step = variables.step(here.values, optimizer.values())
         held = variables.moved(here.values, here.remove_gauge_drift(step))
-        lower = graph.error(held) < here.cost
+        with _in_one_line(variables):
+            lower = graph.error(held) < here.cost
         return [_Linearised(self.problem, held if lower else gtsam.Values(optimizer.values()))]
 
 
@@ -492,14 +538,12 @@ class _Linearised:
 
     def __init__(self, problem: Problem, values: gtsam.Values) -> None:
         variables = problem.variables
-        try:
+        with _in_one_line(variables):
             A, b = dense(problem.graph.linearize(values), variables.keys)
             left = eliminate(A, b, variables.n_columns)
             self._sizes = variables.prior_scales
             tall = np.vstack([left.A * self._sizes, np.zeros((len(self._sizes),) * 2)])  # so that Vt is square
             U, s, Vt = np.linalg.svd(tall, full_matrices=False)
-        except (RuntimeError, np.linalg.LinAlgError) as error:
-            raise SolverError(_in_words(str(error), variables)) from error
         rank = determined(s)
         along = U[: len(left.b), :rank].T @ left.b
         core = self._sizes * (Vt[:rank].T @ (along / s[:rank]))
@@ -550,6 +594,17 @@ def levenberg_marquardt_params(damping: float = FIRST_DAMPING) -> gtsam.Levenber
     parameters.setRelativeErrorTol(1e-13)  # no search for a lambda once the cost's own rounding decides
     parameters.setAbsoluteErrorTol(0.0)
     return parameters
+
+
+@contextmanager
+def _in_one_line(variables: Variables) -> Iterator[None]:
+    """What GTSAM, LAPACK or a factor that somebody added raises in the block becomes a `SolverError`."""
+    try:
+        yield
+    except CalibrationError:
+        raise
+    except Exception as error:
+        raise SolverError(_in_words(str(error) or type(error).__name__, variables)) from error
 
 
 def _in_words(message: str, variables: Variables) -> str:

@@ -12,8 +12,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fg_calib.arrays import NORM_TOLERANCE, Floats, as_array, as_floats, as_rotations, require, shape_of
+from fg_calib.arrays import (
+    NORM_TOLERANCE,
+    Floats,
+    as_array,
+    as_columns,
+    as_floats,
+    as_names,
+    as_rotations,
+    require,
+    shape_of,
+)
 from fg_calib.errors import InputError
+from fg_calib.measurements.limits import limit_hint, outside_limits
 from fg_calib.options import check_names
 from fg_calib.robot.model import Robot
 from fg_calib.sizes import LEAST_SIZE, ORDINARY
@@ -23,11 +34,11 @@ _log = logging.getLogger(__name__)
 Integers = NDArray[np.int64]
 Booleans = NDArray[np.bool_]
 
-LIMIT_SLACK = 1e-3
-"""How far a reading may be beyond its joint's limits, [rad] or [m]: encoders say so of a joint that stands at one."""
-
 ANGLE_SLACK = 1e-5
 """How far a rotation angle may exceed pi, [rad]: half a turn, rounded to six figures."""
+
+ROUNDED = 1e-9
+"""Share of a covariance that may be rounding."""
 
 PAIR_KEYS = ("a", "b", "distance", "angle", "sigma_distance", "sigma_angle", "test")
 
@@ -91,15 +102,15 @@ def checked_joint_sigma(given: ArrayLike, n_joints: int) -> Floats:
     return np.ascontiguousarray(np.broadcast_to(sigma, n_joints))
 
 
-def checked_ids(given: ArrayLike | None, n: int) -> NDArray[np.str_]:
-    """Different names of n configurations: their row numbers if None."""
+def checked_ids(given: ArrayLike | None, n: int, *, repeated: bool = False) -> NDArray[np.str_]:
+    """Names of n configurations, different ones unless `repeated`: their row numbers if None."""
     if given is None:
         return np.arange(n).astype(np.str_)
-    ids = as_array("ids", given, "iuUO", "names").astype(np.str_)
-    if ids.shape != (n,):
-        raise InputError("ids", f"shape {ids.shape}", f"({n},), one a configuration")
+    if (found := shape_of("ids", given, "names")) != (n,):
+        raise InputError("ids", f"shape {found}", f"({n},), one a configuration")
+    ids = np.array(as_names("ids", given), dtype=np.str_)
     first = np.unique(ids, return_index=True)[1]
-    require(np.isin(np.arange(n), first), "ids", ids, "different ids")
+    require(repeated | np.isin(np.arange(n), first), "ids", ids, "different ids")
     return ids
 
 
@@ -113,31 +124,70 @@ def checked_mask(name: str, given: ArrayLike | None, n: int) -> Booleans:
     return mask.copy()
 
 
-def checked_groups(given: ArrayLike | None, n: int) -> tuple[tuple[str, ...], Integers]:
-    """Names of the groups in the order met, and each row's group, -1 for none, shape (n,)."""
-    cells = [] if given is None else as_array("group", given, "iuUO", "names").tolist()
-    if given is not None and np.shape(cells) != (n,):
-        raise InputError("group", f"shape {np.shape(cells)}", f"({n},): a name, or None where no point was touched")
-    named = [None if cell in (None, "") or cell != cell else str(cell) for cell in cells]  # noqa: PLR0124 nan is nan
+def checked_labels(what: str, given: ArrayLike | None, n: int) -> tuple[tuple[str, ...], Integers]:
+    """Different names in the order met, and which of them each row has, -1 for none, shape (n,)."""
+    if given is not None and (found := shape_of(what, given, "names")) != (n,):
+        raise InputError(what, f"shape {found}", f"({n},): a name, or None where there is none")
+    named = [] if given is None else as_names(what, given, missing=True)
     names = tuple(dict.fromkeys(name for name in named if name is not None))
     place = {name: i for i, name in enumerate(names)}
     index = [-1 if name is None else place[name] for name in named] or [-1] * n
     return names, np.array(index, dtype=np.int64)
 
 
+def checked_lengths(name: str, given: ArrayLike | None, n: int, *, signed: bool) -> Floats | None:
+    """Lengths of n rows, or heights over a plane, nan where not measured, shape (n,); None if None."""
+    if given is None:
+        return None
+    lengths = as_floats(name, given, f"({n})", missing=True)
+    require(signed | ~(lengths < 0.0), name, lengths, "a number not below 0")
+    return lengths
+
+
+def checked_image(pixel: ArrayLike | None, corner: ArrayLike | None, n: int) -> Floats | None:
+    """u, v, [px], and the point on the board, x, y, [m], shape (n, 4); None if neither was given."""
+    if pixel is None and corner is None:
+        return None
+    for name, other, given in (("pixel", "corner", pixel), ("corner", "pixel", corner)):
+        if given is None:
+            raise InputError(name, f"none beside {other}", "both: what was seen, and where it is on the board")
+    return np.hstack([as_floats("pixel", pixel, f"({n}, 2)"), as_floats("corner", corner, f"({n}, 2)")])
+
+
+def checked_covariance(given: ArrayLike | None, n: int) -> Floats | None:
+    """Covariances of n poses, shape (n, 6, 6); None if None."""
+    if given is None:
+        return None
+    good, C = covariances(as_floats("covariance", given, f"({n}, 6, 6)"))
+    require(good, "covariance", np.einsum("nii->ni", C), "symmetric matrices with eigenvalues above 0")
+    return C
+
+
+def covariances(C: Floats) -> tuple[Booleans, Floats]:
+    """Which matrices are covariances, shape (n,), and these with rounding taken off, shape (n, d, d)."""
+    size = np.sqrt(np.maximum(np.einsum("nii->ni", C), LEAST_SIZE**2))
+    scaled = C / (size[:, :, None] * size[:, None, :])
+    alike = np.abs(scaled - np.swapaxes(scaled, 1, 2)).max(axis=(1, 2), initial=0.0) < ROUNDED
+    C = 0.5 * (C + np.swapaxes(C, 1, 2))
+    return alike & (np.linalg.eigvalsh(scaled)[:, 0] > ROUNDED), C
+
+
 def checked_pairs(
-    given: Mapping[str, ArrayLike], ids: NDArray[np.str_], group_names: Sequence[str]
+    given: Any, ids: NDArray[np.str_], group_names: Sequence[str]
 ) -> tuple[dict[str, NDArray[Any]], Booleans]:
     """Columns of pairs by the names of `PAIR_KEYS`, ends as rows of configurations or indices of groups.
 
     Args:
-        given: Arrays by these names; `a` and `b` hold ids, row numbers where configurations have none, or groups.
+        given: Arrays by these names; `a` and `b` hold ids, row numbers, or groups. Whole numbers are row numbers
+            where no id and no group is a number.
         ids: Of the configurations.
         group_names: Of the groups.
 
     Returns:
         The columns, shape (n_pairs,) each, and which pairs are of groups.
     """
+    expected = "a mapping of arrays by the names a, b, distance, angle, or a frame of polars or pandas"
+    given = as_columns("pairs", given, expected)
     check_names("pairs", given, PAIR_KEYS, "key")
     for key in ("a", "b"):
         if key not in given:
@@ -164,25 +214,39 @@ def _ends(
     given: Mapping[str, ArrayLike], ids: NDArray[np.str_], group_names: Sequence[str]
 ) -> tuple[dict[str, NDArray[Any]], Booleans]:
     """Rows of configurations or indices of groups that `a` and `b` name, and whether they are groups."""
-    named = {key: as_array(f"pairs: {key}", given[key], "iuUO", "ids") for key in ("a", "b")}
+    named = {key: _names_of_ends(f"pairs: {key}", given[key]) for key in ("a", "b")}
     for key, names in named.items():
         if names.ndim != 1 or len(names) != len(named["a"]):
             raise InputError(f"pairs: {key}", f"shape {names.shape}", "(n_pairs,), as many of a as of b")
     known = np.concatenate([ids, np.array(group_names, dtype=np.str_)])
     twice = np.intersect1d(ids, known[len(ids) :]) if group_names else ids[:0]
     what = "an id or a group" if group_names else "an id (the row number where no ids were given)"
+    by_row = not any(word.isdigit() for word in known.tolist())
     index = {}
     for key, names in named.items():
+        if by_row and names.dtype.kind in "iu":
+            index[key] = np.where((names >= 0) & (names < len(ids)), names, -1).astype(np.int64)
+            require(index[key] >= 0, f"pairs: {key}", names, f"{what}, or a row number, 0 to {len(ids) - 1}")
+            continue
         if len(twice):
             only = ~np.isin(names.astype(np.str_), twice)
             require(only, f"pairs: {key}", names, "different names of ids and groups")
         index[key] = _index_of(names, known)
-        require(index[key] >= 0, f"pairs: {key}", names, what)
+        numbers = "row numbers are understood where no id or group is a number" * (names.dtype.kind in "iu")
+        require(index[key] >= 0, f"pairs: {key}", names, what, numbers)
     a, b = index.values()
     require((a < len(ids)) == (b < len(ids)), "pairs: b", named["b"], "two configurations or two groups")
     require(a != b, "pairs: b", named["b"], "another than a")
     of_groups = a >= len(ids)
     return {key: np.where(of_groups, i - len(ids), i) for key, i in index.items()}, of_groups
+
+
+def _names_of_ends(name: str, given: ArrayLike) -> NDArray[Any]:
+    """Names, or whole numbers as they are, for these are looked up faster."""
+    array = as_array(name, given, "iuUO", "ids")
+    if array.ndim != 1 or array.dtype.kind in "iu":
+        return array
+    return np.array(as_names(name, given), dtype=np.str_)
 
 
 def _index_of(names: NDArray[Any], known: NDArray[np.str_]) -> Integers:
@@ -210,14 +274,13 @@ def check_readings(readings: Floats, robot: Robot, name: str) -> None:
     if readings.shape[1] != robot.n_joints:
         raise InputError(name, f"readings of {readings.shape[1]} joints", f"{robot.n_joints}, as {robot.name} has")
     lower, upper = robot.limits.T
-    outside = (readings < lower - LIMIT_SLACK) | (readings > upper + LIMIT_SLACK)
+    outside = outside_limits(readings, robot)
     if outside.any():
         row, j = divmod(int(np.argmax(outside)), robot.n_joints)
         joint, reading = robot.joints[j], readings[row, j]
-        factor, smaller = (1e-3, "mm") if joint.prismatic else (np.pi / 180.0, "deg")
-        within = lower[j] <= reading * factor <= upper[j]
         found = f"{joint.name} = {reading:.6g} {joint.unit} is outside [{lower[j]:.6g}, {upper[j]:.6g}]"
-        raise InputError(f"{name}: row {row}", found, hint=f"is it in {smaller}?" if within else "")
+        hint = limit_hint(readings, robot, j, (joint.name, "it"), joint.unit)
+        raise InputError(f"{name}: row {row}", found, hint=hint)
     turning = np.array([not joint.prismatic for joint in robot.joints]) & np.isinf(lower) & np.isinf(upper)
     suspicious = turning & ((np.abs(readings) > 4 * np.pi).mean(axis=0) > 0.5)
     if suspicious.any():

@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
-from typing import ClassVar
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fg_calib.arguments import checked
 from fg_calib.arrays import FrozenArrays, as_floats
 from fg_calib.errors import InputError
 from fg_calib.measurements.checks import (
-    checked_groups,
+    checked_covariance,
     checked_ids,
+    checked_image,
     checked_joint_sigma,
+    checked_labels,
+    checked_lengths,
     checked_mask,
     checked_pairs,
     checked_readings,
     checked_rotation,
     checked_sigma,
 )
-from fg_calib.options import Pairing, check_number
+from fg_calib.options import Pairing, check_number, listed
+from fg_calib.sizes import MOST_PAIRS
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -36,9 +41,10 @@ class Noise:
         position: Per axis, [m].
         orientation: Per axis of a rotation vector, [rad].
         joint: Of the joint readings: one figure for all joints or one a joint, [rad] (prismatic: [m]).
-        distance: Of a directly measured distance, [m].
+        distance: Of a directly measured distance, also to an anchor or a plane, [m].
         angle: Of a directly measured rotation angle, [rad].
         point: Of a touched point, per axis, [m].
+        pixel: Of a point's image, per axis, [px].
     """
 
     position: float | None = None
@@ -47,11 +53,15 @@ class Noise:
     distance: float | None = None
     angle: float | None = None
     point: float | None = None
+    pixel: float | None = None
 
     def __post_init__(self) -> None:
         for f in fields(self):
             given = getattr(self, f.name)
-            for figure in given if f.name == "joint" and isinstance(given, tuple | list) else (given,):
+            if f.name == "joint" and isinstance(given, list | np.ndarray):
+                given = tuple(np.atleast_1d(np.array(given, dtype=object)).tolist())
+                object.__setattr__(self, "joint", given)
+            for figure in given if f.name == "joint" and isinstance(given, tuple) else (given,):
                 if figure is not None:
                     check_number(f"noise: {f.name}", figure)
 
@@ -102,6 +112,23 @@ class Pairs(FrozenArrays):
 
 
 @dataclass(frozen=True)
+class Labels(FrozenArrays):
+    """What each row is of, by name: the target that was seen, the station it was seen from.
+
+    Attributes:
+        names: The different names.
+        index: Which of them each row has, -1 for none, shape (n_configurations,).
+    """
+
+    names: tuple[str, ...]
+    index: Integers
+
+    def of(self, rows: Integers) -> Labels:
+        """Those of some rows, the same names."""
+        return replace(self, index=self.index[rows])
+
+
+@dataclass(frozen=True)
 class Groups(FrozenArrays):
     """Configurations in which the tool point touched the same physical point, whose position is unknown.
 
@@ -141,6 +168,16 @@ class Measurements(FrozenArrays):
         sigma_point: Of a touch, per axis, shape (n_configurations,), [m]; nan where it is not stated.
         named: Whether the names were given, so that another table may have the same configurations.
         roll_pitch_yaw: What `rotation` was read from, shape (n_configurations, 3), [rad]; None for quaternions.
+        labels: What the rows are of, by `target`, `station`, `anchor`, `plane` or `board`, where that was said.
+        length: Distance to the row's anchor, or from its plane, shape (n_configurations,), [m]; None where not
+            measured.
+        sigma_length: Shape (n_configurations,), [m]; None where it is not stated.
+        image: Where a point of the row's board was seen, u and v, [px], and where it is on the board, x and y, [m],
+            shape (n_configurations, 4); None where nothing was.
+        sigma_pixel: Along u and v, shape (n_configurations, 2), [px]; None where it is not stated.
+        covariance: Of a board's measured pose, about and along the camera's axes, shape (n_configurations, 6, 6), [rad]
+            and [m]; None where sigmas say it.
+        part: Which rows of a table these are, shape (n_configurations,); None where they are all.
     """
 
     readings: Floats
@@ -157,11 +194,19 @@ class Measurements(FrozenArrays):
     sigma_point: Floats | None = None
     roll_pitch_yaw: Floats | None = None
     named: bool = False
+    labels: Mapping[str, Labels] = field(default_factory=dict)
+    length: Floats | None = None
+    sigma_length: Floats | None = None
+    image: Floats | None = None
+    sigma_pixel: Floats | None = None
+    covariance: Floats | None = None
+    part: Integers | None = None
 
     from_frame: ClassVar[Callable[..., Measurements]]
     """`files.tables.read_measurements`, attached by the package: this folder knows nothing of tables."""
 
     @classmethod
+    @checked
     def from_arrays(
         cls,
         readings: ArrayLike,
@@ -170,14 +215,26 @@ class Measurements(FrozenArrays):
         rotation: ArrayLike | None = None,
         quaternion: ArrayLike | None = None,
         roll_pitch_yaw: ArrayLike | None = None,
-        pairs: Mapping[str, ArrayLike] | None = None,
+        pairs: Mapping[str, ArrayLike] | Any | None = None,
         group: ArrayLike | None = None,
         test: ArrayLike | None = None,
         ids: ArrayLike | None = None,
+        points: Sequence[str] = (),
         sigma_position: ArrayLike | None = None,
         sigma_orientation: ArrayLike | None = None,
         sigma_joint: ArrayLike = 0.0,
         sigma_point: ArrayLike | None = None,
+        target: ArrayLike | None = None,
+        station: ArrayLike | None = None,
+        anchor: ArrayLike | None = None,
+        plane: ArrayLike | None = None,
+        distance: ArrayLike | None = None,
+        sigma_distance: ArrayLike | None = None,
+        board: ArrayLike | None = None,
+        pixel: ArrayLike | None = None,
+        corner: ArrayLike | None = None,
+        sigma_pixel: ArrayLike | None = None,
+        covariance: ArrayLike | None = None,
         source: str = "measurements",
     ) -> Measurements:
         """Measurements from arrays in [m] and [rad], which are copied; sigmas may be one figure for all.
@@ -188,25 +245,43 @@ class Measurements(FrozenArrays):
             rotation: world_R_tool, shape (n, 3, 3); or one of the next two.
             quaternion: As x y z w, shape (n, 4).
             roll_pitch_yaw: As angles, Rz(yaw) Ry(pitch) Rx(roll), shape (n, 3).
-            pairs: Between configurations or touched points, arrays of shape (n_pairs,): `a` and `b` (ids, row numbers
-                where there are none, or groups); `distance`, `angle` (nan: not measured), `sigma_...` each, `test`.
+            pairs: Between configurations or touched points, arrays of shape (n_pairs,), or a frame of polars or pandas:
+                `a` and `b` (ids or groups; row numbers where none of these is a number); `distance`, `angle` (nan: not
+                measured), `sigma_...` each, `test`.
             group: Name of the point that a configuration touched, None where it touched none, shape (n,).
             test: True for rows that are predicted but never fitted, shape (n,).
             ids: Name of each configuration, shape (n,); its row number if None.
+            points: Names of points that other tables touch: pairs may say how far apart they are.
             sigma_position: 1 sigma: one figure, one an axis (3,), one a row (n,), or shape (n, 3).
             sigma_orientation: The same, about the tool's axes.
             sigma_joint: 1 sigma of the readings: one figure, or one a joint.
             sigma_point: 1 sigma of a touch on each axis: one figure, or one a row.
+            target: Name of the target whose position was measured, None for the tool point itself, shape (n,).
+            station: Name of the station it was measured from, each with a frame of its own, shape (n,).
+            anchor: Name of the anchor that `distance` is to, shape (n,).
+            plane: Name of the plane that the tool point is on, or `distance` from, shape (n,).
+            distance: To the anchor or from the plane, nan where not measured, shape (n,).
+            sigma_distance: 1 sigma of that: one figure, or one a row.
+            board: Name of the board that a camera saw; `position` and orientation are then camera_T_board, shape (n,).
+            pixel: Where a point of the board was seen, u and v, [px], shape (n, 2).
+            corner: Where that point is on the board, x and y, shape (n, 2).
+            sigma_pixel: 1 sigma of `pixel`: one figure, one an axis (2,), one a row (n,), or shape (n, 2).
+            covariance: Of camera_T_board, rotation first, about and along the camera's axes, shape (n, 6, 6).
             source: Name of the measurements, for messages.
 
         Raises:
             InputError: An array cannot be used; the message names it and its row.
         """
         n = len(q := checked_readings(readings))
-        names, index = checked_groups(group, n)
-        known, rows = checked_ids(ids, n), checked_mask("test", test, n)
+        names, index = checked_labels("group", group, n)
+        given = {"target": target, "station": station, "anchor": anchor, "plane": plane, "board": board}
+        labels = {what: Labels(*checked_labels(what, v, n)) for what, v in given.items() if v is not None}
+        repeated = pixel is not None or bool(labels.keys() - {"station"})
+        known, rows = checked_ids(ids, n, repeated=repeated), checked_mask("test", test, n)
         R, angles = checked_rotation(n, rotation, quaternion, roll_pitch_yaw)
-        between = None if pairs is None else _pairs_from_arrays(pairs, known, rows, names, index)
+        every = tuple(dict.fromkeys((*names, *listed("points", points))))
+        between = None if pairs is None else _pairs_from_arrays(pairs, known, rows, every, index)
+        names = names if between is None or not between[1].n_pairs else every
         return cls(
             readings=q,
             ids=known,
@@ -222,6 +297,12 @@ class Measurements(FrozenArrays):
             sigma_point=checked_sigma("sigma_point", sigma_point, (n,)),
             roll_pitch_yaw=angles,
             named=ids is not None,
+            labels=labels,
+            length=checked_lengths("distance", distance, n, signed=plane is not None),
+            sigma_length=checked_sigma("sigma_distance", sigma_distance, (n,)),
+            image=checked_image(pixel, corner, n),
+            sigma_pixel=checked_sigma("sigma_pixel", sigma_pixel, (n, 2)),
+            covariance=checked_covariance(covariance, n),
         )
 
     def __repr__(self) -> str:
@@ -240,6 +321,16 @@ class Measurements(FrozenArrays):
         """Number of configurations, train and test."""
         return len(self.readings)
 
+    def select(self, rows: Integers) -> Measurements:
+        """Some rows, with what was measured at them; nothing that was measured between configurations."""
+        n, changes = self.n_configurations, dict[str, Any]()
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if isinstance(value, np.ndarray) and f.name != "sigma_joint" and len(value) == n:
+                changes[f.name] = value[rows]
+        labels = {name: of.of(rows) for name, of in self.labels.items()}
+        return replace(self, **changes, labels=labels, pairs=None, groups=None)
+
     @property
     def end_names(self) -> tuple[str, ...]:
         """Names of what a row can be of: nothing at all (""), the configurations, then the groups.
@@ -250,12 +341,13 @@ class Measurements(FrozenArrays):
 
 
 def _pairs_from_arrays(
-    given: Mapping[str, ArrayLike], ids: NDArray[np.str_], test: Booleans, names: tuple[str, ...], group: Integers
+    given: Any, ids: NDArray[np.str_], test: Booleans, names: tuple[str, ...], group: Integers
 ) -> tuple[Pairs, Pairs]:
     """Pairs of configurations, and pairs of groups; those of test rows alone are test pairs."""
     columns, of_groups = checked_pairs(given, ids, names)
     pairs = Pairs(**columns)  # type: ignore[arg-type]
-    only_test = np.array([bool(test[group == g].all()) for g in range(len(names))], dtype=np.bool_)
+    touches = [test[group == g] for g in range(len(names))]
+    only_test = np.array([len(here) > 0 and here.all() for here in touches], dtype=np.bool_)
     of_rows = pairs.test.copy()
     for flags, chosen in ((test, ~of_groups), (only_test, of_groups)):
         of_rows[chosen] |= flags[pairs.a[chosen]] | flags[pairs.b[chosen]]
@@ -321,6 +413,11 @@ def _choose(rows: Integers, pairing: Pairing, generator: np.random.Generator) ->
     n = len(rows)
     if n < 2:
         return np.empty((0, 2), dtype=np.int64)
+    possible = n * (n - 1) // 2
+    wanted = {"all": possible, "random": min(pairing.count, possible)}.get(pairing.strategy, n - 1)
+    if wanted > MOST_PAIRS:
+        hint = "a random part will do, such as {random: 100000}"
+        raise InputError("pairing", f"{pairing} forms {wanted} pairs", f"at most {MOST_PAIRS}", hint)
     match pairing.strategy:
         case "star":
             first, second = np.zeros(n - 1, dtype=np.int64), np.arange(1, n)

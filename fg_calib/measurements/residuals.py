@@ -49,6 +49,7 @@ class Block(Brief):
         whitening: Lower triangle, row by row, of a matrix that whitens a measurement's rows, shape (n, residual_dim *
             (residual_dim + 1) / 2); zero for a row that is not measured. See `pack`.
         nuisances: Values of the kind's nuisances, shape (n, kind.n_nuisances).
+        source: The table that they are from, for messages.
     """
 
     kind: Kind
@@ -57,6 +58,7 @@ class Block(Brief):
     data: Floats
     whitening: Floats
     nuisances: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+    source: str = ""
 
     @property
     def n(self) -> int:
@@ -90,7 +92,7 @@ def unit_whitening(n: int, residual_dim: int) -> Floats:
 
 def rows_of(block: Block, rows: slice | Integers) -> Block:
     """The measurements at `rows` of a block."""
-    return replace(block, **{f.name: getattr(block, f.name)[rows] for f in fields(block)[2:]})
+    return replace(block, **{f.name: getattr(block, f.name)[rows] for f in fields(block)[2:-1]})
 
 
 def residual(block: Block, chain: Chain) -> Floats:
@@ -191,7 +193,7 @@ def _given(block: Block, chain: Chain, rows: slice) -> tuple[Floats, Floats, Flo
     ends = block.ends[rows]
     at = forward(chain, block.trig, ends.ravel())
     frames = Frames(at.rotation.reshape(*ends.shape, 3, 3), at.position.reshape(*ends.shape, 3))
-    return checked_rows(block.kind, frames, block.data[rows], block.nuisances[rows])
+    return checked_rows(block.kind, frames, block.data[rows], block.nuisances[rows], block.source)
 
 
 def _turning(block: Block, chain: Chain, ends: Integers) -> Floats:

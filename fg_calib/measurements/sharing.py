@@ -31,7 +31,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -61,6 +61,12 @@ LANES = 16
 
 EXACT = 1e-9
 """Bound of the error of the Gram matrix of whitened rows, as a share of it in any direction."""
+
+MAX_EXACT = 1000
+"""Rows, or errors, up to which products of covariances are formed."""
+
+ROUGH = 1e-4
+"""By how much residuals are reduced where what is sought is an estimate anyway."""
 
 N_PROBES = 64
 """Random vectors that a trace is estimated with where it would take too many columns.
@@ -126,6 +132,54 @@ class SharedErrors:
         """`tr E^T (1 + L L^T)^-1 E` for a sparse E, shape (n_rows, k); estimated if large, see `N_PROBES`."""
         return self._way.energy(E)
 
+    def roughly_weighed(self, rows: Floats) -> Floats:
+        """`(1 + L L^T)^-1` times rows, shape (n_rows, m): where it takes steps, so few that `ROUGH` is left."""
+        way = self._way
+        Z = way.roughly(rows) if isinstance(way, _Many) else way.most_likely(rows)
+        out: Floats = rows - self.loadings @ Z
+        return out
+
+    def products(self, roots: Sequence[Sparse]) -> tuple[Floats, Floats]:
+        """What covariances E E^T and the inverse of that of the rows, C = 1 + L L^T, make together.
+
+        Args:
+            roots: E of each, sparse, shape (n_rows, k).
+
+        Returns:
+            `tr E_i^T C^-1 E_i`, shape (m,), and the squared Frobenius norms of `E_i^T C^-1 E_j`, shape (m, m);
+            estimated if there are many errors and rows, see `N_PROBES`.
+        """
+        if min(self.loadings.shape) <= MAX_EXACT:
+            return self._exact_products(roots)
+        rng = np.random.default_rng(0)
+        probed = [E @ rng.choice([-1.0, 1.0], size=(E.shape[1], N_PROBES)) for E in roots]
+        found = [self.roughly_weighed(X) if E.nnz else X for E, X in zip(roots, probed, strict=True)]
+        traces = np.array([np.vdot(X, Y) for X, Y in zip(probed, found, strict=True)])
+        squares = np.array([[np.sum((E.T @ Y) ** 2) for Y in found] for E in roots])
+        return traces / N_PROBES, 0.5 * (squares + squares.T) / N_PROBES
+
+    def _exact_products(self, roots: Sequence[Sparse]) -> tuple[Floats, Floats]:
+        """`products` by a dense matrix of the rows, or of the errors, whichever are fewer.
+
+        With S = 1 + L^T L, C^-1 is 1 - L S^-1 L^T.
+        """
+        L, (n_rows, n_errors) = self.loadings, self.loadings.shape
+        if n_rows <= n_errors:
+            whiten = _FewRows(L).whiten
+            middle = [whiten(whiten((E @ E.T).toarray()).T) for E in roots]
+            return np.array([np.trace(V) for V in middle]), np.array([[np.vdot(V, U) for U in middle] for V in middle])
+        inverse = _FewErrors(L).inverse
+        by_error = [scipy.sparse.csr_array(L.T @ E) for E in roots]
+        reached = [scipy.sparse.csr_array(E @ D.T) for E, D in zip(roots, by_error, strict=True)]  # E E^T L
+        turned = [inverse @ (D @ D.T).toarray() for D in by_error]
+        traces = [E.power(2).sum() - np.trace(F) for E, F in zip(roots, turned, strict=True)]
+        squares = np.zeros((len(roots), len(roots)))
+        for i, (E, H, F) in enumerate(zip(roots, reached, turned, strict=True)):
+            for j in range(i, len(roots)):
+                direct = (E.T @ roots[j]).power(2).sum() - 2.0 * (H.T @ reached[j]).multiply(inverse).sum()
+                squares[i, j] = squares[j, i] = direct + np.vdot(F, turned[j].T)
+        return np.array(traces), squares
+
     @property
     def _is_short(self) -> bool:
         n_rows, n_errors = self.loadings.shape
@@ -175,14 +229,14 @@ class _FewErrors:
         return Z
 
     def variances(self) -> Floats:
-        return np.diag(self._inverse).copy()
+        return np.diag(self.inverse).copy()
 
     def energy(self, E: Sparse) -> float:
         common = self._L.T @ E
-        return float(E.power(2).sum() - (common @ common.T).multiply(self._inverse).sum())
+        return float(E.power(2).sum() - (common @ common.T).multiply(self.inverse).sum())
 
     @property
-    def _inverse(self) -> Floats:
+    def inverse(self) -> Floats:
         inverse: Floats = scipy.linalg.cho_solve(self._factor, np.eye(len(self._factor[0])))
         return inverse
 
@@ -222,6 +276,11 @@ class _Many:
     def most_likely(self, rows: Floats) -> Floats:
         Z = np.empty((len(self._place), rows.shape[1]))
         Z[self._place] = self._solve(rows)
+        return Z
+
+    def roughly(self, rows: Floats) -> Floats:
+        Z = np.empty((len(self._place), rows.shape[1]))
+        Z[self._place] = self._steps(self._L.T @ rows, ROUGH)
         return Z
 
     def variances(self) -> Floats:

@@ -6,10 +6,11 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 from rich.console import Group, RenderableType
-from rich.text import Text
 
+from fg_calib.arguments import checked
 from fg_calib.baseline.comparison import Comparison, Estimate, PoseError
-from fg_calib.report.tables import FAMILY_UNIT, SHOWN, WIDTH, indented, plain_table, plain_text, rounded, section
+from fg_calib.report.shown import FAMILY_UNIT, SHOWN
+from fg_calib.report.tables import WIDTH, indented, line, plain_table, plain_text, rounded, section
 from fg_calib.robot.model import Robot
 
 _ESTIMATORS = {
@@ -29,6 +30,7 @@ _POSE_ERROR: tuple[tuple[str, str, Callable[[PoseError], float]], ...] = (
 )
 
 
+@checked
 def format_comparison(comparison: Comparison, width: int = WIDTH) -> str:
     """`build_comparison_report` as plain text."""
     return plain_text(build_comparison_report(comparison), width)
@@ -40,9 +42,9 @@ def build_comparison_report(comparison: Comparison) -> RenderableType:
     title = (
         f"{job.robot.name}: {job.options.model}, judged at {comparison.n_judged} {comparison.judged_on} configurations"
     )
-    parts: list[RenderableType] = [Text(title)]
-    parts += [Text(f"DOUBTFUL: {finding}", style="bold red") for finding in comparison.findings]
-    parts += [Text(""), _accuracy(comparison)]
+    parts: list[RenderableType] = [line(title)]
+    parts += [line(f"DOUBTFUL: {finding}", "bold red") for finding in comparison.findings]
+    parts += [line(""), _accuracy(comparison)]
     parts += section("Corrections (± sigma claimed)", _corrections(comparison))
     parts += section("Estimators", _estimators(comparison))
     return Group(*parts, *section("Notes", *indented(_comparison_notes(comparison))))
@@ -66,21 +68,21 @@ def _accuracy(comparison: Comparison) -> RenderableType:
     for heading, chosen in sections:
         if not any(chosen):
             continue
-        table.add_row(Text(heading, style="bold"))
+        table.add_row(line(heading, "bold"))
         for label, unit, figure in _POSE_ERROR:
             row(label, unit, [None if e is None else figure(e) for e in chosen])
-    table.add_row(Text("Error predicted by its sigmas", style="bold"))
+    table.add_row(line("Error predicted by its sigmas", "bold"))
     row("position, RMS", "m", [None, *(e.predicted_rms for e in estimates)])
     row("after best rigid fit", "m", [None, *(e.predicted_fitted_rms for e in estimates)])
     before = estimates[0].residual_rms or {}
     for split in ("train", "test"):
         families = [f for f in FAMILY_UNIT if f in before.get(split, {})]
         if families:
-            table.add_row(Text(f"Residuals, {split} rows (RMS)", style="bold"))
+            table.add_row(line(f"Residuals, {split} rows (RMS)", "bold"))
         for family in families:
             after = [None if e.residual_rms is None else e.residual_rms[split][family]["after"] for e in estimates]
             row(family, FAMILY_UNIT[family], [before[split][family]["before"], *after])
-    table.add_row(Text("Effort", style="bold"))
+    table.add_row(line("Effort", "bold"))
     ran = [e.robot is not None for e in estimates]
     table.add_row(
         "  parameters", "", "-", *(f"{len(e.sigma)}" if r else "-" for e, r in zip(estimates, ran, strict=True))

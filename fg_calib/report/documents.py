@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fg_calib import __version__
 from fg_calib.analysis.accuracy import ExpectedError
@@ -30,9 +31,10 @@ from fg_calib.analysis.joint_values import JointValues
 from fg_calib.analysis.mistakes import SetupCheck
 from fg_calib.analysis.typical_residuals import TypicalResidual
 from fg_calib.analysis.uncertainty import ParameterEstimate, Uncertainty
+from fg_calib.arguments import checked
 from fg_calib.errors import InputError
 from fg_calib.files.csv_writer import Words, write_csv_parts
-from fg_calib.files.disk import fill_folder, write_text
+from fg_calib.files.disk import fill_folder, require_own, write_text
 from fg_calib.files.result import (
     SCHEMA,
     BeyondTolerance,
@@ -64,9 +66,11 @@ from fg_calib.files.result import ExpectedError as ExpectedErrorDocument
 from fg_calib.files.result import JointValues as JointValuesDocument
 from fg_calib.files.result import SuspectConfiguration as Suspect
 from fg_calib.files.robot_yaml import write_robot
+from fg_calib.graph.noise import JOINT_NOISE
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
 from fg_calib.job import Job
+from fg_calib.report.shown import FAMILY_UNIT
 from fg_calib.robot.model import Robot
 
 if TYPE_CHECKING:  # a calibration is written without the baseline
@@ -109,6 +113,7 @@ def result_of(solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str,
         trustworthy=u.trustworthy,
         findings=u.findings,
         cautions=u.cautions,
+        reservations=u.reservations,
         setup=_setup(u.setup),
         probability_of_noise=u.noise_like,
         chi2=u.chi2,
@@ -121,6 +126,7 @@ def result_of(solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str,
         priors=_priors(u.priors),
         expected_error=_expected_error(u.expected_error),
         noise_factors=_noise_factors(solution, goodness.kinds),
+        noise_kept=_noise_kept(solution, goodness.kinds),
         suspect_configurations=_suspects(goodness.configurations, names),
         residual_rms=_residual_rms(u),
         parameters=tuple(map(_parameter, u.parameters)),
@@ -136,6 +142,7 @@ def result_of(solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str,
     )
 
 
+@checked
 def result_document(
     solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
@@ -166,6 +173,7 @@ def _solver(solution: Solution) -> Solver:
 
 
 def _residual_rms(uncertainty: Uncertainty) -> dict[str, dict[str, Any]]:
+    """RMS by split and kind, where several tables have a kind also by table; kinds of one's own with their unit."""
     table = uncertainty.residuals
     rms, kinds = table.rms(), list(dict.fromkeys((*KINDS, *table.families)))
     for number, kind in table.groups:
@@ -173,7 +181,13 @@ def _residual_rms(uncertainty: Uncertainty) -> dict[str, dict[str, Any]]:
             kinds.append(f"{kind}, table {number + 1}")
             for split, found in table.rms(number).items():
                 rms[split] |= {kinds[-1]: found[kind]} if kind in found else {}
-    return {split: {kind: rms[split].get(kind) for kind in kinds} for split in ("train", "test")}
+    of_own = {kind: {"unit": table.unit(kind)} for kind in table.families if kind not in FAMILY_UNIT}
+
+    def document(split: str, kind: str) -> dict[str, Any] | None:
+        found = rms[split].get(kind)
+        return None if found is None else found | of_own.get(kind.partition(", table")[0], {})
+
+    return {split: {kind: document(split, kind) for kind in kinds} for split in ("train", "test")}
 
 
 def _parameter(p: ParameterEstimate) -> Parameter:
@@ -197,7 +211,22 @@ def _posterior(found: TangentCovariance) -> Posterior:
 def _noise_factors(solution: Solution, fits: Sequence[KindFit]) -> dict[str, float] | None:
     if solution.estimated_noise is None:
         return None
-    return {_key(fit, fits): fit.factor for fit in fits}
+    of_joints = {"joint": solution.problem.state.factors.get(JOINT_NOISE, 1.0)} if _joints(solution) else {}
+    return {_key(fit, fits): fit.own_factor for fit in fits} | of_joints
+
+
+def _noise_kept(solution: Solution, fits: Sequence[KindFit]) -> tuple[str, ...]:
+    """Keys of the factors that are 1 because the noise could not be estimated."""
+    estimated = solution.estimated_noise
+    if estimated is None:
+        return ()
+    of_joints = ("joint",) if _joints(solution) and JOINT_NOISE not in estimated else ()
+    return (*(_key(fit, fits) for fit in fits if (fit.table, fit.kind) not in estimated), *of_joints)
+
+
+def _joints(solution: Solution) -> bool:
+    """Whether noise of the joint readings is stated."""
+    return bool(np.any(solution.problem.data.sigma_joint > 0.0))
 
 
 def _key(fit: KindFit, fits: Sequence[KindFit]) -> str:
@@ -305,8 +334,7 @@ def _priors(fit: PriorFit | None) -> Priors | None:
         expected=fit.expected,
         p_value=fit.p_value,
         beyond_tolerance=tuple(
-            BeyondTolerance(parameter=fit.names[i], correction_over_tolerance=fit.z[i], sigma=fit.sigma[i])
-            for i in fit.beyond
+            BeyondTolerance(parameter=one.name, correction_over_tolerance=one.z, sigma=one.sigma) for one in fit.beyond
         ),
     )
 
@@ -317,8 +345,11 @@ def _setup(check: SetupCheck) -> Setup:
     def by_kind(residuals: Sequence[TypicalResidual]) -> dict[str, Typical]:
         return {r.kind: Typical(typical=r.size, predicted=r.expected) for r in residuals}
 
+    more = dict[str, Any](table=check.table) if check.table else {}
+    if check.others:
+        more["others"] = tuple(map(_setup, check.others))
     return Setup(
-        **({"table": check.table} if check.table else {}),
+        **more,
         residuals=by_kind(check.residuals),
         explanations=tuple(
             Explanation(mistakes=e.mistakes, residuals=by_kind(e.residuals)) for e in check.explanations
@@ -370,11 +401,13 @@ def _missing(m: MissingMotion) -> Missing:
     )
 
 
+@checked
 def observability_document(found: Identifiability) -> dict[str, Any]:
     """`_observability` as it is written to `observability.json`."""
     return _observability(found).document()
 
 
+@checked
 def write_observability(folder: Path | str, found: Identifiability) -> None:
     """Write `observability.json` and its figures (see `write_figures`) into a folder, all of them or none.
 
@@ -383,15 +416,17 @@ def write_observability(folder: Path | str, found: Identifiability) -> None:
     """
     text = json.dumps(observability_document(found), indent=1, allow_nan=False) + "\n"
 
-    from fg_calib.report.figures import write_figures
+    from fg_calib.report.figures import FIGURES, write_figures
 
     def write(into: Path) -> None:
         write_text(into / "observability.json", text)
         write_figures(into, found)
 
-    fill_folder(Path(folder), write)
+    figures = dict.fromkeys(FIGURES, b"\x89PNG")
+    fill_folder(Path(folder), write, {"observability.json": b'{\n "schema": "fg-calib/observability/', **figures})
 
 
+@checked
 def comparison_document(comparison: Comparison) -> dict[str, Any]:
     """What `comparison.json` holds: SI, full precision, None for what is unknown or infinite.
 
@@ -488,6 +523,7 @@ def _estimated(comparison: Comparison, estimate: Estimate) -> list[dict[str, Any
     ]
 
 
+@checked
 def write_comparison(folder: Path | str, comparison: Comparison) -> None:
     """Write `comparison.json` into a folder, whole or not at all.
 
@@ -495,13 +531,21 @@ def write_comparison(folder: Path | str, comparison: Comparison) -> None:
         InputError: The folder cannot be written.
     """
     text = json.dumps(comparison_document(comparison), indent=1, allow_nan=False) + "\n"
-    fill_folder(Path(folder), lambda into: write_text(into / "comparison.json", text))
+    own = {"comparison.json": b'{\n "schema": "fg-calib/comparison/'}
+    fill_folder(Path(folder), lambda into: write_text(into / "comparison.json", text), own)
 
 
-RESULT_FILES = ("result.json", "residuals.csv", "joints.csv", "robot_calibrated.yaml", "robot_calibrated.urdf")
-"""What a calibration may write; of one result all are of the same calibration."""
+RESULT_FILES = {
+    "result.json": b'{\n "schema": "fg-calib/result/',
+    "residuals.csv": b"kind,a,b,split,used,excluded,",
+    "joints.csv": b"id,joint,unit,reading,estimate,",
+    "robot_calibrated.yaml": b"",
+    "robot_calibrated.urdf": b"",
+}
+"""What a calibration may write and how it begins; of one result all are of the same calibration."""
 
 
+@checked
 def write_results(
     folder: Path | str, solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str, str] | None = None
 ) -> None:
@@ -531,7 +575,7 @@ def write_results(
 
 
 def require_no_input(folder: Path, job: Job) -> None:
-    """Check that results written to a folder would not replace what a job was read from.
+    """Check that results written to a folder would not replace what a job was read from, nor what is of no result.
 
     Raises:
         InputError: They would.
@@ -540,6 +584,7 @@ def require_no_input(folder: Path, job: Job) -> None:
     for name in RESULT_FILES:
         if (folder / name).resolve() in inputs:
             raise InputError(str(folder / name), "the job was read from it", "another folder for the results")
+    require_own(folder, RESULT_FILES)
 
 
 def write_calibrated_robot(folder: Path, robot: Robot) -> None:
@@ -555,7 +600,7 @@ def write_calibrated_robot(folder: Path, robot: Robot) -> None:
 
 
 def _write_residuals(path: Path, solution: Solution, uncertainty: Uncertainty) -> None:
-    """One line a scalar residual: what it is of, whether it was used, before and after, in [m] and [rad]."""
+    """One line a scalar residual: what it is of, whether it was used, before and after, in [m], [rad] or [px]."""
     table, fit = uncertainty.residuals, uncertainty.goodness
     ends = solution.problem.end_names
     suspect = np.zeros(table.n, dtype=np.bool_)
@@ -564,7 +609,7 @@ def _write_residuals(path: Path, solution: Solution, uncertainty: Uncertainty) -
         suspect[fit.test.suspects] = True
     sources = solution.problem.data.labels
     tables = [kind.table for kind in table.kinds]
-    kind_in_metres = np.array([kind.unit == "m" for kind in table.kinds])
+    labelled = len(table.labels) > 1
 
     def columns(rows: slice) -> dict[str, Any]:
         kind = table.kind_code[rows]
@@ -577,7 +622,7 @@ def _write_residuals(path: Path, solution: Solution, uncertainty: Uncertainty) -
             "split": Words(("train", "test"), table.split[rows]),
             "used": table.used[rows],
             "excluded": Words(table.reasons, table.reason_code[rows]),
-            "unit": Words(("rad", "m"), kind_in_metres[kind].astype(np.int8)),
+            "unit": Words([kind.unit for kind in table.kinds], kind),
             "measured": measured,
             "predicted": measured + after,
             "residual_before": table.before[rows],
@@ -591,10 +636,18 @@ def _write_residuals(path: Path, solution: Solution, uncertainty: Uncertainty) -
             "noise_adds": excess,
             "suspect": suspect[rows],
             **({} if len(sources) == 1 else {"table": Words(sources, np.array(tables, dtype=np.int16)[kind])}),
+            **({"of": Words(table.labels, table.label_code[rows])} if labelled else {}),
+            **({"row": _numbers(table.table_row[rows])} if labelled else {}),
         }
 
     starts = range(0, max(table.n, 1), _ROWS_AT_ONCE)
     write_csv_parts(path, (columns(slice(start, start + _ROWS_AT_ONCE)) for start in starts))
+
+
+def _numbers(rows: NDArray[np.int32]) -> Words:
+    """Numbers of rows as words, those below 0 empty."""
+    different, codes = np.unique(rows, return_inverse=True)
+    return Words(["" if row < 0 else str(row) for row in different.tolist()], codes)
 
 
 def _write_joint_values(path: Path, found: JointValues, names: Sequence[str], units: Sequence[str]) -> None:

@@ -19,12 +19,16 @@ from numpy.typing import NDArray
 
 from fg_calib.analysis.identifiability import Identifiability
 from fg_calib.graph.observability import CORRELATED, WEAK
+from fg_calib.libraries import without_settings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
+
+FIGURES = ("spectrum.png", "groups.png", "correlations.png")
+"""What `write_figures` may write."""
 
 KEPT, LOST = "#0072B2", "#D55E00"
 GREY, PALE = "0.45", "0.93"
@@ -39,11 +43,11 @@ _SMALL, _TEXT, _TITLE = 7.0, 8.0, 9.0
 
 def write_figures(folder: Path, found: Identifiability) -> None:
     """Write `spectrum.png`, `groups.png` if anything is lost, and `correlations.png` if practical, into a folder."""
-    draw_spectrum(found).savefig(folder / "spectrum.png", dpi=_DPI)
+    draw_spectrum(found).savefig(folder / FIGURES[0], dpi=_DPI)
     if found.lost:
-        draw_groups(found).savefig(folder / "groups.png", dpi=_DPI)
+        draw_groups(found).savefig(folder / FIGURES[1], dpi=_DPI)
     if found.kind == "practical" and found.observability.kept:
-        draw_correlations(found).savefig(folder / "correlations.png", dpi=_DPI)
+        draw_correlations(found).savefig(folder / FIGURES[2], dpi=_DPI)
 
 
 def draw_spectrum(found: Identifiability) -> Figure:
@@ -213,8 +217,9 @@ def _cell(change: float) -> str:
 
 def _figure(width: float, height: float) -> tuple[Figure, Axes]:
     """An empty figure of a size in inches, with a canvas that needs no display."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    with without_settings("matplotlibrc", "MPLBACKEND or MPLCONFIGDIR"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import RenderableType
 
-from fg_calib.analysis.findings import LIKE_NOISE
 from fg_calib.analysis.goodness import FLAGS, PREDICTION_VERDICTS, VERDICTS, KindFit, SuspectConfiguration
 from fg_calib.analysis.uncertainty import Uncertainty
 from fg_calib.analysis.verdict import probability
+from fg_calib.graph.noise import JOINT_NOISE, NoiseName
 from fg_calib.graph.solver import Solution
-from fg_calib.report.tables import SHOWN, indented, plain_table, rounded, section
+from fg_calib.report.shown import SHOWN
+from fg_calib.report.tables import indented, plain_table, rounded, section
 
 Integers = NDArray[np.int64]
 
@@ -31,21 +32,47 @@ def goodness_of_fit(solution: Solution, uncertainty: Uncertainty) -> Iterable[Re
     for fit in uncertainty.goodness.kinds:
         factor, shown, decimals = SHOWN[fit.unit]
         seen, words = fit.seen_over_stated, VERDICTS[fit.verdict]
+        if uncertainty.change is not None and fit.verdict in ("too small", "outliers", "others", "both", "many"):
+            words = "too large: see what moved, on top"
+        stated = fit.stated_sigma_rms
         if estimated is not None:
-            seen = fit.factor
-            settled = "estimated" if solution.converged else "not settled: the estimate has not converged"
-            words = settled if (fit.table, fit.kind) in estimated else "too few rows to estimate it: as stated"
+            stated, seen = fit.own_sigma_rms, fit.own_factor
+            words = _of_estimate(solution, (fit.table, fit.kind))
         table.add_row(
             _of_table(solution, fit),
             shown,
-            f"{fit.stated_sigma_rms * factor:.{decimals}f}",
-            "-" if np.isnan(seen) else f"{seen * fit.stated_sigma_rms * factor:.{decimals}f}",
+            f"{stated * factor:.{decimals}f}",
+            "-" if np.isnan(seen) else f"{seen * stated * factor:.{decimals}f}",
             "-" if np.isnan(seen) else f"{seen:.3f}",
             "-" if fit.p_value is None else probability(fit.p_value),
             words,
         )
+    if estimated is not None and np.any(solution.problem.data.sigma_joint > 0.0):
+        for name, unit, stated in _joint_noise(solution):
+            factor, shown, decimals = SHOWN[unit]
+            ratio = solution.problem.state.factors.get(JOINT_NOISE, 1.0)
+            figures = f"{stated * factor:.{decimals}f}", f"{ratio * stated * factor:.{decimals}f}", f"{ratio:.3f}"
+            table.add_row(name, shown, *figures, "-", _of_estimate(solution, JOINT_NOISE))
     yield table
     yield from indented(_goodness_lines(solution, uncertainty))
+
+
+def _of_estimate(solution: Solution, name: NoiseName) -> str:
+    """What became of noise that was to be estimated."""
+    if name in (solution.estimated_noise or ()):
+        return "estimated" if solution.converged else "not settled: the estimate has not converged"
+    if np.any(solution.problem.data.sigma_joint > 0.0):
+        return "not to be told from other noise: as stated"
+    return "too few rows to estimate it: as stated"
+
+
+def _joint_noise(solution: Solution) -> Iterable[tuple[str, str, float]]:
+    """Words, unit and RMS sigma as stated of the joint readings, joints that turn and those that slide apart."""
+    sigma, joints = solution.problem.data.sigma_joint, solution.problem.robot.joints
+    for unit in dict.fromkeys(joint.unit for joint in joints):
+        of_unit = np.array([s for s, joint in zip(sigma, joints, strict=True) if joint.unit == unit and s > 0.0])
+        if len(of_unit):
+            yield "joint readings", unit, float(np.sqrt(np.mean(of_unit**2)))
 
 
 def _goodness_lines(solution: Solution, uncertainty: Uncertainty) -> Iterable[str]:
@@ -62,13 +89,11 @@ def _goodness_lines(solution: Solution, uncertainty: Uncertainty) -> Iterable[st
         if joint_noise and "too large" in verdicts:
             yield (
                 "the joint noise stated may be what is too large (one figure a joint: noise: {joint: [...]}); estimate:"
-                " true would make all noise smaller by the same"
+                " true tells it from that of the measurements where these can"
             )
             return
         yield "to take the noise seen for the noise there is: estimate: true beside the figures of noise in the job"
-    if uncertainty.noise_like is not None and uncertainty.noise_like < LIKE_NOISE:
-        yield "the residuals follow the arm, as noise does not: effects that are not modelled"
-    if estimated is None and verdicts & {"outliers", "both"}:
+    if estimated is None and verdicts & {"outliers", "both"} and uncertainty.change is None:
         may_weigh = solution.problem.state.weights is None
         yield "look at the suspicious rows below" + (", or let a robust loss weigh them: loss in the job" * may_weigh)
     if not len(goodness.suspects) and not goodness.configurations:
@@ -77,7 +102,9 @@ def _goodness_lines(solution: Solution, uncertainty: Uncertainty) -> Iterable[st
 
 def with_joint_noise(solution: Solution) -> str:
     """Words for the heading where `stated` has more than the noise of the measurement itself."""
-    return ", stated with joint noise" if np.any(solution.problem.measurements.sigma_joint > 0.0) else ""
+    if not np.any(solution.problem.measurements.sigma_joint > 0.0):
+        return ""
+    return ", stated with joint noise" if solution.estimated_noise is None else ", joint noise apart"
 
 
 def _of_table(solution: Solution, fit: KindFit) -> str:
@@ -123,10 +150,11 @@ def suspicious(solution: Solution, uncertainty: Uncertainty) -> list[RenderableT
     parts: list[RenderableType] = []
     for split, rows, configurations in found:
         if len(rows):
-            behind = _poses_behind(solution, uncertainty, rows)
+            behind = *_poses_behind(solution, uncertainty, rows), *indented(_in_common(solution, uncertainty, rows))
             parts += section(f"Suspicious {split}rows", *behind, _suspects(solution, uncertainty, rows))
         if configurations:
-            parts += section(f"Suspicious {split}configurations", _suspect_configurations(solution, configurations))
+            table = _suspect_configurations(solution, uncertainty, configurations, rows)
+            parts += section(f"Suspicious {split}configurations", table)
     return parts
 
 
@@ -160,19 +188,40 @@ def _poses_behind(
     yield from indented(lines)
 
 
+def _in_common(solution: Solution, uncertainty: Uncertainty, suspects: Integers) -> Iterable[str]:
+    """The target, anchor, corner or table that most of several suspicious rows are of, where most others are not."""
+    rows, tables = uncertainty.residuals, solution.problem.data.labels
+    judged = (rows.reason_code == 0) & (rows.test == rows.test[suspects[0]])
+    of_table = np.array([kind.table for kind in rows.kinds])[rows.kind_code]
+    for names, codes in ((rows.labels, rows.label_code), (tables, of_table)):
+        found = np.bincount(codes[suspects], minlength=len(names))
+        most, n = int(np.argmax(found)), len(suspects)
+        there = judged & (codes == most)
+        mine = suspects[codes[suspects] == most]
+        one_measurement = len({(rows.series[i], rows.measurement[i]) for i in mine.tolist()}) == 1
+        share = float(np.sum(there)) / float(np.sum(judged))
+        if not names[most] or one_measurement or 2 * found[most] <= n or 2.0 * share * n > found[most]:
+            continue
+        count = f"{found[most]} of {n}" if found[most] < n else "both" if n == 2 else f"all {n}"
+        yield f"{count} suspicious rows are of {names[most]}, as are {np.sum(there)} of all {np.sum(judged)} rows"
+
+
 def _suspects(solution: Solution, uncertainty: Uncertainty, suspects: Integers, limit: int = 5) -> RenderableType:
     """The rows least likely, by studentised residual."""
     rows, goodness, names = uncertainty.residuals, uncertainty.goodness, solution.problem.end_names
+    labelled, tables = len(rows.labels) > 1, solution.problem.data.labels
     table = plain_table(
-        *(("a", "left"), ("b", "left"), ("", "left"), ("residual", "right"), ("", "left")),
-        *(("in its sigma", "right"), ("", "left")),
+        *(("a", "left"), ("b", "left"), ("", "left"), *[("of", "left")] * labelled, ("residual", "right")),
+        *(("", "left"), ("in its sigma", "right"), ("", "left")),
     )
     for i in suspects[:limit]:
-        factor, shown, decimals = SHOWN[rows.kinds[rows.kind_code[i]].unit]
+        kind = rows.kinds[rows.kind_code[i]]
+        factor, shown, decimals = SHOWN[kind.unit]
         table.add_row(
             names[rows.a[i] + 1],
             names[rows.b[i] + 1],
-            rows.kinds[rows.kind_code[i]].name,
+            kind.name if len(tables) == 1 else f"{kind.name} of {tables[kind.table]}",
+            *[rows.labels[rows.label_code[i]]] * labelled,
             rounded(rows.after[i] * factor, decimals, "+"),
             shown,
             f"{goodness.studentised[i]:+.1f}",
@@ -184,13 +233,23 @@ def _suspects(solution: Solution, uncertainty: Uncertainty, suspects: Integers, 
 
 
 def _suspect_configurations(
-    solution: Solution, found: tuple[SuspectConfiguration, ...], limit: int = 3
+    solution: Solution,
+    uncertainty: Uncertainty,
+    found: tuple[SuspectConfiguration, ...],
+    suspects: Integers,
+    limit: int = 3,
 ) -> RenderableType:
-    """The configurations least likely, by all the rows that they take part in."""
-    names = solution.problem.end_names
-    table = plain_table(("", "left"), ("rows", "right"), ("chi-square", "right"), ("expected", "right"))
+    """The configurations least likely, by all the rows that they take part in, and what the suspicious ones are of."""
+    names, rows = solution.problem.end_names, uncertainty.residuals
+    labelled = len(rows.labels) > 1
+    headings = (("rows", "right"), ("chi-square", "right"), ("expected", "right"))
+    table = plain_table(("", "left"), *headings, *[("suspicious rows are of", "left")] * labelled)
     for c in found[:limit]:
-        table.add_row(names[c.configuration + 1], f"{c.n}", f"{c.chi2:.4g}", f"{c.expected:.4g}")
+        mine = suspects[(rows.a[suspects] == c.configuration) | (rows.b[suspects] == c.configuration)]
+        of = list(dict.fromkeys(rows.labels[code] for code in rows.label_code[mine].tolist() if code))
+        of[limit:] = [f"{len(of) - limit} more"] if len(of) > limit else []
+        cells = f"{c.n}", f"{c.chi2:.4g}", f"{c.expected:.4g}"
+        table.add_row(names[c.configuration + 1], *cells, *[", ".join(of) or "-"] * labelled)
     if len(found) > limit:
         table.add_row(f"and {len(found) - limit} more")
     return table

@@ -5,18 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from rich.console import Group, RenderableType
-from rich.text import Text
 
 from fg_calib.analysis.identifiability import Identifiability
 from fg_calib.analysis.reasons import LostDirection
+from fg_calib.arguments import checked
 from fg_calib.graph.observability import CORRELATED, Observability
-from fg_calib.report.tables import SHOWN, WIDTH, plain_table, plain_text, section
+from fg_calib.report.shown import SHOWN
+from fg_calib.report.tables import WIDTH, line, plain_table, plain_text, section
 from fg_calib.robot.model import AXIS_OF_KIND, Axis
 
 WEAK = "sigma above a tenth of the tolerance, or of 1 mrad at the reach"
 """What makes a direction weak, for headings."""
 
 
+@checked
 def format_identifiability(found: Identifiability, width: int = WIDTH) -> str:
     """`build_identifiability_report` as plain text."""
     return plain_text(build_identifiability_report(found), width)
@@ -25,14 +27,15 @@ def format_identifiability(found: Identifiability, width: int = WIDTH) -> str:
 def build_identifiability_report(found: Identifiability) -> RenderableType:
     """What can be identified, as in the paper's Tables 3 and 4, and why the rest cannot."""
     where = "random configurations" if found.kind == "structural" else "configurations"
-    title = f"{found.robot}: {found.model}, {found.kind}, {found.n_configurations} {where}"
-    parts: list[RenderableType] = [Text(title, style="bold")]
-    parts += (Text(f"NOT MODELLED: {m}", style="bold red") for m in found.missing)
+    model = f"{found.model}, as poses of the board" if found.model == "pixels" else found.model
+    title = f"{found.robot}: {model}, {found.kind}, {found.n_configurations} {where}"
+    parts: list[RenderableType] = [line(title, "bold")]
+    parts += (line(f"NOT MODELLED: {m}", "bold red") for m in found.missing)
     parts += _classes(found)
     known = found.with_fixed_known
     if known is not None:
         parts += [
-            Text(f"\nWith {', '.join(found.fixed)} known, as the robot's file says", style="bold"),
+            *section(f"With {', '.join(found.fixed)} known, as the robot's file says"),
             *_classes(known),
         ]
     return Group(*parts)
@@ -43,23 +46,23 @@ def _classes(found: Identifiability) -> list[RenderableType]:
     table = plain_table(("Identifiability", "left"), ("Kinematic parameters", "left"), wrap=True)
     table.add_row("Independent", ", ".join(o.named("independent")) or "None")
     relations = (f"[{' '.join(relation)}]" for group in o.relative for relation in group.relations)
-    table.add_row("Relative", Text(", ".join(relations) or "None"))
+    table.add_row("Relative", ", ".join(relations) or "None")
     table.add_row("Ineffective", ", ".join(o.named("ineffective")) or "None")
     table.add_row("Kept", ", ".join(o.kept) or "None")
-    parts: list[RenderableType] = [Text(f"rank {o.rank} of {len(o.names)}\n"), table]
+    parts: list[RenderableType] = [line(f"rank {o.rank} of {len(o.names)}"), line(""), table]
     if found.lost:
         parts += section("Lost directions", lost_directions(found.lost))
     practical = found.kind == "practical"
     parts += section("Singular values" + (" (signal-to-noise ratios)" if practical else ""), _singular_values(o))
     if practical:
         indices = "  ".join(f"{name} {value:.4g}" for name, value in o.indices.items())
-        parts += section("Observability indices", Text(f"{indices}  condition number {o.condition_number:.4g}"))
+        parts += section("Observability indices", line(f"{indices}  condition number {o.condition_number:.4g}"))
         weak = weak_directions(o)
         if weak is not None:
             parts += section(f"Weak directions ({WEAK})", weak)
         parts += section("Sigma of what is kept, the rest at nominal", _sigmas(o))
         if o.correlations:
-            correlated = (Text(f"{a}, {b}: {rho:+.3f}") for a, b, rho in o.correlations)
+            correlated = (line(f"{a}, {b}: {rho:+.3f}") for a, b, rho in o.correlations)
             parts += section(f"Correlations above {CORRELATED:g}", *correlated)
     return parts
 
@@ -111,7 +114,7 @@ def _singular_values(observability: Observability) -> RenderableType:
     lines = [" ".join(f"{v:.3g}" for v in kept) or "none"]
     if len(dropped):
         lines.append(f"gap of {o.gap:.1e}, then {len(dropped)} of at most {dropped[0]:.1e}")
-    return Text("\n".join(lines))
+    return Group(*map(line, lines))
 
 
 def _sigmas(observability: Observability) -> RenderableType:

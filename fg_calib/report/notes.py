@@ -11,7 +11,8 @@ from fg_calib.analysis.uncertainty import ParameterEstimate, Uncertainty
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements.kinds import SamePoint
-from fg_calib.report.tables import SHOWN, rounded
+from fg_calib.report.shown import SHOWN
+from fg_calib.report.tables import rounded
 from fg_calib.robot.model import names_of
 
 _UNMOVED = 1e-9
@@ -29,7 +30,8 @@ def notes(solution: Solution, uncertainty: Uncertainty) -> Iterable[str]:
         if not table.uses_pairs and table.measurements.pairs is not None:
             yield f"{table.measurements.pairs.source} is not used: model {table.model} is of poses, not of pairs"
     yield from _sharing_notes(solution.problem)
-    yield from uncertainty.cautions
+    on_top = () if uncertainty.findings else uncertainty.reservations
+    yield from (text for text in uncertainty.cautions if text not in on_top)
     weights, series = solution.problem.state.weights, solution.problem.data.series
     if weights is not None:
         n = sum(int(np.sum(w[s.train] < OUTLIER_WEIGHT)) for s, w in zip(series, weights, strict=True))

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from rich.console import RenderableType
 
 from fg_calib.analysis.uncertainty import Uncertainty
-from fg_calib.report.tables import SHOWN, plain_table, rounded
+from fg_calib.report.shown import SHOWN
+from fg_calib.report.tables import plain_table, rounded
 
 
 def parameters(uncertainty: Uncertainty) -> RenderableType:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 
-import numpy as np
-
+from fg_calib.errors import escaped
 from fg_calib.files.result import Parameter, Result, Rms
+from fg_calib.report.shown import FAMILY_UNIT, SHOWN
 
 WIDTH = 100
 
-_SHOWN = {"m": (1e3, "mm", 4), "rad": (180.0 / np.pi, "deg", 5)}
-_RMS_UNIT = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad", "point": "m"}
 _HEADINGS = ("", "estimate", "± sigma", "", "correction", "nominal", "prior", "class")
+
+
+def good(reservations: Sequence[str]) -> str:
+    """The word for a result that may be trusted, although perhaps not without reservations."""
+    return "GOOD, with reservations" if reservations else "GOOD"
 
 
 def summary(result: Result) -> list[str]:
@@ -22,7 +25,8 @@ def summary(result: Result) -> list[str]:
     head += "" if result.pairing is None else f", pairs: {result.pairing}"
     head += ", measurement frame unknown" if result.frame_estimate is not None else ""
     chi2 = "" if result.reduced_chi2 is None else f", reduced chi-square {result.reduced_chi2:.3g}"
-    verdicts = [f"DOUBTFUL: {finding}" for finding in result.findings] or [f"GOOD: {result.solver.message}"]
+    verdicts = [f"DOUBTFUL: {finding}" for finding in result.findings]
+    verdicts = verdicts or [f"{good(result.reservations)}: {result.solver.message}", *result.reservations]
     more = [f"... and {len(verdicts) - 3} more findings"] if len(verdicts) > 3 else []
     estimated = [p for p in result.parameters if p.identifiability != "fixed"]
     known = sum(p.sigma is not None for p in estimated)
@@ -34,7 +38,7 @@ def summary(result: Result) -> list[str]:
         f"{len(estimated)} of {len(result.parameters)} parameters estimated, {known} of them with a known sigma",
         *(f"{split} residuals, RMS: {text}" for split, text in _rms(result)),
     ]
-    return [line if len(line) <= WIDTH else f"{line[: WIDTH - 4]} ..." for line in lines]
+    return [escaped(line if len(line) <= WIDTH else f"{line[: WIDTH - 4]} ...") for line in lines]
 
 
 def _rms(result: Result) -> Iterator[tuple[str, str]]:
@@ -45,7 +49,7 @@ def _rms(result: Result) -> Iterator[tuple[str, str]]:
 
 
 def _before_and_after(kind: str, rms: Rms) -> str:
-    factor, unit, _ = _SHOWN[_RMS_UNIT.get(kind.partition(",")[0], "m")]
+    factor, unit, _ = SHOWN[rms.unit or FAMILY_UNIT.get(kind.partition(",")[0], "m")]
     before, after = ("unknown" if v is None else f"{v * factor:.3g}" for v in (rms.before, rms.after))
     return f"{kind} {before} -> {after} {unit}"
 
@@ -54,7 +58,7 @@ def parameter_rows(parameters: Iterable[Parameter]) -> list[tuple[str, ...]]:
     """The cells of a table of parameters, lengths in mm and angles in degrees, headings first."""
     rows: list[tuple[str, ...]] = [_HEADINGS]
     for p in parameters:
-        factor, unit, decimals = _SHOWN[p.unit]
+        factor, unit, decimals = SHOWN[p.unit]
 
         def figure(value: float | None, none: str = "", sign: str = "", f: float = factor, d: int = decimals) -> str:
             return none if value is None else f"{round(value * f, d) + 0.0:{sign}.{d}f}"  # no -0.0
@@ -66,7 +70,7 @@ def parameter_rows(parameters: Iterable[Parameter]) -> list[tuple[str, ...]]:
         sigma, prior = figure(p.sigma, "unknown"), figure(p.prior_sigma)
         correction, nominal = figure(p.correction, sign="+"), figure(p.nominal)
         rows.append((p.name, figure(p.estimate), sigma, unit, correction, nominal, prior, p.identifiability))
-    return rows
+    return [tuple(map(escaped, row)) for row in rows]
 
 
 def format_result(result: Result) -> str:
@@ -83,8 +87,8 @@ def format_result(result: Result) -> str:
         xyz = "  ".join("unknown" if v is None else f"{v * 1e3:.4f}" for v in result.frame_estimate.xyz)
         quaternion = "  ".join("unknown" if v is None else f"{v:.8f}" for v in result.frame_estimate.quaternion_xyzw)
         parts += ["", "Measurement frame (world_T_base)", f"xyz {xyz} mm", f"quaternion xyzw {quaternion}"]
-    if result.cautions:
-        parts += ["", "Notes", *result.cautions]
+    if notes := [text for text in result.cautions if result.findings or text not in result.reservations]:
+        parts += ["", "Notes", *map(escaped, notes)]
     return "\n".join(parts)
 
 

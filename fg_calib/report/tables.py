@@ -1,4 +1,4 @@
-"""What all reports share: plain tables and sections, and the units that figures are shown in."""
+"""What all reports share: plain tables and sections."""
 
 from __future__ import annotations
 
@@ -6,23 +6,19 @@ import io
 from collections.abc import Iterable
 from typing import Any
 
-import numpy as np
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.measure import Measurement
 from rich.padding import Padding
+from rich.style import Style
 from rich.table import Column, Table
 from rich.text import Text
 
+from fg_calib.errors import escaped
 from fg_calib.options import check_number
+from fg_calib.report.shown import FAMILY_UNIT
 
 WIDTH = 100
 """Columns of the plain report."""
-
-SHOWN = {"m": (1e3, "mm", 4), "rad": (180.0 / np.pi, "deg", 5)}
-"""Factor, unit and decimals in which a quantity is shown."""
-
-FAMILY_UNIT = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad", "point": "m"}
-"""Unit of the usual kinds of residual, in the order in which reports show them."""
 
 
 def in_order(families: Iterable[str]) -> list[str]:
@@ -53,21 +49,26 @@ def width_for(report: RenderableType, width: int) -> int:
     return max(width, Console(width=_WIDEST).measure(report).minimum)
 
 
+def line(text: str, style: str | Style = "") -> Text:
+    """A line of a report: all of its text comes through here, so that names from files neither steer nor style it."""
+    return Text(escaped(text), style=style)
+
+
 def section(title: str, *content: RenderableType) -> list[RenderableType]:
     """A heading after a blank line, and what stands below it."""
-    return [Text(f"\n{title}", style="bold"), *content]
+    return [line(""), line(title, "bold"), *content]
 
 
 def indented(lines: Iterable[str]) -> list[RenderableType]:
     """Sentences below a heading or a table."""
-    return [Padding(Text(line), (0, 0, 0, INDENT)) for line in lines]
+    return [Padding(line(text), (0, 0, 0, INDENT)) for text in lines]
 
 
 def plain_table(*columns: tuple[str, str], wrap: bool = False) -> Table:
     """A table without a frame; columns as (heading, justification), which wrap at spaces with `wrap`."""
     table = _WholeWords(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="italic")
     for heading, justify in columns:
-        table.add_column(heading, justify=justify, no_wrap=not wrap, overflow="fold")  # type: ignore[arg-type]
+        table.add_column(line(heading), justify=justify, no_wrap=not wrap, overflow="fold")  # type: ignore[arg-type]
     return table
 
 
@@ -76,7 +77,7 @@ class _WholeWords(Table):
 
     def add_row(self, *cells: RenderableType | None, **options: Any) -> None:
         """Add a row of cells; text in brackets is no markup."""
-        super().add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in cells), **options)
+        super().add_row(*(line(cell) if isinstance(cell, str) else cell for cell in cells), **options)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         widths = self._widths(options.max_width)
@@ -118,9 +119,9 @@ class _WholeWords(Table):
         for i, row in enumerate(self.rows, start=1):
             words = [f"{cells[0]} {cells[i]}".strip() for cells in columns if cells[i]]
             style = row.style or ""
-            yield Text("".join(words[:1]), style=style)
+            yield line("".join(words[:1]), style)
             if words[1:]:
-                yield Padding(Text("  ".join(words[1:]), style=style), (0, 0, 0, INDENT))
+                yield Padding(line("  ".join(words[1:]), style), (0, 0, 0, INDENT))
 
 
 def _longest_word(text: str) -> int:

@@ -6,12 +6,13 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 from rich.console import Group, RenderableType
-from rich.text import Text
 
-from fg_calib.analysis.accuracy import ExpectedError
 from fg_calib.analysis.joint_values import JointValues
-from fg_calib.analysis.uncertainty import FrameEstimate, PointEstimate, Uncertainty
+from fg_calib.analysis.uncertainty import FrameEstimate, Uncertainty
+from fg_calib.analysis.unknowns import PointEstimate
 from fg_calib.analysis.verdict import chi2_in_words, probability
+from fg_calib.arguments import checked
+from fg_calib.graph.noise import JOINT_NOISE
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements.kinds import PointDistance, TouchedPoint
 from fg_calib.measurements.series import Table
@@ -19,9 +20,12 @@ from fg_calib.report.fit import goodness_of_fit, prediction, suspicious, with_jo
 from fg_calib.report.identifiability import WEAK, lost_directions, weak_directions
 from fg_calib.report.notes import notes
 from fg_calib.report.parameters import combinations, parameters
-from fg_calib.report.tables import SHOWN, WIDTH, in_order, indented, plain_table, plain_text, rounded, section
+from fg_calib.report.shown import SHOWN
+from fg_calib.report.summary import good
+from fg_calib.report.tables import WIDTH, in_order, indented, line, plain_table, plain_text, rounded, section
 
 
+@checked
 def format_report(solution: Solution, uncertainty: Uncertainty, width: int = WIDTH) -> str:
     """The report as plain text."""
     return plain_text(build_report(solution, uncertainty), width)
@@ -36,7 +40,7 @@ def build_report(solution: Solution, uncertainty: Uncertainty) -> RenderableType
             f"Goodness of fit (1 sigma of a row{with_joint_noise(solution)})", *goodness_of_fit(solution, uncertainty)
         ),
         *prediction(solution, uncertainty),
-        *_expected_error(uncertainty.expected_error),
+        *_expected_error(uncertainty),
         *section("Residuals (RMS)", _residuals(solution, uncertainty)),
     ]
     if uncertainty.names or not solution.problem.evaluated:
@@ -73,17 +77,19 @@ def _verdict(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
     if problem.state.joint_errors is not None:
         what += ", joint values estimated"
     what += "" if settings.loss == "none" else f", loss {settings.loss}"
-    lines = [Text(what), *(Text(f"DOUBTFUL: {finding}", style="bold red") for finding in uncertainty.findings)]
+    lines: list[RenderableType] = [line(what)]
+    lines += [line(f"DOUBTFUL: {finding}", "bold red") for finding in uncertainty.findings]
     if uncertainty.trustworthy:
-        lines.append(Text(f"GOOD: {solution.message}", style="bold green"))
+        lines.append(line(f"{good(uncertainty.reservations)}: {solution.message}", "bold green"))
+        lines += indented(uncertainty.reservations)
     if solution.problem.evaluated:
-        lines.insert(1, Text("EVALUATED ONLY: all rows are test rows, nothing of the arm was calibrated"))
+        lines.insert(1, line("EVALUATED ONLY: all rows are test rows, nothing of the arm was calibrated"))
         if uncertainty.p_value is not None:
             figures = chi2_in_words(uncertainty.chi2, uncertainty.expected_chi2, uncertainty.p_value)
-            lines.append(Text(f"test rows: {figures}"))
+            lines.append(line(f"test rows: {figures}"))
     test = uncertainty.goodness.test
     if test is not None and test.n:
-        lines.append(Text(f"test rows: {chi2_in_words(test.chi2, test.expected, test.p_value)}"))
+        lines.append(line(f"test rows: {chi2_in_words(test.chi2, test.expected, test.p_value)}"))
     return Group(*lines)
 
 
@@ -144,8 +150,9 @@ def _of_p(p: float | None) -> str:
     return "" if p is None else f", p-value {probability(p)}"
 
 
-def _expected_error(expected: ExpectedError | None) -> list[RenderableType]:
+def _expected_error(uncertainty: Uncertainty) -> list[RenderableType]:
     """How far off the tool is expected to be, by the covariance."""
+    expected = uncertainty.expected_error
     if expected is None:
         return []
     table = plain_table(
@@ -156,7 +163,8 @@ def _expected_error(expected: ExpectedError | None) -> list[RenderableType]:
         values = (getattr(rms, kind) for rms in (expected.base, expected.fitted))
         table.add_row(kind, shown, *("unknown" if v is None else f"{v * factor:.{decimals}f}" for v in values))
     which = "" if expected.n == expected.of else f" of {expected.of}"
-    return section(f"Expected tool error (RMS at {expected.n}{which} {expected.at} configurations)", table)
+    doubtful = ", if model and noise were as stated" * (not uncertainty.trustworthy or bool(uncertainty.reservations))
+    return section(f"Expected tool error (RMS at {expected.n}{which} {expected.at} configurations{doubtful})", table)
 
 
 def _residuals(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
@@ -182,13 +190,14 @@ def _joint_values(solution: Solution, found: JointValues | None, limit: int = 5)
     """How estimated joint values lie about their readings, joint by joint, and the readings that are suspect."""
     if found is None:
         return []
-    table = plain_table(("", "left"), *((h, "right") for h in ("stated", "", "mean error / stated", "scatter")))
+    sigma = "stated" if solution.problem.state.factors.get(JOINT_NOISE, 1.0) == 1.0 else "estimated"
+    table = plain_table(("", "left"), *((h, "right") for h in (sigma, "", f"mean error / {sigma}", "scatter")))
     joints = solution.problem.robot.joints
     for k, name in enumerate(found.names):
         factor, shown, decimals = SHOWN[joints[found.joints[k]].unit]
         scatter = "-" if np.isnan(found.scatter[k]) else f"{found.scatter[k]:.3f}"
         table.add_row(name, f"{found.sigma[k] * factor:.{decimals}f}", shown, rounded(found.mean[k], 3, "+"), scatter)
-    parts = section("Joint readings (estimate minus reading; scatter is 1 where all is as stated)", table)
+    parts = section(f"Joint readings (estimate minus reading; scatter is 1 where all is as {sigma})", table)
     if not found.suspects:
         return parts
     wrong = plain_table(("", "left"), ("", "left"), ("error", "right"), ("", "left"), ("in its sigma", "right"))
@@ -204,21 +213,35 @@ def _joint_values(solution: Solution, found: JointValues | None, limit: int = 5)
     return parts + section("Suspicious joint readings", wrong)
 
 
+_UNKNOWNS = {
+    "point": "Touched points (from the base), mm",
+    "target": "Targets (in the tool frame), mm",
+    "anchor": "Anchors (in the base frame), mm",
+    "offset": "What instruments add to every length, mm",
+    "plane": "Planes (unit normal in the base frame, distance from the base in mm)",
+    "board": "Boards (in the base frame: rotation vector in deg, position in mm)",
+    "unknown": "Other unknowns, [m] and [rad]",
+}
+"""Heading of each kind of unknown."""
+
+_FIGURE = (1.0, "", 7)
+
+
 def _points(solution: Solution, points: Sequence[PointEstimate], limit: int = 8) -> list[RenderableType]:
     """Where touched points and other unknowns of the measurements are; of many the first, `result.json` has all."""
     parts: list[RenderableType] = []
-    letters = solution.problem.data.unknowns.letters
-    for letter, title, unit in (("L", "Touched points (from the base)", "mm"), ("N", "Other unknowns", "")):
-        chosen = [p for p, of in zip(points, letters, strict=True) if of == letter]
-        factor, decimals = (1e3, 4) if unit else (1.0, 7)
+    for kind, title in _UNKNOWNS.items():
+        chosen = [p for p in points if p.kind == kind]
         table = plain_table(("", "left"), ("rows", "right"), ("estimate", "right"), ("", "left"), ("sigma", "right"))
         for p in chosen[:limit]:
-            xyz = "  ".join(rounded(v * factor, decimals) for v in p.xyz)
-            sigma = "  ".join(f"{v * factor:.{decimals}f}" if np.isfinite(v) else "unknown" for v in p.sigma)
-            table.add_row(p.name, f"{p.n}", xyz, "±", sigma)
+            shown = [_FIGURE if kind == "unknown" else SHOWN.get(unit, _FIGURE) for unit in p.units]
+            xyz = "  ".join(rounded(v * of[0], of[2]) for v, of in zip(p.xyz, shown, strict=True))
+            of_each = zip(p.sigma, shown, strict=True)
+            sigma = "  ".join(f"{v * of[0]:.{of[2]}f}" if np.isfinite(v) else "unknown" for v, of in of_each)
+            table.add_row(p.name, f"{p.n}", xyz, "±", "known" if not p.sigma.any() else sigma)
         if len(chosen) > limit:
             table.add_row(f"and {len(chosen) - limit} more", "", "", "", "")
-        parts += section(f"{title}, {unit}" if unit else f"{title}, [m] and [rad]", table) if chosen else []
+        parts += section(title, table) if chosen else []
     return parts
 
 

@@ -20,8 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fg_calib.arguments import checked
 from fg_calib.arrays import as_floats, as_rotations
-from fg_calib.options import check_number, check_type
+from fg_calib.options import check_number
 from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
 from fg_calib.robot.model import Robot
 
@@ -75,6 +76,7 @@ def random_readings(robot: Robot, n: int, generator: np.random.Generator) -> Flo
     return generator.uniform(lower, upper, (n, robot.n_joints))
 
 
+@checked
 def solve_inverse(
     robot: Robot,
     position: ArrayLike,
@@ -105,7 +107,6 @@ def solve_inverse(
     position = as_floats("position", np.atleast_2d(position), "(n, 3)")
     if rotation is not None:
         rotation = as_rotations("rotation", rotation if np.ndim(rotation) == 3 else [rotation], len(position))
-    check_type("generator", generator, np.random.Generator, "numpy.random.default_rng(0)")
     generator = np.random.default_rng(0) if generator is None else generator
     check_number("n_starts", n_starts, least=1, whole=True)
     n_poses = len(position)

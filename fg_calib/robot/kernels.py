@@ -22,10 +22,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
-from numba.core import event
 from numpy.typing import NDArray
+
+from fg_calib.robot.cache import check_cache
+from fg_calib.robot.compiler import event, has_cache_folder, numba
 
 logger = logging.getLogger(__name__)
 
@@ -52,9 +53,10 @@ def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]
     """Compile a kernel with numba: without the GIL, with fused multiply-adds, cached where a folder can be written."""
     options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}} | options
     try:
-        kernel: Callable[..., Any] = numba.njit(cache=True, **options)(function)
+        kernel: Callable[..., Any] = numba.njit(cache=has_cache_folder(), **options)(function)
     except RuntimeError:  # neither the package's folder nor the user's cache can be written
-        kernel = numba.njit(**options)(function)
+        return numba.njit(**options)(function)  # type: ignore[no-any-return]
+    check_cache(kernel)
     return kernel
 
 

@@ -28,7 +28,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.arrays import Brief, shape_of
+from fg_calib.arguments import checked
+from fg_calib.arrays import Brief, as_figures, check_sizes, shape_of
 from fg_calib.errors import InputError
 from fg_calib.robot.kernels import ChainArrays, walk_all
 from fg_calib.robot.model import AXIS_OF_KIND, FRAME_KINDS, Axis, Element, Robot
@@ -316,6 +317,7 @@ def turning_of_points(points: Floats, shifts: Floats) -> Floats:
     return turn
 
 
+@checked
 def pose(robot: Robot, readings: Floats | Sequence[Sequence[float]]) -> Poses:
     """Tool poses of a robot in its base frame, and their derivatives in every parameter, then every joint.
 
@@ -326,10 +328,10 @@ def pose(robot: Robot, readings: Floats | Sequence[Sequence[float]]) -> Poses:
     Raises:
         InputError: The readings are of more or fewer joints.
     """
-    shape_of("readings", readings, f"(n, {robot.n_joints})")
-    q = np.atleast_2d(np.asarray(readings, dtype=np.float64))
+    figures = as_figures("readings", readings, f"numbers of shape (n, {robot.n_joints})")
+    check_sizes("readings", figures)
     chain = build_chain(robot, {i: i for i in range(len(robot.parameters))}).with_joint_columns()
-    return forward(chain, precompute_trig(robot, q))
+    return forward(chain, precompute_trig(robot, np.atleast_2d(figures)))
 
 
 SPAN = 8192

@@ -7,7 +7,9 @@ A convention is therefore data, `CONVENTIONS`, and nothing behind this module kn
 
 from __future__ import annotations
 
+import logging
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
@@ -17,9 +19,13 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fg_calib.arrays import as_floats, require, shape_of
-from fg_calib.errors import InputError
+from fg_calib.arguments import checked
+from fg_calib.arrays import as_figures, as_floats, check_sizes, require, shape_of
+from fg_calib.errors import InputError, escaped, shown
 from fg_calib.options import NEAR, check, check_names, check_number, did_you_mean, known_names, listed
+from fg_calib.sizes import MOST_JOINTS
+
+_log = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
 
@@ -57,6 +63,16 @@ JointType = Literal["revolute", "prismatic"]
 
 FRAME_KINDS = ("x", "y", "z", "yaw", "pitch", "roll")
 """A frame's elementary transforms, left to right: Txyz Rz(yaw) Ry(pitch) Rx(roll), as in URDF."""
+
+
+MOST_ANGLE = 4.0 * np.pi
+"""How large an angle of a robot in rad may be: most of those in deg are larger."""
+
+MOST_LIMIT = 16.0 * np.pi
+"""How far a joint of limited range turns at most, [rad]: limits beyond that are told of as probably in deg."""
+
+IN_RAD = "angles in rad, two turns at most"
+"""What is expected instead."""
 
 
 @dataclass(frozen=True)
@@ -210,6 +226,7 @@ class Robot:
     """`files.urdf.read_urdf`, attached by the package: this folder knows nothing of files."""
 
     @classmethod
+    @checked
     def from_dh(
         cls,
         rows: ArrayLike,
@@ -219,8 +236,8 @@ class Robot:
         types: JointType | Sequence[JointType] = "revolute",
         limits: Sequence[Sequence[float] | None] | Floats | None = None,
         names: Sequence[str] | None = None,
-        base: ArrayLike | None = None,
-        tool: ArrayLike | None = None,
+        base: Mapping[str, float] | ArrayLike | None = None,
+        tool: Mapping[str, float] | ArrayLike | None = None,
         fixed: Sequence[str] = (),
         estimate: Sequence[str] = (),
         tolerance: Mapping[str, float] | None = None,
@@ -235,8 +252,10 @@ class Robot:
             types: `revolute` or `prismatic`, for all joints or for each.
             limits: Lower and upper of each joint, None for one without, [rad] (prismatic: [m]).
             names: Of the joints; q1, q2, ... if None.
-            base: Base frame to frame 0: x y z, or x y z roll pitch yaw (as in URDF), or a matrix of shape (4, 4).
-            tool: Last frame to tool frame, in the same ways.
+            base: Base frame to frame 0: x y z, or x y z roll pitch yaw (as in URDF), or a matrix of shape (4, 4), or
+                values by kind.
+            tool: Last frame to tool frame, in the same ways: where the tool is as seen from the last frame. What a
+                hand-eye calibration calls the camera in the gripper's frame, and not its inverse.
             fixed: See `RobotBuilder.build`.
             estimate: See `RobotBuilder.build`.
             tolerance: See `RobotBuilder.build`.
@@ -253,14 +272,12 @@ class Robot:
         angles = figures[
             :, [i for i, kind in enumerate(DH_COLUMNS[: figures.shape[1]]) if AXIS_OF_KIND[kind] >= Axis.RX]
         ]
-        require(np.abs(angles) <= 2.0 * np.pi, "rows", angles, "angles in rad, a turn at most", "are they in deg?")
+        require(np.abs(angles) <= MOST_ANGLE, "rows", angles, IN_RAD, "are they in deg?")
         builder = RobotBuilder(name, convention)
         builder.add_frame("base", frame_values("base", base), 0, False)
         for joint, row in zip(_joints(len(figures), types, limits, names), figures, strict=True):
             builder.add_convention_joint(joint, {"beta": 0.0} | dict(zip(DH_COLUMNS, row, strict=False)))
         builder.add_frame("tool", frame_values("tool", tool), len(figures) + 1, False)
-        for key, figure in (tolerance or {}).items():
-            check_number(f"tolerance: {key}", figure, above=True)
         return builder.build(fixed=fixed, estimate=estimate, tolerance=tolerance)
 
     def __repr__(self) -> str:
@@ -270,7 +287,7 @@ class Robot:
             f"Robot {self.name!r}, {self.convention}, {self.n_joints} joints: {joints}",
             f"  estimated {len(estimated)} of {len(self.parameters)} parameters: {', '.join(estimated) or 'none'}",
         ]
-        return "\n".join(line if len(line) <= 100 else f"{line[:96]} ..." for line in lines)
+        return "\n".join(escaped(line if len(line) <= 100 else f"{line[:96]} ...") for line in lines)
 
     @property
     def n_joints(self) -> int:
@@ -292,7 +309,7 @@ class Robot:
         """Joint limits, lower and upper, shape (n_joints, 2), [rad] or [m]."""
         return np.array([(j.lower, j.upper) for j in self.joints]).reshape(-1, 2)
 
-    @property
+    @cached_property
     def reach(self) -> float:
         """Length of the arm stretched out, base to tool, sliding joints at their limits, [m]; 1 if it has none."""
         nominal, all_limits, base, reach = self.nominal, self.limits, self.owned_by(0), 0.0
@@ -311,6 +328,7 @@ class Robot:
         """
         return 1e-3 * (self.reach if unit == "m" else 1.0)
 
+    @checked
     def index(self, name: str) -> int:
         """Index of the parameter called `name`.
 
@@ -318,34 +336,42 @@ class Robot:
             InputError: There is no such parameter.
         """
         for i, parameter in enumerate(self.parameters):
-            if parameter.name == name:
+            if isinstance(name, str) and parameter.name == name:
                 return i
         names = names_of(self.parameters)
-        raise InputError(self.name, f"no parameter {name!r}", known_names(names), did_you_mean(name, names, NEAR))
+        raise InputError(self.name, f"no parameter {shown(name)}", known_names(names), did_you_mean(name, names, NEAR))
 
     def owned_by(self, owner: int) -> list[int]:
         """Indices of the parameters of joint `owner` (0 is the base, n + 1 the tool)."""
         return [i for i, p in enumerate(self.parameters) if p.owner == owner]
 
+    @checked
     def with_estimated(self, names: Iterable[str]) -> Robot:
         """The same robot with just the parameters called `names` estimated.
 
         Raises:
             InputError: There is no such parameter.
         """
+        names = (names,) if isinstance(names, str) else listed(self.name, names)
+        check_names(self.name, names, names_of(self.parameters))
         wanted = set(names)
-        check_names(self.name, sorted(wanted), names_of(self.parameters))
         return replace(self, parameters=tuple(replace(p, estimated=p.name in wanted) for p in self.parameters))
 
+    @checked
     def with_values(self, values: Floats | Sequence[float]) -> Robot:
         """The same robot with other nominal values, shape (n_parameters,), [m] or [rad].
 
         Raises:
             InputError: There are more or fewer values than parameters.
         """
-        if len(values) != len(self.parameters):
-            raise InputError(self.name, f"{len(values)} values", f"{len(self.parameters)}, one a parameter")
-        changed = (replace(p, nominal=float(v)) for p, v in zip(self.parameters, values, strict=True))
+        figures, n = as_figures(self.name, values, "values of the parameters"), len(self.parameters)
+        if figures.shape != (n,):
+            found = f"{len(figures)} values" if figures.ndim == 1 else f"shape {figures.shape}"
+            raise InputError(self.name, found, f"{n}, one a parameter")
+        check_sizes(self.name, figures)
+        changed = (
+            p if p.nominal == v else replace(p, nominal=float(v)) for p, v in zip(self.parameters, figures, strict=True)
+        )
         return replace(self, parameters=tuple(changed))
 
 
@@ -429,16 +455,26 @@ class RobotBuilder:
         Raises:
             InputError: A name that is neither a parameter nor, for tolerances, a kind.
         """
+        if len(self._joints) > MOST_JOINTS:
+            raise InputError(place, f"{len(self._joints)} joints", f"at most {MOST_JOINTS}")
+        for joint in self._joints:
+            if not joint.prismatic and np.isfinite([joint.lower, joint.upper]).all() and joint.upper > MOST_LIMIT:
+                limits = f"{joint.lower:g} to {joint.upper:g} rad"
+                _log.warning("%s: joint %s has limits of %s; are they in deg?", place, escaped(joint.name), limits)
         fixed, estimate = listed("fixed", fixed), listed("estimate", estimate)
         names = {p.name for p in self._parameters}
         if len(names) < len(self._parameters):
-            raise InputError(place, "two joints share a name, or one is called base or tool", "different names")
+            twice = next(name for name, n in Counter(names_of(self._parameters)).items() if n > 1).rpartition(".")[0]
+            hint = "base and tool are the frames before and behind the joints"
+            raise InputError(place, f"two frames called {twice!r}", "different names", hint)
         for key, chosen in (("fixed", fixed), ("estimate", estimate)):
             check_names(f"{place}: {key}", chosen, names_of(self._parameters))
         both = sorted(set(fixed) & set(estimate))
         if both:
             raise InputError(f"{place}: estimate", f"{both[0]!r} stands under fixed too", "it under one of the two")
         tolerance = dict(tolerance or {})
+        for key, figure in tolerance.items():
+            check_number(f"tolerance: {key}", figure, above=True)
         kinds = {tolerance_kind(p) for p in self._parameters} - {None}
         for name in tolerance:
             if name not in names and name not in kinds:
@@ -463,22 +499,26 @@ class RobotBuilder:
         self._parameters.append(parameter)
 
 
-def frame_values(name: str, given: ArrayLike | None) -> dict[str, float]:
-    """The values by kind of a frame that is given as x y z, as x y z roll pitch yaw, or as a matrix; zeros if None.
+def frame_values(name: str, given: Mapping[str, float] | ArrayLike | None) -> dict[str, float]:
+    """The values by kind of a frame given by kind, as x y z, as x y z roll pitch yaw, or as a matrix; zeros if None.
 
     Args:
         name: Its name, for messages.
-        given: Shape (3,), (6,) or (4, 4), [m] and [rad].
+        given: A mapping, or of shape (3,), (6,) or (4, 4), [m] and [rad].
 
     Raises:
         InputError: It is something else.
     """
     if given is None:
         return {}
+    if isinstance(given, Mapping):
+        check_names(name, given, FRAME_KINDS, "value")
+        return _frame_in_rad(name, {k: float(as_floats(f"{name}: {k}", figure, "()")) for k, figure in given.items()})
     found = shape_of(name, given, "numbers of shape (3), (6) or (4, 4)")
     if found != (4, 4):
         shape = f"({found[0]})" if found in ((3,), (6,)) else "(3), (6) or (4, 4)"
-        return dict(zip(("x", "y", "z", "roll", "pitch", "yaw"), as_floats(name, given, shape), strict=False))
+        kinds = ("x", "y", "z", "roll", "pitch", "yaw")
+        return _frame_in_rad(name, dict(zip(kinds, as_floats(name, given, shape).tolist(), strict=False)))
     matrix = as_floats(name, given, "(4, 4)")
     R = matrix[:3, :3]
     if not np.allclose(matrix[3], [0, 0, 0, 1]) or np.abs(R.T @ R - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0:
@@ -491,6 +531,13 @@ def frame_values(name: str, given: ArrayLike | None) -> dict[str, float]:
     return dict(zip("xyz", matrix[:3, 3], strict=True)) | angles
 
 
+def _frame_in_rad(name: str, values: dict[str, float]) -> dict[str, float]:
+    for kind in ("roll", "pitch", "yaw"):
+        if abs(values.get(kind, 0.0)) > MOST_ANGLE:
+            raise InputError(f"{name}: {kind}", f"found {values[kind]:g}", IN_RAD, "is it in deg?")
+    return values
+
+
 def _joints(
     n: int,
     types: JointType | Sequence[JointType],
@@ -500,20 +547,23 @@ def _joints(
     """The joints of a table of n rows, by what was given for all of them or for each."""
     if not n:
         raise InputError("rows", "no joints", "at least one")
-    kinds = [types] * n if isinstance(types, str) else list(types)
-    ranges = [None] * n if limits is None else list(limits)
-    called = [f"q{i + 1}" for i in range(n)] if names is None else list(names)
+    kinds = [types] * n if isinstance(types, str) else listed("types", types, "a type, or one a joint")
+    ranges = [None] * n if limits is None else listed("limits", limits, "lower and upper of each joint")
+    called = [f"q{i + 1}" for i in range(n)] if names is None else listed("names", names)
     for key, count in (("types", len(kinds)), ("limits", len(ranges)), ("names", len(called))):
         if count != n:
             raise InputError(key, f"{count} for {n} joints", "one a joint")
     joints: list[Joint] = []
     for i, (kind, given, name) in enumerate(zip(kinds, ranges, called, strict=True), start=1):
         check(f"types: joint {i}", kind, JointType)
+        if not isinstance(name, str) or not name:
+            raise InputError(f"names: joint {i}", f"found {shown(name)}", "a word")
         if name in called[: i - 1]:
             raise InputError(f"names: joint {i}", f"found {name!r}, as before", "different names")
-        lower, upper = (-np.inf, np.inf) if given is None else given
+        pair = (-np.inf, np.inf) if given is None else as_figures(f"limits: joint {i}", given, "lower and upper")
+        lower, upper = pair if np.shape(pair) == (2,) else (np.nan, np.nan)
         if not lower < upper:
-            raise InputError(f"limits: joint {i}", f"found {lower}, {upper}", "lower below upper, or None")
+            raise InputError(f"limits: joint {i}", f"found {shown(given)}", "lower below upper, or None")
         joints.append(Joint(str(name), kind == "prismatic", float(lower), float(upper)))
     return joints
 

@@ -6,7 +6,6 @@ A `Scenario` is complete without a file: everything in it is SI. `files.scenario
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -17,23 +16,13 @@ from numpy.typing import NDArray
 
 from fg_calib.errors import InputError
 from fg_calib.measurements.dataset import Measurements, Noise
-from fg_calib.options import NEAR, AngleUnit, LengthUnit, check, check_number, did_you_mean, known_names
+from fg_calib.measurements.series import Table
+from fg_calib.options import NEAR, AngleUnit, LengthUnit, check, did_you_mean, known_names
 from fg_calib.robot.model import Robot, names_of, tolerance_kind
+from fg_calib.simulation.configurations import Configurations, Placement
+from fg_calib.simulation.instruments import Instrument, frame_knowledge
 
 Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Placement:
-    """A frame in another one, such as world_T_base or base_T_board.
-
-    Attributes:
-        rotation: Shape (3, 3).
-        position: Shape (3,), [m].
-    """
-
-    rotation: Floats
-    position: Floats
 
 
 @dataclass(frozen=True)
@@ -55,70 +44,6 @@ class Errors:
 
 
 @dataclass(frozen=True)
-class BoardViews:
-    """Configurations in which the tool's z axis, a camera's optical axis, meets the centre of a board.
-
-    The first is A, `height` above the centre. The others are spread evenly over the half sphere of `radius` about A
-    on the side away from the board (Jia et al. 2019, section 5.1), or, with `distance`, drawn at such distances from
-    the centre, evenly in distance and in direction within `cone` of the normal.
-
-    Attributes:
-        board: base_T_board; z is the normal on the camera's side.
-        count: Number of configurations beside A.
-        height: Distance of A from the centre, [m].
-        radius: Of the half sphere about A, [m].
-        distance: Smallest and largest distance from the centre, [m]; None for the half sphere.
-        cone: Largest angle between the normal and the direction from the centre to the camera, [rad].
-        roll: Of the camera about its optical axis, [rad]; at 0 its x axis at A is the board's, and elsewhere what
-            the smallest turn of the optical axis makes of that. None draws it.
-        self_motion: `random`: every configuration has its own, from a random start of the inverse kinematics;
-            `held`: all continue from that of A by steps of minimum norm.
-        posture: Configuration near which that of A is sought, if self-motion is held, shape (n_joints,), [rad]
-            (prismatic: [m]); None draws it.
-    """
-
-    board: Placement
-    count: int = 51
-    height: float = 0.5
-    radius: float = 0.5
-    distance: tuple[float, float] | None = None
-    cone: float = math.pi / 3.0
-    roll: float | None = None
-    self_motion: Literal["random", "held"] = "random"
-    posture: tuple[float, ...] | None = None
-
-    def __post_init__(self) -> None:
-        check("board: self_motion", self.self_motion, ("random", "held"))
-        check_number("board: count", self.count, whole=True)
-        for key in ("height", "radius", "cone"):
-            check_number(f"board: {key}", getattr(self, key), above=True)
-
-
-@dataclass(frozen=True)
-class RandomReadings:
-    """Configurations drawn evenly within the joint limits, +-180 degrees or +-1 m where there are none."""
-
-    count: int
-
-    def __post_init__(self) -> None:
-        check_number("random: count", self.count, above=True, whole=True)
-
-
-@dataclass(frozen=True)
-class GivenReadings:
-    """Configurations of a table.
-
-    Attributes:
-        readings: Shape (n_configurations, n_joints), [rad] (prismatic: [m]).
-    """
-
-    readings: Floats
-
-
-Configurations = BoardViews | RandomReadings | GivenReadings
-
-
-@dataclass(frozen=True)
 class Scenario:
     """A simulation to run.
 
@@ -126,7 +51,7 @@ class Scenario:
         robot: The nominal robot.
         errors: True minus nominal parameters.
         configurations: Where the robot is measured to be calibrated, as the nominal robot would get there.
-        noise: What truly disturbs, 1 sigma; `position` and `orientation` are needed.
+        noise: What truly disturbs, 1 sigma; `position` and `orientation` are needed where there are no instruments.
         frame: world_T_base, in whose world the poses are measured: `base` is the base itself, `unknown` an arbitrary
             one, drawn.
         validation: Where it is measured to test the calibration; None without test rows.
@@ -136,6 +61,7 @@ class Scenario:
         angle_unit: Unit of angles of the job's files.
         name: What it is called.
         source: The file's name, or that of a shipped scenario; for messages.
+        instruments: What measures, each a table of its own; poses of the tool are measured if empty.
     """
 
     robot: Robot
@@ -150,12 +76,17 @@ class Scenario:
     angle_unit: AngleUnit = "rad"
     name: str = "scenario"
     source: str = "scenario"
+    instruments: tuple[Instrument, ...] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.frame, Placement):
             check(f"{self.source}: frame", self.frame, ("base", "unknown"))
         check(f"{self.source}: length_unit", self.length_unit, LengthUnit)
         check(f"{self.source}: angle_unit", self.angle_unit, AngleUnit)
+        names = [i.name for i in self.instruments]
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(f"{self.source}: instruments", f"{names.count(name)} with the name {name}", "one")
 
 
 @dataclass(frozen=True)
@@ -168,10 +99,13 @@ class Simulation:
         robot: The nominal robot.
         true_robot: The robot that moved: the same parameters, with their true values.
         measurements: The readings and the measured poses, with the sigmas that are stated; rows of the validation
-            are test rows.
-        true_readings: Where the joints stood: the readings plus the encoder noise, shape (n_configurations,
-            n_joints), [rad] (prismatic: [m]).
+            are test rows. Of several instruments those of the first.
+        true_readings: Where the joints stood at the scenario's configurations: the readings plus the encoder noise,
+            shape (n_configurations, n_joints), [rad] (prismatic: [m]).
         frame: world_T_base.
+        tables: What was measured, as `calibrate` takes it: a table for each instrument.
+        truth: Where targets, anchors, planes, boards, sockets and frames truly are, by kind and name: `Spot`, `Plane`,
+            `Placement` (base_T_board, world_T_base); offsets in [m].
     """
 
     scenario: Scenario
@@ -181,33 +115,45 @@ class Simulation:
     measurements: Measurements
     true_readings: Floats
     frame: Placement
+    tables: tuple[Table, ...]
+    truth: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
     def job(self) -> dict[str, Any]:
         """The keys of the calibration job that are not files or figures: model, pairing, frame, ..."""
-        known = isinstance(self.scenario.frame, str) and self.scenario.frame == "base"
-        return {**self.scenario.job, "frame": "known" if known else "unknown"}
+        return {**self.scenario.job, "frame": frame_knowledge(self.scenario.frame)}
+
+    def n_configurations(self, *, test: bool) -> int:
+        """Number of different configurations of train or of test rows."""
+        tables = [table.measurements for table in self.tables]
+        return len(set(np.concatenate([m.ids[m.test == test] for m in tables]).tolist()))
 
     def summary(self) -> dict[str, Any]:
         """Seed, numbers of rows and truth, for programs: errors and frame in [m] and [rad]."""
-        from scipy.spatial.transform import Rotation
-
-        test = self.measurements.test
+        n_train, n_test = (self.n_configurations(test=test) for test in (False, True))
         errors = self.true_robot.nominal - self.robot.nominal
-        return {
+        found = {
             "scenario": self.scenario.name,
             "seed": self.seed,
-            "n_configurations": len(test),
-            "n_train": int(np.sum(~test)),
-            "n_test": int(np.sum(test)),
+            "n_configurations": n_train + n_test,
+            "n_train": n_train,
+            "n_test": n_test,
             "truth": {
                 "errors": {p.name: float(e) for p, e in zip(self.robot.parameters, errors, strict=True) if e != 0.0},
-                "world_T_base": {
-                    "xyz": self.frame.position.tolist(),
-                    "quaternion_xyzw": Rotation.from_matrix(self.frame.rotation).as_quat(canonical=True).tolist(),
-                },
+                "world_T_base": self.frame.summary(),
             },
         }
+        if self.scenario.instruments:
+            found["tables"] = [
+                {
+                    "table": t.measurements.source,
+                    "model": t.model,
+                    "n_train": int(np.sum(~t.measurements.test)),
+                    "n_test": int(np.sum(t.measurements.test)),
+                }
+                for t in self.tables
+            ]
+        return found
 
 
 def figures_by_name(robot: Robot, figures: Mapping[str, float], place: str) -> dict[str, float]:

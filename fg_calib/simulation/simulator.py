@@ -7,42 +7,38 @@ base_T_tool at the readings plus encoder noise, and the measurement frame world_
     world_R_tool = world_R_base base_R_tool exp(n_orientation)
 
 with independent normal noise along the world's axes and about the tool's axes. The table holds the readings without
-the noise: the arm is not where its encoders say.
+the noise: the arm is not where its encoders say. `measuring` says what other instruments measure.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.arguments import checked
 from fg_calib.errors import InputError
 from fg_calib.measurements.dataset import Measurements, Noise
-from fg_calib.options import check_number
+from fg_calib.measurements.series import Table
+from fg_calib.options import Pairing, check_number
 from fg_calib.robot.inverse import Inverse, random_readings, solve_inverse
 from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
 from fg_calib.robot.model import Robot
-from fg_calib.simulation.scenario import (
-    BoardViews,
-    Configurations,
-    Errors,
-    GivenReadings,
-    Placement,
-    RandomReadings,
-    Scenario,
-    Simulation,
-    figures_by_name,
-)
+from fg_calib.simulation.configurations import BoardViews, Configurations, GivenReadings, Placement, RandomReadings
+from fg_calib.simulation.instruments import frame_knowledge, with_figures
+from fg_calib.simulation.measuring import Scene, Stops, drawn_frame, measure, share_knowledge, together
+from fg_calib.simulation.scenario import Errors, Scenario, Simulation, figures_by_name
 from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
 
-FARTHEST_BASE = 5.0
-"""How far from the world's origin an unknown frame puts the base, along each axis, [m]."""
-
 _PURPOSES = ("errors", "configurations", "validation", "frame", "noise", "noise of validation")
-"""Each has its own generator, so that changing one thing of a scenario leaves what is drawn for the others alone."""
+"""Each, and each instrument, has a generator of its own: changing one thing of a scenario leaves what is drawn for the
+others alone."""
 
 
+@checked
 @single_threaded
 def simulate(scenario: Scenario, seed: int = 0) -> Simulation:
     """Run a scenario.
@@ -56,17 +52,33 @@ def simulate(scenario: Scenario, seed: int = 0) -> Simulation:
             are no parameters, figures that make no sense.
     """
     check_number("seed", seed, whole=True)
-    robot = scenario.robot
-    draw = dict(zip(_PURPOSES, np.random.default_rng(seed).spawn(len(_PURPOSES)), strict=True))
-    true_robot = _true_robot(robot, scenario.errors, draw["errors"], f"{scenario.source}: errors")
+    n = len(_PURPOSES)
+    children = np.random.default_rng(seed).spawn(n + len(scenario.instruments))
+    draw = dict(zip(_PURPOSES, children, strict=False))
+    true_robot = _true_robot(scenario.robot, scenario.errors, draw["errors"], f"{scenario.source}: errors")
     frame = _frame(scenario, draw["frame"])
+    if scenario.instruments:
+        return _by_instruments(scenario, seed, true_robot, frame, draw, children[n:])
+    return _poses(scenario, seed, true_robot, frame, draw)
+
+
+def _sets(scenario: Scenario) -> list[tuple[str, Configurations, str]]:
+    """Key, configurations, and the purpose of their noise: to calibrate, and to test where that is wanted."""
+    sets = (
+        ("configurations", scenario.configurations, "noise"),
+        ("validation", scenario.validation, "noise of validation"),
+    )
+    return [(key, configurations, noise) for key, configurations, noise in sets if configurations is not None]
+
+
+def _poses(
+    scenario: Scenario, seed: int, true_robot: Robot, frame: Placement, draw: Mapping[str, np.random.Generator]
+) -> Simulation:
+    """Poses of the tool at all configurations."""
+    robot = scenario.robot
     sets = [
         _measure(scenario, key, configurations, true_robot, frame, (draw[key], draw[noise]))
-        for key, configurations, noise in (
-            ("configurations", scenario.configurations, "noise"),
-            ("validation", scenario.validation, "noise of validation"),
-        )
-        if configurations is not None
+        for key, configurations, noise in _sets(scenario)
     ]
     readings, true_readings, rotation, position = (np.concatenate(parts) for parts in zip(*sets, strict=True))
     n = len(readings)
@@ -74,7 +86,7 @@ def simulate(scenario: Scenario, seed: int = 0) -> Simulation:
     sigmas = _sigmas(stated, f"{scenario.source}: noise", stated=True)
     measurements = Measurements(
         readings=readings,
-        ids=np.array([f"p{i}" for i in range(n)]),
+        ids=_names(n),
         test=np.arange(n) >= len(sets[0][0]),
         position=position,
         rotation=rotation,
@@ -83,7 +95,84 @@ def simulate(scenario: Scenario, seed: int = 0) -> Simulation:
         sigma_joint=_joint_sigma(stated, robot),
         source="poses.csv",
     )
-    return Simulation(scenario, seed, robot, true_robot, measurements, true_readings, frame)
+    pairing = _pairing(scenario.job.get("pairing", "star"))
+    table = Table(measurements, scenario.job.get("model"), pairing, frame_knowledge(scenario.frame))
+    return Simulation(scenario, seed, robot, true_robot, measurements, true_readings, frame, (table,))
+
+
+def _pairing(given: object) -> Pairing:
+    """A pairing as a job states it."""
+    if isinstance(given, Mapping):
+        return Pairing("random", given["random"], given.get("seed", 0))
+    return Pairing(given)  # type: ignore[arg-type] # checks it
+
+
+def _by_instruments(
+    scenario: Scenario,
+    seed: int,
+    true_robot: Robot,
+    frame: Placement,
+    draw: Mapping[str, np.random.Generator],
+    own: Sequence[np.random.Generator],
+) -> Simulation:
+    """What each instrument measures, where it goes itself or where all go."""
+    common: list[Stops] = []
+    for key, configurations, noise in _sets(scenario):
+        first = sum(map(len, common))
+        place = f"{scenario.source}: {key}"
+        common.append(_stops(scenario, configurations, (draw[key], draw[noise]), place, "p", first, bool(common)))
+    stated = scenario.stated_noise or scenario.noise
+    tables, truths = [], []
+    for instrument, generator in zip(scenario.instruments, own, strict=True):
+        reached, joint, places, noise_draws = generator.spawn(4)
+        stops, configurations = common, instrument.configurations or scenario.configurations
+        if instrument.configurations is not None:
+            place = f"{scenario.source}: instruments: {instrument.name}: configurations"
+            mine = _stops(scenario, configurations, (reached, joint), place, f"{instrument.name} p", 0, False)
+            stops = [mine, *common[1:]]
+        scene = Scene(
+            robot=scenario.robot,
+            true_robot=true_robot,
+            stops=together(stops),
+            configurations=configurations,
+            noise=with_figures(scenario.noise, instrument.noise),
+            stated_noise=with_figures(with_figures(stated, instrument.noise), instrument.stated_noise),
+            sigma_joint=_joint_sigma(stated, scenario.robot),
+            frame=frame,
+            known_frame=frame_knowledge(scenario.frame) == "known",
+            places=places,
+            draws=noise_draws,
+            source=scenario.source,
+        )
+        table, truth = measure(instrument, scene)
+        tables.append(table)
+        truths.append(truth)
+    shared, every = share_knowledge(tables, truths, scenario.source)
+    true_readings = together(common).true_readings
+    return Simulation(
+        scenario, seed, scenario.robot, true_robot, shared[0].measurements, true_readings, frame, shared, every
+    )
+
+
+def _stops(
+    scenario: Scenario,
+    configurations: Configurations,
+    generators: tuple[np.random.Generator, np.random.Generator],
+    place: str,
+    prefix: str,
+    first: int,
+    test: bool,
+) -> Stops:
+    """Configurations, and where the joints stand there."""
+    robot = scenario.robot
+    readings = _readings(robot, configurations, generators[0], place)
+    n = len(readings)
+    off = _joint_sigma(scenario.noise, robot) * generators[1].normal(size=(n, robot.n_joints))
+    return Stops(readings, readings + off, _names(n, prefix, first), np.full(n, test))
+
+
+def _names(n: int, prefix: str = "p", first: int = 0) -> NDArray[np.str_]:
+    return np.array([f"{prefix}{first + i}" for i in range(n)])
 
 
 def _true_robot(robot: Robot, errors: Errors, generator: np.random.Generator, place: str) -> Robot:
@@ -101,14 +190,11 @@ def _true_robot(robot: Robot, errors: Errors, generator: np.random.Generator, pl
 
 
 def _frame(scenario: Scenario, generator: np.random.Generator) -> Placement:
-    from scipy.spatial.transform import Rotation
-
     if isinstance(scenario.frame, Placement):
         return scenario.frame
     if scenario.frame == "base":
         return Placement(np.eye(3), np.zeros(3))
-    rotation = Rotation.from_quat(generator.normal(size=4)).as_matrix()  # any rotation as likely as any other
-    return Placement(rotation, generator.uniform(-FARTHEST_BASE, FARTHEST_BASE, 3))
+    return drawn_frame(generator)
 
 
 def _measure(

@@ -156,7 +156,7 @@ def test_after_the_best_rigid_fit_the_bound_is_what_real_errors_are():
 
 
 @pytest.mark.parametrize("pair_errors", ["shared", "independent"])
-@pytest.mark.slow
+@pytest.mark.long
 def test_fits_of_drawn_errors_and_noise_have_the_bounds_error(pair_errors):
     robot = planar_robot(tolerance={"a": TOLERANCE, "theta": 2e-3})
     readings = spread_readings(8)

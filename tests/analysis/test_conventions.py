@@ -10,10 +10,13 @@ from jobs import UR5E, only, ur5e, write_job
 from oracle import random_robot, rotation, tool_pose, translation
 from simulated import measure, paper_robot, true_robot
 
+from fg_calib import Measurements, Robot, calibrate
 from fg_calib.analysis.conventions import missing_motions
 from fg_calib.files.robot_yaml import read_robot
+from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Axis, Joint, RobotBuilder
 
+QUARTER, SIGMA = np.pi / 2, (5e-5, 1e-4)
 TILT, SHIFT = (Axis.RY,), (Axis.TY,)
 BOTH = (Axis.TY, Axis.RY)
 
@@ -170,6 +173,41 @@ def test_a_bad_fit_says_first_what_the_convention_lacks(tmp_path, fg_calib, mode
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert result["findings"][0] == SAID
     assert result["observability"]["missing"][0]["axes"] == [2, 3, 4]
+
+
+@pytest.mark.parametrize("error", [only(2, 1e-3), only(5, 2e-3)])
+def test_what_the_convention_lacks_is_no_finding_where_something_else_is_wrong(tmp_path, fg_calib, error):
+    """A gear ratio that is off: the convention that has the parameter would not fit any better."""
+    m = measure(true_robot(ur5e(tmp_path, **DH), np.random.default_rng(0)), 60, np.random.default_rng(1), sigma=SIGMA)
+    ended = fg_calib("calibrate", write_job(tmp_path, replace(m, readings=m.readings * (1.0 + error)), model="pose"))
+    assert ended.code == 3
+    assert SAID not in words(ended.out.partition("Fit statistics")[0])
+    assert SAID in words(ended.out.partition("Notes")[2])
+
+
+def anchored(error, rng):
+    """Lengths from three anchors to a gantry's tool, its readings off, of a convention that lacks a tilt."""
+    rows = [[0, QUARTER, 0, QUARTER], [0, QUARTER, 0, QUARTER], [0, QUARTER, 0, QUARTER], [0, 0, 0.3, 0],
+            [0, QUARTER, 0, 0], [0, -QUARTER, 0.1, 0]]  # fmt: skip
+    tolerance = {"a": 5e-4, "d": 5e-4, "alpha": 1e-3, "theta": 1e-3}
+    robot = Robot.from_dh(rows, convention="mdh", types=["prismatic"] * 3 + ["revolute"] * 3, tolerance=tolerance)
+    q = rng.uniform([0, 0, 0, -3, -1.7, -3], [3, 2, 1, 3, 1.7, 3], (70, 6))
+    anchors = np.array([[0.8, -1.0, 0.2], [1.6, -0.3, 1.6], [0.5, -2.8, 0.2]])
+    which = np.arange(70) % 3
+    reached = pose(true_robot(robot, rng), q + error * q).position
+    length = np.linalg.norm(reached - anchors[which], axis=1) + 1e-5 * rng.normal(size=70)
+    names = [f"a{k}" for k in which]
+    return robot, Measurements.from_arrays(q, anchor=names, distance=length, sigma_distance=1e-5)
+
+
+@pytest.mark.parametrize("error", [only(5, -2.0), only(1, 1e-3), only(4, 2e-3)])
+def test_neither_is_it_of_instruments(error):
+    robot, m = anchored(error, np.random.default_rng(2))
+    assert missing_motions(robot)
+    found = calibrate(robot, m, model="anchor")
+    assert not found.trustworthy
+    assert not any("use mdh-hayati" in finding for finding in found.findings)
+    assert any("use mdh-hayati" in caution for caution in found.uncertainty.cautions)
 
 
 @pytest.mark.parametrize("noise", ["estimate", {"position": 5e-5, "orientation": 1e-4, "estimate": True}])

@@ -106,11 +106,13 @@ def test_structural_rank_does_not_depend_on_the_draw(robot, ranks, model):
     assert {rank_at(robot, model, seed) for seed in range(3)} == {ranks[MODELS.index(model)]}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.long
 @pytest.mark.parametrize(("robot", "ranks"), DRAWN, ids=[f"{r.name}-{i}" for i, (r, _) in enumerate(DRAWN)])
-def test_structural_rank_is_the_same_over_200_draws(robot, ranks, model):
-    assert {rank_at(robot, model, seed) for seed in range(200)} == {ranks[MODELS.index(model)]}
+def test_structural_rank_is_the_same_over_200_draws(robot, ranks):
+    """A model after the other: what is drawn is the configurations, whatever the model."""
+    for seed in range(200):
+        model = MODELS[seed % len(MODELS)]
+        assert rank_at(robot, model, seed) == ranks[MODELS.index(model)], (model, seed)
 
 
 @pytest.mark.parametrize("model", ["distance-rotation", "pose"])

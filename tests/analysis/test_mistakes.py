@@ -11,6 +11,7 @@ from oracle import random_robot
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, small_arm, true_robot
 
+from fg_calib import Robot
 from fg_calib.analysis import mistakes
 from fg_calib.analysis.mistakes import EXPLAINED, FAR, REDUCTION, check_setup
 from fg_calib.errors import SolverError
@@ -68,6 +69,13 @@ SPOILT = {
 }
 """Mistakes in a table: how they are named, and how they are made."""
 
+ONE = {
+    "x, y, z are in cm, not mm": lambda m: replace(m, position=m.position * 0.1),
+    "readings of joint 3 are in deg, not rad": lambda m: replace(m, readings=m.readings * only(3, 180 / np.pi, 1)),
+    "readings of joint 2 are in rad, not deg": lambda m: replace(m, readings=m.readings * only(2, np.pi / 180, 1)),
+}
+"""Further ones, of one quantity or one joint."""
+
 LENGTHS = [key for key in SPOILT if key.startswith(("x,", "columns x", "z has"))]
 TURNS = ["the orientations are inverted", "columns qx, qy, qz, qw hold w, x, y, z"]
 JOINTS = [key for key in SPOILT if "joint" in key]
@@ -106,6 +114,48 @@ def test_a_mistake_in_the_table_is_named(tmp_path, model, frame, mistake):
     assert check.explanations[0].excess <= min(EXPLAINED, check.excess / REDUCTION)
 
 
+def stuck(robot, joint, place, seed=0, *, placed=PLACED):
+    """What is measured where one joint stands still while its readings change."""
+    rng = np.random.default_rng(seed)
+    true = true_robot(robot, rng)
+    most = np.array([0.3 if joint.prismatic else 3.1 for joint in robot.joints])
+    q = rng.uniform(-most, most, (50, robot.n_joints))
+    still = np.where(np.arange(robot.n_joints) == joint, place, q)
+    m = measure(true, 50, rng, sigma=SIGMA, frame=placed, readings=still)
+    return replace(m, readings=q)
+
+
+@pytest.mark.parametrize(("joint", "place"), [(0, 0.4), (3, -2.2), (5, 0.3), (5, 3.0)])
+@pytest.mark.parametrize("model", ["pose", "position"])
+def test_a_joint_that_is_stuck_is_not_called_one_in_another_unit(tmp_path, model, joint, place):
+    robot = ur5e(tmp_path)
+    check = check_setup(robot, stuck(robot, joint, place), model, "unknown")
+    assert named(check).startswith(f"joint {joint + 1} does not move: its readings change, but the arm does not follow")
+    assert not any("in deg" in str(e) for e in check.explanations)
+
+
+@pytest.mark.parametrize(("joint", "place"), [(0, 0.4), (2, 0.08), (3, 0.3)])
+def test_a_joint_of_a_scara_that_is_stuck_is_named_too(joint, place):
+    """The last one moves the tool point by 40 mm only, and a slide in mm instead of cm would move by a tenth."""
+    rows = [[0, 0, 0.35, 0], [0.3, 0, 0, 0], [0.25, np.pi, 0, 0], [0, 0, 0.05, 0]]
+    types = ["revolute", "revolute", "prismatic", "revolute"]
+    tolerance = {"a": 5e-4, "d": 5e-4, "alpha": 1e-3, "theta": 2e-3, "tool": 1e-3}
+    place_of_tool = {"tool": [0.04, 0, 0.06], "estimate": ["tool.x", "tool.y", "tool.z"]}
+    robot = Robot.from_dh(rows, convention="mdh", types=types, tolerance=tolerance, **place_of_tool)
+    check = check_setup(robot, stuck(robot, joint, place), "position", "unknown")
+    assert f"joint {joint + 1} does not move" in named(check)
+    assert not any("in deg" in str(e) or "in mm" in str(e) for e in check.explanations)
+
+
+@pytest.mark.parametrize("factor", [np.pi / 180, 180 / np.pi])
+def test_readings_of_a_joint_in_another_unit_are_not_called_stuck(tmp_path, factor):
+    robot = ur5e(tmp_path)
+    m = measured(robot, placed=PLACED)
+    check = check_setup(robot, replace(m, readings=m.readings * only(4, factor, 1)), "pose", "unknown")
+    assert "readings of joint 4 are in" in named(check)
+    assert not any("does not move" in str(e) for e in check.explanations)
+
+
 EVERY_SECOND = CASES[1::2]
 """Every mistake, model and frame; that all their combinations are named is for the test above."""
 
@@ -115,7 +165,7 @@ def test_every_second_case_has_every_mistake_model_and_frame():
     assert {case[:2] for case in EVERY_SECOND} == {case[:2] for case in CASES}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("model", "frame", "mistake"), EVERY_SECOND)
 def test_a_mistake_is_the_first_finding_of_a_calibration(tmp_path, fg_calib, model, frame, mistake):
     m = SPOILT[mistake](measured(ur5e(tmp_path), placed=PLACED if frame == "unknown" else None))
@@ -166,7 +216,7 @@ CHANGED = {
     "the tool point is another one (estimate: [tool.x, tool.y, tool.z])": {"tool": {"roll": 20}},
     "the tool frame is another one (estimate: all of tool.x ... tool.yaw)": {"tool": {}},
     "the robot's convention is mdh-hayati, not dh-hayati": None,
-    "the robot's angles are in deg, not rad": {"units": {"length": "m", "angle": "rad"}, "tolerance": {"a": 0.0005}},
+    "the robot's angles are in deg, not rad": None,
     "the robot's lengths are in mm, not m": None,
 }
 
@@ -183,7 +233,11 @@ def test_a_mistake_in_the_robot_is_named(tmp_path, model, mistake):
         joints = [{k: v * 1e3 if k in "ad" else v for k, v in joint.items()} for joint in UR5E["joints"]]
         changes = {"joints": joints, "tool": {"x": 50, "y": -30, "z": 120, "roll": 20}}
     m = measured(robot)
-    check = check_setup(ur5e(tmp_path, **changes), m, model)
+    nominal = ur5e(tmp_path, **(changes or {}))
+    if "angles" in mistake:  # a file of such angles is refused
+        degrees = [np.rad2deg(p.nominal) if p.unit == "rad" else p.nominal for p in nominal.parameters]
+        nominal = nominal.with_values(np.array(degrees))
+    check = check_setup(nominal, m, model)
     if "frame" in mistake and model != "pose":
         mistake = "the tool point is another one"  # how it is turned does not show in pairs
     assert mistake in named(check)
@@ -206,6 +260,35 @@ def test_a_slide_that_goes_the_other_way_or_in_another_unit_is_named():
         ([1, 1, 1e3, 1], "readings of slides are in mm"),
     ):
         assert mistake in named(check_setup(arm, replace(m, readings=m.readings * factor), "pose"))
+
+
+@pytest.mark.parametrize("mistake", ONE)
+@pytest.mark.parametrize("frame", ["known", "unknown"])
+def test_a_unit_of_one_quantity_or_one_joint_is_named(tmp_path, mistake, frame):
+    robot = ur5e(tmp_path)
+    m = measured(robot, placed=PLACED if frame == "unknown" else None)
+    assert named(check_setup(robot, ONE[mistake](m), "pose", frame)) == mistake
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e-3, "m, not mm"), (0.1, "cm, not mm"), (1e3, "mm, not m")])
+def test_one_slide_of_two_in_another_unit_is_named(factor, unit):
+    rng = np.random.default_rng(0)
+    rows = [(0.0, 1.6, 0.5, 0.0), (0.1, 1.6, 0.4, 1.6), (0.2, 0.7, 0.3, 0.0), (0.3, -1.5, 0.1, 0.0)]
+    arm = Robot.from_dh(rows, types=["prismatic", "prismatic", "revolute", "revolute"], tool=[0.1, 0.0, 0.2])
+    m = measure(true_robot(arm, rng), 50, rng)
+    check = check_setup(arm, replace(m, readings=m.readings * [1.0, factor, 1.0, 1.0]), "pose")
+    assert named(check) == f"readings of joint 2 are in {unit}"
+
+
+def test_one_thing_is_not_said_to_be_in_two_units(tmp_path):
+    """Two changes of the same unit explain what one does: 10 is 1000 / 100."""
+    robot = ur5e(tmp_path)
+    m = measured(robot)
+    for factor in (0.1, 0.3):
+        check = check_setup(robot, replace(m, position=m.position * factor), "pose")
+        for explanation in check.explanations:
+            subjects = [words.partition(" are in ")[0] for words in explanation.mistakes]
+            assert len(set(subjects)) == len(subjects)
 
 
 def pairs_of(m, length=1.0):
@@ -269,7 +352,11 @@ def test_the_mistake_stands_first_in_report_and_result(tmp_path, fg_calib):
     assert ended.code == 3
     said = " ".join(ended.out.split("\n\n")[0].split())
     assert said.startswith("ur5e: pose, measurement frame unknown DOUBTFUL: position residuals fall from")
-    assert said.partition(" DOUBTFUL: ")[2].partition(" DOUBTFUL: ")[0].endswith("mm if x, y, z are in mm, not m")
+    assert (
+        said.partition(" DOUBTFUL: ")[2]
+        .partition(" DOUBTFUL: ")[0]
+        .endswith("mm in the median if x, y, z are in mm, not m")
+    )
     assert "the noise there is" not in " ".join(ended.out.split())
     result = json.loads((tmp_path / "result" / "result.json").read_text())
     assert result["findings"][0].endswith("if x, y, z are in mm, not m")
@@ -286,6 +373,7 @@ def test_what_no_usual_mistake_explains_is_said_plainly(tmp_path, fg_calib):
     ended = fg_calib("calibrate", write_job(tmp_path, shuffled, model="pose"))
     assert ended.code == 3
     said = " ".join(ended.out.split())
+    assert " in the median, " in said
     assert "times what noise and tolerances predict: none of the usual mistakes in a set-up explains it" in said
     assert "the noise there is" not in said
 

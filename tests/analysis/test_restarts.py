@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from simulated import measure, paper_robot, true_robot
+from scipy.stats import chi2
+from simulated import measure, paper_robot, small_arm, true_robot
 
 from fg_calib.analysis.restarts import look_elsewhere
 from fg_calib.analysis.uncertainty import assess
@@ -11,6 +12,8 @@ from fg_calib.files.job import read_job
 from fg_calib.files.robot_yaml import read_robot
 from fg_calib.graph import solver
 from fg_calib.graph.build import build_problem, problem_of
+from fg_calib.graph.solver import solve
+from fg_calib.measurements.dataset import Measurements, rotation_angle
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 
@@ -113,3 +116,24 @@ def test_lost_directions_have_no_second_optimum():
         again = look_elsewhere(solution)
         assert again.others == ()
         assert 2.0 * (again.cost - solution.cost) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", [158, 855, 1357])
+def test_an_angle_that_nominal_has_on_the_other_side_of_half_a_turn_bends_no_arm(seed):
+    """It lies 8 of its sigma or more from half a turn, but tolerances of 2 mrad put nominal on the other side."""
+    rng = np.random.default_rng(seed)
+    robot = small_arm(tolerance={"a": 1e-3, "d": 1e-3, "alpha": 2e-3, "theta": 2e-3})
+    true, n, sigma = true_robot(robot, rng), 14, 2e-4
+    q, a = rng.uniform(-2, 2, (n, 4)), np.arange(n)
+    b = (a + 5) % n
+    at = pose(true, q)
+    angle = rotation_angle(np.swapaxes(at.rotation[a], 1, 2) @ at.rotation[b])[0] + sigma * rng.normal(size=n)
+    angle[np.pi - angle < 8 * sigma] = np.nan
+    distance = np.linalg.norm(at.position[b] - at.position[a], axis=1) + sigma * rng.normal(size=n)
+    pairs = {"a": a, "b": b, "distance": distance, "angle": angle, "sigma_distance": sigma, "sigma_angle": sigma}
+    first = solve(build_problem(robot, Measurements.from_arrays(q, pairs=pairs), model="distance-rotation"))
+    best = look_elsewhere(first)
+    assert first.cost > 400.0
+    assert 2.0 * best.cost < chi2.ppf(0.999, best.problem.n_residuals)
+    assert not best.others
+    assert best.converged

@@ -12,6 +12,7 @@ from tolerances import rounding
 from fg_calib.analysis.accuracy import pose_rms
 from fg_calib.analysis.chi_square import chi2_bounds
 from fg_calib.analysis.uncertainty import assess, marginals
+from fg_calib.errors import InputError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import SolverOptions, solve
 from fg_calib.measurements.dataset import Measurements
@@ -323,3 +324,23 @@ def test_an_error_of_which_rounding_leaves_less_than_nothing_is_unknown():
     points, jacobian = rng.normal(size=(4, 3)), rng.normal(size=(4, 6, 2))
     base, fitted = pose_rms(points, jacobian, lambda rows: np.full(len(rows), -1e-3))
     assert (base.position, base.orientation, fitted.position, fitted.orientation) == (None,) * 4
+
+
+@pytest.mark.parametrize(
+    ("function", "said"),
+    [
+        (lambda robot: 1 / 0, "raised ZeroDivisionError: division by zero, expected figures of any robot"),
+        (lambda robot: "far", "found 'far', expected a number or an array of them"),
+        (lambda robot: [[1.0], [1.0, 2.0]], "found [[1.0], [1.0, 2.0]], expected a number or an array of them"),
+        (lambda robot: 1j, "found 1j, expected a number or an array of them"),
+    ],
+)
+def test_what_a_function_of_ones_own_raises_or_returns_is_one_line(function, said):
+    robot = small_arm(tolerance={"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3})
+    rng = np.random.default_rng(0)
+    found = assess(solve(build_problem(robot, measure(true_robot(robot, rng), 12, rng), model="position")))
+    with pytest.raises(InputError) as error:
+        found.predict(function)
+    assert str(error.value) == f"function: {said}"
+    with pytest.raises(InputError, match=r"^function: 2 figures, expected points, shape \(n, 3\), where errors are f"):
+        found.predict(lambda robot: [1.0, 2.0], fitted=True)

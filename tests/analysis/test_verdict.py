@@ -58,7 +58,8 @@ def healthy(name, rng):
     return build_problem(robot, m, model="distance-rotation", pairing=Pairing(name.split()[0]))
 
 
-@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.usefixtures("without_reasons")
 @pytest.mark.parametrize(
     ("name", "n_runs"),
     {
@@ -234,7 +235,8 @@ def test_touched_points_that_do_not_fit_are_named(fg_calib, tmp_path, mistake):
 # --- priors ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.usefixtures("without_reasons")
 @pytest.mark.parametrize("name", ["pose frame", "star", "touched"])
 def test_healthy_corrections_are_seldom_called_too_large(name):
     """Each of the two alarms at 0.1 %: more than 1 of 60 is unlikely (0.7 %). The p-value by Kolmogorov-Smirnov."""
@@ -348,7 +350,8 @@ def test_a_table_of_test_rows_alone_evaluates_the_arm_as_it_is(fg_calib, tmp_pat
             assert test["p_value"] == pytest.approx(result["chi2_p_value"])
 
 
-@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.usefixtures("without_reasons")
 @pytest.mark.parametrize("name", ["pose joint", "pose frame tool", "star", "touched tool"])
 def test_p_values_of_an_arm_evaluated_as_it_is_are_uniform(name):
     """Kolmogorov-Smirnov at 0.1 %: the fitted frame's degrees of freedom are taken off."""
@@ -421,8 +424,11 @@ def encoders(kind, n, rng, wrong=0.0, sigma_joint=2e-3):
     return robot, m, settings | {"encoder": "estimated"}
 
 
+LONG = pytest.param("pairs", 101, marks=pytest.mark.slow)
+
+
 @pytest.mark.parametrize("wrong", [0.0, 15.0])
-@pytest.mark.parametrize(("kind", "n"), [("pose", 30), ("pose", 120), ("pairs", 30), ("pairs", 101)])
+@pytest.mark.parametrize(("kind", "n"), [("pose", 30), ("pose", 120), ("pairs", 30), LONG])
 def test_a_wrong_encoder_reading_is_written_and_suspect(fg_calib, tmp_path, kind, n, wrong):
     """Up to 100 configurations joint values are variables, beyond that they are eliminated."""
     robot, m, job = encoders(kind, n, np.random.default_rng(61), wrong)
@@ -462,6 +468,7 @@ def test_without_estimated_joint_values_there_is_no_table_of_them(fg_calib, tmp_
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("without_reasons")
 @pytest.mark.parametrize(
     ("model", "frame"), [("pose", "known"), ("position", "unknown"), ("distance-rotation", "known")]
 )

@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,13 +15,15 @@ from tolerances import rounding
 from fg_calib.analysis.uncertainty import assess
 from fg_calib.baseline import comparison as comparison_module
 from fg_calib.baseline.comparison import ESTIMATORS, best_rigid_fit, compare, real_errors
-from fg_calib.errors import InputError
+from fg_calib.errors import InputError, ProblemError
 from fg_calib.files.csv_writer import write_csv
 from fg_calib.files.job import read_job
 from fg_calib.files.robot_yaml import write_robot
 from fg_calib.graph.build import build_problem, problem_of
 from fg_calib.graph.solver import solve
 from fg_calib.job import Job
+from fg_calib.measurements.dataset import Measurements
+from fg_calib.measurements.series import Table
 from fg_calib.options import Options, Pairing
 from fg_calib.report.comparison import format_comparison
 from fg_calib.report.documents import comparison_document
@@ -421,3 +424,14 @@ def test_comparing_bad_input_is_one_line(fg_calib, tmp_path):
     ended = fg_calib("compare", tmp_path / "nowhere.yaml")
     assert (ended.code, ended.out) == (1, "")
     assert ended.err == f"error: {tmp_path / 'nowhere.yaml'}: no such file\n"
+
+
+def test_several_tables_are_named_and_refused():
+    robot = planar_robot(tolerance={"a": 1e-3, "theta": 1e-3})
+    tables = tuple(Table(Measurements.from_arrays(np.zeros((3, 2)), source=name), "distance") for name in ("a", "b"))
+    with pytest.raises(ProblemError) as found:
+        compare(Job(Path("tables.yaml"), robot, tables, Options()))
+    assert str(found.value) == (
+        "tables.yaml: measurements: 2 tables (a, b), expected one: plain least squares, which the graph is compared "
+        "with, takes no more; give one of them as the path of a table"
+    )

@@ -403,7 +403,7 @@ def test_scipy_takes_fewer_rows_than_unknowns():
 ROBOT = planar_robot()
 MISTAKES = [
     ({"model": "poses"}, "model: found 'poses', expected one of pose, position, orientation, distance, rotation, "
-     "distance-rotation; did you mean pose?"),
+     "distance-rotation, anchor, plane, board, pixels; did you mean pose?"),
     ({"method": "newton"}, "method: found 'newton', expected one of gauss-newton, scipy"),
     ({"frame": "lost"}, "frame: found 'lost', expected one of known, unknown"),
     ({"max_iterations": 0}, "max_iterations: found 0, expected a whole number not below 1"),

@@ -5,6 +5,7 @@ import json
 import math
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from tolerances import rounding
 from typer.testing import CliRunner
 
 from fg_calib import __version__, cli, read_measurements, read_robot, write_robot
+from fg_calib.cli import entry
 from fg_calib.files.units import Units
 from fg_calib.robot.model import Joint, RobotBuilder
 
@@ -35,7 +37,7 @@ NUMBER = (int, float)
 def calibrated(tmp_path_factory):
     """A folder with the bundled example, calibrated into `result`, and what the command printed."""
     folder = Path(shutil.copytree(cli.EXAMPLES / "space-robot", tmp_path_factory.mktemp("cli") / "job"))
-    ended = CliRunner().invoke(cli.app, ["calibrate", str(folder / JOB), "--out", str(folder / "result")])
+    ended = CliRunner().invoke(entry.app, ["calibrate", str(folder / JOB), "--out", str(folder / "result")])
     return folder, ended
 
 
@@ -250,7 +252,7 @@ def test_an_existing_folder_keeps_its_other_files(fg_calib, example):
     out = example / "result"
     out.mkdir()
     (out / "notes.txt").write_text("mine")
-    (out / "result.json").write_text("old")
+    (out / "result.json").write_text('{\n "schema": "fg-calib/result/1",\n}')
     assert fg_calib("calibrate", example / JOB, "--out", out).code == 0
     assert {f.name for f in out.iterdir()} == OUTPUTS | {"notes.txt"}
     assert (out / "notes.txt").read_text() == "mine"
@@ -327,6 +329,19 @@ def test_wrong_usage_is_exit_code_2(fg_calib, arguments):
     assert "Traceback" not in ended.err
 
 
+@pytest.mark.parametrize(
+    ("arguments", "what"),
+    [
+        (("calibrate", ""), "an argument"),
+        (("calibrate", "job.yaml", "--out", ""), "--out"),
+        (("calibrate", "job.yaml", "--out="), "--out"),
+    ],
+)
+def test_an_empty_argument_is_not_the_current_folder(fg_calib, arguments, what):
+    """A shell makes one of `"$FOLDER"` where that is not set."""
+    assert fg_calib(*arguments) == (2, "", f"error: {what} is empty; is a variable of the shell not set?\n")
+
+
 def test_the_version_is_printed(fg_calib):
     assert fg_calib("--version") == (0, f"fg-calib {__version__}\n", "")
 
@@ -341,6 +356,12 @@ def test_the_example_is_written_and_its_next_step_named(fg_calib, tmp_path):
     )
     assert sorted(f.name for f in out.iterdir()) == names
     assert all((out / n).read_bytes() == (cli.EXAMPLES / "space-robot" / n).read_bytes() for n in names)
+
+
+def test_the_next_step_can_be_copied_whatever_the_folder_is_called(fg_calib, tmp_path):
+    out = tmp_path / "an arm's demo"
+    step = fg_calib("example", "space-robot", "--out", out).err.partition("now: fg-calib ")[2]
+    assert shlex.split(step) == ["calibrate", str(out / JOB), "--out", str(out / "result")]
 
 
 def test_the_example_overwrites_nothing(fg_calib, tmp_path):
@@ -452,7 +473,8 @@ BAD = {
     "unknown key in the job": (
         sub(JOB, "^pairing", "pairng"),
         "calibration.yaml: unknown key 'pairng', expected one of robot, measurements, pairs, model, pairing, frame, "
-        "units, noise, prior, gauge, prefer, pair_errors, encoder, loss, max_iterations, truth; did you mean pairing?",
+        "units, noise, prior, gauge, prefer, pair_errors, encoder, loss, max_iterations, truth, targets, anchors, "
+        "tolerance, offset, camera, columns; did you mean pairing?",
     ),
     "unknown key in the robot": (
         sub(ROBOT, "^fixed", "fixd"),
@@ -462,7 +484,7 @@ BAD = {
     "unknown key in the noise": (
         sub(JOB, "joint: 0.005", "joints: 0.005"),
         "calibration.yaml: noise: unknown key 'joints', expected one of position, orientation, joint, distance, angle, "
-        "point, estimate; did you mean joint?",
+        "point, pixel, estimate; did you mean joint?",
     ),
     "unknown parameter in fixed": (
         sub(ROBOT, "^fixed: .*", "fixed: [a1, a8]"),
@@ -485,11 +507,14 @@ BAD = {
         sub(JOB, "angle: deg", "angle: rad"),
         "poses.csv:2: q1 = 75.6136 rad is outside [-3.14159, 3.14159]; is the table in deg?",
     ),
-    "outside the limits": (cell(2, "q1", "181"), "poses.csv:3: q1 = 181 deg is outside [-180, 180]"),
+    "outside the limits": (
+        cell(2, "q1", "181"),
+        "poses.csv:3: q1 = 181 deg is outside [-180, 180]; widen the joint's limits if the reading is right",
+    ),
     "an unusable model": (
         sub(JOB, "^model: .*", "model: distances"),
         "calibration.yaml: model: found 'distances', expected one of pose, position, orientation, distance, rotation, "
-        "distance-rotation; did you mean distance?",
+        "distance-rotation, anchor, plane, board, pixels; did you mean distance?",
     ),
     "a model without its orientations": (
         without("qx", "qy", "qz", "qw"),
@@ -649,7 +674,7 @@ def test_units_of_files_do_not_change_the_result(fg_calib, example):
             example / "converted.csv",
             given.readings * angle,
             given.position * length,
-            Rotation.from_matrix(given.rotation).as_quat(),
+            Rotation.from_matrix(given.rotation.copy()).as_quat(),
             id=given.ids,
             split=np.where(given.test, "test", "train"),
         )

@@ -177,12 +177,12 @@ def test_a_robot_without_links_has_none_to_name(fg_calib, example):
         (
             ("{robot}", "--configurations", "{poses}", "--angle", "deg", "--position-noise", "0"),
             1,
-            "position: found 0.0",
+            "--position-noise: found 0.0, expected a finite number above 0",
         ),
         (
             ("{robot}", "--configurations", "{poses}", "--angle", "deg", "--joint-noise", "-1"),
             1,
-            "noise: joint: found -",
+            "--joint-noise: found -1.0, expected a finite number not below 0",
         ),
         ((), 2, "ROBOT"),
     ],
@@ -198,3 +198,10 @@ def test_what_it_refuses(fg_calib, example, tmp_path, arguments, code, message):
     if code == 1:
         assert ended.err.startswith("error: ")
         assert ended.err.count("\n") == 1
+
+
+def test_the_model_that_was_asked_for_is_named(fg_calib, example, tmp_path):
+    ended = fg_calib("observe", example / "robot_nominal.yaml", "--model", "pixels", "--out", tmp_path / "out")
+    assert ended.out.startswith("space-robot: pixels, as poses of the board, structural, ")
+    document = json.loads((tmp_path / "out" / "observability.json").read_text())
+    assert document["model"] == document["with_fixed_known"]["model"] == "pixels"

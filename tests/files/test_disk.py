@@ -1,5 +1,6 @@
 """Folders that are filled: all files or none, whatever interrupts, and the next one makes it good."""
 
+import json
 import os
 import signal
 import subprocess
@@ -11,14 +12,15 @@ import pytest
 
 from fg_calib import Calibration, InputError, calibrate_job
 from fg_calib.files import disk
-from fg_calib.files.disk import fill_folder, finish, require_writable
+from fg_calib.files.disk import exists, fill_folder, read_bytes, require_writable
 
 FILES = ("one", "two", "three")
+OWN = dict.fromkeys((*FILES, "four"), b"")
 
 
-def write(text):
+def write(text, names=FILES):
     def fill(into):
-        for name in FILES:
+        for name in names:
             (into / name).write_text(text)
 
     return fill
@@ -45,27 +47,37 @@ def counted(original):
             os.kill(os.getpid(), signal.SIGKILL)
         return original(*a, **k)
     return call
-for name in ("rename", "replace", "rmdir", "write_text", "iterdir", "mkdir"):
-    setattr(Path, name, counted(getattr(Path, name)))
+for name in ("rename", "replace", "rmdir", "mkdir", "unlink", "listdir"):
+    setattr(os, name, counted(getattr(os, name)))
 def write(into):
     for name in {FILES!r}:
         (into / name).write_text({text!r})
-fill_folder(Path({str(folder)!r}), write)
+fill_folder(Path({str(folder)!r}), write, {OWN!r})
 """
     return subprocess.run([sys.executable, "-c", code], check=False).returncode
 
 
-@pytest.mark.parametrize("moment", range(0, 14))
+def read(folder):
+    """What a reader finds, who moves nothing."""
+    before = sorted(folder.rglob("*"))
+    found = {name: read_bytes(folder / name).decode() for name in OWN if exists(folder / name)}
+    assert sorted(folder.rglob("*")) == before
+    return found
+
+
+@pytest.mark.parametrize("moment", range(0, 20))
 def test_a_kill_at_any_moment_leaves_the_old_or_the_new_for_the_next_reader(tmp_path, moment):
-    fill_folder(tmp_path, write("old"))
+    old, new = dict.fromkeys(("two", "four", "one"), "old"), dict.fromkeys(FILES, "new")
+    fill_folder(tmp_path, write("old", old), OWN)
     ended = killed_at(tmp_path, moment, "new")
     assert ended in (0, -signal.SIGKILL)
-    finish(tmp_path)
-    found, _ = content(tmp_path)
-    assert found in (dict.fromkeys(FILES, "old"), dict.fromkeys(FILES, "new"))
+    found = read(tmp_path)
+    assert found in (old, new)
     if ended == 0:
-        assert found["one"] == "new"
-    fill_folder(tmp_path, write("newer"))  # and what a killed process left is cleared away
+        assert found == new
+    require_writable(tmp_path)  # and what a killed process left is made good and cleared away
+    assert content(tmp_path) == (found, 0)
+    fill_folder(tmp_path, write("newer"), OWN)
     assert content(tmp_path) == (dict.fromkeys(FILES, "newer"), 0)
 
 
@@ -77,11 +89,29 @@ def test_some_moment_is_a_kill_and_some_is_not(tmp_path):
 
 def test_many_writers_at_once_leave_the_files_of_one(tmp_path):
     folder = tmp_path / "new"
+    sets = (FILES, ("one", "four"))
     with ThreadPoolExecutor(8) as pool:
-        [*pool.map(lambda k: fill_folder(folder, write(str(k))), range(40))]
+        [*pool.map(lambda k: fill_folder(folder, write(str(k), sets[k % 2]), OWN), range(40))]
     found, hidden = content(folder)
     assert len(set(found.values())) == 1
+    assert sorted(found) == sorted(sets[int(found["one"]) % 2])
     assert hidden == 0
+
+
+def test_a_writer_that_was_held_up_removes_nothing_of_the_next(tmp_path, monkeypatch):
+    """It wants to remove what the writer that overtook it has written."""
+    replace, overtaken = os.replace, []
+
+    def held_up(source, target, **folders):
+        if Path(source).name == "four" and not overtaken:
+            overtaken.append(True)
+            fill_folder(tmp_path, write("next", ("four",)), OWN)
+        return replace(source, target, **folders)
+
+    monkeypatch.setattr(os, "replace", held_up)
+    fill_folder(tmp_path, write("first"), OWN)
+    assert content(tmp_path) == ({"four": "next"}, 0)
+    assert overtaken
 
 
 def test_a_failure_leaves_nothing_and_no_folder(tmp_path):
@@ -127,8 +157,60 @@ def test_a_result_that_was_written_but_not_moved_is_read(example):
     for file in [*folder.iterdir()]:
         if file.is_file():
             file.rename(within / file.name)
+            (folder / file.name).write_text("of an earlier time")
     assert Calibration.load(folder).parameters == calibration.parameters
+    assert within.exists()  # nothing is moved to be read
+    calibration.save(folder)
     assert not within.exists()
+
+
+def test_a_job_that_was_written_but_not_moved_is_read_whole(example, fg_calib, tmp_path):
+    for seed in (1, 3):
+        assert fg_calib("simulate", "space-robot", "--out", tmp_path / str(seed), "--seed", seed).code == 0
+    expected = fg_calib("calibrate", tmp_path / "3" / "calibration.yaml", "--json").out
+    within = tmp_path / "1" / disk._WRITTEN
+    (tmp_path / "3").rename(within)
+    (within / "robot_nominal.yaml").rename(tmp_path / "1" / "robot_nominal.yaml")
+    found = fg_calib("calibrate", tmp_path / "1" / "calibration.yaml", "--json").out
+    assert json.loads(found)["parameters"] == json.loads(expected)["parameters"]
+
+
+@pytest.mark.parametrize("link", ["folder", "nothing", "a file"])
+def test_what_only_has_the_name_of_files_not_yet_moved_is_left_alone(tmp_path, link):
+    others, folder = tmp_path / "others", tmp_path / "folder"
+    fill_folder(others, write("of a victim"))
+    fill_folder(folder, write("old"))
+    within = folder / disk._WRITTEN
+    if link == "a file":
+        within.write_text("")
+    else:
+        within.symlink_to(others if link == "folder" else "nowhere")
+    assert read_bytes(folder / "one") == b"old"
+    with pytest.raises(
+        InputError, match=r"\.fg-calib-written: is no folder of written files, expected none; remove it$"
+    ):
+        fill_folder(folder, write("new"))
+    assert content(others) == (dict.fromkeys(FILES, "of a victim"), 0)
+
+
+def test_links_among_files_not_yet_moved_are_refused(tmp_path):
+    (tmp_path / disk._WRITTEN).mkdir()
+    (tmp_path / disk._WRITTEN / "one").symlink_to("/etc/hostname")
+    with pytest.raises(InputError, match=r"\.fg-calib-written/one: is no file, expected files alone; remove it$"):
+        fill_folder(tmp_path, write("new"))
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
+def test_files_of_another_user_that_are_not_yet_moved_are_neither_read_nor_moved(tmp_path):
+    (tmp_path / "one").write_text("old")
+    within = tmp_path / disk._WRITTEN
+    within.mkdir()
+    (within / "one").write_text("another's")
+    os.chown(within, 12345, 12345)
+    for access in (lambda: read_bytes(tmp_path / "one"), lambda: fill_folder(tmp_path, write("new"))):
+        with pytest.raises(InputError, match="fg-calib-written: files of another user, expected none"):
+            access()
+    assert (tmp_path / "one").read_text() == "old"
 
 
 def test_what_cannot_be_moved_is_said(tmp_path):
@@ -136,17 +218,39 @@ def test_what_cannot_be_moved_is_said(tmp_path):
     (tmp_path / disk._WRITTEN / "one").write_text("new")
     (tmp_path / "one").mkdir()
     with pytest.raises(InputError, match="holds files that could not be moved to their places: Is a directory"):
-        finish(tmp_path)
+        require_writable(tmp_path)
 
 
 def test_no_file_of_an_earlier_result_stays_beside_a_new_one(example):
     job, folder = example / "calibration.yaml", example / "result"
-    (folder).mkdir()
-    for name in ("joints.csv", "robot_calibrated.urdf", "mine.txt"):
+    calibration = calibrate_job(job)
+    calibration.save(folder)
+    (folder / "joints.csv").write_text("id,joint,unit,reading,estimate,error\n")
+    for name in ("robot_calibrated.urdf", "mine.txt"):
         (folder / name).write_text("old")
-    calibrate_job(job).save(folder)
+    calibration.save(folder)
     names = sorted(file.name for file in folder.iterdir())
     assert names == ["mine.txt", "residuals.csv", "result.json", "robot_calibrated.yaml"]
+
+
+@pytest.mark.parametrize("name", ["joints.csv", "residuals.csv", "robot_calibrated.yaml", "result.json"])
+def test_results_replace_results_and_nothing_else(example, fg_calib, name):
+    (example / name).write_text("q1,mine\n")
+    before = {file.name: file.read_bytes() for file in example.iterdir()}
+    ended = fg_calib("calibrate", example / "calibration.yaml", "--out", example)
+    expected = f"error: {example / name}: is there already, not written by this command, expected another folder\n"
+    assert ended == (1, "", expected)
+    assert {file.name: file.read_bytes() for file in example.iterdir()} == before
+
+
+def test_a_table_that_was_put_among_results_is_not_removed(example, fg_calib):
+    out = example / "result"
+    assert fg_calib("calibrate", example / "calibration.yaml", "--out", out).code == 0
+    assert fg_calib("calibrate", example / "calibration.yaml", "--out", out).code == 0
+    (out / "joints.csv").write_text("q1,mine\n")
+    ended = fg_calib("calibrate", example / "calibration.yaml", "--out", out)
+    expected = f"error: {out / 'joints.csv'}: is there already, not written by this command, expected another folder\n"
+    assert ended == (1, "", expected)
 
 
 def test_results_do_not_replace_what_they_are_of(example, fg_calib):
@@ -166,7 +270,8 @@ def test_a_simulation_replaces_a_simulation_and_nothing_else(fg_calib, tmp_path)
     assert fg_calib("simulate", "space-robot", "--out", tmp_path, "--seed", 3).code == 0
     (tmp_path / "calibration.yaml").write_text("model: pose\n")
     ended = fg_calib("simulate", "space-robot", "--out", tmp_path, "--seed", 4)
-    expected = f"error: {tmp_path / 'calibration.yaml'}: is there already, expected a folder without it\n"
+    found = "is there already, not written by this command, expected another folder"
+    expected = f"error: {tmp_path / 'calibration.yaml'}: {found}\n"
     assert ended == (1, "", expected)
     assert (tmp_path / "calibration.yaml").read_text() == "model: pose\n"
 

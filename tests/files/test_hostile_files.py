@@ -52,7 +52,8 @@ def test_no_yaml_hangs_or_ends_in_a_traceback(tmp_path, text):
 TABLES = {
     ROWS.encode("utf-16"): f"poses.csv: {UTF_16}",
     ROWS.replace("0.2", "9" * 200_000): f"poses.csv:2: q2: found '{'9' * 56}..., expected a finite number",
-    ROWS.replace("0.2", '"0.2'): "poses.csv:3: 2 cells, expected 6 as in the header",
+    ROWS.replace("0.2", '"0.2'): "poses.csv:2: 2 cells, expected 6 as in the header; "
+    "a quote joins it with lines below: is one missing?",
     "\n\n" + ROWS.replace("0.2", ""): "poses.csv:4: q2: found an empty cell, expected a finite number",
     ROWS.replace("0.2", "1e200"): f"poses.csv:2: q2: found '1e200', expected {ORDINARY}",
     ROWS + ",,,,,7\n": "poses.csv:4: q1: found an empty cell, expected a finite number",
@@ -97,6 +98,33 @@ def test_a_parquet_file_may_have_blanks_about_its_names(tmp_path):
     assert found.position[1].tolist() == [4.0, 5.0, 6.0]
 
 
+@pytest.mark.parametrize("ending", ["csv", "parquet", "frame"])
+def test_a_column_is_no_pattern(tmp_path, ending):
+    """Polars takes * for all columns, and ^...$ for those that it matches."""
+    arm = Robot.from_dh(ROWS_OF_DH[:2], convention="dh", names=["*", "^.*$"])
+    frame = pl.DataFrame({"*": [0.1], "^.*$": [0.2], "^a$": [9.0], "row of the file": [3]})
+    file = tmp_path / f"poses.{ending}"
+    if ending != "frame":
+        frame.write_csv(file) if ending == "csv" else frame.write_parquet(file)
+    assert read_measurements(frame if ending == "frame" else file, arm).readings.tolist() == [[0.1, 0.2]]
+
+
+def test_joints_may_be_called_in_capitals(tmp_path):
+    (tmp_path / "poses.csv").write_text(ROWS.replace("q1,q2", "Q1,Q2"))
+    assert read_measurements(tmp_path / "poses.csv", ARM).readings.shape == (2, 3)
+
+
+def test_cells_of_several_types_are_all_read(tmp_path):
+    """None becomes an empty cell in silence."""
+    columns = {"q1": [1, 0.5], "q2": ["0.25", 1], "q3": [np.float32(0.5), 10**400], "id": [1, "b"]}
+    with pytest.raises(InputError) as error:
+        read_measurements(columns, ARM)
+    assert str(error.value) == f"frame: row 1: q3: found '1{'0' * 55}..., expected a finite number"
+    found = read_measurements(columns | {"q3": [0.5, 0.75]}, ARM)
+    assert found.readings.tolist() == [[1.0, 0.25, 0.5], [0.5, 1.0, 0.75]]
+    assert found.ids.tolist() == ["1", "b"]
+
+
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
 def test_columns_of_no_use_cost_next_to_nothing(tmp_path, ending):
     wide = pl.read_csv(ROWS.encode()).with_columns(**{f"c{i}": pl.lit("?") for i in range(1200)})
@@ -125,6 +153,16 @@ def test_a_header_of_another_case_is_understood_and_one_nearly_right_is_told_of(
     assert found.test.tolist() == [True]
     assert found.position.tolist() == [[1.0, 2.0, 3.0]]
     assert caplog.messages == ["poses.csv: column 'sigma_positon' is not used; did you mean sigma_position?"]
+
+
+def test_columns_that_look_as_if_they_were_used_are_told_of(tmp_path, caplog):
+    names = ["sigma_joint", "sigma_yaw", "sigma_pos", "sigma_position [mm]", "X", "note"]
+    (tmp_path / "poses.csv").write_text(",".join(["q1,q2,q3,x,y,z", *names]) + "\n0,0,0,1,2,3" + ",1" * 6 + "\n")
+    read_measurements(tmp_path / "poses.csv", ARM)
+    sigmas = ["distance", "orientation", "pixel", "point", "position", "rx", "ry", "rz", "u", "v", "x", "y", "z"]
+    said = f"sigmas are {', '.join(f'sigma_{name}' for name in sigmas)}"
+    expected = [f"poses.csv: column {name!r} is not used; {said}" for name in names[:4]]
+    assert caplog.messages == [*expected, "poses.csv: column 'X' is not used; x is"]
 
 
 @pytest.mark.parametrize(

@@ -102,6 +102,21 @@ def test_a_full_job_is_converted_to_si(folder):
     assert job.inputs["pairs.csv"] == sha256(folder / "pairs.csv")
 
 
+def test_tables_have_columns_of_their_own_names(folder):
+    """For all tables at the top, or in a table's own entry; figures are in the table's units after their scale."""
+    (folder / "robots" / "robot.yaml").write_text(ROBOT.replace("joints", "units: {angle: deg}\njoints"))
+    (folder / "counts.csv").write_text("C1;C2;X;Y;Z\n180;20;1000,5;0;0\n0;10;0;0;0\n")
+    own = "{q1: {name: C1, scale: 0.5, zero: 160}, q2: C2, x: X, y: Y, z: Z}"
+    units = "units: {length: mm, angle: deg}\n"
+    job = JOB.replace("model: pose", "model: position").replace("poses.csv", "counts.csv") + units
+    data = read(folder, f"{job}columns: {own}\n").measurements
+    assert data.readings[0].tolist() == pytest.approx([np.deg2rad(10.0), 0.02], rel=1e-15)
+    assert data.position[0].tolist() == [1.0005, 0.0, 0.0]
+    entry = f"\n  - {{table: counts.csv, columns: {own}}}"
+    (table,) = read(folder, job.replace(" counts.csv", entry)).measurements
+    assert table.measurements.readings.tolist() == data.readings.tolist()
+
+
 def test_noise_of_orientations_is_converted_too(folder):
     (folder / "poses.csv").write_text("q1,q2,qx,qy,qz,qw\n0,0,0,0,0,1\n")
     job = read(folder, JOB + "units: {angle: mrad}\nnoise: {orientation: 2, joint: [1, 0.5]}\n")
@@ -136,7 +151,7 @@ def test_a_robot_may_be_a_file_or_stand_in_the_job(folder, robot, files):
 
 KEYS = (
     "one of robot, measurements, pairs, model, pairing, frame, units, noise, prior, gauge, prefer, "
-    "pair_errors, encoder, loss, max_iterations, truth"
+    "pair_errors, encoder, loss, max_iterations, truth, targets, anchors, tolerance, offset, camera, columns"
 )
 MISTAKES = [
     ("", "calibration.yaml: an empty file, expected a mapping, key: value"),
@@ -145,7 +160,7 @@ MISTAKES = [
     (JOB + "measurments: a\n",
      f"calibration.yaml: unknown key 'measurments', expected {KEYS}; did you mean measurements?"),
     (JOB.replace("pose\n", "poses\n"), "calibration.yaml: model: found 'poses', expected one of pose, position, "
-     "orientation, distance, rotation, distance-rotation; did you mean pose?"),
+     "orientation, distance, rotation, distance-rotation, anchor, plane, board, pixels; did you mean pose?"),
     (JOB + "frame: free\n", "calibration.yaml: frame: found 'free', expected one of known, unknown"),
     (JOB + "prior: 1\n", "calibration.yaml: prior: found 1, expected true or false"),
     (JOB + "loss: tukey\n",
@@ -154,7 +169,8 @@ MISTAKES = [
     (JOB + "pair_errors: both\n",
      "calibration.yaml: pair_errors: found 'both', expected one of shared, independent"),
     (JOB + "pairing: stars\n",
-     "calibration.yaml: pairing: found 'stars', expected one of star, chain, all, {random: N, seed: S}"),
+     "calibration.yaml: pairing: found 'stars', expected one of star, chain, all, {random: N, seed: S}; "
+     "did you mean star?"),
     (JOB + "pairing: {random: 0}\n", "calibration.yaml: pairing: random: found 0, expected a number above 0"),
     (JOB + "pairing: {random: yes}\n", "calibration.yaml: pairing: random: found True, expected a whole number"),
     (JOB + "pairing: {random: 1.5}\n", "calibration.yaml: pairing: random: found 1.5, expected a whole number"),
@@ -162,7 +178,7 @@ MISTAKES = [
      "calibration.yaml: pairing: unknown key 'sed', expected one of random, seed; did you mean seed?"),
     (JOB + "units: {angle: grad}\n", "calibration.yaml: units: angle: found 'grad', expected one of rad, deg, mrad"),
     (JOB + "noise: {postion: 1}\n", "calibration.yaml: noise: unknown key 'postion', expected one of position, "
-     "orientation, joint, distance, angle, point, estimate; did you mean position?"),
+     "orientation, joint, distance, angle, point, pixel, estimate; did you mean position?"),
     (JOB + "noise: {position: 0}\n", "calibration.yaml: noise: position: found 0, expected a number above 0"),
     (JOB + "noise: {angle: low}\n", "calibration.yaml: noise: angle: found 'low', expected a finite number"),
     (JOB + "noise: {joint: -1}\n", "calibration.yaml: noise: joint: found -1, expected a number not below 0"),

@@ -12,7 +12,8 @@ from fg_calib.errors import InputError
 from fg_calib.files.robot_yaml import read_robot
 from fg_calib.files.scenario import SCENARIOS, read_scenario
 from fg_calib.measurements.dataset import Noise
-from fg_calib.simulation.scenario import BoardViews, Errors, GivenReadings, Placement, RandomReadings
+from fg_calib.simulation.configurations import BoardViews, GivenReadings, Placement, RandomReadings
+from fg_calib.simulation.scenario import Errors
 
 ROBOT = """\
 convention: mdh
@@ -185,7 +186,7 @@ def test_a_job_may_state_another_noise_than_the_true_one(folder):
     assert s.stated_noise.joint == pytest.approx((math.radians(1), 2e-3))
 
 
-KEYS = "one of name, robot, units, errors, configurations, noise, frame, validation, job"
+KEYS = "one of name, robot, units, errors, configurations, noise, frame, validation, job, instruments"
 KINDS = "one of a, alpha, base, d, theta, tool"
 S = "scenario.yaml: "
 
@@ -260,10 +261,11 @@ MISTAKES = [
     (SHORT + "frame: {w: 1}\n", S + "frame: unknown key 'w', expected one of x, y, z, roll, pitch, yaw"),
     (SHORT + "units: {length: km}\n", S + "units: length: found 'km', expected one of m, cm, mm, um"),
     (SHORT + "job: {model: poses}\n", S + "job: model: found 'poses', expected one of pose, position, orientation, "
-     "distance, rotation, distance-rotation; did you mean pose?"),
+     "distance, rotation, distance-rotation, anchor, plane, board, pixels; did you mean pose?"),
     (SHORT + "job: {pairing: star}\n", S + "job: missing key 'model'"),
     (SHORT + "job: {model: pose, pairing: stars}\n",
-     S + "job: pairing: found 'stars', expected one of star, chain, all, {random: N, seed: S}"),
+     S + "job: pairing: found 'stars', expected one of star, chain, all, {random: N, seed: S}; "
+     "did you mean star?"),
     (SHORT + "job: {model: pose, prefer: [x1]}\n", S + "job: prefer: unknown parameter 'x1', expected one of base.x, "
      "base.y, base.z, base.yaw, base.pitch, base.roll, a1, alpha1, d1, theta1, a2, alpha2, ..."),
     (SHORT + "job: {model: pose, robot: r.yaml}\n",

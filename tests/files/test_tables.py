@@ -12,6 +12,7 @@ from oracle import frame
 from tolerances import rounding
 
 from fg_calib.errors import InputError
+from fg_calib.files.columns import Column
 from fg_calib.files.csv_writer import write_csv
 from fg_calib.files.tables import read_measurements
 from fg_calib.files.units import Units
@@ -126,6 +127,91 @@ def test_blank_lines_and_quotes_and_a_byte_order_mark_are_tolerated(write):
     assert read_measurements(path, ARM).readings.tolist() == [[0, 0, 0], [1, 1, 0.1]]
 
 
+@pytest.mark.parametrize("ends", ["\n\n\n", "\r\n\n", "\n\r\n", "\n\n\r", "\r\r\n", "\r\r\r"], ids=repr)
+def test_no_row_is_lost_to_a_mixture_of_line_ends(write, ends):
+    text = "".join(line + end for line, end in zip(("q1,q2,q3,note", "0.1,0,0,", "0.2,0,0,"), ends, strict=True))
+    assert read_measurements(write(text), ARM).readings[:, 0].tolist() == [0.1, 0.2]
+    assert read_measurements(write(text.replace("\r", "\r\r\n")), ARM).readings[:, 0].tolist() == [0.1, 0.2]
+
+
+SPREADSHEET = """\
+id;q1;q2;q3;x;y;z;roll;pitch;yaw
+p1;0,1;-0,25;1e-1;1,5;2;3;0;0;0
+"a;b";,5;1;0;1.5;2,;3;0;0;0
+"""
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_cells_may_have_semicolons_or_tabs_between_and_numbers_decimal_commas(write, separator):
+    """As spreadsheets write them where the comma is the decimal point."""
+    text = SPREADSHEET.replace('"a;b"', "a,b").replace(";", separator)
+    found = read_measurements(write(text), ARM)
+    assert found.readings.tolist() == [[0.1, -0.25, 0.1], [0.5, 1.0, 0.0]]
+    assert found.position.tolist() == [[1.5, 2.0, 3.0], [1.5, 2.0, 3.0]]
+    assert found.ids.tolist() == ["p1", "a,b"]
+    assert read_measurements(write(SPREADSHEET), ARM).ids.tolist() == ["p1", "a;b"]
+
+
+def test_pairs_may_have_semicolons_too(write):
+    found = read_measurements(write(POSES), ARM, pairs=write("a;b;distance\np1;p2;0,5\n", "pairs.csv"))
+    assert found.pairs.distance.tolist() == [0.5]
+
+
+OWN = {"q1": Column("J1 [counts]", scale=0.001, zero=32768), "q2": Column(" A2 "), "q3": Column("lift axis")}
+
+
+def test_columns_have_names_of_their_own_and_figures_their_scale(write):
+    """Counts of an encoder, whose zero and size the user knows; a column that a name would have meant is not used."""
+    text = "J1 [counts],A2,lift axis,x,y,z,X\n33268,0.2,0.1,1,2,3,9\n32768,0.3,0.2,4,5,6,8\n"
+    found = read_measurements(write(text), ARM, columns=OWN | {"x": Column("X", scale=-2.0)})
+    exact = rounding(np.array([[0.5, 0.2, 0.1], [0.0, 0.3, 0.2]]))
+    np.testing.assert_allclose(found.readings, [[0.5, 0.2, 0.1], [0.0, 0.3, 0.2]], rtol=0, atol=exact)
+    assert found.position.tolist() == [[-18.0, 2.0, 3.0], [-16.0, 5.0, 6.0]]
+    table = {"J1 [counts]": [33268, 32768], "A2": [0.2, 0.3], "lift axis": [0.1, 0.2]}
+    assert (
+        read_measurements(write(table, "poses.parquet"), ARM, columns=OWN).readings.tolist() == found.readings.tolist()
+    )
+    assert read_measurements(table, ARM, columns=OWN).readings.tolist() == found.readings.tolist()
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"q1": "J1"}, "columns: q1: found 'J1', expected a Column, such as Column('J1')"),
+        ({"q1": Column("J2")}, "poses.csv: columns: q1: unknown column 'J2', expected one of J1, x"),
+        ({"Q1": Column("J1")}, "poses.csv: columns: unknown column 'Q1', expected one of {known}; did you mean q1?"),
+        (
+            {"q1": Column("J1"), "q2": Column("J1")},
+            "poses.csv: columns: the table's: two columns called 'J1', expected different names",
+        ),
+    ],
+)
+def test_a_mistake_in_names_of_columns_is_named(write, columns, message):
+    with pytest.raises(InputError) as caught:
+        read_measurements(write("J1,x\n0,0\n"), ARM, columns=columns)
+    start, known, end = message.partition("{known}")
+    assert str(caught.value).startswith(start)
+    assert str(caught.value).endswith(end)
+    assert known or str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (("",), "columns: name: found '', expected the name of a column"),
+        ((3,), "columns: name: found 3, expected the name of a column"),
+        (("a", 0), "columns: a: scale: found 0, expected a finite number other than 0"),
+        (("a", math.inf), "columns: a: scale: found inf, expected a finite number other than 0"),
+        (("a", 1.0, math.nan), "columns: a: zero: found nan, expected a finite number"),
+        (("a", 1.0, "x"), "columns: a: zero: found 'x', expected a number"),
+    ],
+)
+def test_a_column_without_a_meaning_is_refused(given, message):
+    with pytest.raises(InputError) as caught:
+        Column(*given)
+    assert str(caught.value) == message
+
+
 def test_parquet_and_csv_read_the_same(write):
     csv = read_measurements(write(POSES), ARM, pairs=write(PAIRS, "pairs.csv"))
     columns = pl.read_csv(write(POSES).read_bytes().replace(b" 0.5 ", b"0.5")).to_dict()
@@ -188,6 +274,14 @@ def test_pairs_name_configurations_by_row_where_there_are_no_ids(write):
     assert read_measurements(path, ARM, pairs=rounded).pairs.angle.tolist() == [math.pi]
 
 
+def test_row_numbers_may_be_whole_floats_and_ids_with_a_hash_are_names(write):
+    pairs = write("a,b,distance\n0.0,1.0,0.5\n", "pairs.csv")
+    found = read_measurements(write("id,q1,q2,q3\n#1,0,0,0\n#2,1,0,0\n"), ARM)
+    assert found.ids.tolist() == ["#1", "#2"]
+    found = read_measurements(write("q1,q2,q3\n0,0,0\n1,0,0\n"), ARM, pairs=pairs)
+    assert (found.pairs.a.tolist(), found.pairs.b.tolist()) == ([0], [1])
+
+
 def test_integer_ids_match_between_csv_and_parquet(write):
     poses = write({"id": [10, 20], "q1": [0, 1], "q2": [0, 0], "q3": [0.0, 0.1]}, "poses.parquet")
     m = read_measurements(poses, ARM, pairs=write("a,b,distance\n20,10,0.5\n", "pairs.csv"))
@@ -202,6 +296,8 @@ def changed(old, new, table=POSES):
 
 COLUMNS = "id, x, y, z, qx, qy, qz, qw, split, note"
 JOINTS = "expected q1 to q3 for the robot's 3 joints, or their names q1, q2, lift; the columns are"
+WIDEN = "; widen the joint's limits if the reading is right"
+
 MISTAKES = [
     ("", "poses.csv:1: an empty file, expected a header and rows"),
     ("q1,q2,q3\n", "poses.csv: no rows, expected at least one"),
@@ -211,7 +307,6 @@ MISTAKES = [
     (changed("q3,id", "q3,q4"),
      f"poses.csv: 4 joint columns (q1, q2, q3, q4), {JOINTS} q1, q2, q3, q4, {COLUMNS[4:]}"),
     ("q1,lift\n0,0\n", f"poses.csv: 2 joint columns (q1, lift), {JOINTS} q1, lift"),
-    ("x;y\n0;0\n", f"poses.csv: no joint columns, {JOINTS} x;y"),
     (changed(",z,", ",w,"), "poses.csv: no column z, expected x y z together"),
     (changed(",qw,", ",w,"), "poses.csv: no column qw, expected qx qy qz qw together"),
     ("q1,q2,q3,roll,yaw\n0,0,0,0,0\n", "poses.csv: no column pitch, expected roll pitch yaw together"),
@@ -233,16 +328,17 @@ MISTAKES = [
     (changed("p2", ""), "poses.csv:3: id: found an empty cell, expected an id"),
     (changed("p2,", ""), "poses.csv:3: 12 cells, expected 13 as in the header"),
     (changed("first", "first,2"), "poses.csv:2: 14 cells, expected 13 as in the header"),
-    ('q1,q2,q3\n"0,0,0\n', "poses.csv:2: 1 cells, expected 3 as in the header"),
+    ('q1,q2,q3\n"0,0,0\n', "poses.csv:2: 1 cell, expected 3 as in the header; "
+     "a quote joins it with lines below: is one missing?"),
     (
         b"q1,q2,q3\n0,0,\xe9\n",
         "poses.csv:2: byte 0xe9, expected UTF-8 text; is it Latin-1 or Windows text? save it as UTF-8",
     ),
-    (changed("1e-3", "2.092"), "poses.csv:3: q1 = 2.092 rad is outside [-2.09, 2.09]; is the table in deg?"),
-    (changed("1e-3", "4.71"), "poses.csv:3: q1 = 4.71 rad is outside [-2.09, 2.09]; is the table in deg?"),
-    (changed("1e-3", "200"), "poses.csv:3: q1 = 200 rad is outside [-2.09, 2.09]"),
+    (changed("1e-3", "2.092"), f"poses.csv:3: q1 = 2.092 rad is outside [-2.09, 2.09]{WIDEN}"),
+    (changed("1e-3", "4.71"), "poses.csv:3: q1 = 4.71 rad is outside [-2.09, 2.09]; is q1 in deg?"),
+    (changed("1e-3", "200"), f"poses.csv:3: q1 = 200 rad is outside [-2.09, 2.09]{WIDEN}"),
     (changed("0.2,0.3", "0.2,300"), "poses.csv:2: q3 = 300 m is outside [0, 0.5]; is the table in mm?"),
-    (changed("0.2,0.3", "0.2,-0.01"), "poses.csv:2: q3 = -0.01 m is outside [0, 0.5]"),
+    (changed("0.2,0.3", "0.2,-0.01"), f"poses.csv:2: q3 = -0.01 m is outside [0, 0.5]{WIDEN}"),
     ("q1,q2,q3,x,y,z,sigma_position\n0,0,0,0,0,0,1\n0,0,0,0,0,0,-1\n",
      "poses.csv:3: sigma_position: found '-1', expected a number above 0"),
     ("q1,q2,q3,x,y,z,sigma_x,sigma_y,sigma_z\n0,0,0,0,0,0,1,0,1\n",
@@ -264,7 +360,7 @@ def test_a_mistake_is_named_in_one_line(write, table, message):
 PARQUET_MISTAKES = [
     (b"nothing", "poses.parquet: not a Parquet file: "),
     ({"q1": [0.0, 3.0], "q2": [0.0, 0.0], "q3": [0.0, 0.0]},
-     "poses.parquet: row 1: q1 = 3 rad is outside [-2.09, 2.09]; is the table in deg?"),
+     f"poses.parquet: row 1: q1 = 3 rad is outside [-2.09, 2.09]{WIDEN}"),
     ({"q1": [0.0, None], "q2": [0.0, 0.0], "q3": [0.0, 0.0]},
      "poses.parquet: row 1: q1: found an empty cell, expected a finite number"),
     ({"q1": [0.0, 0.0], "q2": [math.nan, 0.0], "q3": [0.0, 0.0]},
@@ -286,7 +382,7 @@ def test_a_mistake_in_parquet_is_named_by_its_row(write, table, message):
 def test_the_hint_asks_about_degrees_only_where_the_table_is_in_radians(write):
     with pytest.raises(InputError) as caught:
         read_measurements(write("q1,q2,q3\n150,0,0\n"), ARM, units=Units(angle="deg"))
-    assert str(caught.value) == "poses.csv:2: q1 = 150 deg is outside [-119.748, 119.748]"
+    assert str(caught.value) == f"poses.csv:2: q1 = 150 deg is outside [-119.748, 119.748]{WIDEN}"
 
 
 def test_a_joint_without_limits_that_seems_to_be_in_degrees_is_warned_of(write, caplog):

@@ -163,6 +163,12 @@ def test_an_unchanged_robot_is_written_as_it_was(tree, tmp_path):
     assert written == original
 
 
+def test_an_encoding_that_python_does_not_know_is_a_line(tmp_path):
+    (tmp_path / "arm.urdf").write_text(TREE.replace('"1.0"?>', '"1.0" encoding="ARMSCII-8"?>'))
+    with pytest.raises(InputError, match=r"^arm\.urdf: text in ARMSCII-8, expected text in UTF-8; save it"):
+        read_urdf(tmp_path / "arm.urdf", tip_link="tool")
+
+
 def test_other_encodings_survive(tmp_path):
     text = TREE.replace('"1.0"?>', '"1.0" encoding="ISO-8859-1"?>').replace("a torso", "ein Körper")
     (tmp_path / "in.urdf").write_bytes(text.encode("latin-1"))
@@ -360,7 +366,7 @@ MISTAKES = [
      "torso.urdf: link 'left_1' is the child of joints 'l1' and 'r1', expected one"),
     (changed('<parent link="world"/><child link="left_1"/>', '<parent link="left_tip"/><child link="left_1"/>'),
      {"base_link": "left_1", "tip_link": "left_tip"},
-     "torso.urdf: link 'left_1' is above itself, expected a tree of links"),
+     "torso.urdf: links in a circle: left_1 below left_tip below left_2 below left_1, expected a tree of links"),
     (changed('name="l1" type="revolute"', 'name="l1" type="floating"'), {"tip_link": "left_tip"},
      "torso.urdf: joint 'l1': type floating, expected revolute, continuous, prismatic or fixed on the chain"),
     (changed('name="l1" type="revolute"', 'name="l1" type="planar"'), {"tip_link": "left_tip"},
@@ -393,18 +399,20 @@ MISTAKES = [
     (changed('upper="2"', 'upper="2 rad"'), {"tip_link": "left_tip"},
      "torso.urdf: joint 'l1': limit upper: found '2 rad', expected a number"),
     (changed('upper="2"', 'upper="nan"'), {"tip_link": "left_tip"},
-     "torso.urdf: joint 'l1': limit: lower -1.5, upper nan, expected lower below upper"),
+     "torso.urdf: joint 'l1': limit upper: found 'nan', expected a number"),
     (changed('name="l1" type="revolute"', 'name="l1"'), {"tip_link": "left_tip"},
-     "torso.urdf: joint 'l1': type None, expected revolute, continuous, prismatic or fixed on the chain"),
+     "torso.urdf: joint 'l1': no type, expected revolute, continuous, prismatic or fixed on the chain"),
     (changed('<child link="left_1"/>', "<child/>"), {},
      "torso.urdf:11: joint 'l1': no <child>, expected <child link=\"...\"/>"),
     (changed('<link name="left_1"/>', "<link/>"), {}, "torso.urdf:5: a link without a name"),
     (changed('<robot name="torso">', '<robot name="torso" xmlns="http://www.ros.org">'), {},
      "torso.urdf: root element <{http://www.ros.org}robot>, expected <robot>"),
     (changed("</robot>", "<xacro:arm/></robot>"), {},
-     "torso.urdf:26: not XML: Namespace prefix xacro on arm is not defined, line 26, column 11"),
+     "torso.urdf:26: not XML: Namespace prefix xacro on arm is not defined, line 26, column 11; "
+     "it holds elements of xacro: expand them by `xacro arm.urdf.xacro > arm.urdf`"),
     (changed("l1", "tool"), {"tip_link": "left_tip"},
-     "torso.urdf: two joints share a name, or one is called base or tool, expected different names"),
+     "torso.urdf: two frames called 'tool', expected different names; "
+     "base and tool are the frames before and behind the joints"),
 ]  # fmt: skip
 
 
@@ -489,3 +497,16 @@ def test_tool_and_base_may_be_given_as_for_a_table_of_dh(tmp_path):
     assert listed.nominal.tolist() == named.nominal.tolist()
     with pytest.raises(InputError, match=r"tool: shape \(2,\)"):
         read_urdf(file, tool=[0.02, 0])
+
+
+def test_what_is_nearly_an_element_of_a_joint_is_told_of(tmp_path, caplog):
+    inner = '<orign xyz="1 0 0"/><axes xyz="0 0 1"/><limit min="-1" effort="1"/><origin pos="1"/><dynamics/>'
+    joint = f'<joint name="j" type="revolute"><parent link="a"/><child link="b"/>{inner}</joint>'
+    (tmp_path / "arm.urdf").write_text(f'<robot name="r"><link name="a"/><link name="b"/>{joint}</robot>')
+    read_urdf(tmp_path / "arm.urdf")
+    assert caplog.messages == [
+        "arm.urdf:1: joint 'j': element <orign> is not used; did you mean origin?",
+        "arm.urdf:1: joint 'j': element <axes> is not used; did you mean axis?",
+        "arm.urdf:1: joint 'j': attribute min of <limit> is not used; known are lower, upper, effort, velocity",
+        "arm.urdf:1: joint 'j': attribute pos of <origin> is not used; known are xyz, rpy",
+    ]

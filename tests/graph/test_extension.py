@@ -10,7 +10,7 @@ from tolerances import rounding
 
 from fg_calib.analysis.uncertainty import assess
 from fg_calib.analysis.variance_components import estimate_noise
-from fg_calib.errors import InputError, ProblemError
+from fg_calib.errors import InputError, ProblemError, SolverError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.extension import DistanceFactor, RotationAngleFactor, expand
 from fg_calib.graph.factors import prior_factors
@@ -357,3 +357,104 @@ def test_what_was_solved_with_pairs_and_a_tool_can_be_solved_again():
     again = solve(first.problem)
     sigma = np.array([p.sigma or np.inf for p in assess(first).parameters])
     assert np.abs((again.parameters - first.parameters)[: len(sigma)] / sigma).max() < 1e-6
+
+
+K1, T0 = gtsam.symbol("K", 1), gtsam.symbol("T", 0)
+TIPS = [f"tool.{kind}" for kind in ("x", "y", "z", "roll", "pitch", "yaw")]
+
+
+def damaged(damage):
+    """A small problem, with something done to its graph or its initial values."""
+    rng = np.random.default_rng(1)
+    robot = small_arm({"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3, "tool": 1e-3}, TIPS)
+    problem = build_problem(robot, measure(true_robot(robot, rng), 12, rng), model="pose")
+    damage(problem)
+    return problem
+
+
+def with_value(key, value):
+    def damage(problem):
+        problem.initial.erase(key)
+        problem.initial.insert(key, value)
+
+    return damage
+
+
+def with_factor(factor):
+    return lambda problem: problem.graph.add(factor)
+
+
+def custom(error):
+    return with_factor(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), [K1], error))
+
+
+def fails(*_):
+    raise ZeroDivisionError("mine")
+
+
+UNIT = gtsam.noiseModel.Unit.Create
+DAMAGES = {
+    "emptied": (lambda p: p.graph.resize(0), "problem.graph: 0 of the problem's 6 factors, expected all of them, in "
+                "their places"),
+    "longer": (lambda p: p.graph.resize(9), "problem.graph: None among its factors, expected factors"),
+    "no start": (lambda p: p.initial.erase(K1), "problem.initial: no value of K(1), expected one for every variable of "
+                 "the problem"),
+    "no starts": (lambda p: p.initial.clear(), "problem.initial: no value of K(1), expected one for every variable of "
+                  "the problem"),
+    "a longer start": (with_value(K1, np.zeros(7)), "problem.initial: K(1): 7 numbers, expected 4 finite numbers"),
+    "a start of another type": (with_value(T0, np.zeros(6)), "problem.initial: T(0): a value of another type, expected "
+                                "a gtsam.Pose3"),
+    "a start that is nan": (with_value(K1, np.full(4, np.nan)), "problem.initial: K(1): a number that is not finite, "
+                            "expected 4 finite numbers"),
+    "a factor of other size": (with_factor(gtsam.PriorFactorVector(K1, np.zeros(3), UNIT(3))), "problem.graph: added "
+                               "PriorFactorVector on K1: raised ValueError: NoiseModelFactor: NoiseModel has dimension "
+                               "3 instead of 4."),
+    "a factor at nan": (with_factor(gtsam.PriorFactorVector(K1, np.full(4, np.nan), UNIT(4))), "problem.graph: added "
+                        "PriorFactorVector on K1: an error of nan at the initial values, expected a finite one"),
+    "a factor that raises": (custom(fails), "problem.graph: added CustomFactor on K1: raised ZeroDivisionError: mine"),
+    "a factor of no numbers": (custom(lambda *_: None), "problem.graph: added CustomFactor on K1: raised RuntimeError: "
+                               "None is only valid for an optional Matrix pointer"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("function", [solve, expand])
+@pytest.mark.parametrize("name", DAMAGES)
+def test_what_is_wrong_with_a_graph_is_said_in_one_line(name, function):
+    damage, said = DAMAGES[name]
+    problem = damaged(damage)
+    with pytest.raises(ProblemError) as found:
+        function(problem)
+    assert str(found.value) == said
+
+
+def test_what_a_factor_raises_on_the_way_is_one_line():
+    calls = []
+
+    def error(_, values, H):
+        calls.append(0)
+        if len(calls) > 3:
+            raise ValueError("out of\nreach")
+        if H is not None:
+            H[0] = np.ones((1, 4), order="F")
+        return np.array([float(np.sum(values.atVector(K1)))])
+
+    with pytest.raises(SolverError, match=r"^out of reach$") as found:
+        solve(damaged(custom(error)))
+    assert isinstance(found.value.__cause__, ValueError)
+
+
+def test_what_was_added_is_expanded_too():
+    def anchored(problem):
+        problem.graph.add(gtsam.PriorFactorVector(ANCHOR, np.ones(3), UNIT(3)))
+        problem.initial.insert(ANCHOR, np.zeros(3))
+
+    without, _ = expand(damaged(lambda _: None))
+    graph, initial = expand(damaged(anchored))
+    assert graph.size() == without.size() + 1
+    assert initial.exists(ANCHOR)
+
+
+def test_an_angle_is_at_most_half_a_turn():
+    variables = damaged(lambda _: None).variables
+    with pytest.raises(InputError, match=r"^angle: found 4\.0, expected 0 to pi, in rad$"):
+        RotationAngleFactor(variables, np.zeros(4), np.ones(4), 4.0, 1e-3)

@@ -65,6 +65,7 @@ CELLS = {
 EVERY_CELL = pytest.mark.parametrize(("robot", "model", "gauge", "options"), CELLS.values(), ids=CELLS.keys())
 
 
+@pytest.mark.usefixtures("without_reasons")
 @EVERY_CELL
 def test_intervals_hold_the_truth(robot, model, gauge, options):
     """Roughly: 4 draws, the intervals of one of which depend on each other. Sigmas half as large hold 67 %."""
@@ -72,7 +73,8 @@ def test_intervals_hold_the_truth(robot, model, gauge, options):
         assert share > 0.8, (of, n)
 
 
-@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.usefixtures("without_reasons")
 @EVERY_CELL
 def test_intervals_hold_the_truth_95_times_in_100(robot, model, gauge, options):
     """Were the intervals of a draw one and the same, the share would be within the bounds in 99.9 % of all runs."""

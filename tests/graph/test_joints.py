@@ -171,12 +171,12 @@ def everything_given_the_noise(solution):
 @pytest.mark.parametrize(
     ("kind", "model", "options"),
     [
-        ("poses", "pose", {"frame": "unknown"}),
+        pytest.param("poses", "pose", {"frame": "unknown"}, marks=pytest.mark.slow),
         ("poses", "distance-rotation", {"pairing": Pairing("star")}),
-        ("poses", "distance-rotation", {"pairing": Pairing("all")}),
-        ("poses", "distance", {"pairing": Pairing("chain"), "loss": "huber"}),
-        ("poses", "pose", {"loss": "cauchy"}),
-        ("direct", "distance-rotation", {"loss": "gnc"}),
+        pytest.param("poses", "distance-rotation", {"pairing": Pairing("all")}, marks=pytest.mark.slow),
+        pytest.param("poses", "distance", {"pairing": Pairing("chain"), "loss": "huber"}, marks=pytest.mark.slow),
+        pytest.param("poses", "pose", {"loss": "cauchy"}, marks=pytest.mark.slow),
+        pytest.param("direct", "distance-rotation", {"loss": "gnc"}, marks=pytest.mark.slow),
     ],
 )
 def test_eliminated_joint_values_have_the_optimum_over_everything(kind, model, options):

@@ -8,15 +8,16 @@ import polars as pl
 import pytest
 import scipy.optimize
 import yaml
+from instruments import measured_by
 from scipy.spatial.transform import Rotation
-from simulated import measure, paper_robot, small_arm, true_robot
+from simulated import measure, paper_robot, small_arm, true_robot, write_job
 from test_own_kind import measured
 from touches import corners, touch
 
-from fg_calib import write_robot
+from fg_calib import Measurements, read_job, write_robot
 from fg_calib.analysis.uncertainty import assess
 from fg_calib.analysis.variance_components import estimate_noise
-from fg_calib.errors import ProblemError
+from fg_calib.errors import InputError, ProblemError
 from fg_calib.files.csv_writer import write_csv
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
@@ -84,7 +85,7 @@ def everything(robot, tables, sigma_joint):
     return values, 2.0 * found.cost
 
 
-@pytest.mark.parametrize("sigma_joint", [0.0, 1e-3])
+@pytest.mark.parametrize("sigma_joint", [pytest.param(0.0, marks=pytest.mark.slow), 1e-3])
 def test_the_optimum_is_that_over_everything(sigma_joint):
     """Joint errors of a configuration are the same in both tables."""
     robot, _, tables = mixture(1, sigma_joint=sigma_joint)
@@ -102,7 +103,8 @@ def test_the_optimum_is_that_over_everything(sigma_joint):
     assert apart < (0.5 if sigma_joint else 1e-4)  # to first order the same
 
 
-@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.usefixtures("without_reasons")
 @pytest.mark.parametrize("shared", [True, False])
 def test_sigmas_are_honest(shared):
     """60 draws: the mean of NEES over its degrees of freedom, within five of its sigmas."""
@@ -116,7 +118,8 @@ def test_sigmas_are_honest(shared):
     assert total == pytest.approx(1.0, abs=5 * np.sqrt(2.0 / (n * len(names))))
 
 
-@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.usefixtures("without_reasons")
 def test_sigmas_are_honest_where_a_loss_loses_less_of_lengths_than_of_poses():
     """Cauchy keeps 92 % of what a clean length says, 64 % of what a pose does; both share the joints' errors."""
     nees = []
@@ -347,6 +350,45 @@ def test_a_table_that_is_there_twice_is_refused(models, said):
         build_problem(robot, tables)
 
 
+def pasted(m, rows):
+    """Measurements with these rows, some of them perhaps again, by names of their own."""
+    parts = {name: getattr(m, name)[rows] for name in ("readings", "test", "position", "rotation")}
+    sigmas = {name: getattr(m, name)[rows] for name in ("sigma_position", "sigma_orientation")}
+    return replace(m, ids=np.arange(len(rows)).astype(str), **parts, **sigmas)
+
+
+@pytest.mark.parametrize("model", ["pose", "position", "distance-rotation"])
+def test_a_block_that_was_pasted_twice_into_a_table_is_told_of(model, caplog):
+    rng = np.random.default_rng(9)
+    robot = small_arm(tolerance=TOLERANCE)
+    m = measure(true_robot(robot, rng), 12, rng, sigma=SIGMA)
+    found = "have the readings and figures of another, as '0' and '12'; were they copied? They count as often"
+    for rows, n in (([*range(12), *range(12)], 24), ([*range(12), 0], 2)):
+        build_problem(robot, [Table(pasted(m, rows), model)])
+        assert [r.message for r in caplog.records] == [f"measurements: {n} of {len(rows)} poses {found}"]
+        caplog.clear()
+    again = pasted(m, [*range(12), *range(12)])
+    build_problem(robot, [Table(replace(again, position=again.position + rng.normal(size=(24, 3)) * 1e-4), model)])
+    build_problem(robot, [Table(replace(again, test=np.arange(24) >= 12), model)])
+    assert caplog.records == []
+
+
+def test_pairs_in_both_directions_are_told_of_and_repeats_are_not(caplog):
+    robot, _, (_, table) = mixture(11)
+    m, p = table.measurements, table.measurements.pairs
+    twice = p.select(np.tile(np.arange(p.n_pairs), 2))
+    back = np.arange(twice.n_pairs) >= p.n_pairs
+    both = replace(twice, a=np.where(back, twice.b, twice.a), b=np.where(back, twice.a, twice.b))
+    for pairs, other in ((twice, "0-1"), (both, "1-0")):
+        build_problem(robot, [Table(replace(m, pairs=pairs), "distance")])
+        found = f"30 of 30 pairs have the readings and figures of another, as '0-1' and '{other}'"
+        assert [r.message for r in caplog.records] == [f"pairs.csv: {found}; were they copied? They count as often"]
+        caplog.clear()
+    repeats = replace(both, distance=both.distance + 1e-4 * back)
+    assert build_problem(robot, [Table(replace(m, pairs=repeats), "distance")]).n_residuals == 30
+    assert caplog.records == []
+
+
 def test_other_pairs_of_the_same_poses_are_not_the_same():
     rng = np.random.default_rng(9)
     q = rng.uniform(-np.pi, np.pi, (10, 4))
@@ -362,15 +404,15 @@ def test_other_pairs_of_the_same_poses_are_not_the_same():
     ("keys", "said"),
     [
         ({"measurements": []}, "job.yaml: measurements: found [], expected a path, or a list of tables"),
-        ({"measurements": [{"table": "tracker.csv"}]}, "job.yaml: measurements[0]: missing key 'model'"),
-        ({"measurements": [{"model": "position"}]}, "job.yaml: measurements[0]: missing key 'table'"),
+        ({"measurements": [{"table": "tracker.csv"}]}, "job.yaml: measurement 1: missing key 'model'"),
+        ({"measurements": [{"model": "position"}]}, "job.yaml: measurement 1: missing key 'table'"),
         (
             {"pairs": "lengths.csv"},
             "job.yaml: pairs: beside a list of tables, expected the key in the table's own entry",
         ),
         (
             {"measurements": [{"table": "tracker.csv", "model": "position", "loss": "huber"}]},
-            "job.yaml: measurements[0]: unknown key 'loss'",
+            "job.yaml: measurement 1: unknown key 'loss'",
         ),
     ],
 )
@@ -427,6 +469,7 @@ def test_a_loss_weighs_more_pairs_than_positions_that_share_joint_noise(loss, en
     assert not found.findings
 
 
+@pytest.mark.slow
 def test_a_loss_that_drops_a_whole_table_is_a_finding():
     rng = np.random.default_rng(3)
     robot = small_arm(tolerance=TOLERANCE)
@@ -464,3 +507,58 @@ def test_another_target_on_the_tool_in_one_table_is_named():
     second = replace(measure(true.with_values(values), 30, rng, sigma=(1e-4, 1e-4)), source="second.csv")
     found = assess(solve(build_problem(robot, [first, second], model="position")))
     assert any("tool or base are others here than in the other tables" in text for text in found.findings)
+
+
+def test_a_distance_between_points_that_another_table_touched(tmp_path):
+    """The distance stands beside another table than the touches: the same as beside these."""
+    rng = np.random.default_rng(7)
+    robot = small_arm(tolerance=TOLERANCE)
+    true = true_robot(robot, rng)
+    m = touch(true, corners(robot, 3, rng), 8, rng, distances=((1, 2, 1e-5),))
+    tracker = measure(true, 10, rng, sigma=SIGMA)
+    path = write_job(tmp_path, robot, m)
+    columns = {f"q{i + 1}": q for i, q in enumerate(tracker.readings.T)}
+    write_csv(tmp_path / "tracker.csv", columns | dict(zip("xyz", tracker.position.T, strict=True)))
+    noise = {"position": SIGMA[0], "point": float(m.sigma_point[0])}
+    touches, poses = {"table": "poses.csv", "model": "distance"}, {"table": "tracker.csv", "model": "distance"}
+    found = []
+    for tables in (
+        [touches | {"pairs": "pairs.csv"}, poses],
+        [touches, poses | {"pairs": "pairs.csv"}],
+        [poses | {"pairs": "pairs.csv"}, touches],
+    ):
+        path.write_text(yaml.safe_dump({"robot": "robot.yaml", "noise": noise, "measurements": tables}))
+        job = read_job(path)
+        (between,) = [t.measurements.groups.pairs for t in job.tables
+                      if t.measurements.groups is not None and t.measurements.groups.pairs.n_pairs]  # fmt: skip
+        assert not between.test.any()
+        problem = build_problem(job.robot, job.tables)
+        of_points = [s for s in problem.data.series if s.kind.n_nuisances]
+        found.append({s.kind.names[0]: len(s.train) for s in of_points})
+    assert found == 3 * [{"point.x": 24, "distance": 1}]
+
+
+def test_points_of_another_table_are_named_where_arrays_are_given():
+    pairs = {"a": ["left"], "b": ["right"], "distance": [0.2], "sigma_distance": [1e-5]}
+    m = Measurements.from_arrays(np.zeros((3, 4)), pairs=pairs, points=["left", "right"])
+    assert (m.groups.names, m.groups.pairs.test.tolist()) == (("left", "right"), [False])
+    with pytest.raises(InputError, match="pairs: a: row 0: found 'left', expected an id"):
+        Measurements.from_arrays(np.zeros((3, 4)), pairs=pairs)
+
+
+@pytest.mark.parametrize("instrument", ["anchors", "planes", "board"])
+def test_an_anchor_plane_or_board_of_one_name_in_two_tables_is_one(instrument):
+    """Started by the first table's rows, solved as in one table: to what the rounding of its optimum leaves."""
+    robot, _, table = measured_by(instrument, np.random.default_rng(0), n=60)
+    m = table.measurements
+    parts = [
+        replace(table, measurements=replace(m.select(rows), source=source))
+        for source, rows in (("monday", np.arange(24)), ("tuesday", np.arange(24, 60)))
+    ]
+    whole, mixed = (assess(solve(build_problem(robot, tables))) for tables in (table, parts))
+    rows = [robot.index(name) for name in whole.names]
+    off = (mixed.robot.nominal - whole.robot.nominal)[rows] / np.sqrt(np.diag(whole.covariance))
+    assert np.abs(off).max() < 1e-4
+    named = [[p.name for p in u.points if not p.name.startswith("offset of")] for u in (mixed, whole)]
+    assert named[0] == named[1]
+    assert mixed.chi2 == pytest.approx(whole.chi2, rel=1e-6)

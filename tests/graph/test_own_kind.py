@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import polars as pl
 import pytest
 import scipy.optimize
 from scipy.stats import chi2
@@ -15,7 +16,7 @@ from fg_calib.errors import InputError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.kinds import Kind, Rows
+from fg_calib.measurements.kinds import Distance, Kind, Rows
 from fg_calib.measurements.series import Own, Table
 from fg_calib.report.documents import result_document
 from fg_calib.report.text import format_report
@@ -186,6 +187,22 @@ def test_it_has_residuals_goodness_and_predictions():
     assert document["goodness"]["anchor"]["n"] == 60
 
 
+class AnchorTurns(AnchorDistance):
+    """The same length as the turns of a drum of 1 m radius."""
+
+    units = ("rad",)
+
+
+def test_its_rows_are_in_its_unit_and_in_no_other(tmp_path):
+    robot, _, table = measured(3)
+    result = calibrate(robot, replace(table, own=(replace(table.own[0], kind=AnchorTurns()),)))
+    result.save(tmp_path)
+    assert set(pl.read_csv(tmp_path / "residuals.csv")["unit"]) == {"rad"}
+    size = np.degrees(result.residuals.rms()["train"]["anchor"]["after"])
+    for calibration in (result, Calibration.load(tmp_path)):
+        assert f"-> {size:.3g} deg" in repr(calibration)
+
+
 @pytest.mark.parametrize("loss", ["huber", "cauchy", "geman-mcclure", "gnc"])
 def test_robust_losses_leave_gross_errors_out(loss):
     robot, _, table = measured(4, gross=4)
@@ -229,9 +246,9 @@ class WrongShape(AnchorDistance):
     [
         (
             WrongDerivative(),
-            r"^kind WrongDerivative: wrenches: \S+ where a small change gives \S+, expected ",
+            r"^lengths: kind WrongDerivative: wrenches: \S+ where a small change gives \S+, expected ",
         ),
-        (WrongShape(), r"^kind WrongShape: wrenches: shape \(3, 1, 1, 3\), expected \(3, 1, 1, 6\)$"),
+        (WrongShape(), r"^lengths: kind WrongShape: wrenches: shape \(60, 1, 1, 3\), expected \(60, 1, 1, 6\)$"),
     ],
 )
 def test_a_kind_that_is_wrong_about_itself_is_refused(kind, said):
@@ -243,10 +260,10 @@ def test_a_kind_that_is_wrong_about_itself_is_refused(kind, said):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"data": "far"}, "own: data: found no array of numbers, expected finite numbers"),
-        ({"data": np.full(60, np.nan)}, "own: data: found nan or infinity, expected finite numbers"),
+        ({"data": "far"}, "own: data: found 'far', expected finite numbers"),
+        ({"data": np.full(60, np.nan)}, "own: data: row 0: found nan, expected a finite number$"),
         ({"data": np.zeros((60, 2))}, r"own: data: shape \(60, 2\), expected \(60, 1\)"),
-        ({"sigma": -1.0}, "own: sigma: found -1.0, expected figures above 0"),
+        ({"sigma": -1.0}, "own: sigma: found -1, expected a number above 0"),
         ({"which": np.full((60, 1), 3)}, "own: which: found 3, expected 0 to 2"),
         ({"ends": np.full((60, 1), -1)}, "own: ends: found -1, expected 0 and above"),
         ({"names": ("A", "A", "B")}, r"own: names: found \('A', 'A', 'B'\), expected 3 different names"),
@@ -297,3 +314,137 @@ def test_reasons_beside_a_kind_of_ones_own_do_not_say_what_it_cannot_see():
     reasons = {name: lost.reason for lost in found.lost for name in lost.relation}
     assert "blind to the base" in reasons["d1"]  # the anchors move with it
     assert not any("unseen by" in reason or reason == NOT_EXCITED for reason in reasons.values())
+
+
+def of_kind(kind, **changes):
+    robot, _, table = measured(5, n=12)
+    return build_problem(robot, replace(table, own=(replace(table.own[0], kind=kind, **changes),)))
+
+
+def changed(change):
+    """The kind with something done to its rows."""
+
+    class Mine(AnchorDistance):
+        def rows(self, at, data, nuisances):
+            return change(super().rows(at, data, nuisances))
+
+    return Mine()
+
+
+def described(**attributes):
+    """The kind with other attributes; None of them leaves an attribute out."""
+    own = {name: value for name, value in vars(AnchorDistance).items() if not name.startswith("_")} | attributes
+    return type("Mine", (Kind,), {name: value for name, value in own.items() if value is not None})()
+
+
+def fail(_):
+    raise KeyError("tip")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (fail, "lengths: kind Mine: rows: raised KeyError: 'tip'"),
+        (lambda r: None, "lengths: kind Mine: rows: returned a NoneType, expected Rows(residual, D, N)"),
+        (lambda r: r._replace(residual=r.residual * np.nan), "lengths: kind Mine: residual: row 0: found nan, expected "
+         "a finite number; at the start of the unknowns"),
+        (lambda r: r._replace(wrenches=r.wrenches + np.inf), "lengths: kind Mine: wrenches: row 0: found inf, expected "
+         "a finite number; at the start of the unknowns"),
+        (lambda r: r._replace(residual="far"), "lengths: kind Mine: residual: found 'far', expected numbers of shape "
+         "(12, 1)"),
+        (lambda r: r._replace(residual=[[1.0], [1.0, 2.0]]), "lengths: kind Mine: residual: found [[1.0], [1.0, 2.0]], "
+         "expected numbers of shape (12, 1)"),
+        (lambda r: r._replace(residual=r.residual + 1j), "lengths: kind Mine: residual: found ndarray of shape (12, 1)"
+         ", complex128, expected numbers of shape (12, 1)"),
+        (lambda r: r._replace(nuisances=None), "lengths: kind Mine: nuisances: shape (0,), expected (12, 1, 3)"),
+    ],
+)  # fmt: skip
+def test_what_rows_raise_or_return_is_one_line_that_names_kind_and_table(change, said):
+    with pytest.raises(InputError) as found:
+        of_kind(changed(change))
+    assert str(found.value) == said
+    assert isinstance(found.value.__cause__, KeyError) == (change is fail)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "said"),
+    [
+        ({"ends": None}, "ends: it is missing, expected a whole number, 0 to 2"),
+        ({"ends": 3}, "ends: found 3, expected a whole number, 0 to 2"),
+        ({"residual_dim": "1"}, "residual_dim: found '1', expected a whole number, 1 to 1000"),
+        ({"width": 1.0}, "width: found 1.0, expected a whole number, 0 to 1000"),
+        ({"n_nuisances": True}, "n_nuisances: found True, expected a whole number, 0 to 1000"),
+        ({"names": "anchor"},
+         "names: found 'anchor', expected a tuple of residual_dim = 1 words, such as ('height',)"),
+        ({"units": ("m", "m")}, "units: found ('m', 'm'), expected a tuple of residual_dim = 1 words, such as ('m',)"),
+        ({"units": None}, "units: it is missing, expected a tuple of residual_dim = 1 words, such as ('m',)"),
+        ({"units": ("mm",)}, "units: found ('mm',), expected m, rad or px each"),
+        ({"code": 1}, "code: found 1, expected None: compiled code would take the place of its rows"),
+    ],
+)  # fmt: skip
+def test_what_a_kind_does_not_say_of_itself_is_named(attributes, said):
+    with pytest.raises(InputError) as found:
+        Own(described(**attributes), np.ones(3), SIGMA, unknowns=ANCHORS)
+    assert str(found.value) == f"kind Mine: {said}"
+
+
+def test_a_kind_of_ours_cannot_be_changed_under_its_compiled_twin():
+    class Longer(Distance):
+        def rows(self, at, data, nuisances):
+            return super().rows(at, 1.1 * data, nuisances)
+
+    with pytest.raises(InputError, match="kind Longer: code: found 0, expected None: compiled code would take"):
+        Own(Longer(), np.ones(3), SIGMA, ends=np.zeros((3, 2), int))
+
+
+def test_figures_are_checked_before_anything_is_solved():
+    class Mine(AnchorDistance):
+        def figures(self, data):
+            return data.ravel()
+
+    with pytest.raises(InputError, match=r"^lengths: kind Mine: figures: shape \(12,\), expected \(12, 1\)$"):
+        of_kind(Mine())
+
+
+def test_a_kind_may_compute_in_single_precision():
+    class Single(AnchorDistance):
+        def rows(self, at, data, nuisances):
+            at = at._replace(position=at.position.astype(np.float32))
+            found = super().rows(at, data.astype(np.float32), nuisances.astype(np.float32))
+            return Rows(*(np.float32(array) for array in found))
+
+    class Wrong(Single):
+        def rows(self, at, data, nuisances):
+            found = super().rows(at, data, nuisances)
+            return found._replace(wrenches=np.float32(1.1) * found.wrenches)
+
+    fine, single = of_kind(AnchorDistance()), of_kind(Single())
+    assert single.rows[0].squared_norm(single.variables.at(single.start)) == pytest.approx(
+        fine.rows[0].squared_norm(fine.variables.at(fine.start)), rel=1e-3
+    )
+    with pytest.raises(InputError, match=r"^lengths: kind Wrong: wrenches: \S+ where a small change gives"):
+        of_kind(Wrong())
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"data": ["1.0"] * 60}, "own: data: found ['1.0', '1.0', '1.0', '1.0', '1.0', '1.0', ...], expected finite "
+         "numbers"),
+        ({"sigma": "1e-3"}, "own: sigma: found '1e-3', expected finite numbers"),
+        ({"sigma": 1e-200}, "own: sigma: found 1e-200, expected a number no larger than 1e+15; sigmas and tolerances "
+         "no less than 1e-30"),
+        ({"data": np.ma.masked_array(np.ones(60))}, "own: data: found a masked array, expected finite numbers; nan "
+         "where something was not measured"),
+        ({"data": (x for x in range(60))}, "own: data: found a generator, expected finite numbers; list(...) makes a "
+         "list of it"),
+        ({"names": (1, 2, 3)}, "own: names: found (1, 2, 3), expected a word for each unknown"),
+        ({"names": 3}, "own: names: found 3, expected a list of names"),
+        ({"unknowns": np.zeros((3, 1, 3))}, "own: unknowns: shape (3, 1, 3), expected a start for each unknown; "
+         "AnchorDistance has 3 coordinates of them"),
+    ],
+)  # fmt: skip
+def test_text_and_other_things_are_no_figures(change, said):
+    with pytest.raises(InputError) as found:
+        replace(measured(5)[2].own[0], **change)
+    assert str(found.value) == said

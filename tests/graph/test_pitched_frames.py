@@ -204,6 +204,7 @@ def test_yaw_and_roll_are_relative_at_a_quarter_turn_of_pitch(frame):
     assert apart.observability.rank == 6
 
 
+@pytest.mark.slow
 def test_a_pitched_tool_is_kept_whole():
     """Yaw and roll turn it about one axis only: left to them and pitch it could not turn about the third."""
     robot = pitched("tool", 90.0).with_estimated(TOOL)

@@ -146,7 +146,7 @@ def _robust_factor(block, variables, estimator):
     ],
     ids=["pose", "unknown frame", "star", "all"],
 )
-@pytest.mark.slow
+@pytest.mark.long
 def test_gnc_comes_near_the_clean_fit_where_a_share_of_the_configurations_is_wrong(model, options, share):
     robot = small_arm(tolerance=TOLERANCE)
     test = np.random.default_rng(9).uniform(-np.pi, np.pi, (100, robot.n_joints))
@@ -168,7 +168,8 @@ def test_gnc_comes_near_the_clean_fit_where_a_share_of_the_configurations_is_wro
 
 @pytest.mark.parametrize("loss", ["huber", "gnc"])
 @pytest.mark.parametrize("share", [0.0, 0.2])
-@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.usefixtures("without_reasons")
 def test_sigmas_and_chi_square_hold_with_a_robust_loss(loss, share):
     robot = small_arm(tolerance=TOLERANCE)
     rng = np.random.default_rng(2)

@@ -171,22 +171,22 @@ def test_rows_are_reweighted_at_the_estimate():
     assert np.abs(at_start.sigma / expected.sigma - 1.0).max() > 1e-3
 
 
-@pytest.mark.slow
-def test_a_hundred_thousand_pairs_reach_the_optimum_with_weak_priors():
-    """Where GTSAM's default parameters return the initial values without a word."""
+@pytest.mark.long
+def test_tens_of_thousands_of_pairs_reach_the_optimum_with_weak_priors():
+    """Where GTSAM's default parameters return the first step's values without a word."""
     rng = np.random.default_rng(9)
     robot = paper_robot(tolerance={"a": 0.05, "d": 0.05, "alpha": 0.05, "theta": 0.05, "beta": 0.05})
     true = paper_robot().with_values(
         robot.nominal + 5e-3 * rng.normal(size=len(robot.nominal)) * [p.estimated for p in robot.parameters]
     )
     problem = build_problem(
-        robot, measure(true, 2000, rng), model="distance-rotation", pairing=Pairing("random", 100_000)
+        robot, measure(true, 700, rng), model="distance-rotation", pairing=Pairing("random", 35_000)
     )
     solution = solve(problem)
     assert solution.converged
-    # 200 000 distances and angles of 2000 poses, whose errors they share, hold no more than these: 12 000 figures.
-    assert solution.problem.n_independent == pytest.approx(12_000, rel=0.01)
-    assert 2 * solution.cost == pytest.approx(12_000, rel=5 * np.sqrt(2 / 12_000))
+    # 70 000 distances and angles of 700 poses, whose errors they share, hold no more than these: 4200 figures.
+    assert solution.problem.n_independent == pytest.approx(4200, rel=0.01)
+    assert 2 * solution.cost == pytest.approx(4200, rel=5 * np.sqrt(2 / 4200))
 
 
 def test_where_rounding_hides_the_optimum_nothing_has_converged():

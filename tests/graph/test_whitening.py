@@ -12,6 +12,7 @@ from tolerances import rounding
 from fg_calib.analysis.uncertainty import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.information import correlation, whitened_triangle
+from fg_calib.graph.noise import JOINT_NOISE
 from fg_calib.graph.problem import joint_errors, noises_at, reweighted_at
 from fg_calib.graph.solver import solve
 from fg_calib.measurements import residuals
@@ -154,6 +155,7 @@ def learned(problem, rng):
     weights = tuple(rng.uniform(0.1, 1.0, s.n) for s in problem.data.series)
     kinds = {(s.table, name.split(".")[0]) for s in problem.data.series for name in s.kind.names}
     factors = dict(zip(sorted(kinds), rng.uniform(0.5, 2.0, len(kinds)), strict=True))
+    factors[JOINT_NOISE] = rng.uniform(0.5, 2.0)
     return reweighted_at(problem, problem.start, replace(problem.state, weights=weights, factors=factors))
 
 
@@ -266,7 +268,7 @@ def test_estimated_joint_values_are_those_that_the_dense_covariance_says(kind, a
     check_rows(problem)
     A, L, C = dense(problem, problem.start)
     z = np.einsum("ncj,n->cj", L, np.linalg.solve(C, A[:, -1]))
-    found = joint_errors(problem, problem.start) / problem.data.sigma_joint
+    found = joint_errors(problem, problem.start) / problem.sigma_joint
     seen = np.flatnonzero(L.any(axis=(0, 2)))
     # Steps end with 1e-9 of the Gram matrix left: of the errors, in their sigma, the root of that.
     assert np.abs(found[seen] + z[seen]).max() < np.sqrt(EXACT) * np.sqrt(A[:, -1] @ np.linalg.solve(C, A[:, -1]))

@@ -10,17 +10,26 @@ from tolerances import rounding
 
 from fg_calib.measurements import residuals
 from fg_calib.measurements.kinds import (
+    AnchorContact,
+    AnchorDistance,
+    BoardPose,
+    Camera,
     Distance,
     Frames,
     Kind,
     Orientation,
+    Pixel,
+    PlaneDistance,
     PointDistance,
     Position,
+    RoomPixel,
     RotationAngle,
     Rows,
     SamePoint,
     Stacked,
+    TargetPosition,
     TouchedPoint,
+    check_derivatives,
 )
 from fg_calib.measurements.residuals import Block, pack, unit_whitening, unpack
 from fg_calib.robot.kernels import LANES
@@ -31,7 +40,9 @@ COMPILED = [
     *(Distance(), RotationAngle(), Position(), Orientation(), SamePoint()),
     *(Stacked(Distance(), RotationAngle()), Stacked(Orientation(), Position()), Stacked(Position(), Orientation())),
 ]
-KINDS = [*COMPILED, TouchedPoint(), PointDistance()]
+INSTRUMENTS = [TargetPosition(), AnchorDistance(), AnchorContact(), PlaneDistance(), BoardPose()]
+INSTRUMENTS += [Stacked(Orientation(), TargetPosition())]
+KINDS = [*COMPILED, TouchedPoint(), PointDistance(), *INSTRUMENTS]
 
 
 def name_of(kind):
@@ -54,6 +65,8 @@ def data_of(kind, n, rng):
         return np.concatenate([data_of(part, n, rng) for part in kind.parts], axis=1)
     if isinstance(kind, Orientation):
         return Rotation.random(n, random_state=rng.integers(1000)).as_matrix().reshape(n, 9)
+    if isinstance(kind, BoardPose):
+        return np.hstack([data_of(Orientation(), n, rng), rng.normal(size=(n, 3))])
     return rng.uniform(0.0, 1.0, (n, kind.width))
 
 
@@ -129,6 +142,50 @@ def test_the_reductions_are_those_of_the_rows(kind):
     assert residuals.gram(block, chain) == pytest.approx(expected, abs=rounding(expected, 10))
     assert R.T @ R == pytest.approx(expected, abs=rounding(expected, 10))
     assert residuals.squared_norm(block, chain) == pytest.approx(expected[-1, -1], rel=rounding(1, 10))
+
+
+CAMERA = Camera(fx=900, fy=910, cx=640, cy=480, k1=-0.2, k2=0.1, p1=0.001, p2=-0.002, k3=0.01)
+
+
+def seen_by_camera(n, rng):
+    """Frames of a camera, points of boards, and the boards, all before the camera."""
+    R = Rotation.random(n, random_state=rng.integers(1000)).as_matrix()
+    p, ahead = rng.normal(size=(n, 3)), np.column_stack([0.3 * rng.normal(size=(n, 2)), rng.uniform(3, 4, n)])
+    data = np.hstack([rng.uniform(0, 1000, (n, 2)), rng.uniform(-0.2, 0.2, (n, 2))])
+    return (
+        Frames(R[:, None], p[:, None]),
+        data,
+        np.hstack([rng.normal(size=(n, 3)), p + (R @ ahead[:, :, None])[..., 0]]),
+    )
+
+
+def test_pixels_have_the_derivatives_of_central_differences():
+    at, data, board = seen_by_camera(40, np.random.default_rng(23))
+    check_derivatives(Pixel(CAMERA), at, data, board)
+    in_room = Frames(at.rotation, 0.3 * at.position + [0.0, 0.0, 4.0])
+    check_derivatives(RoomPixel(CAMERA), in_room, data, np.zeros((40, 0)))
+
+
+def test_a_camera_in_the_room_and_one_on_the_tool_see_the_same_board():
+    at, data, board = seen_by_camera(10, np.random.default_rng(24))
+    R, p = at.rotation[:, 0], at.position[:, 0]
+    B, b = Rotation.from_rotvec(board[:, :3]).as_matrix(), board[:, 3:]
+    camera_T_board = Frames((np.swapaxes(R, 1, 2) @ B)[:, None], np.einsum("nji,nj->ni", R, b - p)[:, None])
+    on_tool = Pixel(CAMERA).rows(at, data, board).residual
+    assert RoomPixel(CAMERA).rows(camera_T_board, data, np.zeros((10, 0))).residual == pytest.approx(on_tool, abs=1e-9)
+
+
+def test_an_image_is_that_of_the_textbook():
+    """OpenCV's model written out for one point, 3-D reconstruction section of its manual: x' = 0.1, y' = -0.2."""
+    k1, k2, p1, p2, k3, r2 = -0.2, 0.1, 0.001, -0.002, 0.01, 0.05
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    x = 0.1 * radial + 2 * p1 * 0.1 * -0.2 + p2 * (r2 + 2 * 0.01)
+    y = -0.2 * radial + p1 * (r2 + 2 * 0.04) + 2 * p2 * 0.1 * -0.2
+    assert CAMERA.image(np.array([[0.2, -0.4, 2.0]]))[0][0] == pytest.approx([900 * x + 640, 910 * y + 480])
+
+
+def test_what_is_behind_a_camera_has_no_image_that_leads_anywhere():
+    assert not CAMERA.image(np.array([[0.1, 0.2, -1.0]]))[1].any()
 
 
 class FixedPoint(Kind):

@@ -114,6 +114,29 @@ def test_the_trace_over_the_covariance_is_exact_or_within_its_bound(case, way):
     assert abs(WAYS[way](L).energy(E) - expected) < off
 
 
+@pytest.mark.parametrize("exact", [True, False])
+def test_products_of_covariances_are_exact_or_within_their_bounds(case, exact, monkeypatch):
+    """Estimates to four of their sigmas, at most sqrt(2 / 64) of each; the others to rounding of what cancels.
+
+    Squares of sums of some 24 loadings of 30, of which 1e-9 is left.
+    """
+    L, _, C = case
+    rng = np.random.default_rng(6)
+    roots = [
+        scipy.sparse.diags_array(rng.random(L.shape[0]), format="csr"),
+        scipy.sparse.csr_array(L[:, ::2]),
+        scipy.sparse.csr_array((L.shape[0], 0)),
+    ]
+    if not exact:
+        for name in ("MAX_EXACT", "MAX_DENSE", "FILLED"):
+            monkeypatch.setattr(sharing, name, 0)
+    traces, squares = SharedErrors(L, WIDTH).products(roots)
+    between = [[(E.T @ np.linalg.solve(C, F.toarray())) for F in roots] for E in roots]
+    rel = 4.0 * np.sqrt(2.0 / sharing.N_PROBES) if not exact else 1e-6
+    assert traces == pytest.approx([np.trace(row[i]) for i, row in enumerate(between)], rel=rel)
+    assert squares == pytest.approx(np.array([[np.sum(N**2) for N in row] for row in between]), rel=rel)
+
+
 @pytest.mark.parametrize("weak", [1e-3, 1e-6, 1e-9])
 @pytest.mark.parametrize("way", WAYS)
 def test_weak_directions_survive(halved, way, weak):

@@ -66,19 +66,34 @@ FOUR = [row[:4] for row in ROWS]
         ({"rows": np.zeros((0, 4))}, "rows: no joints, expected at least one"),
         ({"rows": [[0, 1, 2, np.nan]]}, "rows: row 0: found nan, expected a finite number"),
         ({"rows": [[0, 1, 2, "x"]]}, "rows: found .*, expected numbers of shape"),
-        ({"rows": [[0, 90, 2, 0]]}, "rows: row 0: found 90, expected angles in rad, a turn at most; are they in deg?"),
+        (
+            {"rows": [[0, 90, 2, 0]]},
+            "rows: row 0: found 90, expected angles in rad, two turns at most; are they",
+        ),
         ({"rows": ROWS}, r"rows: shape \(3, 5\), expected \(n, 4\): the convention dh has no beta"),
         ({"convention": "DH"}, "convention: found 'DH', expected one of dh, .* did you mean dh?"),
         ({"types": "sliding"}, "types: joint 1: found 'sliding', expected one of revolute, prismatic"),
         ({"types": ["revolute"]}, "types: 1 for 3 joints, expected one a joint"),
         ({"limits": [[0, 1]]}, "limits: 1 for 3 joints"),
-        ({"limits": [[0, 1], [1, 0], None]}, "limits: joint 2: found 1, 0, expected lower below upper"),
+        ({"limits": [[0, 1], [1, 0], None]}, r"limits: joint 2: found \[1, 0\], expected lower below upper"),
         ({"names": ["a", "a", "b"]}, "names: joint 2: found 'a', as before, expected different names"),
         ({"tool": [1, 2]}, r"tool: shape \(2,\), expected \(3\), \(6\) or \(4, 4\)"),
         ({"base": np.ones((4, 4))}, "base: a matrix that is no pose"),
         ({"base": np.diag([1, 1, -1, 1])}, "base: a matrix that is no pose"),
         ({"tolerance": {"a": 0.0}}, "tolerance: a: found 0.0, expected a finite number above 0"),
         ({"tolerance": {"b": 1.0}}, "robot: tolerance: unknown parameter or kind 'b'"),
+        ({"types": 3}, "types: found 3, expected a type, or one a joint$"),
+        ({"limits": 3}, "limits: found 3, expected lower and upper of each joint$"),
+        ({"limits": [1, 2, 3]}, "limits: joint 1: found 1, expected lower below upper, or None$"),
+        ({"limits": [["-1", "1"]] * 3}, "limits: joint 1: found .*'-1', '1'.*, expected lower and upper$"),
+        ({"limits": [[np.nan, 1]] * 3}, r"limits: joint 1: found \[nan, 1\], expected lower below upper, or None$"),
+        ({"names": [1, 2, 3]}, "names: joint 1: found 1, expected a word$"),
+        ({"tolerance": ["a"]}, r"tolerance: found \['a'\], expected a mapping$"),
+        ({"tolerance": {"a": "1e-3"}}, "tolerance: a: found '1e-3', expected a finite number above 0$"),
+        ({"tool": {"w": 1.0}}, "tool: unknown value 'w', expected one of x, y, z, yaw, pitch, roll$"),
+        ({"tool": {"x": "far"}}, r"tool: x: found 'far', expected numbers of shape \(\)$"),
+        ({"estimate": 3}, "estimate: found 3, expected a list of names$"),
+        ({"fixed": [None]}, "robot: fixed: unknown parameter None, expected one of base.x"),
         ({"fixed": ["a9"]}, "robot: fixed: unknown parameter 'a9'"),
     ],
 )
@@ -102,3 +117,41 @@ def test_a_robot_of_many_joints_fits_a_screen():
     assert len(lines) <= 10
     assert max(map(len, lines)) <= 100
     assert lines[0].startswith("Robot 'robot', dh, 30 joints: q1, q2")
+
+
+def test_a_frame_may_be_given_by_kind():
+    assert Robot.from_dh(FOUR, tool={"z": 0.1, "yaw": 0.2}) == Robot.from_dh(FOUR, tool=[0, 0, 0.1, 0, 0, 0.2])
+
+
+def test_the_text_of_a_urdf_is_no_path():
+    with pytest.raises(InputError, match=r"^path: found XML text, expected the path of a URDF; write the text to a f"):
+        Robot.from_urdf('<?xml version="1.0"?>\n<robot name="arm"/>')
+
+
+@pytest.mark.parametrize(("values", "found"), [(None, "shape ()"), ([1.0], "1 values"), ([[1.0]], "shape (1, 1)")])
+def test_values_are_one_a_parameter(values, found):
+    robot = Robot.from_dh(FOUR)
+    with pytest.raises(InputError) as said:
+        robot.with_values(values)
+    assert str(said.value) == f"robot: {found}, expected {len(robot.parameters)}, one a parameter"
+
+
+def test_values_are_finite():
+    robot = Robot.from_dh(FOUR)
+    with pytest.raises(InputError, match=r"^robot: row 3: found nan, expected a finite number$"):
+        robot.with_values([0.0, 0.0, 0.0, np.nan, *robot.nominal[4:]])
+
+
+@pytest.mark.parametrize("tool", [[0, 0, 0.1, 90, 0, 0], {"roll": 90}])
+def test_a_frame_in_degrees_is_refused(tool):
+    with pytest.raises(InputError) as said:
+        Robot.from_dh(FOUR, tool=tool)
+    assert str(said.value) == "tool: roll: found 90, expected angles in rad, two turns at most; is it in deg?"
+
+
+@pytest.mark.parametrize(("limit", "told"), [(170.0, True), (20.0, False)])
+def test_limits_of_many_turns_are_told_of(caplog, limit, told):
+    """Limits in deg refuse no reading, so nothing else would say that their unit is wrong."""
+    Robot.from_dh([[1.0, 0.0, 0.0, 0.0]], convention="dh", limits=[[-limit, limit]])
+    expected = ["robot: joint q1 has limits of -170 to 170 rad; are they in deg?"] if told else []
+    assert caplog.messages == expected

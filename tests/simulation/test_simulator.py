@@ -25,8 +25,10 @@ from fg_calib.files.robot_yaml import read_robot
 from fg_calib.files.scenario import SCENARIOS, read_scenario
 from fg_calib.files.simulation import write_simulation
 from fg_calib.measurements.dataset import Noise
-from fg_calib.simulation.scenario import BoardViews, Errors, GivenReadings, Placement, RandomReadings, Scenario
-from fg_calib.simulation.simulator import FARTHEST_BASE, simulate, view_board
+from fg_calib.simulation.configurations import BoardViews, GivenReadings, Placement, RandomReadings
+from fg_calib.simulation.measuring import FARTHEST_BASE
+from fg_calib.simulation.scenario import Errors, Scenario
+from fg_calib.simulation.simulator import simulate, view_board
 
 FILES = ("calibration.yaml", "poses.csv", "robot_nominal.yaml", "robot_true.yaml")
 BOARD = np.array([0.0, 6.5, 2.55])

@@ -9,12 +9,14 @@ the frame, a parameter, a joint, a frame before or behind the arm, has a (w, dp)
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import NamedTuple
+from numbers import Integral
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.errors import InputError
+from fg_calib.arrays import as_array, as_figures, require
+from fg_calib.errors import InputError, shown
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -52,7 +54,7 @@ class Kind(ABC):
 
     Attributes:
         names: What its rows are called, such as `position.x`: kind of noise, then component.
-        units: Unit of each row, `m` or `rad`.
+        units: Unit of each row, `m`, `rad` or `px`.
         ends: Configurations of one measurement: 1, 2, or 0 if it is of nuisances alone.
         residual_dim: Rows of residual.
         width: Columns of data that it reads.
@@ -103,78 +105,174 @@ class Kind(ABC):
         return hash(type(self))
 
 
-def checked_rows(kind: Kind, at: Frames, data: Floats, nuisances: Floats) -> tuple[Floats, Floats, Floats]:
-    """`Kind.rows` as arrays of the shapes that it must have.
+def is_ours(kind: Kind) -> bool:
+    """Whether a kind is one of the package's, which the tests check."""
+    return type(kind).__module__.startswith("fg_calib.")
+
+
+def check_kind(kind: Kind) -> None:
+    """Check what a kind of one's own says of itself.
 
     Raises:
-        InputError: One has another shape, or no numbers.
+        InputError: Something is missing, of another type, or contradicts the rest.
     """
+    place = f"kind {type(kind).__name__}"
+    for name, (least, most) in _COUNTS.items():
+        value = getattr(kind, name, None)
+        if not isinstance(value, Integral) or isinstance(value, bool) or not least <= int(value) <= most:
+            found = f"found {shown(value)}" if hasattr(kind, name) else "it is missing"
+            raise InputError(f"{place}: {name}", found, f"a whole number, {least} to {most}")
+    n = kind.residual_dim
+    for name, what in (("names", "('height',)"), ("units", "('m',)")):
+        value = getattr(kind, name, None)
+        if not isinstance(value, tuple | list) or len(value) != n or not all(isinstance(v, str) and v for v in value):
+            found = f"found {shown(value)}" if hasattr(kind, name) else "it is missing"
+            raise InputError(f"{place}: {name}", found, f"a tuple of residual_dim = {n} words, such as {what}")
+    if not set(kind.units) <= {"m", "rad", "px"}:
+        raise InputError(f"{place}: units", f"found {shown(kind.units)}", "m, rad or px each")
+    if not is_ours(kind) and len(_called(kind, "twins")):
+        found = f"found {shown(kind.code)}"
+        raise InputError(f"{place}: code", found, "None: compiled code would take the place of its rows")
+
+
+_COUNTS = {"ends": (0, 2), "residual_dim": (1, 1000), "width": (0, 1000), "n_nuisances": (0, 1000)}
+"""Least and most of what a kind says of its sizes."""
+
+
+def _called(kind: Kind, method: str, *arguments: Any, source: str = "") -> Any:
+    """What a method of a kind returns; what it raises becomes one line.
+
+    Raises:
+        InputError: It raised something.
+    """
+    try:
+        return getattr(kind, method)(*arguments)
+    except Exception as error:
+        message = f"{type(error).__name__}: {error}".rstrip(": ")
+        raise InputError(_place(kind, method, source), f"raised {message}") from error
+
+
+def _place(kind: Kind, name: str, source: str) -> str:
+    return f"{source}{': ' * bool(source)}kind {type(kind).__name__}: {name}"
+
+
+def checked_rows(
+    kind: Kind, at: Frames, data: Floats, nuisances: Floats, source: str = ""
+) -> tuple[Floats, Floats, Floats]:
+    """`Kind.rows` as arrays of the shapes that it must have.
+
+    Args:
+        kind: The kind.
+        at: Tool frames of the measurements.
+        data: What was measured.
+        nuisances: Values of the nuisances.
+        source: The table that they are from, for messages.
+
+    Raises:
+        InputError: It raised something, or one has another shape, or no numbers.
+    """
+    found = _raw_rows(kind, at, data, nuisances, source)
     n = len(at.position)
-    found = kind.rows(at, data.copy(), nuisances)
-    if not isinstance(found, tuple) or len(found) != len(Rows._fields):
-        raise InputError(
-            f"kind {type(kind).__name__}: rows", f"returned a {type(found).__name__}", "Rows(residual, D, N)"
-        )
     none = np.zeros((n, kind.residual_dim, 0)) if kind.n_nuisances == 0 else np.zeros(0)
     shapes = ((n, kind.residual_dim), (n, kind.ends, kind.residual_dim, 6), (n, kind.residual_dim, kind.n_nuisances))
     arrays = []
     for name, given, shape in zip(Rows._fields, found, shapes, strict=True):
-        array = np.ascontiguousarray(none if given is None else given, dtype=np.float64)
+        place = _place(kind, name, source)
+        numbers = as_array(place, none if given is None else given, "iuf", f"numbers of shape {shape}")
+        array = np.ascontiguousarray(numbers, dtype=np.float64)
         if array.shape != shape:
-            raise InputError(f"kind {type(kind).__name__}: {name}", f"shape {array.shape}", f"{shape}")
+            raise InputError(place, f"shape {array.shape}", f"{shape}")
         arrays.append(array)
     return arrays[0], arrays[1], arrays[2]
 
 
-def check_derivatives(kind: Kind, at: Frames, data: Floats, nuisances: Floats) -> None:
-    """Compare what a kind says of its derivatives with differences.
+def _raw_rows(kind: Kind, at: Frames, data: Floats, nuisances: Floats, source: str) -> Rows:
+    found = _called(kind, "rows", at, data.copy(), nuisances.copy(), source=source)
+    if not isinstance(found, tuple) or len(found) != len(Rows._fields):
+        place = _place(kind, "rows", source)
+        raise InputError(place, f"returned a {type(found).__name__}", "Rows(residual, D, N)")
+    return Rows(*found)
+
+
+def checked_figures(kind: Kind, data: Floats, source: str) -> Floats:
+    """`Kind.figures` as an array of the shape that it must have.
+
+    Raises:
+        InputError: It raised something, or has another shape, or no numbers.
+    """
+    place, shape = _place(kind, "figures", source), f"({len(data)}, {kind.residual_dim})"
+    found = as_figures(place, _called(kind, "figures", data.copy(), source=source), f"numbers of shape {shape}")
+    if found.shape != (len(data), kind.residual_dim):
+        raise InputError(place, f"shape {found.shape}", shape)
+    return found
+
+
+def check_start(kind: Kind, at: Frames, data: Floats, nuisances: Floats, source: str) -> None:
+    """Check that residuals and derivatives are finite where a kind is started, and its figures are figures.
+
+    Raises:
+        InputError: They are not.
+    """
+    for name, array in zip(Rows._fields, checked_rows(kind, at, data, nuisances, source), strict=True):
+        place = _place(kind, name, source)
+        require(np.isfinite(array), place, array, "a finite number", "at the start of the unknowns")
+    checked_figures(kind, data, source)
+
+
+def check_derivatives(kind: Kind, at: Frames, data: Floats, nuisances: Floats, source: str = "") -> None:
+    """Compare what a kind says of its derivatives with differences; coarsely, where it computes in float32.
 
     Args:
         kind: The kind.
         at: Tool frames of some measurements.
         data: What was measured.
         nuisances: Values of the nuisances.
+        source: The table that they are from, for messages.
 
     Raises:
         InputError: They differ by more than differences do.
     """
-    _, D, N = checked_rows(kind, at, data, nuisances)
+    fine = np.asarray(_raw_rows(kind, at, data, nuisances, source).residual).dtype.itemsize >= np.float64().itemsize
+    step, alike = (_STEP, _ALIKE) if fine else (_COARSE_STEP, _COARSELY_ALIKE)
+    _, D, N = checked_rows(kind, at, data, nuisances, source)
+
+    def compare(name: str, ahead: Floats, behind: Floats, said: Floats) -> None:
+        difference = (ahead - behind) / (2.0 * step)
+        off = np.nan_to_num(np.abs(difference - said) / np.maximum(1.0, np.abs(difference)), nan=np.inf)
+        if not np.all(off < alike):
+            worst = np.unravel_index(np.argmax(off), off.shape)
+            found = f"{said[worst]:.6g} where a small change gives {difference[worst]:.6g}"
+            raise InputError(_place(kind, name, source), found, "the derivative of its residual")
+
     for end in range(kind.ends):
         for column in range(6):
-            difference = (_moved(kind, at, data, nuisances, end, column, h) for h in (_STEP, -_STEP))
-            _compare(kind, "wrenches", (next(difference) - next(difference)) / (2.0 * _STEP), D[:, end, :, column])
+            ahead, behind = (
+                checked_rows(kind, _moved(at, end, column, h), data, nuisances, source)[0] for h in (step, -step)
+            )
+            compare("wrenches", ahead, behind, D[:, end, :, column])
     for column in range(kind.n_nuisances):
-        ahead, behind = nuisances.copy(), nuisances.copy()
-        ahead[:, column] += _STEP
-        behind[:, column] -= _STEP
-        both = (checked_rows(kind, at, data, z)[0] for z in (ahead, behind))
-        _compare(kind, "nuisances", (next(both) - next(both)) / (2.0 * _STEP), N[:, :, column])
+        h = step * np.eye(kind.n_nuisances)[column]
+        ahead, behind = (checked_rows(kind, at, data, nuisances + by, source)[0] for by in (h, -h))
+        compare("nuisances", ahead, behind, N[:, :, column])
 
 
-_STEP = 1e-6
-"""Of differences, [rad] and [m]: their error is some 1e-9 of a derivative of ordinary size."""
+_STEP, _ALIKE = 1e-6, 1e-4
+"""Of differences, [rad] and [m]: their error is some 1e-9 of a derivative of ordinary size; and the difference of a
+derivative, of 1 or its size, that is a mistake."""
 
-_ALIKE = 1e-4
-"""Difference of a derivative, of 1 or its size, that is a mistake."""
+_COARSE_STEP, _COARSELY_ALIKE = 5e-3, 1e-2
+"""The same in float32, whose rounding is 1e-7 of the lengths."""
 
 
-def _moved(kind: Kind, at: Frames, data: Floats, nuisances: Floats, end: int, column: int, h: float) -> Floats:
-    """Residuals with one end's frame turned or shifted."""
+def _moved(at: Frames, end: int, column: int, h: float) -> Frames:
+    """The frames with one end's turned or shifted."""
     rotation, position = at.rotation.copy(), at.position.copy()
     if column < 3:
         K = np.cross(np.eye(3), h * np.eye(3)[column])
         rotation[:, end] = (np.eye(3) + K + 0.5 * K @ K) @ rotation[:, end]
     else:
         position[:, end, column - 3] += h
-    return checked_rows(kind, Frames(rotation, position), data, nuisances)[0]
-
-
-def _compare(kind: Kind, name: str, difference: Floats, said: Floats) -> None:
-    off = np.abs(difference - said) / np.maximum(1.0, np.abs(difference))
-    if not np.all(off < _ALIKE):
-        worst = np.unravel_index(np.nanargmax(off), off.shape)
-        found = f"{said[worst]:.6g} where a small change gives {difference[worst]:.6g}"
-        raise InputError(f"kind {type(kind).__name__}: {name}", found, "the derivative of its residual")
+    return Frames(rotation, position)
 
 
 def between(start: Floats, end: Floats) -> tuple[Floats, Floats]:
@@ -182,3 +280,11 @@ def between(start: Floats, end: Floats) -> tuple[Floats, Floats]:
     vector = end - start
     length: Floats = np.linalg.norm(vector, axis=1)
     return length, vector / np.maximum(length, 1e-300)[:, None]
+
+
+def cross_matrix(v: Floats) -> Floats:
+    """[v]x with `[v]x w = v x w`, shape (n, 3, 3)."""
+    out = np.zeros((len(v), 3, 3))
+    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
+    out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = v[:, 2], -v[:, 1], v[:, 0]
+    return out

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.measurements.kinds.kind import Floats, Frames, Kind, Rows
+from fg_calib.measurements.kinds.kind import Floats, Frames, Kind, Rows, cross_matrix
 from fg_calib.robot import kernels
 
 
@@ -35,6 +35,6 @@ def inverse_right_jacobian(r: Floats) -> Floats:
     angle = np.linalg.norm(r, axis=1)
     half = 0.5 * np.maximum(angle, 1e-4)
     g = np.where(angle < 1e-4, 1.0 / 12.0 + angle**2 / 720.0, (1.0 - half / np.tan(half)) / (4.0 * half**2))
-    cross = np.cross(r[:, None], -np.eye(3))  # [r]x, row by row
+    cross = cross_matrix(r)
     out: Floats = np.eye(3) + 0.5 * cross + g[:, None, None] * (cross @ cross)
     return out

@@ -10,7 +10,7 @@ from fg_calib.measurements.kinds.kind import Floats, Frames, Integers, Kind, Row
 class Stacked(Kind):
     """Rows of several kinds of the same ends, one below the other: a pose is an orientation and a position.
 
-    Data: those of the kinds, side by side. Nuisances: none.
+    Data: those of the kinds, side by side. Nuisances: the same.
     """
 
     def __init__(self, *parts: Kind) -> None:
@@ -20,15 +20,23 @@ class Stacked(Kind):
         self.ends = parts[0].ends
         self.residual_dim = sum(part.residual_dim for part in parts)
         self.width = sum(part.width for part in parts)
+        self.n_nuisances = sum(part.n_nuisances for part in parts)
 
     def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
         """See `Kind.rows`."""
-        columns = np.cumsum([0, *(part.width for part in self.parts)])
+        of_data = np.split(data, np.cumsum([part.width for part in self.parts])[:-1], axis=1)
+        ends = np.cumsum([part.n_nuisances for part in self.parts])
         rows = [
-            part.rows(at, data[:, c : c + part.width], nuisances) for part, c in zip(self.parts, columns, strict=False)
+            part.rows(at, columns, nuisances[:, end - part.n_nuisances : end])
+            for part, columns, end in zip(self.parts, of_data, ends, strict=True)
         ]
+        N, first = np.zeros((len(data), self.residual_dim, self.n_nuisances)), 0
+        for part, found, end in zip(self.parts, rows, ends, strict=True):
+            if found.nuisances is not None:
+                N[:, first : first + part.residual_dim, end - part.n_nuisances : end] = found.nuisances
+            first += part.residual_dim
         residual = np.concatenate([r.residual for r in rows], axis=1)
-        return Rows(residual, np.concatenate([r.wrenches for r in rows], axis=2))
+        return Rows(residual, np.concatenate([r.wrenches for r in rows], axis=2), N)
 
     def figures(self, data: Floats) -> Floats:
         """See `Kind.figures`."""
@@ -48,3 +56,8 @@ class Stacked(Kind):
 def stack(*parts: Kind) -> Kind:
     """The kinds measured together; one alone is itself."""
     return parts[0] if len(parts) == 1 else Stacked(*parts)
+
+
+def parts_of(kind: Kind) -> tuple[Kind, ...]:
+    """The kinds that are measured together, or the one alone."""
+    return kind.parts if isinstance(kind, Stacked) else (kind,)

@@ -5,7 +5,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tolerances import rounding
 
-from fg_calib.graph.frames import Frame, Unknown, start_from_distances, start_from_poses
+from fg_calib.measurements.frames import (
+    Frame,
+    Unknown,
+    start_from_distances,
+    start_from_most_poses,
+    start_from_poses,
+)
 
 ALL = np.ones(3, dtype=bool)
 NONE = np.zeros(3, dtype=bool)
@@ -122,3 +128,22 @@ def test_tool_point_is_found_from_distances(t):
     distance = np.linalg.norm(tip[b] - tip[a], axis=1)
     found = start_from_distances((R, p), a, b, distance, IDENTITY, ALL)
     assert found.translation == pytest.approx(t, abs=rounding(1, 10))
+
+
+@pytest.mark.parametrize("n_wrong", [1, 4])
+def test_poses_that_are_wrong_or_the_other_of_two_do_not_move_frame_and_tool(n_wrong):
+    """Of 30 with 1 mm and 1 mrad of noise some are kilometres away and a third is tilted the other way."""
+    for seed in range(5):
+        rng, X, T = np.random.default_rng(seed), FAR[0], FAR[2]
+        flange = flange_poses(30, seed)
+        R, p = measured(flange, X, T)
+        R = R @ Rotation.from_rotvec(1e-3 * rng.normal(size=(30, 3))).as_matrix()
+        p = p + 1e-3 * rng.normal(size=p.shape)
+        choices = np.stack([R, R @ Rotation.from_rotvec([0.0, 0.9, 0.0]).as_matrix()], axis=1), np.stack([p, p], axis=1)
+        swapped = rng.permutation(30)[:10]
+        choices[0][swapped] = choices[0][swapped, ::-1]
+        choices[1][rng.permutation(30)[:n_wrong]] += 2e3 * rng.normal(size=(n_wrong, 1, 3))
+        found = start_from_most_poses(flange, choices, (IDENTITY, IDENTITY), Unknown(True, True, ALL))
+        for f, expected in zip(found, (X, T), strict=True):
+            assert f.rotation == pytest.approx(expected.rotation, abs=1e-3)
+            assert f.translation == pytest.approx(expected.translation, abs=3e-3)

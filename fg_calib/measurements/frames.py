@@ -27,6 +27,15 @@ Booleans = NDArray[np.bool_]
 MAX_ROWS = 2000
 """Poses used for a start: more do not make it better."""
 
+FAR_OFF = 6.0
+"""A pose is wrong if it is off by so many times what half of them are."""
+
+LEAST_OFF = 1e-6
+"""What poses may be off by without being wrong, [m] and [rad]."""
+
+MOST_ROUNDS = 10
+"""Times that poses are chosen and left out."""
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -78,6 +87,38 @@ def start_from_poses(
         candidates = [(R, T.rotation) for R in _frame_rotations(R_F, p_F, p_M, T.translation, unknown)]
     fits = [_translations(R_F, p_F, p_M, R_X, R_T, X, T, unknown) for R_X, R_T in candidates]
     return min(fits, key=lambda fit: fit[1])[0]
+
+
+def start_from_most_poses(
+    flange: tuple[Floats, Floats], choices: tuple[Floats, Floats], nominal: tuple[Frame, Frame], unknown: Unknown
+) -> tuple[Frame, Frame]:
+    """`start_from_poses` of poses that may each be one of several, or wrong.
+
+    In turns each is taken as what frame and tool say that it is, and those that are far beyond what most are off by
+    are left out, until nothing changes.
+
+    Args:
+        flange: base_T_flange at the nominal parameters: rotations (n, 3, 3), translations (n, 3), [m].
+        choices: world_T_tool: rotations (n, k, 3, 3) and positions (n, k, 3), the likeliest of each first.
+        nominal: world_T_base and flange_T_tool as they are known so far.
+        unknown: What is to be found.
+    """
+    (R_F, p_F), (R_M, p_M) = ((v[:MAX_ROWS] for v in each) for each in (flange, choices))
+    n = np.arange(len(R_F))
+    chosen, kept = np.zeros(len(n), dtype=np.int64), np.ones(len(n), dtype=np.bool_)
+    for _ in range(MOST_ROUNDS):
+        measured = R_M[n, chosen][kept], p_M[n, chosen][kept]
+        X, T = start_from_poses((R_F[kept], p_F[kept]), measured, nominal, unknown)
+        R, p = X.rotation @ R_F @ T.rotation, (p_F + R_F @ T.translation) @ X.rotation.T + X.translation
+        off = np.stack([np.linalg.norm(R_M - R[:, None], axis=(2, 3)), np.linalg.norm(p_M - p[:, None], axis=2)])
+        typical = np.maximum(np.median(off[:, n, chosen], axis=1), LEAST_OFF)
+        score = (off / typical[:, None, None]).max(axis=0)
+        last = chosen, kept
+        chosen = np.argmin(score, axis=1)
+        kept = score[n, chosen] <= FAR_OFF
+        if 2 * np.sum(kept) < len(n) or all(map(np.array_equal, last, (chosen, kept))):
+            break
+    return X, T
 
 
 def start_from_distances(

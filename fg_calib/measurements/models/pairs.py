@@ -1,0 +1,98 @@
+"""Distances and angles of pairs of configurations, measured, or formed from measured poses."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.errors import ProblemError
+from fg_calib.measurements.dataset import Pairs, form_pairs, no_pairs
+from fg_calib.measurements.kinds import Distance, Kind, RotationAngle, SamePoint, stack
+from fg_calib.measurements.models.poses import ANGLES
+from fg_calib.measurements.series import Series, Table, Unknowns
+from fg_calib.options import PAIR_MODELS
+from fg_calib.robot.model import Robot
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Booleans = NDArray[np.bool_]
+
+
+def usable_pairs(table: Table) -> Pairs:
+    """The pairs of a table, nan where its model does not want a measurement; every wanted one has its sigma.
+
+    Raises:
+        ProblemError: Poses to form pairs from are missing, or a sigma is.
+    """
+    assert table.model is not None
+    m, wanted = table.measurements, PAIR_MODELS[table.model]
+    lacking = [columns for use, values, columns in zip(
+        wanted, (m.position, m.rotation), ("x, y, z", ANGLES), strict=True) if use and values is None]  # fmt: skip
+    if m.pairs is not None:
+        pairs = m.pairs
+    elif m.groups is not None and lacking:  # touched points suffice
+        pairs = no_pairs(m.source)
+    elif lacking:
+        what = "measured positions" if lacking[0] == "x, y, z" else "orientations"
+        raise ProblemError(m.source, f"no columns {lacking[0]}", f"{what} for model {table.model}")
+    else:
+        pairs = form_pairs(m, table.pairing)
+    measured = np.zeros(pairs.n_pairs, dtype=np.bool_)
+    for use, kind, source, values, sigma in (
+        (wanted[0], "distance", "position", pairs.distance, pairs.sigma_distance),
+        (wanted[1], "angle", "orientation", pairs.angle, pairs.sigma_angle),
+    ):
+        if use and np.any(np.isfinite(values) & ~np.isfinite(sigma)):
+            noise = source if m.pairs is None else kind
+            raise ProblemError(pairs.source, f"no sigma for {kind}", f"noise.{noise} or a column sigma_{noise}")
+        measured |= use & np.isfinite(values)
+    return pairs.select(measured)
+
+
+def pair_series(robot: Robot, table: Table, number: int, unknowns: Unknowns) -> list[Series]:
+    """Distances and angles of pairs; vectors of those whose distance was measured as exactly 0.
+
+    A directly measured 0 is not a noisy number: it says that both points are one. Where both readings are the same,
+    nothing changes the prediction.
+
+    Raises:
+        ProblemError: Poses to form pairs from are missing, or a sigma is.
+    """
+    m, pairs = table.measurements, usable_pairs(table)
+    assert table.model is not None
+    formed, wanted = m.pairs is None, PAIR_MODELS[table.model]
+    values, sigmas = np.stack([pairs.distance, pairs.angle]), np.stack([pairs.sigma_distance, pairs.sigma_angle])
+    there = np.isfinite(values) & np.array(wanted)[:, None]
+    point = there[0] & (values[0] == 0.0) & (not formed)
+    there[0] &= ~point
+    ends = np.stack([pairs.a, pairs.b], axis=1)
+    same = np.all(m.readings[pairs.a] == m.readings[pairs.b], axis=1)
+
+    def series(kind: Kind, rows: Integers, data: Floats, sigma: Floats, measured: Booleans) -> Series:
+        return Series(
+            kind=kind,
+            table=number,
+            ends=np.ascontiguousarray(ends[rows]),
+            data=data,
+            sigma=sigma,
+            measured=measured,
+            test=pairs.test[rows],
+            number=rows,
+            nuisances=np.zeros((len(rows), 0), dtype=np.int64),
+            formed=formed,
+            excluded={"same_configuration": same[rows]},
+            source=pairs.source,
+        )
+
+    found, use = [], [k for k in (0, 1) if wanted[k]]
+    rows = np.flatnonzero(there.any(axis=0))
+    if len(rows):
+        kind = stack(*((Distance(), RotationAngle())[k] for k in use))
+        data = np.ascontiguousarray(np.nan_to_num(values[use][:, rows].T))
+        sigma = np.zeros_like(data) if formed else np.nan_to_num(sigmas[use][:, rows].T)
+        found.append(series(kind, rows, data, sigma, there[use][:, rows].T))
+    rows = np.flatnonzero(point)
+    if len(rows):
+        sigma = np.repeat(pairs.sigma_distance[rows, None], 3, axis=1)
+        found.append(series(SamePoint(), rows, np.zeros((len(rows), 0)), sigma, np.ones((len(rows), 3), np.bool_)))
+    return found

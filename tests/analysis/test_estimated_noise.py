@@ -1,0 +1,52 @@
+"""Estimated noise is judged by how far the arm moved what was measured, of every instrument."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from instruments import TOLERANCE, measured_by
+from simulated import small_arm, true_robot
+from touches import reach, reach_faces
+
+from fg_calib.calibration import calibrate
+from fg_calib.measurements.dataset import Measurements
+from fg_calib.measurements.series import KnownPoint, Table
+from fg_calib.robot.kinematics import pose
+
+SIGMA = 1e-4
+TOUCHED = ("faces", "contacts")
+
+
+def touched(what, rng, n=36, n_points=3):
+    """A nominal arm and a tip on three faces, which no figure says more of, or in contact with some points."""
+    robot = small_arm(tolerance=TOLERANCE)
+    true, which = true_robot(robot, rng), np.arange(n) % n_points
+    points = pose(true, 0.4 + 0.15 * rng.normal(size=(n_points, 4))).position
+    if what == "faces":
+        normals = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        heights = np.einsum("ni,ni->n", normals, points)[which] + SIGMA * rng.normal(size=n)
+        q = reach_faces(true, normals[which], heights, rng)
+        data = Measurements.from_arrays(q, plane=[f"p{i}" for i in which], sigma_distance=SIGMA)
+        return robot, Table(data, "plane")
+    q = reach(true, points[which] + SIGMA * rng.normal(size=(n, 3)), rng)
+    data = Measurements.from_arrays(q, anchor=[f"p{i}" for i in which], distance=np.zeros(n), sigma_distance=SIGMA)
+    return robot, Table(data, "anchor", known={"p0": KnownPoint(points[0])})
+
+
+@pytest.mark.parametrize("instrument", ["board", "anchors", "planes", "targets", *TOUCHED])
+def test_estimated_noise_of_a_healthy_table_is_good_and_of_another_arm_is_not(instrument):
+    """All readings exchanged with those of other rows: the noise estimated is then as large as what was measured."""
+    rng = np.random.default_rng(0)
+    robot, table = touched(instrument, rng) if instrument in TOUCHED else measured_by(instrument, rng)[::2]
+    found = calibrate(robot, table, estimate_noise=True)
+    assert not found.findings
+    m = table.measurements
+    mixed = replace(m, readings=rng.permutation(m.readings), ids=np.arange(m.n_configurations).astype(str))
+    wrong = calibrate(robot, replace(table, measurements=mixed), estimate_noise=True)
+    assert any("times as large as what was measured moved" in finding for finding in wrong.findings)
+
+
+def test_contact_with_a_single_point_does_not_move_it():
+    """Nothing that was measured moves: healthy, and no figure over 0."""
+    robot, table = touched("contacts", np.random.default_rng(1), n_points=1)
+    assert not calibrate(robot, table, estimate_noise=True).findings

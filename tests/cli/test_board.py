@@ -1,0 +1,387 @@
+"""`fg-calib board`: images become tables that a job takes as they are; what cannot be used is named in one line."""
+
+import json
+import shutil
+from dataclasses import asdict, astuple
+
+import numpy as np
+import polars as pl
+import pytest
+import yaml
+from boards import CAMERA, SIZE, render, views
+from scipy.spatial.transform import Rotation
+
+from fg_calib.camera.board import CalibrationBoard
+from fg_calib.camera.opencv import opencv
+from fg_calib.files import images
+from fg_calib.files.calibration_board import read_calibration_board
+from fg_calib.files.instruments import read_camera
+
+cv2 = pytest.importorskip("cv2", reason="no OpenCV: pip install 'fg_calib[camera]'")
+
+CHECKERBOARD = {"type": "checkerboard", "columns": 9, "rows": 6, "square": 20, "units": {"length": "mm"}}
+CHARUCO = CHECKERBOARD | {"type": "charuco", "rows": 7, "marker": 14, "dictionary": "DICT_5X5_100"}
+EVEN = CHECKERBOARD | {"columns": 8, "upright": True}
+TABLES = {"board.csv", "board.json", "camera.yaml", "pixels.csv"}
+N = 4
+
+
+def drawn(folder, board, rng, n=N, **of_views):
+    """Images of a board in a folder, and the true poses."""
+    folder.mkdir()
+    R, t = views(board, n, rng, **({"tilt": 35.0, "off": 0.05} | of_views))
+    for k in range(n):
+        cv2.imwrite(str(folder / f"view{k}.png"), render(board, R[k], t[k], rng))
+    return R, t
+
+
+@pytest.fixture(scope="module")
+def drawing(tmp_path_factory):
+    """Images of a checkerboard, board and camera beside them, and the true poses."""
+    folder = tmp_path_factory.mktemp("board")
+    (folder / "board.yaml").write_text(yaml.safe_dump(CHECKERBOARD))
+    (folder / "camera.yaml").write_text(yaml.safe_dump(asdict(CAMERA)))
+    true = drawn(folder / "images", CalibrationBoard("checkerboard", 9, 6, 0.02), np.random.default_rng(0))
+    rows = "".join(f"view{k},{10 * k},0.50,,{1 + k}\n" for k in range(N))
+    (folder / "poses.csv").write_text(f"id,q1,q2,split,x\n{rows}absent,1,2,test,3\n")
+    return folder, true
+
+
+@pytest.fixture
+def job(drawing, tmp_path):
+    """A copy of it, to be changed at will."""
+    return shutil.copytree(drawing[0], tmp_path / "job")
+
+
+def add_wall(job):
+    """An image without the board."""
+    cv2.imwrite(str(job / "images" / "wall.png"), np.full(SIZE[::-1], 170, np.uint8))
+
+
+def run(fg_calib, folder, *arguments, camera=True):
+    given = ["--camera", folder / "camera.yaml"] if camera else []
+    return fg_calib(
+        *("board", folder / "images", "--board", folder / "board.yaml", "--out", folder / "out", *given, *arguments)
+    )
+
+
+def test_images_become_tables_of_corners_and_poses(drawing, job, fg_calib):
+    add_wall(job)
+    ended = run(fg_calib, job)
+    assert (ended.code, ended.err) == (0, f"wrote {', '.join(sorted(TABLES))} to {job / 'out'}\n")
+    assert ended.out.startswith(
+        "checkerboard 9 x 6, square 20 mm: seen in 4 of 5 images, 216 corners\nRMS of residuals 0"
+    )
+    assert "No board in wall.png: no board." in ended.out
+    assert "The tables have no joint readings: add q1, q2" in ended.out
+    assert {f.name for f in (job / "out").iterdir()} == TABLES
+    poses, pixels = (pl.read_csv(job / "out" / f"{name}.csv") for name in ("board", "pixels"))
+    assert poses["id"].to_list() == [f"view{k}" for k in range(N)]
+    assert pixels.columns == ["id", "u", "v", "corner_x", "corner_y", "sigma_pixel"]
+    assert len(pixels) == N * 54
+    for row, R, t in zip(poses.iter_rows(named=True), *drawing[1], strict=True):
+        C = np.zeros((6, 6))
+        C[np.triu_indices(6)] = [row[name] for name in poses.columns if name.startswith("cov_")]
+        C = C + np.triu(C, 1).T
+        turn = Rotation.from_matrix(R) * Rotation.from_rotvec([row["rx"], row["ry"], row["rz"]]).inv()
+        e = np.append(turn.as_rotvec(), t - [row["x"], row["y"], row["z"]])
+        assert e @ np.linalg.solve(C, e) < 30.0  # 1 in 25 000
+        assert np.sqrt(np.diag(C)[3:]).max() < 1e-3
+
+
+def test_joint_readings_are_joined_by_the_images_name_as_they_are_written(job, fg_calib):
+    ended = run(fg_calib, job, "--configurations", job / "poses.csv", "--length", "mm", "--angle", "deg")
+    assert ended.code == 0
+    assert "Rows of joint readings without an image of the board: absent." in " ".join(ended.out.split())
+    assert "units: {length: mm, angle: deg}" in " ".join(ended.out.split())
+    lines = (job / "out" / "pixels.csv").read_text().splitlines()
+    assert lines[0] == "id,q1,q2,split,u,v,corner_x,corner_y,sigma_pixel"
+    assert lines[55].startswith("view1,10,0.50,")
+    found = pl.read_csv(job / "out" / "pixels.csv")
+    assert found["corner_x"].unique().sort().to_list() == pytest.approx(np.arange(9) * 20.0)
+    in_m = pl.read_csv(_other_units(fg_calib, job) / "board.csv")
+    in_mm = pl.read_csv(job / "out" / "board.csv")
+    for name, factor in {
+        "z": 1e3,
+        "rx": 180 / np.pi,
+        "cov_11": (180 / np.pi) ** 2,
+        "cov_14": 180e3 / np.pi,
+        "cov_66": 1e6,
+    }.items():
+        assert in_mm[name].to_list() == pytest.approx((factor * in_m[name]).to_list(), rel=1e-9)
+
+
+def _other_units(fg_calib, job):
+    assert fg_calib(*("board", job / "images", "--board", job / "board.yaml", "--camera", job / "camera.yaml"),
+                    *("--out", job / "si")).code == 0  # fmt: skip
+    return job / "si"
+
+
+def test_decimal_commas_of_readings_become_points(job, fg_calib):
+    (job / "poses.csv").write_text("ID;Axis 1;note\nview0;-1,5e-1;a,b\nview1;,25;\nview2;3;1,2,3\nview3;7,0;1.5\n")
+    assert run(fg_calib, job, "--configurations", job / "poses.csv").code == 0
+    found = pl.read_csv(job / "out" / "board.csv", infer_schema=False)
+    assert found["Axis 1"].to_list() == ["-1.5e-1", ".25", "3", "7.0"]
+    assert found["note"].to_list() == ["a,b", "", "1,2,3", "1.5"]
+
+
+def test_an_image_without_a_row_is_told_and_left_out(job, fg_calib):
+    rows = (job / "poses.csv").read_text().splitlines()
+    (job / "poses.csv").write_text("\n".join(rows[:3]) + "\n")
+    ended = run(fg_calib, job, "--configurations", job / "poses.csv")
+    assert ended.code == 0
+    told = "No row of joint readings, and so not in the tables: view2, view3."
+    assert told in " ".join(ended.out.split())
+    assert pl.read_csv(job / "out" / "board.csv")["id"].to_list() == ["view0", "view1"]
+
+
+def test_the_camera_is_estimated_from_the_same_images(job, fg_calib):
+    add_wall(job)
+    ended = run(fg_calib, job, "--estimate-camera", "--json", camera=False)
+    assert ended.code == 0
+    found = json.loads(ended.out)
+    for name, true in asdict(CAMERA).items():
+        assert abs(found["camera"][name] - true) < 4.0 * found["camera_sigma"][name]
+    written = yaml.safe_load((job / "out" / "camera.yaml").read_text())
+    assert written["sigma"] == found["camera_sigma"]
+    assert (written["width"], written["height"]) == SIZE
+    assert astuple(read_camera(job / "out" / "camera.yaml")) == tuple(found["camera"].values())
+    assert json.loads((job / "out" / "board.json").read_text()) == found
+    assert found["schema"] == "fg-calib/board/1"
+    assert [image["id"] for image in found["images"]] == [f"view{k}" for k in range(N)]
+    assert found["without_board"] == {"wall.png": "no board"}
+
+
+def test_a_camera_that_was_estimated_serves_again_in_the_same_folder(job, fg_calib):
+    run(fg_calib, job, "--estimate-camera", camera=False)
+    before = (job / "out" / "camera.yaml").read_bytes()
+    ended = run(fg_calib, job, "--camera", job / "out" / "camera.yaml", camera=False)
+    assert ended.code == 0
+    assert (job / "out" / "camera.yaml").read_bytes() == before
+
+
+def test_images_that_do_not_determine_the_camera_end_with_3(job, fg_calib):
+    shutil.rmtree(job / "images")
+    board = CalibrationBoard("checkerboard", 9, 6, 0.02)
+    drawn(job / "images", board, np.random.default_rng(1), n=3, tilt=4.0, off=0.02, distance=(0.5, 0.52))
+    ended = run(fg_calib, job, "--estimate-camera", camera=False)
+    assert ended.code == 3
+    assert ended.err.splitlines()[-1].startswith("not to be trusted: the images do not determine the camera: f")
+    assert "DOUBTFUL: the images do not determine the camera" in ended.out
+
+
+def test_an_even_checkerboard_is_seen_one_way_round_within_a_quarter_turn(job, fg_calib, monkeypatch):
+    """Also where the search begins at the other end of the board in every second image."""
+    (job / "board.yaml").write_text(yaml.safe_dump(EVEN))
+    shutil.rmtree(job / "images")
+    R, _ = drawn(job / "images", CalibrationBoard("checkerboard", 8, 6, 0.02), np.random.default_rng(2), roll=40.0)
+    search, turn = images.find_corners, iter([1, -1, 1, -1])
+
+    def find_corners(image, board):
+        corners, uv = search(image, board)
+        return corners, uv[:: next(turn)]
+
+    monkeypatch.setattr(images, "find_corners", find_corners)
+    assert run(fg_calib, job).code == 0
+    found = pl.read_csv(job / "out" / "board.csv")
+    turns = Rotation.from_rotvec(found.select("rx", "ry", "rz").to_numpy())
+    between = (turns[0] * turns.inv()).magnitude()
+    assert between == pytest.approx((Rotation.from_matrix(R)[0] * Rotation.from_matrix(R).inv()).magnitude(), abs=0.01)
+
+
+def test_a_board_with_two_poses_is_in_the_table_of_corners_alone(job, fg_calib, monkeypatch):
+    """One is far away, hardly tilted, and its corners are noisy; where all are, there is no table of poses."""
+    R = Rotation.from_euler("x", 10.0, degrees=True).as_matrix()
+    corners = CalibrationBoard("checkerboard", 9, 6, 0.02).corners
+    uv = CAMERA.image(np.array([-0.08, -0.05, 3.0]) + corners @ R[:, :2].T)[0]
+    uv += np.random.default_rng(10).normal(scale=0.3, size=uv.shape)
+    search, pick = images.find_corners, iter([1, 0, 0, 0] + [1] * N)
+    monkeypatch.setattr(images, "find_corners", lambda *a: (np.arange(54), uv) if next(pick) else search(*a))
+    ended = run(fg_calib, job)
+    assert ended.code == 0
+    told = "Only in pixels.csv, as a second pose, tilted the other way, explains the corners as well: view0."
+    assert told in " ".join(ended.out.split())
+    assert pl.read_csv(job / "out" / "board.csv")["id"].to_list() == ["view1", "view2", "view3"]
+    assert pl.read_csv(job / "out" / "pixels.csv")["id"].n_unique() == N
+    assert run(fg_calib, job).code == 0
+    assert {f.name for f in (job / "out").iterdir()} == TABLES - {"board.csv"}
+
+
+def test_a_name_of_the_board_is_a_column(job, fg_calib):
+    (job / "board.yaml").write_text(yaml.safe_dump(CHECKERBOARD | {"name": "wall, left"}))
+    assert run(fg_calib, job).code == 0
+    assert pl.read_csv(job / "out" / "board.csv")["board"].unique().to_list() == ["wall, left"]
+
+
+def test_its_own_tables_are_replaced_and_no_others(job, fg_calib):
+    assert run(fg_calib, job).code == 0
+    before = (job / "out" / "board.csv").read_text()
+    assert run(fg_calib, job, "--length", "mm").code == 0
+    assert (job / "out" / "board.csv").read_text() != before
+    (job / "out" / "board.json").unlink()
+    ended = run(fg_calib, job)
+    place = job / "out" / "board.csv"
+    expected = f"error: {place}: is there already, not written by this command, expected another folder\n"
+    assert (ended.code, ended.err) == (1, expected)
+
+
+def test_nothing_is_written_where_something_is_wrong(job, fg_calib):
+    (job / "images" / "view3.png").write_bytes(b"no image")
+    assert run(fg_calib, job).code == 1
+    assert not (job / "out").exists()
+
+
+@pytest.mark.parametrize("given", [[], ["--camera", "camera.yaml", "--estimate-camera"]])
+def test_one_camera_is_needed(job, fg_calib, given):
+    ended = run(fg_calib, job, *given, camera=False)
+    assert (ended.code, ended.err) == (2, "error: one of --camera and --estimate-camera is needed, and only one\n")
+
+
+def test_images_are_a_folder_files_or_a_pattern(job, fg_calib):
+    for given in (["view[01].png"], ["view0.png", "view1.png"], ["view1.png", "view[01].png"]):
+        ended = fg_calib(*("board", *(job / "images" / g for g in given), "--board", job / "board.yaml"),
+                         *("--camera", job / "camera.yaml", "--out", job / "out", "--json"))  # fmt: skip
+        assert {image["id"] for image in json.loads(ended.out)["images"]} == {"view0", "view1"}
+
+
+def test_without_opencv_it_says_what_to_install(job, fg_calib, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "cv2", None)
+    opencv.cache_clear()
+    try:
+        ended = run(fg_calib, job)
+    finally:
+        opencv.cache_clear()
+    assert (ended.code, ended.err) == (1, "error: fg-calib board needs OpenCV: pip install 'fg_calib[camera]'\n")
+
+
+def test_an_opencv_that_is_too_old_is_refused(job, fg_calib, monkeypatch):
+    monkeypatch.setattr(cv2, "__version__", "4.6.0")
+    opencv.cache_clear()
+    try:
+        ended = run(fg_calib, job)
+    finally:
+        opencv.cache_clear()
+    hint = "expected 4.11 or newer; pip install 'fg_calib[camera]'"
+    assert (ended.code, ended.err) == (1, f"error: OpenCV: version 4.6.0, {hint}\n")
+
+
+BOARDS = [
+    ({"colums": 9}, "board.yaml: unknown key 'colums', expected one of type, columns, rows, square, marker"),
+    ({"type": "chequerboard"}, "board.yaml: type: found 'chequerboard', expected one of checkerboard, charuco"),
+    ({"columns": 2}, "board.yaml: columns: found 2, expected a number not below 3"),
+    ({"square": 20, "units": {}}, "board.yaml: square: found 20.0 m, expected at most 2 m; is it in mm? units: {"),
+    ({"marker": 14}, "board.yaml: marker: found 14.0, expected none with a checkerboard"),
+    ({"columns": 8}, "board.yaml: 8 x 6 inner corners look the same after half a turn, expected columns + rows odd, or "
+     "a charuco board; where the camera never turns more than a quarter about its axis, say upright: true"),
+    ({"columns": 6}, "board.yaml: 6 x 6 inner corners look the same from several sides, expected columns + rows odd"),
+    ({"upright": True}, "board.yaml: upright: found true, expected none with 9 x 6 inner corners, whose ends differ"),
+    (CHARUCO | {"dictionary": "DICT_5x5_1000000"}, "board.yaml: dictionary: found 'DICT_5x5_1000000', expected one of "
+     "OpenCV's, such as DICT_5X5_100; did you mean DICT_5X5_1000?"),
+    (CHARUCO | {"dictionary": None}, "board.yaml: missing key 'dictionary'"),
+    (CHARUCO | {"marker": None}, "board.yaml: missing key 'marker'"),
+    (CHARUCO | {"marker": 20}, "board.yaml: marker: found 20.0, expected a side shorter than a square's, 20.0"),
+    (CHARUCO | {"upright": True}, "board.yaml: upright: found true, expected none with a charuco board"),
+    (CHARUCO | {"columns": 20, "rows": 20}, "board.yaml: dictionary: DICT_5X5_100 has 100 markers, expected 200"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("changes", "message"), BOARDS, ids=[m.partition(": ")[2][:30] for _, m in BOARDS])
+def test_a_board_that_cannot_be_used_is_named(changes, message, job, fg_calib):
+    (job / "board.yaml").write_text(yaml.safe_dump(CHECKERBOARD | changes))
+    ended = run(fg_calib, job)
+    assert ended.code == 1
+    assert ended.err.startswith(f"error: {message}")
+    assert ended.err.count("\n") == 1
+
+
+def _replace(path, old, new):
+    path.write_text(path.read_text().replace(old, new))
+
+
+CASES = {
+    "an image that is none": (
+        lambda job: (job / "images" / "view1.png").write_bytes(b"GIF89a"),
+        "view1.png: no image that OpenCV can read, expected PNG, JPEG, TIFF, BMP or the like",
+    ),
+    "an empty image": (
+        lambda job: (job / "images" / "view1.png").write_bytes(b""),
+        "view1.png: no image that OpenCV can read, expected PNG, JPEG, TIFF, BMP or the like",
+    ),
+    "images of two sizes": (
+        lambda job: cv2.imwrite(str(job / "images" / "view9.png"), np.zeros((40, 60), np.uint8)),
+        "view9.png: an image of 60 x 40 px, expected 640 x 480 px as view0.png; one camera at a time",
+    ),
+    "two images of one name": (
+        lambda job: shutil.copy(job / "images" / "view1.png", job / "images" / "view1.bmp"),
+        "{job}/images/view1.png: a second image called 'view1', expected one, as view1.bmp is called so",
+    ),
+    "an image of no name": (
+        lambda job: shutil.copy(job / "images" / "view1.png", job / "images" / "nan.png"),
+        "{job}/images/nan.png: an image called 'nan', expected a name that a table can have under id",
+    ),
+    "no images": (
+        lambda job: [file.unlink() for file in (job / "images").iterdir()],
+        "{job}/images: no images, expected files that end in .png, .jpg, .jpeg, .tif, .tiff, .bmp, .pgm, .ppm,",
+    ),
+    "a board in none": (
+        lambda job: (add_wall(job), [file.unlink() for file in (job / "images").glob("view*")]),
+        "images: the board in none of 1 (no board), expected at least one; are columns, rows and dictionary those of "
+        "the board? older charuco boards: legacy: true",
+    ),
+    "a camera of other images": (
+        lambda job: (job / "camera.yaml").write_text(yaml.safe_dump(asdict(CAMERA) | {"width": 1280, "height": 960})),
+        "camera.yaml: width: found 1280, expected 640 px as the images have; figures of other images would have to be",
+    ),
+    "a camera with an unknown key": (
+        lambda job: (job / "camera.yaml").write_text(yaml.safe_dump(asdict(CAMERA) | {"k4": 0.1})),
+        "camera.yaml: unknown key 'k4', expected one of ",
+    ),
+    "readings without an id": (
+        lambda job: _replace(job / "poses.csv", "id,", "name,"),
+        "poses.csv: no column id, expected the name of each row's image without its ending",
+    ),
+    "readings without readings": (
+        lambda job: (job / "poses.csv").write_text("id,x\nview0,1\n"),
+        "poses.csv: no columns of joint readings, expected q1, q2 and so on, or the joints' names",
+    ),
+    "two rows of an image": (
+        lambda job: _replace(job / "poses.csv", "absent,", "view0,"),
+        "poses.csv:6: id: found 'view0', expected one row an image",
+    ),
+    "readings of other images": (
+        lambda job: _replace(job / "poses.csv", "view", "image_"),
+        "configurations: no id is the name of an image: image_0, image_1, image_2, expected ids such as view0, view1,",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_cannot_be_used_is_named(case, job, fg_calib):
+    change, message = CASES[case]
+    change(job)
+    ended = run(fg_calib, job, "--configurations", job / "poses.csv")
+    assert ended.code == 1
+    assert ended.err.startswith(f"error: {message}".replace("{job}", str(job)))
+    assert ended.err.count("\n") == 1
+    assert not (job / "out").exists()
+
+
+def test_a_principal_point_outside_the_images_is_told(job, fg_calib, caplog):
+    (job / "camera.yaml").write_text(yaml.safe_dump(asdict(CAMERA) | {"cx": 960.0}))
+    assert run(fg_calib, job).code == 0
+    assert "camera.yaml: cx = 960 px is outside the images of 640 x 480 px; is it the camera" in caplog.text
+
+
+def test_a_configuration_table_is_not_replaced_by_what_is_made_of_it(job, fg_calib):
+    ended = fg_calib(*("board", job / "images", "--board", job / "board.yaml", "--camera", job / "camera.yaml"),
+                     *("--configurations", job / "pixels.csv", "--out", job))  # fmt: skip
+    expected = f"error: {job / 'pixels.csv'}: would be replaced by what is made of it, expected another folder\n"
+    assert (ended.code, ended.err) == (1, expected)
+
+
+def test_every_key_of_a_board_is_read(tmp_path):
+    (tmp_path / "board.yaml").write_text(yaml.safe_dump(CHARUCO | {"legacy": True, "name": "b"}))
+    expected = CalibrationBoard("charuco", 9, 7, 0.02, 0.014, "DICT_5X5_100", legacy=True, name="b")
+    found = read_calibration_board(tmp_path / "board.yaml")
+    assert found.square == pytest.approx(expected.square)
+    assert asdict(found) | {"square": 0.02, "marker": 0.014} == asdict(expected)

@@ -1,0 +1,297 @@
+"""What commands print: nothing from files steers a terminal, and no stream or limit ends one in a traceback."""
+
+import csv
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+import fg_calib
+from fg_calib import Calibration, InputError, cli
+from fg_calib.errors import escaped
+
+STEERING = "\x1b[31m\x07\b\x9b2J\x7f\u202e\u2066[/red]"
+"""What turns a terminal red, rings, goes back, clears the screen, deletes, and turns the direction of reading."""
+
+SHOWN = r"\x1b[31m\x07\x08\x9b2J\x7f\u202e\u2066[/red]"
+"""The same as it is shown."""
+
+ROBOT = """
+name: "arm{0}\\nGOOD"
+convention: mdh
+units: {{length: m, angle: deg}}
+joints:
+- {{name: "one{0}", a: 0.0, alpha: 0.0, d: 0.33, theta: 0.0, limits: [-170.0, 170.0]}}
+- {{name: "two{0}", a: 0.05, alpha: -90.0, d: 0.0, theta: 0.0, limits: [-120.0, 120.0]}}
+- {{name: "three{0}", a: 0.6, alpha: 0.0, d: 0.0, theta: 0.0, limits: [-150.0, 150.0]}}
+tolerance: {{a: 0.001, d: 0.001, theta: 0.05, alpha: 0.05}}
+"""
+
+SCENARIO = """
+robot: robot.yaml
+units: {length: m, angle: deg}
+errors: {normal: tolerance}
+configurations: {random: {count: 25}}
+noise: {position: 0.0005, orientation: 0.02, joint: 0.01}
+frame: unknown
+job: {model: pose, encoder: estimated}
+"""
+
+
+def quoted(text):
+    """As a quoted word of YAML."""
+    return "".join(c if " " <= c <= "~" else f"\\\\u{ord(c):04x}"[1:] for c in text)
+
+
+def clean(text):
+    return all(line.isprintable() for line in text.split("\n"))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A job all of whose names would steer a terminal, the folder's and those of files included."""
+    folder = tmp_path_factory.mktemp("steering") / f"job{STEERING.replace('/', '')}"
+    folder.mkdir()
+    (folder / "robot.yaml").write_text(ROBOT.format(quoted(STEERING)))
+    (folder / "scenario.yaml").write_text(SCENARIO)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def job(folder):
+    """A simulated job in which two rows are grossly wrong, and ids and the table's name would steer a terminal."""
+    fg_calib.write_simulation(folder, fg_calib.simulate(fg_calib.read_scenario(folder / "scenario.yaml"), 1))
+    rows = list(csv.reader((folder / "poses.csv").read_text().splitlines()))
+    for k, row in enumerate(rows[1:]):
+        row[0] = f"p{k}{STEERING}"
+    rows[3][rows[0].index("x")] = "3.0"
+    rows[7][rows[0].index("q1")] = "0.0"
+    with (folder / f"poses{STEERING.replace('/', '')}.csv").open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
+    text = (folder / "calibration.yaml").read_text()
+    word = quoted(STEERING.replace("/", ""))
+    (folder / "calibration.yaml").write_text(text.replace("poses.csv", f'"poses{word}.csv"'))
+    return folder / "calibration.yaml"
+
+
+def test_what_is_printable_stays():
+    assert escaped("arm é 机器人 ±1 µm [left]") == "arm é 机器人 ±1 µm [left]"
+    assert escaped(f"a{STEERING}\n\u2028b") == f"a{SHOWN}\\n\\u2028b"
+
+
+@pytest.mark.parametrize("command", ["calibrate", "compare"])
+def test_no_name_steers_the_terminal(fg_calib, job, tmp_path, command):
+    out = tmp_path / f"out{STEERING.replace('/', '')}"
+    ended = fg_calib(command, job, "--out", out)
+    assert ended.code == 3
+    assert r"arm\x1b[31m" in ended.out
+    assert clean(ended.out)
+    assert clean(ended.err)
+    assert ended.err.count("not to be trusted: ") == ended.err.count("\n")  # a name's new line is none of ours
+    assert clean(fg_calib(command, job, "--json").out)
+
+
+def test_a_terminal_gets_colours_and_no_others(job, monkeypatch):
+    from fg_calib.report.text import build_report
+
+    found = fg_calib.calibrate_job(job)
+    console = Console(force_terminal=True, color_system="standard", width=100, highlight=False)
+    with console.capture() as capture:
+        console.print(build_report(*found.assessed))
+    assert "\x1b[1;31mDOUBTFUL: " in capture.get()
+    assert "\x1b[31m" not in capture.get()
+    assert f"p2{SHOWN}" in capture.get()
+
+
+def test_a_notebook_a_saved_result_and_reprs_are_clean(job, tmp_path):
+    found = fg_calib.calibrate_job(job)
+    found.save(tmp_path / "result")
+    loaded = Calibration.load(tmp_path / "result")
+    shown = [str(found), repr(found), str(loaded), repr(loaded), found._repr_html_(), loaded._repr_html_()]
+    shown += [repr(found.robot), repr(found.parameters), repr(found.uncertainty), repr(found.solution)]
+    shown += [repr(found.solution.problem), repr(found.solution.problem.measurements)]
+    assert [text for text in shown if not clean(text)] == []
+
+
+def test_a_damaged_result_cannot_steer_either(job, tmp_path):
+    fg_calib.calibrate_job(job).save(tmp_path / "result")
+    file = tmp_path / "result" / "result.json"
+    document = json.loads(file.read_text())
+    document["cautions"] = document["findings"] = [f"a{STEERING}\nb"]
+    document["robot"] = STEERING
+    file.write_text(json.dumps(document))
+    loaded = Calibration.load(tmp_path / "result")
+    assert clean(str(loaded) + repr(loaded) + loaded._repr_html_())
+
+
+@pytest.mark.parametrize("more", [(), ("--configurations", "poses.csv", "--angle", "deg")])
+def test_observe_is_clean(fg_calib, job, monkeypatch, more):
+    monkeypatch.chdir(job.parent)
+    ended = fg_calib("observe", job.parent / "robot.yaml", *more)
+    assert (ended.code, ended.err) == (0, "")
+    assert r"arm\x1b[31m" in ended.out
+    assert clean(ended.out)
+
+
+def test_simulate_is_clean(fg_calib, folder, tmp_path):
+    ended = fg_calib("simulate", folder / "scenario.yaml", "--out", tmp_path / "a\x1b[31m\nb")
+    assert ended.code == 0
+    assert clean(ended.out + ended.err)
+    assert (ended.out.count("\n"), ended.err.count("\n")) == (1, 2)
+
+
+def test_errors_and_warnings_are_clean(fg_calib, folder, tmp_path):
+    message = str(InputError(f"a{STEERING}\nb", "found \x1b", "\x07"))
+    assert message == rf"a{SHOWN} b: found \x1b, expected \x07"
+    ended = fg_calib("calibrate", tmp_path / "a\x1b[31m\nb")
+    assert ended == (1, "", f"error: {tmp_path}/a\\x1b[31m b: no such file\n")
+
+
+def run(arguments, **options):
+    """A command in a process of its own: exit code, stdout, stderr."""
+    command = [sys.executable, "-m", "fg_calib.cli", *map(str, arguments)]
+    ended = subprocess.run(command, check=False, text=True, **({"capture_output": True} | options))
+    return ended.returncode, ended.stdout, ended.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("closed", [(1,), (2,), (0, 1, 2)])
+def test_closed_streams_are_no_traceback_and_lose_no_result(example, closed):
+    def close():
+        for stream in closed:
+            os.close(stream)
+
+    out = example / "result"
+    code, _, err = run(["calibrate", example / "calibration.yaml", "--out", out], preexec_fn=close)
+    assert (code, err) == (0, "")
+    assert fg_calib.read_result(out).trustworthy
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("command", ["calibrate", "compare", "observe"])
+@pytest.mark.parametrize("stdout", ["/dev/full", "closed pipe"])
+def test_a_report_that_nobody_takes_loses_no_result(example, command, stdout):
+    job = example / ("robot_nominal.yaml" if command == "observe" else "calibration.yaml")
+    if stdout == "closed pipe":
+        end, sink = os.pipe()
+        os.close(end)
+    else:
+        sink = os.open(stdout, os.O_WRONLY)
+    code, _, err = run(
+        [command, job, "--out", example / "out"], stdout=sink, stderr=subprocess.PIPE, capture_output=False
+    )
+    os.close(sink)
+    full = "error: the output cannot be written: No space left on device\n"
+    assert (code, err) == (1, full if stdout == "/dev/full" else "")
+    assert list((example / "out").glob("*.json"))
+
+
+@pytest.mark.long
+def test_a_limit_on_the_size_of_files_is_one_line_after_the_report(example, monkeypatch):
+    def limit():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+
+    job = example / "calibration.yaml"
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(example / "cache"))  # which cannot be written either
+    out = example / "result"
+    code, shown, err = run(["calibrate", job, "--out", out], preexec_fn=limit)
+    *notice, error = err.splitlines()
+    assert (code, error) == (1, f"error: {out}/result.json: cannot be written: File too large")
+    assert notice == ["compiling the kernels: some seconds, once an installation"]
+    assert "GOOD: converged" in shown
+    assert not out.exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("megabytes", [600, 1000, 1400, 2000])
+@pytest.mark.parametrize(("option", "kind"), [("-v", "RLIMIT_AS"), ("-d", "RLIMIT_DATA")])
+def test_a_limit_on_memory_is_one_line(example, megabytes, option, kind):
+    def limit():
+        resource.setrlimit(getattr(resource, kind), (megabytes * 2**20,) * 2)
+
+    ended = run(["calibrate", example / "calibration.yaml"], preexec_fn=limit)
+    expected = f"error: memory: limited to {megabytes} MB, expected at least 2048 MB; see `ulimit {option}`\n"
+    assert ended == (1, "", expected)
+
+
+@pytest.mark.slow
+def test_a_limit_on_open_files_is_one_line(example):
+    def limit():
+        resource.setrlimit(resource.RLIMIT_NOFILE, (20, 20))
+
+    ended = run(["calibrate", example / "calibration.yaml"], preexec_fn=limit)
+    assert ended == (1, "", "error: open files: limited to 20, expected at least 32; see `ulimit -n`\n")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "value", "widest"),
+    [("TERMINAL_WIDTH", "abc", 100), ("COLUMNS", "0", 40), ("COLUMNS", "99999999", 1000), ("COLUMNS", "wide", 100)],
+)
+def test_the_width_of_a_page_is_one_that_pages_have(monkeypatch, name, value, widest):
+    monkeypatch.setenv(name, value)
+    code, shown, err = run(["calibrate", "--help"])
+    assert (code, err) == (0, "")
+    assert "Usage: fg-calib" in shown
+    assert max(map(len, shown.splitlines())) <= widest
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seconds", [0.02, 0.1, 0.2, 0.3, 0.4])
+def test_an_interrupt_is_silent_while_libraries_are_loaded_too(example, seconds):
+    command = [sys.executable, "-c", "import fg_calib.cli as c; print('.', flush=True); c.main()", "calibrate"]
+    with subprocess.Popen(
+        [*command, str(example / "calibration.yaml")], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout.readline() == ".\n"
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(seconds)
+        process.send_signal(signal.SIGINT)
+        shown, err = process.communicate()
+    assert (process.returncode, shown, err) == (-signal.SIGINT, "", "")
+
+
+def test_the_command_leaves_interrupts_as_they_were(fg_calib):
+    before = signal.getsignal(signal.SIGINT)
+    assert fg_calib("--version").code == 0
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (
+            ("random: {count: 25}", "random: {count: 1000000000}"),
+            "configurations: random: count: found 1000000000, expected a number not above 1e+06",
+        ),
+        (
+            (
+                "random: {count: 25}",
+                "board: {pose: {x: 1}, count: 1000000000, height: 0.5, radius: 0.5, roll: random, self_motion: random}",
+            ),
+            "configurations: board: count: found 1000000000, expected a number not above 1e+06",
+        ),
+    ],
+)
+def test_a_scenario_of_any_size_is_refused_at_once(fg_calib, folder, tmp_path, edit, message):
+    scenario = folder / "large.yaml"
+    scenario.write_text(SCENARIO.replace(*edit))
+    ended = fg_calib("simulate", scenario, "--out", tmp_path / "out")
+    assert ended == (1, "", f"error: large.yaml: {message}\n")
+
+
+def test_a_robot_of_any_size_is_refused_at_once(fg_calib, tmp_path):
+    robot = tmp_path / "robot.yaml"
+    joints = "".join("- {a: 0.1, alpha: 0, d: 0, theta: 0}\n" for _ in range(201))
+    robot.write_text(f"name: long\nconvention: dh\nunits: {{length: m, angle: deg}}\njoints:\n{joints}")
+    assert fg_calib("observe", robot) == (1, "", "error: robot.yaml: 201 joints, expected at most 200\n")
+
+
+def test_examples_are_where_they_were():
+    assert (Path(cli.EXAMPLES) / "space-robot" / "calibration.yaml").is_file()

@@ -1,0 +1,62 @@
+"""Scenarios of a small arm and one instrument, of every kind, that several test files use."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from simulated import small_arm
+
+from fg_calib import Camera, Pairing
+from fg_calib.measurements.dataset import Noise
+from fg_calib.simulation.configurations import Placement, RandomReadings
+from fg_calib.simulation.instruments import (
+    BoardCamera,
+    Corners,
+    Indicator,
+    LengthGauge,
+    PairGauge,
+    Sockets,
+    Spot,
+    Tracker,
+)
+from fg_calib.simulation.scenario import Errors, Scenario
+
+TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3, "tool": 5e-3}
+SIGMA = Noise(1e-4, 2e-4, 0.0, distance=1e-4, angle=2e-4, point=1e-4, pixel=0.1)
+EXACT = Noise(0.0, 0.0, 0.0, distance=0.0, angle=0.0, point=0.0, pixel=0.0)
+CAMERA = Camera(fx=900, fy=905, cx=640, cy=480, k1=-0.1, k2=0.05)
+GRID = Corners(5, 4, 0.1)
+WALL = {"wall": Placement(Rotation.from_euler("y", -0.5 * np.pi).as_matrix(), np.array([2.5, 0.0, 0.0]))}
+"""Across x, its front towards the arm."""
+
+
+INSTRUMENTS = {
+    "pose": Tracker(model="pose", name="it"),
+    "orientations": Tracker(model="orientation", name="it", stations=2),
+    "targets": Tracker(model="position", name="it", targets=3),
+    "stations": Tracker(model="position", name="it", targets={"a": Spot([0.1, 0, 0]), "b": Spot([0, 0.2, 0.1])},
+                        stations=2),
+    "formed pairs": Tracker(model="distance-rotation", name="it", pairing=Pairing("chain")),
+    "pairs": PairGauge(model="distance-rotation", name="it", pairs=Pairing("random", 80)),
+    "anchors": LengthGauge(name="it"),
+    "offset": LengthGauge(name="it", anchors={"bolt": Spot([1.0, -2.0, 0.5], 0.0), "pin": Spot([2.0, 1.0, 0.5])},
+                          offset=0.12),
+    "contact": LengthGauge(name="it", anchors=3, contact=True),
+    "planes": Indicator(name="it", planes=4),
+    "faces": Indicator(name="it", contact=True),
+    "board": BoardCamera(model="board", name="it", boards=WALL),
+    "pixels": BoardCamera(model="pixels", name="it", boards=WALL, camera=CAMERA, corners=GRID),
+    "camera in the room": BoardCamera(model="pixels", name="it", camera=CAMERA, corners=GRID, fixed=True),
+    "sockets": Sockets(name="it", sockets=3),
+}  # fmt: skip
+
+
+def scenario(*instruments, n=60, **changes):
+    """A small arm with one prismatic joint, measured with 1e-4 m, 2e-4 rad and 0.1 px."""
+    given = {
+        "robot": small_arm(tolerance=TOLERANCE),
+        "errors": Errors("normal", {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}),
+        "configurations": RandomReadings(n),
+        "noise": SIGMA,
+        "instruments": instruments,
+        "job": {},
+    }
+    return Scenario(**given | changes)

@@ -1,0 +1,365 @@
+"""What simulated instruments measure: against 4x4 products without noise, noise by statistics, jobs by running."""
+
+import re
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from oracle import tool_pose
+from scenarios import CAMERA, EXACT, GRID, INSTRUMENTS, SIGMA, TOLERANCE, WALL, scenario
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+from simulated import paper_robot, small_arm
+from tolerances import rounding
+
+from fg_calib import InputError, Pairing, calibrate, read_job, simulate, write_simulation
+from fg_calib.measurements.dataset import Noise, rotation_angle
+from fg_calib.simulation.configurations import BoardViews, GivenReadings, Placement, RandomReadings
+from fg_calib.simulation.instruments import (
+    BoardCamera,
+    Indicator,
+    LengthGauge,
+    Plane,
+    Spot,
+    Tracker,
+)
+
+README = Path(__file__).resolve().parents[2] / "README.md"
+EVERY = pytest.mark.parametrize("which", INSTRUMENTS)
+
+
+@cache
+def exact(which, seed=0):
+    """A simulation without noise, which the calibration is told of all the same; and the true tool frames, 4x4."""
+    it = INSTRUMENTS[which]
+    more = {"pixels": 400, "camera in the room": 60, "faces": 12}.get(which, 40)
+    s = simulate(scenario(replace(it, stated_noise=SIGMA), n=more, noise=EXACT, validation=RandomReadings(7)), seed)
+    m = s.tables[0].measurements
+    return s, np.stack([tool_pose(s.true_robot, q) for q in m.readings])
+
+
+def as_matrix(frame):
+    """4x4 of a `Placement`."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = frame.rotation, frame.position
+    return T
+
+
+def names_of(labels):
+    return [labels.names[k] for k in labels.index]
+
+
+CLOSE = rounding(30.0)  # products of a few lengths of metres
+
+
+@pytest.mark.parametrize("which", ["pose", "orientations", "targets", "stations"])
+def test_a_tracker_sees_targets_from_its_stations(which):
+    s, T = exact(which)
+    m, frames = s.tables[0].measurements, s.truth["frames"]
+    targets = names_of(m.labels["target"]) if "target" in m.labels else [None] * len(T)
+    stations = names_of(m.labels["station"]) if "station" in m.labels else [None] * len(T)
+    for k, (target, station) in enumerate(zip(targets, stations, strict=True)):
+        X = as_matrix(frames["it" if station is None else f"it, station {station}"])
+        there = [0, 0, 0] if target is None else s.truth["targets"][target].xyz
+        seen = X @ T[k]
+        if m.position is not None:
+            assert m.position[k] == pytest.approx((seen @ [*there, 1.0])[:3], abs=CLOSE)
+        if m.rotation is not None:
+            assert m.rotation[k] == pytest.approx(seen[:3, :3], abs=CLOSE)
+    if which == "stations":
+        assert stations[:4] == ["s1", "s1", "s2", "s2"]
+        assert targets[:4] == ["a", "b", "a", "b"]
+        assert m.ids[:4].tolist() == ["p0", "p0", "p1", "p1"]
+
+
+def test_pairs_are_measured_between_configurations():
+    s, T = exact("pairs")
+    pairs = s.tables[0].measurements.pairs
+    assert pairs.n_pairs == 80 + 21  # and all of seven test rows
+    step = T[pairs.b, :3, 3] - T[pairs.a, :3, 3]
+    turn = np.swapaxes(T[pairs.a, :3, :3], 1, 2) @ T[pairs.b, :3, :3]
+    assert pairs.distance == pytest.approx(np.linalg.norm(step, axis=1), abs=CLOSE)
+    assert pairs.angle == pytest.approx(rotation_angle(turn)[0], abs=rounding(100.0))
+
+
+@pytest.mark.parametrize("which", ["anchors", "offset", "contact"])
+def test_lengths_go_to_anchors_in_turn(which):
+    s, T = exact(which)
+    m = s.tables[0].measurements
+    names = names_of(m.labels["anchor"])
+    anchors = np.array([s.truth["anchors"][name].xyz for name in names])
+    added = 0.12 if which == "offset" else 0.0
+    away = np.linalg.norm(T[:, :3, 3] - anchors, axis=1)
+    assert m.length == pytest.approx(away + added, abs=1e-9 if which == "contact" else CLOSE)
+    assert names == [m.labels["anchor"].names[k % len(m.labels["anchor"].names)] for k in range(len(T))]
+    assert s.truth.get("offsets", {}) == ({"it": 0.12} if added else {})
+    assert s.tables[0].offset == bool(added)
+
+
+@pytest.mark.parametrize("which", ["planes", "faces"])
+def test_distances_are_across_planes(which):
+    s, T = exact(which)
+    m = s.tables[0].measurements
+    planes = [s.truth["planes"][name] for name in names_of(m.labels["plane"])]
+    away = np.array([p.normal @ t[:3, 3] - p.distance for p, t in zip(planes, T, strict=True)])
+    assert away == pytest.approx(0.0 if m.length is None else m.length, abs=1e-9 if which == "faces" else CLOSE)
+    assert (m.length is None) == (which == "faces")
+    normals = np.array([p.normal for p in s.truth["planes"].values()])[:3]
+    assert normals @ normals.T == pytest.approx(np.eye(3), abs=CLOSE)
+
+
+def test_a_camera_on_the_tool_sees_boards_before_it():
+    s, T = exact("board")
+    m = s.tables[0].measurements
+    wall = as_matrix(WALL["wall"])
+    for k in range(len(T)):
+        seen = np.linalg.inv(T[k]) @ wall
+        assert m.rotation[k] == pytest.approx(seen[:3, :3], abs=CLOSE)
+        assert m.position[k] == pytest.approx(seen[:3, 3], abs=CLOSE)
+        assert seen[2, 3] > 0.0
+        assert seen[:3, 2] @ seen[:3, 3] < 0.0
+    assert 5 < len(T) < 40  # the others are behind
+
+
+@pytest.mark.parametrize("which", ["pixels", "camera in the room"])
+def test_corners_are_seen_where_a_pinhole_has_them_and_nowhere_else(which):
+    s, T = exact(which)
+    m = s.tables[0].measurements
+    seen = {}
+    for k in range(len(T)):
+        corner = [*m.image[k, 2:], 0.0, 1.0]
+        on_tool = np.linalg.inv(T[k]) @ as_matrix(WALL["wall"])
+        X = on_tool if which == "pixels" else as_matrix(s.truth["frames"]["it"]) @ T[k]
+        x, y, z = (X @ corner)[:3]
+        assert z > 0.0
+        assert X[:3, 2] @ X[:3, 3] < 0.0  # from its front
+        r2 = (x * x + y * y) / z**2
+        distorted = 1.0 - 0.1 * r2 + 0.05 * r2**2
+        u, v = 900 * x / z * distorted + 640, 905 * y / z * distorted + 480
+        assert m.image[k, :2] == pytest.approx([u, v], abs=rounding(1000.0, 100))
+        assert 0 <= u <= 1280
+        assert 0 <= v <= 960
+        seen.setdefault(m.ids[k], set()).add(tuple(corner[:2]))
+    counts = [len(corners) for corners in seen.values()]
+    assert max(counts) == 20  # all of 5 by 4
+    assert {tuple(c) for c in GRID.points.tolist()} >= set.union(*seen.values())
+    assert min(counts) < 20  # where the board leaves the image
+
+
+def test_sockets_are_touched_in_turn_and_measured_against_each_other():
+    s, T = exact("sockets")
+    groups = s.tables[0].measurements.groups
+    places = np.array([s.truth["sockets"][name].xyz for name in groups.names])
+    assert T[:, :3, 3] == pytest.approx(places[groups.index], abs=1e-9)
+    assert groups.index[:4].tolist() == [0, 1, 2, 0]
+    apart = [np.linalg.norm(places[a] - places[b]) for a, b in ((0, 1), (0, 2), (1, 2))]
+    assert groups.pairs.distance == pytest.approx(apart, abs=CLOSE)
+
+
+NOISY = {
+    "pose": [("position", 1e-4), ("rotation", 2e-4)],
+    "targets": [("position", 1e-4)],
+    "anchors": [("length", 1e-4)],
+    "planes": [("length", 1e-4)],
+    "board": [("position", 1e-4), ("rotation", 2e-4)],
+    "pixels": [("image", 0.1)],
+}
+
+
+@pytest.mark.parametrize("which", NOISY)
+def test_noise_has_its_sigma(which):
+    """The same seed with and without: standard normal numbers times sigma, to five of its own sigma."""
+    noisy, clean = (
+        simulate(scenario(replace(INSTRUMENTS[which], stated_noise=SIGMA), n=700, noise=noise), 3)
+        .tables[0]
+        .measurements
+        for noise in (SIGMA, EXACT)
+    )
+    for name, sigma in NOISY[which]:
+        a, b = getattr(noisy, name), getattr(clean, name)
+        if name == "rotation":
+            # the tracker's about the tool's axes, the camera's about its own
+            off = a @ np.swapaxes(b, 1, 2) if which == "board" else np.swapaxes(b, 1, 2) @ a
+            off = Rotation.from_matrix(off).as_rotvec()
+        else:
+            off = (a - b)[:, :2] if name == "image" else (a - b).reshape(len(a), -1)
+        assert off.std() == pytest.approx(sigma, rel=5.0 / np.sqrt(2.0 * off.size))
+        assert np.abs(off.mean(axis=0)).max() < 5.0 * sigma / np.sqrt(len(off))
+
+
+@EVERY
+def test_every_instrument_calibrates_as_it_is_simulated(which):
+    """At a chi-square and errors of the arm that noise explains, within 99.9 %."""
+    n = {"board": 100, "pixels": 300, "camera in the room": 120}.get(which, 40)
+    s = simulate(scenario(INSTRUMENTS[which], n=n, noise=replace(SIGMA, joint=1e-4)), 1)
+    result = calibrate(s.robot, s.tables)
+    assert result.trustworthy
+    found = result.uncertainty
+    rows = [s.robot.index(name) for name in found.names]
+    error = (found.robot.nominal - s.true_robot.nominal)[rows]
+    assert chi2.cdf(error @ np.linalg.solve(found.covariance, error), len(rows)) < 0.999
+
+
+@EVERY
+def test_the_files_say_what_the_tables_do(which, tmp_path):
+    s = simulate(scenario(INSTRUMENTS[which], n=300 if which == "pixels" else 12, length_unit="mm", angle_unit="deg",
+                          validation=RandomReadings(9)), 4)  # fmt: skip
+    names = write_simulation(tmp_path / "job", s)
+    assert sorted(file.name for file in (tmp_path / "job").iterdir()) == list(names)
+    job = read_job(tmp_path / "job" / "calibration.yaml")
+    assert job.truth.nominal == pytest.approx(s.true_robot.nominal, abs=rounding(10.0))
+    (read,), (made,) = job.measurements, s.tables
+    for name in ("model", "pairing", "frame", "offset", "camera", "fixed_camera"):
+        assert getattr(read, name) == getattr(made, name), name
+    assert list(read.known) == list(made.known)
+    for name, point in made.known.items():
+        assert read.known[name].xyz == pytest.approx(point.xyz)
+        assert read.known[name].tolerance == point.tolerance
+    same_measurements(read.measurements, made.measurements)
+
+
+def same_measurements(a, b):
+    """To the rounding of a change of units."""
+    assert a.ids.tolist() == b.ids.tolist()
+    assert a.test.tolist() == b.test.tolist()
+    for name in ("readings", "position", "rotation", "sigma_position", "sigma_orientation", "sigma_joint",
+                 "sigma_point", "length", "sigma_length", "image", "sigma_pixel"):  # fmt: skip
+        mine, others = getattr(a, name), getattr(b, name)
+        if others is not None:
+            assert mine == pytest.approx(others, rel=rounding(1, 10), abs=rounding(10.0)), name
+        else:
+            assert mine is None or name.startswith("sigma"), name
+    assert {k: names_of(v) for k, v in a.labels.items()} == {k: names_of(v) for k, v in b.labels.items()}
+    assert (a.groups is None) == (b.groups is None)
+    for mine, others in ((a.pairs, b.pairs), (a.groups and a.groups.pairs, b.groups and b.groups.pairs)):
+        if others is not None:
+            for name in ("a", "b", "distance", "angle", "sigma_distance", "sigma_angle"):
+                assert getattr(mine, name) == pytest.approx(getattr(others, name), rel=rounding(1, 10), nan_ok=True)
+
+
+# --- several at once --------------------------------------------------------------------------------------------------
+
+
+def test_the_same_configuration_has_the_same_joint_errors_in_all_tables():
+    """Instruments without noise of their own, of an arm whose encoders have some."""
+    noise = replace(EXACT, joint=1e-3)
+    one = Tracker(model="position", name="one", frame="base", stated_noise=SIGMA)
+    s = simulate(scenario(one, replace(one, name="two"), LengthGauge(name="wire", stated_noise=SIGMA), noise=noise))
+    first, second, wire = (table.measurements for table in s.tables)
+    assert first.ids.tolist() == second.ids.tolist() == wire.ids.tolist()
+    assert first.position == pytest.approx(second.position, abs=0.0)
+    anchors = np.array([s.truth["anchors"][name].xyz for name in names_of(wire.labels["anchor"])])
+    assert wire.length == pytest.approx(np.linalg.norm(first.position - anchors, axis=1), abs=CLOSE)
+    there = np.stack([tool_pose(s.true_robot, q)[:3, 3] for q in first.readings])
+    assert np.abs(first.position - there).max() > 1e-4  # and not where the readings say
+    assert first.position == pytest.approx(
+        np.stack([tool_pose(s.true_robot, q)[:3, 3] for q in s.true_readings]), abs=CLOSE
+    )
+
+
+def test_an_instrument_may_have_configurations_of_its_own_and_shares_the_test_rows():
+    own = GivenReadings(np.zeros((4, 4)) + np.arange(4)[:, None])
+    a, b = Tracker(model="position", name="a"), Tracker(model="position", name="b", configurations=own)
+    s = simulate(scenario(a, b, n=5, validation=RandomReadings(3)))
+    assert s.tables[0].measurements.ids.tolist() == [f"p{i}" for i in range(8)]
+    assert s.tables[1].measurements.ids.tolist() == ["b p0", "b p1", "b p2", "b p3", "p5", "p6", "p7"]
+    assert s.tables[1].measurements.readings[:4] == pytest.approx(own.readings)
+    assert [s.n_configurations(test=test) for test in (False, True)] == [9, 3]
+
+
+def test_what_one_instrument_draws_leaves_the_others_alone():
+    wire, plane = LengthGauge(name="wire"), Indicator(name="plane")
+    alone, both = simulate(scenario(wire)), simulate(scenario(wire, plane))
+    assert alone.tables[0].measurements.length.tolist() == both.tables[0].measurements.length.tolist()
+    louder = simulate(scenario(replace(wire, noise=Noise(distance=2e-4)), plane))
+    assert louder.tables[1].measurements.length.tolist() == both.tables[1].measurements.length.tolist()
+    assert louder.tables[0].measurements.sigma_length[0] == 2e-4
+
+
+def test_a_point_of_one_name_is_one_and_all_are_told_the_same_of_it():
+    bolt = {"bolt": Spot([1.0, 0.5, 0.2], 1e-3)}
+    s = simulate(scenario(LengthGauge(name="wire", anchors=bolt), LengthGauge(name="bar", anchors=bolt)), 2)
+    told = [table.known["bolt"] for table in s.tables]
+    assert told[0].xyz.tolist() == told[1].xyz.tolist()
+    assert told[0].tolerance == 1e-3
+    assert 0.0 < np.abs(told[0].xyz - bolt["bolt"].xyz).max() < 5e-3
+    assert calibrate(s.robot, s.tables).trustworthy
+    other = {"bolt": Spot([1.0, 0.5, 0.3])}
+    with pytest.raises(InputError) as caught:
+        simulate(scenario(LengthGauge(name="wire", anchors=bolt), LengthGauge(name="bar", anchors=other)))
+    assert str(caught.value) == "scenario: instruments: anchors: bolt: at two places, expected one, or other names"
+
+
+def test_boards_are_those_that_the_views_look_at():
+    robot = small_arm(tolerance=TOLERANCE)
+    pose_at = tool_pose(robot, [0.3, 0.4, 0.2, 0.5])
+    # a board 0.4 m ahead of the tool there, facing it, so that the first view is that configuration
+    ahead = Placement(pose_at[:3, :3] @ np.diag([1.0, -1.0, -1.0]), pose_at[:3, 3] + 0.4 * pose_at[:3, 2])
+    views = BoardViews(ahead, count=0, height=0.4, roll=0.0)
+    camera = BoardCamera(model="board", name="eye", configurations=views)
+    s = simulate(scenario(camera, Tracker(model="position", name="tracker")))
+    assert s.tables[0].measurements.position == pytest.approx(np.array([[0.0, 0.0, 0.4]]), abs=2e-2)
+    assert s.truth["boards"]["board"] is ahead
+
+
+def test_a_plain_scenario_has_a_table_too():
+    s = simulate(scenario(job={"model": "distance", "pairing": {"random": 30, "seed": 2}}, noise=Noise(1e-4, 1e-4)))
+    (table,) = s.tables
+    assert (table.model, table.pairing, table.frame) == ("distance", Pairing("random", 30, 2), "unknown")
+    assert table.measurements is s.measurements
+    assert s.truth == {}
+
+
+@pytest.mark.slow
+def test_the_scenario_of_the_readme_runs(fg_calib, tmp_path):
+    """With the robot of its own pages, a UR10."""
+    (text,) = re.findall(r"```yaml\n([^`]*\ninstruments:\n[^`]*)```", README.read_text())
+    (tmp_path / "scenario.yaml").write_text(text)
+    rows = [[0, 90, 127.3], [-612, 0, 0], [-572.3, 0, 0], [0, 90, 163.9], [0, -90, 115.7], [0, 0, 92.2]]
+    joints = [dict(zip(("a", "alpha", "d"), row, strict=True)) | {"theta": 0, "beta": 0} for row in rows]
+    tolerance = {"a": 1, "d": 1, "alpha": 0.05, "theta": 0.05, "beta": 0.05}
+    robot = {"convention": "dh-hayati", "joints": joints, "tool": {"z": 100}, "tolerance": tolerance}
+    robot["units"] = {"length": "mm", "angle": "deg"}
+    (tmp_path / "robot.yaml").write_text(yaml.safe_dump(robot))
+    assert fg_calib("simulate", tmp_path / "scenario.yaml", "--out", tmp_path / "job").code == 0
+    assert fg_calib("calibrate", tmp_path / "job" / "calibration.yaml").code == 0
+
+
+# --- what cannot be ---------------------------------------------------------------------------------------------------
+
+ARM, FEW = paper_robot(), RandomReadings(2)  # no slide, which would go anywhere
+CANNOT = [
+    (LengthGauge(name="it"), {"noise": Noise(1e-3, 1e-3)},
+     "scenario: instruments: it: noise: distance: found none, expected 1 sigma, for model anchor"),
+    (LengthGauge(name="it"), {"noise": EXACT},
+     "scenario: instruments: it: noise: distance: found 0, expected a number above 0; a calibration takes nothing "
+     "for exact: tell it what to assume under job: noise: distance"),
+    (LengthGauge(name="it", anchors={"far": Spot([50.0, 0, 0])}, contact=True), {"robot": ARM, "configurations": FEW},
+     "scenario: instruments: it: far not reached from 2 of 2 configurations, expected points within the joint limits"),
+    (Indicator(name="it", planes={"far": Plane([0, 0, 1], 50.0)}, contact=True), {"robot": ARM, "configurations": FEW},
+     "scenario: instruments: it: no plane is reached from any configuration, expected planes within reach"),
+    (BoardCamera(model="board", name="it"), {},
+     "scenario: instruments: it: boards: found none, expected boards by name, or configurations: {board: ...}"),
+    (BoardCamera(model="pixels", name="it", camera=CAMERA, corners=GRID,
+                 boards={"away": Placement(np.eye(3), np.array([0, 0, 900.0]))}), {},
+     "scenario: instruments: it: sees no board at any of 60 configurations; configurations: {board: ...} have the "
+     "camera look at one"),
+    (Tracker(model="position", name="it", stations=2), {"frame": "base"},
+     "scenario: instruments: it: stations: 2 with frame base, expected 1"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("instrument", "changes", "message"), CANNOT, ids=range(len(CANNOT)))
+def test_what_cannot_be_measured_is_one_line(instrument, changes, message):
+    with pytest.raises(InputError) as caught:
+        simulate(scenario(instrument, **changes))
+    assert str(caught.value) == message
+
+
+def test_two_of_one_name_are_refused():
+    with pytest.raises(InputError) as caught:
+        scenario(LengthGauge(name="it"), Indicator(name="it"))
+    assert str(caught.value) == "scenario: instruments: 2 with the name it, expected one"
