@@ -18,7 +18,7 @@ from fg_calib.errors import SolverError
 from fg_calib.files.csv_writer import write_csv
 from fg_calib.files.job import read_job
 from fg_calib.graph import solver
-from fg_calib.options import MODELS
+from fg_calib.options import MODELS, PAIR_MODELS, POSE_MODELS
 from fg_calib.robot.inverse import solve_inverse
 
 PLACED = (Rotation.from_euler("xyz", [0.3, -0.7, 1.9]), np.array([1.0, -2.0, 0.5]))
@@ -403,7 +403,8 @@ def test_a_healthy_job_raises_no_alarm(seed):
         random_robot("urdf", 6, rng),
         random_robot("dh", 5, rng),
     )[seed % 5]
-    model = MODELS[seed % len(MODELS)]
+    models = (*POSE_MODELS, *PAIR_MODELS)
+    model = models[seed % len(models)]
     unknown = bool(rng.random() < 0.5) and model in ("pose", "position", "orientation")
     m = measure(true_robot(robot, rng), 40 + 10 * seed, rng, sigma=(1e-3, 1e-3), frame=PLACED if unknown else None)
     check = check_setup(robot, m, model, "unknown" if unknown else "known", doubtful=True)
