@@ -42,7 +42,8 @@ if TYPE_CHECKING:
     from fg_calib.measurements.dataset import Measurements, Noise
     from fg_calib.measurements.kinds.pixel import Camera
     from fg_calib.measurements.series import KnownPoint, Own, Table
-    from fg_calib.options import Options, Pairing
+    from fg_calib.options import Limits, Options, Pairing
+    from fg_calib.pages import write_report
     from fg_calib.report.comparison import format_comparison
     from fg_calib.report.documents import (
         comparison_document,
@@ -88,7 +89,8 @@ _HOMES = {
     "fg_calib.graph.problem": ("Problem",),
     "fg_calib.measurements.kinds.pixel": ("Camera",),
     "fg_calib.measurements.series": ("KnownPoint", "Own", "Table"),
-    "fg_calib.options": ("Options", "Pairing"),
+    "fg_calib.pages": ("write_report",),
+    "fg_calib.options": ("Limits", "Options", "Pairing"),
     "fg_calib.report.comparison": ("format_comparison",),
     "fg_calib.report.identifiability": ("format_identifiability",),
     "fg_calib.report.text": ("format_report",),
@@ -123,6 +125,7 @@ __all__ = [
     "Job",
     "KnownPoint",
     "LeastSquares",
+    "Limits",
     "Measurements",
     "Noise",
     "Options",
@@ -177,6 +180,7 @@ __all__ = [
     "solve_job",
     "write_comparison",
     "write_observability",
+    "write_report",
     "write_results",
     "write_robot",
     "write_simulation",

@@ -40,7 +40,7 @@ from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.series import Table
 from fg_calib.options import NEAR, Options, check_flag, check_names, did_you_mean, listed
 from fg_calib.report.documents import result_of, write_results
-from fg_calib.report.summary import format_result, html, summary
+from fg_calib.report.summary import format_result, html, judged, summary
 from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import forward, precompute_trig
 from fg_calib.robot.model import Robot
@@ -302,6 +302,12 @@ class Calibration:
     def findings(self) -> tuple[str, ...]:
         """Why it is not to be trusted; empty if it is."""
         return self.result.findings
+
+    @property
+    def not_accepted(self) -> tuple[str, ...]:
+        """The limits of `accept` that it does not keep to, or that could not be judged, each in a line."""
+        found = () if self.result.acceptance is None else self.result.acceptance.judgements
+        return tuple(judged(one for one in found if one.verdict != "pass"))
 
     @property
     def trustworthy(self) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from numbers import Integral, Real
 from typing import Any, Literal, get_args
@@ -243,6 +243,49 @@ POSE_MODELS: dict[Model, tuple[bool, bool]] = {
 """Whether a model uses orientations and positions."""
 
 
+LIMITED: dict[str, Literal["m", "rad"]] = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad"}
+"""What `Limits` may limit, and its unit."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The largest RMS errors at test rows with which the arm is good enough; None where there is no limit.
+
+    Attributes:
+        position: Of the tool, [m].
+        orientation: Of the tool, [rad].
+        distance: Of distances and lengths, [m].
+        angle: Of angles between configurations, [rad].
+
+    Raises:
+        InputError: A limit is no number above 0.
+    """
+
+    position: float | None = None
+    orientation: float | None = None
+    distance: float | None = None
+    angle: float | None = None
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            if getattr(self, f.name) is not None:
+                check_number(f"accept: {f.name}", getattr(self, f.name), above=True)
+
+    @classmethod
+    def given(cls, limits: Limits | Mapping[str, float] | None) -> Limits:
+        """The limits given, as such or by name; none at all if None.
+
+        Raises:
+            InputError: A name is not known, or a limit is no number above 0.
+        """
+        if limits is None or isinstance(limits, Limits):
+            return limits or cls()
+        if not isinstance(limits, Mapping):
+            raise InputError("accept", f"found {shown(limits)}", "limits by name")
+        check_names("accept", limits, [f.name for f in fields(cls)], "limit")
+        return cls(**limits)
+
+
 @dataclass(frozen=True)
 class Options:
     """Every choice of a calibration, checked.
@@ -263,6 +306,7 @@ class Options:
         loss: What becomes of large residuals: `none` or a robust loss (see `graph.robust`).
         estimate_noise: Whether the sigmas stated are only a start, and scaled to what is seen.
         max_iterations: Steps after which the solver gives up; None for its default.
+        accept: How large errors at test rows may be; by name (`{"position": 5e-4}`) as well.
 
     Raises:
         InputError: A choice is not one of those possible.
@@ -278,6 +322,7 @@ class Options:
     loss: Loss = "none"
     estimate_noise: bool = False
     max_iterations: int | None = None
+    accept: Limits = field(default_factory=Limits)
 
     def __post_init__(self) -> None:
         set_checked(self, model=Model, frame=FrameKnowledge, gauge=Gauge)
@@ -286,6 +331,7 @@ class Options:
         check_flag("estimate_noise", self.estimate_noise)
         if self.max_iterations is not None:
             check_number("max_iterations", self.max_iterations, above=True, whole=True)
+        object.__setattr__(self, "accept", Limits.given(self.accept))
 
     @classmethod
     def given(cls, options: Options | None, choices: dict[str, Any]) -> Options:

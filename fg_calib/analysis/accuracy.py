@@ -69,12 +69,7 @@ def expected_error(solution: Solution, spread: Spread) -> ExpectedError:
         solution: The solution.
         spread: Its covariance, what was left out to fix the gauge included.
     """
-    data = solution.problem.data
-    test = np.zeros(data.n_configurations, dtype=np.bool_)
-    for s in data.series:
-        test[data.places[s.table][s.ends[s.test]]] = True
-    for table, place in zip(data.tables, data.places, strict=True):
-        test[place[table.measurements.test]] = True
+    data, test = solution.problem.data, solution.problem.data.tested
     there = np.flatnonzero(test if test.any() else ~test)
     chosen = there[np.unique(np.linspace(0, len(there) - 1, MOST).round().astype(np.int64))]
     base, fitted = errors_at(spread, data.readings[chosen])

@@ -36,9 +36,6 @@ Floats = NDArray[np.float64]
 NO_ANGLE = 1.0
 """An angle of a pose with a larger sigma is not known, [rad]: near a pitch of a quarter turn yaw and roll are none."""
 
-_AT_ONCE = 192
-"""Functions whose covariance is formed at once where only variances are wanted."""
-
 
 @dataclass(frozen=True)
 class TangentCovariance(FrozenArrays):
@@ -61,23 +58,28 @@ class TangentCovariance(FrozenArrays):
 
     def covariance(self, rows: Floats) -> Floats:
         """Covariance of linear functions of the columns, shape (m, n_columns); nan where undetermined."""
-        scaled = rows * self.variables.scales
         with np.errstate(invalid="ignore"):  # yaw and roll at a pitch of a quarter turn have no derivative
             out: Floats = rows @ self.tangent @ rows.T
-            size = np.linalg.norm(scaled, axis=1)
-            unknown = ~np.isfinite(np.diag(out))
-            shares = [np.linalg.norm(scaled @ loose.T, axis=1) for loose in (self.loose, self.loose_at_nominal)]
-            unknown |= (shares[0] > SUPPORT_TOLERANCE * size) & (shares[1] > SUPPORT_TOLERANCE * size)
+        unknown = self._unknown(rows) | ~np.isfinite(np.diag(out))
         out[unknown, :] = np.nan
         out[:, unknown] = np.nan
         return out
 
     def variance(self, rows: Floats) -> Floats:
-        """The diagonal of `covariance` for any number of functions, shape (m,)."""
-        if not len(rows):
-            return np.zeros(0)
-        chunks = (rows[start : start + _AT_ONCE] for start in range(0, len(rows), _AT_ONCE))
-        return np.concatenate([np.diag(self.covariance(chunk)) for chunk in chunks])
+        """The diagonal of `covariance`, shape (m,)."""
+        with np.errstate(invalid="ignore"):
+            out: Floats = np.einsum("ij,ij->i", rows @ self.tangent, rows)
+        out[self._unknown(rows) | ~np.isfinite(out)] = np.nan
+        return out
+
+    def _unknown(self, rows: Floats) -> NDArray[np.bool_]:
+        """Which linear functions have a share in what nothing determines, at nominal and at the estimate."""
+        scaled = rows * self.variables.scales
+        with np.errstate(invalid="ignore"):
+            size = np.linalg.norm(scaled, axis=1)
+            shares = [np.linalg.norm(scaled @ loose.T, axis=1) for loose in (self.loose, self.loose_at_nominal)]
+            found: NDArray[np.bool_] = (shares[0] > SUPPORT_TOLERANCE * size) & (shares[1] > SUPPORT_TOLERANCE * size)
+        return found
 
     def named(self) -> Floats:
         """Covariance of the robot's parameters among the columns, shape (n_robot_columns, n_robot_columns)."""

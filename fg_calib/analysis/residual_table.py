@@ -173,6 +173,38 @@ class ResidualTable(FrozenArrays):
                     }
         return found
 
+    def of_configurations(self, n: int) -> tuple[NDArray[np.int64], Floats, dict[str, Floats]]:
+        """How many rows that count each configuration takes part in, the sum of their squares, and RMS by kind.
+
+        Args:
+            n: Number of configurations.
+
+        Returns:
+            Rows, shape (n,); sum of squares in sigma, shape (n,); by kind of noise the RMS of the length of a
+            measurement's rows at the estimate, shape (n,), nan where there are none.
+        """
+        counted, first = self.reason_code == 0, self._is_first_of_family()
+        ends = [(end, counted & (end >= 0) & (end < n)) for end in (self.a, self.b)]
+
+        def summed(values: Floats, of: Booleans) -> Floats:
+            found = [np.bincount(end[at & of], values[at & of], n).astype(np.float64) for end, at in ends]
+            return found[0] + found[1]
+
+        whole = np.ones(self.n, dtype=np.bool_)
+        rms = {}
+        for k, family in enumerate(self.families):
+            mine = self.family == k
+            with np.errstate(invalid="ignore"):
+                rms[family] = np.sqrt(summed(self.after**2, mine) / summed(first.astype(np.float64), mine))
+        rows = summed(np.ones(self.n), whole).astype(np.int64)
+        return rows, summed((self.after / self.sigma) ** 2, whole), rms
+
+    def noise_of_test(self, family: str) -> tuple[int, float]:
+        """Number of test measurements of a kind of noise that count, and the RMS length of the noise stated of them."""
+        rows = (self.reason_code == 0) & (self.split == 1) & (self.family == self.families.index(family))
+        n = int(np.sum(rows & self._is_first_of_family()))
+        return n, float(np.sqrt(np.sum(self.sigma[rows] ** 2) / max(n, 1)))
+
     def _is_first_of_family(self) -> Booleans:
         """Rows that begin a measurement's rows of one kind of noise, shape (n,)."""
         change = np.ones(self.n, dtype=np.bool_)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from fg_calib.analysis.acceptance import Acceptance, accept
 from fg_calib.analysis.accuracy import ExpectedError, expected_error, without_rigid_motion
 from fg_calib.analysis.changes import Change
 from fg_calib.analysis.chi_square import chi_square
@@ -132,6 +133,7 @@ class Uncertainty(FrozenArrays):
         joint_values: Estimated joint values beside their readings; None where these were not estimated.
         reservations: Those of the cautions that say that sigmas are too small.
         change: What moved while a table was measured; None if nothing did.
+        acceptance: What became of the limits that its user set; None without any.
     """
 
     names: tuple[str, ...]
@@ -160,6 +162,7 @@ class Uncertainty(FrozenArrays):
     joint_values: JointValues | None = None
     reservations: tuple[str, ...] = ()
     change: Change | None = None
+    acceptance: Acceptance | None = None
 
     def __repr__(self) -> str:
         known = sum(p.sigma is not None for p in self.parameters if p.identifiability != "fixed")
@@ -319,6 +322,7 @@ def _assess(solution: Solution) -> Uncertainty:
         noise_like=verdict.noise_like,
         reservations=verdict.reservations,
         change=verdict.change,
+        acceptance=accept(problem.options.accept, table, verdict.findings),
     )
 
 

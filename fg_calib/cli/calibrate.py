@@ -21,6 +21,12 @@ def calibrate(
             help="Write result.json, the calibrated robot and residuals.csv there.",
         ),
     ] = None,
+    report: Annotated[
+        bool, typer.Option("--report", help="Write report.html there too: one page to look at and to pass on.")
+    ] = False,
+    figures: Annotated[
+        bool, typer.Option("--figures", help="Write the page's figures there too, as SVG files.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Estimate a robot's parameters from measurements, with their uncertainties."""
@@ -29,6 +35,9 @@ def calibrate(
     from fg_calib.files.job import read_job
     from fg_calib.report.documents import require_no_input
 
+    if out is None and (report or figures):
+        option = "--report" if report else "--figures"
+        raise typer.BadParameter("needs --out, the folder to write to", param_hint=option)
     if out is not None:
         require_writable(out)
     given = read_job(job)
@@ -45,4 +54,8 @@ def calibrate(
     finally:  # also where nobody takes the report
         if out is not None:
             found.save(out)
-    end(found.findings)
+            if report or figures:
+                from fg_calib.pages import write_report
+
+                write_report(out, page=report, figures=figures)
+    end(found.findings, found.not_accepted)

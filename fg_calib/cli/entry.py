@@ -26,6 +26,7 @@ from fg_calib.cli.compare import compare
 from fg_calib.cli.example import example
 from fg_calib.cli.observe import observe
 from fg_calib.cli.output import say
+from fg_calib.cli.report import report
 from fg_calib.cli.simulate import simulate
 from fg_calib.errors import CalibrationError, InputError, printable
 
@@ -36,7 +37,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (calibrate, compare, observe, simulate, example, bag, board):
+for command in (calibrate, report, compare, observe, simulate, example, bag, board):
     app.command()(command)
 
 

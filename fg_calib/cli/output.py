@@ -41,11 +41,13 @@ def show_report(report: RenderableType) -> None:
     Console(highlight=False, width=width).print(report)
 
 
-def end(findings: Sequence[str]) -> None:
-    """Say on stderr why a result is not to be trusted, and end with 3 if there is a reason."""
+def end(findings: Sequence[str], not_accepted: Sequence[str] = ()) -> None:
+    """Say on stderr why a result is not to be trusted, or not accepted, and end with 3 if there is a reason."""
     for finding in findings:
         say(f"not to be trusted: {finding}")
-    if findings:
+    for reason in not_accepted:
+        say(f"not accepted: {reason}")
+    if findings or not_accepted:
         raise typer.Exit(3)
 
 

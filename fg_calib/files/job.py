@@ -30,16 +30,18 @@ from fg_calib.files.schema import (
     validate,
 )
 from fg_calib.files.tables import read_measurements, read_points
-from fg_calib.files.units import Units, UnitsOfFile
+from fg_calib.files.units import Units, UnitsOfFile, quantity
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import Noise
 from fg_calib.measurements.kinds import Camera
 from fg_calib.measurements.series import KnownPoint, Table
 from fg_calib.options import (
+    LIMITED,
     POSE_MODELS,
     EncoderNoise,
     FrameKnowledge,
     Gauge,
+    Limits,
     Loss,
     Model,
     Options,
@@ -96,6 +98,7 @@ class _JobOfTables(Schema):
     encoder: EncoderNoise = "propagated"
     loss: Loss = "none"
     max_iterations: Annotated[Count, Field(gt=0)] | None = None
+    accept: Any = None  # an `_Accept`
     truth: FilePath | None = None
     targets: dict[str, Any] = Field(default_factory=dict)  # by name a `_Point`
     anchors: dict[str, Any] = Field(default_factory=dict)
@@ -133,6 +136,13 @@ class _Point(Schema):
     y: Number
     z: Number
     tolerance: Positive | None = None
+
+
+class _Accept(Schema):
+    position: Any = None  # a number, or text with its unit
+    orientation: Any = None
+    distance: Any = None
+    angle: Any = None
 
 
 class _Fixed(Schema):
@@ -313,7 +323,15 @@ def _options(file: _JobOfTables, estimate_noise: bool, place: str, first: Table)
     """The choices of a job; its old key `prior: false` is `gauge: none`."""
     choices = {key: getattr(file, key) for key in _CHOICES if key in file.model_fields_set} | {"model": first.model}
     pairing = pairing_of(file.pairing, f"{place}: pairing")
-    return Options.of(**choices, pairing=pairing, estimate_noise=estimate_noise)
+    accept = _limits(file.accept, file.units, f"{place}: accept")
+    return Options.of(**choices, pairing=pairing, estimate_noise=estimate_noise, accept=accept)
+
+
+def _limits(given: object, units: Units, place: str) -> Limits:
+    """What errors the user accepts, in [m] and [rad]."""
+    file = validate(_Accept, {} if given is None else given, place)
+    stated = {key: getattr(file, key) for key in file.model_fields_set}
+    return Limits(**{key: quantity(one, LIMITED[key], units, f"{place}: {key}") for key, one in stated.items()})
 
 
 def check_choices(choices: Mapping[str, Any], robot: Robot, place: str) -> None:
@@ -329,6 +347,7 @@ def check_choices(choices: Mapping[str, Any], robot: Robot, place: str) -> None:
     """
     file = validate(_Job, {"robot": ".", "measurements": ".", **choices}, place)
     pairing_of(file.pairing, f"{place}: pairing")
+    _limits(file.accept, file.units, f"{place}: accept")
     _check_preferred(file, robot, place)
 
 

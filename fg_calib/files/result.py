@@ -180,6 +180,25 @@ class Priors(Section):
     beyond_tolerance: tuple[BeyondTolerance, ...]
 
 
+class Judgement(Section):
+    """A limit that the user set, and what the rows held out say of it."""
+
+    kind: Literal["position", "orientation", "distance", "angle"]
+    limit: Annotated[float, Field(gt=0)]
+    error: Figure
+    noise: Figure
+    n: Whole
+    verdict: Literal["pass", "fail", "not evaluated"]
+    reason: str = ""
+
+
+class Acceptance(Section):
+    """What became of all limits that the user set."""
+
+    verdict: Literal["pass", "fail", "not evaluated"]
+    judgements: tuple[Judgement, ...]
+
+
 class InFrames(Section):
     """An error in the base frame, and after the best rigid fit."""
 
@@ -411,6 +430,7 @@ class Result(Section):
     goodness: dict[str, KindGoodness] = {}
     evaluated_only: bool = False
     test: TestRows | None = None
+    acceptance: Acceptance | None = None
     priors: Priors | None = None
     expected_error: ExpectedError | None = None
     noise_factors: dict[str, float] | None = None
@@ -426,6 +446,8 @@ class Result(Section):
     joint_values: JointValues | None = None
     groups: tuple[TouchedPoint, ...] = ()
     observability: Observability
+    options: dict[str, Any] = {}
+    versions: dict[str, str] = {}
     inputs: dict[str, str]
 
 

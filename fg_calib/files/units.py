@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
 from pydantic import BeforeValidator
 
-from fg_calib.files.schema import refuse_unknown_keys
-from fg_calib.options import AngleUnit, LengthUnit, set_checked
+from fg_calib.errors import InputError
+from fg_calib.files.schema import Positive, Schema, refuse_unknown_keys, shown, validate
+from fg_calib.options import AngleUnit, LengthUnit, did_you_mean, set_checked
 
 LENGTHS: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 """Metres in one unit of length."""
@@ -48,6 +50,39 @@ class Units:
         figure = float(value) / factor
         short = float(f"{figure:.15g}")
         return short if short * factor == value else figure
+
+
+def quantity(given: object, unit: str, units: Units, place: str) -> float:
+    """A positive figure in [m] or [rad] from a number in the file's units, or from text with its own: `0.5 mm`.
+
+    Args:
+        given: What the file holds.
+        unit: `m` or `rad`.
+        units: Of the file.
+        place: File and key, for messages.
+
+    Raises:
+        InputError: It is neither.
+    """
+    known = LENGTHS if unit == "m" else ANGLES
+    number, name = given, units.name(unit)
+    if isinstance(given, str) and (read := _QUANTITY.fullmatch(given)):
+        number, name = read["number"], read["unit"] or name
+    if name not in known:
+        expected = f"a number with one of {', '.join(known)}"
+        raise InputError(place, f"found {shown(given)}", expected, did_you_mean(name, known))
+    try:
+        return validate(_Figure, {"figure": number}, "").figure * known[name]
+    except InputError as error:
+        expected = f"{error.expected}, with its unit or without"
+        raise InputError(place, f"found {shown(given)}", expected, error.hint) from None
+
+
+class _Figure(Schema):
+    figure: Positive
+
+
+_QUANTITY = re.compile(r"\s*(?P<number>[^\s]*[0-9.])\s*(?P<unit>[A-Za-z]*)\s*")
 
 
 UnitsOfFile = Annotated[Units, BeforeValidator(refuse_unknown_keys("length", "angle"))]

@@ -67,6 +67,16 @@ class Dataset(Brief):
         return out
 
     @property
+    def tested(self) -> Booleans:
+        """Which configurations have test rows, shape (n_configurations,)."""
+        found = np.zeros(self.n_configurations, dtype=np.bool_)
+        for s in self.series:
+            found[self.places[s.table][s.ends[s.test]]] = True
+        for table, place in zip(self.tables, self.places, strict=True):
+            found[place[table.measurements.test]] = True
+        return found
+
+    @property
     def sigma_joint(self) -> Floats:
         """1 sigma of the readings, shape (n_joints,)."""
         return self.tables[0].measurements.sigma_joint

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +39,7 @@ from fg_calib.files.csv_writer import Words, write_csv_parts
 from fg_calib.files.disk import fill_folder, require_own, write_text
 from fg_calib.files.result import (
     SCHEMA,
+    Acceptance,
     BeyondTolerance,
     Correlated,
     Covariance,
@@ -70,7 +73,9 @@ from fg_calib.graph.noise import JOINT_NOISE
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
 from fg_calib.job import Job
+from fg_calib.report.page.files import FIGURE_FILES, PAGE
 from fg_calib.report.shown import FAMILY_UNIT
+from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
 
 if TYPE_CHECKING:  # a calibration is written without the baseline
@@ -123,6 +128,7 @@ def result_of(solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str,
         goodness=_goodness_by_kind(goodness.kinds, VERDICTS),
         evaluated_only=problem.evaluated,
         test=_test_rows(u, names),
+        acceptance=None if u.acceptance is None else Acceptance.model_validate(u.acceptance),
         priors=_priors(u.priors),
         expected_error=_expected_error(u.expected_error),
         noise_factors=_noise_factors(solution, goodness.kinds),
@@ -138,8 +144,24 @@ def result_of(solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str,
         joint_values=_joint_values(u.joint_values, names),
         groups=tuple(map(TouchedPoint.model_validate, u.points)),
         observability=_observability(u.identifiability),
+        options=_options(problem),
+        versions=_versions(),
         inputs=dict(inputs or {}),
     )
+
+
+def _options(problem: Problem) -> dict[str, Any]:
+    """Every choice by name; of what is accepted the limits that were set."""
+    given = {f.name: getattr(problem.options, f.name) for f in fields(problem.options)}
+    limits = {key: limit for key, limit in asdict(problem.options.accept).items() if limit is not None}
+    words = {"pairing": str(problem.options.pairing), "prefer": list(problem.options.prefer), "accept": limits}
+    return given | words
+
+
+def _versions() -> dict[str, str]:
+    """What the figures were computed with."""
+    libraries = {name: metadata.version(name) for name in ("gtsam", "numpy", "scipy")}
+    return {"fg-calib": __version__, "python": platform.python_version(), **libraries}
 
 
 @checked
@@ -524,20 +546,33 @@ def _estimated(comparison: Comparison, estimate: Estimate) -> list[dict[str, Any
 
 
 @checked
-def write_comparison(folder: Path | str, comparison: Comparison) -> None:
-    """Write `comparison.json` into a folder, whole or not at all.
+def write_comparison(folder: Path | str, comparison: Comparison, *, figures: bool = False) -> None:
+    """Write `comparison.json`, and `comparison.svg` if figures are wanted, into a folder, all of them or none.
 
     Raises:
         InputError: The folder cannot be written.
     """
     text = json.dumps(comparison_document(comparison), indent=1, allow_nan=False) + "\n"
-    own = {"comparison.json": b'{\n "schema": "fg-calib/comparison/'}
-    fill_folder(Path(folder), lambda into: write_text(into / "comparison.json", text), own)
+    texts = {"comparison.json": text}
+    if figures:
+        from fg_calib.report.page.estimators import draw_estimators
+
+        texts["comparison.svg"] = draw_estimators(comparison)
+
+    def write(into: Path) -> None:
+        for name, content in texts.items():
+            write_text(into / name, content)
+
+    own = {"comparison.json": b'{\n "schema": "fg-calib/comparison/', "comparison.svg": b"<svg"}
+    fill_folder(Path(folder), write, own)
 
 
 RESULT_FILES = {
     "result.json": b'{\n "schema": "fg-calib/result/',
     "residuals.csv": b"kind,a,b,split,used,excluded,",
+    "configurations.csv": b"id,split,q1,",
+    **PAGE,
+    **FIGURE_FILES,
     "joints.csv": b"id,joint,unit,reading,estimate,",
     "robot_calibrated.yaml": b"",
     "robot_calibrated.urdf": b"",
@@ -549,7 +584,7 @@ RESULT_FILES = {
 def write_results(
     folder: Path | str, solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str, str] | None = None
 ) -> None:
-    """Write `result.json`, `residuals.csv` and the calibrated robot into a folder, all of them or none.
+    """Write `result.json`, the calibrated robot, `residuals.csv` and `configurations.csv` into a folder, all or none.
 
     Where joint values were estimated there is a `joints.csv` too.
 
@@ -567,6 +602,7 @@ def write_results(
         write_text(into / "result.json", document)
         write_calibrated_robot(into, calibrated)
         _write_residuals(into / "residuals.csv", solution, uncertainty)
+        _write_configurations(into / "configurations.csv", solution, uncertainty)
         if uncertainty.joint_values is not None:
             units = [robot.joints[j].unit for j in uncertainty.joint_values.joints]
             _write_joint_values(into / "joints.csv", uncertainty.joint_values, solution.problem.end_names, units)
@@ -642,6 +678,24 @@ def _write_residuals(path: Path, solution: Solution, uncertainty: Uncertainty) -
 
     starts = range(0, max(table.n, 1), _ROWS_AT_ONCE)
     write_csv_parts(path, (columns(slice(start, start + _ROWS_AT_ONCE)) for start in starts))
+
+
+def _write_configurations(path: Path, solution: Solution, uncertainty: Uncertainty) -> None:
+    """One line a configuration: its readings, where the calibrated tool is (from the base), how large residuals are."""
+    data, robot = solution.problem.data, uncertainty.robot
+    readings, n = data.readings, data.n_configurations
+    rows, chi2, rms = uncertainty.residuals.of_configurations(n)
+    tool = pose(robot, readings).position
+    columns: dict[str, Any] = {
+        "id": Words(data.names[:n], np.arange(n)),
+        "split": Words(("train", "test"), data.tested.astype(np.int64)),
+        **{f"q{i + 1}": readings[:, i] for i in range(robot.n_joints)},
+        **{f"tool_{axis}": tool[:, i] for i, axis in enumerate("xyz")},
+        "rows": rows,
+        "chi2": chi2,
+        **{f"rms_{family}": figures for family, figures in rms.items()},
+    }
+    write_csv_parts(path, [columns])
 
 
 def _numbers(rows: NDArray[np.int32]) -> Words:

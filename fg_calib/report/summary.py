@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 
+from fg_calib.analysis.acceptance import Judgement
 from fg_calib.errors import escaped
+from fg_calib.files.result import Judgement as JudgementDocument
 from fg_calib.files.result import Parameter, Result, Rms
+from fg_calib.options import LIMITED
 from fg_calib.report.shown import FAMILY_UNIT, SHOWN
 
 WIDTH = 100
@@ -17,6 +20,17 @@ _HEADINGS = ("", "estimate", "± sigma", "", "correction", "nominal", "prior", "
 def good(reservations: Sequence[str]) -> str:
     """The word for a result that may be trusted, although perhaps not without reservations."""
     return "GOOD, with reservations" if reservations else "GOOD"
+
+
+def judged(found: Iterable[Judgement | JudgementDocument]) -> list[str]:
+    """A line a limit: `PASS: position 0.31 mm (RMS of 30 test measurements), limit 0.5 mm`."""
+    lines = []
+    for one in found:
+        factor, unit, _ = SHOWN[LIMITED[one.kind]]
+        error = "" if one.error is None else f" {one.error * factor:.3g} {unit} (RMS of {one.n} test measurements)"
+        reason = f": {one.reason}" if one.reason else ""
+        lines.append(f"{one.verdict.upper()}: {one.kind}{error}, limit {one.limit * factor:.3g} {unit}{reason}")
+    return lines
 
 
 def summary(result: Result) -> list[str]:
@@ -32,6 +46,7 @@ def summary(result: Result) -> list[str]:
     known = sum(p.sigma is not None for p in estimated)
     lines = [
         head,
+        *([] if result.acceptance is None else judged(result.acceptance.judgements)),
         *verdicts[:3],
         *more,
         f"{result.n_configurations} configurations, {result.n_residuals} residuals{chi2}",

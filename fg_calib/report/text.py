@@ -21,7 +21,7 @@ from fg_calib.report.identifiability import WEAK, lost_directions, weak_directio
 from fg_calib.report.notes import notes
 from fg_calib.report.parameters import combinations, parameters
 from fg_calib.report.shown import SHOWN
-from fg_calib.report.summary import good
+from fg_calib.report.summary import good, judged
 from fg_calib.report.tables import WIDTH, in_order, indented, line, plain_table, plain_text, rounded, section
 
 
@@ -78,6 +78,9 @@ def _verdict(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
         what += ", joint values estimated"
     what += "" if settings.loss == "none" else f", loss {settings.loss}"
     lines: list[RenderableType] = [line(what)]
+    if uncertainty.acceptance is not None:
+        colour = {"pass": "bold green", "fail": "bold red"}.get(uncertainty.acceptance.verdict, "bold yellow")
+        lines += [line(text, colour) for text in judged(uncertainty.acceptance.judgements)]
     lines += [line(f"DOUBTFUL: {finding}", "bold red") for finding in uncertainty.findings]
     if uncertainty.trustworthy:
         lines.append(line(f"{good(uncertainty.reservations)}: {solution.message}", "bold green"))

@@ -26,7 +26,7 @@ from fg_calib.files.units import Units
 from fg_calib.robot.model import Joint, RobotBuilder
 
 JOB, POSES, ROBOT, TRUTH = "calibration.yaml", "poses.csv", "robot_nominal.yaml", "robot_true.yaml"
-OUTPUTS = {"result.json", "robot_calibrated.yaml", "residuals.csv"}
+OUTPUTS = {"result.json", "robot_calibrated.yaml", "residuals.csv", "configurations.csv"}
 NUMBER = (int, float)
 
 
@@ -67,7 +67,7 @@ def calibrate(fg_calib, job, *arguments):
     return json.loads(ended.out, parse_constant=_refuse)
 
 
-def test_calibrating_the_example_ends_well_and_writes_three_files(calibrated):
+def test_calibrating_the_example_ends_well_and_writes_its_files(calibrated):
     folder, ended = calibrated
     assert (ended.exit_code, ended.stderr) == (0, "")
     assert ended.stdout.startswith("space-robot: distance-rotation, pairs: star\nGOOD: converged")
@@ -473,8 +473,8 @@ BAD = {
     "unknown key in the job": (
         sub(JOB, "^pairing", "pairng"),
         "calibration.yaml: unknown key 'pairng', expected one of robot, measurements, pairs, model, pairing, frame, "
-        "units, noise, prior, gauge, prefer, pair_errors, encoder, loss, max_iterations, truth, targets, anchors, "
-        "tolerance, offset, camera, columns; did you mean pairing?",
+        "units, noise, prior, gauge, prefer, pair_errors, encoder, loss, max_iterations, accept, truth, targets, "
+        "anchors, tolerance, offset, camera, columns; did you mean pairing?",
     ),
     "unknown key in the robot": (
         sub(ROBOT, "^fixed", "fixd"),
@@ -745,8 +745,7 @@ def test_a_urdf_gives_a_calibrated_urdf_that_reads_back_to_the_estimates(fg_cali
     true = write_urdf_job(tmp_path, "arm.urdf")
     result = calibrate(fg_calib, tmp_path / JOB, "--out", tmp_path / "result")
     assert {f.name for f in (tmp_path / "result").iterdir()} == {
-        "result.json",
-        "residuals.csv",
+        *(OUTPUTS - {"robot_calibrated.yaml"}),
         "robot_calibrated.urdf",
     }
     calibrated = read_robot(tmp_path / "result" / "robot_calibrated.urdf")

@@ -230,7 +230,7 @@ def test_no_file_of_an_earlier_result_stays_beside_a_new_one(example):
         (folder / name).write_text("old")
     calibration.save(folder)
     names = sorted(file.name for file in folder.iterdir())
-    assert names == ["mine.txt", "residuals.csv", "result.json", "robot_calibrated.yaml"]
+    assert names == ["configurations.csv", "mine.txt", "residuals.csv", "result.json", "robot_calibrated.yaml"]
 
 
 @pytest.mark.parametrize("name", ["joints.csv", "residuals.csv", "robot_calibrated.yaml", "result.json"])

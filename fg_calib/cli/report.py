@@ -1,0 +1,28 @@
+"""`fg-calib report`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fg_calib.cli.output import say
+
+
+def report(
+    result: Annotated[
+        Path, typer.Argument(metavar="RESULT", readable=False, help="A folder that `calibrate --out` wrote.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", readable=False, help="Write there instead of beside the result."),
+    ] = None,
+    figures: Annotated[bool, typer.Option("--figures", help="Write its figures too, as SVG files.")] = False,
+) -> None:
+    """Write report.html of a calibration: one page to look at and to pass on, which needs nothing else."""
+    from fg_calib.pages import write_report
+
+    write_report(result, out, figures=figures)
+    folder = (result if result.is_dir() else result.parent) if out is None else out
+    say(f"wrote {folder / 'report.html'}")

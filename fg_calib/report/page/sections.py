@@ -1,0 +1,307 @@
+"""The sections of the page of one calibration, in the order in which they are read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.files.result import Parameter, Rms
+from fg_calib.report.identifiability import format_relation
+from fg_calib.report.page.figures import (
+    accuracy_bars,
+    arm_ranges,
+    correlation_matrix,
+    error_over_joints,
+    parameter_whiskers,
+    residual_charts,
+    workspace_slices,
+)
+from fg_calib.report.page.markup import tag
+from fg_calib.report.page.run import Run
+from fg_calib.report.shown import FAMILY_UNIT, SHOWN
+from fg_calib.report.summary import good, judged, parameter_rows
+
+if TYPE_CHECKING:
+    from lxml.etree import _Element as Element
+
+Floats = NDArray[np.float64]
+
+_MOST_ROWS = 40
+"""Suspicious rows that the page lists; `residuals.csv` has all."""
+
+
+def verdict(run: Run) -> list[Element]:
+    """Whether the arm is good enough, and whether the figures are to be trusted."""
+    result = run.result
+    parts = []
+    if result.acceptance is not None:
+        word = {"pass": "PASS", "fail": "FAIL"}.get(result.acceptance.verdict, "NOT EVALUATED")
+        kind = {"pass": "pass", "fail": "fail"}.get(result.acceptance.verdict, "open")
+        lines = [tag("div", text) for text in judged(result.acceptance.judgements)]
+        parts.append(tag("div", tag("strong", f"{word}: the limits that were set"), lines, class_=f"verdict {kind}"))
+    if result.findings:
+        lines = [tag("div", text) for text in result.findings]
+        parts.append(tag("div", tag("strong", "DOUBTFUL: not to be trusted"), lines, class_="verdict fail"))
+    else:
+        word = good(result.reservations)
+        lines = [tag("div", text) for text in (*result.reservations, result.solver.message)]
+        kind = "open" if result.reservations else "pass"
+        parts.append(tag("div", tag("strong", f"{word}: figures may be trusted"), lines, class_=f"verdict {kind}"))
+    if result.acceptance is None:
+        text = "No limits were set: with accept: {position: 0.5 mm} in the job this page says pass or fail."
+        parts.append(tag("p", text, class_="soft"))
+    cautions = [text for text in result.cautions if text not in result.reservations]
+    if cautions:
+        parts += [tag("h3", "Worth knowing"), tag("ul", [tag("li", text) for text in cautions])]
+    return parts
+
+
+def tiles(run: Run) -> Element:
+    """The few figures that count."""
+    result, split = run.result, run.judged_on
+    rows = "held out" if run.held_out else "fitted (none were held out)"
+    found = []
+    for family, rms in result.residual_rms.get(split, {}).items():
+        if rms is not None and ", table" not in family:
+            words = f"{family}, rows {rows}; before: {_shown(rms.before, run.unit(family))}"
+            found.append((_shown(rms.after, run.unit(family)), words))
+    expected = result.expected_error
+    if expected is not None:
+        where = "after the best rigid fit" if run.free_of_frame else "in the base frame"
+        for kind, unit in (("position", "m"), ("orientation", "rad")):
+            both = getattr(expected, kind)
+            value = both.fitted if run.free_of_frame else both.base
+            found.append((_shown(value, unit), f"tool {kind} error expected from the covariance, {where} (RMS)"))
+    known = sum(p.sigma is not None for p in result.parameters if p.identifiability != "fixed")
+    estimated = sum(p.identifiability != "fixed" for p in result.parameters)
+    found.append((f"{result.n_configurations}", "configurations measured"))
+    found.append((f"{known} of {estimated}", "parameters estimated with a known uncertainty"))
+    return tag("div", [tag("div", tag("b", value), words, class_="tile") for value, words in found], class_="tiles")
+
+
+def accuracy(run: Run) -> list[Element]:
+    """Before and after, on rows that were held out where there are any."""
+    held, fitted = (
+        "rows that were held out: the estimate never saw them",
+        "rows that were fitted, for none were held out (split: test): elsewhere the arm will do worse",
+    )
+    words = f"RMS residuals before and after the calibration, of {held if run.held_out else fitted}."
+    parts = [tag("p", f"{words} They contain the measurements' noise.")]
+    return [*parts, figures([accuracy_bars(run)])]
+
+
+def joints(run: Run) -> list[Element]:
+    """Residuals against each joint's reading, and where each joint was read."""
+    charts = error_over_joints(run)
+    if not charts:
+        return [_missing("configurations.csv")]
+    words = "Each dot is a configuration. A bow or a slope means an effect that the model lacks at that joint."
+    parts = [tag("p", words), figures(charts)]
+    workspace = run.workspace
+    if workspace is not None:
+        parts += [tag("h3", "Where the joints were measured"), figures([arm_ranges(workspace)])]
+        share = 100.0 * float(np.mean(workspace.far))
+        text = f"{share:.0f} % of the workspace within the joint limits has no measured position near it."
+        parts.append(tag("p", text))
+        parts.append(tag("ul", [tag("li", line) for line in _gaps(run)]))
+    return parts
+
+
+def _gaps(run: Run) -> Iterator[str]:
+    """The widest part of each joint's range that was not measured, where it is wide."""
+    assert run.workspace is not None
+    for joint in run.workspace.joints:
+        factor, unit, _ = SHOWN[joint.unit]
+        low, high = (v * factor for v in joint.gap)
+        limits = [v for v in joint.limits if np.isfinite(v)]
+        width = (max((*joint.range, *limits)) - min((*joint.range, *limits))) * factor
+        if width > 0.0 and high - low > 0.25 * width:
+            yield f"{joint.name}: nothing between {low:.4g} and {high:.4g} {unit}; measure there"
+
+
+def parameters(run: Run) -> list[Element]:
+    """Every parameter, by class."""
+    found = [p for p in run.result.parameters if p.identifiability != "fixed"]
+    if not found:
+        return [tag("p", "No parameter was estimated.")]
+    words = (
+        "Dots are corrections, estimate less nominal, with 1 sigma to both sides; the pale band is the tolerance that"
+        " was assumed. Orange: its uncertainty is not known."
+    )
+    parts = [tag("p", words), figures(parameter_whiskers(run))]
+    titles = {
+        "independent": "Independent: the measurements alone determine each of these",
+        "relative": "Relative: determined only together with others",
+        "ineffective": "Ineffective: no measurement depends on these",
+    }
+    for kind, title in titles.items():
+        chosen = [p for p in found if p.identifiability == kind]
+        if chosen:
+            parts += [tag("h3", title), _table_of_parameters(chosen)]
+    return parts
+
+
+def _table_of_parameters(found: Sequence[Parameter]) -> Element:
+    head, *rows = parameter_rows(found)
+    cells = [[*row, _share(p)] for row, p in zip(rows, found, strict=True)]
+    return table([*head, "sigma / tolerance"], cells, drop=7)
+
+
+def _share(p: Parameter) -> str:
+    return "" if p.sigma is None or not p.prior_sigma else f"{p.sigma / p.prior_sigma:.2f}"
+
+
+def undetermined(run: Run) -> list[Element]:
+    """What nothing determines, and what is determined badly, in words."""
+    o = run.result.observability
+    parts = []
+    if o.lost:
+        by_reason: dict[str, list[str]] = {}
+        for lost in o.lost:
+            by_reason.setdefault(lost.reason, []).append(format_relation(lost.relation))
+        rows = [[", ".join(relations), reason] for reason, relations in by_reason.items()]
+        parts += [tag("p", "The measurements cannot tell these apart:"), table(["what", "because"], rows, words=True)]
+    if o.weak:
+        weak = [
+            [f"{1.0 / w.signal_to_noise:.3g}" if w.signal_to_noise else "unknown", _relation(w.members)]
+            for w in o.weak[:8]
+        ]
+        parts += [
+            tag("p", "Determined badly: the uncertainty is above a tenth of the tolerance, or of 1 mrad at the reach."),
+            table(["sigma / tolerance", "largest members"], weak, words=True),
+        ]
+    parts += [tag("p", f"Not modelled: {missing.message}") for missing in o.missing]
+    return parts or [tag("p", "The measurements determine every parameter that was estimated.")]
+
+
+def _relation(members: dict[str, float]) -> str:
+    listed = sorted(members.items(), key=lambda item: -abs(item[1]))
+    words = ", ".join(f"{name} {share:+.2f}" for name, share in listed[:6])
+    return words if len(listed) <= 6 else f"{words} and {len(listed) - 6} more"
+
+
+def correlations(run: Run) -> list[Element]:
+    """What is correlated."""
+    found = correlation_matrix(run)
+    if found is None:
+        return [tag("p", "Fewer than two parameters have a known uncertainty.")]
+    words = "Strong colours: errors of the two go together, so neither is known alone as well as both together."
+    return [tag("p", words), tag("div", figures([found]), class_="scene")]
+
+
+def residuals(run: Run) -> list[Element]:
+    """What is left, and what is suspicious."""
+    charts = residual_charts(run)
+    if not charts:
+        return [_missing("residuals.csv")]
+    words = "Residuals in their own standard deviations: noise as stated follows the curve, and 1 in 370 is beyond 3."
+    parts = [tag("p", words), figures(charts)]
+    found = run.residuals
+    assert found is not None
+    suspects = np.flatnonzero(found.suspect)
+    suspects = suspects[np.argsort(-np.abs(np.nan_to_num(found.studentised[suspects])))]
+    if not len(suspects):
+        return [*parts, tag("p", "No row is suspicious.")]
+    rows = []
+    for k in suspects[:_MOST_ROWS].tolist():
+        factor, unit, decimals = SHOWN.get(found.units[found.kind[k]], (1.0, "", 6))
+        of = f"{found.a[k]} {found.b[k]}".strip()
+        split = "test" if found.test[k] else "train"
+        shown = f"{found.residual[k] * factor:+.{decimals}f} {unit}", f"{found.studentised[k]:+.1f}"
+        rows.append([found.kinds[found.kind[k]], of, found.of[k], split, *shown, f"residuals.csv:{found.line[k]}"])
+    heading = ["what", "configuration", "of", "split", "residual", "in its sigma", "where"]
+    parts += [tag("h3", f"Suspicious rows ({len(suspects)})"), table(heading, rows)]
+    if len(suspects) > _MOST_ROWS:
+        parts.append(tag("p", f"and {len(suspects) - _MOST_ROWS} more: suspect in residuals.csv", class_="soft"))
+    return parts
+
+
+def workspace(run: Run) -> list[Element]:
+    """Expected error all over the workspace."""
+    found = run.workspace
+    if found is None:
+        return [_missing("configurations.csv")]
+    if not np.isfinite(found.error).any():
+        return [tag("p", "The error of the tool depends on what the measurements do not determine: it is not known.")]
+    where = "after the best rigid fit to the measured positions" if found.fitted else "in the base frame"
+    low, middle, high = (_shown(float(v), "m") for v in np.nanquantile(found.error, [0.05, 0.5, 0.95]))
+    unknown = float(np.mean(~np.isfinite(found.error)))
+    words = (
+        f"RMS error of the tool's position expected from the covariance, {where}, at {len(found.error)} configurations"
+        f" drawn within the joint limits: 5 % are below {low}, half below {middle}, 95 % below {high}. It says what is"
+        " left of the measurements' noise, not what the model lacks."
+    )
+    parts = [tag("p", words)]
+    if unknown > 0.0:
+        parts.append(tag("p", f"At {100.0 * unknown:.0f} % of them it is not known."))
+    return [*parts, figures(workspace_slices(found))]
+
+
+def inputs(run: Run) -> list[Element]:
+    """What it was made from, and how to make it again."""
+    result = run.result
+    parts = []
+    if run.command is not None:
+        parts.append(tag("p", "In the folder of the job: ", tag("code", run.command)))
+    if result.inputs:
+        files = [[name, digest] for name, digest in result.inputs.items()]
+        parts.append(table(["file", "SHA-256"], files, words=True))
+    options = [
+        [key, _plain(value)] for key, value in result.options.items() if value not in (None, [], "") and key != "accept"
+    ]
+    if options:
+        parts += [tag("h3", "Options"), table(["", ""], options, words=True)]
+    versions = [[name, version] for name, version in result.versions.items()] or [["fg-calib", result.version]]
+    parts += [tag("h3", "Versions"), table(["", ""], versions, words=True)]
+    return parts
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return ", ".join(map(str, value))
+    return {True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value)
+
+
+def _shown(value: float | None, unit: str) -> str:
+    """A figure with its unit, in three digits."""
+    factor, name, _ = SHOWN.get(unit, (1.0, unit, 3))
+    return "unknown" if value is None or not np.isfinite(value) else f"{value * factor:.3g} {name}"
+
+
+def shown_rms(rms: Rms | None, family: str, when: str) -> str:
+    """An RMS before or after with its unit; a dash where there is none."""
+    if rms is None:
+        return "-"
+    return _shown(getattr(rms, when), rms.unit or FAMILY_UNIT.get(family.partition(",")[0], "m"))
+
+
+def figures(charts: Sequence[tuple[str, Element]]) -> Element:
+    """Charts with what they show below each."""
+    return tag("div", [tag("figure", svg, tag("figcaption", words)) for words, svg in charts], class_="figures")
+
+
+def table(heading: Sequence[str], rows: Sequence[Sequence[str]], *, words: bool = False, drop: int = -1) -> Element:
+    """A table that scrolls by itself where the page is narrow.
+
+    Args:
+        heading: Of each column.
+        rows: Cells.
+        words: Whether the last column holds sentences.
+        drop: A column to leave out.
+    """
+
+    def cells(name: str, row: Sequence[str]) -> list[Element]:
+        kinds = ["words" if words and i == len(row) - 1 else None for i in range(len(row))]
+        chosen = [(cell, kind) for i, (cell, kind) in enumerate(zip(row, kinds, strict=True)) if i != drop]
+        return [tag(name, cell, class_=kind) for cell, kind in chosen]
+
+    head = tag("thead", tag("tr", cells("th", heading))) if any(heading) else None
+    body = tag("tbody", [tag("tr", cells("td", row)) for row in rows])
+    return tag("div", tag("table", head, body), class_="wide")
+
+
+def _missing(name: str) -> Element:
+    return tag("p", f"The folder holds no {name}: calibrate again with --out to have this part.", class_="soft")

@@ -1,0 +1,135 @@
+"""Whether the arm keeps to the limits that its user set."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from simulated import measure, small_arm, true_robot, write_job
+
+from fg_calib import InputError, calibrate
+from fg_calib.options import Limits, Options
+
+TOOL = ("tool.x", "tool.y", "tool.z")
+
+
+def calibrated(seed=0, n_test=20, wrong=0.0, model="pose", **options):
+    rng = np.random.default_rng(seed)
+    robot = small_arm(tolerance={"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}, estimate=TOOL)
+    m = measure(true_robot(robot, rng), 40, rng, sigma=(1e-4, 1e-4), n_test=n_test)
+    if wrong:
+        m = replace(m, position=m.position + wrong * m.test[:, None])
+    return calibrate(robot, m, model=model, **options)
+
+
+def verdicts(result):
+    return [one.verdict for one in result.result.acceptance.judgements]
+
+
+def test_without_limits_nothing_is_judged():
+    assert calibrated().result.acceptance is None
+    assert calibrated().not_accepted == ()
+
+
+def test_limits_are_judged_by_the_rms_of_the_test_rows():
+    result = calibrated(accept={"position": 5e-4, "orientation": 5e-4})
+    one = result.result.acceptance.judgements[0]
+    table = result.residuals
+    rows = (table.reason_code == 0) & table.test & np.char.startswith(table.kind, "position")
+    assert one.error == pytest.approx(np.sqrt(np.sum(table.after[rows] ** 2) / 20), rel=1e-12)
+    assert one.noise == pytest.approx(np.sqrt(np.sum(table.sigma[rows] ** 2) / 20), rel=1e-12)
+    assert one.n == 20
+    assert verdicts(result) == ["pass", "pass"]
+    assert result.not_accepted == ()
+    assert "PASS: position" in str(result)
+
+
+def test_an_arm_that_is_worse_fails():
+    """Of two limits one is kept: the whole fails."""
+    result = calibrated(wrong=0.01, accept=Limits(position=5e-3, orientation=5e-4))
+    assert verdicts(result)[0] == "fail"
+    assert result.result.acceptance.verdict == "fail"
+    assert result.not_accepted[0].startswith("FAIL: position 17.3 mm (RMS of 20 test measurements), limit 5 mm")
+
+
+def test_what_passes_needs_a_result_to_be_trusted():
+    result = calibrated(wrong=0.002, accept={"position": 5e-3})
+    assert result.findings
+    assert verdicts(result) == ["not evaluated"]
+    assert "not to be trusted" in result.not_accepted[0]
+
+
+def test_noise_may_hide_what_is_asked_for():
+    """1 sigma of 0.1 mm an axis is 0.17 mm in all: a limit of 0.1 mm is beyond these measurements."""
+    result = calibrated(accept={"position": 1e-4})
+    assert verdicts(result) == ["not evaluated"]
+    assert "the noise of the measurements hides it" in result.not_accepted[0]
+
+
+@pytest.mark.parametrize(("n_test", "words"), [(0, "no test rows measure"), (4, "only 4 test measurements")])
+def test_without_rows_held_out_nothing_is_evaluated(n_test, words):
+    result = calibrated(n_test=n_test, accept={"position": 1.0})
+    assert verdicts(result) == ["not evaluated"]
+    assert words in result.not_accepted[0]
+
+
+def test_pairs_are_judged_by_distances_and_not_by_positions():
+    limits = {"position": 1e-3, "distance": 1e-3, "angle": 1e-3}
+    assert verdicts(calibrated(model="distance-rotation", accept=limits)) == ["not evaluated", "pass", "pass"]
+
+
+@pytest.mark.parametrize(
+    ("accept", "message"),
+    [
+        ({"positon": 1e-3}, "accept: unknown limit 'positon', expected one of position, orientation, distance, angle"),
+        ({"position": 0.0}, "accept: position: found 0.0, expected a finite number above 0"),
+        ({"position": True}, "accept: position: found True, expected a finite number above 0"),
+        ("0.5 mm", "accept: found '0.5 mm', expected limits by name"),
+    ],
+)
+def test_wrong_limits_are_one_line(accept, message):
+    with pytest.raises(InputError) as error:
+        Options.of(accept=accept)
+    assert str(error.value).startswith(message)
+
+
+def of_job(tmp_path, fg_calib, accept, *arguments, units=None):
+    rng = np.random.default_rng(0)
+    robot = small_arm(tolerance={"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}, estimate=TOOL)
+    m = measure(true_robot(robot, rng), 40, rng, sigma=(1e-4, 1e-4), n_test=20)
+    job = write_job(tmp_path, robot, m, model="pose", accept=accept, **({"units": units} if units else {}))
+    return fg_calib("calibrate", job, *arguments)
+
+
+def test_a_job_may_state_units_or_not(tmp_path, fg_calib):
+    ended = of_job(tmp_path, fg_calib, {"position": "0.5 mm", "orientation": "0.05deg"}, "--json")
+    found = json.loads(ended.out)["acceptance"]
+    assert (ended.code, ended.err, found["verdict"]) == (0, "", "pass")
+    assert [one["limit"] for one in found["judgements"]] == pytest.approx([5e-4, np.deg2rad(0.05)], rel=1e-12)
+    ended = of_job(tmp_path, fg_calib, {"position": 5e-4}, "--json")
+    assert json.loads(ended.out)["acceptance"]["judgements"][0]["limit"] == 5e-4
+
+
+def test_what_is_not_accepted_ends_with_3_and_says_why(tmp_path, fg_calib):
+    ended = of_job(tmp_path, fg_calib, {"position": "0.1 mm"})
+    assert ended.code == 3
+    assert ended.err.startswith("not accepted: NOT EVALUATED: position 0.1")
+
+
+@pytest.mark.parametrize(
+    ("accept", "message"),
+    [
+        ({"position": "0.5 deg"}, "accept: position: found '0.5 deg', expected a number with one of m, cm, mm, um"),
+        ({"position": "0.5 Mm"}, "expected a number with one of m, cm, mm, um; did you mean mm?"),
+        ({"position": "a lot"}, "accept: position: found 'a lot', expected a finite number, with its unit or without"),
+        ({"position": -1}, "accept: position: found -1, expected a number above 0"),
+        ({"orientation": "5 mm"}, "accept: orientation: found '5 mm', expected a number with one of rad, deg, mrad"),
+        ({"posiion": 1}, "accept: unknown key 'posiion', expected one of position, orientation, distance, angle"),
+        ([1], "accept: found [1], expected a mapping"),
+    ],
+)
+def test_limits_of_a_job_that_cannot_be_are_one_line(tmp_path, fg_calib, accept, message):
+    ended = of_job(tmp_path, fg_calib, accept)
+    assert (ended.code, ended.out) == (1, "")
+    assert message in ended.err
+    assert ended.err.count("\n") == 1

@@ -1,0 +1,304 @@
+"""The report as a page: all of it there, in a browser too, and no name of a file can do anything."""
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from browser import browse
+from instruments import measured_by
+from lxml import etree, html
+from simulated import measure, plus, small_arm, true_robot, write_job
+
+from fg_calib import Robot, calibrate, write_report
+from fg_calib.pages import load_run
+from fg_calib.report.page.arm import link_points
+from fg_calib.report.page.charts import Scale, limits_of
+from fg_calib.report.page.files import FIGURES
+from fg_calib.robot.kinematics import pose
+
+LARGE = {"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}
+TITLES = (
+    *("Accuracy before and after", "The arm and what was measured", "Error over joint space", "Parameters"),
+    *("What is not determined", "Correlations", "Residuals", "Expected error over the workspace"),
+    "Inputs, options and versions",
+)
+MOST_BYTES = 1_500_000
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A saved calibration with a wrong row among the fitted ones, and its page and figures."""
+    into = tmp_path_factory.mktemp("page")
+    rng = np.random.default_rng(0)
+    robot = small_arm(tolerance=LARGE, estimate=("tool.x", "tool.y", "tool.z"))
+    m = measure(true_robot(robot, rng), 40, rng, sigma=(1e-4, 1e-4), n_test=20)
+    m = replace(m, position=plus(m.position, 7, 0.003))
+    limits = {"position": 5e-4, "orientation": 1e-9}
+    calibrate(robot, m, model="pose", frame="unknown", accept=limits).save(into / "result")
+    write_report(into / "result", figures=True)
+    return into / "result"
+
+
+@pytest.fixture(scope="module")
+def page(folder):
+    return html.parse(str(folder / "report.html"))
+
+
+def text_of(page):
+    return " ".join(page.getroot().body.text_content().split())
+
+
+def test_every_section_is_there(page):
+    assert tuple(page.xpath("//section/h2/text()")) == TITLES
+
+
+def test_the_verdict_comes_first(page, folder):
+    first, second, *_ = page.xpath("//main/div[contains(@class, 'verdict')]")
+    assert first.findtext("strong") == "NOT EVALUATED: the limits that were set"
+    assert second.findtext("strong") == "DOUBTFUL: not to be trusted"
+    result = json.loads((folder / "result.json").read_text())
+    assert all(" ".join(finding.split()) in text_of(page) for finding in result["findings"])
+
+
+def test_every_parameter_is_in_the_table_of_its_class(page, folder):
+    parameters = json.loads((folder / "result.json").read_text())["parameters"]
+    for title, kind in (("Independent", "independent"), ("Relative", "relative"), ("Ineffective", "ineffective")):
+        names = [p["name"] for p in parameters if p["identifiability"] == kind]
+        found = page.xpath(f"//h3[starts-with(., '{title}:')]/following-sibling::div[1]//tr/td[1]/text()")
+        assert found == names
+
+
+def test_suspects_can_be_found(page, folder):
+    """Each is named with its configuration and the line of residuals.csv that it stands in."""
+    rows = page.xpath("//h3[starts-with(., 'Suspicious rows')]/following-sibling::div[1]//tbody/tr")
+    cells = [[td.text_content() for td in row] for row in rows]
+    lines = (folder / "residuals.csv").read_text().splitlines()
+    names = lines[0].split(",")
+    assert cells
+    assert cells[0][1] == "7"
+    for kind, configuration, *_, place in cells:
+        line = lines[int(place.removeprefix("residuals.csv:")) - 1].split(",")
+        found = dict(zip(names, line, strict=True))
+        assert (found["kind"], found["a"], found["suspect"]) == (kind, configuration, "true")
+
+
+def test_inputs_options_versions_and_the_command_are_there(tmp_path, fg_calib):
+    rng = np.random.default_rng(0)
+    robot = small_arm(tolerance=LARGE)
+    job = write_job(tmp_path, robot, measure(true_robot(robot, rng), 30, rng, n_test=9), model="position")
+    ended = fg_calib("calibrate", job, "--out", tmp_path / "out", "--report")
+    assert (ended.code, ended.err) == (0, "")
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    words = text_of(html.parse(str(tmp_path / "out" / "report.html")))
+    assert "fg-calib calibrate calibration.yaml --out out" in words
+    assert result["inputs"]
+    for name, digest in result["inputs"].items():
+        assert f"{name}{digest}" in words
+    for name, version in result["versions"].items():
+        assert f"{name}{version}" in words
+    assert result["options"]["model"] == "position"
+    assert "modelposition" in words
+
+
+def test_it_is_one_small_file_that_asks_for_nothing(folder):
+    text = (folder / "report.html").read_text()
+    assert len(text.encode()) < MOST_BYTES
+    assert not re.search(r"""(?:src|href|action|url)\s*[=(]\s*["']?(?!#)""", text.replace("xmlns", ""))
+    assert "default-src 'none'" in text
+
+
+def test_ten_thousand_configurations_are_still_a_small_file(tmp_path):
+    rng = np.random.default_rng(0)
+    robot = small_arm(tolerance=LARGE)
+    result = calibrate(robot, measure(true_robot(robot, rng), 10_000, rng, n_test=500), model="pose")
+    result.save(tmp_path)
+    write_report(tmp_path)
+    assert (tmp_path / "report.html").stat().st_size < MOST_BYTES
+
+
+HOSTILE = "</script><script>document.title='hacked'</script><img src=x onerror=\"document.title='hacked'\">&lt;\x1b[2J"
+
+
+class Tags(HTMLParser):
+    """Every element and attribute of a page, as browsers tell them."""
+
+    def __init__(self):
+        super().__init__()
+        self.names = []
+        self.attributes = set()
+
+    def handle_starttag(self, tag, attrs):
+        self.names.append(tag)
+        self.attributes |= {name for name, _ in attrs}
+
+
+def hostile_page(folder):
+    rng = np.random.default_rng(0)
+    robot = replace(small_arm(tolerance=LARGE), name=HOSTILE)
+    robot = replace(robot, joints=tuple(replace(j, name=f"{HOSTILE}{i}") for i, j in enumerate(robot.joints)))
+    m = measure(true_robot(robot, rng), 30, rng)
+    m = replace(m, ids=np.array([f"{HOSTILE}{i}" for i in range(30)]), position=plus(m.position, 4, 0.1))
+    calibrate(robot, m, model="pose").save(folder)
+    write_report(folder)
+    return folder / "report.html"
+
+
+def test_names_are_text_and_nothing_else(tmp_path):
+    page = hostile_page(tmp_path)
+    tags = Tags()
+    tags.feed(page.read_text())
+    assert tags.names.count("script") == 2
+    assert "img" not in tags.names
+    assert not any(name.startswith("on") for name in tags.attributes)
+    assert "\x1b" not in page.read_text()
+    words = text_of(html.parse(str(page)))
+    assert "document.title='hacked'" in words  # it is shown
+
+
+@pytest.mark.slow
+def test_names_do_nothing_in_a_browser(tmp_path):
+    dom, console = browse(hostile_page(tmp_path), tmp_path)
+    assert "<title>Calibration of &lt;/script&gt;" in dom
+    assert console == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [(), ("--force-dark-mode", "--window-size=390,844")], ids=["light", "dark phone"])
+def test_a_browser_shows_all_of_it_and_has_nothing_to_say(folder, tmp_path, options):
+    dom, console = browse(folder / "report.html", tmp_path, *options)
+    page = html.fromstring(dom)
+    assert console == []
+    assert len(page.xpath("//figure/*[name() = 'svg']")) == len(page.xpath("//figure")) > 10
+    assert page.get_element_by_id("arm-words").text.startswith("configuration 7 (train): position residual")
+    width, height = (int(page.get_element_by_id("arm").get(key)) for key in ("width", "height"))
+    assert width == height > 100
+
+
+@pytest.mark.parametrize("instrument", ["anchors", "planes", "board", "targets", "pixels"])
+def test_every_instrument_has_a_page(tmp_path, instrument):
+    robot, _, table = measured_by(instrument, np.random.default_rng(1), n=30)
+    result = calibrate(robot, table)
+    result.save(tmp_path)
+    write_report(tmp_path, figures=True)
+    assert tuple(html.parse(str(tmp_path / "report.html")).xpath("//section/h2/text()")) == TITLES
+
+
+def test_figures_are_files_of_their_own(folder):
+    for name in FIGURES:
+        root = etree.parse(folder / f"{name}.svg").getroot()
+        assert root.tag == "{http://www.w3.org/2000/svg}svg"
+        assert len(root.findall("{http://www.w3.org/2000/svg}svg"))
+
+
+@pytest.mark.parametrize("option", ["--report", "--figures"])
+def test_a_page_needs_a_folder(example, fg_calib, option):
+    ended = fg_calib("calibrate", example / "calibration.yaml", option)
+    assert ended.code == 2
+    assert "needs --out" in ended.err
+
+
+def test_a_result_without_its_tables_has_a_page_that_says_so(folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "result", ignore=shutil.ignore_patterns("*.csv", "*.html", "*.svg"))
+    write_report(tmp_path / "result")
+    words = text_of(html.parse(str(tmp_path / "result" / "report.html")))
+    assert words.count("The folder holds no configurations.csv") == 2
+    assert words.count("The folder holds no residuals.csv") == 1
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "message"),
+    [
+        ("configurations.csv", ("q1", "q0"), "configurations.csv: no column q1"),
+        ("configurations.csv", ("test", "tset"), "configurations.csv:42: split: found 'tset', expected train or test"),
+        ("residuals.csv", ("studentised", "student"), "residuals.csv: no column studentised"),
+    ],
+)
+def test_damaged_tables_are_one_line(folder, tmp_path, fg_calib, file, change, message):
+    shutil.copytree(folder, tmp_path / "result")
+    text = (tmp_path / "result" / file).read_text()
+    (tmp_path / "result" / file).write_text(text.replace(*change, 1))
+    (tmp_path / "result" / "report.html").unlink()
+    ended = fg_calib("report", tmp_path / "result")
+    assert ended.code == 1
+    assert ended.err.startswith(f"error: {message}")
+    assert ended.err.count("\n") == 1
+    assert not (tmp_path / "result" / "report.html").exists()
+
+
+def test_another_page_of_that_name_is_not_replaced(folder, tmp_path, fg_calib):
+    (tmp_path / "report.html").write_text("mine")
+    ended = fg_calib("report", folder, "--out", tmp_path)
+    assert ended.code == 1
+    assert (tmp_path / "report.html").read_text() == "mine"
+
+
+def test_two_results_are_shown_side_by_side(tmp_path, fg_calib):
+    rng = np.random.default_rng(0)
+    robot = small_arm(tolerance=LARGE, estimate=("tool.x", "tool.y", "tool.z"))
+    true = true_robot(robot, rng)
+    for name, moved in (("old", 0.0), ("new", 0.005)):
+        theta = [0.0] * len(robot.parameters)
+        theta[[p.name for p in robot.parameters].index("theta2")] = moved
+        m = measure(true.with_values(true.nominal + theta), 40, rng, sigma=(1e-4, 1e-4), n_test=10)
+        calibrate(robot, m, model="pose").save(tmp_path / name)
+    ended = fg_calib("compare", tmp_path / "old", tmp_path / "new", "--json", "--out", tmp_path / "two", "--figures")
+    assert (ended.code, ended.err) == (0, "")
+    by_name = {p["name"]: p for p in json.loads(ended.out)["parameters"]}
+    assert by_name["theta2"]["change"] == pytest.approx(0.005, abs=5 * by_name["theta2"]["sigma"])
+    assert by_name["theta2"]["in_sigma"] > 10.0
+    assert abs(by_name["a1"]["in_sigma"]) < 5.0
+    words = text_of(html.parse(str(tmp_path / "two" / "comparison.html")))
+    assert "Old: old" in words
+    assert f"{by_name['theta2']['in_sigma']:+.1f}" in words
+    assert (tmp_path / "two" / "comparison.svg").read_text().startswith("<svg")
+    shown = fg_calib("compare", tmp_path / "old", tmp_path / "new")
+    assert f"{by_name['theta2']['in_sigma']:+.1f}" in shown.out
+
+
+def test_results_of_different_robots_are_not_compared(folder, tmp_path, fg_calib):
+    rng = np.random.default_rng(0)
+    other = Robot.from_dh([[0.5, 0.3, 0.1, 0.0], [0.4, 1.3, 0.0, 0.0]], convention="mdh")
+    calibrate(other, measure(other, 30, rng), model="pose", gauge="none").save(tmp_path / "other")
+    ended = fg_calib("compare", folder, tmp_path / "other")
+    assert ended.code == 1
+    assert "another robot, expected the parameters of" in ended.err
+
+
+def test_estimators_have_a_figure_too(example, tmp_path, fg_calib):
+    ended = fg_calib("compare", example / "calibration.yaml", "--out", tmp_path / "out", "--figures")
+    assert ended.code == 0
+    text = (tmp_path / "out" / "comparison.svg").read_text()
+    assert all(f">{name}<" in text for name in ("nominal", "graph", "scipy", "gauss-newton"))
+
+
+def test_the_arm_ends_where_its_tool_is():
+    rng = np.random.default_rng(3)
+    robot = true_robot(small_arm(estimate=("tool.x", "tool.y", "tool.z")), rng)
+    q = rng.uniform(-3.0, 3.0, (5, robot.n_joints))
+    assert link_points(robot, q)[:, -1] == pytest.approx(pose(robot, q).position, abs=1e-12)  # some rounding of metres
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (-3.2, 7.9), (1e-9, 2e-9), (-1e6, 1e6), (99.9, 100.1)])
+def test_ticks_are_round_and_within(low, high):
+    scale = Scale(low, high, 0.0, 300.0)
+    ticks = scale.ticks()
+    assert 2 <= len(ticks) <= 7
+    assert all(low - 1e-9 * (high - low) <= t <= high + 1e-9 * (high - low) for t in ticks)
+    assert np.ptp(np.diff(ticks)) == pytest.approx(0.0, abs=1e-9 * (high - low))
+
+
+def test_nothing_to_show_has_limits_too():
+    assert limits_of() == (-0.05, 1.05)
+    assert limits_of([np.nan]) == (-0.05, 1.05)
+    assert limits_of([2.0]) == pytest.approx((1.9, 2.1))
+    assert limits_of([0.0]) == (-1.0, 1.0)
+
+
+def test_a_run_knows_what_it_is_of(folder):
+    run = load_run(folder / "result.json")
+    assert run.folder == folder
+    assert (run.judged_on, run.family, run.free_of_frame, run.command) == ("test", "position", True, None)
