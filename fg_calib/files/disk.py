@@ -12,10 +12,17 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from functools import wraps
 from pathlib import Path
 from tempfile import mkdtemp
+from typing import ParamSpec, TypeVar
 
 from fg_calib.errors import InputError
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+NO_MEMORY = "there is not enough memory for it"
 
 _noted: ContextVar[dict[Path, str] | None] = ContextVar("_noted", default=None)
 
@@ -31,6 +38,32 @@ def noting_reads() -> Iterator[dict[Path, str]]:
         _noted.reset(token)
 
 
+def within_memory(read: Callable[P, R]) -> Callable[P, R]:
+    """A reader of tables that names its table, the argument `path`, where memory does not suffice for it.
+
+    It raises `InputError` then.
+    """
+
+    @wraps(read)
+    def reading(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return read(*args, **kwargs)
+        except MemoryError:
+            table = args[0] if args else kwargs["path"]
+            name = Path(table).name if isinstance(table, str | os.PathLike) else "frame"
+            raise InputError(name, NO_MEMORY) from None
+
+    return reading
+
+
+def require_memory(name: str, size: int) -> None:
+    """Raise, for a table of this name, where so many bytes cannot be had: polars would end the process instead."""
+    try:
+        bytes(size)  # zeros, which the system hands out when they are first looked at
+    except MemoryError:
+        raise InputError(name, NO_MEMORY) from None
+
+
 def read_bytes(path: Path) -> bytes:
     """The content of a file.
 
@@ -44,7 +77,7 @@ def read_bytes(path: Path) -> bytes:
     except PermissionError:
         raise InputError(str(path), "may not be read", hint="check the permissions of file and folder") from None
     except MemoryError:
-        raise InputError(_short(str(path)), "there is not enough memory for it") from None
+        raise InputError(_short(str(path)), NO_MEMORY) from None
     except (OSError, ValueError) as error:  # ValueError: a path with a null character
         found = f"cannot be read: {getattr(error, 'strerror', None) or error}"
         raise InputError(_short(str(path)), found, "a file") from None

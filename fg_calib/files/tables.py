@@ -26,6 +26,7 @@ import numpy as np
 from fg_calib.arguments import checked
 from fg_calib.errors import InputError
 from fg_calib.files.columns import Column, Header, Table
+from fg_calib.files.disk import within_memory
 from fg_calib.files.instruments import COLUMNS, InstrumentColumns
 from fg_calib.files.pairs import Configurations, read_pairs
 from fg_calib.files.poses import OF_POSES, PoseColumns
@@ -49,6 +50,7 @@ KNOWN = {*_RESERVED, *COLUMNS, "sigma_position", "sigma_orientation", "sigma_poi
 
 
 @checked
+@within_memory
 def read_measurements(
     path: Path | str | Any,
     robot: Robot,
