@@ -41,3 +41,8 @@ class Job:
         if not isinstance(self.measurements, Measurements):
             return self.measurements
         return (Table(self.measurements, self.options.model, self.options.pairing, self.options.frame),)
+
+    @property
+    def model(self) -> str:
+        """The models of all tables, in words."""
+        return " + ".join(dict.fromkeys(table.model or "own" for table in self.tables))

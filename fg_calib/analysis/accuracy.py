@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 
 from fg_calib.analysis.covariance import Spread
 from fg_calib.graph.solver import Solution
+from fg_calib.measurements.gathering import Dataset
 from fg_calib.robot.kinematics import forward, precompute_trig
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
 MOST = 1000
 """Configurations up to which all are looked at; of more, so many that are evenly spaced."""
@@ -69,11 +71,17 @@ def expected_error(solution: Solution, spread: Spread) -> ExpectedError:
         solution: The solution.
         spread: Its covariance, what was left out to fix the gauge included.
     """
-    data, test = solution.problem.data, solution.problem.data.tested
-    there = np.flatnonzero(test if test.any() else ~test)
+    data = solution.problem.data
+    there, at = judged_configurations(data)
     chosen = there[np.unique(np.linspace(0, len(there) - 1, MOST).round().astype(np.int64))]
     base, fitted = errors_at(spread, data.readings[chosen])
-    return ExpectedError(base, fitted, "test" if test.any() else "train", len(chosen), len(there))
+    return ExpectedError(base, fitted, at, len(chosen), len(there))
+
+
+def judged_configurations(data: Dataset) -> tuple[Integers, Literal["test", "train"]]:
+    """The test configurations of all tables, or the train ones for want of these, and which they are."""
+    test = data.tested
+    return np.flatnonzero(test if test.any() else ~test), "test" if test.any() else "train"
 
 
 def errors_at(spread: Spread, readings: Floats) -> tuple[PoseRms, PoseRms]:

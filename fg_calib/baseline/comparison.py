@@ -4,9 +4,12 @@
 |---|---|---|
 | `graph` | what the job says, with its priors | noise |
 | `graph-keep` | the kept parameters alone, no priors (gauge `keep`) | noise |
-| `gauss-newton` | the same parameters, by Eq. (54)-(55) of Jia et al. (2019) | none: metres beside radians |
+| `gauss-newton` | the same parameters, by Eq. (54)-(55) of Jia et al. (2019) | none: metres, radians, pixels alike |
 | `weighted-gauss-newton` | the same parameters, by the same steps | noise |
 | `scipy` | the same parameters, by `scipy.optimize.least_squares` | noise |
+
+All of them estimate the places, unknown frames and offsets that the measurements depend on as well, from where the
+graph starts. Plain least squares takes every measurement for independent, whatever errors they share.
 
 Where a job has its noise estimated, both graphs do so; plain least squares weighs by the noise stated.
 
@@ -29,19 +32,18 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.analysis.accuracy import errors_at, pose_rms
+from fg_calib.analysis.accuracy import errors_at, judged_configurations, pose_rms
 from fg_calib.analysis.residual_table import residual_table
 from fg_calib.analysis.uncertainty import Uncertainty, assess
 from fg_calib.analysis.variance_components import solve_job
 from fg_calib.arguments import checked
-from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
+from fg_calib.baseline.least_squares import LeastSquares, fit_dataset
 from fg_calib.errors import CalibrationError, ProblemError
 from fg_calib.graph.build import problem_of
 from fg_calib.graph.factors import corrections_of
 from fg_calib.graph.solver import Solution
 from fg_calib.job import Job
-from fg_calib.measurements.dataset import Measurements, rotation_angle
-from fg_calib.options import PAIR_MODELS, POSE_MODELS
+from fg_calib.measurements.dataset import rotation_angle
 from fg_calib.robot.kinematics import Poses, build_chain, forward, precompute_trig
 from fg_calib.robot.model import Robot
 from fg_calib.threads import single_threaded
@@ -55,7 +57,7 @@ ESTIMATORS: Mapping[str, str] = {
     "graph": "the factor graph, as the job says",
     "graph-keep": "the factor graph, the kept parameters alone and no priors",
     "gauss-newton": "plain least squares of the kept parameters, metres beside radians: Eq. (54) of Jia et al. (2019)",
-    "weighted-gauss-newton": "the same, weighted by noise",
+    "weighted-gauss-newton": "the same, weighted by noise, each measurement as if it were alone",
     "scipy": "scipy.optimize.least_squares of the same parameters and weights",
 }
 """The estimators in the order of a comparison, in words."""
@@ -141,6 +143,7 @@ class Comparison:
         judged_on: `test`, or `train` where there are no test rows.
         n_judged: Number of configurations judged on.
         findings: Why the graph's result is not to be trusted; empty if it is.
+        units: `m`, `rad` or `px` of each kind of residual.
     """
 
     job: Job
@@ -150,6 +153,7 @@ class Comparison:
     judged_on: Literal["test", "train"]
     n_judged: int
     findings: tuple[str, ...]
+    units: Mapping[str, str]
 
     @property
     def trustworthy(self) -> bool:
@@ -171,24 +175,12 @@ def compare(job: Job) -> Comparison:
     Raises:
         CalibrationError: The job's own problem cannot be built or solved.
     """
-    place = "" if job.path is None else f"{job.path.name}: "
-    for table in job.tables:
-        if table.model not in (*POSE_MODELS, *PAIR_MODELS) or "target" in table.measurements.labels:
-            found = "targets" if table.model in POSE_MODELS else f"model {table.model}"
-            expected = (
-                "poses of the tool, or pairs: plain least squares, which the graph is compared with, knows no more"
-            )
-            raise ProblemError(f"{place}measurements", found, expected)
-    if not isinstance(job.measurements, Measurements):
-        found = f"{len(job.measurements)} tables ({', '.join(t.measurements.source for t in job.measurements)})"
-        expected = "one: plain least squares, which the graph is compared with, takes no more"
-        raise ProblemError(f"{place}measurements", found, expected, "give one of them as the path of a table")
-    test = job.measurements.test
-    judged_on: Literal["test", "train"] = "test" if test.any() else "train"
-    readings = job.measurements.readings[test] if test.any() else job.measurements.readings
     solution = solve_job(job)
+    data = solution.problem.data
     if solution.problem.evaluated:
-        raise ProblemError(job.measurements.source, "test rows alone", "train rows, for there is nothing to compare")
+        raise ProblemError(data.source, "test rows alone", "train rows, for there is nothing to compare")
+    there, judged_on = judged_configurations(data)
+    readings = data.readings[there]
     uncertainty = assess(solution)
     judge = _Judge(job, readings, solution)
     estimates = [judge.of_graph("graph", solution, uncertainty)]
@@ -206,29 +198,18 @@ def compare(job: Job) -> Comparison:
         judged_on=judged_on,
         n_judged=len(readings),
         findings=uncertainty.findings,
+        units={family: uncertainty.residuals.unit(family) for family in uncertainty.residuals.families},
     )
 
 
 def _without_priors(job: Job, judge: _Judge) -> list[Estimate]:
     """The estimates of the kept parameters: by the graph, and by plain least squares from the same start."""
-    assert isinstance(job.measurements, Measurements)
-    if job.measurements.groups is not None:
-        raise ProblemError(job.measurements.source, "a column group", "pairs or poses: they know no points")
     problem = problem_of(job, gauge="keep")
     kept = [p.name for p in problem.estimated]
     held = [i for i, p in enumerate(job.robot.parameters) if p.name not in kept]
     start = problem.start.copy()
     start[held] = job.robot.nominal[held]  # of an unknown tool too, as in the graph
-    plain = partial(
-        fit_least_squares,
-        job.robot,
-        job.measurements,
-        model=job.options.model,
-        pairing=job.options.pairing,
-        frame=job.options.frame,
-        names=kept,
-        start=start,
-    )
+    plain = partial(fit_dataset, job.robot, problem.data, names=kept, start=start)
 
     def graph() -> Estimate:
         solution = solve_job(job, problem)

@@ -11,12 +11,14 @@ knows of GTSAM, priors, damping or observability: of the graph's mathematics onl
 
 A measurement frame that is unknown takes six more unknowns: world_T_base = start * Txyz Rz(yaw) Ry(pitch) Rx(roll), a
 correction of the frame that the fit starts from. It starts at zero, so that its angles stay away from where they are
-singular.
+singular. Targets, anchors, planes, boards and touched points whose places are not known are unknowns as well; one that
+is nearly known is a measurement of its place.
 
 Note:
     Every measured train row takes part. Only a row that has no derivative at the start (a distance of exactly 0, an
     angle of exactly 0 or pi) is left out: the paper mentions these kinks and judges no further, and near one a row
-    misleads. Pairs formed from poses count as independent. All rows and derivatives are held at once.
+    misleads. Every measurement counts as independent, pairs formed from poses and the rows of one configuration, which
+    share its joint noise, among them. All rows and derivatives are held at once.
 
 References:
     Jia, Wang, Chen, Sun (2019), Error Modeling in Distance and Rotation for Self-Calibration of Space Robots on
@@ -33,13 +35,14 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from fg_calib.arguments import checked
-from fg_calib.baseline.methods import Fit, Solver, claimed_covariance, gauss_newton, scipy_fit
-from fg_calib.baseline.rows import Rows, evaluate, train_rows, whitening_of, without_kinks
+from fg_calib.baseline.methods import claimed_covariance, gauss_newton, scipy_fit
+from fg_calib.baseline.system import build_system, start_at
 from fg_calib.errors import InputError
-from fg_calib.measurements.dataset import Measurements
+from fg_calib.measurements.dataset import Measurements, Pairs
+from fg_calib.measurements.gathering import Dataset, gather
+from fg_calib.measurements.series import Table
 from fg_calib.options import (
     PAIR_MODELS,
     POSE_MODELS,
@@ -52,19 +55,12 @@ from fg_calib.options import (
     check_names,
     check_number,
 )
-from fg_calib.robot.kinematics import Chain, build_chain
-from fg_calib.robot.model import AXIS_OF_KIND, FRAME_KINDS, Element, Parameter, Robot, names_of
+from fg_calib.robot.model import Robot, names_of
 from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
 
 Method = Literal["gauss-newton", "scipy"]
-
-REWEIGHTED = 1e-10
-"""Weights are final once a fit with them moves the parameters by less than this, [m] and [rad]."""
-
-_ROUNDS = 20
-"""Fits with new weights at most."""
 
 
 @dataclass(frozen=True)
@@ -74,13 +70,15 @@ class LeastSquares:
     Attributes:
         robot: The robot with the estimated values.
         names: The parameters that were estimated, in the order of the covariance.
-        frame: x, y, z, yaw, pitch, roll of the measurement frame world_T_base, shape (6,), [m] and [rad]; that of the
-            start where it was not estimated.
+        frames: x, y, z, yaw, pitch, roll of each unknown measurement frame world_T_base, shape (n_frames, 6), [m] and
+            [rad].
+        places: Coordinates of the estimated targets, anchors, planes, boards and points, shape (n_coordinates,).
         covariance: Of the estimated parameters as least squares claims it, shape (n_names, n_names), [m] and [rad]:
             (J^T W J)^-1 if weighted by noise, else s^2 (J^T J)^-1 with s^2 = |r|^2 / (n_rows - rank). nan in rows and
             columns of parameters that J leaves open, and everywhere where s^2 has no degree of freedom.
-        residuals: Predicted minus measured of the rows that took part, not weighted, shape (n_rows,), [m] and [rad].
-        rank: Of J at the estimate, the measurement frame's columns included.
+        residuals: Predicted minus measured of the rows that took part, not weighted, shape (n_rows,), [m], [rad] and
+            pixels.
+        rank: Of J at the estimate, the columns of frames and places included.
         converged: Whether the last step was small enough.
         message: Why it stopped.
         iterations: Steps taken (scipy: derivatives asked for).
@@ -90,7 +88,8 @@ class LeastSquares:
 
     robot: Robot
     names: tuple[str, ...]
-    frame: Floats
+    frames: Floats
+    places: Floats
     covariance: Floats
     residuals: Floats
     rank: int
@@ -111,9 +110,15 @@ class LeastSquares:
         return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
     @property
+    def frame(self) -> Floats:
+        """The first of `frames`, zero where none was estimated, shape (6,), [m] and [rad]."""
+        return self.frames[0] if len(self.frames) else np.zeros(6)
+
+    @property
     def parameters(self) -> Floats:
-        """The robot's values and `frame`, shape (n_parameters + 6,), [m] and [rad]."""
-        return np.concatenate([self.robot.nominal, self.frame])
+        """The robot's values, `frames` (six values where there is none), and `places`: as `Problem.start` has them."""
+        frames = self.frames if len(self.frames) else np.zeros(6)
+        return np.concatenate([self.robot.nominal, frames.ravel(), self.places])
 
 
 @checked
@@ -164,150 +169,76 @@ def fit_least_squares(
     check_flag("weighted", weighted)
     check_number("max_iterations", max_iterations, least=1, whole=True)
     check_number("tolerance", tolerance, finite=False)
-    pairing = as_pairing(pairing)
-    clock = time.perf_counter()
-    unknown = frame == "unknown" and model not in PAIR_MODELS
-    system = _system(robot, measurements, (model, pairing, weighted), names, start, unknown)
-    solver = partial(gauss_newton if method == "gauss-newton" else scipy_fit, limit=max_iterations, tolerance=tolerance)
-    fit, whitening = _solve(system, solver, weighted)
-    return system.result(fit, whitening, weighted, clock)
-
-
-@dataclass(frozen=True)
-class _System:
-    """Rows as a function of the unknowns.
-
-    Attributes:
-        robot: The nominal robot.
-        chosen: Its parameters to estimate.
-        frame: x, y, z, yaw, pitch, roll of the measurement frame at the start.
-        rows: What is fitted.
-        chain: The arm behind its measurement frame.
-        start: Its parameters at the start, shape (n_parameters,), [m] and [rad].
-        columns: Which of them are unknown.
-        sigma_joint: Of the joint readings, shape (n_joints,), [rad] or [m].
-    """
-
-    robot: Robot
-    chosen: list[int]
-    frame: Floats
-    rows: Rows
-    chain: Chain
-    start: Floats
-    columns: NDArray[np.int64]
-    sigma_joint: Floats
-
-    def parameters(self, x: Floats) -> Floats:
-        """All parameters at the unknowns x."""
-        full = self.start.copy()
-        full[self.columns] = x
-        return full
-
-    def evaluate(self, x: Floats, whitening: Floats | None) -> tuple[Floats, Floats]:
-        """Residuals, shape (m,), and derivatives, shape (m, n_unknowns)."""
-        return evaluate(self.rows, self.chain.at(self.parameters(x)), whitening)
-
-    def whitening(self, x: Floats) -> Floats:
-        """`whitening_of` the rows at the unknowns x."""
-        return whitening_of(self.rows, self.chain.at(self.parameters(x)), self.sigma_joint)
-
-    def result(self, fit: Fit, whitening: Floats | None, weighted: bool, clock: float) -> LeastSquares:
-        """The estimate, begun at `clock`."""
-        covariance, rank = claimed_covariance(*self.evaluate(fit.x, whitening), weighted)
-        full, n, m = self.parameters(fit.x), len(self.robot.parameters), len(self.chosen)
-        return LeastSquares(
-            robot=self.robot.with_values(full[:n]),
-            names=tuple(self.robot.parameters[i].name for i in self.chosen),
-            frame=self.frame if len(self.columns) == m else _composed(self.frame, full[n:]),
-            covariance=covariance[:m, :m],
-            residuals=evaluate(self.rows, self.chain.at(full).without_columns(), None)[0],
-            rank=rank,
-            converged=fit.converged,
-            message=fit.message,
-            iterations=fit.iterations,
-            steps=fit.steps,
-            seconds=time.perf_counter() - clock,
-        )
-
-
-def _system(
-    robot: Robot,
-    measurements: Measurements,
-    wanted: tuple[Model, Pairing, bool],
-    names: Sequence[str] | None,
-    start: Floats | None,
-    frame_unknown: bool,
-) -> _System:
-    """What is fitted, from where."""
-    n = len(robot.parameters)
-    values, world_T_base = _start(robot, start)
-    chosen = _chosen(robot, names)
-    columns = np.array([*chosen, *(range(n, n + 6) if frame_unknown else ())], dtype=np.int64)
-    # The chain starts in the measurement frame as the fit does; a correction of it is six more parameters.
-    extended = _with_frame(robot.with_values(values), np.zeros(6) if wanted[0] in PAIR_MODELS else world_T_base)
-    chain = build_chain(extended, {int(c): k for k, c in enumerate(columns)})
-    rows = without_kinks(train_rows(robot, measurements, *wanted), chain.at(extended.nominal))
-    if not rows.use.any():
-        raise InputError(measurements.source, "no row left to fit", f"train rows for model {rows.model}")
-    return _System(
-        robot=robot,
-        chosen=chosen,
-        frame=world_T_base,
-        rows=rows,
-        chain=chain,
-        start=extended.nominal,
-        columns=columns,
-        sigma_joint=measurements.sigma_joint,
+    known: FrameKnowledge = "known" if model in PAIR_MODELS else frame
+    table = Table(measurements if weighted else _with_any_noise(measurements), model, as_pairing(pairing), known)
+    return fit_dataset(
+        robot,
+        gather(robot, [table]),
+        names=names,
+        start=start,
+        weighted=weighted,
+        method=method,
+        max_iterations=max_iterations,
+        tolerance=tolerance,
     )
 
 
-def _solve(system: _System, solver: Solver, weighted: bool) -> tuple[Fit, Floats | None]:
-    """The fit, and the weights that it was made with: those at the estimate, if they matter."""
-    x = system.start[system.columns]
-    if not weighted:
-        return solver(lambda x: system.evaluate(x, None), x), None
-    fit = Fit(x, converged=False, message="", iterations=0, steps=())
-    for _ in range(_ROUNDS):
-        whitening = system.whitening(fit.x)
-        again = solver(partial(system.evaluate, whitening=whitening), fit.x)
-        moved = float(np.linalg.norm(again.x - fit.x))
-        fit = replace(again, iterations=fit.iterations + again.iterations, steps=fit.steps + again.steps)
-        if not fit.converged or moved <= REWEIGHTED or not np.any(system.sigma_joint > 0.0):
-            return fit, whitening
-    message = f"not converged: new weights still move it by {moved:.1e}"
-    return replace(fit, converged=False, message=message), whitening
+def fit_dataset(
+    robot: Robot,
+    data: Dataset,
+    *,
+    names: Sequence[str] | None,
+    start: Floats | None,
+    weighted: bool = False,
+    method: Method = "gauss-newton",
+    max_iterations: int = 50,
+    tolerance: float = 1e-12,
+) -> LeastSquares:
+    """`fit_least_squares` of all tables of a calibration, with the places that they depend on; arguments as there.
+
+    Raises:
+        InputError: There is no row to fit, nothing to estimate or no start of that length.
+    """
+    clock = time.perf_counter()
+    system = build_system(robot, data, _chosen(robot, names), start_at(robot, data, start))
+    solver = partial(gauss_newton if method == "gauss-newton" else scipy_fit, limit=max_iterations, tolerance=tolerance)
+    fit, weights = system.solve(solver, weighted)
+    covariance, rank = claimed_covariance(*system.evaluate(fit.x, weights), weighted)
+    m, n_core = len(system.chosen), system.n_core
+    values = system.start.values.copy()
+    values[system.chosen] = fit.x[:m]
+    return LeastSquares(
+        robot=robot.with_values(values),
+        names=tuple(robot.parameters[i].name for i in system.chosen),
+        frames=system.frames(fit.x),
+        places=fit.x[n_core:],
+        covariance=covariance[:m, :m],
+        residuals=system.evaluate(fit.x, None)[0],
+        rank=rank,
+        converged=fit.converged,
+        message=fit.message,
+        iterations=fit.iterations,
+        steps=fit.steps,
+        seconds=time.perf_counter() - clock,
+    )
 
 
-def _with_frame(robot: Robot, world_T_base: Floats) -> Robot:
-    """The robot behind a frame and a correction of it, whose six parameters come last."""
-    n = len(robot.parameters)
-    fixed = [Element(AXIS_OF_KIND[kind], float(v)) for kind, v in zip(FRAME_KINDS, world_T_base, strict=True)]
-    free = [Element(AXIS_OF_KIND[kind], parameter=n + i) for i, kind in enumerate(FRAME_KINDS)]
-    correction = (Parameter(f"frame.{kind}", kind, 0, 0.0) for kind in FRAME_KINDS)
-    return replace(robot, parameters=(*robot.parameters, *correction), elements=(*fixed, *free, *robot.elements))
+def _with_any_noise(m: Measurements) -> Measurements:
+    """Measurements with a sigma of 1 m or 1 rad where none is stated, for fits that weigh nothing."""
 
+    def of_poses(sigma: Floats | None, values: Floats | None) -> Floats | None:
+        return np.ones((len(values), 3)) if sigma is None and values is not None else sigma
 
-def _composed(start: Floats, correction: Floats) -> Floats:
-    """x, y, z, yaw, pitch, roll of a frame and its correction, one after the other."""
-    turn, more = (Rotation.from_euler("ZYX", frame[3:]) for frame in (start, correction))
-    R = (turn * more).as_matrix()
-    level = np.hypot(R[0, 0], R[1, 0])
-    pitch = np.arctan2(-R[2, 0], level)
-    if level < 1e-9:  # straight up or down: yaw and roll are one, take it all as roll
-        yaw, roll = 0.0, np.arctan2(-R[1, 2], R[1, 1])
-    else:
-        yaw, roll = np.arctan2(R[1, 0], R[0, 0]), np.arctan2(R[2, 1], R[2, 2])
-    return np.array([*(start[:3] + turn.apply(correction[:3])), yaw, pitch, roll])
+    def of_pairs(pairs: Pairs) -> Pairs:
+        figures = {name: np.nan_to_num(getattr(pairs, name), nan=1.0) for name in ("sigma_distance", "sigma_angle")}
+        return replace(pairs, **figures)
 
-
-def _start(robot: Robot, start: Floats | None) -> tuple[Floats, Floats]:
-    """The robot's values and the measurement frame to start from."""
-    n = len(robot.parameters)
-    given = robot.nominal if start is None else np.asarray(start, dtype=np.float64)
-    if given.shape not in ((n,), (n + 6,)) or not np.isfinite(given).all():
-        found = f"shape {given.shape}" if given.shape not in ((n,), (n + 6,)) else "a value that is not finite"
-        raise InputError("start", found, f"{n} values of the robot, or {n + 6} with the measurement frame's")
-    return given[:n], given[n:] if len(given) > n else np.zeros(6)
+    return replace(
+        m,
+        sigma_position=of_poses(m.sigma_position, m.position),
+        sigma_orientation=of_poses(m.sigma_orientation, m.rotation),
+        pairs=None if m.pairs is None else of_pairs(m.pairs),
+    )
 
 
 def _chosen(robot: Robot, names: Sequence[str] | None) -> list[int]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from fg_calib.arrays import NOTHING, as_figures, check_different
 from fg_calib.errors import InputError
-from fg_calib.files.disk import decoded, read_bytes
+from fg_calib.files.disk import decoded, read_bytes, require_memory
 from fg_calib.files.frames import as_polars, cells, of_polars, select
 from fg_calib.files.parquet import parquet_columns, read_parquet
 from fg_calib.files.schema import number_hint, shown
@@ -29,6 +29,9 @@ if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need
     import polars as pl
 
 _log = logging.getLogger(__name__)
+
+_BYTES_A_CELL = 32
+"""What polars needs of memory for a short text, the number that it makes of it, and a little more."""
 
 _ENDINGS = (".csv", ".parquet", ".pq")
 
@@ -338,6 +341,7 @@ def _read_csv(header: Header, numbers: Sequence[str], texts: Sequence[str]) -> t
     wanted = list(dict.fromkeys((*numbers, *texts, last)))
     chosen = sorted(header.columns.index(c) for c in wanted)
     start = _start_of_header(header.content)
+    require_memory(header.name, _BYTES_A_CELL * len(chosen) * header.content.count(b"\n"))
     try:
         frame = of_polars(
             header.name,

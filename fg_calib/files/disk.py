@@ -8,14 +8,20 @@ import os
 import shutil
 import socket
 import stat
-import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from functools import wraps
 from pathlib import Path
 from tempfile import mkdtemp
+from typing import ParamSpec, TypeVar
 
 from fg_calib.errors import InputError
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+NO_MEMORY = "there is not enough memory for it"
 
 _noted: ContextVar[dict[Path, str] | None] = ContextVar("_noted", default=None)
 
@@ -31,6 +37,32 @@ def noting_reads() -> Iterator[dict[Path, str]]:
         _noted.reset(token)
 
 
+def within_memory(read: Callable[P, R]) -> Callable[P, R]:
+    """A reader of tables that names its table, the argument `path`, where memory does not suffice for it.
+
+    It raises `InputError` then.
+    """
+
+    @wraps(read)
+    def reading(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return read(*args, **kwargs)
+        except MemoryError:
+            table = args[0] if args else kwargs["path"]
+            name = Path(table).name if isinstance(table, str | os.PathLike) else "frame"
+            raise InputError(name, NO_MEMORY) from None
+
+    return reading
+
+
+def require_memory(name: str, size: int) -> None:
+    """Raise, for a table of this name, where so many bytes cannot be had: polars would end the process instead."""
+    try:
+        bytes(size)  # zeros, which the system hands out when they are first looked at
+    except MemoryError:
+        raise InputError(name, NO_MEMORY) from None
+
+
 def read_bytes(path: Path) -> bytes:
     """The content of a file.
 
@@ -44,7 +76,7 @@ def read_bytes(path: Path) -> bytes:
     except PermissionError:
         raise InputError(str(path), "may not be read", hint="check the permissions of file and folder") from None
     except MemoryError:
-        raise InputError(_short(str(path)), "there is not enough memory for it") from None
+        raise InputError(_short(str(path)), NO_MEMORY) from None
     except (OSError, ValueError) as error:  # ValueError: a path with a null character
         found = f"cannot be read: {getattr(error, 'strerror', None) or error}"
         raise InputError(_short(str(path)), found, "a file") from None
@@ -112,21 +144,25 @@ def read_text(path: Path) -> str:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary file beside `path`, which takes its place when the block ends well and vanishes when it does not.
+    """A temporary file, which takes the place of `path` when the block ends well and vanishes when it does not.
+
+    It is in a folder of its own beside that: nobody else can have put a file there.
 
     Raises:
         InputError: The folder does not exist or may not be written to.
     """
     if not path.parent.is_dir():
         raise InputError(str(path), f"there is no folder {path.parent}")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}.tmp")
+    within = None
     try:
-        yield temporary
-        temporary.replace(path)
+        within = Path(mkdtemp(prefix=_BESIDE, dir=path.parent))
+        yield within / path.name
+        (within / path.name).replace(path)
     except OSError as error:
         raise InputError(str(path), f"cannot be written: {error.strerror or error}") from None
     finally:
-        temporary.unlink(missing_ok=True)
+        if within is not None:
+            shutil.rmtree(within, ignore_errors=True)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -138,6 +174,9 @@ def write_text(path: Path, text: str) -> None:
     with replacing(path) as temporary:
         temporary.write_bytes(text.encode())
 
+
+_BESIDE = ".fg-calib-file-"
+"""Folder beside a file that is written."""
 
 _WRITING, _WRITTEN, _REMOVED = ".fg-calib-writing-", ".fg-calib-written", ".fg-calib-removed"
 """Folders within a folder that is filled: while files are written, and when all are there but not yet moved; and in the
@@ -248,7 +287,7 @@ def require_own(folder: Path, own: Mapping[str, bytes]) -> None:
             begin as anybody's may.
 
     Raises:
-        InputError: One was not, or it cannot be read.
+        InputError: One was not, it cannot be read, or it is another user's and not to be replaced.
     """
     first = next(iter(own), "")
     for name, beginning in own.items():
@@ -258,6 +297,19 @@ def require_own(folder: Path, own: Mapping[str, bytes]) -> None:
         # The first is looked at after it: other writers may have come between.
         if found != beginning or _beginning(folder / first, len(own[first])) != own[first]:
             raise InputError(str(folder / name), "is there already, not written by this command", "another folder")
+        if not _may_replace(folder / name, os.geteuid()):
+            raise InputError(str(folder / name), "is another user's in a folder that all share", "another folder")
+
+
+def _may_replace(path: Path, user: int) -> bool:
+    """Whether a user who may write to a file's folder may replace or remove it: not all may, if the folder is sticky.
+
+    A file that is not there may be put there.
+    """
+    folder = path.parent.stat()
+    with suppress(FileNotFoundError):
+        return not folder.st_mode & stat.S_ISVTX or user in (0, folder.st_uid, path.lstat().st_uid)
+    return True
 
 
 def _beginning(path: Path, size: int) -> bytes | None:
@@ -304,8 +356,11 @@ def _newest(path: Path) -> Path:
         InputError: Somebody else wrote it than the folder's owner or this user, or it may not be read.
     """
     written = path.parent / _WRITTEN
-    foreign = InputError(str(written), "files of another user", "none", "have them moved to their places, or removed")
+    foreign = InputError(str(written), "files of another user", "none", _OF_ANOTHER)
     try:
+        user = written.lstat().st_uid
+        if user not in (os.geteuid(), path.parent.stat().st_uid) and not _may_replace(path, user):
+            return path  # whose place theirs can never take
         with _opened(written) as journal:
             if os.fstat(journal).st_uid not in (os.geteuid(), path.parent.stat().st_uid):
                 raise foreign
@@ -318,6 +373,9 @@ def _newest(path: Path) -> Path:
         return path
     except (OSError, ValueError):  # none, or none of ours: a file or link; ValueError: a path with a null character
         return path
+
+
+_OF_ANOTHER = "have them moved to their places or removed, or use another folder"
 
 
 @contextmanager
@@ -369,6 +427,8 @@ def _finish(folder: Path) -> None:
     except OSError as error:
         if error.errno in (errno.ENOTDIR, errno.ELOOP):
             raise InputError(str(written), "is no folder of written files", "none", "remove it") from None
+        if error.errno in (errno.EACCES, errno.EPERM) and written.lstat().st_uid != os.geteuid():
+            raise InputError(str(written), "files of another user", "none", _OF_ANOTHER) from None
         found = f"holds files that could not be moved to their places: {error.strerror or error}"
         raise InputError(str(folder), found, f"those of {_WRITTEN} in it") from None
     with suppress(OSError):
@@ -381,9 +441,8 @@ def _require_mine(written: Path, journal: int) -> None:
     Raises:
         InputError: It is not so.
     """
-    hint = "move them to their places, or remove it"
     if os.fstat(journal).st_uid != os.geteuid():
-        raise InputError(str(written), "files of another user", "none", hint)
+        raise InputError(str(written), "files of another user", "none", _OF_ANOTHER)
     for name in os.listdir(journal):
         with suppress(FileNotFoundError):  # another process moves them too
             if not stat.S_ISREG(os.stat(name, dir_fd=journal, follow_symlinks=False).st_mode):
@@ -401,11 +460,12 @@ def _unlink(name: str, folder: int) -> None:
 
 
 def _clear_dead(folder: Path) -> None:
-    """Remove what processes of this machine, or container, left half written when they were killed."""
+    """Remove what this user's processes of this machine, or container, left half written when they were killed."""
     for left in folder.glob(f"{_WRITING}{_host()}-*"):
         process = left.name.rpartition("-")[0].rpartition("-")[2]
-        if process.isdigit() and not _runs(int(process)):
-            shutil.rmtree(left, ignore_errors=True)
+        with suppress(FileNotFoundError):
+            if process.isdigit() and not _runs(int(process)) and left.lstat().st_uid == os.geteuid():
+                shutil.rmtree(left, ignore_errors=True)
 
 
 def _here() -> str:

@@ -70,12 +70,14 @@ class InstrumentColumns:
 
     @classmethod
     def of(cls, header: Header, model: Model | None) -> InstrumentColumns:
-        """Those that are there.
+        """Those that are there; of targets that the model does not know a warning.
 
         Args:
             header: The table's.
             model: The model; None for those of all models.
         """
+        if model in PAIR_MODELS and "target" in header.columns:
+            _log.warning("%s: column target is not used: model %s is of one point of the tool", header.name, model)
         every = tuple(dict.fromkeys(name for names in _LABELS.values() for name in names))
         labels = header.present(*(every if model is None else _LABELS.get(model, ())))
         has_lengths = bool({"anchor", "plane"}.intersection(labels)) and model not in PAIR_MODELS

@@ -10,6 +10,7 @@ import numpy as np
 
 from fg_calib.errors import InputError
 from fg_calib.files.columns import Header, Table, unit_hint
+from fg_calib.files.disk import within_memory
 from fg_calib.files.schema import shown
 from fg_calib.files.units import Units
 from fg_calib.measurements.checks import ANGLE_SLACK
@@ -51,6 +52,7 @@ class _Ends:
     of_groups: Booleans
 
 
+@within_memory
 def read_pairs(
     path: Path | str | Any, configurations: Configurations, units: Units, noise: Noise
 ) -> tuple[Pairs, Pairs]:

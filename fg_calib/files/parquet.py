@@ -10,15 +10,18 @@ from __future__ import annotations
 import atexit
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from io import BytesIO
+from tempfile import TemporaryFile
 from threading import Event, Lock, Timer
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 from fg_calib.errors import InputError
+from fg_calib.files.disk import NO_MEMORY, require_memory
 from fg_calib.libraries import require_polars
 
 if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it
@@ -26,6 +29,12 @@ if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need
 
 _SECONDS, _SECONDS_A_BYTE = 60.0, 1e-6
 """After which a file counts as one that never ends: a hundred times what ordinary ones take."""
+
+_MEMORY_WORDS = (b"memory allocation of", b"MemoryError")
+"""What polars and Python say before they end for want of memory."""
+
+_SECONDS_TO_END = 5.0
+"""After which a process whose pipes are closed has ended."""
 
 _READ = """
 import json, sys
@@ -41,11 +50,16 @@ while head := source.readline():
             found.write(json.dumps(list(pl.read_parquet_schema(content))).encode())
         else:
             pl.read_parquet(content, columns=columns).write_ipc(found)
+    except MemoryError:
+        error = "memory"
     except BaseException as caught:
         panic = type(caught).__name__ == "PanicException"
         error = "polars cannot read it" if panic else str(caught).strip().partition("\\n")[0] or type(caught).__name__
-    answer = b"" if error else found.getvalue()
-    sink.write(json.dumps([error, len(answer)]).encode() + b"\\n" + answer)
+        if type(caught) is OSError and not str(caught):  # so polars passes a MemoryError on
+            error = "memory"
+    answer = b"" if error else found.getbuffer()
+    sink.write(json.dumps([error, len(answer)]).encode() + b"\\n")
+    sink.write(answer)
     sink.flush()
 """
 """What the process does: a line `[columns, size]` and the file in, a line `[error, size]` and the answer out."""
@@ -73,11 +87,13 @@ def read_parquet(content: bytes, columns: Sequence[int], name: str) -> pl.DataFr
         name: Its name, for messages.
 
     Raises:
-        InputError: It is damaged.
+        InputError: It is damaged, or memory does not suffice for it.
     """
     import polars as pl
 
-    return pl.read_ipc(BytesIO(_READER.ask(list(columns), content, name)))
+    answer = _READER.ask(list(columns), content, name)
+    require_memory(name, 2 * len(answer))
+    return pl.read_ipc(BytesIO(answer))
 
 
 class _Reader:
@@ -85,6 +101,7 @@ class _Reader:
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
+        self._said: IO[bytes] = BytesIO()  # what the process says on stderr
         self._owner = 0  # a fork of the owner has its pipes, but is not to be answered
         self._lock = Lock()
 
@@ -104,16 +121,21 @@ class _Reader:
             try:
                 error, answer = _exchange(process, columns, content)
             except (OSError, ValueError):  # it has ended
+                no_memory = self._ended_for_memory(process)
                 self.stop()
                 if late.is_set():  # of a damaged file, or because it was stopped
                     found = f"polars took more than {seconds:.3g} s to read it"
                     raise InputError(name, found, hint="try again; if it is damaged, write it anew") from None
+                if no_memory:
+                    raise InputError(name, NO_MEMORY, hint="if it is damaged, write it anew") from None
                 raise InputError(name, "not a Parquet file: polars ends on it", hint="write it anew") from None
             except BaseException:  # such as Ctrl-C: what it would still answer is to nobody's question
                 self.stop()
                 raise
             finally:
                 waiting.cancel()
+        if error == "memory":
+            raise InputError(name, NO_MEMORY)
         if error:
             raise InputError(name, f"not a Parquet file: {error}", hint="write it anew")
         return answer
@@ -124,16 +146,27 @@ class _Reader:
             command = [sys.executable, "-I", "-c", _READ, path]
             pipe = subprocess.PIPE
             try:
-                self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL)
+                self._said.close()
+                self._said = TemporaryFile()  # noqa: SIM115 -- as long as the process
+                self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=self._said)
             except OSError as error:
                 found = f"cannot be read: no process can be started for it: {error.strerror or error}"
                 raise InputError(name, found, hint="a CSV needs none") from None
             self._owner = os.getpid()
         return self._process
 
+    def _ended_for_memory(self, process: subprocess.Popen[bytes]) -> bool:
+        """Whether a process that ends does so because it got no memory, or the system took it for using too much."""
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(_SECONDS_TO_END)
+        self._said.seek(0)
+        said = self._said.read()
+        return process.returncode == -signal.SIGKILL or any(word in said for word in _MEMORY_WORDS)
+
     def stop(self) -> None:
         """End the process, if there is one."""
         process, self._process = self._process, None
+        self._said.close()
         if process is not None and self._owner == os.getpid():
             process.kill()
             process.wait()

@@ -247,12 +247,28 @@ def _of_yaml(error: yaml.MarkedYAMLError, name: str) -> InputError:
     return InputError(f"{name}:{mark.line + 1}" if mark else name, found, hint=hint)
 
 
-MOST_VALUES = 1_000_000
-"""Values that a file may hold, what its aliases stand for counted each time."""
+MOST_VALUES = 50_000
+"""Values that a file may hold, what its aliases stand for counted each time: a second's work, and far above any robot's
+or job's; what is long is a table."""
 
 
 class _Loader(yaml.SafeLoader):
     """The safe loader, which by itself would let the later of two equal keys win, and take any scalar for a key."""
+
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self._n_values = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        """The next node, if there are not too many before it: a long file is given up where it becomes too long."""
+        self._n_values += 1
+        if self._n_values > MOST_VALUES:
+            raise yaml.MarkedYAMLError(
+                problem=f"more than {MOST_VALUES} values in one file",
+                problem_mark=self.peek_event().start_mark,  # type: ignore[no-untyped-call]
+            )
+        node: yaml.Node | None = super().compose_node(parent, index)
+        return node
 
     def get_single_node(self) -> yaml.Node | None:
         """The document's node, which is of a size that can be looked at."""

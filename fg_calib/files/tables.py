@@ -24,15 +24,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import NORM_TOLERANCE
 from fg_calib.errors import InputError
 from fg_calib.files.columns import Column, Header, Table
+from fg_calib.files.disk import within_memory
 from fg_calib.files.instruments import COLUMNS, InstrumentColumns
 from fg_calib.files.pairs import Configurations, read_pairs
+from fg_calib.files.poses import OF_POSES, PoseColumns
 from fg_calib.files.units import Units
 from fg_calib.measurements.dataset import Booleans, Floats, Groups, Integers, Measurements, Noise, no_pairs
 from fg_calib.measurements.limits import limit_hint, outside_limits
-from fg_calib.options import PAIR_MODELS, Model, check_number
+from fg_calib.options import Model, check_number
 from fg_calib.robot.model import Robot
 
 if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it
@@ -40,13 +41,7 @@ if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need
 
 _log = logging.getLogger(__name__)
 
-_POSITION = ("x", "y", "z")
-_QUATERNION = ("qx", "qy", "qz", "qw")
-_ROLL_PITCH_YAW = ("roll", "pitch", "yaw")
-_ROTATION_VECTOR = ("rx", "ry", "rz")
-_SIGMA_POSITION = ("sigma_x", "sigma_y", "sigma_z")
-_SIGMA_ORIENTATION = ("sigma_rx", "sigma_ry", "sigma_rz")
-_RESERVED = {*_POSITION, *_QUATERNION, *_ROLL_PITCH_YAW, *_SIGMA_POSITION, *_SIGMA_ORIENTATION, "id", "split", "group"}
+_RESERVED = {*OF_POSES, "id", "split", "group"}
 
 _POINT = "the name of a point, or an empty cell"
 
@@ -55,6 +50,7 @@ KNOWN = {*_RESERVED, *COLUMNS, "sigma_position", "sigma_orientation", "sigma_poi
 
 
 @checked
+@within_memory
 def read_measurements(
     path: Path | str | Any,
     robot: Robot,
@@ -84,25 +80,16 @@ def read_measurements(
     """
     units, noise = units or Units(), noise or Noise()
     _check_noise(noise)
-    meant = {*KNOWN, *(f"q{i + 1}" for i in range(robot.n_joints))}
-    called = {joint.name for joint in robot.joints}
-    header = Header.read(path, "frame").renamed(columns or {}, meant | called).understood(meant, called)
+    header = _header(path, robot, columns or {})
     joints = _joint_columns(header, robot)
-    position = header.group(_POSITION)
-    orientation = _orientation_columns(header)
-    sigma_position = header.sigmas("sigma_position", _SIGMA_POSITION)
-    sigma_orientation = header.sigmas("sigma_orientation", _SIGMA_ORIENTATION)
+    of_poses = PoseColumns.of(header)
     sigma_point = header.present("sigma_point") if "group" in header.columns else ()
     of_instrument = InstrumentColumns.of(header, model)
-    if model in PAIR_MODELS and "target" in header.columns:
-        _log.warning("%s: column target is not used: model %s is of one point of the tool", header.name, model)
-    numbers = (*joints, *position, *orientation, *sigma_position, *sigma_orientation, *sigma_point)
     table = Table.read(
         header,
-        numbers=(*numbers, *of_instrument.numbers),
+        numbers=(*joints, *of_poses.numbers, *sigma_point, *of_instrument.numbers),
         texts=(*header.present("id", "split", "group"), *of_instrument.labels),
     )
-    length, angle = units.factor("m"), units.factor("rad")
     ids, test = _ids(table, repeated=of_instrument.several_rows), table.test_rows()
     names, group = _groups(table)
     between, between_groups = None, no_pairs(header.name)
@@ -115,19 +102,22 @@ def read_measurements(
         readings=_readings(table, joints, robot, units),
         ids=ids.to_numpy().astype(np.str_),
         test=test,
-        position=table.numbers(position) * length if position else None,
-        rotation=_rotation(table, orientation, angle) if orientation else None,
-        sigma_position=_sigma(table, sigma_position, noise.position, length),
-        sigma_orientation=_sigma(table, sigma_orientation, noise.orientation, angle),
         sigma_joint=_joint_sigma(noise.joint, robot.n_joints),
         pairs=between,
         source=header.name,
         groups=Groups(names, group, between_groups) if names else None,
-        sigma_point=_sigma_point(table, sigma_point, group >= 0, noise.point, length) if names else None,
-        roll_pitch_yaw=table.numbers(orientation) * angle if orientation == _ROLL_PITCH_YAW else None,
+        sigma_point=_sigma_point(table, sigma_point, group >= 0, noise.point, units.factor("m")) if names else None,
         named="id" in header.columns,
+        **of_poses.read(table, units, noise),
         **of_instrument.read(table, units, noise),
     )
+
+
+def _header(path: Path | str | Any, robot: Robot, columns: Mapping[str, Column]) -> Header:
+    """The header of a table, its columns called as they are known."""
+    meant = {*KNOWN, *(f"q{i + 1}" for i in range(robot.n_joints))}
+    called = {joint.name for joint in robot.joints}
+    return Header.read(path, "frame").renamed(columns, meant | called).understood(meant, called)
 
 
 def _check_noise(noise: Noise) -> None:
@@ -168,15 +158,6 @@ def _joint_columns(header: Header, robot: Robot) -> tuple[str, ...]:
         + (f", or their names {', '.join(names)}" if names not in {(), expected} else ""),
         f"the columns are {', '.join(header.columns)}",
     )
-
-
-def _orientation_columns(header: Header) -> tuple[str, ...]:
-    """The columns of a measured orientation, if there is one."""
-    quaternion, roll_pitch_yaw = header.group(_QUATERNION), header.group(_ROLL_PITCH_YAW)
-    if quaternion and roll_pitch_yaw:
-        raise InputError(header.name, "both qx qy qz qw and roll pitch yaw", "one of the two")
-    rotation_vector = header.present(*_ROTATION_VECTOR) == _ROTATION_VECTOR
-    return quaternion or roll_pitch_yaw or (_ROTATION_VECTOR if rotation_vector else ())
 
 
 def _readings(table: Table, columns: Sequence[str], robot: Robot, units: Units) -> Floats:
@@ -258,30 +239,6 @@ def _sigma_point(
     expected = "a number above 0" if default is None else "a number above 0, or an empty cell"
     table.require(~touched | np.where(np.isnan(values), default is not None, values > 0.0), column[0], expected)
     return np.where(np.isnan(values), np.nan if default is None else default, values * factor)
-
-
-def _rotation(table: Table, columns: tuple[str, ...], angle: float) -> Floats:
-    """Measured orientations as rotation matrices, shape (n_rows, 3, 3)."""
-    from scipy.spatial.transform import Rotation
-
-    values = table.numbers(columns)
-    if columns == _ROLL_PITCH_YAW:
-        return Rotation.from_euler("xyz", values * angle).as_matrix()  # about fixed axes: Rz(yaw) Ry(pitch) Rx(roll)
-    if columns == _ROTATION_VECTOR:
-        return Rotation.from_rotvec(values * angle).as_matrix()
-    norm = np.linalg.norm(values, axis=1)
-    good = np.abs(norm - 1.0) <= NORM_TOLERANCE
-    if not good.all():
-        row = int(np.argmin(good))
-        raise InputError(table.place(row), f"quaternion of norm {norm[row]:.6g}", f"1 within {NORM_TOLERANCE:g}")
-    return Rotation.from_quat(values).as_matrix()
-
-
-def _sigma(table: Table, columns: Sequence[str], default: float | None, factor: float) -> Floats | None:
-    """Sigmas along three axes, shape (n_rows, 3); None where neither table nor default states them."""
-    if not columns:
-        return None if default is None else np.full((table.n_rows, 3), default)
-    return np.broadcast_to(table.positive(columns, default, factor), (table.n_rows, 3)).copy()
 
 
 def _joint_sigma(joint: float | tuple[float, ...], n_joints: int) -> Floats:

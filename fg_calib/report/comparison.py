@@ -9,8 +9,8 @@ from rich.console import Group, RenderableType
 
 from fg_calib.arguments import checked
 from fg_calib.baseline.comparison import Comparison, Estimate, PoseError
-from fg_calib.report.shown import FAMILY_UNIT, SHOWN
-from fg_calib.report.tables import WIDTH, indented, line, plain_table, plain_text, rounded, section
+from fg_calib.report.shown import SHOWN
+from fg_calib.report.tables import WIDTH, in_order, indented, line, plain_table, plain_text, rounded, section
 from fg_calib.robot.model import Robot
 
 _ESTIMATORS = {
@@ -39,9 +39,7 @@ def format_comparison(comparison: Comparison, width: int = WIDTH) -> str:
 def build_comparison_report(comparison: Comparison) -> RenderableType:
     """The estimators side by side: errors, residuals, effort, then the parameters that each found."""
     job = comparison.job
-    title = (
-        f"{job.robot.name}: {job.options.model}, judged at {comparison.n_judged} {comparison.judged_on} configurations"
-    )
+    title = f"{job.robot.name}: {job.model}, judged at {comparison.n_judged} {comparison.judged_on} configurations"
     parts: list[RenderableType] = [line(title)]
     parts += [line(f"DOUBTFUL: {finding}", "bold red") for finding in comparison.findings]
     parts += [line(""), _accuracy(comparison)]
@@ -76,12 +74,12 @@ def _accuracy(comparison: Comparison) -> RenderableType:
     row("after best rigid fit", "m", [None, *(e.predicted_fitted_rms for e in estimates)])
     before = estimates[0].residual_rms or {}
     for split in ("train", "test"):
-        families = [f for f in FAMILY_UNIT if f in before.get(split, {})]
+        families = in_order(before.get(split, {}))
         if families:
             table.add_row(line(f"Residuals, {split} rows (RMS)", "bold"))
         for family in families:
             after = [None if e.residual_rms is None else e.residual_rms[split][family]["after"] for e in estimates]
-            row(family, FAMILY_UNIT[family], [before[split][family]["before"], *after])
+            row(family, comparison.units[family], [before[split][family]["before"], *after])
     table.add_row(line("Effort", "bold"))
     ran = [e.robot is not None for e in estimates]
     table.add_row(

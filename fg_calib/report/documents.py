@@ -467,15 +467,16 @@ def comparison_document(comparison: Comparison) -> dict[str, Any]:
     thereby known, so their sigma is None. "parameters" is empty where it did not run.
     """
     job, first = comparison.job, comparison.estimates[0]
-    uses_pairs = job.options.model in ("distance", "rotation", "distance-rotation")
-    measured = job.tables[0].measurements.pairs is not None
-    pairing = ("measured" if measured else str(job.options.pairing)) if uses_pairs else None
+    of_pairs = next((table for table in job.tables if table.uses_pairs), None)
+    measured = of_pairs is not None and of_pairs.measurements.pairs is not None
+    pairing = "measured" if measured else None if of_pairs is None else str(of_pairs.pairing)
+    unknown = any(table.unknown_frame for table in job.tables)
     document = {
         "schema": COMPARISON_SCHEMA,
         "version": __version__,
         "robot": job.robot.name,
-        "model": job.options.model,
-        "frame": job.options.frame,
+        "model": job.model,
+        "frame": "unknown" if unknown else job.tables[0].frame,
         "pairing": pairing,
         "judged_on": comparison.judged_on,
         "n_judged": comparison.n_judged,
@@ -515,7 +516,8 @@ def _rms(estimate: Estimate, when: str) -> dict[str, dict[str, float | None]] | 
     rms = estimate.residual_rms
     if rms is None:
         return None
-    return {split: {kind: rms[split].get(kind, {}).get(when) for kind in KINDS} for split in ("train", "test")}
+    kinds = list(dict.fromkeys((*KINDS, *rms["train"], *rms["test"])))
+    return {split: {kind: rms[split].get(kind, {}).get(when) for kind in kinds} for split in ("train", "test")}
 
 
 def _errors(errors: RealErrors | None) -> dict[str, Any] | None:

@@ -3,10 +3,11 @@
 import json
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+import touches
+from instruments import measured_by
 from oracle import tool_pose
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
@@ -15,14 +16,14 @@ from tolerances import rounding
 from fg_calib.analysis.uncertainty import assess
 from fg_calib.baseline import comparison as comparison_module
 from fg_calib.baseline.comparison import ESTIMATORS, best_rigid_fit, compare, real_errors
-from fg_calib.errors import InputError, ProblemError
+from fg_calib.baseline.least_squares import fit_least_squares
+from fg_calib.errors import InputError
 from fg_calib.files.csv_writer import write_csv
 from fg_calib.files.job import read_job
 from fg_calib.files.robot_yaml import write_robot
 from fg_calib.graph.build import build_problem, problem_of
 from fg_calib.graph.solver import solve
 from fg_calib.job import Job
-from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.series import Table
 from fg_calib.options import Options, Pairing
 from fg_calib.report.comparison import format_comparison
@@ -114,7 +115,7 @@ def test_a_prediction_is_the_trace_of_the_propagated_covariance(simulated_job):
     found = compare(simulated_job)
     job, weighted = simulated_job, found.estimates[3]
     readings = job.measurements.readings[job.measurements.test]
-    fit = comparison_module.fit_least_squares(
+    fit = fit_least_squares(
         job.robot, job.measurements, model=job.options.model, names=list(weighted.sigma), weighted=True
     )
     total = 0.0
@@ -185,14 +186,14 @@ def test_a_job_without_test_rows_is_reweighted_at_its_train_rows(simulated_job):
 
 
 def test_a_baseline_that_cannot_run_or_goes_astray_says_so(simulated_job, monkeypatch):
-    original = comparison_module.fit_least_squares
+    original = comparison_module.fit_dataset
 
     def broken(*arguments, method="gauss-newton", weighted=False, **settings):
         if method == "scipy":
             raise InputError("poses.csv", "no sigma for distance")
         return original(*arguments, weighted=weighted, max_iterations=50 if weighted else 1, **settings)
 
-    monkeypatch.setattr(comparison_module, "fit_least_squares", broken)
+    monkeypatch.setattr(comparison_module, "fit_dataset", broken)
     found = compare(simulated_job)
     *_, plain, _, scipys = found.estimates
     assert (scipys.robot, scipys.converged, scipys.predicted_rms) == (None, False, None)
@@ -234,6 +235,86 @@ def test_problem_of_takes_the_jobs_settings_but_for_changes(simulated_job):
     changed = problem_of(job, gauge="keep")
     assert changed.options.gauge == "keep"
     assert "d3" in [p.name for p in changed.estimated]
+
+
+# --- every instrument -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "instrument",
+    [
+        *("targets", "targets known", "targets nearly", "targets stations", "anchors offset", "anchors nearly"),
+        *(
+            "planes",
+            "board",
+            pytest.param("pixels", marks=pytest.mark.slow),
+            "room",
+        ),
+    ],
+)
+def test_plain_least_squares_finds_the_graphs_optimum_of_every_instrument(instrument, tmp_path):
+    """Two roads that share residuals alone, places and frames unknown to both: to a thousandth of a sigma."""
+    robot, true, table = measured_by(instrument, np.random.default_rng(0))
+    _same_optimum(compare(Job(tmp_path / "job.yaml", robot, (table,), Options(), true)))
+
+
+@pytest.mark.parametrize("instrument", ["anchors", "planes", "board"])
+def test_of_one_row_a_configuration_joint_noise_weighs_as_in_the_graph(instrument, tmp_path):
+    robot, true, table = measured_by(instrument, np.random.default_rng(0), sigma_joint=5e-4)
+    _same_optimum(compare(Job(tmp_path / "job.yaml", robot, (table,), Options(), true)))
+
+
+def test_several_tables_have_one_optimum_and_are_told_of_together(tmp_path):
+    """Each table has its own model and frame; the test configurations of all of them judge."""
+    rng = np.random.default_rng(1)
+    robot, true, lengths = measured_by("anchors", rng, n_test=6)
+    q = rng.uniform(-2.0, 2.0, (25, 4))
+    seen = measure(true, 25, rng, frame=FRAME, sigma=(1e-4, 1e-4), readings=q)
+    tables = (lengths, Table(seen, "position", frame="unknown"))
+    found = compare(Job(tmp_path / "job.yaml", robot, tables, Options(), true))
+    _same_optimum(found)
+    assert (found.judged_on, found.n_judged) == ("test", 6)
+    assert format_comparison(found).startswith("small-arm: anchor + position, judged at 6 test configurations\n")
+    document = comparison_document(found)
+    assert (document["model"], document["frame"], document["pairing"]) == ("anchor + position", "unknown", None)
+
+
+def test_touched_points_are_unknowns_of_plain_least_squares_too(tmp_path):
+    rng = np.random.default_rng(3)
+    robot = small_arm(tolerance=touches.TOLERANCE)
+    true = true_robot(robot, rng)
+    measurements = touches.touch(true, touches.corners(true, 3, rng), 14, rng, distances=((0, 1, 1e-4), (1, 2, 1e-4)))
+    found = compare(Job(tmp_path / "job.yaml", robot, measurements, Options("distance"), true))
+    _same_optimum(found)
+    assert found.units == {"point": "m", "distance": "m"}
+
+
+def test_pixels_stand_in_report_and_document(tmp_path):
+    robot, true, table = measured_by("room", np.random.default_rng(0))
+    found = compare(Job(tmp_path / "job.yaml", robot, (table,), Options(), true))
+    after = found.estimates[3].residual_rms["train"]["pixel"]["after"]
+    line = next(line for line in format_comparison(found).splitlines() if line.startswith("  pixel "))
+    assert line.split()[1:] == [
+        "px",
+        *(f"{found.estimates[0].residual_rms['train']['pixel']['before']:.2f}",),
+        *5 * [f"{after:.2f}"],
+    ]
+    assert comparison_document(found)["estimates"][3]["residual_rms"]["train"]["pixel"] == after
+
+
+def _same_optimum(found):
+    """Of the graph that is weighted by the same noise and has no priors, and of what is claimed there."""
+    _, keep, plain, *weighted = found.estimates
+    assert plain.converged, plain.message
+    for e in weighted:
+        assert e.converged, e.message
+        for name, sigma in keep.sigma.items():
+            expected = keep.robot.nominal[keep.robot.index(name)]
+            assert e.robot.nominal[e.robot.index(name)] == pytest.approx(expected, rel=0, abs=1e-3 * sigma), name
+            assert e.sigma[name] == pytest.approx(sigma, rel=1e-3), name
+        for split, kinds in keep.residual_rms.items():
+            for kind, rms in kinds.items():
+                assert e.residual_rms[split][kind]["after"] == pytest.approx(rms["after"], rel=1e-3)
 
 
 # --- real errors ------------------------------------------------------------------------------------------------------
@@ -424,14 +505,3 @@ def test_comparing_bad_input_is_one_line(fg_calib, tmp_path):
     ended = fg_calib("compare", tmp_path / "nowhere.yaml")
     assert (ended.code, ended.out) == (1, "")
     assert ended.err == f"error: {tmp_path / 'nowhere.yaml'}: no such file\n"
-
-
-def test_several_tables_are_named_and_refused():
-    robot = planar_robot(tolerance={"a": 1e-3, "theta": 1e-3})
-    tables = tuple(Table(Measurements.from_arrays(np.zeros((3, 2)), source=name), "distance") for name in ("a", "b"))
-    with pytest.raises(ProblemError) as found:
-        compare(Job(Path("tables.yaml"), robot, tables, Options()))
-    assert str(found.value) == (
-        "tables.yaml: measurements: 2 tables (a, b), expected one: plain least squares, which the graph is compared "
-        "with, takes no more; give one of them as the path of a table"
-    )

@@ -10,7 +10,7 @@ from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_
 from tolerances import NEGLIGIBLE, rounding, sigmas_apart
 
 from fg_calib.analysis.uncertainty import assess
-from fg_calib.baseline import least_squares
+from fg_calib.baseline import system
 from fg_calib.baseline.least_squares import fit_least_squares
 from fg_calib.errors import InputError
 from fg_calib.graph.build import build_problem
@@ -373,7 +373,7 @@ def test_it_says_when_it_has_not_arrived():
 
 
 def test_it_says_when_the_weights_do_not_settle(monkeypatch):
-    monkeypatch.setattr(least_squares, "_ROUNDS", 1)
+    monkeypatch.setattr(system, "_ROUNDS", 1)
     measurements = simulated(paper_robot(), "pose", sigma_joint=3e-4)
     fit = fit_least_squares(paper_robot(), measurements, model="pose", weighted=True)
     assert not fit.converged
@@ -415,9 +415,10 @@ MISTAKES = [
      "base.roll, theta1, d1, a1, alpha1, theta2, d2, ..."),
     ({"names": ["a1", "a1"]}, "names: 'a1' twice, expected each parameter once"),
     ({"names": []}, "names: nothing to estimate, expected at least one parameter"),
-    ({"model": "pose"}, "measurements: no measured orientations, expected orientations for model pose"),
+    ({"model": "pose"},
+     "measurements: no columns qx, qy, qz, qw or roll, pitch, yaw, expected measured orientations for model pose"),
     ({"model": "distance-rotation"},
-     "measurements: no measured orientations, expected orientations for model distance-rotation"),
+     "measurements: no columns qx, qy, qz, qw or roll, pitch, yaw, expected orientations for model distance-rotation"),
 ]  # fmt: skip
 
 
@@ -428,7 +429,7 @@ def test_a_mistake_is_named_in_one_line(arguments, message):
     assert str(caught.value) == message
 
 
-NO_POSITIONS = "no measured positions, expected positions for model "
+NO_POSITIONS = "no columns x, y, z, expected measured positions for model "
 
 
 def test_what_measurements_lack_is_named():
@@ -437,7 +438,7 @@ def test_what_measurements_lack_is_named():
         (replace(whole, position=None), "position", False, NO_POSITIONS + "position"),
         (replace(whole, position=None), "distance", False, NO_POSITIONS + "distance"),
         (replace(whole, sigma_position=None), "position", True,
-         "no sigma for position, expected the noise of every row, to weight by"),
+         "no sigma for position, expected noise.position or a column sigma_position"),
         (replace(whole, test=np.ones(4, bool)), "position", False,
          "no row left to fit, expected train rows for model position"),
         (replace(whole, test=np.ones(4, bool)), "distance", False,
@@ -450,7 +451,7 @@ def test_what_measurements_lack_is_named():
     with pytest.raises(InputError) as caught:
         fit_least_squares(ROBOT, replace(whole, sigma_position=None), model="distance", weighted=True)
     assert str(caught.value) == (
-        "pairs from measurements: no sigma for distance, expected the noise of every row, to weight by"
+        "pairs from measurements: no sigma for distance, expected noise.position or a column sigma_position"
     )
     with pytest.raises(InputError) as caught:
         fit_least_squares(ROBOT, replace(whole, sigma_position=np.zeros((4, 3))), model="position", weighted=True)

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import pytest
 
 from fg_calib import Calibration, InputError, calibrate_job
 from fg_calib.files import disk
-from fg_calib.files.disk import exists, fill_folder, read_bytes, require_writable
+from fg_calib.files.disk import exists, fill_folder, read_bytes, require_writable, write_text
 
 FILES = ("one", "two", "three")
 OWN = dict.fromkeys((*FILES, "four"), b"")
@@ -211,6 +212,90 @@ def test_files_of_another_user_that_are_not_yet_moved_are_neither_read_nor_moved
         with pytest.raises(InputError, match="fg-calib-written: files of another user, expected none"):
             access()
     assert (tmp_path / "one").read_text() == "old"
+
+
+# --- a folder that all may write to, and nobody may remove another's files from, as /tmp is ---------------------------
+
+OTHER = 12345
+
+
+@pytest.fixture
+def sticky(tmp_path, monkeypatch):
+    """Such a folder, where this process is no longer root."""
+    if os.geteuid() != 0:
+        pytest.skip("only root becomes another user")
+    tmp_path.chmod(0o755)
+    folder = Path("shared")  # of the current folder: those above it may not be looked through
+    monkeypatch.chdir(tmp_path)
+    folder.mkdir()
+    folder.chmod(0o1777)
+    yield folder
+    os.seteuid(0)
+
+
+def of_another(path, mode=0o755):
+    """A file or folder of another user."""
+    path.chmod(mode)
+    os.chown(path, OTHER, OTHER)
+    return path
+
+
+@pytest.mark.parametrize("mode", [0o700, 0o777])
+def test_what_another_user_left_half_written_is_left_alone(sticky, mode):
+    left = sticky / f".fg-calib-writing-{disk._host()}-{2**30}-x"
+    left.mkdir()
+    (left / "one").write_text("another's")
+    of_another(left, mode)
+    os.seteuid(65534)
+    for folder in (sticky, sticky / "out"):
+        fill_folder(folder, write("new"), OWN)
+        assert (folder / "one").read_text() == "new"
+    os.seteuid(0)
+    fill_folder(sticky, write("newer"), OWN)  # nor does root remove it
+    assert (left / "one").read_text() == "another's"
+
+
+@pytest.mark.parametrize("name", ["one", "four"])
+def test_results_of_another_user_are_not_to_be_replaced_or_removed(sticky, name):
+    (sticky / "one").write_text("mine")
+    os.chown(sticky / "one", 65534, 65534)
+    (sticky / name).write_text("another's")
+    of_another(sticky / name)
+    os.seteuid(65534)
+    expected = f"{sticky / name}: is another user's in a folder that all share, expected another folder"
+    with pytest.raises(InputError) as caught:
+        fill_folder(sticky, write("new"), OWN)
+    assert str(caught.value) == expected
+    assert (sticky / name).read_text() == "another's"
+    assert [file for file in sticky.iterdir() if file.name.startswith(".")] == []
+
+
+@pytest.mark.parametrize("mode", [0o700, 0o755])
+def test_what_another_user_has_not_moved_is_no_reason_not_to_read_what_stands_there(sticky, mode):
+    """Theirs can never take the place of what is not theirs; but who writes there would have to move it."""
+    (sticky / "one").write_text("root's")
+    within = sticky / disk._WRITTEN
+    within.mkdir()
+    (within / "one").write_text("another's")
+    of_another(within, mode)
+    os.seteuid(65534)
+    assert read_bytes(sticky / "one") == b"root's"
+    with pytest.raises(InputError) as caught:
+        fill_folder(sticky, write("new"), {})
+    hint = "have them moved to their places or removed, or use another folder"
+    assert str(caught.value) == f"{within}: files of another user, expected none; {hint}"
+
+
+def test_a_file_is_written_whatever_another_user_has_put_beside_it(sticky):
+    """The name of the file that was written first could be foreseen."""
+    beside = sticky / f".poses.csv.{os.getpid()}.{threading.get_ident()}.tmp"
+    beside.write_text("")
+    of_another(beside)
+    os.seteuid(65534)
+    write_text(sticky / "poses.csv", "mine")
+    os.seteuid(0)
+    assert (sticky / "poses.csv").read_text() == "mine"
+    assert sorted(file.name for file in sticky.iterdir()) == [beside.name, "poses.csv"]
 
 
 def test_what_cannot_be_moved_is_said(tmp_path):

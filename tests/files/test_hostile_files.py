@@ -13,6 +13,7 @@ import polars as pl
 import pytest
 
 from fg_calib import InputError, Robot, read_job, read_measurements
+from fg_calib.files import schema
 from fg_calib.files.disk import read_bytes
 from fg_calib.files.schema import read_yaml
 from fg_calib.sizes import ORDINARY
@@ -27,8 +28,8 @@ MERGES = "a0: &a0 {k: 1}\n" + "".join(f"a{i + 1}: &a{i + 1}\n  <<: [{', '.join([
 UTF_16 = "UTF-16 text, expected UTF-8 text; save it as UTF-8"
 
 YAML = {
-    LAUGHS: "robot.yaml:7: aliases that stand for more than 1000000 values",
-    MERGES: "robot.yaml:13: aliases that stand for more than 1000000 values",
+    LAUGHS: "robot.yaml:5: aliases that stand for more than 50000 values",
+    MERGES: "robot.yaml:11: aliases that stand for more than 50000 values",
     "a: &a [*a]\n": "robot.yaml:1: an alias of what it stands in",
     "a: " + "[" * 3000: "robot.yaml: nested too deeply, expected a mapping, key: value",
     "a: !!int ''\n": "robot.yaml:1: '' is no YAML of type int",
@@ -47,6 +48,19 @@ def test_no_yaml_hangs_or_ends_in_a_traceback(tmp_path, text):
     with pytest.raises(InputError) as error:
         read_yaml(file)
     assert str(error.value) == YAML[text]
+
+
+def test_a_long_yaml_is_given_up_where_it_becomes_too_long(tmp_path, monkeypatch):
+    """Not when all of it has been read: 900 000 names took 17 s. The mapping, its key and the list are values too."""
+    monkeypatch.setattr(schema, "MOST_VALUES", 1000)
+    file = tmp_path / "robot.yaml"
+    for text, line in (("fixed: [" + 9000 * "a1, " + "]", 1), ("fixed:\n" + 9000 * "- a1\n", 999)):
+        file.write_text(text)
+        with pytest.raises(InputError) as error:
+            read_yaml(file)
+        assert str(error.value) == f"robot.yaml:{line}: more than 1000 values in one file"
+    file.write_text("fixed:\n" + 997 * "- a1\n")
+    assert len(read_yaml(file)["fixed"]) == 997
 
 
 TABLES = {

@@ -1,5 +1,6 @@
 """Tables and jobs of instruments: what is read is what stands there, and what cannot be used is named."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,6 @@ import yaml
 from instruments import CAMERA, measured_by
 from scipy.spatial.transform import Rotation
 
-from fg_calib.baseline.comparison import compare
 from fg_calib.calibration import calibrate, calibrate_job
 from fg_calib.errors import InputError
 from fg_calib.files.csv_writer import write_csv
@@ -200,17 +200,14 @@ def test_a_key_that_cannot_be_used_is_named(key, value, message, tmp_path):
     assert str(error.value).startswith(message)
 
 
-@pytest.mark.parametrize(
-    ("instrument", "found"),
-    [("anchors offset", "model anchor"), ("targets stations", "targets"), ("pixels", "model pixels")],
-)
-def test_what_plain_least_squares_does_not_know_is_named(instrument, found, tmp_path):
+@pytest.mark.parametrize("instrument", ["anchors offset", "targets stations"])
+def test_the_command_compares_instruments(instrument, fg_calib, tmp_path):
     robot, _, table = measured_by(instrument, np.random.default_rng(27))
-    job = read_job(write_files(tmp_path, robot, table, KEYS[instrument]))
-    with pytest.raises(InputError) as error:
-        compare(job)
-    expected = "poses of the tool, or pairs: plain least squares, which the graph is compared with, knows no more"
-    assert str(error.value) == f"job.yaml: measurements: {found}, expected {expected}"
+    ended = fg_calib("compare", write_files(tmp_path, robot, table, KEYS[instrument]), "--json")
+    assert (ended.code, ended.err) == (0, "")
+    document = json.loads(ended.out)
+    assert (document["model"], document["frame"]) == (table.model, table.frame)
+    assert all(e["converged"] for e in document["estimates"])
 
 
 @pytest.mark.parametrize(("column", "word"), [("anchor", "NA"), ("plane", "nan"), ("station", "-"), ("target", "None")])

@@ -1,14 +1,20 @@
 """Parquet is read by another process: what ends, stops or misleads that one is a line here."""
 
+import subprocess
 import sys
 
+import numpy as np
 import polars as pl
 import pytest
+from simulated import planar_robot
 
 from fg_calib import InputError
-from fg_calib.files import parquet
+from fg_calib.files import pairs, parquet, tables
+from fg_calib.files.tables import read_measurements
+from fg_calib.measurements.dataset import Noise
 
 NAMES = ["a", "b c", "*"]
+_READ = parquet._READ
 
 
 @pytest.fixture
@@ -43,6 +49,80 @@ def test_a_process_that_ends_is_a_line_and_the_next_file_is_read(content, reader
             parquet.parquet_columns(content, "table.parquet")
     assert str(caught.value) == "table.parquet: not a Parquet file: polars ends on it; write it anew"
     assert parquet.parquet_columns(content, "table.parquet") == NAMES
+
+
+@pytest.mark.parametrize(
+    "program",
+    [
+        "import os, sys; sys.stderr.write('memory allocation of 8 bytes failed'); sys.stderr.flush(); os.abort()",
+        "raise MemoryError",
+        "import os; os.kill(os.getpid(), 9)",
+    ],
+)
+def test_a_process_that_gets_no_memory_is_a_line_that_says_so(content, reader, monkeypatch, program):
+    """Rust aborts, Python raises, and the system ends who uses most."""
+    monkeypatch.setattr(parquet, "_READ", program)
+    with pytest.raises(InputError) as caught:
+        parquet.parquet_columns(content, "table.parquet")
+    expected = "table.parquet: there is not enough memory for it; if it is damaged, write it anew"
+    assert str(caught.value) == expected
+
+
+def test_columns_that_memory_does_not_suffice_for_are_a_line_and_the_process_goes_on(content, reader, monkeypatch):
+    """polars hands a MemoryError on as an OSError without words."""
+    for error in ("MemoryError()", "OSError()"):
+        failing = f"pl.DataFrame.write_ipc = lambda self, file: (_ for _ in ()).throw({error})"
+        reader.stop()
+        monkeypatch.setattr(parquet, "_READ", _READ.replace("source, sink", f"{failing}\nsource, sink", 1))
+        with pytest.raises(InputError) as caught:
+            parquet.read_parquet(content, [0], "table.parquet")
+        assert str(caught.value) == "table.parquet: there is not enough memory for it"
+        assert parquet.parquet_columns(content, "table.parquet") == NAMES
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="RLIMIT_AS")
+@pytest.mark.slow
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+@pytest.mark.parametrize("room", [1.0, 1.3, 1.8, 2.5])
+def test_with_hardly_any_memory_left_a_large_table_is_named(tmp_path, ending, room):
+    """polars would end the process at a small piece that it does not get: so much is asked for before it is called."""
+    table, n = tmp_path / f"poses.{ending}", 3_000_000
+    frame = pl.DataFrame({name: np.zeros(n, dtype=int) for name in ("q1", "q2", "x", "y", "z")})
+    frame.write_csv(table) if ending == "csv" else frame.write_parquet(table)
+    size = int(room * (8 * 5 * n if ending == "parquet" else 16 * 5 * n))
+    code = f"""
+import resource, sys, polars
+sys.path[:0] = {sys.path!r}
+from simulated import planar_robot
+from fg_calib import InputError, read_measurements
+read_measurements(polars.DataFrame({{name: [0.0, 1.0] for name in ("q1", "q2", "x", "y", "z")}}), planar_robot())
+used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + {size}, used + {size}))
+try:
+    read_measurements({str(table)!r}, planar_robot())
+except InputError as error:
+    print(error)
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout.count("\n")) == (0, 1), ended.stderr
+    assert ended.stdout.startswith(f"poses.{ending}: there is not enough memory for it")
+
+
+@pytest.mark.parametrize("module", [tables, pairs])
+def test_a_table_that_memory_does_not_suffice_for_is_named(module, tmp_path, monkeypatch):
+    """Where it is read whole already, and arrays are made of it."""
+    robot = planar_robot()
+    (tmp_path / "poses.csv").write_text("q1,q2,x,y,z\n0,0,3,0,0\n0,1,2,1,0\n")
+    (tmp_path / "pairs.csv").write_text("a,b,distance\n0,1,1\n")
+    name = {tables: "poses.csv", pairs: "pairs.csv"}[module]
+
+    def full(*_):
+        raise MemoryError
+
+    monkeypatch.setattr(module, "_readings" if module is tables else "_ends", full)
+    with pytest.raises(InputError) as caught:
+        read_measurements(tmp_path / "poses.csv", robot, pairs=tmp_path / "pairs.csv", noise=Noise(position=1e-3))
+    assert str(caught.value) == f"{name}: there is not enough memory for it"
 
 
 def test_a_process_that_never_ends_is_a_line(content, reader, monkeypatch):
