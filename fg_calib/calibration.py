@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fg_calib.analysis.covariance import TangentCovariance
+from fg_calib.analysis.folds import cross_validate
 from fg_calib.analysis.residual_table import ResidualTable
 from fg_calib.analysis.uncertainty import FrameEstimate, Uncertainty, assess
 from fg_calib.analysis.variance_components import solve_job
@@ -100,7 +101,10 @@ def calibrate_job(job: Job | Path | str) -> Calibration:
     """
     given = job if isinstance(job, Job) else read_job(job)
     solution = solve_job(given)
-    return Calibration.of(solution, assess(solution), given.inputs)
+    uncertainty = assess(solution)
+    if given.options.folds is not None:
+        uncertainty = uncertainty.with_folds(cross_validate(given, given.options.folds), given.options.accept)
+    return Calibration.of(solution, uncertainty, given.inputs)
 
 
 def _with_first_sigmas(m: Measurements) -> Measurements:

@@ -306,7 +306,8 @@ class Options:
         loss: What becomes of large residuals: `none` or a robust loss (see `graph.robust`).
         estimate_noise: Whether the sigmas stated are only a start, and scaled to what is seen.
         max_iterations: Steps after which the solver gives up; None for its default.
-        accept: How large errors at test rows may be; by name (`{"position": 5e-4}`) as well.
+        accept: How large errors may be where rows are held out; by name (`{"position": 5e-4}`) as well.
+        folds: Into how many folds configurations are dealt for cross-validation; None for none.
 
     Raises:
         InputError: A choice is not one of those possible.
@@ -323,6 +324,7 @@ class Options:
     estimate_noise: bool = False
     max_iterations: int | None = None
     accept: Limits = field(default_factory=Limits)
+    folds: int | None = None
 
     def __post_init__(self) -> None:
         set_checked(self, model=Model, frame=FrameKnowledge, gauge=Gauge)
@@ -332,6 +334,8 @@ class Options:
         if self.max_iterations is not None:
             check_number("max_iterations", self.max_iterations, above=True, whole=True)
         object.__setattr__(self, "accept", Limits.given(self.accept))
+        if self.folds is not None:
+            check_number("folds", self.folds, least=2, whole=True)
 
     @classmethod
     def given(cls, options: Options | None, choices: dict[str, Any]) -> Options:

@@ -1,19 +1,20 @@
 """Whether the arm is as accurate as its user needs it: rows that were held out against the limits of a job.
 
-What is judged is the RMS error of the calibrated arm at the test rows, which the estimate never saw. It contains the
-noise of the measurements themselves: an error within the limit is within it all the more without that noise; one beyond
-the limit, which would be within it without the noise stated, says nothing.
+What is judged is the RMS error of the calibrated arm at the test rows, which the estimate never saw, or else at those
+that cross-validation held out (see `folds`). It contains the noise of the measurements themselves: an error within the
+limit is within it all the more without that noise; one beyond the limit, which would be within it without the noise
+stated, says nothing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
 
-from fg_calib.analysis.residual_table import ResidualTable
+from fg_calib.analysis.residual_table import HeldOut
 from fg_calib.options import Limits
 
 Verdict = Literal["pass", "fail", "not evaluated"]
@@ -62,33 +63,31 @@ class Acceptance:
         return "fail" if "fail" in found else "not evaluated" if "not evaluated" in found else "pass"
 
 
-def accept(limits: Limits, table: ResidualTable, findings: Sequence[str]) -> Acceptance | None:
-    """Judge the limits of a job by its test rows; None without limits.
+def accept(limits: Limits, held_out: Mapping[str, HeldOut], findings: Sequence[str]) -> Acceptance | None:
+    """Judge the limits of a job by what was held out; None without limits.
 
     Args:
         limits: The limits.
-        table: Every residual.
+        held_out: Test rows, or those of cross-validation, by kind.
         findings: Why the result is not to be trusted: it then passes nothing.
     """
     stated = {f.name: getattr(limits, f.name) for f in fields(limits)}
-    judged = tuple(_judge(kind, limit, table, findings) for kind, limit in stated.items() if limit is not None)
-    return Acceptance(judged) if judged else None
+    judged = (_judge(kind, limit, held_out.get(kind), findings) for kind, limit in stated.items() if limit is not None)
+    return Acceptance(tuple(judged)) if any(stated.values()) else None
 
 
-def _judge(kind: str, limit: float, table: ResidualTable, findings: Sequence[str]) -> Judgement:
-    error = table.rms()["test"].get(kind, {}).get("after")
-    if error is None:
-        return Judgement(kind, limit, None, None, 0, "not evaluated", f"no test rows measure any {kind}")
-    n, noise = table.noise_of_test(kind)
+def _judge(kind: str, limit: float, held: HeldOut | None, findings: Sequence[str]) -> Judgement:
+    if held is None:
+        return Judgement(kind, limit, None, None, 0, "not evaluated", f"no measurement of any {kind} was held out")
 
     def judgement(verdict: Verdict, reason: str = "") -> Judgement:
-        return Judgement(kind, limit, error, noise, n, verdict, reason)
+        return Judgement(kind, limit, held.after, held.noise, held.n, verdict, reason)
 
-    if n < LEAST:
-        return judgement("not evaluated", f"only {n} test measurement{'s' * (n > 1)}, fewer than {LEAST}")
-    if error > limit:
-        hidden = error**2 - noise**2 <= limit**2
+    if held.n < LEAST:
+        return judgement("not evaluated", f"fewer than {LEAST} were held out")
+    if held.after > limit:
+        hidden = held.after**2 - held.noise**2 <= limit**2
         return judgement("not evaluated", "the noise of the measurements hides it") if hidden else judgement("fail")
-    if findings or not np.isfinite(error):
+    if findings or not np.isfinite(held.after):
         return judgement("not evaluated", "within the limit, but the result is not to be trusted")
     return judgement("pass")

@@ -43,6 +43,23 @@ class RowKind:
 
 
 @dataclass(frozen=True)
+class HeldOut:
+    """Measurements of one kind that were predicted and not fitted; RMS of the length of each one's rows.
+
+    Attributes:
+        n: Number of measurements.
+        before: With the nominal arm, in the kind's unit.
+        after: With the calibrated arm.
+        noise: Of the noise stated.
+    """
+
+    n: int
+    before: float
+    after: float
+    noise: float
+
+
+@dataclass(frozen=True)
 class ResidualTable(FrozenArrays):
     """Every scalar residual, train and test, before and after, in its kind's unit. Words are codes: a table is long.
 
@@ -199,11 +216,16 @@ class ResidualTable(FrozenArrays):
         rows = summed(np.ones(self.n), whole).astype(np.int64)
         return rows, summed((self.after / self.sigma) ** 2, whole), rms
 
-    def noise_of_test(self, family: str) -> tuple[int, float]:
-        """Number of test measurements of a kind of noise that count, and the RMS length of the noise stated of them."""
-        rows = (self.reason_code == 0) & (self.split == 1) & (self.family == self.families.index(family))
-        n = int(np.sum(rows & self._is_first_of_family()))
-        return n, float(np.sqrt(np.sum(self.sigma[rows] ** 2) / max(n, 1)))
+    def held_out(self) -> dict[str, HeldOut]:
+        """Test rows that count, by kind of noise; kinds without any are left out."""
+        found, first = {}, self._is_first_of_family()
+        for k, family in enumerate(self.families):
+            rows = (self.reason_code == 0) & (self.split == 1) & (self.family == k)
+            n = int(np.sum(rows & first))
+            if n:
+                rms = (float(np.sqrt(np.sum(v[rows] ** 2) / n)) for v in (self.before, self.after, self.sigma))
+                found[family] = HeldOut(n, *rms)
+        return found
 
     def _is_first_of_family(self) -> Booleans:
         """Rows that begin a measurement's rows of one kind of noise, shape (n,)."""

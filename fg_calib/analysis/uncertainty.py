@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -17,6 +17,7 @@ from fg_calib.analysis.chi_square import chi_square
 from fg_calib.analysis.corrections import PriorFit, judge_priors
 from fg_calib.analysis.covariance import Spread, spread_of, with_left_out
 from fg_calib.analysis.findings import MOST_ESTIMATED, Fit, judge
+from fg_calib.analysis.folds import Folds
 from fg_calib.analysis.goodness import Goodness, judge_fit
 from fg_calib.analysis.identifiability import Identifiability, identifiability_of
 from fg_calib.analysis.joint_values import JointValues, joint_values
@@ -32,6 +33,7 @@ from fg_calib.graph.extension import check_graph
 from fg_calib.graph.factors import corrections_of, pose_of
 from fg_calib.graph.observability import IdentifiabilityClass, Observability
 from fg_calib.graph.solver import Solution
+from fg_calib.options import Limits
 from fg_calib.robot.model import Robot
 from fg_calib.threads import one_blas_thread, single_threaded
 
@@ -134,6 +136,7 @@ class Uncertainty(FrozenArrays):
         reservations: Those of the cautions that say that sigmas are too small.
         change: What moved while a table was measured; None if nothing did.
         acceptance: What became of the limits that its user set; None without any.
+        folds: What cross-validation found; None where it was not asked for.
     """
 
     names: tuple[str, ...]
@@ -163,6 +166,17 @@ class Uncertainty(FrozenArrays):
     reservations: tuple[str, ...] = ()
     change: Change | None = None
     acceptance: Acceptance | None = None
+    folds: Folds | None = None
+
+    def with_folds(self, folds: Folds, limits: Limits) -> Uncertainty:
+        """The same with cross-validation, by which limits are judged that no test rows speak of.
+
+        Args:
+            folds: What cross-validation found.
+            limits: The limits that the user set.
+        """
+        held_out = folds.kinds | self.residuals.held_out()
+        return replace(self, folds=folds, acceptance=accept(limits, held_out, self.findings))
 
     def __repr__(self) -> str:
         known = sum(p.sigma is not None for p in self.parameters if p.identifiability != "fixed")
@@ -322,7 +336,7 @@ def _assess(solution: Solution) -> Uncertainty:
         noise_like=verdict.noise_like,
         reservations=verdict.reservations,
         change=verdict.change,
-        acceptance=accept(problem.options.accept, table, verdict.findings),
+        acceptance=accept(problem.options.accept, table.held_out(), verdict.findings),
     )
 
 

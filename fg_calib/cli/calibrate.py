@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -20,6 +21,9 @@ def calibrate(
             readable=False,
             help="Write result.json, the calibrated robot and residuals.csv there.",
         ),
+    ] = None,
+    folds: Annotated[
+        int | None, typer.Option("--folds", min=2, help="Hold every configuration out once, in so many folds.")
     ] = None,
     report: Annotated[
         bool, typer.Option("--report", help="Write report.html there too: one page to look at and to pass on.")
@@ -43,6 +47,8 @@ def calibrate(
     given = read_job(job)
     if out is not None:
         require_no_input(out, given)
+    if folds is not None:
+        given = replace(given, options=replace(given.options, folds=folds))
     found = calibrate_job(given)
     try:
         if as_json:

@@ -99,6 +99,7 @@ class _JobOfTables(Schema):
     loss: Loss = "none"
     max_iterations: Annotated[Count, Field(gt=0)] | None = None
     accept: Any = None  # an `_Accept`
+    folds: Annotated[Count, Field(ge=2)] | None = None
     truth: FilePath | None = None
     targets: dict[str, Any] = Field(default_factory=dict)  # by name a `_Point`
     anchors: dict[str, Any] = Field(default_factory=dict)
@@ -154,7 +155,7 @@ class _Tolerances(Schema):
     anchors: Positive | None = None
 
 
-_CHOICES = ("model", "frame", "prior", "gauge", "prefer", "pair_errors", "encoder", "loss", "max_iterations")
+_CHOICES = ("model", "frame", "prior", "gauge", "prefer", "pair_errors", "encoder", "loss", "max_iterations", "folds")
 """Keys of a job that are options as they stand."""
 
 

@@ -199,6 +199,25 @@ class Acceptance(Section):
     judgements: tuple[Judgement, ...]
 
 
+class HeldOut(Section):
+    """Residuals of one kind that cross-validation held out: RMS with the nominal arm, the calibrated one, and noise."""
+
+    n: Whole
+    before: Figure
+    after: Figure
+    noise: Figure
+
+
+class Folds(Section):
+    """Cross-validation; `spread` is the jackknife of each parameter (see `analysis.folds`)."""
+
+    n: Whole
+    n_held_out: Whole
+    n_not_converged: Whole
+    kinds: dict[str, HeldOut]
+    spread: dict[str, Figure]
+
+
 class InFrames(Section):
     """An error in the base frame, and after the best rigid fit."""
 
@@ -431,6 +450,7 @@ class Result(Section):
     evaluated_only: bool = False
     test: TestRows | None = None
     acceptance: Acceptance | None = None
+    folds: Folds | None = None
     priors: Priors | None = None
     expected_error: ExpectedError | None = None
     noise_factors: dict[str, float] | None = None

@@ -45,6 +45,7 @@ from fg_calib.files.result import (
     Covariance,
     Explanation,
     Frame,
+    HeldOut,
     InFrames,
     JointScatter,
     KindGoodness,
@@ -66,6 +67,7 @@ from fg_calib.files.result import (
     Weak,
 )
 from fg_calib.files.result import ExpectedError as ExpectedErrorDocument
+from fg_calib.files.result import Folds as FoldsDocument
 from fg_calib.files.result import JointValues as JointValuesDocument
 from fg_calib.files.result import SuspectConfiguration as Suspect
 from fg_calib.files.robot_yaml import write_robot
@@ -129,6 +131,7 @@ def result_of(solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str,
         evaluated_only=problem.evaluated,
         test=_test_rows(u, names),
         acceptance=None if u.acceptance is None else Acceptance.model_validate(u.acceptance),
+        folds=_folds(u),
         priors=_priors(u.priors),
         expected_error=_expected_error(u.expected_error),
         noise_factors=_noise_factors(solution, goodness.kinds),
@@ -307,6 +310,22 @@ def _test_rows(uncertainty: Uncertainty, names: Sequence[str]) -> TestRows | Non
         goodness=_goodness_by_kind(fit.kinds, PREDICTION_VERDICTS),
         n_suspect_rows=len(fit.suspects),
         suspect_configurations=_suspects(fit.configurations, names),
+    )
+
+
+def _folds(uncertainty: Uncertainty) -> FoldsDocument | None:
+    """What cross-validation found; None without it."""
+    found = uncertainty.folds
+    if found is None:
+        return None
+    estimated = {p.name for p in uncertainty.parameters if p.identifiability != "fixed"}
+    spread = {name: s for name, s in zip(found.names, found.spread, strict=True) if name in estimated}
+    return FoldsDocument.make(
+        n=found.n,
+        n_held_out=int(np.sum(found.fold >= 0)),
+        n_not_converged=found.not_converged,
+        kinds={kind: HeldOut.model_validate(held) for kind, held in found.kinds.items()},
+        spread=spread,
     )
 
 

@@ -23,11 +23,11 @@ def good(reservations: Sequence[str]) -> str:
 
 
 def judged(found: Iterable[Judgement | JudgementDocument]) -> list[str]:
-    """A line a limit: `PASS: position 0.31 mm (RMS of 30 test measurements), limit 0.5 mm`."""
+    """A line a limit: `PASS: position 0.31 mm (RMS of 30 held-out measurements), limit 0.5 mm`."""
     lines = []
     for one in found:
         factor, unit, _ = SHOWN[LIMITED[one.kind]]
-        error = "" if one.error is None else f" {one.error * factor:.3g} {unit} (RMS of {one.n} test measurements)"
+        error = "" if one.error is None else f" {one.error * factor:.3g} {unit} (RMS of {one.n} held-out measurements)"
         reason = f": {one.reason}" if one.reason else ""
         lines.append(f"{one.verdict.upper()}: {one.kind}{error}, limit {one.limit * factor:.3g} {unit}{reason}")
     return lines

@@ -17,6 +17,7 @@ from fg_calib.graph.solver import Solution
 from fg_calib.measurements.kinds import PointDistance, TouchedPoint
 from fg_calib.measurements.series import Table
 from fg_calib.report.fit import goodness_of_fit, prediction, suspicious, with_joint_noise
+from fg_calib.report.folds import folds
 from fg_calib.report.identifiability import WEAK, lost_directions, weak_directions
 from fg_calib.report.notes import notes
 from fg_calib.report.parameters import combinations, parameters
@@ -40,6 +41,7 @@ def build_report(solution: Solution, uncertainty: Uncertainty) -> RenderableType
             f"Goodness of fit (1 sigma of a row{with_joint_noise(solution)})", *goodness_of_fit(solution, uncertainty)
         ),
         *prediction(solution, uncertainty),
+        *folds(uncertainty),
         *_expected_error(uncertainty),
         *section("Residuals (RMS)", _residuals(solution, uncertainty)),
     ]

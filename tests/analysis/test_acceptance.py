@@ -49,7 +49,7 @@ def test_an_arm_that_is_worse_fails():
     result = calibrated(wrong=0.01, accept=Limits(position=5e-3, orientation=5e-4))
     assert verdicts(result)[0] == "fail"
     assert result.result.acceptance.verdict == "fail"
-    assert result.not_accepted[0].startswith("FAIL: position 17.3 mm (RMS of 20 test measurements), limit 5 mm")
+    assert result.not_accepted[0].startswith("FAIL: position 17.3 mm (RMS of 20 held-out measurements), limit 5 mm")
 
 
 def test_what_passes_needs_a_result_to_be_trusted():
@@ -66,7 +66,9 @@ def test_noise_may_hide_what_is_asked_for():
     assert "the noise of the measurements hides it" in result.not_accepted[0]
 
 
-@pytest.mark.parametrize(("n_test", "words"), [(0, "no test rows measure"), (4, "only 4 test measurements")])
+@pytest.mark.parametrize(
+    ("n_test", "words"), [(0, "no measurement of any position"), (4, "fewer than 5 were held out")]
+)
 def test_without_rows_held_out_nothing_is_evaluated(n_test, words):
     result = calibrated(n_test=n_test, accept={"position": 1.0})
     assert verdicts(result) == ["not evaluated"]

@@ -473,8 +473,8 @@ BAD = {
     "unknown key in the job": (
         sub(JOB, "^pairing", "pairng"),
         "calibration.yaml: unknown key 'pairng', expected one of robot, measurements, pairs, model, pairing, frame, "
-        "units, noise, prior, gauge, prefer, pair_errors, encoder, loss, max_iterations, accept, truth, targets, "
-        "anchors, tolerance, offset, camera, columns; did you mean pairing?",
+        "units, noise, prior, gauge, prefer, pair_errors, encoder, loss, max_iterations, accept, folds, truth, "
+        "targets, anchors, tolerance, offset, camera, columns; did you mean pairing?",
     ),
     "unknown key in the robot": (
         sub(ROBOT, "^fixed", "fixd"),

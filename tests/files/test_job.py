@@ -150,8 +150,8 @@ def test_a_robot_may_be_a_file_or_stand_in_the_job(folder, robot, files):
 
 
 KEYS = (
-    "one of robot, measurements, pairs, model, pairing, frame, units, noise, prior, gauge, prefer, "
-    "pair_errors, encoder, loss, max_iterations, accept, truth, targets, anchors, tolerance, offset, camera, columns"
+    "one of robot, measurements, pairs, model, pairing, frame, units, noise, prior, gauge, prefer, pair_errors, "
+    "encoder, loss, max_iterations, accept, folds, truth, targets, anchors, tolerance, offset, camera, columns"
 )
 MISTAKES = [
     ("", "calibration.yaml: an empty file, expected a mapping, key: value"),

@@ -22,7 +22,8 @@ from fg_calib.robot.kinematics import pose
 
 LARGE = {"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}
 TITLES = (
-    *("Accuracy before and after", "The arm and what was measured", "Error over joint space", "Parameters"),
+    *("Accuracy before and after", "The arm and what was measured", "Cross-validation"),
+    *("Error over joint space", "Parameters"),
     *("What is not determined", "Correlations", "Residuals", "Expected error over the workspace"),
     "Inputs, options and versions",
 )

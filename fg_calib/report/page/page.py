@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 _SECTIONS: tuple[tuple[str, Callable[[Run], list[Element]]], ...] = (
     ("Accuracy before and after", sections.accuracy),
+    ("Cross-validation", sections.cross_validation),
     ("Error over joint space", sections.joints),
     ("Parameters", sections.parameters),
     ("What is not determined", sections.undetermined),

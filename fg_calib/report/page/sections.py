@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.analysis.folds import wide
 from fg_calib.files.result import Parameter, Rms
 from fg_calib.report.identifiability import format_relation
 from fg_calib.report.page.figures import (
@@ -91,6 +92,35 @@ def accuracy(run: Run) -> list[Element]:
     words = f"RMS residuals before and after the calibration, of {held if run.held_out else fitted}."
     parts = [tag("p", f"{words} They contain the measurements' noise.")]
     return [*parts, figures([accuracy_bars(run)])]
+
+
+def cross_validation(run: Run) -> list[Element]:
+    """How well configurations are predicted without which it was calibrated."""
+    found = run.result.folds
+    if found is None:
+        return [tag("p", "Not done: fg-calib calibrate --folds 5 holds every configuration out once.", class_="soft")]
+    words = (
+        f"{found.n_held_out} configurations in {found.n} folds, each predicted by a calibration without it. RMS; the"
+        " noise stated is there to compare."
+    )
+    rows = []
+    for kind, held in found.kinds.items():
+        unit = run.unit(kind)
+        rows.append([kind, f"{held.n}", *(_shown(v, unit) for v in (held.before, held.after, held.noise))])
+    parts = [tag("p", words), table(["", "held out", "before", "after", "noise stated"], rows)]
+    sigma = {p.name: p.sigma for p in run.result.parameters if p.sigma}
+    ratio = {name: v / sigma[name] for name, v in found.spread.items() if v is not None and name in sigma}
+    if ratio:
+        by = 100.0 / np.sqrt(2.0 * (found.n - 1))
+        words = (
+            f"Between folds a parameter spreads by {np.median(list(ratio.values())):.2f} of its sigma (median; each is"
+            f" known to {by:.0f} %). Below 1 is where tolerances determine it, far above 1 what the model lacks."
+        )
+        parts.append(tag("p", words))
+        if beyond := wide(ratio, found.n):
+            named = ", ".join(f"{name} {ratio[name]:.1f}" for name in beyond[:8])
+            parts.append(tag("p", f"More than their sigmas say, not by chance: {named}."))
+    return parts
 
 
 def joints(run: Run) -> list[Element]:
