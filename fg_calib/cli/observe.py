@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from fg_calib.cli.output import Json, say, show_json, show_report
 from fg_calib.options import AngleUnit, FrameKnowledge, LengthUnit, Model, check_number
+
+if TYPE_CHECKING:  # imported where it is used: `--help` need not wait for it
+    from fg_calib.files.units import Units
+    from fg_calib.measurements.dataset import Noise
+    from fg_calib.robot.model import Robot
 
 _NOISES = ("position_noise", "orientation_noise", "joint_noise")
 
@@ -74,7 +79,6 @@ def observe(
     from fg_calib.files.robot_yaml import read_robot
     from fg_calib.files.tables import read_measurements
     from fg_calib.files.units import Units
-    from fg_calib.measurements.dataset import Noise
     from fg_calib.options import Pairing
     from fg_calib.report.documents import observability_document, write_observability
     from fg_calib.report.identifiability import build_identifiability_report
@@ -94,11 +98,7 @@ def observe(
         found = observe_structure(arm, model, frame=frame, prefer=names, seed=seed)
     else:
         units = Units(length=length, angle=angle)
-        noise = Noise(
-            position=None if position_noise is None else position_noise * units.factor("m"),
-            orientation=None if orientation_noise is None else orientation_noise * units.factor("rad"),
-            joint=tuple(joint_noise * units.factor(j.unit) for j in arm.joints),
-        )
+        noise = _noise(units, arm, position_noise, orientation_noise, joint_noise)
         table = read_measurements(configurations, arm, units=units, noise=noise)
         found = observe_configurations(arm, table, model, frame=frame, pairing=Pairing(pairing), prefer=names)
     try:
@@ -109,6 +109,17 @@ def observe(
     finally:  # also where nobody takes the report
         if out is not None:
             write_observability(out, found)
+
+
+def _noise(units: Units, robot: Robot, position: float | None, orientation: float | None, joint: float) -> Noise:
+    """The noise that the options state."""
+    from fg_calib.measurements.dataset import Noise
+
+    return Noise(
+        position=None if position is None else units.sigma(position, "m", "--position-noise"),
+        orientation=None if orientation is None else units.sigma(orientation, "rad", "--orientation-noise"),
+        joint=tuple(units.sigma(joint, j.unit, "--joint-noise") for j in robot.joints),
+    )
 
 
 def _refuse_idle(context: typer.Context, names: Sequence[str], circumstance: str) -> None:

@@ -286,9 +286,11 @@ def _known_points(file: _JobOfTables, model: Model, place: str) -> dict[str, Kno
     factor, found = file.units.factor("m"), {}
     for name, one in getattr(file, key).items():
         point = validate(_Point, one, f"{place}: {key}: {name}")
-        tolerance = getattr(for_all, key) if point.tolerance is None else point.tolerance
+        tolerance, said_by = point.tolerance, f"{place}: {key}: {name}: tolerance"
+        if tolerance is None:
+            tolerance, said_by = getattr(for_all, key), f"{place}: tolerance: {key}"
         xyz = np.array([point.x, point.y, point.z]) * factor
-        found[name] = KnownPoint(xyz, None if tolerance is None else tolerance * factor)
+        found[name] = KnownPoint(xyz, None if tolerance is None else file.units.sigma(tolerance, "m", said_by))
     return found
 
 
@@ -412,16 +414,17 @@ def _noise(given: object, units: Units, robot: Robot, place: str) -> tuple[Noise
         raise InputError(place, f"found {shown(given)}", "a mapping of figures, or estimate")
     file = validate(_Noise, given or {}, place)
 
-    def si(figure: float | None, unit: str) -> float | None:
-        return None if figure is None else figure * units.factor(unit)
+    def si(key: str, unit: str) -> float | None:
+        figure = getattr(file, key)
+        return None if figure is None else units.sigma(figure, unit, f"{place}: {key}")
 
     noise = Noise(
-        position=si(file.position, "m"),
-        orientation=si(file.orientation, "rad"),
+        position=si("position", "m"),
+        orientation=si("orientation", "rad"),
         joint=joint_noise(file.joint, units, robot, place),
-        distance=si(file.distance, "m"),
-        angle=si(file.angle, "rad"),
-        point=si(file.point, "m"),
+        distance=si("distance", "m"),
+        angle=si("angle", "rad"),
+        point=si("point", "m"),
         pixel=file.pixel,
     )
     if not file.estimate:
@@ -447,4 +450,4 @@ def joint_noise(given: object, units: Units, robot: Robot, place: str) -> tuple[
         if figures[0] > 0.0 and len(kinds) > 1:
             words = " and ".join(f"{given} {units.name(unit)} for {name}" for unit, name in sorted(kinds.items()))
             _log.warning("%s: joint: %s is %s; a list has one figure a joint", place, given, words)
-    return tuple(f * units.factor(j.unit) for f, j in zip(figures, robot.joints, strict=True))
+    return tuple(units.sigma(f, j.unit, f"{place}: joint") for f, j in zip(figures, robot.joints, strict=True))

@@ -76,9 +76,16 @@ class _Robot(Schema):
     estimate: tuple[str, ...] = ()
     tolerance: dict[str, Positive] = Field(default_factory=dict)
 
-    def choices(self) -> dict[str, Any]:
-        """What `RobotBuilder.build` wants to know, [m] and [rad]."""
-        tolerance = {key: value * self.units.factor(unit_of_key(key)) for key, value in self.tolerance.items()}
+    def choices(self, place: str) -> dict[str, Any]:
+        """What `RobotBuilder.build` wants to know, [m] and [rad].
+
+        Raises:
+            InputError: A tolerance is too small.
+        """
+        tolerance = {
+            key: self.units.sigma(value, unit_of_key(key), f"{place}: tolerance: {key}")
+            for key, value in self.tolerance.items()
+        }
         return {"fixed": self.fixed, "estimate": self.estimate, "tolerance": tolerance}
 
 
@@ -163,7 +170,7 @@ def _build_urdf(file: _UrdfRobot, place: str, folder: Path) -> Robot:
         base=file.base.si(file.units, f"{place}: base"),
         tool=file.tool.si(file.units, f"{place}: tool"),
         place=place,
-        **file.choices(),
+        **file.choices(place),
     )
 
 
@@ -198,7 +205,7 @@ def _build_dh(file: _DhRobot, place: str) -> Robot:
         factor = file.units.factor(joint.unit)
         builder.add_convention_joint(Joint(name, joint.prismatic, lower * factor, upper * factor), values)
     builder.add_frame("tool", file.tool.si(file.units, f"{place}: tool"), len(file.joints) + 1, False)
-    return builder.build(place=place, **file.choices())
+    return builder.build(place=place, **file.choices(place))
 
 
 @checked

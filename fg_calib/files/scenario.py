@@ -145,8 +145,8 @@ class _Reader:
         if file.instruments is None:
             figures = validate(_Noise, file.noise, place)
             noise = Noise(
-                position=figures.position * units.factor("m"),
-                orientation=figures.orientation * units.factor("rad"),
+                position=units.sigma(figures.position, "m", f"{place}: position"),
+                orientation=units.sigma(figures.orientation, "rad", f"{place}: orientation"),
                 joint=joint_noise(figures.joint, units, self._robot, place),
             )
             stated, job = self._job(noise)
@@ -253,9 +253,9 @@ class _Reader:
             return None, given
         stated = validate(_StatedNoise, file, f"{place}: noise")
         if stated.position is not None:
-            noise = replace(noise, position=stated.position * units.factor("m"))
+            noise = replace(noise, position=units.sigma(stated.position, "m", f"{place}: noise: position"))
         if stated.orientation is not None:
-            noise = replace(noise, orientation=stated.orientation * units.factor("rad"))
+            noise = replace(noise, orientation=units.sigma(stated.orientation, "rad", f"{place}: noise: orientation"))
         if stated.joint is not None:
             noise = replace(noise, joint=joint_noise(stated.joint, units, self._robot, f"{place}: noise"))
         return noise, given

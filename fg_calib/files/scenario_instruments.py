@@ -156,7 +156,8 @@ def noise_figures(given: object, units: Units, place: str, *, stated: bool = Fal
     figures: dict[str, Any] = {name: getattr(file, name) for name in schema.model_fields}
     for name, figure in figures.items():
         if figure is not None and name != "pixel":
-            figures[name] = figure * units.factor("rad" if name in ("orientation", "angle") else "m")
+            unit = "rad" if name in ("orientation", "angle") else "m"
+            figures[name] = units.sigma(figure, unit, f"{place}: {name}")
     return Noise(**figures)
 
 
@@ -274,7 +275,7 @@ class InstrumentReader:
 
     def _spot(self, given: object, place: str) -> Spot:
         file, length = validate(_Spot, given, place), self.units.factor("m")
-        tolerance = None if file.tolerance is None else file.tolerance * length
+        tolerance = None if file.tolerance is None else self.units.sigma(file.tolerance, "m", f"{place}: tolerance")
         return Spot(np.array([file.x, file.y, file.z]) * length, tolerance)
 
     def _plane(self, given: object, place: str) -> Plane:

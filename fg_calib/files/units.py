@@ -13,6 +13,7 @@ from pydantic import BeforeValidator
 from fg_calib.errors import InputError
 from fg_calib.files.schema import Positive, Schema, refuse_unknown_keys, shown, validate
 from fg_calib.options import AngleUnit, LengthUnit, did_you_mean, set_checked
+from fg_calib.sizes import LEAST_SIZE
 
 LENGTHS: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 """Metres in one unit of length."""
@@ -43,6 +44,22 @@ class Units:
     def factor(self, unit: str) -> float:
         """What a figure of the file is multiplied by to be in `unit`, `m` or `rad`."""
         return LENGTHS[self.length] if unit == "m" else ANGLES[self.angle]
+
+    def sigma(self, figure: float, unit: str, place: str) -> float:
+        """A sigma or tolerance of the file, 0 or above, in `unit`, `m` or `rad`.
+
+        Args:
+            figure: As the file has it.
+            unit: What it is in inside the program.
+            place: File and key, for messages.
+
+        Raises:
+            InputError: It is so small that nothing can be weighted by it.
+        """
+        value = figure * self.factor(unit)
+        if 0.0 < value < LEAST_SIZE:
+            raise InputError(place, f"found {figure:g} {self.name(unit)}", f"{LEAST_SIZE:g} {unit} or more")
+        return value
 
     def from_si(self, value: float, unit: str) -> float:
         """The figure for the file of a value in `unit`: the shorter one where that reads back the same."""

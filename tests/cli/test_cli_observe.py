@@ -184,6 +184,11 @@ def test_a_robot_without_links_has_none_to_name(fg_calib, example):
             1,
             "--joint-noise: found -1.0, expected a finite number not below 0",
         ),
+        (
+            ("{robot}", "--configurations", "{poses}", "--angle", "deg", "--orientation-noise", "1e-29"),
+            1,
+            "--orientation-noise: found 1e-29 deg, expected 1e-30 rad or more",
+        ),
         ((), 2, "ROBOT"),
     ],
 )

@@ -12,12 +12,16 @@ from simulated import measure, small_arm, true_robot
 from fg_calib import Calibration, calibrate
 from fg_calib.analysis.reasons import NOT_EXCITED
 from fg_calib.analysis.uncertainty import assess
+from fg_calib.baseline.comparison import compare
 from fg_calib.errors import InputError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
+from fg_calib.job import Job
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.kinds import Distance, Kind, Rows
 from fg_calib.measurements.series import Own, Table
+from fg_calib.options import Options
+from fg_calib.report.comparison import format_comparison
 from fg_calib.report.documents import result_document
 from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import pose
@@ -448,3 +452,16 @@ def test_text_and_other_things_are_no_figures(change, said):
     with pytest.raises(InputError) as found:
         replace(measured(5)[2].own[0], **change)
     assert str(found.value) == said
+
+
+def test_plain_least_squares_takes_it_too():
+    robot, true, table = measured(5, n_test=10)
+    found = compare(Job(None, robot, (table,), Options(), true))
+    _, keep, _, weighted, _ = found.estimates
+    assert weighted.converged
+    for name, sigma in keep.sigma.items():
+        values = [e.robot.nominal[robot.index(name)] for e in (keep, weighted)]
+        assert values[1] == pytest.approx(values[0], rel=0, abs=1e-3 * sigma)
+    lines = format_comparison(found).splitlines()
+    assert lines[0] == "small-arm: own, judged at 10 test configurations"
+    assert sum(line.startswith("  anchor ") for line in lines) == 2  # train and test rows

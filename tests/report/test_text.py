@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 from scipy.spatial.transform import Rotation
 from simulated import measure, plus, small_arm, true_robot
 
+import fg_calib
 from fg_calib import (
     Job,
     Measurements,
@@ -26,6 +28,8 @@ from fg_calib import (
     observe_structure,
     solve,
 )
+from fg_calib.cli.entry import app
+from fg_calib.files.result import Result
 from fg_calib.options import Options
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Joint, Robot, RobotBuilder
@@ -269,6 +273,26 @@ def test_a_row_without_room_is_a_paragraph(long_reports):
         f"{name} estimate {estimate} ± sigma {sigma} {unit} correction {correction} nominal {nominal} prior {prior} "
         f"class {kind}" in found
     )
+
+
+def names_of_commands():
+    """Options of all commands as they are typed."""
+    for command in typer.main.get_command(app).commands.values():
+        for option in command.params:
+            yield from (name for name in option.opts if name.startswith("--"))
+
+
+NAMES = {
+    "keys of result.json": [f.alias or name for name, f in Result.model_fields.items()],
+    "functions": [name for name in fg_calib.__all__ if name.islower()],
+    "options": [*names_of_commands()],
+}
+
+
+@pytest.mark.parametrize("what", NAMES)
+def test_the_readme_names_all_that_a_user_may_meet(what):
+    words = set(re.findall(r"[\w-]+", README.read_text()))
+    assert [name for name in NAMES[what] if name not in words] == []
 
 
 def readme_code(heading):
