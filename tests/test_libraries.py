@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+from sparing import most_slow
 
 DRAW = """
 from fg_calib import InputError
@@ -30,9 +31,10 @@ def ended(folder, **variables):
     return ran.stdout.strip(), ran.stderr
 
 
-@pytest.mark.parametrize(
-    ("numba", "matplotlib"), [("cache_dir: of-a-stranger", "text.usetex: True"), ("a: [", b"\xff".decode("latin-1"))]
-)
+FILES = [("cache_dir: of-a-stranger", "text.usetex: True"), ("a: [", b"\xff".decode("latin-1"))]
+
+
+@pytest.mark.parametrize(("numba", "matplotlib"), most_slow(FILES, every=2))
 def test_files_of_the_current_folder_set_nothing(tmp_path, numba, matplotlib):
     (tmp_path / ".numba_config.yaml").write_text(numba)
     (tmp_path / "matplotlibrc").write_bytes(matplotlib.encode("latin-1"))

@@ -199,6 +199,10 @@ class Variables(Brief):
 
     def nominal(self) -> Floats:
         """The parameter vector at the robot's nominal values, measurement frame and nuisance values zero."""
+        return self._nominal.copy()
+
+    @cached_property
+    def _nominal(self) -> Floats:
         return np.concatenate([self.robot.nominal, np.zeros(self.nuisance_span.stop - len(self.robot.parameters))])
 
     def values(self, parameters: Floats) -> gtsam.Values:

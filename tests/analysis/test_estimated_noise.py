@@ -33,6 +33,7 @@ def touched(what, rng, n=36, n_points=3):
     return robot, Table(data, "anchor", known={"p0": KnownPoint(points[0])})
 
 
+@pytest.mark.usefixtures("without_reasons", "without_mistakes")
 @pytest.mark.parametrize("instrument", ["board", "anchors", "planes", "targets", *TOUCHED])
 def test_estimated_noise_of_a_healthy_table_is_good_and_of_another_arm_is_not(instrument):
     """All readings exchanged with those of other rows: the noise estimated is then as large as what was measured."""

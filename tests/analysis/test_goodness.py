@@ -9,6 +9,7 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.stats import kstest
 from simulated import measure, plus, small_arm, true_robot
+from sparing import diagonal
 from touches import SIGMA, TOOL_POINT, corners, touch
 
 from fg_calib.analysis import goodness as goodness_module
@@ -264,8 +265,7 @@ def noise_estimated_from(name, stated):
     return stated * np.array(list(factors_of(solution).values()))
 
 
-@pytest.mark.parametrize("name", ["pose", "star", "all"])
-@pytest.mark.parametrize("wrong", [1 / 25, 25.0])
+@pytest.mark.parametrize(("name", "wrong"), diagonal(["star", "pose", "all"], [1 / 25, 25.0]))
 def test_estimated_noise_is_the_same_wherever_it_starts(name, wrong):
     """To a hundredth of the factor, whose own sigma is some ten times that: rows near kinks are judged as stated."""
     found = [noise_estimated_from(name, stated) for stated in (1.0, wrong)]

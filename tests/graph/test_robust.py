@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from simulated import measure, small_arm, true_robot
+from sparing import diagonal
 from tolerances import rounding
 
 from fg_calib.analysis.uncertainty import assess
@@ -80,8 +81,7 @@ def test_weights_fall_with_the_residual_and_are_half_where_said(loss):
     assert around.tolist() == [1.0, 0.0] if loss == "gnc" else around == pytest.approx([0.5, 0.5], abs=0.01)
 
 
-@pytest.mark.parametrize("model", ["pose", "distance", "distance-rotation"])
-@pytest.mark.parametrize("loss", SMOOTH)
+@pytest.mark.parametrize(("loss", "model"), diagonal(SMOOTH, ["pose", "distance", "distance-rotation"]))
 def test_the_optimum_is_that_of_gtsams_robust_noise_on_factors_of_one_measurement(loss, model):
     rng = np.random.default_rng(3)
     robot = small_arm(tolerance=TOLERANCE)

@@ -7,6 +7,7 @@ import pytest
 import scipy.sparse
 from oracle import central_differences, random_robot, tool_pose
 from scipy.spatial.transform import Rotation
+from sparing import diagonal
 from tolerances import rounding
 
 from fg_calib.graph.rows import At, Part, RowSet
@@ -112,9 +113,10 @@ def test_same_point_residual_and_its_derivatives(convention):
     assert rigid.sum() >= 7
 
 
-@pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("kinds", [(True, True), (True, False), (False, True)])
-@pytest.mark.parametrize("size", [1e-7, 0.5, 2.9])
+POSES = [(True, True), (True, False), (False, True)]
+
+
+@pytest.mark.parametrize(("convention", "kinds", "size"), diagonal(CONVENTIONS, POSES, [1e-7, 0.5, 2.9]))
 def test_orientation_and_position_and_their_derivatives(convention, kinds, size):
     rng = np.random.default_rng(13)
     robot = random_robot(convention, 6, rng)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from simulated import measure, plus, small_arm, true_robot
+from sparing import most_slow
 
 from fg_calib import (
     Job,
@@ -242,7 +243,7 @@ def words(text):
     return set(text.split()) - {"prior", "b"}
 
 
-@pytest.mark.parametrize("width", [40, 60, 80, 100, 200])
+@pytest.mark.parametrize("width", most_slow([40, 60, 100, 80, 200], every=2))
 def test_no_width_breaks_a_word(long_reports, width):
     """What was a word on a very wide page is one on every page: names, figures, units."""
     for text in long_reports:
