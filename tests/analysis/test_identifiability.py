@@ -104,7 +104,7 @@ def rank_at(robot, model, seed):
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize(("robot", "ranks"), DRAWN, ids=[f"{r.name}-{i}" for i, (r, _) in enumerate(DRAWN)])
 def test_structural_rank_does_not_depend_on_the_draw(robot, ranks, model):
-    assert {rank_at(robot, model, seed) for seed in range(3)} == {ranks[MODELS.index(model)]}
+    assert {rank_at(robot, model, seed) for seed in range(2)} == {ranks[MODELS.index(model)]}
 
 
 @pytest.mark.long

@@ -216,6 +216,7 @@ def with_distances(m, distance):
     return replace(m, groups=replace(m.groups, pairs=replace(m.groups.pairs, distance=distance)))
 
 
+@pytest.mark.usefixtures("without_mistakes")
 @pytest.mark.parametrize("mistake", ["distance", "labels"])
 def test_touched_points_that_do_not_fit_are_named(fg_calib, tmp_path, mistake):
     """A socket distance that is 3 mm wrong, or three touches booked to the wrong socket."""

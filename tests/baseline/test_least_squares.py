@@ -7,6 +7,7 @@ import pytest
 from oracle import central_differences, tool_pose
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
+from sparing import diagonal
 from tolerances import NEGLIGIBLE, rounding, sigmas_apart
 
 from fg_calib.analysis.uncertainty import assess
@@ -133,8 +134,7 @@ SECOND_ORDER = 0.01
 """Sigma by which the mean of a noisy length moves an estimate here: 0.3 mrad of joint noise over 10 m (0.004 found)."""
 
 
-@pytest.mark.parametrize("model", PAPERS)
-@pytest.mark.parametrize("method", ["gauss-newton", "scipy"])
+@pytest.mark.parametrize(("model", "method"), diagonal(PAPERS, ["gauss-newton", "scipy"]))
 def test_weighted_by_joint_noise_it_is_the_graph(model, method):
     """With the weights of the same parameters."""
     robot = paper_robot()

@@ -205,8 +205,7 @@ def test_the_limit_holds_for_all_rounds_together():
     assert nearly.message.startswith(f"converged: {needed - 1} iterations, ")
 
 
-@pytest.mark.parametrize("loss", ["huber", "cauchy"])
-@pytest.mark.parametrize("seed", [0, 7])
+@pytest.mark.parametrize(("loss", "seed"), diagonal(["huber", "cauchy"], [0, 7]))
 def test_touches_and_positions_that_share_joint_noise_arrive_with_robust_losses(loss, seed):
     """Derivatives of touches leave out a turn that moves no length, but acts on noise that is not the same all round.
 

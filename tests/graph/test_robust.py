@@ -48,8 +48,7 @@ def test_constants_in_one_dimension_are_those_of_the_books():
     assert tuning("none", 3) == np.inf
 
 
-@pytest.mark.parametrize("residual_dim", [1, 2, 6])
-@pytest.mark.parametrize("loss", SMOOTH)
+@pytest.mark.parametrize(("loss", "residual_dim"), diagonal(SMOOTH, [1, 2, 6]))
 def test_clean_measurements_lose_five_percent(loss, residual_dim):
     """The location of a cloud of Gaussian vectors, by reweighting, against its mean: Monte Carlo."""
     rng = np.random.default_rng(1)

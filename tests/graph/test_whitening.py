@@ -85,9 +85,7 @@ def directly_measured(m, robot, a, b, sigma=(1e-3, 5e-4)):
     return replace(m, pairs=pairs)
 
 
-@pytest.mark.parametrize("direct", [False, True])
-@pytest.mark.parametrize("model", KINDS)
-@pytest.mark.parametrize("pairing", ["star", "chain"])
+@pytest.mark.parametrize(("model", "pairing", "direct"), diagonal(KINDS, ["star", "chain"], [False, True]))
 def test_shared_errors_whiten_as_the_dense_covariance(pairing, model, direct):
     rng = np.random.default_rng(3)
     robot = small_arm()

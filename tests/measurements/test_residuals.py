@@ -179,8 +179,9 @@ def random_block(kind, n, rng):
     return block, chain_of(robot)
 
 
-@pytest.mark.parametrize("kind", ["pairs", "points", "poses"])
-@pytest.mark.parametrize("n", [1, LANES + 1, 700, 2 * SPAN + 5])
+@pytest.mark.parametrize(
+    ("kind", "n"), diagonal(["pairs", "points", "poses"], [1, LANES + 1, 700, 2 * SPAN + 5], every=2)
+)
 def test_reductions_keep_cost_gradient_and_hessian(kind, n):
     block, chain = random_block(kind, n, np.random.default_rng(n))
     r, J = residuals.linearise(block, chain)
