@@ -99,7 +99,7 @@ def named(check):
     return str(check.explanations[0]) if check.explanations else ""
 
 
-@pytest.mark.parametrize(("model", "frame", "mistake"), most_slow(CASES, every=5))
+@pytest.mark.parametrize(("model", "frame", "mistake"), most_slow(CASES, every=8))
 def test_a_mistake_in_the_table_is_named(tmp_path, model, frame, mistake):
     robot = ur5e(tmp_path)
     m = measured(robot, placed=PLACED if frame == "unknown" else None)
@@ -131,7 +131,7 @@ def test_a_joint_that_is_stuck_is_not_called_one_in_another_unit(tmp_path, stand
     assert not any("in deg" in str(e) for e in check.explanations)
 
 
-@pytest.mark.parametrize(("joint", "place"), [(0, 0.4), (2, 0.08), (3, 0.3)])
+@pytest.mark.parametrize(("joint", "place"), most_slow([(0, 0.4), (2, 0.08), (3, 0.3)], every=3))
 def test_a_joint_of_a_scara_that_is_stuck_is_named_too(joint, place):
     """The last one moves the tool point by 40 mm only, and a slide in mm instead of cm would move by a tenth."""
     rows = [[0, 0, 0.35, 0], [0.3, 0, 0, 0], [0.25, np.pi, 0, 0], [0, 0, 0.05, 0]]
@@ -263,7 +263,9 @@ def test_a_unit_of_one_quantity_or_one_joint_is_named(tmp_path, mistake, frame):
     assert named(check_setup(robot, ONE[mistake](m), "pose", frame)) == mistake
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(1e-3, "m, not mm"), (0.1, "cm, not mm"), (1e3, "mm, not m")])
+@pytest.mark.parametrize(
+    ("factor", "unit"), most_slow([(1e-3, "m, not mm"), (0.1, "cm, not mm"), (1e3, "mm, not m")], every=3)
+)
 def test_one_slide_of_two_in_another_unit_is_named(factor, unit):
     rng = np.random.default_rng(0)
     rows = [(0.0, 1.6, 0.5, 0.0), (0.1, 1.6, 0.4, 1.6), (0.2, 0.7, 0.3, 0.0), (0.3, -1.5, 0.1, 0.0)]
@@ -384,7 +386,7 @@ def test_a_solver_that_gives_up_names_the_mistake_too(tmp_path, fg_calib, monkey
     assert "if x, y, z are in mm, not m" in ended.err
 
 
-@pytest.mark.parametrize("seed", range(24))
+@pytest.mark.parametrize("seed", most_slow(range(24), every=2))
 def test_a_healthy_job_raises_no_alarm(seed):
     """With large but stated tolerances; also where it is looked at although its residuals are as predicted."""
     rng = np.random.default_rng(seed)

@@ -11,7 +11,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 from simulated import measure, plus, small_arm, true_robot, write_job
-from sparing import as_case, diagonal
+from sparing import as_case, diagonal, most_slow
 from touches import TOLERANCE as TOUCH_TOLERANCE
 from touches import TOOL_POINT, corners, touch
 
@@ -328,7 +328,7 @@ EVALUATIONS = (
 )
 
 
-@pytest.mark.parametrize("name", EVALUATIONS)
+@pytest.mark.parametrize("name", most_slow(EVALUATIONS, every=2))
 @pytest.mark.filterwarnings("error")
 def test_a_table_of_test_rows_alone_evaluates_the_arm_as_it_is(fg_calib, tmp_path, name):
     for error in (0.0, 1.0):

@@ -17,7 +17,7 @@ import pytest
 import yaml
 from oracle import tool_pose
 from scipy.spatial.transform import Rotation
-from sparing import diagonal
+from sparing import diagonal, most_slow
 from tolerances import rounding
 from typer.testing import CliRunner
 
@@ -831,7 +831,9 @@ PAIR_TABLES = {
 }
 
 
-@pytest.mark.parametrize(("model", "header", "cells", "n_distances", "n_angles"), PAIR_TABLES.values(), ids=PAIR_TABLES)
+@pytest.mark.parametrize(
+    ("model", "header", "cells", "n_distances", "n_angles"), most_slow(PAIR_TABLES.values(), every=2), ids=PAIR_TABLES
+)
 def test_measured_pairs_are_fitted(fg_calib, measured_pairs, model, header, cells, n_distances, n_angles):
     folder, rows, true = measured_pairs
     result = _run_pairs(fg_calib, folder, model, header.split(","), [cells(i, r) for i, r in enumerate(rows)])

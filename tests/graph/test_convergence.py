@@ -157,7 +157,7 @@ def test_random_arms_arrive_in_few_steps(convention, tolerance):
             assert solution.iterations <= MOST
 
 
-@pytest.mark.parametrize("model", ["pose", "distance-rotation", "distance"])
+@pytest.mark.parametrize("model", most_slow(["pose", "distance-rotation", "distance"], every=3))
 def test_sixty_real_poses_without_priors_arrive_in_few_steps(model, data_folder):
     """Distances see wrist offsets in a curved valley: undamped steps leave it and come back, damped ones take 41."""
     robot = read_robot(data_folder / "ur10_tmac" / "robot.yaml")

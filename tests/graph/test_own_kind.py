@@ -204,7 +204,7 @@ def test_its_rows_are_in_its_unit_and_in_no_other(tmp_path):
         assert f"-> {size:.3g} deg" in repr(calibration)
 
 
-@pytest.mark.parametrize("loss", ["huber", "cauchy", "geman-mcclure", "gnc"])
+@pytest.mark.parametrize("loss", most_slow(["huber", "cauchy", "geman-mcclure", "gnc"], every=2))
 def test_robust_losses_leave_gross_errors_out(loss):
     robot, _, table = measured(4, gross=4)
     clean = replace(table, own=(replace(table.own[0], test=np.arange(60) < 4),))

@@ -7,7 +7,7 @@ import pytest
 import scipy.sparse
 from oracle import central_differences, random_robot, tool_pose
 from scipy.spatial.transform import Rotation
-from sparing import diagonal
+from sparing import diagonal, most_slow
 from tolerances import rounding
 
 from fg_calib.graph.rows import At, Part, RowSet
@@ -61,7 +61,7 @@ def pair_formula(robot, measured):
     return formula
 
 
-@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("convention", most_slow(CONVENTIONS, every=2))
 def test_distance_and_angle_and_their_derivatives(convention):
     rng = np.random.default_rng(11)
     for n_joints in (1, 4, 7, 12):

@@ -86,7 +86,7 @@ def test_pairs_are_measured_between_configurations():
     assert pairs.angle == pytest.approx(rotation_angle(turn)[0], abs=rounding(100.0))
 
 
-@pytest.mark.parametrize("which", ["anchors", "offset", "contact"])
+@pytest.mark.parametrize("which", most_slow(["anchors", "offset", "contact"], every=3))
 def test_lengths_go_to_anchors_in_turn(which):
     s, T = exact(which)
     m = s.tables[0].measurements
