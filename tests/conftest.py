@@ -1,5 +1,6 @@
 """Fixtures of several test files: the real data, the bundled example, and the command line as a function."""
 
+import gc
 import os
 import shutil
 import sys
@@ -13,7 +14,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # one worker a processor: threads of BL
 os.environ["PYTHONSAFEPATH"] = "1"  # subprocesses have the package that is tested, compiled once, wherever they run
 
 from fg_calib import cli
-from fg_calib.analysis import identifiability
+from fg_calib.analysis import identifiability, mistakes
 
 
 @pytest.hookimpl(tryfirst=True)  # before tests are chosen by their marks
@@ -22,6 +23,12 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if item.get_closest_marker("long"):
             item.add_marker("slow")
+
+
+def pytest_collection_finish():
+    """Spare garbage collections what imports and the tests themselves keep, which is most of all objects."""
+    gc.collect()
+    gc.freeze()
 
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -37,15 +44,29 @@ def data_folder():
 
 
 @pytest.fixture
-def example(tmp_path):
+def whole_example(tmp_path):
     """A copy of the bundled example's folder, to be changed at will."""
     return Path(shutil.copytree(cli.EXAMPLES / "space-robot", tmp_path / "space-robot"))
+
+
+@pytest.fixture
+def example(whole_example):
+    """The same with 50 of its 500 test rows: half of what it takes is judging these."""
+    poses = whole_example / "poses.csv"
+    poses.write_text("".join(poses.read_text().splitlines(keepends=True)[:-450]))
+    return whole_example
 
 
 @pytest.fixture
 def without_reasons(monkeypatch):
     """Leave out why directions are lost: two fifths of `assess`, and no part of what repeated calibrations look at."""
     monkeypatch.setattr(identifiability, "explain", lambda *_: ())
+
+
+@pytest.fixture
+def without_mistakes(monkeypatch):
+    """Leave out the search for a mistake in the set-up: most of what an arm that does not fit costs."""
+    monkeypatch.setattr(mistakes, "_explanations", lambda *_: ())
 
 
 class Ended(NamedTuple):

@@ -1,5 +1,6 @@
 """Independent formulas that the tests hold the package to: 4x4 products, central differences, random robots."""
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -11,17 +12,20 @@ from fg_calib.robot.model import CONVENTIONS, Joint, Robot, RobotBuilder
 Floats = NDArray[np.float64]
 
 
+_IDENTITY = np.eye(4)
+
+
 def translation(axis: int, value: float) -> Floats:
-    T = np.eye(4)
+    T = _IDENTITY.copy()
     T[axis, 3] = value
     return T
 
 
 def rotation(axis: int, value: float) -> Floats:
-    T = np.eye(4)
+    T = _IDENTITY.copy()
     i, j = (axis + 1) % 3, (axis + 2) % 3  # it turns i towards j
-    T[i, i] = T[j, j] = np.cos(value)
-    T[j, i] = np.sin(value)
+    T[i, i] = T[j, j] = math.cos(value)
+    T[j, i] = math.sin(value)
     T[i, j] = -T[j, i]
     return T
 

@@ -33,6 +33,12 @@ def parse(path):
 
 
 @cache
+def nodes(path):
+    """All that a module is made of."""
+    return list(ast.walk(parse(path)))
+
+
+@cache
 def imported(tree):
     """Modules of the package that a module imports anywhere, as paths below the package: `robot`, `files/units`."""
     found = set()
@@ -105,7 +111,7 @@ def test_a_function_is_seen_whole_on_a_screen(name, path):
 
 @EVERY_MODULE
 def test_only_the_command_line_prints(name, path):
-    calls = [node for node in ast.walk(parse(path)) if isinstance(node, ast.Call)]
+    calls = [node for node in nodes(path) if isinstance(node, ast.Call)]
     printing = [c for c in calls if isinstance(c.func, ast.Name) and c.func.id == "print"]
     assert name.startswith("cli/") or printing == []
 
@@ -113,14 +119,12 @@ def test_only_the_command_line_prints(name, path):
 @EVERY_MODULE
 def test_no_input_can_run_code_or_reach_a_network(name, path):
     """What `docs/security.md` says: pickles are those of numba's cache alone, YAML goes through one safe loader."""
-    calls = {ast.unparse(node.func) for node in ast.walk(parse(path)) if isinstance(node, ast.Call)}
+    calls = {ast.unparse(node.func) for node in nodes(path) if isinstance(node, ast.Call)}
     assert calls & {"eval", "exec", "compile", "__import__", "os.system", "yaml.unsafe_load", "yaml.full_load"} == set()
     assert "yaml.load" not in calls or name == "files/schema"
-    used = {alias.name.partition(".")[0] for node in ast.walk(parse(path)) if isinstance(node, ast.Import)
+    used = {alias.name.partition(".")[0] for node in nodes(path) if isinstance(node, ast.Import)
             for alias in node.names}  # fmt: skip
-    used |= {
-        (node.module or "").partition(".")[0] for node in ast.walk(parse(path)) if isinstance(node, ast.ImportFrom)
-    }
+    used |= {(node.module or "").partition(".")[0] for node in nodes(path) if isinstance(node, ast.ImportFrom)}
     forbidden = {"pickle", "marshal", "shelve", "subprocess", "urllib", "http", "requests", "ctypes", "multiprocessing"}
     allowed = {"robot/cache": {"pickle"}, "files/parquet": {"subprocess"}}  # the latter starts this Python alone
     assert used & forbidden == allowed.get(name, set())
@@ -132,12 +136,12 @@ def test_no_module_uses_global_random_state(name, path):
     tree = parse(path)
     used = {
         node.attr
-        for node in ast.walk(tree)
+        for node in nodes(path)
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Attribute) and node.value.attr == "random"
     }
     assert used <= {"default_rng", "Generator"}
-    assert not any(isinstance(n, ast.Import) and any(a.name == "random" for a in n.names) for n in ast.walk(tree))
-    for node in ast.walk(tree):
+    assert not any(isinstance(n, ast.Import) and any(a.name == "random" for a in n.names) for n in nodes(path))
+    for node in nodes(path):
         if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("default_rng"):
             assert node.args, "a generator without a seed"
     at_import = [n for statement in tree.body if not isinstance(statement, ast.FunctionDef | ast.ClassDef)
@@ -181,7 +185,7 @@ def test_all_that_is_imported_is_installed_with_the_package():
     installed = installed - {"pyyaml"} | {"yaml", "pydantic_core"}  # as imported; pydantic brings its core
     used = {}
     for name, path in zip(NAMES, MODULES, strict=True):
-        for node in ast.walk(parse(path)):
+        for node in nodes(path):
             if isinstance(node, ast.Import):
                 modules = [alias.name for alias in node.names]
             else:

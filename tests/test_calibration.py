@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, small_arm, true_robot, write_job
+from sparing import most_slow
 
 from fg_calib import (
     Calibration,
@@ -60,7 +61,7 @@ def found():
 Q = np.random.default_rng(1).uniform(-1.5, 1.5, (4, 4))
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", most_slow(CASES, every=2))
 def test_one_call_does_the_steps(found, name):
     robot, m, settings = given(name)
     solution = look_elsewhere(solve(build_problem(robot, m, **settings)))
@@ -109,7 +110,7 @@ def test_covariance_is_in_the_order_asked_for(found):
         result.covariance("a2")
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", most_slow(CASES, every=2))
 def test_predictions_agree_with_differences(found, name):
     """`Uncertainty.predict` differentiates any function of the robot by central differences.
 

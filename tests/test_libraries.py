@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+from sparing import most_slow
 
 DRAW = """
 from fg_calib import InputError
@@ -30,9 +31,10 @@ def ended(folder, **variables):
     return ran.stdout.strip(), ran.stderr
 
 
-@pytest.mark.parametrize(
-    ("numba", "matplotlib"), [("cache_dir: of-a-stranger", "text.usetex: True"), ("a: [", b"\xff".decode("latin-1"))]
-)
+FILES = [("cache_dir: of-a-stranger", "text.usetex: True"), ("a: [", b"\xff".decode("latin-1"))]
+
+
+@pytest.mark.parametrize(("numba", "matplotlib"), most_slow(FILES, every=2))
 def test_files_of_the_current_folder_set_nothing(tmp_path, numba, matplotlib):
     (tmp_path / ".numba_config.yaml").write_text(numba)
     (tmp_path / "matplotlibrc").write_bytes(matplotlib.encode("latin-1"))
@@ -40,23 +42,19 @@ def test_files_of_the_current_folder_set_nothing(tmp_path, numba, matplotlib):
     assert sorted(f.name for f in tmp_path.iterdir()) == [".numba_config.yaml", "matplotlibrc"]
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "expected"),
-    [
-        (
-            "POLARS_MAX_THREADS",
-            "0",
-            "POLARS_MAX_THREADS in the environment: found '0', expected a number above 0",
-        ),
-        ("NUMBA_DISABLE_JIT", "1", "NUMBA_DISABLE_JIT in the environment: found '1', expected none"),
-        (
-            "NUMBA_NUM_THREADS",
-            "abc",
-            "NUMBA_* in the environment: Environment variable 'NUMBA_NUM_THREADS' is defined but its associated value"
-            " 'abc' could not be parsed, expected values that it takes",
-        ),
-    ],
-)
+WRONG = [
+    ("POLARS_MAX_THREADS", "0", "POLARS_MAX_THREADS in the environment: found '0', expected a number above 0"),
+    ("NUMBA_DISABLE_JIT", "1", "NUMBA_DISABLE_JIT in the environment: found '1', expected none"),
+    (
+        "NUMBA_NUM_THREADS",
+        "abc",
+        "NUMBA_* in the environment: Environment variable 'NUMBA_NUM_THREADS' is defined but its associated value"
+        " 'abc' could not be parsed, expected values that it takes",
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "expected"), most_slow(WRONG, every=3))
 def test_a_wrong_environment_is_one_line(tmp_path, name, value, expected):
     assert ended(tmp_path, **{name: value}) == (expected, "")
 

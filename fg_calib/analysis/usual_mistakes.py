@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from itertools import combinations, permutations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from fg_calib.analysis.placed_residuals import residuals_of
@@ -35,8 +36,11 @@ STILL_TURN, STILL_SLIDE = 0.1, 0.01
 """Range of a joint's readings, [rad] and [m], below which another unit is no explanation but a joint that stands still:
 nobody measures so."""
 
-_PLACES = 16
-"""Places at which a joint may stand still that are tried first, evenly spaced over its readings' range or a turn."""
+_PLACES = 10
+"""Places at which each joint may stand still that are tried first."""
+
+_WORTH = 3.0
+"""Excess that is left there, over the least of all joints, up to which a joint is looked at more closely."""
 
 _ANGLES = {np.pi / 180.0: "deg, not rad", 180.0 / np.pi: "rad, not deg"}
 
@@ -163,30 +167,53 @@ def _moves(setup: Setup, joints: Booleans, factor: float) -> bool:
 
 
 def still_joints(setup: Setup) -> Iterator[Mistake]:
-    """Every joint whose readings change, standing still where that explains most."""
-    m = setup.measurements
-    for i, joint in enumerate(setup.robot.joints):
-        low, high = float(np.min(m.readings[:, i])), float(np.max(m.readings[:, i]))
-        if high - low <= (STILL_SLIDE if joint.prismatic else STILL_TURN):
+    """Joints whose readings change, each standing still where that explains most; those that explain least left out."""
+    joints = [i for i, extent in enumerate(np.ptp(setup.measurements.readings, axis=0)) if extent > _still(setup, i)]
+    tried = {i: [(_left_still(setup, i, place), place) for place in _places(setup, i)] for i in joints}
+    least = min((min(found)[0] for found in tried.values()), default=np.inf)
+    for i, found in tried.items():
+        best, place = min(found)
+        if best > _WORTH * least:
             continue
-
-        def at(place: float, i: int = i) -> Setup:
-            readings = m.readings.copy()
-            readings[:, i] = place
-            return _measured(setup, readings=readings)
-
-        def left(place: float, at: Callable[[float], Setup] = at) -> float:
-            residuals = residuals_of(at(place))
-            return max((residual.excess for residual in residuals), default=np.inf)
-
-        places = np.linspace(low, high, _PLACES) if joint.prismatic else np.linspace(-np.pi, np.pi, _PLACES)
-        best, step = min(places, key=left), places[1] - places[0]
-        for _ in range(2):
-            best, step = min(best + step * np.linspace(-0.8, 0.8, 9), key=left), 0.2 * step
+        (_, first), (_, second), *_ = found
+        step = second - first
+        refined = minimize_scalar(
+            lambda at, i=i: _left_still(setup, i, at),
+            bounds=(place - step, place + step),
+            method="bounded",
+            options={"xatol": 0.03 * step},
+        )
         words = (
             f"joint {i + 1} does not move: its readings change, but the arm does not follow (joint or encoder stuck)"
         )
-        yield Mistake(About.JOINT, words, at(float(best)))
+        at = float(refined.x) if refined.fun < best else place
+        yield Mistake(About.JOINT, words, _standing(setup, i, at))
+
+
+def _still(setup: Setup, i: int) -> float:
+    """Range of a joint's readings below which it stands still by what they say, [rad] or [m]."""
+    return STILL_SLIDE if setup.robot.joints[i].prismatic else STILL_TURN
+
+
+def _places(setup: Setup, i: int) -> Floats:
+    """Places where a joint may stand still, evenly spaced over its readings' range or a turn."""
+    q = setup.measurements.readings[:, i]
+    if setup.robot.joints[i].prismatic:
+        return np.linspace(np.min(q), np.max(q), _PLACES)
+    return np.linspace(-np.pi, np.pi, _PLACES, endpoint=False)
+
+
+def _standing(setup: Setup, i: int, place: float) -> Setup:
+    """The set-up with a joint that stands still."""
+    readings = setup.measurements.readings.copy()
+    readings[:, i] = place
+    return _measured(setup, readings=readings)
+
+
+def _left_still(setup: Setup, i: int, place: float) -> float:
+    """The excess that is left if a joint stands still there."""
+    residuals = residuals_of(_standing(setup, i, place))
+    return max((residual.excess for residual in residuals), default=np.inf)
 
 
 _UNITS = (_robot_units, _lengths, _angles, _joint_units)

@@ -27,6 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import gtsam
@@ -185,8 +186,23 @@ class Variables(Brief):
         """`scales`, then those of the nuisance columns, shape (n_columns + n_nuisance,)."""
         return np.concatenate([self.scales, *(v.scales for v in self.nuisance)])
 
+    @cached_property
+    def stated(self) -> dict[str, tuple[list[int], Floats]]:
+        """Of each core variable, by its symbol: which of its parameters have a prior, and 1 / sigma of these."""
+        found = {}
+        for v in self.items:
+            of_v = () if v.kind == "frame" or not self.priors else v.parameters
+            tolerances = [self.robot.parameters[i].tolerance for i in of_v]
+            weights = np.array([1.0 / t for t in tolerances if t is not None])
+            found[v.symbol] = [k for k, t in enumerate(tolerances) if t is not None], weights
+        return found
+
     def nominal(self) -> Floats:
         """The parameter vector at the robot's nominal values, measurement frame and nuisance values zero."""
+        return self._nominal.copy()
+
+    @cached_property
+    def _nominal(self) -> Floats:
         return np.concatenate([self.robot.nominal, np.zeros(self.nuisance_span.stop - len(self.robot.parameters))])
 
     def values(self, parameters: Floats) -> gtsam.Values:
@@ -705,16 +721,14 @@ def prior_rows(variables: Variables, parameters: Floats, only: Variable | None =
     r: list[Floats] = [np.zeros(0)]
     J: list[Floats] = [np.zeros((0, variables.n_columns))]
     for v in variables.items if only is None else (only,):
-        if v.kind == "frame" or not variables.priors:
+        stated, weight = variables.stated[v.symbol]
+        if not stated:
             continue
         of_v = list(v.parameters)
-        tolerances = [variables.robot.parameters[i].tolerance for i in of_v]
-        stated = [k for k, t in enumerate(tolerances) if t is not None]
         if v.is_pose:
             off, D = _off_nominal(parameters[of_v], nominal[of_v])
         else:
             off, D = parameters[of_v] - nominal[of_v], np.eye(len(of_v))
-        weight = np.array([1.0 / t for t in tolerances if t is not None])
         rows = np.zeros((len(stated), variables.n_columns))
         rows[:, v.columns] = weight[:, None] * D[stated]
         r.append(weight * off[stated])

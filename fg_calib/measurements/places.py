@@ -3,6 +3,7 @@
 From the nominal arm, wherever these are: metres away, or turned by half a turn.
 
 References:
+    Gander (1981), Least squares with a quadratic constraint. Numerische Mathematik 36.
     Umeyama (1991), Least-squares estimation of transformation parameters between two point patterns. IEEE PAMI 13(4).
 """
 
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 from fg_calib.measurements.frames import Frame, nearest_rotation
 
@@ -138,61 +140,73 @@ def _trilaterated(points: Floats, length: Floats) -> Floats:
     A = np.hstack([2.0 * about, -np.ones((len(about), 1))])
     lifted = np.linalg.lstsq(A, np.sum(about**2, axis=1) - length**2, rcond=1e-10)[0][:3]
     across = np.linalg.svd(np.vstack([about, np.zeros((3, 3))]), full_matrices=False)[2][-1]
-    starts = [lifted, lifted - 2.0 * (lifted @ across) * across]
-    starts += [sign * reach * axis for axis in np.eye(3) for sign in (1.0, -1.0)]
-    fits = [_by_lengths(about, length, start) for start in starts]
-    found: Floats = middle + min(fits, key=lambda fit: fit[1])[0]
+    mirrored = lifted - 2.0 * (lifted @ across) * across
+    starts = np.vstack([lifted, mirrored, reach * np.eye(3), -reach * np.eye(3)])
+    found: Floats = middle + _by_lengths(about, length, starts)
     return found
 
 
-def _by_lengths(points: Floats, length: Floats, start: Floats) -> tuple[Floats, float]:
-    """Gauss-Newton on the lengths; the point with the least cost met, and that cost."""
-    a, best, least = start, start, np.inf
+def _by_lengths(points: Floats, length: Floats, starts: Floats) -> Floats:
+    """Gauss-Newton on the lengths from each of some starts, shape (k, 3); the point with the least cost met."""
+    a, best, least = starts, starts.copy(), np.full(len(starts), np.inf)
+    going = np.ones(len(starts), dtype=np.bool_)
     for _ in range(STEPS):
-        step = a - points
-        far = np.linalg.norm(step, axis=1)
+        step = a[:, None] - points  # (k, n, 3)
+        far = np.linalg.norm(step, axis=2)
         r = far - length
-        cost = float(r @ r)
-        if cost < least * (1.0 - 1e-12):
-            best, least = a, cost
-        elif cost > 100.0 * least:
+        cost = np.sum(r**2, axis=1)
+        better = cost < least * (1.0 - 1e-12)
+        best[better], least[better] = a[better], cost[better]
+        unit = step / np.maximum(far, 1e-12)[:, :, None]
+        values, V = np.linalg.eigh(np.swapaxes(unit, 1, 2) @ unit)
+        along = (r[:, None] @ unit) @ V  # (k, 1, 3): the gradient along the eigenvectors
+        known = values > 1e-12 * values[:, 2:]
+        along[:, 0] *= np.divide(1.0, values, out=np.zeros_like(values), where=known)
+        move = (along @ np.swapaxes(V, 1, 2))[:, 0]
+        going &= (cost <= 100.0 * least) & (np.abs(move).max(axis=1) >= STILL)
+        if not going.any():
             break
-        move = np.linalg.lstsq(step / np.maximum(far, 1e-12)[:, None], r, rcond=1e-6)[0]
-        if np.abs(move).max() < STILL:
-            break
-        a = a - move
-    return best, least
+        a = np.where(going[:, None], a - move, a)
+    found: Floats = best[np.argmin(least)]
+    return found
 
 
 def plane_from_distances(points: Floats, distance: Floats) -> tuple[Floats, Floats]:
     """A plane from points at given distances from it, as `PlaneDistance` has it: c, and f, shapes (3,), [m].
 
-    Gauss-Newton steps for the unit normal, from the direction that the points vary least along, from that the other way
-    round, and from all sides. Where all distances are the same, such as 0, they do not tell which side of the plane the
-    points are on: the normal then points away from the base.
+    Where all distances are the same, such as 0, they do not tell which side of the plane the points are on: the normal
+    then points away from the base.
 
     Args:
         points: Tool points at the nominal parameters, shape (n, 3), [m].
         distance: Measured distances, shape (n,), [m].
     """
     middle, height = points.mean(axis=0), float(distance.mean())
-    about, off = points - middle, distance - height
-    flattest = np.linalg.svd(np.vstack([about, np.zeros((3, 3))]), full_matrices=False)[2][2]
-    fits: list[tuple[float, int, Floats]] = []
-    for start in (flattest, -flattest, *np.eye(3), *-np.eye(3)):
-        n = start
-        for _ in range(STEPS):
-            across = np.linalg.svd(n[None])[2][1:]
-            step = np.linalg.lstsq(about @ across.T, off - about @ n, rcond=1e-9)[0]
-            n = n + across.T @ step
-            n = n / np.linalg.norm(n)
-            if np.abs(step).max() < STILL:
-                break
-        left = about @ n - off
-        fits.append((float(left @ left), len(fits), n))
-    n = min(fits)[2]
+    about = points - middle
+    n = _unit_solution(about, distance - height)
     if np.ptp(distance) == 0.0 and n @ middle < 0.0:
         n = -n
     f = middle - height * n
     reach = max(float(np.sqrt(np.max(np.sum(about**2, axis=1)))), 1e-3)
     return f - reach * n, f
+
+
+def _unit_solution(A: Floats, b: Floats) -> Floats:
+    """The unit vector n of the least |A n - b|, of all there are, shape (3,) (Gander 1981).
+
+    It solves (A^T A + m) n = A^T b for the largest m with which |n| = 1, which is no less than minus the least
+    eigenvalue of A^T A. With the eigenvectors as axes, and m counted from there, the length falls steadily with m.
+
+    Args:
+        A: Shape (n, 3).
+        b: Shape (n,).
+    """
+    values, V = np.linalg.svd(np.vstack([A, np.zeros((3, 3))]), full_matrices=False)[1:]
+    above = values**2 - values[2] ** 2
+    g = V @ (A.T @ b)
+    least = 1e-15 * max(values[0] ** 2, 1e-200)  # rounding: where b says nothing along the third axis n is along it
+    g[2] = np.copysign(max(abs(g[2]), least), g[2])
+    bounds = 0.5 * abs(g[2]), 2.0 * float(np.linalg.norm(g))
+    m = brentq(lambda m: 1.0 / np.linalg.norm(g / (above + m)) - 1.0, *bounds, xtol=1e-14 * least, maxiter=1000)
+    n: Floats = V.T @ (g / (above + m))
+    return n / np.linalg.norm(n)

@@ -301,7 +301,11 @@ class Robot:
 
     @property
     def nominal(self) -> Floats:
-        """Nominal values, shape (n_parameters,), [m] or [rad]."""
+        """Nominal values, shape (n_parameters,), [m] or [rad]; a new array each time."""
+        return self._nominal.copy()
+
+    @cached_property
+    def _nominal(self) -> Floats:
         return np.array([p.nominal for p in self.parameters])
 
     @property

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from simulated import measure, plus, true_robot
+from sparing import diagonal, most_slow
 from test_structure import EFFECTS, PLACED, SIGMA, SIGMA_JOINT, arm, measured, problem_of
 
 from fg_calib.analysis.changes import find_change
@@ -70,9 +71,9 @@ def test_the_last_few_rows_alone_are_no_change():
         assert set(found.goodness.gross.names) <= {"41", "42", "43", "44"}
 
 
-@pytest.mark.parametrize("away", [1.0, 0.03, 0.003])
-@pytest.mark.parametrize("name", ["6R", "scara"])
-@pytest.mark.parametrize("forgotten", ["frame", "tool"])
+@pytest.mark.parametrize(
+    ("name", "forgotten", "away"), diagonal(["6R", "scara"], ["frame", "tool"], [1.0, 0.03, 0.003])
+)
 def test_a_frame_or_tool_that_was_forgotten_is_no_change(name, forgotten, away):
     """From metres, where nothing is linear, down to millimetres."""
     robot, m = measured(name, np.random.default_rng(2), n=48)
@@ -88,7 +89,7 @@ def test_a_frame_or_tool_that_was_forgotten_is_no_change(name, forgotten, away):
     assert find_change(solve(problem)) is None
 
 
-@pytest.mark.parametrize("effect", EFFECTS)
+@pytest.mark.parametrize("effect", most_slow(EFFECTS, every=2))
 def test_effects_that_are_not_modelled_are_no_change(effect):
     for seed in range(2):
         robot, m = measured("6R", np.random.default_rng(seed), effect=EFFECTS[effect], n=45)

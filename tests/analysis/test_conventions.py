@@ -9,6 +9,7 @@ import yaml
 from jobs import UR5E, only, ur5e, write_job
 from oracle import random_robot, rotation, tool_pose, translation
 from simulated import measure, paper_robot, true_robot
+from sparing import most_slow
 
 from fg_calib import Measurements, Robot, calibrate
 from fg_calib.analysis.conventions import missing_motions
@@ -163,7 +164,7 @@ def words(text):
     return " ".join(text.split())
 
 
-@pytest.mark.parametrize("model", ["pose", "position", "distance-rotation"])
+@pytest.mark.parametrize("model", most_slow(["pose", "position", "distance-rotation"], every=3))
 def test_a_bad_fit_says_first_what_the_convention_lacks(tmp_path, fg_calib, model):
     ended = fg_calib("calibrate", textbook_job(tmp_path, model=model), "--out", tmp_path / "out")
     assert ended.code == 3
@@ -175,7 +176,7 @@ def test_a_bad_fit_says_first_what_the_convention_lacks(tmp_path, fg_calib, mode
     assert result["observability"]["missing"][0]["axes"] == [2, 3, 4]
 
 
-@pytest.mark.parametrize("error", [only(2, 1e-3), only(5, 2e-3)])
+@pytest.mark.parametrize("error", most_slow([only(2, 1e-3), only(5, 2e-3)], every=2))
 def test_what_the_convention_lacks_is_no_finding_where_something_else_is_wrong(tmp_path, fg_calib, error):
     """A gear ratio that is off: the convention that has the parameter would not fit any better."""
     m = measure(true_robot(ur5e(tmp_path, **DH), np.random.default_rng(0)), 60, np.random.default_rng(1), sigma=SIGMA)
@@ -200,7 +201,8 @@ def anchored(error, rng):
     return robot, Measurements.from_arrays(q, anchor=names, distance=length, sigma_distance=1e-5)
 
 
-@pytest.mark.parametrize("error", [only(5, -2.0), only(1, 1e-3), only(4, 2e-3)])
+@pytest.mark.usefixtures("without_mistakes")
+@pytest.mark.parametrize("error", most_slow([only(5, -2.0), only(1, 1e-3), only(4, 2e-3)], every=3))
 def test_neither_is_it_of_instruments(error):
     robot, m = anchored(error, np.random.default_rng(2))
     assert missing_motions(robot)

@@ -10,6 +10,7 @@ import scipy.sparse
 from instruments import measured_by
 from scipy.stats import beta
 from simulated import measure, plus, small_arm, true_robot, write_job
+from sparing import diagonal, most_slow
 from test_structure import measured, of_joint, problem_of
 
 from fg_calib.analysis.gross_errors import find_gross_errors, log_chance
@@ -64,7 +65,7 @@ def test_where_the_problem_is_linearised_is_no_matter():
         assert np.flatnonzero(find_gross_errors(*given)).tolist() == [4, 5]
 
 
-@pytest.mark.parametrize("swapped", [3, 4])
+@pytest.mark.parametrize("swapped", most_slow([3, 4], every=2))
 def test_anchors_exchanged_where_the_fit_goes_far_astray_are_outliers(swapped):
     """Half a metre, beside one row too many a parameter."""
     robot, _, table = measured_by("anchors", np.random.default_rng(10), n=45)
@@ -130,8 +131,10 @@ def spoilt(name, by, rng):
     return build_problem(robot, m, model="distance-rotation", pairing=Pairing(name)), "9"
 
 
-@pytest.mark.parametrize("by", [60.0, 2000.0])
-@pytest.mark.parametrize("name", ["pose", "star", "all", "anchors", "planes", "board", "targets"])
+SPOILT = ["pose", "star", "all", "anchors", "planes", "board", "targets"]
+
+
+@pytest.mark.parametrize(("name", "by"), diagonal(SPOILT, [60.0, 2000.0]))
 def test_one_wrong_measurement_is_named_however_far_it_is_off(name, by):
     problem, wrong = spoilt(name, min(by, 300.0) if name == "all" else by, np.random.default_rng(5))
     found = assess(solve(problem))

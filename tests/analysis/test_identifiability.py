@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from simulated import measure, paper_robot, planar_robot, small_arm
+from sparing import diagonal
 
 from fg_calib.analysis.identifiability import identifiability_of, observe_configurations, observe_structure
 from fg_calib.analysis.reasons import NO_CAUSE, NOT_EXCITED
@@ -103,7 +104,7 @@ def rank_at(robot, model, seed):
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize(("robot", "ranks"), DRAWN, ids=[f"{r.name}-{i}" for i, (r, _) in enumerate(DRAWN)])
 def test_structural_rank_does_not_depend_on_the_draw(robot, ranks, model):
-    assert {rank_at(robot, model, seed) for seed in range(3)} == {ranks[MODELS.index(model)]}
+    assert {rank_at(robot, model, seed) for seed in range(2)} == {ranks[MODELS.index(model)]}
 
 
 @pytest.mark.long
@@ -252,9 +253,12 @@ def in_other_units(robot, k):
     return replace(robot, parameters=tuple(map(scaled, robot.parameters)), joints=joints, elements=elements)
 
 
-@pytest.mark.parametrize("tolerance", [None, {"a": 1e-3, "d": 1e-4, "theta": 2e-3}], ids=["without", "with"])
-@pytest.mark.parametrize("model", ["pose", "distance-rotation"])
-@pytest.mark.parametrize("arm", ["paper", "small", "scara"])
+TOLERANCES = [None, {"a": 1e-3, "d": 1e-4, "theta": 2e-3}]
+
+
+@pytest.mark.parametrize(
+    ("arm", "model", "tolerance"), diagonal(["paper", "small", "scara"], ["pose", "distance-rotation"], TOLERANCES)
+)
 def test_the_answer_does_not_depend_on_the_unit_of_length(arm, model, tolerance):
     """At the user's configurations and at random ones; the small arm and the scara have sliding joints."""
     robot = {"paper": paper_robot(tolerance), "small": small_arm(tolerance), "scara": scara(OFF_AXIS)}[arm]

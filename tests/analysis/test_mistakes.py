@@ -10,6 +10,7 @@ from jobs import SIGMA, UR5E, only, ur5e, write_job
 from oracle import random_robot
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, small_arm, true_robot
+from sparing import as_case, diagonal, most_slow
 
 from fg_calib import Robot
 from fg_calib.analysis import mistakes
@@ -93,16 +94,12 @@ CASES = [
 ]
 
 
-EVERY_THIRD = [pytest.param(*case, marks=[pytest.mark.slow] * (i % 3 > 0)) for i, case in enumerate(CASES)]
-"""All cases, most of them for the slow run: they take the same way."""
-
-
 def named(check):
     """What the first explanation says."""
     return str(check.explanations[0]) if check.explanations else ""
 
 
-@pytest.mark.parametrize(("model", "frame", "mistake"), EVERY_THIRD)
+@pytest.mark.parametrize(("model", "frame", "mistake"), most_slow(CASES, every=8))
 def test_a_mistake_in_the_table_is_named(tmp_path, model, frame, mistake):
     robot = ur5e(tmp_path)
     m = measured(robot, placed=PLACED if frame == "unknown" else None)
@@ -125,16 +122,16 @@ def stuck(robot, joint, place, seed=0, *, placed=PLACED):
     return replace(m, readings=q)
 
 
-@pytest.mark.parametrize(("joint", "place"), [(0, 0.4), (3, -2.2), (5, 0.3), (5, 3.0)])
-@pytest.mark.parametrize("model", ["pose", "position"])
-def test_a_joint_that_is_stuck_is_not_called_one_in_another_unit(tmp_path, model, joint, place):
+@pytest.mark.parametrize(("stands", "model"), diagonal([(0, 0.4), (3, -2.2), (5, 0.3), (5, 3.0)], ["pose", "position"]))
+def test_a_joint_that_is_stuck_is_not_called_one_in_another_unit(tmp_path, stands, model):
+    joint, place = stands
     robot = ur5e(tmp_path)
     check = check_setup(robot, stuck(robot, joint, place), model, "unknown")
     assert named(check).startswith(f"joint {joint + 1} does not move: its readings change, but the arm does not follow")
     assert not any("in deg" in str(e) for e in check.explanations)
 
 
-@pytest.mark.parametrize(("joint", "place"), [(0, 0.4), (2, 0.08), (3, 0.3)])
+@pytest.mark.parametrize(("joint", "place"), most_slow([(0, 0.4), (2, 0.08), (3, 0.3)], every=3))
 def test_a_joint_of_a_scara_that_is_stuck_is_named_too(joint, place):
     """The last one moves the tool point by 40 mm only, and a slide in mm instead of cm would move by a tenth."""
     rows = [[0, 0, 0.35, 0], [0.3, 0, 0, 0], [0.25, np.pi, 0, 0], [0, 0, 0.05, 0]]
@@ -185,7 +182,7 @@ TWO = [
 ]
 
 
-@pytest.mark.parametrize("two", TWO, ids=" and ".join)
+@pytest.mark.parametrize("two", [as_case((two,), is_slow=i in (0, 2)) for i, two in enumerate(TWO)], ids=" and ".join)
 def test_two_mistakes_at_once_are_named(tmp_path, two):
     robot = ur5e(tmp_path)
     m = measured(robot, placed=PLACED)
@@ -203,13 +200,11 @@ ANGLES = {
 
 
 @pytest.mark.parametrize("mistake", ANGLES)
-def test_other_angles_than_roll_pitch_yaw_are_named(tmp_path, fg_calib, mistake):
-    robot = ur5e(tmp_path)
-    m = measured(robot)
-    job = write_job(tmp_path, m, angles=ANGLES[mistake](Rotation.from_matrix(m.rotation.copy())), model="pose")
-    ended = fg_calib("calibrate", job)
-    assert ended.code == 3
-    assert f"if {mistake}" in " ".join(ended.out.split())
+def test_other_angles_than_roll_pitch_yaw_are_named(tmp_path, mistake):
+    m = measured(ur5e(tmp_path))
+    angles = ANGLES[mistake](Rotation.from_matrix(m.rotation.copy()))
+    job = read_job(write_job(tmp_path, m, angles=angles, model="pose"))
+    assert f"if {mistake}" in str(check_setup(job.robot, job.measurements, "pose"))
 
 
 CHANGED = {
@@ -221,8 +216,7 @@ CHANGED = {
 }
 
 
-@pytest.mark.parametrize("mistake", CHANGED)
-@pytest.mark.parametrize("model", ["pose", "distance-rotation"])
+@pytest.mark.parametrize(("mistake", "model"), diagonal(CHANGED, ["pose", "distance-rotation"]))
 def test_a_mistake_in_the_robot_is_named(tmp_path, model, mistake):
     robot = ur5e(tmp_path)
     changes = CHANGED[mistake]
@@ -243,7 +237,7 @@ def test_a_mistake_in_the_robot_is_named(tmp_path, model, mistake):
     assert mistake in named(check)
 
 
-@pytest.mark.parametrize("model", ["pose", "position", "orientation"])
+@pytest.mark.parametrize("model", most_slow(["position", "pose", "orientation"], every=3))
 def test_a_forgotten_unknown_frame_is_named(tmp_path, fg_calib, model):
     job = write_job(tmp_path, measured(ur5e(tmp_path), placed=PLACED), model=model)
     ended = fg_calib("calibrate", job)
@@ -262,15 +256,16 @@ def test_a_slide_that_goes_the_other_way_or_in_another_unit_is_named():
         assert mistake in named(check_setup(arm, replace(m, readings=m.readings * factor), "pose"))
 
 
-@pytest.mark.parametrize("mistake", ONE)
-@pytest.mark.parametrize("frame", ["known", "unknown"])
+@pytest.mark.parametrize(("mistake", "frame"), diagonal(ONE, ["known", "unknown"]))
 def test_a_unit_of_one_quantity_or_one_joint_is_named(tmp_path, mistake, frame):
     robot = ur5e(tmp_path)
     m = measured(robot, placed=PLACED if frame == "unknown" else None)
     assert named(check_setup(robot, ONE[mistake](m), "pose", frame)) == mistake
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(1e-3, "m, not mm"), (0.1, "cm, not mm"), (1e3, "mm, not m")])
+@pytest.mark.parametrize(
+    ("factor", "unit"), most_slow([(1e-3, "m, not mm"), (0.1, "cm, not mm"), (1e3, "mm, not m")], every=3)
+)
 def test_one_slide_of_two_in_another_unit_is_named(factor, unit):
     rng = np.random.default_rng(0)
     rows = [(0.0, 1.6, 0.5, 0.0), (0.1, 1.6, 0.4, 1.6), (0.2, 0.7, 0.3, 0.0), (0.3, -1.5, 0.1, 0.0)]
@@ -391,7 +386,7 @@ def test_a_solver_that_gives_up_names_the_mistake_too(tmp_path, fg_calib, monkey
     assert "if x, y, z are in mm, not m" in ended.err
 
 
-@pytest.mark.parametrize("seed", range(24))
+@pytest.mark.parametrize("seed", most_slow(range(24), every=2))
 def test_a_healthy_job_raises_no_alarm(seed):
     """With large but stated tolerances; also where it is looked at although its residuals are as predicted."""
     rng = np.random.default_rng(seed)

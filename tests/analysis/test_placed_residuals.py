@@ -13,7 +13,7 @@ from fg_calib.analysis.mistakes import FAR, check_setup
 from fg_calib.analysis.setup import has_places, setup_of_table
 from fg_calib.analysis.uncertainty import assess
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.solver import solve
+from fg_calib.graph.solver import SolverOptions, solve
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.series import KnownPoint, Table
 from fg_calib.robot.kinematics import pose
@@ -131,7 +131,8 @@ def test_what_could_not_be_checked_is_said(monkeypatch):
     monkeypatch.setattr(placed_residuals, "_placed_residuals", lambda setup: ())
     robot, _, table = measured_by("planes", np.random.default_rng(6))
     m = table.measurements
-    found = assess(solve(build_problem(robot, [replace(table, measurements=replace(m, length=m.length / 1e3))])))
+    wrong = build_problem(robot, [replace(table, measurements=replace(m, length=m.length / 1e3))])
+    found = assess(solve(wrong, SolverOptions(max_iterations=5)))
     assert any("was not checked for the usual mistakes (units, signs, columns)" in said for said in found.cautions)
     good = assess(solve(build_problem(robot, [table])))
     assert not any("was not checked" in said for said in good.cautions)

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, kstest
 from simulated import measure, true_robot, write_job
+from sparing import most_slow
 
 from fg_calib import Robot
 from fg_calib.analysis.conventions import end_of_link
@@ -103,7 +104,7 @@ EFFECTS = {
 """What moves the tool of the 6R arm by 2 to 4 sigma."""
 
 
-@pytest.mark.parametrize("effect", EFFECTS)
+@pytest.mark.parametrize("effect", most_slow(EFFECTS, every=2))
 def test_an_effect_of_a_few_sigma_is_seen_whatever_the_noise_stated(effect):
     for unit in (1.0, 0.2):
         robot, m = measured("6R", np.random.default_rng(1), effect=EFFECTS[effect], unit=unit)

@@ -9,6 +9,7 @@ from dense import dense
 from scipy.optimize import minimize
 from scipy.stats import chi2, kstest
 from simulated import measure, small_arm, true_robot
+from sparing import diagonal
 from touches import TOOL_POINT, corners, touch
 
 from fg_calib.analysis import variance_components as estimation
@@ -147,8 +148,7 @@ def spare_of(problem):
 DENSE = ["pose", "frame unknown", "encoder estimated", "touches", "tables", "star of distances", "all distances"]
 
 
-@pytest.mark.parametrize("exact", [True, False])
-@pytest.mark.parametrize("name", DENSE)
+@pytest.mark.parametrize(("name", "exact"), diagonal(DENSE, [True, False]))
 def test_components_are_those_of_the_dense_covariance(name, exact, monkeypatch):
     """To rounding of the dense inverse; estimated products to four of their sigmas, some sqrt(2 / 64) of themselves."""
     problem, _ = draw(name, np.random.default_rng(1), own=0.8, joint=1.3, n=14)

@@ -11,6 +11,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 from simulated import measure, plus, small_arm, true_robot, write_job
+from sparing import as_case, diagonal, most_slow
 from touches import TOLERANCE as TOUCH_TOLERANCE
 from touches import TOOL_POINT, corners, touch
 
@@ -105,8 +106,10 @@ def drifted(seed=3, degrees=0.03):
     return robot, replace(m, position=m.position + moved.position - at.position, rotation=rotation)
 
 
-@pytest.mark.parametrize("estimate", [False, True])
-@pytest.mark.parametrize("settings", [{"model": "pose"}, {"model": "distance-rotation", "pairing": "all"}])
+DRIFTED = [{"model": "pose"}, {"model": "distance-rotation", "pairing": "all"}]
+
+
+@pytest.mark.parametrize(("settings", "estimate"), diagonal(DRIFTED, [False, True]))
 def test_a_joint_that_drifted_before_the_test_rows_is_not_good(fg_calib, tmp_path, settings, estimate):
     robot, m = drifted()
     noise = {"position": 1e-4, "orientation": 1e-4} | ({"estimate": True} if estimate else {})
@@ -213,6 +216,7 @@ def with_distances(m, distance):
     return replace(m, groups=replace(m.groups, pairs=replace(m.groups.pairs, distance=distance)))
 
 
+@pytest.mark.usefixtures("without_mistakes")
 @pytest.mark.parametrize("mistake", ["distance", "labels"])
 def test_touched_points_that_do_not_fit_are_named(fg_calib, tmp_path, mistake):
     """A socket distance that is 3 mm wrong, or three touches booked to the wrong socket."""
@@ -324,7 +328,7 @@ EVALUATIONS = (
 )
 
 
-@pytest.mark.parametrize("name", EVALUATIONS)
+@pytest.mark.parametrize("name", most_slow(EVALUATIONS, every=2))
 @pytest.mark.filterwarnings("error")
 def test_a_table_of_test_rows_alone_evaluates_the_arm_as_it_is(fg_calib, tmp_path, name):
     for error in (0.0, 1.0):
@@ -424,11 +428,12 @@ def encoders(kind, n, rng, wrong=0.0, sigma_joint=2e-3):
     return robot, m, settings | {"encoder": "estimated"}
 
 
-LONG = pytest.param("pairs", 101, marks=pytest.mark.slow)
+ENCODERS = [(kind, n, wrong) for kind, n in (("pose", 30), ("pose", 120), ("pairs", 30), ("pairs", 101))
+            for wrong in (0.0, 15.0)]  # fmt: skip
+QUICK = {("pose", 30, 0.0), ("pose", 120, 15.0), ("pairs", 30, 0.0)}
 
 
-@pytest.mark.parametrize("wrong", [0.0, 15.0])
-@pytest.mark.parametrize(("kind", "n"), [("pose", 30), ("pose", 120), ("pairs", 30), LONG])
+@pytest.mark.parametrize(("kind", "n", "wrong"), [as_case(case, is_slow=case not in QUICK) for case in ENCODERS])
 def test_a_wrong_encoder_reading_is_written_and_suspect(fg_calib, tmp_path, kind, n, wrong):
     """Up to 100 configurations joint values are variables, beyond that they are eliminated."""
     robot, m, job = encoders(kind, n, np.random.default_rng(61), wrong)

@@ -441,7 +441,8 @@ def _refuse(constant):
     raise AssertionError(f"{constant} is no JSON")
 
 
-def test_comparing_the_bundled_example(fg_calib, example):
+def test_comparing_the_bundled_example(fg_calib, whole_example):
+    example = whole_example
     job = example / "calibration.yaml"
     text = job.read_text().replace("truth:", "# truth:")
     job.write_text(text)

@@ -17,6 +17,7 @@ import pytest
 import yaml
 from oracle import tool_pose
 from scipy.spatial.transform import Rotation
+from sparing import diagonal, most_slow
 from tolerances import rounding
 from typer.testing import CliRunner
 
@@ -829,7 +830,9 @@ PAIR_TABLES = {
 }
 
 
-@pytest.mark.parametrize(("model", "header", "cells", "n_distances", "n_angles"), PAIR_TABLES.values(), ids=PAIR_TABLES)
+@pytest.mark.parametrize(
+    ("model", "header", "cells", "n_distances", "n_angles"), most_slow(PAIR_TABLES.values(), every=2), ids=PAIR_TABLES
+)
 def test_measured_pairs_are_fitted(fg_calib, measured_pairs, model, header, cells, n_distances, n_angles):
     folder, rows, true = measured_pairs
     result = _run_pairs(fg_calib, folder, model, header.split(","), [cells(i, r) for i, r in enumerate(rows)])
@@ -891,13 +894,13 @@ def test_a_job_may_leave_the_noise_to_the_residuals(fg_calib, example, given):
     )
 
 
-@pytest.mark.parametrize(
-    ("columns", "widest"),
-    [(None, 100), ("40", 40), *(pytest.param(str(n), n, marks=pytest.mark.slow) for n in (60, 200))],
-)
-@pytest.mark.parametrize("command", ["calibrate", "compare", "observe"])
-def test_a_report_is_as_wide_as_the_page(fg_calib, example, monkeypatch, command, columns, widest):
+PAGES = [("40", 40), (None, 100), ("60", 60), ("200", 200)]
+
+
+@pytest.mark.parametrize(("page", "command"), diagonal(PAGES, ["calibrate", "observe", "compare"]))
+def test_a_report_is_as_wide_as_the_page(fg_calib, example, monkeypatch, command, page):
     """A pipe has no width: 100 columns, in which all tables of the example have room."""
+    columns, widest = page
     monkeypatch.delenv("COLUMNS", raising=False)
     if columns is not None:
         monkeypatch.setenv("COLUMNS", columns)

@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from sparing import most_slow
 
 
 def test_structure_prints_the_papers_table(fg_calib, example):
@@ -76,7 +77,7 @@ def test_a_frame_may_be_unknown(fg_calib, example):
     assert json.loads(ended.out)["rank"] == 25
 
 
-@pytest.mark.parametrize("model", ["pose", "position", "orientation", "distance", "rotation"])
+@pytest.mark.parametrize("model", most_slow(["pose", "position", "orientation", "distance", "rotation"], every=2))
 def test_the_noise_stated_is_used_where_nothing_was_measured_yet(fg_calib, example, tmp_path, model):
     """A table of joint readings alone: twice the noise, twice every sigma."""
     rows = [line.split(",") for line in (example / "poses.csv").read_text().splitlines()]

@@ -85,6 +85,7 @@ def test_what_is_printable_stays():
     assert escaped(f"a{STEERING}\n\u2028b") == f"a{SHOWN}\\n\\u2028b"
 
 
+@pytest.mark.usefixtures("without_mistakes")
 @pytest.mark.parametrize("command", ["calibrate", "compare"])
 def test_no_name_steers_the_terminal(fg_calib, job, tmp_path, command):
     out = tmp_path / f"out{STEERING.replace('/', '')}"
@@ -97,10 +98,15 @@ def test_no_name_steers_the_terminal(fg_calib, job, tmp_path, command):
     assert clean(fg_calib(command, job, "--json").out)
 
 
-def test_a_terminal_gets_colours_and_no_others(job, monkeypatch):
+@pytest.fixture(scope="module")
+def found(job):
+    """Its calibration."""
+    return fg_calib.calibrate_job(job)
+
+
+def test_a_terminal_gets_colours_and_no_others(found):
     from fg_calib.report.text import build_report
 
-    found = fg_calib.calibrate_job(job)
     console = Console(force_terminal=True, color_system="standard", width=100, highlight=False)
     with console.capture() as capture:
         console.print(build_report(*found.assessed))
@@ -109,8 +115,7 @@ def test_a_terminal_gets_colours_and_no_others(job, monkeypatch):
     assert f"p2{SHOWN}" in capture.get()
 
 
-def test_a_notebook_a_saved_result_and_reprs_are_clean(job, tmp_path):
-    found = fg_calib.calibrate_job(job)
+def test_a_notebook_a_saved_result_and_reprs_are_clean(found, tmp_path):
     found.save(tmp_path / "result")
     loaded = Calibration.load(tmp_path / "result")
     shown = [str(found), repr(found), str(loaded), repr(loaded), found._repr_html_(), loaded._repr_html_()]
@@ -119,8 +124,8 @@ def test_a_notebook_a_saved_result_and_reprs_are_clean(job, tmp_path):
     assert [text for text in shown if not clean(text)] == []
 
 
-def test_a_damaged_result_cannot_steer_either(job, tmp_path):
-    fg_calib.calibrate_job(job).save(tmp_path / "result")
+def test_a_damaged_result_cannot_steer_either(found, tmp_path):
+    found.save(tmp_path / "result")
     file = tmp_path / "result" / "result.json"
     document = json.loads(file.read_text())
     document["cautions"] = document["findings"] = [f"a{STEERING}\nb"]

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from recordings import FORMATS, NAMES, POSE_TYPES, START, BagWriter, arm, record, write_bag
+from sparing import diagonal
 
 from fg_calib import InputError, Robot, read_measurements, read_robot, write_robot
 from fg_calib.files.bag import read_bag
@@ -57,8 +58,7 @@ def test_what_was_recorded_is_read(bags, short, form):
     assert joints.source.notes == poses.source.notes == ()
 
 
-@pytest.mark.parametrize("form", ["ros1", "mcap"])
-@pytest.mark.parametrize("pose_type", POSE_TYPES[1:])
+@pytest.mark.parametrize(("pose_type", "form"), diagonal(POSE_TYPES[1:], ["ros1", "mcap"]))
 def test_poses_of_every_type_are_read(tmp_path, short, form, pose_type):
     _, poses = read_bag(write_bag(tmp_path, short, form, pose_type), arm())
     assert poses.position == pytest.approx(short.position, abs=0)
@@ -350,8 +350,7 @@ LEFT_OPEN = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableException
 
 
 @LEFT_OPEN
-@pytest.mark.parametrize("form", FORMATS)
-@pytest.mark.parametrize("kept", [0.02, 0.4, 0.97])
+@pytest.mark.parametrize(("form", "kept"), diagonal(FORMATS, [0.02, 0.4, 0.97]))
 def test_a_bag_that_was_cut_off(tmp_path, bags, form, kept):
     path = cut(bags[form], tmp_path, kept)
     found = error(path)

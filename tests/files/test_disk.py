@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from sparing import most_slow
 
 from fg_calib import Calibration, InputError, calibrate_job
 from fg_calib.files import disk
@@ -66,7 +67,7 @@ def read(folder):
     return found
 
 
-@pytest.mark.parametrize("moment", range(0, 20))
+@pytest.mark.parametrize("moment", most_slow(range(20), every=3))
 def test_a_kill_at_any_moment_leaves_the_old_or_the_new_for_the_next_reader(tmp_path, moment):
     old, new = dict.fromkeys(("two", "four", "one"), "old"), dict.fromkeys(FILES, "new")
     fill_folder(tmp_path, write("old", old), OWN)

@@ -64,7 +64,7 @@ def test_all_readers_take_part(files):
 
 @pytest.mark.parametrize("what", SHARES)
 def test_some_damaged_files_end_in_errors_of_the_package_alone(files, what):
-    damage_and_read(files, what, 15)
+    damage_and_read(files, what, 8)
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import pytest
 import yaml
 from instruments import CAMERA, measured_by
 from scipy.spatial.transform import Rotation
+from sparing import most_slow
 
 from fg_calib.calibration import calibrate, calibrate_job
 from fg_calib.errors import InputError
@@ -65,7 +66,7 @@ def write_files(folder, robot, table, job):
     return folder / "job.yaml"
 
 
-@pytest.mark.parametrize("instrument", KEYS)
+@pytest.mark.parametrize("instrument", most_slow(KEYS, every=2))
 def test_a_job_is_what_python_makes_of_the_same_arrays(instrument, tmp_path):
     """Parameters within a hundredth of their sigma: what twelve digits in mm and degrees leave is far less."""
     robot, _, table = measured_by(instrument, np.random.default_rng(20))

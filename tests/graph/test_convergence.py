@@ -7,6 +7,7 @@ import pytest
 from oracle import random_robot
 from scipy.spatial.transform import Rotation
 from simulated import measure, paper_robot, small_arm, true_robot
+from sparing import diagonal, most_slow
 from touches import TOLERANCE as TOUCH_TOLERANCE
 from touches import TOOL_POINT, corners, touch
 
@@ -51,14 +52,14 @@ def measured(robot, unit, n, rng, *, error=1e-3, sigma=1.0, sigma_joint=0.0):
     return replace(m, sigma_joint=sigma_joint * slide)
 
 
-@pytest.mark.parametrize("gauge", ["prior", "none"])
-@pytest.mark.parametrize(
-    ("model", "frame"),
-    [("pose", "unknown"), ("position", "unknown"), ("distance", "known"), ("distance-rotation", "known")],
-)
-@pytest.mark.parametrize("sigma_joint", [pytest.param(0.0, marks=pytest.mark.slow), 5e-4])
-def test_the_unit_of_length_changes_nothing(model, frame, gauge, sigma_joint):
+FITS = [("pose", "unknown"), ("position", "unknown"), ("distance", "known"), ("distance-rotation", "known")]
+SETTINGS = diagonal(FITS, ["prior", "none"], [5e-4, 0.0], every=4)
+
+
+@pytest.mark.parametrize(("fit", "gauge", "sigma_joint"), SETTINGS)
+def test_the_unit_of_length_changes_nothing(fit, gauge, sigma_joint):
     """The same arm a thousand times smaller, a hundred (a crane) and a thousand times larger."""
+    model, frame = fit
     found = []
     for unit in (1.0, 1e-3, 1e2, 1e3):
         robot = arm(unit, tolerance=1e-3 if gauge == "prior" else None)
@@ -95,13 +96,17 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("gauge", ["prior", pytest.param("none", marks=pytest.mark.slow)])
+DRAWS = [(gauge, draws) for gauge in ("prior", "none") for draws in (range(1), range(1, 6))]
+"""The first draw, with priors, is in the default run."""
+
+
+@pytest.mark.parametrize(("gauge", "draws"), most_slow(DRAWS, every=4))
 @pytest.mark.parametrize("name", CASES)
-def test_solving_again_from_the_answer_moves_nothing(name, gauge):
+def test_solving_again_from_the_answer_moves_nothing(name, gauge, draws):
     """Rows whitened at the answer have their optimum there: within 1e-6 sigma in any direction."""
     options, sigma_joint = CASES[name]
     robot = paper_robot(tolerance={"a": 5.8e-3, "d": 5.8e-3, "alpha": 5e-4, "theta": 5e-4, "beta": 5e-4})
-    for seed in range(1 if "pairs" in name else 6 if "loss" in name else 3):
+    for seed in draws[: 0 if draws[0] and "pairs" in name else 5 if "loss" in name else 2]:
         rng = np.random.default_rng(seed)
         m = measure(true_robot(robot, rng), 40, rng, sigma=(1e-3, 1.7e-4), sigma_joint=sigma_joint)
         solution = solve(build_problem(robot, m, gauge=gauge, **options))
@@ -152,7 +157,7 @@ def test_random_arms_arrive_in_few_steps(convention, tolerance):
             assert solution.iterations <= MOST
 
 
-@pytest.mark.parametrize("model", ["pose", "distance-rotation", "distance"])
+@pytest.mark.parametrize("model", most_slow(["pose", "distance-rotation", "distance"], every=3))
 def test_sixty_real_poses_without_priors_arrive_in_few_steps(model, data_folder):
     """Distances see wrist offsets in a curved valley: undamped steps leave it and come back, damped ones take 41."""
     robot = read_robot(data_folder / "ur10_tmac" / "robot.yaml")
@@ -200,8 +205,7 @@ def test_the_limit_holds_for_all_rounds_together():
     assert nearly.message.startswith(f"converged: {needed - 1} iterations, ")
 
 
-@pytest.mark.parametrize("loss", ["huber", "cauchy"])
-@pytest.mark.parametrize("seed", [0, 7])
+@pytest.mark.parametrize(("loss", "seed"), diagonal(["huber", "cauchy"], [0, 7]))
 def test_touches_and_positions_that_share_joint_noise_arrive_with_robust_losses(loss, seed):
     """Derivatives of touches leave out a turn that moves no length, but acts on noise that is not the same all round.
 

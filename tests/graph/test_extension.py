@@ -6,6 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 from simulated import measure, paper_robot, small_arm, true_robot
+from sparing import most_slow
 from tolerances import rounding
 
 from fg_calib.analysis.uncertainty import assess
@@ -241,7 +242,7 @@ EXPANDED = {
 }
 
 
-@pytest.mark.parametrize("name", EXPANDED)
+@pytest.mark.parametrize("name", most_slow(EXPANDED, every=2))
 def test_the_expanded_graph_has_the_same_optimum(name):
     options, sigma_joint = EXPANDED[name]
     rng = np.random.default_rng(4)

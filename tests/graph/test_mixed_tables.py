@@ -11,6 +11,7 @@ import yaml
 from instruments import measured_by
 from scipy.spatial.transform import Rotation
 from simulated import measure, paper_robot, small_arm, true_robot, write_job
+from sparing import diagonal
 from test_own_kind import measured
 from touches import corners, touch
 
@@ -444,8 +445,7 @@ def test_pairs_formed_of_one_table_are_mixed_with_poses_of_another():
     assert np.array_equal(at, alone[0].start)
 
 
-@pytest.mark.parametrize("loss", ["cauchy", "gnc"])
-@pytest.mark.parametrize("encoder", ["propagated", "estimated"])
+@pytest.mark.parametrize(("loss", "encoder"), diagonal(["cauchy", "gnc"], ["propagated", "estimated"]))
 def test_a_loss_weighs_more_pairs_than_positions_that_share_joint_noise(loss, encoder):
     """Lengths lose less than positions: no measurement may count for more than it is by that."""
     rng = np.random.default_rng(0)

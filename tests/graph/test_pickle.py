@@ -15,6 +15,7 @@ import pytest
 import scipy.sparse
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, small_arm, true_robot
+from sparing import most_slow
 from touches import TOOL_POINT, corners, touch
 
 from fg_calib import Pairing, ProblemError, assess, build_problem, solve
@@ -74,7 +75,8 @@ def through_pickle(thing):
 
 
 @pytest.mark.parametrize(
-    ("name", "again"), [*((name, through_pickle) for name in CASES), ("touched points", copy.deepcopy)]
+    ("name", "again"),
+    most_slow([*((name, through_pickle) for name in CASES), ("touched points", copy.deepcopy)], every=2),
 )
 def test_nothing_changes_on_the_way(name, again):
     given = problem(name)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from simulated import measure, small_arm, true_robot
+from sparing import diagonal, most_slow
 from tolerances import rounding
 
 from fg_calib.analysis.uncertainty import assess
@@ -47,8 +48,7 @@ def test_constants_in_one_dimension_are_those_of_the_books():
     assert tuning("none", 3) == np.inf
 
 
-@pytest.mark.parametrize("residual_dim", [1, 2, 6])
-@pytest.mark.parametrize("loss", SMOOTH)
+@pytest.mark.parametrize(("loss", "residual_dim"), diagonal(SMOOTH, [1, 2, 6]))
 def test_clean_measurements_lose_five_percent(loss, residual_dim):
     """The location of a cloud of Gaussian vectors, by reweighting, against its mean: Monte Carlo."""
     rng = np.random.default_rng(1)
@@ -80,8 +80,7 @@ def test_weights_fall_with_the_residual_and_are_half_where_said(loss):
     assert around.tolist() == [1.0, 0.0] if loss == "gnc" else around == pytest.approx([0.5, 0.5], abs=0.01)
 
 
-@pytest.mark.parametrize("model", ["pose", "distance", "distance-rotation"])
-@pytest.mark.parametrize("loss", SMOOTH)
+@pytest.mark.parametrize(("loss", "model"), diagonal(SMOOTH, ["pose", "distance", "distance-rotation"]))
 def test_the_optimum_is_that_of_gtsams_robust_noise_on_factors_of_one_measurement(loss, model):
     rng = np.random.default_rng(3)
     robot = small_arm(tolerance=TOLERANCE)
@@ -230,7 +229,7 @@ def test_a_measurement_that_takes_no_part_keeps_its_weight(loss):
     assert 0.0 <= weights[1] < weights[0] <= 1.0
 
 
-@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("loss", most_slow(LOSSES, every=2))
 def test_weights_settle_where_rows_are_excluded(loss):
     """Pairs at a kink take no part; the others' weights are those of the residuals at the estimate all the same."""
     rng = np.random.default_rng(6)

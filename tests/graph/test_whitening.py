@@ -7,6 +7,7 @@ import pytest
 from dense import dense
 from scipy.spatial.transform import Rotation
 from simulated import measure, small_arm, true_robot
+from sparing import diagonal
 from tolerances import rounding
 
 from fg_calib.analysis.uncertainty import assess
@@ -84,9 +85,7 @@ def directly_measured(m, robot, a, b, sigma=(1e-3, 5e-4)):
     return replace(m, pairs=pairs)
 
 
-@pytest.mark.parametrize("direct", [False, True])
-@pytest.mark.parametrize("model", KINDS)
-@pytest.mark.parametrize("pairing", ["star", "chain"])
+@pytest.mark.parametrize(("model", "pairing", "direct"), diagonal(KINDS, ["star", "chain"], [False, True]))
 def test_shared_errors_whiten_as_the_dense_covariance(pairing, model, direct):
     rng = np.random.default_rng(3)
     robot = small_arm()
@@ -178,18 +177,22 @@ def check_rows(problem):
     assert cost == pytest.approx(expected[-1, -1], rel=EXACT)
 
 
-@pytest.fixture(params=[2000, 0], ids=["dense", "steps"])
-def way(request, monkeypatch):
-    """Shared errors eliminated by dense matrices, or in steps."""
-    monkeypatch.setattr(sharing_module, "MAX_DENSE", request.param)
-    monkeypatch.setattr(sharing_module, "FILLED", min(request.param, sharing_module.FILLED))
+@pytest.fixture
+def eliminated(monkeypatch):
+    """`eliminated("dense")`: shared errors are eliminated by dense matrices, or in steps."""
+
+    def by(way):
+        most = {"dense": 2000, "steps": 0}[way]
+        monkeypatch.setattr(sharing_module, "MAX_DENSE", most)
+        monkeypatch.setattr(sharing_module, "FILLED", min(most, sharing_module.FILLED))
+
+    return by
 
 
-@pytest.mark.parametrize("as_stated", [True, False], ids=["stated", "learned"])
-@pytest.mark.parametrize("kind", GRAPHS)
-@pytest.mark.usefixtures("way")
-def test_rows_are_whitened_by_the_dense_covariance_of_all_errors(kind, as_stated):
+@pytest.mark.parametrize(("kind", "way", "as_stated"), diagonal(GRAPHS, ["dense", "steps"], [True, False]))
+def test_rows_are_whitened_by_the_dense_covariance_of_all_errors(eliminated, kind, way, as_stated):
     """That of `dense`, which knows plain formulas of rows alone, to 1e-9."""
+    eliminated(way)
     rng = np.random.default_rng(GRAPHS.index(kind))
     robot = small_arm(tolerance=TOLERANCE)
     m, pairing = measured_in(kind, robot, rng)
@@ -225,11 +228,13 @@ def two_tables(kind, robot, rng, *, named=True):
     return [Table(poses, model="pose"), Table(other, model="distance", pairing=Pairing("chain"))]
 
 
-@pytest.mark.parametrize("as_stated", [True, False], ids=["stated", "learned"])
-@pytest.mark.parametrize("kind", ["pairs", "chain", "touches"])
-@pytest.mark.usefixtures("way")
-def test_tables_share_the_joint_errors_of_configurations_of_one_name(kind, as_stated):
+TABLES = ["pairs", "chain", "touches"]
+
+
+@pytest.mark.parametrize(("kind", "way", "as_stated"), diagonal(TABLES, ["dense", "steps"], [True, False]))
+def test_tables_share_the_joint_errors_of_configurations_of_one_name(eliminated, kind, way, as_stated):
     """Poses and what another table has of the same configurations: one covariance of all their rows."""
+    eliminated(way)
     robot, rng = small_arm(tolerance=TOLERANCE), np.random.default_rng(7)
     problem = build_problem(robot, two_tables(kind, robot, rng))
     assert problem.data.n_configurations == 16
@@ -249,11 +254,13 @@ def test_tables_whose_names_are_made_up_share_nothing():
     check_rows(problem)
 
 
-@pytest.mark.parametrize("as_stated", [True, False], ids=["stated", "learned"])
-@pytest.mark.parametrize("kind", ["star joint", "mixed direct joint", "poses", "two tables"])
-@pytest.mark.usefixtures("way")
-def test_estimated_joint_values_are_those_that_the_dense_covariance_says(kind, as_stated):
+ENCODERS = ["star joint", "mixed direct joint", "poses", "two tables"]
+
+
+@pytest.mark.parametrize(("kind", "way", "as_stated"), diagonal(ENCODERS, ["dense", "steps"], [True, False]))
+def test_estimated_joint_values_are_those_that_the_dense_covariance_says(eliminated, kind, way, as_stated):
     """About joint values already taken the rows are still those of the readings, and say the same to first order."""
+    eliminated(way)
     robot, rng = small_arm(tolerance=TOLERANCE), np.random.default_rng(9)
     if kind == "two tables":
         problem = build_problem(robot, two_tables("pairs", robot, rng), encoder="estimated")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 from scipy.spatial.transform import Rotation
+from sparing import diagonal
 
 from fg_calib.measurements.moments import angle_moments, length_moments
 
@@ -39,9 +40,12 @@ def mean_of_root(of_square, f):
     return integrate.quad(lambda m: m * of_square.pdf(m * m) * 2.0 * m, low, high, epsabs=1e-12, limit=400)[0]
 
 
-@pytest.mark.parametrize(("s", "t", "own"), [(1.0, 0.3, 0.0), (0.2, 1.0, 0.0), (0.05, 1.0, 0.0), (0.0, 0.0, 1.0)])
-@pytest.mark.parametrize("f", [0.0, 0.5, 1.0, 3.0, 8.0, 9.0, 30.0])
-def test_moments_are_those_of_drawn_lengths(f, s, t, own):
+SPREADS = [(1.0, 0.3, 0.0), (0.2, 1.0, 0.0), (0.05, 1.0, 0.0), (0.0, 0.0, 1.0)]
+
+
+@pytest.mark.parametrize(("f", "spread"), diagonal([0.0, 0.5, 1.0, 3.0, 8.0, 9.0, 30.0], SPREADS, every=2))
+def test_moments_are_those_of_drawn_lengths(f, spread):
+    s, t, own = spread
     rng = np.random.default_rng(5)
     n = 400_000
     x, y, z, e = rng.normal(size=(4, n))
@@ -68,11 +72,12 @@ def small_turns(sigma, n):
     return Rotation.from_rotvec(sigma * np.random.default_rng(7).normal(size=(n, 3)))
 
 
-@pytest.mark.parametrize("sigma", [1e-4, 0.02])
-@pytest.mark.parametrize("from_kink", [0.0, 0.5, 1.0, 2.0, 5.0, 20.0])
-@pytest.mark.parametrize("pi", [False, True])
+KINKS = [0.0, 0.5, 1.0, 2.0, 5.0, 20.0]
+
+
+@pytest.mark.parametrize(("from_kink", "pi", "sigma"), diagonal(KINKS, [False, True], [1e-4, 0.02]))
 def test_moments_are_those_of_drawn_rotations(from_kink, pi, sigma):
-    n = 200_000
+    n = 100_000
     f = np.pi - from_kink * sigma if pi else from_kink * sigma
     axis = np.array([0.6, 0.0, 0.8])
     drawn = (Rotation.from_rotvec(f * axis) * small_turns(sigma, n)).magnitude()

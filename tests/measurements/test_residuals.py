@@ -7,6 +7,7 @@ import pytest
 import scipy.sparse
 from oracle import central_differences, random_robot, tool_pose
 from scipy.spatial.transform import Rotation
+from sparing import diagonal, most_slow
 from tolerances import rounding
 
 from fg_calib.graph.rows import At, Part, RowSet
@@ -60,7 +61,7 @@ def pair_formula(robot, measured):
     return formula
 
 
-@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("convention", most_slow(CONVENTIONS, every=2))
 def test_distance_and_angle_and_their_derivatives(convention):
     rng = np.random.default_rng(11)
     for n_joints in (1, 4, 7, 12):
@@ -112,9 +113,10 @@ def test_same_point_residual_and_its_derivatives(convention):
     assert rigid.sum() >= 7
 
 
-@pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("kinds", [(True, True), (True, False), (False, True)])
-@pytest.mark.parametrize("size", [1e-7, 0.5, 2.9])
+POSES = [(True, True), (True, False), (False, True)]
+
+
+@pytest.mark.parametrize(("convention", "kinds", "size"), diagonal(CONVENTIONS, POSES, [1e-7, 0.5, 2.9]))
 def test_orientation_and_position_and_their_derivatives(convention, kinds, size):
     rng = np.random.default_rng(13)
     robot = random_robot(convention, 6, rng)
@@ -177,8 +179,9 @@ def random_block(kind, n, rng):
     return block, chain_of(robot)
 
 
-@pytest.mark.parametrize("kind", ["pairs", "points", "poses"])
-@pytest.mark.parametrize("n", [1, LANES + 1, 700, 2 * SPAN + 5])
+@pytest.mark.parametrize(
+    ("kind", "n"), diagonal(["pairs", "points", "poses"], [1, LANES + 1, 700, 2 * SPAN + 5], every=2)
+)
 def test_reductions_keep_cost_gradient_and_hessian(kind, n):
     block, chain = random_block(kind, n, np.random.default_rng(n))
     r, J = residuals.linearise(block, chain)

@@ -13,6 +13,7 @@ from scenarios import CAMERA, EXACT, GRID, INSTRUMENTS, SIGMA, TOLERANCE, WALL, 
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from simulated import paper_robot, small_arm
+from sparing import most_slow
 from tolerances import rounding
 
 from fg_calib import InputError, Pairing, calibrate, read_job, simulate, write_simulation
@@ -85,7 +86,7 @@ def test_pairs_are_measured_between_configurations():
     assert pairs.angle == pytest.approx(rotation_angle(turn)[0], abs=rounding(100.0))
 
 
-@pytest.mark.parametrize("which", ["anchors", "offset", "contact"])
+@pytest.mark.parametrize("which", most_slow(["anchors", "offset", "contact"], every=3))
 def test_lengths_go_to_anchors_in_turn(which):
     s, T = exact(which)
     m = s.tables[0].measurements
@@ -190,7 +191,7 @@ def test_noise_has_its_sigma(which):
         assert np.abs(off.mean(axis=0)).max() < 5.0 * sigma / np.sqrt(len(off))
 
 
-@EVERY
+@pytest.mark.parametrize("which", most_slow(INSTRUMENTS, every=2))
 def test_every_instrument_calibrates_as_it_is_simulated(which):
     """At a chi-square and errors of the arm that noise explains, within 99.9 %."""
     n = {"board": 100, "pixels": 300, "camera in the room": 120}.get(which, 40)

@@ -15,6 +15,7 @@ from oracle import random_robot, tool_pose
 from scipy.spatial import SphericalVoronoi
 from scipy.spatial.transform import Rotation
 from simulated import paper_robot, planar_robot
+from sparing import diagonal
 from tolerances import rounding
 
 import fg_calib
@@ -459,8 +460,10 @@ def test_json_is_all_there_is_on_stdout(fg_calib, tmp_path):
     assert Rotation.from_quat(frame["quaternion_xyzw"]).as_matrix() == pytest.approx(s.frame.rotation)
 
 
-@pytest.mark.parametrize("model", ["pose", "position", "orientation", "distance", "rotation"])
-@pytest.mark.parametrize("frame", ["base", "unknown"])
+MODELS = ["pose", "position", "orientation", "distance", "rotation"]
+
+
+@pytest.mark.parametrize(("model", "frame"), diagonal(MODELS, ["unknown", "base"]))
 def test_every_model_runs_as_it_is_written(fg_calib, tmp_path, model, frame):
     """Stated noise is true noise, so the fit is good: 0, and never the 3 of a doubtful one."""
     text = f"""\
