@@ -150,7 +150,9 @@ def inspect_job(job: Job) -> Inspection:
     tables = tables_of(job.measurements, job.options)
     labels = problem.data.labels if len(tables) > 1 else ("",)
     before = (problem.whole or problem).start
-    every, setups = check_tables(problem, before, placed=True)
+    every, setups = check_tables(
+        replace(problem, robot=job.robot) if problem.evaluated else problem, before, placed=True
+    )
     disagreements = Disagreements((), 0, 0)
     if not any(check.explanations for check in setups):
         disagreements = find_disagreements(job.robot, tables, labels)

@@ -24,6 +24,7 @@ from fg_calib.cli.board import board
 from fg_calib.cli.calibrate import calibrate
 from fg_calib.cli.compare import compare
 from fg_calib.cli.example import example
+from fg_calib.cli.help import help_
 from fg_calib.cli.inspect import inspect
 from fg_calib.cli.observe import observe
 from fg_calib.cli.output import say
@@ -39,6 +40,7 @@ app = typer.Typer(
 )
 for command in (inspect, calibrate, compare, observe, simulate, example, bag, board):
     app.command()(command)
+app.command(name="help")(help_)
 
 
 _OBJECTS_BEFORE_GARBAGE = 500_000

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from pydantic import BeforeValidator
 
-from fg_calib.files.schema import refuse_unknown_keys
+from fg_calib.files.schema import Schema, Section, meaning, refuse_unknown_keys
 from fg_calib.options import AngleUnit, LengthUnit, set_checked
 
 LENGTHS: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
@@ -50,5 +50,13 @@ class Units:
         return short if short * factor == value else figure
 
 
-UnitsOfFile = Annotated[Units, BeforeValidator(refuse_unknown_keys("length", "angle"))]
+class _Units(Schema):
+    length: LengthUnit = meaning("Of lengths", "m")
+    angle: AngleUnit = meaning("Of angles", "rad")
+
+
+UnitsOfFile = Annotated[Units, BeforeValidator(refuse_unknown_keys(*_Units.model_fields))]
 """Units under a file's key `units`."""
+
+UNITS = Section("units", _Units)
+"""The keys of `units`, for the reference."""

