@@ -25,6 +25,7 @@ from fg_calib.cli.calibrate import calibrate
 from fg_calib.cli.compare import compare
 from fg_calib.cli.example import example
 from fg_calib.cli.help import help_
+from fg_calib.cli.init import init
 from fg_calib.cli.inspect import inspect
 from fg_calib.cli.observe import observe
 from fg_calib.cli.output import say
@@ -38,7 +39,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (inspect, calibrate, compare, observe, simulate, example, bag, board):
+for command in (init, inspect, calibrate, compare, observe, simulate, example, bag, board):
     app.command()(command)
 app.command(name="help")(help_)
 

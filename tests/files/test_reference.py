@@ -6,7 +6,7 @@ import pytest
 
 from fg_calib import InputError, read_job
 from fg_calib.files import job, robot_yaml
-from fg_calib.files.pairs import _KNOWN
+from fg_calib.files.pairs import PAIR_COLUMNS
 from fg_calib.files.reference import SECTIONS, TABLE_COLUMNS, keys_of, kind_of
 from fg_calib.files.schema import Schema
 from fg_calib.files.tables import KNOWN
@@ -67,7 +67,7 @@ def test_the_keys_in_the_reference_are_those_that_the_reader_of_a_job_expects(tm
 
 def test_the_columns_in_the_reference_are_those_that_the_readers_know():
     by_table = {title: {n for c in columns for n in c.names} for title, columns in TABLE_COLUMNS}
-    assert by_table.pop("a table of pairs") == set(_KNOWN)
+    assert by_table.pop("a table of pairs") == set(PAIR_COLUMNS)
     assert set().union(*by_table.values()) - {"q1 ... qn"} == KNOWN
 
 
