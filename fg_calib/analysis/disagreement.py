@@ -1,4 +1,4 @@
-"""Measurements that disagree with the arm as drawn by more than noise and tolerances allow: gross errors, told early.
+"""Measurements that disagree with the arm as drawn far more than the others do: gross errors, told early.
 
 The arm stays as drawn. Measurement frame, base, tool and what else is unknown are fitted to all rows, train and test,
 from their start in closed form, each measurement with a weight (Cauchy's) that falls with its distance
@@ -7,8 +7,9 @@ from their start in closed form, each measurement with a weight (Cauchy's) that 
 
 with r its residual, J the derivatives in the arm's estimated parameters, T their tolerances (or usual errors, see
 `typical_residuals`) and N the covariance of its noise. All rows have the arm's errors in common, which may be larger
-than the tolerances say: so it is the distances beside their median that tell. Pairs formed from poses are looked at as
-these poses in an unknown frame, for one wrong pose spoils many pairs.
+than the tolerances say, or far smaller: so it is the distances beside their median that tell. Far is what is so beside
+noise and tolerances too, or what is farther than any arm's errors spread distances that are all small. Pairs formed
+from poses are looked at as these poses in an unknown frame, for one wrong pose spoils many pairs.
 """
 
 from __future__ import annotations
@@ -42,7 +43,13 @@ MOST_ROWS = 5000
 """Rows of a table up to which all are looked at; of more, so many that are evenly spaced."""
 
 FAR = 5.0
-"""Distance over the typical one, per row of a measurement, from which it is far: chance does not reach it."""
+"""Distance over the typical one from which a measurement is far; chance does not reach it."""
+
+OUT_OF_LINE = 10.0
+"""The same where the typical one is smaller than tolerances allow: an arm's errors are not alike in all rows."""
+
+LEAST_SIZE = 1e-2
+"""Typical distance that is taken for this at least: rounding alone says nothing."""
 
 _ROUNDS = 5
 """Times that what is unknown is fitted with weights from the fit before."""
@@ -64,7 +71,7 @@ class Disagreement:
         unit: `m`, `rad` or `px`.
         size: Length of the residual of that kind.
         expected: What noise and tolerances make of it.
-        ratio: Its distance over the typical one.
+        ratio: Its distance over the typical one; `FAR` and more.
         test: Whether it is a test row.
     """
 
@@ -169,7 +176,7 @@ def _arm(problem: Problem, robot: Robot, parameters: Floats) -> list[Chain]:
 def _fitted(problem: Problem, robot: Robot) -> tuple[Floats, list[RowNoise], list[Floats]]:
     """What is unknown fitted with weights: the parameter vector, the rows there, and the distance of each measurement.
 
-    Distances are over their typical size, per row; 0 for measurements that take no part.
+    Distances are per row and over the typical one; 0 for measurements that take no part.
     """
     parameters = problem.start
     for last in range(_ROUNDS):
@@ -181,9 +188,7 @@ def _fitted(problem: Problem, robot: Robot) -> tuple[Floats, list[RowNoise], lis
             used = noise.series.used
             r = np.where(used, noise.residual(), 0.0)
             z = np.linalg.norm(whitening_of(total, used) @ r[:, :, None], axis=(1, 2))
-            d = z / np.sqrt(np.maximum(used.sum(axis=1), 1))
-            typical = float(np.median(d[used.any(axis=1)])) if used.any() else 1.0
-            d = d / max(1.0, typical)
+            d = z / np.sqrt(np.maximum(used.sum(axis=1), 1)) / _typical(z, used)
             share = np.einsum("nii->n", own) / np.einsum("nii->n", total)
             distances.append(d)
             weights.append(share / (1.0 + (d / _CAUCHY) ** 2))
@@ -192,6 +197,21 @@ def _fitted(problem: Problem, robot: Robot) -> tuple[Floats, list[RowNoise], lis
         problem = reweighted_at(problem, parameters, replace(problem.state, weights=tuple(weights)))
         parameters = placed(problem)
     return parameters, noises, distances
+
+
+def _typical(z: Floats, used: NDArray[np.bool_]) -> float:
+    """The typical distance over what noise and tolerances make of it, so that what is `FAR` times it is far.
+
+    Args:
+        z: Lengths of whitened residuals, shape (n,).
+        used: Rows that take part, shape (n, residual_dim).
+    """
+    n_rows = used.sum(axis=1)
+    there = n_rows > 0
+    if not there.any():
+        return 1.0
+    size = float(np.median(z[there] / np.sqrt(special.chdtri(n_rows[there], 0.5))))
+    return min(max(1.0, size), OUT_OF_LINE / FAR * max(size, LEAST_SIZE))
 
 
 def _covariance(noise: RowNoise, chain: Chain, robot: Robot) -> Floats:

@@ -87,7 +87,7 @@ class Inspection:
         tables: What each table holds, table by table (a table seen from several stations is several).
         joints: The ranges of the readings.
         setups: Typical residuals of each table before calibration, and a mistake in its set-up if one explains them.
-        disagreements: Rows that disagree with the arm as drawn by more than noise and tolerances allow.
+        disagreements: Rows that disagree with the arm as drawn far more than the others do.
         identifiability: What the train rows determine, at nominal.
         expected_error: How far off the calibrated tool is expected to be; None where the arm is only evaluated.
         n_residuals: Scalar residuals of the fit.
@@ -240,7 +240,7 @@ def _of_disagreements(found: Disagreements, job: Job) -> str:
     who = _listed(list(dict.fromkeys(names)))
     count = f"{len(found.found)} measurements disagree" if several else "one measurement disagrees"
     of = "" if many_tables or not first.table else f" of {first.table}"
-    what = f"{count} with the arm as drawn by more than noise and tolerances allow ({who}{of})"
+    what = f"{count} with the arm as drawn far more than the others do ({who}{of})"
     them = "them" if several else "it"
     return what + (f": look at {them}, or let a robust loss do so (loss: gnc)" if job.options.loss == "none" else "")
 

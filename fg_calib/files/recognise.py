@@ -27,9 +27,7 @@ UNITS |= {unit: unit for unit in (*LENGTHS, *ANGLES)} | {"px": "px", "pixel": "p
 
 _BRACKETED = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]$")
 _SUFFIXED = re.compile(r"^(?P<name>.*?)[_\s](?P<unit>um|mm|cm|m|deg|rad|mrad|px)$", re.IGNORECASE)
-_JOINT = re.compile(
-    r"^(?:q|j|a|axis|joint|theta|th)(?:oint)?[ _-]?(?:pos|position|angle)?[ _-]?0*(\d+)$", re.IGNORECASE
-)
+_JOINT = re.compile(r"^(?:actual[ _])?(?:q|j|a|axis|joint|theta|th)[ _-]?(?:pos|position|angle)?[ _-]?0*(\d+)$", re.I)
 
 _SYNONYMS: Mapping[str, tuple[str, ...]] = {
     **{axis: (f"pos_{axis}", f"position_{axis}", f"p{axis}", f"tcp_{axis}", f"t{axis}") for axis in "xyz"},

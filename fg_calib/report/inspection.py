@@ -143,19 +143,18 @@ def _disagreements(found: Disagreements, limit: int = 5) -> list[RenderableType]
         return []
     tables, labelled = len({one.table for one in found.found}) > 1, any(one.of for one in found.found)
     table = plain_table(
-        *(("", "left"), ("row", "right"), *[("table", "left")] * tables, *[("of", "left")] * labelled, ("", "left")),
+        *(("", "left"), *[("table", "left")] * tables, *[("of", "left")] * labelled, ("", "left")),
         *(("off by", "right"), ("expected", "right"), ("", "left"), ("", "left")),
     )
     for one in found.found[:limit]:
         factor, unit, _ = SHOWN[one.unit]
         figures = (f"{v * factor:.{_DECIMALS[one.unit]}f}" for v in (one.size, one.expected))
-        row = "" if one.row < 0 else f"{one.row + 1}"
         names = [*[one.table] * tables, *[one.of] * labelled]
-        table.add_row("-".join(one.ends), row, *names, one.kind, *figures, unit, "test" * one.test)
+        table.add_row("-".join(one.ends), *names, one.kind, *figures, unit, "test" * one.test)
     if len(found.found) > limit:
-        table.add_row(f"and {len(found.found) - limit} more", "")
-    looked = "" if found.n >= found.of else f"; {found.n} of {found.of} were looked at"
-    return section(f"Rows that disagree with the arm as drawn (first row of a table: 1{looked})", table)
+        table.add_row(f"and {len(found.found) - limit} more")
+    looked = "" if found.n >= found.of else f" ({found.n} of {found.of} were looked at)"
+    return section(f"Rows that disagree with the arm as drawn{looked}", table)
 
 
 def _determined(found: Inspection) -> list[RenderableType]:

@@ -93,6 +93,7 @@ def test_rows_to_test_alone_are_inspected_as_an_evaluation(arm):
     assert found.expected_error is None
 
 
+@pytest.mark.slow
 def test_what_an_arm_without_tolerances_is_off_by_is_a_caution(tmp_path):
     """Nobody said that it is not: by 50 mm here, which is 25 times the usual."""
     arm = ur5e(tmp_path, tolerance={})
@@ -136,6 +137,7 @@ def test_a_mistake_in_one_of_two_tables_is_said_of_that_table(arm):
     assert [bool(check.explanations) for check in found.setups] == [False, True]
 
 
+@pytest.mark.slow
 def test_a_mistake_with_targets_is_found_although_they_have_to_be_placed():
     simulation = simulate(scenario(INSTRUMENTS["targets"]), seed=0)
     (table,) = simulation.tables
@@ -149,13 +151,13 @@ def test_a_mistake_with_targets_is_found_although_they_have_to_be_placed():
 
 
 @pytest.mark.parametrize(("model", "frame"), MODELS)
-@pytest.mark.parametrize("size", [0.03, 1.0])
+@pytest.mark.parametrize("size", [0.03, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_rows_that_disagree_with_the_arm_are_named(arm, model, frame, size):
     """The rest of the table is not spoilt by them: one off by a metre shifts a frame by least squares."""
     m = measured(arm, placed=PLACED if frame == "unknown" else None)
     found = inspected(arm, replace(m, position=plus(m.position, [7, 43], [0.0, size, 0.0])), model, frame)
     (finding,) = found.findings
-    assert finding.startswith("2 measurements disagree with the arm as drawn by more than noise and tolerances allow")
+    assert finding.startswith("2 measurements disagree with the arm as drawn far more than the others do")
     rows = {one.row: one for one in found.disagreements.found}
     assert set(rows) == {7, 43}
     assert (rows[7].ends, rows[7].kind, rows[7].test, rows[43].test) == (("7",), "position", False, True)
@@ -202,7 +204,7 @@ def test_a_robust_loss_makes_wrong_rows_a_caution(arm):
 def test_of_a_long_table_some_rows_are_looked_at_and_it_is_said(arm, monkeypatch):
     monkeypatch.setattr(disagreement, "MOST_ROWS", 25)
     m = measured(arm)
-    found = inspected(arm, replace(m, position=plus(m.position, [49], 0.1)))
+    found = inspected(arm, replace(m, position=plus(m.position, [49], 0.05)))
     assert [one.row for one in found.disagreements.found] == [49]
     assert (found.disagreements.n, found.disagreements.of) == (25, 50)
 

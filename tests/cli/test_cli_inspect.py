@@ -67,10 +67,10 @@ def test_a_mistake_in_units_ends_with_3_and_one_line(fg_calib, example):
 def test_rows_that_disagree_are_listed(fg_calib, job):
     from dataclasses import replace
 
-    ended = fg_calib("inspect", job(lambda m: replace(m, position=plus(m.position, range(1, 8), 0.3))))
+    ended = fg_calib("inspect", job(lambda m: replace(m, position=plus(m.position, range(1, 8), 0.03))))
     assert ended.code == 3
     assert "look at this first: 7 measurements disagree with the arm as drawn" in ended.err
-    part = ended.out[ended.out.index("Rows that disagree with the arm as drawn (first row of a table: 1)") :]
+    part = ended.out[ended.out.index("Rows that disagree with the arm as drawn") :]
     assert "and 2 more" in part
 
 
@@ -111,7 +111,7 @@ def test_json_has_every_key_and_nothing_else_is_on_stdout(fg_calib, example):
 def test_json_of_a_job_with_findings_has_them(fg_calib, job):
     from dataclasses import replace
 
-    ended = fg_calib("inspect", job(lambda m: replace(m, position=plus(m.position, [4], 0.3))), "--json")
+    ended = fg_calib("inspect", job(lambda m: replace(m, position=plus(m.position, [4], 0.05))), "--json")
     assert ended.code == 3
     found = json.loads(ended.out, parse_constant=_refuse)
     assert not found["ready"]
