@@ -51,6 +51,9 @@ OUT_OF_LINE = 10.0
 LEAST_SIZE = 1e-2
 """Typical distance that is taken for this at least: rounding alone says nothing."""
 
+LEAST_MANY = 20
+"""Measurements from which their median says what is typical of them although tolerances allow more."""
+
 _ROUNDS = 5
 """Times that what is unknown is fitted with weights from the fit before."""
 
@@ -120,6 +123,8 @@ def find_disagreements(robot: Robot, tables: Sequence[Table], labels: Sequence[s
         except (InputError, ProblemError, SolverError, RuntimeError, np.linalg.LinAlgError):
             return Disagreements((), 0, sum(of))
         for noise, d in zip(noises, distances, strict=True):
+            if not noise.series.kind.ends:  # distances of touched points follow from the arm through these alone
+                continue
             share = of[noise.series.table] / max(chosen[noise.series.table].measurements.n_configurations, 1)
             n, total = n + int(np.sum(d > 0.0)), total + round(share * float(np.sum(d > 0.0)))
             bad = np.flatnonzero(_are_far(d, noise.series.used.sum(axis=1)))
@@ -211,7 +216,8 @@ def _typical(z: Floats, used: NDArray[np.bool_]) -> float:
     if not there.any():
         return 1.0
     size = float(np.median(z[there] / np.sqrt(special.chdtri(n_rows[there], 0.5))))
-    return min(max(1.0, size), OUT_OF_LINE / FAR * max(size, LEAST_SIZE))
+    in_line = OUT_OF_LINE / FAR * max(size, LEAST_SIZE) if np.sum(there) >= LEAST_MANY else 1.0
+    return max(size, min(1.0, in_line))
 
 
 def _covariance(noise: RowNoise, chain: Chain, robot: Robot) -> Floats:

@@ -72,7 +72,7 @@ def test_a_healthy_table_of_every_instrument_is_ready(name, seed):
     found = inspect_job(Job(None, simulation.robot, tuple(simulation.tables), Options()))
     assert found.findings == ()
     assert [check.table for check in found.setups] == [t.name if len(found.tables) > 1 else "" for t in found.tables]
-    assert found.disagreements.n >= 25
+    assert found.disagreements.n >= 15
 
 
 def test_the_expected_accuracy_is_that_of_the_calibration(example):

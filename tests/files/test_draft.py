@@ -42,7 +42,10 @@ def drafted(fg_calib, folder, *files):
     return yaml.safe_load((folder / JOB).read_text())
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW)) for n in INSTRUMENTS])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.slow] * (n in (*SLOW, "contact", "faces", "sockets"))) for n in INSTRUMENTS],
+)
 def test_a_job_for_the_tables_of_every_instrument_is_ready(fg_calib, tmp_path, name):
     simulation = simulate(scenario(INSTRUMENTS[name], n=40 + 20 * (name == "faces")), seed=0)
     write_simulation(tmp_path / "simulated", simulation)
