@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from fg_calib.analysis.bounds import Bound, cramer_rao
     from fg_calib.analysis.identifiability import Identifiability, observe_configurations, observe_structure
+    from fg_calib.analysis.inspection import Inspection, inspect_job
     from fg_calib.analysis.mistakes import SetupCheck, check_setup
     from fg_calib.analysis.restarts import look_elsewhere
     from fg_calib.analysis.uncertainty import Uncertainty, assess
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
         write_results,
     )
     from fg_calib.report.identifiability import format_identifiability
+    from fg_calib.report.inspection import format_inspection, inspection_document
     from fg_calib.report.text import format_report
     from fg_calib.robot.inverse import Inverse, solve_inverse
     from fg_calib.robot.kinematics import pose
@@ -83,6 +85,7 @@ _HOMES = {
     "fg_calib.robot.kinematics": ("pose",),
     "fg_calib.baseline.least_squares": ("LeastSquares", "fit_least_squares"),
     "fg_calib.measurements.dataset": ("Measurements", "Noise"),
+    "fg_calib.analysis.inspection": ("Inspection", "inspect_job"),
     "fg_calib.analysis.mistakes": ("SetupCheck", "check_setup"),
     "fg_calib.analysis.variance_components": ("estimate_noise", "solve_job"),
     "fg_calib.graph.build": ("build_problem", "problem_of"),
@@ -93,6 +96,7 @@ _HOMES = {
     "fg_calib.options": ("Limits", "Options", "Pairing"),
     "fg_calib.report.comparison": ("format_comparison",),
     "fg_calib.report.identifiability": ("format_identifiability",),
+    "fg_calib.report.inspection": ("format_inspection", "inspection_document"),
     "fg_calib.report.text": ("format_report",),
     "fg_calib.report.documents": (
         *("comparison_document", "observability_document", "result_document"),
@@ -121,6 +125,7 @@ __all__ = [
     "DistanceFactor",
     "Identifiability",
     "InputError",
+    "Inspection",
     "Inverse",
     "Job",
     "KnownPoint",
@@ -158,7 +163,10 @@ __all__ = [
     "fit_least_squares",
     "format_comparison",
     "format_identifiability",
+    "format_inspection",
     "format_report",
+    "inspect_job",
+    "inspection_document",
     "levenberg_marquardt_params",
     "look_elsewhere",
     "observability_document",

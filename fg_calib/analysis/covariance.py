@@ -143,8 +143,10 @@ def spread_of(solution: Solution) -> Spread:
         _, s, Vt = np.linalg.svd(stacked, full_matrices=False)
         return s, Vt * scales, determined(s)
 
-    s, directions, rank = decomposed(solution.parameters)
-    _, directions_nominal, rank_nominal = decomposed(solution.before)
+    found = s, directions, rank = decomposed(solution.parameters)
+    _, directions_nominal, rank_nominal = (
+        found if solution.before is solution.parameters else decomposed(solution.before)
+    )
     half = directions[:rank].T / s[:rank]
     added = correlation(problem, solution.parameters)
     middle = np.zeros((rank, rank)) if added is None else half.T @ added @ half

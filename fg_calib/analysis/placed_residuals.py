@@ -19,11 +19,12 @@ from scipy.spatial.transform import Rotation
 from fg_calib.analysis.setup import Setup
 from fg_calib.analysis.typical_residuals import USUAL_ANGLE, USUAL_LENGTH, TypicalResidual, fitted_residuals
 from fg_calib.errors import InputError, ProblemError, SolverError
-from fg_calib.graph.build import build_problem
+from fg_calib.graph.build import problem_of_tables
 from fg_calib.graph.factors import build_variables
 from fg_calib.graph.noise import RowNoise
-from fg_calib.graph.problem import Problem, noises_at
+from fg_calib.graph.problem import Problem, noises_at, tables_of
 from fg_calib.measurements import residuals
+from fg_calib.options import Options
 from fg_calib.robot.kinematics import Chain, pose
 from fg_calib.robot.model import Robot
 
@@ -50,8 +51,8 @@ def _placed_residuals(setup: Setup) -> tuple[TypicalResidual, ...]:
     table = replace(setup.table, measurements=m, frame="unknown" if setup.frame else setup.table.frame)
     robot = _with_tool(setup)
     try:
-        problem = build_problem(robot, [table], gauge="none")
-        parameters = _placed(problem)
+        problem = problem_of_tables(robot, tables_of(table, options := Options(gauge="none")), options)
+        parameters = placed(problem)
     except (InputError, ProblemError, SolverError, RuntimeError, np.linalg.LinAlgError):
         return ()
     n_free = problem.variables.n_columns + problem.variables.n_nuisance
@@ -61,7 +62,7 @@ def _placed_residuals(setup: Setup) -> tuple[TypicalResidual, ...]:
     of_arm, of_frame = problem.variables.robot_span, problem.variables.frame_span
     values = np.concatenate([parameters[of_arm], parameters[of_frame]])
     chains = [chain.at(values) for chain in variables.chains]
-    scale = _tolerances(robot, variables.names)
+    scale = tolerances_of(robot, variables.names)
     at = robot.with_values(parameters[of_arm])
     found: list[TypicalResidual] = []
     for noise in noises_at(problem, parameters):
@@ -69,8 +70,12 @@ def _placed_residuals(setup: Setup) -> tuple[TypicalResidual, ...]:
     return tuple(found) if all(np.isfinite([r.size, r.expected]).all() for r in found) else ()
 
 
-def _placed(problem: Problem) -> Floats:
-    """The parameter vector with what is unknown where the rows, whitened as at the start, say it is."""
+def placed(problem: Problem) -> Floats:
+    """The parameter vector with what is unknown where the rows, whitened as at the start, say it is.
+
+    Args:
+        problem: A problem of the arm as it is (see `Problem.evaluated`).
+    """
     variables, values = problem.variables, problem.initial
     parameters = variables.parameters(values)
 
@@ -105,7 +110,7 @@ def _with_tool(setup: Setup) -> Robot:
     return robot.with_estimated(sorted(kept | freed))
 
 
-def _tolerances(robot: Robot, names: tuple[str, ...]) -> Floats:
+def tolerances_of(robot: Robot, names: tuple[str, ...]) -> Floats:
     """1 sigma of the arm's parameters in the order of the columns, 0 of those that were fitted, shape (n_columns,)."""
     scale, by_name = np.zeros(len(names)), {p.name: p for p in robot.parameters}
     for column, name in enumerate(names):

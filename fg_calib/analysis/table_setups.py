@@ -37,31 +37,54 @@ def check_problem(problem: Problem, before: Floats, *, doubtful: bool = False) -
         before: The parameter vector with base, tool and measurement frame fitted, the arm at nominal.
         doubtful: Look for a mistake even where the residuals are not far from what is predicted.
     """
+    every, found = check_tables(problem, before, doubtful=doubtful, placed=doubtful)
+    found = found or sorted(every, key=lambda check: -check.excess)[:1]
+    checked = {name for name, check in zip(_labels(problem), every, strict=True) if check.residuals}
+    unchecked = tuple(name for name in problem.data.labels if name not in checked)
+    told = replace(found[0], others=tuple(found[1:])) if found else SetupCheck()
+    return replace(told, unchecked=unchecked) if doubtful else told
+
+
+def check_tables(
+    problem: Problem, before: Floats, *, doubtful: bool = False, placed: bool = False
+) -> tuple[list[SetupCheck], list[SetupCheck]]:
+    """`check_setup` of each table with a model, and those of them that have something to say, worst first.
+
+    Args:
+        problem: The problem.
+        before: The parameter vector with base, tool and measurement frame fitted, the arm at nominal.
+        doubtful: Look for a mistake even where the residuals are not far from what is predicted.
+        placed: Look at tables whose targets, anchors, planes or boards have to be placed first.
+    """
     whole, variables = problem.whole or problem, problem.variables
     robot = whole.robot.with_values(before[variables.robot_span])
-    placed = {v.symbol: before[list(v.parameters)] for v in variables.frames}
-    checks, setups, frames, checked = [], [], [], set[str]()
+    frame_of_table = {v.symbol: before[list(v.parameters)] for v in variables.frames}
+    checks, setups, frames = [], [], []
     for number, (name, table) in enumerate(zip(problem.data.labels, problem.data.tables, strict=True)):
         if table.model is None:
             continue
         frame = Frame(np.eye(3), np.zeros(3))
-        if f"X({number})" in placed:
-            world_T_base = pose_of(placed[f"X({number})"])
+        if f"X({number})" in frame_of_table:
+            world_T_base = pose_of(frame_of_table[f"X({number})"])
             frame = Frame(world_T_base.rotation().matrix(), world_T_base.translation())
         given = (whole.robot, table.measurements, table.model, table.frame)
-        check = check_setup(*given, doubtful=doubtful, fitted=(robot, frame), table=table)
-        checked |= {name} if check.residuals else set()
+        places = has_places(table.measurements, table.model)
+        look = placed if places else doubtful
+        check = check_setup(*given, doubtful=look, fitted=(robot, frame), table=table)
         checks.append(replace(check, table=name if len(problem.data.labels) > 1 else ""))
-        setups.append(None if has_places(table.measurements, table.model) else setup_of(*given))
+        setups.append(None if places else setup_of(*given))
         frames.append(frame)
     found = _alone(checks)
     if not found and len(checks) > 1:
         with one_blas_thread:
             found = _disagreeing(robot, checks, setups, frames)
-    found = found or sorted(checks, key=lambda check: -check.excess)[:1]
-    unchecked = tuple(name for name in problem.data.labels if name not in checked)
-    told = replace(found[0], others=tuple(found[1:])) if found else SetupCheck()
-    return replace(told, unchecked=unchecked) if doubtful else told
+    return checks, found
+
+
+def _labels(problem: Problem) -> list[str]:
+    """Names of the tables that have a model."""
+    named = zip(problem.data.labels, problem.data.tables, strict=True)
+    return [name for name, table in named if table.model is not None]
 
 
 def _alone(checks: Sequence[SetupCheck]) -> list[SetupCheck]:

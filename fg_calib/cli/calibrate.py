@@ -64,4 +64,4 @@ def calibrate(
                 from fg_calib.pages import write_report
 
                 write_report(out, page=report, figures=figures)
-    end(found.findings, found.not_accepted)
+    end(found.findings, not_accepted=found.not_accepted)

@@ -1,6 +1,6 @@
 """The entry point: the commands, and the one door where errors become a line and an exit code.
 
-Exit codes: 0 good; 1 bad input; 2 wrong usage; 3 solved, but not to be trusted.
+Exit codes: 0 good; 1 bad input; 2 wrong usage; 3 solved, or to be solved, but not to be trusted.
 """
 
 from __future__ import annotations
@@ -24,6 +24,9 @@ from fg_calib.cli.board import board
 from fg_calib.cli.calibrate import calibrate
 from fg_calib.cli.compare import compare
 from fg_calib.cli.example import example
+from fg_calib.cli.help import help_
+from fg_calib.cli.init import init
+from fg_calib.cli.inspect import inspect
 from fg_calib.cli.observe import observe
 from fg_calib.cli.output import say
 from fg_calib.cli.report import report
@@ -37,8 +40,9 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (calibrate, report, compare, observe, simulate, example, bag, board):
+for command in (init, inspect, calibrate, report, compare, observe, simulate, example, bag, board):
     app.command()(command)
+app.command(name="help")(help_)
 
 
 _OBJECTS_BEFORE_GARBAGE = 500_000

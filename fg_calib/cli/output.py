@@ -41,10 +41,10 @@ def show_report(report: RenderableType) -> None:
     Console(highlight=False, width=width).print(report)
 
 
-def end(findings: Sequence[str], not_accepted: Sequence[str] = ()) -> None:
+def end(findings: Sequence[str], what: str = "not to be trusted", not_accepted: Sequence[str] = ()) -> None:
     """Say on stderr why a result is not to be trusted, or not accepted, and end with 3 if there is a reason."""
     for finding in findings:
-        say(f"not to be trusted: {finding}")
+        say(f"{what}: {finding}")
     for reason in not_accepted:
         say(f"not accepted: {reason}")
     if findings or not_accepted:

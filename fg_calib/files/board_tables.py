@@ -17,7 +17,7 @@ from fg_calib.errors import InputError
 from fg_calib.files.columns import Header, Table
 from fg_calib.files.csv_writer import write_csv
 from fg_calib.files.disk import fill_folder, require_own, write_text
-from fg_calib.files.instruments import COVARIANCE
+from fg_calib.files.table_columns import COVARIANCE
 from fg_calib.files.tables import KNOWN
 from fg_calib.files.units import Units
 

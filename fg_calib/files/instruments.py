@@ -23,6 +23,7 @@ from pydantic import BeforeValidator, Field, create_model
 from fg_calib.errors import InputError
 from fg_calib.files.columns import Header, Table
 from fg_calib.files.schema import Count, NotNegative, Number, Schema, read_yaml, refuse_unknown_keys, validate
+from fg_calib.files.table_columns import COVARIANCE
 from fg_calib.files.units import Units
 from fg_calib.measurements.checks import covariances
 from fg_calib.measurements.dataset import Floats, Labels, Noise
@@ -32,8 +33,6 @@ from fg_calib.options import PAIR_MODELS, POSE_MODELS, Model
 _log = logging.getLogger(__name__)
 
 IMAGE = ("u", "v", "corner_x", "corner_y")
-COVARIANCE = tuple(f"cov_{i}{j}" for i in range(1, 7) for j in range(i, 7))
-"""Upper triangle of the covariance of a board's pose, row by row: about, then along the camera's x, y and z."""
 
 _LABELS: dict[str, tuple[str, ...]] = dict.fromkeys(POSE_MODELS, ("target", "station")) | {
     "anchor": ("anchor",),

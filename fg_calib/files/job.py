@@ -24,13 +24,15 @@ from fg_calib.files.schema import (
     Number,
     Positive,
     Schema,
+    Section,
     Seed,
+    meaning,
     read_yaml,
     shown,
     validate,
 )
 from fg_calib.files.tables import read_measurements, read_points
-from fg_calib.files.units import Units, UnitsOfFile, quantity
+from fg_calib.files.units import UNITS, Units, UnitsOfFile, quantity
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import Noise
 from fg_calib.measurements.kinds import Camera
@@ -59,14 +61,20 @@ UNSTATED = Noise(position=1e-3, orientation=1e-3, distance=1e-3, angle=1e-3, poi
 
 
 class _Noise(Schema):
-    position: Positive | None = None
-    orientation: Positive | None = None
-    joint: Any = 0.0  # an `_OneFigure` or a `_FigureEach`
-    distance: Positive | None = None
-    angle: Positive | None = None
-    point: Positive | None = None
-    pixel: Positive | None = None
-    estimate: StrictBool = False
+    position: Positive | None = meaning("Of a measured position, on each axis", None)
+    orientation: Positive | None = meaning("Of a measured orientation, about each axis", None)
+    joint: Any = meaning(
+        "Of the joint readings, each in its joint's unit",
+        0.0,
+        kind="number not below 0, or a list of them, one a joint",
+    )
+    distance: Positive | None = meaning("Of a directly measured distance: of pairs, to anchors, from planes", None)
+    angle: Positive | None = meaning("Of a directly measured rotation angle of pairs", None)
+    point: Positive | None = meaning("Of a touch of a point, on each axis", None)
+    pixel: Positive | None = meaning("Of a corner's image, along u and v, in pixels", None)
+    estimate: StrictBool = meaning(
+        "Whether the figures are only where to start, and the noise is estimated from the residuals", False
+    )
 
 
 class _OneFigure(Schema):
@@ -78,35 +86,65 @@ class _FigureEach(Schema):
 
 
 class _RandomPairing(Schema):
-    random: Annotated[Count, Field(gt=0)]
-    seed: Seed = 0
+    random: Annotated[Count, Field(gt=0)] = meaning("Number of different pairs that are drawn")
+    seed: Seed = meaning("What random numbers begin with", 0)
+
+
+_NOISE = "mapping, or `estimate`"
+_PAIRING = "star | chain | all | {random: N}"
+_CAMERA = "path, or mapping"
+_LIMIT = "number, or text such as 0.5 mm"
+
+_COLUMNS = "By the name that is known here (q1, x, group, ...) what the table calls a column"
 
 
 class _JobOfTables(Schema):
-    robot: Any  # a path, or the mapping of a robot file
-    measurements: Any  # the path of a table, or a list of `_Table`
-    pairs: FilePath | None = None
-    model: Model | None = None
-    pairing: Any = "star"  # a strategy's name, or a `_RandomPairing`
-    frame: FrameKnowledge = "known"
-    units: UnitsOfFile = Units()
-    noise: Any = None  # a `_Noise`, or `estimate`
-    prior: StrictBool | None = None
-    gauge: Gauge = "prior"
-    prefer: tuple[str, ...] = ()
-    pair_errors: PairErrors = "shared"
-    encoder: EncoderNoise = "propagated"
-    loss: Loss = "none"
-    max_iterations: Annotated[Count, Field(gt=0)] | None = None
-    accept: Any = None  # an `_Accept`
-    folds: Annotated[Count, Field(ge=2)] | None = None
-    truth: FilePath | None = None
-    targets: dict[str, Any] = Field(default_factory=dict)  # by name a `_Point`
-    anchors: dict[str, Any] = Field(default_factory=dict)
-    tolerance: Any = None  # a `_Tolerances`
-    offset: Literal["estimate"] | None = None
-    camera: Any = None  # a path, or a camera's mapping
-    columns: dict[str, Any] | None = None  # by known name a column's own name, or a `_Column`
+    robot: Any = meaning(
+        "The nominal robot: a robot file, a URDF, or what would stand in a robot file", kind="path, or mapping"
+    )
+    measurements: Any = meaning("What was measured: a table, or a list with an entry a table", kind="path, or list")
+    pairs: FilePath | None = meaning("Table of pairs that were measured directly", None)
+    model: Model | None = meaning(
+        "What of the measurements is compared with the arm; each entry of a list may have its own", None
+    )
+    pairing: Any = meaning("How pairs are formed from poses where none were measured directly", "star", kind=_PAIRING)
+    frame: FrameKnowledge = meaning(
+        "Whether the measurement frame is the base, or world_T_base is estimated too", "known"
+    )
+    units: UnitsOfFile = meaning("Of the tables and of the figures in this file", Units(), kind="mapping")
+    noise: Any = meaning("1 sigma of what was measured, where the tables do not say it row by row", None, kind=_NOISE)
+    prior: StrictBool | None = meaning("Older word for gauge: false is gauge: none", None)
+    gauge: Gauge = meaning(
+        "What holds directions that the data do not determine: tolerances; leaving parameters out; nothing", "prior"
+    )
+    prefer: tuple[str, ...] = meaning("With gauge keep: parameters to keep, first choice first", ())
+    pair_errors: PairErrors = meaning("Whether pairs of one configuration share its errors", "shared")
+    encoder: EncoderNoise = meaning(
+        "Whether joint noise is added to that of the rows, or true joint values are estimated", "propagated"
+    )
+    loss: Loss = meaning("What becomes of gross errors: least squares, or a robust loss", "none")
+    max_iterations: Annotated[Count, Field(gt=0)] | None = meaning(
+        "Steps after which the solver gives up; 200 if left out", None
+    )
+    accept: Any = meaning(
+        "The largest RMS errors, where rows are held out, with which the arm is good enough", None, kind="mapping"
+    )
+    folds: Annotated[Count, Field(ge=2)] | None = meaning(
+        "Into how many folds configurations are dealt to hold each out once; none if left out",
+        None,
+        kind="whole number above 1",
+    )
+    truth: FilePath | None = meaning("The true robot, where a simulation knows it", None)
+    targets: dict[str, Any] = meaning(
+        "Where targets are on the tool, by name; others are estimated", {}, kind="mapping of points"
+    )
+    anchors: dict[str, Any] = meaning(
+        "Where anchors are in the base frame, by name; others are estimated", {}, kind="mapping of points"
+    )
+    tolerance: Any = meaning("1 sigma of all targets, or anchors, that are named with a place", None, kind="mapping")
+    offset: Literal["estimate"] | None = meaning("Whether an unknown length is in every distance to an anchor", None)
+    camera: Any = meaning("Of model pixels: the camera that took the images", None, kind=_CAMERA)
+    columns: dict[str, Any] | None = meaning(_COLUMNS, None, kind="mapping of columns")
 
 
 class _Job(_JobOfTables):
@@ -114,45 +152,67 @@ class _Job(_JobOfTables):
 
 
 class _Table(Schema):
-    table: FilePath
-    pairs: FilePath | None = None
-    model: Model | None = None
-    pairing: Any = None
-    frame: FrameKnowledge | None = None
-    units: UnitsOfFile | None = None
-    noise: Any = None
-    offset: Literal["estimate"] | None = None
-    camera: Any = None
-    columns: dict[str, Any] | None = None
+    table: FilePath = meaning("The table: CSV or Parquet")
+    pairs: FilePath | None = meaning("Table of pairs that were measured directly", None)
+    model: Model | None = meaning("What of it is compared with the arm", None)
+    pairing: Any = meaning("How pairs are formed from its poses", None, kind=_PAIRING)
+    frame: FrameKnowledge | None = meaning(
+        "Whether its measurement frame is the base; each unknown one is its own", None
+    )
+    units: UnitsOfFile | None = meaning("Of the table and of the figures in this entry", None, kind="mapping")
+    noise: Any = meaning("1 sigma of what was measured", None, kind="mapping")
+    offset: Literal["estimate"] | None = meaning("Whether an unknown length is in every distance to an anchor", None)
+    camera: Any = meaning(
+        "Of model pixels: the camera; `fixed`: that of the job, in the room", None, kind=_CAMERA + ", or `fixed`"
+    )
+    columns: dict[str, Any] | None = meaning(_COLUMNS, None, kind="mapping of columns")
 
 
 class _Column(Schema):
-    name: str
-    scale: Number = 1.0
-    zero: Number = 0.0
+    name: str = meaning("In the table's header")
+    scale: Number = meaning("What one of its units is in those of the table", 1.0)
+    zero: Number = meaning("The figure that means 0: a cell is (figure - zero) * scale", 0.0)
 
 
 class _Point(Schema):
-    x: Number
-    y: Number
-    z: Number
-    tolerance: Positive | None = None
+    x: Number = meaning("Its place")
+    y: Number = meaning("Its place")
+    z: Number = meaning("Its place")
+    tolerance: Positive | None = meaning("1 sigma of that on each axis; exact if left out", None)
 
 
 class _Accept(Schema):
-    position: Any = None  # a number, or text with its unit
-    orientation: Any = None
-    distance: Any = None
-    angle: Any = None
+    position: Any = meaning("Of the tool", None, kind=_LIMIT)
+    orientation: Any = meaning("Of the tool", None, kind=_LIMIT)
+    distance: Any = meaning("Of distances and lengths", None, kind=_LIMIT)
+    angle: Any = meaning("Of angles between configurations", None, kind=_LIMIT)
 
 
-class _Fixed(Schema):
-    fixed: StrictBool
+class _CameraOfJob(Schema):
+    file: FilePath | None = meaning("The camera's file: fx fy cx cy in pixels, and OpenCV's k1 k2 p1 p2 k3", None)
+    fixed: StrictBool = meaning("Whether it stands in the room, and the board is on the tool", False)
 
 
 class _Tolerances(Schema):
-    targets: Positive | None = None
-    anchors: Positive | None = None
+    targets: Positive | None = meaning("Of targets", None)
+    anchors: Positive | None = meaning("Of anchors", None)
+
+
+SECTIONS = (
+    Section("", _JobOfTables, "Paths are relative to the job's folder.", required=("model",)),
+    Section("measurements: each entry of a list", _Table, "What an entry leaves out is as the keys at the top say."),
+    UNITS,
+    Section("noise", _Noise, "1 sigma, in the file's units. `noise: estimate` is `{estimate: true}`."),
+    Section(
+        "pairing", _RandomPairing, "star: the first pose with each other; chain: each with the next; or a mapping."
+    ),
+    Section("accept", _Accept, "Judged by test rows, or else by `folds`. In the file's units, or with their own."),
+    Section("targets, anchors: each point", _Point),
+    Section("tolerance", _Tolerances),
+    Section("camera", _CameraOfJob, "A path, or the figures of a camera's file themselves, or"),
+    Section("columns: each column", _Column, "A column's name alone, or"),
+)
+"""The mappings of a job, for the reference."""
 
 
 _CHOICES = ("model", "frame", "prior", "gauge", "prefer", "pair_errors", "encoder", "loss", "max_iterations", "folds")
@@ -314,7 +374,7 @@ def camera_in(given: object, place: str, folder: Path) -> tuple[Camera | None, b
     """
     fixed = False
     if isinstance(given, dict) and "fixed" in given:
-        fixed = validate(_Fixed, {"fixed": given["fixed"]}, place).fixed
+        fixed = validate(_CameraOfJob, {"fixed": given["fixed"]}, place).fixed
         given = {key: value for key, value in given.items() if key != "fixed"}
         given = given["file"] if set(given) == {"file"} else given
     if given in (None, "fixed"):

@@ -20,7 +20,7 @@ if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need
     import polars as pl
 
 
-_KNOWN = ("a", "b", "distance", "angle", "sigma_distance", "sigma_angle", "split")
+PAIR_COLUMNS = ("a", "b", "distance", "angle", "sigma_distance", "sigma_angle", "split")
 """Columns that mean something."""
 
 
@@ -70,7 +70,7 @@ def read_pairs(
     Raises:
         InputError: The file is missing, is no table, lacks a column or holds a cell that cannot be used.
     """
-    header = Header.read(path, "frame of pairs").understood(_KNOWN)
+    header = Header.read(path, "frame of pairs").understood(PAIR_COLUMNS)
     for column in ("a", "b"):
         if column not in header.columns:
             raise InputError(header.name, f"no column {column}", "a and b, the two configurations of a pair")

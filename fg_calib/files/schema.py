@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from reprlib import Repr
@@ -93,6 +94,34 @@ class Schema(BaseModel):
     @classmethod
     def _refuse_unknown_keys(cls, value: object) -> object:
         return refuse_unknown_keys(*cls.model_fields)(value)
+
+
+def meaning(words: str, default: Any = ..., *, kind: str = "") -> Any:
+    """A key of a schema with what it means: what the reader knows, `fg-calib help` and the reference say.
+
+    Args:
+        words: What it means, a sentence without its full stop.
+        default: What it is where it is left out; ... where it must not be.
+        kind: What it may be, where its type does not say.
+    """
+    return Field(default, description=words, json_schema_extra={"kind": kind})
+
+
+@dataclass(frozen=True)
+class Section:
+    """A mapping of a file, as the reference shows it.
+
+    Attributes:
+        title: Where it stands.
+        schema: Its keys.
+        words: What there is to say before them.
+        required: Keys that must be given although the schema alone does not say so.
+    """
+
+    title: str
+    schema: type[BaseModel]
+    words: str = ""
+    required: tuple[str, ...] = ()
 
 
 AnySchema = TypeVar("AnySchema", bound=Schema)

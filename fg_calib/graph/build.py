@@ -73,18 +73,33 @@ def build_problem(
         ProblemError: The measurements lack what the model needs, or do not suffice.
     """
     options = Options.given(options, choices)
-    check_names("prefer", options.prefer, names_of(robot.parameters))
-    if not any(p.estimated for p in robot.parameters):
-        raise ProblemError(f"robot {robot.name}", "nothing to estimate", "at least one parameter that is not fixed")
     tables = tables_of(measurements, options)
-    evaluated = all(map(_all_test, tables))
-    if evaluated:
-        robot, options, tables = _for_evaluation(robot, options, tables)
     for table in tables:
         if not table.uses_pairs and table.measurements.pairs is not None:
             source = table.measurements.pairs.source
             _log.warning("%s: not used, model %s is of poses", source, table.model)
         check_repeats(table)
+    return problem_of_tables(robot, tables, options)
+
+
+def problem_of_tables(robot: Robot, tables: Sequence[Table], options: Options) -> Problem:
+    """`build_problem` without warnings of what tables hold twice or in vain.
+
+    Args:
+        robot: The nominal robot.
+        tables: What was measured.
+        options: What is estimated from what.
+
+    Raises:
+        InputError: An option is not one of those possible.
+        ProblemError: The measurements lack what the model needs, or do not suffice.
+    """
+    check_names("prefer", options.prefer, names_of(robot.parameters))
+    if not any(p.estimated for p in robot.parameters):
+        raise ProblemError(f"robot {robot.name}", "nothing to estimate", "at least one parameter that is not fixed")
+    evaluated = all(map(_all_test, tables))
+    if evaluated:
+        robot, options, tables = _for_evaluation(robot, options, tables)
     data = gather(robot, tables)
     _check_frames(data)
     variables = variables_of(robot, data, options)

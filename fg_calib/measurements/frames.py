@@ -223,7 +223,8 @@ def _rotations(R_F: Floats, R_M: Floats, R_X: Floats, R_T: Floats, unknown: Unkn
     all_X, all_T, reached = _alternate(R_F, R_M, starts, steps=20)
     best = int(np.argmax(np.round(reached, 9)))
     R_X, R_T = all_X[best], all_T[best]
-    turns = [_about(_common_axis(R_F), angle) for angle in np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)]
+    axis = _common_axis(R_F)
+    turns = [_about(axis, angle) for angle in np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)]
     return [(R_X @ turn, turn.T @ R_T) for turn in turns]
 
 
@@ -256,7 +257,7 @@ def _alternate(R_F: Floats, R_M: Floats, R_T: Floats, steps: int) -> tuple[Float
 def _common_axis(R_F: Floats) -> Floats:
     """The axis that takes the first rotation to the others, in the base frame, shape (3,); any if there is none."""
     _, axes = rotation_angle(R_F @ R_F[0].T)
-    axis: Floats = np.linalg.svd(axes)[2][0]
+    axis: Floats = np.linalg.svd(axes, full_matrices=False)[2][0]
     return axis
 
 

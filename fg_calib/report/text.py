@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from rich.console import Group, RenderableType
 
+from fg_calib.analysis.accuracy import ExpectedError
 from fg_calib.analysis.joint_values import JointValues
 from fg_calib.analysis.uncertainty import FrameEstimate, Uncertainty
 from fg_calib.analysis.unknowns import PointEstimate
@@ -70,7 +71,7 @@ def build_report(solution: Solution, uncertainty: Uncertainty) -> RenderableType
 def _verdict(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
     problem, settings = solution.problem, solution.problem.options
     labels = problem.data.labels
-    tables = [_in_words(table) for table in problem.data.tables]
+    tables = [in_words(table) for table in problem.data.tables]
     if len(labels) > 1:
         tables = [f"{label} ({words})" for label, words in zip(labels, tables, strict=True)]
     what = f"{problem.robot.name}: {'; '.join(tables)}"
@@ -98,7 +99,7 @@ def _verdict(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
     return Group(*lines)
 
 
-def _in_words(table: Table) -> str:
+def in_words(table: Table) -> str:
     """What a table is of."""
     kinds = [type(own.kind).__name__ for own in table.own]
     if table.model is None:
@@ -157,7 +158,17 @@ def _of_p(p: float | None) -> str:
 
 def _expected_error(uncertainty: Uncertainty) -> list[RenderableType]:
     """How far off the tool is expected to be, by the covariance."""
-    expected = uncertainty.expected_error
+    doubtful = not uncertainty.trustworthy or bool(uncertainty.reservations)
+    return expected_tool_error(uncertainty.expected_error, ", if model and noise were as stated" * doubtful)
+
+
+def expected_tool_error(expected: ExpectedError | None, condition: str = "") -> list[RenderableType]:
+    """The section on how far off the tool is expected to be; none where the arm was evaluated as it is.
+
+    Args:
+        expected: How far.
+        condition: Words for the heading.
+    """
     if expected is None:
         return []
     table = plain_table(
@@ -168,8 +179,7 @@ def _expected_error(uncertainty: Uncertainty) -> list[RenderableType]:
         values = (getattr(rms, kind) for rms in (expected.base, expected.fitted))
         table.add_row(kind, shown, *("unknown" if v is None else f"{v * factor:.{decimals}f}" for v in values))
     which = "" if expected.n == expected.of else f" of {expected.of}"
-    doubtful = ", if model and noise were as stated" * (not uncertainty.trustworthy or bool(uncertainty.reservations))
-    return section(f"Expected tool error (RMS at {expected.n}{which} {expected.at} configurations{doubtful})", table)
+    return section(f"Expected tool error (RMS at {expected.n}{which} {expected.at} configurations{condition})", table)
 
 
 def _residuals(solution: Solution, uncertainty: Uncertainty) -> RenderableType:

@@ -1,0 +1,32 @@
+"""`fg-calib init`."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fg_calib.cli.output import say
+
+
+def init(
+    files: Annotated[
+        list[Path],
+        typer.Argument(metavar="FILES...", readable=False, help="robot.yaml or a URDF, tables, perhaps camera.yaml."),
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="JOB", readable=False, help="The job to write.")] = Path(
+        "calibration.yaml"
+    ),
+) -> None:
+    """Write a commented job for a robot and its tables, recognised by their headers; nothing is overwritten."""
+    from fg_calib.files.disk import require_absent, write_text
+    from fg_calib.files.draft import draft_job
+
+    require_absent(out.parent, [out.name])
+    text = draft_job(files, out)
+    write_text(out, text)
+    decisions = sum("DECIDE" in line for line in text.splitlines()[2:])
+    say(f"wrote {out}: {decisions} lines with DECIDE are yours to look at")
+    say(f"now: fg-calib inspect {shlex.quote(str(out))}")

@@ -1,0 +1,28 @@
+"""`fg-calib inspect`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fg_calib.cli.output import Json, end, show_json, show_report
+
+
+def inspect(
+    job: Annotated[Path, typer.Argument(metavar="JOB", readable=False, help="The job, such as calibration.yaml.")],
+    as_json: Json = False,
+) -> None:
+    """Say what a job holds, what looks wrong with it, and what it can determine, without solving it."""
+    from fg_calib.analysis.inspection import inspect_job
+    from fg_calib.files.job import read_job
+    from fg_calib.report.inspection import build_inspection_report, inspection_document
+
+    given = read_job(job)
+    found = inspect_job(given)
+    if as_json:
+        show_json(inspection_document(found, given))
+    else:
+        show_report(build_inspection_report(found, given))
+    end(found.findings, "look at this first")

@@ -1,0 +1,156 @@
+"""`fg-calib inspect`: exit codes, the report, and what `--json` promises."""
+
+import json
+
+import pytest
+import yaml
+from jobs import ur5e, write_job
+from simulated import measure, plus, true_robot
+
+from fg_calib import inspection_document
+from fg_calib.report.inspection import SCHEMA
+
+JOB = "calibration.yaml"
+NUMBER = (int, float)
+
+
+@pytest.fixture
+def job(tmp_path):
+    """`job(change)`: a healthy job of 50 poses, but for what `change` does to the measurements."""
+    import numpy as np
+
+    robot, rng = ur5e(tmp_path), np.random.default_rng(0)
+    m = measure(true_robot(robot, rng), 50, rng, sigma=(5e-5, 1e-4), readings=rng.uniform(-2, 2, (50, 6)))
+
+    def written(change=lambda m: m, **keys):
+        return write_job(tmp_path, change(m), model="pose", frame="unknown", **keys)
+
+    return written
+
+
+def changed(folder, **keys):
+    """The example's job with some keys changed."""
+    path = folder / JOB
+    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | keys))
+    return path
+
+
+def test_a_healthy_job_ends_with_0_and_its_verdict_stands_first(fg_calib, example):
+    ended = fg_calib("inspect", example / JOB)
+    assert (ended.code, ended.err) == (0, "")
+    lines = [line.rstrip() for line in ended.out.splitlines()]
+    assert lines[:2] == [
+        "space-robot: distance-rotation, pairs: star",
+        "READY: nothing speaks against calibrating this job",
+    ]
+    assert lines[4:6] == [
+        "          rows configurations test rows train pairs test pairs residuals to fit",
+        "poses.csv  552            552       500          51        499 51 distance, 51 angle",
+    ]
+    assert "What these rows can determine: 23 of 30 parameters" in lines
+    assert "position    mm             5.6799                   5.6780" in lines
+    assert not any(line.startswith("Notes") for line in lines)
+    assert max(map(len, lines)) <= 100
+
+
+def test_a_mistake_in_units_ends_with_3_and_one_line(fg_calib, example):
+    units = {"length": "mm", "angle": "deg"}
+    ended = fg_calib("inspect", changed(example, units=units, noise={"position": 1, "orientation": 0.01}))
+    assert ended.code == 3
+    assert ended.err.startswith("look at this first: distance residuals fall from")
+    assert ended.err.count("\n") == 1
+    assert "are in m, not mm" in ended.err
+    assert ended.out.splitlines()[1].startswith("LOOK AT THIS FIRST: distance residuals fall from")
+    assert "far too large" in ended.out
+
+
+def test_rows_that_disagree_are_listed(fg_calib, job):
+    from dataclasses import replace
+
+    ended = fg_calib("inspect", job(lambda m: replace(m, position=plus(m.position, range(1, 8), 0.03))))
+    assert ended.code == 3
+    assert "look at this first: 7 measurements disagree with the arm as drawn" in ended.err
+    part = ended.out[ended.out.index("Rows that disagree with the arm as drawn") :]
+    assert "and 2 more" in part
+
+
+def test_notes_stand_last(fg_calib, job):
+    ended = fg_calib("inspect", job())
+    assert ended.code == 0
+    assert ended.out.splitlines()[1].rstrip() == "READY: nothing speaks against calibrating this job, see the notes"
+    assert ended.out.rstrip().endswith(
+        "no test rows: nothing would check how well the calibration predicts (column split)"
+    )
+
+
+def _refuse(constant):
+    raise AssertionError(f"{constant} is no JSON")
+
+
+def test_json_has_every_key_and_nothing_else_is_on_stdout(fg_calib, example):
+    ended = fg_calib("inspect", example / JOB, "--json")
+    assert (ended.code, ended.err) == (0, "")
+    found = json.loads(ended.out, parse_constant=_refuse)
+    shape = {
+        "schema": str, "version": str, "robot": str, "ready": bool, "findings": list, "cautions": list,
+        "evaluated": bool, "tables": list, "joints": list, "residuals": list, "explanations": list,
+        "disagreements": dict, "n_residuals": int, "n_priors": int, "n_unknowns": int, "dof": int,
+        "n_excluded": dict, "observability": dict, "expected_error": dict, "inputs": dict,
+    }  # fmt: skip
+    assert {key: type(value) for key, value in found.items()} == shape
+    assert found["schema"] == SCHEMA == "fg-calib/inspection/1"
+    assert found["observability"]["schema"].startswith("fg-calib/observability/")
+    assert found["tables"][0]["n_rows"] == 552
+    assert set(found["residuals"][0]) == {"table", "kind", "unit", "size", "expected", "excess", "n"}
+    assert set(found["joints"][0]) == {"name", "unit", "least", "most", "limits", "share", "still", "n_outside"}
+    assert isinstance(found["expected_error"]["base"]["position"], NUMBER)
+    assert set(found["inputs"]) == {JOB, "poses.csv", "robot_nominal.yaml", "robot_true.yaml"}
+    assert all(f'"{key}"' in (inspection_document.__doc__ or "") for key in found)
+
+
+def test_json_of_a_job_with_findings_has_them(fg_calib, job):
+    from dataclasses import replace
+
+    ended = fg_calib("inspect", job(lambda m: replace(m, position=plus(m.position, [4], 0.05))), "--json")
+    assert ended.code == 3
+    found = json.loads(ended.out, parse_constant=_refuse)
+    assert not found["ready"]
+    assert len(found["findings"]) == 1
+    (one,) = found["disagreements"]["found"]
+    assert (one["ends"], one["row"], one["kind"], one["table"]) == (["4"], 4, "position", "")
+
+
+@pytest.mark.parametrize(
+    ("keys", "says"),
+    [
+        ({"modell": "pose"}, "error: calibration.yaml: unknown key 'modell'"),
+        ({"measurements": "none.csv"}, "error: "),
+        ({"units": {"length": "m", "angle": "rad"}}, "error: poses.csv:2: q1 = "),
+    ],
+)
+def test_bad_input_ends_with_1_and_the_line_that_calibrate_gives(fg_calib, example, keys, says):
+    path = changed(example, **keys)
+    ended = fg_calib("inspect", path)
+    assert (ended.code, ended.out) == (1, "")
+    assert ended.err.startswith(says)
+    assert ended.err.count("\n") == 1
+    assert fg_calib("calibrate", path).err == ended.err
+
+
+def test_wrong_usage_ends_with_2(fg_calib):
+    assert fg_calib("inspect").code == 2
+    assert fg_calib("inspect", "a.yaml", "--out", "x").code == 2
+
+
+def test_names_from_files_steer_no_terminal(fg_calib, example):
+    table = (example / "poses.csv").read_text().splitlines()
+    cells = table[3].split(",")
+    header = table[0].split(",")
+    cells[header.index("x")] = "9.0"
+    if "id" in header:
+        cells[header.index("id")] = "\x1b[31mred"
+    table[3] = ",".join(cells)
+    (example / "poses.csv").write_text("\n".join(table) + "\n")
+    ended = fg_calib("inspect", example / JOB)
+    assert ended.code == 3
+    assert "\x1b" not in ended.out + ended.err
