@@ -35,8 +35,8 @@ def changed(folder, **keys):
     return path
 
 
-def test_a_healthy_job_ends_with_0_and_its_verdict_stands_first(fg_calib, example):
-    ended = fg_calib("inspect", example / JOB)
+def test_a_healthy_job_ends_with_0_and_its_verdict_stands_first(fg_calib, whole_example):
+    ended = fg_calib("inspect", whole_example / JOB)
     assert (ended.code, ended.err) == (0, "")
     lines = [line.rstrip() for line in ended.out.splitlines()]
     assert lines[:2] == [
@@ -100,7 +100,7 @@ def test_json_has_every_key_and_nothing_else_is_on_stdout(fg_calib, example):
     assert {key: type(value) for key, value in found.items()} == shape
     assert found["schema"] == SCHEMA == "fg-calib/inspection/1"
     assert found["observability"]["schema"].startswith("fg-calib/observability/")
-    assert found["tables"][0]["n_rows"] == 552
+    assert found["tables"][0]["n_rows"] == 102
     assert set(found["residuals"][0]) == {"table", "kind", "unit", "size", "expected", "excess", "n"}
     assert set(found["joints"][0]) == {"name", "unit", "least", "most", "limits", "share", "still", "n_outside"}
     assert isinstance(found["expected_error"]["base"]["position"], NUMBER)

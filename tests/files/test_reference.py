@@ -47,6 +47,7 @@ AT = {
     "units": f"{{{GOOD}, units: {{nonsense: 1}}}}",
     "noise": f"{{{GOOD}, noise: {{nonsense: 1}}}}",
     "pairing": f"{{{GOOD}, pairing: {{nonsense: 1}}}}",
+    "accept": f"{{{GOOD}, accept: {{nonsense: 1}}}}",
     "targets, anchors: each point": f"{{{GOOD}, targets: {{t: {{nonsense: 1}}}}}}",
     "tolerance": f"{{{GOOD}, tolerance: {{nonsense: 1}}}}",
     "columns: each column": f"{{{GOOD}, columns: {{x: {{nonsense: 1}}}}}}",
