@@ -40,6 +40,7 @@ from fg_calib.measurements.checks import check_readings
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.series import Table
 from fg_calib.options import NEAR, Options, check_flag, check_names, did_you_mean, listed
+from fg_calib.progress import tell
 from fg_calib.report.documents import result_of, write_results
 from fg_calib.report.summary import format_result, html, judged, summary
 from fg_calib.report.text import format_report
@@ -100,7 +101,9 @@ def calibrate_job(job: Job | Path | str) -> Calibration:
         SolverError: GTSAM could not solve a step at all.
     """
     given = job if isinstance(job, Job) else read_job(job)
+    tell("calibrating")
     solution = solve_job(given)
+    tell("judging the result")
     uncertainty = assess(solution)
     if given.options.folds is not None:
         uncertainty = uncertainty.with_folds(cross_validate(given, given.options.folds), given.options.accept)

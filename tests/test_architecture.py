@@ -17,7 +17,19 @@ import fg_calib
 
 PACKAGE = Path(fg_calib.__file__).parent
 FOLDERS = (
-    *("errors", "libraries", "arguments", "sizes", "threads", "arrays", "options", "robot", "measurements", "job"),
+    *(
+        "errors",
+        "libraries",
+        "arguments",
+        "sizes",
+        "threads",
+        "arrays",
+        "options",
+        "progress",
+        "robot",
+        "measurements",
+        "job",
+    ),
     *("camera", "simulation", "files", "graph", "analysis", "baseline", "report", "calibration", "pages", "cli"),
 )
 """From the ground up: a folder (or module of the package itself) imports from those before it."""

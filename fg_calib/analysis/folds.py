@@ -37,6 +37,7 @@ from fg_calib.measurements.dataset import Pairs
 from fg_calib.measurements.gathering import Dataset
 from fg_calib.measurements.series import Table
 from fg_calib.options import check_number
+from fg_calib.progress import tell
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -117,6 +118,7 @@ def cross_validate(job: Job, n: int = 5, seed: int = 0) -> Folds:
         )
     solutions = []
     for k in range(n):
+        tell("calibrating without one fold after the other", k, n)
         held = [_held_out(table, fold[place] == k) for table, place in zip(data.tables, data.places, strict=True)]
         try:
             solutions.append(solve_job(replace(whole, measurements=tuple(held))))

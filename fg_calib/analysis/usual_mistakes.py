@@ -9,7 +9,6 @@ from itertools import combinations, permutations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from fg_calib.analysis.placed_residuals import residuals_of
@@ -168,6 +167,8 @@ def _moves(setup: Setup, joints: Booleans, factor: float) -> bool:
 
 def still_joints(setup: Setup) -> Iterator[Mistake]:
     """Joints whose readings change, each standing still where that explains most; those that explain least left out."""
+    from scipy.optimize import minimize_scalar  # here, for it takes as long to import as a small calibration
+
     joints = [i for i, extent in enumerate(np.ptp(setup.measurements.readings, axis=0)) if extent > _still(setup, i)]
     tried = {i: [(_left_still(setup, i, place), place) for place in _places(setup, i)] for i in joints}
     least = min((min(found)[0] for found in tried.values()), default=np.inf)

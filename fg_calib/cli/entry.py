@@ -29,6 +29,7 @@ from fg_calib.cli.init import init
 from fg_calib.cli.inspect import inspect
 from fg_calib.cli.observe import observe
 from fg_calib.cli.output import say
+from fg_calib.cli.progress import hide_progress, progress
 from fg_calib.cli.report import report
 from fg_calib.cli.simulate import simulate
 from fg_calib.errors import CalibrationError, InputError, printable
@@ -37,7 +38,6 @@ app = typer.Typer(
     name="fg-calib",
     help="Calibrate a robot arm's geometry, and say how well it is known.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 for command in (init, inspect, calibrate, report, compare, observe, simulate, example, bag, board):
@@ -64,7 +64,8 @@ def run() -> None:
         try:
             _require_words(sys.argv[1:])
             _require_resources()
-            app(prog_name="fg-calib")
+            with progress():
+                app(prog_name="fg-calib")
         finally:
             sys.stdout.flush()
     except CalibrationError as error:
@@ -97,6 +98,7 @@ class _Line(logging.Formatter):
     """A message of the log as the one line it is."""
 
     def format(self, record: logging.LogRecord) -> str:
+        hide_progress()
         return printable(super().format(record))
 
 

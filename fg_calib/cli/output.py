@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from fg_calib.cli.progress import hide_progress
 from fg_calib.errors import printable
 
 if TYPE_CHECKING:
@@ -22,11 +23,13 @@ Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on 
 
 def say(text: str) -> None:
     """Print a line on stderr; what names from files and of folders hold steers no terminal."""
+    hide_progress()
     print(printable(text), file=sys.stderr)
 
 
 def show_json(document: dict[str, Any]) -> None:
     """Print a document as JSON."""
+    hide_progress()
     print(json.dumps(document, allow_nan=False))
 
 
@@ -36,6 +39,7 @@ def show_report(report: RenderableType) -> None:
 
     from fg_calib.report.tables import WIDTH, width_for
 
+    hide_progress()
     given = Console().is_terminal or "COLUMNS" in os.environ
     width = width_for(report, Console().width if given else WIDTH)
     Console(highlight=False, width=width).print(report)

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from fg_calib.cli.output import Json, say_next, show_json
+from fg_calib.cli.progress import hide_progress
 from fg_calib.errors import printable
 
 
@@ -29,6 +30,7 @@ def simulate(
     if as_json:
         show_json({"files": [str(out / name) for name in names], **simulation.summary()})
     else:
+        hide_progress()
         n_train, n_test = (simulation.n_configurations(test=test) for test in (False, True))
         counts = f"{n_train} configurations to calibrate, {n_test} to test"
         print(printable(f"{simulation.scenario.name}, seed {seed}: {counts}"))

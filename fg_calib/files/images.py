@@ -13,6 +13,7 @@ from fg_calib.camera.views import Corners
 from fg_calib.errors import InputError
 from fg_calib.files.disk import read_bytes
 from fg_calib.measurements.dataset import Floats
+from fg_calib.progress import tell
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp", ".jp2")
 
@@ -72,7 +73,8 @@ def read_corners(files: Sequence[Path], board: CalibrationBoard) -> FoundCorners
     found: list[Corners] = []
     without: dict[str, str] = {}
     size: tuple[int, int] | None = None
-    for file in files:
+    for k, file in enumerate(files):
+        tell("looking for corners", k, len(files))
         image = decode(read_bytes(file), file.name)
         height, width = image.shape
         if size is None:

@@ -145,7 +145,7 @@ def validate(schema: type[AnySchema], value: object, place: str) -> AnySchema:
 
 
 def first_misfit(error: ValidationError, place: str) -> InputError:
-    """A validation error as one line: the first misfit is named, others are counted."""
+    """A validation error as one line: the first misfit is named, with all keys that are missing there; others count."""
     misfits = error.errors(include_url=False)
     first = misfits[0]
     context = first.get("ctx", {})
@@ -155,7 +155,10 @@ def first_misfit(error: ValidationError, place: str) -> InputError:
             *path, key = first["loc"]
             if isinstance(key, int):
                 return InputError(_place(place, path), f"found {shown(first['input'])}", f"more than {key} in the list")
-            return InputError(_place(place, path), f"missing key {key!r}{more}")
+            missing = [m["loc"][-1] for m in misfits if m["type"] == "missing" and list(m["loc"][:-1]) == path]
+            names = ", ".join(map(repr, missing))
+            others = f" (and {len(misfits) - len(missing)} more)" if len(misfits) > len(missing) else ""
+            return InputError(_place(place, path), f"missing key{'s' * (len(missing) > 1)} {names}{others}")
         case "unknown_key":
             hint = did_you_mean(context["key"], context["known"])
             known = f"one of {', '.join(context['known'])}"

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from fg_calib.measurements.frames import Frame, nearest_rotation
 
@@ -207,6 +206,8 @@ def _unit_solution(A: Floats, b: Floats) -> Floats:
     least = 1e-15 * max(values[0] ** 2, 1e-200)  # rounding: where b says nothing along the third axis n is along it
     g[2] = np.copysign(max(abs(g[2]), least), g[2])
     bounds = 0.5 * abs(g[2]), 2.0 * float(np.linalg.norm(g))
+    from scipy.optimize import brentq  # here, for it takes as long to import as a small calibration
+
     m = brentq(lambda m: 1.0 / np.linalg.norm(g / (above + m)) - 1.0, *bounds, xtol=1e-14 * least, maxiter=1000)
     n: Floats = V.T @ (g / (above + m))
     return n / np.linalg.norm(n)

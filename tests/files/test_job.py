@@ -155,7 +155,7 @@ KEYS = (
 )
 MISTAKES = [
     ("", "calibration.yaml: an empty file, expected a mapping, key: value"),
-    ("robot: a\n", "calibration.yaml: missing key 'measurements' (and 1 more)"),
+    ("robot: a\n", "calibration.yaml: missing keys 'measurements', 'model'"),
     (JOB.replace("model: pose\n", ""), "calibration.yaml: missing key 'model'"),
     (JOB + "measurments: a\n",
      f"calibration.yaml: unknown key 'measurments', expected {KEYS}; did you mean measurements?"),
