@@ -252,7 +252,7 @@ def _of_figures(found: Inspection) -> Iterator[str]:
             yield f"{joint.name} is outside its limits in {joint.n_outside} configurations: is it in another unit?"
     o = found.identifiability.observability
     if o.names and not o.rank:
-        yield "these rows determine none of the parameters: the configurations differ too little, or noise is too large"
+        yield "these rows determine none of the parameters that are estimated"
     if found.dof <= 0:
         yield "no degree of freedom is left: nothing would say whether the fit is right, or the noise; measure more"
 
@@ -275,9 +275,11 @@ def _of_readings(found: Inspection, job: Job) -> Iterator[str]:
 def _of_table(t: TableSurvey) -> Iterator[str]:
     """What the rows of a table give reason to say."""
     if t.n_copies:
-        yield f"{t.name}: {t.n_copies} rows are exact copies of others ({t.copy}): they count as often as they stand"
+        what = "one row is an exact copy" if t.n_copies == 1 else f"{t.n_copies} rows are exact copies"
+        yield f"{t.name}: {what} of another ({t.copy}): what was copied counts as often as it stands there"
     if t.n_leaked:
-        yield f"{t.name}: {t.n_leaked} test rows are at configurations of train rows: they do not check a prediction"
+        what = "one test row is" if t.n_leaked == 1 else f"{t.n_leaked} test rows are"
+        yield f"{t.name}: {what} at configurations of train rows: no check of a prediction"
     if t.n_pairs and t.n_folded > LEAST_FOLDED * t.n_pairs:
         yield (
             f"{t.name}: {t.n_folded} of {t.n_pairs} train pairs are so near 0 or half a turn that tolerances let their"
@@ -287,7 +289,7 @@ def _of_table(t: TableSurvey) -> Iterator[str]:
 
 def _of_noise(found: Inspection, job: Job) -> Iterator[str]:
     if job.options.estimate_noise:
-        yield "noise is to be estimated: sigmas and accuracy below are for noise as stated, or 1 mm and 1 mrad"
+        yield "noise is to be estimated: sigmas and accuracy here are for noise as stated, or 1 mm and 1 mrad"
     unseen = [t.name for t, check in zip(found.tables, found.setups, strict=False) if not check.residuals]
     if unseen and len(found.setups) == len(found.tables):
         yield f"{_listed(unseen)}: too few rows to look for the usual mistakes (units, signs, columns) before solving"
