@@ -364,3 +364,25 @@ def test_the_repr_fits_a_screen(arm):
     lines = repr(inspected(arm, MISTAKES["x, y, z are in mm, not m"](measured(arm)))).splitlines()
     assert lines[1].startswith("  LOOK AT THIS FIRST: position residuals fall")
     assert max(map(len, lines)) <= 100
+
+
+@pytest.mark.parametrize("frames", [("known", "known"), ("unknown", "known")])
+def test_a_base_and_a_tool_that_are_far_from_nominal_are_no_mistake_where_they_are_estimated(frames):
+    """Also with several tables, which are compared at the base and the tool that they say together."""
+    estimate = ["base.x", "base.y", "base.z", "base.roll", "base.pitch", "base.yaw", "tool.x", "tool.y", "tool.z"]
+    true = small_arm({"a": 2e-3, "d": 2e-3, "alpha": 4e-3, "theta": 4e-3}, estimate=estimate)
+    rng = np.random.default_rng(3)
+    off = [0.05 * rng.normal() * (p.name in estimate) for p in true.parameters]
+    nominal, true = true.with_values(true.nominal + off), true_robot(true, rng)
+    tables = [
+        Table(
+            replace(
+                measure(true, 30, rng, sigma=SIGMA, frame=PLACED if frame == "unknown" else None), source=f"{k}.csv"
+            ),
+            "position",
+            frame=frame,
+        )
+        for k, frame in enumerate(frames)
+    ]
+    found = inspect_job(Job(None, nominal, tuple(tables), Options()))
+    assert found.findings == ()
