@@ -29,7 +29,7 @@ from fg_calib.graph.factors import build_variables
 from fg_calib.graph.noise import RowNoise, whitening_of
 from fg_calib.graph.problem import Problem, noises_at, reweighted_at
 from fg_calib.measurements import residuals
-from fg_calib.measurements.dataset import Measurements
+from fg_calib.measurements.dataset import Booleans, Measurements
 from fg_calib.measurements.series import Table
 from fg_calib.options import PAIR_MODELS, Model, Options
 from fg_calib.robot.kinematics import Chain
@@ -105,39 +105,83 @@ class Disagreements:
     of: int
 
 
-def find_disagreements(robot: Robot, tables: Sequence[Table], labels: Sequence[str]) -> Disagreements:
-    """The measurements of some tables that disagree with the arm as drawn.
+@dataclass(frozen=True)
+class RoughFit:
+    """The arm as drawn, with measurement frames, base, tool and other unknowns fitted to what most rows say.
+
+    Attributes:
+        robot: The nominal robot.
+        problem: The problem that was fitted: some rows of each table, all of them as test rows.
+        parameters: Its parameter vector.
+        noises: The rows there.
+        distances: Of each measurement of each series, per row and over the typical one, shape (n,) each; 0 where it
+            takes no part.
+        n_rows: Rows that each table has.
+        tests: Which of the rows looked at are test rows, shape (n,) each.
+    """
+
+    robot: Robot
+    problem: Problem
+    parameters: Floats
+    noises: tuple[RowNoise, ...]
+    distances: tuple[Floats, ...]
+    n_rows: tuple[int, ...]
+    tests: tuple[Booleans, ...]
+
+    def start(self, problem: Problem) -> Floats:
+        """The start of a problem of the same tables with base, tool and measurement frames where they were fitted."""
+        start, fitted = problem.start.copy(), self.problem.variables
+        start[problem.variables.robot_span] = self.parameters[fitted.robot_span]
+        frames = {v.symbol: self.parameters[list(v.parameters)] for v in fitted.frames}
+        for v in problem.variables.frames:
+            start[list(v.parameters)] = frames[v.symbol]
+        return start
+
+
+def fit_roughly(robot: Robot, tables: Sequence[Table]) -> RoughFit | None:
+    """The arm as drawn where most rows of some tables say that it stands; None if they do not.
 
     Args:
         robot: The nominal robot.
         tables: What was measured.
-        labels: Names of the tables.
     """
-    chosen, of = zip(*map(_looked_at, tables), strict=True)
-    flagged: list[Disagreement] = []
-    n = total = 0
+    chosen, n_rows, tests = zip(*map(_looked_at, tables), strict=True)
     with one_blas_thread:
         try:
             problem = problem_of_tables(robot, chosen, Options(gauge="none"))
-            parameters, noises, distances = _fitted(problem, robot)
+            fitted = _fitted(problem, robot)
         except (InputError, ProblemError, SolverError, RuntimeError, np.linalg.LinAlgError):
-            return Disagreements((), 0, sum(of))
-        for noise, d in zip(noises, distances, strict=True):
-            if not noise.series.kind.ends:  # distances of touched points follow from the arm through these alone
+            return None
+    return RoughFit(robot, problem, *fitted, n_rows=n_rows, tests=tests)
+
+
+def find_disagreements(fit: RoughFit, labels: Sequence[str]) -> Disagreements:
+    """The measurements that disagree with the arm as drawn.
+
+    Args:
+        fit: What most rows say.
+        labels: Names of the tables.
+    """
+    flagged: list[Disagreement] = []
+    n = total = 0
+    with one_blas_thread:
+        chains = _arm(fit.problem, fit.robot, fit.parameters)
+        for noise, d in zip(fit.noises, fit.distances, strict=True):
+            s = noise.series
+            if not s.kind.ends:  # distances of touched points follow from the arm through these alone
                 continue
-            share = of[noise.series.table] / max(chosen[noise.series.table].measurements.n_configurations, 1)
+            share = fit.n_rows[s.table] / max(len(fit.tests[s.table]), 1)
             n, total = n + int(np.sum(d > 0.0)), total + round(share * float(np.sum(d > 0.0)))
-            bad = np.flatnonzero(_are_far(d, noise.series.used.sum(axis=1)))
-            covariance = _covariance(noise, _arm(problem, robot, parameters)[noise.series.table], robot)
-            given = tables[noise.series.table].measurements
-            flagged += _described(problem, noise, covariance, (d, bad), (labels, given))
+            bad = np.flatnonzero(_are_far(d, s.used.sum(axis=1)))
+            covariance = _covariance(noise, chains[s.table], fit.robot)
+            flagged += _described(fit, noise, covariance, (d, bad), labels[s.table])
     if len(flagged) > MOST_FEW * max(n, 1):
         flagged = []
     return Disagreements(tuple(sorted(flagged, key=lambda one: -one.ratio)), n, total)
 
 
-def _looked_at(table: Table) -> tuple[Table, int]:
-    """A table with all its rows as test rows, by which the arm is evaluated as it is, and how many rows it has."""
+def _looked_at(table: Table) -> tuple[Table, int, Booleans]:
+    """Some rows of a table, all as test rows, by which the arm is evaluated as it is; how many it has; which are."""
     m, n = table.measurements, table.measurements.n_configurations
     model, frame, pairs = table.model, table.frame, m.pairs
     if table.uses_pairs and pairs is None and m.groups is None:
@@ -149,13 +193,13 @@ def _looked_at(table: Table) -> tuple[Table, int]:
     elif n > MOST_ROWS and not own and m.groups is None and not (table.uses_pairs and pairs is not None):
         rows = _evenly(n)
         m = replace(m if m.part is not None else replace(m, part=np.arange(n))).select(rows)
-    m = replace(m, test=np.ones(m.n_configurations, np.bool_))
+    test, m = m.test, replace(m, test=np.ones(m.n_configurations, np.bool_))
     if m.pairs is not None:
         m = replace(m, pairs=replace(m.pairs, test=np.ones(m.pairs.n_pairs, np.bool_)))
     if m.groups is not None:
         between = m.groups.pairs
         m = replace(m, groups=replace(m.groups, pairs=replace(between, test=np.ones(between.n_pairs, np.bool_))))
-    return replace(table, measurements=m, model=model, frame=frame, own=own), n
+    return replace(table, measurements=m, model=model, frame=frame, own=own), n, test
 
 
 def _of_poses(m: Measurements, table: Table) -> Model | None:
@@ -178,14 +222,11 @@ def _arm(problem: Problem, robot: Robot, parameters: Floats) -> list[Chain]:
     return [chain.at(values) for chain in every.chains]
 
 
-def _fitted(problem: Problem, robot: Robot) -> tuple[Floats, list[RowNoise], list[Floats]]:
-    """What is unknown fitted with weights: the parameter vector, the rows there, and the distance of each measurement.
-
-    Distances are per row and over the typical one; 0 for measurements that take no part.
-    """
+def _fitted(problem: Problem, robot: Robot) -> tuple[Floats, tuple[RowNoise, ...], tuple[Floats, ...]]:
+    """What is unknown fitted with weights: parameters, noises and distances of a `RoughFit`."""
     parameters = problem.start
     for last in range(_ROUNDS):
-        noises = list(noises_at(problem, parameters))
+        noises = noises_at(problem, parameters)
         chains = _arm(problem, robot, parameters)
         distances, weights = [], []
         for noise in noises:
@@ -201,10 +242,10 @@ def _fitted(problem: Problem, robot: Robot) -> tuple[Floats, list[RowNoise], lis
             break
         problem = reweighted_at(problem, parameters, replace(problem.state, weights=tuple(weights)))
         parameters = placed(problem)
-    return parameters, noises, distances
+    return parameters, noises, tuple(distances)
 
 
-def _typical(z: Floats, used: NDArray[np.bool_]) -> float:
+def _typical(z: Floats, used: Booleans) -> float:
     """The typical distance over what noise and tolerances make of it, so that what is `FAR` times it is far.
 
     Args:
@@ -228,51 +269,41 @@ def _covariance(noise: RowNoise, chain: Chain, robot: Robot) -> Floats:
     return out
 
 
-def _are_far(d: Floats, n_rows: Integers) -> NDArray[np.bool_]:
+def _are_far(d: Floats, n_rows: Integers) -> Booleans:
     """Which distances, per row, are too far for chance, shape (n,)."""
     n = max(int(np.sum(n_rows > 0)), 1)
     limit = special.chdtri(np.maximum(n_rows, 1), CHANCE / n) / np.maximum(n_rows, 1)
-    far: NDArray[np.bool_] = d**2 > np.maximum(limit, FAR**2)
+    far: Booleans = d**2 > np.maximum(limit, FAR**2)
     return far
 
 
 def _described(
-    problem: Problem,
-    noise: RowNoise,
-    covariance: Floats,
-    found: tuple[Floats, Integers],
-    named: tuple[Sequence[str], Measurements],
+    fit: RoughFit, noise: RowNoise, covariance: Floats, found: tuple[Floats, Integers], label: str
 ) -> list[Disagreement]:
     """What is to be said of some measurements of a series.
 
     Args:
-        problem: The problem.
+        fit: What most rows say.
         noise: The series' rows.
         covariance: Of each measurement's rows by noise and tolerances.
         found: Distances of all, and which are far.
-        named: Names of the tables, and the table as it was given.
+        label: Name of their table.
     """
-    s, (d, bad), (labels, given) = noise.series, found, named
+    s, (d, bad), data = noise.series, found, fit.problem.data
     kinds = np.array([name.partition(".")[0] for name in s.kind.names])
     units = dict(zip(kinds.tolist(), s.kind.units, strict=True))
     r = np.where(s.used, noise.residual(), 0.0)
     variance = np.einsum("nii->ni", covariance)
-    place, names, out = problem.data.places[s.table], problem.data.names, []
+    part, out = data.tables[s.table].measurements.part, []
     for k in bad.tolist():
         sizes = {kind: float(np.linalg.norm(r[k, kinds == kind])) for kind in units}
         expected = {kind: float(np.sqrt(np.sum(variance[k, kinds == kind]))) for kind in units}
         kind = max(units, key=lambda kind: sizes[kind] / expected[kind])
-        part = problem.data.tables[s.table].measurements.part
-        row = int(s.ends[k, 0]) if s.kind.ends == 1 else -1
-        row = int(part[row]) if part is not None and row >= 0 else row
-        unknown = problem.data.unknowns.owners[s.nuisances[k, :1]] + problem.data.n_configurations
-        ends = place[s.ends[k]] if s.kind.ends else unknown
+        here = int(s.ends[k, 0]) if s.kind.ends == 1 else -1
+        row = int(part[here]) if part is not None and here >= 0 else here
+        ends = tuple(data.names[i] for i in data.places[s.table][s.ends[k]].tolist())
         of = s.of.names[s.of.index[k]] if s.of is not None and s.of.index[k] >= 0 else ""
-        test = bool(given.test[s.ends[k]].any()) if s.kind.ends and len(given.test) == len(place) else False
-        out.append(
-            Disagreement(
-                *(labels[s.table], tuple(names[i] for i in ends.tolist()), of, row, kind, units[kind]),
-                *(sizes[kind], expected[kind], float(d[k]), test),
-            )
-        )
+        test = bool(fit.tests[s.table][s.ends[k]].any())
+        figures = (sizes[kind], expected[kind], float(d[k]), test)
+        out.append(Disagreement(label, ends, of, row, kind, units[kind], *figures))
     return out

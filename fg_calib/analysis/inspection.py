@@ -6,7 +6,7 @@ cautions are what its reader should know, as in the verdict on a calibration.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fg_calib.analysis.accuracy import ExpectedError, expected_error
 from fg_calib.analysis.covariance import spread_of, with_left_out
-from fg_calib.analysis.disagreement import Disagreements, find_disagreements
+from fg_calib.analysis.disagreement import Disagreements, find_disagreements, fit_roughly
 from fg_calib.analysis.identifiability import Identifiability, identifiability_of
 from fg_calib.analysis.mistakes import SetupCheck
 from fg_calib.analysis.reasons import NOT_EXCITED
@@ -29,6 +29,7 @@ from fg_calib.graph.problem import Problem, tables_of
 from fg_calib.graph.solver import Solution
 from fg_calib.job import Job
 from fg_calib.measurements.limits import outside_limits
+from fg_calib.measurements.series import Table
 from fg_calib.robot.model import Robot
 from fg_calib.threads import single_threaded
 
@@ -148,14 +149,7 @@ def inspect_job(job: Job) -> Inspection:
     """
     problem = problem_of(job)
     tables = tables_of(job.measurements, job.options)
-    labels = problem.data.labels if len(tables) > 1 else ("",)
-    before = (problem.whole or problem).start
-    every, setups = check_tables(
-        replace(problem, robot=job.robot) if problem.evaluated else problem, before, placed=True
-    )
-    disagreements = Disagreements((), 0, 0)
-    if not any(check.explanations for check in setups):
-        disagreements = find_disagreements(job.robot, tables, labels)
+    every, setups, disagreements = _of_set_up(problem, job, tables)
     at_nominal = _unsolved(problem)
     spread = spread_of(at_nominal)
     expected = None if problem.evaluated else expected_error(at_nominal, with_left_out(at_nominal, spread))
@@ -166,7 +160,7 @@ def inspect_job(job: Job) -> Inspection:
         joints=_joints(problem, job.robot),
         setups=tuple(next((s for s in setups if s.table == check.table), check) for check in every),
         disagreements=disagreements,
-        identifiability=identifiability_of(problem.whole or problem, before, "practical"),
+        identifiability=identifiability_of(problem.whole or problem, problem.start, "practical"),
         expected_error=expected,
         n_residuals=problem.n_residuals,
         n_priors=problem.n_priors,
@@ -179,6 +173,22 @@ def inspect_job(job: Job) -> Inspection:
     )
     findings, cautions = _judged(found, job, setups)
     return replace(found, findings=findings, cautions=cautions)
+
+
+def _of_set_up(
+    problem: Problem, job: Job, tables: Sequence[Table]
+) -> tuple[list[SetupCheck], list[SetupCheck], Disagreements]:
+    """The set-up of each table, those that have something to say of it, and rows that disagree with the others.
+
+    Where a mistake in the set-up was found single rows are not looked for: all disagree.
+    """
+    fit = fit_roughly(job.robot, tables)
+    whole = problem.whole or problem
+    judged = replace(whole, robot=job.robot) if problem.evaluated else whole
+    every, setups = check_tables(judged, whole.start if fit is None else fit.start(whole), placed=True)
+    if fit is None or any(check.explanations for check in setups):
+        return every, setups, Disagreements((), 0, 0)
+    return every, setups, find_disagreements(fit, problem.data.labels if len(tables) > 1 else ("",))
 
 
 def _unsolved(problem: Problem) -> Solution:
@@ -252,7 +262,7 @@ def _of_figures(found: Inspection) -> Iterator[str]:
             yield f"{joint.name} is outside its limits in {joint.n_outside} configurations: is it in another unit?"
     o = found.identifiability.observability
     if o.names and not o.rank:
-        yield "these rows determine none of the parameters: the configurations differ too little, or noise is too large"
+        yield "these rows determine none of the parameters that are estimated"
     if found.dof <= 0:
         yield "no degree of freedom is left: nothing would say whether the fit is right, or the noise; measure more"
 
@@ -275,9 +285,11 @@ def _of_readings(found: Inspection, job: Job) -> Iterator[str]:
 def _of_table(t: TableSurvey) -> Iterator[str]:
     """What the rows of a table give reason to say."""
     if t.n_copies:
-        yield f"{t.name}: {t.n_copies} rows are exact copies of others ({t.copy}): they count as often as they stand"
+        what = "one row is an exact copy" if t.n_copies == 1 else f"{t.n_copies} rows are exact copies"
+        yield f"{t.name}: {what} of another ({t.copy}): what was copied counts as often as it stands there"
     if t.n_leaked:
-        yield f"{t.name}: {t.n_leaked} test rows are at configurations of train rows: they do not check a prediction"
+        what = "one test row is" if t.n_leaked == 1 else f"{t.n_leaked} test rows are"
+        yield f"{t.name}: {what} at configurations of train rows: no check of a prediction"
     if t.n_pairs and t.n_folded > LEAST_FOLDED * t.n_pairs:
         yield (
             f"{t.name}: {t.n_folded} of {t.n_pairs} train pairs are so near 0 or half a turn that tolerances let their"
@@ -287,7 +299,7 @@ def _of_table(t: TableSurvey) -> Iterator[str]:
 
 def _of_noise(found: Inspection, job: Job) -> Iterator[str]:
     if job.options.estimate_noise:
-        yield "noise is to be estimated: sigmas and accuracy below are for noise as stated, or 1 mm and 1 mrad"
+        yield "noise is to be estimated: sigmas and accuracy here are for noise as stated, or 1 mm and 1 mrad"
     unseen = [t.name for t, check in zip(found.tables, found.setups, strict=False) if not check.residuals]
     if unseen and len(found.setups) == len(found.tables):
         yield f"{_listed(unseen)}: too few rows to look for the usual mistakes (units, signs, columns) before solving"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from fg_calib.graph.noise import PairNoise
 from fg_calib.graph.problem import Problem
-from fg_calib.measurements.dataset import Measurements
+from fg_calib.measurements.dataset import Measurements, Pairs
 from fg_calib.measurements.series import Table
 
 Floats = NDArray[np.float64]
@@ -37,9 +38,9 @@ class TableSurvey:
         n_test_pairs: Test pairs.
         n_residuals: Scalar residuals of the fit, by kind.
         labels: How many stations, targets, anchors, planes, boards or touched points it names, by what they are.
-        n_copies: Rows that are the same as one before them in every figure.
-        copy: Two rows that are the same; empty without.
-        n_repeats: Rows at the readings of one before them, with other figures: they tell of the noise.
+        n_copies: Rows, or measured pairs, that are the same as one before them in every figure.
+        copy: Two that are the same; empty without.
+        n_repeats: Those at the readings of one before them, with other figures: they tell of the noise.
         n_near: Configurations within `NEAR` of another, but not the same.
         n_leaked: Test rows at, or within `NEAR` of, a configuration of train rows.
         n_near_kink: Train pairs within `NEAR_KINK` sigma of 0 or, an angle, of half a turn.
@@ -73,7 +74,7 @@ def survey_of(problem: Problem, number: int, table: Table) -> TableSurvey:
         table: The table, with the test rows that it states.
     """
     m = table.measurements
-    copies, repeats = _same_rows(m) if m.pairs is None or not table.uses_pairs else (np.zeros((0, 2), np.int64), 0)
+    copies, copy, repeats = _same_pairs(m, m.pairs) if table.uses_pairs and m.pairs is not None else _same_rows(m)
     near, leaked = _neighbours(m)
     kink, folded = _near_kinks(problem, number)
     series = [s for s in problem.data.series if s.table == number]
@@ -94,8 +95,8 @@ def survey_of(problem: Problem, number: int, table: Table) -> TableSurvey:
         n_test_pairs=len({k for s in of_pairs for k in s.number[s.test].tolist()}),
         n_residuals=n_residuals,
         labels=labels | ({} if m.groups is None else {"touched point": m.groups.n_groups}),
-        n_copies=len(copies),
-        copy=" and ".join(m.ids[copies[0]].tolist()) if len(copies) else "",
+        n_copies=copies,
+        copy=copy,
         n_repeats=repeats,
         n_near=near,
         n_leaked=leaked,
@@ -104,19 +105,37 @@ def survey_of(problem: Problem, number: int, table: Table) -> TableSurvey:
     )
 
 
-def _same_rows(m: Measurements) -> tuple[Integers, int]:
-    """Rows that equal an earlier one, with that one, shape (n, 2), and how many have its readings but other figures."""
-    figures = [m.position, m.rotation, m.length, m.image]
+def _same_rows(m: Measurements) -> tuple[int, str, int]:
+    """How many rows equal an earlier one, names of two, and how many have its readings but other figures."""
     columns = [m.readings, *(of.index[:, None] for of in m.labels.values())]
     columns += [] if m.groups is None else [m.groups.index[:, None]]
     columns += [] if m.image is None else [m.image[:, 2:]]
-    same_place = _first_like(np.hstack(columns))
+    figures = [m.position, m.rotation, m.length, m.image]
     measured = [v.reshape(m.n_configurations, -1) for v in figures if v is not None]
-    same = _first_like(np.hstack([*columns, *(np.nan_to_num(v, nan=-1e300) for v in measured)]))
-    rows = np.arange(m.n_configurations)
+    return _same(np.hstack(columns), measured, m.ids)
+
+
+def _same_pairs(m: Measurements, pairs: Pairs) -> tuple[int, str, int]:
+    """The same of measured pairs, whichever end is a."""
+    a, b = np.sort(np.stack([pairs.a, pairs.b]), axis=0)
+    names = np.array([f"{m.ids[i]}-{m.ids[j]}" for i, j in zip(a.tolist(), b.tolist(), strict=True)])
+    return _same(np.stack([a, b], axis=1).astype(np.float64), [np.stack([pairs.distance, pairs.angle], axis=1)], names)
+
+
+def _same(places: Floats, measured: Sequence[Floats], names: NDArray[np.str_]) -> tuple[int, str, int]:
+    """How many rows equal an earlier one, names of two, and how many have its place but other figures.
+
+    Args:
+        places: Where each row was measured, shape (n, k).
+        measured: What was, shape (n, width) each; nan where not.
+        names: Of the rows.
+    """
+    rows = np.arange(len(places))
+    same = _first_like(np.hstack([places, *(np.nan_to_num(v, nan=-1e300) for v in measured)]))
     copied = np.flatnonzero(same != rows) if measured else rows[:0]
-    repeats = int(np.sum(same_place != rows)) - len(copied)
-    return np.stack([same[copied], copied], axis=1), repeats
+    repeats = int(np.sum(_first_like(places) != rows)) - len(copied)
+    two = [str(names[same[copied[0]]]), str(names[copied[0]])] if len(copied) else []
+    return len(copied), " and ".join(dict.fromkeys(two)), repeats
 
 
 def _first_like(rows: Floats) -> Integers:

@@ -218,13 +218,24 @@ def test_copies_of_rows_are_told_from_repeats(arm):
     again = m.select(np.array([*range(50), 3]))
     again = replace(again, ids=np.arange(51).astype(str), test=np.append(m.test, False))
     found = inspected(arm, again)
-    assert found.cautions == (
-        "measurements: 1 rows are exact copies of others (3 and 50): they count as often as they stand",
-    )
+    (caution,) = found.cautions
+    assert caution.startswith("measurements: one row is an exact copy of another (3 and 50): what was copied counts")
     assert (found.tables[0].n_copies, found.tables[0].n_repeats) == (1, 0)
     repeated = inspected(arm, replace(again, position=plus(again.position, [50], 1e-5)))
     assert said(repeated) == ()
     assert (repeated.tables[0].n_copies, repeated.tables[0].n_repeats) == (0, 1)
+
+
+def test_copies_of_measured_pairs_are_told_of():
+    simulation = simulate(scenario(INSTRUMENTS["pairs"], n=40), seed=0)
+    (table,) = simulation.tables
+    m = table.measurements
+    again = m.pairs.select(np.array([*range(m.pairs.n_pairs), 3]))
+    again = replace(again, a=np.append(again.a[:-1], again.b[3]), b=np.append(again.b[:-1], again.a[3]))
+    twice = replace(table, measurements=replace(m, pairs=again))
+    (survey,) = inspect_job(Job(None, simulation.robot, (twice,), Options())).tables
+    assert (survey.n_copies, survey.n_repeats) == (1, 0)
+    assert survey.copy == f"{m.ids[m.pairs.a[3]]}-{m.ids[m.pairs.b[3]]}"
 
 
 def test_several_targets_at_one_configuration_are_no_repeats():
@@ -238,7 +249,7 @@ def test_test_rows_at_train_configurations_are_told_of(arm):
     q[[41, 42]] = q[[1, 2]] + 5e-4
     found = inspected(arm, measured(arm, readings=q))
     assert found.cautions == (
-        "measurements: 2 test rows are at configurations of train rows: they do not check a prediction",
+        "measurements: 2 test rows are at configurations of train rows: no check of a prediction",
     )
     assert found.tables[0].n_near == 4
 
@@ -317,6 +328,14 @@ def test_configurations_that_are_all_the_same_determine_nothing(arm):
     assert found.identifiability.observability.rank < 6
 
 
+def test_a_job_whose_rows_determine_nothing_is_not_ready():
+    """Lengths alone are to be estimated, and turns alone were measured."""
+    robot = Robot.from_dh([[0.5, 0.2, 0.1, 0]] * 3, "dh", tolerance={"a": 1e-3}).with_estimated(["a1", "a2"])
+    found = inspected(robot, measured(robot, placed=None), "orientation", "known")
+    assert found.identifiability.observability.rank == 0
+    assert found.findings == ("these rows determine none of the parameters that are estimated",)
+
+
 def test_as_many_unknowns_as_rows_leave_nothing_to_judge_by():
     robot = Robot.from_dh([[0.5, 0, 0, 0], [0.4, 0, 0, 0]], "dh").with_estimated(["a1", "a2", "theta1"])
     at = pose(robot, [[0.3, 1.0]])
@@ -330,7 +349,7 @@ def test_as_many_unknowns_as_rows_leave_nothing_to_judge_by():
 def test_noise_to_be_estimated_is_told_of(arm):
     found = inspected(arm, measured(arm), estimate_noise=True)
     assert found.cautions == (
-        "noise is to be estimated: sigmas and accuracy below are for noise as stated, or 1 mm and 1 mrad",
+        "noise is to be estimated: sigmas and accuracy here are for noise as stated, or 1 mm and 1 mrad",
     )
 
 
@@ -345,3 +364,25 @@ def test_the_repr_fits_a_screen(arm):
     lines = repr(inspected(arm, MISTAKES["x, y, z are in mm, not m"](measured(arm)))).splitlines()
     assert lines[1].startswith("  LOOK AT THIS FIRST: position residuals fall")
     assert max(map(len, lines)) <= 100
+
+
+@pytest.mark.parametrize("frames", [("known", "known"), ("unknown", "known")])
+def test_a_base_and_a_tool_that_are_far_from_nominal_are_no_mistake_where_they_are_estimated(frames):
+    """Also with several tables, which are compared at the base and the tool that they say together."""
+    estimate = ["base.x", "base.y", "base.z", "base.roll", "base.pitch", "base.yaw", "tool.x", "tool.y", "tool.z"]
+    true = small_arm({"a": 2e-3, "d": 2e-3, "alpha": 4e-3, "theta": 4e-3}, estimate=estimate)
+    rng = np.random.default_rng(3)
+    off = [0.05 * rng.normal() * (p.name in estimate) for p in true.parameters]
+    nominal, true = true.with_values(true.nominal + off), true_robot(true, rng)
+    tables = [
+        Table(
+            replace(
+                measure(true, 30, rng, sigma=SIGMA, frame=PLACED if frame == "unknown" else None), source=f"{k}.csv"
+            ),
+            "position",
+            frame=frame,
+        )
+        for k, frame in enumerate(frames)
+    ]
+    found = inspect_job(Job(None, nominal, tuple(tables), Options()))
+    assert found.findings == ()
