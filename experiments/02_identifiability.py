@@ -171,12 +171,18 @@ def draw(spectra: dict[str, dict[str, Floats]], names: Sequence[str]) -> Figure:
         label = f"{model}: {int(np.sum(ratio > 0.5))} kept by the prior alone"
         left.semilogy(np.arange(1, len(ratio) + 1), ratio, marker, color=colour, label=label, fillstyle="none")
         right.semilogx(values["posterior"], np.arange(len(names)), marker, color=colour, label=model, fillstyle="none")
-    left.set(xlabel="direction", ylabel="posterior over prior variance", title="Eigenvalues")
+    left.set(
+        xlabel="number of the combination of parameters",
+        ylabel="variance left by the measurements (1: they say nothing)",
+        title="What measurements say of combinations",
+    )
     left.legend(loc="center left", bbox_to_anchor=(0.0, 0.75), frameon=False)
     right.set_yticks(np.arange(len(names)), names, fontsize=8)
     right.invert_yaxis()
     right.grid(axis="y", color="0.9")
-    right.set(xlabel="posterior over prior sigma", title="Parameters: at 1 the data say nothing")
+    right.set(
+        xlabel="sigma left by the measurements, over the tolerance", title="... and of parameters: at 1 they say nothing"
+    )
     for axes in (left, right):
         axes.spines[["top", "right"]].set_visible(False)
     return figure

@@ -555,30 +555,34 @@ def draw(found: dict[str, Any]) -> Figure:
     y = np.arange(len(cells))
     low, high = np.array([row["nees_bounds"] for row in cells]).T
     nees.margins(x=0.08)
-    nees.barh(y, high - low, left=low, height=0.7, color="0.85", label="99 % bounds")
-    nees.plot([row["nees"] for row in cells], y, "o", color=COLOURS[0], label="NEES over its degrees of freedom")
+    nees.barh(y, high - low, left=low, height=0.7, color="0.85", label="what chance allows (99 %)")
+    nees.plot([row["nees"] for row in cells], y, "o", color=COLOURS[0], label="found")
     nees.axvline(1.0, color="0.5", lw=0.8)
     nees.set_yticks(
         y, [f"{r['arm']}, {r['way']}{', encoder noise' if r['encoder'] else ''}" for r in cells], fontsize=8
     )
     nees.invert_yaxis()
-    nees.set_title(f"NEES, {found['n_draws']} calibrations each")
-    coverage.axvspan(*(100 * np.array(COVERAGE)), color="0.85", label="limits")
+    nees.set_title(f"Squared error over that claimed (1 is honest), {found['n_draws']} draws")
+    coverage.axvspan(*(100 * np.array(COVERAGE)), color="0.85", label="accepted")
     for of, colour, marker in zip(("parameters", "kept", "tool"), COLOURS, "os^", strict=False):
         label = {"kept": "kept combinations", "tool": "tool positions"}.get(of, of)
         values = [100 * row["coverage"][of] for row in cells]
         coverage.plot(values, y, marker, color=colour, label=label, fillstyle="none")
-    coverage.set_title("Coverage of 95 % intervals, %")
+    coverage.set_title("How often 95 % intervals hold the truth [%]")
     for axes in (nees, coverage):
         axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.06), ncols=4, frameon=False)
     panels = bottom.subplots(1, 3)
-    shown = (("nees", "NEES"), ("tool", "Coverage of tool positions, %"), ("warned", "Results that warn, %"))
+    shown = (
+        ("nees", "The same with larger noise (UR10)"),
+        ("tool", "How often 95 % intervals hold the true tool [%]"),
+        ("warned", "Results that warn [%]"),
+    )
     for axes, (what, title) in zip(panels, shown, strict=True):
         for (name, rows), colour, marker in zip(found["breaking"].items(), COLOURS, "os^D", strict=False):
             values = [100 * r["coverage"]["tool"] if what == "tool" else r[what] * (1 if what == "nees" else 100)
                       for r in rows]  # fmt: skip
             axes.plot([r["noise"] for r in rows], values, f"{marker}-", color=colour, label=name, fillstyle="none")
-        axes.set(xscale="log", xlabel="noise, multiple", title=title)
+        axes.set(xscale="log", xlabel="noise, times the ordinary", title=title)
         axes.set_xticks(NOISE, [str(n) for n in NOISE])
         axes.minorticks_off()
     panels[0].axhline(1.0, color="0.5", lw=0.8)
