@@ -181,7 +181,8 @@ def draw(spectra: dict[str, dict[str, Floats]], names: Sequence[str]) -> Figure:
     right.invert_yaxis()
     right.grid(axis="y", color="0.9")
     right.set(
-        xlabel="sigma left by the measurements, over the tolerance", title="... and of parameters: at 1 they say nothing"
+        xlabel="sigma left by the measurements, over the tolerance",
+        title="... and of parameters: at 1 they say nothing",
     )
     for axes in (left, right):
         axes.spines[["top", "right"]].set_visible(False)
