@@ -168,8 +168,6 @@ def find_disagreements(fit: RoughFit, labels: Sequence[str]) -> Disagreements:
         chains = _arm(fit.problem, fit.robot, fit.parameters)
         for noise, d in zip(fit.noises, fit.distances, strict=True):
             s = noise.series
-            if not s.kind.ends:  # distances of touched points follow from the arm through these alone
-                continue
             share = fit.n_rows[s.table] / max(len(fit.tests[s.table]), 1)
             n, total = n + int(np.sum(d > 0.0)), total + round(share * float(np.sum(d > 0.0)))
             bad = np.flatnonzero(_are_far(d, s.used.sum(axis=1)))
@@ -301,9 +299,12 @@ def _described(
         kind = max(units, key=lambda kind: sizes[kind] / expected[kind])
         here = int(s.ends[k, 0]) if s.kind.ends == 1 else -1
         row = int(part[here]) if part is not None and here >= 0 else here
-        ends = tuple(data.names[i] for i in data.places[s.table][s.ends[k]].tolist())
+        unknowns = data.n_configurations + np.unique(data.unknowns.owners[s.nuisances[k]])
+        ends = data.places[s.table][s.ends[k]] if s.kind.ends else unknowns
         of = s.of.names[s.of.index[k]] if s.of is not None and s.of.index[k] >= 0 else ""
         test = bool(fit.tests[s.table][s.ends[k]].any())
         figures = (sizes[kind], expected[kind], float(d[k]), test)
-        out.append(Disagreement(label, ends, of, row, kind, units[kind], *figures))
+        out.append(
+            Disagreement(label, tuple(data.names[i] for i in ends.tolist()), of, row, kind, units[kind], *figures)
+        )
     return out
