@@ -155,7 +155,7 @@ def replacing(path: Path) -> Iterator[Path]:
         raise InputError(str(path), f"there is no folder {path.parent}")
     within = None
     try:
-        within = Path(mkdtemp(prefix=_BESIDE, dir=path.parent))
+        within = _made_in(path.parent, _BESIDE)
         yield within / path.name
         (within / path.name).replace(path)
     except OSError as error:
@@ -205,7 +205,7 @@ def fill_folder(folder: Path, write: Callable[[Path], None], own: Mapping[str, b
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _clear_dead(folder)
-        temporary = Path(mkdtemp(prefix=f"{_WRITING}{_here()}-", dir=folder))
+        temporary = _made_in(folder, f"{_WRITING}{_here()}-")
         write(temporary)
         names = [file.name for file in temporary.iterdir()]
         for name in names:
@@ -235,6 +235,11 @@ def fill_folder(folder: Path, write: Callable[[Path], None], own: Mapping[str, b
         if temporary is not None:
             shutil.rmtree(temporary, ignore_errors=True)
             _remove_empty(missing)
+
+
+def _made_in(folder: Path, prefix: str) -> Path:
+    """A new folder in another, by the other's own path: one that leads there from the root need not be open to us."""
+    return folder / Path(mkdtemp(prefix=prefix, dir=folder)).name
 
 
 def require_writable(folder: Path) -> None:

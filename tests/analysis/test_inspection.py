@@ -48,8 +48,8 @@ def said(found):
 # --- healthy jobs ----------------------------------------------------------------------------------------------------
 
 
-def test_the_bundled_example_is_ready_and_nothing_is_to_be_said_of_it(example):
-    found = inspect_job(read_job(example / "calibration.yaml"))
+def test_the_bundled_example_is_ready_and_nothing_is_to_be_said_of_it(whole_example):
+    found = inspect_job(read_job(whole_example / "calibration.yaml"))
     assert found.ready
     assert said(found) == ()
     (table,) = found.tables

@@ -160,7 +160,7 @@ def test_a_cell_that_cannot_be_used_is_named(model, text, message, tmp_path):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"fx": 1}, "camera.yaml: missing key 'fy'"),
+        ({"fx": 1}, "camera.yaml: missing keys 'fy', 'cx', 'cy'"),
         (INTRINSICS | {"fx": -1}, "camera.yaml: fx: found -1, expected 1 to 1e+06 px"),
         (INTRINSICS | {"fx": 1e300}, "camera.yaml: fx: found 1e+300, expected a number no larger than 1e+15"),
         (INTRINSICS | {"fy": True}, "camera.yaml: fy: found True, expected a finite number"),

@@ -197,7 +197,7 @@ MISTAKES = {
     "base:\n  x: 1\n  x: 2\n": "robot.yaml:3: key 'x' stands here twice",
     "1: 2\n": "robot.yaml:1: key 1, expected a word",
     "[1]: 2\n": "robot.yaml:1: key that is no word, expected a word",
-    "name: a\n": "robot.yaml: missing key 'convention' (and 1 more)",
+    "name: a\n": "robot.yaml: missing keys 'convention', 'joints'",
     "convention: dh\n": "robot.yaml: missing key 'joints'",
     f"convension: dh\njoints:\n{ROW}": (
         f"robot.yaml: unknown key 'convension', expected {KEYS}; did you mean convention?"

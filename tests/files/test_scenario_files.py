@@ -201,7 +201,7 @@ def with_board(more):
 
 MISTAKES = [
     ("", S + "an empty file, expected a mapping, key: value"),
-    ("robot: robot.yaml\n", S + "missing key 'errors' (and 2 more)"),
+    ("robot: robot.yaml\n", S + "missing keys 'errors', 'configurations', 'noise'"),
     (SHORT + "eror: 1\n", S + f"unknown key 'eror', expected {KEYS}; did you mean errors?"),
     (SHORT.replace("robot.yaml", "[]"), S + "robot: found [], expected a path, or the mapping of a robot file"),
     (with_errors("{}"), S + "errors: found none, expected one of uniform, normal, values"),

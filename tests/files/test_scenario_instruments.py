@@ -150,7 +150,7 @@ MISTAKES = [
     ("{model: rotation, sockets: 2}", f"{S} 1: model: found 'rotation', expected one of distance"),
     ("{model: pixels}", f"{S} 1: camera: found none with model pixels, expected it with model pixels"),
     ("{model: board, " + CORNERS + "}", f"{S} 1: corners: found one with model board, expected it with model pixels"),
-    ("{model: pixels, camera: {fx: 1}, " + CORNERS + "}", f"{S} 1: camera: missing key 'fy' (and 2 more)"),
+    ("{model: pixels, camera: {fx: 1}, " + CORNERS + "}", f"{S} 1: camera: missing keys 'fy', 'cx', 'cy'"),
     ("{model: pixels, " + CAMERA + ", corners: {columns: 0, rows: 1, square: 1}}",
      f"{S} 1: corners: columns: found 0, expected a number above 0"),
     ("{model: pixels, " + CAMERA + ", " + CORNERS + ", frame: {x: 1}}",
