@@ -106,7 +106,7 @@ def calibrate_job(job: Job | Path | str) -> Calibration:
     tell("judging the result")
     uncertainty = assess(solution)
     if given.options.folds is not None:
-        uncertainty = uncertainty.with_folds(cross_validate(given, given.options.folds), given.options.accept)
+        uncertainty = uncertainty.with_folds(cross_validate(given, given.options.folds), solution)
     return Calibration.of(solution, uncertainty, given.inputs)
 
 

@@ -156,7 +156,7 @@ def test_what_is_loaded_says_what_was_saved(found, tmp_path, name):
     result = found[name]
     result.save(tmp_path)
     again = Calibration.load(tmp_path)
-    assert again.result == result.result
+    assert again.result.model_copy(update={"files": {}}) == result.result
     assert again.parameters == result.parameters
     assert np.array_equal(again.covariance(), result.covariance(), equal_nan=True)
     assert again.robot.nominal == pytest.approx(result.robot.nominal, abs=1e-15)

@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from fg_calib.analysis.residual_table import HeldOut
+from fg_calib.analysis.residual_table import HeldOut, pooled
 from fg_calib.options import Limits
 
 Verdict = Literal["pass", "fail", "not evaluated"]
@@ -35,6 +35,7 @@ class Judgement:
         n: Number of measurements held out.
         verdict: Whether the arm keeps to it.
         reason: Why that was not evaluated; empty where it was.
+        table: Which table it is of; empty where there is one alone.
     """
 
     kind: str
@@ -44,6 +45,7 @@ class Judgement:
     n: int
     verdict: Verdict
     reason: str = ""
+    table: str = ""
 
 
 @dataclass(frozen=True)
@@ -63,28 +65,49 @@ class Acceptance:
         return "fail" if "fail" in found else "not evaluated" if "not evaluated" in found else "pass"
 
 
-def accept(limits: Limits, held_out: Mapping[str, HeldOut], findings: Sequence[str]) -> Acceptance | None:
+Kinds = Mapping[tuple[str, str], HeldOut]
+"""What was held out, by table (empty where there is one alone) and kind of noise."""
+
+
+def accept(limits: Limits, held_out: Kinds, findings: Sequence[str]) -> Acceptance | None:
     """Judge the limits of a job by what was held out; None without limits.
+
+    Tables are judged one by one: many rows of one do not make up for those of another.
 
     Args:
         limits: The limits.
-        held_out: Test rows, or those of cross-validation, by kind.
+        held_out: Test rows, or those of cross-validation.
         findings: Why the result is not to be trusted: it then passes nothing.
     """
     stated = {f.name: getattr(limits, f.name) for f in fields(limits)}
-    judged = (_judge(kind, limit, held_out.get(kind), findings) for kind, limit in stated.items() if limit is not None)
-    return Acceptance(tuple(judged)) if any(stated.values()) else None
+    judged = []
+    for kind, limit in stated.items():
+        if limit is not None:
+            parts = _parts({table: held for (table, of), held in held_out.items() if of == kind})
+            judged += [_judge(kind, table, limit, held, findings) for table, held in parts.items()]
+    return Acceptance(tuple(judged)) if judged else None
 
 
-def _judge(kind: str, limit: float, held: HeldOut | None, findings: Sequence[str]) -> Judgement:
+def _parts(held_out: Mapping[str, HeldOut]) -> dict[str, HeldOut | None]:
+    """What is judged by itself: each table with rows enough, the others together where these are enough."""
+    alone: dict[str, HeldOut | None] = {table: held for table, held in held_out.items() if held.n >= LEAST}
+    others = [held for held in held_out.values() if held.n < LEAST]
+    if others and (not alone or pooled(others).n >= LEAST):
+        alone["" if not alone else "other tables"] = pooled(others)
+    return alone or {"": None}
+
+
+def _judge(kind: str, table: str, limit: float, held: HeldOut | None, findings: Sequence[str]) -> Judgement:
     if held is None:
         return Judgement(kind, limit, None, None, 0, "not evaluated", f"no measurement of any {kind} was held out")
 
     def judgement(verdict: Verdict, reason: str = "") -> Judgement:
-        return Judgement(kind, limit, held.after, held.noise, held.n, verdict, reason)
+        return Judgement(kind, limit, held.after, held.noise, held.n, verdict, reason, table)
 
     if held.n < LEAST:
         return judgement("not evaluated", f"fewer than {LEAST} were held out")
+    if held.few:
+        return judgement("not evaluated", "frame, base or tool were fitted to these rows, which are too few for that")
     if held.after > limit:
         hidden = held.after**2 - held.noise**2 <= limit**2
         return judgement("not evaluated", "the noise of the measurements hides it") if hidden else judgement("fail")

@@ -148,7 +148,7 @@ def fit_roughly(robot: Robot, tables: Sequence[Table]) -> RoughFit | None:
     chosen, n_rows, tests = zip(*map(_looked_at, tables), strict=True)
     with one_blas_thread:
         try:
-            problem = problem_of_tables(robot, chosen, Options(gauge="none"))
+            problem = problem_of_tables(robot, [table.by_itself() for table in chosen], Options(gauge="none"))
             fitted = _fitted(problem, robot)
         except (InputError, ProblemError, SolverError, RuntimeError, np.linalg.LinAlgError):
             return None

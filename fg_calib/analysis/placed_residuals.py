@@ -24,7 +24,7 @@ from fg_calib.graph.factors import build_variables
 from fg_calib.graph.noise import RowNoise
 from fg_calib.graph.problem import Problem, noises_at, tables_of
 from fg_calib.measurements import residuals
-from fg_calib.options import Options
+from fg_calib.options import FrameKnowledge, Options
 from fg_calib.robot.kinematics import Chain, pose
 from fg_calib.robot.model import Robot
 
@@ -48,7 +48,8 @@ def _placed_residuals(setup: Setup) -> tuple[TypicalResidual, ...]:
     assert setup.table is not None
     m = setup.measurements
     m = replace(m, test=np.ones(m.n_configurations, dtype=np.bool_))  # test rows alone: the arm is taken as it is
-    table = replace(setup.table, measurements=m, frame="unknown" if setup.frame else setup.table.frame)
+    frame: FrameKnowledge = "unknown" if setup.frame else setup.table.frame
+    table = replace(setup.table, measurements=m, frame=frame).by_itself()
     robot = _with_tool(setup)
     try:
         problem = problem_of_tables(robot, tables_of(table, options := Options(gauge="none")), options)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -51,12 +52,28 @@ class HeldOut:
         before: With the nominal arm, in the kind's unit.
         after: With the calibrated arm.
         noise: Of the noise stated.
+        few: Whether they are few for the frame, base or tool that were fitted to them.
     """
 
     n: int
     before: float
     after: float
     noise: float
+    few: bool = False
+
+
+_ROWS_PER_UNKNOWN = 10
+"""Rows by which an arm is evaluated, over what was fitted to them, from which on that hardly makes them smaller."""
+
+
+def pooled(parts: Sequence[HeldOut]) -> HeldOut:
+    """Several together."""
+    n = np.array([part.n for part in parts])
+
+    def rms(of: str) -> float:
+        return float(np.sqrt(n @ np.array([getattr(part, of) for part in parts]) ** 2 / n.sum()))
+
+    return HeldOut(int(n.sum()), rms("before"), rms("after"), rms("noise"), any(part.few for part in parts))
 
 
 @dataclass(frozen=True)
@@ -84,7 +101,9 @@ class ResidualTable(FrozenArrays):
         excess: What noise adds to the measured value on average (see `moments`), at the estimate, shape (n,); the arm's
             own prediction is measured + after - excess.
         sigma: 1 sigma of the residual, shape (n,).
+        seen: Which rows are of readings that are fitted too, shape (n,).
         evaluated: Whether these are test rows, all of them, by which the arm was evaluated as it is.
+        n_fitted: Of an evaluation: unknowns of frame, base, tool and places that were fitted to them.
     """
 
     kinds: tuple[RowKind, ...]
@@ -106,7 +125,9 @@ class ResidualTable(FrozenArrays):
     after: Floats
     excess: Floats
     sigma: Floats
+    seen: Booleans
     evaluated: bool = False
+    n_fitted: int = 0
 
     @property
     def split(self) -> Codes:
@@ -216,15 +237,22 @@ class ResidualTable(FrozenArrays):
         rows = summed(np.ones(self.n), whole).astype(np.int64)
         return rows, summed((self.after / self.sigma) ** 2, whole), rms
 
-    def held_out(self) -> dict[str, HeldOut]:
-        """Test rows that count, by kind of noise; kinds without any are left out."""
+    def held_out(self, labels: Sequence[str]) -> dict[tuple[str, str], HeldOut]:
+        """Test rows that count, by table and kind of noise; where there are none there is nothing.
+
+        Rows at readings that are fitted too are none of them: the estimate has seen the arm there.
+
+        Args:
+            labels: Of the tables; a single one has none here.
+        """
         found, first = {}, self._is_first_of_family()
-        for k, family in enumerate(self.families):
-            rows = (self.reason_code == 0) & (self.split == 1) & (self.family == k)
+        for k, (number, family) in enumerate(self.groups):
+            rows = (self.reason_code == 0) & (self.split == 1) & ~self.seen & (self.group == k)
             n = int(np.sum(rows & first))
             if n:
-                rms = (float(np.sqrt(np.sum(v[rows] ** 2) / n)) for v in (self.before, self.after, self.sigma))
-                found[family] = HeldOut(n, *rms)
+                rms = [float(np.sqrt(np.sum(v[rows] ** 2) / n)) for v in (self.before, self.after, self.sigma)]
+                few = bool(np.sum(rows) < _ROWS_PER_UNKNOWN * self.n_fitted)
+                found[labels[number] if len(labels) > 1 else "", family] = HeldOut(n, rms[0], rms[1], rms[2], few)
         return found
 
     def _is_first_of_family(self) -> Booleans:
@@ -282,9 +310,32 @@ def residual_table(solution: Solution) -> ResidualTable:
         names=problem.data.names,
         labels=tuple(labels),
         reasons=tuple(reasons),
+        seen=_seen(problem.data.readings, together) & (not problem.evaluated),
         evaluated=problem.evaluated,
+        n_fitted=len(problem.variables.all_scales) if problem.evaluated else 0,
         **together,
     )
+
+
+def _seen(readings: Floats, rows: dict[str, NDArray[Any]]) -> Booleans:
+    """Which rows are of readings, at both ends, at which rows are fitted, shape (n,)."""
+    n = len(readings)
+    _, place = np.unique(np.round(readings, _DIGITS), axis=0, return_inverse=True)
+    counts = (rows["reason_code"] == 0) & ~rows["test"]
+    ends = [np.where((end >= 0) & (end < n), end, n) for end in (rows["a"], rows["b"])]
+    place = np.append(place.ravel(), n)
+    at = np.zeros(n + 1, dtype=np.bool_)
+    for end in ends:
+        at[place[end[counts]]] = True
+    at[n] = False
+    fitted = at[place]
+    there = [end < n for end in ends]
+    known = [~is_there | fitted[end] for end, is_there in zip(ends, there, strict=True)]
+    return known[0] & known[1] & (there[0] | there[1])
+
+
+_DIGITS = 9
+"""Decimals of readings, [rad] or [m], that tell configurations apart."""
 
 
 def _codes(of: Labels | None, codes: dict[str, int], n: int) -> Indices:

@@ -33,7 +33,6 @@ from fg_calib.graph.extension import check_graph
 from fg_calib.graph.factors import corrections_of, pose_of
 from fg_calib.graph.observability import IdentifiabilityClass, Observability
 from fg_calib.graph.solver import Solution
-from fg_calib.options import Limits
 from fg_calib.robot.model import Robot
 from fg_calib.threads import one_blas_thread, single_threaded
 
@@ -168,15 +167,17 @@ class Uncertainty(FrozenArrays):
     acceptance: Acceptance | None = None
     folds: Folds | None = None
 
-    def with_folds(self, folds: Folds, limits: Limits) -> Uncertainty:
+    def with_folds(self, folds: Folds, solution: Solution) -> Uncertainty:
         """The same with cross-validation, by which limits are judged that no test rows speak of.
 
         Args:
             folds: What cross-validation found.
-            limits: The limits that the user set.
+            solution: What was assessed.
         """
-        held_out = folds.kinds | self.residuals.held_out()
-        return replace(self, folds=folds, acceptance=accept(limits, held_out, self.findings))
+        tested = self.residuals.held_out(solution.problem.data.labels)
+        kinds = {kind for _, kind in tested}
+        held_out = tested | {key: held for key, held in folds.by_table.items() if key[1] not in kinds}
+        return replace(self, folds=folds, acceptance=accept(solution.problem.options.accept, held_out, self.findings))
 
     def __repr__(self) -> str:
         known = sum(p.sigma is not None for p in self.parameters if p.identifiability != "fixed")
@@ -336,7 +337,7 @@ def _assess(solution: Solution) -> Uncertainty:
         noise_like=verdict.noise_like,
         reservations=verdict.reservations,
         change=verdict.change,
-        acceptance=accept(problem.options.accept, table.held_out(), verdict.findings),
+        acceptance=accept(problem.options.accept, table.held_out(problem.data.labels), verdict.findings),
     )
 
 

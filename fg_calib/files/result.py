@@ -190,6 +190,7 @@ class Judgement(Section):
     n: Whole
     verdict: Literal["pass", "fail", "not evaluated"]
     reason: str = ""
+    table: str = ""
 
 
 class Acceptance(Section):
@@ -214,6 +215,7 @@ class Folds(Section):
     n: Whole
     n_held_out: Whole
     n_not_converged: Whole
+    of_pairs: bool = False
     kinds: dict[str, HeldOut]
     spread: dict[str, Figure]
 
@@ -361,7 +363,7 @@ class Relative(Section):
 class Lost(Section):
     """A direction that is not determined, and why."""
 
-    relation: dict[str, float]
+    relation: Annotated[dict[str, float], Field(min_length=1)]
     reason: str
 
 
@@ -386,7 +388,7 @@ class Weak(Section):
     """A direction that is determined badly."""
 
     signal_to_noise: Figure
-    members: dict[str, float]
+    members: Annotated[dict[str, float], Field(min_length=1)]
 
 
 class Observability(Section):
@@ -419,7 +421,7 @@ class Observability(Section):
 
 
 class Result(Section):
-    """What `result.json` holds; `links` are those of a URDF between which its chain runs."""
+    """What `result.json` holds; `links` are those of a URDF between which its chain runs, `files` SHA-256 of tables."""
 
     schema_: Literal["fg-calib/result/1", "fg-calib/result/2"] = Field(alias="schema")
     version: str
@@ -468,6 +470,7 @@ class Result(Section):
     observability: Observability
     options: dict[str, Any] = {}
     versions: dict[str, str] = {}
+    files: dict[str, str] = {}
     inputs: dict[str, str]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -87,7 +87,7 @@ def read_configurations(folder: Path, n_joints: int) -> SavedConfigurations | No
     joints, tool = [f"q{i + 1}" for i in range(n_joints)], [f"tool_{axis}" for axis in "xyz"]
     rms = [name for name in header.columns if name.startswith(_RMS)]
     _require(header, ["id", "split", *joints, *tool])
-    table = Table.read(header, [*joints, *tool, *rms], ["id", "split"])
+    table = _with_unknown(Table.read(header, [*joints, *tool, *rms], ["id", "split"]), rms)
     figures = table.numbers(rms, optional=True)
     return SavedConfigurations(
         ids=tuple(table.frame["id"].fill_null("").to_list()),
@@ -109,7 +109,7 @@ def read_residuals(folder: Path) -> SavedResiduals | None:
         return None
     texts = ["kind", "a", "b", "split", "excluded", "unit", "suspect", *header.present("of")]
     _require(header, [*texts, "residual", "studentised"])
-    table = Table.read(header, ["residual", "studentised"], texts)
+    table = _with_unknown(Table.read(header, ["residual", "studentised"], texts), ["residual", "studentised"])
     counts = table.frame["excluded"].is_null().to_numpy()
 
     def words(column: str) -> tuple[str, ...]:
@@ -130,6 +130,13 @@ def read_residuals(folder: Path) -> SavedResiduals | None:
         suspect=np.array(words("suspect")) == "true",
         units=tuple(units.get(str(name), "") for name in kinds),
     )
+
+
+def _with_unknown(table: Table, columns: Sequence[str]) -> Table:
+    """A table of ours, where NaN is what is not known, as an empty cell is."""
+    import polars as pl
+
+    return replace(table, frame=table.frame.with_columns(pl.col(name).fill_nan(None) for name in columns))
 
 
 def _header(file: Path) -> Header | None:

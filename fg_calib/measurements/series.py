@@ -278,6 +278,11 @@ class Table(Brief):
         """Whether its model is one of pairs."""
         return self.model in PAIR_MODELS
 
+    def by_itself(self) -> Table:
+        """The same without known places that none of its own rows is of."""
+        there = {name for labels in self.measurements.labels.values() for name in labels.names}
+        return replace(self, known={name: place for name, place in self.known.items() if name in there})
+
     @property
     def unknown_frame(self) -> bool:
         """Whether its world_T_base is estimated."""

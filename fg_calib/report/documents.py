@@ -7,6 +7,7 @@ import math
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
+from hashlib import sha256
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,7 +37,7 @@ from fg_calib.analysis.uncertainty import ParameterEstimate, Uncertainty
 from fg_calib.arguments import checked
 from fg_calib.errors import InputError
 from fg_calib.files.csv_writer import Words, write_csv_parts
-from fg_calib.files.disk import fill_folder, require_own, write_text
+from fg_calib.files.disk import fill_folder, read_bytes, require_own, write_text
 from fg_calib.files.result import (
     SCHEMA,
     Acceptance,
@@ -324,6 +325,7 @@ def _folds(uncertainty: Uncertainty) -> FoldsDocument | None:
         n=found.n,
         n_held_out=int(np.sum(found.fold >= 0)),
         n_not_converged=found.not_converged,
+        of_pairs=found.of_pairs,
         kinds={kind: HeldOut.model_validate(held) for kind, held in found.kinds.items()},
         spread=spread,
     )
@@ -617,16 +619,17 @@ def write_results(
     """
     robot = solution.problem.robot
     calibrated = robot.with_values(solution.parameters[solution.problem.variables.robot_span])
-    document = json.dumps(result_document(solution, uncertainty, inputs), indent=1, allow_nan=False) + "\n"
+    document = result_document(solution, uncertainty, inputs)
 
     def write(into: Path) -> None:
-        write_text(into / "result.json", document)
         write_calibrated_robot(into, calibrated)
         _write_residuals(into / "residuals.csv", solution, uncertainty)
         _write_configurations(into / "configurations.csv", solution, uncertainty)
         if uncertainty.joint_values is not None:
             units = [robot.joints[j].unit for j in uncertainty.joint_values.joints]
             _write_joint_values(into / "joints.csv", uncertainty.joint_values, solution.problem.end_names, units)
+        tables = {name: sha256(read_bytes(into / name)).hexdigest() for name in ("configurations.csv", "residuals.csv")}
+        write_text(into / "result.json", json.dumps(document | {"files": tables}, indent=1, allow_nan=False) + "\n")
 
     fill_folder(Path(folder), write, RESULT_FILES)
 
@@ -709,7 +712,7 @@ def _write_configurations(path: Path, solution: Solution, uncertainty: Uncertain
     tool = pose(robot, readings).position
     columns: dict[str, Any] = {
         "id": Words(data.names[:n], np.arange(n)),
-        "split": Words(("train", "test"), data.tested.astype(np.int64)),
+        "split": Words(("train", "test"), (data.tested | solution.problem.evaluated).astype(np.int64)),
         **{f"q{i + 1}": readings[:, i] for i in range(robot.n_joints)},
         **{f"tool_{axis}": tool[:, i] for i, axis in enumerate("xyz")},
         "rows": rows,

@@ -29,7 +29,8 @@ def judged(found: Iterable[Judgement | JudgementDocument]) -> list[str]:
         factor, unit, _ = SHOWN[LIMITED[one.kind]]
         error = "" if one.error is None else f" {one.error * factor:.3g} {unit} (RMS of {one.n} held-out measurements)"
         reason = f": {one.reason}" if one.reason else ""
-        lines.append(f"{one.verdict.upper()}: {one.kind}{error}, limit {one.limit * factor:.3g} {unit}{reason}")
+        of = f" of {one.table}" if one.table else ""
+        lines.append(f"{one.verdict.upper()}: {one.kind}{of}{error}, limit {one.limit * factor:.3g} {unit}{reason}")
     return lines
 
 

@@ -135,3 +135,39 @@ def test_limits_of_a_job_that_cannot_be_are_one_line(tmp_path, fg_calib, accept,
     assert (ended.code, ended.out) == (1, "")
     assert message in ended.err
     assert ended.err.count("\n") == 1
+
+
+def test_an_evaluation_by_few_rows_is_not_evaluated():
+    """Frame and tool are fitted to them: 9 unknowns and 15 figures."""
+    rng = np.random.default_rng(0)
+    robot = small_arm(tolerance={"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}, estimate=TOOL)
+    for n, verdict in ((5, "not evaluated"), (40, "pass")):
+        m = measure(robot, n, rng, sigma=(1e-3, 1e-3))
+        m = replace(m, test=np.ones(n, dtype=bool))
+        result = calibrate(robot, m, model="position", frame="unknown", accept={"position": 3e-3})
+        assert verdicts(result) == [verdict]
+
+
+def test_test_rows_at_readings_that_are_fitted_do_not_count():
+    rng = np.random.default_rng(0)
+    robot = small_arm(tolerance={"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}, estimate=TOOL)
+    q = rng.uniform(-2.0, 2.0, (30, robot.n_joints))
+    m = measure(true_robot(robot, rng), 30, rng, sigma=(1e-4, 1e-4), n_test=10, readings=np.vstack([q, q[:10]]))
+    result = calibrate(robot, m, model="pose", accept={"position": 5e-4})
+    assert verdicts(result) == ["not evaluated"]
+    assert "no measurement of any position was held out" in result.not_accepted[0]
+
+
+def test_many_rows_of_one_table_do_not_make_up_for_those_of_another():
+    rng = np.random.default_rng(0)
+    robot = small_arm(tolerance={"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}, estimate=TOOL)
+    true = true_robot(robot, rng)
+    good, bad = (
+        replace(measure(true, 40, rng, sigma=(1e-4, 1e-4), n_test=n), source=name)
+        for n, name in ((200, "good.csv"), (10, "bad.csv"))
+    )
+    bad = replace(bad, position=bad.position + 0.002 * bad.test[:, None])
+    result = calibrate(robot, [good, bad], model="position", accept={"position": 1.5e-3})
+    by_table = {one.table: one.verdict for one in result.result.acceptance.judgements}
+    assert by_table["bad.csv"] == "fail"
+    assert result.result.acceptance.verdict == "fail"

@@ -8,8 +8,9 @@ import pytest
 from instruments import measured_by
 from simulated import measure, small_arm, true_robot, write_job
 
-from fg_calib import InputError, Job, Measurements, Options, ProblemError, calibrate
-from fg_calib.analysis.folds import cross_validate, wide
+from fg_calib import InputError, Job, Measurements, Options, Own, ProblemError, calibrate
+from fg_calib.analysis.folds import _train, cross_validate, wide
+from fg_calib.measurements.kinds import Position
 from fg_calib.measurements.series import Table
 
 LARGE = {"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}
@@ -87,13 +88,13 @@ def with_measured_pairs(ends, seed=0):
     return robot, Measurements.from_arrays(m.readings, ids=m.ids, pairs=pairs)
 
 
-def test_a_measured_pair_is_held_out_with_either_end():
+def test_a_measured_pair_is_held_out_once():
     chain = [(k, k + 1) for k in range(39)] + [(k, (k + 7) % 40) for k in range(33)] + [(k, k + 3) for k in range(37)]
     robot, m = with_measured_pairs(chain)
     found = cross_validate(job_of(robot, m, model="distance"), 5)
     fold = found.fold
     assert (fold >= 0).all()
-    assert found.kinds["distance"].n == sum(len({fold[a], fold[b]}) for a, b in chain)
+    assert found.kinds["distance"].n == len(chain)  # each once, although it is fitted without neither of its ends
 
 
 def test_the_hub_of_measured_pairs_is_never_held_out():
@@ -101,6 +102,7 @@ def test_the_hub_of_measured_pairs_is_never_held_out():
     found = cross_validate(job_of(robot, m, model="distance"), 5)
     assert found.fold[0] == -1
     assert found.kinds["distance"].n == 39
+    assert found.of_pairs
 
 
 @pytest.mark.slow
@@ -192,3 +194,51 @@ def test_only_what_chance_does_not_explain_is_wide():
     assert wide({"a": 2.0, "b": 1.0}, 5) == []
     assert wide({"a": 3.0, "b": 4.0, "c": 1.0}, 5) == ["b", "a"]
     assert wide({"a": 2.0}, 30) == ["a"]
+
+
+def test_repeats_of_one_place_are_held_out_together():
+    robot, m = poses(n=20)
+    rows = np.repeat(np.arange(20), 3)
+    noise = 1e-4 * np.random.default_rng(5).normal(size=(60, 3))
+    repeated = replace(m.select(rows), ids=np.arange(60).astype(str), position=m.position[rows] + noise)
+    fold = cross_validate(job_of(robot, repeated), 5).fold
+    assert all(len(set(fold[rows == k])) == 1 for k in range(20))
+
+
+def test_an_anchor_that_few_lengths_go_to_is_never_held_out():
+    robot, _, table = measured_by("anchors", np.random.default_rng(0), n=40)
+    m = table.measurements
+    labels = m.labels["anchor"]
+    index = labels.index.copy()
+    first = np.flatnonzero(index == 0)
+    keep = np.sort(np.concatenate([first[:4], np.flatnonzero(index != 0)]))
+    few = replace(table, measurements=m.select(keep))
+    found = cross_validate(job_of(robot, few), 5)
+    of_few = few.measurements.labels["anchor"].index == 0
+    assert (found.fold[of_few] == -1).all()
+    assert (found.fold[~of_few] >= 0).all()
+    assert found.kinds["distance"].after < 3.0 * found.kinds["distance"].noise
+
+
+def test_measurements_of_ones_own_are_refused():
+    robot, m = poses()
+    own = Own(Position(), data=m.position, sigma=1e-3)
+    with pytest.raises(InputError, match="folds: measurements of one's own"):
+        cross_validate(job_of(robot, Table(m, "pose", own=(own,))), 5)
+
+
+def test_test_rows_alone_have_nothing_to_hold_out():
+    robot, m = poses(n=20)
+    with pytest.raises(InputError, match="folds: test rows alone"):
+        cross_validate(job_of(robot, replace(m, test=np.ones(20, dtype=bool))), 5)
+
+
+def test_distances_of_points_touched_in_another_table_stay():
+    _, m = poses(n=40)
+    touches = Measurements.from_arrays(m.readings, group=np.repeat(["a", "b"], 20), sigma_point=1e-3)
+    pairs = {"a": ["a"], "b": ["b"], "distance": [0.4], "sigma_distance": [1e-4]}
+    given = {"position": m.position[:1], "sigma_position": 1e-3, "pairs": pairs, "points": ["a", "b"]}
+    between = Measurements.from_arrays(m.readings[:1], **given)
+    first, second = _train((Table(touches, "distance"), Table(between, "distance")))
+    assert second.measurements.groups.pairs.n_pairs == 1
+    assert first.measurements.groups.n_groups == 2

@@ -13,10 +13,10 @@ from instruments import measured_by
 from lxml import etree, html
 from simulated import measure, plus, small_arm, true_robot, write_job
 
-from fg_calib import Robot, calibrate, write_report
+from fg_calib import Measurements, Robot, Table, calibrate, write_report
 from fg_calib.pages import load_run
-from fg_calib.report.page.arm import link_points
-from fg_calib.report.page.charts import Scale, limits_of
+from fg_calib.report.page.arm import link_points, scene
+from fg_calib.report.page.charts import Scale, limits_of, short
 from fg_calib.report.page.files import FIGURES
 from fg_calib.robot.kinematics import pose
 
@@ -223,6 +223,10 @@ def test_damaged_tables_are_one_line(folder, tmp_path, fg_calib, file, change, m
     text = (tmp_path / "result" / file).read_text()
     (tmp_path / "result" / file).write_text(text.replace(*change, 1))
     (tmp_path / "result" / "report.html").unlink()
+    other = fg_calib("report", tmp_path / "result")
+    assert other.err.startswith(f"error: {tmp_path / 'result' / file}: changed, or of another calibration")
+    result = json.loads((tmp_path / "result" / "result.json").read_text())
+    (tmp_path / "result" / "result.json").write_text(json.dumps(result | {"files": {}}))  # as older ones are
     ended = fg_calib("report", tmp_path / "result")
     assert ended.code == 1
     assert ended.err.startswith(f"error: {message}")
@@ -303,3 +307,35 @@ def test_a_run_knows_what_it_is_of(folder):
     run = load_run(folder / "result.json")
     assert run.folder == folder
     assert (run.judged_on, run.family, run.free_of_frame, run.command) == ("test", "position", True, None)
+
+
+def test_several_tables_and_touched_points_have_a_page(tmp_path):
+    """A configuration may have no row of a kind."""
+    rng = np.random.default_rng(2)
+    robot, true, anchors = measured_by("anchors", rng, n=30)
+    tables = [anchors, Table(measure(true, 30, rng, sigma=(1e-4, 1e-4)), "position")]
+    calibrate(robot, tables).save(tmp_path / "tables")
+    write_report(tmp_path / "tables", figures=True)
+    q = np.repeat(rng.uniform(-1.0, 1.0, (6, robot.n_joints)), 4, axis=0) + 0.2 * rng.normal(size=(24, robot.n_joints))
+    touched = Measurements.from_arrays(q, group=np.repeat(["a", "b"], 12), sigma_point=1e-2)
+    calibrate(robot, touched, model="distance").save(tmp_path / "touched")
+    write_report(tmp_path / "touched")
+    for name in ("tables", "touched"):
+        assert tuple(html.parse(str(tmp_path / name / "report.html")).xpath("//section/h2/text()")) == TITLES
+
+
+def test_an_evaluation_says_that_it_is_one(tmp_path):
+    rng = np.random.default_rng(0)
+    robot = small_arm(tolerance=LARGE, estimate=("tool.x", "tool.y", "tool.z"))
+    m = measure(robot, 30, rng)
+    calibrate(robot, replace(m, test=np.ones(30, dtype=bool)), model="position", frame="unknown").save(tmp_path)
+    write_report(tmp_path)
+    words = text_of(html.parse(str(tmp_path / "report.html")))
+    assert "Evaluated only: all rows are test rows" in words
+    assert "the estimate never saw them" not in words
+    assert {item["test"] for item in scene(load_run(tmp_path))["items"]} == {True}
+
+
+def test_long_names_keep_what_tells_them_apart():
+    assert short("shoulder_pan_joint.x") == "should…joint.x"
+    assert short("theta7") == "theta7"

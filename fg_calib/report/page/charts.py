@@ -207,7 +207,7 @@ def whiskers(rows: Sequence[Whisker], about: str, name: str) -> Element:
 
 def _draw_whisker(svg: Element, x: Scale, y: float, row: Whisker) -> None:
     name, value, sigma, tolerance = row
-    add(svg, tag("text", _short(name), x=_NAMES - 6.0, y=y + 3.5, class_="tick end"))
+    add(svg, tag("text", short(name), x=_NAMES - 6.0, y=y + 3.5, class_="tick end"))
     if np.isfinite(tolerance):
         left, right = x(-tolerance), x(tolerance)
         add(svg, tag("rect", x=left, y=y - 6.0, width=right - left, height=12.0, class_="band"))
@@ -224,10 +224,10 @@ def matrix(names: Sequence[str], values: Floats, about: str) -> Element:
     svg = tag("svg", tag("title", about), viewBox=f"0 0 {figure(width)} {figure(width)}", role="img")
     for i, name in enumerate(names):
         y = 2.0 + cell * (i + 1)
-        add(svg, tag("text", _short(name), x=side - 4.0, y=y - 3.5, class_="tick end"))
+        add(svg, tag("text", short(name), x=side - 4.0, y=y - 3.5, class_="tick end"))
         x, foot = side + cell * (i + 0.5) + 3.0, 6.0 + cell * n
         turned = f"rotate(-90 {figure(x)} {figure(foot)})"
-        add(svg, tag("text", _short(name), x=x, y=foot, class_="tick end", transform=turned))
+        add(svg, tag("text", short(name), x=x, y=foot, class_="tick end", transform=turned))
         for j in range(i):
             rho = values[i, j]
             if np.isfinite(rho) and abs(rho) > 0.02:
@@ -257,5 +257,6 @@ def _label(value: float) -> str:
     return text.replace("-", "\N{MINUS SIGN}")
 
 
-def _short(name: str, most: int = 14) -> str:
-    return name if len(name) <= most else f"{name[: most - 1]}…"
+def short(name: str, most: int = 14) -> str:
+    """A name in few characters: its end tells it from others, such as `.x`."""
+    return name if len(name) <= most else f"{name[: most - 8]}…{name[-7:]}"

@@ -22,6 +22,7 @@ from fg_calib.report.page.charts import (
     colour,
     limits_of,
     matrix,
+    short,
     whiskers,
 )
 from fg_calib.report.page.markup import add, figure, tag
@@ -77,7 +78,7 @@ def error_over_joints(run: Run) -> list[Figure]:
         turned, of_reading, _ = SHOWN[joint.unit]
         q = found.readings[:, i] * turned
         about = f"{family} residual over the reading of {joint.name}"
-        names = f"{joint.name} [{of_reading}]", f"{family} residual [{unit}]"
+        names = f"{short(joint.name, 40)} [{of_reading}]", f"{family} residual [{unit}]"
         chart = Chart(limits_of(q), limits_of(rms, with_zero=True), names, about)
         chart.dots(q[~found.test], rms[~found.test], "a")
         chart.dots(q[found.test], rms[found.test], "b")
@@ -99,7 +100,7 @@ def arm_ranges(workspace: Workspace) -> Figure:
         low, high = min(ends), max(ends)
         scale, y = Scale(low, high if high > low else low + 1.0, left, WIDTH - 10.0), TOP + row * i
         factor, unit, _ = SHOWN[joint.unit]
-        add(svg, tag("text", joint.name, x=left - 6.0, y=y + 10.0, class_="tick end"))
+        add(svg, tag("text", short(joint.name), x=left - 6.0, y=y + 10.0, class_="tick end"))
         add(svg, tag("rect", x=left, y=y, width=WIDTH - 10.0 - left, height=12.0, class_="band"))
         start, end = scale(joint.range[0]), scale(joint.range[1])
         add(svg, tag("rect", x=start, y=y + 3.0, width=max(end - start, 1.0), height=6.0, class_="after"))

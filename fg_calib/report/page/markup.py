@@ -58,9 +58,18 @@ def data(name: str, document: Any) -> Element:
     from lxml import etree
 
     element = etree.Element("script", {"type": "application/json", "id": name})
-    text = json.dumps(document, allow_nan=False, separators=(",", ":"))
+    text = json.dumps(_printable(document), allow_nan=False, separators=(",", ":"))
     element.text = text.replace("<", "\\u003c").replace("&", "\\u0026")
     return element
+
+
+def _printable(document: Any) -> Any:
+    """A document whose texts steer nothing."""
+    if isinstance(document, dict):
+        return {key: _printable(value) for key, value in document.items()}
+    if isinstance(document, list):
+        return [_printable(value) for value in document]
+    return escaped(document) if isinstance(document, str) else document
 
 
 def as_html(root: Element) -> str:

@@ -138,8 +138,11 @@ def _arm(run: Run) -> Element | None:
     words = (
         "Drag to turn it; click a dot or move the slider for another configuration. Dots are where the tool was"
         f" measured (squares: held out); their {family} residual goes from dark ({found['low']:.3g} {unit}) to bright"
-        f" ({found['high']:.3g} {unit})."
+        f" ({found['high']:.3g} {unit} and more)."
     )
+    of = 0 if run.configurations is None else len(run.configurations.ids)
+    if len(found["items"]) < of:
+        words += f" {len(found['items'])} of {of} configurations are shown, the worst among them."
     canvas = tag("canvas", id="arm", tabindex="0", role="img", aria_label="The arm in three dimensions")
     canvas.set("data-ramp", json.dumps(RAMP))
     slider = tag("input", id="arm-slider", type="range", min="0", value="0", aria_label="Configuration")

@@ -38,6 +38,8 @@ def verdict(run: Run) -> list[Element]:
     """Whether the arm is good enough, and whether the figures are to be trusted."""
     result = run.result
     parts = []
+    if result.evaluated_only:
+        parts.append(tag("p", "Evaluated only: all rows are test rows, nothing of the arm was calibrated."))
     if result.acceptance is not None:
         word = {"pass": "PASS", "fail": "FAIL"}.get(result.acceptance.verdict, "NOT EVALUATED")
         kind = {"pass": "pass", "fail": "fail"}.get(result.acceptance.verdict, "open")
@@ -64,7 +66,12 @@ def tiles(run: Run) -> Element:
     """The few figures that count."""
     result, split = run.result, run.judged_on
     rows = "held out" if run.held_out else "fitted (none were held out)"
+    rows = "of an evaluation" if result.evaluated_only else rows
     found = []
+    for family, held in (result.folds.kinds if result.folds is not None and not run.held_out else {}).items():
+        unit = run.unit(family)
+        words = f"{family}, held out by cross-validation; before: {_shown(held.before, unit)}"
+        found.append((_shown(held.after, unit), words))
     for family, rms in result.residual_rms.get(split, {}).items():
         if rms is not None and ", table" not in family:
             words = f"{family}, rows {rows}; before: {_shown(rms.before, run.unit(family))}"
@@ -78,18 +85,23 @@ def tiles(run: Run) -> Element:
             found.append((_shown(value, unit), f"tool {kind} error expected from the covariance, {where} (RMS)"))
     known = sum(p.sigma is not None for p in result.parameters if p.identifiability != "fixed")
     estimated = sum(p.identifiability != "fixed" for p in result.parameters)
-    found.append((f"{result.n_configurations}", "configurations measured"))
+    found.append(
+        (f"{result.n_configurations}", "configurations fitted" if not result.evaluated_only else "configurations")
+    )
     found.append((f"{known} of {estimated}", "parameters estimated with a known uncertainty"))
     return tag("div", [tag("div", tag("b", value), words, class_="tile") for value, words in found], class_="tiles")
 
 
 def accuracy(run: Run) -> list[Element]:
     """Before and after, on rows that were held out where there are any."""
-    held, fitted = (
-        "rows that were held out: the estimate never saw them",
-        "rows that were fitted, for none were held out (split: test): elsewhere the arm will do worse",
+    rows = (
+        "test rows, to which frame, base and tool alone were fitted"
+        if run.result.evaluated_only
+        else "rows that were held out: the estimate never saw them"
+        if run.held_out
+        else "rows that were fitted, for none were held out (split: test): elsewhere the arm will do worse"
     )
-    words = f"RMS residuals before and after the calibration, of {held if run.held_out else fitted}."
+    words = f"RMS residuals before and after the calibration, of {rows}."
     parts = [tag("p", f"{words} They contain the measurements' noise.")]
     return [*parts, figures([accuracy_bars(run)])]
 
@@ -319,12 +331,12 @@ def table(heading: Sequence[str], rows: Sequence[Sequence[str]], *, words: bool 
     Args:
         heading: Of each column.
         rows: Cells.
-        words: Whether the last column holds sentences.
+        words: Whether cells hold words, which wrap.
         drop: A column to leave out.
     """
 
     def cells(name: str, row: Sequence[str]) -> list[Element]:
-        kinds = ["words" if words and i == len(row) - 1 else None for i in range(len(row))]
+        kinds = ["words" if words else None for _ in row]
         chosen = [(cell, kind) for i, (cell, kind) in enumerate(zip(row, kinds, strict=True)) if i != drop]
         return [tag(name, cell, class_=kind) for cell, kind in chosen]
 
