@@ -37,7 +37,7 @@ from fg_calib.files.result import Result
 from fg_calib.report.guide import TOPICS, read_page
 from fg_calib.robot.kinematics import pose
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PAGES = {"README": ROOT / "README.md"} | {path.stem: path for path in sorted((ROOT / "docs").glob("*.md"))}
 GENERATED = ("job", "robot", "tables")
 COMMANDS = typer.main.get_command(app).commands
