@@ -14,6 +14,12 @@ JOB = "calibration.yaml"
 NUMBER = (int, float)
 
 
+@pytest.fixture(autouse=True)
+def width(monkeypatch):
+    """As wide as a pipe: where tests run in parallel, COLUMNS is that of the terminal or 80."""
+    monkeypatch.setenv("COLUMNS", "100")
+
+
 @pytest.fixture
 def job(tmp_path):
     """`job(change)`: a healthy job of 50 poses, but for what `change` does to the measurements."""

@@ -10,6 +10,7 @@ from fg_calib.files.pairs import PAIR_COLUMNS
 from fg_calib.files.reference import SECTIONS, TABLE_COLUMNS, keys_of, kind_of
 from fg_calib.files.schema import Schema
 from fg_calib.files.tables import KNOWN
+from fg_calib.report.guide import TOPICS
 from fg_calib.report.reference import reference_markdown
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -83,7 +84,9 @@ def test_a_kind_is_told_by_its_type():
 def test_help_without_a_topic_lists_the_topics(fg_calib):
     ended = fg_calib("help")
     assert ended.code == 0
-    assert all(f"fg-calib help {topic}" in ended.out for topic in ("job", "robot", "tables"))
+    *topics, last = ended.out.splitlines()
+    assert [line.split()[2] for line in topics] == list(TOPICS)
+    assert last == "fg-calib COMMAND --help says what a command does"
 
 
 def test_help_of_a_topic_has_every_key_and_fits_a_terminal(fg_calib, monkeypatch):
@@ -96,4 +99,8 @@ def test_help_of_a_topic_has_every_key_and_fits_a_terminal(fg_calib, monkeypatch
 
 
 def test_help_of_nothing_known_is_wrong_usage(fg_calib):
-    assert fg_calib("help", "jobs").code == 2
+    ended = fg_calib("help", "jobs")
+    assert (ended.code, ended.out, ended.err.count("\n")) == (2, "", 1)
+    assert ended.err.startswith("error: TOPIC: found 'jobs', expected one of tutorial, files, job, robot, tables, ")
+    assert ended.err.endswith("; did you mean job?\n")
+    assert "\x1b" not in fg_calib("help", "\x1b[31m").err

@@ -1,20 +1,14 @@
-"""The report: its whole text for a problem one can draw, its width, and the README's code."""
+"""The report: its whole text for a problem one can draw, and its width."""
 
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
-from scipy.spatial.transform import Rotation
 from simulated import measure, plus, small_arm, true_robot
 from sparing import most_slow
 
-import fg_calib
 from fg_calib import (
     Job,
     Measurements,
@@ -29,13 +23,8 @@ from fg_calib import (
     observe_structure,
     solve,
 )
-from fg_calib.cli.entry import app
-from fg_calib.files.result import Result
 from fg_calib.options import Options
-from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Joint, Robot, RobotBuilder
-
-README = Path(__file__).resolve().parents[2] / "README.md"
 
 
 def planar_arm(tolerance=None) -> Robot:
@@ -274,104 +263,6 @@ def test_a_row_without_room_is_a_paragraph(long_reports):
         f"{name} estimate {estimate} ± sigma {sigma} {unit} correction {correction} nominal {nominal} prior {prior} "
         f"class {kind}" in found
     )
-
-
-def names_of_commands():
-    """Options of all commands as they are typed."""
-    for command in typer.main.get_command(app).commands.values():
-        for option in command.params:
-            yield from (name for name in option.opts if name.startswith("--"))
-
-
-NAMES = {
-    "keys of result.json": [f.alias or name for name, f in Result.model_fields.items()],
-    "functions": [name for name in fg_calib.__all__ if name.islower()],
-    "options": [*names_of_commands()],
-}
-
-
-@pytest.mark.parametrize("what", NAMES)
-def test_the_readme_names_all_that_a_user_may_meet(what):
-    words = set(re.findall(r"[\w-]+", README.read_text()))
-    assert [name for name in NAMES[what] if name not in words] == []
-
-
-def readme_code(heading):
-    """The first code of a section of the README."""
-    section = README.read_text().split(heading)[1]
-    return re.search(r"```python\n(.*?)```", section, flags=re.S).group(1)
-
-
-def run_in(folder, code):
-    ended = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code], cwd=folder, capture_output=True, text=True, check=False
-    )
-    assert (ended.returncode, ended.stderr) == (0, "")
-    return ended.stdout.splitlines()
-
-
-@pytest.mark.slow
-def test_the_readme_has_a_kind_of_ones_own(tmp_path):
-    code = readme_code("### A kind of measurement of your own\n")
-    made = {}
-    exec("from fg_calib import Robot\n" + code[code.index("tolerance = ") : code.index("result = ")], made)
-    rng, post = np.random.default_rng(4), np.array([1.1, 0.4, -0.2])
-    q = rng.uniform(-np.pi, np.pi, (40, 3))
-    p = pose(true_robot(made["robot"], rng), q).position
-    np.save(tmp_path / "q.npy", q)
-    np.save(tmp_path / "lengths.npy", np.linalg.norm(p - post, axis=1) + 2e-4 * rng.normal(size=40))
-    (line,) = run_in(tmp_path, code)
-    found = np.array([float(x) for x in re.findall(r"[-+.e\d]+", line)]).reshape(2, 3)
-    assert np.all(np.abs(found[0] - post) < 6 * found[1])
-    assert np.all(found[1] < 0.01)
-
-
-@pytest.mark.slow
-def test_the_readme_extends_the_graph(tmp_path):
-    code = readme_code("### Extend the graph\n")
-    made = {}
-    exec("from fg_calib import Robot\n" + code[code.index("tolerance = ") : code.index("data = ")], made)
-    rng = np.random.default_rng(5)
-    m = measure(true_robot(made["robot"], rng), 30, rng, sigma=(1e-4, 1e-4))
-    np.save(tmp_path / "q.npy", m.readings)
-    np.save(tmp_path / "p.npy", m.position)
-    message, expanded = run_in(tmp_path, code)
-    assert message.startswith("converged: ")
-    plain = assess(solve(build_problem(made["robot"], replace(m, rotation=None), model="position")))
-    assert int(message.split()[-1]) == plain.dof + 4 + 1  # the prior's rows, and the distance
-    size, error, cost = map(float, expanded.split())
-    assert size == 30 + 3 + 2  # measurements, priors of three joints, what was added
-    assert error == pytest.approx(cost, rel=1e-9)
-
-
-@pytest.mark.slow
-def test_the_readme_calibrates_from_arrays(tmp_path):
-    """As a user runs it, in an interpreter of its own, on a tracker's positions of an arm like its own."""
-    code = readme_code("## In Python\n")
-    made = {}
-    exec(code[: code.index("q, p = ")], made)  # its robot
-    rng = np.random.default_rng(3)
-    frame = (Rotation.from_rotvec([0.1, 0.2, -0.7]), np.array([2.0, 1.0, 0.3]))
-    m = measure(true_robot(made["robot"], rng), 50, rng, sigma=(1e-4, 1e-4), frame=frame)
-    np.save(tmp_path / "q.npy", m.readings)
-    np.save(tmp_path / "p.npy", m.position)
-    ended = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
-    assert (ended.returncode, ended.stderr) == (0, "")
-    assert ended.stdout.startswith("robot: position, measurement frame unknown\nGOOD: ")
-    assert [line for line in ended.stdout.splitlines() if line in {"Fit statistics", "Parameters", "Notes"}] == [
-        "Fit statistics",
-        "Parameters",
-        "Notes",
-    ]
-    sigma = re.search(r"^-0\.6\d+ (\S+)$", ended.stdout, flags=re.M).group(1)
-    assert ended.stdout.splitlines()[-1] == sigma
-    assert {f.name for f in (tmp_path / "result").iterdir()} == {
-        "result.json",
-        "residuals.csv",
-        "robot_calibrated.yaml",
-    }
 
 
 # --- the poses behind suspicious pairs -------------------------------------------------------------------------------

@@ -1,13 +1,10 @@
 """What simulated instruments measure: against 4x4 products without noise, noise by statistics, jobs by running."""
 
-import re
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from oracle import tool_pose
 from scenarios import CAMERA, EXACT, GRID, INSTRUMENTS, SIGMA, TOLERANCE, WALL, scenario
 from scipy.spatial.transform import Rotation
@@ -28,7 +25,6 @@ from fg_calib.simulation.instruments import (
     Tracker,
 )
 
-README = Path(__file__).resolve().parents[2] / "README.md"
 EVERY = pytest.mark.parametrize("which", INSTRUMENTS)
 
 
@@ -312,21 +308,6 @@ def test_a_plain_scenario_has_a_table_too():
     assert (table.model, table.pairing, table.frame) == ("distance", Pairing("random", 30, 2), "unknown")
     assert table.measurements is s.measurements
     assert s.truth == {}
-
-
-@pytest.mark.slow
-def test_the_scenario_of_the_readme_runs(fg_calib, tmp_path):
-    """With the robot of its own pages, a UR10."""
-    (text,) = re.findall(r"```yaml\n([^`]*\ninstruments:\n[^`]*)```", README.read_text())
-    (tmp_path / "scenario.yaml").write_text(text)
-    rows = [[0, 90, 127.3], [-612, 0, 0], [-572.3, 0, 0], [0, 90, 163.9], [0, -90, 115.7], [0, 0, 92.2]]
-    joints = [dict(zip(("a", "alpha", "d"), row, strict=True)) | {"theta": 0, "beta": 0} for row in rows]
-    tolerance = {"a": 1, "d": 1, "alpha": 0.05, "theta": 0.05, "beta": 0.05}
-    robot = {"convention": "dh-hayati", "joints": joints, "tool": {"z": 100}, "tolerance": tolerance}
-    robot["units"] = {"length": "mm", "angle": "deg"}
-    (tmp_path / "robot.yaml").write_text(yaml.safe_dump(robot))
-    assert fg_calib("simulate", tmp_path / "scenario.yaml", "--out", tmp_path / "job").code == 0
-    assert fg_calib("calibrate", tmp_path / "job" / "calibration.yaml").code == 0
 
 
 # --- what cannot be ---------------------------------------------------------------------------------------------------
