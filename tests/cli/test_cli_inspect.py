@@ -34,12 +34,6 @@ def job(tmp_path):
     return written
 
 
-@pytest.fixture(autouse=True)
-def usual_width(monkeypatch):
-    """As wide as a page: workers of pytest-xdist have the width of the terminal that started them."""
-    monkeypatch.setenv("COLUMNS", "100")
-
-
 def changed(folder, **keys):
     """The example's job with some keys changed."""
     path = folder / JOB
