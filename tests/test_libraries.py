@@ -34,6 +34,7 @@ def ended(folder, **variables):
 FILES = [("cache_dir: of-a-stranger", "text.usetex: True"), ("a: [", b"\xff".decode("latin-1"))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("numba", "matplotlib"), most_slow(FILES, every=2))
 def test_files_of_the_current_folder_set_nothing(tmp_path, numba, matplotlib):
     (tmp_path / ".numba_config.yaml").write_text(numba)
@@ -54,6 +55,7 @@ WRONG = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "value", "expected"), most_slow(WRONG, every=3))
 def test_a_wrong_environment_is_one_line(tmp_path, name, value, expected):
     assert ended(tmp_path, **{name: value}) == (expected, "")

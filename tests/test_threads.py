@@ -93,12 +93,12 @@ def everything(job, threads, processors, seed="0"):
 
 
 @pytest.mark.long
-def test_every_bit_is_the_same_on_one_thread_and_on_several(example):
+def test_every_bit_is_the_same_on_one_thread_and_on_several(whole_example):
     """With joint noise, so that all pairs share errors: the dense algebra that BLAS would spread over its threads.
 
     All pairs of 162 poses, where they count as independent, are more than one task of the pool.
     """
-    job, table = example / "calibration.yaml", example / "poses.csv"
+    job, table = whole_example / "calibration.yaml", whole_example / "poses.csv"
     table.write_text("".join(table.read_text().splitlines(keepends=True)[:163]))
     job.write_text(re.sub("joint: [0-9.]+", "joint: 0.005", job.read_text()))
     m = read_job(job).measurements
@@ -124,7 +124,7 @@ def test_every_byte_of_the_files_is_the_same_again(example):
         files = {file.name: file.read_bytes() for file in (example / command[-1]).iterdir()}
         files["result.json"] = re.sub(rb'"seconds": [0-9.e-]+', b'"seconds": 0', files["result.json"])
         written.append(files)
-    assert len(written[0]) == 3
+    assert len(written[0]) == 4
     assert written[0] == written[1] == written[2]
 
 

@@ -134,12 +134,16 @@ def _corrections(solution: Solution, spread: Spread) -> tuple[tuple[str, ...], F
     return tuple(names), np.concatenate([z, z_places]), A, len(z_places)
 
 
+_NO_CORRECTION = 1e50
+"""Corrections in tolerances beyond which nothing is left but the rounding of a fit that went far astray."""
+
+
 def _beyond(names: tuple[str, ...], z: Floats, A: Floats, n_parameters: int) -> Iterator[Beyond]:
     """Corrections that are too large, each without the priors of those before it."""
     left = {name: np.array([i for i, other in enumerate(names) if other == name]) for name in names}
     level = -np.expm1(np.log1p(-ALARM) / len(left))
     rest, C = z, A
-    while left:
+    while left and np.abs(rest).max() < _NO_CORRECTION:
         found = []
         for name, rows in left.items():
             values, V = np.linalg.eigh(C[np.ix_(rows, rows)])

@@ -62,6 +62,7 @@ def test_outliers_are_no_change(row):
         assert find_change(solve(problem_of(robot, spoilt, "position"))) is None
 
 
+@pytest.mark.slow
 def test_the_last_few_rows_alone_are_no_change():
     """Four rows after a bump are fewer than a change needs: they are outliers, and no other row is where it moved."""
     for seed in range(3):

@@ -176,6 +176,7 @@ def test_a_bad_fit_says_first_what_the_convention_lacks(tmp_path, fg_calib, mode
     assert result["observability"]["missing"][0]["axes"] == [2, 3, 4]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", most_slow([only(2, 1e-3), only(5, 2e-3)], every=2))
 def test_what_the_convention_lacks_is_no_finding_where_something_else_is_wrong(tmp_path, fg_calib, error):
     """A gear ratio that is off: the convention that has the parameter would not fit any better."""
@@ -270,6 +271,7 @@ def test_noise_is_not_offered_to_be_estimated_where_residuals_follow_the_arm(tmp
     assert "the noise there is" not in words(ended.out)
 
 
+@pytest.mark.slow
 def test_a_wrong_encoder_reading_is_not_offered_as_noise(tmp_path, fg_calib):
     """Noise that is estimated hides it; the loss that is offered beside the suspicious rows does not."""
     m = measure(true_robot(ur5e(tmp_path), np.random.default_rng(0)), 60, np.random.default_rng(1), sigma=(5e-5, 1e-4))

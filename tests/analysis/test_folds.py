@@ -70,6 +70,7 @@ def test_what_few_configurations_know_of_is_spread_over_the_folds(instrument):
     assert all(held.after < 3.0 * held.noise for held in found.kinds.values())
 
 
+@pytest.mark.slow
 def test_who_alone_knows_of_a_station_is_never_held_out():
     robot, _, table = measured_by("targets stations", np.random.default_rng(0), n=20)
     m = table.measurements
@@ -97,6 +98,7 @@ def test_a_measured_pair_is_held_out_once():
     assert found.kinds["distance"].n == len(chain)  # each once, although it is fitted without neither of its ends
 
 
+@pytest.mark.slow
 def test_the_hub_of_measured_pairs_is_never_held_out():
     robot, m = with_measured_pairs([(0, k) for k in range(1, 40)])
     found = cross_validate(job_of(robot, m, model="distance"), 5)

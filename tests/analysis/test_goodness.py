@@ -165,6 +165,7 @@ def test_studentised_residuals_of_fitted_and_predicted_rows_have_a_variance_of_o
         assert np.mean(values) == pytest.approx(1.0, abs=4 * np.std(values) / np.sqrt(40))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "wrong"), diagonal(["star", "all", "pose"], [0, 7]))
 def test_a_configuration_wrong_by_50_sigma_is_the_first_suspect(name, wrong):
     rng = np.random.default_rng(4)
@@ -231,6 +232,7 @@ def test_noise_stated_wrong_by_two_is_found(name):
     assert np.all(logs.std(axis=0) < 0.35)
 
 
+@pytest.mark.slow
 def test_estimated_noise_gives_each_kind_the_sum_of_squares_it_expects():
     rng = np.random.default_rng(9)
     robot = small_arm(tolerance=TOLERANCE)
@@ -264,6 +266,7 @@ def noise_estimated_from(name, stated):
     return stated * np.array(list(factors_of(solution).values()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "wrong"),
     most_slow(
@@ -527,6 +530,7 @@ def test_touches_of_a_point_that_is_their_mean_share_its_noise():
     assert goodness.leverage[row] == pytest.approx((J @ C @ J + 2 * SIGMA**2 / n) / sigma**2, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_the_only_touch_of_a_point_is_met_whatever_was_measured():
     rng = np.random.default_rng(23)
     robot = small_arm(tolerance=TOLERANCE | {"tool": 5e-3}, estimate=TOOL_POINT)

@@ -169,6 +169,7 @@ def test_labels_exchanged_at_one_stop_are_outliers_of_that_stop():
     assert found.goodness.gross.names == ("c7",)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 5])
 def test_a_loud_table_with_outliers_is_both(n):
     rng = np.random.default_rng(8)

@@ -212,6 +212,7 @@ def test_a_row_out_of_line_is_named_although_tolerances_would_allow_it(tmp_path)
     assert said(inspected(ur5e(tmp_path, tolerance=loose), m)) == ()
 
 
+@pytest.mark.slow
 def test_a_wrong_distance_of_touched_points_is_named_by_these():
     simulation = simulate(scenario(INSTRUMENTS["sockets"], n=30), seed=1)
     (table,) = simulation.tables

@@ -65,6 +65,7 @@ def sides(problem, parameters, normals):
     return [np.sign((place["F", f"p{i}"] - place["C", f"p{i}"]) @ n) for i, n in enumerate(normals)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reading", [1e-4, 1e-3])
 def test_planes_with_readings_below_what_the_arm_is_off_by_get_their_normals_right(reading):
     """Some are wrong after the descent from nominal; chi-square and the arm's error within 99.9 %."""

@@ -182,6 +182,7 @@ TWO = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("two", [as_case((two,), is_slow=i in (0, 2)) for i, two in enumerate(TWO)], ids=" and ".join)
 def test_two_mistakes_at_once_are_named(tmp_path, two):
     robot = ur5e(tmp_path)
@@ -237,6 +238,7 @@ def test_a_mistake_in_the_robot_is_named(tmp_path, model, mistake):
     assert mistake in named(check)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", most_slow(["position", "pose", "orientation"], every=3))
 def test_a_forgotten_unknown_frame_is_named(tmp_path, fg_calib, model):
     job = write_job(tmp_path, measured(ur5e(tmp_path), placed=PLACED), model=model)
@@ -275,6 +277,7 @@ def test_one_slide_of_two_in_another_unit_is_named(factor, unit):
     assert named(check) == f"readings of joint 2 are in {unit}"
 
 
+@pytest.mark.slow
 def test_one_thing_is_not_said_to_be_in_two_units(tmp_path):
     """Two changes of the same unit explain what one does: 10 is 1000 / 100."""
     robot = ur5e(tmp_path)
@@ -340,6 +343,7 @@ def test_sockets_whose_distance_is_in_another_unit_are_named(tmp_path):
     assert named(check_setup(job.robot, job.measurements, "distance")) == "distances are in mm, not m"
 
 
+@pytest.mark.slow
 def test_the_mistake_stands_first_in_report_and_result(tmp_path, fg_calib):
     m = measured(ur5e(tmp_path), placed=PLACED)
     job = write_job(tmp_path, replace(m, position=m.position * 1e3), model="pose", frame="unknown")
@@ -362,6 +366,7 @@ def test_the_mistake_stands_first_in_report_and_result(tmp_path, fg_calib):
     assert after < 0.01
 
 
+@pytest.mark.slow
 def test_what_no_usual_mistake_explains_is_said_plainly(tmp_path, fg_calib):
     m = measured(ur5e(tmp_path))
     shuffled = replace(m, position=m.position[::-1], rotation=m.rotation[::-1])
@@ -461,6 +466,7 @@ def test_real_poses_raise_no_alarm(data_folder, tmp_path):
         assert check.explanations == ()
 
 
+@pytest.mark.slow
 def test_more_explanations_than_are_told_are_counted(tmp_path, fg_calib):
     """In an unknown frame one wrong sign is as good as any exchange of two columns: six explain it, three are told."""
     m = measured(ur5e(tmp_path))

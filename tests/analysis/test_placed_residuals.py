@@ -93,6 +93,7 @@ def test_rows_are_drawn_so_that_every_target_and_anchor_is_there():
         assert has_places(table.measurements, table.model)
 
 
+@pytest.mark.slow
 def test_targets_in_the_frame_of_the_flange_are_named():
     rng = np.random.default_rng(3)
     rows = [[0, np.pi / 2, 0.4, 0], [0.5, 0, 0, 0], [0.1, np.pi / 2, 0, 0], [0, -np.pi / 2, 0.5, 0],

@@ -178,6 +178,7 @@ def test_components_are_those_of_the_dense_covariance(name, exact, monkeypatch):
     assert found.products == pytest.approx(products, rel=rel)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pose", "frame unknown"])
 def test_factors_are_the_most_likely_ones(name):
     """Restricted maximum likelihood by Nelder-Mead on the dense linear model: the least of it is at the factors."""

@@ -216,6 +216,7 @@ def with_distances(m, distance):
     return replace(m, groups=replace(m.groups, pairs=replace(m.groups.pairs, distance=distance)))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_mistakes")
 @pytest.mark.parametrize("mistake", ["distance", "labels"])
 def test_touched_points_that_do_not_fit_are_named(fg_calib, tmp_path, mistake):
@@ -278,6 +279,7 @@ def test_tolerances_stated_too_small_for_all_are_a_finding():
     assert any("tolerances stated too small" in finding for finding in found.findings)
 
 
+@pytest.mark.slow
 def test_sockets_that_are_not_as_far_apart_as_stated_are_a_finding(fg_calib, tmp_path):
     """12 % too far apart: the arm grows until its tolerances protest, and every residual is small."""
     rng = np.random.default_rng(34)
@@ -496,6 +498,7 @@ def test_the_expected_tool_error_is_the_real_one(model, frame):
     assert ratio == pytest.approx(np.ones(4), abs=4 * 0.5 / np.sqrt(n_runs))
 
 
+@pytest.mark.slow
 def test_calibrate_and_compare_say_the_expected_error_in_both_frames(fg_calib, tmp_path):
     """In an unknown frame priors of the base rule the one in the base frame: millimetres beside tenths."""
     rng = np.random.default_rng(72)

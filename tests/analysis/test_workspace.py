@@ -44,6 +44,7 @@ def test_after_the_best_fit_measured_configurations_have_the_error_that_is_expec
     assert np.sqrt(np.mean(found.error**2)) == pytest.approx(fitted.position, rel=1e-7)
 
 
+@pytest.mark.slow
 def test_the_best_fit_holds_all_over_the_workspace(calibrated, monkeypatch):
     """Against drawn parameters: points of a drawn arm, brought to the estimate's by the motion of measured points."""
     result, m = calibrated

@@ -98,6 +98,7 @@ def test_all_estimators_run_on_the_same_job(simulated_job):
     assert weighted.predicted_rms == pytest.approx(keep.predicted_rms, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_the_graph_is_the_one_that_calibrate_shows(simulated_job):
     job = simulated_job
     found = compare(job)
@@ -111,6 +112,7 @@ def test_the_graph_is_the_one_that_calibrate_shows(simulated_job):
         assert found.correction(graph.robot, name) == correction
 
 
+@pytest.mark.slow
 def test_a_prediction_is_the_trace_of_the_propagated_covariance(simulated_job):
     found = compare(simulated_job)
     job, weighted = simulated_job, found.estimates[3]
@@ -427,6 +429,7 @@ def test_figures_that_went_astray_stay_within_the_page(simulated_job):
     assert "e+09" in text.split("\na2 ")[1].split("\nalpha2 ")[0]
 
 
+@pytest.mark.slow
 def test_a_doubtful_graph_is_doubtful_in_the_comparison(simulated_job):
     m = simulated_job.measurements
     optimistic = replace(m, sigma_position=m.sigma_position / 20, sigma_orientation=m.sigma_orientation / 20,
@@ -474,6 +477,7 @@ def test_comparing_the_bundled_example(fg_calib, whole_example):
     assert "poses.csv" in document["inputs"]
 
 
+@pytest.mark.slow
 def test_comparing_a_simulated_job_from_files_tells_real_errors(fg_calib, simulated_folder):
     job = simulated_folder / "calibration.yaml"
     ended = fg_calib("compare", job)

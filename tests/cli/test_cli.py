@@ -691,6 +691,7 @@ def test_units_of_files_do_not_change_the_result(fg_calib, example):
         assert result["n_excluded"] == expected["n_excluded"]
 
 
+@pytest.mark.slow
 def test_parquet_tables_give_the_result_of_csv(fg_calib, example):
     expected = calibrate(fg_calib, example / JOB)
     pl.read_csv(example / POSES).write_parquet(example / "poses.parquet")

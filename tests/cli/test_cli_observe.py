@@ -45,6 +45,7 @@ def test_json_has_every_key_of_its_schema(fg_calib, example, model, rank):
     assert all(direction["reason"] for direction in found["lost"])
 
 
+@pytest.mark.slow
 def test_configurations_give_sigmas_and_files(fg_calib, example, tmp_path):
     folder = tmp_path / "seen"
     ended = fg_calib(
@@ -206,6 +207,7 @@ def test_what_it_refuses(fg_calib, example, tmp_path, arguments, code, message):
         assert ended.err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_the_model_that_was_asked_for_is_named(fg_calib, example, tmp_path):
     ended = fg_calib("observe", example / "robot_nominal.yaml", "--model", "pixels", "--out", tmp_path / "out")
     assert ended.out.startswith("space-robot: pixels, as poses of the board, structural, ")

@@ -85,6 +85,7 @@ def test_what_is_printable_stays():
     assert escaped(f"a{STEERING}\n\u2028b") == f"a{SHOWN}\\n\\u2028b"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_mistakes")
 @pytest.mark.parametrize("command", ["calibrate", "compare"])
 def test_no_name_steers_the_terminal(fg_calib, job, tmp_path, command):
@@ -104,6 +105,7 @@ def found(job):
     return fg_calib.calibrate_job(job)
 
 
+@pytest.mark.slow
 def test_a_terminal_gets_colours_and_no_others(found):
     from fg_calib.report.text import build_report
 

@@ -82,6 +82,7 @@ def test_a_pipe_gets_no_bar(monkeypatch):
     assert stream.getvalue() == ""
 
 
+@pytest.mark.slow
 def test_folds_tell_how_far_they_are(example, fg_calib):
     heard = []
     with listening(lambda *told: heard.append(told)):

@@ -166,6 +166,7 @@ def test_a_result_that_was_written_but_not_moved_is_read(example):
     assert not within.exists()
 
 
+@pytest.mark.slow
 def test_a_job_that_was_written_but_not_moved_is_read_whole(example, fg_calib, tmp_path):
     for seed in (1, 3):
         assert fg_calib("simulate", "space-robot", "--out", tmp_path / str(seed), "--seed", seed).code == 0
@@ -329,6 +330,7 @@ def test_results_replace_results_and_nothing_else(example, fg_calib, name):
     assert {file.name: file.read_bytes() for file in example.iterdir()} == before
 
 
+@pytest.mark.slow
 def test_a_table_that_was_put_among_results_is_not_removed(example, fg_calib):
     out = example / "result"
     assert fg_calib("calibrate", example / "calibration.yaml", "--out", out).code == 0

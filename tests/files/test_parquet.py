@@ -71,6 +71,7 @@ def test_a_process_that_gets_no_memory_is_a_line_that_says_so(content, reader, m
     assert str(caught.value) == expected
 
 
+@pytest.mark.slow
 def test_columns_that_memory_does_not_suffice_for_are_a_line_and_the_process_goes_on(content, reader, monkeypatch):
     """polars hands a MemoryError on as an OSError without words."""
     for error in ("MemoryError()", "OSError()"):

@@ -107,6 +107,7 @@ def test_joints_stand_in_chain_order_with_their_own_parameters_and_limits(tree):
     assert {p.owner for p in robot.parameters if p.estimated} == {1, 2, 3, 4}
 
 
+@pytest.mark.slow
 @given(
     rpy=st.tuples(*[st.floats(-3.2, 3.2)] * 3),
     xyz=st.tuples(*[st.floats(-2, 2)] * 3),

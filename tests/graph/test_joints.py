@@ -85,6 +85,7 @@ def optimum(request):
     return robot, m, model, *everything(robot, m, model)
 
 
+@pytest.mark.slow
 def test_estimated_joint_values_give_the_optimum_over_everything(optimum):
     robot, m, model, values, chi2 = optimum
     solution = solve(build_problem(robot, m, model=model, encoder="estimated"))

@@ -88,6 +88,7 @@ def everything(robot, table, sigma_joint):
     return values, own.unknowns + 0.1 * found.x[k : k + 9].reshape(3, 3), 2.0 * found.cost
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma_joint", most_slow([1e-3, 0.0], every=2))
 def test_it_is_solved_to_the_optimum_over_everything(sigma_joint):
     robot, _, table = measured(1, n=24, sigma_joint=sigma_joint)

@@ -83,6 +83,7 @@ def measured(robot, frame, noise):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("frame", "noise"), diagonal(["tool", "base"], [1.0, 0.0]))
 def test_cost_and_the_arm_do_not_depend_on_the_pitch_of_a_frame(frame, noise):
     costs, arms, sigmas = [], [], []

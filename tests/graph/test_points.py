@@ -454,6 +454,7 @@ def test_estimated_joint_values_give_the_optimum_over_arm_points_and_joint_value
     assert 1e-3 < sigmas_from(propagated, values) < 0.5  # the same to first order only
 
 
+@pytest.mark.slow
 def test_estimated_noise_of_touches_is_the_most_likely_one():
     """Restricted maximum likelihood of both factors, by Nelder-Mead on a dense linear model."""
     pairs = tuple((a, b, 1e-4) for a in range(5) for b in range(a))

@@ -128,6 +128,7 @@ def test_images_of_no_board_have_no_pose_that_breaks_anything():
     assert boards_from_image(CAMERA, np.hstack([np.full((12, 2), 300.0), CORNERS])) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("corners", [[[0, 0], [1, 0], [0, 1], [1, 1]], [[0, 0], [1, 0], [2, 0], [3, 0], [0, 1]]])
 def test_a_board_from_a_few_corners_is_before_the_camera_or_nowhere(corners):
     """Few corners fit many poses: steps that leave for infinity once started whole calibrations there."""

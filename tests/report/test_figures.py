@@ -78,6 +78,7 @@ def test_the_correlations_name_every_kept_parameter(practical):
     assert all(name in shown for name in practical.observability.kept)
 
 
+@pytest.mark.slow
 def test_files_are_written_where_they_mean_something(structural, practical, tmp_path):
     for name, found in (("structural", structural), ("practical", practical)):
         folder = tmp_path / name

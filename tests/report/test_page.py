@@ -112,6 +112,7 @@ def test_it_is_one_small_file_that_asks_for_nothing(folder):
     assert "default-src 'none'" in text
 
 
+@pytest.mark.slow
 def test_ten_thousand_configurations_are_still_a_small_file(tmp_path):
     rng = np.random.default_rng(0)
     robot = small_arm(tolerance=LARGE)
@@ -273,6 +274,7 @@ def test_results_of_different_robots_are_not_compared(folder, tmp_path, fg_calib
     assert "another robot, expected the parameters of" in ended.err
 
 
+@pytest.mark.slow
 def test_estimators_have_a_figure_too(example, tmp_path, fg_calib):
     ended = fg_calib("compare", example / "calibration.yaml", "--out", tmp_path / "out", "--figures")
     assert ended.code == 0

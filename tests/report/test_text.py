@@ -237,6 +237,7 @@ def words(text):
     return set(text.split()) - {"prior", "b"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", most_slow([40, 60, 100, 80, 200], every=2))
 def test_no_width_breaks_a_word(long_reports, width):
     """What was a word on a very wide page is one on every page: names, figures, units."""
@@ -278,6 +279,7 @@ def suspicious_rows(pairing, wrong, *, n=30, **options):
     return sections(format_report(solution, assess(solution)))["Suspicious rows"]
 
 
+@pytest.mark.slow
 def test_a_pose_is_named_before_its_pairs():
     first, second, *_ = suspicious_rows(Pairing("all"), [17], loss="gnc").splitlines()
     found = re.fullmatch(r"  pose p17 is in (\d+) of (\d+) suspicious pairs, and in 29 pairs in all", first)
@@ -286,6 +288,7 @@ def test_a_pose_is_named_before_its_pairs():
     assert "pose" not in second
 
 
+@pytest.mark.slow
 def test_several_wrong_poses_are_told_apart():
     text = suspicious_rows(Pairing("all"), [5, 17], loss="gnc")
     assert set(re.findall(r"pose (p\d+) is in", text)) == {"p5", "p17"}

@@ -102,6 +102,7 @@ def test_steps_are_of_minimum_norm():
     assert abs(null @ change) < 1e-4 * np.linalg.norm(change)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_reached_is_told_with_its_miss():
     robot, rng = elbow_arm(180), np.random.default_rng(5)
     T = poses_of(robot, random_readings(robot, 3, rng))
@@ -115,6 +116,7 @@ def test_what_cannot_be_reached_is_told_with_its_miss():
     assert 4.0 - 0.3 - 1.8 < found.miss_position[1] < 4.0
 
 
+@pytest.mark.slow
 def test_a_limit_that_is_in_the_way_is_not_passed():
     """Two links of 2 and 1 m: 2.2 m away needs an elbow of 90 degrees or so, and here it opens by 30 at most."""
     builder = RobotBuilder("stiff", "dh")

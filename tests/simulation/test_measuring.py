@@ -146,6 +146,7 @@ def test_corners_are_seen_where_a_pinhole_has_them_and_nowhere_else(which):
     assert min(counts) < 20  # where the board leaves the image
 
 
+@pytest.mark.slow
 def test_sockets_are_touched_in_turn_and_measured_against_each_other():
     s, T = exact("sockets")
     groups = s.tables[0].measurements.groups

@@ -158,6 +158,7 @@ def test_another_noise_may_be_stated(shipped):
 # --- errors -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_uniform_errors_fill_their_bounds_and_spare_fixed_parameters(shipped):
     small = replace(shipped, configurations=RandomReadings(1), validation=None)
     errors = np.array([simulate(small, seed).true_robot.nominal - shipped.robot.nominal for seed in range(300)])
@@ -295,6 +296,7 @@ def test_a_table_is_where_the_arm_goes(shipped):
 # --- frames -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_frame_is_the_base_or_any_or_given(shipped):
     base = simulate(replace(exact(shipped), frame="base"))
     assert base.frame.rotation.tolist() == np.eye(3).tolist()
@@ -349,6 +351,7 @@ def test_each_purpose_draws_for_itself(shipped):
 # --- what cannot be ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_board_out_of_reach_is_reported_with_what_misses(shipped):
     far = replace(shipped.configurations, board=Placement(np.eye(3), np.array([0.0, 50.0, 2.55])), count=2)
     with pytest.raises(InputError) as caught:
