@@ -85,6 +85,10 @@ Position = Annotated[tuple[float, float, float], BeforeValidator(_listed)]
 Quaternion = Annotated[tuple[float, float, float, float], BeforeValidator(_listed), AfterValidator(_unit)]
 
 
+Choice = str | bool | int | float | tuple[str, ...] | dict[str, float] | None
+"""What an option may be."""
+
+
 class Section(BaseModel):
     """A part of a result; it may be made of any object that has its fields as attributes."""
 
@@ -468,7 +472,7 @@ class Result(Section):
     joint_values: JointValues | None = None
     groups: tuple[TouchedPoint, ...] = ()
     observability: Observability
-    options: dict[str, Any] = {}
+    options: dict[str, Choice] = {}
     versions: dict[str, str] = {}
     files: dict[str, str] = {}
     inputs: dict[str, str]
