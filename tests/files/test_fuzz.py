@@ -15,6 +15,8 @@ from hypothesis import strategies as st
 
 from fg_calib import InputError
 
+pytestmark = pytest.mark.filterwarnings("ignore::hypothesis.errors.HypothesisWarning")  # of random generators it meets
+
 CASES = int(os.environ.get("FG_CALIB_FUZZ_CASES", "10000"))
 SHARES = {
     **{"urdf": 0.2, "result": 0.1, "robot yaml": 0.2, "from_frame": 0.1, "poses csv": 0.1},
