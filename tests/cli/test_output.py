@@ -209,7 +209,7 @@ def test_a_limit_on_the_size_of_files_is_one_line_after_the_report(example, monk
     out = example / "result"
     code, shown, err = run(["calibrate", job, "--out", out], preexec_fn=limit)
     *notice, error = err.splitlines()
-    assert (code, error) == (1, f"error: {out}/result.json: cannot be written: File too large")
+    assert (code, error) == (1, f"error: {out}/robot_calibrated.yaml: cannot be written: File too large")
     assert notice == ["compiling the kernels: some seconds, once an installation"]
     assert "GOOD: converged" in shown
     assert not out.exists()
