@@ -652,6 +652,7 @@ RESULTS = [
     (lambda d: d["frame_estimate"].update(xyz=[1,2,"x"]), "{folder}/result.json: frame_estimate: xyz 3: found 'x', expected a finite number"),
     (lambda d: d["frame_estimate"].update(sigma=[-1]*6), '{folder}/result.json: frame_estimate: sigma 1: found -1, expected a number not below 0 (and 5 more)'),
     (lambda d: d["posterior"].update(covariance=[[1,2],[3,4]]), '{folder}/result.json: posterior: covariance: found [[1, 2], [3, 4]], expected a symmetric matrix of variances and covariances of errors'),
+    (lambda d: d["observability"]["lost"].append({"relation": {}, "reason": "none"}), "{folder}/result.json: observability: lost ..."),
     (lambda d: d["observability"].pop("rank"), "{folder}/result.json: observability: missing key 'rank'"),
     (lambda d: d.update(residual_rms=5), '{folder}/result.json: residual_rms: found 5, expected a mapping'),
     (lambda d: d.update(n_excluded={"a":"b"}), "{folder}/result.json: n_excluded: a: found 'b', expected a whole number"),
