@@ -129,7 +129,9 @@ def cross_validation(run: Run) -> list[Element]:
             f" known to {by:.0f} %). Below 1 is where tolerances determine it, far above 1 what the model lacks."
         )
         parts.append(tag("p", words))
-        if beyond := wide(ratio, found.n):
+        if found.of_pairs:
+            parts.append(tag("p", "Of pairs it is 1.4 to 1.7 times as large: they leave with either end."))
+        elif beyond := wide(ratio, found.n):
             named = ", ".join(f"{name} {ratio[name]:.1f}" for name in beyond[:8])
             parts.append(tag("p", f"More than their sigmas say, not by chance: {named}."))
     return parts
