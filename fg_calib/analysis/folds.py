@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from fg_calib.analysis.residual_table import HeldOut, pooled, residual_table
+from fg_calib.analysis.residual_table import DIGITS, HeldOut, pooled, residual_table
 from fg_calib.analysis.variance_components import solve_job
 from fg_calib.arguments import checked
 from fg_calib.arrays import FrozenArrays
@@ -46,9 +46,6 @@ Booleans = NDArray[np.bool_]
 
 CHANCE = 1e-3
 """Probability with which noise as stated alone makes the spread of any parameter worth naming."""
-
-DIGITS = 9
-"""Decimals of readings, [rad] or [m], that tell places apart."""
 
 _HUB = 0.5
 """Share of the measured pairs from which on a configuration that is in them is never held out."""

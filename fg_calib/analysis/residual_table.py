@@ -320,7 +320,7 @@ def residual_table(solution: Solution) -> ResidualTable:
 def _seen(readings: Floats, rows: dict[str, NDArray[Any]]) -> Booleans:
     """Which rows are of readings, at both ends, at which rows are fitted, shape (n,)."""
     n = len(readings)
-    _, place = np.unique(np.round(readings, _DIGITS), axis=0, return_inverse=True)
+    _, place = np.unique(np.round(readings, DIGITS), axis=0, return_inverse=True)
     counts = (rows["reason_code"] == 0) & ~rows["test"]
     ends = [np.where((end >= 0) & (end < n), end, n) for end in (rows["a"], rows["b"])]
     place = np.append(place.ravel(), n)
@@ -334,7 +334,7 @@ def _seen(readings: Floats, rows: dict[str, NDArray[Any]]) -> Booleans:
     return known[0] & known[1] & (there[0] | there[1])
 
 
-_DIGITS = 9
+DIGITS = 9
 """Decimals of readings, [rad] or [m], that tell configurations apart."""
 
 
