@@ -35,7 +35,7 @@ from fg_calib.analysis.variance_components import solve_job
 from fg_calib.arguments import checked
 from fg_calib.arrays import as_floats, shape_of
 from fg_calib.errors import InputError, escaped, shown
-from fg_calib.files.disk import exists, is_folder
+from fg_calib.files.disk import exists, is_folder, noting_reads
 from fg_calib.files.history import HISTORY, History, Run, history_of, run_of
 from fg_calib.files.job import UNSTATED, read_job, read_table_like
 from fg_calib.files.result import Carried, KindGoodness, Parameter, Posterior, Previous, Result, read_result
@@ -55,7 +55,7 @@ from fg_calib.report.documents import result_of, write_result
 from fg_calib.report.summary import format_result, html, judged, summary
 from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import forward, precompute_trig
-from fg_calib.robot.model import Robot
+from fg_calib.robot.model import Robot, names_of
 from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
@@ -268,6 +268,14 @@ class Calibration:
         return {HISTORY: History(robot=self.result.robot, runs=runs).text()}
 
     @property
+    def runs(self) -> tuple[Run, ...]:
+        """The runs that it came from, and itself."""
+        if self.assessed is None:
+            return self.history
+        digest = sha256(json.dumps(self.result.document()).encode()).hexdigest()
+        return (*self.history, run_of(self.result, digest, self.history[-1] if self.history else None))
+
+    @property
     def calibrated(self) -> Calibrated:
         """What is known of the arm, for new rows."""
         nominal = self.posterior.variables.robot
@@ -292,8 +300,9 @@ class Calibration:
 
         Args:
             rows: A table like the calibration's (a file, or measurements), or a job with several.
-            limit: The largest RMS error of positions, [m]; those of the job's `accept` if None.
-            limit_angle: The same of orientations, [rad].
+            limit: The largest RMS error of positions, or of distances where there are no others, [m]; those of the
+                job's `accept` if None.
+            limit_angle: The same of orientations, or angles, [rad].
             pairs: Table of pairs that were measured directly.
             like: Of which of the job's tables that is, where it has several.
 
@@ -302,10 +311,14 @@ class Calibration:
             ProblemError: The rows lack what their model needs.
         """
         self._require_trust()
-        stated = {"position": limit, "orientation": limit_angle}
+        new, _ = self._rows(rows, pairs, like)
+        between = all(table.model not in ("pose", "position", "orientation", "board") for table in new.tables)
+        stated = dict(
+            zip(("distance", "angle") if between else ("position", "orientation"), (limit, limit_angle), strict=True)
+        )
         stated = {name: figure for name, figure in stated.items() if figure is not None}
         limits = replace(_saved_options(self.result).accept, **stated)
-        return check_rows(self.calibrated, self._rows(rows, pairs, like), limits)
+        return check_rows(self.calibrated, new, limits)
 
     @checked
     def update(
@@ -337,24 +350,26 @@ class Calibration:
             SolverError: GTSAM could not solve a step at all.
         """
         self._require_trust()
-        if self.assessed is not None and not self.history:
-            digest = sha256(json.dumps(self.result.document()).encode()).hexdigest()
-            history: tuple[Run, ...] = (run_of(self.result, digest),)
-        else:
-            history = self.history
+        history = self.runs
         new, before = _date(date), history[-1]
         growth = {} if growth is None else growth
         days = _days(before.date, new) if growth else 0.0
+        table, inputs = self._rows(rows, pairs, like)
+        before_now = {digest for run in history for digest in run.inputs.values()}
+        sources = {one.measurements.source.partition(", station ")[0] for one in table.tables}
+        for name, file_digest in inputs.items():
+            if Path(name).name in sources and file_digest in before_now:
+                raise InputError(name, "its rows are in the calibration already", "new rows")
         found = updated(
             self.calibrated,
-            self._rows(rows, pairs, like),
+            table,
             growth={name: size * float(np.sqrt(days)) for name, size in growth.items()},
             changed=listed("changed", changed),
             anchors_stay=anchors_stay,
         )
         job = {} if self.result.carried is None else self.result.carried.job
         previous = Previous(sha256=before.sha256, date=before.date)
-        made = Calibration.of(found, assess(found), {}, job=job, date=new, previous=previous)
+        made = Calibration.of(found, assess(found), inputs, job=job, date=new, previous=previous)
         return replace(made, history=history)
 
     def _require_trust(self) -> None:
@@ -362,36 +377,37 @@ class Calibration:
             reason = (*self.findings, self.result.solver.message)[0]
             raise InputError(self.result.robot, f"the calibration is not to be trusted: {reason}", "one that is")
 
-    def _rows(self, given: Given, pairs: Path | str | None, like: str | None) -> Rows:
-        """New rows, understood as the calibration's own.
+    def _rows(self, given: Given, pairs: Path | str | None, like: str | None) -> tuple[Rows, dict[str, str]]:
+        """New rows, understood as the calibration's own, and SHA-256 of the files that they are from.
 
         Raises:
             InputError: They are of another robot, or cannot be read.
         """
         options, robot = _saved_options(self.result), self.posterior.variables.robot
-        if isinstance(given, Path | str):
-            path = Path(given)
-            if path.suffix.lower() in (".yaml", ".yml"):
-                given = read_job(path)
-            else:
-                job = {} if self.result.carried is None else self.result.carried.job
-                if not job:
-                    found = "the calibration does not say how its tables were read"
-                    raise InputError(path.name, found, "a job that names the table")
-                of_pairs = None if pairs is None else Path(pairs)
+        if isinstance(given, Path | str) and Path(given).suffix.lower() not in (".yaml", ".yml"):
+            path, of_pairs = Path(given), None if pairs is None else Path(pairs)
+            job = {} if self.result.carried is None else self.result.carried.job
+            if not job:
+                found = "the calibration does not say how its tables were read"
+                raise InputError(path.name, found, "a job that names the table")
+            with noting_reads() as files:
                 table = read_table_like(job, robot, path, pairs=of_pairs, like=like)
-                return Rows.of([table], [like or path.name], options)
-        if isinstance(given, Job):
-            names = [[p.name for p in r.parameters] for r in (given.robot, robot)]
-            if names[0] != names[1] or given.robot.convention != robot.convention:
-                raise InputError(
-                    str(given.path or "job"), f"robot {given.robot.name}", f"that of the result, {robot.name}"
-                )
-            given = given.tables
-        tables = tables_of(given, options)
-        for table in tables:
-            check_readings(table.measurements.readings, robot, table.measurements.source)
-        return Rows.of(tables, [table.measurements.source for table in tables], options)
+            inputs = {file.name: digest for file, digest in files.items()}
+            return Rows.of([table], [like or path.name], options), inputs
+        if pairs is not None or like is not None:
+            raise InputError("pairs" if pairs else "like", "given beside rows that say it themselves", "none")
+        new, inputs = given, {}
+        if isinstance(new, Path | str):
+            new = read_job(new)
+        if isinstance(new, Job):
+            if names_of(new.robot.parameters) != names_of(robot.parameters) or new.robot.convention != robot.convention:
+                expected = f"that of the result, {robot.name}"
+                raise InputError(str(new.path or "job"), f"the robot {new.robot.name}", expected)
+            inputs, new = new.inputs, new.tables
+        tables = tables_of(new, options)
+        for one in tables:
+            check_readings(one.measurements.readings, robot, one.measurements.source)
+        return Rows.of(tables, [one.measurements.source for one in tables], options), inputs
 
     @property
     def solution(self) -> Solution:

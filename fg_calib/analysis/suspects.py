@@ -44,7 +44,8 @@ CERTAIN = 1e-3
 """Probability, times the number of suspects, below which what a suspect explains is no chance."""
 
 SEEN = 1e-6
-"""Part of a suspect's columns that must be left beside what is fitted; else the rows do not see it."""
+"""Part of a suspect's columns that must be left beside what is fitted; else the rows do not see it. So, in sigma, must
+what an ordinary change makes of all rows together (see `Robot.scale_of`)."""
 
 SAME = 1e-6
 """Sine of the angle between what two suspects do to the tool everywhere, below which they are one."""
@@ -132,8 +133,11 @@ def tried(suspect: Suspect, rows: Linear, n_suspects: int) -> Found | None:
         n_suspects: How many are tried.
     """
     size = np.linalg.norm(suspect.columns, axis=0)
-    scale = np.where(size > 0.0, size, 1.0)
-    new = rows.new(suspect.columns / scale)
+    robot = rows.placed.problem.robot
+    ordinary = np.array([robot.scale_of(unit) if unit else 1.0 for unit in suspect.units])
+    acts = size * ordinary > SEEN
+    scale = np.where(acts, size, 1.0)
+    new = rows.new(np.where(acts, suspect.columns / scale, 0.0))
     U, s, Vt = np.linalg.svd(new, full_matrices=False)
     k = int(np.sum(s > SEEN))
     if not k or rows.dof - k < 1:
@@ -176,8 +180,8 @@ def all_suspects(calibrated: Calibrated, rows: Linear) -> list[Suspect]:
     single = _without_same(found, effects)
     poses = {i.kind: rows.columns[:, i.columns] for i in v.items if i.is_pose}
     units = ("rad",) * 3 + ("m",) * 3
-    groups = [Suspect(("tool",), "tool", units, poses["tool"]), Suspect(("frame",), "frame", units, poses["base"])]
-    return single + groups
+    of_kind: tuple[tuple[Kind, str], ...] = (("tool", "tool"), ("frame", "base"))
+    return single + [Suspect((kind,), kind, units, poses[item]) for kind, item in of_kind if item in poses]
 
 
 def zero_names(robot: Robot) -> tuple[str, ...]:
@@ -211,8 +215,12 @@ def motions(robot: Robot, readings: Floats) -> tuple[dict[str, Floats], Floats, 
     named = at.jacobian[:, :, :n] @ v.tangent_derivative(x)
     found = dict(zip(v.names, named.transpose(2, 0, 1), strict=True))
     found |= dict(zip(zero_names(robot), at.jacobian[:, :, n:].transpose(2, 0, 1), strict=True))
-    base, tool = (next(i for i in v.items if i.kind == kind) for kind in ("base", "tool"))
-    return found, at.jacobian[:, :, base.columns], at.jacobian[:, :, tool.columns]
+    p, base = at.position, np.zeros((len(readings), 6, 6))
+    base[:, range(6), range(6)] = 1.0
+    for axis in range(3):
+        base[:, 3:, axis] = np.cross(np.eye(3)[axis], p)
+    whole = {i.kind: at.jacobian[:, :, i.columns] for i in v.items if i.is_pose}
+    return found, whole.get("base", base), whole.get("tool", base)
 
 
 def _effects(robot: Robot, names: Sequence[str], blind: bool) -> Floats:

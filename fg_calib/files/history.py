@@ -48,6 +48,7 @@ class Run(Section):
         verdict: `good`, or `doubtful`.
         moved: What changed most; None of the first run.
         parameters: What was estimated, by name.
+        inputs: SHA-256 of the files of its rows, by path.
     """
 
     sha256: str
@@ -59,6 +60,7 @@ class Run(Section):
     verdict: Literal["good", "doubtful"]
     moved: Moved | None = None
     parameters: dict[str, Known]
+    inputs: dict[str, str] = Field(default_factory=dict)
 
 
 class History(Section):
@@ -96,6 +98,7 @@ def run_of(result: Result, digest: str, before: Run | None = None) -> Run:
         verdict="good" if result.trustworthy else "doubtful",
         moved=None if before is None else _moved(parameters, before),
         parameters=parameters,
+        inputs=result.inputs,
     )
 
 

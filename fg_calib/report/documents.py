@@ -101,10 +101,7 @@ def result_of(
     solution: Solution,
     uncertainty: Uncertainty,
     inputs: Mapping[str, str] | None = None,
-    *,
-    job: Mapping[str, Any] | None = None,
-    date: str | None = None,
-    previous: Previous | None = None,
+    **origin: Any,
 ) -> Result:
     """What `result.json` holds: SI, full precision, None for what is unknown or infinite.
 
@@ -112,9 +109,7 @@ def result_of(
         solution: The solution.
         uncertainty: Its assessment.
         inputs: SHA-256 of the files it came from, by path.
-        job: The job's own document, for reading tables like its own.
-        date: When the rows were measured; now if None.
-        previous: What it came from.
+        origin: `job`, its document, to read tables like its own; `date` of its rows; `previous`, what it came from.
     """
     problem, settings, u = solution.problem, solution.problem.options, uncertainty
     names, goodness = problem.end_names, uncertainty.goodness
@@ -155,22 +150,43 @@ def result_of(
         noise_kept=_noise_kept(solution, goodness.kinds),
         suspect_configurations=_suspects(goodness.configurations, names),
         residual_rms=_residual_rms(u),
-        parameters=tuple(map(_parameter, u.parameters)),
-        covariance=Covariance.make(names=u.names, matrix=u.covariance),
-        posterior=_posterior(u.whole),
-        links=None if problem.robot.urdf is None else (problem.robot.urdf.base_link, problem.robot.urdf.tip_link),
-        frame_estimate=None if u.frame is None else Frame.model_validate(u.frame),
-        frames={v.symbol: Frame.model_validate(f) for v, f in zip(problem.variables.frames, u.frames, strict=True)},
-        joint_values=_joint_values(u.joint_values, names),
-        groups=tuple(map(TouchedPoint.model_validate, u.points)),
+        **_estimates(problem, u),
         observability=_observability(u.identifiability),
-        options=_options(problem),
-        versions=_versions(),
-        inputs=dict(inputs or {}),
-        date=date or datetime.now(UTC).isoformat(timespec="seconds"),
-        previous=previous,
-        carried=_carried(solution, job or {}),
+        **_origin(solution, inputs or {}, **origin),
     )
+
+
+def _estimates(problem: Problem, u: Uncertainty) -> dict[str, Any]:
+    """What was estimated, and of which links of a URDF."""
+    urdf, frames = problem.robot.urdf, problem.variables.frames
+    return {
+        "parameters": tuple(map(_parameter, u.parameters)),
+        "covariance": Covariance.make(names=u.names, matrix=u.covariance),
+        "posterior": _posterior(u.whole),
+        "links": None if urdf is None else (urdf.base_link, urdf.tip_link),
+        "frame_estimate": None if u.frame is None else Frame.model_validate(u.frame),
+        "frames": {v.symbol: Frame.model_validate(f) for v, f in zip(frames, u.frames, strict=True)},
+        "joint_values": _joint_values(u.joint_values, problem.end_names),
+        "groups": tuple(map(TouchedPoint.model_validate, u.points)),
+    }
+
+
+def _origin(
+    solution: Solution,
+    inputs: Mapping[str, str],
+    job: Mapping[str, Any] | None = None,
+    date: str | None = None,
+    previous: Previous | None = None,
+) -> dict[str, Any]:
+    """What a result came from, and what the next one takes over."""
+    return {
+        "options": _options(solution.problem),
+        "versions": _versions(),
+        "inputs": dict(inputs),
+        "date": date or datetime.now(UTC).isoformat(timespec="seconds"),
+        "previous": previous,
+        "carried": _carried(solution, job or {}),
+    }
 
 
 def _carried(solution: Solution, job: Mapping[str, Any]) -> Carried:

@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import month
 import numpy as np
 import pytest
 import typer
@@ -274,6 +275,15 @@ def calibrates_two_tables(code, folder, fg_calib):
     exec(code, made | {"tracker": measure(true, 30, rng), "bar": measure(true, 30, rng)})
 
 
+def checks_and_updates(code, folder, fg_calib):
+    calibration, true, rng = month.calibrated(1)
+    rows = month.measured(month.slipped(true, theta3=2e-3), 10, rng)
+    exec(code, made := {"calibration": calibration, "rows": rows})
+    assert made["found"].verdict == "fail"
+    assert [e.parameters for e in made["found"].explanations if e.likely] == [("theta3",)]
+    assert len(made["updated"].runs) == 2
+
+
 def slow(function, mark=pytest.mark.slow):
     return pytest.param(function, marks=mark)
 
@@ -285,6 +295,7 @@ HOW = {
     "instruments": [is_job, is_a_table_of_lengths, is_table, is_job, calibrates_two_tables],
     "from-bags-and-images": [are_typed, is_job, are_typed, is_board, is_board],
     "believe-it": [is_key_of_a_job],
+    "next-month": [are_typed, slow(checks_and_updates)],
     "observability": [is_printed],
     "simulate": [slow(are_run), is_scenario, slow(is_scenario, pytest.mark.long)],
     "compare": [slow(is_printed)],
