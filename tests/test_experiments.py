@@ -651,3 +651,13 @@ def test_no_kill_full_disk_or_second_writer_mixes_or_loses_a_result(tmp_path):
     hidden = found.pop("hidden folders")
     assert {which for counts in found.values() for which in counts} <= allowed
     assert hidden["after it"] == 0
+
+
+def test_next_month_quick_says_nothing_of_what_did_not_change_and_finds_what_did(tmp_path):
+    found = load("14_next_month.py").main(["--quick", "--out", str(tmp_path)])
+    assert {case["verdicts"].get("pass", 0) for case in found["healthy"].values()} == {1}
+    for case in ("known 30", "unknown 30"):
+        assert found["slips"][case]["failed"] == found["slips"][case]["among"] == found["slips"][case]["n"]
+    off = [found["updates"][f"unknown {finer}"]["off"][0] for finer in ("1", "0.1", "0.01", "0.001")]
+    assert off[-1] < 1e-6
+    assert all(a / b == pytest.approx(10.0, rel=0.1) for a, b in zip(off[:-1], off[1:], strict=True))

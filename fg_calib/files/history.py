@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError
 
+from fg_calib.arguments import checked
 from fg_calib.errors import InputError
 from fg_calib.files.disk import exists, is_folder, read_bytes, read_text
 from fg_calib.files.result import Figure, Result, Section, Sigma, Whole, read_result
@@ -112,6 +113,7 @@ def _moved(parameters: dict[str, Known], before: Run) -> Moved | None:
     return max(found, key=lambda m: -1.0 if m.in_sigma is None else m.in_sigma, default=None)
 
 
+@checked
 def history_of(path: Path | str) -> History:
     """The runs that a saved calibration came from; of one that came from none it alone.
 

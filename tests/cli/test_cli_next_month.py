@@ -115,7 +115,7 @@ BAD = {
     "rows that are in it": (["update", "result", "first.csv", "--out", "new"], "in the calibration already"),
     "its own folder": (["update", "result", "healthy.csv", "--out", "result"], "the folder of the result"),
     "no parameter": (["update", "result", "healthy.csv", "--changed", "theta9", "--out", "new"], "theta9"),
-    "a growth without figure": (["update", "result", "healthy.csv", "--growth", "theta", "--out", "new"], "NAME=FIGURE"),
+    "a bare growth": (["update", "result", "healthy.csv", "--growth", "theta", "--out", "new"], "NAME=FIGURE"),
     "a date before": (
         ["update", "result", "healthy.csv", "--growth", "theta=1deg", "--date", "1999-01-01", "--out", "new"],
         "is before the calibration",
