@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from fg_calib.analysis.mistakes import SetupCheck, check_setup
     from fg_calib.analysis.restarts import look_elsewhere
     from fg_calib.analysis.uncertainty import Uncertainty, assess
+    from fg_calib.analysis.estimated_tolerances import estimate_tolerances
     from fg_calib.analysis.variance_components import estimate_noise, solve_job
     from fg_calib.baseline.comparison import Comparison, compare
     from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
@@ -87,6 +88,7 @@ _HOMES = {
     "fg_calib.measurements.dataset": ("Measurements", "Noise"),
     "fg_calib.analysis.inspection": ("Inspection", "inspect_job"),
     "fg_calib.analysis.mistakes": ("SetupCheck", "check_setup"),
+    "fg_calib.analysis.estimated_tolerances": ("estimate_tolerances",),
     "fg_calib.analysis.variance_components": ("estimate_noise", "solve_job"),
     "fg_calib.graph.build": ("build_problem", "problem_of"),
     "fg_calib.graph.problem": ("Problem",),
@@ -159,6 +161,7 @@ __all__ = [
     "comparison_document",
     "cramer_rao",
     "estimate_noise",
+    "estimate_tolerances",
     "expand",
     "fit_least_squares",
     "format_comparison",

@@ -1,0 +1,249 @@
+r"""How far the arm is off in tolerances: marginal likelihood of a scale for each group of them.
+
+With u the corrections in units of the tolerances stated, what the data say of them to first order is an information
+matrix G and a vector g: they prefer `G^+ g`, and `-(u^T G u) / 2 + g^T u` is their log-likelihood. What has no
+tolerance, such as a measurement frame, is eliminated. Where u has the variance s^2, s the scale of its group, with
+W = diag(s), `M = 1 + W G W` and `a = M^-1 W g`,
+
+    L(s) = (g^T W a - log det M) / 2
+
+is the likelihood with u integrated out. The estimate is `u = W a`, its covariance W C W with C = M^-1. In theta = log s
+
+    dL / dtheta_k           = sum over k of (a_i^2 + C_ii - 1)
+    d2L / dtheta_k dtheta_l = 4 a_k^T C_kl a_l + 2 |C_kl|^2 - delta_kl 2 sum over k of (a_i^2 + C_ii)
+
+of which the mean is `-2 |(1 - C)_kl|^2`: a correction that data determine counts 2, one that they do not, nothing.
+`sum over k of (1 - C_ii)` is how many corrections of a group the data tell of.
+
+Besides there is what one knows of tolerances before: that they were stated for good reason. theta is normal about 0
+with sigma `GUESS`, a factor of 10 either way. A group that the data do not tell of stays as stated; one of a single
+correction that happens to be nil does not collapse.
+
+The posterior of theta is not normal where few corrections are seen. It is integrated over points that a normal
+distribution about its mode, `WIDER` than its curvature says, lays out, each weighted by what the posterior is there
+over what that distribution is (importance sampling; the points are the same always). It says the interval of each
+scale, and what not knowing them adds to the covariance of the estimate:
+
+    E[W C W + (W a - u) (W a - u)^T] - W C W at the mode.
+
+References:
+    MacKay (1992), Bayesian interpolation. Neural Computation 4(3): evidence, and number of well-determined parameters.
+    Kass & Steffey (1989), Approximate Bayesian inference in conditionally independent hierarchical models. JASA 84.
+    Gelman (2006), Prior distributions for variance parameters in hierarchical models. Bayesian Analysis 1(3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+from scipy.stats import qmc
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+TOGETHER, APART = float(np.log(10.0)), float(np.log(3.0))
+"""1 sigma of the logarithm of a scale before any data: of all alike, and of each beside the others."""
+
+FARTHEST = 2.0
+"""A step of the logarithm of a scale is at most this long."""
+
+MOST_STEPS = 100
+
+NEAR_MODE = 1e-9
+"""Gain of the logarithm of the posterior that a step must promise."""
+
+STARTS = (0.0, float(np.log(0.1)), float(np.log(10.0)))
+"""Logarithms of all scales that ascents start from: where few corrections are seen there may be two modes."""
+
+N_POINTS, HEAVY = (128, 256), 5.0
+"""Points that the posterior is integrated over, first roughly; degrees of freedom of the t-distribution that they have."""
+
+INTERVAL = 0.95
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """What the data say of the corrections in tolerances.
+
+    Attributes:
+        information: G, shape (n, n).
+        preferred: g, shape (n,).
+        group: Number of the group of each, shape (n,).
+    """
+
+    information: Floats
+    preferred: Floats
+    group: Integers
+
+    @property
+    def n_groups(self) -> int:
+        """Number of groups."""
+        return int(self.group.max(initial=-1)) + 1
+
+    @cached_property
+    def guess(self) -> Floats:
+        """Information on the logarithms of the scales before any data, shape (n_groups, n_groups)."""
+        n = self.n_groups
+        return np.linalg.inv(TOGETHER**2 * np.ones((n, n)) + APART**2 * np.eye(n)).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """What is known of the scales.
+
+    Attributes:
+        theta: Mean of the logarithms, shape (n_groups,).
+        low: Lower ends of the intervals of the logarithms, shape (n_groups,).
+        high: Upper ends.
+        seen: How many corrections of each group the data tell of.
+        unsure: What not knowing the scales adds to the covariance of the corrections, shape (n, n).
+    """
+
+    theta: Floats
+    low: Floats
+    high: Floats
+    seen: Floats
+    unsure: Floats
+
+
+def posterior_of(corrections: Corrections) -> Posterior:
+    """What data say of the scales.
+
+    Args:
+        corrections: What they say of the corrections.
+    """
+    starts = (_climbed(_Point(corrections, np.full(corrections.n_groups, start))) for start in STARTS)
+    mode = max(starts, key=lambda point: point.value)
+    middle, spread = mode.theta, np.linalg.inv(-mode.derivatives()[1]).astype(np.float64)
+    for n in N_POINTS:
+        points, weights = _sampled(corrections, middle, spread, n)
+        thetas = np.array([point.theta for point in points])
+        middle = weights @ thetas
+        off = thetas - middle
+        spread = (weights * off.T) @ off
+    best = _Point(corrections, middle)
+    unsure = -best.covariance
+    for point, weight in zip(points, weights, strict=True):
+        away = point.estimate - best.estimate
+        unsure += weight * (point.covariance + np.outer(away, away))
+    low, high = _interval(thetas, weights)
+    return Posterior(middle, low, high, best.seen, unsure)
+
+
+def _sampled(corrections: Corrections, middle: Floats, spread: Floats, n: int) -> tuple[list[_Point], Floats]:
+    """Points of a t-distribution about the middle, and their weights by the posterior, which sum to 1."""
+    k = corrections.n_groups
+    uniform = np.clip(qmc.Sobol(k + 1, scramble=True, rng=0).random(n), 1e-9, 1.0 - 1e-9)
+    stretch = np.sqrt(HEAVY / special.chdtri(HEAVY, uniform[:, k]))
+    standard = stretch[:, None] * special.ndtri(uniform[:, :k])
+    points = [_Point(corrections, middle + x) for x in standard @ np.linalg.cholesky(spread).T]
+    log_weights = np.array([point.value for point in points])
+    log_weights += 0.5 * (HEAVY + k) * np.log1p(np.sum(standard**2, axis=1) / HEAVY)
+    weights = np.exp(log_weights - log_weights.max())
+    return points, weights / weights.sum()
+
+
+@dataclass(frozen=True)
+class _Point:
+    """The posterior at one theta.
+
+    Attributes:
+        corrections: What the data say.
+        theta: Logarithms of the scales, shape (n_groups,).
+    """
+
+    corrections: Corrections
+    theta: Floats
+
+    @cached_property
+    def s(self) -> Floats:
+        """Scale of each correction, shape (n,)."""
+        out: Floats = np.exp(self.theta)[self.corrections.group]
+        return out
+
+    @cached_property
+    def M(self) -> Floats:
+        """Shape (n, n)."""
+        out: Floats = np.eye(len(self.s)) + self.s[:, None] * self.corrections.information * self.s
+        return out
+
+    @cached_property
+    def C(self) -> Floats:
+        """Shape (n, n)."""
+        return np.linalg.inv(self.M).astype(np.float64)
+
+    @cached_property
+    def a(self) -> Floats:
+        """Shape (n,)."""
+        out: Floats = self.C @ (self.s * self.corrections.preferred)
+        return out
+
+    @cached_property
+    def value(self) -> float:
+        """Logarithm of the posterior."""
+        fit = float((self.s * self.corrections.preferred) @ self.a)
+        log_det = float(np.linalg.slogdet(self.M)[1])
+        return 0.5 * (fit - log_det - float(self.theta @ self.corrections.guess @ self.theta))
+
+    @property
+    def estimate(self) -> Floats:
+        """Of the corrections, shape (n,)."""
+        return self.s * self.a
+
+    @property
+    def covariance(self) -> Floats:
+        """Of the corrections, shape (n, n)."""
+        out: Floats = self.s[:, None] * self.C * self.s
+        return out
+
+    @property
+    def seen(self) -> Floats:
+        """How many corrections of each group the data tell of, shape (n_groups,)."""
+        return self._sums(1.0 - np.diag(self.C))
+
+    def derivatives(self) -> tuple[Floats, Floats, Floats]:
+        """Gradient and Hessian of the logarithm of the posterior, and the Hessian's mean."""
+        a, C, n = self.a, self.C, self.corrections.n_groups
+        member = np.equal.outer(np.arange(n), self.corrections.group).astype(np.float64)
+        square, of_guess = self._sums(a**2 + np.diag(C)), self.corrections.guess
+        gradient = square - self._sums(np.ones(len(a))) - of_guess @ self.theta
+        hessian = member @ (4.0 * a[:, None] * C * a + 2.0 * C**2) @ member.T - np.diag(2.0 * square) - of_guess
+        mean = -2.0 * member @ (np.eye(len(a)) - C) ** 2 @ member.T - of_guess
+        return gradient, hessian, mean
+
+    def _sums(self, of_each: Floats) -> Floats:
+        """Sums by group, shape (n_groups,)."""
+        out: Floats = np.bincount(self.corrections.group, of_each, self.corrections.n_groups).astype(np.float64)
+        return out
+
+
+def _climbed(here: _Point) -> _Point:
+    """Where the posterior is largest, from a start: Newton's steps, or Fisher's where it is not concave."""
+    for _ in range(MOST_STEPS):
+        gradient, hessian, mean = here.derivatives()
+        concave = np.linalg.eigvalsh(hessian)[-1] < 0.0
+        step = np.linalg.solve(-hessian if concave else -mean, gradient)
+        step *= min(1.0, FARTHEST / max(float(np.abs(step).max(initial=0.0)), NEAR_MODE))
+        if float(gradient @ step) < NEAR_MODE:
+            break
+        there = _Point(here.corrections, here.theta + step)
+        while there.value < here.value and float(np.abs(step).max()) > NEAR_MODE:
+            step *= 0.5
+            there = _Point(here.corrections, here.theta + step)
+        here = there
+    return here
+
+
+def _interval(points: Floats, weights: Floats) -> tuple[Floats, Floats]:
+    """Ends of the interval of each column of weighted points."""
+    ends = []
+    for column in points.T:
+        order = np.argsort(column)
+        share = np.cumsum(weights[order]) - 0.5 * weights[order]
+        ends.append(np.interp([0.5 - INTERVAL / 2.0, 0.5 + INTERVAL / 2.0], share, column[order]))
+    low, high = np.array(ends).T
+    return low, high
