@@ -2,8 +2,8 @@
 
 Command: python experiments/14_unknown_tolerances.py [--quick] [--seed N] [--draws N] [--processes N] [--out FOLDER]
 
-Four arms (UR10 in dh-hayati and as a URDF, the paper's 7R, a SCARA), measured as poses in an unknown frame, by distances
-and angles of a star of pairs, or by lengths to three unknown anchors, at 10 or 100 configurations. The true errors are
+Four arms (UR10 in dh-hayati and as a URDF, the 7R of the paper, a SCARA) are measured as poses in an unknown frame, by
+distances and angles of a star of pairs, or by lengths to three unknown anchors, at 10 or 100 stops. The true errors are
 0.1, 0.3, 1, 3 and 10 times the tolerances stated, all kinds alike, or each kind one of these at random (`mixed`). Each
 draw is calibrated with the scales estimated, with the true ones (`known`), with the tolerances as stated, and without
 priors. Compared are the RMS errors of the tool's position over 200 other configurations, after the best rigid fit;
@@ -47,7 +47,15 @@ INSTRUMENTS = {
     "anchors": LengthGauge(name="wire", anchors=3),
 }
 NOISE = Noise(position=1e-4, orientation=np.deg2rad(0.01), distance=5e-5)
-N_SMALL, N_LARGE = 10, 100
+CELLS = (
+    *(("UR10", "pose", 10), ("UR10", "pairs", 10), ("UR10", "pairs", 100), ("UR10", "anchors", 10)),
+    *(("UR10", "anchors", 100), ("7R", "pairs", 10), ("7R", "pose", 100)),
+    *(("URDF", "pose", 10), ("URDF", "anchors", 100), ("SCARA", "pose", 10), ("SCARA", "pairs", 100)),
+)
+"""Arm, model and number of stops; of anchors as many lengths to each of three."""
+MARKS = {"none": ("tab:red", "x"), "stated": ("tab:orange", "s"), "estimated": ("tab:blue", "o")}
+WORDS = {"none": "without priors", "stated": "tolerances as stated", "estimated": "tolerances estimated"}
+MOST_SHOWN = 5.0
 UR10_DH = [(0, 90, 0.1273), (-0.612, 0, 0), (-0.5723, 0, 0), (0, 90, 0.163941), (0, -90, 0.1157), (0, 0, 0.0922)]
 """a [m], alpha [deg], d [m] of each joint, standard DH."""
 UR10_URDF = [
@@ -166,9 +174,102 @@ def consistency(solution: Solution, true: Robot) -> dict[str, Any]:
     e = solution.parameters[columns] - true.nominal[columns]
     sigma = np.sqrt(np.diag(C))
     nees = (e / sigma) @ np.linalg.solve(C / np.outer(sigma, sigma), e / sigma) / len(e)
-    found = {"nees": float(nees), "single": float(np.mean((e / sigma) ** 2)), "covered": float(np.mean(np.abs(e) < 1.96 * sigma))}
-    scales = solution.estimated_tolerances
-    if scales is not None:
-        figures = zip(scales.groups, scales.scale, scales.low, scales.high, scales.seen, strict=True)
-        found["scales"] = {name: list(map(float, of)) for name, *of in figures}
+    found: dict[str, Any] = {"nees": float(nees), "covered": float(np.mean(np.abs(e) < 1.96 * sigma))}
+    found_scales = solution.estimated_tolerances
+    if found_scales is not None:
+        found["scales"] = {one.group: [one.scale, one.low, one.high, one.seen] for one in found_scales.scales}
     return found
+
+
+def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
+    """Run the experiment; returns what is written as JSON."""
+    given = arguments_of(__doc__, NAME, arguments, 60, 1)
+    cells = CELLS[:2] if given.quick else CELLS
+    tasks = [
+        Task(*cell, true, seed)
+        for cell in cells
+        for true in (TRUE[-1:] if given.quick else TRUE)
+        for seed in range(given.seed, given.seed + given.draws)
+    ]
+    clock = time.perf_counter()
+    rows = over_draws(one_draw, tasks, given.processes)
+    found: dict[str, Any] = {"cells": [], "n_draws": given.draws, "seed": given.seed}
+    for first in range(0, len(rows), given.draws):
+        found["cells"].append(summary(rows[first : first + given.draws]))
+    found["seconds"] = time.perf_counter() - clock
+    write_json(given.file, found)
+    if not given.quick:
+        picture(found).savefig(given.file.with_suffix(".png"), dpi=120)
+    report(found)
+    return found
+
+
+def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Ratios of errors, consistency and coverage of one cell."""
+    rms = {
+        name: float(np.sqrt(np.mean([row[name]["rms"] ** 2 for row in rows])))
+        for name in ESTIMATORS
+        if all(name in row for row in rows)
+    }
+    scales = [(row["true"][name], *of) for row in rows for name, of in row["estimated"]["scales"].items()]
+    true, scale, low, high, _ = np.array(scales).T
+    cell = {key: value for key, value in rows[0]["task"].items() if key != "seed"}
+    return cell | {
+        "rms": rms,
+        "over_known": rms["estimated"] / rms["known"],
+        "over_none": rms["estimated"] / rms["none"] if "none" in rms else None,
+        "stated_over_known": rms["stated"] / rms["known"],
+        "nees": {name: float(np.median([row[name]["nees"] for row in rows])) for name in ESTIMATORS[:3]},
+        "covered": {name: float(np.mean([row[name]["covered"] for row in rows])) for name in ESTIMATORS[:3]},
+        "scales_covered": float(np.mean((low <= true) & (true <= high))),
+        "log_scale_error": {"mean": float(np.mean(np.log(scale / true))), "sd": float(np.std(np.log(scale / true)))},
+        "not_converged": {name: sum(not row[name]["converged"] for row in rows if name in row) for name in ESTIMATORS},
+        "seconds": {name: float(np.median([row[name]["seconds"] for row in rows])) for name in rms},
+    }
+
+
+def picture(found: dict[str, Any]) -> Figure:
+    """Errors over those of who knows the scales: estimated, as stated, and without priors, cell by cell."""
+    cells = list(dict.fromkeys((c["arm"], c["model"], c["n"]) for c in found["cells"]))
+    figure = Figure(figsize=(12, 5.5), layout="constrained")
+    panels = figure.subplots(1, len(TRUE), sharey=True)
+    for axes, true in zip(panels, TRUE, strict=True):
+        for y, cell in enumerate(cells):
+            rms = next(c["rms"] for c in found["cells"] if (c["arm"], c["model"], c["n"], c["true"]) == (*cell, true))
+            for name, (colour, mark) in MARKS.items():
+                if name in rms:
+                    axes.plot(min(rms[name] / rms["known"], MOST_SHOWN), y, mark, color=colour, ms=8)
+        axes.axvspan(0.9, 1.1, color="0.92", zorder=0)
+        axes.set_xscale("log")
+        axes.set(xlim=(0.85, MOST_SHOWN * 1.1), title=true if true == "mixed" else f"{true} times")
+        axes.set_xticks([1, 2, 4], ["1", "2", "4"])
+        axes.minorticks_off()
+        clean(axes)
+    panels[0].set_yticks(range(len(cells)), [f"{arm}, {model}, {n} stops" for arm, model, n in cells])
+    panels[0].invert_yaxis()
+    for name, (colour, mark) in MARKS.items():
+        panels[-1].plot([], [], mark, color=colour, ms=8, label=WORDS[name])
+    figure.legend(*panels[-1].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    figure.suptitle(
+        "Tool error, over that of who knows how far the arm is off. True errors over the tolerances stated:"
+    )
+    return figure
+
+
+def report(found: dict[str, Any]) -> None:
+    """Print the table."""
+    print(f"{found['n_draws']} draws a cell, {found['seconds']:.0f} s; RMS tool error, ratios")
+    print(f"{'':34} est/known  est/none  stated/known  NEES/n (known)  covered  scales covered  log error  not conv.")
+    for c in found["cells"]:
+        cell = f"{c['arm']}, {c['model']}, {c['n']} stops, {c['true']}"
+        none = "-" if c["over_none"] is None else f"{c['over_none']:.3f}"
+        nees, off = c["nees"], c["log_scale_error"]
+        print(
+            f"{cell:34} {c['over_known']:9.3f} {none:>9} {c['stated_over_known']:13.2f}"
+            f" {nees['estimated']:8.2f} ({nees['known']:.2f}) {c['covered']['estimated']:8.3f}"
+            f" {c['scales_covered']:15.3f} {off['mean']:+6.2f}±{off['sd']:.2f} {sum(c['not_converged'].values()):6d}"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from fg_calib.analysis.bounds import Bound, cramer_rao
+    from fg_calib.analysis.estimated_tolerances import estimate_tolerances
     from fg_calib.analysis.identifiability import Identifiability, observe_configurations, observe_structure
     from fg_calib.analysis.inspection import Inspection, inspect_job
     from fg_calib.analysis.mistakes import SetupCheck, check_setup
     from fg_calib.analysis.restarts import look_elsewhere
     from fg_calib.analysis.uncertainty import Uncertainty, assess
-    from fg_calib.analysis.estimated_tolerances import estimate_tolerances
     from fg_calib.analysis.variance_components import estimate_noise, solve_job
     from fg_calib.baseline.comparison import Comparison, compare
     from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares

@@ -1,10 +1,9 @@
 """Tolerances estimated from the corrections: a scale on those stated, iterated with the fit.
 
 Nobody knows how far an arm is from its drawing; the corrections of all its parameters together tell. At each solution
-the scales are those of largest posterior, the parameters integrated out to first order (see `tolerance_likelihood`);
+the scales are what the data say of them, the parameters integrated out to first order (see `tolerance_likelihood`);
 then everything is solved again with the tolerances that they say, until no scale moves. An arm is nearly linear within
-its tolerances, so that takes two or three rounds. Where the noise is estimated too, that happens in each round, by the
-same likelihood.
+its tolerances, so that takes two or three rounds. Where the noise is estimated too, that happens in each round.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from fg_calib.graph.information import correlation, whitened_triangle
 from fg_calib.graph.observability import RANK_TOLERANCE
 from fg_calib.graph.problem import Problem, reweighted_at
 from fg_calib.graph.solver import Solution, solve
-from fg_calib.graph.tolerances import ToleranceScales, groups_of, prior_parameters, with_scales
+from fg_calib.graph.tolerances import ToleranceScale, ToleranceScales, groups_of, prior_parameters, with_scales
 from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
@@ -67,10 +66,13 @@ def estimate_tolerances(problem: Problem, solve_with: Callable[[Problem], Soluti
             break
         scale = after
         noise = replace(problem.state, factors=solution.problem.state.factors)
-        now = with_scales(reweighted_at(problem, problem.start, noise), members, scale)
-    low, high = np.exp(found.low), np.exp(found.high)
-    scales = ToleranceScales(groups, members, scale, low, high, found.seen, follow @ found.unsure @ follow.T)
-    solution = replace(solution, estimated_tolerances=scales, seconds=seconds)
+        now = with_scales(
+            reweighted_at(problem, problem.start, noise), by, dict(zip(groups, scale.tolist(), strict=True))
+        )
+    figures = (v.tolist() for v in (scale, np.exp(found.low), np.exp(found.high), found.seen))
+    scales = tuple(ToleranceScale(*of) for of in zip(groups, members, *figures, strict=True))
+    estimated = ToleranceScales(scales, follow @ found.unsure @ follow.T)
+    solution = replace(solution, estimated_tolerances=estimated, seconds=seconds)
     if moves < SETTLED or not solution.converged:
         return solution
     message = f"not converged: the estimated tolerances still moved by {moves:.1g} after {MAX_ROUNDS} rounds"

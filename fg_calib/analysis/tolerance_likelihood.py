@@ -15,16 +15,19 @@ is the likelihood with u integrated out. The estimate is `u = W a`, its covarian
 of which the mean is `-2 |(1 - C)_kl|^2`: a correction that data determine counts 2, one that they do not, nothing.
 `sum over k of (1 - C_ii)` is how many corrections of a group the data tell of.
 
-Besides there is what one knows of tolerances before: that they were stated for good reason. theta is normal about 0
-with sigma `GUESS`, a factor of 10 either way. A group that the data do not tell of stays as stated; one of a single
-correction that happens to be nil does not collapse.
+Besides there is what one knows of tolerances before: they were stated for good reason, but all may be off by a common
+factor, 1 sigma of which is 5 (`TOGETHER`), and each group by another of 3 (`APART`). So a group that the data do not
+tell of goes with the others, or stays as stated if there are none; one of a single correction that happens to be nil
+does not collapse. A group of six corrections that the data determine is moved by these by less than a tenth of what its
+scale is known to.
 
-The posterior of theta is not normal where few corrections are seen. It is integrated over points that a normal
-distribution about its mode, `WIDER` than its curvature says, lays out, each weighted by what the posterior is there
-over what that distribution is (importance sampling; the points are the same always). It says the interval of each
-scale, and what not knowing them adds to the covariance of the estimate:
+The posterior of theta is not normal where few corrections are seen, and its mode is too small: the scale taken is its
+mean. It is integrated over points laid out by a t-distribution, first about the mode, then with the mean and covariance
+found, each weighted by what the posterior is there over what that distribution is (adaptive importance sampling; the
+points are the same always). They say the interval of each scale, and what not knowing the scales adds to the covariance
+of the estimate:
 
-    E[W C W + (W a - u) (W a - u)^T] - W C W at the mode.
+    E[W C W + (W a - u) (W a - u)^T] - W C W at the mean.
 
 References:
     MacKay (1992), Bayesian interpolation. Neural Computation 4(3): evidence, and number of well-determined parameters.
@@ -45,7 +48,7 @@ from scipy.stats import qmc
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-TOGETHER, APART = float(np.log(10.0)), float(np.log(3.0))
+TOGETHER, APART = float(np.log(5.0)), float(np.log(3.0))
 """1 sigma of the logarithm of a scale before any data: of all alike, and of each beside the others."""
 
 FARTHEST = 2.0
@@ -60,7 +63,10 @@ STARTS = (0.0, float(np.log(0.1)), float(np.log(10.0)))
 """Logarithms of all scales that ascents start from: where few corrections are seen there may be two modes."""
 
 N_POINTS, HEAVY = (128, 256), 5.0
-"""Points that the posterior is integrated over, first roughly; degrees of freedom of the t-distribution that they have."""
+"""Points that the posterior is integrated over, first roughly, and degrees of freedom of their t-distribution."""
+
+OLD = 0.1
+"""Share of the spread of points that stays as it was where they are laid out anew: few points may bear all weight."""
 
 INTERVAL = 0.95
 
@@ -118,13 +124,13 @@ def posterior_of(corrections: Corrections) -> Posterior:
     """
     starts = (_climbed(_Point(corrections, np.full(corrections.n_groups, start))) for start in STARTS)
     mode = max(starts, key=lambda point: point.value)
-    middle, spread = mode.theta, np.linalg.inv(-mode.derivatives()[1]).astype(np.float64)
+    middle, spread = mode.theta, np.linalg.inv(-mode.derivatives()[2]).astype(np.float64)
     for n in N_POINTS:
         points, weights = _sampled(corrections, middle, spread, n)
         thetas = np.array([point.theta for point in points])
         middle = weights @ thetas
         off = thetas - middle
-        spread = (weights * off.T) @ off
+        spread = (1.0 - OLD) * (weights * off.T) @ off + OLD * spread
     best = _Point(corrections, middle)
     unsure = -best.covariance
     for point, weight in zip(points, weights, strict=True):
@@ -166,27 +172,27 @@ class _Point:
         return out
 
     @cached_property
-    def M(self) -> Floats:
-        """Shape (n, n)."""
+    def moment(self) -> Floats:
+        """M, shape (n, n)."""
         out: Floats = np.eye(len(self.s)) + self.s[:, None] * self.corrections.information * self.s
         return out
 
     @cached_property
-    def C(self) -> Floats:
-        """Shape (n, n)."""
-        return np.linalg.inv(self.M).astype(np.float64)
+    def inverse(self) -> Floats:
+        """C, shape (n, n)."""
+        return np.linalg.inv(self.moment).astype(np.float64)
 
     @cached_property
     def a(self) -> Floats:
         """Shape (n,)."""
-        out: Floats = self.C @ (self.s * self.corrections.preferred)
+        out: Floats = self.inverse @ (self.s * self.corrections.preferred)
         return out
 
     @cached_property
     def value(self) -> float:
         """Logarithm of the posterior."""
         fit = float((self.s * self.corrections.preferred) @ self.a)
-        log_det = float(np.linalg.slogdet(self.M)[1])
+        log_det = float(np.linalg.slogdet(self.moment)[1])
         return 0.5 * (fit - log_det - float(self.theta @ self.corrections.guess @ self.theta))
 
     @property
@@ -197,17 +203,17 @@ class _Point:
     @property
     def covariance(self) -> Floats:
         """Of the corrections, shape (n, n)."""
-        out: Floats = self.s[:, None] * self.C * self.s
+        out: Floats = self.s[:, None] * self.inverse * self.s
         return out
 
     @property
     def seen(self) -> Floats:
         """How many corrections of each group the data tell of, shape (n_groups,)."""
-        return self._sums(1.0 - np.diag(self.C))
+        return self._sums(1.0 - np.diag(self.inverse))
 
     def derivatives(self) -> tuple[Floats, Floats, Floats]:
         """Gradient and Hessian of the logarithm of the posterior, and the Hessian's mean."""
-        a, C, n = self.a, self.C, self.corrections.n_groups
+        a, C, n = self.a, self.inverse, self.corrections.n_groups
         member = np.equal.outer(np.arange(n), self.corrections.group).astype(np.float64)
         square, of_guess = self._sums(a**2 + np.diag(C)), self.corrections.guess
         gradient = square - self._sums(np.ones(len(a))) - of_guess @ self.theta

@@ -282,6 +282,17 @@ class Parameter(Section):
     sigma_of_combination: Sigma = None
 
 
+class ToleranceScale(Section):
+    """A factor on tolerances that was estimated, with its 95 % interval; see `graph.tolerances.ToleranceScale`."""
+
+    group: str
+    parameters: tuple[str, ...]
+    scale: Annotated[float, Field(gt=0.0)]
+    low: Annotated[float, Field(gt=0.0)]
+    high: Annotated[float, Field(gt=0.0)]
+    seen: float
+
+
 class Covariance(Section):
     """Covariance of the errors of parameters."""
 
@@ -461,6 +472,7 @@ class Result(Section):
     expected_error: ExpectedError | None = None
     noise_factors: dict[str, float] | None = None
     noise_kept: tuple[str, ...] = ()
+    tolerance_scales: tuple[ToleranceScale, ...] | None = None
     suspect_configurations: tuple[SuspectConfiguration, ...] = ()
     residual_rms: dict[str, dict[str, Rms | None]]
     parameters: tuple[Parameter, ...]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,25 +22,36 @@ FIRST = 1e-3
 
 
 @dataclass(frozen=True)
-class ToleranceScales(FrozenArrays):
-    """Factors on the tolerances stated, estimated with the parameters.
+class ToleranceScale:
+    """A factor on the tolerances stated of a group of parameters, estimated with them.
 
     Attributes:
-        groups: What shares a scale: `a`, `theta`, `tool`; or a joint's name.
-        members: The parameters of each.
-        scale: Tolerance estimated over tolerance stated, shape (n_groups,).
-        low: Lower end of the 95 % interval of each, shape (n_groups,).
-        high: Upper end, shape (n_groups,).
-        seen: How many of its members' corrections the data tell of, shape (n_groups,).
-        unsure: What not knowing the scales adds to the covariance of the estimate, shape (n_columns, n_columns).
+        group: What shares the scale: `a`, `theta`, `tool`; or a joint's name.
+        parameters: The parameters.
+        scale: Tolerance estimated over tolerance stated.
+        low: Lower end of its 95 % interval.
+        high: Upper end.
+        seen: How many of the parameters' corrections the data tell of.
     """
 
-    groups: tuple[str, ...]
-    members: tuple[tuple[str, ...], ...]
-    scale: Floats
-    low: Floats
-    high: Floats
-    seen: Floats
+    group: str
+    parameters: tuple[str, ...]
+    scale: float
+    low: float
+    high: float
+    seen: float
+
+
+@dataclass(frozen=True)
+class ToleranceScales(FrozenArrays):
+    """The scales of all groups.
+
+    Attributes:
+        scales: Group by group.
+        unsure: What not knowing them adds to the covariance of the estimate, shape (n_columns, n_columns).
+    """
+
+    scales: tuple[ToleranceScale, ...]
     unsure: Floats
 
 
@@ -71,26 +82,28 @@ def groups_of(robot: Robot, parameters: Sequence[Parameter], by: SharedScale) ->
     Returns:
         The groups in the order in which they come first, and the number of each parameter's, shape (n,).
     """
-    owners = ("base", *(joint.name for joint in robot.joints), "tool")
-    names = []
-    for p in parameters:
-        kind = tolerance_kind(p)
-        names.append(owners[p.owner] if by == "joint" else f"{owners[p.owner]} angles" if kind is None else kind)
+    names = [_group_of(robot, p, by) for p in parameters]
     groups = tuple(dict.fromkeys(names))
     return groups, np.array([groups.index(name) for name in names], dtype=np.int64)
 
 
-def with_scales(problem: Problem, members: Sequence[Sequence[str]], scale: Floats) -> Problem:
-    """The problem from its start, with the tolerances of some parameters multiplied.
+def _group_of(robot: Robot, parameter: Parameter, by: SharedScale) -> str:
+    owner = ("base", *(joint.name for joint in robot.joints), "tool")[parameter.owner]
+    return owner if by == "joint" else tolerance_kind(parameter) or f"{owner} angles"
+
+
+def with_scales(problem: Problem, by: SharedScale, scales: Mapping[str, float]) -> Problem:
+    """The problem from its start, with the tolerances of each group multiplied, those of fixed parameters too.
 
     Args:
         problem: The problem.
-        members: Names of the parameters of each group.
-        scale: Factor on the tolerances of each, shape (n_groups,).
+        by: What shares a scale.
+        scales: Factor on the tolerances of each group.
     """
-    factor = {name: float(s) for names, s in zip(members, scale, strict=True) for name in names}
     parameters = tuple(
-        p if p.tolerance is None else replace(p, tolerance=p.tolerance * factor.get(p.name, 1.0))
+        p
+        if p.tolerance is None
+        else replace(p, tolerance=p.tolerance * scales.get(_group_of(problem.robot, p, by), 1.0))
         for p in problem.robot.parameters
     )
     robot = replace(problem.robot, parameters=parameters)

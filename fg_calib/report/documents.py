@@ -63,6 +63,7 @@ from fg_calib.files.result import (
     Step,
     SuspectReading,
     TestRows,
+    ToleranceScale,
     TouchedPoint,
     Typical,
     Weak,
@@ -137,6 +138,7 @@ def result_of(solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str,
         expected_error=_expected_error(u.expected_error),
         noise_factors=_noise_factors(solution, goodness.kinds),
         noise_kept=_noise_kept(solution, goodness.kinds),
+        tolerance_scales=_tolerance_scales(solution),
         suspect_configurations=_suspects(goodness.configurations, names),
         residual_rms=_residual_rms(u),
         parameters=tuple(map(_parameter, u.parameters)),
@@ -248,6 +250,11 @@ def _noise_kept(solution: Solution, fits: Sequence[KindFit]) -> tuple[str, ...]:
         return ()
     of_joints = ("joint",) if _joints(solution) and JOINT_NOISE not in estimated else ()
     return (*(_key(fit, fits) for fit in fits if (fit.table, fit.kind) not in estimated), *of_joints)
+
+
+def _tolerance_scales(solution: Solution) -> tuple[ToleranceScale, ...] | None:
+    found = solution.estimated_tolerances
+    return None if found is None else tuple(map(ToleranceScale.model_validate, found.scales))
 
 
 def _joints(solution: Solution) -> bool:
