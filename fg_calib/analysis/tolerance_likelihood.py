@@ -68,6 +68,9 @@ N_POINTS, HEAVY = (128, 256), 5.0
 OLD = 0.1
 """Share of the spread of points that stays as it was where they are laid out anew: few points may bear all weight."""
 
+LIGHT = 1e-6
+"""Weight of a point below which it adds nothing to the covariance."""
+
 INTERVAL = 0.95
 
 
@@ -127,30 +130,41 @@ def posterior_of(corrections: Corrections) -> Posterior:
     middle, spread = mode.theta, np.linalg.inv(-mode.derivatives()[2]).astype(np.float64)
     for n in N_POINTS:
         points, weights = _sampled(corrections, middle, spread, n)
-        thetas = np.array([point.theta for point in points])
-        middle = weights @ thetas
-        off = thetas - middle
+        middle = weights @ points
+        off = points - middle
         spread = (1.0 - OLD) * (weights * off.T) @ off + OLD * spread
     best = _Point(corrections, middle)
     unsure = -best.covariance
-    for point, weight in zip(points, weights, strict=True):
+    for k in np.flatnonzero(weights > LIGHT).tolist():
+        point = _Point(corrections, points[k])
         away = point.estimate - best.estimate
-        unsure += weight * (point.covariance + np.outer(away, away))
-    low, high = _interval(thetas, weights)
+        unsure += weights[k] * (point.covariance + np.outer(away, away))
+    low, high = _interval(points, weights)
     return Posterior(middle, low, high, best.seen, unsure)
 
 
-def _sampled(corrections: Corrections, middle: Floats, spread: Floats, n: int) -> tuple[list[_Point], Floats]:
+def _sampled(corrections: Corrections, middle: Floats, spread: Floats, n: int) -> tuple[Floats, Floats]:
     """Points of a t-distribution about the middle, and their weights by the posterior, which sum to 1."""
     k = corrections.n_groups
     uniform = np.clip(qmc.Sobol(k + 1, scramble=True, rng=0).random(n), 1e-9, 1.0 - 1e-9)
     stretch = np.sqrt(HEAVY / special.chdtri(HEAVY, uniform[:, k]))
     standard = stretch[:, None] * special.ndtri(uniform[:, :k])
-    points = [_Point(corrections, middle + x) for x in standard @ np.linalg.cholesky(spread).T]
-    log_weights = np.array([point.value for point in points])
+    points = middle + standard @ np.linalg.cholesky(spread).T
+    log_weights = _values(corrections, points)
     log_weights += 0.5 * (HEAVY + k) * np.log1p(np.sum(standard**2, axis=1) / HEAVY)
     weights = np.exp(log_weights - log_weights.max())
     return points, weights / weights.sum()
+
+
+def _values(corrections: Corrections, thetas: Floats) -> Floats:
+    """Logarithms of the posterior at many points at once, shape (m,)."""
+    s = np.exp(thetas)[:, corrections.group]
+    moments = np.eye(s.shape[1]) + s[:, :, None] * corrections.information * s[:, None, :]
+    right = s * corrections.preferred
+    fit = np.sum(right * np.linalg.solve(moments, right[..., None])[..., 0], axis=1)
+    of_guess = np.sum((thetas @ corrections.guess) * thetas, axis=1)
+    out: Floats = 0.5 * (fit - np.linalg.slogdet(moments)[1] - of_guess)
+    return out
 
 
 @dataclass(frozen=True)
@@ -191,9 +205,7 @@ class _Point:
     @cached_property
     def value(self) -> float:
         """Logarithm of the posterior."""
-        fit = float((self.s * self.corrections.preferred) @ self.a)
-        log_det = float(np.linalg.slogdet(self.moment)[1])
-        return 0.5 * (fit - log_det - float(self.theta @ self.corrections.guess @ self.theta))
+        return float(_values(self.corrections, self.theta[None])[0])
 
     @property
     def estimate(self) -> Floats:
