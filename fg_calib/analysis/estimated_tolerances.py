@@ -69,7 +69,8 @@ def estimate_tolerances(problem: Problem, solve_with: Callable[[Problem], Soluti
         now = with_scales(
             reweighted_at(problem, problem.start, noise), by, dict(zip(groups, scale.tolist(), strict=True))
         )
-    figures = (v.tolist() for v in (scale, np.exp(found.low), np.exp(found.high), found.seen))
+    low, high = np.exp(found.interval)
+    figures = (v.tolist() for v in (scale, low, high, found.seen))
     scales = tuple(ToleranceScale(*of) for of in zip(groups, members, *figures, strict=True))
     estimated = ToleranceScales(scales, follow @ found.unsure @ follow.T)
     solution = replace(solution, estimated_tolerances=estimated, seconds=seconds)

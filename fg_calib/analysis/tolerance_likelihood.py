@@ -105,18 +105,43 @@ class Posterior:
     """What is known of the scales.
 
     Attributes:
+        corrections: What it follows from.
         theta: Mean of the logarithms, shape (n_groups,).
-        low: Lower ends of the intervals of the logarithms, shape (n_groups,).
-        high: Upper ends.
-        seen: How many corrections of each group the data tell of.
-        unsure: What not knowing the scales adds to the covariance of the corrections, shape (n, n).
+        points: Logarithms at the points that it is integrated over, shape (n_points, n_groups).
+        weights: Of these, shape (n_points,).
     """
 
+    corrections: Corrections
     theta: Floats
-    low: Floats
-    high: Floats
-    seen: Floats
-    unsure: Floats
+    points: Floats
+    weights: Floats
+
+    @property
+    def interval(self) -> tuple[Floats, Floats]:
+        """Lower and upper ends of the intervals of the logarithms, shape (n_groups,) each."""
+        ends = []
+        for column in self.points.T:
+            order = np.argsort(column)
+            share = np.cumsum(self.weights[order]) - 0.5 * self.weights[order]
+            ends.append(np.interp([0.5 - INTERVAL / 2.0, 0.5 + INTERVAL / 2.0], share, column[order]))
+        low, high = np.array(ends).T
+        return low, high
+
+    @property
+    def seen(self) -> Floats:
+        """How many corrections of each group the data tell of, shape (n_groups,)."""
+        return _Point(self.corrections, self.theta).seen
+
+    @property
+    def unsure(self) -> Floats:
+        """What not knowing the scales adds to the covariance of the corrections, shape (n, n)."""
+        best = _Point(self.corrections, self.theta)
+        added = -best.covariance
+        for k in np.flatnonzero(self.weights > LIGHT).tolist():
+            point = _Point(self.corrections, self.points[k])
+            away = point.estimate - best.estimate
+            added += self.weights[k] * (point.covariance + np.outer(away, away))
+        return added
 
 
 def posterior_of(corrections: Corrections) -> Posterior:
@@ -133,14 +158,7 @@ def posterior_of(corrections: Corrections) -> Posterior:
         middle = weights @ points
         off = points - middle
         spread = (1.0 - OLD) * (weights * off.T) @ off + OLD * spread
-    best = _Point(corrections, middle)
-    unsure = -best.covariance
-    for k in np.flatnonzero(weights > LIGHT).tolist():
-        point = _Point(corrections, points[k])
-        away = point.estimate - best.estimate
-        unsure += weights[k] * (point.covariance + np.outer(away, away))
-    low, high = _interval(points, weights)
-    return Posterior(middle, low, high, best.seen, unsure)
+    return Posterior(corrections, middle, points, weights)
 
 
 def _sampled(corrections: Corrections, middle: Floats, spread: Floats, n: int) -> tuple[Floats, Floats]:
@@ -254,14 +272,3 @@ def _climbed(here: _Point) -> _Point:
             there = _Point(here.corrections, here.theta + step)
         here = there
     return here
-
-
-def _interval(points: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Ends of the interval of each column of weighted points."""
-    ends = []
-    for column in points.T:
-        order = np.argsort(column)
-        share = np.cumsum(weights[order]) - 0.5 * weights[order]
-        ends.append(np.interp([0.5 - INTERVAL / 2.0, 0.5 + INTERVAL / 2.0], share, column[order]))
-    low, high = np.array(ends).T
-    return low, high

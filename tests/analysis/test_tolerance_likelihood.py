@@ -74,7 +74,7 @@ def test_points_integrate_a_skew_posterior_as_a_fine_grid_does():
     sd = np.sqrt(density @ (grid - mean) ** 2)
     assert abs(found.theta[0] - mean) < 0.05 * sd  # 256 points that repeat themselves less than chance
     ends = np.interp([0.025, 0.975], np.cumsum(density), grid)
-    np.testing.assert_allclose([found.low[0], found.high[0]], ends, atol=0.2 * sd)
+    np.testing.assert_allclose(np.ravel(found.interval), ends, atol=0.2 * sd)
     at = _Point(corrections, found.theta)
     away = [p.estimate - at.estimate for p in points]
     whole = sum(d * (p.covariance + np.outer(o, o)) for d, p, o in zip(density, points, away, strict=True))
@@ -88,7 +88,8 @@ def test_a_group_that_rows_do_not_tell_of_goes_with_the_others():
     assert found.seen[2] == pytest.approx(0.0, abs=rounding())
     share = guess(3)[2, :2] @ np.linalg.inv(guess(3)[:2, :2])
     assert found.theta[2] == pytest.approx(share @ found.theta[:2], abs=0.1)
-    assert found.high[2] - found.low[2] > 3.0 * APART
+    low, high = found.interval
+    assert high[2] - low[2] > 3.0 * APART
 
 
 def test_tolerances_that_rows_do_not_tell_of_stay_as_stated():
@@ -96,8 +97,9 @@ def test_tolerances_that_rows_do_not_tell_of_stay_as_stated():
     found = posterior_of(corrections)
     half = norm.ppf(0.975) * np.sqrt(guess(1)[0, 0])
     np.testing.assert_allclose(found.theta, 0.0, atol=0.1 * half)
-    np.testing.assert_allclose(found.high, half, rtol=0.15)
-    np.testing.assert_allclose(found.low, -half, rtol=0.15)
+    low, high = found.interval
+    np.testing.assert_allclose(high, half, rtol=0.15)
+    np.testing.assert_allclose(low, -half, rtol=0.15)
 
 
 def test_one_correction_that_is_nil_does_not_make_its_tolerance_nothing():
@@ -111,7 +113,7 @@ def test_many_good_rows_leave_what_the_corrections_themselves_say():
     u = 7.0 * rng.normal(size=6)
     found = posterior_of(Corrections(1e10 * np.eye(6), 1e10 * u, group))
     assert found.theta[0] == pytest.approx(np.log(np.sqrt(np.mean(u**2))), abs=0.15)
-    assert found.high[0] - found.low[0] == pytest.approx(2.0 * 1.96 / np.sqrt(12.0), rel=0.15)
+    assert np.ptp(found.interval) == pytest.approx(2.0 * 1.96 / np.sqrt(12.0), rel=0.15)
     assert found.seen[0] == pytest.approx(6.0, abs=1e-6)
 
 
@@ -122,6 +124,6 @@ def test_intervals_of_scales_hold_the_true_ones_as_often_as_they_say():
     held = []
     for _ in range(80):
         theta = rng.multivariate_normal(np.zeros(3), guess(3))
-        found = posterior_of(drawn(rng, np.exp(theta))[2])
-        held += ((found.low <= theta) & (theta <= found.high)).tolist()
+        low, high = posterior_of(drawn(rng, np.exp(theta))[2]).interval
+        held += ((low <= theta) & (theta <= high)).tolist()
     assert abs(np.mean(held) - 0.95) < 4.0 * np.sqrt(0.95 * 0.05 / 80)
