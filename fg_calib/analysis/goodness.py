@@ -46,7 +46,7 @@ from fg_calib.analysis.covariance import Spread
 from fg_calib.analysis.gross_errors import MOST_FEW, find_gross_errors
 from fg_calib.analysis.residual_covariance import Dense, Errors, LowRank, Nuisances
 from fg_calib.analysis.residual_table import ResidualTable
-from fg_calib.arrays import Brief
+from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.factors import prior_rows
 from fg_calib.graph.noise import JOINT_NOISE, NoiseName
 from fg_calib.graph.problem import noises_at
@@ -234,7 +234,7 @@ class OutlierCounts(NamedTuple):
 
 
 @dataclass(frozen=True)
-class PredictedFit(Brief):
+class PredictedFit(FrozenArrays):
     """How well the calibrated arm predicts the test rows.
 
     Attributes:
@@ -264,7 +264,7 @@ class PredictedFit(Brief):
 
 
 @dataclass(frozen=True)
-class Goodness(Brief):
+class Goodness(FrozenArrays):
     """How well residuals and stated noise agree; arrays are in the order of the residual table, shape (n,).
 
     Attributes:
