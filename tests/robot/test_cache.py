@@ -41,6 +41,7 @@ def test_a_kernel_is_compiled_once(tmp_path):
     assert (again(1.5), hits(again)) == (3.0, 1)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
 @pytest.mark.parametrize(
     "damage", [lambda c: b"", lambda c: c[: len(c) // 2], lambda c: c[:-40] + bytes(40), lambda c: b"x" * len(c)]
@@ -78,7 +79,8 @@ def test_a_cached_kernel_is_loaded_without_what_compiling_needs(tmp_path):
             for file in (tmp_path / "__pycache__").glob("kernel.sines*"):
                 file.unlink()
         command = [sys.executable, "-c", code]
-        found.append(subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True))
+        env = os.environ | {"PYTHONPATH": path}
+        found.append(subprocess.run(command, env=env, capture_output=True, text=True, check=False))
     assert [(run.stdout, run.returncode) for run in found] == [
         ("3.0 True\n(3,) True\n", 0), ("3.0 False\n(3,) True\n", 0), ("3.0 False\n(3,) False\n", 0)
     ]  # fmt: skip
