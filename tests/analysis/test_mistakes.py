@@ -244,6 +244,20 @@ def test_a_mistake_in_the_robot_is_named(tmp_path, model, mistake):
     assert mistake in named(check)
 
 
+@pytest.mark.parametrize("model", ["pose", "position"])
+def test_a_wrong_tool_is_named_though_it_is_estimated(tmp_path, fg_calib, model):
+    """Its corrections alone were told of, d6 +22 of its tolerances first, where the file had the flange as the tool."""
+    point = {"estimate": ["tool.x", "tool.y", "tool.z"], "tolerance": UR5E["tolerance"] | {"tool": 0.002}}
+    m = measured(ur5e(tmp_path, **point))
+    assert not check_setup(ur5e(tmp_path, **point), m, model, doubtful=True).explanations
+    ur5e(tmp_path, **point, tool=UR5E["tool"] | {"x": 0, "y": 0, "z": 0})
+    ended = fg_calib("calibrate", write_job(tmp_path, m, model=model))
+    first = " ".join(ended.out.split("DOUBTFUL: ")[1].split())
+    assert ended.code == 3
+    assert first.startswith("position residuals fall from 1")
+    assert first.endswith("if the tool is another one, farther off than its tolerance lets it be")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["position", "pose", "orientation"])
 def test_a_forgotten_unknown_frame_is_named(tmp_path, fg_calib, model):
