@@ -3,7 +3,8 @@
 Nobody knows how far an arm is from its drawing; the corrections of all its parameters together tell. At each solution
 the scales are what the data say of them, the parameters integrated out to first order (see `tolerance_likelihood`);
 then everything is solved again with the tolerances that they say, until no scale moves. An arm is nearly linear within
-its tolerances, so that takes two or three rounds. Where the noise is estimated too, that happens in each round.
+its tolerances, so that takes two or three rounds; where it is not, scales may jump to and fro, and each way back is
+made shorter. Where the noise is estimated too, that happens in each round.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ Floats = NDArray[np.float64]
 SETTLED = 1e-3
 """Relative change of a scale below which it has settled: a hundredth of what it is known to at best."""
 
-MAX_ROUNDS = 20
+MAX_ROUNDS = 30
 
 
 @checked
@@ -54,17 +55,17 @@ def estimate_tolerances(problem: Problem, solve_with: Callable[[Problem], Soluti
         return solve_with(problem)
     groups, group = groups_of(problem.robot, parameters, by)
     members = tuple(tuple(p.name for p, k in zip(parameters, group, strict=True) if k == j) for j in range(len(groups)))
-    scale, seconds, now = np.ones(len(groups)), 0.0, problem
+    scale, step, seconds, now = np.ones(len(groups)), np.zeros(len(groups)), 0.0, problem
     for _ in range(MAX_ROUNDS):
         solution = solve_with(now)
         seconds += solution.seconds
         corrections, follow = _corrections(solution, stated, scale[group], group)
         found = posterior_of(corrections)
-        after = np.exp(found.theta)
-        moves = float(np.abs(np.log(after / scale)).max())
+        step = _held(found.theta - np.log(scale), step)
+        moves = float(np.abs(step).max())
         if moves < SETTLED:
             break
-        scale = after
+        scale = scale * np.exp(step)
         noise = replace(problem.state, factors=solution.problem.state.factors)
         now = with_scales(
             reweighted_at(problem, problem.start, noise), by, dict(zip(groups, scale.tolist(), strict=True))
@@ -78,6 +79,12 @@ def estimate_tolerances(problem: Problem, solve_with: Callable[[Problem], Soluti
         return solution
     message = f"not converged: the estimated tolerances still moved by {moves:.1g} after {MAX_ROUNDS} rounds"
     return replace(solution, converged=False, message=message)
+
+
+def _held(wanted: Floats, last: Floats) -> Floats:
+    """Steps as wanted, but back no more than half of the last one: so they end where an arm is far from linear."""
+    half = 0.5 * np.abs(last)
+    return np.where(wanted * last < 0.0, np.clip(wanted, -half, half), wanted)
 
 
 def _corrections(

@@ -136,9 +136,7 @@ def result_of(solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str,
         folds=_folds(u),
         priors=_priors(u.priors),
         expected_error=_expected_error(u.expected_error),
-        noise_factors=_noise_factors(solution, goodness.kinds),
-        noise_kept=_noise_kept(solution, goodness.kinds),
-        tolerance_scales=_tolerance_scales(solution),
+        **_noise_and_tolerances(solution, goodness.kinds),
         suspect_configurations=_suspects(goodness.configurations, names),
         residual_rms=_residual_rms(u),
         parameters=tuple(map(_parameter, u.parameters)),
@@ -252,9 +250,12 @@ def _noise_kept(solution: Solution, fits: Sequence[KindFit]) -> tuple[str, ...]:
     return (*(_key(fit, fits) for fit in fits if (fit.table, fit.kind) not in estimated), *of_joints)
 
 
-def _tolerance_scales(solution: Solution) -> tuple[ToleranceScale, ...] | None:
+def _noise_and_tolerances(solution: Solution, fits: Sequence[KindFit]) -> dict[str, Any]:
+    """What noise and tolerances were estimated, by key."""
     found = solution.estimated_tolerances
-    return None if found is None else tuple(map(ToleranceScale.model_validate, found.scales))
+    scales = None if found is None else tuple(map(ToleranceScale.model_validate, found.scales))
+    factors, kept = _noise_factors(solution, fits), _noise_kept(solution, fits)
+    return {"noise_factors": factors, "noise_kept": kept, "tolerance_scales": scales}
 
 
 def _joints(solution: Solution) -> bool:
