@@ -7,7 +7,11 @@ distances and angles of a star of pairs, or by lengths to three unknown anchors,
 0.1, 0.3, 1, 3 and 10 times the tolerances stated, all kinds alike, or each kind one of these at random (`mixed`). Each
 draw is calibrated with the scales estimated, with the true ones (`known`), with the tolerances as stated, and without
 priors. Compared are the RMS errors of the tool's position over 200 other configurations, after the best rigid fit;
-NEES of the parameters over their number; how often true scales lie in their 95 % intervals.
+NEES of the parameters over their number (median); how often true scales lie in their 95 % intervals.
+
+Takes hours with 60 draws of all 66 cells on a shared machine; what stands in `results/` is of fewer, as it says.
+Expected: within 4 % of knowing the scales, and no worse than no priors, where rows determine all directions that errors
+of that size show in; 10 to 30 % where there are fewer rows than parameters.
 """
 
 from __future__ import annotations
@@ -193,7 +197,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     ]
     clock = time.perf_counter()
     rows = over_draws(one_draw, tasks, given.processes)
-    found: dict[str, Any] = {"cells": [], "n_draws": given.draws, "seed": given.seed}
+    found: dict[str, Any] = {"cells": [], "seed": given.seed}
     for first in range(0, len(rows), given.draws):
         found["cells"].append(summary(rows[first : first + given.draws]))
     found["seconds"] = time.perf_counter() - clock
@@ -215,6 +219,7 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     true, scale, low, high, _ = np.array(scales).T
     cell = {key: value for key, value in rows[0]["task"].items() if key != "seed"}
     return cell | {
+        "n_draws": len(rows),
         "rms": rms,
         "over_known": rms["estimated"] / rms["known"],
         "over_none": rms["estimated"] / rms["none"] if "none" in rms else None,
@@ -235,7 +240,8 @@ def picture(found: dict[str, Any]) -> Figure:
     panels = figure.subplots(1, len(TRUE), sharey=True)
     for axes, true in zip(panels, TRUE, strict=True):
         for y, cell in enumerate(cells):
-            rms = next(c["rms"] for c in found["cells"] if (c["arm"], c["model"], c["n"], c["true"]) == (*cell, true))
+            there = [c["rms"] for c in found["cells"] if (c["arm"], c["model"], c["n"], c["true"]) == (*cell, true)]
+            rms = there[0] if there else {}
             for name, (colour, mark) in MARKS.items():
                 if name in rms:
                     axes.plot(min(rms[name] / rms["known"], MOST_SHOWN), y, mark, color=colour, ms=8)
@@ -258,7 +264,7 @@ def picture(found: dict[str, Any]) -> Figure:
 
 def report(found: dict[str, Any]) -> None:
     """Print the table."""
-    print(f"{found['n_draws']} draws a cell, {found['seconds']:.0f} s; RMS tool error, ratios")
+    print(f"{found['cells'][0]['n_draws']} draws a cell, {found['seconds']:.0f} s; RMS tool error, ratios")
     print(f"{'':34} est/known  est/none  stated/known  NEES/n (known)  covered  scales covered  log error  not conv.")
     for c in found["cells"]:
         cell = f"{c['arm']}, {c['model']}, {c['n']} stops, {c['true']}"

@@ -593,6 +593,15 @@ def test_corners_say_more_than_poses_and_these_more_than_pairs(tmp_path):
         assert row["realised"]["views"] < 3.0 * row["predicted"]["views"]
 
 
+def test_tolerances_estimated_are_nearly_as_good_as_known(tmp_path):
+    """Ten poses of a UR10, each kind off by another scale: one draw, so the ratio is near 1 and no more."""
+    cells = load("14_unknown_tolerances.py").main(["--quick", "--out", str(tmp_path)])["cells"]
+    poses = cells[0]
+    assert (poses["model"], poses["true"]) == ("pose", "mixed")
+    assert poses["over_known"] < 1.2
+    assert not any(sum(cell["not_converged"].values()) for cell in cells)
+
+
 @pytest.fixture(scope="module")
 def outliers_run(tmp_path_factory):
     """The quick run: its rows by way, share and loss."""
