@@ -232,13 +232,14 @@ class InFrames(Section):
 
 
 class ExpectedError(Section):
-    """Expected RMS errors of the tool."""
+    """Expected RMS errors of the tool; `relative`: nothing says where the base is, so only `fitted` tells of them."""
 
     position: InFrames
     orientation: InFrames
     at: str
     n: Whole
     of: Whole
+    relative: bool | None = None
 
 
 class Typical(Section):
