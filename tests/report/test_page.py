@@ -91,6 +91,7 @@ def test_suspects_can_be_found(page, folder):
         assert (found["kind"], found["a"], found["suspect"]) == (kind, configuration, "true")
 
 
+@pytest.mark.slow
 def test_inputs_options_versions_and_the_command_are_there(tmp_path, fg_calib):
     rng = np.random.default_rng(0)
     robot = small_arm(tolerance=LARGE)
@@ -153,6 +154,7 @@ def hostile_page(folder):
     return folder / "report.html"
 
 
+@pytest.mark.slow
 def test_names_are_text_and_nothing_else(tmp_path):
     page = hostile_page(tmp_path)
     tags = Tags()
@@ -184,6 +186,7 @@ def test_a_browser_shows_all_of_it_and_has_nothing_to_say(folder, tmp_path, opti
     assert width == height > 100
 
 
+@pytest.mark.slow
 def test_errors_count_in_the_frame_that_the_measurements_know(tmp_path):
     """After the best rigid fit where nothing says where the base is; in the base frame where something does."""
     rng = np.random.default_rng(1)
@@ -201,6 +204,7 @@ def test_errors_count_in_the_frame_that_the_measurements_know(tmp_path):
             assert ("covariance, in the base frame" in words) != fitted
 
 
+@pytest.mark.slow
 def test_the_command_repeats_what_was_done_whatever_names_are(tmp_path, fg_calib):
     robot = small_arm(tolerance=LARGE)
     rng = np.random.default_rng(0)
@@ -230,6 +234,7 @@ def test_correlations_of_few_rows_are_told_to_be_that(tmp_path, n, few):
     assert "farther apart" in words or not few
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("instrument", ["anchors", "planes", "board", "targets", "pixels"])
 def test_every_instrument_has_a_page(tmp_path, instrument):
     robot, _, table = measured_by(instrument, np.random.default_rng(1), n=30)
@@ -292,6 +297,7 @@ def test_another_page_of_that_name_is_not_replaced(folder, tmp_path, fg_calib):
     assert (tmp_path / "report.html").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_two_results_are_shown_side_by_side(tmp_path, fg_calib):
     rng = np.random.default_rng(0)
     robot = small_arm(tolerance=LARGE, estimate=("tool.x", "tool.y", "tool.z"))
@@ -361,6 +367,7 @@ def test_a_run_knows_what_it_is_of(folder):
     assert (run.judged_on, run.family, run.free_of_frame, run.command) == ("test", "position", True, None)
 
 
+@pytest.mark.slow
 def test_several_tables_and_touched_points_have_a_page(tmp_path):
     """A configuration may have no row of a kind."""
     rng = np.random.default_rng(2)
@@ -376,6 +383,7 @@ def test_several_tables_and_touched_points_have_a_page(tmp_path):
         assert tuple(html.parse(str(tmp_path / name / "report.html")).xpath("//section/h2/text()")) == TITLES
 
 
+@pytest.mark.slow
 def test_an_evaluation_says_that_it_is_one(tmp_path):
     rng = np.random.default_rng(0)
     robot = small_arm(tolerance=LARGE, estimate=("tool.x", "tool.y", "tool.z"))

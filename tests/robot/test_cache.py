@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fg_calib.robot import cache
+from fg_calib.robot import cache, kernels
 
 KERNEL = """
 from fg_calib.robot.kernels import compiled
@@ -38,6 +38,7 @@ def test_a_kernel_is_compiled_once(tmp_path):
     assert (again(1.5), hits(again)) == (3.0, 1)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
 @pytest.mark.parametrize(
     "damage", [lambda c: b"", lambda c: c[: len(c) // 2], lambda c: c[:-40] + bytes(40), lambda c: b"x" * len(c)]
@@ -50,6 +51,16 @@ def test_a_damaged_cache_is_made_anew(tmp_path, ending, damage):
     assert (found(1.5), hits(found)) == (3.0, 0)
     again = kernel(tmp_path)
     assert (again(1.5), hits(again)) == (3.0, 1)
+
+
+@pytest.mark.parametrize(("there", "often"), [(True, "once an installation"), (False, "each time, unless NUMBA_CACHE")])
+def test_it_is_said_whether_kernels_will_be_compiled_again(tmp_path, monkeypatch, caplog, there, often):
+    monkeypatch.setattr(kernels._CompileNotice, "said", False)
+    monkeypatch.setattr(kernels._CompileNotice, "kept", True)
+    monkeypatch.setattr(kernels, "has_cache_folder", lambda: there)
+    kernel(tmp_path)(1.5)
+    (notice,) = caplog.messages
+    assert notice.startswith(f"compiling the kernels: some seconds, {often}")
 
 
 def test_a_cache_that_cannot_be_written_is_none(tmp_path, monkeypatch):
