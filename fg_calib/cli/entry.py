@@ -70,6 +70,11 @@ def run() -> None:
                 app(prog_name="fg-calib")
         finally:
             sys.stdout.flush()
+    except SystemExit as ended:
+        if isinstance(ended.__context__, BrokenPipeError):  # typer has taken it for a failure
+            _close_stdout()
+            sys.exit(_READER_GONE)
+        raise
     except CalibrationError as error:
         _fail(str(error))
     except MemoryError:
