@@ -46,7 +46,7 @@ EncoderNoise = Literal["propagated", "estimated"]
 Loss = Literal["none", "huber", "cauchy", "geman-mcclure", "gnc"]
 """What becomes of large residuals: least squares, or a robust loss."""
 
-LengthUnit = Literal["m", "cm", "mm", "um"]
+LengthUnit = Literal["m", "cm", "mm", "um", "in"]
 AngleUnit = Literal["rad", "deg", "mrad"]
 
 MODELS: tuple[Model, ...] = get_args(Model)
