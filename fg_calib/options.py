@@ -49,7 +49,7 @@ Loss = Literal["none", "huber", "cauchy", "geman-mcclure", "gnc"]
 SharedScale = Literal["kind", "joint"]
 """Whether the tolerances of a kind of parameters, or those of a joint, are off by the same factor."""
 
-LengthUnit = Literal["m", "cm", "mm", "um"]
+LengthUnit = Literal["m", "cm", "mm", "um", "in"]
 AngleUnit = Literal["rad", "deg", "mrad"]
 
 MODELS: tuple[Model, ...] = get_args(Model)
