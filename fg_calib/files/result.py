@@ -298,11 +298,11 @@ class ToleranceScale(Section):
     """A factor on tolerances that was estimated, with its 95 % interval; see `graph.tolerances.ToleranceScale`."""
 
     group: str
-    parameters: tuple[str, ...]
-    scale: Annotated[float, Field(gt=0.0)]
-    low: Annotated[float, Field(gt=0.0)]
-    high: Annotated[float, Field(gt=0.0)]
-    seen: float
+    parameters: Annotated[tuple[str, ...], Field(min_length=1)]
+    scale: Annotated[float, Field(gt=0.0, le=MOST_FIGURE)]
+    low: Annotated[float, Field(gt=0.0, le=MOST_FIGURE)]
+    high: Annotated[float, Field(gt=0.0, le=MOST_FIGURE)]
+    seen: Bounded
 
 
 class Covariance(Section):
@@ -582,6 +582,9 @@ def _of_names(result: Result) -> Iterator[tuple[str, str, str]]:
             yield key, f"{max(given, key=given.count)!r} twice", "different names"
     for name in set(names).difference(known):
         yield "covariance: names", f"{name!r}, which is no parameter", "names of parameters"
+    for i, one in enumerate(result.tolerance_scales or (), start=1):
+        for name in set(one.parameters).difference(known):
+            yield f"tolerance_scale {i}: parameters", f"{name!r}, which is no parameter", "names of parameters"
 
 
 def _of_parameters(result: Result) -> Iterator[tuple[str, str, str]]:

@@ -1,5 +1,6 @@
 """Tolerances estimated with the fit: of whole arms, beside noise, in the report and the files."""
 
+import json
 from dataclasses import replace
 from functools import cache
 
@@ -14,6 +15,7 @@ from fg_calib.analysis.variance_components import estimate_noise
 from fg_calib.analysis.verdict import of_tolerances
 from fg_calib.calibration import Calibration, calibrate, calibrate_job
 from fg_calib.errors import InputError
+from fg_calib.files.result import read_result
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.graph.tolerances import FIRST, ToleranceScale
@@ -177,6 +179,12 @@ def test_scales_are_in_the_report_the_result_and_the_saved_robot(tmp_path):
         if p.tolerance is not None:
             assert p.tolerance == pytest.approx(by_kind[p.kind], rel=1e-9)
     np.testing.assert_allclose(loaded.covariance(), found.covariance(), rtol=1e-9)
+    file = tmp_path / "result" / "result.json"
+    document = json.loads(file.read_text())
+    document["tolerance_scales"][1]["parameters"][0] = "elbow"
+    file.write_text(json.dumps(document))
+    with pytest.raises(InputError, match="tolerance_scale 2: parameters: 'elbow', which is no parameter"):
+        read_result(file)
 
 
 def test_scales_far_from_1_and_those_that_data_do_not_tell_are_told_of():
