@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
     from fg_calib.calibration import Calibration, calibrate, calibrate_job
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
+    from fg_calib.exports.export import Export, export
     from fg_calib.files.columns import Column
     from fg_calib.files.job import read_job
     from fg_calib.files.result import Result, read_result, result_schema
@@ -70,6 +71,7 @@ _HOMES = {
     "fg_calib.baseline.comparison": ("Comparison", "compare"),
     "fg_calib.calibration": ("Calibration", "calibrate", "calibrate_job"),
     "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
+    "fg_calib.exports.export": ("Export", "export"),
     "fg_calib.files.columns": ("Column",),
     "fg_calib.files.job": ("read_job",),
     "fg_calib.job": ("Job",),
@@ -123,6 +125,7 @@ __all__ = [
     "Column",
     "Comparison",
     "DistanceFactor",
+    "Export",
     "Identifiability",
     "InputError",
     "Inspection",
@@ -160,6 +163,7 @@ __all__ = [
     "cramer_rao",
     "estimate_noise",
     "expand",
+    "export",
     "fit_least_squares",
     "format_comparison",
     "format_identifiability",

@@ -30,7 +30,19 @@ FOLDERS = (
         "measurements",
         "job",
     ),
-    *("camera", "simulation", "files", "graph", "analysis", "baseline", "report", "calibration", "pages", "cli"),
+    *(
+        "camera",
+        "simulation",
+        "files",
+        "graph",
+        "analysis",
+        "baseline",
+        "report",
+        "calibration",
+        "pages",
+        "exports",
+        "cli",
+    ),
 )
 """From the ground up: a folder (or module of the package itself) imports from those before it."""
 

@@ -250,6 +250,20 @@ def write_robot(path: Path | str, robot: Robot, *, units: Units | None = None, u
         InputError: The folder does not exist or may not be written to.
         ValueError: A URDF robot without `urdf_name`, or the other way round.
     """
+    write_text(Path(path), robot_text(robot, units=units, urdf_name=urdf_name))
+
+
+def robot_text(robot: Robot, *, units: Units | None = None, urdf_name: str | None = None) -> str:
+    """The text that `write_robot` writes.
+
+    Args:
+        robot: The robot.
+        units: Of the text; default m and rad.
+        urdf_name: See `write_robot`.
+
+    Raises:
+        ValueError: A URDF robot without `urdf_name`, or the other way round.
+    """
     if (robot.urdf is None) != (urdf_name is None):
         raise ValueError("a URDF robot, and no other, is written with urdf_name")
     units = units or Units()
@@ -272,7 +286,7 @@ def write_robot(path: Path | str, robot: Robot, *, units: Units | None = None, u
         "tolerance": _Flow(_tolerances(robot, units)),
     }
     kept = {key: value for key, value in mapping.items() if value or key == "joints"}
-    write_text(Path(path), yaml.dump(kept, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=math.inf))
+    return str(yaml.dump(kept, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=math.inf))
 
 
 def _unit_of_kind(kind: str) -> str:

@@ -544,7 +544,12 @@ def roll_pitch_yaw(rotation: Floats) -> dict[str, float]:
     yaw = np.arctan2(-R[0, 1], R[1, 1]) if level < UPRIGHT else np.arctan2(R[1, 0], R[0, 0])
     left = np.cos(yaw) * R[1] - np.sin(yaw) * R[0]  # the second row of what is left: 0, cos(roll), -sin(roll)
     roll = 0.0 if level < UPRIGHT else np.arctan2(-left[2], left[1])
-    return {"roll": float(roll), "pitch": float(np.arctan2(-R[2, 0], level)), "yaw": float(yaw)}
+    pitch = np.arctan2(-R[2, 0], level)
+    return {
+        "roll": float(roll) + 0.0,
+        "pitch": float(pitch) + 0.0,
+        "yaw": float(yaw) + 0.0,
+    }  # of two zeros the plain one
 
 
 UPRIGHT = 1e-14
