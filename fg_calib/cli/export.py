@@ -99,6 +99,8 @@ def export(
     elif out is None:
         hide_progress()
         print(made.text, end="")
+    on_stdout = made.text if out is None and not as_json else ""
     for note in made.notes:
-        say(note)
+        if note not in on_stdout:
+            say(note)
     end(made.findings, not_accepted=made.not_accepted)

@@ -334,14 +334,14 @@ def _table(arm: _Arm, to: str, far: bool) -> Export:
     if table.nearly:
         found = fit_parameters(found, robot, drawn(robot, N_FITTED, 0))
     error = errors(found, robot, drawn(robot, N_JUDGED, 1))
-    reasons = [str(nearly) for nearly in table.nearly]
     exact = max(error.position_max, error.rotation_max) <= EXACT
+    reasons = [] if exact else [str(nearly) for nearly in table.nearly] or ["figures too large for their digits"]
     order = " ".join(f"{_ELEMENTS[kind]}({kind})" for kind in CONVENTIONS[convention])
     notes = [f"{words}: {order} a joint; readings are added to theta, of slides to d; mm and deg"]
     if exact:
         notes.append("the same arm: base and tool below hold what rows do not")
     else:
-        notes += [f"NOT EXACT: {reason}" for reason in reasons or ["figures too large for their digits"]]
+        notes += [f"NOT EXACT: {reason}" for reason in reasons]
         notes.append(f"the best fit over the joint limits, base and tool included: {_error_words(error)}")
     text = _commented((*arm.comments, *notes), robot_text(found, units=_MM_DEG))
     details = {"convention": convention, "exact": exact, "reasons": reasons, "error": asdict(error)}

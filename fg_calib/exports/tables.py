@@ -15,11 +15,11 @@ that of the joint before them, or behind them.
     p = d e_z + a x + d' z',   x = (cos theta, sin theta, 0), y = e_z x x:
     a = p.x,   d' = -p.y / sin alpha,   d = p.z - d' cos alpha
 
-Exactly parallel axes have a common normal anywhere, and d' is 0. But d' and d grow without bound as axes become nearly
-parallel: by p.y over the angle, and a small tilt would move them by kilometres. Beyond `FARTHEST` a table that holds
-the arm is none that anybody can use, and this module says so (`Nearly`) and takes the axes to be parallel; `fits` then
-finds the best table of such. Hayati's row is for these: where the plane through the frame, square to z, meets the next
-axis,
+Exactly parallel axes have a common normal anywhere: d stays what the joint before left. But d' and d grow without bound
+as axes become nearly parallel: by p.y over the angle, and a small tilt would move them by kilometres. Beyond `FARTHEST`
+a table that holds the arm is none that anybody can use, and this module says so (`Nearly`) and takes the axes to be
+parallel; `fits` then finds the best table of such. Hayati's row is for these: where the plane through the frame, square
+to z, meets the next axis,
 
     M = [Rz(theta)] [Tx(a) Rx(alpha) Ry(beta)] [Tz(d') Rz(theta')]
     P = p - z' p_z / z'_z = a x,   Rz(-theta) z' = (sin beta, -sin alpha cos beta, cos alpha cos beta)
@@ -143,11 +143,11 @@ def _rows(
         if convention == "dh-hayati" and sine < NEARLY_PARALLEL:
             row = plane_crossing(M)
         else:
-            row = common_normal(M)
+            row = common_normal(M, height=carried[2, 3])
             away = max(abs(row["d"]), abs(left_over(M, row)[2, 3]))
             if away > farthest:
                 nearly.append(Nearly((i, i + 1), float(np.arcsin(sine)), away))
-                row = common_normal(M, parallel=True)
+                row = common_normal(M, height=carried[2, 3], parallel=True)
         carried = _along_z(left_over(M, row))
         link = {kind: row.pop(kind) for kind in ("a", "alpha")}
         rows[i - 1] |= row
@@ -158,17 +158,18 @@ def _rows(
     return rows, base, left_over(M, row) @ links.tool, tuple(nearly)
 
 
-def common_normal(M: Floats, *, parallel: bool = False) -> dict[str, float]:
+def common_normal(M: Floats, *, height: float = 0.0, parallel: bool = False) -> dict[str, float]:
     """theta, d, a and alpha from the z axis of a frame to that of another.
 
     Args:
         M: From the one frame to the other, shape (4, 4).
+        height: d of parallel axes, which have common normals anywhere, [m].
         parallel: Whether to take both axes to be parallel.
     """
     (x, y, z), p = M[:3, 2], M[:3, 3]
     sine = np.hypot(x, y)
     if parallel or sine < PARALLEL:
-        row = {"theta": _direction(p), "d": p[2], "a": np.hypot(p[0], p[1]), "alpha": 0.0 if z > 0 else np.pi}
+        row = {"theta": _direction(p), "d": height, "a": np.hypot(p[0], p[1]), "alpha": 0.0 if z > 0 else np.pi}
         return _upright(row)
     theta = np.arctan2(x, -y)
     c, s = np.cos(theta), np.sin(theta)

@@ -274,6 +274,11 @@ def calibrates_two_tables(code, folder, fg_calib):
     exec(code, made | {"tracker": measure(true, 30, rng), "bar": measure(true, 30, rng)})
 
 
+def exports_an_arm(code, folder, fg_calib):
+    exec(code, {})
+    assert read_robot(folder / "arm_hayati.yaml").n_joints == 2
+
+
 def slow(function, mark=pytest.mark.slow):
     return pytest.param(function, marks=mark)
 
@@ -285,6 +290,7 @@ HOW = {
     "instruments": [is_job, is_a_table_of_lengths, is_table, is_job, calibrates_two_tables],
     "from-bags-and-images": [are_typed, is_job, are_typed, is_board, is_board],
     "believe-it": [is_key_of_a_job],
+    "export": [are_typed, exports_an_arm],
     "observability": [is_printed],
     "simulate": [slow(are_run), is_scenario, slow(is_scenario, pytest.mark.long)],
     "compare": [slow(is_printed)],
