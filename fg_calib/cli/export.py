@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -9,6 +10,7 @@ import typer
 
 from fg_calib.cli.output import Json, end, say, show_json
 from fg_calib.cli.progress import hide_progress
+from fg_calib.errors import escaped
 
 _Arm = Annotated[
     Path,
@@ -64,7 +66,9 @@ def export(
     as_json: Json = False,
 ) -> None:
     """Write the calibrated arm as others read it: URDF, ROS, Tesseract, tables, joint zeros."""
-    is_result = arm.is_dir() or arm.suffix.lower() == ".json"
+    from fg_calib.files.disk import is_folder, require_absent
+
+    is_result = is_folder(arm) or arm.suffix.lower() == ".json"
     if is_result and (base_link or tip_link):
         raise typer.BadParameter("a RESULT knows its links", param_hint="--base-link and --tip-link")
     if at is not None and to != "zeros":
@@ -74,7 +78,6 @@ def export(
     from fg_calib.calibration import Calibration
     from fg_calib.exports.export import export as export_arm
     from fg_calib.exports.export import measured_configurations
-    from fg_calib.files.disk import require_absent
     from fg_calib.files.robot_yaml import read_robot
 
     if out is not None:
@@ -98,9 +101,14 @@ def export(
         show_json(made.document())
     elif out is None:
         hide_progress()
-        print(made.text, end="")
+        print(_shown(made.text) if sys.stdout.isatty() else made.text, end="")
     on_stdout = made.text if out is None and not as_json else ""
     for note in made.notes:
         if note not in on_stdout:
             say(note)
     end(made.findings, not_accepted=made.not_accepted)
+
+
+def _shown(text: str) -> str:
+    """A file's text as a terminal may get it: what names in it hold steers none."""
+    return "\n".join(escaped(line.expandtabs()) for line in text.split("\n"))

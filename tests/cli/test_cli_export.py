@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from arms import column, off, ur10
+from exported import column, off, ur10
 from simulated import measure
 from sparing import as_case
 
@@ -58,6 +58,7 @@ def test_stdout_is_the_file_or_the_document(result, to, fg_calib):
     assert found["findings"] == found["not_accepted"] == []
 
 
+@pytest.mark.slow
 def test_zeros_where_it_was_measured_are_better_there(result, fg_calib):
     ended = [json.loads(fg_calib("export", result, "--to", "zeros", *more, "--json").out)
              for more in ((), ("--at", "workspace"), ("--at", "measured"))]  # fmt: skip
@@ -120,7 +121,7 @@ def doubtful(result, tmp_path):
 
 
 def test_a_result_that_is_not_to_be_trusted_says_so_and_ends_with_3(doubtful, fg_calib, tmp_path):
-    for to in ("hayati", "ur", "zeros", "yaml", "tesseract"):
+    for to in ("hayati", "tesseract"):
         ended = fg_calib("export", doubtful, "--to", to)
         assert ended.code == 3
         assert ended.err.splitlines()[-1] == f"not to be trusted: {FINDING}"
@@ -130,6 +131,16 @@ def test_a_result_that_is_not_to_be_trusted_says_so_and_ends_with_3(doubtful, fg
     assert json.loads(ended.out)["findings"] == [FINDING]
     assert "<!-- NOT TO BE TRUSTED: reduced chi-square 7 - - far too large -->" in (tmp_path / "arm.urdf").read_text()
     assert read_urdf(tmp_path / "arm.urdf").n_joints == 6
+
+
+def test_names_steer_no_terminal(fg_calib, tmp_path, monkeypatch):
+    write_robot(tmp_path / "arm.yaml", Robot.from_dh([[0.1, 0, 0.2, 0]], names=["\u202eone"], name="\u2066arm"))
+    piped = fg_calib("export", tmp_path / "arm.yaml", "--to", "urdf")
+    assert "\u202eone" in piped.out
+    monkeypatch.setattr("fg_calib.cli.export.sys.stdout.isatty", lambda: True)
+    shown = fg_calib("export", tmp_path / "arm.yaml", "--to", "urdf")
+    assert r'name="\u202eone"' in shown.out
+    assert all(line.isprintable() for line in shown.out.split("\n"))
 
 
 MISTAKES = {

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import yaml
-from arms import ARMS, TREE, UR10, column, matrix, off, pin_poses, scara, seven, ur10, yourdfpy_poses
+from exported import ARMS, TREE, UR10, column, matrix, off, pin_poses, scara, seven, ur10, yourdfpy_poses
 from oracle import dh_joint, frame, tool_pose
 from scipy.spatial.transform import Rotation
 from sparing import as_case

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from arms import matrix, off, scara
+from exported import matrix, off, scara
 from scipy.spatial.transform import Rotation
 
 from fg_calib import Robot, export
