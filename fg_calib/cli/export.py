@@ -35,7 +35,7 @@ _At = Annotated[
 ]
 _Tool = Annotated[
     Literal["nominal", "calibrated"] | None,
-    typer.Option("--tool", help="Of zeros: the tool that the controller works with."),
+    typer.Option("--tool", help="Of zeros: the tool that the controller works with; as calibrated if not given."),
 ]
 _Far = Annotated[bool, typer.Option("--far", help="Of dh and mdh: be exact, however far frames are from the arm.")]
 _Elements = Annotated[
@@ -88,7 +88,7 @@ def export(
         to,
         nominal=None if nominal is None else read_robot(nominal, base_link=base_link, tip_link=tip_link),
         configurations=measured_configurations(arm) if at == "measured" else None,
-        tool=tool or "nominal",
+        tool=tool or "calibrated",
         far=far,
         calibration_elements=calibration_elements,
         ur_base=ur_base,

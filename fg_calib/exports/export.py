@@ -140,7 +140,7 @@ def export(
     *,
     nominal: Robot | None = None,
     configurations: ArrayLike | None = None,
-    tool: ToolOfZeros = "nominal",
+    tool: ToolOfZeros = "calibrated",
     far: bool = False,
     calibration_elements: bool = False,
     ur_base: UrBase | None = None,
@@ -155,7 +155,8 @@ def export(
         nominal: The robot as drawn; a calibration has it.
         configurations: Of `zeros`: where the fit is wanted, shape (n, n_joints), [rad] (prismatic: [m]); all over the
             joint limits if None.
-        tool: Of `zeros`: the tool that the controller works with: as drawn, or as calibrated.
+        tool: Of `zeros`: the tool that the controller works with: as calibrated, as it is set there on its own and the
+            tool of a calibration is often an instrument's target; or as drawn, so that zeros make up for it.
         far: Of `dh` and `mdh`: take common normals of nearly parallel axes however far away they are, and be exact.
         calibration_elements: Of `urdf`: write what is a joint's zero into `<calibration rising="...">`.
         ur_base: Of `ur`: which frame of ur_description the arm's base is; `base_link` if that is its name in a URDF,
@@ -174,7 +175,7 @@ def export(
     _require_use(
         to,
         configurations=configurations is not None,
-        tool=tool != "nominal",
+        tool=tool != "calibrated",
         far=far,
         calibration_elements=calibration_elements,
         ur_base=ur_base is not None,
@@ -378,8 +379,11 @@ def _zeros(arm: _Arm, tool: ToolOfZeros, configurations: ArrayLike | None) -> Ex
         "it is subtracted from what is commanded, and from a stored encoder offset (angle = encoder - offset)",
         f"fitted at {len(fitted)} configurations {'within the joint limits' if configurations is None else 'given'}",
     ]
-    if tool == "calibrated":
-        notes.append(f"with the calibrated tool: {_frame_words(robot, robot.n_joints + 1) or 'none'} (mm, deg)")
+    if _frame_words(robot, robot.n_joints + 1) != (
+        as_drawn := _frame_words(arm.nominal_for("zeros"), robot.n_joints + 1)
+    ):
+        words = as_drawn if tool == "nominal" else _frame_words(robot, robot.n_joints + 1)
+        notes.append(f"with the tool as {'drawn' if tool == 'nominal' else 'calibrated'}: {words or 'none'} (mm, deg)")
     for name in at:
         where = "over the joint limits" if name == "workspace" else "at the configurations given"
         notes += [f"before, {where}: {_error_words(before[name])}", f"after, {where}: {_error_words(after[name])}"]

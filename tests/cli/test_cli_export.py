@@ -159,7 +159,7 @@ MISTAKES = {
     "no drawing": (("{robot}", "--to", "zeros"), 1, "error: zeros: an arm without the one as drawn, expected a RESULT"),
     "measured nowhere": (("{robot}", "--to", "zeros", "--at", "measured"), 2, "needs a RESULT"),
     "an idle place": (("{robot}", "--to", "dh", "--at", "workspace"), 2, "means nothing for dh"),
-    "an idle tool": (("{robot}", "--to", "dh", "--tool", "calibrated"), 1, "error: tool: means nothing for dh, "),
+    "an idle tool": (("{robot}", "--to", "dh", "--tool", "nominal"), 1, "error: tool: means nothing for dh, "),
     "links of no URDF": (("{robot}", "--to", "dh", "--tip-link", "a"), 1, "error: robot.yaml: a robot without links, "),
     "links of a result": (("{empty}", "--to", "dh", "--tip-link", "a"), 2, "a RESULT knows its links"),
     "no URDF": (

@@ -366,6 +366,7 @@ def test_zeros_are_the_best_there_are():
     nominal, robot = ur10(), off(ur10())
     q = drawn(robot, 40, 7)
     made = export(robot, "zeros", nominal=nominal, configurations=q)
+    assert "with the tool" not in made.text  # it is the same
     best = np.array([zero["reading"] for zero in made.details["zeros"].values()])
 
     def cost(zeros):
@@ -407,7 +408,8 @@ def test_a_tool_that_is_set_as_calibrated_is_no_matter_of_zeros():
     kept, told = (export(robot, "zeros", nominal=nominal, tool=tool) for tool in ("nominal", "calibrated"))
     assert max(abs(zero["reading"]) for zero in told.details["zeros"].values()) < 1e-12
     assert max(abs(zero["reading"]) for zero in kept.details["zeros"].values()) > 1e-3
-    assert "with the calibrated tool: x 20, y -20, z 100" in told.text
+    assert "with the tool as drawn: x 10, y -20, z 100" in kept.text
+    assert "with the tool as calibrated: x 20, y -20, z 100" in told.text
 
 
 # --- what cannot be ---------------------------------------------------------------------------------------------------
@@ -434,7 +436,7 @@ MISTAKES = {
         "calibration_elements: an arm that is no URDF, expected an arm that was read from a URDF",
     ),
     "an idle option": (
-        lambda: export(UR, "dh", tool="calibrated"),
+        lambda: export(UR, "dh", tool="nominal"),
         "tool: means nothing for dh, expected the format zeros",
     ),
     "an idle flag": (

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from exported import matrix, off, scara
+from exported import matrix, off, scara, ur10
 from scipy.spatial.transform import Rotation
 
 from fg_calib import Robot, export
@@ -180,3 +180,18 @@ def test_links_of_an_arm_are_its_chain():
         T = T @ L @ moved
     at = poses(robot, q[None])
     assert T @ links.between[-1] @ links.tool == pytest.approx(matrix(at.rotation[0], at.position[0]), abs=1e-14)
+
+
+def test_what_a_ur10_misses_in_a_table_of_four_figures_is_what_the_page_says():
+    made = export(off(ur10()), "dh")
+    assert "axes 2 and 3 are parallel within 0.041 deg, not exactly: their common normal is 429 m away" in made.text
+    assert made.details["error"]["position_rms"] == pytest.approx(0.17e-3, abs=5e-6)
+
+
+@pytest.mark.slow
+def test_the_best_fit_does_not_depend_on_how_its_figures_are_held(monkeypatch):
+    rms = []
+    for hold in (1e-3, 1e-2, 1e-1):
+        monkeypatch.setattr("fg_calib.exports.fits.HOLD", hold)
+        rms.append(export(off(ur10()), "dh").details["error"]["position_rms"])
+    assert rms == pytest.approx([rms[1]] * 3, rel=1e-3)
