@@ -39,6 +39,7 @@ FOLDERS = (
         "baseline",
         "report",
         "calibration",
+        "correction",
         "pages",
         "exports",
         "cli",

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, small_arm, true_robot, write_job
-from sparing import most_slow
 
 from fg_calib import (
     Calibration,
@@ -61,7 +60,8 @@ def found():
 Q = np.random.default_rng(1).uniform(-1.5, 1.5, (4, 4))
 
 
-@pytest.mark.parametrize("name", most_slow(CASES, every=2))
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("name", CASES)
 def test_one_call_does_the_steps(found, name):
     robot, m, settings = given(name)
     solution = look_elsewhere(solve(build_problem(robot, m, **settings)))
@@ -77,6 +77,7 @@ def test_one_call_does_the_steps(found, name):
     }
 
 
+@pytest.mark.slow
 def test_options_come_as_one_or_as_keywords():
     robot, m, _ = given("priors")
     one = calibrate(robot, m, Options(model="distance", pairing=Pairing("chain")))
@@ -110,7 +111,8 @@ def test_covariance_is_in_the_order_asked_for(found):
         result.covariance("a2")
 
 
-@pytest.mark.parametrize("name", most_slow(CASES, every=2))
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("name", CASES)
 def test_predictions_agree_with_differences(found, name):
     """`Uncertainty.predict` differentiates any function of the robot by central differences.
 
@@ -180,6 +182,7 @@ def test_what_is_loaded_says_what_was_saved(found, tmp_path, name):
         again.save(tmp_path / "elsewhere")
 
 
+@pytest.mark.slow
 def test_the_command_writes_and_prints_the_same(fg_calib, tmp_path):
     robot, m, settings = given("priors")
     path = write_job(tmp_path, robot, m, **settings)
@@ -200,6 +203,7 @@ def test_the_command_writes_and_prints_the_same(fg_calib, tmp_path):
     assert calibrate_job(read_job(path)).result.inputs.keys() == {"calibration.yaml", "robot.yaml", "poses.csv"}
 
 
+@pytest.mark.slow
 def test_noise_is_estimated_from_nothing_stated():
     robot, m, _ = given("priors", n=40)
     stated = calibrate(robot, m, model="pose", estimate_noise=True)
@@ -223,6 +227,7 @@ def of_dataclasses(value):
         yield value
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", CASES)
 def test_everything_fits_a_screen(found, name):
     result = found[name]
@@ -242,6 +247,7 @@ def test_everything_fits_a_screen(found, name):
     assert "Fit statistics" in str(result)
 
 
+@pytest.mark.slow
 def test_a_doubtful_result_says_so_in_a_few_lines():
     robot, m, _ = given("priors")
     result = calibrate(robot, replace(m, position=m.position * 1.05), model="pose")
@@ -251,6 +257,7 @@ def test_a_doubtful_result_says_so_in_a_few_lines():
     assert all(len(line) <= 100 for line in repr(result).splitlines())
 
 
+@pytest.mark.slow
 def test_a_notebook_gets_a_table(found):
     robot, m, settings = given("priors")
     text = calibrate(replace(robot, name="<b>arm</b>"), m, **settings)._repr_html_()

@@ -179,7 +179,7 @@ class _Search:
             jacobian[:, :3] = 0.0
             return np.concatenate([np.zeros_like(shift), shift], axis=1), jacobian
         turn = self._rotation[rows] @ np.swapaxes(at.rotation, 1, 2)  # (n, 3, 3)
-        return np.concatenate([_rotation_vector(turn), shift], axis=1), jacobian
+        return np.concatenate([rotation_vector(turn), shift], axis=1), jacobian
 
     def step(self, q: Floats, miss: Floats, jacobian: Floats) -> Floats:
         """The next configurations, within the limits, shape (n, n_joints)."""
@@ -221,7 +221,7 @@ def _range_of_starts(robot: Robot) -> tuple[Floats, Floats]:
     return low, high
 
 
-def _rotation_vector(rotation: Floats) -> Floats:
+def rotation_vector(rotation: Floats) -> Floats:
     """Rotation vectors of rotation matrices, shape (n, 3), exact near 0, [rad]."""
     from scipy.spatial.transform import Rotation
 
