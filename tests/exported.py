@@ -1,6 +1,9 @@
 """Arms of several conventions, as drawn and a little off, and what others compute of them."""
 
+import warnings
+
 import numpy as np
+import pytest
 
 from fg_calib import Robot, read_urdf
 
@@ -99,10 +102,16 @@ def matrix(rotation, position):
     return T
 
 
+def pinocchio():
+    """Pinocchio, or the test is skipped without it; what it warns of when it is loaded is its own."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return pytest.importorskip("pinocchio", reason="needs pinocchio: pip install pin")
+
+
 def pin_poses(text, base, tip, names, readings):
     """base_T_tip by pinocchio for joints of these names, shape (n, 4, 4)."""
-    import pinocchio as pin
-
+    pin = pinocchio()
     model = pin.buildModelFromXML(text)
     data = model.createData()
     joints = [model.joints[model.getJointId(name)] for name in names]

@@ -191,9 +191,9 @@ def export(
         part = _zeros(found, tool, configurations)
     else:
         part = _yaml(found) if to == "yaml" else _table(found, to, far)
-    if isinstance(arm, Calibration):
-        part = replace(part, findings=_findings(arm), not_accepted=arm.not_accepted)
-    return replace(part, to=to, robot=found.robot.name)
+    if not isinstance(arm, Calibration):
+        return part
+    return replace(part, findings=_findings(arm), not_accepted=arm.not_accepted)
 
 
 def _findings(calibration: Calibration) -> tuple[str, ...]:
@@ -281,6 +281,8 @@ def _urdf(arm: _Arm, calibration_elements: bool) -> Export:
     notes = (f"link {BASE_LINK} is the base frame and link {TOOL_LINK} the tool frame; joints turn about z",)
     if any(np.isinf([joint.lower, joint.upper]).any() for joint in robot.joints if joint.prismatic):
         notes += ("slides without limits have 1000 m, as URDF knows none without",)
+    if any(np.isfinite([joint.lower, joint.upper]).sum() == 1 for joint in robot.joints if not joint.prismatic):
+        notes += ("joints that turn and have one limit alone are continuous here, without it",)
     if any(np.isfinite([joint.lower, joint.upper]).all() for joint in robot.joints):
         notes += ("effort and velocity in <limit> are 0, as nobody has stated them",)
     return Export("urdf", robot.name, new_urdf(robot, [printable(c) for c in (*arm.comments, *notes)]), notes)
@@ -354,7 +356,7 @@ _ELEMENTS = {"a": "Tx", "alpha": "Rx", "d": "Tz", "theta": "Rz", "beta": "Ry"}
 
 def _yaml(arm: _Arm) -> Export:
     robot, notes = arm.robot, list[str]()
-    if robot.urdf is not None:
+    if robot.convention not in CONVENTIONS:
         robot = in_table(robot, "dh-hayati").robot
         notes.append("the same arm as rows of dh-hayati, as it came from a URDF: `--to urdf` writes that")
     return Export("yaml", robot.name, _commented((*arm.comments, *notes), robot_text(robot)), tuple(notes))

@@ -1,19 +1,21 @@
 """Every format has the forward kinematics of the arm: by pinocchio, yourdfpy and products of matrices."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import yaml
 from exported import ARMS, TREE, UR10, column, matrix, off, pin_poses, scara, seven, ur10, yourdfpy_poses
-from oracle import dh_joint, frame, tool_pose
+from oracle import dh_joint, frame, random_robot, tool_pose
 from scipy.spatial.transform import Rotation
 from sparing import as_case
 
 from fg_calib import InputError, Robot, export, read_robot, read_urdf
 from fg_calib.exports.fits import drawn, poses
 from fg_calib.exports.tables import in_table
+from fg_calib.robot.model import CONVENTIONS
 
 EXACT = 1e-9  # [m] and [rad], as the issue states
-NO_PIN = "needs pinocchio: pip install pin"
 
 
 def ours(robot, q):
@@ -44,15 +46,15 @@ def ends(robot):
 
 
 def test_pinocchio_computes_the_tool_poses_of_the_urdf(arm):
-    pytest.importorskip("pinocchio", reason=NO_PIN)
     q = drawn(arm, 1000, 3)
     base, tip, before, behind = ends(arm)
     found = before @ pin_poses(export(arm, "urdf").text, base, tip, names(arm), q) @ behind
     assert np.abs(found - ours(arm, q)).max() < EXACT
 
 
-def test_yourdfpy_computes_the_tool_poses_of_the_urdf(arm, tmp_path):
-    q = drawn(arm, 20, 3)
+@pytest.mark.parametrize("n", [20, as_case(1000, is_slow=True)])
+def test_yourdfpy_computes_the_tool_poses_of_the_urdf(arm, n, tmp_path):
+    q = drawn(arm, n, 3)
     base, tip, before, behind = ends(arm)
     export(arm, "urdf").write(tmp_path / "out.urdf")
     found = before @ yourdfpy_poses(tmp_path / "out.urdf", base, tip, names(arm), q) @ behind
@@ -100,6 +102,48 @@ def test_tables_of_four_figures_say_what_they_miss_and_by_how_much(name, to, tmp
     assert np.sqrt(np.mean(miss**2)) == pytest.approx(error["position_rms"], rel=0.1)
     assert miss.max() < 1.5 * error["position_max"]
     assert f"{1e3 * error['position_rms']:.4g} mm RMS" in made.text
+
+
+def random_arm(seed):
+    """Any convention, 1 to 7 joints; of two in three all angles are quarter turns, of one in three nearly so."""
+    rng = np.random.default_rng(seed)
+    robot = random_robot(["urdf", *CONVENTIONS][seed % 5], int(rng.integers(1, 8)), rng)
+    if seed % 3 == 0:
+        return robot
+    angles = np.array([p.unit == "rad" for p in robot.parameters])
+    values = np.where(angles, np.round(robot.nominal / (np.pi / 2)) * np.pi / 2, robot.nominal)
+    return robot.with_values(values + (seed % 3 == 2) * rng.normal(size=len(values)) * 10.0 ** rng.uniform(-12, -3))
+
+
+EXTREMES = {
+    "one joint": lambda: Robot.from_dh([[0.1, 0.2, 0.3, 0.4]]),
+    "of no length": lambda: Robot.from_dh([[0, 0, 0, 0]] * 3),
+    "back and forth": lambda: Robot.from_dh([[0, np.pi, 0, 0]] * 4, "mdh"),
+    "a gantry": lambda: Robot.from_dh(
+        [[0, np.pi / 2, 0, 0], [0, np.pi / 2, 0, np.pi / 2], [0, 0, 0, 0]], types="prismatic"
+    ),
+    "two slides along a line": lambda: Robot.from_dh([[0, 0, 0, 0]] * 2, types="prismatic"),
+    "slides along turning axes": lambda: Robot.from_dh(
+        [[0, 1e-4, 0, 0, 2e-4]] * 4, "mdh-hayati", types=["revolute", "prismatic"] * 2
+    ),
+    **{f"random {i}": partial(random_arm, i) for i in range(50)},
+}
+
+
+@pytest.mark.parametrize("name", [as_case(n, is_slow=n.startswith("random") and int(n[7:]) > 4) for n in EXTREMES])
+def test_whatever_the_arm_its_exact_formats_are_exact(name, tmp_path):
+    arm = EXTREMES[name]()
+    q = drawn(arm, 50, 0)
+    for to in ("urdf", "hayati", "yaml", "dh", "mdh"):
+        made = export(arm, to)
+        made.write(tmp_path / f"{to}.{'urdf' if to == 'urdf' else 'yaml'}")
+        (file,) = tmp_path.glob(f"{to}.*")
+        if made.details.get("exact", True):
+            assert np.abs(ours(read_robot(file), q) - ours(arm, q)).max() < EXACT, to
+        else:
+            assert to in ("dh", "mdh")
+    zeros = export(arm, "zeros", nominal=arm).details["zeros"].values()
+    assert [zero["reading"] for zero in zeros] == pytest.approx([0.0] * arm.n_joints, abs=EXACT)
 
 
 def test_which_arms_have_exact_tables_of_four_figures(tmp_path):
@@ -201,7 +245,6 @@ def ur_urdf(tmp_path):
 
 @pytest.mark.parametrize("convention", ["dh", "mdh", "dh-hayati", "mdh-hayati", "urdf", "other axes"])
 def test_pinocchio_computes_the_tool_poses_of_ur_description_with_the_file(convention, ur_urdf, tmp_path):
-    pytest.importorskip("pinocchio", reason=NO_PIN)
     if convention == "urdf":
         robot, base = ur_urdf, "base_link"
     elif convention == "other axes":  # the same joints about other axes of turned frames, and none of a UR
@@ -486,6 +529,22 @@ def test_a_file_that_is_there_is_not_replaced(tmp_path):
         export(UR, "urdf").write(tmp_path / "nowhere" / "arm.urdf")
     assert (tmp_path / "arm.urdf").read_text() == "mine"
     assert [file.name for file in tmp_path.iterdir()] == ["arm.urdf"]
+
+
+def test_what_of_limits_a_new_urdf_cannot_hold_is_said():
+    limits = [(-1.0, 2.0), (-np.inf, 1.0), (0.0, np.inf)]
+    robot = Robot.from_dh([[0.1, 0.2, 0.3, 0.4]] * 3, types=["revolute", "revolute", "prismatic"], limits=limits)
+    made = export(robot, "urdf")
+    assert [line.strip() for line in made.text.splitlines() if "<limit" in line] == [
+        '<limit lower="-1.0" upper="2.0" effort="0" velocity="0"/>',
+        '<limit lower="0.0" upper="1000.0" effort="0" velocity="0"/>',
+    ]
+    assert made.notes[1:] == (
+        "slides without limits have 1000 m, as URDF knows none without",
+        "joints that turn and have one limit alone are continuous here, without it",
+        "effort and velocity in <limit> are 0, as nobody has stated them",
+    )
+    assert all(f"<!-- {note.replace('--', '- -')} -->" in made.text for note in made.notes)
 
 
 def test_names_that_are_those_of_a_new_urdfs_frames_are_kept(tmp_path):
