@@ -13,20 +13,27 @@ from simulated import TOOL, measure, small_arm, true_robot, write_job
 from fg_calib import (
     Calibration,
     InputError,
+    Job,
     Measurements,
     Options,
     Pairing,
     ProblemError,
+    Table,
     assess,
     build_problem,
     calibrate,
     calibrate_job,
+    check_setup,
+    compare,
+    cramer_rao,
+    fit_least_squares,
     look_elsewhere,
     pose,
     read_job,
     solve,
+    solve_inverse,
 )
-from fg_calib.arrays import Brief
+from fg_calib.arrays import Brief, FrozenArrays
 
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3, "tool": 2e-3}
 FRAME = (Rotation.from_rotvec([0.3, -0.2, 1.0]), np.array([0.5, 1.0, -0.3]))
@@ -245,6 +252,51 @@ def test_everything_fits_a_screen(found, name):
             assert "array(" not in repr(shown), type(shown)
     assert str(result).startswith(f"{robot.name}: {result.result.model}")
     assert "Fit statistics" in str(result)
+
+
+def test_all_that_functions_hand_back_fits_a_screen(found):
+    """Arrays of hundreds of rows, tuples of dozens of parameters, a result of 90 000 characters."""
+    robot, m, _ = given("priors")
+    job = Job(None, robot, (Table(m, "position"),), Options("position"), robot)
+    for shown in (
+        fit_least_squares(robot, m, model="position", names=["a2", "d2"]),
+        solve_inverse(robot, m.position, m.rotation),
+        cramer_rao(robot, m, model="pose"),
+        check_setup(robot, m, "pose"),
+        compare(job),
+        job,
+        found["priors"].result,
+        found["priors"].result.observability,
+    ):
+        lines = repr(shown).splitlines()
+        assert len(lines) <= 60, type(shown)
+        assert max(map(len, lines)) <= 100, type(shown)
+        assert "array(" not in repr(shown), type(shown)
+    assert str(found["priors"].result) == repr(found["priors"].result)
+
+
+def frozen(value, seen):
+    """The dataclasses whose arrays are to be read-only, in a value at any depth."""
+    if id(value) in seen or not is_dataclass(value):
+        return
+    seen[id(value)] = value
+    if isinstance(value, FrozenArrays):
+        yield value
+    for field in fields(value):
+        one = getattr(value, field.name)
+        for part in one if isinstance(one, tuple) else (one,):
+            yield from frozen(part, seen)
+
+
+def test_what_a_calibration_is_made_of_is_read_only(found):
+    """But for arrays that kernels were compiled for."""
+    uncertainty = found["priors"].uncertainty
+    every = {type(part).__name__: part for part in frozen(uncertainty, {})}
+    assert {"Uncertainty", "Goodness", "PredictedFit", "PriorFit", "Spread"} <= set(every)
+    for name, part in every.items():
+        for key, array in vars(part).items():
+            if isinstance(array, np.ndarray) and key not in part._left_open:
+                assert not array.flags.writeable, (name, key)
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import as_floats, as_rotations
+from fg_calib.arrays import Brief, as_floats, as_rotations
 from fg_calib.options import check_number
 from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
 from fg_calib.robot.model import Robot
@@ -47,7 +47,7 @@ FINISHED = 1e-13
 
 
 @dataclass(frozen=True)
-class Inverse:
+class Inverse(Brief):
     """Configurations for poses.
 
     Attributes:

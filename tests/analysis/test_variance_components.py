@@ -10,6 +10,7 @@ from scipy.optimize import minimize
 from scipy.stats import chi2, kstest
 from simulated import measure, small_arm, true_robot
 from sparing import diagonal
+from tolerances import rounding
 from touches import TOOL_POINT, corners, touch
 
 from fg_calib.analysis import variance_components as estimation
@@ -362,3 +363,19 @@ def test_sigmas_are_honest_with_estimated_noise(name):
             # The logarithm of a root of a mean of squares is less than that of its mean by half its variance.
             bias = np.median(found) - np.log(true_factor)
             assert abs(bias) < 4 * 1.25 * np.std(found) / np.sqrt(N_DRAWS) + np.var(found) / 2, (key, bias)
+
+
+def test_curvature_is_there_where_a_noise_has_next_to_no_degrees_of_freedom():
+    """T is singular then, or by rounding less than that; else it is `2 seen - T`, lifted where it is too little."""
+    rng = np.random.default_rng(3)
+    A, B = rng.normal(size=(2, 4, 4))
+    T, seen = A @ A.T, B @ B.T
+    plain = estimation._curvature(T, T + 0.1 * seen)
+    assert plain == pytest.approx(T + 0.2 * seen, rel=rounding(1.0, 1e4))
+    lifted = np.linalg.eigvals(np.linalg.solve(T, estimation._curvature(T, 0.1 * seen)))
+    assert lifted.real.min() == pytest.approx(estimation.LEAST_CURVED, rel=rounding(1.0, 1e4))
+    for gone in (np.diag([1.0, 1.0, 1.0, 0.0]), np.diag([1.0, 1.0, 1.0, 1e-9])):
+        singular = gone @ T @ gone - np.diag([0.0, 0.0, 0.0, 1e-15])
+        found = estimation._curvature(singular, gone @ (T + 0.1 * seen) @ gone)
+        assert found[:3, :3] == pytest.approx(T[:3, :3] + 0.2 * seen[:3, :3], rel=1e-6)
+        assert np.linalg.eigvalsh(found).min() >= 0.0
