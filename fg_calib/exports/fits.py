@@ -126,7 +126,7 @@ def _least_squares(
     def jacobian(x: Floats) -> Floats:
         found = predict(x)
         J = found.jacobian[:, :, columns].copy()
-        J[:, :3] = _log_derivative(_miss(found, at)[:, :3]) @ J[:, :3]
+        J[:, :3] = log_derivative(_miss(found, at)[:, :3]) @ J[:, :3]
         return np.vstack([(weight[:, None] * J).reshape(-1, len(start)), held])
 
     found = least_squares(residual, start, jacobian, xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=200)
@@ -142,7 +142,7 @@ def _miss(found: Poses, wanted: Poses) -> Floats:
     return np.concatenate([turn, found.position - wanted.position], axis=1)
 
 
-def _log_derivative(v: Floats) -> Floats:
+def log_derivative(v: Floats) -> Floats:
     """Derivative of the rotation vector v in a small turn from the left, shape (n, 3, 3).
 
     1 - [v]/2 + [v]^2 (1/t^2 - (1 + cos t)/(2 t sin t)), t = |v| (Chirikjian 2012, Stochastic Models, eq. 10.86).
