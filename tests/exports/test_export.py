@@ -45,6 +45,7 @@ def ends(robot):
     return robot.urdf.base_link, robot.urdf.tip_link, frames(robot, 0), frames(robot, robot.n_joints + 1)
 
 
+@pytest.mark.slow
 def test_pinocchio_computes_the_tool_poses_of_the_urdf(arm):
     q = drawn(arm, 1000, 3)
     base, tip, before, behind = ends(arm)
@@ -243,6 +244,7 @@ def ur_urdf(tmp_path):
     return off(read_urdf(tmp_path / "ur.urdf", base_link="base_link", tip_link="tool0"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("convention", ["dh", "mdh", "dh-hayati", "mdh-hayati", "urdf", "other axes"])
 def test_pinocchio_computes_the_tool_poses_of_ur_description_with_the_file(convention, ur_urdf, tmp_path):
     if convention == "urdf":
