@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from fg_calib.calibration import Calibration, calibrate, calibrate_job
     from fg_calib.correction import correct
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
+    from fg_calib.exports.export import Export, export
     from fg_calib.files.columns import Column
     from fg_calib.files.job import read_job
     from fg_calib.files.result import Result, read_result, result_schema
@@ -75,6 +76,7 @@ _HOMES = {
     "fg_calib.calibration": ("Calibration", "calibrate", "calibrate_job"),
     "fg_calib.correction": ("correct",),
     "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
+    "fg_calib.exports.export": ("Export", "export"),
     "fg_calib.files.columns": ("Column",),
     "fg_calib.files.job": ("read_job",),
     "fg_calib.job": ("Job",),
@@ -132,6 +134,7 @@ __all__ = [
     "Comparison",
     "Correction",
     "DistanceFactor",
+    "Export",
     "Identifiability",
     "InputError",
     "Inspection",
@@ -172,6 +175,7 @@ __all__ = [
     "estimate_noise",
     "estimate_tolerances",
     "expand",
+    "export",
     "fit_least_squares",
     "format_comparison",
     "format_identifiability",
