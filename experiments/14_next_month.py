@@ -1,7 +1,7 @@
 """Next month: is what `check` and `update` say of a calibration true?
 
 Command: python experiments/14_next_month.py [--quick] [--seed N] [--draws N] [--processes N] [--out FOLDER]
-Takes about ten minutes on two free cores.
+Takes about half an hour of processor time.
 
 A UR10-like arm (experiment 08's, tolerances 1 mm and 1 mrad), calibrated by 40 poses (0.05 mm, 0.1 mrad), or by 6
 (*weak*); new rows are 8 poses, or 3 (*small*), a tracker that was moved has an unknown frame. Each draw has its own

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from fg_calib.analysis.bounds import Bound, cramer_rao
     from fg_calib.analysis.check import Check, Explanation
+    from fg_calib.analysis.estimated_tolerances import estimate_tolerances
     from fg_calib.analysis.identifiability import Identifiability, observe_configurations, observe_structure
     from fg_calib.analysis.inspection import Inspection, inspect_job
     from fg_calib.analysis.mistakes import SetupCheck, check_setup
@@ -26,7 +27,9 @@ if TYPE_CHECKING:
     from fg_calib.baseline.comparison import Comparison, compare
     from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
     from fg_calib.calibration import Calibration, calibrate, calibrate_job
+    from fg_calib.correction import correct
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
+    from fg_calib.exports.export import Export, export
     from fg_calib.files.columns import Column
     from fg_calib.files.history import History, history_of
     from fg_calib.files.job import read_job
@@ -35,6 +38,7 @@ if TYPE_CHECKING:
     from fg_calib.files.scenario import read_scenario
     from fg_calib.files.simulation import write_simulation
     from fg_calib.files.tables import read_measurements
+    from fg_calib.files.targets import Targets, read_targets
     from fg_calib.files.units import Units
     from fg_calib.files.urdf import read_urdf
     from fg_calib.graph.build import build_problem, problem_of
@@ -62,6 +66,7 @@ if TYPE_CHECKING:
     from fg_calib.robot.inverse import Inverse, solve_inverse
     from fg_calib.robot.kinematics import pose
     from fg_calib.robot.model import Robot
+    from fg_calib.robot.reaching import Correction
     from fg_calib.simulation.scenario import Scenario, Simulation
     from fg_calib.simulation.simulator import simulate
 
@@ -71,7 +76,9 @@ _HOMES = {
     "fg_calib.analysis.bounds": ("Bound", "cramer_rao"),
     "fg_calib.baseline.comparison": ("Comparison", "compare"),
     "fg_calib.calibration": ("Calibration", "calibrate", "calibrate_job"),
+    "fg_calib.correction": ("correct",),
     "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
+    "fg_calib.exports.export": ("Export", "export"),
     "fg_calib.files.columns": ("Column",),
     "fg_calib.analysis.check": ("Check", "Explanation"),
     "fg_calib.files.history": ("History", "history_of"),
@@ -80,10 +87,12 @@ _HOMES = {
     "fg_calib.files.result": ("Result", "read_result", "result_schema"),
     "fg_calib.files.urdf": ("read_urdf",),
     "fg_calib.robot.inverse": ("Inverse", "solve_inverse"),
+    "fg_calib.robot.reaching": ("Correction",),
     "fg_calib.files.robot_yaml": ("read_robot", "write_robot"),
     "fg_calib.files.scenario": ("read_scenario",),
     "fg_calib.files.simulation": ("write_simulation",),
     "fg_calib.files.tables": ("read_measurements",),
+    "fg_calib.files.targets": ("Targets", "read_targets"),
     "fg_calib.files.units": ("Units",),
     "fg_calib.analysis.identifiability": ("Identifiability", "observe_configurations", "observe_structure"),
     "fg_calib.robot.kinematics": ("pose",),
@@ -91,6 +100,7 @@ _HOMES = {
     "fg_calib.measurements.dataset": ("Measurements", "Noise"),
     "fg_calib.analysis.inspection": ("Inspection", "inspect_job"),
     "fg_calib.analysis.mistakes": ("SetupCheck", "check_setup"),
+    "fg_calib.analysis.estimated_tolerances": ("estimate_tolerances",),
     "fg_calib.analysis.variance_components": ("estimate_noise", "solve_job"),
     "fg_calib.graph.build": ("build_problem", "problem_of"),
     "fg_calib.graph.problem": ("Problem",),
@@ -127,8 +137,10 @@ __all__ = [
     "Check",
     "Column",
     "Comparison",
+    "Correction",
     "DistanceFactor",
     "Explanation",
+    "Export",
     "History",
     "Identifiability",
     "InputError",
@@ -155,6 +167,7 @@ __all__ = [
     "SolverError",
     "SolverOptions",
     "Table",
+    "Targets",
     "Uncertainty",
     "Units",
     "assess",
@@ -164,9 +177,12 @@ __all__ = [
     "check_setup",
     "compare",
     "comparison_document",
+    "correct",
     "cramer_rao",
     "estimate_noise",
+    "estimate_tolerances",
     "expand",
+    "export",
     "fit_least_squares",
     "format_comparison",
     "format_identifiability",
@@ -187,6 +203,7 @@ __all__ = [
     "read_result",
     "read_robot",
     "read_scenario",
+    "read_targets",
     "read_urdf",
     "result_document",
     "result_schema",

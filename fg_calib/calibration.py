@@ -278,7 +278,12 @@ class Calibration:
     @property
     def calibrated(self) -> Calibrated:
         """What is known of the arm, for new rows."""
+        of_result = {p.name: p.prior_sigma for p in self.result.parameters}  # as they were estimated, perhaps
         nominal = self.posterior.variables.robot
+        nominal = replace(
+            nominal,
+            parameters=tuple(replace(p, tolerance=of_result[p.name] or p.tolerance) for p in nominal.parameters),
+        )
         values = np.array([p.estimate for p in self.result.parameters])
         carried = self.result.carried or Carried()
         known = None

@@ -156,7 +156,13 @@ def placed(calibrated: Calibrated, rows: Rows, values: Floats) -> Placed:
     """
     robot, known = calibrated.robot.with_values(values), calibrated.knowledge
     options = replace(
-        calibrated.options, gauge="none", encoder="propagated", loss="none", estimate_noise=False, prefer=()
+        calibrated.options,
+        gauge="none",
+        encoder="propagated",
+        loss="none",
+        estimate_noise=False,
+        estimate_tolerance=None,
+        prefer=(),
     )
     state = calibrated.state_for(rows.tables, rows.like)
 

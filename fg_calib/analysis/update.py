@@ -64,7 +64,7 @@ def updated(
 
 def _problem(calibrated: Calibrated, robot: Robot, known: Knowledge, rows: Rows, at: Placed) -> Problem:
     """The problem of the rows with what is known, started at the arm as it was calibrated."""
-    options = replace(calibrated.options, estimate_noise=False)
+    options = replace(calibrated.options, estimate_noise=False, estimate_tolerance=None)
     stays = {name for _, name in known.unknowns}
     tables = tuple(
         replace(t, known={name: place for name, place in t.known.items() if name not in stays}) for t in rows.tables

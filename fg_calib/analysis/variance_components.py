@@ -29,10 +29,10 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from fg_calib.analysis.covariance import spread_of
+from fg_calib.analysis.estimated_tolerances import estimate_tolerances
 from fg_calib.analysis.goodness import KindFit, kind_fits
 from fg_calib.analysis.mistakes import check_setup
 from fg_calib.analysis.noise_components import has_joint_noise, noise_components
@@ -81,7 +81,7 @@ TINY = 1e-100
 
 @checked
 def solve_job(job: Job, problem: Problem | None = None) -> Solution:
-    """The solution of a job: the best optimum that is found, with its noise estimated if the job asks for it.
+    """The solution of a job: the best optimum that is found, with noise and tolerances estimated if it asks for that.
 
     Args:
         job: The job.
@@ -93,7 +93,7 @@ def solve_job(job: Job, problem: Problem | None = None) -> Solution:
     """
     problem = problem or problem_of(job)
     try:
-        solution = estimate_noise(problem) if job.options.estimate_noise else solve(problem)
+        solution = estimate_tolerances(problem, estimate_noise if job.options.estimate_noise else solve)
     except SolverError as error:
         for table in job.tables:
             if table.model is not None:
@@ -227,11 +227,17 @@ def _of_origins(solution: Solution, kept: frozenset[NoiseName] = frozenset()) ->
 
 
 def _curvature(T: Floats, seen: Floats) -> Floats:
-    """`2 seen - T`, T its mean: half the curvature of the likelihood, in no direction less than `LEAST_CURVED` T."""
-    by = np.sqrt(np.maximum(np.diag(T), TINY))
-    values, vectors = scipy.linalg.eigh(2.0 * seen - T, T + FLAT * np.diag(by**2))
-    of_T = (T + FLAT * np.diag(by**2)) @ vectors
-    out: Floats = (of_T * np.maximum(values, LEAST_CURVED)) @ of_T.T
+    """`2 seen - T`, T its mean: half the curvature of the likelihood, in no direction less than `LEAST_CURVED` T.
+
+    T counts degrees of freedom; where noise has next to none it may be singular, and by rounding less than that.
+    """
+    by = np.sqrt(np.maximum(np.diag(T), FLAT))
+    values, vectors = np.linalg.eigh(T / by[:, None] / by)
+    length = np.sqrt(np.maximum(values, FLAT))
+    inverse = vectors / length / by[:, None]  # of the root of T
+    curved, turned = np.linalg.eigh(inverse.T @ (2.0 * seen - T) @ inverse)
+    root = by[:, None] * (vectors * length) @ turned
+    out: Floats = (root * np.maximum(curved, LEAST_CURVED)) @ root.T
     return out
 
 

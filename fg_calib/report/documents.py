@@ -68,6 +68,7 @@ from fg_calib.files.result import (
     Step,
     SuspectReading,
     TestRows,
+    ToleranceScale,
     TouchedPoint,
     Typical,
     Weak,
@@ -146,8 +147,7 @@ def result_of(
         folds=_folds(u),
         priors=_priors(u.priors),
         expected_error=_expected_error(u.expected_error),
-        noise_factors=_noise_factors(solution, goodness.kinds),
-        noise_kept=_noise_kept(solution, goodness.kinds),
+        **_noise_and_tolerances(solution, goodness.kinds),
         suspect_configurations=_suspects(goodness.configurations, names),
         residual_rms=_residual_rms(u),
         **_estimates(problem, u),
@@ -304,6 +304,14 @@ def _noise_kept(solution: Solution, fits: Sequence[KindFit]) -> tuple[str, ...]:
     return (*(_key(fit, fits) for fit in fits if (fit.table, fit.kind) not in estimated), *of_joints)
 
 
+def _noise_and_tolerances(solution: Solution, fits: Sequence[KindFit]) -> dict[str, Any]:
+    """What noise and tolerances were estimated, by key."""
+    found = solution.estimated_tolerances
+    scales = None if found is None else tuple(map(ToleranceScale.model_validate, found.scales))
+    factors, kept = _noise_factors(solution, fits), _noise_kept(solution, fits)
+    return {"noise_factors": factors, "noise_kept": kept, "tolerance_scales": scales}
+
+
 def _joints(solution: Solution) -> bool:
     """Whether noise of the joint readings is stated."""
     return bool(np.any(solution.problem.data.sigma_joint > 0.0))
@@ -396,6 +404,7 @@ def _expected_error(expected: ExpectedError | None) -> ExpectedErrorDocument | N
         at=expected.at,
         n=expected.n,
         of=expected.of,
+        relative=expected.relative,
     )
 
 

@@ -48,6 +48,7 @@ def said(found):
 # --- healthy jobs ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_bundled_example_is_ready_and_nothing_is_to_be_said_of_it(whole_example):
     found = inspect_job(read_job(whole_example / "calibration.yaml"))
     assert found.ready
@@ -59,6 +60,7 @@ def test_the_bundled_example_is_ready_and_nothing_is_to_be_said_of_it(whole_exam
     assert found.dof == 102
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("model", [model for model, _ in MODELS])
 def test_a_healthy_table_of_poses_is_ready(arm, model):
     found = inspected(arm, measured(arm), model)
@@ -66,6 +68,7 @@ def test_a_healthy_table_of_poses_is_ready(arm, model):
     assert all(one.excess < 2.0 for check in found.setups for one in check.residuals)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW)) for n in INSTRUMENTS])
 def test_a_healthy_table_of_every_instrument_is_ready(name, seed):
@@ -76,6 +79,7 @@ def test_a_healthy_table_of_every_instrument_is_ready(name, seed):
     assert found.disagreements.n >= 15
 
 
+@pytest.mark.slow
 def test_the_expected_accuracy_is_that_of_the_calibration(example):
     """To first order, at nominal instead of at the estimate."""
     from fg_calib import calibrate_job
@@ -120,6 +124,7 @@ MISTAKES = {
 }
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_in_the_set_up_is_a_finding(arm, mistake):
     found = inspected(arm, MISTAKES[mistake](measured(arm)))
@@ -128,6 +133,7 @@ def test_a_mistake_in_the_set_up_is_a_finding(arm, mistake):
     assert found.disagreements.found == ()  # not looked for: all rows would
 
 
+@pytest.mark.slow
 def test_a_mistake_in_one_of_two_tables_is_said_of_that_table(arm):
     good = Table(replace(measured(arm), source="monday.csv"), "position", frame="unknown")
     spoilt = replace(measured(arm, 1), source="tuesday.csv")
@@ -165,6 +171,36 @@ def test_rows_that_disagree_with_the_arm_are_named(arm, model, frame, size):
     assert rows[7].size == pytest.approx(size, rel=0.3)
 
 
+@pytest.mark.parametrize(
+    ("rows", "advice"),
+    [
+        ([7], "look at it, or let a robust loss do so (loss: gnc)"),
+        ([43], "look at it; a test row: no loss acts on what is held out"),
+        ([43, 45], "look at them; test rows: no loss acts on what is held out"),
+        ([7, 43], "(loss: gnc); 1 are test rows: no loss acts on what is held out"),
+    ],
+)
+def test_a_robust_loss_is_not_offered_for_test_rows(arm, rows, advice):
+    m = measured(arm)
+    (finding,) = inspected(arm, replace(m, position=plus(m.position, rows, [0.0, 0.3, 0.0]))).findings
+    assert finding.endswith(advice)
+
+
+@pytest.mark.parametrize("n_test", [0, 10])
+def test_limits_that_cannot_be_evaluated_are_told_of(arm, n_test):
+    m = measured(arm)
+    m = replace(m, test=np.arange(m.n_configurations) < n_test)
+    limits = {"position": 1e-3, "distance": 1e-3}
+    found = inspect_job(Job(None, arm, m, Options(model="pose", frame="unknown", accept=limits)))
+    lacking, *others = found.findings
+    assert lacking == "accept: nothing in this job measures any distance: its limit cannot be evaluated"
+    assert [text.startswith("accept: limits are judged by what is held out, and nothing is") for text in others] == [
+        True
+    ] * (n_test == 0)
+    folds = Options(model="pose", frame="unknown", accept={"position": 1e-3}, folds=5)
+    assert inspect_job(Job(None, arm, m, folds)).ready
+
+
 def test_a_wrong_orientation_is_named_as_that(arm):
     m = measured(arm)
     R = m.rotation.copy()
@@ -174,6 +210,7 @@ def test_a_wrong_orientation_is_named_as_that(arm):
     assert one.size == pytest.approx(0.2, rel=0.1)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "name",
     [pytest.param("targets", marks=pytest.mark.slow), "anchors", "planes", "board", "pairs", "sockets", "stations"],
@@ -387,6 +424,7 @@ def test_nothing_to_estimate_is_refused_as_by_calibrate(arm):
         inspected(arm.with_estimated([]), measured(arm))
 
 
+@pytest.mark.slow
 def test_the_repr_fits_a_screen(arm):
     found = inspected(arm, measured(arm))
     assert repr(found) == "Inspection of 'ur5e': 50 rows in 1 table, rank 23 of 30\n  ready"

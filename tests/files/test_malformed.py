@@ -74,7 +74,7 @@ ROBOTS = [
     (R+'name: "\\ud800"\n', "robot.yaml:4: '\\ud800' is no text of Unicode"),
     (R+"units: mm\n", "robot.yaml: units: found 'mm', expected a mapping"),
     (R+"units: [m, deg]\n", "robot.yaml: units: found ['m', 'deg'], expected a mapping"),
-    (R+"units: {length: M}\n", "robot.yaml: units: length: found 'M', expected one of m, cm, mm, um; did you mean m?"),
+    (R+"units: {length: M}\n", "robot.yaml: units: length: found 'M', expected one of m, cm, mm, um, in; did you mean m?"),
     (R+"units: {angle: 1}\n", 'robot.yaml: units: angle: found 1, expected one of rad, deg, mrad'),
     (R+"units:\n", 'robot.yaml: units: found nothing, expected a mapping'),
     (R+"base: [0, 0, 1]\n", 'robot.yaml: base: found [0, 0, 1], expected a mapping'),
@@ -300,7 +300,7 @@ JOBS = [
     (JOB+"pairing: Star\n", "job.yaml: pairing: found 'Star', expected one of star, chain, all, {random: N, seed: S}; did you mean star?"),
     (JOB+"pairing:\n", 'job.yaml: pairing: found nothing, expected one of star, chain, all, {random: N, seed: S}'),
     (JOB+"pairing: {random: 99999999999999999999}\n", 'job.yaml: pairing: random: found 99999999999999999999, expected a number not above 1e+07'),
-    (JOB+"units: {length: inch}\n", "job.yaml: units: length: found 'inch', expected one of m, cm, mm, um"),
+    (JOB+"units: {length: inch}\n", "job.yaml: units: length: found 'inch', expected one of m, cm, mm, um, in; did you mean in?"),
     (JOB+"units: deg\n", "job.yaml: units: found 'deg', expected a mapping"),
     (JOB+"units: {angle: °}\n", "job.yaml: units: angle: found '°', expected one of rad, deg, mrad"),
     (JOB+"unit: {angle: deg}\n", "job.yaml: unknown key 'unit', expected one of robot, measurements, pairs, model, pairing, frame, units, noise, prior, gauge, prefer, pair_errors, encoder, loss, max_iterations, accept, folds, truth, targets, anchors, tolerance, offset, camera, columns; did you mean units?"),
@@ -349,7 +349,7 @@ JOBS = [
     (T+"  - {table: poses.csv, model: pose, noise: {estimate: true}}\n", 'job.yaml: measurement 1: noise: estimate in the entry of a table, expected the key noise of the whole job'),
     (T+"  - {table: poses.csv, model: pose, noise: 1}\n", 'job.yaml: measurement 1: noise: found 1, expected a mapping of figures, or estimate'),
     (T+"  - {table: poses.csv, model: pose, pairing: {random: 0}}\n", 'job.yaml: measurement 1: pairing: random: found 0, expected a number above 0'),
-    (T+"  - {table: poses.csv, model: pose, units: {length: ft}}\n", "job.yaml: measurement 1: units: length: found 'ft', expected one of m, cm, mm, um"),
+    (T+"  - {table: poses.csv, model: pose, units: {length: ft}}\n", "job.yaml: measurement 1: units: length: found 'ft', expected one of m, cm, mm, um, in"),
     (T+"  - {table: poses.csv, model: pose, robot: r}\n", "job.yaml: measurement 1: unknown key 'robot', expected one of table, pairs, model, pairing, frame, units, noise, offset, camera, columns"),
     (T+"  - {tabel: poses.csv, model: pose}\n", "job.yaml: measurement 1: unknown key 'tabel', expected one of table, pairs, model, pairing, frame, units, noise, offset, camera, columns; did you mean table?"),
     (T+"  - {table: poses.csv, model: pose, frame: maybe}\n", "job.yaml: measurement 1: frame: found 'maybe', expected one of known, unknown"),
@@ -427,7 +427,7 @@ SCENARIOS = [
     (SC+"frame:\n", 'scenario.yaml: frame: found nothing, expected base, unknown, or a mapping of x, y, z, roll, pitch, yaw'),
     (SC+"frame: [0]\n", 'scenario.yaml: frame: found [0], expected base, unknown, or a mapping of x, y, z, roll, pitch, yaw'),
     (SC+"frame: {x: a}\n", "scenario.yaml: frame: x: found 'a', expected a finite number"),
-    (SC+"units: {length: mile}\n", "scenario.yaml: units: length: found 'mile', expected one of m, cm, mm, um"),
+    (SC+"units: {length: mile}\n", "scenario.yaml: units: length: found 'mile', expected one of m, cm, mm, um, in"),
     (SC+"validation: {random: {count: 0}}\n", 'scenario.yaml: validation: random: count: found 0, expected a number above 0'),
     (SC+"validation: []\n", 'scenario.yaml: validation: found [], expected a mapping'),
     (SC+"job: pose\n", "scenario.yaml: job: found 'pose', expected a mapping"),
@@ -746,6 +746,7 @@ def test_scenarios(folder, given, message):
     refuses(folder, "scenario.yaml", given, read_scenario, message)
 
 
+@pytest.mark.sampled(61)
 @cases(POSES)
 def test_poses(tmp_path, given, message):
     refuses(tmp_path, "poses.csv", given, lambda file: read_measurements(file, ARM), message)
@@ -785,6 +786,7 @@ def test_results(tmp_path, document, given, message):
     refuses(tmp_path, "result.json", given, read_result, message)
 
 
+@pytest.mark.sampled(8)
 @cases(COMMANDS)
 def test_commands(folder, fg_calib, monkeypatch, given, message):
     """Exit code 1 and one line on stderr, nothing on stdout, no folder made."""

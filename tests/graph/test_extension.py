@@ -6,7 +6,6 @@ import gtsam
 import numpy as np
 import pytest
 from simulated import measure, paper_robot, small_arm, true_robot
-from sparing import most_slow
 from tolerances import rounding
 
 from fg_calib.analysis.uncertainty import assess
@@ -96,6 +95,7 @@ def dense_covariance(solution, n):
     return (inverse @ inverse.T)[:n, :n]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("way", ["in place", "in a copy"])
 def test_factors_on_our_variables_are_solved_and_assessed(way):
     problem = problem_of()
@@ -136,6 +136,7 @@ def test_the_optimum_is_that_of_gtsams_own_optimiser():
     assert graph.error(solution.values) < graph.error(initial)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("gauge", ["prior", "none"])
 def test_a_variable_of_ones_own_is_solved_and_found_again(gauge):
     point = np.array([3.0, -2.0, 1.0])
@@ -159,6 +160,7 @@ def test_a_variable_of_ones_own_is_solved_and_found_again(gauge):
     assert again.values.atPoint3(ANCHOR) == pytest.approx(solution.values.atPoint3(ANCHOR), abs=1e-7)
 
 
+@pytest.mark.slow
 def test_a_pose_of_ones_own_is_solved():
     """Of any of GTSAM's types: a frame in which the base stands, known by a prior alone."""
     problem, key = problem_of(), gtsam.symbol("p", 7)
@@ -207,6 +209,7 @@ def test_a_variable_needs_a_start_and_a_factor():
         solve(problem)
 
 
+@pytest.mark.slow
 def test_factors_added_to_what_was_solved_are_to_be_solved_again():
     problem = problem_of()
     solution = solve(problem)
@@ -239,10 +242,13 @@ EXPANDED = {
         {"model": "distance-rotation", "pairing": Pairing("all"), "pair_errors": "independent"},
         0.0,
     ),
+    "poses, much joint noise": ({"model": "pose", "frame": "unknown"}, 0.03),
+    "joint values estimated": ({"model": "distance-rotation", "encoder": "estimated"}, 0.03),
 }
 
 
-@pytest.mark.parametrize("name", most_slow(EXPANDED, every=2))
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("name", EXPANDED)
 def test_the_expanded_graph_has_the_same_optimum(name):
     options, sigma_joint = EXPANDED[name]
     rng = np.random.default_rng(4)
@@ -254,7 +260,7 @@ def test_the_expanded_graph_has_the_same_optimum(name):
     n_measurements = sum(part.block.n for rows in problem.rows for part in rows.parts)
     shared = [rows for rows in problem.rows if rows.shared is not None]
     n_errors = sum(len(rows.configurations) for rows in shared)
-    assert bool(shared) == (name in ("star", "chain, joint noise"))
+    assert bool(shared) == (name in ("star", "chain, joint noise", "joint values estimated"))
     assert graph.size() == n_measurements + n_errors + len(prior_factors(problem.variables))
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, initial, levenberg_marquardt_params())
     values = optimizer.optimize()
@@ -280,6 +286,7 @@ def test_the_expanded_graph_can_be_solved_incrementally():
     assert graph.error(isam.calculateBestEstimate()) == pytest.approx(solution.cost, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_pair_factors_by_name_are_the_rows_of_a_table():
     """Against the problem that the same pairs make as a table; and usable with GTSAM's marginals."""
     rng = np.random.default_rng(6)
