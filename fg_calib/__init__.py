@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from fg_calib.baseline.comparison import Comparison, compare
     from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
     from fg_calib.calibration import Calibration, calibrate, calibrate_job
+    from fg_calib.correction import correct
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
     from fg_calib.files.columns import Column
     from fg_calib.files.job import read_job
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from fg_calib.files.scenario import read_scenario
     from fg_calib.files.simulation import write_simulation
     from fg_calib.files.tables import read_measurements
+    from fg_calib.files.targets import Targets, read_targets
     from fg_calib.files.units import Units
     from fg_calib.files.urdf import read_urdf
     from fg_calib.graph.build import build_problem, problem_of
@@ -60,6 +62,7 @@ if TYPE_CHECKING:
     from fg_calib.robot.inverse import Inverse, solve_inverse
     from fg_calib.robot.kinematics import pose
     from fg_calib.robot.model import Robot
+    from fg_calib.robot.reaching import Correction
     from fg_calib.simulation.scenario import Scenario, Simulation
     from fg_calib.simulation.simulator import simulate
 
@@ -69,6 +72,7 @@ _HOMES = {
     "fg_calib.analysis.bounds": ("Bound", "cramer_rao"),
     "fg_calib.baseline.comparison": ("Comparison", "compare"),
     "fg_calib.calibration": ("Calibration", "calibrate", "calibrate_job"),
+    "fg_calib.correction": ("correct",),
     "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
     "fg_calib.files.columns": ("Column",),
     "fg_calib.files.job": ("read_job",),
@@ -76,10 +80,12 @@ _HOMES = {
     "fg_calib.files.result": ("Result", "read_result", "result_schema"),
     "fg_calib.files.urdf": ("read_urdf",),
     "fg_calib.robot.inverse": ("Inverse", "solve_inverse"),
+    "fg_calib.robot.reaching": ("Correction",),
     "fg_calib.files.robot_yaml": ("read_robot", "write_robot"),
     "fg_calib.files.scenario": ("read_scenario",),
     "fg_calib.files.simulation": ("write_simulation",),
     "fg_calib.files.tables": ("read_measurements",),
+    "fg_calib.files.targets": ("Targets", "read_targets"),
     "fg_calib.files.units": ("Units",),
     "fg_calib.analysis.identifiability": ("Identifiability", "observe_configurations", "observe_structure"),
     "fg_calib.robot.kinematics": ("pose",),
@@ -122,6 +128,7 @@ __all__ = [
     "Camera",
     "Column",
     "Comparison",
+    "Correction",
     "DistanceFactor",
     "Identifiability",
     "InputError",
@@ -148,6 +155,7 @@ __all__ = [
     "SolverError",
     "SolverOptions",
     "Table",
+    "Targets",
     "Uncertainty",
     "Units",
     "assess",
@@ -157,6 +165,7 @@ __all__ = [
     "check_setup",
     "compare",
     "comparison_document",
+    "correct",
     "cramer_rao",
     "estimate_noise",
     "expand",
@@ -179,6 +188,7 @@ __all__ = [
     "read_result",
     "read_robot",
     "read_scenario",
+    "read_targets",
     "read_urdf",
     "result_document",
     "result_schema",

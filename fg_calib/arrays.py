@@ -29,14 +29,23 @@ class Brief:
 
 
 def _brief(of: object) -> str:
-    """`Series(kind=Distance, ends=int64 (12, 2), ...)`, a line each where it is long."""
-    parts = [f"{f.name}={_in_brief(getattr(of, f.name))}" for f in fields(of) if f.repr]  # type: ignore[arg-type]
+    return brief(of, (f.name for f in fields(of) if f.repr))  # type: ignore[arg-type]
+
+
+def brief(of: object, names: Iterable[str]) -> str:
+    """`Series(kind=Distance, ends=int64 (12, 2), ...)`, a line each where it is long.
+
+    Args:
+        of: An object.
+        names: Those of its attributes that are shown.
+    """
+    parts = [f"{name}={_in_brief(getattr(of, name))}" for name in names]
     line = f"{type(of).__name__}({', '.join(parts)})"
     return line if len(line) <= _WIDTH else "\n  ".join([f"{type(of).__name__}:", *parts])
 
 
 def _in_brief(value: object) -> str:
-    if isinstance(value, np.ndarray) and value.size <= _FEW:
+    if isinstance(value, np.ndarray) and value.ndim < 2 and value.size <= _FEW:
         return np.array2string(value, precision=6, separator=", ")
     if hasattr(value, "dtype") and hasattr(value, "shape"):  # scipy's sparse arrays too
         return f"{value.dtype} {value.shape}"

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from fg_calib.arguments import check_fields
+from fg_calib.arrays import Brief
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.series import Table
 from fg_calib.options import Options
@@ -13,7 +14,7 @@ from fg_calib.robot.model import Robot
 
 
 @dataclass(frozen=True)
-class Job:
+class Job(Brief):
     """A calibration job with everything it refers to.
 
     Attributes:

@@ -19,10 +19,19 @@ from fg_calib.analysis import identifiability, mistakes
 
 @pytest.hookimpl(tryfirst=True)  # before tests are chosen by their marks
 def pytest_collection_modifyitems(items):
-    """Long tests are slow ones."""
+    """Long tests are slow ones, and of a `sampled` test all cases but some."""
+    cases = {}
     for item in items:
         if item.get_closest_marker("long"):
             item.add_marker("slow")
+        if item.get_closest_marker("sampled") and not item.get_closest_marker("slow"):
+            cases.setdefault((item.parent, item.function), []).append(item)
+    for (_, function), quick in cases.items():
+        n = next(mark.args[0] for mark in function.pytestmark if mark.name == "sampled")
+        kept = {i * len(quick) // n for i in range(n)}
+        for i, item in enumerate(quick):
+            if i not in kept:
+                item.add_marker("slow")
 
 
 def pytest_collection_finish():

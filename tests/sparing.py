@@ -5,11 +5,6 @@ from itertools import product
 import pytest
 
 
-def most_slow(cases, every):
-    """Cases of one argument, or tuples of several: every so many-th, from the first, is in the default run."""
-    return [as_case(case, is_slow=i % every > 0) for i, case in enumerate(cases)]
-
-
 def diagonal(*arguments, every=None):
     """All combinations of the values of arguments; the default run has a diagonal of them, and so each value.
 

@@ -5,7 +5,6 @@ import subprocess
 import sys
 
 import pytest
-from sparing import most_slow
 
 DRAW = """
 from fg_calib import InputError
@@ -35,7 +34,7 @@ FILES = [("cache_dir: of-a-stranger", "text.usetex: True"), ("a: [", b"\xff".dec
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("numba", "matplotlib"), most_slow(FILES, every=2))
+@pytest.mark.parametrize(("numba", "matplotlib"), FILES)
 def test_files_of_the_current_folder_set_nothing(tmp_path, numba, matplotlib):
     (tmp_path / ".numba_config.yaml").write_text(numba)
     (tmp_path / "matplotlibrc").write_bytes(matplotlib.encode("latin-1"))
@@ -56,7 +55,7 @@ WRONG = [
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "value", "expected"), most_slow(WRONG, every=3))
+@pytest.mark.parametrize(("name", "value", "expected"), WRONG)
 def test_a_wrong_environment_is_one_line(tmp_path, name, value, expected):
     assert ended(tmp_path, **{name: value}) == (expected, "")
 

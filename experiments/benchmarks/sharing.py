@@ -68,6 +68,9 @@ SIGMA = (1e-3, np.deg2rad(0.01))
 """1 sigma of positions and orientations (Table 5), [m] and [rad]."""
 
 POSES = {"star": 10_000, "chain": 10_000, "random": 10_000, "direct": 2_000_000}
+PART = 10_000
+"""Configurations whose poses are computed at once."""
+
 QUICK = 50
 """By how much fewer with `--quick`."""
 
@@ -83,15 +86,19 @@ def measured(kind: str, n: int, seed: int) -> Measurements:
     """Noisy poses, or pairs of them measured directly, two configurations of their own each."""
     rng, arm = np.random.default_rng(seed), robot()
     q = rng.uniform(-np.pi, np.pi, (n, arm.n_joints))
-    at = fg_calib.pose(arm, q)
-    m = Measurements(readings=q, ids=np.arange(n).astype(str), test=np.zeros(n, dtype=np.bool_), position=at.position,
-                     rotation=at.rotation, sigma_position=np.full((n, 3), SIGMA[0]),
+    # In parts: poses bring their derivatives, gigabytes for all at once, beside which no peak of ours would show.
+    position, rotation = np.empty((n, 3)), np.empty((n, 3, 3))
+    for start in range(0, n, PART):
+        at = fg_calib.pose(arm, q[start : start + PART])
+        position[start : start + PART], rotation[start : start + PART] = at.position, at.rotation
+    m = Measurements(readings=q, ids=np.arange(n).astype(str), test=np.zeros(n, dtype=np.bool_), position=position,
+                     rotation=rotation, sigma_position=np.full((n, 3), SIGMA[0]),
                      sigma_orientation=np.full((n, 3), SIGMA[1]), sigma_joint=np.zeros(arm.n_joints))  # fmt: skip
     if kind != "direct":
-        return replace(m, position=at.position + SIGMA[0] * rng.normal(size=(n, 3)))
+        return replace(m, position=position + SIGMA[0] * rng.normal(size=(n, 3)))
     a, b = np.arange(0, n, 2), np.arange(1, n, 2)
-    distance = np.linalg.norm(at.position[b] - at.position[a], axis=1)
-    cosine = 0.5 * (np.einsum("nij,nij->n", at.rotation[a], at.rotation[b]) - 1.0)
+    distance = np.linalg.norm(position[b] - position[a], axis=1)
+    cosine = 0.5 * (np.einsum("nij,nij->n", rotation[a], rotation[b]) - 1.0)
     values = distance + SIGMA[0] * rng.normal(size=len(a)), np.arccos(np.clip(cosine, -1.0, 1.0))
     stated = (np.full(len(a), s) for s in SIGMA)
     return replace(m, pairs=Pairs(a, b, *values, *stated, test=np.zeros(len(a), dtype=np.bool_)))

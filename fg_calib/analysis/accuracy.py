@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.analysis.covariance import Spread
+from fg_calib.analysis.covariance import Spread, TangentCovariance
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements.gathering import Dataset
 from fg_calib.robot.kinematics import forward, precompute_trig
@@ -84,7 +84,7 @@ def judged_configurations(data: Dataset) -> tuple[Integers, Literal["test", "tra
     return np.flatnonzero(test if test.any() else ~test), "test" if test.any() else "train"
 
 
-def errors_at(spread: Spread, readings: Floats) -> tuple[PoseRms, PoseRms]:
+def errors_at(spread: TangentCovariance, readings: Floats) -> tuple[PoseRms, PoseRms]:
     """Expected errors of the tool at joint readings, in the base frame and after the best rigid fit.
 
     Args:

@@ -35,6 +35,7 @@ from scipy.stats import qmc
 
 from fg_calib.analysis.accuracy import without_rigid_motion
 from fg_calib.arguments import checked
+from fg_calib.arrays import Brief
 from fg_calib.errors import InputError, shown
 from fg_calib.graph.build import predicted_problem, true_problem
 from fg_calib.graph.information import correlation, named_triangle
@@ -60,7 +61,7 @@ _SAMPLES = 512
 
 
 @dataclass(frozen=True)
-class PositionBound:
+class PositionBound(Brief):
     """Errors of the tool point over some configurations, as a bound expects them.
 
     Attributes:
@@ -76,7 +77,7 @@ class PositionBound:
 
 
 @dataclass(frozen=True)
-class Bound:
+class Bound(Brief):
     """The least error that some measurements allow, to first order.
 
     Attributes:

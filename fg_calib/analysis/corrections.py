@@ -32,6 +32,7 @@ from scipy import special
 
 from fg_calib.analysis.covariance import Spread
 from fg_calib.analysis.unknowns import KINDS
+from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.factors import prior_rows, unknown_prior_rows
 from fg_calib.graph.information import eliminated
 from fg_calib.graph.solver import Solution
@@ -67,7 +68,7 @@ class Beyond:
 
 
 @dataclass(frozen=True)
-class PriorFit:
+class PriorFit(FrozenArrays):
     """How corrections and tolerances agree.
 
     Attributes:

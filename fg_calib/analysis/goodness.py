@@ -46,7 +46,7 @@ from fg_calib.analysis.covariance import Spread
 from fg_calib.analysis.gross_errors import MOST_FEW, find_gross_errors
 from fg_calib.analysis.residual_covariance import Dense, Errors, LowRank, Nuisances
 from fg_calib.analysis.residual_table import ResidualTable
-from fg_calib.arrays import Brief
+from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.factors import prior_rows
 from fg_calib.graph.noise import JOINT_NOISE, NoiseName
 from fg_calib.graph.problem import noises_at
@@ -234,7 +234,7 @@ class OutlierCounts(NamedTuple):
 
 
 @dataclass(frozen=True)
-class PredictedFit(Brief):
+class PredictedFit(FrozenArrays):
     """How well the calibrated arm predicts the test rows.
 
     Attributes:
@@ -264,7 +264,7 @@ class PredictedFit(Brief):
 
 
 @dataclass(frozen=True)
-class Goodness(Brief):
+class Goodness(FrozenArrays):
     """How well residuals and stated noise agree; arrays are in the order of the residual table, shape (n,).
 
     Attributes:
@@ -395,10 +395,10 @@ class _Part:
         nu = trace**2 / square if square > 0.0 else 1.0
         return nu if self.covariance is not None or not self.shared else min(nu, 3.0)
 
-    def p_value(self, chosen: Integers, chi2: float) -> float:
-        """Probability of a sum of squares as large."""
+    def p_value(self, chosen: Integers, chi2: float, degrees: float) -> float:
+        """Probability of a sum of squares as large, with the rows' `degrees` of freedom."""
         ratio = chi2 / float(np.sum(self.means[chosen]))
-        return upper_probability(ratio, self.degrees(chosen), self.degrees_behind(chosen))
+        return upper_probability(ratio, degrees, self.degrees_behind(chosen))
 
     def degrees_behind(self, chosen: Integers) -> float:
         """Degrees of freedom behind the noise that some rows were divided by."""
@@ -568,8 +568,9 @@ class _Rows:
         white = scipy.linalg.solve_triangular(factor, z, lower=True)
         expected = nu = float(len(chosen))
         if floor.any():  # less what was added: of tr B and tr B^2, B = 1 - (A + floor)^-1 floor
-            half = scipy.linalg.solve_triangular(factor, np.diag(np.sqrt(floor)), lower=True)
-            added, squared = float(np.vdot(half, half)), float(np.sum((half.T @ half) ** 2))
+            lower = np.tril(scipy.linalg.lapack.dpotri(factor, lower=True)[0])  # of the inverse
+            lower *= np.sqrt(floor)[:, None] * np.sqrt(floor)
+            added, squared = float(np.trace(lower)), float(2.0 * np.vdot(lower, lower) - np.sum(np.diag(lower) ** 2))
             expected, square = expected - added, expected - 2.0 * added + squared
             nu = expected**2 / square
         return float(white @ white), expected, nu
@@ -587,7 +588,7 @@ class _Rows:
         chi2, expected = float(np.sum(part.squares[chosen])), float(np.sum(part.means[chosen])) - excess
         rows, (table, family) = part.rows[chosen], self._table.groups[code]
         factor = self._factor(rows, (table, family))
-        enough = expected >= 1.0
+        enough, degrees = expected >= 1.0, part.degrees(chosen)
         size = np.abs(self.studentised[rows])
         return KindFit(
             kind=family,
@@ -599,10 +600,10 @@ class _Rows:
             seen_over_stated=factor * float(np.sqrt(chi2 / expected)) if enough else np.nan,
             chi2=chi2,
             expected=max(expected, 0.0),
-            p_value=part.p_value(chosen, chi2) if enough and known else None,
+            p_value=part.p_value(chosen, chi2, degrees) if enough and known else None,
             typical=float(np.nanmedian(size)) / _MEDIAN if enough else np.nan,
             largest=float(np.nanmax(size)) if enough else np.nan,
-            degrees=part.degrees(chosen),
+            degrees=degrees,
             n_beyond=int(np.sum(size > suspect_level(len(rows)))),
             own_sigma_rms=float(np.sqrt(np.mean(self._stated[1][rows]))),
             own_factor=self._problem.state.factors.get((table, family), 1.0),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from fg_calib.analysis.covariance import Spread
-from fg_calib.arrays import Brief
+from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.information import eliminated
 from fg_calib.graph.solver import Solution
 
@@ -29,7 +29,7 @@ _SEEN = 1e-3
 
 
 @dataclass(frozen=True)
-class JointValues(Brief):
+class JointValues(FrozenArrays):
     """Estimated joint values of the fitted configurations, of the joints that have noise.
 
     Attributes:

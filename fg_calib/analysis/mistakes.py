@@ -20,6 +20,7 @@ from fg_calib.analysis.setup import Setup, has_places, setup_of, setup_of_table
 from fg_calib.analysis.typical_residuals import TypicalResidual, fitted_residuals, residuals_at
 from fg_calib.analysis.usual_mistakes import About, Mistake, still_joints, usual_mistakes
 from fg_calib.arguments import checked
+from fg_calib.arrays import Brief
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.frames import Frame
 from fg_calib.measurements.series import Table
@@ -72,7 +73,7 @@ class Explanation:
 
 
 @dataclass(frozen=True)
-class SetupCheck:
+class SetupCheck(Brief):
     """What residuals before a calibration say of its set-up.
 
     Attributes:

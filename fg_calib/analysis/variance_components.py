@@ -29,7 +29,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from fg_calib.analysis.covariance import spread_of
@@ -227,11 +226,17 @@ def _of_origins(solution: Solution, kept: frozenset[NoiseName] = frozenset()) ->
 
 
 def _curvature(T: Floats, seen: Floats) -> Floats:
-    """`2 seen - T`, T its mean: half the curvature of the likelihood, in no direction less than `LEAST_CURVED` T."""
-    by = np.sqrt(np.maximum(np.diag(T), TINY))
-    values, vectors = scipy.linalg.eigh(2.0 * seen - T, T + FLAT * np.diag(by**2))
-    of_T = (T + FLAT * np.diag(by**2)) @ vectors
-    out: Floats = (of_T * np.maximum(values, LEAST_CURVED)) @ of_T.T
+    """`2 seen - T`, T its mean: half the curvature of the likelihood, in no direction less than `LEAST_CURVED` T.
+
+    T counts degrees of freedom; where noise has next to none it may be singular, and by rounding less than that.
+    """
+    by = np.sqrt(np.maximum(np.diag(T), FLAT))
+    values, vectors = np.linalg.eigh(T / by[:, None] / by)
+    length = np.sqrt(np.maximum(values, FLAT))
+    inverse = vectors / length / by[:, None]  # of the root of T
+    curved, turned = np.linalg.eigh(inverse.T @ (2.0 * seen - T) @ inverse)
+    root = by[:, None] * (vectors * length) @ turned
+    out: Floats = (root * np.maximum(curved, LEAST_CURVED)) @ root.T
     return out
 
 

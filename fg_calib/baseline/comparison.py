@@ -37,6 +37,7 @@ from fg_calib.analysis.residual_table import residual_table
 from fg_calib.analysis.uncertainty import Uncertainty, assess
 from fg_calib.analysis.variance_components import solve_job
 from fg_calib.arguments import checked
+from fg_calib.arrays import Brief
 from fg_calib.baseline.least_squares import LeastSquares, fit_dataset
 from fg_calib.errors import CalibrationError, ProblemError
 from fg_calib.graph.build import problem_of
@@ -64,7 +65,7 @@ ESTIMATORS: Mapping[str, str] = {
 
 
 @dataclass(frozen=True)
-class PoseError:
+class PoseError(Brief):
     """Estimated minus true tool poses over some configurations.
 
     Attributes:
@@ -81,7 +82,7 @@ class PoseError:
 
 
 @dataclass(frozen=True)
-class RealErrors:
+class RealErrors(Brief):
     """Errors of an arm whose truth is known.
 
     Attributes:
@@ -95,7 +96,7 @@ class RealErrors:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class Estimate(Brief):
     """What one estimator made of a job.
 
     Attributes:
@@ -132,7 +133,7 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class Comparison(Brief):
     """Several estimators on one job.
 
     Attributes:

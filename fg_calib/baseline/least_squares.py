@@ -37,6 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
+from fg_calib.arrays import Brief
 from fg_calib.baseline.methods import claimed_covariance, gauss_newton, scipy_fit
 from fg_calib.baseline.system import build_system, start_at
 from fg_calib.errors import InputError
@@ -64,7 +65,7 @@ Method = Literal["gauss-newton", "scipy"]
 
 
 @dataclass(frozen=True)
-class LeastSquares:
+class LeastSquares(Brief):
     """What plain least squares found.
 
     Attributes:

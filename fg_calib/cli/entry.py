@@ -23,6 +23,7 @@ from fg_calib.cli.bag import bag
 from fg_calib.cli.board import board
 from fg_calib.cli.calibrate import calibrate
 from fg_calib.cli.compare import compare
+from fg_calib.cli.correct import correct
 from fg_calib.cli.example import example
 from fg_calib.cli.help import help_
 from fg_calib.cli.init import init
@@ -40,7 +41,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-for command in (init, inspect, calibrate, report, compare, observe, simulate, example, bag, board):
+for command in (init, inspect, calibrate, report, correct, compare, observe, simulate, example, bag, board):
     app.command()(command)
 app.command(name="help")(help_)
 

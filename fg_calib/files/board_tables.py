@@ -158,7 +158,7 @@ def _image_document(view: View, estimated: bool) -> dict[str, Any]:
 
 
 def require_no_input_of_board(folder: Path, inputs: Sequence[Path]) -> None:
-    """Check that tables written to a folder would not replace what they are made of, nor what is of nobody's board.
+    """Check that tables written to a folder would not replace what they are made of, nor a file that no board wrote.
 
     Raises:
         InputError: They would.

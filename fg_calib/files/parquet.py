@@ -129,7 +129,7 @@ class _Reader:
                 if no_memory:
                     raise InputError(name, NO_MEMORY, hint="if it is damaged, write it anew") from None
                 raise InputError(name, "not a Parquet file: polars ends on it", hint="write it anew") from None
-            except BaseException:  # such as Ctrl-C: what it would still answer is to nobody's question
+            except BaseException:  # such as Ctrl-C: its answer would be taken for that to the next question
                 self.stop()
                 raise
             finally:

@@ -18,7 +18,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from pydantic_core import PydanticCustomError
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import NORM_TOLERANCE
+from fg_calib.arrays import NORM_TOLERANCE, brief
 from fg_calib.errors import InputError
 from fg_calib.files.disk import exists, is_folder, read_text
 from fg_calib.files.schema import first_misfit
@@ -95,6 +95,12 @@ class Section(BaseModel):
     model_config = ConfigDict(
         frozen=True, from_attributes=True, populate_by_name=True, protected_namespaces=(), allow_inf_nan=False
     )
+
+    def __repr__(self) -> str:
+        return brief(self, (name for name in type(self).model_fields if name in self.model_fields_set))
+
+    def __str__(self) -> str:
+        return repr(self)
 
     @classmethod
     def make(cls, **values: Any) -> Self:

@@ -247,7 +247,7 @@ def write_robot(path: Path | str, robot: Robot, *, units: Units | None = None, u
             what it cannot. The joints' own values are those of the URDF: see `write_urdf`.
 
     Raises:
-        InputError: The folder does not exist or may not be written to.
+        InputError: The folder does not exist or may not be written to, or the robot has what no such file can say.
         ValueError: A URDF robot without `urdf_name`, or the other way round.
     """
     if (robot.urdf is None) != (urdf_name is None):
@@ -272,7 +272,25 @@ def write_robot(path: Path | str, robot: Robot, *, units: Units | None = None, u
         "tolerance": _Flow(_tolerances(robot, units)),
     }
     kept = {key: value for key, value in mapping.items() if value or key == "joints"}
+    if robot.urdf is None:
+        _check_written(robot, kept, Path(path))
     write_text(Path(path), yaml.dump(kept, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=math.inf))
+
+
+def _check_written(robot: Robot, mapping: Mapping[str, Any], path: Path) -> None:
+    """Check that what is to be written describes the robot, element by element.
+
+    Raises:
+        InputError: It does not, as the robot has other elements than its convention, a base and a tool.
+    """
+    place = str(path)
+    expected = "base, joints of one convention, tool: all that a robot file can say"
+    if robot.convention not in CONVENTIONS:
+        raise InputError(place, f"the robot is of the convention {shown(robot.convention)}", expected)
+    again = robot_from_mapping(mapping, place, path.parent)
+    names = [p.name for p in robot.parameters]
+    if [p.name for p in again.parameters] != names or again.elements != robot.elements:
+        raise InputError(place, "the robot has elements or parameters of its own", expected)
 
 
 def _unit_of_kind(kind: str) -> str:

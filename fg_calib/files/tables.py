@@ -80,8 +80,8 @@ def read_measurements(
     """
     units, noise = units or Units(), noise or Noise()
     _check_noise(noise)
-    header = _header(path, robot, columns or {})
-    joints = _joint_columns(header, robot)
+    header = header_for(path, robot, columns or {})
+    joints = find_joint_columns(header, robot)
     of_poses = PoseColumns.of(header)
     sigma_point = header.present("sigma_point") if "group" in header.columns else ()
     of_instrument = InstrumentColumns.of(header, model)
@@ -90,7 +90,7 @@ def read_measurements(
         numbers=(*joints, *of_poses.numbers, *sigma_point, *of_instrument.numbers),
         texts=(*header.present("id", "split", "group"), *of_instrument.labels),
     )
-    ids, test = _ids(table, repeated=of_instrument.several_rows), table.test_rows()
+    ids, test = read_ids(table, repeated=of_instrument.several_rows), table.test_rows()
     names, group = _groups(table)
     between, between_groups = None, no_pairs(header.name)
     if pairs is not None:
@@ -99,7 +99,7 @@ def read_measurements(
         between, between_groups = read_pairs(pairs, configurations, units, noise)
         names = known if between_groups.n_pairs else names
     return Measurements(
-        readings=_readings(table, joints, robot, units),
+        readings=read_readings(table, joints, robot, units),
         ids=ids.to_numpy().astype(np.str_),
         test=test,
         sigma_joint=_joint_sigma(noise.joint, robot.n_joints),
@@ -113,7 +113,7 @@ def read_measurements(
     )
 
 
-def _header(path: Path | str | Any, robot: Robot, columns: Mapping[str, Column]) -> Header:
+def header_for(path: Path | str | Any, robot: Robot, columns: Mapping[str, Column]) -> Header:
     """The header of a table, its columns called as they are known."""
     meant = {*KNOWN, *(f"q{i + 1}" for i in range(robot.n_joints))}
     called = {joint.name for joint in robot.joints}
@@ -138,7 +138,7 @@ def joint_columns(robot: Robot) -> tuple[str, ...]:
     return names if plain and not clashing else tuple(f"q{i + 1}" for i in range(robot.n_joints))
 
 
-def _joint_columns(header: Header, robot: Robot) -> tuple[str, ...]:
+def find_joint_columns(header: Header, robot: Robot) -> tuple[str, ...]:
     """The columns of joint readings, in chain order: all by the joints' names, or all by their numbers."""
     n = robot.n_joints
     names = tuple(joint.name for joint in robot.joints)
@@ -160,7 +160,7 @@ def _joint_columns(header: Header, robot: Robot) -> tuple[str, ...]:
     )
 
 
-def _readings(table: Table, columns: Sequence[str], robot: Robot, units: Units) -> Floats:
+def read_readings(table: Table, columns: Sequence[str], robot: Robot, units: Units) -> Floats:
     """Joint readings within the joints' limits, shape (n_rows, n_joints), [rad] or [m]."""
     readings = table.numbers(columns) * [units.factor(joint.unit) for joint in robot.joints]
     lower, upper = robot.limits.T
@@ -187,7 +187,7 @@ def _warn_of_degrees(table: Table, columns: Sequence[str], robot: Robot, units: 
         _log.warning("%s: most of %s are more than two turns; is the table in deg?", name, column)
 
 
-def _ids(table: Table, *, repeated: bool) -> pl.Series:
+def read_ids(table: Table, *, repeated: bool) -> pl.Series:
     """The configurations' names, different ones unless `repeated`: their ids, or else their 0-based row numbers."""
     import polars as pl
 

@@ -1,6 +1,7 @@
 """Numba's cache of compiled kernels, with a checksum: LLVM ends the process when it is handed damaged machine code.
 
-A file that is damaged counts as none, so its kernel is compiled anew; so it is where the cache cannot be written.
+A file that is damaged counts as none, so its kernel is compiled anew; so it is where the cache cannot be written. What
+is cached is loaded without all that numba knows to compile, which takes longer than the machine code.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from fg_calib.robot.compiler import IndexDataCacheFile
+from fg_calib.robot.compiler import FunctionCache, IndexDataCacheFile, runtime
 
 _SIZE = hashlib.sha256().digest_size
 
@@ -47,11 +48,22 @@ class _CheckedFiles(IndexDataCacheFile):  # type: ignore[misc]
             file.write(hashlib.sha256(data).digest() + data)
 
 
+class _LightCache(FunctionCache):  # type: ignore[misc]
+    """A kernel's cache, from which it is loaded with numba's runtime alone: compiling asks for the rest by itself."""
+
+    def load_overload(self, sig: object, target_context: Any) -> Any:
+        """The kernel of a signature; None if it is not there."""
+        runtime.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
+
+
 def check_cache(kernel: Callable[..., Any]) -> None:
     """Have a kernel's cache checked wherever it is read; as numba has it if this numba has another kind of cache."""
-    files = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
-    if type(files) is IndexDataCacheFile:
-        files.__class__ = _CheckedFiles
+    cache = getattr(kernel, "_cache", None)
+    files = getattr(cache, "_cache_file", None)
+    if type(cache) is FunctionCache and type(files) is IndexDataCacheFile:
+        cache.__class__, files.__class__ = _LightCache, _CheckedFiles
 
 
 def _read(path: str) -> Any:

@@ -12,9 +12,10 @@ _FILE = ".numba_config.yaml"
 with without_settings(_FILE, "NUMBA_*"):
     import numba
     from numba.core import config, event
-    from numba.core.caching import IndexDataCacheFile
+    from numba.core.caching import FunctionCache, IndexDataCacheFile
+    from numba.core.runtime import rtsys as runtime
 
-__all__ = ["IndexDataCacheFile", "event", "has_cache_folder", "numba"]
+__all__ = ["FunctionCache", "IndexDataCacheFile", "event", "has_cache_folder", "numba", "runtime"]
 
 config._config_fname = ""  # it is looked for again whenever a function is compiled
 

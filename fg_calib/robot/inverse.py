@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import as_floats, as_rotations
+from fg_calib.arrays import Brief, as_floats, as_rotations
 from fg_calib.options import check_number
 from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
 from fg_calib.robot.model import Robot
@@ -47,7 +47,7 @@ FINISHED = 1e-13
 
 
 @dataclass(frozen=True)
-class Inverse:
+class Inverse(Brief):
     """Configurations for poses.
 
     Attributes:
@@ -179,7 +179,7 @@ class _Search:
             jacobian[:, :3] = 0.0
             return np.concatenate([np.zeros_like(shift), shift], axis=1), jacobian
         turn = self._rotation[rows] @ np.swapaxes(at.rotation, 1, 2)  # (n, 3, 3)
-        return np.concatenate([_rotation_vector(turn), shift], axis=1), jacobian
+        return np.concatenate([rotation_vector(turn), shift], axis=1), jacobian
 
     def step(self, q: Floats, miss: Floats, jacobian: Floats) -> Floats:
         """The next configurations, within the limits, shape (n, n_joints)."""
@@ -221,7 +221,7 @@ def _range_of_starts(robot: Robot) -> tuple[Floats, Floats]:
     return low, high
 
 
-def _rotation_vector(rotation: Floats) -> Floats:
+def rotation_vector(rotation: Floats) -> Floats:
     """Rotation vectors of rotation matrices, shape (n, 3), exact near 0, [rad]."""
     from scipy.spatial.transform import Rotation
 

@@ -400,7 +400,13 @@ class RobotBuilder:
         self._elements += _inverse(elements) if backwards else elements
 
     def add_convention_joint(self, joint: Joint, values: Mapping[str, float]) -> None:
-        """Append a joint of one of the `CONVENTIONS`; `values` are keyed by kind, [m] or [rad]."""
+        """Append a joint of one of the `CONVENTIONS`; `values` are keyed by kind, [m] or [rad].
+
+        Before the first one goes the frame `base` if nothing else did, and `build` adds a `tool` that was left out:
+        the parameters of such a robot are those that its file has.
+        """
+        if not self._parameters:
+            self.add_frame("base", {}, 0, False)
         index = len(self._joints)
         self._joints.append(joint)
         moving = "d" if joint.prismatic else "theta"
@@ -465,6 +471,9 @@ class RobotBuilder:
             if not joint.prismatic and np.isfinite([joint.lower, joint.upper]).all() and joint.upper > MOST_LIMIT:
                 limits = f"{joint.lower:g} to {joint.upper:g} rad"
                 _log.warning("%s: joint %s has limits of %s; are they in deg?", place, escaped(joint.name), limits)
+        behind = len(self._joints) + 1
+        if self._convention in CONVENTIONS and all(p.owner != behind for p in self._parameters):
+            self.add_frame("tool", {}, behind, False)
         fixed, estimate = listed("fixed", fixed), listed("estimate", estimate)
         names = {p.name for p in self._parameters}
         if len(names) < len(self._parameters):

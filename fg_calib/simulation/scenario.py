@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.arrays import Brief
 from fg_calib.errors import InputError
 from fg_calib.measurements.dataset import Measurements, Noise
 from fg_calib.measurements.series import Table
@@ -44,7 +45,7 @@ class Errors:
 
 
 @dataclass(frozen=True)
-class Scenario:
+class Scenario(Brief):
     """A simulation to run.
 
     Attributes:
@@ -90,7 +91,7 @@ class Scenario:
 
 
 @dataclass(frozen=True)
-class Simulation:
+class Simulation(Brief):
     """One run of a scenario.
 
     Attributes:

@@ -45,6 +45,7 @@ def given(table, names):
     return replace(table, known={name: KnownPoint(TARGETS[int(name[1:])]) for name in names})
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("instrument", ["targets", "targets stations"])
 def test_unknown_targets_take_up_what_a_known_one_shows(instrument):
     robot, _, table = measured_by(instrument, np.random.default_rng(0))
@@ -58,6 +59,7 @@ def test_unknown_targets_take_up_what_a_known_one_shows(instrument):
         assert seen(without, relation) < 1e-6 * seen(with_one, relation)
 
 
+@pytest.mark.slow
 def test_how_many_places_must_be_given_is_counted():
     """The tool may turn about two of three known targets."""
     robot, _, table = measured_by("targets", np.random.default_rng(0))
@@ -71,6 +73,7 @@ def test_how_many_places_must_be_given_is_counted():
         assert looked_at(robot, given(table, names))[1].observability.rank == rank
 
 
+@pytest.mark.slow
 def test_a_joint_that_hardly_moves_is_still_the_reason_with_targets():
     """Targets or not: a joint that was not moved says nothing of its own axis."""
     robot, true, table = measured_by("targets", np.random.default_rng(0))
@@ -126,6 +129,7 @@ def test_touched_points_take_up_the_size_of_the_arm():
     assert max(seen(problem, relation) for relation in reasons["the unknown touched points take it up"]) > 1.0
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("instrument", ["targets", "targets known", "targets stations", "anchors", "anchors known",
                                         "anchors offset", "planes", "board", "pixels"])  # fmt: skip
 def test_every_reason_holds_of_random_configurations_too(instrument):

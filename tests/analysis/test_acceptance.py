@@ -103,6 +103,7 @@ def of_job(tmp_path, fg_calib, accept, *arguments, units=None):
     return fg_calib("calibrate", job, *arguments)
 
 
+@pytest.mark.slow
 def test_a_job_may_state_units_or_not(tmp_path, fg_calib):
     ended = of_job(tmp_path, fg_calib, {"position": "0.5 mm", "orientation": "0.05deg"}, "--json")
     found = json.loads(ended.out)["acceptance"]
@@ -118,6 +119,7 @@ def test_what_is_not_accepted_ends_with_3_and_says_why(tmp_path, fg_calib):
     assert ended.err.startswith("not accepted: NOT EVALUATED: position 0.1")
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize(
     ("accept", "message"),
     [

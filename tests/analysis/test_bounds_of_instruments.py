@@ -7,7 +7,6 @@ import pytest
 from instruments import measured_by
 from scenarios import INSTRUMENTS, scenario
 from simulated import planar_robot
-from sparing import most_slow
 from tolerances import rounding
 
 from fg_calib import InputError, Measurements, Table, assess, build_problem, cramer_rao, simulate, solve
@@ -39,7 +38,8 @@ def test_a_length_seen_by_a_wire_has_the_share_of_its_direction():
 MEASURED = ["targets known", "targets stations", "anchors offset", "targets", "board", "planes", "pixels"]
 
 
-@pytest.mark.parametrize("instrument", most_slow(MEASURED, every=2))
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("instrument", MEASURED)
 def test_the_bound_is_what_a_calibration_of_the_table_says(instrument):
     """Which has it at the estimate, where noise bends little: some percent of a sigma."""
     robot, true, table = measured_by(instrument, np.random.default_rng(3), sigma_joint=1e-4)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from simulated import measure, plus, true_robot
-from sparing import diagonal, most_slow
+from sparing import diagonal
 from test_structure import EFFECTS, PLACED, SIGMA, SIGMA_JOINT, arm, measured, problem_of
 
 from fg_calib.analysis.changes import find_change
@@ -38,6 +38,7 @@ def moved(what, first, rng, n=45):
     return robot, replace(parts[0], ids=np.arange(n).astype(str), **together)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("what", ["tool", "base"])
 @pytest.mark.parametrize("model", ["position", "pose"])
 def test_what_moved_is_said_with_the_row(what, model):
@@ -54,6 +55,7 @@ def test_what_moved_is_said_with_the_row(what, model):
     assert "follow the arm" not in report
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("row", [2, 25, 43])
 def test_outliers_are_no_change(row):
     robot, m = moved("nothing", 22, np.random.default_rng(1))
@@ -72,6 +74,7 @@ def test_the_last_few_rows_alone_are_no_change():
         assert set(found.goodness.gross.names) <= {"41", "42", "43", "44"}
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("name", "forgotten", "away"), diagonal(["6R", "scara"], ["frame", "tool"], [1.0, 0.03, 0.003])
 )
@@ -90,13 +93,15 @@ def test_a_frame_or_tool_that_was_forgotten_is_no_change(name, forgotten, away):
     assert find_change(solve(problem)) is None
 
 
-@pytest.mark.parametrize("effect", most_slow(EFFECTS, every=2))
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("effect", EFFECTS)
 def test_effects_that_are_not_modelled_are_no_change(effect):
     for seed in range(2):
         robot, m = measured("6R", np.random.default_rng(seed), effect=EFFECTS[effect], n=45)
         assert find_change(solve(problem_of(robot, m, "pose"))) is None
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["6R", "scara"])
 def test_noise_has_no_change(name):
     assert find_change(solve(problem_of(*measured(name, np.random.default_rng(1)), "pose"))) is None

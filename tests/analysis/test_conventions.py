@@ -9,7 +9,6 @@ import yaml
 from jobs import UR5E, only, ur5e, write_job
 from oracle import random_robot, rotation, tool_pose, translation
 from simulated import measure, paper_robot, true_robot
-from sparing import most_slow
 
 from fg_calib import Measurements, Robot, calibrate
 from fg_calib.analysis.conventions import missing_motions
@@ -41,6 +40,7 @@ GANTRY = ((0, 90, 0, "slide"), (0, 90, 0, "slide"), (0, 0, 0, "slide"), (0, 90, 
 BENT = ((0, 90, 0.1), (0.3, 80, 0), (0.2, -70, 0.1), (0, 90, 0.2))
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize(
     ("convention", "joints", "expected"),
     [
@@ -111,6 +111,7 @@ def test_units_do_not_matter():
         assert [(m.axes, m.motions) for m in found] == [((2, 3, 4), TILT)]
 
 
+@pytest.mark.slow
 def test_a_tilt_that_is_missing_is_followed_by_no_parameters():
     """Against products of matrices: the best change of all parameters leaves most of a tilt between axes 2 and 3."""
     robot = arm("dh", *UR)
@@ -164,7 +165,8 @@ def words(text):
     return " ".join(text.split())
 
 
-@pytest.mark.parametrize("model", most_slow(["pose", "position", "distance-rotation"], every=3))
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["pose", "position", "distance-rotation"])
 def test_a_bad_fit_says_first_what_the_convention_lacks(tmp_path, fg_calib, model):
     ended = fg_calib("calibrate", textbook_job(tmp_path, model=model), "--out", tmp_path / "out")
     assert ended.code == 3
@@ -177,7 +179,7 @@ def test_a_bad_fit_says_first_what_the_convention_lacks(tmp_path, fg_calib, mode
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("error", most_slow([only(2, 1e-3), only(5, 2e-3)], every=2))
+@pytest.mark.parametrize("error", [only(2, 1e-3), only(5, 2e-3)])
 def test_what_the_convention_lacks_is_no_finding_where_something_else_is_wrong(tmp_path, fg_calib, error):
     """A gear ratio that is off: the convention that has the parameter would not fit any better."""
     m = measure(true_robot(ur5e(tmp_path, **DH), np.random.default_rng(0)), 60, np.random.default_rng(1), sigma=SIGMA)
@@ -202,8 +204,9 @@ def anchored(error, rng):
     return robot, Measurements.from_arrays(q, anchor=names, distance=length, sigma_distance=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_mistakes")
-@pytest.mark.parametrize("error", most_slow([only(5, -2.0), only(1, 1e-3), only(4, 2e-3)], every=3))
+@pytest.mark.parametrize("error", [only(5, -2.0), only(1, 1e-3), only(4, 2e-3)])
 def test_neither_is_it_of_instruments(error):
     robot, m = anchored(error, np.random.default_rng(2))
     assert missing_motions(robot)
@@ -213,6 +216,7 @@ def test_neither_is_it_of_instruments(error):
     assert any("use mdh-hayati" in caution for caution in found.uncertainty.cautions)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("noise", ["estimate", {"position": 5e-5, "orientation": 1e-4, "estimate": True}])
 def test_estimated_noise_does_not_make_it_good(tmp_path, fg_calib, noise):
     ended = fg_calib("calibrate", textbook_job(tmp_path, noise=noise))
@@ -220,6 +224,7 @@ def test_estimated_noise_does_not_make_it_good(tmp_path, fg_calib, noise):
     assert words(ended.out).partition("DOUBTFUL: ")[2].startswith(SAID)
 
 
+@pytest.mark.slow
 def test_a_good_fit_has_it_as_a_caution(tmp_path, fg_calib):
     ended = fg_calib("calibrate", textbook_job(tmp_path, tilts=False))
     assert ended.code == 0
@@ -254,6 +259,7 @@ def stated(factor):
     return {"position": 5e-5 / factor, "orientation": 1e-4 / factor}
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("factor", "offered"), [(1.6, True), (5.0, False)])
 def test_noise_is_offered_to_be_estimated_only_near_what_was_stated(tmp_path, fg_calib, factor, offered):
     m = measure(true_robot(ur5e(tmp_path), np.random.default_rng(0)), 80, np.random.default_rng(1), sigma=(5e-5, 1e-4))
@@ -262,6 +268,7 @@ def test_noise_is_offered_to_be_estimated_only_near_what_was_stated(tmp_path, fg
     assert "follow the arm" not in said
 
 
+@pytest.mark.slow
 def test_noise_is_not_offered_to_be_estimated_where_residuals_follow_the_arm(tmp_path, fg_calib):
     """An eccentric encoder: joint 2 is off by 0.2 mrad times the sine of itself."""
     m = measure(true_robot(ur5e(tmp_path), np.random.default_rng(0)), 80, np.random.default_rng(1), sigma=(5e-5, 1e-4))

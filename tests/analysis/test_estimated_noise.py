@@ -34,6 +34,7 @@ def touched(what, rng, n=36, n_points=3):
     return robot, Table(data, "anchor", known={"p0": KnownPoint(points[0])})
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.usefixtures("without_reasons", "without_mistakes")
 @pytest.mark.parametrize(
     "instrument", [*TOUCHED, "board", "targets", *(as_case(x, is_slow=True) for x in ("anchors", "planes"))]
@@ -50,6 +51,7 @@ def test_estimated_noise_of_a_healthy_table_is_good_and_of_another_arm_is_not(in
     assert any("times as large as what was measured moved" in finding for finding in wrong.findings)
 
 
+@pytest.mark.slow
 def test_contact_with_a_single_point_does_not_move_it():
     """Nothing that was measured moves: healthy, and no figure over 0."""
     robot, table = touched("contacts", np.random.default_rng(1), n_points=1)

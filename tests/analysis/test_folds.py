@@ -31,6 +31,7 @@ def job_of(robot, *tables, **options):
     return Job(None, robot, given, options)
 
 
+@pytest.mark.slow
 def test_every_configuration_is_predicted_once_by_the_others():
     """Against calibrations of one's own, fold by fold."""
     robot, m = poses(n_test=7)
@@ -49,6 +50,7 @@ def test_every_configuration_is_predicted_once_by_the_others():
     assert found.spread == pytest.approx(jackknife, rel=1e-4, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_rows_of_one_configuration_stay_together():
     robot, _, table = measured_by("targets", np.random.default_rng(0), n=30)
     found = cross_validate(job_of(robot, table), 5)
@@ -57,6 +59,7 @@ def test_rows_of_one_configuration_stay_together():
     assert found.kinds["position"].n == 90
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("instrument", ["anchors", "planes", "board"])
 def test_what_few_configurations_know_of_is_spread_over_the_folds(instrument):
     robot, _, table = measured_by(instrument, np.random.default_rng(0), n=40)
@@ -89,6 +92,7 @@ def with_measured_pairs(ends, seed=0):
     return robot, Measurements.from_arrays(m.readings, ids=m.ids, pairs=pairs)
 
 
+@pytest.mark.slow
 def test_a_measured_pair_is_held_out_once():
     chain = [(k, k + 1) for k in range(39)] + [(k, (k + 7) % 40) for k in range(33)] + [(k, k + 3) for k in range(37)]
     robot, m = with_measured_pairs(chain)
@@ -128,6 +132,7 @@ def test_the_spread_is_sigma_where_measurements_determine_a_parameter():
     assert np.mean(squares) > 0.85
 
 
+@pytest.mark.slow
 def test_what_the_model_lacks_makes_folds_worse_than_the_noise():
     """Joint 2 turns by 1 % more than its reading."""
     robot, m = poses()
@@ -139,6 +144,7 @@ def test_what_the_model_lacks_makes_folds_worse_than_the_noise():
     assert healthy.kinds["position"].after < 1.5 * healthy.kinds["position"].noise
 
 
+@pytest.mark.slow
 def test_limits_without_test_rows_are_judged_by_the_folds():
     robot, m = poses()
     result = calibrate(robot, m, model="pose", folds=5, accept={"position": 5e-4})
@@ -147,6 +153,7 @@ def test_limits_without_test_rows_are_judged_by_the_folds():
     assert one.error == result.result.folds.kinds["position"].after
 
 
+@pytest.mark.slow
 def test_test_rows_come_before_folds():
     robot, m = poses(n_test=6)
     result = calibrate(robot, m, model="pose", folds=5, accept={"position": 5e-4})
@@ -172,6 +179,7 @@ def test_a_fold_that_leaves_too_little_is_named():
         cross_validate(job_of(robot, m, gauge="keep", model="position"), 5)
 
 
+@pytest.mark.slow
 def test_the_command_says_it_in_report_and_result(tmp_path, fg_calib):
     robot, m = poses()
     job = write_job(tmp_path, robot, m, model="pose")
@@ -185,6 +193,7 @@ def test_the_command_says_it_in_report_and_result(tmp_path, fg_calib):
     assert fg_calib("calibrate", job, "--folds", "1").code == 2
 
 
+@pytest.mark.slow
 def test_a_job_may_ask_for_it(tmp_path, fg_calib):
     robot, m = poses()
     job = write_job(tmp_path, robot, m, model="pose", folds=3)
@@ -207,6 +216,7 @@ def test_repeats_of_one_place_are_held_out_together():
     assert all(len(set(fold[rows == k])) == 1 for k in range(20))
 
 
+@pytest.mark.slow
 def test_an_anchor_that_few_lengths_go_to_is_never_held_out():
     robot, _, table = measured_by("anchors", np.random.default_rng(0), n=40)
     m = table.measurements

@@ -72,6 +72,7 @@ RANKS = [
 ]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("robot", "ranks", "n"), RANKS, ids=[f"{r.name}-{i}" for i, (r, _, _) in enumerate(RANKS)])
 def test_ranks_of_known_arms(robot, ranks, n):
     for model, rank in zip(MODELS, ranks, strict=True):
@@ -101,6 +102,7 @@ def rank_at(robot, model, seed):
     return observability_of(problem, problem.start, (), STRUCTURAL_FLOOR).rank
 
 
+@pytest.mark.sampled(9)
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize(("robot", "ranks"), DRAWN, ids=[f"{r.name}-{i}" for i, (r, _) in enumerate(DRAWN)])
 def test_structural_rank_does_not_depend_on_the_draw(robot, ranks, model):
@@ -213,6 +215,7 @@ def test_configurations_that_do_not_move_a_joint_are_named_as_the_reason():
     assert {lost.reason for lost in found.lost} == {NOT_EXCITED}
 
 
+@pytest.mark.slow
 def test_practical_sigmas_are_those_of_the_kept_set():
     rng = np.random.default_rng(3)
     robot = paper_robot()
@@ -256,6 +259,7 @@ def in_other_units(robot, k):
 TOLERANCES = [None, {"a": 1e-3, "d": 1e-4, "theta": 2e-3}]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("arm", "model", "tolerance"), diagonal(["paper", "small", "scara"], ["pose", "distance-rotation"], TOLERANCES)
 )
@@ -310,6 +314,7 @@ def test_structure_and_problem_agree():
     assert found.observability.rank == observe_structure(paper_robot(), "distance").observability.rank == 21
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("model", ["pose", "distance-rotation", "position"])
 def test_reasons_are_found_where_the_tool_turned_out_to_be(model):
     """The tool is estimated and far from nominal: directions and reasons are those at the fitted tool."""

@@ -48,6 +48,7 @@ def said(found):
 # --- healthy jobs ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_bundled_example_is_ready_and_nothing_is_to_be_said_of_it(whole_example):
     found = inspect_job(read_job(whole_example / "calibration.yaml"))
     assert found.ready
@@ -59,6 +60,7 @@ def test_the_bundled_example_is_ready_and_nothing_is_to_be_said_of_it(whole_exam
     assert found.dof == 102
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("model", [model for model, _ in MODELS])
 def test_a_healthy_table_of_poses_is_ready(arm, model):
     found = inspected(arm, measured(arm), model)
@@ -66,6 +68,7 @@ def test_a_healthy_table_of_poses_is_ready(arm, model):
     assert all(one.excess < 2.0 for check in found.setups for one in check.residuals)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW)) for n in INSTRUMENTS])
 def test_a_healthy_table_of_every_instrument_is_ready(name, seed):
@@ -76,6 +79,7 @@ def test_a_healthy_table_of_every_instrument_is_ready(name, seed):
     assert found.disagreements.n >= 15
 
 
+@pytest.mark.slow
 def test_the_expected_accuracy_is_that_of_the_calibration(example):
     """To first order, at nominal instead of at the estimate."""
     from fg_calib import calibrate_job
@@ -120,6 +124,7 @@ MISTAKES = {
 }
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_in_the_set_up_is_a_finding(arm, mistake):
     found = inspected(arm, MISTAKES[mistake](measured(arm)))
@@ -128,6 +133,7 @@ def test_a_mistake_in_the_set_up_is_a_finding(arm, mistake):
     assert found.disagreements.found == ()  # not looked for: all rows would
 
 
+@pytest.mark.slow
 def test_a_mistake_in_one_of_two_tables_is_said_of_that_table(arm):
     good = Table(replace(measured(arm), source="monday.csv"), "position", frame="unknown")
     spoilt = replace(measured(arm, 1), source="tuesday.csv")
@@ -174,6 +180,7 @@ def test_a_wrong_orientation_is_named_as_that(arm):
     assert one.size == pytest.approx(0.2, rel=0.1)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "name",
     [pytest.param("targets", marks=pytest.mark.slow), "anchors", "planes", "board", "pairs", "sockets", "stations"],
@@ -387,6 +394,7 @@ def test_nothing_to_estimate_is_refused_as_by_calibrate(arm):
         inspected(arm.with_estimated([]), measured(arm))
 
 
+@pytest.mark.slow
 def test_the_repr_fits_a_screen(arm):
     found = inspected(arm, measured(arm))
     assert repr(found) == "Inspection of 'ur5e': 50 rows in 1 table, rank 23 of 30\n  ready"

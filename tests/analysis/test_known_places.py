@@ -14,6 +14,7 @@ from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("instrument", "name"), [("targets", "target t0"), ("anchors", "anchor a0")])
 def test_a_place_that_is_twelve_tolerances_off_is_named_and_nothing_else(instrument, name):
     for seed in (0, 1):

@@ -10,7 +10,7 @@ from jobs import SIGMA, UR5E, only, ur5e, write_job
 from oracle import random_robot
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, small_arm, true_robot
-from sparing import as_case, diagonal, most_slow
+from sparing import as_case, diagonal
 
 from fg_calib import Robot
 from fg_calib.analysis import mistakes
@@ -99,7 +99,8 @@ def named(check):
     return str(check.explanations[0]) if check.explanations else ""
 
 
-@pytest.mark.parametrize(("model", "frame", "mistake"), most_slow(CASES, every=8))
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize(("model", "frame", "mistake"), CASES)
 def test_a_mistake_in_the_table_is_named(tmp_path, model, frame, mistake):
     robot = ur5e(tmp_path)
     m = measured(robot, placed=PLACED if frame == "unknown" else None)
@@ -122,6 +123,7 @@ def stuck(robot, joint, place, seed=0, *, placed=PLACED):
     return replace(m, readings=q)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("stands", "model"), diagonal([(0, 0.4), (3, -2.2), (5, 0.3), (5, 3.0)], ["pose", "position"]))
 def test_a_joint_that_is_stuck_is_not_called_one_in_another_unit(tmp_path, stands, model):
     joint, place = stands
@@ -131,7 +133,8 @@ def test_a_joint_that_is_stuck_is_not_called_one_in_another_unit(tmp_path, stand
     assert not any("in deg" in str(e) for e in check.explanations)
 
 
-@pytest.mark.parametrize(("joint", "place"), most_slow([(0, 0.4), (2, 0.08), (3, 0.3)], every=3))
+@pytest.mark.slow
+@pytest.mark.parametrize(("joint", "place"), [(0, 0.4), (2, 0.08), (3, 0.3)])
 def test_a_joint_of_a_scara_that_is_stuck_is_named_too(joint, place):
     """The last one moves the tool point by 40 mm only, and a slide in mm instead of cm would move by a tenth."""
     rows = [[0, 0, 0.35, 0], [0.3, 0, 0, 0], [0.25, np.pi, 0, 0], [0, 0, 0.05, 0]]
@@ -144,6 +147,7 @@ def test_a_joint_of_a_scara_that_is_stuck_is_named_too(joint, place):
     assert not any("in deg" in str(e) or "in mm" in str(e) for e in check.explanations)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("factor", [np.pi / 180, 180 / np.pi])
 def test_readings_of_a_joint_in_another_unit_are_not_called_stuck(tmp_path, factor):
     robot = ur5e(tmp_path)
@@ -200,6 +204,7 @@ ANGLES = {
 }
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("mistake", ANGLES)
 def test_other_angles_than_roll_pitch_yaw_are_named(tmp_path, mistake):
     m = measured(ur5e(tmp_path))
@@ -217,6 +222,7 @@ CHANGED = {
 }
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("mistake", "model"), diagonal(CHANGED, ["pose", "distance-rotation"]))
 def test_a_mistake_in_the_robot_is_named(tmp_path, model, mistake):
     robot = ur5e(tmp_path)
@@ -239,7 +245,7 @@ def test_a_mistake_in_the_robot_is_named(tmp_path, model, mistake):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", most_slow(["position", "pose", "orientation"], every=3))
+@pytest.mark.parametrize("model", ["position", "pose", "orientation"])
 def test_a_forgotten_unknown_frame_is_named(tmp_path, fg_calib, model):
     job = write_job(tmp_path, measured(ur5e(tmp_path), placed=PLACED), model=model)
     ended = fg_calib("calibrate", job)
@@ -247,6 +253,7 @@ def test_a_forgotten_unknown_frame_is_named(tmp_path, fg_calib, model):
     assert "if the measurement frame is not the base (frame: unknown)" in " ".join(ended.out.split())
 
 
+@pytest.mark.slow
 def test_a_slide_that_goes_the_other_way_or_in_another_unit_is_named():
     rng = np.random.default_rng(0)
     arm = small_arm()
@@ -258,6 +265,7 @@ def test_a_slide_that_goes_the_other_way_or_in_another_unit_is_named():
         assert mistake in named(check_setup(arm, replace(m, readings=m.readings * factor), "pose"))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("mistake", "frame"), diagonal(ONE, ["known", "unknown"]))
 def test_a_unit_of_one_quantity_or_one_joint_is_named(tmp_path, mistake, frame):
     robot = ur5e(tmp_path)
@@ -265,9 +273,8 @@ def test_a_unit_of_one_quantity_or_one_joint_is_named(tmp_path, mistake, frame):
     assert named(check_setup(robot, ONE[mistake](m), "pose", frame)) == mistake
 
 
-@pytest.mark.parametrize(
-    ("factor", "unit"), most_slow([(1e-3, "m, not mm"), (0.1, "cm, not mm"), (1e3, "mm, not m")], every=3)
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("factor", "unit"), [(1e-3, "m, not mm"), (0.1, "cm, not mm"), (1e3, "mm, not m")])
 def test_one_slide_of_two_in_another_unit_is_named(factor, unit):
     rng = np.random.default_rng(0)
     rows = [(0.0, 1.6, 0.5, 0.0), (0.1, 1.6, 0.4, 1.6), (0.2, 0.7, 0.3, 0.0), (0.3, -1.5, 0.1, 0.0)]
@@ -331,6 +338,7 @@ def touches(folder, seed=0, distance=0.05):
     return read_job(path)
 
 
+@pytest.mark.slow
 def test_touched_points_name_a_joint_that_turns_the_other_way(tmp_path):
     job = touches(tmp_path)
     assert not check_setup(job.robot, job.measurements, "distance").far
@@ -338,6 +346,7 @@ def test_touched_points_name_a_joint_that_turns_the_other_way(tmp_path):
     assert "joint 2 turns the other way" in named(check_setup(job.robot, spoilt, "distance"))
 
 
+@pytest.mark.slow
 def test_sockets_whose_distance_is_in_another_unit_are_named(tmp_path):
     job = touches(tmp_path, distance=50.0)
     assert named(check_setup(job.robot, job.measurements, "distance")) == "distances are in mm, not m"
@@ -378,6 +387,7 @@ def test_what_no_usual_mistake_explains_is_said_plainly(tmp_path, fg_calib):
     assert "the noise there is" not in said
 
 
+@pytest.mark.slow
 def test_a_solver_that_gives_up_names_the_mistake_too(tmp_path, fg_calib, monkeypatch):
     def gives_up(*_):
         raise SolverError("no step can be solved")
@@ -391,7 +401,8 @@ def test_a_solver_that_gives_up_names_the_mistake_too(tmp_path, fg_calib, monkey
     assert "if x, y, z are in mm, not m" in ended.err
 
 
-@pytest.mark.parametrize("seed", most_slow(range(24), every=2))
+@pytest.mark.sampled(4)
+@pytest.mark.parametrize("seed", range(24))
 def test_a_healthy_job_raises_no_alarm(seed):
     """With large but stated tolerances; also where it is looked at although its residuals are as predicted."""
     rng = np.random.default_rng(seed)
@@ -429,6 +440,7 @@ def test_gross_errors_are_no_mistake_in_the_set_up(tmp_path):
     assert check.explanations == ()
 
 
+@pytest.mark.sampled(13)
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("n", [1, 2, 3])
 def test_few_rows_say_nothing(tmp_path, model, n):

@@ -67,6 +67,7 @@ def test_a_mistake_in_an_instruments_table_is_named(instrument, mistake, spoil):
     assert mistake in str(check(robot, table, **spoil(table.measurements)))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("instrument", ["targets stations", "anchors offset", "planes", "board", "pixels"])
 def test_healthy_tables_have_no_mistake(instrument):
     for seed in range(3):
@@ -128,6 +129,7 @@ def test_what_no_usual_mistake_explains_is_said_of_instruments_too():
     assert str(check(robot, table, position=mixed)).endswith("none of the usual mistakes in a set-up explains it")
 
 
+@pytest.mark.slow
 def test_what_could_not_be_checked_is_said(monkeypatch):
     monkeypatch.setattr(placed_residuals, "_placed_residuals", lambda setup: ())
     robot, _, table = measured_by("planes", np.random.default_rng(6))

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 from simulated import measure, paper_robot, small_arm, true_robot
-from sparing import most_slow
 
 from fg_calib.analysis.restarts import look_elsewhere
 from fg_calib.analysis.uncertainty import assess
@@ -54,6 +53,7 @@ def pointer(folder, *, nominal, true, tolerance=0.02, job=JOB, n=40, seed=0):
     return folder / "job.yaml"
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_two_mirrored_optima_are_told_of_and_not_called_good(fg_calib, tmp_path, side):
     """20 mm aside with a tolerance of 20 mm, and 1 mm at nominal: chi-square differs by 0.2."""
@@ -82,6 +82,7 @@ def test_the_best_of_two_optima_is_kept(tmp_path):
     assert best.others == ()  # chi-square decides: the other is 80 worse
 
 
+@pytest.mark.slow
 def test_a_start_between_two_optima_is_left(tmp_path):
     """At nominal 0 the derivative is 0: the descent stays there, with a chi-square of tens of thousands."""
     problem = problem_of(job := read_job(pointer(tmp_path, nominal=0.0, true=0.02)))
@@ -107,6 +108,7 @@ def test_what_data_see_has_one_optimum_and_costs_nothing_more(tmp_path, monkeypa
     assert assess(solution).trustworthy
 
 
+@pytest.mark.slow
 def test_lost_directions_have_no_second_optimum():
     """Twelve directions of the paper's arm are held by priors alone: other starts along them come back."""
     robot = paper_robot(tolerance={"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3})
@@ -119,7 +121,8 @@ def test_lost_directions_have_no_second_optimum():
         assert 2.0 * (again.cost - solution.cost) == pytest.approx(0.0, abs=1e-6)
 
 
-@pytest.mark.parametrize("seed", most_slow([158, 855, 1357], every=3))
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [158, 855, 1357])
 def test_an_angle_that_nominal_has_on_the_other_side_of_half_a_turn_bends_no_arm(seed):
     """It lies 8 of its sigma or more from half a turn, but tolerances of 2 mrad put nominal on the other side."""
     rng = np.random.default_rng(seed)

@@ -8,7 +8,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, kstest
 from simulated import measure, true_robot, write_job
-from sparing import most_slow
 
 from fg_calib import Robot
 from fg_calib.analysis.conventions import end_of_link
@@ -104,13 +103,15 @@ EFFECTS = {
 """What moves the tool of the 6R arm by 2 to 4 sigma."""
 
 
-@pytest.mark.parametrize("effect", most_slow(EFFECTS, every=2))
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("effect", EFFECTS)
 def test_an_effect_of_a_few_sigma_is_seen_whatever_the_noise_stated(effect):
     for unit in (1.0, 0.2):
         robot, m = measured("6R", np.random.default_rng(1), effect=EFFECTS[effect], unit=unit)
         assert probability_of_noise(solve(problem_of(robot, m, "position"))) < NOT_NOISE
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ARMS)
 @pytest.mark.parametrize("model", ["position", "pose", "pairs"])
 def test_noise_does_not_follow_the_arm(name, model):
@@ -161,6 +162,7 @@ def test_true_errors_are_twice_those_claimed_or_more_where_residuals_follow_the_
 FOLLOW = "the residuals follow the arm, as noise does not: effects that are not modelled"
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("noise", ["estimate", {"position": 5e-5, "joint": 2e-5, "estimate": True}])
 def test_estimated_noise_does_not_hide_what_is_not_modelled(fg_calib, tmp_path, noise):
     robot, m = measured("6R", np.random.default_rng(1), effect=EFFECTS["backlash"])
@@ -171,6 +173,7 @@ def test_estimated_noise_does_not_hide_what_is_not_modelled(fg_calib, tmp_path, 
     assert said in " ".join(ended.out.split())
 
 
+@pytest.mark.slow
 def test_estimated_noise_of_a_clean_table_is_good(fg_calib, tmp_path):
     robot, m = measured("6R", np.random.default_rng(1))
     ended = fg_calib("calibrate", write_job(tmp_path, robot, m, model="position", frame="unknown", noise="estimate"))

@@ -71,6 +71,7 @@ def three_tables(true, rng, mistake):
     return [first, Table(bar, "distance"), Table(cam, "pose", frame="unknown")]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("mistake", "order"), diagonal(MISTAKES, [(0, 1, 2), (2, 1, 0)]))
 def test_a_mistake_in_one_of_three_tables_is_said_of_that_table(tmp_path, mistake, order):
     rng = np.random.default_rng(3)
@@ -81,6 +82,7 @@ def test_a_mistake_in_one_of_three_tables_is_said_of_that_table(tmp_path, mistak
     assert MISTAKES[mistake] in found[0]
 
 
+@pytest.mark.slow
 def test_all_tables_that_have_an_explanation_of_their_own_are_named(tmp_path):
     rng = np.random.default_rng(3)
     robot = ur5e(tmp_path, estimate=["tool.x", "tool.y", "tool.z"], tolerance=TOLERANCE)

@@ -45,6 +45,7 @@ def test_covariance_of_a_planar_arm_is_the_one_computed_by_hand():
     assert found["theta2"] == pytest.approx(sigma / np.sqrt(n), rel=1e-6)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("model", "frame", "estimate"),
     [
@@ -223,6 +224,7 @@ def test_frame_estimate_is_world_T_base():
     assert found.xyz == pytest.approx(frame[1], abs=0.01)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("model", ["distance-rotation", "pose", "position"])
 def test_every_gauge_predicts_the_same_where_prediction_is_possible(model):
     rng = np.random.default_rng(10)

@@ -10,6 +10,7 @@ from scipy.optimize import minimize
 from scipy.stats import chi2, kstest
 from simulated import measure, small_arm, true_robot
 from sparing import diagonal
+from tolerances import rounding
 from touches import TOOL_POINT, corners, touch
 
 from fg_calib.analysis import variance_components as estimation
@@ -148,6 +149,7 @@ def spare_of(problem):
 DENSE = ["pose", "frame unknown", "encoder estimated", "touches", "tables", "star of distances", "all distances"]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("name", "exact"), diagonal(DENSE, [True, False]))
 def test_components_are_those_of_the_dense_covariance(name, exact, monkeypatch):
     """To rounding of the dense inverse; estimated products to four of their sigmas, some sqrt(2 / 64) of themselves."""
@@ -215,6 +217,7 @@ def estimated(name, own=1 / 3, joint=2.0):
     return estimate_noise(problem), true
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["pose", "tables"])
 def test_own_noise_and_that_of_the_joints_are_told_apart(name):
     """Each within four of its own sigmas; its degrees of freedom are 15 at least, or 5 of lengths."""
@@ -227,6 +230,7 @@ def test_own_noise_and_that_of_the_joints_are_told_apart(name):
         assert np.log(factor) == pytest.approx(np.log(3.0), abs=4 * sigma)
 
 
+@pytest.mark.slow
 def test_estimated_joint_values_tell_of_the_same_noise():
     """To first order only: 1 mrad turns residuals by 1e-3 of themselves."""
     found, other = (factors_of(estimated(name)[0]) for name in ("pose", "encoder estimated"))
@@ -236,6 +240,7 @@ def test_estimated_joint_values_tell_of_the_same_noise():
     assert values.scatter == pytest.approx(np.ones(4), abs=4 / np.sqrt(2 * 30))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("times", [1 / 25, 25.0])
 def test_factors_are_the_same_wherever_they_start(times):
     """To ten times what settles them: they are the optimum's."""
@@ -243,6 +248,7 @@ def test_factors_are_the_same_wherever_they_start(times):
     assert {name: times * factor for name, factor in found.items()} == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_joint_noise_that_is_not_there_goes_to_nothing():
     solution, _ = estimated("joints drowned", joint=1.0)
     found = factors_of(solution)
@@ -251,6 +257,7 @@ def test_joint_noise_that_is_not_there_goes_to_nothing():
     assert list(found.values()) == pytest.approx([3.0, 3.0], rel=4 / np.sqrt(2 * 60))
 
 
+@pytest.mark.slow
 def test_noise_that_is_drowned_keeps_what_was_stated_and_is_said_to(monkeypatch):
     """Own noise of a hundredth of what the joints add."""
     rng = np.random.default_rng(5)
@@ -297,6 +304,7 @@ def test_a_report_tells_own_noise_and_that_of_the_joints():
     assert rms["position"] == pytest.approx(np.sqrt(np.mean(sigma**2)))
 
 
+@pytest.mark.slow
 def test_factors_of_own_and_joint_noise_that_do_not_settle_are_a_finding(monkeypatch):
     monkeypatch.setattr(estimation, "MAX_ROUNDS", 1)
     solution = estimate_noise(draw("pose", np.random.default_rng(11))[0])
@@ -304,6 +312,7 @@ def test_factors_of_own_and_joint_noise_that_do_not_settle_are_a_finding(monkeyp
     assert assess(solution).findings[0].startswith("not converged: the estimated noise still moved by ")
 
 
+@pytest.mark.slow
 def test_kept_parameters_have_the_same_noise():
     rng = np.random.default_rng(12)
     robot = small_arm()
@@ -354,3 +363,19 @@ def test_sigmas_are_honest_with_estimated_noise(name):
             # The logarithm of a root of a mean of squares is less than that of its mean by half its variance.
             bias = np.median(found) - np.log(true_factor)
             assert abs(bias) < 4 * 1.25 * np.std(found) / np.sqrt(N_DRAWS) + np.var(found) / 2, (key, bias)
+
+
+def test_curvature_is_there_where_a_noise_has_next_to_no_degrees_of_freedom():
+    """T is singular then, or by rounding less than that; else it is `2 seen - T`, lifted where it is too little."""
+    rng = np.random.default_rng(3)
+    A, B = rng.normal(size=(2, 4, 4))
+    T, seen = A @ A.T, B @ B.T
+    plain = estimation._curvature(T, T + 0.1 * seen)
+    assert plain == pytest.approx(T + 0.2 * seen, rel=rounding(1.0, 1e4))
+    lifted = np.linalg.eigvals(np.linalg.solve(T, estimation._curvature(T, 0.1 * seen)))
+    assert lifted.real.min() == pytest.approx(estimation.LEAST_CURVED, rel=rounding(1.0, 1e4))
+    for gone in (np.diag([1.0, 1.0, 1.0, 0.0]), np.diag([1.0, 1.0, 1.0, 1e-9])):
+        singular = gone @ T @ gone - np.diag([0.0, 0.0, 0.0, 1e-15])
+        found = estimation._curvature(singular, gone @ (T + 0.1 * seen) @ gone)
+        assert found[:3, :3] == pytest.approx(T[:3, :3] + 0.2 * seen[:3, :3], rel=1e-6)
+        assert np.linalg.eigvalsh(found).min() >= 0.0

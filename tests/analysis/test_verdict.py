@@ -11,7 +11,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 from simulated import measure, plus, small_arm, true_robot, write_job
-from sparing import as_case, diagonal, most_slow
+from sparing import as_case, diagonal
 from touches import TOLERANCE as TOUCH_TOLERANCE
 from touches import TOOL_POINT, corners, touch
 
@@ -109,6 +109,7 @@ def drifted(seed=3, degrees=0.03):
 DRIFTED = [{"model": "pose"}, {"model": "distance-rotation", "pairing": "all"}]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("settings", "estimate"), diagonal(DRIFTED, [False, True]))
 def test_a_joint_that_drifted_before_the_test_rows_is_not_good(fg_calib, tmp_path, settings, estimate):
     robot, m = drifted()
@@ -125,6 +126,7 @@ def test_a_joint_that_drifted_before_the_test_rows_is_not_good(fg_calib, tmp_pat
     assert not result["trustworthy"]
 
 
+@pytest.mark.slow
 def test_a_robust_loss_does_not_take_all_test_rows_for_outliers(fg_calib, tmp_path):
     robot, m = drifted()
     ended = fg_calib("calibrate", write_job(tmp_path, robot, m, model="position", loss="huber"))
@@ -134,6 +136,7 @@ def test_a_robust_loss_does_not_take_all_test_rows_for_outliers(fg_calib, tmp_pa
     )
 
 
+@pytest.mark.slow
 def test_a_robust_loss_takes_one_wrong_test_row_for_an_outlier(fg_calib, tmp_path):
     robot, m = drifted(degrees=0.0)
     m = replace(m, position=plus(m.position, (34, 0), 0.05))
@@ -150,6 +153,7 @@ def test_the_same_arm_without_drift_is_good(fg_calib, tmp_path):
     assert json.loads(ended.out)["test"]["p_value"] > 1e-3
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("settings", [{"model": "pose"}, {"model": "distance-rotation", "pairing": "star"}])
 def test_a_wrong_test_row_is_named(fg_calib, tmp_path, settings):
     robot, m = drifted(degrees=0.0)
@@ -166,6 +170,7 @@ def test_a_wrong_test_row_is_named(fg_calib, tmp_path, settings):
     assert {end for row in rows if row["suspect"] == "true" for end in (row["a"], row["b"])} >= {"34"}
 
 
+@pytest.mark.slow
 def test_without_test_rows_nothing_is_said_of_them(fg_calib, tmp_path):
     robot, m = drifted()
     m = replace(m, test=np.zeros(40, dtype=bool))
@@ -176,6 +181,7 @@ def test_without_test_rows_nothing_is_said_of_them(fg_calib, tmp_path):
 # --- chi-square -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("stated", "code", "said"),
     [
@@ -197,6 +203,7 @@ def test_noise_stated_wrong_is_a_caution_or_a_finding_by_how_much(fg_calib, tmp_
     assert [text for text in texts if "chi-square" in text and said in text] if said else not texts
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("digits", [3, 4, 5])
 def test_the_exit_code_does_not_depend_on_the_digits_of_an_overstated_noise(fg_calib, tmp_path, digits):
     """Stated so that reduced chi-square is 0.5 within the last digit kept."""
@@ -253,6 +260,7 @@ def test_healthy_corrections_are_seldom_called_too_large(name):
     assert sums[:, 0].sum() / sums[:, 1].sum() == pytest.approx(1.0, abs=4 * np.sqrt(2 / sums[:, 1].sum()))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("wrong", [{"a2": 0.02}, {"alpha3": -0.02}])
 def test_a_correction_far_beyond_its_tolerance_is_a_finding_that_names_it(fg_calib, tmp_path, wrong):
     rng = np.random.default_rng(32)
@@ -330,7 +338,8 @@ EVALUATIONS = (
 )
 
 
-@pytest.mark.parametrize("name", most_slow(EVALUATIONS, every=2))
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("name", EVALUATIONS)
 @pytest.mark.filterwarnings("error")
 def test_a_table_of_test_rows_alone_evaluates_the_arm_as_it_is(fg_calib, tmp_path, name):
     for error in (0.0, 1.0):
@@ -382,6 +391,7 @@ def test_what_was_evaluated_only_cannot_be_compared(fg_calib, tmp_path):
 # --- what the data leave open ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("robot", "settings", "said"),
     [
@@ -435,6 +445,7 @@ ENCODERS = [(kind, n, wrong) for kind, n in (("pose", 30), ("pose", 120), ("pair
 QUICK = {("pose", 30, 0.0), ("pose", 120, 15.0), ("pairs", 30, 0.0)}
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("kind", "n", "wrong"), [as_case(case, is_slow=case not in QUICK) for case in ENCODERS])
 def test_a_wrong_encoder_reading_is_written_and_suspect(fg_calib, tmp_path, kind, n, wrong):
     """Up to 100 configurations joint values are variables, beyond that they are eliminated."""

@@ -73,6 +73,7 @@ def simulated_folder(tmp_path):
 # --- what is compared -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_all_estimators_run_on_the_same_job(simulated_job):
     found = compare(simulated_job)
     assert [e.name for e in found.estimates] == list(ESTIMATORS)
@@ -148,6 +149,7 @@ def test_predicted_errors_come_true(tmp_path):
         assert np.sqrt(np.mean(np.square(ratios[name]))) == pytest.approx(1.0, abs=0.2), name
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("prefer", [(), ("theta4", "d4")])
 def test_unknown_frame_and_tool_start_where_the_graph_starts(tmp_path, prefer):
     """What is held of an unknown tool stays at nominal, not where the closed form would start it."""
@@ -170,6 +172,7 @@ def test_unknown_frame_and_tool_start_where_the_graph_starts(tmp_path, prefer):
     assert found.errors_before.fitted.rms > keep.errors.fitted.rms
 
 
+@pytest.mark.slow
 def test_a_job_without_test_rows_is_reweighted_at_its_train_rows(simulated_job):
     job = replace(
         simulated_job,
@@ -187,6 +190,7 @@ def test_a_job_without_test_rows_is_reweighted_at_its_train_rows(simulated_job):
     assert "truth " not in text.partition("Corrections")[2].partition("Estimators")[0]
 
 
+@pytest.mark.slow
 def test_a_baseline_that_cannot_run_or_goes_astray_says_so(simulated_job, monkeypatch):
     original = comparison_module.fit_dataset
 
@@ -242,6 +246,7 @@ def test_problem_of_takes_the_jobs_settings_but_for_changes(simulated_job):
 # --- every instrument -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "instrument",
     [
@@ -260,12 +265,14 @@ def test_plain_least_squares_finds_the_graphs_optimum_of_every_instrument(instru
     _same_optimum(compare(Job(tmp_path / "job.yaml", robot, (table,), Options(), true)))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("instrument", ["anchors", "planes", "board"])
 def test_of_one_row_a_configuration_joint_noise_weighs_as_in_the_graph(instrument, tmp_path):
     robot, true, table = measured_by(instrument, np.random.default_rng(0), sigma_joint=5e-4)
     _same_optimum(compare(Job(tmp_path / "job.yaml", robot, (table,), Options(), true)))
 
 
+@pytest.mark.slow
 def test_several_tables_have_one_optimum_and_are_told_of_together(tmp_path):
     """Each table has its own model and frame; the test configurations of all of them judge."""
     rng = np.random.default_rng(1)
@@ -281,6 +288,7 @@ def test_several_tables_have_one_optimum_and_are_told_of_together(tmp_path):
     assert (document["model"], document["frame"], document["pairing"]) == ("anchor + position", "unknown", None)
 
 
+@pytest.mark.slow
 def test_touched_points_are_unknowns_of_plain_least_squares_too(tmp_path):
     rng = np.random.default_rng(3)
     robot = small_arm(tolerance=touches.TOLERANCE)
@@ -291,6 +299,7 @@ def test_touched_points_are_unknowns_of_plain_least_squares_too(tmp_path):
     assert found.units == {"point": "m", "distance": "m"}
 
 
+@pytest.mark.slow
 def test_pixels_stand_in_report_and_document(tmp_path):
     robot, true, table = measured_by("room", np.random.default_rng(0))
     found = compare(Job(tmp_path / "job.yaml", robot, (table,), Options(), true))
@@ -368,6 +377,7 @@ def test_an_arm_that_was_only_moved_has_no_error_after_the_fit():
     assert real_errors(moved, robot, q[:2]).fitted is None
 
 
+@pytest.mark.slow
 def test_a_correction_goes_the_shorter_way(simulated_job):
     found = compare(simulated_job)
     robot = simulated_job.robot
@@ -380,6 +390,7 @@ def test_a_correction_goes_the_shorter_way(simulated_job):
 # --- report, document, command ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_report_shows_the_figures_in_millimetres_and_degrees(simulated_job):
     found = compare(simulated_job)
     text = format_comparison(found)
@@ -418,6 +429,7 @@ def test_the_report_shows_the_figures_in_millimetres_and_degrees(simulated_job):
     assert " -0.000 " not in text
 
 
+@pytest.mark.slow
 def test_figures_that_went_astray_stay_within_the_page(simulated_job):
     found = compare(simulated_job)
     astray = found.estimates[2].robot.with_values(found.estimates[2].robot.nominal * 1e7 + 1e6)
@@ -444,6 +456,7 @@ def _refuse(constant):
     raise AssertionError(f"{constant} is no JSON")
 
 
+@pytest.mark.slow
 def test_comparing_the_bundled_example(fg_calib, whole_example):
     example = whole_example
     job = example / "calibration.yaml"

@@ -7,7 +7,7 @@ import pytest
 from oracle import central_differences, tool_pose
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
-from sparing import diagonal, most_slow
+from sparing import diagonal
 from tolerances import NEGLIGIBLE, rounding, sigmas_apart
 
 from fg_calib.analysis.uncertainty import assess
@@ -102,7 +102,8 @@ def test_the_other_models_agree_too(model):
     assert apart(scipys, graph) < 1e-4  # 5e-6 was measured
 
 
-@pytest.mark.parametrize("model", most_slow(PAPERS, every=3))
+@pytest.mark.slow
+@pytest.mark.parametrize("model", PAPERS)
 def test_with_everything_estimated_they_agree_in_what_the_measurements_determine(model):
     """Estimates with and without parameters held end apart on one surface of equal predictions."""
     robot = paper_robot()
@@ -134,6 +135,7 @@ SECOND_ORDER = 0.01
 """Sigma by which the mean of a noisy length moves an estimate here: 0.3 mrad of joint noise over 10 m (0.004 found)."""
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("model", "method"), diagonal(PAPERS, ["gauss-newton", "scipy"]))
 def test_weighted_by_joint_noise_it_is_the_graph(model, method):
     """With the weights of the same parameters."""
@@ -239,7 +241,8 @@ def oracles_misfit(robot, measurements, model, values):
     return np.concatenate(rows)
 
 
-@pytest.mark.parametrize("model", most_slow(PAPERS, every=3))
+@pytest.mark.slow
+@pytest.mark.parametrize("model", PAPERS)
 def test_one_step_is_the_pseudoinverse_times_what_is_left(model):
     """All 35 parameters: the minimum-norm step, which leaves alone what has no effect."""
     robot = paper_robot()

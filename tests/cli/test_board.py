@@ -152,6 +152,7 @@ def test_the_camera_is_estimated_from_the_same_images(job, fg_calib):
     assert found["without_board"] == {"wall.png": "no board"}
 
 
+@pytest.mark.slow
 def test_a_camera_that_was_estimated_serves_again_in_the_same_folder(job, fg_calib):
     run(fg_calib, job, "--estimate-camera", camera=False)
     before = (job / "out" / "camera.yaml").read_bytes()
@@ -160,6 +161,7 @@ def test_a_camera_that_was_estimated_serves_again_in_the_same_folder(job, fg_cal
     assert (job / "out" / "camera.yaml").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_images_that_do_not_determine_the_camera_end_with_3(job, fg_calib):
     shutil.rmtree(job / "images")
     board = CalibrationBoard("checkerboard", 9, 6, 0.02)
@@ -170,6 +172,7 @@ def test_images_that_do_not_determine_the_camera_end_with_3(job, fg_calib):
     assert "DOUBTFUL: the images do not determine the camera" in ended.out
 
 
+@pytest.mark.slow
 def test_an_even_checkerboard_is_seen_one_way_round_within_a_quarter_turn(job, fg_calib, monkeypatch):
     """Also where the search begins at the other end of the board in every second image."""
     (job / "board.yaml").write_text(yaml.safe_dump(EVEN))
@@ -213,6 +216,7 @@ def test_a_name_of_the_board_is_a_column(job, fg_calib):
     assert pl.read_csv(job / "out" / "board.csv")["board"].unique().to_list() == ["wall, left"]
 
 
+@pytest.mark.slow
 def test_its_own_tables_are_replaced_and_no_others(job, fg_calib):
     assert run(fg_calib, job).code == 0
     before = (job / "out" / "board.csv").read_text()
@@ -237,6 +241,7 @@ def test_one_camera_is_needed(job, fg_calib, given):
     assert (ended.code, ended.err) == (2, "error: one of --camera and --estimate-camera is needed, and only one\n")
 
 
+@pytest.mark.slow
 def test_images_are_a_folder_files_or_a_pattern(job, fg_calib):
     for given in (["view[01].png"], ["view0.png", "view1.png"], ["view1.png", "view[01].png"]):
         ended = fg_calib(*("board", *(job / "images" / g for g in given), "--board", job / "board.yaml"),
@@ -285,6 +290,7 @@ BOARDS = [
 ]  # fmt: skip
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize(("changes", "message"), BOARDS, ids=[m.partition(": ")[2][:30] for _, m in BOARDS])
 def test_a_board_that_cannot_be_used_is_named(changes, message, job, fg_calib):
     (job / "board.yaml").write_text(yaml.safe_dump(CHECKERBOARD | changes))
@@ -355,6 +361,7 @@ CASES = {
 }  # fmt: skip
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("case", CASES)
 def test_what_cannot_be_used_is_named(case, job, fg_calib):
     change, message = CASES[case]

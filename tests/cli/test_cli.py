@@ -17,7 +17,7 @@ import pytest
 import yaml
 from oracle import tool_pose
 from scipy.spatial.transform import Rotation
-from sparing import diagonal, most_slow
+from sparing import diagonal
 from tolerances import rounding
 from typer.testing import CliRunner
 
@@ -136,6 +136,7 @@ def test_cost_chi_square_and_degrees_of_freedom_agree(result):
     assert result["dof"] == result["n_residuals"] + 30 - 30  # priors make every one of the 30 unknowns determined
 
 
+@pytest.mark.slow
 def test_chi_square_of_independent_pairs_is_that_of_the_rows(fg_calib, example):
     """Where pairs share errors, rows do not add up; nor, exactly, where joint noise correlates distance and angle."""
     (example / JOB).write_text((example / JOB).read_text() + "pair_errors: independent\n")
@@ -227,6 +228,7 @@ def test_json_puts_the_result_and_nothing_else_on_stdout(fg_calib, example):
     assert printed == written
 
 
+@pytest.mark.slow
 def test_without_out_nothing_is_written(fg_calib, example, monkeypatch):
     monkeypatch.chdir(example)
     before = sorted(example.iterdir())
@@ -234,6 +236,7 @@ def test_without_out_nothing_is_written(fg_calib, example, monkeypatch):
     assert sorted(example.iterdir()) == before
 
 
+@pytest.mark.slow
 def test_the_report_fits_80_columns(fg_calib, example, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     ended = fg_calib("calibrate", example / JOB)
@@ -241,6 +244,7 @@ def test_the_report_fits_80_columns(fg_calib, example, monkeypatch):
     assert "…" not in ended.out
 
 
+@pytest.mark.slow
 def test_a_nested_folder_is_made_and_a_relative_one_is_relative_to_where_one_stands(fg_calib, example, monkeypatch):
     elsewhere = example.parent / "elsewhere"
     elsewhere.mkdir()
@@ -250,6 +254,7 @@ def test_a_nested_folder_is_made_and_a_relative_one_is_relative_to_where_one_sta
     assert sorted(f.name for f in elsewhere.rglob("*") if f.is_dir()) == ["a", "b", "c"]
 
 
+@pytest.mark.slow
 def test_an_existing_folder_keeps_its_other_files(fg_calib, example):
     out = example / "result"
     out.mkdir()
@@ -270,6 +275,7 @@ def test_a_failure_leaves_an_existing_folder_as_it_was(fg_calib, example):
     assert [(f.name, f.read_text()) for f in out.iterdir()] == [("result.json", "old")]
 
 
+@pytest.mark.slow
 def test_a_failure_while_writing_leaves_no_file_behind(fg_calib, example, monkeypatch):
     from fg_calib.report import documents as results
 
@@ -286,6 +292,7 @@ def test_a_failure_while_writing_leaves_no_file_behind(fg_calib, example, monkey
     assert sorted(example.iterdir()) == before
 
 
+@pytest.mark.slow
 def test_noise_stated_too_small_by_5_is_exit_code_3_with_the_reason_and_results(fg_calib, example):
     text = (example / JOB).read_text()
     (example / JOB).write_text(re.sub("noise: .*", "noise: {position: 0.0002, orientation: 0.002, joint: 0.001}", text))
@@ -299,6 +306,7 @@ def test_noise_stated_too_small_by_5_is_exit_code_3_with_the_reason_and_results(
     assert {f.name for f in (example / "result").iterdir()} == OUTPUTS
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("factor", [1.3, 5.0])
 def test_noise_stated_too_large_is_a_caution(fg_calib, example, factor):
     """Sigmas are then larger than they need be, not wrong, however much."""
@@ -551,6 +559,7 @@ BAD = {
 }
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize(("edit", "message"), BAD.values(), ids=BAD)
 def test_bad_input_is_one_line_and_writes_nothing(fg_calib, example, edit, message):
     edit(example)
@@ -640,6 +649,7 @@ def write_poses(path, q, xyz, quaternion, names=None, **more):
     frame.write_parquet(path) if path.suffix == ".parquet" else frame.write_csv(path)
 
 
+@pytest.mark.slow
 def test_test_rows_never_touch_the_estimate(fg_calib, example):
     first = calibrate(fg_calib, example / JOB)
     table(
@@ -666,6 +676,7 @@ noise: {{position: {!r}, orientation: {!r}, joint: {!r}}}
 """
 
 
+@pytest.mark.slow
 def test_units_of_files_do_not_change_the_result(fg_calib, example):
     expected = calibrate(fg_calib, example / JOB)
     robot = read_robot(example / ROBOT)
@@ -832,9 +843,8 @@ PAIR_TABLES = {
 }
 
 
-@pytest.mark.parametrize(
-    ("model", "header", "cells", "n_distances", "n_angles"), most_slow(PAIR_TABLES.values(), every=2), ids=PAIR_TABLES
-)
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize(("model", "header", "cells", "n_distances", "n_angles"), PAIR_TABLES.values(), ids=PAIR_TABLES)
 def test_measured_pairs_are_fitted(fg_calib, measured_pairs, model, header, cells, n_distances, n_angles):
     folder, rows, true = measured_pairs
     result = _run_pairs(fg_calib, folder, model, header.split(","), [cells(i, r) for i, r in enumerate(rows)])
@@ -899,6 +909,7 @@ def test_a_job_may_leave_the_noise_to_the_residuals(fg_calib, example, given):
 PAGES = [("40", 40), (None, 100), ("60", 60), ("200", 200)]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("page", "command"), diagonal(PAGES, ["calibrate", "observe", "compare"]))
 def test_a_report_is_as_wide_as_the_page(fg_calib, example, monkeypatch, command, page):
     """A pipe has no width: 100 columns, in which all tables of the example have room."""

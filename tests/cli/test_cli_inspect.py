@@ -41,6 +41,7 @@ def changed(folder, **keys):
     return path
 
 
+@pytest.mark.slow
 def test_a_healthy_job_ends_with_0_and_its_verdict_stands_first(fg_calib, whole_example):
     ended = fg_calib("inspect", whole_example / JOB)
     assert (ended.code, ended.err) == (0, "")
@@ -59,6 +60,7 @@ def test_a_healthy_job_ends_with_0_and_its_verdict_stands_first(fg_calib, whole_
     assert max(map(len, lines)) <= 100
 
 
+@pytest.mark.slow
 def test_a_mistake_in_units_ends_with_3_and_one_line(fg_calib, example):
     units = {"length": "mm", "angle": "deg"}
     ended = fg_calib("inspect", changed(example, units=units, noise={"position": 1, "orientation": 0.01}))

@@ -3,7 +3,6 @@
 import json
 
 import pytest
-from sparing import most_slow
 
 
 def test_structure_prints_the_papers_table(fg_calib, example):
@@ -16,6 +15,7 @@ def test_structure_prints_the_papers_table(fg_calib, example):
     assert "rank 23 of 30" in ended.out
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("model", "rank"),
     [
@@ -78,7 +78,8 @@ def test_a_frame_may_be_unknown(fg_calib, example):
     assert json.loads(ended.out)["rank"] == 25
 
 
-@pytest.mark.parametrize("model", most_slow(["pose", "position", "orientation", "distance", "rotation"], every=2))
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("model", ["pose", "position", "orientation", "distance", "rotation"])
 def test_the_noise_stated_is_used_where_nothing_was_measured_yet(fg_calib, example, tmp_path, model):
     """A table of joint readings alone: twice the noise, twice every sigma."""
     rows = [line.split(",") for line in (example / "poses.csv").read_text().splitlines()]
@@ -167,6 +168,7 @@ def test_a_robot_without_links_has_none_to_name(fg_calib, example):
     assert ended.err.startswith("error: robot_nominal.yaml: a robot without links, expected a URDF")
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [

@@ -58,6 +58,7 @@ def test_what_was_recorded_is_read(bags, short, form):
     assert joints.source.notes == poses.source.notes == ()
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("pose_type", "form"), diagonal(POSE_TYPES[1:], ["ros1", "mcap"]))
 def test_poses_of_every_type_are_read(tmp_path, short, form, pose_type):
     _, poses = read_bag(write_bag(tmp_path, short, form, pose_type), arm())
@@ -177,6 +178,7 @@ def poses(bag, n=2, **more):
         bag.pose(START + k, [k, 0, 0], [0, 0, np.sin(0.1 * k), np.cos(0.1 * k)], **more)
 
 
+@pytest.mark.slow
 def test_transforms_of_one_frame_are_chosen(bag):
     poses(bag, form="TFMessage", topic="/tf", frames=("/map", "base"))
     poses(bag, n=3, form="TFMessage", topic="/tf", frames=("camera", "marker"))
@@ -368,6 +370,7 @@ def cut(bag, folder, kept):
     return path
 
 
+@pytest.mark.sampled(2)
 @LEFT_OPEN
 @pytest.mark.parametrize("form", FORMATS)
 def test_damage_is_one_line_or_nothing(tmp_path, bags, form):

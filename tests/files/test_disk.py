@@ -10,7 +10,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from sparing import most_slow
 
 from fg_calib import Calibration, InputError, calibrate_job
 from fg_calib.files import disk
@@ -67,7 +66,8 @@ def read(folder):
     return found
 
 
-@pytest.mark.parametrize("moment", most_slow(range(20), every=3))
+@pytest.mark.sampled(7)
+@pytest.mark.parametrize("moment", range(20))
 def test_a_kill_at_any_moment_leaves_the_old_or_the_new_for_the_next_reader(tmp_path, moment):
     old, new = dict.fromkeys(("two", "four", "one"), "old"), dict.fromkeys(FILES, "new")
     fill_folder(tmp_path, write("old", old), OWN)
@@ -150,6 +150,7 @@ def test_what_another_machine_is_writing_is_left_alone(tmp_path):
     assert others.is_dir()
 
 
+@pytest.mark.slow
 def test_a_result_that_was_written_but_not_moved_is_read(example):
     calibration = calibrate_job(example / "calibration.yaml")
     folder = example / "result"
@@ -308,6 +309,7 @@ def test_what_cannot_be_moved_is_said(tmp_path):
         require_writable(tmp_path)
 
 
+@pytest.mark.slow
 def test_no_file_of_an_earlier_result_stays_beside_a_new_one(example):
     job, folder = example / "calibration.yaml", example / "result"
     calibration = calibrate_job(job)
@@ -320,6 +322,7 @@ def test_no_file_of_an_earlier_result_stays_beside_a_new_one(example):
     assert names == ["configurations.csv", "mine.txt", "residuals.csv", "result.json", "robot_calibrated.yaml"]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", ["joints.csv", "residuals.csv", "robot_calibrated.yaml", "result.json"])
 def test_results_replace_results_and_nothing_else(example, fg_calib, name):
     (example / name).write_text("q1,mine\n")
@@ -353,6 +356,7 @@ def test_results_do_not_replace_what_they_are_of(example, fg_calib):
     assert {file.name: file.read_bytes() for file in example.iterdir()} == before
 
 
+@pytest.mark.slow
 def test_a_simulation_replaces_a_simulation_and_nothing_else(fg_calib, tmp_path):
     assert fg_calib("simulate", "space-robot", "--out", tmp_path).code == 0
     assert fg_calib("simulate", "space-robot", "--out", tmp_path, "--seed", 3).code == 0

@@ -42,6 +42,7 @@ def drafted(fg_calib, folder, *files):
     return yaml.safe_load((folder / JOB).read_text())
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "name",
     [pytest.param(n, marks=[pytest.mark.slow] * (n in (*SLOW, "contact", "faces", "sockets"))) for n in INSTRUMENTS],
@@ -67,6 +68,7 @@ def test_a_job_for_the_tables_of_every_instrument_is_ready(fg_calib, tmp_path, n
     assert np.allclose(read.readings, simulation.tables[0].measurements.readings, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_columns_of_other_names_and_units_are_explained(fg_calib, folder):
     folder, write = folder
     names = {f"q{i}": f"J{i} [deg]" for i in range(1, 7)} | {"x": "X (mm)", "y": "Y_mm", "z": "pos_z [cm]"}
@@ -88,6 +90,7 @@ def test_columns_of_other_names_and_units_are_explained(fg_calib, folder):
     assert np.allclose(mine.readings, plain.readings, atol=1e-12)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("names", ["joint_{}", "Axis {}", "actual_q_{}", "q{}"])
 def test_joints_are_recognised_whether_counted_from_0_or_1(fg_calib, folder, names):
     folder, write = folder
@@ -109,6 +112,7 @@ def test_units_that_no_header_says_are_guessed_from_the_figures_and_said_to_be(f
     assert given["noise"]["position"] == 0.1
 
 
+@pytest.mark.slow
 def test_several_tables_have_entries_and_units_of_their_own(fg_calib, folder):
     folder, write = folder
     mm = write({"x": "x [mm]", "y": "y [mm]", "z": "z [mm]"}, dict.fromkeys("xyz", 1e3), "monday.csv")
@@ -220,6 +224,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_cannot_be_used_is_refused_in_one_line(fg_calib, folder, case):
     folder, write = folder

@@ -8,7 +8,6 @@ import pytest
 import yaml
 from instruments import CAMERA, measured_by
 from scipy.spatial.transform import Rotation
-from sparing import most_slow
 
 from fg_calib.calibration import calibrate, calibrate_job
 from fg_calib.errors import InputError
@@ -66,7 +65,8 @@ def write_files(folder, robot, table, job):
     return folder / "job.yaml"
 
 
-@pytest.mark.parametrize("instrument", most_slow(KEYS, every=2))
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("instrument", KEYS)
 def test_a_job_is_what_python_makes_of_the_same_arrays(instrument, tmp_path):
     """Parameters within a hundredth of their sigma: what twelve digits in mm and degrees leave is far less."""
     robot, _, table = measured_by(instrument, np.random.default_rng(20))
@@ -201,6 +201,7 @@ def test_a_key_that_cannot_be_used_is_named(key, value, message, tmp_path):
     assert str(error.value).startswith(message)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("instrument", ["anchors offset", "targets stations"])
 def test_the_command_compares_instruments(instrument, fg_calib, tmp_path):
     robot, _, table = measured_by(instrument, np.random.default_rng(27))

@@ -746,6 +746,7 @@ def test_scenarios(folder, given, message):
     refuses(folder, "scenario.yaml", given, read_scenario, message)
 
 
+@pytest.mark.sampled(61)
 @cases(POSES)
 def test_poses(tmp_path, given, message):
     refuses(tmp_path, "poses.csv", given, lambda file: read_measurements(file, ARM), message)
@@ -785,6 +786,7 @@ def test_results(tmp_path, document, given, message):
     refuses(tmp_path, "result.json", given, read_result, message)
 
 
+@pytest.mark.sampled(8)
 @cases(COMMANDS)
 def test_commands(folder, fg_calib, monkeypatch, given, message):
     """Exit code 1 and one line on stderr, nothing on stdout, no folder made."""

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from simulated import measure, small_arm, true_robot, write_job
-from sparing import most_slow
 
 import fg_calib.files.result
 from fg_calib import Calibration, InputError, Pairing, calibrate, calibrate_job, read_result, read_urdf, result_schema
@@ -65,7 +64,8 @@ def enlarge_one_covariance(document):
     C[0][1] = C[1][0] = 2.0 * (C[0][0] * C[1][1]) ** 0.5
 
 
-@pytest.mark.parametrize("name", most_slow(CASES, every=2))
+@pytest.mark.sampled(3)
+@pytest.mark.parametrize("name", CASES)
 def test_what_is_written_reads_back_the_same(calibrations, tmp_path, name):
     calibrations[name].save(tmp_path)
     found = read_result(tmp_path)
@@ -75,7 +75,8 @@ def test_what_is_written_reads_back_the_same(calibrations, tmp_path, name):
     assert read_result(tmp_path / "result.json") == found
 
 
-@pytest.mark.parametrize("name", most_slow(CASES, every=2))
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("name", CASES)
 def test_what_is_written_has_the_schema(calibrations, tmp_path, name):
     """By a validator that knows nothing of the model."""
     jsonschema = pytest.importorskip("jsonschema")
@@ -84,6 +85,7 @@ def test_what_is_written_has_the_schema(calibrations, tmp_path, name):
     jsonschema.validate(document, result_schema())
 
 
+@pytest.mark.slow
 def test_the_schema_finds_what_is_missing(calibrations, tmp_path):
     jsonschema = pytest.importorskip("jsonschema")
     calibrations[next(iter(CASES))].save(tmp_path)

@@ -2,6 +2,7 @@
 
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from tolerances import rounding
 from fg_calib.errors import InputError
 from fg_calib.files.robot_yaml import read_robot, write_robot
 from fg_calib.files.units import Units
-from fg_calib.robot.model import CONVENTIONS, Joint, RobotBuilder
+from fg_calib.robot.model import CONVENTIONS, Axis, Element, Joint, Robot, RobotBuilder
 
 GOOD = """\
 name: two
@@ -128,6 +129,40 @@ def test_a_robot_written_in_other_units_reads_back_to_rounding(tmp_path, robot, 
     for p, p_back in zip(robot.parameters, back.parameters, strict=True):
         assert (p.name, p.estimated, p.tolerance is None) == (p_back.name, p_back.estimated, p_back.tolerance is None)
         assert p_back.tolerance == (p.tolerance and pytest.approx(p.tolerance, rel=4.5e-16))
+
+
+@pytest.mark.parametrize("base", [True, False])
+@pytest.mark.parametrize("tool", [True, False])
+def test_a_robot_built_without_base_or_tool_reads_back_the_same(tmp_path, base, tool):
+    """It has those of its file, all zero: what is saved with one could not be loaded else."""
+    built = []
+    for with_base, with_tool in ((base, tool), (True, True)):
+        builder = RobotBuilder("arm", "mdh")
+        if with_base:
+            builder.add_frame("base", {}, 0, False)
+        for i in range(3):
+            builder.add_convention_joint(Joint(f"q{i + 1}"), {"a": 0.1 * i, "alpha": 0.2, "d": 0.3, "theta": 0.4})
+        if with_tool:
+            builder.add_frame("tool", {}, 4, False)
+        built.append(builder.build(tolerance={"a": 1e-3}))
+    write_robot(tmp_path / "robot.yaml", built[0])
+    assert built[0] == built[1] == replace(read_robot(tmp_path / "robot.yaml"), name="arm")
+
+
+def test_a_robot_that_no_file_can_hold_is_refused(tmp_path):
+    """Elements of one's own would be lost without a word, and a result saved with them could not be loaded."""
+    robot = Robot.from_dh([[0.1, 0.2, 0.3, 0.4]] * 2)
+    more = replace(robot, elements=(*robot.elements, Element(Axis.TX, 0.1)))
+    another = RobotBuilder("arm", "dh")
+    another.add_frame("base", {}, 0, False)
+    another.add_convention_joint(Joint("q1"), {"a": 0.1, "alpha": 0.2, "d": 0.3, "theta": 0.4})
+    another.add_frame("flange", {"x": 0.1}, 2, False)
+    for one in (more, another.build()):
+        with pytest.raises(InputError, match="the robot has elements or parameters of its own, expected base, joints"):
+            write_robot(tmp_path / "robot.yaml", one)
+    with pytest.raises(InputError, match="the robot is of the convention 'urdf', expected base, joints"):
+        write_robot(tmp_path / "robot.yaml", replace(robot, convention="urdf"))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_written_robot_is_readable_for_people(tmp_path):

@@ -191,6 +191,7 @@ def test_a_mistake_in_the_list_is_named(folder, change, message):
     assert str(caught.value) == message
 
 
+@pytest.mark.slow
 def test_the_command_says_what_each_table_has_and_writes_the_truth(fg_calib, folder):
     tracker = "{model: position, name: tracker, targets: {ball: {x: 50, y: 0, z: 100}}}"
     wire = "{model: anchor, name: wire, anchors: {bolt: {x: 800, y: 0, z: 0, tolerance: 0}}, offset: 120}"

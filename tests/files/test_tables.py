@@ -225,6 +225,7 @@ def test_parquet_and_csv_read_the_same(write):
         )
 
 
+@pytest.mark.slow
 @given(
     rows=st.lists(st.tuples(*[st.floats(-1e15, 1e15)] * 3), min_size=1, max_size=5),
     units=st.sampled_from([Units(), Units(length="mm", angle="deg")]),
@@ -350,6 +351,7 @@ MISTAKES = [
 ]  # fmt: skip
 
 
+@pytest.mark.sampled(22)
 @pytest.mark.parametrize(("table", "message"), MISTAKES, ids=range(len(MISTAKES)))
 def test_a_mistake_is_named_in_one_line(write, table, message):
     with pytest.raises(InputError) as caught:

@@ -7,7 +7,7 @@ import pytest
 from oracle import random_robot
 from scipy.spatial.transform import Rotation
 from simulated import measure, paper_robot, small_arm, true_robot
-from sparing import diagonal, most_slow
+from sparing import diagonal
 from touches import TOLERANCE as TOUCH_TOLERANCE
 from touches import TOOL_POINT, corners, touch
 
@@ -56,6 +56,7 @@ FITS = [("pose", "unknown"), ("position", "unknown"), ("distance", "known"), ("d
 SETTINGS = diagonal(FITS, ["prior", "none"], [5e-4, 0.0], every=4)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("fit", "gauge", "sigma_joint"), SETTINGS)
 def test_the_unit_of_length_changes_nothing(fit, gauge, sigma_joint):
     """The same arm a thousand times smaller, a hundred (a crane) and a thousand times larger."""
@@ -100,7 +101,8 @@ DRAWS = [(gauge, draws) for gauge in ("prior", "none") for draws in (range(1), r
 """The first draw, with priors, is in the default run."""
 
 
-@pytest.mark.parametrize(("gauge", "draws"), most_slow(DRAWS, every=4))
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize(("gauge", "draws"), DRAWS)
 @pytest.mark.parametrize("name", CASES)
 def test_solving_again_from_the_answer_moves_nothing(name, gauge, draws):
     """Rows whitened at the answer have their optimum there: within 1e-6 sigma in any direction."""
@@ -157,7 +159,8 @@ def test_random_arms_arrive_in_few_steps(convention, tolerance):
             assert solution.iterations <= MOST
 
 
-@pytest.mark.parametrize("model", most_slow(["pose", "distance-rotation", "distance"], every=3))
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("model", ["pose", "distance-rotation", "distance"])
 def test_sixty_real_poses_without_priors_arrive_in_few_steps(model, data_folder):
     """Distances see wrist offsets in a curved valley: undamped steps leave it and come back, damped ones take 41."""
     robot = read_robot(data_folder / "ur10_tmac" / "robot.yaml")
@@ -189,6 +192,7 @@ def test_no_iterations_are_too_few(fg_calib, example):
     assert run.err == "error: calibration.yaml: max_iterations: found 0, expected a number above 0\n"
 
 
+@pytest.mark.slow
 def test_the_limit_holds_for_all_rounds_together():
     """Rows weighted anew again and again: with one step fewer than it takes it has not arrived, and says so."""
     robot = paper_robot(tolerance={"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3})
@@ -205,6 +209,7 @@ def test_the_limit_holds_for_all_rounds_together():
     assert nearly.message.startswith(f"converged: {needed - 1} iterations, ")
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("loss", "seed"), diagonal(["huber", "cauchy"], [0, 7]))
 def test_touches_and_positions_that_share_joint_noise_arrive_with_robust_losses(loss, seed):
     """Derivatives of touches leave out a turn that moves no length, but acts on noise that is not the same all round.

@@ -6,7 +6,6 @@ import gtsam
 import numpy as np
 import pytest
 from simulated import measure, paper_robot, small_arm, true_robot
-from sparing import most_slow
 from tolerances import rounding
 
 from fg_calib.analysis.uncertainty import assess
@@ -96,6 +95,7 @@ def dense_covariance(solution, n):
     return (inverse @ inverse.T)[:n, :n]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("way", ["in place", "in a copy"])
 def test_factors_on_our_variables_are_solved_and_assessed(way):
     problem = problem_of()
@@ -136,6 +136,7 @@ def test_the_optimum_is_that_of_gtsams_own_optimiser():
     assert graph.error(solution.values) < graph.error(initial)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("gauge", ["prior", "none"])
 def test_a_variable_of_ones_own_is_solved_and_found_again(gauge):
     point = np.array([3.0, -2.0, 1.0])
@@ -159,6 +160,7 @@ def test_a_variable_of_ones_own_is_solved_and_found_again(gauge):
     assert again.values.atPoint3(ANCHOR) == pytest.approx(solution.values.atPoint3(ANCHOR), abs=1e-7)
 
 
+@pytest.mark.slow
 def test_a_pose_of_ones_own_is_solved():
     """Of any of GTSAM's types: a frame in which the base stands, known by a prior alone."""
     problem, key = problem_of(), gtsam.symbol("p", 7)
@@ -207,6 +209,7 @@ def test_a_variable_needs_a_start_and_a_factor():
         solve(problem)
 
 
+@pytest.mark.slow
 def test_factors_added_to_what_was_solved_are_to_be_solved_again():
     problem = problem_of()
     solution = solve(problem)
@@ -242,7 +245,8 @@ EXPANDED = {
 }
 
 
-@pytest.mark.parametrize("name", most_slow(EXPANDED, every=2))
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("name", EXPANDED)
 def test_the_expanded_graph_has_the_same_optimum(name):
     options, sigma_joint = EXPANDED[name]
     rng = np.random.default_rng(4)
@@ -280,6 +284,7 @@ def test_the_expanded_graph_can_be_solved_incrementally():
     assert graph.error(isam.calculateBestEstimate()) == pytest.approx(solution.cost, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_pair_factors_by_name_are_the_rows_of_a_table():
     """Against the problem that the same pairs make as a table; and usable with GTSAM's marginals."""
     rng = np.random.default_rng(6)

@@ -9,7 +9,6 @@ from oracle import tool_pose
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 from simulated import TOOL, measure, paper_robot, small_arm, true_robot
-from sparing import most_slow
 
 from fg_calib.analysis.bounds import cramer_rao
 from fg_calib.analysis.covariance import Spread
@@ -66,8 +65,9 @@ CELLS = {
 EVERY_CELL = pytest.mark.parametrize(("robot", "model", "gauge", "options"), CELLS.values(), ids=CELLS.keys())
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.usefixtures("without_reasons")
-@pytest.mark.parametrize(("robot", "model", "gauge", "options"), most_slow(CELLS.values(), every=2), ids=list(CELLS))
+@pytest.mark.parametrize(("robot", "model", "gauge", "options"), CELLS.values(), ids=list(CELLS))
 def test_intervals_hold_the_truth(robot, model, gauge, options):
     """Roughly: 4 draws, the intervals of one of which depend on each other. Sigmas half as large hold 67 %."""
     for of, (share, n) in coverage(robot, model, gauge, 4, seed=1, **options).items():
@@ -214,6 +214,7 @@ def test_results_and_report_name_what_a_kept_parameter_stands_for(tmp_path, fg_c
     assert shown["theta6"][3:] == ["theta6", "-", "beta5"]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("gauge", ["prior", "none"])
 def test_where_nothing_was_left_out_parameters_stand_for_themselves(tmp_path, fg_calib, gauge):
     ended = fg_calib("calibrate", job_files(tmp_path, paper_robot(tolerance=HAYATI), gauge), "--json")

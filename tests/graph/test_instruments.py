@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 from instruments import CAMERA, TARGETS, measured_by
 from scipy.stats import chi2, kstest
-from sparing import diagonal, most_slow
+from sparing import diagonal
 
 from fg_calib.analysis.residual_table import residual_table
 from fg_calib.analysis.uncertainty import assess
@@ -36,8 +36,9 @@ def errors_of(uncertainty, true):
     return float(e @ np.linalg.solve(uncertainty.covariance, e)), len(rows)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("instrument", [*INSTRUMENTS, "room"])
-@pytest.mark.parametrize("seed", most_slow([0, 1], every=2))
+@pytest.mark.parametrize("seed", [0, 1])
 def test_it_arrives_from_nominal_wherever_things_are(instrument, seed):
     """In few steps, at a chi-square and errors of the arm that noise explains: within 99.9 %."""
     robot, true, table = measured_by(instrument, np.random.default_rng(seed))
@@ -91,6 +92,7 @@ def test_targets_that_are_known_hold_the_others_and_those_with_a_tolerance_move(
     assert np.all(points["t1"].sigma < 1e-3)
 
 
+@pytest.mark.slow
 def test_several_rows_of_a_configuration_share_its_joint_noise():
     """What three targets show of one and the same error is told apart from the arm's own."""
     rng = np.random.default_rng(3)
@@ -129,6 +131,7 @@ def calibrated(instrument):
     return calibrate(robot, [table])
 
 
+@pytest.mark.sampled(1)
 @EVERY
 def test_the_front_door_reports_and_saves_it(instrument, tmp_path):
     result = calibrated(instrument)
@@ -144,6 +147,7 @@ def test_the_front_door_reports_and_saves_it(instrument, tmp_path):
     assert {group.kind for group in loaded.groups} >= {wanted}
 
 
+@pytest.mark.sampled(6)
 @EVERY
 def test_rows_are_in_the_unit_of_their_kind(instrument, tmp_path):
     calibrated(instrument).save(tmp_path / "result")
@@ -155,6 +159,7 @@ def test_rows_are_in_the_unit_of_their_kind(instrument, tmp_path):
 CHOICES = [{"loss": "huber"}, {"encoder": "estimated"}, {"estimate_noise": True}]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("instrument", "choices"), diagonal(INSTRUMENTS, CHOICES, every=3), ids=str)
 def test_losses_joint_values_and_noise_work_with_it(instrument, choices):
     robot, true, table = measured_by(instrument, np.random.default_rng(6), sigma_joint=2e-4)
@@ -216,6 +221,7 @@ def in_two(table, rows):
 SHARED = ["anchors", "anchors known", "planes", "board"]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("instrument", "second"), diagonal(SHARED, ["half", "few", "test rows"], every=2))
 def test_what_has_one_name_in_two_tables_is_one_thing(instrument, second):
     """The optimum is that of one table, also where the second alone does not say where its anchors and planes are."""
@@ -266,6 +272,7 @@ def test_a_camera_is_needed_for_pixels():
 # --- rows say what they are of ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("instrument", "column"), [("targets", "target"), ("targets stations", "target"), ("anchors", "anchor"),
                                ("planes", "plane"), ("pixels", None)]
@@ -338,12 +345,14 @@ def test_the_anchor_that_is_off_is_named_among_others():
     assert text.startswith("  3 of 4 suspicious rows are of a1, as are 10 of all 30 rows\n")
 
 
+@pytest.mark.slow
 def test_the_station_that_is_off_is_named():
     text = suspicious(shifted("targets stations", [3, 16, 11]))
     assert text.startswith("  all 9 suspicious rows are of measurements, station s1, as are 45 of all 90 rows\n")
     assert re.search(r"^c25 +position\.[xyz] of measurements, station s1 +t1 ", text, flags=re.M)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("instrument", "rows"), [("anchors", [7]), ("targets", [4]), ("targets", [0, 13, 26])])
 def test_nothing_is_said_in_common_of_one_measurement_or_of_all_alike(instrument, rows):
     assert "suspicious rows are of" not in suspicious(shifted(instrument, rows))

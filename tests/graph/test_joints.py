@@ -169,6 +169,7 @@ def everything_given_the_noise(solution):
     return values, 2.0 * found.cost, covariance, round(n_independent) - n_frame  # a prior for each parameter
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "model", "options"),
     [
@@ -210,6 +211,7 @@ def test_what_joint_values_explain_is_still_part_of_how_far_off_a_measurement_is
     assert squared[1] == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / residual_dim.sum()))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("loss", ["huber", "gnc"])
 def test_gross_errors_are_not_taken_for_joint_errors(loss):
     robot, m = measured("poses", 40, seed=8)

@@ -86,6 +86,7 @@ def everything(robot, tables, sigma_joint):
     return values, 2.0 * found.cost
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma_joint", [pytest.param(0.0, marks=pytest.mark.slow), 1e-3])
 def test_the_optimum_is_that_over_everything(sigma_joint):
     """Joint errors of a configuration are the same in both tables."""
@@ -160,6 +161,7 @@ def test_each_table_has_its_own_frame():
     assert np.all(together <= alone * (1 + 1e-9))
 
 
+@pytest.mark.slow
 def test_order_of_tables_and_one_table_in_parts_change_nothing():
     rng = np.random.default_rng(6)
     robot = small_arm(tolerance=TOLERANCE)
@@ -181,6 +183,7 @@ def test_order_of_tables_and_one_table_in_parts_change_nothing():
         assert found.dof == whole.dof
 
 
+@pytest.mark.slow
 def test_a_point_of_one_name_in_two_tables_is_one_point():
     """Touches of three sockets, the last of them and the distances in a second table: the same as one table."""
     rng = np.random.default_rng(7)
@@ -234,6 +237,7 @@ def test_an_unknown_of_one_name_in_another_frame_is_another():
     assert len(build_problem(robot, [table, elsewhere]).data.unknowns.names) == 6
 
 
+@pytest.mark.slow
 def test_noise_is_estimated_table_by_table():
     rng = np.random.default_rng(7)
     robot = paper_robot({"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3})
@@ -250,6 +254,7 @@ def test_noise_is_estimated_table_by_table():
     assert [(kind.table, kind.kind) for kind in kinds] == [(0, "position"), (1, "position")]
 
 
+@pytest.mark.slow
 def test_a_gross_error_in_one_table_is_left_out():
     robot, _, tables = mixture(8, n=40)
     wrong = tables[1].measurements.pairs.distance.copy()
@@ -291,6 +296,7 @@ def write_tables(folder, robot, tables, **keys):
     return path
 
 
+@pytest.mark.slow
 def test_a_job_of_several_tables_runs(fg_calib, tmp_path):
     robot, _, tables = mixture(11, sigma_joint=5e-4)
     ended = fg_calib("calibrate", write_tables(tmp_path, robot, tables), "--out", tmp_path / "result")
@@ -445,6 +451,7 @@ def test_pairs_formed_of_one_table_are_mixed_with_poses_of_another():
     assert np.array_equal(at, alone[0].start)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("loss", "encoder"), diagonal(["cauchy", "gnc"], ["propagated", "estimated"]))
 def test_a_loss_weighs_more_pairs_than_positions_that_share_joint_noise(loss, encoder):
     """Lengths lose less than positions: no measurement may count for more than it is by that."""
@@ -495,6 +502,7 @@ def test_a_mistake_in_one_table_names_the_table():
     assert "if x, y, z are in mm" in found.findings[0]
 
 
+@pytest.mark.slow
 def test_another_target_on_the_tool_in_one_table_is_named():
     rng = np.random.default_rng(5)
     robot = small_arm(
@@ -509,6 +517,7 @@ def test_another_target_on_the_tool_in_one_table_is_named():
     assert any("tool or base are others here than in the other tables" in text for text in found.findings)
 
 
+@pytest.mark.slow
 def test_a_distance_between_points_that_another_table_touched(tmp_path):
     """The distance stands beside another table than the touches: the same as beside these."""
     rng = np.random.default_rng(7)
@@ -546,6 +555,7 @@ def test_points_of_another_table_are_named_where_arrays_are_given():
         Measurements.from_arrays(np.zeros((3, 4)), pairs=pairs)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("instrument", ["anchors", "planes", "board"])
 def test_an_anchor_plane_or_board_of_one_name_in_two_tables_is_one(instrument):
     """Started by the first table's rows, solved as in one table: to what the rounding of its optimum leaves."""

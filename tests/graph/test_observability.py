@@ -55,6 +55,7 @@ def observed(robot, model, frame="known", n=300, seed=0):
     return observability_of(problem, problem.variables.nominal())
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("model", TABLE)
 def test_the_papers_robot_has_the_ranks_and_groups_of_its_tables(model):
     rank, ineffective, groups = TABLE[model]
@@ -73,6 +74,7 @@ def test_the_package_keeps_what_the_paper_keeps():
     assert [g.keep for g in found.relative] == [("theta2",), ("theta3",), ("d5",), ("theta6",), ("theta7",)]
 
 
+@pytest.mark.slow
 def test_relations_say_what_moves_together():
     found = observed(paper_robot(), "distance")
     relations = {g.parameters: g.relations for g in found.relative}
@@ -177,6 +179,7 @@ def test_a_tolerance_says_what_is_weak():
     assert found.sigma == pytest.approx(dict.fromkeys(("a1", "a2", "a3"), 1e-6))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("tolerance", [1e-7, 1e-3, 5.0])
 def test_a_prior_holds_what_the_data_leave_open_whatever_its_size(tolerance):
     """Its sigma is the tolerance: nothing else is known of the base of an arm that is seen in pairs alone."""

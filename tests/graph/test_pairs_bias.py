@@ -58,6 +58,7 @@ def test_lengths_from_a_chain_of_short_steps_are_as_good_as_their_sigmas(fg_cali
     assert np.sum(squares) < stats.chi2.ppf(0.9999, 16)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("measured", "turn"), [(0.0, 1.0), (np.pi, 1.0), (1.0, 1e-3), (1.0, np.pi - 1e-3)])
 def test_an_angle_at_a_kink_that_the_arm_contradicts_is_not_good(fg_calib, tmp_path, measured, turn):
     """It used to leave as `angle near zero`; chi-square was that of the others."""

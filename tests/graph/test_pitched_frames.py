@@ -129,6 +129,7 @@ def test_yaw_and_roll_have_no_sigma_at_a_quarter_turn_of_pitch(tmp_path, fg_cali
     assert all(abs(p["correction"]) < 1e-6 for p in by_name.values())  # the data are exact
 
 
+@pytest.mark.slow
 def test_the_report_says_where_corrections_are_turns():
     robot = pitched("tool", 90.0)
     solution = solve(build_problem(robot, measured(robot, "tool", 1.0), model="pose"))

@@ -88,6 +88,7 @@ def test_residuals_are_those_of_4x4_products():
     assert between == pytest.approx([expected], rel=rounding(1, 10))
 
 
+@pytest.mark.slow
 def test_derivatives_are_central_differences_up_to_a_turn_of_the_residuals():
     robot, _, _, m = case()
     problem = build(robot, m)
@@ -156,6 +157,7 @@ def test_elimination_leaves_what_the_other_columns_do_not_explain():
 # --- the optimum ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_optimum_is_that_of_group_means():
     robot, _, _, m = case(distances=())
     solution = solve(build(robot, m))
@@ -177,6 +179,7 @@ def test_the_optimum_is_that_of_group_means():
     assert solution.parameters[chosen] == pytest.approx(robot.nominal[chosen] + tolerance * found.x, abs=1e-6)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("gauge", ["prior", "none"])
 def test_groups_are_all_their_pairs(gauge):
     robot, _, _, m = case(distances=())
@@ -209,6 +212,7 @@ def test_without_noise_the_information_is_that_of_all_pairs():
     assert grams[0] == pytest.approx(grams[1], abs=1e-8 * np.abs(grams[1]).max())
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("distances", [(), ((0, 1, 1e-4), (2, 3, 1e-4))])
 def test_what_moves_arm_and_points_as_one_body_stays_where_it_is(distances):
     robot, _, points, m = case(distances=distances, tolerance=None)
@@ -244,6 +248,7 @@ def gradient(problem):
     return left.A.T @ left.b
 
 
+@pytest.mark.slow
 def test_a_point_touched_once_tells_nothing_and_a_distance_holds_the_scale():
     robot, true, points, m = case(distances=(), tolerance=None)
     rng = np.random.default_rng(5)
@@ -366,6 +371,7 @@ def knocked(m, rows, rng, size=30.0):
     return replace(m, readings=readings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "loss", ["huber", *(pytest.param(w, marks=pytest.mark.slow) for w in ("cauchy", "geman-mcclure"))]
 )
@@ -386,6 +392,7 @@ def test_the_robust_optimum_is_that_of_the_loss_over_arm_and_points(loss):
     assert np.max(weights[0][[1, 14, 30]]) < 0.5 < np.median(weights[0])
 
 
+@pytest.mark.slow
 def test_descents_end_where_rounding_alone_changes_weights_and_joint_values():
     """Rows whitened anew, again and again, came back to themselves only after three rounds, without end."""
     robot, _, _, m = case(n_points=6, n_each=8)
@@ -487,6 +494,7 @@ def test_estimated_noise_of_touches_is_the_most_likely_one():
     assert found[0, "point"] == pytest.approx(3.0, rel=4 / np.sqrt(2 * 3 * 60))
 
 
+@pytest.mark.slow
 def test_touches_and_pairs_share_the_joint_noise_of_their_configurations():
     """Their rows are whitened by the covariance of all of them together, formed densely."""
     robot, true, _, m = case(distances=())
@@ -554,6 +562,7 @@ def test_errors_are_as_large_as_the_sigmas_say(options):
         assert chi2.ppf(1e-4, dof) <= total <= chi2.ppf(1 - 1e-4, dof)
 
 
+@pytest.mark.slow
 def test_degrees_of_freedom_count_the_points():
     robot, _, _, m = case()
     problem = build(robot, m)
@@ -563,6 +572,7 @@ def test_degrees_of_freedom_count_the_points():
     assert whitened_triangle(problem, problem.start).shape[1] == problem.variables.n_columns
 
 
+@pytest.mark.slow
 def test_test_groups_are_predicted_and_of_mixed_ones_the_train_rows_fitted():
     robot, _, _, m = case(distances=((0, 1, 1e-4), (0, 3, 1e-4)), test=(3,))
     m = replace(m, test=m.test | (np.arange(len(m.test)) == 0))  # a row of group 0
@@ -600,6 +610,7 @@ def test_test_groups_are_predicted_and_of_mixed_ones_the_train_rows_fitted():
     assert [g["n"] for g in groups] == [11, 12, 12, 0]
 
 
+@pytest.mark.slow
 def test_a_distance_to_a_point_of_test_rows_alone_is_a_test_row_whatever_is_said():
     robot, _, _, m = case(distances=((0, 1, 1e-4), (0, 3, 1e-4)), test=(3,))
     stated = replace(m, groups=replace(m.groups, pairs=replace(m.groups.pairs, test=np.zeros(2, dtype=bool))))
@@ -609,6 +620,7 @@ def test_a_distance_to_a_point_of_test_rows_alone_is_a_test_row_whatever_is_said
     assert assess(b).residuals.test[-2:].tolist() == [False, True]
 
 
+@pytest.mark.slow
 def test_groups_and_pairs_work_side_by_side():
     robot, true, _, m = case(distances=())
     rng = np.random.default_rng(6)
@@ -624,6 +636,7 @@ def test_groups_and_pairs_work_side_by_side():
     assert np.linalg.slogdet(both.covariance)[1] < np.linalg.slogdet(alone.covariance)[1]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("gauge", ["keep", "none"])
 def test_other_gauges_predict_the_same(gauge):
     # Tool and arm of ordinary errors; the rows between touches alone are predicted, whatever holds the rest.
@@ -747,6 +760,7 @@ def test_misuse_in_a_table_is_one_line(tmp_path, rows, pairs, message):
     assert str(error.value) == message
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("change", "model", "message"),
     [
@@ -805,6 +819,7 @@ def write_job(folder, seed=0, **job):
     return folder / "job.yaml"
 
 
+@pytest.mark.slow
 def test_a_job_with_groups_runs_from_the_command_line(fg_calib, tmp_path):
     ended = fg_calib("calibrate", write_job(tmp_path), "--out", tmp_path / "out")
     assert (ended.code, ended.err) == (0, "")
@@ -822,12 +837,14 @@ def test_a_job_with_groups_runs_from_the_command_line(fg_calib, tmp_path):
     assert (last["kind"], last["a"], last["b"], last["split"], last["unit"]) == ("distance", "g0", "g3", "test", "m")
 
 
+@pytest.mark.slow
 def test_a_job_of_touches_alone_needs_no_pairs_and_no_poses(fg_calib, tmp_path):
     ended = fg_calib("calibrate", write_job(tmp_path, pairs=None), "--json")
     assert ended.code == 0
     assert json.loads(ended.out)["pairing"] is None
 
 
+@pytest.mark.slow
 def test_compare_runs_every_estimator_on_touches(fg_calib, tmp_path):
     ended = fg_calib("compare", write_job(tmp_path), "--json")
     estimates = json.loads(ended.out)["estimates"]
@@ -844,6 +861,7 @@ def test_a_job_without_the_noise_of_touches_is_one_line(fg_calib, tmp_path):
     assert ended.err.splitlines() == [f"error: {expected}"] or ended.err.splitlines() == [expected]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "job",
     [

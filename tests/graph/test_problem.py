@@ -158,6 +158,7 @@ def test_test_rows_are_counted_nowhere_and_give_no_residual():
         assert sum(part.n_rows for part in rows.parts) == (60 if model == "pose" else 18)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("model", ["pose", "position", "orientation", "distance", "rotation", "distance-rotation"])
 def test_whitened_residuals_of_noise_have_unit_covariance(model):
     """Joint noise, position and orientation noise together: the whitening is what Monte Carlo says."""

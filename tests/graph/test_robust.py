@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from simulated import measure, small_arm, true_robot
-from sparing import diagonal, most_slow
+from sparing import diagonal
 from tolerances import rounding
 
 from fg_calib.analysis.uncertainty import assess
@@ -48,6 +48,7 @@ def test_constants_in_one_dimension_are_those_of_the_books():
     assert tuning("none", 3) == np.inf
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("loss", "residual_dim"), diagonal(SMOOTH, [1, 2, 6]))
 def test_clean_measurements_lose_five_percent(loss, residual_dim):
     """The location of a cloud of Gaussian vectors, by reweighting, against its mean: Monte Carlo."""
@@ -80,6 +81,7 @@ def test_weights_fall_with_the_residual_and_are_half_where_said(loss):
     assert around.tolist() == [1.0, 0.0] if loss == "gnc" else around == pytest.approx([0.5, 0.5], abs=0.01)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("loss", "model"), diagonal(SMOOTH, ["pose", "distance", "distance-rotation"]))
 def test_the_optimum_is_that_of_gtsams_robust_noise_on_factors_of_one_measurement(loss, model):
     rng = np.random.default_rng(3)
@@ -203,6 +205,7 @@ def test_the_cost_is_that_before_any_weight():
     assert solution.weighted_cost < 0.1 * solution.cost
 
 
+@pytest.mark.slow
 def test_clean_measurements_keep_their_weight_under_gnc_up_to_the_one_percent():
     rng = np.random.default_rng(5)
     robot = small_arm(tolerance=TOLERANCE)
@@ -229,7 +232,8 @@ def test_a_measurement_that_takes_no_part_keeps_its_weight(loss):
     assert 0.0 <= weights[1] < weights[0] <= 1.0
 
 
-@pytest.mark.parametrize("loss", most_slow(LOSSES, every=2))
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("loss", LOSSES)
 def test_weights_settle_where_rows_are_excluded(loss):
     """Pairs at a kink take no part; the others' weights are those of the residuals at the estimate all the same."""
     rng = np.random.default_rng(6)

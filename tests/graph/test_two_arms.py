@@ -69,6 +69,7 @@ def test_a_chain_from_flange_to_flange_is_two_arms_composed(arms):
     assert pose(whole.with_values(values), q).position == pytest.approx(composed, abs=rounding(3.0, 10))
 
 
+@pytest.mark.slow
 def test_two_arms_in_contact_are_calibrated_as_one_chain(arms):
     """Against scipy on both arms composed by hand: the right tip on pins of unknown place on the left flange."""
     whole, left, right = arms

@@ -32,6 +32,7 @@ def tilted(cosine, rng):
     return R, place
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("distortion", [{}, {"k1": -0.25, "k2": 0.08, "p1": 1e-3, "p2": -5e-4}])
 def test_a_board_from_its_image(distortion):
     """Nearer than 2 mm and 5 mrad at a metre with 0.1 pixel, and exact without noise."""
@@ -48,6 +49,7 @@ def test_a_board_from_its_image(distortion):
             assert found.rotation == pytest.approx(R, abs=abs_R)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("cosine", [-0.9, 0.05, 0.12, 0.3, 0.9])
 def test_an_image_leaves_two_poses_and_the_true_one_is_among_them(cosine):
     """At 0.3 pixel, of a board seen nearly from its edge too."""

@@ -7,7 +7,7 @@ import pytest
 import scipy.sparse
 from oracle import central_differences, random_robot, tool_pose
 from scipy.spatial.transform import Rotation
-from sparing import diagonal, most_slow
+from sparing import diagonal
 from tolerances import rounding
 
 from fg_calib.graph.rows import At, Part, RowSet
@@ -61,7 +61,8 @@ def pair_formula(robot, measured):
     return formula
 
 
-@pytest.mark.parametrize("convention", most_slow(CONVENTIONS, every=2))
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("convention", CONVENTIONS)
 def test_distance_and_angle_and_their_derivatives(convention):
     rng = np.random.default_rng(11)
     for n_joints in (1, 4, 7, 12):
@@ -116,6 +117,7 @@ def test_same_point_residual_and_its_derivatives(convention):
 POSES = [(True, True), (True, False), (False, True)]
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize(("convention", "kinds", "size"), diagonal(CONVENTIONS, POSES, [1e-7, 0.5, 2.9]))
 def test_orientation_and_position_and_their_derivatives(convention, kinds, size):
     rng = np.random.default_rng(13)
@@ -179,6 +181,7 @@ def random_block(kind, n, rng):
     return block, chain_of(robot)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("kind", "n"), diagonal(["pairs", "points", "poses"], [1, LANES + 1, 700, 2 * SPAN + 5], every=2)
 )

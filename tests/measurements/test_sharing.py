@@ -82,6 +82,7 @@ def halved(request):
     return L, A, half
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("way", WAYS)
 def test_rows_are_whitened_by_their_dense_covariance(case, way):
     L, A, C = case
@@ -92,6 +93,7 @@ def test_rows_are_whitened_by_their_dense_covariance(case, way):
     assert one.T @ one == pytest.approx(expected[2:3, 2:3], rel=EXACT)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("way", WAYS)
 def test_most_likely_errors_are_those_of_the_dense_covariance(case, way):
     """Steps end with what is left of the Gram matrix; of the errors, in their sigma, it is the root of that."""
@@ -104,6 +106,7 @@ def test_most_likely_errors_are_those_of_the_dense_covariance(case, way):
     assert way.variances() == pytest.approx(variances, rel=EXACT, abs=rounding(1.0, 1e3))
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("way", WAYS)
 def test_the_trace_over_the_covariance_is_exact_or_within_its_bound(case, way):
     L, _, C = case
@@ -114,6 +117,7 @@ def test_the_trace_over_the_covariance_is_exact_or_within_its_bound(case, way):
     assert abs(WAYS[way](L).energy(E) - expected) < off
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("exact", [True, False])
 def test_products_of_covariances_are_exact_or_within_their_bounds(case, exact, monkeypatch):
     """Estimates to four of their sigmas, at most sqrt(2 / 64) of each; the others to rounding of what cancels.
@@ -137,6 +141,7 @@ def test_products_of_covariances_are_exact_or_within_their_bounds(case, exact, m
     assert squares == pytest.approx(np.array([[np.sum(N**2) for N in row] for row in between]), rel=rel)
 
 
+@pytest.mark.sampled(12)
 @pytest.mark.parametrize("weak", [1e-3, 1e-6, 1e-9])
 @pytest.mark.parametrize("way", WAYS)
 def test_weak_directions_survive(halved, way, weak):
@@ -152,6 +157,7 @@ def test_weak_directions_survive(halved, way, weak):
         assert np.linalg.eigvalsh(gram)[0] != pytest.approx(expected[-1] ** 2, rel=0.1, abs=0.0)
 
 
+@pytest.mark.slow
 def test_without_loops_one_step_is_all_it_takes(monkeypatch):
     monkeypatch.setattr(sharing, "_MOST_STEPS", 1)
     monkeypatch.setattr(sharing, "_MOST_PASSES", 2)  # the second for what is rounding

@@ -77,6 +77,7 @@ def test_a_large_offset_is_refused_where_that_is_asked(motion):
     assert averaged(motion, most_offset=0.2).ids
 
 
+@pytest.mark.slow
 def test_of_motions_that_repeat_themselves_the_offset_nearest_to_receipt_is_taken():
     once = record(5, n_stops=4, sigma_position=1e-5, sigma_orientation=1e-5)
     period = once.joint_time[-1] + 1.0

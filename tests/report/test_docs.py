@@ -274,6 +274,13 @@ def calibrates_two_tables(code, folder, fg_calib):
     exec(code, made | {"tracker": measure(true, 30, rng), "bar": measure(true, 30, rng)})
 
 
+def corrects_a_program(code, folder, fg_calib):
+    rng, robot = np.random.default_rng(1), small_arm({"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3})
+    calibrate(robot, measure(true_robot(robot, rng), 20, rng), model="position").save(folder / "result")
+    (folder / "program.csv").write_text("q1,q2,q3,q4\n0.1,0.2,0.3,0.4\n")
+    exec(code, {})
+
+
 def slow(function, mark=pytest.mark.slow):
     return pytest.param(function, marks=mark)
 
@@ -285,6 +292,7 @@ HOW = {
     "instruments": [is_job, is_a_table_of_lengths, is_table, is_job, calibrates_two_tables],
     "from-bags-and-images": [are_typed, is_job, are_typed, is_board, is_board],
     "believe-it": [is_key_of_a_job],
+    "correct": [are_typed, corrects_a_program],
     "observability": [is_printed],
     "simulate": [slow(are_run), is_scenario, slow(is_scenario, pytest.mark.long)],
     "compare": [slow(is_printed)],
@@ -302,6 +310,7 @@ def test_every_snippet_of_every_page_runs():
 EVERY_SNIPPET = [(page, n, how) for page, hows in HOW.items() for n, how in enumerate(hows)]
 
 
+@pytest.mark.sampled(8)
 @pytest.mark.parametrize(
     ("page", "n", "run"),
     [pytest.param(page, n, *getattr(how, "values", [how]), marks=getattr(how, "marks", ()), id=f"{page}-{n}")
@@ -378,6 +387,7 @@ def test_lines_fit_a_terminal_of_100_columns(page):
     assert [line for line in PAGES[page].read_text().splitlines() if len(line) > 100 and line[0] != "|"] == []
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("page", [page for page in TOPICS if page not in GENERATED])
 def test_help_shows_the_page_of_a_topic(page, fg_calib, monkeypatch):
     """Also where the package is installed without its checkout: its own copy is then what is tested here."""

@@ -87,6 +87,7 @@ def test_suspects_can_be_found(page, folder):
         assert (found["kind"], found["a"], found["suspect"]) == (kind, configuration, "true")
 
 
+@pytest.mark.slow
 def test_inputs_options_versions_and_the_command_are_there(tmp_path, fg_calib):
     rng = np.random.default_rng(0)
     robot = small_arm(tolerance=LARGE)
@@ -149,6 +150,7 @@ def hostile_page(folder):
     return folder / "report.html"
 
 
+@pytest.mark.slow
 def test_names_are_text_and_nothing_else(tmp_path):
     page = hostile_page(tmp_path)
     tags = Tags()
@@ -180,6 +182,7 @@ def test_a_browser_shows_all_of_it_and_has_nothing_to_say(folder, tmp_path, opti
     assert width == height > 100
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("instrument", ["anchors", "planes", "board", "targets", "pixels"])
 def test_every_instrument_has_a_page(tmp_path, instrument):
     robot, _, table = measured_by(instrument, np.random.default_rng(1), n=30)
@@ -242,6 +245,7 @@ def test_another_page_of_that_name_is_not_replaced(folder, tmp_path, fg_calib):
     assert (tmp_path / "report.html").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_two_results_are_shown_side_by_side(tmp_path, fg_calib):
     rng = np.random.default_rng(0)
     robot = small_arm(tolerance=LARGE, estimate=("tool.x", "tool.y", "tool.z"))
@@ -311,6 +315,7 @@ def test_a_run_knows_what_it_is_of(folder):
     assert (run.judged_on, run.family, run.free_of_frame, run.command) == ("test", "position", True, None)
 
 
+@pytest.mark.slow
 def test_several_tables_and_touched_points_have_a_page(tmp_path):
     """A configuration may have no row of a kind."""
     rng = np.random.default_rng(2)
@@ -326,6 +331,7 @@ def test_several_tables_and_touched_points_have_a_page(tmp_path):
         assert tuple(html.parse(str(tmp_path / name / "report.html")).xpath("//section/h2/text()")) == TITLES
 
 
+@pytest.mark.slow
 def test_an_evaluation_says_that_it_is_one(tmp_path):
     rng = np.random.default_rng(0)
     robot = small_arm(tolerance=LARGE, estimate=("tool.x", "tool.y", "tool.z"))

@@ -7,7 +7,6 @@ from functools import partial
 import numpy as np
 import pytest
 from simulated import measure, plus, small_arm, true_robot
-from sparing import most_slow
 
 from fg_calib import (
     Job,
@@ -238,7 +237,7 @@ def words(text):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("width", most_slow([40, 60, 100, 80, 200], every=2))
+@pytest.mark.parametrize("width", [40, 60, 100, 80, 200])
 def test_no_width_breaks_a_word(long_reports, width):
     """What was a word on a very wide page is one on every page: names, figures, units."""
     for text, expected in long_reports:
@@ -294,6 +293,7 @@ def test_several_wrong_poses_are_told_apart():
     assert set(re.findall(r"pose (p\d+) is in", text)) == {"p5", "p17"}
 
 
+@pytest.mark.slow
 def test_the_hub_of_a_star_is_not_blamed_for_a_wrong_spoke():
     """It is in every suspicious pair, but in many good ones too; the spoke's only pair stands in the table."""
     text = suspicious_rows(Pairing("star"), [9], loss="gnc")
@@ -301,6 +301,7 @@ def test_the_hub_of_a_star_is_not_blamed_for_a_wrong_spoke():
     assert re.search(r"^p0 +p9 +distance", text, flags=re.M)
 
 
+@pytest.mark.slow
 def test_in_a_chain_both_pairs_of_a_pose_are_its():
     assert suspicious_rows(Pairing("chain"), [9], loss="gnc").startswith(
         "  pose p9 is in 2 of 2 suspicious pairs, and in 2 pairs in all\n"

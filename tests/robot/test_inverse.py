@@ -46,6 +46,7 @@ ARMS = [
 ]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("robot", ARMS, ids=range(len(ARMS)))
 def test_poses_that_can_be_reached_are_reached_within_the_limits(robot):
     """Any convention, revolute and prismatic, with base and tool, fewer than six joints and more."""
@@ -54,6 +55,7 @@ def test_poses_that_can_be_reached_are_reached_within_the_limits(robot):
     require_reached(robot, solve_inverse(robot, T[:, :3, 3], T[:, :3, :3], generator=rng), T)
 
 
+@pytest.mark.slow
 def test_limits_that_are_no_whole_turn_about_zero_are_kept():
     builder = RobotBuilder("shifted", "dh")
     builder.add_frame("base", {}, 0, False)

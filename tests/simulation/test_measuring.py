@@ -10,7 +10,6 @@ from scenarios import CAMERA, EXACT, GRID, INSTRUMENTS, SIGMA, TOLERANCE, WALL, 
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from simulated import paper_robot, small_arm
-from sparing import most_slow
 from tolerances import rounding
 
 from fg_calib import InputError, Pairing, calibrate, read_job, simulate, write_simulation
@@ -82,7 +81,8 @@ def test_pairs_are_measured_between_configurations():
     assert pairs.angle == pytest.approx(rotation_angle(turn)[0], abs=rounding(100.0))
 
 
-@pytest.mark.parametrize("which", most_slow(["anchors", "offset", "contact"], every=3))
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("which", ["anchors", "offset", "contact"])
 def test_lengths_go_to_anchors_in_turn(which):
     s, T = exact(which)
     m = s.tables[0].measurements
@@ -188,7 +188,8 @@ def test_noise_has_its_sigma(which):
         assert np.abs(off.mean(axis=0)).max() < 5.0 * sigma / np.sqrt(len(off))
 
 
-@pytest.mark.parametrize("which", most_slow(INSTRUMENTS, every=2))
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("which", INSTRUMENTS)
 def test_every_instrument_calibrates_as_it_is_simulated(which):
     """At a chi-square and errors of the arm that noise explains, within 99.9 %."""
     n = {"board": 100, "pixels": 300, "camera in the room": 120}.get(which, 40)
@@ -201,6 +202,7 @@ def test_every_instrument_calibrates_as_it_is_simulated(which):
     assert chi2.cdf(error @ np.linalg.solve(found.covariance, error), len(rows)) < 0.999
 
 
+@pytest.mark.sampled(3)
 @EVERY
 def test_the_files_say_what_the_tables_do(which, tmp_path):
     s = simulate(scenario(INSTRUMENTS[which], n=300 if which == "pixels" else 12, length_unit="mm", angle_unit="deg",
@@ -335,6 +337,7 @@ CANNOT = [
 ]  # fmt: skip
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("instrument", "changes", "message"), CANNOT, ids=range(len(CANNOT)))
 def test_what_cannot_be_measured_is_one_line(instrument, changes, message):
     with pytest.raises(InputError) as caught:

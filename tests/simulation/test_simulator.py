@@ -96,6 +96,7 @@ def test_any_robot_is_simulated(convention):
     assert s.true_robot.nominal - robot.nominal == pytest.approx(0.01 * np.arange(len(robot.parameters)))
 
 
+@pytest.mark.slow
 def test_written_poses_follow_from_the_written_true_robot(simulation, tmp_path):
     """From the files alone: what is left is the noise that calibration.yaml states, encoders included."""
     write_simulation(tmp_path / "job", simulation)
@@ -119,6 +120,7 @@ def test_written_poses_follow_from_the_written_true_robot(simulation, tmp_path):
 # --- noise ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_noise_has_its_sigma_along_every_axis(shipped, seed):
     n = 1500
@@ -174,6 +176,7 @@ def test_uniform_errors_fill_their_bounds_and_spare_fixed_parameters(shipped):
     assert np.ptp(scaled, axis=0).min() > 1.8  # every one on its own
 
 
+@pytest.mark.slow
 def test_normal_errors_have_their_sigma(shipped):
     small = replace(shipped, configurations=RandomReadings(1), validation=None, errors=Errors("normal", {"a": 0.01}))
     errors = np.array([simulate(small, seed).true_robot.nominal - shipped.robot.nominal for seed in range(300)])
@@ -325,6 +328,7 @@ def test_the_same_seed_writes_the_same_bytes(shipped, tmp_path):
         assert (a == c) == (name == "robot_nominal.yaml")
 
 
+@pytest.mark.slow
 def test_each_purpose_draws_for_itself(shipped):
     """Another noise, validation, frame or camera changes neither the errors nor each other's draws."""
     s = simulate(shipped)
@@ -408,6 +412,7 @@ def test_a_seed_is_not_negative(shipped):
 # --- files and the command --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_job_that_runs(fg_calib, tmp_path):
     out = tmp_path / "deep" / "demo"
     ended = fg_calib("simulate", "space-robot", "--seed", 1, "--out", out)
@@ -466,6 +471,7 @@ def test_json_is_all_there_is_on_stdout(fg_calib, tmp_path):
 MODELS = ["pose", "position", "orientation", "distance", "rotation"]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("model", "frame"), diagonal(MODELS, ["unknown", "base"]))
 def test_every_model_runs_as_it_is_written(fg_calib, tmp_path, model, frame):
     """Stated noise is true noise, so the fit is good: 0, and never the 3 of a doubtful one."""

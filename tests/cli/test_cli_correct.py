@@ -1,0 +1,121 @@
+"""`fg-calib correct`: tables of targets in, tables of commands out."""
+
+import json
+
+import numpy as np
+import polars as pl
+import pytest
+from oracle import tool_pose
+from scipy.spatial.transform import Rotation
+
+from fg_calib import Calibration, calibrate_job, read_robot
+
+JOINTS = [f"q{i + 1}" for i in range(7)]
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    """The folder of the bundled example's result."""
+    from fg_calib.cli import EXAMPLES
+
+    folder = tmp_path_factory.mktemp("result")
+    calibrate_job(EXAMPLES / "space-robot" / "calibration.yaml").save(folder)
+    return folder
+
+
+def near(n):
+    return np.random.default_rng(2).uniform(-1.0, 1.0, (n, 7))
+
+
+def test_targets_in_their_units_become_commands_in_the_same(result, fg_calib, tmp_path):
+    """In mm and degrees, with roll, pitch and yaw and names; read again and held to 4x4 products."""
+    found = Calibration.load(result)
+    nominal = found.robot.with_values([p.nominal for p in found.result.parameters])
+    q = near(5)
+    T = np.array([tool_pose(nominal, row) for row in q])
+    angles = Rotation.from_matrix(T[:, :3, :3]).as_euler("xyz", degrees=True)
+    columns = {"id": [f"hole {i}" for i in range(5)]}
+    columns |= dict(zip("xyz", 1e3 * T[:, :3, 3].T, strict=True))
+    columns |= dict(zip(("roll", "pitch", "yaw"), angles.T, strict=True))
+    columns |= dict(zip(JOINTS, np.degrees(q).T, strict=True))
+    pl.DataFrame(columns).write_csv(tmp_path / "targets.csv")
+    out = tmp_path / "commands.csv"
+    ended = fg_calib("correct", result, tmp_path / "targets.csv", "--length", "mm", "--angle", "deg", "--out", out)
+    assert ended.code == 0, ended.err
+    assert "5 of 5 targets can be reached" in ended.out
+    written = pl.read_csv(out)
+    assert written["id"].to_list() == columns["id"]
+    assert written["reached"].to_list() == ["yes"] * 5
+    for row, target in zip(written.iter_rows(named=True), T, strict=True):
+        commanded = np.radians([row[name] for name in JOINTS])
+        assert np.abs(tool_pose(found.robot, commanded)[:3] - target[:3]).max() < 1e-9
+        pose = tool_pose(nominal, commanded)
+        assert [row[k] for k in "xyz"] == pytest.approx(1e3 * pose[:3, 3], abs=1e-6)
+        turned = Rotation.from_quat([row[f"q{k}"] for k in "xyzw"]).as_matrix()
+        assert np.abs(turned - pose[:3, :3]).max() < 1e-9
+
+
+def test_a_program_of_joint_values_and_json(result, fg_calib, tmp_path):
+    q = near(3)
+    pl.DataFrame(dict(zip(JOINTS, q.T, strict=True))).write_csv(tmp_path / "program.csv")
+    ended = fg_calib("correct", result, tmp_path / "program.csv", "--json")
+    assert ended.code == 0
+    document = json.loads(ended.out)
+    assert document["n_reached"] == document["n_targets"] == 3
+    assert "nothing is written" in ended.err
+    found = Calibration.load(result)
+    nominal = found.robot.with_values([p.nominal for p in found.result.parameters])
+    for target, row in zip(document["targets"], q, strict=True):
+        there = tool_pose(found.robot, target["readings"])
+        assert np.abs(there - tool_pose(nominal, row)).max() < 1e-9
+        assert target["uncorrected"]["position"] == pytest.approx(
+            np.linalg.norm((tool_pose(found.robot, row) - there)[:3, 3]), rel=1e-6
+        )
+
+
+def test_targets_out_of_reach_are_named_and_end_with_3(result, fg_calib, tmp_path):
+    (tmp_path / "targets.csv").write_text("id,x,y,z\nmoon,384e6,0,0\nhere,1,2,3\n")
+    ended = fg_calib("correct", result, tmp_path / "targets.csv", "--out", tmp_path / "commands.csv")
+    assert ended.code == 3
+    assert "1 of 2 targets are not reached" in ended.err
+    assert "Out of reach within the joint limits: moon." in " ".join(ended.out.split())
+    assert pl.read_csv(tmp_path / "commands.csv")["reached"].to_list() == ["no", "yes"]
+
+
+@pytest.mark.parametrize(
+    ("table", "options", "message"),
+    [
+        ("x,y\n1,2\n", [], "targets.csv"),
+        ("qx,qy,qz,qw\n0,0,0,1\n", [], "orientations without x y z"),
+        ("a\n1\n", [], "targets.csv"),
+        ("x,y,z,q1\n1,2,3,0\n", [], "1 joint columns (q1)"),
+        ("x,y,z\n1,2,three\n", [], "targets.csv:2"),
+        ("x,y,z\n", [], "targets.csv"),
+        ("id,x,y,z\na,1,2,3\na,1,2,3\n", [], "different ids"),
+        ("x,y,z\n1,2,3\n", ["--world"], "world: the measurement frame was not estimated"),
+        ("x,y,z\n1,2,3\n", ["--out", "commands.txt"], "expected .csv"),
+    ],
+)
+def test_what_cannot_be_used_is_one_line(result, fg_calib, tmp_path, monkeypatch, table, options, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "targets.csv").write_text(table)
+    ended = fg_calib("correct", result, "targets.csv", *options)
+    assert ended.code == 1
+    assert message in ended.err
+    assert len(ended.err.splitlines()) == 1
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["targets.csv"]
+
+
+def test_a_table_that_is_no_commands_is_not_replaced(result, fg_calib, tmp_path):
+    (tmp_path / "targets.csv").write_text("x,y,z\n1,2,3\n")
+    ended = fg_calib("correct", result, tmp_path / "targets.csv", "--out", tmp_path / "targets.csv")
+    assert ended.code == 1
+    assert (tmp_path / "targets.csv").read_text() == "x,y,z\n1,2,3\n"
+
+
+def test_the_nominal_arm_is_that_of_the_robot_file(result):
+    from fg_calib.cli import EXAMPLES
+    from fg_calib.correction import nominal_robot
+
+    given = read_robot(EXAMPLES / "space-robot" / "robot_nominal.yaml")
+    assert nominal_robot(Calibration.load(result)).nominal == pytest.approx(given.nominal, abs=1e-15)
