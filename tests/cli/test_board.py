@@ -375,7 +375,7 @@ def test_what_cannot_be_used_is_named(case, job, fg_calib):
 
 def test_a_principal_point_outside_the_images_is_told(job, fg_calib, caplog):
     (job / "camera.yaml").write_text(yaml.safe_dump(asdict(CAMERA) | {"cx": 960.0}))
-    assert run(fg_calib, job).code == 0
+    assert run(fg_calib, job).code == 3
     assert "camera.yaml: cx = 960 px is outside the images of 640 x 480 px; is it the camera" in caplog.text
 
 
