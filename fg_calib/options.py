@@ -46,7 +46,7 @@ EncoderNoise = Literal["propagated", "estimated"]
 Loss = Literal["none", "huber", "cauchy", "geman-mcclure", "gnc"]
 """What becomes of large residuals: least squares, or a robust loss."""
 
-LengthUnit = Literal["m", "cm", "mm", "um"]
+LengthUnit = Literal["m", "cm", "mm", "um", "in"]
 AngleUnit = Literal["rad", "deg", "mrad"]
 
 MODELS: tuple[Model, ...] = get_args(Model)
@@ -201,8 +201,11 @@ class Pairing:
     Attributes:
         strategy: `star` (the first with each other), `chain` (each with the next), `all`, or `random`
             (different pairs, each configuration about equally often).
-        count: Number of random pairs.
-        seed: Seed of the random pairs.
+        count: Number of random pairs; of no other strategy.
+        seed: Seed of the random pairs; of no other strategy.
+
+    Raises:
+        InputError: One of them is not possible, or has no effect.
     """
 
     strategy: Strategy = "star"
@@ -213,6 +216,9 @@ class Pairing:
         object.__setattr__(self, "strategy", check("pairing", self.strategy, Strategy))
         check_number("pairing: count", self.count, above=self.strategy == "random", whole=True)
         check_number("pairing: seed", self.seed, whole=True)
+        for key in ("count", "seed"):
+            if self.strategy != "random" and getattr(self, key):
+                raise InputError(f"pairing: {key}", f"has no effect on {self.strategy}", "the strategy random")
 
     def __str__(self) -> str:
         return self.strategy if self.strategy != "random" else f"random ({self.count}, seed {self.seed})"

@@ -104,6 +104,12 @@ MISTAKES = {
     "a seed below 0": (
         lambda: Pairing("random", 3, -1), "pairing: seed: found -1, expected a whole number not below 0"
     ),
+    "a number of pairs of a star": (
+        lambda: Pairing("star", 3), "pairing: count: has no effect on star, expected the strategy random"
+    ),
+    "a seed of a chain": (
+        lambda: Pairing("chain", seed=3), "pairing: seed: has no effect on chain, expected the strategy random"
+    ),
     **{f"a bare strategy {f.__name__}": (
         lambda f=f: f(pairing="chain"), "pairing: found 'chain', expected a Pairing, such as Pairing('chain')"
     ) for f in (problem, bound, plain, practical)},
@@ -138,7 +144,7 @@ MISTAKES = {
                                "number not below 0"),
     "a structural seed": (lambda: structure(seed=0.5), "seed: found 0.5, expected a whole number not below 0"),
     "a simulation's seed": (lambda: simulate(scenario(), 1.0), "seed: found 1.0, expected a whole number not below 0"),
-    "a unit of length": (lambda: Units(length="MM"), "units: length: found 'MM', expected one of m, cm, mm, um; "
+    "a unit of length": (lambda: Units(length="MM"), "units: length: found 'MM', expected one of m, cm, mm, um, in; "
                          "did you mean mm?"),
     "a unit of angle": (lambda: Units(angle="degrees"), "units: angle: found 'degrees', expected one of rad, deg, "
                         "mrad; did you mean deg?"),

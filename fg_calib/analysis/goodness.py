@@ -291,6 +291,11 @@ class Goodness(FrozenArrays):
     test: PredictedFit | None
     gross: GrossErrors | None = None
 
+    def unknown(self, table: ResidualTable) -> Booleans:
+        """Predicted rows that depend on what neither data nor priors determine, shape (n,)."""
+        found: Booleans = table.test & (table.reason_code == 0) & ~np.isfinite(self.leverage)
+        return found
+
     @property
     def spoilt(self) -> bool:
         """Whether a few gross errors are all that is wrong with the fit."""

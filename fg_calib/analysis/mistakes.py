@@ -51,6 +51,9 @@ NOTHING = 1e-6
 """Residuals over what is predicted below which there is nothing to explain: each unknown takes its own row up."""
 
 
+_OTHER_TOOL = "the tool is another one, farther off than its tolerance lets it be"
+
+
 @dataclass(frozen=True)
 class Explanation:
     """A mistake in the set-up that explains a table, or two together.
@@ -176,7 +179,25 @@ def check_setup(
         if fitted is not None:
             closed_form = SetupCheck(fitted_residuals(setup))
             found = min((found, closed_form), key=lambda check: check.excess) if closed_form.residuals else found
-        return replace(found, explanations=_explanations(setup, found))
+        explanations = _explanations(setup, found)
+        return replace(found, explanations=explanations) if explanations else _tool_held(setup, found) or found
+
+
+def _tool_held(setup: Setup, found: SetupCheck) -> SetupCheck | None:
+    """The check with the tool where the robot says, if a tool far beyond its tolerance is what explains the table."""
+    robot = setup.robot
+    owned = [robot.parameters[i] for i in robot.owned_by(robot.n_joints + 1)]
+    tolerances = np.array([np.nan if p.tolerance is None else p.tolerance for p in owned if p.estimated])
+    known, in_m = np.isfinite(tolerances), np.array([p.unit == "m" for p in owned if p.estimated], dtype=np.bool_)
+    if found.far or not known.all() or not known.size:
+        return None
+    held = replace(setup, tool_rotation=False, tool_translation=np.zeros(3, dtype=np.bool_))
+    slack = {"m": np.linalg.norm(tolerances[in_m]), "rad": np.linalg.norm(tolerances[~in_m])}
+    residuals = fitted_residuals(held)
+    stated = SetupCheck(tuple(replace(r, expected=float(np.hypot(r.expected, slack[r.unit]))) for r in residuals))
+    if not stated.far or found.excess > min(EXPLAINED, stated.excess / REDUCTION):
+        return None
+    return replace(stated, explanations=(Explanation((_OTHER_TOOL,), found.residuals),))
 
 
 def _check_placed(robot: Robot, table: Table) -> SetupCheck:

@@ -308,6 +308,7 @@ def _assess(solution: Solution) -> Uncertainty:
     frames = _frame_estimates(solution, whole)
     chi2, table = chi_square(solution, spread), residual_table(solution)
     goodness = judged_without_gross_errors(solution, spread, table, judge_fit(solution, spread, table))
+    table = table.without(goodness.unknown(table))
     fit = Fit(chi2, table, goodness, judge_priors(solution, spread))
     verdict = judge(solution, spread, fit, identifiability.missing)
     return Uncertainty(

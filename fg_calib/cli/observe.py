@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from fg_calib.cli.output import Json, say, show_json, show_report
-from fg_calib.options import AngleUnit, FrameKnowledge, LengthUnit, Model, check_number
+from fg_calib.options import PAIR_MODELS, POSE_MODELS, AngleUnit, FrameKnowledge, LengthUnit, Model, check_number
 
 if TYPE_CHECKING:  # imported where it is used: `--help` need not wait for it
     from fg_calib.files.units import Units
@@ -87,6 +87,7 @@ def observe(
         _refuse_idle(context, _OF_A_TABLE, "without --configurations")
     else:
         _refuse_idle(context, ("seed",), "with --configurations")
+    _refuse_idle(context, _idle(model), f"with --model {model}")
     for option, figure in zip(_NOISES, (position_noise, orientation_noise, joint_noise), strict=True):
         if figure is not None:
             check_number(f"--{option.replace('_', '-')}", figure, above=option != "joint_noise")
@@ -109,6 +110,19 @@ def observe(
     finally:  # also where nobody takes the report
         if out is not None:
             write_observability(out, found)
+
+
+def _idle(model: Model) -> tuple[str, ...]:
+    """Options that say nothing of what a model measures."""
+    with_orientation, with_position = POSE_MODELS.get(model, (True, True))
+    with_distance, with_angle = PAIR_MODELS.get(model, (True, True))
+    idle = {
+        "frame": model in PAIR_MODELS,
+        "pairing": model not in PAIR_MODELS,
+        "position_noise": not (with_position and with_distance),
+        "orientation_noise": not (with_orientation and with_angle),
+    }
+    return tuple(option for option, nothing in idle.items() if nothing)
 
 
 def _noise(units: Units, robot: Robot, position: float | None, orientation: float | None, joint: float) -> Noise:

@@ -71,17 +71,22 @@ ROUNDING = 1e-6
 NEAR_NOTHING = 1e-9
 """How far a correction may be from estimate less nominal, [m] and [rad]: rounding, and no error of a robot."""
 
-Figure = Annotated[float | None, BeforeValidator(_known)]
+MOST_FIGURE = 1e150
+"""The most that a figure of a result may be: its square is a number too, and no residuals are as large."""
+
+Bounded = Annotated[float, Field(ge=-MOST_FIGURE, le=MOST_FIGURE)]
+
+Figure = Annotated[Bounded | None, BeforeValidator(_known)]
 """A number, None where it is unknown or infinite."""
 
-Sigma = Annotated[Annotated[float, Field(ge=0)] | None, BeforeValidator(_known)]
+Sigma = Annotated[Annotated[float, Field(ge=0, le=MOST_FIGURE)] | None, BeforeValidator(_known)]
 """A standard deviation, None where it is unknown or infinite."""
 
 Row = Annotated[tuple[Figure, ...], BeforeValidator(_listed)]
 Matrix = Annotated[tuple[Row, ...], BeforeValidator(_listed)]
 CovarianceMatrix = Annotated[Matrix, AfterValidator(_of_errors)]
 Sigmas = Annotated[tuple[Sigma, ...], BeforeValidator(_listed)]
-Position = Annotated[tuple[float, float, float], BeforeValidator(_listed)]
+Position = Annotated[tuple[Bounded, Bounded, Bounded], BeforeValidator(_listed)]
 Quaternion = Annotated[tuple[float, float, float, float], BeforeValidator(_listed), AfterValidator(_unit)]
 
 
@@ -238,13 +243,14 @@ class InFrames(Section):
 
 
 class ExpectedError(Section):
-    """Expected RMS errors of the tool."""
+    """Expected RMS errors of the tool; `relative`: nothing says where the base is, so only `fitted` tells of them."""
 
     position: InFrames
     orientation: InFrames
     at: str
     n: Whole
     of: Whole
+    relative: bool | None = None
 
 
 class Typical(Section):
@@ -278,9 +284,9 @@ class Parameter(Section):
 
     name: str
     unit: Literal["m", "rad"]
-    nominal: float
-    estimate: float
-    correction: float
+    nominal: Bounded
+    estimate: Bounded
+    correction: Bounded
     sigma: Sigma
     prior_sigma: Sigma
     identifiability: Literal["independent", "relative", "ineffective", "fixed"]

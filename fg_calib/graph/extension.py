@@ -177,7 +177,11 @@ def expand(problem: Problem) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """A problem's graph with one factor a measurement, for inspection and for incremental optimisers, and its start.
 
     Measurements that share errors depend on these: variables `E(k)`, errors of configuration k in units of their
-    sigma, with a prior of their own each. The optimum is the problem's own. What somebody added to the graph is there.
+    sigma, with a prior of their own each. What somebody added to the graph is there.
+
+    Note:
+        Rows keep the weights that they have in the problem. Those of `solution.problem` are of the solution, so that
+        the optimum is the solution; those of a problem that was not solved are of its start.
 
     Raises:
         ProblemError: Factors of the problem's graph are missing, or a variable has no start.

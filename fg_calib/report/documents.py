@@ -342,6 +342,7 @@ def _expected_error(expected: ExpectedError | None) -> ExpectedErrorDocument | N
         at=expected.at,
         n=expected.n,
         of=expected.of,
+        relative=expected.relative,
     )
 
 

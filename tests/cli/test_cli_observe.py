@@ -87,14 +87,11 @@ def test_the_noise_stated_is_used_where_nothing_was_measured_yet(fg_calib, examp
     assert rows[0][:8] == ["id", *(f"q{i + 1}" for i in range(7))]
 
     def sigma(factor):
-        noise = (
-            "--position-noise",
-            2e-4 * factor,
-            "--orientation-noise",
-            3e-3 * factor,
-            "--joint-noise",
-            1e-3 * factor,
-        )
+        noise = ["--joint-noise", 1e-3 * factor]
+        if model not in ("orientation", "rotation"):
+            noise += ["--position-noise", 2e-4 * factor]
+        if model not in ("position", "distance"):
+            noise += ["--orientation-noise", 3e-3 * factor]
         ended = fg_calib("observe", example / "robot_nominal.yaml", "--model", model, "--angle", "deg",
                          "--configurations", tmp_path / "q.csv", *noise, "--json")  # fmt: skip
         assert ended.code == 0
@@ -133,6 +130,23 @@ OF_A_TABLE = (
 def test_what_is_said_of_a_table_needs_one(fg_calib, example, option):
     ended = fg_calib("observe", example / "robot_nominal.yaml", *option)
     assert ended == (2, "", f"error: {option[0]} has no effect without --configurations\n")
+
+
+IDLE = (
+    ("position", "--orientation-noise", "0.001"),
+    ("orientation", "--position-noise", "0.001"),
+    ("distance", "--orientation-noise", "0.001"),
+    ("rotation", "--position-noise", "0.001"),
+    ("distance", "--frame", "unknown"),
+    ("pose", "--pairing", "chain"),
+)
+
+
+@pytest.mark.parametrize(("model", "option", "value"), IDLE, ids=lambda value: value)
+def test_what_a_model_does_not_use_is_refused(fg_calib, example, model, option, value):
+    table = ("--configurations", example / "poses.csv", "--angle", "deg")
+    ended = fg_calib("observe", example / "robot_nominal.yaml", "--model", model, *table, option, value)
+    assert ended == (2, "", f"error: {option} has no effect with --model {model}\n")
 
 
 def test_a_seed_is_for_random_configurations(fg_calib, example):

@@ -242,6 +242,8 @@ EXPANDED = {
         {"model": "distance-rotation", "pairing": Pairing("all"), "pair_errors": "independent"},
         0.0,
     ),
+    "poses, much joint noise": ({"model": "pose", "frame": "unknown"}, 0.03),
+    "joint values estimated": ({"model": "distance-rotation", "encoder": "estimated"}, 0.03),
 }
 
 
@@ -258,7 +260,7 @@ def test_the_expanded_graph_has_the_same_optimum(name):
     n_measurements = sum(part.block.n for rows in problem.rows for part in rows.parts)
     shared = [rows for rows in problem.rows if rows.shared is not None]
     n_errors = sum(len(rows.configurations) for rows in shared)
-    assert bool(shared) == (name in ("star", "chain, joint noise"))
+    assert bool(shared) == (name in ("star", "chain, joint noise", "joint values estimated"))
     assert graph.size() == n_measurements + n_errors + len(prior_factors(problem.variables))
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, initial, levenberg_marquardt_params())
     values = optimizer.optimize()
