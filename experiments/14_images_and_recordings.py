@@ -1,7 +1,7 @@
 """Are the sigmas honest of what `fg-calib board` makes of images, and `fg-calib bag` of a recording?
 
 Command: python experiments/14_images_and_recordings.py [--quick] [--seed N] [--draws N] [--out FOLDER]
-Takes five minutes on one free core.
+Takes a minute on one free core.
 
 *Images* are rendered (640 x 480, focal length 620 px, distortion, blur, noise; `tests/boards.py`) from known places,
 their corners searched, and poses fitted with the camera given: errors of corners beside their sigma, and NEES of the

@@ -116,8 +116,9 @@ def is_slow(tau: float, n: float) -> bool:
 def sigmas_of_means(residuals: Sequence[Floats], tau: float) -> Floats:
     """Sigma of each stop's mean of correlated samples, shape (n_stops, k).
 
-    The variance of Student's t with n / tau - 1 degrees of freedom, for the scatter is estimated from the same samples.
-    Of slow noise a stop hardly shows the scatter, which is then that of all stops together.
+    The variance of Student's t, for the scatter is estimated from the same samples: with 2 n tau / (tau^2 + 1) - 1
+    degrees of freedom, those of the mean square of AR(1) noise (Bartlett), n - 1 of white noise. Of slow noise a stop
+    hardly shows the scatter, which is then that of all stops together.
 
     Args:
         residuals: Of each stop, less its mean, shape (n, k).
@@ -130,7 +131,7 @@ def sigmas_of_means(residuals: Sequence[Floats], tau: float) -> Floats:
         variance = square.mean(axis=0) * np.minimum(tau / each, 1.0) / (1.0 - tau / middle)
     else:
         part = np.minimum(tau / each, 0.5)
-        freedom = np.maximum(1.0 / part - 1.0, 3.0)
+        freedom = np.maximum(2.0 * each * tau / (tau**2 + 1.0) - 1.0, 3.0)
         variance = square * part / (1.0 - part) * (freedom / (freedom - 2.0))
     sigma: Floats = np.maximum(np.sqrt(variance), LEAST_SIGMA)
     return sigma
