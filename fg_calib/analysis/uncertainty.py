@@ -288,7 +288,7 @@ def assess(solution: Solution) -> Uncertainty:
         Away from the nominal parameters undetermined directions turn, by about as many radians as the angles were
         corrected, and get a small share of parameters that they did not have at nominal. Unknown is what has a share
         in one both at the nominal parameters and at the estimate; the others are known given that the undetermined
-        directions are near nominal.
+        directions are near nominal. Frames have no nominal value: what follows them may be off by as much as they are.
 
     Raises:
         ProblemError: The graph of the solution's problem has factors of somebody else.

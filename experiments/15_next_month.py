@@ -1,6 +1,6 @@
 """Next month: is what `check` and `update` say of a calibration true?
 
-Command: python experiments/14_next_month.py [--quick] [--seed N] [--draws N] [--processes N] [--out FOLDER]
+Command: python experiments/15_next_month.py [--quick] [--seed N] [--draws N] [--processes N] [--out FOLDER]
 Takes about half an hour of processor time.
 
 A UR10-like arm (experiment 08's, tolerances 1 mm and 1 mrad), calibrated by 40 poses (0.05 mm, 0.1 mrad), or by 6
@@ -29,7 +29,7 @@ from space_robot import arguments_of, over_draws, write_json
 import fg_calib
 from fg_calib import Calibration, Measurements, Robot, Table
 
-NAME = "14_next_month"
+NAME = "15_next_month"
 SIGMA = (5e-5, 1e-4)
 HEALTHY = ("known", "unknown", "unknown small", "unknown weak", "pairs", "pairs weak")
 SLIPS = (1.0, 3.0, 10.0, 30.0)
