@@ -236,7 +236,7 @@ def _judged(
     if any(f.suspect.kind != "row" for f in likely):
         found = _refined(calibrated, rows, at, found, likely) if not gross else found
         likely = _likely(found, at) or likely
-    rms, noise, counts = _rms(at, gross)
+    rms, noise, counts = _rms(calibrated, rows, at, gross)
     alike = {f.suspect.names for f in likely}
     likely = _merged(calibrated, likely, noise)
     alike -= {f.suspect.names for f in likely}
@@ -296,13 +296,20 @@ def _refined(calibrated: Calibrated, rows: Rows, at: Linear, found: list[Found],
     ]
 
 
-def _rms(at: Linear, gross: Sequence[str]) -> tuple[dict[str, float], dict[str, float], dict[str, int]]:
-    """RMS of residuals and of noise by kind, and the number of measurements; frames fitted, the arm as calibrated."""
-    table = residual_table(at.placed.solution)
-    names = at.placed.problem.data.names
-    left_out = [names.index(name) for name in gross]
-    counted = table.used & ~np.isin(table.a, left_out) & ~np.isin(table.b, left_out)
-    first = table.is_first_of_family()
+def _rms(
+    calibrated: Calibrated, rows: Rows, at: Linear, gross: Sequence[str]
+) -> tuple[dict[str, float], dict[str, float], dict[str, int]]:
+    """RMS of residuals and of noise by kind, and the number of measurements, by what is no gross error.
+
+    Frames are fitted without gross errors, too, and the arm is as calibrated.
+    """
+    solution, data = at.placed.solution, at.placed.problem.data
+    if gross:
+        wrong = [data.names.index(name) for name in gross]
+        tables = (t.tested_on(np.isin(k, wrong)) for t, k in zip(rows.tables, data.places, strict=True))
+        solution = placed(calibrated, replace(rows, tables=tuple(tables)), calibrated.values).solution
+    table = residual_table(solution)
+    counted, first = table.used & ~table.test, table.is_first_of_family()
     rms, noise, counts = {}, {}, {}
     for k, family in enumerate(table.families):
         mine = counted & (table.family == k)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fg_calib.arguments import check_fields
 from fg_calib.arrays import Brief, FrozenArrays, as_figures, as_floats, check_sizes, require
 from fg_calib.errors import InputError, ProblemError, shown
-from fg_calib.measurements.dataset import Labels, Measurements, Pairs
+from fg_calib.measurements.dataset import Groups, Labels, Measurements, Pairs
 from fg_calib.measurements.kinds import Camera, Kind, check_kind
 from fg_calib.options import (
     PAIR_MODELS,
@@ -285,18 +285,38 @@ class Table(Brief):
 
     def all_train(self) -> Table:
         """The same with its test rows as train rows."""
+        return self.tested_on(np.zeros(self.measurements.n_configurations, dtype=np.bool_))
+
+    def tested_on(self, configurations: Booleans) -> Table:
+        """The same with what was measured at some configurations as its test rows, all others as train rows.
+
+        Args:
+            configurations: True for those, shape (n_configurations,).
+        """
         m = self.measurements
 
-        def fitted(pairs: Pairs) -> Pairs:
-            return replace(pairs, test=np.zeros(pairs.n_pairs, dtype=np.bool_))
+        def split(pairs: Pairs, test: Booleans) -> Pairs:
+            return replace(pairs, test=test[pairs.a] | test[pairs.b])
+
+        def of_groups(groups: Groups) -> Groups:
+            touches = [configurations[groups.index == g] for g in range(groups.n_groups)]
+            only = np.array([len(here) > 0 and bool(here.all()) for here in touches], dtype=np.bool_)
+            return replace(groups, pairs=split(groups.pairs, only))
+
+        def of_own(own: Own) -> Own:
+            if not configurations.any():
+                return replace(own, test=None)
+            ends = np.arange(len(configurations)) if own.ends is None else own.ends
+            test: Booleans = np.any(configurations[np.reshape(ends, (len(own.data), -1))], axis=1)
+            return replace(own, test=test)
 
         m = replace(
             m,
-            test=np.zeros(m.n_configurations, dtype=np.bool_),
-            pairs=None if m.pairs is None else fitted(m.pairs),
-            groups=None if m.groups is None else replace(m.groups, pairs=fitted(m.groups.pairs)),
+            test=configurations,
+            pairs=None if m.pairs is None else split(m.pairs, configurations),
+            groups=None if m.groups is None else of_groups(m.groups),
         )
-        return replace(self, measurements=m, own=tuple(replace(own, test=None) for own in self.own))
+        return replace(self, measurements=m, own=tuple(map(of_own, self.own)))
 
     @property
     def unknown_frame(self) -> bool:

@@ -86,7 +86,9 @@ def build_correction_report(ids: Sequence[str], correction: Correction, robot: R
 
 def _summary(correction: Correction) -> RenderableType:
     """Errors over all targets."""
-    table = plain_table(("error at the targets", "left"), ("RMS", "right"), ("largest", "right"), ("", "left"))
+    table = plain_table(
+        ("error at the targets", "left"), ("RMS", "right"), ("largest", "right"), ("", "left"), wrap=True
+    )
     for of, words in _EXPLAINED.items():
         for k, unit in enumerate(("m", "rad") if correction.turns or of == "expected" else ("m",)):
             factor, name, decimals = SHOWN[unit]
@@ -110,7 +112,7 @@ def _commands(ids: Sequence[str], correction: Correction, robot: Robot, rows: An
     names = [f"{joint.name} {unit}" for joint, (_, unit, _) in zip(robot.joints, units, strict=True)]
     factor, name, decimals = SHOWN["m"]
     headings = (*names, f"before {name}", f"after {name}")
-    table = plain_table(("target", "left"), *((heading, "right") for heading in headings))
+    table = plain_table(("target", "left"), *((heading, "right") for heading in headings), wrap=True)
     after = np.hypot(correction.missed[:, 0], correction.expected[:, 0])
     for i in rows:
         figures = [rounded(q * f, d) for q, (f, _, d) in zip(correction.readings[i].tolist(), units, strict=True)]

@@ -59,7 +59,9 @@ def draw_history(history: History) -> Figure:
     figure = empty_figure(2.4 * columns, 0.4 + 1.9 * rows)
     dates = [_when(run.date) for run in runs]
     days = np.array([(d - dates[0]).total_seconds() / 86400.0 for d in dates])
-    at, label = (days, "days") if days[-1] > 0.0 and np.all(np.diff(days) > 0.0) else (np.arange(len(runs)), "run")
+    at, label = (
+        (days, "days") if days[-1] > 0.0 and np.all(np.diff(days) > 0.0) else (np.arange(1, len(runs) + 1), "run")
+    )
     for i, name in enumerate(names):
         axes = figure.add_subplot(rows, columns, i + 1)
         known = [run.parameters.get(name) for run in runs]
@@ -73,6 +75,8 @@ def draw_history(history: History) -> Figure:
         axes.errorbar(at[there], off, yerr=sigma, fmt="o-", color="#0072B2", markersize=3.5, capsize=2, linewidth=1.0)
         axes.set_title(f"{name} [{unit}]", fontsize=8)
         axes.set_xlabel(label, fontsize=7)
+        if label == "run":
+            axes.set_xticks(at)
         axes.tick_params(labelsize=6.5)
         axes.spines[["top", "right"]].set_visible(False)
     figure.suptitle(f"{history.robot}: change since {runs[0].date[:10]}, with 1 sigma", fontsize=9)

@@ -114,14 +114,16 @@ class _WholeWords(Table):
         return widths
 
     def _paragraphs(self) -> Iterable[RenderableType]:
-        """The rows one below the other: the first cell, then the others behind their headings."""
+        """The rows one below the other: the first cell if it has words, then the others behind their headings."""
         columns = [self._texts(column) for column in self.columns]
         for i, row in enumerate(self.rows, start=1):
-            words = [f"{cells[0]} {cells[i]}".strip() for cells in columns if cells[i]]
+            title, *others = (f"{cells[0]} {cells[i]}".strip() if cells[i] else "" for cells in columns)
+            words = "  ".join(filter(None, others))
             style = row.style or ""
-            yield line("".join(words[:1]), style)
-            if words[1:]:
-                yield Padding(line("  ".join(words[1:]), style), (0, 0, 0, INDENT))
+            if title or not words:
+                yield line(title, style)
+            if words:
+                yield Padding(line(words, style), (0, 0, 0, INDENT))
 
 
 def _longest_word(text: str) -> int:

@@ -120,6 +120,22 @@ def test_a_gross_row_is_named_and_is_no_drift(known):
     assert found.explanations == ()
 
 
+def test_a_gross_row_does_not_count_against_a_limit(known):
+    """The frame is fitted without it: the errors are those that the other rows have by themselves."""
+    calibration, true, rng = known
+    rows = measured(true, 12, np.random.default_rng(4), ids="r", frame=placed(rng))
+    spoilt = rows.position.copy()
+    spoilt[6] += [8e-3, -5e-3, 3e-3]
+    limit = 5 * SIGMA[0]
+    table = Table(replace(rows, position=spoilt), "pose", frame="unknown")
+    found = calibration.check(table, limit=limit)
+    keep = np.flatnonzero(np.arange(12) != 6)
+    without = calibration.check(Table(rows.select(keep), "pose", frame="unknown"), limit=limit)
+    assert found.gross_rows == ("r6",)
+    assert found.verdict == without.verdict == "pass"
+    assert found.rms["position"] == pytest.approx(without.rms["position"], rel=1e-3)  # frames to convergence
+
+
 @pytest.mark.parametrize("factor", [1.3, 3.0])
 def test_noise_that_is_larger_than_stated_is_no_drift(known, factor):
     calibration, true, _ = known

@@ -55,6 +55,20 @@ def test_targets_in_their_units_become_commands_in_the_same(result, fg_calib, tm
         assert np.abs(turned - pose[:3, :3]).max() < 1e-9
 
 
+def test_errors_are_a_table_on_a_narrow_screen(result, fg_calib, tmp_path, monkeypatch):
+    """Figures below their headings, a line for mm and one for deg."""
+    monkeypatch.setenv("COLUMNS", "60")
+    pl.DataFrame(dict(zip(JOINTS, near(2).T, strict=True))).write_csv(tmp_path / "program.csv")
+    said = fg_calib("correct", result, tmp_path / "program.csv").out.splitlines()
+    top = next(k for k, line in enumerate(said) if line.startswith("error at the targets"))
+    assert said[top].split()[-2:] == ["RMS", "largest"]
+    assert said[top + 1].split()[-1] == "mm"
+    assert said[top + 2].split()[-1] == "deg"
+    assert [line.rindex(line.split()[-2]) + len(line.split()[-2]) for line in said[top + 1 : top + 3]] == [
+        len(said[top].rstrip())
+    ] * 2
+
+
 def test_a_program_of_joint_values_and_json(result, fg_calib, tmp_path):
     q = near(3)
     pl.DataFrame(dict(zip(JOINTS, q.T, strict=True))).write_csv(tmp_path / "program.csv")

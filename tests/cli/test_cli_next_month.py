@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 from simulated import true_robot
 from typer.testing import CliRunner
 
-from fg_calib import read_result, write_robot
+from fg_calib import History, history_of, read_result, write_robot
 from fg_calib.cli import entry
 from fg_calib.files.csv_writer import write_csv
+from fg_calib.report.history import draw_history
 
 
 def run(*words):
@@ -96,6 +97,15 @@ def test_a_history_outlives_the_older_folders(place, tmp_path):
     assert (tmp_path / "third" / "history.svg").read_text().startswith("<?xml")
     assert (tmp_path / "third" / "history.png").stat().st_size > 0
     assert "3 runs" in run("history", tmp_path / "third")[1]
+
+
+def test_runs_whose_dates_say_no_order_are_numbered(place):
+    """Of one date, or of one that is earlier: whole numbers from 1, as nothing is between runs."""
+    (run,) = history_of(place / "result").runs
+    later = run.model_copy(update={"date": "2000-01-01"})
+    axes = draw_history(History(robot="arm", runs=[run, later, run])).axes[0]
+    assert axes.get_xlabel() == "run"
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["1", "2", "3"]
 
 
 def test_a_job_may_stand_in_place_of_a_table(place):

@@ -23,6 +23,7 @@ from fg_calib import (
     solve,
 )
 from fg_calib.options import Options
+from fg_calib.report.tables import plain_table, plain_text
 from fg_calib.robot.model import Joint, Robot, RobotBuilder
 
 
@@ -305,4 +306,13 @@ def test_the_hub_of_a_star_is_not_blamed_for_a_wrong_spoke():
 def test_in_a_chain_both_pairs_of_a_pose_are_its():
     assert suspicious_rows(Pairing("chain"), [9], loss="gnc").startswith(
         "  pose p9 is in 2 of 2 suspicious pairs, and in 2 pairs in all\n"
+    )
+
+
+def test_a_row_of_a_paragraph_without_a_name_goes_on_with_the_one_above():
+    table = plain_table(("error", "left"), ("RMS", "right"), ("largest", "right"))
+    table.add_row("of positions", "1.5", "2.5")
+    table.add_row("", "0.1", "0.2")
+    assert plain_text(table, 20) == "\n".join(
+        ["error of positions", "  RMS 1.5  largest", "  2.5", "  RMS 0.1  largest", "  0.2"]
     )
