@@ -591,7 +591,7 @@ def test_labels_keep_apart():
 def test_images_and_recordings_quick(tmp_path):
     """Sigmas of corners within a fifth, NEES of six images and two recordings no more than 3."""
     pytest.importorskip("cv2", reason="no OpenCV: pip install 'fg_calib[camera]'")
-    found = load("14_images_and_recordings.py").main(["--quick", "--out", str(tmp_path)])
+    found = load("15_images_and_recordings.py").main(["--quick", "--out", str(tmp_path)])
     for name, row in found["images"].items():
         assert row["sigma_px"] == pytest.approx(row["corner_rms_px"], rel=0.2), name
         assert row["nees"] < 3.0, name
@@ -607,6 +607,15 @@ def test_corners_say_more_than_poses_and_these_more_than_pairs(tmp_path):
     for row in found["ways"].values():
         assert row["not_converged"] == 0
         assert row["realised"]["views"] < 3.0 * row["predicted"]["views"]
+
+
+def test_tolerances_estimated_are_nearly_as_good_as_known(tmp_path):
+    """Ten poses of a UR10, each kind off by another scale: one draw, so the ratio is near 1 and no more."""
+    cells = load("14_unknown_tolerances.py").main(["--quick", "--out", str(tmp_path)])["cells"]
+    poses = cells[0]
+    assert (poses["model"], poses["true"]) == ("pose", "mixed")
+    assert poses["over_known"] < 1.2
+    assert not any(sum(cell["not_converged"].values()) for cell in cells)
 
 
 @pytest.fixture(scope="module")

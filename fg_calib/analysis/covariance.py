@@ -214,6 +214,19 @@ def with_left_out(solution: Solution, spread: Spread) -> Spread:
     )
 
 
+def with_unsure_tolerances(solution: Solution, spread: Spread) -> Spread:
+    """The covariance with what it adds that tolerances were estimated, and are not known; the same where they are.
+
+    Args:
+        solution: The solution.
+        spread: That with the tolerances taken as known.
+    """
+    scales = solution.estimated_tolerances
+    if scales is None:
+        return spread
+    return replace(spread, tangent=spread.tangent + scales.unsure, actual=spread.actual + scales.unsure)
+
+
 def _errors(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
     """How the error of the estimate comes about, in the columns of all parameters, left-out ones among them.
 

@@ -326,6 +326,8 @@ def _of_table(t: TableSurvey) -> Iterator[str]:
 def _of_noise(found: Inspection, job: Job) -> Iterator[str]:
     if job.options.estimate_noise:
         yield "noise is to be estimated: sigmas and accuracy here are for noise as stated, or 1 mm and 1 mrad"
+    if job.options.estimate_tolerance:
+        yield "tolerances are to be estimated: accuracy here is for those stated, or 1 mm and 1 mrad"
     unseen = [t.name for t, check in zip(found.tables, found.setups, strict=False) if not check.residuals]
     if unseen and len(found.setups) == len(found.tables):
         yield f"{_listed(unseen)}: too few rows to look for the usual mistakes (units, signs, columns) before solving"

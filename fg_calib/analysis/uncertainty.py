@@ -15,7 +15,7 @@ from fg_calib.analysis.accuracy import ExpectedError, expected_error, without_ri
 from fg_calib.analysis.changes import Change
 from fg_calib.analysis.chi_square import chi_square
 from fg_calib.analysis.corrections import PriorFit, judge_priors
-from fg_calib.analysis.covariance import Spread, spread_of, with_left_out
+from fg_calib.analysis.covariance import Spread, spread_of, with_left_out, with_unsure_tolerances
 from fg_calib.analysis.findings import MOST_ESTIMATED, Fit, judge
 from fg_calib.analysis.folds import Folds
 from fg_calib.analysis.goodness import Goodness, judge_fit
@@ -302,7 +302,7 @@ def _assess(solution: Solution) -> Uncertainty:
     problem = solution.problem
     variables = problem.variables
     spread = spread_of(solution)
-    whole = with_left_out(solution, spread)
+    whole = with_unsure_tolerances(solution, with_left_out(solution, spread))
     identifiability = identifiability_of(problem.whole or problem, solution.before, "practical")
     covariance = whole.named()
     frames = _frame_estimates(solution, whole)

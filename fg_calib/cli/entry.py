@@ -27,6 +27,7 @@ from fg_calib.cli.calibrate import calibrate
 from fg_calib.cli.compare import compare
 from fg_calib.cli.correct import correct
 from fg_calib.cli.example import example
+from fg_calib.cli.export import export
 from fg_calib.cli.help import help_
 from fg_calib.cli.init import init
 from fg_calib.cli.inspect import inspect
@@ -43,7 +44,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-for command in (init, inspect, calibrate, report, correct, compare, observe, simulate, example, bag, board):
+for command in (init, inspect, calibrate, report, export, correct, compare, observe, simulate, example, bag, board):
     app.command()(command)
 app.command(name="help")(help_)
 

@@ -49,6 +49,7 @@ from fg_calib.options import (
     Options,
     PairErrors,
     Pairing,
+    SharedScale,
     check_names,
     did_you_mean,
 )
@@ -141,7 +142,11 @@ class _JobOfTables(Schema):
     anchors: dict[str, Any] = meaning(
         "Where anchors are in the base frame, by name; others are estimated", {}, kind="mapping of points"
     )
-    tolerance: Any = meaning("1 sigma of all targets, or anchors, that are named with a place", None, kind="mapping")
+    tolerance: Any = meaning(
+        "1 sigma of all targets, or anchors, that are named with a place; whether the robot's tolerances are estimated",
+        None,
+        kind="mapping, or `estimate`",
+    )
     offset: Literal["estimate"] | None = meaning("Whether an unknown length is in every distance to an anchor", None)
     camera: Any = meaning("Of model pixels: the camera that took the images", None, kind=_CAMERA)
     columns: dict[str, Any] | None = meaning(_COLUMNS, None, kind="mapping of columns")
@@ -194,6 +199,11 @@ class _CameraOfJob(Schema):
 
 
 class _Tolerances(Schema):
+    estimate: SharedScale | None = meaning(
+        "Whether the robot's tolerances are only where to start (1 mm and 1 mrad where it has none), and scaled to the"
+        " corrections seen: by one factor for each kind of parameter (a, theta, ...), or for each joint",
+        None,
+    )
     targets: Positive | None = meaning("Of targets", None)
     anchors: Positive | None = meaning("Of anchors", None)
 
@@ -208,7 +218,7 @@ SECTIONS = (
     ),
     Section("accept", _Accept, "Judged by test rows, or else by `folds`. In the file's units, or with their own."),
     Section("targets, anchors: each point", _Point),
-    Section("tolerance", _Tolerances),
+    Section("tolerance", _Tolerances, "`tolerance: estimate` is `{estimate: kind}`."),
     Section("camera", _CameraOfJob, "A path, or the figures of a camera's file themselves, or"),
     Section("columns: each column", _Column, "A column's name alone, or"),
 )
@@ -342,7 +352,7 @@ def _known_points(file: _JobOfTables, model: Model, place: str) -> dict[str, Kno
     if model not in what:
         return {}
     key = what[model]
-    for_all = validate(_Tolerances, {} if file.tolerance is None else file.tolerance, f"{place}: tolerance")
+    for_all = _tolerances(file.tolerance, place)
     factor, found = file.units.factor("m"), {}
     for name, one in getattr(file, key).items():
         point = validate(_Point, one, f"{place}: {key}: {name}")
@@ -387,7 +397,18 @@ def _options(file: _JobOfTables, estimate_noise: bool, place: str, first: Table)
     choices = {key: getattr(file, key) for key in _CHOICES if key in file.model_fields_set} | {"model": first.model}
     pairing = pairing_of(file.pairing, f"{place}: pairing")
     accept = _limits(file.accept, file.units, f"{place}: accept")
-    return Options.of(**choices, pairing=pairing, estimate_noise=estimate_noise, accept=accept)
+    scale = _tolerances(file.tolerance, place).estimate
+    estimated = {"estimate_noise": estimate_noise, "estimate_tolerance": scale}
+    return Options.of(**choices, **estimated, pairing=pairing, accept=accept)
+
+
+def _tolerances(given: object, place: str) -> _Tolerances:
+    """Tolerances of targets and anchors, and what becomes of the robot's."""
+    if given == "estimate":
+        return _Tolerances(estimate="kind")
+    if given is not None and not isinstance(given, dict):
+        raise InputError(f"{place}: tolerance", f"found {shown(given)}", "a mapping of figures, or estimate")
+    return validate(_Tolerances, given or {}, f"{place}: tolerance")
 
 
 def _limits(given: object, units: Units, place: str) -> Limits:
@@ -411,6 +432,7 @@ def check_choices(choices: Mapping[str, Any], robot: Robot, place: str) -> None:
     file = validate(_Job, {"robot": ".", "measurements": ".", **choices}, place)
     pairing_of(file.pairing, f"{place}: pairing")
     _limits(file.accept, file.units, f"{place}: accept")
+    _tolerances(file.tolerance, place)
     _check_preferred(file, robot, place)
 
 

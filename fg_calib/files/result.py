@@ -294,6 +294,17 @@ class Parameter(Section):
     sigma_of_combination: Sigma = None
 
 
+class ToleranceScale(Section):
+    """A factor on tolerances that was estimated, with its 95 % interval; see `graph.tolerances.ToleranceScale`."""
+
+    group: str
+    parameters: Annotated[tuple[str, ...], Field(min_length=1)]
+    scale: Annotated[float, Field(gt=0.0, le=MOST_FIGURE)]
+    low: Annotated[float, Field(gt=0.0, le=MOST_FIGURE)]
+    high: Annotated[float, Field(gt=0.0, le=MOST_FIGURE)]
+    seen: Bounded
+
+
 class Covariance(Section):
     """Covariance of the errors of parameters."""
 
@@ -473,6 +484,7 @@ class Result(Section):
     expected_error: ExpectedError | None = None
     noise_factors: dict[str, float] | None = None
     noise_kept: tuple[str, ...] = ()
+    tolerance_scales: tuple[ToleranceScale, ...] | None = None
     suspect_configurations: tuple[SuspectConfiguration, ...] = ()
     residual_rms: dict[str, dict[str, Rms | None]]
     parameters: tuple[Parameter, ...]
@@ -570,6 +582,9 @@ def _of_names(result: Result) -> Iterator[tuple[str, str, str]]:
             yield key, f"{max(given, key=given.count)!r} twice", "different names"
     for name in set(names).difference(known):
         yield "covariance: names", f"{name!r}, which is no parameter", "names of parameters"
+    for i, one in enumerate(result.tolerance_scales or (), start=1):
+        for name in set(one.parameters).difference(known):
+            yield f"tolerance_scale {i}: parameters", f"{name!r}, which is no parameter", "names of parameters"
 
 
 def _of_parameters(result: Result) -> Iterator[tuple[str, str, str]]:

@@ -17,6 +17,7 @@ from fg_calib.graph.information import observability_of, whitened_triangle
 from fg_calib.graph.observability import determined, singular_values
 from fg_calib.graph.problem import Problem, problem_at, tables_of, variables_of
 from fg_calib.graph.start import start_of
+from fg_calib.graph.tolerances import with_first_tolerances
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import Measurements, Pairs
 from fg_calib.measurements.gathering import Dataset, check_repeats, gather
@@ -100,6 +101,8 @@ def problem_of_tables(robot: Robot, tables: Sequence[Table], options: Options) -
     evaluated = all(map(_all_test, tables))
     if evaluated:
         robot, options, tables = _for_evaluation(robot, options, tables)
+    elif options.estimate_tolerance is not None:
+        robot = with_first_tolerances(robot)
     data = gather(robot, tables)
     _check_frames(data)
     variables = variables_of(robot, data, options)

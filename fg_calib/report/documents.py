@@ -63,6 +63,7 @@ from fg_calib.files.result import (
     Step,
     SuspectReading,
     TestRows,
+    ToleranceScale,
     TouchedPoint,
     Typical,
     Weak,
@@ -135,8 +136,7 @@ def result_of(solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str,
         folds=_folds(u),
         priors=_priors(u.priors),
         expected_error=_expected_error(u.expected_error),
-        noise_factors=_noise_factors(solution, goodness.kinds),
-        noise_kept=_noise_kept(solution, goodness.kinds),
+        **_noise_and_tolerances(solution, goodness.kinds),
         suspect_configurations=_suspects(goodness.configurations, names),
         residual_rms=_residual_rms(u),
         parameters=tuple(map(_parameter, u.parameters)),
@@ -248,6 +248,14 @@ def _noise_kept(solution: Solution, fits: Sequence[KindFit]) -> tuple[str, ...]:
         return ()
     of_joints = ("joint",) if _joints(solution) and JOINT_NOISE not in estimated else ()
     return (*(_key(fit, fits) for fit in fits if (fit.table, fit.kind) not in estimated), *of_joints)
+
+
+def _noise_and_tolerances(solution: Solution, fits: Sequence[KindFit]) -> dict[str, Any]:
+    """What noise and tolerances were estimated, by key."""
+    found = solution.estimated_tolerances
+    scales = None if found is None else tuple(map(ToleranceScale.model_validate, found.scales))
+    factors, kept = _noise_factors(solution, fits), _noise_kept(solution, fits)
+    return {"noise_factors": factors, "noise_kept": kept, "tolerance_scales": scales}
 
 
 def _joints(solution: Solution) -> bool:

@@ -281,6 +281,11 @@ def corrects_a_program(code, folder, fg_calib):
     exec(code, {})
 
 
+def exports_an_arm(code, folder, fg_calib):
+    exec(code, {})
+    assert read_robot(folder / "arm_hayati.yaml").n_joints == 2
+
+
 def slow(function, mark=pytest.mark.slow):
     return pytest.param(function, marks=mark)
 
@@ -293,6 +298,7 @@ HOW = {
     "from-bags-and-images": [are_typed, is_job, are_typed, is_board, is_board],
     "believe-it": [is_key_of_a_job],
     "correct": [are_typed, corrects_a_program],
+    "export": [are_typed, exports_an_arm],
     "observability": [is_printed],
     "simulate": [slow(are_run), is_scenario, slow(is_scenario, pytest.mark.long)],
     "compare": [slow(is_printed)],

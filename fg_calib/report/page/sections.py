@@ -24,6 +24,7 @@ from fg_calib.report.page.markup import tag
 from fg_calib.report.page.run import Run
 from fg_calib.report.shown import FAMILY_UNIT, SHOWN
 from fg_calib.report.summary import good, judged, parameter_rows
+from fg_calib.report.tolerances import HEADINGS, TITLE, tolerance_rows
 
 if TYPE_CHECKING:
     from lxml.etree import _Element as Element
@@ -188,6 +189,9 @@ def parameters(run: Run) -> list[Element]:
         chosen = [p for p in found if p.identifiability == kind]
         if chosen:
             parts += [tag("h3", title), _table_of_parameters(chosen)]
+    if run.result.tolerance_scales:
+        rows = tolerance_rows(run.result.tolerance_scales, found)
+        parts += [tag("h3", TITLE), table(HEADINGS, rows)]
     return parts
 
 
