@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from fg_calib.analysis.bounds import Bound, cramer_rao
+    from fg_calib.analysis.check import Check, Explanation
     from fg_calib.analysis.estimated_tolerances import estimate_tolerances
     from fg_calib.analysis.identifiability import Identifiability, observe_configurations, observe_structure
     from fg_calib.analysis.inspection import Inspection, inspect_job
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
     from fg_calib.exports.export import Export, export
     from fg_calib.files.columns import Column
+    from fg_calib.files.history import History, history_of
     from fg_calib.files.job import read_job
     from fg_calib.files.result import Result, read_result, result_schema
     from fg_calib.files.robot_yaml import read_robot, write_robot
@@ -78,6 +80,8 @@ _HOMES = {
     "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
     "fg_calib.exports.export": ("Export", "export"),
     "fg_calib.files.columns": ("Column",),
+    "fg_calib.analysis.check": ("Check", "Explanation"),
+    "fg_calib.files.history": ("History", "history_of"),
     "fg_calib.files.job": ("read_job",),
     "fg_calib.job": ("Job",),
     "fg_calib.files.result": ("Result", "read_result", "result_schema"),
@@ -130,11 +134,14 @@ __all__ = [
     "Calibration",
     "CalibrationError",
     "Camera",
+    "Check",
     "Column",
     "Comparison",
     "Correction",
     "DistanceFactor",
+    "Explanation",
     "Export",
+    "History",
     "Identifiability",
     "InputError",
     "Inspection",
@@ -181,6 +188,7 @@ __all__ = [
     "format_identifiability",
     "format_inspection",
     "format_report",
+    "history_of",
     "inspect_job",
     "inspection_document",
     "levenberg_marquardt_params",

@@ -7,6 +7,7 @@ import shutil
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 
@@ -591,7 +592,7 @@ def test_labels_keep_apart():
 def test_images_and_recordings_quick(tmp_path):
     """Sigmas of corners within a fifth, NEES of six images and two recordings no more than 3."""
     pytest.importorskip("cv2", reason="no OpenCV: pip install 'fg_calib[camera]'")
-    found = load("15_images_and_recordings.py").main(["--quick", "--out", str(tmp_path)])
+    found = load("14_images_and_recordings.py").main(["--quick", "--out", str(tmp_path)])
     for name, row in found["images"].items():
         assert row["sigma_px"] == pytest.approx(row["corner_rms_px"], rel=0.2), name
         assert row["nees"] < 3.0, name
@@ -611,7 +612,7 @@ def test_corners_say_more_than_poses_and_these_more_than_pairs(tmp_path):
 
 def test_tolerances_estimated_are_nearly_as_good_as_known(tmp_path):
     """Ten poses of a UR10, each kind off by another scale: one draw, so the ratio is near 1 and no more."""
-    cells = load("14_unknown_tolerances.py").main(["--quick", "--out", str(tmp_path)])["cells"]
+    cells = load("16_unknown_tolerances.py").main(["--quick", "--out", str(tmp_path)])["cells"]
     poses = cells[0]
     assert (poses["model"], poses["true"]) == ("pose", "mixed")
     assert poses["over_known"] < 1.2
@@ -676,3 +677,13 @@ def test_no_kill_full_disk_or_second_writer_mixes_or_loses_a_result(tmp_path):
     hidden = found.pop("hidden folders")
     assert {which for counts in found.values() for which in counts} <= allowed
     assert hidden["after it"] == 0
+
+
+def test_next_month_quick_says_nothing_of_what_did_not_change_and_finds_what_did(tmp_path):
+    found = load("15_next_month.py").main(["--quick", "--out", str(tmp_path)])
+    assert {case["verdicts"].get("pass", 0) for case in found["healthy"].values()} == {1}
+    for case in ("known 30", "unknown 30"):
+        assert found["slips"][case]["failed"] == found["slips"][case]["among"] == found["slips"][case]["n"]
+    off = [found["updates"][f"unknown {finer}"]["off"][0] for finer in ("1", "0.1", "0.01", "0.001")]
+    assert off[-1] < 1e-6
+    assert all(a / b == pytest.approx(10.0, rel=0.1) for a, b in pairwise(off))

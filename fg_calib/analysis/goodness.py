@@ -503,7 +503,7 @@ class _Rows:
         if self._robust or not self._carried or self._errors is None:
             return None
         unknowns = self._spread.rank + self._errors.own.shape[1]
-        dof = problem.n_independent + problem.n_priors + problem.n_added - unknowns
+        dof = problem.n_independent + problem.n_priors + problem.n_added + problem.n_known - unknowns
         z = self._table.after[rows] / self._table.sigma[rows]
         found = find_gross_errors(
             z,

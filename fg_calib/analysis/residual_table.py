@@ -207,7 +207,7 @@ class ResidualTable(FrozenArrays):
         family, counted = self.family, self.reason_code == 0
         if table is not None:
             counted = counted & np.isin(self.group, [k for k, (number, _) in enumerate(self.groups) if number == table])
-        first = self._is_first_of_family()
+        first = self.is_first_of_family()
         for code, split in enumerate(("train", "test")):
             of_split = counted & (self.split == code)
             for k, name in enumerate(self.families):
@@ -230,7 +230,7 @@ class ResidualTable(FrozenArrays):
             Rows, shape (n,); sum of squares in sigma, shape (n,); by kind of noise the RMS of the length of a
             measurement's rows at the estimate, shape (n,), nan where there are none.
         """
-        counted, first = self.reason_code == 0, self._is_first_of_family()
+        counted, first = self.reason_code == 0, self.is_first_of_family()
         ends = [(end, counted & (end >= 0) & (end < n)) for end in (self.a, self.b)]
 
         def summed(values: Floats, of: Booleans) -> Floats:
@@ -254,7 +254,7 @@ class ResidualTable(FrozenArrays):
         Args:
             labels: Of the tables; a single one has none here.
         """
-        found, first = {}, self._is_first_of_family()
+        found, first = {}, self.is_first_of_family()
         for k, (number, family) in enumerate(self.groups):
             rows = (self.reason_code == 0) & (self.split == 1) & ~self.seen & (self.group == k)
             n = int(np.sum(rows & first))
@@ -293,7 +293,7 @@ class ResidualTable(FrozenArrays):
         code = np.where(unknown, len(self.reasons), self.reason_code).astype(self.reason_code.dtype)
         return replace(self, reasons=(*self.reasons, "depends on what is not determined"), reason_code=code)
 
-    def _is_first_of_family(self) -> Booleans:
+    def is_first_of_family(self) -> Booleans:
         """Rows that begin a measurement's rows of one kind of noise, shape (n,)."""
         change = np.ones(self.n, dtype=np.bool_)
         for code in (self.series, self.measurement, self.family):

@@ -24,11 +24,13 @@ from fg_calib import __version__
 from fg_calib.cli.bag import bag
 from fg_calib.cli.board import board
 from fg_calib.cli.calibrate import calibrate
+from fg_calib.cli.check import check
 from fg_calib.cli.compare import compare
 from fg_calib.cli.correct import correct
 from fg_calib.cli.example import example
 from fg_calib.cli.export import export
 from fg_calib.cli.help import help_
+from fg_calib.cli.history import history
 from fg_calib.cli.init import init
 from fg_calib.cli.inspect import inspect
 from fg_calib.cli.observe import observe
@@ -36,6 +38,7 @@ from fg_calib.cli.output import say
 from fg_calib.cli.progress import hide_progress, progress
 from fg_calib.cli.report import report
 from fg_calib.cli.simulate import simulate
+from fg_calib.cli.update import update
 from fg_calib.errors import CalibrationError, InputError, printable
 
 app = typer.Typer(
@@ -44,7 +47,23 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-for command in (init, inspect, calibrate, report, export, correct, compare, observe, simulate, example, bag, board):
+for command in (
+    init,
+    inspect,
+    calibrate,
+    report,
+    export,
+    correct,
+    compare,
+    check,
+    update,
+    history,
+    observe,
+    simulate,
+    example,
+    bag,
+    board,
+):
     app.command()(command)
 app.command(name="help")(help_)
 

@@ -262,7 +262,70 @@ def _job(path: Path) -> Job:
     plain = isinstance(file.measurements, str) and tables[0].is_plain
     alone = tables[0].measurements if plain else tuple(tables)
     truth = None if file.truth is None else _truth(folder / file.truth, robot)
-    return Job(path, robot, alone, _options(file, estimate_noise, path.name, tables[0]), truth)
+    options = _options(file, estimate_noise, path.name, tables[0])
+    return Job(path, robot, alone, options, truth, document=_document(given, folder))
+
+
+_OF_THE_ROBOT = ("robot", "truth", "prior", "gauge", "prefer", "folds")
+"""Keys of a job that say nothing of how a table is read."""
+
+
+def _document(given: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """A job's mapping, for reading tables like its own elsewhere: with its cameras in it, and without its robot."""
+
+    def whole(entry: Mapping[str, Any]) -> dict[str, Any]:
+        camera = entry.get("camera")
+        file = camera.get("file") if isinstance(camera, dict) else camera if camera != "fixed" else None
+        if not isinstance(file, str):
+            return dict(entry)
+        more = {"fixed": True} if isinstance(camera, dict) and camera.get("fixed") else {}
+        return {**entry, "camera": {**read_yaml(folder / file), **more}}
+
+    found = whole({key: value for key, value in given.items() if key not in _OF_THE_ROBOT})
+    if isinstance(found["measurements"], list):
+        found["measurements"] = [whole(entry) for entry in found["measurements"]]
+    return found
+
+
+def read_table_like(
+    document: Mapping[str, Any], robot: Robot, path: Path, *, pairs: Path | None = None, like: str | None = None
+) -> Table:
+    """A table read as a job read one of its own: with its columns, units, noise, model and frame.
+
+    Args:
+        document: The job (see `Job.document`).
+        robot: Its robot.
+        path: The table.
+        pairs: Table of pairs that were measured directly, if the job has one.
+        like: Name of the job's table that it is like; of several the one of the same file name if None.
+
+    Raises:
+        InputError: A file is missing or cannot be used, or it is not clear which table it is like.
+    """
+    given = document["measurements"]
+    entries = given if isinstance(given, list) else [{"table": given, "pairs": document.get("pairs")}]
+    entry = _entry_like(entries, path, like)
+    if (pairs is None) != (entry.get("pairs") is None):
+        found = "no table of pairs" if pairs is None else f"a table of pairs, {pairs.name}"
+        expected = "pairs, as its job has them" if pairs is None else "none, as in its job"
+        raise InputError(path.name, found, expected)
+    alone = {**entry, "table": str(path.absolute()), "pairs": None if pairs is None else str(pairs.absolute())}
+    job = {key: value for key, value in document.items() if key != "pairs"} | {"robot": ".", "measurements": [alone]}
+    file: _JobOfTables = validate(_JobOfTables, job, path.name)
+    (table,) = _tables(file, robot, path)
+    return table
+
+
+def _entry_like(entries: Sequence[Mapping[str, Any]], path: Path, like: str | None) -> Mapping[str, Any]:
+    names = [Path(entry["table"]).name for entry in entries]
+    if like is not None and like not in names:
+        raise InputError("like", f"found {shown(like)}", f"one of {', '.join(names)}", did_you_mean(like, names))
+    wanted = like or path.name
+    if wanted in names:
+        return entries[names.index(wanted)]
+    if len(entries) > 1:
+        raise InputError(path.name, "of none of the names that the job's tables have", ", ".join(names), "see --like")
+    return entries[0]
 
 
 def _tables(file: _JobOfTables, robot: Robot, path: Path) -> list[Table]:

@@ -447,8 +447,43 @@ class Observability(Section):
     with_fixed_known: Observability | None = None
 
 
+class Knowledge(Section):
+    """What rows say of the arm and of what stays with it, linearised at the estimate (see `graph.knowledge`).
+
+    `rows` by the columns of `columns`, those of the arm as in `posterior`, then three of each of `unknowns`.
+    """
+
+    columns: tuple[str, ...]
+    unknowns: tuple[tuple[str, str], ...] = ()
+    at: Annotated[tuple[float, ...], BeforeValidator(_listed)] = ()
+    rows: Annotated[tuple[Annotated[tuple[float, ...], BeforeValidator(_listed)], ...], BeforeValidator(_listed)]
+    right: Annotated[tuple[float, ...], BeforeValidator(_listed)]
+
+
+class Carried(Section):
+    """What the next calibration of this arm takes over.
+
+    `job` is the job without robot, by which tables like its own are read; `noise` the factors on stated sigmas by table
+    and kind, where noise was estimated.
+    """
+
+    job: dict[str, Any] = {}
+    noise: dict[str, dict[str, float]] = {}
+    knowledge: Knowledge | None = None
+
+
+class Previous(Section):
+    """The result that an update came from."""
+
+    sha256: str
+    date: str
+
+
 class Result(Section):
-    """What `result.json` holds; `links` are those of a URDF between which its chain runs, `files` SHA-256 of tables."""
+    """What `result.json` holds; `links` are those of a URDF between which its chain runs, `files` SHA-256 of tables.
+
+    `date` is when the rows were measured, so far as is known; when they were calibrated where nobody said.
+    """
 
     schema_: Literal["fg-calib/result/1", "fg-calib/result/2"] = Field(alias="schema")
     version: str
@@ -500,6 +535,9 @@ class Result(Section):
     versions: dict[str, str] = {}
     files: dict[str, str] = {}
     inputs: dict[str, str]
+    date: str = ""
+    previous: Previous | None = None
+    carried: Carried | None = None
 
 
 def result_schema() -> dict[str, Any]:

@@ -37,6 +37,7 @@ from fg_calib.graph.noise import NoiseState
 from fg_calib.graph.observability import determined
 from fg_calib.graph.problem import (
     Problem,
+    depends,
     frames_only,
     joint_errors,
     mahalanobis_distances,
@@ -303,7 +304,7 @@ def _constant_cost(problem: Problem) -> float:
     if problem.variables.items:
         return 0.0
     at = problem.variables.at(problem.start)
-    return 0.5 * sum(rows.squared_norm(at) for rows in problem.rows if not len(rows.coordinates))
+    return 0.5 * sum(rows.squared_norm(at) for rows in problem.rows if not depends(rows, problem.variables))
 
 
 def _taken_as_it_is(problem: Problem, clock: float) -> Solution:

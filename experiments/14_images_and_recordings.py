@@ -1,6 +1,6 @@
 """Are the sigmas honest of what `fg-calib board` makes of images, and `fg-calib bag` of a recording?
 
-Command: python experiments/15_images_and_recordings.py [--quick] [--seed N] [--draws N] [--out FOLDER]
+Command: python experiments/14_images_and_recordings.py [--quick] [--seed N] [--draws N] [--out FOLDER]
 Takes a minute on one free core.
 
 *Images* are rendered (640 x 480, focal length 620 px, distortion, blur, noise; `tests/boards.py`) from known places,
@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import boards
 import recordings
 
-NAME = "15_images_and_recordings"
+NAME = "14_images_and_recordings"
 CHECKERBOARD = CalibrationBoard("checkerboard", 9, 6, 0.02)
 CHARUCO = CalibrationBoard("charuco", 9, 7, 0.02, 0.014, "DICT_5X5_100")
 

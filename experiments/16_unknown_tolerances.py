@@ -1,6 +1,6 @@
 """Is `tolerance: estimate` as good as knowing how far an arm is off, and never worse than no priors at all?
 
-Command: python experiments/14_unknown_tolerances.py [--quick] [--seed N] [--draws N] [--processes N] [--out FOLDER]
+Command: python experiments/16_unknown_tolerances.py [--quick] [--seed N] [--draws N] [--processes N] [--out FOLDER]
 
 Four arms (UR10 in dh-hayati and as a URDF, the 7R of the paper, a SCARA) are measured as poses in an unknown frame, by
 distances and angles of a star of pairs, or by lengths to three unknown anchors, at 10 or 100 stops. The true errors are
@@ -41,7 +41,7 @@ from fg_calib.simulation.scenario import Errors
 
 Floats = NDArray[np.float64]
 
-NAME = "14_unknown_tolerances"
+NAME = "16_unknown_tolerances"
 SCALES = (0.1, 0.3, 1.0, 3.0, 10.0)
 TRUE = (*map(str, SCALES), "mixed")
 ESTIMATORS = ("estimated", "known", "stated", "none")
