@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from oracle import random_robot
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 from simulated import measure, paper_robot, small_arm, true_robot
 from sparing import diagonal
 from touches import TOLERANCE as TOUCH_TOLERANCE
@@ -19,9 +20,10 @@ from fg_calib.files.tables import read_measurements
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.problem import reweighted_at
 from fg_calib.graph.solver import SolverOptions, solve
-from fg_calib.measurements.dataset import Noise
+from fg_calib.measurements.dataset import Noise, rotation_angle
 from fg_calib.measurements.series import Table
 from fg_calib.options import Pairing
+from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Joint, RobotBuilder
 
 MOST = 15
@@ -227,3 +229,20 @@ def test_touches_and_positions_that_share_joint_noise_arrive_with_robust_losses(
     solution = solve(problem)
     assert solution.message == "converged: less than 3e-07 sigma from the optimum"
     assert solution.iterations < 50
+
+
+@pytest.mark.slow
+def test_angles_about_half_a_turn_converge():
+    """Rows measured beyond it, but for the fold, have their least cost at the kink: there they are whitened anew."""
+    robot, sigma = small_arm(tolerance={"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}), 7e-3
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (20000, robot.n_joints))
+    R = pose(robot, q).rotation
+    off = np.pi - rotation_angle(np.swapaxes(R[:1], 1, 2) @ R)[0]
+    q = q[np.concatenate([[0], np.flatnonzero(off < 3.0 * np.sqrt(2.0) * sigma)[:40]])]
+    for seed in (2, 11, 38):
+        rng = np.random.default_rng(seed)
+        m = measure(true_robot(robot, rng), len(q), rng, sigma=(1e-3, sigma), readings=q)
+        solution = solve(build_problem(robot, m, model="rotation"))
+        assert solution.converged, solution.message
+        assert solution.iterations <= 80
+        assert 2.0 * solution.cost < chi2.ppf(0.999, 40)
