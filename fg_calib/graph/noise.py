@@ -53,11 +53,6 @@ by a derivative that is there only at the estimate; with 1 the NEES of a SCARA's
 MOST_BEND = 1.0
 """A row is bent by no more sigma: what is off by more than that is for the optimum to find, not to be called noise."""
 
-FOLDED_NOISE = 5.0
-"""Sigma of its noise that a vector must be able to be off to end up folded: within less a wrong side costs little, and
-steps find back. Angles 2 to 6 sigma from half a turn that may be off by 3.6 sigma have a NEES of 1, by 7 sigma one
-calibration in ten ends on the wrong side (experiment 08)."""
-
 REDUNDANT = 100.0
 """Factor on what is not linear in pairs that are more than the errors they share: they have nothing else to say there,
 and its distribution is not normal."""
@@ -306,13 +301,13 @@ class PairNoise(RowNoise):
     def may_fold(self, spread: Floats) -> Booleans:
         """Which rows some uncertainty of the parameters may fold, shape (n, residual_dim).
 
-        Half the way to 0, or of an angle to half a turn, is then less than that uncertainty (and this far more than the
+        Half the way to 0, or of an angle to half a turn, is then less than that uncertainty (and this more than the
         noise): the vector may as well point the other way, and a descent may end with the wrong one.
 
         Args:
             spread: A square root of the parameters' covariance, shape (n_columns, k).
         """
-        f, noise, train = self.predicted, FOLDED_NOISE**2 * self._own, np.flatnonzero(~self.series.test)
+        f, noise, train = self.predicted, 4.0 * self._own, np.flatnonzero(~self.series.test)
         folds = np.zeros(f.shape, dtype=np.bool_)
         if not len(train):
             return folds[:, self._parts]
@@ -325,6 +320,12 @@ class PairNoise(RowNoise):
             folds[rows] = across + along > np.maximum(f[rows] ** 2 / 4.0, noise[rows])
             folds[rows, 1] |= along[:, 1] > np.maximum((np.pi - f[rows, 1]) ** 2 / 4.0, noise[rows, 1])
         return folds[:, self._parts]
+
+    def about_half_a_turn(self) -> Booleans:
+        """Which rows are angles nearer to half a turn than to 0, shape (n, residual_dim)."""
+        near = np.stack([np.zeros(self.series.n, dtype=np.bool_), self.predicted[:, 1] > 0.5 * np.pi], axis=1)
+        out: Booleans = near[:, self._parts]
+        return out
 
     @cached_property
     def _poses(self) -> Poses:
