@@ -24,7 +24,7 @@ from fg_calib.measurements.dataset import Noise, rotation_angle
 from fg_calib.measurements.series import Table
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
-from fg_calib.robot.model import Joint, RobotBuilder
+from fg_calib.robot.model import Axis, Element, Joint, RobotBuilder
 
 MOST = 15
 """Steps within which everything here arrives; scipy takes as many."""
@@ -246,3 +246,19 @@ def test_angles_about_half_a_turn_converge():
         assert solution.converged, solution.message
         assert solution.iterations <= 80
         assert 2.0 * solution.cost < chi2.ppf(0.999, 40)
+
+
+def test_a_parameter_of_two_elements_is_calibrated_with_both():
+    """Twists add up: one length along two axes, whose derivative is that of both."""
+    rng = np.random.default_rng(3)
+    robot = small_arm(tolerance={"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3})
+    shared = robot.index("a2")
+    again = Element(Axis.TY, parameter=shared)
+    place = next(i for i, e in enumerate(robot.elements) if e.joint == 2)
+    robot = replace(robot, elements=(*robot.elements[:place], again, *robot.elements[place:]))
+    true = true_robot(robot, rng)
+    found = assess(solve(build_problem(robot, measure(true, 60, rng, sigma=(1e-5, 1e-5)), model="pose")))
+    columns = [robot.index(name) for name in found.names]
+    error = (found.robot.nominal - true.nominal)[columns]
+    assert error @ np.linalg.solve(found.covariance, error) < chi2.ppf(0.9999, len(error))
+    assert found.covariance[columns.index(shared), columns.index(shared)] < 1e-10
