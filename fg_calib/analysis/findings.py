@@ -235,9 +235,11 @@ def _of_kept_noise(solution: Solution, goodness: Goodness) -> list[Statement]:
     if estimated is None:
         return []
     kept = [kind.kind for kind in goodness.kinds if (kind.table, kind.kind) not in estimated]
+    factors = solution.problem.state.factors
+    off = max((factors.get(name, 1.0) for name in estimated), default=1.0) if kept else 1.0
     if has_joint_noise(solution.problem) and JOINT_NOISE not in estimated:
         kept.append("the joint readings")
-    return of_kept_noise(list(dict.fromkeys(kept)), not estimated)
+    return of_kept_noise(list(dict.fromkeys(kept)), not estimated, off)
 
 
 def _of_solver(solution: Solution) -> list[Statement]:
