@@ -1,7 +1,7 @@
 """Which instrument for how many stops: one simulated UR10, measured by every instrument the package knows.
 
 Command: python experiments/12_every_instrument.py [--quick] [--seed N] [--draws N] [--processes N] [--out FOLDER]
-Takes five minutes on one free core; --draws 10 half of that.
+Takes five minutes on one free core; the ledger's --draws 40 twice that.
 
 The same arm (UR10-like, errors and priors of 1 mm and 1 mrad, encoders 0.002 deg) is calibrated from 10, 20, 40 and 80
 stops of each instrument, with noise as such instruments have it (`WAYS`). All that the instrument does not know is

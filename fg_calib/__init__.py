@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from fg_calib.analysis.bounds import Bound, cramer_rao
+    from fg_calib.analysis.check import Check, Explanation
+    from fg_calib.analysis.estimated_tolerances import estimate_tolerances
     from fg_calib.analysis.identifiability import Identifiability, observe_configurations, observe_structure
     from fg_calib.analysis.inspection import Inspection, inspect_job
     from fg_calib.analysis.mistakes import SetupCheck, check_setup
@@ -27,7 +29,9 @@ if TYPE_CHECKING:
     from fg_calib.calibration import Calibration, calibrate, calibrate_job
     from fg_calib.correction import correct
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
+    from fg_calib.exports.export import Export, export
     from fg_calib.files.columns import Column
+    from fg_calib.files.history import History, history_of
     from fg_calib.files.job import read_job
     from fg_calib.files.result import Result, read_result, result_schema
     from fg_calib.files.robot_yaml import read_robot, write_robot
@@ -74,7 +78,10 @@ _HOMES = {
     "fg_calib.calibration": ("Calibration", "calibrate", "calibrate_job"),
     "fg_calib.correction": ("correct",),
     "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
+    "fg_calib.exports.export": ("Export", "export"),
     "fg_calib.files.columns": ("Column",),
+    "fg_calib.analysis.check": ("Check", "Explanation"),
+    "fg_calib.files.history": ("History", "history_of"),
     "fg_calib.files.job": ("read_job",),
     "fg_calib.job": ("Job",),
     "fg_calib.files.result": ("Result", "read_result", "result_schema"),
@@ -93,6 +100,7 @@ _HOMES = {
     "fg_calib.measurements.dataset": ("Measurements", "Noise"),
     "fg_calib.analysis.inspection": ("Inspection", "inspect_job"),
     "fg_calib.analysis.mistakes": ("SetupCheck", "check_setup"),
+    "fg_calib.analysis.estimated_tolerances": ("estimate_tolerances",),
     "fg_calib.analysis.variance_components": ("estimate_noise", "solve_job"),
     "fg_calib.graph.build": ("build_problem", "problem_of"),
     "fg_calib.graph.problem": ("Problem",),
@@ -126,10 +134,14 @@ __all__ = [
     "Calibration",
     "CalibrationError",
     "Camera",
+    "Check",
     "Column",
     "Comparison",
     "Correction",
     "DistanceFactor",
+    "Explanation",
+    "Export",
+    "History",
     "Identifiability",
     "InputError",
     "Inspection",
@@ -168,12 +180,15 @@ __all__ = [
     "correct",
     "cramer_rao",
     "estimate_noise",
+    "estimate_tolerances",
     "expand",
+    "export",
     "fit_least_squares",
     "format_comparison",
     "format_identifiability",
     "format_inspection",
     "format_report",
+    "history_of",
     "inspect_job",
     "inspection_document",
     "levenberg_marquardt_params",

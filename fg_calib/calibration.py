@@ -9,9 +9,13 @@
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from datetime import UTC, datetime
 from functools import cached_property
+from hashlib import sha256
 from numbers import Integral
 from pathlib import Path
 from typing import Any
@@ -20,32 +24,38 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fg_calib.analysis.check import Check, check_rows
 from fg_calib.analysis.covariance import TangentCovariance
 from fg_calib.analysis.folds import cross_validate
+from fg_calib.analysis.new_rows import Calibrated, Rows
 from fg_calib.analysis.residual_table import ResidualTable
 from fg_calib.analysis.uncertainty import FrameEstimate, Uncertainty, assess
+from fg_calib.analysis.update import updated
 from fg_calib.analysis.variance_components import solve_job
 from fg_calib.arguments import checked
 from fg_calib.arrays import as_floats, shape_of
 from fg_calib.errors import InputError, escaped, shown
-from fg_calib.files.disk import exists, is_folder
-from fg_calib.files.job import UNSTATED, read_job
-from fg_calib.files.result import KindGoodness, Parameter, Posterior, Result, read_result
+from fg_calib.files.disk import exists, is_folder, noting_reads
+from fg_calib.files.history import HISTORY, History, Run, history_of, run_of
+from fg_calib.files.job import UNSTATED, read_job, read_table_like
+from fg_calib.files.result import Carried, KindGoodness, Parameter, Posterior, Previous, Result, read_result
+from fg_calib.files.result import Knowledge as SavedKnowledge
 from fg_calib.files.robot_yaml import read_robot
 from fg_calib.graph.factors import Variables, build_variables, frame_of
+from fg_calib.graph.knowledge import SIZE, Knowledge
 from fg_calib.graph.problem import tables_of
 from fg_calib.graph.solver import Solution
 from fg_calib.job import Job
 from fg_calib.measurements.checks import check_readings
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.series import Table
-from fg_calib.options import NEAR, Options, check_flag, check_names, did_you_mean, listed
+from fg_calib.options import NEAR, Options, Pairing, check_flag, check_names, did_you_mean, listed
 from fg_calib.progress import tell
-from fg_calib.report.documents import result_of, write_results
+from fg_calib.report.documents import result_of, write_result
 from fg_calib.report.summary import format_result, html, judged, summary
 from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import forward, precompute_trig
-from fg_calib.robot.model import Robot
+from fg_calib.robot.model import Robot, names_of
 from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
@@ -107,7 +117,7 @@ def calibrate_job(job: Job | Path | str) -> Calibration:
     uncertainty = assess(solution)
     if given.options.folds is not None:
         uncertainty = uncertainty.with_folds(cross_validate(given, given.options.folds), solution)
-    return Calibration.of(solution, uncertainty, given.inputs)
+    return Calibration.of(solution, uncertainty, given.inputs, job=given.document)
 
 
 def _with_first_sigmas(m: Measurements) -> Measurements:
@@ -125,6 +135,10 @@ def _with_first_sigmas(m: Measurements) -> Measurements:
         }
         first["pairs"] = replace(m.pairs, **of_pairs)
     return replace(m, **first)
+
+
+Given = Path | str | Job | Measurements | Table | Sequence[Measurements | Table]
+"""New rows: a table or a job, by its path or in memory."""
 
 
 @dataclass(frozen=True)
@@ -194,24 +208,33 @@ class Calibration:
         result: All that `result.json` holds.
         posterior: The covariance of all parameters in the tangent space of the variables.
         assessed: The solution and its assessment; None of a calibration that was loaded.
+        history: The runs that it came from, itself not among them; of one that was loaded itself the last.
     """
 
     robot: Robot
     result: Result
     posterior: TangentCovariance
     assessed: tuple[Solution, Uncertainty] | None = None
+    history: tuple[Run, ...] = ()
 
     @classmethod
     @checked
-    def of(cls, solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str, str] | None = None) -> Calibration:
+    def of(
+        cls,
+        solution: Solution,
+        uncertainty: Uncertainty,
+        inputs: Mapping[str, str] | None = None,
+        **more: Any,
+    ) -> Calibration:
         """The calibration of a solution and its assessment.
 
         Args:
             solution: The solution.
             uncertainty: Its assessment.
             inputs: SHA-256 of the files it came from, by path.
+            more: The job's document, the date, what it came from: see `report.documents.result_of`.
         """
-        result = result_of(solution, uncertainty, inputs)
+        result = result_of(solution, uncertainty, inputs, **more)
         return cls(uncertainty.robot, result, uncertainty.whole, (solution, uncertainty))
 
     @classmethod
@@ -227,7 +250,8 @@ class Calibration:
         result, folder = read_result(path), Path(path) if is_folder(Path(path)) else Path(path).parent
         robot = _saved_robot(folder, result)
         nominal = robot.with_values([p.nominal for p in result.parameters])  # by its reach columns are scaled
-        return cls(robot, result, _saved_posterior(nominal, result, f"{folder / 'result.json'}: posterior"))
+        posterior = _saved_posterior(nominal, result, f"{folder / 'result.json'}: posterior")
+        return cls(robot, result, posterior, history=history_of(path).runs)
 
     @checked
     def save(self, folder: Path | str) -> None:
@@ -236,7 +260,159 @@ class Calibration:
         Raises:
             InputError: The folder cannot be written, or the calibration was itself loaded from one.
         """
-        write_results(folder, self.solution, self.uncertainty, self.result.inputs)
+        write_result(folder, self.result, self.solution, self.uncertainty, self._history if self.history else None)
+
+    def _history(self, digest: str) -> dict[str, str]:
+        """What is written of the runs that it came from, with itself."""
+        runs = (*self.history, run_of(self.result, digest, self.history[-1]))
+        return {HISTORY: History(robot=self.result.robot, runs=runs).text()}
+
+    @property
+    def runs(self) -> tuple[Run, ...]:
+        """The runs that it came from, and itself."""
+        if self.assessed is None:
+            return self.history
+        digest = sha256(json.dumps(self.result.document()).encode()).hexdigest()
+        return (*self.history, run_of(self.result, digest, self.history[-1] if self.history else None))
+
+    @property
+    def calibrated(self) -> Calibrated:
+        """What is known of the arm, for new rows."""
+        of_result = {p.name: p.prior_sigma for p in self.result.parameters}  # as they were estimated, perhaps
+        nominal = self.posterior.variables.robot
+        nominal = replace(
+            nominal,
+            parameters=tuple(replace(p, tolerance=of_result[p.name] or p.tolerance) for p in nominal.parameters),
+        )
+        values = np.array([p.estimate for p in self.result.parameters])
+        carried = self.result.carried or Carried()
+        known = None
+        if carried.knowledge is not None and not self.result.evaluated_only:
+            known = _saved_knowledge(nominal.with_values(values), carried.knowledge)
+        return Calibrated(nominal, values, self.posterior, known, _saved_options(self.result), carried.noise)
+
+    @checked
+    def check(
+        self,
+        rows: Given,
+        *,
+        limit: float | None = None,
+        limit_angle: float | None = None,
+        pairs: Path | str | None = None,
+        like: str | None = None,
+    ) -> Check:
+        """Whether it is still good by new rows: what `fg-calib check` does.
+
+        Args:
+            rows: A table like the calibration's (a file, or measurements), or a job with several.
+            limit: The largest RMS error of positions, or of distances where there are no others, [m]; those of the
+                job's `accept` if None.
+            limit_angle: The same of orientations, or angles, [rad].
+            pairs: Table of pairs that were measured directly.
+            like: Of which of the job's tables that is, where it has several.
+
+        Raises:
+            InputError: The rows cannot be read, or are of another robot; or the calibration is not to be trusted.
+            ProblemError: The rows lack what their model needs.
+        """
+        self._require_trust()
+        new, _ = self._rows(rows, pairs, like)
+        between = all(table.model not in ("pose", "position", "orientation", "board") for table in new.tables)
+        stated = dict(
+            zip(("distance", "angle") if between else ("position", "orientation"), (limit, limit_angle), strict=True)
+        )
+        stated = {name: figure for name, figure in stated.items() if figure is not None}
+        limits = replace(_saved_options(self.result).accept, **stated)
+        return check_rows(self.calibrated, new, limits)
+
+    @checked
+    def update(
+        self,
+        rows: Given,
+        *,
+        date: str | None = None,
+        growth: Mapping[str, float] | None = None,
+        changed: Sequence[str] = (),
+        anchors_stay: bool = False,
+        pairs: Path | str | None = None,
+        like: str | None = None,
+    ) -> Calibration:
+        """The calibration with new rows added, from its posterior: what `fg-calib update` does.
+
+        Args:
+            rows: A table like the calibration's (a file, or measurements), or a job with several.
+            date: When they were measured, such as 2026-03-01; now if None.
+            growth: 1 sigma by which parameters wander in a day, by name or kind, [m] and [rad]; as the root of days.
+            changed: Parameters, or zeros of joints, that have changed since: nothing is taken over of them.
+            anchors_stay: Whether anchors of the same name are where they were.
+            pairs: Table of pairs that were measured directly.
+            like: Of which of the job's tables that is, where it has several.
+
+        Raises:
+            InputError: The rows cannot be read, or are of another robot; the calibration is not to be trusted or holds
+                nothing to go on from; or there is no such parameter.
+            ProblemError: The rows lack what their model needs, or do not suffice.
+            SolverError: GTSAM could not solve a step at all.
+        """
+        self._require_trust()
+        history = self.runs
+        new, before = _date(date), history[-1]
+        growth = {} if growth is None else growth
+        days = _days(before.date, new) if growth else 0.0
+        table, inputs = self._rows(rows, pairs, like)
+        before_now = {digest for run in history for digest in run.inputs.values()}
+        sources = {one.measurements.source.partition(", station ")[0] for one in table.tables}
+        for name, file_digest in inputs.items():
+            if Path(name).name in sources and file_digest in before_now:
+                raise InputError(name, "its rows are in the calibration already", "new rows")
+        found = updated(
+            self.calibrated,
+            table,
+            growth={name: size * float(np.sqrt(days)) for name, size in growth.items()},
+            changed=listed("changed", changed),
+            anchors_stay=anchors_stay,
+        )
+        job = {} if self.result.carried is None else self.result.carried.job
+        previous = Previous(sha256=before.sha256, date=before.date)
+        made = Calibration.of(found, assess(found), inputs, job=job, date=new, previous=previous)
+        return replace(made, history=history)
+
+    def _require_trust(self) -> None:
+        if not self.trustworthy:
+            reason = (*self.findings, self.result.solver.message)[0]
+            raise InputError(self.result.robot, f"the calibration is not to be trusted: {reason}", "one that is")
+
+    def _rows(self, given: Given, pairs: Path | str | None, like: str | None) -> tuple[Rows, dict[str, str]]:
+        """New rows, understood as the calibration's own, and SHA-256 of the files that they are from.
+
+        Raises:
+            InputError: They are of another robot, or cannot be read.
+        """
+        options, robot = _saved_options(self.result), self.posterior.variables.robot
+        if isinstance(given, Path | str) and Path(given).suffix.lower() not in (".yaml", ".yml"):
+            path, of_pairs = Path(given), None if pairs is None else Path(pairs)
+            job = {} if self.result.carried is None else self.result.carried.job
+            if not job:
+                found = "the calibration does not say how its tables were read"
+                raise InputError(path.name, found, "a job that names the table")
+            with noting_reads() as files:
+                table = read_table_like(job, robot, path, pairs=of_pairs, like=like)
+            inputs = {file.name: digest for file, digest in files.items()}
+            return Rows.of([table], [like or path.name], options), inputs
+        if pairs is not None or like is not None:
+            raise InputError("pairs" if pairs else "like", "given beside rows that say it themselves", "none")
+        new, inputs = given, {}
+        if isinstance(new, Path | str):
+            new = read_job(new)
+        if isinstance(new, Job):
+            if names_of(new.robot.parameters) != names_of(robot.parameters) or new.robot.convention != robot.convention:
+                expected = f"that of the result, {robot.name}"
+                raise InputError(str(new.path or "job"), f"the robot {new.robot.name}", expected)
+            inputs, new = new.inputs, new.tables
+        tables = tables_of(new, options)
+        for one in tables:
+            check_readings(one.measurements.readings, robot, one.measurements.source)
+        return Rows.of(tables, [one.measurements.source for one in tables], options), inputs
 
     @property
     def solution(self) -> Solution:
@@ -414,6 +590,68 @@ def _saved_posterior(robot: Robot, result: Result, place: str) -> TangentCovaria
     if saved.variables != wanted or len(saved.covariance) != n or any(len(row) != n for m in matrices for row in m):
         raise InputError(place, "other variables than the robot and the covariance have", f"{n} columns of them")
     return TangentCovariance(variables, parameters, *(_array(matrix, n) for matrix in matrices))
+
+
+def _saved_options(result: Result) -> Options:
+    """The options of a result, its folds not among them."""
+    given = {name: value for name, value in result.options.items() if name in {f.name for f in fields(Options)}}
+    words = str(given.get("pairing", "star")).partition(" ")
+    pairing = Pairing("star") if words[0] not in ("chain", "all") else Pairing(words[0])  # type: ignore[arg-type]
+    if drawn := re.fullmatch(r"random \((\d+), seed (\d+)\)", str(given.get("pairing"))):
+        pairing = Pairing("random", int(drawn[1]), int(drawn[2]))
+    accept = given.get("accept") or {}
+    return Options.of(**{**given, "pairing": pairing, "accept": accept, "folds": None})
+
+
+def _saved_knowledge(robot: Robot, saved: SavedKnowledge) -> Knowledge:
+    """What was saved of what rows say.
+
+    Raises:
+        InputError: It is of another robot, or damaged.
+    """
+    found = Knowledge(
+        robot=robot,
+        unknowns=saved.unknowns,
+        at=np.array(saved.at, dtype=np.float64),
+        rows=_array(saved.rows, len(saved.columns) + len(saved.at)),
+        right=np.array(saved.right, dtype=np.float64),
+    )
+    sizes = len(saved.at) == SIZE * len(saved.unknowns) and len(saved.right) == len(saved.rows)
+    if found.variables.names != saved.columns or not sizes:
+        raise InputError(
+            "result.json: carried", "knowledge of other parameters than those estimated", "that of one run"
+        )
+    return found
+
+
+def _date(given: str | None) -> str:
+    """A date as it is written; now if None.
+
+    Raises:
+        InputError: It is none.
+    """
+    if given is None:
+        return datetime.now(UTC).isoformat(timespec="seconds")
+    try:
+        return datetime.fromisoformat(given).isoformat()
+    except ValueError:
+        raise InputError("date", f"found {shown(given)}", "a date such as 2026-03-01") from None
+
+
+def _days(before: str, now: str) -> float:
+    """Days from one date to another.
+
+    Raises:
+        InputError: The first is not known, or after the other.
+    """
+    if not before:
+        raise InputError("growth", "the calibration has no date", "one that this version of fg-calib wrote")
+    dates = [datetime.fromisoformat(date) for date in (before, now)]
+    first, second = (d if d.tzinfo else d.replace(tzinfo=UTC) for d in dates)
+    days = (second - first).total_seconds() / 86400.0
+    if days < 0.0:
+        raise InputError("date", f"{now} is before the calibration, {before}", "a later one")
+    return days
 
 
 def _posterior_of_names(robot: Robot, parameters: Floats, result: Result) -> TangentCovariance:

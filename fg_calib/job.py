@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from fg_calib.arguments import check_fields
 from fg_calib.arrays import Brief
@@ -24,6 +25,7 @@ class Job(Brief):
         options: Every choice.
         truth: The robot as it truly is, known from a simulation; None where it is not.
         inputs: SHA-256 of every file read, by its path relative to the job.
+        document: The job as its file has it, without its robot, and with its cameras in it.
     """
 
     path: Path | None
@@ -32,6 +34,7 @@ class Job(Brief):
     options: Options
     truth: Robot | None = None
     inputs: dict[str, str] = field(default_factory=dict)
+    document: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_fields(self, "job")

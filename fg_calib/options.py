@@ -46,7 +46,10 @@ EncoderNoise = Literal["propagated", "estimated"]
 Loss = Literal["none", "huber", "cauchy", "geman-mcclure", "gnc"]
 """What becomes of large residuals: least squares, or a robust loss."""
 
-LengthUnit = Literal["m", "cm", "mm", "um"]
+SharedScale = Literal["kind", "joint"]
+"""Whether the tolerances of a kind of parameters, or those of a joint, are off by the same factor."""
+
+LengthUnit = Literal["m", "cm", "mm", "um", "in"]
 AngleUnit = Literal["rad", "deg", "mrad"]
 
 MODELS: tuple[Model, ...] = get_args(Model)
@@ -311,6 +314,8 @@ class Options:
             the true joint values of every configuration are estimated too, with the readings as their priors.
         loss: What becomes of large residuals: `none` or a robust loss (see `graph.robust`).
         estimate_noise: Whether the sigmas stated are only a start, and scaled to what is seen.
+        estimate_tolerance: Whether the robot's tolerances are only a start, and scaled to the corrections seen: one
+            scale for each kind of parameters, or each joint; None if they are taken as stated.
         max_iterations: Steps after which the solver gives up; None for its default.
         accept: How large errors may be where rows are held out; by name (`{"position": 5e-4}`) as well.
         folds: Into how many folds configurations are dealt for cross-validation; None for none.
@@ -328,6 +333,7 @@ class Options:
     encoder: EncoderNoise = "propagated"
     loss: Loss = "none"
     estimate_noise: bool = False
+    estimate_tolerance: SharedScale | None = None
     max_iterations: int | None = None
     accept: Limits = field(default_factory=Limits)
     folds: int | None = None
@@ -337,6 +343,11 @@ class Options:
         set_checked(self, pair_errors=PairErrors, encoder=EncoderNoise, loss=Loss)
         as_hinted("pairing", self.pairing, Pairing)
         check_flag("estimate_noise", self.estimate_noise)
+        if self.estimate_tolerance is not None:
+            set_checked(self, estimate_tolerance=SharedScale)
+            if self.gauge != "prior":
+                found = f"to be estimated beside gauge: {self.gauge}"
+                raise InputError("tolerance", found, "gauge: prior, the scale of which it is")
         if self.max_iterations is not None:
             check_number("max_iterations", self.max_iterations, above=True, whole=True)
         object.__setattr__(self, "accept", Limits.given(self.accept))

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from hashlib import sha256
 from pathlib import Path
 
 from fg_calib.arguments import checked
 from fg_calib.calibration import Calibration
-from fg_calib.errors import InputError
-from fg_calib.files.disk import exists, is_folder, read_bytes
-from fg_calib.files.saved import read_configurations, read_residuals
+from fg_calib.files.disk import is_folder
+from fg_calib.files.saved import read_configurations, read_residuals, require_unchanged
 from fg_calib.report.page.figures import figures_of
 from fg_calib.report.page.page import write_figures, write_page
 from fg_calib.report.page.run import Run, written_at
@@ -23,9 +21,7 @@ def load_run(path: Path | str) -> Run:
     """
     found = Calibration.load(path)
     folder = Path(path) if is_folder(Path(path)) else Path(path).parent
-    for name, digest in found.result.files.items():
-        if exists(folder / name) and sha256(read_bytes(folder / name)).hexdigest() != digest:
-            raise InputError(str(folder / name), "changed, or of another calibration", "the files of one calibration")
+    require_unchanged(folder, found.result.files)
     return Run(
         folder=folder.absolute(),
         result=found.result,

@@ -41,6 +41,7 @@ FOLDERS = (
         "calibration",
         "correction",
         "pages",
+        "exports",
         "cli",
     ),
 )

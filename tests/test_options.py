@@ -144,7 +144,7 @@ MISTAKES = {
                                "number not below 0"),
     "a structural seed": (lambda: structure(seed=0.5), "seed: found 0.5, expected a whole number not below 0"),
     "a simulation's seed": (lambda: simulate(scenario(), 1.0), "seed: found 1.0, expected a whole number not below 0"),
-    "a unit of length": (lambda: Units(length="MM"), "units: length: found 'MM', expected one of m, cm, mm, um; "
+    "a unit of length": (lambda: Units(length="MM"), "units: length: found 'MM', expected one of m, cm, mm, um, in; "
                          "did you mean mm?"),
     "a unit of angle": (lambda: Units(angle="degrees"), "units: angle: found 'degrees', expected one of rad, deg, "
                         "mrad; did you mean deg?"),

@@ -23,6 +23,10 @@ LEAST = 5
 """Measurements that must have been held out for a limit to be judged by them."""
 
 
+_NAMED = 3
+"""Measurements that a reason names."""
+
+
 @dataclass(frozen=True)
 class Judgement:
     """One limit, and what the held-out rows say of it.
@@ -34,7 +38,7 @@ class Judgement:
         noise: RMS noise stated of these rows.
         n: Number of measurements held out.
         verdict: Whether the arm keeps to it.
-        reason: Why that was not evaluated; empty where it was.
+        reason: Why that was not evaluated, or which few measurements alone are why it failed; empty otherwise.
         table: Which table it is of; empty where there is one alone.
     """
 
@@ -104,13 +108,23 @@ def _judge(kind: str, table: str, limit: float, held: HeldOut | None, findings: 
     def judgement(verdict: Verdict, reason: str = "") -> Judgement:
         return Judgement(kind, limit, held.after, held.noise, held.n, verdict, reason, table)
 
-    if held.n < LEAST:
-        return judgement("not evaluated", f"fewer than {LEAST} were held out")
-    if held.few:
-        return judgement("not evaluated", "frame, base or tool were fitted to these rows, which are too few for that")
+    few = "frame, base or tool were fitted to these rows, which are too few for that" if held.few else ""
+    few = few if held.n >= LEAST else f"fewer than {LEAST} were held out"
+    if few:
+        return judgement("not evaluated", few)
+    if held.after > limit and held.after**2 - held.noise**2 <= limit**2:
+        return judgement("not evaluated", "the noise of the measurements hides it")
     if held.after > limit:
-        hidden = held.after**2 - held.noise**2 <= limit**2
-        return judgement("not evaluated", "the noise of the measurements hides it") if hidden else judgement("fail")
+        return judgement("fail", _because_of(held) if held.rest <= limit else "")
     if findings or not np.isfinite(held.after):
         return judgement("not evaluated", "within the limit, but the result is not to be trusted")
     return judgement("pass")
+
+
+def _because_of(held: HeldOut) -> str:
+    """That few measurements alone are why a limit is not kept."""
+    several = len(held.far) > 1
+    them, are = ("them", "are") if several else ("it", "is")
+    more = len(held.far) - _NAMED
+    names = ", ".join(held.far[:_NAMED]) + (f" and {more} more" if more > 0 else "")
+    return f"within the limit without {names}, which {are} far off beside the others: look at {them}"

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.analysis.covariance import Spread, TangentCovariance
+from fg_calib.analysis.seen import Seen
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements.gathering import Dataset
 from fg_calib.robot.kinematics import forward, precompute_trig
@@ -55,6 +56,7 @@ class ExpectedError:
         at: Whether at the test configurations, or at the train ones for want of these.
         n: Number of configurations looked at.
         of: Number that there are.
+        relative: Whether nothing measured says where the base is, so that `fitted` alone tells of the measurements.
     """
 
     base: PoseRms
@@ -62,6 +64,7 @@ class ExpectedError:
     at: Literal["test", "train"]
     n: int
     of: int
+    relative: bool = False
 
 
 def expected_error(solution: Solution, spread: Spread) -> ExpectedError:
@@ -75,7 +78,8 @@ def expected_error(solution: Solution, spread: Spread) -> ExpectedError:
     there, at = judged_configurations(data)
     chosen = there[np.unique(np.linspace(0, len(there) - 1, MOST).round().astype(np.int64))]
     base, fitted = errors_at(spread, data.readings[chosen])
-    return ExpectedError(base, fitted, at, len(chosen), len(there))
+    relative = Seen.by(data.tables).blind_to_base
+    return ExpectedError(base, fitted, at, len(chosen), len(there), relative)
 
 
 def judged_configurations(data: Dataset) -> tuple[Integers, Literal["test", "train"]]:

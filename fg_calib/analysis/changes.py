@@ -68,7 +68,9 @@ def find_change(solution: Solution) -> Change | None:
         It is looked for in one table of poses, positions or orientations, without robust losses.
     """
     problem, state = solution.problem, solution.problem.state
-    other = problem.data.unknowns.names or problem.added or state.weights is not None or state.joint_errors is not None
+    other = (
+        problem.data.unknowns.names or problem.has_more or state.weights is not None or state.joint_errors is not None
+    )
     pairs = any(part.block.kind.ends != 1 for rows in problem.rows for part in rows.parts)
     several = len(problem.data.tables) > 1 or any(rows.shared is not None for rows in problem.rows)
     if other or pairs or several or problem.n_residuals > MAX_ROWS:

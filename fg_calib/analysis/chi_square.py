@@ -59,7 +59,14 @@ def chi_square(solution: Solution, spread: Spread) -> ChiSquare:
     """
     problem = solution.problem
     chi2, n_rows, of_loss = _weighted_chi2(solution)
-    dof = n_rows + problem.n_priors + problem.n_added - spread.rank - eliminated(problem, solution.parameters).rank
+    dof = (
+        n_rows
+        + problem.n_priors
+        + problem.n_added
+        + problem.n_known
+        - spread.rank
+        - eliminated(problem, solution.parameters).rank
+    )
     expected = max(0.0, dof - spread.excess - (1.0 - of_loss) * n_rows)
     independent = _independent_dof(problem, dof, spread.rank)
     p_value = _p_value(solution, chi2, expected, independent)

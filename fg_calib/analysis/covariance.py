@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.factors import Variables, prior_rows
 from fg_calib.graph.information import correlation, whitened_triangle
-from fg_calib.graph.observability import RANK_TOLERANCE, SUPPORT_TOLERANCE, determined
+from fg_calib.graph.observability import RANK_TOLERANCE, SIGNAL_FLOOR, SUPPORT_TOLERANCE, determined
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
 from fg_calib.robot.model import Robot
@@ -126,7 +126,8 @@ class Spread(TangentCovariance):
 def spread_of(solution: Solution) -> Spread:
     """The covariance: that of the weighted least-squares estimate under the noise as it is taken to be.
 
-    Parameters that were left out to fix the gauge count as known; see `with_left_out`.
+    Parameters that were left out to fix the gauge count as known; see `with_left_out`. Where nothing determines frames,
+    what follows them as they are held is in it: see `_held`.
 
     Where rows share errors but are asked to count as independent, with H = J^T J and C their covariance, the `actual`
     one is H^-1 (J^T C J) H^-1 (priors are rows of their own). The mean of chi-square, tr C - tr(H^-1 J^T C J), is then
@@ -147,19 +148,40 @@ def spread_of(solution: Solution) -> Spread:
     _, directions_nominal, rank_nominal = (
         found if solution.before is solution.parameters else decomposed(solution.before)
     )
+    held = _held(directions[rank:], directions_nominal[rank_nominal:], scales, variables.n_robot_columns)
     half = directions[:rank].T / s[:rank]
     added = correlation(problem, solution.parameters)
     middle = np.zeros((rank, rank)) if added is None else half.T @ added @ half
     return Spread(
         variables=variables,
         parameters=solution.parameters,
-        tangent=half @ half.T,
-        actual=half @ (np.eye(rank) + middle) @ half.T,
+        tangent=half @ half.T + held @ held.T,
+        actual=half @ (np.eye(rank) + middle) @ half.T + held @ held.T,
         loose=_orthonormal(directions[rank:], variables.scales),
         loose_at_nominal=_orthonormal(directions_nominal[rank_nominal:], variables.scales),
         rank=rank,
         excess=float(np.trace(middle)),
     )
+
+
+def _held(loose: Floats, loose_at_nominal: Floats, scales: Floats, n_robot: int) -> Floats:
+    """Errors of frames that nothing determines, with what follows them; shape (n_columns, k).
+
+    No nominal value says where frames are: they stay where they were started. Where nothing at nominal determines one
+    in some direction (the height of a SCARA's frame and targets, its axes being parallel), the angles that were
+    corrected make other parameters depend on it. It may be off by what is the least that counts as undetermined.
+
+    Args:
+        loose: Undetermined directions at the estimate, shape (n, n_columns), orthonormal in units of `scales`.
+        loose_at_nominal: The same at the nominal parameters.
+        scales: Of the columns, shape (n_columns,).
+        n_robot: How many columns, the first ones, are the robot's.
+    """
+    at_nominal, here = loose_at_nominal / scales, loose / scales
+    U, s, _ = np.linalg.svd(at_nominal[:, :n_robot])
+    of_frames = U[:, np.append(s, np.zeros(len(U) - len(s))) <= SUPPORT_TOLERANCE].T @ at_nominal
+    turned: Floats = of_frames @ here.T @ here
+    return (turned * scales).T / SIGNAL_FLOOR
 
 
 def with_left_out(solution: Solution, spread: Spread) -> Spread:
@@ -190,6 +212,19 @@ def with_left_out(solution: Solution, spread: Spread) -> Spread:
         loose=loose(spread.loose, M, errors),
         loose_at_nominal=loose(spread.loose_at_nominal, M_nominal, errors_nominal),
     )
+
+
+def with_unsure_tolerances(solution: Solution, spread: Spread) -> Spread:
+    """The covariance with what it adds that tolerances were estimated, and are not known; the same where they are.
+
+    Args:
+        solution: The solution.
+        spread: That with the tolerances taken as known.
+    """
+    scales = solution.estimated_tolerances
+    if scales is None:
+        return spread
+    return replace(spread, tangent=spread.tangent + scales.unsure, actual=spread.actual + scales.unsure)
 
 
 def _errors(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:

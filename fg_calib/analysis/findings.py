@@ -34,6 +34,7 @@ from fg_calib.analysis.verdict import (
     of_priors,
     of_structure,
     of_test,
+    of_tolerances,
 )
 from fg_calib.graph.noise import JOINT_NOISE, PairNoise
 from fg_calib.graph.problem import at_parameters, noises_at
@@ -127,6 +128,7 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
         *_of_kept_noise(solution, fit.goodness),
         *of_test(fit.goodness.test, fit.chi2.ratio, problem.end_names),
         *of_priors(fit.priors),
+        *_of_tolerances(solution, fit),
         *_of_bent_rows(solution, spread, fit.table, fit.goodness, too_large=fit.chi2.too_large),
         *_of_noise(solution, fit.table, fit.goodness),
     ]
@@ -157,6 +159,12 @@ def _too_large(fit: Fit) -> bool:
     return rest > max(fit.chi2.bounds[1] * dof, 0.0) or any(
         kind.verdict in ("too small", "both", "many") for kind in fit.goodness.kinds
     )
+
+
+def _of_tolerances(solution: Solution, fit: Fit) -> list[Statement]:
+    """What tolerances that were estimated say."""
+    found = solution.estimated_tolerances
+    return [] if found is None else of_tolerances(found.scales, _too_large(fit))
 
 
 def _of_bent_rows(

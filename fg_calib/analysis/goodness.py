@@ -291,6 +291,11 @@ class Goodness(FrozenArrays):
     test: PredictedFit | None
     gross: GrossErrors | None = None
 
+    def unknown(self, table: ResidualTable) -> Booleans:
+        """Predicted rows that depend on what neither data nor priors determine, shape (n,)."""
+        found: Booleans = table.test & (table.reason_code == 0) & ~np.isfinite(self.leverage)
+        return found
+
     @property
     def spoilt(self) -> bool:
         """Whether a few gross errors are all that is wrong with the fit."""
@@ -498,7 +503,7 @@ class _Rows:
         if self._robust or not self._carried or self._errors is None:
             return None
         unknowns = self._spread.rank + self._errors.own.shape[1]
-        dof = problem.n_independent + problem.n_priors + problem.n_added - unknowns
+        dof = problem.n_independent + problem.n_priors + problem.n_added + problem.n_known - unknowns
         z = self._table.after[rows] / self._table.sigma[rows]
         found = find_gross_errors(
             z,

@@ -6,8 +6,8 @@ cautions are what its reader should know, as in the verdict on a calibration.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -172,7 +172,8 @@ def inspect_job(job: Job) -> Inspection:
         cautions=(),
     )
     findings, cautions = _judged(found, job, setups)
-    return replace(found, findings=findings, cautions=cautions)
+    limits = _of_limits(found, job, {name.partition(".")[0] for s in problem.data.series for name in s.kind.names})
+    return replace(found, findings=(*findings, *limits), cautions=cautions)
 
 
 def _of_set_up(
@@ -226,7 +227,8 @@ def _judged(found: Inspection, job: Job, setups: list[SetupCheck]) -> tuple[tupl
         elif check.far and check.table not in suspicious:
             cautions.append(str(check))
     if found.disagreements.found:
-        (findings if job.options.loss == "none" else cautions).append(_of_disagreements(found.disagreements, job))
+        robust = job.options.loss != "none" and not any(one.test for one in found.disagreements.found)
+        (cautions if robust else findings).append(_of_disagreements(found.disagreements, job))
     findings += _of_figures(found)
     cautions += map(str, found.identifiability.missing)
     cautions += _of_readings(found, job)
@@ -252,7 +254,14 @@ def _of_disagreements(found: Disagreements, job: Job) -> str:
     of = "" if many_tables or not first.table else f" of {first.table}"
     what = f"{count} with the arm as drawn far more than the others do ({who}{of})"
     them = "them" if several else "it"
-    return what + (f": look at {them}, or let a robust loss do so (loss: gnc)" if job.options.loss == "none" else "")
+    tested = sum(one.test for one in found.found)
+    advice = f"look at {them}"
+    if tested < len(found.found) and job.options.loss == "none":
+        advice += ", or let a robust loss do so (loss: gnc)"
+    if tested:
+        rows = "a test row" if not several else "test rows" if tested == len(found.found) else f"{tested} are test rows"
+        advice += f"; {rows}: no loss acts on what is held out"
+    return f"{what}: {advice}" if tested or job.options.loss == "none" else what
 
 
 def _of_figures(found: Inspection) -> Iterator[str]:
@@ -265,6 +274,23 @@ def _of_figures(found: Inspection) -> Iterator[str]:
         yield "these rows determine none of the parameters that are estimated"
     if found.dof <= 0:
         yield "no degree of freedom is left: nothing would say whether the fit is right, or the noise; measure more"
+
+
+def _of_limits(found: Inspection, job: Job, kinds: Collection[str]) -> Iterator[str]:
+    """Limits that would not be evaluated, whatever the arm is like.
+
+    Args:
+        found: What was found of the tables.
+        job: The job.
+        kinds: What its tables measure.
+    """
+    stated = [f.name for f in fields(job.options.accept) if getattr(job.options.accept, f.name) is not None]
+    for kind in stated:
+        if kind not in kinds:
+            yield f"accept: nothing in this job measures any {kind}: its limit cannot be evaluated"
+    held_out = job.options.folds is not None or any(table.n_test or table.n_test_pairs for table in found.tables)
+    if not (held_out or found.evaluated) and any(kind in kinds for kind in stated):
+        yield "accept: limits are judged by what is held out, and nothing is: add test rows (column split), or folds"
 
 
 def _of_readings(found: Inspection, job: Job) -> Iterator[str]:
@@ -300,6 +326,8 @@ def _of_table(t: TableSurvey) -> Iterator[str]:
 def _of_noise(found: Inspection, job: Job) -> Iterator[str]:
     if job.options.estimate_noise:
         yield "noise is to be estimated: sigmas and accuracy here are for noise as stated, or 1 mm and 1 mrad"
+    if job.options.estimate_tolerance:
+        yield "tolerances are to be estimated: accuracy here is for those stated, or 1 mm and 1 mrad"
     unseen = [t.name for t, check in zip(found.tables, found.setups, strict=False) if not check.residuals]
     if unseen and len(found.setups) == len(found.tables):
         yield f"{_listed(unseen)}: too few rows to look for the usual mistakes (units, signs, columns) before solving"

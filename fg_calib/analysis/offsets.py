@@ -38,7 +38,7 @@ def forgotten_offsets(solution: Solution) -> tuple[Offset, ...]:
     """Offsets that were not estimated and are no chance; none with robust losses, or of more rows than `MAX_ROWS`."""
     problem = solution.problem
     tables = [k for k, table in enumerate(problem.data.tables) if table.model == "anchor" and not table.offset]
-    if not tables or problem.n_residuals > MAX_ROWS or problem.state.weights is not None or problem.added:
+    if not tables or problem.n_residuals > MAX_ROWS or problem.state.weights is not None or problem.has_more:
         return ()
     at, found = at_parameters(problem, solution.parameters), []
     column = at.n_columns + at.n_nuisance

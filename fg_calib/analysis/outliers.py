@@ -46,7 +46,7 @@ def judged_without_gross_errors(solution: Solution, spread: Spread, table: Resid
     """
     robust = solution.problem.state.weights is not None or solution.estimated_noise is not None
     spoilt = any(kind.verdict not in FINE for kind in fit.kinds)
-    if robust or not spoilt or solution.problem.evaluated or solution.problem.added or table.n > MAX_ROWS:
+    if robust or not spoilt or solution.problem.evaluated or solution.problem.has_more or table.n > MAX_ROWS:
         return fit
     found = _fit_without(solution, table, (solution, spread, table))
     if found is None or not _fits(found[2]):

@@ -7,19 +7,17 @@ Where no check succeeds the reason is `NO_CAUSE`, never a guess.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.analysis.absorbed import Absorbed
+from fg_calib.analysis.seen import SEES_ORIENTATION, SEES_POSITION, Seen
 from fg_calib.graph.elsewhere import elsewhere
 from fg_calib.graph.information import named_triangle
 from fg_calib.graph.observability import Observability
 from fg_calib.graph.problem import Problem
-from fg_calib.measurements.series import Table
-from fg_calib.options import PAIR_MODELS, FrameKnowledge, Model
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
 from fg_calib.robot.model import Parameter
@@ -29,10 +27,6 @@ Floats = NDArray[np.float64]
 NO_CAUSE = "no simple cause found"
 NOT_EXCITED = "not excited by these configurations"
 BASE = "the measurement is blind to the base: the whole arm moves as one body"
-
-PLACES: tuple[Model, ...] = ("anchor", "plane", "board", "pixels")
-SEES_POSITION: tuple[Model, ...] = ("pose", "position", "distance", "distance-rotation", *PLACES)
-SEES_ORIENTATION: tuple[Model, ...] = ("pose", "orientation", "rotation", "distance-rotation", "board", "pixels")
 
 _NOTHING = 1e-7
 """A motion below this part of what its members do one by one is none: relations are rounded to nine digits."""
@@ -57,7 +51,7 @@ def explain(problem: Problem, observability: Observability, parameters: Floats) 
     if not lost:
         return ()
     tables = problem.data.tables
-    motion = _Motion(problem, parameters, _Seen.by(tables))
+    motion = _Motion(problem, parameters, Seen.by(tables))
     directions = np.array([[relation.get(name, 0.0) for name in observability.names] for relation in lost]).T
     absorbed, anywhere = Absorbed(problem, parameters, directions), elsewhere(problem, parameters)
     # What kinds of one's own would show elsewhere is not known.
@@ -77,51 +71,10 @@ def explain(problem: Problem, observability: Observability, parameters: Floats) 
     return tuple(LostDirection(relation, reason(k, directions[:, k])) for k, relation in enumerate(lost))
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """What tables together see of the tool's motion; other kinds may see anything, in any frame.
-
-    Attributes:
-        views: Models with the knowledge of their frames, each once.
-        own: Whether there are measurements of other kinds.
-    """
-
-    views: tuple[tuple[Model, FrameKnowledge], ...]
-    own: bool
-
-    @classmethod
-    def by(cls, tables: Sequence[Table]) -> _Seen:
-        """By tables."""
-        views = [
-            (t.model, "unknown" if t.unknown_frame or (t.model in PLACES and not t.known) else "known")
-            for t in tables
-            if t.model is not None
-        ]
-        return cls(tuple(dict.fromkeys(views)), any(t.own for t in tables))  # type: ignore[arg-type]
-
-    def any_of(self, models: Sequence[Model]) -> bool:
-        """Whether a model is among these, or might be."""
-        return self.own or any(model in models for model, _ in self.views)
-
-    @property
-    def pairs(self) -> bool:
-        """Whether all that is measured is between configurations."""
-        return not self.own and all(model in PAIR_MODELS for model, _ in self.views)
-
-    def relative(self, models: Sequence[Model]) -> bool:
-        """Whether what tables of these models see does not say where the base is."""
-        return all(
-            model in PAIR_MODELS or frame == "unknown" for model, frame in self.views if self.own or model in models
-        )
-
-    def __str__(self) -> str:
-        return " and ".join(dict.fromkeys(model for model, _ in self.views))
-
-
 class _Motion:
     """What a problem's parameters do to the tool at random configurations."""
 
-    def __init__(self, problem: Problem, parameters: Floats, seen: _Seen) -> None:
+    def __init__(self, problem: Problem, parameters: Floats, seen: Seen) -> None:
         robot = problem.robot.with_values(parameters[problem.variables.robot_span])
         self._parameters = problem.estimated
         self._seen = seen

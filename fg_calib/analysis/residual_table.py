@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
+from fg_calib.analysis.gross_errors import CHANCE, MOST_FEW
 from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.problem import noises_at
 from fg_calib.graph.solver import Solution
@@ -53,6 +55,8 @@ class HeldOut:
         after: With the calibrated arm.
         noise: Of the noise stated.
         few: Whether they are few for the frame, base or tool that were fitted to them.
+        far: Names of the few that are far off beside the others, the farthest first; empty if none is.
+        rest: With the calibrated arm, without those.
     """
 
     n: int
@@ -60,6 +64,8 @@ class HeldOut:
     after: float
     noise: float
     few: bool = False
+    far: tuple[str, ...] = ()
+    rest: float = np.nan
 
 
 _ROWS_PER_UNKNOWN = 10
@@ -69,11 +75,14 @@ _ROWS_PER_UNKNOWN = 10
 def pooled(parts: Sequence[HeldOut]) -> HeldOut:
     """Several together."""
     n = np.array([part.n for part in parts])
+    near = n - [len(part.far) for part in parts]
 
-    def rms(of: str) -> float:
+    def rms(of: str, n: NDArray[np.int64] = n) -> float:
         return float(np.sqrt(n @ np.array([getattr(part, of) for part in parts]) ** 2 / n.sum()))
 
-    return HeldOut(int(n.sum()), rms("before"), rms("after"), rms("noise"), any(part.few for part in parts))
+    far = tuple(dict.fromkeys(name for part in parts for name in part.far))
+    few = any(part.few for part in parts)
+    return HeldOut(int(n.sum()), rms("before"), rms("after"), rms("noise"), few, far, rms("rest", near))
 
 
 @dataclass(frozen=True)
@@ -198,7 +207,7 @@ class ResidualTable(FrozenArrays):
         family, counted = self.family, self.reason_code == 0
         if table is not None:
             counted = counted & np.isin(self.group, [k for k, (number, _) in enumerate(self.groups) if number == table])
-        first = self._is_first_of_family()
+        first = self.is_first_of_family()
         for code, split in enumerate(("train", "test")):
             of_split = counted & (self.split == code)
             for k, name in enumerate(self.families):
@@ -221,7 +230,7 @@ class ResidualTable(FrozenArrays):
             Rows, shape (n,); sum of squares in sigma, shape (n,); by kind of noise the RMS of the length of a
             measurement's rows at the estimate, shape (n,), nan where there are none.
         """
-        counted, first = self.reason_code == 0, self._is_first_of_family()
+        counted, first = self.reason_code == 0, self.is_first_of_family()
         ends = [(end, counted & (end >= 0) & (end < n)) for end in (self.a, self.b)]
 
         def summed(values: Floats, of: Booleans) -> Floats:
@@ -245,17 +254,46 @@ class ResidualTable(FrozenArrays):
         Args:
             labels: Of the tables; a single one has none here.
         """
-        found, first = {}, self._is_first_of_family()
+        found, first = {}, self.is_first_of_family()
         for k, (number, family) in enumerate(self.groups):
             rows = (self.reason_code == 0) & (self.split == 1) & ~self.seen & (self.group == k)
             n = int(np.sum(rows & first))
             if n:
                 rms = [float(np.sqrt(np.sum(v[rows] ** 2) / n)) for v in (self.before, self.after, self.sigma)]
                 few = bool(np.sum(rows) < _ROWS_PER_UNKNOWN * self.n_fitted)
-                found[labels[number] if len(labels) > 1 else "", family] = HeldOut(n, rms[0], rms[1], rms[2], few)
+                table = labels[number] if len(labels) > 1 else ""
+                far, rest = self._far(np.flatnonzero(rows), first)
+                found[table, family] = HeldOut(n, rms[0], rms[1], rms[2], few, far, rest)
         return found
 
-    def _is_first_of_family(self) -> Booleans:
+    def _far(self, rows: NDArray[np.int64], first: Booleans) -> tuple[tuple[str, ...], float]:
+        """Names of the few measurements that no chance puts as far beyond the median, and RMS of the others.
+
+        Args:
+            rows: Of the measurements, all of one kind.
+            first: Which rows of the table begin a measurement's.
+        """
+        begins = np.flatnonzero(first[rows])
+        squares, in_sigma = (np.add.reduceat(v[rows] ** 2, begins) for v in (self.after, self.after / self.sigma))
+        d = np.diff(np.append(begins, len(rows)))
+        n = len(d)
+        typical = max(float(np.median(in_sigma / special.chdtri(d, 0.5))), 1.0)
+        far = in_sigma > typical * special.chdtri(d, CHANCE / n)
+        if not far.any() or np.sum(far) > MOST_FEW * n:
+            return (), float(np.sqrt(squares.sum() / n))
+        worst = np.flatnonzero(far)[np.argsort(-in_sigma[far], kind="stable")]
+        ends = [(self.a[i], self.b[i]) for i in rows[begins[worst]].tolist()]
+        names = tuple("-".join(self.names[end] for end in pair if end >= 0) for pair in ends)
+        return names, float(np.sqrt(squares[~far].sum() / (n - np.sum(far))))
+
+    def without(self, unknown: Booleans) -> ResidualTable:
+        """The same where some rows take no part, for nothing determines what they depend on."""
+        if not unknown.any():
+            return self
+        code = np.where(unknown, len(self.reasons), self.reason_code).astype(self.reason_code.dtype)
+        return replace(self, reasons=(*self.reasons, "depends on what is not determined"), reason_code=code)
+
+    def is_first_of_family(self) -> Booleans:
         """Rows that begin a measurement's rows of one kind of noise, shape (n,)."""
         change = np.ones(self.n, dtype=np.bool_)
         for code in (self.series, self.measurement, self.family):

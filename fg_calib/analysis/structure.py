@@ -67,7 +67,7 @@ def probability_of_noise(solution: Solution) -> float | None:
     """
     problem, state = solution.problem, solution.problem.state
     weighted = state.weights is not None or state.joint_errors is not None
-    several = problem.data.unknowns.names or problem.added or weighted or problem.missing_correlation
+    several = problem.data.unknowns.names or problem.has_more or weighted or problem.missing_correlation
     if several or problem.n_residuals > MAX_ROWS:
         return None
     chains, names = with_link_motions(problem, solution.parameters)

@@ -15,7 +15,7 @@ from fg_calib.analysis.accuracy import ExpectedError, expected_error, without_ri
 from fg_calib.analysis.changes import Change
 from fg_calib.analysis.chi_square import chi_square
 from fg_calib.analysis.corrections import PriorFit, judge_priors
-from fg_calib.analysis.covariance import Spread, spread_of, with_left_out
+from fg_calib.analysis.covariance import Spread, spread_of, with_left_out, with_unsure_tolerances
 from fg_calib.analysis.findings import MOST_ESTIMATED, Fit, judge
 from fg_calib.analysis.folds import Folds
 from fg_calib.analysis.goodness import Goodness, judge_fit
@@ -288,7 +288,7 @@ def assess(solution: Solution) -> Uncertainty:
         Away from the nominal parameters undetermined directions turn, by about as many radians as the angles were
         corrected, and get a small share of parameters that they did not have at nominal. Unknown is what has a share
         in one both at the nominal parameters and at the estimate; the others are known given that the undetermined
-        directions are near nominal.
+        directions are near nominal. Frames have no nominal value: what follows them may be off by as much as they are.
 
     Raises:
         ProblemError: The graph of the solution's problem has factors of somebody else.
@@ -302,12 +302,13 @@ def _assess(solution: Solution) -> Uncertainty:
     problem = solution.problem
     variables = problem.variables
     spread = spread_of(solution)
-    whole = with_left_out(solution, spread)
+    whole = with_unsure_tolerances(solution, with_left_out(solution, spread))
     identifiability = identifiability_of(problem.whole or problem, solution.before, "practical")
     covariance = whole.named()
     frames = _frame_estimates(solution, whole)
     chi2, table = chi_square(solution, spread), residual_table(solution)
     goodness = judged_without_gross_errors(solution, spread, table, judge_fit(solution, spread, table))
+    table = table.without(goodness.unknown(table))
     fit = Fit(chi2, table, goodness, judge_priors(solution, spread))
     verdict = judge(solution, spread, fit, identifiability.missing)
     return Uncertainty(

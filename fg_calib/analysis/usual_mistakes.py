@@ -29,6 +29,12 @@ _LENGTHS = {
     1e2: "m, not cm",
     1e-1: "mm, not cm",
     1e1: "cm, not mm",
+    0.0254: "inches, not m",
+    2.54: "inches, not cm",
+    25.4: "inches, not mm",
+    1.0 / 0.0254: "m, not inches",
+    1.0 / 2.54: "cm, not inches",
+    1.0 / 25.4: "mm, not inches",
 }
 
 STILL_TURN, STILL_SLIDE = 0.1, 0.01

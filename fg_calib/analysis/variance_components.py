@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.analysis.covariance import spread_of
+from fg_calib.analysis.estimated_tolerances import estimate_tolerances
 from fg_calib.analysis.goodness import KindFit, kind_fits
 from fg_calib.analysis.mistakes import check_setup
 from fg_calib.analysis.noise_components import has_joint_noise, noise_components
@@ -80,7 +81,7 @@ TINY = 1e-100
 
 @checked
 def solve_job(job: Job, problem: Problem | None = None) -> Solution:
-    """The solution of a job: the best optimum that is found, with its noise estimated if the job asks for it.
+    """The solution of a job: the best optimum that is found, with noise and tolerances estimated if it asks for that.
 
     Args:
         job: The job.
@@ -92,7 +93,7 @@ def solve_job(job: Job, problem: Problem | None = None) -> Solution:
     """
     problem = problem or problem_of(job)
     try:
-        solution = estimate_noise(problem) if job.options.estimate_noise else solve(problem)
+        solution = estimate_tolerances(problem, estimate_noise if job.options.estimate_noise else solve)
     except SolverError as error:
         for table in job.tables:
             if table.model is not None:

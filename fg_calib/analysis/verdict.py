@@ -19,6 +19,7 @@ from fg_calib.analysis.chi_square import CONFIDENCE, FACTOR, ChiSquare
 from fg_calib.analysis.corrections import PriorFit
 from fg_calib.analysis.goodness import GrossErrors, PredictedFit
 from fg_calib.analysis.offsets import Offset
+from fg_calib.graph.tolerances import ToleranceScale
 
 LIKE_NOISE, NOT_NOISE = 1e-3, 1e-6
 """Probability below which residuals follow the arm more than noise does, and below which true errors are several times
@@ -47,6 +48,13 @@ LEAST_REDUNDANCY = 3.0
 
 _NAMED = 3
 """Configurations or parameters that a statement names."""
+
+
+FAR_OFF = 10.0
+"""Tolerance estimated over tolerance stated above which one asks why."""
+
+UNSEEN = 0.5
+"""Corrections of a group that the data tell of, below which they do not tell its scale."""
 
 
 @dataclass(frozen=True)
@@ -244,6 +252,26 @@ def of_priors(fit: PriorFit | None) -> list[Statement]:
         what = f"corrections are too large for their tolerances (in sigma of these: {_listed(largest)}; sum of squares"
         text = f"{what} {fit.chi2:.3g} where {fit.expected:.3g} is expected): {causes}"
         statements.append(Statement(text, fit.chi2 > FACTOR * fit.expected and fit.p_value < CERTAIN))
+    return statements
+
+
+def of_tolerances(scales: Sequence[ToleranceScale], too_large: bool) -> list[Statement]:
+    """What a reader of tolerances that were estimated should know.
+
+    Args:
+        scales: Them.
+        too_large: Whether residuals are larger than their noise.
+    """
+    statements = []
+    far = [f"{one.group} {one.scale:.3g}" for one in scales if one.scale > FAR_OFF]
+    if far:
+        text = f"corrections are far larger than the tolerances stated ({', '.join(far)} times)"
+        text += ": residuals are too large as well, so corrections may take up what is not modelled" * too_large
+        statements.append(Statement(text, finding=False))
+    unseen = [one.group for one in scales if one.seen < UNSEEN]
+    if unseen:
+        text = f"the data tell next to nothing of the corrections of {', '.join(unseen)}"
+        statements.append(Statement(f"{text}: the scale of their tolerances goes with the others", finding=False))
     return statements
 
 

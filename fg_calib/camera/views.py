@@ -37,6 +37,9 @@ _AS_GOOD = 10.8
 _POOR = 3.0
 """RMS of an image's residuals over the median of all from which something is wrong with it: blur, a bent board."""
 
+_FAR_OFF = 0.002
+"""RMS of all residuals, in diagonals of the image, that no lens unlike its model leaves: a camera of other images."""
+
 _WELL_KNOWN = 0.01
 """Sigma of a focal length over itself above which it is hardly determined: distances are wrong by as much."""
 
@@ -133,6 +136,10 @@ class BoardFit:
             if sigma > _WELL_KNOWN * value:
                 hint = "tilt the board by 30 degrees or so, in several directions, and fill the image with it"
                 found.append(f"the images do not determine the camera: {name} = {value:.0f} ± {sigma:.0f} px; {hint}")
+        if self.rms > _FAR_OFF * float(np.hypot(*self.size)):
+            width, height = self.size
+            hint = f"is the camera that of these images of {width} x {height} px, is the board as its file says?"
+            found.append(f"no poses explain the corners: residuals of {self.rms:.3g} px RMS; {hint}")
         return tuple(found)
 
 

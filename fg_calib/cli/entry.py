@@ -1,6 +1,7 @@
 """The entry point: the commands, and the one door where errors become a line and an exit code.
 
-Exit codes: 0 good; 1 bad input; 2 wrong usage; 3 solved, or to be solved, but not to be trusted.
+Exit codes: 0 good; 1 bad input; 2 wrong usage; 3 solved, or to be solved, but not to be trusted; 141 nobody reads what
+is printed, as of other commands before `head`.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import logging
 import os
 import re
 import resource
+import signal
 import sys
 from collections.abc import Sequence
 from typing import Annotated, NoReturn
@@ -22,10 +24,13 @@ from fg_calib import __version__
 from fg_calib.cli.bag import bag
 from fg_calib.cli.board import board
 from fg_calib.cli.calibrate import calibrate
+from fg_calib.cli.check import check
 from fg_calib.cli.compare import compare
 from fg_calib.cli.correct import correct
 from fg_calib.cli.example import example
+from fg_calib.cli.export import export
 from fg_calib.cli.help import help_
+from fg_calib.cli.history import history
 from fg_calib.cli.init import init
 from fg_calib.cli.inspect import inspect
 from fg_calib.cli.observe import observe
@@ -33,6 +38,7 @@ from fg_calib.cli.output import say
 from fg_calib.cli.progress import hide_progress, progress
 from fg_calib.cli.report import report
 from fg_calib.cli.simulate import simulate
+from fg_calib.cli.update import update
 from fg_calib.errors import CalibrationError, InputError, printable
 
 app = typer.Typer(
@@ -41,7 +47,23 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-for command in (init, inspect, calibrate, report, correct, compare, observe, simulate, example, bag, board):
+for command in (
+    init,
+    inspect,
+    calibrate,
+    report,
+    export,
+    correct,
+    compare,
+    check,
+    update,
+    history,
+    observe,
+    simulate,
+    example,
+    bag,
+    board,
+):
     app.command()(command)
 app.command(name="help")(help_)
 
@@ -69,13 +91,18 @@ def run() -> None:
                 app(prog_name="fg-calib")
         finally:
             sys.stdout.flush()
+    except SystemExit as ended:
+        if isinstance(ended.__context__, BrokenPipeError):  # typer has taken it for a failure
+            _close_stdout()
+            sys.exit(_READER_GONE)
+        raise
     except CalibrationError as error:
         _fail(str(error))
     except MemoryError:
         _fail("there is not enough memory for this")
     except BrokenPipeError:  # the reader of our output has gone
         _close_stdout()
-        sys.exit(1)
+        sys.exit(_READER_GONE)
     except OSError as error:
         _close_stdout()
         what = "the output cannot be written" if error.filename is None else error.filename
@@ -131,6 +158,9 @@ def _limit_widths() -> None:
         else:
             del os.environ[name]
 
+
+_READER_GONE = 128 + signal.SIGPIPE
+"""How shells report a command that ended because nobody reads its output, as `head` does to the one before it."""
 
 _WIDTHS = (20, 1000)
 """Narrowest and widest page."""

@@ -279,7 +279,7 @@ def require_absent(folder: Path, names: Iterable[str]) -> None:
         InputError: One is.
     """
     for name in names:
-        if (folder / name).exists():
+        if os.path.lexists(folder / name):  # also a link to nothing
             raise InputError(str(folder / name), "is there already", "a folder without it")
 
 
@@ -321,7 +321,7 @@ def _beginning(path: Path, size: int) -> bytes | None:
     """How a file begins; None where there is none.
 
     Raises:
-        InputError: It is a folder, a pipe or a device.
+        InputError: It is a folder, a pipe or a device, or a link that leads nowhere.
     """
     for found in (_newest(path), path):  # again: it may have been moved to its place in the meantime
         try:
@@ -330,6 +330,8 @@ def _beginning(path: Path, size: int) -> bytes | None:
             with found.open("rb") as file:
                 return file.read(size)
         except FileNotFoundError:
+            if found.is_symlink():
+                raise InputError(str(path), "is a link to nothing", "a place for a file") from None
             continue
         except OSError:
             return b""

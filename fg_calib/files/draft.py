@@ -116,6 +116,9 @@ def _sorted(files: Sequence[Path]) -> _Inputs:
     if not robots or not tables:
         missing, expected = ("table", "poses.csv") if robots else ("robot", "robot.yaml or a URDF")
         raise InputError("init", f"no {missing} among the files", f"one, such as {expected}")
+    twice = [table.name for k, table in enumerate(tables) if any(_same_file(table, other) for other in tables[:k])]
+    if twice:
+        raise InputError("init", f"the same table twice: {twice[0]}", "every table once")
     robot = read_robot(robots[0])
     recognised = [recognise(table, robot) for table in tables]
     pairs = _pairs_among(recognised)
@@ -127,6 +130,11 @@ def _sorted(files: Sequence[Path]) -> _Inputs:
         if table.model == "pixels" and not cameras:
             raise InputError(table.path.name, "images of a camera that is not among the files", "camera.yaml too")
     return _Inputs(robots[0], robot, tuple(measured), pairs, cameras[0] if cameras else None)
+
+
+def _same_file(one: Path, other: Path) -> bool:
+    """Whether two paths lead to one file; one that is not there is told of when it is read."""
+    return one.exists() and other.exists() and one.samefile(other)
 
 
 def _pairs_among(tables: Sequence[Recognised]) -> Recognised | None:
@@ -233,20 +241,34 @@ def _keys(table: Recognised, inputs: _Inputs, folder: Path) -> Iterator[tuple[st
         assert inputs.camera is not None
         room = "  # DECIDE: if it stands in the room, {file: ..., fixed: true}, and frame: unknown"
         yield "camera", _path(inputs.camera, folder), room
-    if table.columns:
-        columns: dict[str, Any] = {
-            name: {"name": column, "scale": table.scales[name]} if name in table.scales else column
-            for name, column in table.columns.items()
-        }
+    alone = len(inputs.tables) == 1  # names of several tables would have to agree
+    named = {"id": table.maybe_id} if table.maybe_id and alone else {}
+    columns: dict[str, Any] = {name: _column(table, name) for name in table.columns} | named
+    if columns:
         yield "columns", _flow(columns), "  # DECIDE whether these are what the names mean"
-    if table.unused:
-        names = printable(", ".join(table.unused))
+    if table.counts:
+        yield "# DECIDE scale and zero of each", "reading = (count - zero) * scale, in the units below", ""
+    if table.maybe_id and not alone:
+        same = "  # if the same name in two tables is the same configuration"
+        yield "# DECIDE, among columns", _flow({"id": table.maybe_id}), same
+    unused = [name for name in table.unused if name not in named.values()]
+    if unused:
+        names = printable(", ".join(unused))
         yield "# not used", names if len(names) <= 90 else f"{names[:86]} ...", ""
+
+
+def _column(table: Recognised, name: str) -> Any:
+    """What the job says of a column that the table calls otherwise, or has in counts or another unit."""
+    column = table.columns[name]
+    if name in table.counts:
+        return {"name": column, "scale": 1.0, "zero": 0.0}
+    return {"name": column, "scale": table.scales[name]} if name in table.scales else column
 
 
 def _of_model(table: Recognised) -> str:
     other: dict[str | None, str] = {
-        "pose": "or distance-rotation, which needs no frame; position without the orientations",
+        "pose": "or distance-rotation, which needs no frame; position without the orientations; board if a camera on"
+        " the tool measured where a board is",
         "position": "or distance, which needs no frame",
         "orientation": "or rotation, which needs no frame",
         "anchor": "offset: estimate if the instrument adds a length of its own",
@@ -290,6 +312,12 @@ def _noise(inputs: _Inputs) -> Iterator[str]:
     yield f"noise: {_flow({**figures, 'joint': 0.0, 'estimate': True})}"
 
 
+def _lengths(inputs: _Inputs, **metres: float) -> str:
+    """An example of lengths in the job's unit."""
+    factor = LENGTHS[_common_units(inputs)["length"]]
+    return _flow({name: float(f"{value / factor:.3g}") for name, value in metres.items()})
+
+
 def _noise_of(table: Recognised, inputs: _Inputs) -> list[str]:
     """Kinds of noise that a job has to state for a table, because the table does not."""
     if table.model not in PAIR_MODELS:
@@ -309,9 +337,11 @@ def _choices(inputs: _Inputs) -> Iterator[str]:
     if any(table.model in POSE_MODELS for table in inputs.tables):
         yield "# pairing: star        # of models of pairs: star | chain | all | {random: 3000, seed: 0}"
     if "target" in columns:
-        yield "# targets: {smr1: {x: 0, y: 0, z: 0.1, tolerance: 0.001}}   # where targets are on the tool, if known"
+        near = _lengths(inputs, x=0.0, y=0.0, z=0.1, tolerance=0.001)
+        yield f"# targets: {{smr1: {near}}}   # where targets are on the tool, if known"
     if "anchor" in columns:
-        yield "# anchors: {bolt: {x: 1, y: 0, z: 0, tolerance: 0.002}}     # where anchors are from the base, if known"
+        near = _lengths(inputs, x=1.0, y=0.0, z=0.0, tolerance=0.002)
+        yield f"# anchors: {{bolt: {near}}}     # where anchors are from the base, if known"
     yield "# loss: none           # huber | cauchy | geman-mcclure | gnc where there are gross errors"
     yield "# gauge: prior         # what data do not determine: tolerances hold it; keep: it stays at nominal; none"
     yield "# encoder: propagated  # estimated: the true joint values too"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fg_calib.arrays import NOTHING
 from fg_calib.camera.board import CalibrationBoard
-from fg_calib.camera.opencv import decode, find_corners
+from fg_calib.camera.opencv import LARGER, decode, find_corners
 from fg_calib.camera.views import Corners
 from fg_calib.errors import InputError
 from fg_calib.files.disk import read_bytes
@@ -16,6 +16,9 @@ from fg_calib.measurements.dataset import Floats
 from fg_calib.progress import tell
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp", ".jp2")
+
+_ENOUGH = 3
+"""Images that show the same larger board: it is another one than the file says, and parts of it may look like that."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,7 @@ def read_corners(files: Sequence[Path], board: CalibrationBoard) -> FoundCorners
     """Corners of a board in images.
 
     Raises:
-        InputError: An image cannot be read, they have different sizes, or none shows the board.
+        InputError: An image cannot be read, they have different sizes, none shows the board, or some a larger one.
     """
     found: list[Corners] = []
     without: dict[str, str] = {}
@@ -85,6 +88,7 @@ def read_corners(files: Sequence[Path], board: CalibrationBoard) -> FoundCorners
         seen = find_corners(image, board)
         if isinstance(seen, str):
             without[file.name] = seen
+            _check_larger(seen, without, board)
         else:
             found.append(Corners(_name(file), *seen))
     if size is None or not found:
@@ -92,6 +96,14 @@ def read_corners(files: Sequence[Path], board: CalibrationBoard) -> FoundCorners
         hint = "are columns, rows and dictionary those of the board? older charuco boards: legacy: true"
         raise InputError("images", f"the board in none of {len(files)} ({reasons})", "at least one", hint)
     return FoundCorners(tuple(_upright(found) if board.upright else found), without, size)
+
+
+def _check_larger(reason: str, without: Mapping[str, str], board: CalibrationBoard) -> None:
+    """Whether the images show a larger checkerboard, of which a part would now and then be taken for the board."""
+    alike = [name for name, other in without.items() if other == reason]
+    if reason.startswith(LARGER) and len(alike) >= _ENOUGH:
+        expected = f"{board.columns} x {board.rows} as the board's file says"
+        raise InputError(", ".join(alike), reason, expected, "columns and rows count inner corners")
 
 
 def _upright(found: Sequence[Corners]) -> list[Corners]:

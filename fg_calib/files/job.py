@@ -49,6 +49,7 @@ from fg_calib.options import (
     Options,
     PairErrors,
     Pairing,
+    SharedScale,
     check_names,
     did_you_mean,
 )
@@ -141,7 +142,11 @@ class _JobOfTables(Schema):
     anchors: dict[str, Any] = meaning(
         "Where anchors are in the base frame, by name; others are estimated", {}, kind="mapping of points"
     )
-    tolerance: Any = meaning("1 sigma of all targets, or anchors, that are named with a place", None, kind="mapping")
+    tolerance: Any = meaning(
+        "1 sigma of all targets, or anchors, that are named with a place; whether the robot's tolerances are estimated",
+        None,
+        kind="mapping, or `estimate`",
+    )
     offset: Literal["estimate"] | None = meaning("Whether an unknown length is in every distance to an anchor", None)
     camera: Any = meaning("Of model pixels: the camera that took the images", None, kind=_CAMERA)
     columns: dict[str, Any] | None = meaning(_COLUMNS, None, kind="mapping of columns")
@@ -194,6 +199,11 @@ class _CameraOfJob(Schema):
 
 
 class _Tolerances(Schema):
+    estimate: SharedScale | None = meaning(
+        "Whether the robot's tolerances are only where to start (1 mm and 1 mrad where it has none), and scaled to the"
+        " corrections seen: by one factor for each kind of parameter (a, theta, ...), or for each joint",
+        None,
+    )
     targets: Positive | None = meaning("Of targets", None)
     anchors: Positive | None = meaning("Of anchors", None)
 
@@ -208,7 +218,7 @@ SECTIONS = (
     ),
     Section("accept", _Accept, "Judged by test rows, or else by `folds`. In the file's units, or with their own."),
     Section("targets, anchors: each point", _Point),
-    Section("tolerance", _Tolerances),
+    Section("tolerance", _Tolerances, "`tolerance: estimate` is `{estimate: kind}`."),
     Section("camera", _CameraOfJob, "A path, or the figures of a camera's file themselves, or"),
     Section("columns: each column", _Column, "A column's name alone, or"),
 )
@@ -252,7 +262,70 @@ def _job(path: Path) -> Job:
     plain = isinstance(file.measurements, str) and tables[0].is_plain
     alone = tables[0].measurements if plain else tuple(tables)
     truth = None if file.truth is None else _truth(folder / file.truth, robot)
-    return Job(path, robot, alone, _options(file, estimate_noise, path.name, tables[0]), truth)
+    options = _options(file, estimate_noise, path.name, tables[0])
+    return Job(path, robot, alone, options, truth, document=_document(given, folder))
+
+
+_OF_THE_ROBOT = ("robot", "truth", "prior", "gauge", "prefer", "folds")
+"""Keys of a job that say nothing of how a table is read."""
+
+
+def _document(given: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """A job's mapping, for reading tables like its own elsewhere: with its cameras in it, and without its robot."""
+
+    def whole(entry: Mapping[str, Any]) -> dict[str, Any]:
+        camera = entry.get("camera")
+        file = camera.get("file") if isinstance(camera, dict) else camera if camera != "fixed" else None
+        if not isinstance(file, str):
+            return dict(entry)
+        more = {"fixed": True} if isinstance(camera, dict) and camera.get("fixed") else {}
+        return {**entry, "camera": {**read_yaml(folder / file), **more}}
+
+    found = whole({key: value for key, value in given.items() if key not in _OF_THE_ROBOT})
+    if isinstance(found["measurements"], list):
+        found["measurements"] = [whole(entry) for entry in found["measurements"]]
+    return found
+
+
+def read_table_like(
+    document: Mapping[str, Any], robot: Robot, path: Path, *, pairs: Path | None = None, like: str | None = None
+) -> Table:
+    """A table read as a job read one of its own: with its columns, units, noise, model and frame.
+
+    Args:
+        document: The job (see `Job.document`).
+        robot: Its robot.
+        path: The table.
+        pairs: Table of pairs that were measured directly, if the job has one.
+        like: Name of the job's table that it is like; of several the one of the same file name if None.
+
+    Raises:
+        InputError: A file is missing or cannot be used, or it is not clear which table it is like.
+    """
+    given = document["measurements"]
+    entries = given if isinstance(given, list) else [{"table": given, "pairs": document.get("pairs")}]
+    entry = _entry_like(entries, path, like)
+    if (pairs is None) != (entry.get("pairs") is None):
+        found = "no table of pairs" if pairs is None else f"a table of pairs, {pairs.name}"
+        expected = "pairs, as its job has them" if pairs is None else "none, as in its job"
+        raise InputError(path.name, found, expected)
+    alone = {**entry, "table": str(path.absolute()), "pairs": None if pairs is None else str(pairs.absolute())}
+    job = {key: value for key, value in document.items() if key != "pairs"} | {"robot": ".", "measurements": [alone]}
+    file: _JobOfTables = validate(_JobOfTables, job, path.name)
+    (table,) = _tables(file, robot, path)
+    return table
+
+
+def _entry_like(entries: Sequence[Mapping[str, Any]], path: Path, like: str | None) -> Mapping[str, Any]:
+    names = [Path(entry["table"]).name for entry in entries]
+    if like is not None and like not in names:
+        raise InputError("like", f"found {shown(like)}", f"one of {', '.join(names)}", did_you_mean(like, names))
+    wanted = like or path.name
+    if wanted in names:
+        return entries[names.index(wanted)]
+    if len(entries) > 1:
+        raise InputError(path.name, "of none of the names that the job's tables have", ", ".join(names), "see --like")
+    return entries[0]
 
 
 def _tables(file: _JobOfTables, robot: Robot, path: Path) -> list[Table]:
@@ -342,7 +415,7 @@ def _known_points(file: _JobOfTables, model: Model, place: str) -> dict[str, Kno
     if model not in what:
         return {}
     key = what[model]
-    for_all = validate(_Tolerances, {} if file.tolerance is None else file.tolerance, f"{place}: tolerance")
+    for_all = _tolerances(file.tolerance, place)
     factor, found = file.units.factor("m"), {}
     for name, one in getattr(file, key).items():
         point = validate(_Point, one, f"{place}: {key}: {name}")
@@ -387,7 +460,18 @@ def _options(file: _JobOfTables, estimate_noise: bool, place: str, first: Table)
     choices = {key: getattr(file, key) for key in _CHOICES if key in file.model_fields_set} | {"model": first.model}
     pairing = pairing_of(file.pairing, f"{place}: pairing")
     accept = _limits(file.accept, file.units, f"{place}: accept")
-    return Options.of(**choices, pairing=pairing, estimate_noise=estimate_noise, accept=accept)
+    scale = _tolerances(file.tolerance, place).estimate
+    estimated = {"estimate_noise": estimate_noise, "estimate_tolerance": scale}
+    return Options.of(**choices, **estimated, pairing=pairing, accept=accept)
+
+
+def _tolerances(given: object, place: str) -> _Tolerances:
+    """Tolerances of targets and anchors, and what becomes of the robot's."""
+    if given == "estimate":
+        return _Tolerances(estimate="kind")
+    if given is not None and not isinstance(given, dict):
+        raise InputError(f"{place}: tolerance", f"found {shown(given)}", "a mapping of figures, or estimate")
+    return validate(_Tolerances, given or {}, f"{place}: tolerance")
 
 
 def _limits(given: object, units: Units, place: str) -> Limits:
@@ -411,6 +495,7 @@ def check_choices(choices: Mapping[str, Any], robot: Robot, place: str) -> None:
     file = validate(_Job, {"robot": ".", "measurements": ".", **choices}, place)
     pairing_of(file.pairing, f"{place}: pairing")
     _limits(file.accept, file.units, f"{place}: accept")
+    _tolerances(file.tolerance, place)
     _check_preferred(file, robot, place)
 
 

@@ -71,17 +71,22 @@ ROUNDING = 1e-6
 NEAR_NOTHING = 1e-9
 """How far a correction may be from estimate less nominal, [m] and [rad]: rounding, and no error of a robot."""
 
-Figure = Annotated[float | None, BeforeValidator(_known)]
+MOST_FIGURE = 1e150
+"""The most that a figure of a result may be: its square is a number too, and no residuals are as large."""
+
+Bounded = Annotated[float, Field(ge=-MOST_FIGURE, le=MOST_FIGURE)]
+
+Figure = Annotated[Bounded | None, BeforeValidator(_known)]
 """A number, None where it is unknown or infinite."""
 
-Sigma = Annotated[Annotated[float, Field(ge=0)] | None, BeforeValidator(_known)]
+Sigma = Annotated[Annotated[float, Field(ge=0, le=MOST_FIGURE)] | None, BeforeValidator(_known)]
 """A standard deviation, None where it is unknown or infinite."""
 
 Row = Annotated[tuple[Figure, ...], BeforeValidator(_listed)]
 Matrix = Annotated[tuple[Row, ...], BeforeValidator(_listed)]
 CovarianceMatrix = Annotated[Matrix, AfterValidator(_of_errors)]
 Sigmas = Annotated[tuple[Sigma, ...], BeforeValidator(_listed)]
-Position = Annotated[tuple[float, float, float], BeforeValidator(_listed)]
+Position = Annotated[tuple[Bounded, Bounded, Bounded], BeforeValidator(_listed)]
 Quaternion = Annotated[tuple[float, float, float, float], BeforeValidator(_listed), AfterValidator(_unit)]
 
 
@@ -238,13 +243,14 @@ class InFrames(Section):
 
 
 class ExpectedError(Section):
-    """Expected RMS errors of the tool."""
+    """Expected RMS errors of the tool; `relative`: nothing says where the base is, so only `fitted` tells of them."""
 
     position: InFrames
     orientation: InFrames
     at: str
     n: Whole
     of: Whole
+    relative: bool | None = None
 
 
 class Typical(Section):
@@ -278,14 +284,25 @@ class Parameter(Section):
 
     name: str
     unit: Literal["m", "rad"]
-    nominal: float
-    estimate: float
-    correction: float
+    nominal: Bounded
+    estimate: Bounded
+    correction: Bounded
     sigma: Sigma
     prior_sigma: Sigma
     identifiability: Literal["independent", "relative", "ineffective", "fixed"]
     stands_for: dict[str, float] | None = None
     sigma_of_combination: Sigma = None
+
+
+class ToleranceScale(Section):
+    """A factor on tolerances that was estimated, with its 95 % interval; see `graph.tolerances.ToleranceScale`."""
+
+    group: str
+    parameters: Annotated[tuple[str, ...], Field(min_length=1)]
+    scale: Annotated[float, Field(gt=0.0, le=MOST_FIGURE)]
+    low: Annotated[float, Field(gt=0.0, le=MOST_FIGURE)]
+    high: Annotated[float, Field(gt=0.0, le=MOST_FIGURE)]
+    seen: Bounded
 
 
 class Covariance(Section):
@@ -430,8 +447,43 @@ class Observability(Section):
     with_fixed_known: Observability | None = None
 
 
+class Knowledge(Section):
+    """What rows say of the arm and of what stays with it, linearised at the estimate (see `graph.knowledge`).
+
+    `rows` by the columns of `columns`, those of the arm as in `posterior`, then three of each of `unknowns`.
+    """
+
+    columns: tuple[str, ...]
+    unknowns: tuple[tuple[str, str], ...] = ()
+    at: Annotated[tuple[float, ...], BeforeValidator(_listed)] = ()
+    rows: Annotated[tuple[Annotated[tuple[float, ...], BeforeValidator(_listed)], ...], BeforeValidator(_listed)]
+    right: Annotated[tuple[float, ...], BeforeValidator(_listed)]
+
+
+class Carried(Section):
+    """What the next calibration of this arm takes over.
+
+    `job` is the job without robot, by which tables like its own are read; `noise` the factors on stated sigmas by table
+    and kind, where noise was estimated.
+    """
+
+    job: dict[str, Any] = {}
+    noise: dict[str, dict[str, float]] = {}
+    knowledge: Knowledge | None = None
+
+
+class Previous(Section):
+    """The result that an update came from."""
+
+    sha256: str
+    date: str
+
+
 class Result(Section):
-    """What `result.json` holds; `links` are those of a URDF between which its chain runs, `files` SHA-256 of tables."""
+    """What `result.json` holds; `links` are those of a URDF between which its chain runs, `files` SHA-256 of tables.
+
+    `date` is when the rows were measured, so far as is known; when they were calibrated where nobody said.
+    """
 
     schema_: Literal["fg-calib/result/1", "fg-calib/result/2"] = Field(alias="schema")
     version: str
@@ -467,6 +519,7 @@ class Result(Section):
     expected_error: ExpectedError | None = None
     noise_factors: dict[str, float] | None = None
     noise_kept: tuple[str, ...] = ()
+    tolerance_scales: tuple[ToleranceScale, ...] | None = None
     suspect_configurations: tuple[SuspectConfiguration, ...] = ()
     residual_rms: dict[str, dict[str, Rms | None]]
     parameters: tuple[Parameter, ...]
@@ -482,6 +535,9 @@ class Result(Section):
     versions: dict[str, str] = {}
     files: dict[str, str] = {}
     inputs: dict[str, str]
+    date: str = ""
+    previous: Previous | None = None
+    carried: Carried | None = None
 
 
 def result_schema() -> dict[str, Any]:
@@ -564,6 +620,9 @@ def _of_names(result: Result) -> Iterator[tuple[str, str, str]]:
             yield key, f"{max(given, key=given.count)!r} twice", "different names"
     for name in set(names).difference(known):
         yield "covariance: names", f"{name!r}, which is no parameter", "names of parameters"
+    for i, one in enumerate(result.tolerance_scales or (), start=1):
+        for name in set(one.parameters).difference(known):
+            yield f"tolerance_scale {i}: parameters", f"{name!r}, which is no parameter", "names of parameters"
 
 
 def _of_parameters(result: Result) -> Iterator[tuple[str, str, str]]:

@@ -250,6 +250,24 @@ def write_robot(path: Path | str, robot: Robot, *, units: Units | None = None, u
         InputError: The folder does not exist or may not be written to, or the robot has what no such file can say.
         ValueError: A URDF robot without `urdf_name`, or the other way round.
     """
+    write_text(Path(path), robot_text(robot, units=units, urdf_name=urdf_name, place=str(path)))
+
+
+def robot_text(
+    robot: Robot, *, units: Units | None = None, urdf_name: str | None = None, place: str | None = None
+) -> str:
+    """The text that `write_robot` writes.
+
+    Args:
+        robot: The robot.
+        units: Of the text; default m and rad.
+        urdf_name: See `write_robot`.
+        place: The file, for messages; the robot's name if None.
+
+    Raises:
+        InputError: The robot has what no such file can say.
+        ValueError: A URDF robot without `urdf_name`, or the other way round.
+    """
     if (robot.urdf is None) != (urdf_name is None):
         raise ValueError("a URDF robot, and no other, is written with urdf_name")
     units = units or Units()
@@ -273,21 +291,20 @@ def write_robot(path: Path | str, robot: Robot, *, units: Units | None = None, u
     }
     kept = {key: value for key, value in mapping.items() if value or key == "joints"}
     if robot.urdf is None:
-        _check_written(robot, kept, Path(path))
-    write_text(Path(path), yaml.dump(kept, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=math.inf))
+        _check_written(robot, kept, place or robot.name)
+    return str(yaml.dump(kept, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=math.inf))
 
 
-def _check_written(robot: Robot, mapping: Mapping[str, Any], path: Path) -> None:
+def _check_written(robot: Robot, mapping: Mapping[str, Any], place: str) -> None:
     """Check that what is to be written describes the robot, element by element.
 
     Raises:
         InputError: It does not, as the robot has other elements than its convention, a base and a tool.
     """
-    place = str(path)
     expected = "base, joints of one convention, tool: all that a robot file can say"
     if robot.convention not in CONVENTIONS:
         raise InputError(place, f"the robot is of the convention {shown(robot.convention)}", expected)
-    again = robot_from_mapping(mapping, place, path.parent)
+    again = robot_from_mapping(mapping, place, Path())
     names = [p.name for p in robot.parameters]
     if [p.name for p in again.parameters] != names or again.elements != robot.elements:
         raise InputError(place, "the robot has elements or parameters of its own", expected)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from fg_calib.arrays import FrozenArrays
 from fg_calib.errors import InputError
 from fg_calib.files.columns import Header, Table
-from fg_calib.files.disk import exists
+from fg_calib.files.disk import exists, read_bytes
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -69,6 +70,21 @@ class SavedResiduals(FrozenArrays):
     studentised: Floats
     suspect: Booleans
     units: tuple[str, ...]
+
+
+def require_unchanged(folder: Path, digests: Mapping[str, str]) -> None:
+    """Check that files of a saved result are those that were written with it; what is not there is not missed.
+
+    Args:
+        folder: What `calibrate --out` wrote.
+        digests: SHA-256 by name, as its `result.json` has them.
+
+    Raises:
+        InputError: One is another.
+    """
+    for name, digest in digests.items():
+        if exists(folder / name) and sha256(read_bytes(folder / name)).hexdigest() != digest:
+            raise InputError(str(folder / name), "changed, or of another calibration", "the files of one calibration")
 
 
 def read_configurations(folder: Path, n_joints: int) -> SavedConfigurations | None:

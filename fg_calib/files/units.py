@@ -15,7 +15,7 @@ from fg_calib.files.schema import Positive, Schema, Section, meaning, refuse_unk
 from fg_calib.options import AngleUnit, LengthUnit, did_you_mean, set_checked
 from fg_calib.sizes import LEAST_SIZE
 
-LENGTHS: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
+LENGTHS: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
 """Metres in one unit of length."""
 
 ANGLES: Mapping[str, float] = {"rad": 1.0, "deg": math.pi / 180.0, "mrad": 1e-3}

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fg_calib.arguments import checked
 from fg_calib.errors import InputError
-from fg_calib.files.disk import decoded, read_bytes, write_text
+from fg_calib.files.disk import decoded, read_bytes, replacing
 from fg_calib.files.schema import shown, shown_word
 from fg_calib.options import NEAR, did_you_mean, known_names
 from fg_calib.robot.model import FRAME_KINDS, IN_RAD, MOST_ANGLE, Joint, Robot, RobotBuilder, UrdfSource, frame_values
@@ -177,27 +177,120 @@ def _check_spelling(joint: _UrdfJoint, place: str) -> None:
 def write_urdf(path: Path | str, robot: Robot) -> None:
     """Write the URDF the robot was read from with the origins of its moving joints at the nominal values.
 
-    Everything else is kept: comments, meshes, other joints. A URDF has no place for base and tool: `write_robot`
-    writes them beside it.
+    Everything else is kept byte for byte: see `urdf_text`. A URDF has no place for base and tool: `write_robot` writes
+    them beside it.
 
     Raises:
         InputError: The folder does not exist or may not be written to.
         ValueError: The robot was not read from a URDF.
     """
-    from lxml import etree
-
     if robot.urdf is None:
         raise ValueError("the robot was not read from a URDF")
-    _, root = _parse(robot.urdf.text.encode(), robot.name, encoding="utf-8")
-    elements = {joint.get("name"): joint for joint in root.findall("joint")}
     values = {p.name: p.nominal for p in robot.parameters}
-    for joint in robot.joints:
-        _write_origin(elements[joint.name], {kind: values[f"{joint.name}.{kind}"] for kind in FRAME_KINDS})
-    # lxml would put the comments before and behind the root on one line with it.
-    nodes = [*reversed([*root.itersiblings(preceding=True)]), root, *root.itersiblings()]
-    lines = [etree.tostring(node, encoding="unicode", with_tail=False) for node in nodes]
-    declaration = ['<?xml version="1.0"?>'] * robot.urdf.text.startswith("<?xml")
-    write_text(Path(path), "\n".join([*declaration, *lines, ""]))
+    origins = {j.name: {kind: values[f"{j.name}.{kind}"] for kind in FRAME_KINDS} for j in robot.joints}
+    text = urdf_text(robot.urdf.text, origins)
+    with replacing(Path(path)) as temporary:
+        temporary.write_bytes(text.encode(encoding_of(text)))
+
+
+def encoding_of(text: str) -> str:
+    """The encoding that an XML text declares; UTF-8 if it declares none."""
+    declared = _DECLARED.match(text)
+    return declared[1] if declared else "utf-8"
+
+
+_DECLARED = re.compile(r"""\ufeff?<\?xml[^>]*?\sencoding\s*=\s*["']([\w.-]+)["']""")
+
+
+def urdf_text(text: str, origins: Mapping[str, Mapping[str, float]], zeros: Mapping[str, float] | None = None) -> str:
+    """A URDF with other origins of some joints and nothing else changed: comments, blanks and quotes stay.
+
+    An attribute of `<origin>` whose figures are those wanted stays as it is written.
+
+    Args:
+        text: The URDF, as it was read.
+        origins: By joint x, y, z, roll, pitch and yaw, [m] and [rad].
+        zeros: By joint what is to be added to its reading, [rad] or [m]: it is added to `rising` of the joint's
+            `<calibration>`, which it gets if it has none.
+    """
+    data = text.encode()
+    edits: list[tuple[int, int, str]] = []  # from, to, instead
+    for name, place in _places(data).items():
+        if name in origins:
+            wanted = {attribute: [origins[name][kind] for kind in kinds] for attribute, kinds in _ORIGIN.items()}
+            edits += _edits(data, place, "origin", wanted)
+        if zeros is not None and zeros.get(name, 0.0) != 0.0:
+            before = _figures(_attributes(data, place.get("calibration")).get("rising", (0, 0, "0"))[2])
+            edits += _edits(data, place, "calibration", {"rising": [sum(before) + zeros[name]]})
+    for start, end, instead in sorted(edits, reverse=True):
+        data = data[:start] + instead.encode() + data[end:]
+    return data.decode()
+
+
+def _places(data: bytes) -> dict[str, dict[str, int]]:
+    """Where the tags of each joint of a URDF in UTF-8 begin, and those of the first of its elements of each name.
+
+    The document was read before, and holds no entities.
+    """
+    from xml.parsers.expat import ParserCreate
+
+    parser = ParserCreate("utf-8")
+    found: dict[str, dict[str, int]] = {}
+    within: list[dict[str, int] | None] = []  # of each open element, the joint that it is
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        joint = found.setdefault(attributes.get("name", ""), {}) if len(within) == 1 and tag == "joint" else None
+        parent = within[-1] if within else None
+        for place in (joint, parent):
+            if place is not None:
+                place.setdefault(tag, parser.CurrentByteIndex)
+        within.append(joint)
+
+    def end(_: str) -> None:
+        within.pop()
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.Parse(data, True)
+    return found
+
+
+_TAG = re.compile(rb"""<[^\s/>]+((?:\s+[^\s=/>]+\s*=\s*(?:"[^"]*"|'[^']*'))*)\s*/?>""")
+_NAMED = re.compile(rb"""([^\s=]+)\s*=\s*("[^"]*"|'[^']*')""")
+
+
+def _attributes(data: bytes, tag: int | None) -> dict[str, tuple[int, int, str]]:
+    """By name where the values of the attributes of the tag at a place are, without quotes, and what they are."""
+    if tag is None or (read := _TAG.match(data, tag)) is None:
+        return {}
+    named = (found for found in _NAMED.finditer(data, read.start(1), read.end(1)))
+    return {n[1].decode(): (n.start(2) + 1, n.end(2) - 1, n[2][1:-1].decode()) for n in named}
+
+
+def _edits(
+    data: bytes, place: Mapping[str, int], tag: str, wanted: Mapping[str, Sequence[float]]
+) -> list[tuple[int, int, str]]:
+    """What to write where so that a joint's element has attributes with these figures; 0 is what is left out."""
+    words = {name: " ".join(repr(float(figure)) for figure in figures) for name, figures in wanted.items()}
+    present = _attributes(data, place.get(tag))
+    changed = {}
+    for name, figures in wanted.items():
+        read = _figures(present[name][2]) if name in present else [0.0] * len(figures)
+        if read != [float(figure) for figure in figures]:
+            changed[name] = words[name]
+    if not changed:
+        return []
+    if tag not in place:
+        opened = _TAG.match(data, place["joint"])
+        behind = place["joint"] if opened is None else opened.end()
+        blanks = re.match(rb"\s*", data[behind:])
+        indent = "" if blanks is None else blanks[0].decode()
+        new = "".join(f' {name}="{figures}"' for name, figures in words.items())
+        return [(behind, behind, f"{indent}<{tag}{new}/>")]
+    edits = [(*present[name][:2], figures) for name, figures in changed.items() if name in present]
+    read_tag = _TAG.match(data, place[tag])
+    end = place[tag] if read_tag is None else read_tag.end(1)
+    new = "".join(f' {name}="{figures}"' for name, figures in changed.items() if name not in present)
+    return [*edits, (end, end, new)] if new else edits
 
 
 def _parse(data: bytes, place: str, encoding: str | None = None) -> tuple[str, Element]:
@@ -221,7 +314,7 @@ def _parse(data: bytes, place: str, encoding: str | None = None) -> tuple[str, E
     if root.tag != "robot":
         raise InputError(place, f"root element <{root.tag}>", "<robot>")
     try:
-        return data.decode(document.encoding or "utf-8").removeprefix("\ufeff"), root
+        return data.decode(document.encoding or "utf-8"), root
     except UnicodeDecodeError as error:
         raise InputError(place, f"not {document.encoding or 'utf-8'}: {error.reason}", "text in UTF-8") from None
     except LookupError:  # libxml2 knows more encodings than Python
@@ -284,21 +377,6 @@ def _figures(text: str) -> list[float]:
     """The numbers in a text; none if a word of it is none as other readers have them (`1_000` is Python's alone)."""
     words = text.split()
     return [float(word) for word in words] if all(_NUMBER.fullmatch(word) for word in words) else []
-
-
-def _write_origin(joint: Element, values: Mapping[str, float]) -> None:
-    """Set the origin of a joint, unless it has these values already."""
-    from lxml import etree
-
-    if _origin(joint, "") == values:
-        return
-    element = joint.find("origin")
-    if element is None:
-        element = etree.Element("origin")
-        element.tail = joint.text  # the indentation of the elements that follow
-        joint.insert(0, element)
-    for attribute, kinds in _ORIGIN.items():
-        element.set(attribute, " ".join(repr(float(values[kind])) for kind in kinds))
 
 
 def _moving_joint(joint: _UrdfJoint, place: str) -> Joint:

@@ -17,8 +17,9 @@ from fg_calib.graph.information import observability_of, whitened_triangle
 from fg_calib.graph.observability import determined, singular_values
 from fg_calib.graph.problem import Problem, problem_at, tables_of, variables_of
 from fg_calib.graph.start import start_of
+from fg_calib.graph.tolerances import with_first_tolerances
 from fg_calib.job import Job
-from fg_calib.measurements.dataset import Measurements, Pairs
+from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.gathering import Dataset, check_repeats, gather
 from fg_calib.measurements.kinds import Frames, check_derivatives, check_start, is_ours
 from fg_calib.measurements.models.predictions import predictions
@@ -100,6 +101,8 @@ def problem_of_tables(robot: Robot, tables: Sequence[Table], options: Options) -
     evaluated = all(map(_all_test, tables))
     if evaluated:
         robot, options, tables = _for_evaluation(robot, options, tables)
+    elif options.estimate_tolerance is not None:
+        robot = with_first_tolerances(robot)
     data = gather(robot, tables)
     _check_frames(data)
     variables = variables_of(robot, data, options)
@@ -109,7 +112,7 @@ def problem_of_tables(robot: Robot, tables: Sequence[Table], options: Options) -
     _check_enough(problem)
     if options.gauge != "keep":
         return problem
-    kept = _kept(problem, options.prefer)
+    kept = kept_of(problem, options.prefer)
     if not kept:
         found = "the rows determine none of the parameters to estimate"
         raise ProblemError(_source(problem), found, "rows that some of them act on")
@@ -118,7 +121,7 @@ def problem_of_tables(robot: Robot, tables: Sequence[Table], options: Options) -
     return problem_at(reduced, data, options, variables, start, whole=problem, evaluated=evaluated)
 
 
-def _kept(problem: Problem, prefer: Sequence[str]) -> list[str]:
+def kept_of(problem: Problem, prefer: Sequence[str]) -> list[str]:
     """The parameters that gauge `keep` estimates.
 
     At a pitch of a quarter turn yaw and roll of a frame are relative for want of coordinates, not of data: a frame that
@@ -151,24 +154,10 @@ def _for_evaluation(
     robot: Robot, options: Options, tables: Sequence[Table]
 ) -> tuple[Robot, Options, tuple[Table, ...]]:
     """A robot whose base and tool alone are estimated, where they were, and test rows that these are fitted to."""
-
-    def fitted(pairs: Pairs) -> Pairs:
-        return replace(pairs, test=np.zeros(pairs.n_pairs, dtype=np.bool_))
-
-    def of_fit(table: Table) -> Table:
-        m = table.measurements
-        m = replace(
-            m,
-            test=np.zeros(m.n_configurations, dtype=np.bool_),
-            pairs=None if m.pairs is None else fitted(m.pairs),
-            groups=None if m.groups is None else replace(m.groups, pairs=fitted(m.groups.pairs)),
-        )
-        return replace(table, measurements=m, own=tuple(replace(own, test=None) for own in table.own))
-
     of_frames = [p.name for p in robot.parameters if p.estimated and not 1 <= p.owner <= robot.n_joints]
     gauge: Gauge = "none" if options.gauge == "keep" else options.gauge
     options = replace(options, gauge=gauge, encoder="propagated")
-    return robot.with_estimated(of_frames), options, tuple(map(of_fit, tables))
+    return robot.with_estimated(of_frames), options, tuple(table.all_train() for table in tables)
 
 
 @checked

@@ -20,7 +20,7 @@ from fg_calib.arguments import checked
 from fg_calib.arrays import as_floats
 from fg_calib.errors import CalibrationError, InputError, ProblemError, shown
 from fg_calib.graph.factors import Variable, Variables, custom_factor, factor_columns, prior_factors, row_factor
-from fg_calib.graph.problem import Problem, reweighted_at
+from fg_calib.graph.problem import Problem, known_factors, reweighted_at
 from fg_calib.graph.rows import Part, RowSet
 from fg_calib.measurements.kinds import Distance, Kind, RotationAngle
 from fg_calib.measurements.residuals import Block
@@ -202,7 +202,7 @@ def expand(problem: Problem) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
             unit = gtsam.noiseModel.Unit.Create(width)
             graph.add(gtsam.PriorFactorVector(gtsam.symbol("E", k), np.zeros(width), unit))
             initial.insert(gtsam.symbol("E", k), np.zeros(width))
-    for factor in (*prior_factors(problem.variables), *problem.added):
+    for factor in (*prior_factors(problem.variables), *known_factors(problem), *problem.added):
         graph.add(factor)
     return graph, initial
 

@@ -39,11 +39,22 @@ def whitened_jacobian(problem: Problem, parameters: Floats, *, with_loss: bool =
         with_loss: Whether a robust loss counts for what it loses of clean data (see `robust.Effect`).
     """
     v = problem.variables
-    at = v.at(parameters)
-    blocks = [unknown_prior_rows(v, parameters)[1], added_rows(problem, parameters)]
-    row_sets, variance = _with_loss(problem) if with_loss else (problem.rows, 1.0)
-    blocks += [rows.triangle(at)[:, :-1] / np.sqrt(variance) for rows in row_sets]
+    blocks = [unknown_prior_rows(v, parameters)[1], added_rows(problem, parameters), known_rows(problem, parameters)[1]]
+    blocks += [R[:, :-1] for R in row_triangles(problem, parameters, with_loss=with_loss)]
     return np.vstack(blocks)
+
+
+def row_triangles(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> list[Floats]:
+    """A square root of [J r] of each set of train rows, shape (n_columns + n_nuisance + 1,) * 2 each.
+
+    Args:
+        problem: The problem.
+        parameters: The parameter vector.
+        with_loss: Whether a robust loss counts for what it loses of clean data (see `robust.Effect`).
+    """
+    at = problem.variables.at(parameters)
+    row_sets, variance = _with_loss(problem) if with_loss else (problem.rows, 1.0)
+    return [rows.triangle(at) / np.sqrt(variance) for rows in row_sets]
 
 
 def _with_loss(problem: Problem) -> tuple[tuple[RowSet, ...], float]:
@@ -73,6 +84,14 @@ def _with_loss(problem: Problem) -> tuple[tuple[RowSet, ...], float]:
 def whitened_triangle(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> Floats:
     """A square root of what the train rows and added factors say of the core, shape (m, n_columns)."""
     return eliminated(problem, parameters, with_loss=with_loss).A
+
+
+def known_rows(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
+    """What earlier rows say, whitened, and its derivatives, shapes (n_known,), (n_known, n_columns + n_nuisance)."""
+    v = problem.variables
+    if problem.known is None:
+        return np.zeros(0), np.zeros((0, v.n_columns + v.n_nuisance))
+    return problem.known.at_parameters(v, problem.data.unknowns, parameters)
 
 
 def added_rows(problem: Problem, parameters: Floats) -> Floats:

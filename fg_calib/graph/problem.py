@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import gtsam
@@ -25,6 +26,7 @@ from fg_calib.graph.factors import (
     row_factor,
     unknown_prior_rows,
 )
+from fg_calib.graph.knowledge import Knowledge
 from fg_calib.graph.noise import JOINT_NOISE, NoiseState, PairNoise, Place, RowNoise, row_noise
 from fg_calib.graph.rows import At, RowSet, share_errors, whitened_rows
 from fg_calib.measurements.dataset import Measurements
@@ -60,6 +62,7 @@ class Problem(FrozenArrays):
         added: Those among them that somebody added (see `extension`).
         evaluated: Whether there are test rows alone: the arm is taken as it is, and measurement frame, base and tool,
             where they are estimated, are fitted to these.
+        knowledge: What earlier rows say of the arm; None without any.
     """
 
     robot: Robot
@@ -76,6 +79,7 @@ class Problem(FrozenArrays):
     factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     added: tuple[gtsam.NonlinearFactor, ...] = ()
     evaluated: bool = False
+    knowledge: Knowledge | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """All but GTSAM's objects, whose factors call back into Python: they are made anew of the rows.
@@ -85,7 +89,7 @@ class Problem(FrozenArrays):
         """
         if self.added or self.graph.size() != self.factors.size():
             raise ProblemError("problem.graph", "added factors", "none: GTSAM's factors cannot be written")
-        left = ("graph", "factors", "initial")
+        left = ("graph", "factors", "initial", "known")
         return {name: value for name, value in self.__dict__.items() if name not in left}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -181,6 +185,24 @@ class Problem(FrozenArrays):
         """Scalar rows of the factors that somebody added."""
         return sum(factor.dim() for factor in self.added)
 
+    @cached_property
+    def known(self) -> Knowledge | None:
+        """What earlier rows say of what is estimated; None where they say nothing."""
+        if self.knowledge is None:
+            return None
+        found = self.knowledge.seen_by(self.variables, self.data.unknowns)
+        return found if found.n else None
+
+    @property
+    def n_known(self) -> int:
+        """Scalar rows of what earlier rows say."""
+        return 0 if self.known is None else self.known.n
+
+    @property
+    def has_more(self) -> bool:
+        """Whether more than measurements and tolerances says something of the arm."""
+        return bool(self.added) or self.knowledge is not None
+
     @property
     def n_excluded(self) -> dict[str, int]:
         """Train pairs that take no part, by reason: once each, whatever was measured of them."""
@@ -223,11 +245,22 @@ def _graph_of(problem: Problem) -> gtsam.NonlinearFactorGraph:
     """The rows, the priors and what somebody added as factors; rows that depend on no variable are none."""
     graph = gtsam.NonlinearFactorGraph()
     for rows in problem.rows:
-        if problem.variables.items or len(rows.coordinates):
+        if depends(rows, problem.variables):
             graph.add(row_factor(rows, problem.variables))
-    for factor in (*prior_factors(problem.variables), *problem.added):
+    for factor in (*prior_factors(problem.variables), *known_factors(problem), *problem.added):
         graph.add(factor)
     return graph
+
+
+def depends(rows: RowSet, variables: Variables) -> bool:
+    """Whether rows depend on any variable: on the core, or on an unknown that is estimated."""
+    return bool(variables.items) or bool(np.any(variables.coordinates[rows.coordinates] >= 0))
+
+
+def known_factors(problem: Problem) -> list[gtsam.CustomFactor]:
+    """What earlier rows say as a factor, where they say anything."""
+    known = problem.known
+    return [] if known is None else [known.factor(problem.variables, problem.data.unknowns)]
 
 
 def _row_sets(noises: Sequence[RowNoise], state: NoiseState, *, sharing: bool) -> tuple[RowSet, ...]:
@@ -387,7 +420,9 @@ def frames_only(problem: Problem) -> Problem | None:
     options = replace(problem.options, encoder="propagated", pair_errors="independent")  # good enough for a start
     start = problem.start[: variables.nuisance_span.stop]
     state = replace(problem.state, joint_errors=None, spread=None)  # of other columns
-    return assembled(problem, start, state, robot=robot, variables=variables, options=options, added=(), whole=None)
+    return assembled(
+        problem, start, state, robot=robot, variables=variables, options=options, added=(), knowledge=None, whole=None
+    )
 
 
 def variables_of(robot: Robot, data: Dataset, options: Options) -> Variables:

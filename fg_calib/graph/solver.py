@@ -37,6 +37,7 @@ from fg_calib.graph.noise import NoiseState
 from fg_calib.graph.observability import determined
 from fg_calib.graph.problem import (
     Problem,
+    depends,
     frames_only,
     joint_errors,
     mahalanobis_distances,
@@ -45,6 +46,7 @@ from fg_calib.graph.problem import (
     started_at,
 )
 from fg_calib.graph.robust import Weighting
+from fg_calib.graph.tolerances import ToleranceScales
 from fg_calib.options import check_number
 from fg_calib.threads import one_blas_thread
 
@@ -147,6 +149,7 @@ class Solution(FrozenArrays):
         weighted_cost: The same with every measurement by its robust weight.
         seconds: Time taken.
         estimated_noise: Tables and kinds whose noise was estimated (see `noise`); None where it was taken as stated.
+        estimated_tolerances: Scales on the robot's tolerances; None where they are taken as stated.
         others: Parameter vectors of other optima that the data cannot tell from this one (see `restarts`).
     """
 
@@ -162,6 +165,7 @@ class Solution(FrozenArrays):
     weighted_cost: float
     seconds: float
     estimated_noise: tuple[tuple[int, str], ...] | None = None
+    estimated_tolerances: ToleranceScales | None = None
     others: tuple[Floats, ...] = ()
 
     def __repr__(self) -> str:
@@ -239,7 +243,7 @@ def solve_from(solution: Solution, start: Floats, most: float, options: SolverOp
             return None
         run = _fit(reweighted_at(problem, rough.parameters), options)
         found = _solution(run, solution.before, solution.initial_cost, clock)
-        return replace(found, estimated_noise=solution.estimated_noise)
+        return _estimated_as(solution, found)
 
 
 def solve_image(
@@ -271,7 +275,12 @@ def solve_image(
         first = reweighted_at(problem, before)
         before = _before(first, options)
         initial_cost = reweighted_at(first, before).graph.error(first.variables.values(before))
-        return replace(_solution(run, before, initial_cost, clock), estimated_noise=solution.estimated_noise)
+        return _estimated_as(solution, _solution(run, before, initial_cost, clock))
+
+
+def _estimated_as(solution: Solution, other: Solution) -> Solution:
+    """Another solution, with noise and tolerances that were estimated at the first."""
+    return replace(other, estimated_noise=solution.estimated_noise, estimated_tolerances=solution.estimated_tolerances)
 
 
 def _solution(run: _Run, before: Floats, initial_cost: float, clock: float) -> Solution:
@@ -300,7 +309,7 @@ def _constant_cost(problem: Problem) -> float:
     if problem.variables.items:
         return 0.0
     at = problem.variables.at(problem.start)
-    return 0.5 * sum(rows.squared_norm(at) for rows in problem.rows if not len(rows.coordinates))
+    return 0.5 * sum(rows.squared_norm(at) for rows in problem.rows if not depends(rows, problem.variables))
 
 
 def _taken_as_it_is(problem: Problem, clock: float) -> Solution:

@@ -24,6 +24,18 @@ LEAST_SIGMA = 1e-6
 _WINDOW = 3.0
 """Autocorrelations are summed up to so many times the time itself."""
 
+_BLOCKS = 64
+"""Blocks at most that a stop is averaged in where its slow noise is looked for."""
+
+_WHITE = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95, 0.98)
+"""Shares of white noise that are tried."""
+
+_MUCH = 1.5
+"""How much more slow noise must say than the sum, which holds for noise of any shape that ends within a stop."""
+
+_BETTER = 12.0
+"""What slow noise must gain in twice the logarithm of the likelihood: white noise alone gains it once in 400 times."""
+
 
 def correlation_time(residuals: Sequence[Floats]) -> float:
     """Integrated autocorrelation time of noise, in samples, at least 1.
@@ -31,7 +43,7 @@ def correlation_time(residuals: Sequence[Floats]) -> float:
     The autocovariance of what is left of a stop after its mean is too small by about the variance v of that mean, which
     is therefore added: v = A / (1 - B) with the sums A of the covariances and B of ones up to the lag where the sum
     ends. That lag is the first beyond three times the time itself (Sokal's window). Where there is none within half a
-    stop, noise is taken as AR(1): `_time_of_ar1`.
+    stop, or where that says much more, noise is white and AR(1) together: `_time_of_white_and_slow`.
 
     Args:
         residuals: Of each stop, less its mean, shape (n, k).
@@ -56,28 +68,44 @@ def correlation_time(residuals: Sequence[Floats]) -> float:
     of_mean = total / n / np.maximum(1.0 - ones, 0.1)
     tau = np.maximum(n * of_mean / (covariance[0] + of_mean), 1.0)
     over = np.arange(longest + 1) >= _WINDOW * tau
-    if over.any():
-        return float(tau[np.argmax(over)])
-    return max(_time_of_ar1(1.0 / float(covariance[0]), n), n / (2.0 * _WINDOW))
+    slow = _time_of_white_and_slow(scaled, n, float(covariance[0]))
+    if not over.any():
+        return max(slow, n / (2.0 * _WINDOW))
+    fast = float(tau[np.argmax(over)])
+    return slow if slow > _MUCH * fast else fast
 
 
-def _time_of_ar1(ratio: float, n: int) -> float:
-    """Integrated time of AR(1) noise from von Neumann's ratio, squared steps over the variance about a stop's mean.
+def _time_of_white_and_slow(scaled: Sequence[Floats], n: int, square: float) -> float:
+    """Integrated time over a stop of n samples where noise is white and AR(1) together; 1 where white alone will do.
 
-    The ratio is 2 (1 - phi) / (1 - variance of the mean), which falls as phi grows; what is slower than ten stops
-    cannot be told from a walk.
+    By the likelihood of the steps from sample to sample, which know nothing of a stop's mean, on a grid of how much is
+    white and how slow the rest is. Long stops are averaged in blocks. What is slower than ten stops cannot be told from
+    a walk.
+
+    Args:
+        scaled: Of each stop, shape (n_samples, k).
+        n: Samples of a stop.
+        square: Mean square of the residuals.
     """
-    grid = np.geomspace(1.0, 20.0 * n, 400)
-    phi = (grid - 1.0) / (grid + 1.0)
-    expected = 2.0 * (1.0 - phi) / (1.0 - _variance_of_mean(grid, n))
-    return float(np.interp(-ratio, -expected, grid))
-
-
-def _variance_of_mean(tau: Floats, n: int) -> Floats:
-    """Variance of the mean of n samples of AR(1) noise of variance 1, by its integrated time."""
-    phi = (tau - 1.0) / (tau + 1.0)
-    variance: Floats = (tau - 2.0 * phi * (1.0 - phi**n) / (n * (1.0 - phi) ** 2)) / n
-    return variance
+    size = -(-n // _BLOCKS)
+    length = n // size
+    whole = [r[: length * size].reshape(length, size, -1).mean(axis=1) for r in scaled if len(r) >= length * size]
+    steps = np.diff(np.concatenate(whole, axis=1), axis=0)  # (length - 1, n_series)
+    lags = np.abs(np.subtract.outer(np.arange(length), np.arange(length)))
+    best, found = np.inf, 1.0
+    for time in np.geomspace(1.0, 20.0 * length, 30):
+        slow = ((time - 1.0) / (time + 1.0)) ** lags
+        for share in _WHITE if time > 1.0 else (1.0,):
+            V = share * np.eye(length) + (1.0 - share) * slow
+            L = np.linalg.cholesky(np.diff(np.diff(V, axis=0), axis=1))
+            misfit = float(np.sum(np.linalg.solve(L, steps) ** 2))
+            cost = 2.0 * steps.shape[1] * np.log(np.diag(L)).sum() + steps.size * np.log(max(misfit, 1e-300))
+            if time == 1.0:
+                best = cost - _BETTER  # of white noise alone
+            elif cost < best:
+                best, of_mean = cost, float(V.mean()) * misfit / steps.size
+                found = n * of_mean / (square + of_mean)
+    return found
 
 
 def is_slow(tau: float, n: float) -> bool:
@@ -85,25 +113,25 @@ def is_slow(tau: float, n: float) -> bool:
     return tau > n / (2.0 * _WINDOW)
 
 
-def sigma_of_mean(residuals: Floats, tau: float) -> Floats:
-    """Sigma of the mean of correlated samples, shape (k,).
+def sigmas_of_means(residuals: Sequence[Floats], tau: float) -> Floats:
+    """Sigma of each stop's mean of correlated samples, shape (n_stops, k).
 
-    The variance of Student's t with n / tau - 1 degrees of freedom, for the scatter is estimated from the same samples.
-    Of slow noise that of AR(1), from the steps from sample to sample as a stop hardly shows the scatter, and at least
-    that of a single sample.
+    The variance of Student's t, for the scatter is estimated from the same samples: with 2 n tau / (tau^2 + 1) - 1
+    degrees of freedom, those of the mean square of AR(1) noise (Bartlett), n - 1 of white noise. Of slow noise a stop
+    hardly shows the scatter, which is then that of all stops together.
 
     Args:
-        residuals: Less their mean, shape (n, k).
+        residuals: Of each stop, less its mean, shape (n, k).
         tau: Integrated autocorrelation time, in samples.
     """
-    n = len(residuals)
-    square = np.mean(residuals**2, axis=0)
-    if is_slow(tau, n):
-        steps = np.mean(np.diff(residuals, axis=0) ** 2, axis=0)  # of AR(1): 2 (1 - phi) of a sample's variance
-        single = steps * (tau + 1.0) / 4.0
-        variance = np.maximum(single * _variance_of_mean(np.array(tau), n), square * n / (n - 1))
+    each = np.array([len(r) for r in residuals], dtype=np.float64)[:, None]
+    square = np.array([np.mean(r**2, axis=0) for r in residuals])
+    middle = float(np.median(each))
+    if is_slow(tau, middle):
+        variance = square.mean(axis=0) * np.minimum(tau / each, 1.0) / (1.0 - tau / middle)
     else:
-        freedom = max(n / tau - 1.0, 3.0)
-        variance = square * (tau / n) / (1.0 - tau / n) * (freedom / (freedom - 2.0))
+        part = np.minimum(tau / each, 0.5)
+        freedom = np.maximum(2.0 * each * tau / (tau**2 + 1.0) - 1.0, 3.0)
+        variance = square * part / (1.0 - part) * (freedom / (freedom - 2.0))
     sigma: Floats = np.maximum(np.sqrt(variance), LEAST_SIGMA)
     return sigma

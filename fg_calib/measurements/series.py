@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fg_calib.arguments import check_fields
 from fg_calib.arrays import Brief, FrozenArrays, as_figures, as_floats, check_sizes, require
 from fg_calib.errors import InputError, ProblemError, shown
-from fg_calib.measurements.dataset import Labels, Measurements
+from fg_calib.measurements.dataset import Labels, Measurements, Pairs
 from fg_calib.measurements.kinds import Camera, Kind, check_kind
 from fg_calib.options import (
     PAIR_MODELS,
@@ -282,6 +282,21 @@ class Table(Brief):
         """The same without known places that none of its own rows is of."""
         there = {name for labels in self.measurements.labels.values() for name in labels.names}
         return replace(self, known={name: place for name, place in self.known.items() if name in there})
+
+    def all_train(self) -> Table:
+        """The same with its test rows as train rows."""
+        m = self.measurements
+
+        def fitted(pairs: Pairs) -> Pairs:
+            return replace(pairs, test=np.zeros(pairs.n_pairs, dtype=np.bool_))
+
+        m = replace(
+            m,
+            test=np.zeros(m.n_configurations, dtype=np.bool_),
+            pairs=None if m.pairs is None else fitted(m.pairs),
+            groups=None if m.groups is None else replace(m.groups, pairs=fitted(m.groups.pairs)),
+        )
+        return replace(self, measurements=m, own=tuple(replace(own, test=None) for own in self.own))
 
     @property
     def unknown_frame(self) -> bool:

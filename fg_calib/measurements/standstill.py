@@ -6,8 +6,8 @@ stops (`correlated`).
 
 Note:
     What stays the same during a stop does not scatter: neither errors of the instrument in one place, nor noise that
-    wanders more slowly than a stop lasts. Where noise is correlated over more than a sixth of a stop, the sigma is that
-    of a single measurement at least.
+    wanders more slowly than several stops last. Noise that is slow beside a stop is told from white noise by the steps
+    from sample to sample.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from fg_calib.arrays import Floats, FrozenArrays
 from fg_calib.errors import InputError
 from fg_calib.measurements.clock import ClockOffset, estimate_offset
-from fg_calib.measurements.correlated import LEAST_SIGMA, correlation_time, is_slow, sigma_of_mean
+from fg_calib.measurements.correlated import LEAST_SIGMA, correlation_time, is_slow, sigmas_of_means
 from fg_calib.measurements.streams import JointStream, PoseStream, period
 from fg_calib.options import check_number
 from fg_calib.robot.model import Robot
@@ -59,7 +59,7 @@ class Scatter:
         single: Of single measurements, the median over stops of the largest component, [m] or [rad].
         mean: Sigma of a stop's mean, likewise.
         correlation: Integrated autocorrelation time in samples, 1 for white noise.
-        slow: Whether that is so much of a stop that a mean counts as a single measurement.
+        slow: Whether that is so much of a stop that averaging says little.
     """
 
     single: float
@@ -311,7 +311,7 @@ def _averaged(
 def _scatter(residuals: Sequence[Floats]) -> tuple[Scatter, Floats]:
     """Scatter of one quantity, its largest component's, and the sigma of each stop's mean, shape (n_stops, k)."""
     tau = correlation_time(residuals)
-    sigma = np.array([sigma_of_mean(r, tau) for r in residuals])
+    sigma = sigmas_of_means(residuals, tau)
     single = np.median([r.std(axis=0) for r in residuals], axis=0)
     n = float(np.median([len(r) for r in residuals]))
     return Scatter(float(single.max()), float(np.median(sigma, axis=0).max()), tau, is_slow(tau, n)), sigma

@@ -102,4 +102,6 @@ def _slow(stops: Stops) -> list[str]:
     if not slow:
         return []
     what = " and ".join(slow)
-    return [f"noise of {what} is slow beside the stops: sigmas are of single poses or more; longer stops tell more"]
+    return [
+        f"noise of {what} is slow beside the stops: they show it in part, and sigmas are rough; longer ones tell more"
+    ]

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import math
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
+from datetime import UTC, datetime
 from hashlib import sha256
 from importlib import metadata
 from pathlib import Path
@@ -31,6 +32,7 @@ from fg_calib.analysis.goodness import (
 )
 from fg_calib.analysis.identifiability import Identifiability
 from fg_calib.analysis.joint_values import JointValues
+from fg_calib.analysis.learned import knowledge_of
 from fg_calib.analysis.mistakes import SetupCheck
 from fg_calib.analysis.typical_residuals import TypicalResidual
 from fg_calib.analysis.uncertainty import ParameterEstimate, Uncertainty
@@ -42,6 +44,7 @@ from fg_calib.files.result import (
     SCHEMA,
     Acceptance,
     BeyondTolerance,
+    Carried,
     Correlated,
     Covariance,
     Explanation,
@@ -50,11 +53,13 @@ from fg_calib.files.result import (
     InFrames,
     JointScatter,
     KindGoodness,
+    Knowledge,
     Lost,
     Missing,
     Observability,
     Parameter,
     Posterior,
+    Previous,
     Priors,
     Relative,
     Result,
@@ -63,6 +68,7 @@ from fg_calib.files.result import (
     Step,
     SuspectReading,
     TestRows,
+    ToleranceScale,
     TouchedPoint,
     Typical,
     Weak,
@@ -92,13 +98,19 @@ _ROWS_AT_ONCE = 200_000
 """Rows of `residuals.csv` that are turned into text at once."""
 
 
-def result_of(solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str, str] | None = None) -> Result:
+def result_of(
+    solution: Solution,
+    uncertainty: Uncertainty,
+    inputs: Mapping[str, str] | None = None,
+    **origin: Any,
+) -> Result:
     """What `result.json` holds: SI, full precision, None for what is unknown or infinite.
 
     Args:
         solution: The solution.
         uncertainty: Its assessment.
         inputs: SHA-256 of the files it came from, by path.
+        origin: `job`, its document, to read tables like its own; `date` of its rows; `previous`, what it came from.
     """
     problem, settings, u = solution.problem, solution.problem.options, uncertainty
     names, goodness = problem.end_names, uncertainty.goodness
@@ -135,23 +147,65 @@ def result_of(solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str,
         folds=_folds(u),
         priors=_priors(u.priors),
         expected_error=_expected_error(u.expected_error),
-        noise_factors=_noise_factors(solution, goodness.kinds),
-        noise_kept=_noise_kept(solution, goodness.kinds),
+        **_noise_and_tolerances(solution, goodness.kinds),
         suspect_configurations=_suspects(goodness.configurations, names),
         residual_rms=_residual_rms(u),
-        parameters=tuple(map(_parameter, u.parameters)),
-        covariance=Covariance.make(names=u.names, matrix=u.covariance),
-        posterior=_posterior(u.whole),
-        links=None if problem.robot.urdf is None else (problem.robot.urdf.base_link, problem.robot.urdf.tip_link),
-        frame_estimate=None if u.frame is None else Frame.model_validate(u.frame),
-        frames={v.symbol: Frame.model_validate(f) for v, f in zip(problem.variables.frames, u.frames, strict=True)},
-        joint_values=_joint_values(u.joint_values, names),
-        groups=tuple(map(TouchedPoint.model_validate, u.points)),
+        **_estimates(problem, u),
         observability=_observability(u.identifiability),
-        options=_options(problem),
-        versions=_versions(),
-        inputs=dict(inputs or {}),
+        **_origin(solution, inputs or {}, **origin),
     )
+
+
+def _estimates(problem: Problem, u: Uncertainty) -> dict[str, Any]:
+    """What was estimated, and of which links of a URDF."""
+    urdf, frames = problem.robot.urdf, problem.variables.frames
+    return {
+        "parameters": tuple(map(_parameter, u.parameters)),
+        "covariance": Covariance.make(names=u.names, matrix=u.covariance),
+        "posterior": _posterior(u.whole),
+        "links": None if urdf is None else (urdf.base_link, urdf.tip_link),
+        "frame_estimate": None if u.frame is None else Frame.model_validate(u.frame),
+        "frames": {v.symbol: Frame.model_validate(f) for v, f in zip(frames, u.frames, strict=True)},
+        "joint_values": _joint_values(u.joint_values, problem.end_names),
+        "groups": tuple(map(TouchedPoint.model_validate, u.points)),
+    }
+
+
+def _origin(
+    solution: Solution,
+    inputs: Mapping[str, str],
+    job: Mapping[str, Any] | None = None,
+    date: str | None = None,
+    previous: Previous | None = None,
+) -> dict[str, Any]:
+    """What a result came from, and what the next one takes over."""
+    return {
+        "options": _options(solution.problem),
+        "versions": _versions(),
+        "inputs": dict(inputs),
+        "date": date or datetime.now(UTC).isoformat(timespec="seconds"),
+        "previous": previous,
+        "carried": _carried(solution, job or {}),
+    }
+
+
+def _carried(solution: Solution, job: Mapping[str, Any]) -> Carried:
+    """What the next calibration takes over."""
+    problem, known = solution.problem, knowledge_of(solution)
+    noise: dict[str, dict[str, float]] = {}
+    for (table, kind), factor in problem.state.factors.items():
+        source = "" if table < 0 else problem.data.tables[table].measurements.source
+        noise.setdefault(source.partition(", station ")[0], {})[kind] = factor
+    document = None
+    if known is not None:
+        document = Knowledge.make(
+            columns=known.variables.names,
+            unknowns=known.unknowns,
+            at=known.at,
+            rows=known.rows,
+            right=known.right,
+        )
+    return Carried.make(job=dict(job), noise=noise, knowledge=document)
 
 
 def _options(problem: Problem) -> dict[str, Any]:
@@ -250,6 +304,14 @@ def _noise_kept(solution: Solution, fits: Sequence[KindFit]) -> tuple[str, ...]:
     return (*(_key(fit, fits) for fit in fits if (fit.table, fit.kind) not in estimated), *of_joints)
 
 
+def _noise_and_tolerances(solution: Solution, fits: Sequence[KindFit]) -> dict[str, Any]:
+    """What noise and tolerances were estimated, by key."""
+    found = solution.estimated_tolerances
+    scales = None if found is None else tuple(map(ToleranceScale.model_validate, found.scales))
+    factors, kept = _noise_factors(solution, fits), _noise_kept(solution, fits)
+    return {"noise_factors": factors, "noise_kept": kept, "tolerance_scales": scales}
+
+
 def _joints(solution: Solution) -> bool:
     """Whether noise of the joint readings is stated."""
     return bool(np.any(solution.problem.data.sigma_joint > 0.0))
@@ -342,6 +404,7 @@ def _expected_error(expected: ExpectedError | None) -> ExpectedErrorDocument | N
         at=expected.at,
         n=expected.n,
         of=expected.of,
+        relative=expected.relative,
     )
 
 
@@ -597,6 +660,7 @@ RESULT_FILES = {
     **PAGE,
     **FIGURE_FILES,
     "joints.csv": b"id,joint,unit,reading,estimate,",
+    "history.json": b'{\n "schema": "fg-calib/history/',
     "robot_calibrated.yaml": b"",
     "robot_calibrated.urdf": b"",
 }
@@ -617,9 +681,31 @@ def write_results(
     Raises:
         InputError: The folder cannot be written.
     """
+    write_result(folder, result_of(solution, uncertainty, inputs), solution, uncertainty)
+
+
+def write_result(
+    folder: Path | str,
+    result: Result,
+    solution: Solution,
+    uncertainty: Uncertainty,
+    more: Callable[[str], dict[str, str]] | None = None,
+) -> None:
+    """`write_results` of a result that has been made.
+
+    Args:
+        folder: Where to.
+        result: What `result.json` holds.
+        solution: The solution.
+        uncertainty: Its assessment.
+        more: Text of other files by name, of the SHA-256 of `result.json`.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
     robot = solution.problem.robot
     calibrated = robot.with_values(solution.parameters[solution.problem.variables.robot_span])
-    document = result_document(solution, uncertainty, inputs)
+    document = result.document()
 
     def write(into: Path) -> None:
         write_calibrated_robot(into, calibrated)
@@ -629,7 +715,10 @@ def write_results(
             units = [robot.joints[j].unit for j in uncertainty.joint_values.joints]
             _write_joint_values(into / "joints.csv", uncertainty.joint_values, solution.problem.end_names, units)
         tables = {name: sha256(read_bytes(into / name)).hexdigest() for name in ("configurations.csv", "residuals.csv")}
-        write_text(into / "result.json", json.dumps(document | {"files": tables}, indent=1, allow_nan=False) + "\n")
+        text = json.dumps(document | {"files": tables}, indent=1, allow_nan=False) + "\n"
+        write_text(into / "result.json", text)
+        for name, content in ({} if more is None else more(sha256(text.encode()).hexdigest())).items():
+            write_text(into / name, content)
 
     fill_folder(Path(folder), write, RESULT_FILES)
 
@@ -644,6 +733,25 @@ def require_no_input(folder: Path, job: Job) -> None:
     for name in RESULT_FILES:
         if (folder / name).resolve() in inputs:
             raise InputError(str(folder / name), "the job was read from it", "another folder for the results")
+    require_own(folder, RESULT_FILES)
+
+
+def require_apart(folder: Path, results: Sequence[Path], inputs: Sequence[Path]) -> None:
+    """Check that an update written to a folder would replace neither what it comes from nor what is of no result.
+
+    Args:
+        folder: Where to.
+        results: Folders that are read.
+        inputs: Files that are read.
+
+    Raises:
+        InputError: It would.
+    """
+    if any(folder.resolve() == result.resolve() for result in results):
+        raise InputError(str(folder), "the folder of the result that is updated", "another one, for the new result")
+    for name in RESULT_FILES:
+        if (folder / name).resolve() in {path.resolve() for path in inputs}:
+            raise InputError(str(folder / name), "it is read", "another folder for the results")
     require_own(folder, RESULT_FILES)
 
 

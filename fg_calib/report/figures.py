@@ -215,7 +215,7 @@ def _cell(change: float) -> str:
     return ("+" if change > 0 else "\N{MINUS SIGN}") + digits.replace("0.", ".")
 
 
-def _figure(width: float, height: float) -> tuple[Figure, Axes]:
+def empty_figure(width: float, height: float) -> Figure:
     """An empty figure of a size in inches, with a canvas that needs no display."""
     with without_settings("matplotlibrc", "MPLBACKEND or MPLCONFIGDIR"):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -223,6 +223,12 @@ def _figure(width: float, height: float) -> tuple[Figure, Axes]:
 
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
+    return figure
+
+
+def _figure(width: float, height: float) -> tuple[Figure, Axes]:
+    """The same with axes."""
+    figure = empty_figure(width, height)
     axes = figure.add_subplot()
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(labelsize=_SMALL)

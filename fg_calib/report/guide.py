@@ -19,6 +19,8 @@ TOPICS: Mapping[str, str] = {
     "reading-a-report": "what the numbers mean",
     "believe-it": "inspect, limits, folds, the page to show, two results side by side",
     "correct": "what to command so that the calibrated arm reaches its targets",
+    "export": "into the robot: URDF, ROS, Tesseract, tables, joint zeros",
+    "next-month": "is a calibration still good, what has moved, and what was learned since",
     "observability": "which parameters measurements can determine at all",
     "simulate": "a robot and measurements to try things on",
     "compare": "beside plain least squares, and against the truth",

@@ -190,7 +190,7 @@ def inspection_document(found: Inspection, job: Job) -> dict[str, Any]:
       "disagreements": {"found": [the fields of `Disagreement`], "n", "of"},
       "n_residuals", "n_priors", "n_unknowns", "dof", "n_excluded": {reason: count},
       "observability": as observability.json,
-      "expected_error": {"base": {"position", "orientation"}, "fitted": {...}, "at", "n", "of"} | null,
+      "expected_error": {"base": {"position", "orientation"}, "fitted": {...}, "at", "n", "of", "relative"} | null,
       "inputs": {path: sha256} }
     """
     checks = found.setups

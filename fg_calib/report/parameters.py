@@ -7,8 +7,10 @@ from collections.abc import Mapping
 from rich.console import RenderableType
 
 from fg_calib.analysis.uncertainty import Uncertainty
+from fg_calib.graph.tolerances import ToleranceScales
 from fg_calib.report.shown import SHOWN
 from fg_calib.report.tables import plain_table, rounded
+from fg_calib.report.tolerances import HEADINGS, tolerance_rows
 
 
 def parameters(uncertainty: Uncertainty) -> RenderableType:
@@ -36,6 +38,15 @@ def parameters(uncertainty: Uncertainty) -> RenderableType:
             "" if p.prior_sigma is None else f"{p.prior_sigma * factor:.{decimals}f}",
             p.identifiability,
         )
+    return table
+
+
+def tolerances(found: ToleranceScales, uncertainty: Uncertainty) -> RenderableType:
+    """The scales of tolerances that were estimated."""
+    left = {0, 3}
+    table = plain_table(*((heading, "left" if i in left else "right") for i, heading in enumerate(HEADINGS)))
+    for row in tolerance_rows(found.scales, uncertainty.parameters):
+        table.add_row(*row)
     return table
 
 

@@ -11,6 +11,7 @@ from fg_calib.files.result import Judgement as JudgementDocument
 from fg_calib.files.result import Parameter, Result, Rms
 from fg_calib.options import LIMITED
 from fg_calib.report.shown import FAMILY_UNIT, SHOWN
+from fg_calib.report.tolerances import TITLE, tolerance_rows
 
 WIDTH = 100
 
@@ -99,6 +100,8 @@ def format_result(result: Result) -> str:
         for row in rows
     )
     parts = [*summary(result), "", "Parameters", *("  ".join(row).rstrip() for row in cells)]
+    if result.tolerance_scales:
+        parts += ["", TITLE, *_scales(result)]
     if result.frame_estimate is not None:
         xyz = "  ".join("unknown" if v is None else f"{v * 1e3:.4f}" for v in result.frame_estimate.xyz)
         quaternion = "  ".join("unknown" if v is None else f"{v:.8f}" for v in result.frame_estimate.quaternion_xyzw)
@@ -106,6 +109,12 @@ def format_result(result: Result) -> str:
     if notes := [text for text in result.cautions if result.findings or text not in result.reservations]:
         parts += ["", "Notes", *map(escaped, notes)]
     return "\n".join(parts)
+
+
+def _scales(result: Result) -> Iterator[str]:
+    """A line for each scale: `a: 2.9 (1.8 to 6.5), 5.0 of 6 corrections seen`."""
+    for group, *_, ratio, low, high, seen in tolerance_rows(result.tolerance_scales or (), result.parameters):
+        yield escaped(f"{group}: {ratio} ({low} to {high}), {seen} corrections seen")
 
 
 def html(result: Result) -> str:

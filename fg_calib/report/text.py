@@ -21,10 +21,11 @@ from fg_calib.report.fit import goodness_of_fit, prediction, suspicious, with_jo
 from fg_calib.report.folds import folds
 from fg_calib.report.identifiability import WEAK, lost_directions, weak_directions
 from fg_calib.report.notes import notes
-from fg_calib.report.parameters import combinations, parameters
+from fg_calib.report.parameters import combinations, parameters, tolerances
 from fg_calib.report.shown import SHOWN
 from fg_calib.report.summary import good, judged
 from fg_calib.report.tables import WIDTH, in_order, indented, line, plain_table, plain_text, rounded, section
+from fg_calib.report.tolerances import TITLE
 
 
 @checked
@@ -48,6 +49,8 @@ def build_report(solution: Solution, uncertainty: Uncertainty) -> RenderableType
     ]
     if uncertainty.names or not solution.problem.evaluated:
         parts += section("Parameters", parameters(uncertainty))
+    if solution.estimated_tolerances is not None:
+        parts += section(TITLE, tolerances(solution.estimated_tolerances, uncertainty))
     if any(p.stands_for for p in uncertainty.parameters):
         parts += section("What kept parameters were estimated for", combinations(uncertainty))
     parts += suspicious(solution, uncertainty)

@@ -35,15 +35,17 @@ LANES = 32
 
 
 class _CompileNotice(event.Listener):  # type: ignore[misc]
-    """Says once, when numba starts to compile, why the program is silent for some seconds."""
+    """Says once, when numba starts to compile, why the program is silent for some seconds, and how often it will be."""
 
-    said = False
+    said, kept = False, True
 
     def on_start(self, event: object) -> None:
         """Numba begins to compile (a kernel found in its cache does not come here)."""
         if not _CompileNotice.said:
             _CompileNotice.said = True
-            logger.warning("compiling the kernels: some seconds, once an installation")
+            each = "each time, unless NUMBA_CACHE_DIR is a folder that can be written"
+            often = "once an installation" if _CompileNotice.kept else each
+            logger.warning("compiling the kernels: some seconds, %s", often)
 
     def on_end(self, event: object) -> None:
         """Numba is done with one function."""
@@ -52,9 +54,11 @@ class _CompileNotice(event.Listener):  # type: ignore[misc]
 def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     """Compile a kernel with numba: without the GIL, with fused multiply-adds, cached where a folder can be written."""
     options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}} | options
+    _CompileNotice.kept &= has_cache_folder()
     try:
         kernel: Callable[..., Any] = numba.njit(cache=has_cache_folder(), **options)(function)
     except RuntimeError:  # neither the package's folder nor the user's cache can be written
+        _CompileNotice.kept = False
         return numba.njit(**options)(function)  # type: ignore[no-any-return]
     check_cache(kernel)
     return kernel

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from simulated import measure, small_arm, true_robot, write_job
+from simulated import measure, plus, small_arm, true_robot, write_job
 
 from fg_calib import InputError, calibrate
 from fg_calib.options import Limits, Options
@@ -123,8 +123,8 @@ def test_what_is_not_accepted_ends_with_3_and_says_why(tmp_path, fg_calib):
 @pytest.mark.parametrize(
     ("accept", "message"),
     [
-        ({"position": "0.5 deg"}, "accept: position: found '0.5 deg', expected a number with one of m, cm, mm, um"),
-        ({"position": "0.5 Mm"}, "expected a number with one of m, cm, mm, um; did you mean mm?"),
+        ({"position": "0.5 deg"}, "accept: position: found '0.5 deg', expected a number with one of m, cm, mm, um, in"),
+        ({"position": "0.5 Mm"}, "expected a number with one of m, cm, mm, um, in; did you mean mm?"),
         ({"position": "a lot"}, "accept: position: found 'a lot', expected a finite number, with its unit or without"),
         ({"position": -1}, "accept: position: found -1, expected a number above 0"),
         ({"orientation": "5 mm"}, "accept: orientation: found '5 mm', expected a number with one of rad, deg, mrad"),
@@ -158,6 +158,59 @@ def test_test_rows_at_readings_that_are_fitted_do_not_count():
     result = calibrate(robot, m, model="pose", accept={"position": 5e-4})
     assert verdicts(result) == ["not evaluated"]
     assert "no measurement of any position was held out" in result.not_accepted[0]
+
+
+@pytest.mark.parametrize("loss", ["huber", "gnc"])
+def test_few_rows_that_alone_are_why_a_limit_is_not_kept_are_named(loss):
+    """A gross error is held out: no loss acts on it, and the arm is not what is wrong."""
+    rng = np.random.default_rng(0)
+    robot = small_arm(tolerance={"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}, estimate=TOOL)
+    m = measure(true_robot(robot, rng), 40, rng, sigma=(1e-4, 1e-4), n_test=20)
+    wrong = int(np.flatnonzero(m.test)[4])
+    m = replace(m, position=plus(m.position, wrong, 0.02))
+    (one,) = calibrate(robot, m, model="pose", loss=loss, accept={"position": 5e-4}).result.acceptance.judgements
+    assert one.verdict == "fail"
+    assert one.reason == f"within the limit without {m.ids[wrong]}, which is far off beside the others: look at it"
+
+
+def test_an_arm_that_is_wrong_everywhere_blames_no_row():
+    (one,) = calibrated(wrong=0.01, accept={"position": 5e-3}).result.acceptance.judgements
+    assert (one.verdict, one.reason) == ("fail", "")
+
+
+def test_folds_name_the_rows_that_are_why_too():
+    rng = np.random.default_rng(0)
+    robot = small_arm(tolerance={"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}, estimate=TOOL)
+    m = measure(true_robot(robot, rng), 40, rng, sigma=(1e-4, 1e-4))
+    m = replace(m, position=plus(m.position, 7, 0.02))
+    result = calibrate(robot, m, model="pose", loss="gnc", accept={"position": 5e-4}, folds=4)
+    (one,) = result.result.acceptance.judgements
+    assert (one.verdict, one.n) == ("fail", 40)
+    assert one.reason.startswith(f"within the limit without {m.ids[7]}, which is")
+
+
+def test_rows_whose_prediction_nothing_determines_are_not_held_out():
+    """Joint 3 stands still while the arm is calibrated: where it moves, nothing says what the arm does."""
+    rng = np.random.default_rng(0)
+    robot = small_arm()
+    q = rng.uniform(-2.0, 2.0, (60, robot.n_joints))
+    q[:50, 2] = 0.4
+    m = measure(
+        true_robot(small_arm(tolerance=dict.fromkeys(("a", "d", "alpha", "theta"), 0.003)), rng),
+        50,
+        rng,
+        sigma=(1e-4, 1e-4),
+        n_test=10,
+        readings=q,
+    )
+    m = replace(m, test=np.arange(60) >= 40)
+    result = calibrate(robot, m, model="position", gauge="none", accept={"position": 1e-3})
+    assert result.residuals.reason[result.residuals.test].tolist() == (
+        [""] * 30 + ["depends on what is not determined"] * 30
+    )
+    (one,) = result.result.acceptance.judgements
+    assert (one.n, one.verdict) == (10, "pass")
+    assert one.error == pytest.approx(result.residuals.rms()["test"]["position"]["after"], rel=1e-12)
 
 
 def test_many_rows_of_one_table_do_not_make_up_for_those_of_another():

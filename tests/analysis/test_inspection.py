@@ -171,6 +171,36 @@ def test_rows_that_disagree_with_the_arm_are_named(arm, model, frame, size):
     assert rows[7].size == pytest.approx(size, rel=0.3)
 
 
+@pytest.mark.parametrize(
+    ("rows", "advice"),
+    [
+        ([7], "look at it, or let a robust loss do so (loss: gnc)"),
+        ([43], "look at it; a test row: no loss acts on what is held out"),
+        ([43, 45], "look at them; test rows: no loss acts on what is held out"),
+        ([7, 43], "(loss: gnc); 1 are test rows: no loss acts on what is held out"),
+    ],
+)
+def test_a_robust_loss_is_not_offered_for_test_rows(arm, rows, advice):
+    m = measured(arm)
+    (finding,) = inspected(arm, replace(m, position=plus(m.position, rows, [0.0, 0.3, 0.0]))).findings
+    assert finding.endswith(advice)
+
+
+@pytest.mark.parametrize("n_test", [0, 10])
+def test_limits_that_cannot_be_evaluated_are_told_of(arm, n_test):
+    m = measured(arm)
+    m = replace(m, test=np.arange(m.n_configurations) < n_test)
+    limits = {"position": 1e-3, "distance": 1e-3}
+    found = inspect_job(Job(None, arm, m, Options(model="pose", frame="unknown", accept=limits)))
+    lacking, *others = found.findings
+    assert lacking == "accept: nothing in this job measures any distance: its limit cannot be evaluated"
+    assert [text.startswith("accept: limits are judged by what is held out, and nothing is") for text in others] == [
+        True
+    ] * (n_test == 0)
+    folds = Options(model="pose", frame="unknown", accept={"position": 1e-3}, folds=5)
+    assert inspect_job(Job(None, arm, m, folds)).ready
+
+
 def test_a_wrong_orientation_is_named_as_that(arm):
     m = measured(arm)
     R = m.rotation.copy()

@@ -73,6 +73,9 @@ SPOILT = {
 """Mistakes in a table: how they are named, and how they are made."""
 
 ONE = {
+    "x, y, z are in inches, not mm": lambda m: replace(m, position=m.position / 25.4),
+    "x, y, z are in inches, not m": lambda m: replace(m, position=m.position / 0.0254),
+    "x, y, z are in mm, not inches": lambda m: replace(m, position=m.position * 25.4),
     "x, y, z are in cm, not mm": lambda m: replace(m, position=m.position * 0.1),
     "readings of joint 3 are in deg, not rad": lambda m: replace(m, readings=m.readings * only(3, 180 / np.pi, 1)),
     "readings of joint 2 are in rad, not deg": lambda m: replace(m, readings=m.readings * only(2, np.pi / 180, 1)),

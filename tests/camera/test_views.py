@@ -219,3 +219,13 @@ def test_corners_that_no_pose_explains_are_named(monkeypatch):
     monkeypatch.setattr(module, "both_poses", lambda p, uv, c: [])
     with pytest.raises(InputError, match="images: corners that no pose of the board explains, expected images of this"):
         fit_board(BOARD, found, SIZE, CAMERA)
+
+
+def test_a_camera_of_images_of_another_size_is_found_out():
+    """Images four times as large as those that the camera was calibrated with."""
+    found, _ = drawn(4, np.random.default_rng(13))
+    larger = [one._replace(uv=4.0 * one.uv + 1.5) for one in found]
+    (finding,) = fit_board(BOARD, larger, (4 * SIZE[0], 4 * SIZE[1]), CAMERA).findings
+    assert finding.startswith("no poses explain the corners: residuals of ")
+    assert finding.endswith("is the camera that of these images of 2560 x 1920 px, is the board as its file says?")
+    assert fit_board(BOARD, found, SIZE, CAMERA).findings == ()

@@ -197,6 +197,18 @@ def test_what_only_has_the_name_of_files_not_yet_moved_is_left_alone(tmp_path, l
     assert content(others) == (dict.fromkeys(FILES, "of a victim"), 0)
 
 
+@pytest.mark.parametrize("check", [disk.require_own, disk.require_absent])
+def test_a_link_to_nothing_is_not_replaced(tmp_path, check):
+    """It is somebody's, wherever it is to lead one day."""
+    (tmp_path / "report.html").symlink_to(tmp_path / "elsewhere" / "report.html")
+    with pytest.raises(InputError, match=r"report.html: is (a link to nothing|there already)"):
+        check(tmp_path, {"report.html": b"<!DOCTYPE"})
+    with pytest.raises(InputError, match="is a link to nothing"):
+        disk.fill_folder(tmp_path, lambda into: disk.write_text(into / "report.html", "new"), {"report.html": b"<!"})
+    assert (tmp_path / "report.html").is_symlink()
+    assert not (tmp_path / "elsewhere").exists()
+
+
 def test_links_among_files_not_yet_moved_are_refused(tmp_path):
     (tmp_path / disk._WRITTEN).mkdir()
     (tmp_path / disk._WRITTEN / "one").symlink_to("/etc/hostname")

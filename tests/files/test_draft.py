@@ -184,6 +184,62 @@ def test_the_commented_keys_are_keys_of_a_job(fg_calib, folder):
     assert read_job(folder / JOB).options.loss == "none"
 
 
+def test_columns_of_counts_are_recognised_and_their_scale_is_asked_for(fg_calib, folder):
+    folder, write = folder
+    counts = {f"q{i}": 1000.0 for i in range(1, 7)}
+    given = drafted(fg_calib, folder, folder / "robot.yaml", write({f"q{i}": f"Enc{i}" for i in range(1, 7)}, counts))
+    assert given["columns"] == {f"q{i}": {"name": f"Enc{i}", "scale": 1.0, "zero": 0.0} for i in range(1, 7)}
+    text = (folder / JOB).read_text()
+    assert "# DECIDE scale and zero of each: reading = (count - zero) * scale" in text
+    assert "guessed" in text  # the unit of x, y, z
+    (folder / JOB).write_text(text.replace("scale: 1.0", "scale: 0.001"))
+    assert fg_calib("inspect", folder / JOB).code == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "cells", "found"),
+    [
+        ("Messpunkt", [f"P{i}" for i in range(40)], "Messpunkt"),
+        ("No.", [str(i) for i in range(40)], "No."),
+        ("Bediener", ["Eva"] * 40, None),
+        ("Temperatur", [f"{20 + 0.01 * i:.2f}" for i in range(40)], None),
+        ("Zeit", [f"{i}e-3" for i in range(40)], None),
+    ],
+)
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_a_column_that_names_the_rows_is_suggested_as_id(fg_calib, folder, name, cells, found, ending):
+    folder, write = folder
+    table = pl.read_csv(write()).with_columns(pl.Series(name, cells))
+    file = folder / f"named.{ending}"
+    table.write_csv(file) if ending == "csv" else table.write_parquet(file)
+    given = drafted(fg_calib, folder, folder / "robot.yaml", file)
+    assert given.get("columns", {}).get("id") == found
+    assert (f"# not used: {name}" in (folder / JOB).read_text()) == (found is None)
+    assert fg_calib("inspect", folder / JOB).code == 0
+
+
+def test_examples_in_comments_are_in_the_jobs_units(fg_calib, folder):
+    folder, _ = folder
+    q = np.random.default_rng(1).uniform(-100, 100, (30, 6))
+    far = {"anchor": np.array(["bolt"] * 30), "distance [mm]": np.linspace(700.0, 900.0, 30)}
+    write_csv(folder / "bar.csv", {f"q{i + 1}": q[:, i] for i in range(6)} | far)
+    drafted(fg_calib, folder, folder / "robot.yaml", folder / "bar.csv")
+    text = (folder / JOB).read_text()
+    assert "# anchors: {bolt: {x: 1000.0, y: 0.0, z: 0.0, tolerance: 2.0}}" in text
+    (folder / JOB).write_text(text.replace("# anchors", "anchors"))
+    assert read_job(folder / JOB).tables[0].known["bolt"].xyz[0] == 1.0
+
+
+def test_a_table_of_poses_may_be_a_boards(fg_calib, folder):
+    """A hand-eye table has the columns of one of poses: only its user knows."""
+    folder, _ = folder
+    q = np.random.default_rng(1).uniform(-2, 2, (30, 6))
+    columns = {name: np.full(30, 0.1) for name in ("x", "y", "z", "rx", "ry", "rz")}
+    write_csv(folder / "seen.csv", {f"q{i + 1}": q[:, i] for i in range(6)} | columns)
+    drafted(fg_calib, folder, folder / "robot.yaml", folder / "seen.csv")
+    assert "board if a camera on the tool measured where a board is" in (folder / JOB).read_text()
+
+
 def test_an_existing_file_is_never_overwritten(fg_calib, folder):
     folder, write = folder
     (folder / JOB).write_text("mine")
@@ -199,6 +255,10 @@ REFUSED = {
     "two robots": (
         ["robot.yaml", "other.yaml", "poses.csv"],
         "error: init: several robot files: robot.yaml, other.yaml",
+    ),
+    "one table twice": (
+        ["robot.yaml", "poses.csv", "../{}/poses.csv"],
+        "error: init: the same table twice: poses.csv, ",
     ),
     "a picture": (["robot.yaml", "poses.png"], "error: {}/poses.png: ending '.png', expected robot.yaml, a .urdf"),
     "a job": (["robot.yaml", "job.yaml"], "error: job.yaml: a job, expected a robot"),
@@ -241,7 +301,7 @@ def test_what_cannot_be_used_is_refused_in_one_line(fg_calib, folder, case):
     (folder / "seen.csv").write_text(f"{q},u,v,corner_x,corner_y\n{zeros},1,2,0,0\n")
     (folder / "bad.csv").write_text(f"{q},x,y,z\n{zeros},far,0,0\n")
     files, says = REFUSED[case]
-    ended = fg_calib("init", *(folder / file for file in files), "--out", folder / JOB)
+    ended = fg_calib("init", *(folder / file.format(folder.name) for file in files), "--out", folder / JOB)
     assert (ended.code, ended.out) == (1, "")
     assert ended.err.startswith(says.format(folder))
     assert ended.err.count("\n") == 1

@@ -121,7 +121,7 @@ def test_a_table_that_memory_does_not_suffice_for_is_named(module, tmp_path, mon
     def full(*_):
         raise MemoryError
 
-    monkeypatch.setattr(module, "_readings" if module is tables else "_ends", full)
+    monkeypatch.setattr(module, "read_readings" if module is tables else "_ends", full)
     with pytest.raises(InputError) as caught:
         read_measurements(tmp_path / "poses.csv", robot, pairs=tmp_path / "pairs.csv", noise=Noise(position=1e-3))
     assert str(caught.value) == f"{name}: there is not enough memory for it"

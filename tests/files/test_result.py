@@ -215,6 +215,18 @@ def test_version_1_is_readable_with_no_more_than_it_promised(folder):
             "json: covariance: names: 'a9', which is no parameter, expected names",
         ),
         (lambda f: changed(f, lambda d: d.update(schema="fg-calib/comparison/1")), "json: no result of a calibration"),
+        (
+            lambda f: changed(f, lambda d: d["residual_rms"]["train"]["position"].update(after=1e308)),
+            r"residual_rms: train: position: after: found 1e\+308, expected a number not above 1e\+150",
+        ),
+        (
+            lambda f: changed(f, lambda d: d["expected_error"]["position"].update(fitted=-1e308)),
+            r"expected_error: position: fitted: found -1e\+308, expected a number not below -1e\+150",
+        ),
+        (
+            lambda f: changed(f, lambda d: d["posterior"]["covariance"][0].__setitem__(0, 1e300)),
+            r"posterior: covariance 1 1: found 1e\+300, expected a number not above 1e\+150",
+        ),
         (lambda f: changed(f, lambda d: d["parameters"][2].pop("sigma")), "json: parameter 3: missing key 'sigma'"),
         (lambda f: changed(f, lambda d: d["parameters"][2].update(nominal=None)), "json: parameter 3: nominal: found"),
         (lambda f: changed(f, lambda d: d["covariance"]["names"].pop()), "covariance: another size than its names"),

@@ -118,7 +118,9 @@ def test_a_robot_written_in_si_reads_back_the_same(tmp_path, robot):
 
 
 @pytest.mark.slow
-@given(robot=robots(), length=st.sampled_from(["m", "cm", "mm", "um"]), angle=st.sampled_from(["rad", "deg", "mrad"]))
+@given(
+    robot=robots(), length=st.sampled_from(["m", "cm", "mm", "um", "in"]), angle=st.sampled_from(["rad", "deg", "mrad"])
+)
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 def test_a_robot_written_in_other_units_reads_back_to_rounding(tmp_path, robot, length, angle):
     write_robot(tmp_path / "robot.yaml", robot, units=Units(length=length, angle=angle))
@@ -279,7 +281,9 @@ MISTAKES = {
     HEAD + ROW + "  - {a: 0, alpha: 0, d: 0, theta: 0, name: q1}\n": (
         "robot.yaml: joint 2: name: found 'q1', the name of joint 1, expected another"
     ),
-    HEAD + ROW + "units: {length: inch}\n": ("robot.yaml: units: length: found 'inch', expected one of m, cm, mm, um"),
+    HEAD + ROW + "units: {length: inch}\n": (
+        "robot.yaml: units: length: found 'inch', expected one of m, cm, mm, um, in; did you mean in?"
+    ),
     HEAD + ROW + "units: {lenght: m}\n": (
         "robot.yaml: units: unknown key 'lenght', expected one of length, angle; did you mean length?"
     ),

@@ -259,7 +259,7 @@ MISTAKES = [
     (SHORT + "frame: free\n",
      S + "frame: found 'free', expected base, unknown, or a mapping of x, y, z, roll, pitch, yaw"),
     (SHORT + "frame: {w: 1}\n", S + "frame: unknown key 'w', expected one of x, y, z, roll, pitch, yaw"),
-    (SHORT + "units: {length: km}\n", S + "units: length: found 'km', expected one of m, cm, mm, um"),
+    (SHORT + "units: {length: km}\n", S + "units: length: found 'km', expected one of m, cm, mm, um, in"),
     (SHORT + "job: {model: poses}\n", S + "job: model: found 'poses', expected one of pose, position, orientation, "
      "distance, rotation, distance-rotation, anchor, plane, board, pixels; did you mean pose?"),
     (SHORT + "job: {pairing: star}\n", S + "job: missing key 'model'"),

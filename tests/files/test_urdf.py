@@ -8,13 +8,12 @@ import pytest
 import yourdfpy
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from lxml import etree
 from oracle import tool_pose
 from tolerances import rounding
 
 from fg_calib.errors import InputError
 from fg_calib.files.robot_yaml import read_robot, write_robot
-from fg_calib.files.urdf import read_urdf, write_urdf
+from fg_calib.files.urdf import read_urdf, urdf_text, write_urdf
 from fg_calib.robot.model import Joint
 
 TREE = """\
@@ -153,15 +152,58 @@ def test_only_origins_of_moving_joints_are_rewritten(tree, tmp_path):
     expected = (
         TREE.replace('<joint name="r1" type="continuous">\n    ', '<joint name="r1" type="continuous">\n    '
                  '<origin xyz="0.0 0.0 0.1" rpy="0.0 0.0 0.0"/>\n    ')
-        .replace('<origin xyz="0 0.05 0.7"/>', '<origin xyz="0.0 0.05 0.7" rpy="0.0 0.0 0.3333333333333333"/>')
+        .replace('<origin xyz="0 0.05 0.7"/>', '<origin xyz="0 0.05 0.7" rpy="0.0 0.0 0.3333333333333333"/>')
     )  # fmt: skip
     assert (tmp_path / "out.urdf").read_text() == expected
 
 
-def test_an_unchanged_robot_is_written_as_it_was(tree, tmp_path):
-    write_urdf(tmp_path / "out.urdf", read_urdf(tree, tip_link="left_tip"))
-    written, original = (etree.tostring(etree.parse(p), method="c14n") for p in (tmp_path / "out.urdf", tree))
-    assert written == original
+ODD = """\
+<?xml version='1.0' encoding="utf-8" ?>
+<!DOCTYPE robot [ <!-- nothing --> ]>
+<?editor <joint name="l1"><origin xyz="9 9 9"/></joint> ?>
+<robot   name = 'odd' >\t<!-- <joint name="l1"><origin xyz="8 8 8"/></joint> -->
+<link name="a"/><link name='b&amp;c'
+/><link name="d"/><gazebo><joint name="l1"><origin xyz="7 7 7"/></joint></gazebo>
+<joint
+    note='xyz="1 2 3" > origin' type='revolute'
+    name="l1" ><![CDATA[<origin xyz="6 6 6"/>]]>
+  <dynamics damping="0"><origin xyz="5 5 5"/></dynamics>
+  <origin  rpy='0.1  0.20
+     3e-1'
+     xyz = "1.0 +2.0 3.00"  ></origin  >
+  <parent link="a"/><child link="b&amp;c"/><axis xyz="0 0 1"/><calibration falling="0.5"/>
+</joint  >
+<joint name="&lt;l2&gt;" type="continuous"><parent link="b&amp;c"/><child link="d"/><origin /></joint>
+</robot >
+<!-- after -->
+"""
+
+
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "iso-8859-1", "utf-16"])
+def test_a_urdf_is_written_byte_for_byte_but_for_the_figures_of_origins(tmp_path, encoding, newline):
+    text = ODD.replace("utf-8", encoding.removesuffix("-sig")).replace("nothing", "kein Körper")
+    (tmp_path / "in.urdf").write_bytes(text.replace("\n", newline).encode(encoding))
+    robot = read_urdf(tmp_path / "in.urdf")
+    write_urdf(tmp_path / "out.urdf", robot)
+    assert (tmp_path / "out.urdf").read_bytes() == (tmp_path / "in.urdf").read_bytes()
+    values = robot.nominal
+    values[robot.index("l1.y")] = -0.25
+    values[robot.index("<l2>.roll")] = 1e-7
+    write_urdf(tmp_path / "out.urdf", robot.with_values(values))
+    expected = text.replace('"1.0 +2.0 3.00"', '"1.0 -0.25 3.0"').replace(
+        "<origin />", '<origin rpy="1e-07 0.0 0.0" />'
+    )
+    assert (tmp_path / "out.urdf").read_bytes() == expected.replace("\n", newline).encode(encoding)
+    assert read_urdf(tmp_path / "out.urdf").parameters == robot.with_values(values).parameters
+
+
+def test_zeros_are_added_to_what_a_joint_is_calibrated_by():
+    text = ODD.replace('falling="0.5"', 'rising="0.5" falling="0"')
+    assert urdf_text(ODD, {}, {"l1": 0.25, "<l2>": -0.5}) == ODD.replace(
+        '<calibration falling="0.5"/>', '<calibration falling="0.5" rising="0.25"/>'
+    ).replace('type="continuous">', 'type="continuous"><calibration rising="-0.5"/>')
+    assert urdf_text(text, {}, {"l1": 0.25}) == text.replace('rising="0.5"', 'rising="0.75"')
 
 
 def test_an_encoding_that_python_does_not_know_is_a_line(tmp_path):
@@ -175,7 +217,7 @@ def test_other_encodings_survive(tmp_path):
     (tmp_path / "in.urdf").write_bytes(text.encode("latin-1"))
     robot = read_urdf(tmp_path / "in.urdf", tip_link="left_tip")
     write_urdf(tmp_path / "out.urdf", robot)
-    assert "ein Körper" in (tmp_path / "out.urdf").read_text(encoding="utf-8")
+    assert (tmp_path / "out.urdf").read_bytes() == text.encode("latin-1")
     assert read_urdf(tmp_path / "out.urdf", tip_link="left_tip").parameters == robot.parameters
 
 

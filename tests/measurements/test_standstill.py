@@ -8,7 +8,7 @@ from recordings import arm, correlated, record
 from scipy.spatial.transform import Rotation
 
 from fg_calib import InputError, Robot
-from fg_calib.measurements.correlated import correlation_time, is_slow, sigma_of_mean
+from fg_calib.measurements.correlated import correlation_time, is_slow, sigmas_of_means
 from fg_calib.measurements.standstill import average_stops, find_standstills
 from fg_calib.measurements.streams import JointStream, PoseStream, Source
 
@@ -163,7 +163,7 @@ def test_sigma_of_white_noise_is_that_of_students_t():
     x = np.random.default_rng(0).standard_normal((20, 3))
     x -= x.mean(axis=0)
     s2 = x.var(axis=0, ddof=1)
-    assert sigma_of_mean(x, 1.0) == pytest.approx(np.sqrt(s2 / 20 * 19 / 17), rel=1e-12)
+    assert sigmas_of_means([x], 1.0)[0] == pytest.approx(np.sqrt(s2 / 20 * 19 / 17), rel=1e-12)
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.5, 0.8])
@@ -179,7 +179,7 @@ def test_correlation_time_is_that_of_the_noise(phi):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "least"),
-    [({}, 0.85), ({"pose_rate": 20.0}, 0.8), ({"phi": 0.8}, 0.75), ({"phi": 0.9}, 0.4), ({"phi": 0.97}, 0.7)],
+    [({}, 0.85), ({"pose_rate": 20.0}, 0.8), ({"phi": 0.8}, 0.6), ({"phi": 0.9}, 0.4), ({"phi": 0.97}, 0.35)],
     ids=str,
 )
 def test_sigmas_are_those_of_the_errors(settings, least):
@@ -212,3 +212,24 @@ def test_sigmas_of_orientations_are_about_the_tools_axes_and_of_positions_along_
     assert np.median(stops.sigma_position / stops.sigma_position[:, :1], axis=0) == pytest.approx([1, 10, 1], rel=0.2)
     ratio = stops.sigma_orientation / stops.sigma_orientation[:, 1:2]
     assert np.median(ratio, axis=0) == pytest.approx([10, 1, 1], rel=0.2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seconds", "most"), [(0.3, 1.2), (1.0, 1.7)])
+def test_slow_noise_is_seen_beneath_white_noise(seconds, most):
+    """Monte Carlo: 12 recordings of noise of 0.2 mm as slow as a stop under 0.05 mm that is white; was 4.5 for 1 s."""
+    found = []
+    for seed in range(12):
+        motion = record(300 + seed, sigma_position=5e-5)
+        slow = correlated(np.random.default_rng(seed), motion.position.shape, np.exp(-1.0 / (60.0 * seconds)))
+        motion.position += 2e-4 * slow
+        found.append(nees(averaged(motion), motion)[0])
+    assert np.mean(found) < most + 3.0 * np.std(found) / np.sqrt(12)
+    assert np.mean(found) > 0.2
+
+
+def test_white_noise_alone_is_not_called_slow():
+    generator = np.random.default_rng(4)
+    for n in (12, 70, 500):
+        stops = [x - x.mean(axis=0) for x in generator.standard_normal((12, n, 3))]
+        assert correlation_time(stops) < 1.3

@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import month
 import numpy as np
 import pytest
 import typer
@@ -281,6 +282,20 @@ def corrects_a_program(code, folder, fg_calib):
     exec(code, {})
 
 
+def exports_an_arm(code, folder, fg_calib):
+    exec(code, {})
+    assert read_robot(folder / "arm_hayati.yaml").n_joints == 2
+
+
+def checks_and_updates(code, folder, fg_calib):
+    calibration, true, rng = month.calibrated(1)
+    rows = month.measured(month.slipped(true, theta3=2e-3), 10, rng)
+    exec(code, made := {"calibration": calibration, "rows": rows})
+    assert made["found"].verdict == "fail"
+    assert [e.parameters for e in made["found"].explanations if e.likely] == [("theta3",)]
+    assert len(made["updated"].runs) == 2
+
+
 def slow(function, mark=pytest.mark.slow):
     return pytest.param(function, marks=mark)
 
@@ -293,6 +308,8 @@ HOW = {
     "from-bags-and-images": [are_typed, is_job, are_typed, is_board, is_board],
     "believe-it": [is_key_of_a_job],
     "correct": [are_typed, corrects_a_program],
+    "export": [are_typed, exports_an_arm],
+    "next-month": [are_typed, slow(checks_and_updates)],
     "observability": [is_printed],
     "simulate": [slow(are_run), is_scenario, slow(is_scenario, pytest.mark.long)],
     "compare": [slow(is_printed)],

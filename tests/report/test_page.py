@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -13,11 +14,14 @@ from instruments import measured_by
 from lxml import etree, html
 from simulated import measure, plus, small_arm, true_robot, write_job
 
-from fg_calib import Measurements, Robot, Table, calibrate, write_report
+from fg_calib import KnownPoint, Measurements, Robot, Table, calibrate, write_report
+from fg_calib.analysis.seen import Seen
 from fg_calib.pages import load_run
 from fg_calib.report.page.arm import link_points, scene
 from fg_calib.report.page.charts import Scale, limits_of, short
+from fg_calib.report.page.figures import _histogram
 from fg_calib.report.page.files import FIGURES
+from fg_calib.report.page.sections import correlations, tiles
 from fg_calib.robot.kinematics import pose
 
 LARGE = {"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}
@@ -187,6 +191,54 @@ def test_a_browser_shows_all_of_it_and_has_nothing_to_say(folder, tmp_path, opti
     assert page.get_element_by_id("arm-words").text.startswith("configuration 7 (train): position residual")
     width, height = (int(page.get_element_by_id("arm").get(key)) for key in ("width", "height"))
     assert width == height > 100
+
+
+@pytest.mark.slow
+def test_errors_count_in_the_frame_that_the_measurements_know(tmp_path):
+    """After the best rigid fit where nothing says where the base is; in the base frame where something does."""
+    rng = np.random.default_rng(1)
+    robot, true, anchors = measured_by("anchors", rng, n=30)
+    seen = Table(measure(true, 30, rng, sigma=(1e-4, 1e-4)), "position")
+    names = anchors.measurements.labels["anchor"].names
+    known = replace(anchors, known={name: KnownPoint((1.0, 0.5, 0.0), 0.5) for name in names})
+    assert not Seen.by([known]).blind_to_base
+    for tables, fitted in (([anchors], True), ([seen], False), ([anchors, seen], False)):
+        assert Seen.by(tables).blind_to_base == fitted
+        if len(tables) == 1:
+            calibrate(robot, tables).save(tmp_path)
+            words = " ".join(tiles(load_run(tmp_path)).itertext())
+            assert ("covariance, after the best rigid fit" in words) == fitted
+            assert ("covariance, in the base frame" in words) != fitted
+
+
+@pytest.mark.slow
+def test_the_command_repeats_what_was_done_whatever_names_are(tmp_path, fg_calib):
+    robot = small_arm(tolerance=LARGE)
+    rng = np.random.default_rng(0)
+    job = write_job(tmp_path, robot, measure(true_robot(robot, rng), 30, rng), model="position")
+    job = job.rename(tmp_path / "my job; ls.yaml")
+    assert fg_calib("calibrate", job, "--out", tmp_path / "it's", "--folds", "3").code == 0
+    command = load_run(tmp_path / "it's").command
+    assert shlex.split(command) == ["fg-calib", "calibrate", "my job; ls.yaml", "--out", "it's", "--folds", "3"]
+
+
+def test_columns_at_the_ends_hold_what_is_beyond():
+    values = np.concatenate([np.zeros(90), [-7.0, 5.5, 6.0, 1e6, *[4.9] * 6]])
+    svg = _histogram(values, "position")
+    assert [t.text for t in svg.iter("text") if t.text[0] in "<>"] == ["< \N{MINUS SIGN}5", "> 5"]
+    heights = [float(box.get("height")) for box in svg.iter("rect") if box.get("class") == "beyond"]
+    assert heights[1] / heights[0] == pytest.approx(3.0, abs=0.3)  # a decimal of a coordinate
+    assert not [box for box in _histogram(np.zeros(9), "position").iter("rect") if box.get("class") == "beyond"]
+
+
+@pytest.mark.parametrize(("n", "few"), [(9, True), (60, False)])
+def test_correlations_of_few_rows_are_told_to_be_that(tmp_path, n, few):
+    rng = np.random.default_rng(0)
+    robot = small_arm(tolerance=LARGE)
+    calibrate(robot, measure(true_robot(robot, rng), n, rng), model="position").save(tmp_path)
+    words = " ".join(p.text or "" for p in correlations(load_run(tmp_path)))
+    assert ("Only 27 residuals for 16 parameters" in words) == few
+    assert "farther apart" in words or not few
 
 
 @pytest.mark.sampled(1)

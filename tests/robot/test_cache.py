@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from fg_calib.robot import cache
+from fg_calib.robot import cache, kernels
 
 KERNEL = """
 from fg_calib.robot.kernels import compiled
@@ -54,6 +54,16 @@ def test_a_damaged_cache_is_made_anew(tmp_path, ending, damage):
     assert (found(1.5), hits(found)) == (3.0, 0)
     again = kernel(tmp_path)
     assert (again(1.5), hits(again)) == (3.0, 1)
+
+
+@pytest.mark.parametrize(("there", "often"), [(True, "once an installation"), (False, "each time, unless NUMBA_CACHE")])
+def test_it_is_said_whether_kernels_will_be_compiled_again(tmp_path, monkeypatch, caplog, there, often):
+    monkeypatch.setattr(kernels._CompileNotice, "said", False)
+    monkeypatch.setattr(kernels._CompileNotice, "kept", True)
+    monkeypatch.setattr(kernels, "has_cache_folder", lambda: there)
+    kernel(tmp_path)(1.5)
+    (notice,) = caplog.messages
+    assert notice.startswith(f"compiling the kernels: some seconds, {often}")
 
 
 def test_a_cache_that_cannot_be_written_is_none(tmp_path, monkeypatch):

@@ -37,13 +37,16 @@
     [["#D55E00", 0, "x"], ["#009E73", 1, "y"], ["#0072B2", 2, "z"]].forEach(([stroke, i, name]) => {
       const end = base.map((v, k) => v + (k === i ? axis : 0));
       line([base, end], 2, stroke);
-      c.fillStyle = stroke; c.font = "12px sans-serif"; c.fillText(name, at(end)[0] + 3, at(end)[1]);
+      const [x, y] = at(base.map((v, k) => v + (k === i ? 1.2 * axis : 0)));
+      c.fillStyle = ink; c.font = "12px sans-serif"; c.textAlign = "center"; c.textBaseline = "middle";
+      c.fillText(name, x, y);
     });
     dots = items.map((item, i) => [...at(tip(item)), i]).sort((a, b) => a[2] - b[2]);
     for (const [x, y, , i] of dots) {
       c.beginPath();
       if (items[i].test) c.rect(x - 3, y - 3, 6, 6); else c.arc(x, y, 3.5, 0, 7);
       c.fillStyle = colour(items[i].value); c.fill();
+      c.lineWidth = 0.8; c.strokeStyle = ink; c.stroke();  // seen on a panel of any colour
     }
     line(items[chosen].links, 4, ink);
     c.fillStyle = ink;

@@ -45,6 +45,9 @@ _SLAB = 0.12
 _MOST_PARAMETERS = 40
 """Parameters of which correlations are shown: the most correlated ones."""
 
+_MOST_SIGMA = 5.0
+"""Residuals in their sigma, up to which a histogram tells them apart."""
+
 _WORST = 5
 """Dots that are marked by name."""
 
@@ -85,8 +88,13 @@ def error_over_joints(run: Run) -> list[Figure]:
         for k in worst:
             if np.isfinite(rms[k]):
                 chart.marked(q[k], rms[k], f"{found.ids[k]}: {rms[k]:.3g} {unit}")
-        charts.append((f"{joint.name}: blue fitted, orange held out, rings the {len(worst)} largest", chart.svg))
+        charts.append((f"{joint.name}: {_colours(found.test)}, rings the {len(worst)} largest", chart.svg))
     return charts
+
+
+def _colours(test: NDArray[np.bool_]) -> str:
+    """What the colours of dots mean."""
+    return ", ".join(["blue fitted"] * (not test.all()) + ["orange held out"] * bool(test.any()))
 
 
 def arm_ranges(workspace: Workspace) -> Figure:
@@ -162,7 +170,10 @@ def residual_charts(run: Run) -> list[Figure]:
         if mine.any():
             rows = "fitted" if fitted.any() else "held-out"
             about = f"{family}: {int(mine.sum())} {rows} rows, and the curve of noise"
-            charts.append((about, _histogram(found.studentised[mine], family)))
+            values = found.studentised[mine]
+            beyond = int(np.sum(np.abs(values) > _MOST_SIGMA))
+            about += f"; {beyond} beyond {_MOST_SIGMA:g} are in the columns at the ends" if beyond else ""
+            charts.append((about, _histogram(values, family)))
     shown = np.clip(found.studentised, -12.0, 12.0)
     order = np.arange(len(shown), dtype=np.float64)
     about = "Residuals in the order of residuals.csv"
@@ -175,20 +186,32 @@ def residual_charts(run: Run) -> list[Figure]:
     for k in suspects[np.argsort(-np.abs(found.studentised[suspects]))][: 4 * _WORST].tolist():
         name = " ".join(filter(None, (found.kinds[found.kind[k]], found.a[k], found.b[k], found.of[k])))
         chart.marked(float(order[k]), float(shown[k]), f"{name}: {found.studentised[k]:+.1f}")
-    charts.append((f"{about}: blue fitted, orange held out, rings suspicious (cut at 12)", chart.svg))
+    rings = ", rings suspicious" if len(suspects) else ""
+    cut = "; what is larger is drawn at 12" if np.any(np.abs(found.studentised) > 12.0) else ""
+    charts.append((f"{about}: {_colours(found.test)}{rings}{cut}", chart.svg))
     return charts
 
 
 def _histogram(values: Floats, family: str) -> Element:
-    edges = np.linspace(-5.0, 5.0, 41)
-    counts, _ = np.histogram(np.clip(values, -4.99, 4.99), edges)
+    """How residuals are distributed; a column of its own at each end, in another colour, holds what is beyond."""
+    most, end = _MOST_SIGMA, 0.5
+    edges, beyond = np.linspace(-most, most, 41), np.abs(values) > most
+    counts, _ = np.histogram(values[~beyond], edges)
     density = counts / (len(values) * (edges[1] - edges[0]))
+    ends = [float(np.mean(beyond & (np.sign(values) == sign))) / end for sign in (-1.0, 1.0)]
     about = f"How {family} residuals are distributed"
-    chart = Chart((-5.0, 5.0), limits_of(density, [0.45], with_zero=True), ("in its sigma", "density"), about)
+    heights = limits_of(density, ends, [0.45], with_zero=True)
+    chart = Chart((-most - end, most + end), heights, ("residual, in its sigma", "share per sigma"), about)
     for low, high, height in zip(edges[:-1], edges[1:], density, strict=True):
         if height > 0.0:
             chart.box(float(low), 0.0, float(high), float(height), class_="column")
-    x = np.linspace(-5.0, 5.0, 81)
+    for sign, height in zip((-1.0, 1.0), ends, strict=True):
+        if height > 0.0:
+            chart.box(sign * most, 0.0, sign * (most + end), height, class_="beyond")
+            words = f"{'<' if sign < 0.0 else '>'} {sign * most:g}".replace("-", "\N{MINUS SIGN}")
+            where = "tick" if sign < 0.0 else "tick end"
+            chart.text(chart.x(sign * (most + end)), chart.y(height) - 3.0, words, where)
+    x = np.linspace(-most, most, 81)
     chart.curve(x, np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi), "curve")
     return chart.svg
 
@@ -215,8 +238,9 @@ def workspace_slices(found: Workspace) -> list[Figure]:
         )
         _draw_cells(chart, found.position[inside][:, [across, up]], found.error[inside] * 1e3, ends)
         near = np.abs(found.measured[:, through] - middle[through]) < thick / 2.0
-        chart.dots(found.measured[near, across], found.measured[near, up], "b")
-        charts.append((f"{about}; orange: measured", chart.svg))
+        for kind in ("halo", "measured"):
+            chart.dots(found.measured[near, across], found.measured[near, up], kind)
+        charts.append((f"{about}; dots: measured", chart.svg))
     return [*charts, _legend(ends)]
 
 
@@ -240,8 +264,8 @@ def _legend(ends: Floats) -> Figure:
     for k, fill in enumerate(RAMP):
         add(svg, tag("rect", x=10.0 + wide * k, y=4.0, width=wide + 0.5, height=16.0, fill=fill))
     for k in range(5):
-        value = ends[0] + (ends[1] - ends[0]) * k / 4.0
-        add(svg, tag("text", f"{value:.3g} mm", x=10.0 + (WIDTH - 20.0) * k / 4.0, y=36.0, class_=_place(k)))
+        words = f"{ends[0] + (ends[1] - ends[0]) * k / 4.0:.3g}{' mm' * (k == 4)}"
+        add(svg, tag("text", words, x=10.0 + (WIDTH - 20.0) * k / 4.0, y=36.0, class_=_place(k)))
     return f"{about}: what is expected of the tool's position (RMS)", svg
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -57,11 +58,17 @@ class Run:
     def command(self) -> str | None:
         """The command that repeats the calibration from the folder of its job; None where it had no job."""
         job = next(iter(self.result.inputs), None)
-        return None if job is None else f"fg-calib calibrate {job} --out {self.folder.name or 'result'}"
+        if job is None:
+            return None
+        folds = [] if self.result.folds is None else ["--folds", f"{self.result.folds.n}"]
+        return shlex.join(["fg-calib", "calibrate", job, "--out", self.folder.name or "result", *folds])
 
     @property
     def free_of_frame(self) -> bool:
         """Whether nothing was measured in the base frame, so that errors count after the best rigid fit."""
+        expected = self.result.expected_error
+        if expected is not None and expected.relative is not None:
+            return expected.relative
         return self.result.frame_estimate is not None or self.result.pairing is not None
 
     @cached_property

@@ -25,11 +25,15 @@ from fg_calib.report.page.markup import tag
 from fg_calib.report.page.run import Run
 from fg_calib.report.shown import FAMILY_UNIT, SHOWN
 from fg_calib.report.summary import good, judged, parameter_rows
+from fg_calib.report.tolerances import HEADINGS, TITLE, tolerance_rows
 
 if TYPE_CHECKING:
     from lxml.etree import _Element as Element
 
 Floats = NDArray[np.float64]
+
+_FEW = 3
+"""Residuals a parameter, below which strong correlations may come from that alone."""
 
 _MOST_ROWS = 40
 """Suspicious rows that the page lists; `residuals.csv` has all."""
@@ -196,6 +200,9 @@ def parameters(run: Run) -> list[Element]:
         chosen = [p for p in found if p.identifiability == kind]
         if chosen:
             parts += [tag("h3", title), _table_of_parameters(chosen)]
+    if run.result.tolerance_scales:
+        rows = tolerance_rows(run.result.tolerance_scales, found)
+        parts += [tag("h3", TITLE), table(HEADINGS, rows)]
     return parts
 
 
@@ -244,7 +251,12 @@ def correlations(run: Run) -> list[Element]:
     if found is None:
         return [tag("p", "Fewer than two parameters have a known uncertainty.")]
     words = "Strong colours: errors of the two go together, so neither is known alone as well as both together."
-    return [tag("p", words), tag("div", figures([found]), class_="scene")]
+    parts = [tag("p", words)]
+    n, of = run.result.n_residuals, sum(p.identifiability != "fixed" for p in run.result.parameters)
+    if n < _FEW * of:
+        few = f"Only {n} residuals for {of} parameters: correlations as strong as here may come from that alone;"
+        parts.append(tag("p", f"{few} more configurations, farther apart, tell parameters apart."))
+    return [*parts, tag("div", figures([found]), class_="scene")]
 
 
 def residuals(run: Run) -> list[Element]:
@@ -304,9 +316,8 @@ def inputs(run: Run) -> list[Element]:
     if result.inputs:
         files = [[name, digest] for name, digest in result.inputs.items()]
         parts.append(table(["file", "SHA-256"], files, words=True))
-    options = [
-        [key, _plain(value)] for key, value in result.options.items() if value not in (None, [], "") and key != "accept"
-    ]
+    said = {key: value for key, value in result.options.items() if value not in (None, [], (), "") and key != "accept"}
+    options = [[key, _plain(value)] for key, value in said.items()]
     if options:
         parts += [tag("h3", "Options"), table(["", ""], options, words=True)]
     versions = [[name, version] for name, version in result.versions.items()] or [["fg-calib", result.version]]

@@ -1,0 +1,92 @@
+"""`fg-calib update`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fg_calib.cli.check import Like, NewTable, Pairs, Result
+from fg_calib.cli.output import Json, end, show_json, show_report
+
+if TYPE_CHECKING:
+    from fg_calib.robot.model import Robot
+
+
+def update(
+    result: Result,
+    table: NewTable,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", readable=False, help="Write the new result there, with its history.")
+    ],
+    date: Annotated[
+        str | None, typer.Option("--date", metavar="DATE", help="When the rows were measured; now if left out.")
+    ] = None,
+    growth: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--growth",
+            metavar="NAME=FIGURE",
+            help="1 sigma by which a parameter, or a kind, wanders in a day: theta=0.001deg.",
+        ),
+    ] = None,
+    changed: Annotated[
+        list[str] | None,
+        typer.Option("--changed", metavar="NAME", help="What has changed since: nothing is taken over of it."),
+    ] = None,
+    anchors_stay: Annotated[
+        bool, typer.Option("--anchors-stay", help="Anchors of the same name are where they were.")
+    ] = False,
+    pairs: Pairs = None,
+    like: Like = None,
+    as_json: Json = False,
+) -> None:
+    """Add new rows to a calibration, from what it has learned: its own rows are not read again."""
+    from fg_calib.calibration import Calibration
+    from fg_calib.files.disk import is_folder, require_writable
+    from fg_calib.report.documents import require_apart
+
+    require_writable(out)
+    require_apart(out, [result if is_folder(result) else result.parent], [table, *([] if pairs is None else [pairs])])
+    before = Calibration.load(result)
+    found = before.update(
+        table,
+        date=date,
+        growth=_growth(growth or [], before.robot),
+        changed=changed or [],
+        anchors_stay=anchors_stay,
+        pairs=pairs,
+        like=like,
+    )
+    try:
+        if as_json:
+            show_json(found.result.document())
+        else:
+            from fg_calib.report.text import build_report
+
+            show_report(build_report(found.solution, found.uncertainty))
+    finally:  # also where nobody takes the report
+        found.save(out)
+    end(found.findings, not_accepted=found.not_accepted)
+
+
+def _growth(given: Sequence[str], robot: Robot) -> dict[str, float]:
+    """Growth by name or kind, in [m] and [rad].
+
+    Raises:
+        InputError: One is not `NAME=FIGURE` with a unit.
+    """
+    from fg_calib.errors import InputError
+    from fg_calib.files.units import Units, quantity
+    from fg_calib.robot.model import tolerance_kind
+
+    units = {name: p.unit for p in robot.parameters for name in (tolerance_kind(p), p.name) if name}
+    found = {}
+    for one in given:
+        name, equals, figure = one.partition("=")
+        if not equals:
+            raise InputError("--growth", f"found {one!r}", "NAME=FIGURE, such as theta=0.001deg")
+        found[name] = quantity(figure, units.get(name, "rad"), Units(), f"--growth: {name}")
+    return found

@@ -1,0 +1,419 @@
+"""The door to all formats: a calibration or a robot, and the text that others read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fg_calib import __version__
+from fg_calib.arguments import checked
+from fg_calib.arrays import as_floats
+from fg_calib.calibration import Calibration
+from fg_calib.errors import InputError, printable, shown
+from fg_calib.exports.fits import (
+    N_FITTED,
+    N_JUDGED,
+    PoseErrors,
+    drawn,
+    errors,
+    fit_parameters,
+    fit_zeros,
+    with_frames_of,
+)
+from fg_calib.exports.ros import UrBase, dumped, hash_of, tesseract_text, ur_base_of, ur_kinematics, ur_text
+from fg_calib.exports.tables import TableConvention, in_table
+from fg_calib.exports.urdf import BASE_LINK, TOOL_LINK, calibrated_urdf, new_urdf
+from fg_calib.files.disk import is_folder, replacing, require_absent
+from fg_calib.files.robot_yaml import robot_text
+from fg_calib.files.saved import read_configurations, require_unchanged
+from fg_calib.files.units import Units
+from fg_calib.files.urdf import encoding_of
+from fg_calib.options import check, check_flag
+from fg_calib.robot.model import CONVENTIONS, Robot, frame_values
+
+Floats = NDArray[np.float64]
+
+ExportFormat = Literal["urdf", "ur", "tesseract", "dh", "mdh", "hayati", "zeros", "yaml"]
+ToolOfZeros = Literal["nominal", "calibrated"]
+
+EXACT = 1e-9
+"""A table is exact if its tool is that of the arm within, [m] and [rad]."""
+
+_MM_DEG = Units("mm", "deg")
+
+_TABLES: Mapping[str, tuple[TableConvention, str]] = {
+    "dh": ("dh", "Denavit and Hartenberg"),
+    "mdh": ("mdh", "Craig (modified Denavit-Hartenberg)"),
+    "hayati": ("dh-hayati", "Hayati: rows of Denavit and Hartenberg, with beta in place of d between parallel axes"),
+}
+
+
+@dataclass(frozen=True)
+class Export:
+    """An arm as others read it.
+
+    Attributes:
+        to: The format.
+        robot: The arm's name.
+        text: What the file holds.
+        notes: What the format could not hold and where it is instead, and what else one has to know: a line each.
+        findings: Why the calibration is not to be trusted; empty if it is, or of a robot.
+        not_accepted: The limits of `accept` that it does not keep to.
+        details: The same as figures: see `document`.
+    """
+
+    to: str
+    robot: str
+    text: str = field(repr=False)
+    notes: tuple[str, ...] = ()
+    findings: tuple[str, ...] = ()
+    not_accepted: tuple[str, ...] = ()
+    details: Mapping[str, Any] = field(default_factory=dict, repr=False)
+
+    @checked
+    def write(self, path: Path | str) -> None:
+        """Write the file, whole or not at all.
+
+        Raises:
+            InputError: It is there already, or cannot be written.
+        """
+        path = Path(path)
+        require_absent(path.parent, [path.name])
+        with replacing(path) as temporary:
+            temporary.write_bytes(self.text.encode(encoding_of(self.text) if self.to == "urdf" else "utf-8"))
+
+    def document(self) -> dict[str, Any]:
+        """What `--json` prints.
+
+        { "schema": "fg-calib/export/1", "version", "to", "robot", "text", "notes": [text], "findings": [text],
+          "not_accepted": [text],
+          of tables: "convention", "exact", "reasons": [text], "error": {errors},
+          of zeros: "zeros": {joint: {"reading", "unit"}}, "before", "after": {"workspace": {errors}, "measured": ...},
+          of ur: "base", "hash", "tool0_T_tool": [[...]], of tesseract: "joints": [names] }
+
+        with errors as in `PoseErrors`; SI.
+        """
+        return {
+            "schema": "fg-calib/export/1",
+            "version": __version__,
+            "to": self.to,
+            "robot": self.robot,
+            "text": self.text,
+            "notes": list(self.notes),
+            "findings": list(self.findings),
+            "not_accepted": list(self.not_accepted),
+            **self.details,
+        }
+
+    def __str__(self) -> str:
+        return self.text
+
+
+@dataclass(frozen=True)
+class _Arm:
+    """What is exported: the calibrated arm, the arm as drawn where that is known, and the comments for its file."""
+
+    robot: Robot
+    nominal: Robot | None
+    comments: tuple[str, ...]
+
+    def nominal_for(self, what: str) -> Robot:
+        """The arm as drawn.
+
+        Raises:
+            InputError: It is not known.
+        """
+        if self.nominal is None:
+            raise InputError(what, "an arm without the one as drawn", "a RESULT of calibrate, or a nominal robot")
+        return self.nominal
+
+
+@checked
+def export(
+    arm: Robot | Calibration,
+    to: ExportFormat,
+    *,
+    nominal: Robot | None = None,
+    configurations: ArrayLike | None = None,
+    tool: ToolOfZeros = "calibrated",
+    far: bool = False,
+    calibration_elements: bool = False,
+    ur_base: UrBase | None = None,
+    ur_hash: str | None = None,
+) -> Export:
+    """An arm in a format of others: `print(export(result, "ur"))`, `export(result, "urdf").write("arm.urdf")`.
+
+    Args:
+        arm: A calibration, or a robot.
+        to: `urdf`, `ur` (kinematics for ROS' ur_description), `tesseract` (calibration of joint origins), `dh`, `mdh`,
+            `hayati` (tables in mm and deg), `zeros` (joint zeros alone), `yaml` (this package's robot file).
+        nominal: The robot as drawn; a calibration has it.
+        configurations: Of `zeros`: where the fit is wanted, shape (n, n_joints), [rad] (prismatic: [m]); all over the
+            joint limits if None.
+        tool: Of `zeros`: the tool that the controller works with: as calibrated, as it is set there on its own and the
+            tool of a calibration is often an instrument's target; or as drawn, so that zeros make up for it.
+        far: Of `dh` and `mdh`: take common normals of nearly parallel axes however far away they are, and be exact.
+        calibration_elements: Of `urdf`: write what is a joint's zero into `<calibration rising="...">`.
+        ur_base: Of `ur`: which frame of ur_description the arm's base is; `base_link` if that is its name in a URDF,
+            else `base`, the controller's.
+        ur_hash: Of `ur`: the controller's own hash, for which the driver asks.
+
+    Raises:
+        InputError: The format cannot hold the arm, the nominal robot is not known or another one, or an option means
+            nothing for the format.
+    """
+    check("to", to, ExportFormat)
+    found = _arm_of(arm, nominal)
+    check("tool", tool, ToolOfZeros)
+    check_flag("far", far)
+    check_flag("calibration_elements", calibration_elements)
+    _require_use(
+        to,
+        configurations=configurations is not None,
+        tool=tool != "calibrated",
+        far=far,
+        calibration_elements=calibration_elements,
+        ur_base=ur_base is not None,
+        ur_hash=ur_hash is not None,
+    )
+    if to == "urdf":
+        part = _urdf(found, calibration_elements)
+    elif to == "ur":
+        part = _ur(found, ur_base, ur_hash)
+    elif to == "tesseract":
+        part = _tesseract(found)
+    elif to == "zeros":
+        part = _zeros(found, tool, configurations)
+    else:
+        part = _yaml(found) if to == "yaml" else _table(found, to, far)
+    if not isinstance(arm, Calibration):
+        return part
+    return replace(part, findings=_findings(arm), not_accepted=arm.not_accepted)
+
+
+def _findings(calibration: Calibration) -> tuple[str, ...]:
+    """Why it is not to be trusted."""
+    if calibration.trustworthy or calibration.findings:
+        return calibration.findings
+    return ("the solver did not converge",)
+
+
+def _arm_of(arm: Robot | Calibration, nominal: Robot | None) -> _Arm:
+    """The arm that is meant.
+
+    Raises:
+        InputError: The nominal robot is one of other parameters.
+    """
+    comments = [f"by fg-calib {__version__}"]
+    if isinstance(arm, Calibration):
+        robot = arm.robot
+        comments += [f"NOT TO BE TRUSTED: {finding}" for finding in _findings(arm)]
+        comments += [f"not accepted: {reason}" for reason in arm.not_accepted]
+        drawn_arm = robot.with_values([p.nominal for p in arm.result.parameters])
+    elif isinstance(arm, Robot):
+        robot, drawn_arm = arm, None
+    else:
+        raise InputError("arm", f"found {shown(arm)}", "a Robot or a Calibration")
+    if nominal is not None:
+        kinds = [(joint.name, joint.prismatic) for joint in robot.joints]
+        if [(joint.name, joint.prismatic) for joint in nominal.joints] != kinds:
+            raise InputError("nominal", f"{nominal.name} has other joints", ", ".join(name for name, _ in kinds))
+        drawn_arm = nominal
+    return _Arm(robot, drawn_arm, tuple(comments))
+
+
+_FORMATS_OF: Mapping[str, tuple[str, ...]] = {
+    **{"configurations": ("zeros",), "tool": ("zeros",), "far": ("dh", "mdh")},
+    **{"calibration_elements": ("urdf",), "ur_base": ("ur",), "ur_hash": ("ur",)},
+}
+"""The formats for which an option means something."""
+
+
+def _require_use(to: str, **given: bool) -> None:
+    """Check that each option that was given means something for the format.
+
+    Raises:
+        InputError: One means nothing.
+    """
+    for name, is_given in given.items():
+        if is_given and to not in _FORMATS_OF[name]:
+            raise InputError(name, f"means nothing for {to}", f"the format {' or '.join(_FORMATS_OF[name])}")
+
+
+def _commented(comments: tuple[str, ...], text: str) -> str:
+    """YAML with lines of comment before it."""
+    return "".join(f"# {printable(comment)}\n" for comment in comments) + text
+
+
+def _frame_words(robot: Robot, owner: int) -> str:
+    """A frame of an arm in words; empty where it is none."""
+    own = [robot.parameters[i] for i in robot.owned_by(owner)]
+    figures = [f"{p.kind} {_MM_DEG.from_si(p.nominal, p.unit):.9g}" for p in own if p.nominal != 0.0]
+    return ", ".join(figures)
+
+
+def _frames_outside(robot: Robot, start: str, end: str) -> tuple[str, ...]:
+    """That a format has no place for base and tool of an arm, where it has any."""
+    notes = []
+    for owner, name, where in ((0, "base", f"before {start}"), (robot.n_joints + 1, "tool", f"behind {end}")):
+        if words := _frame_words(robot, owner):
+            notes.append(f"it has no place for the frame {name}, which is {where}: {words} (mm, deg)")
+    return tuple(notes)
+
+
+def _urdf(arm: _Arm, calibration_elements: bool) -> Export:
+    robot = arm.robot
+    if robot.urdf is not None:
+        nominal = arm.nominal_for("calibration_elements") if calibration_elements else None
+        notes = _frames_outside(robot, f"link {robot.urdf.base_link}", f"link {robot.urdf.tip_link}")
+        if nominal is not None:
+            if nominal.convention != "urdf":
+                raise InputError("nominal", f"a robot of convention {nominal.convention}", "the URDF as drawn")
+            notes += ("what reads it must add `rising` of <calibration> to readings, or the arm lacks that",)
+        return Export("urdf", robot.name, calibrated_urdf(robot, nominal), notes)
+    if calibration_elements:
+        raise InputError("calibration_elements", "an arm that is no URDF", "an arm that was read from a URDF")
+    notes = (f"link {BASE_LINK} is the base frame and link {TOOL_LINK} the tool frame; joints turn about z",)
+    if any(np.isinf([joint.lower, joint.upper]).any() for joint in robot.joints if joint.prismatic):
+        notes += ("slides without limits have 1000 m, as URDF knows none without",)
+    if any(np.isfinite([joint.lower, joint.upper]).sum() == 1 for joint in robot.joints if not joint.prismatic):
+        notes += ("joints that turn and have one limit alone are continuous here, without it",)
+    if any(np.isfinite([joint.lower, joint.upper]).all() for joint in robot.joints):
+        notes += ("effort and velocity in <limit> are 0, as nobody has stated them",)
+    return Export("urdf", robot.name, new_urdf(robot, [printable(c) for c in (*arm.comments, *notes)]), notes)
+
+
+def _ur(arm: _Arm, base: UrBase | None, word: str | None) -> Export:
+    base = ur_base_of(arm.robot) if base is None else check("ur_base", base, UrBase)
+    if word is not None and (not isinstance(word, str) or not word.isprintable() or " " in word or not word):
+        raise InputError("ur_hash", f"found {shown(word)}", "a word such as calib_12788084448423163542")
+    kinematics, tool = ur_kinematics(arm.robot, base)
+    word = word or hash_of(kinematics)
+    notes = [f"kinematics_parameters_file of ur_description; its frame {base} is the base of {arm.robot.name}"]
+    values = frame_values("tool", tool)
+    if max(map(abs, values.values())) > EXACT:
+        words = ", ".join(f"{k} {_MM_DEG.from_si(v, 'm' if k in 'xyz' else 'rad'):.9g}" for k, v in values.items())
+        notes.append(f"the tool is not in it: from tool0 it is at {words} (mm, deg; Rz(yaw) Ry(pitch) Rx(roll))")
+    if word.startswith("fg_calib_"):
+        notes.append("the driver will say that the controller's hash is another: its own kinematics are")
+    text = _commented((*arm.comments, *notes), ur_text(kinematics, word))
+    details = {"base": base, "hash": word, "tool0_T_tool": tool.tolist()}
+    return Export("ur", arm.robot.name, text, tuple(notes), details=details)
+
+
+def _tesseract(arm: _Arm) -> Export:
+    robot = arm.robot
+    text, joints = tesseract_text(robot)
+    if robot.urdf is not None:
+        notes = _frames_outside(robot, f"link {robot.urdf.base_link}", f"link {robot.urdf.tip_link}")
+    else:
+        notes = (f"joints of the URDF that `export --to urdf` makes; {joints[0]} and {joints[-1]} are base and tool",)
+    notes = (*notes, 'named in the SRDF: <calibration_config filename="..."/>')
+    return Export("tesseract", robot.name, _commented((*arm.comments, *notes), text), notes, details={"joints": joints})
+
+
+def _error_words(found: PoseErrors) -> str:
+    """Errors in mm and deg."""
+    position, rotation = (
+        f"{_MM_DEG.from_si(rms, unit):.4g} {_MM_DEG.name(unit)} RMS, {_MM_DEG.from_si(most, unit):.4g} at most"
+        for rms, most, unit in (
+            (found.position_rms, found.position_max, "m"),
+            (found.rotation_rms, found.rotation_max, "rad"),
+        )
+    )
+    return f"position {position}; orientation {rotation}"
+
+
+def _table(arm: _Arm, to: str, far: bool) -> Export:
+    convention, words = _TABLES[to]
+    robot = arm.robot
+    table = in_table(robot, convention, np.inf) if far else in_table(robot, convention)
+    found = table.robot
+    if table.nearly:
+        found = fit_parameters(found, robot, drawn(robot, N_FITTED, 0))
+    error = errors(found, robot, drawn(robot, N_JUDGED, 1))
+    exact = max(error.position_max, error.rotation_max) <= EXACT
+    reasons = [] if exact else [str(nearly) for nearly in table.nearly] or ["figures too large for their digits"]
+    order = " ".join(f"{_ELEMENTS[kind]}({kind})" for kind in CONVENTIONS[convention])
+    notes = [f"{words}: {order} a joint; readings are added to theta, of slides to d; mm and deg"]
+    if exact:
+        notes.append("the same arm: base and tool below hold what rows do not")
+    else:
+        notes += [f"NOT EXACT: {reason}" for reason in reasons]
+        notes.append(f"the best fit over the joint limits, base and tool included: {_error_words(error)}")
+    text = _commented((*arm.comments, *notes), robot_text(found, units=_MM_DEG))
+    details = {"convention": convention, "exact": exact, "reasons": reasons, "error": asdict(error)}
+    return Export(to, robot.name, text, tuple(notes), details=details)
+
+
+_ELEMENTS = {"a": "Tx", "alpha": "Rx", "d": "Tz", "theta": "Rz", "beta": "Ry"}
+
+
+def _yaml(arm: _Arm) -> Export:
+    robot, notes = arm.robot, list[str]()
+    if robot.convention not in CONVENTIONS:
+        robot = in_table(robot, "dh-hayati").robot
+        notes.append("the same arm as rows of dh-hayati, as it came from a URDF: `--to urdf` writes that")
+    return Export("yaml", robot.name, _commented((*arm.comments, *notes), robot_text(robot)), tuple(notes))
+
+
+def _zeros(arm: _Arm, tool: ToolOfZeros, configurations: ArrayLike | None) -> Export:
+    robot, nominal = arm.robot, arm.nominal_for("zeros")
+    if tool == "calibrated":
+        nominal = with_frames_of(nominal, robot, (robot.n_joints + 1,))
+    at = {"workspace": drawn(robot, N_JUDGED, 1)}
+    fitted = drawn(robot, N_FITTED, 0)
+    if configurations is not None:
+        fitted = as_floats("configurations", configurations, f"(n, {robot.n_joints})")
+        if not len(fitted):
+            raise InputError("configurations", "none", "at least one")
+        at = {"measured": fitted} | at
+    zeros = fit_zeros(nominal, robot, fitted)
+    before = {name: errors(nominal, robot, q) for name, q in at.items()}
+    after = {name: errors(nominal, robot, q, zeros) for name, q in at.items()}
+    notes = [
+        "joint zeros, all else as drawn: zero is what to add to a joint's reading (angle = reading + zero);",
+        "it is subtracted from what is commanded, and from a stored encoder offset (angle = encoder - offset)",
+        f"fitted at {len(fitted)} configurations {'within the joint limits' if configurations is None else 'given'}",
+    ]
+    if _frame_words(robot, robot.n_joints + 1) != (
+        as_drawn := _frame_words(arm.nominal_for("zeros"), robot.n_joints + 1)
+    ):
+        words = as_drawn if tool == "nominal" else _frame_words(robot, robot.n_joints + 1)
+        notes.append(f"with the tool as {'drawn' if tool == 'nominal' else 'calibrated'}: {words or 'none'} (mm, deg)")
+    for name in at:
+        where = "over the joint limits" if name == "workspace" else "at the configurations given"
+        notes += [f"before, {where}: {_error_words(before[name])}", f"after, {where}: {_error_words(after[name])}"]
+    pairs = list(zip(robot.joints, zeros.tolist(), strict=True))
+    rows = {j.name: {"zero": _MM_DEG.from_si(z, j.unit), "unit": _MM_DEG.name(j.unit)} for j, z in pairs}
+    document = {"robot": robot.name, "zeros": rows}
+    details = {
+        "zeros": {j.name: {"reading": z, "unit": j.unit} for j, z in pairs},
+        "before": {name: asdict(found) for name, found in before.items()},
+        "after": {name: asdict(found) for name, found in after.items()},
+    }
+    text = _commented((*arm.comments, *notes), dumped(document))
+    return Export("zeros", robot.name, text, tuple(notes), details=details)
+
+
+def measured_configurations(path: Path | str) -> Floats:
+    """The configurations that a saved calibration was measured at, shape (n, n_joints), [rad] (prismatic: [m]).
+
+    Args:
+        path: The folder that `calibrate --out` wrote, or its `result.json`.
+
+    Raises:
+        InputError: There are none, or they are damaged.
+    """
+    folder = Path(path) if is_folder(Path(path)) else Path(path).parent
+    calibration = Calibration.load(path)
+    require_unchanged(folder, calibration.result.files)
+    found = read_configurations(folder, calibration.robot.n_joints)
+    if found is None:
+        raise InputError(str(folder), "no configurations.csv", "what `fg-calib calibrate --out` wrote")
+    return found.readings

@@ -1,0 +1,283 @@
+"""An arm in the tables of Denavit and Hartenberg, Craig, and Hayati, exactly where these can hold it.
+
+A table has four figures a joint where a rigid transform has six. What makes up for it is that frames may be moved along
+and turned about the z axis of their joint (`links`): between joints i and i + 1, with M what is left of the link after
+the frame of joint i was moved,
+
+    M = [Rz(theta) Tz(d)] [Tx(a) Rx(alpha)] [Tz(d') Rz(theta')]
+
+the first bracket joins what is about joint i, and the last is carried on to joint i + 1. That is one product with six
+figures, and `common_normal` solves it: x goes along the common normal of both axes, a and alpha are their distance and
+angle, d and d' are where the normal meets them. DH and Craig's table differ only in the row that a and alpha stand in:
+that of the joint before them, or behind them.
+
+    z' = R e_z = Rz(theta) (0, -sin alpha, cos alpha)        theta = atan2(z'_x, -z'_y),  alpha = atan2(|z'_xy|, z'_z)
+    p = d e_z + a x + d' z',   x = (cos theta, sin theta, 0), y = e_z x x:
+    a = p.x,   d' = -p.y / sin alpha,   d = p.z - d' cos alpha
+
+Exactly parallel axes have a common normal anywhere: d stays what the joint before left. But d' and d grow without bound
+as axes become nearly parallel: by p.y over the angle, and a small tilt would move them by kilometres. Beyond `FARTHEST`
+a table that holds the arm is none that anybody can use, and this module says so (`Nearly`) and takes the axes to be
+parallel; `fits` then finds the best table of such. Hayati's row is for these: where the plane through the frame, square
+to z, meets the next axis,
+
+    M = [Rz(theta)] [Tx(a) Rx(alpha) Ry(beta)] [Tz(d') Rz(theta')]
+    P = p - z' p_z / z'_z = a x,   Rz(-theta) z' = (sin beta, -sin alpha cos beta, cos alpha cos beta)
+
+which stays well determined, and fails only for axes at right angles. With rows of DH for those and Hayati's for these,
+every arm has a table; rows of DH have no beta, rows of Hayati no d of their own. Both (theta, a, alpha) and
+(theta + pi, -a, -alpha) say the same; theta within a quarter turn is taken, as drawings have it.
+
+Base and tool take what is left. Before the first joint it is the base frame, unless frame 0 and the joint are such that
+the first row holds it; behind the last one it is the tool, but for the d and theta of the last row.
+
+References:
+    Denavit & Hartenberg (1955), A kinematic notation for lower-pair mechanisms, J. Applied Mechanics 22.
+    Craig (2005), Introduction to Robotics, 3rd ed., section 3.4.
+    Hayati (1983), Robot arm geometric link parameter estimation, 22nd IEEE Conf. on Decision and Control.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.exports.links import Links, inverse, links_of, rigid, row_transform, transform
+from fg_calib.robot.model import Robot, RobotBuilder, frame_values
+
+Floats = NDArray[np.float64]
+
+TableConvention = Literal["dh", "mdh", "dh-hayati"]
+
+PARALLEL = 1e-11
+"""Sine of the angle of axes that count as parallel: at an arm's length it moves the tool by as much, [m]."""
+
+NEARLY_PARALLEL = 0.2
+"""Sine of the angle of axes below which Hayati's row is taken where there is one."""
+
+FARTHEST = 10.0
+"""How far along an axis the next frame of a table may be, in the arm's length."""
+
+SAME = 1e-12
+"""What of a transform counts as nothing, [m] and [rad]: rounding of a product is some 1e-16."""
+
+
+@dataclass(frozen=True)
+class Nearly:
+    """Neighbouring axes that are too nearly parallel for a row of four figures.
+
+    Attributes:
+        axes: 1-based numbers of both joints.
+        angle: Between them, [rad].
+        away: How far along an axis their common normal is, [m].
+    """
+
+    axes: tuple[int, int]
+    angle: float
+    away: float
+
+    def __str__(self) -> str:
+        first, second = self.axes
+        return (
+            f"axes {first} and {second} are parallel within {np.rad2deg(self.angle):.2g} deg, not exactly: "
+            f"their common normal is {self.away:.3g} m away"
+        )
+
+
+@dataclass(frozen=True)
+class TableRobot:
+    """An arm in a table.
+
+    Attributes:
+        robot: The arm, its names and limits as they were.
+        nearly: The axes that it takes to be parallel and that are not; none where it is the same arm.
+    """
+
+    robot: Robot
+    nearly: tuple[Nearly, ...]
+
+
+def in_table(robot: Robot, convention: TableConvention, farthest: float = FARTHEST) -> TableRobot:
+    """An arm in one of the conventions with a table; as it is if it is in that one already.
+
+    Args:
+        robot: The arm, at its nominal values.
+        convention: `dh`, `mdh` (Craig), or `dh-hayati`, each row of which has d or beta.
+        farthest: How far along an axis the next frame may be, in the arm's length; infinite: as far as it must.
+
+    Raises:
+        InputError: A joint's value is more than its reading plus a constant.
+    """
+    links = links_of(robot)
+    if robot.convention == convention != "dh-hayati":
+        return TableRobot(robot, ())
+    farthest = farthest * robot.reach
+    if convention != "dh-hayati":
+        links = _with_slides_placed(robot, links, farthest)
+    rows, base, tool, nearly = _rows(links, convention, farthest)
+    builder = RobotBuilder(robot.name, convention)
+    builder.add_frame("base", frame_values("base", _tidy(base)), 0, False)
+    for joint, row in zip(robot.joints, rows, strict=True):
+        builder.add_convention_joint(joint, {"beta": 0.0} | {kind: _turn(kind, row[kind]) for kind in row})
+    builder.add_frame("tool", frame_values("tool", _tidy(tool)), robot.n_joints + 1, False)
+    return TableRobot(builder.build(), nearly)
+
+
+def _rows(
+    links: Links, convention: TableConvention, farthest: float
+) -> tuple[list[dict[str, float]], Floats, Floats, tuple[Nearly, ...]]:
+    """Rows by kind, base, tool, and the axes that are taken to be parallel."""
+    n = len(links.between) - 1
+    craig = convention == "mdh"
+    rows = [dict.fromkeys(("a", "alpha", "d", "theta"), 0.0) for _ in range(n)]
+    first, carried, base = _start(links, craig)
+    rows[0] |= first
+    nearly: list[Nearly] = []
+    for i in range(1, n):
+        M = carried @ links.between[i]
+        sine = float(np.hypot(M[0, 2], M[1, 2]))
+        if convention == "dh-hayati" and sine < NEARLY_PARALLEL:
+            row = plane_crossing(M)
+        else:
+            row = common_normal(M, height=carried[2, 3])
+            away = max(abs(row["d"]), abs(left_over(M, row)[2, 3]))
+            if away > farthest:
+                nearly.append(Nearly((i, i + 1), float(np.arcsin(sine)), away))
+                row = common_normal(M, height=carried[2, 3], parallel=True)
+        carried = _along_z(left_over(M, row))
+        link = {kind: row.pop(kind) for kind in ("a", "alpha")}
+        rows[i - 1] |= row
+        rows[i if craig else i - 1] |= link
+    M = carried @ links.between[n]
+    row = _end(M, craig)
+    rows[n - 1] |= row
+    return rows, base, left_over(M, row) @ links.tool, tuple(nearly)
+
+
+def common_normal(M: Floats, *, height: float = 0.0, parallel: bool = False) -> dict[str, float]:
+    """theta, d, a and alpha from the z axis of a frame to that of another.
+
+    Args:
+        M: From the one frame to the other, shape (4, 4).
+        height: d of parallel axes, which have common normals anywhere, [m].
+        parallel: Whether to take both axes to be parallel.
+    """
+    (x, y, z), p = M[:3, 2], M[:3, 3]
+    sine = np.hypot(x, y)
+    if parallel or sine < PARALLEL:
+        row = {"theta": _direction(p), "d": height, "a": np.hypot(p[0], p[1]), "alpha": 0.0 if z > 0 else np.pi}
+        return _upright(row)
+    theta = np.arctan2(x, -y)
+    c, s = np.cos(theta), np.sin(theta)
+    back = -(c * p[1] - s * p[0]) / sine  # d'
+    return _upright({"theta": theta, "d": p[2] - z * back, "a": c * p[0] + s * p[1], "alpha": np.arctan2(sine, z)})
+
+
+def plane_crossing(M: Floats) -> dict[str, float]:
+    """theta, a, alpha and beta from the z axis of a frame to another one that is not square to it (Hayati).
+
+    Args:
+        M: From the one frame to the other, shape (4, 4).
+    """
+    z, p = M[:3, 2], M[:3, 3]
+    P = p - z * (p[2] / z[2])
+    row = _upright({"theta": _direction(P), "d": 0.0, "a": np.hypot(P[0], P[1]), "alpha": 0.0})
+    x, y, z_ = transform(theta=-row["theta"])[:3, :3] @ z
+    return row | {"alpha": float(np.arctan2(-y, z_)), "beta": float(np.arctan2(x, np.hypot(y, z_)))}
+
+
+def left_over(M: Floats, row: Mapping[str, float]) -> Floats:
+    """What is left of a transform behind a row of figures, shape (4, 4)."""
+    return inverse(row_transform("dh-hayati", dict(row))) @ M
+
+
+def _direction(p: Floats) -> float:
+    """The angle of a point about z; 0 for one on it."""
+    return float(np.arctan2(p[1], p[0])) if np.hypot(p[0], p[1]) > SAME else 0.0
+
+
+def _upright(row: dict[str, float]) -> dict[str, float]:
+    """The same row with theta within a quarter turn of 0."""
+    if np.cos(row["theta"]) < -SAME:
+        row = row | {"theta": row["theta"] + np.pi, "a": -row["a"], "alpha": -row["alpha"]}
+    return {kind: _turn(kind, value) for kind, value in row.items()}
+
+
+def _turn(kind: str, value: float) -> float:
+    """An angle within half a turn, (-pi, pi]; lengths as they are."""
+    if kind not in ("theta", "alpha", "beta"):
+        return float(value) + 0.0
+    turned = value - 2.0 * np.pi * np.round(value / (2.0 * np.pi))
+    return float(turned + 2.0 * np.pi if turned <= -np.pi + SAME else turned) + 0.0  # of two zeros the plain one
+
+
+def _along_z(M: Floats) -> Floats:
+    """The turn about z and the shift along z that are nearest to a transform, shape (4, 4)."""
+    return transform(theta=_about_z(M), d=float(M[2, 3]))
+
+
+def _about_z(M: Floats) -> float:
+    """How far a transform turns about z, the rest being a turn about an axis square to it; 0 where that is any."""
+    cosine, sine = M[0, 0] + M[1, 1], M[1, 0] - M[0, 1]
+    return float(np.arctan2(sine, cosine)) if np.hypot(cosine, sine) > SAME else 0.0
+
+
+def _start(links: Links, craig: bool) -> tuple[dict[str, float], Floats, Floats]:
+    """The a and alpha of the first row, what is carried on to its theta and d, and the base.
+
+    Frame 0 stays where it is if the first joint is along its z axis or, in Craig's table, from there by a and alpha.
+    """
+    M = links.between[0]
+    row = {"a": float(M[0, 3]), "alpha": float(np.arctan2(-M[1, 2], M[2, 2]))} if craig else {"a": 0.0, "alpha": 0.0}
+    rest = inverse(transform(**row)) @ M
+    if _is_same(rest, _along_z(rest)):
+        return {kind: value if abs(value) > SAME else 0.0 for kind, value in row.items()}, _along_z(rest), links.base
+    return {}, np.eye(4), links.base @ M
+
+
+def _end(M: Floats, craig: bool) -> dict[str, float]:
+    """The theta and d of the last row and, where nothing else is left and the row is not Craig's, a and alpha."""
+    row = {"theta": _about_z(M), "d": float(M[2, 3])}
+    rest = left_over(M, row)
+    link = {"a": float(rest[0, 3]), "alpha": float(np.arctan2(rest[2, 1], rest[1, 1]))}
+    return row | link if not craig and _is_same(rest, transform(**link)) else row
+
+
+def _is_same(first: Floats, second: Floats) -> bool:
+    return bool(np.abs(first - second).max() <= SAME)
+
+
+def _tidy(T: Floats) -> Floats:
+    """A transform without what is rounding."""
+    return np.eye(4) if _is_same(T, np.eye(4)) else rigid(T[:3, :3], np.where(np.abs(T[:3, 3]) > SAME, T[:3, 3], 0.0))
+
+
+def _with_slides_placed(robot: Robot, links: Links, farthest: float) -> Links:
+    """The same arm with the axes of slides where rows can hold them: of a slide only the direction matters.
+
+    An axis that is nearly parallel to a neighbour is put through the neighbour's origin, so that they meet there.
+    """
+    between = list(links.between)
+    for i, joint in enumerate(robot.joints):
+        if not joint.prismatic:
+            continue
+        before, behind = between[i], between[i + 1]
+        shifts = [np.zeros(3), -before[:3, :3].T @ before[:3, 3], behind[:3, 3]]  # in the frame of the slide
+        for shift in shifts:
+            moved = rigid(np.eye(3), shift)
+            placed = before @ moved, inverse(moved) @ behind
+            inner = [M for k, M in zip((i, i + 1), placed, strict=True) if 0 < k < robot.n_joints]
+            if all(_away(M) <= farthest for M in inner):
+                between[i : i + 2] = placed
+                break
+    return replace(links, between=tuple(between))
+
+
+def _away(M: Floats) -> float:
+    """How far along either axis their common normal is, [m]."""
+    row = common_normal(M)
+    return max(abs(row["d"]), abs(float(left_over(M, row)[2, 3])))

@@ -1,0 +1,221 @@
+"""What earlier rows say, without these rows: the square root of their information, about where they were linearised.
+
+Of rows r(x), whitened, all is kept that acts on the arm and on what stays with it (targets on the tool, anchors):
+`|r|^2 = |z + R s|^2 + constant` to second order, s the step from where they were linearised in the tangent space of the
+variables. What the rows depended on besides, such as measurement frames, is eliminated: it may be another by now.
+
+Growth: where x may have wandered since by g with 1 sigma G, `|z + R (s - G h)|^2 + |h|^2` with h eliminated; where G is
+unlimited h has no row of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.arrays import FrozenArrays
+from fg_calib.graph.factors import Variables, build_variables, custom_factor, eliminate, pose_of
+from fg_calib.graph.observability import determined
+from fg_calib.measurements.series import Unknowns
+from fg_calib.robot.model import Robot
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+STAYING = "PA"
+"""Letters of the unknowns that may stay where they are: targets on the tool, anchors beside the arm."""
+
+SIZE = 3
+"""Coordinates of each of them."""
+
+Name = tuple[str, str]
+"""Letter and name of an unknown."""
+
+
+@dataclass(frozen=True)
+class Knowledge(FrozenArrays):
+    """What earlier rows say of an arm and of what stays with it.
+
+    Attributes:
+        robot: The arm with its values where the rows were linearised; what they are about is estimated.
+        unknowns: Letter and name of what stays with it.
+        at: Where these were, one after the other, shape (3 * len(unknowns),), [m].
+        rows: R, shape (k, n_columns + len(at)): columns of the arm's variables, then of the unknowns.
+        right: z, shape (k,).
+    """
+
+    robot: Robot
+    unknowns: tuple[Name, ...]
+    at: Floats
+    rows: Floats
+    right: Floats
+
+    @cached_property
+    def variables(self) -> Variables:
+        """The arm's variables."""
+        return build_variables(self.robot, [False], False)
+
+    @property
+    def n(self) -> int:
+        """Number of rows: directions that are known."""
+        return len(self.rows)
+
+    @property
+    def scales(self) -> Floats:
+        """A change of ordinary size in each column."""
+        return np.append(self.variables.scales, np.full(len(self.at), self.robot.scale_of("m")))
+
+    @classmethod
+    def of_rows(cls, robot: Robot, unknowns: Sequence[Name], at: Floats, A: Floats, b: Floats) -> Knowledge:
+        """Knowledge of whitened rows `A s + b`, of which as many are kept as there are directions known.
+
+        Args:
+            robot: The arm where they were linearised.
+            unknowns: What stays with it.
+            at: Where that was.
+            A: Derivatives, shape (m, n_columns + len(at)).
+            b: Residuals, shape (m,).
+        """
+        bare = cls(robot, tuple(unknowns), at, np.zeros((0, A.shape[1])), np.zeros(0))
+        _, R = np.linalg.qr(np.column_stack([A * bare.scales, b]))
+        U, s, Vt = np.linalg.svd(R[:, :-1], full_matrices=False)
+        rank = determined(s)
+        return replace(bare, rows=s[:rank, None] * Vt[:rank] / bare.scales, right=U[:, :rank].T @ R[:, -1])
+
+    def about(self, unknowns: Sequence[Name]) -> Knowledge:
+        """The same of some of the unknowns alone, the others eliminated."""
+        kept = [name for name in unknowns if name in self.unknowns]
+        n = self.variables.n_columns
+        if list(self.unknowns) == kept:
+            return self
+        spans = [np.arange(SIZE) + SIZE * self.unknowns.index(name) for name in kept]
+        chosen = np.concatenate([np.zeros(0, dtype=np.int64), *spans])
+        others = np.setdiff1d(np.arange(len(self.at)), chosen)
+        order = np.concatenate([np.arange(n), n + chosen, n + others])
+        left = eliminate(self.rows[:, order], self.right, n + len(chosen))
+        return Knowledge.of_rows(self.robot, kept, self.at[chosen], left.A, left.b)
+
+    def grown(self, directions: Floats, free: NDArray[np.bool_]) -> Knowledge:
+        """The same of an arm that may have changed since.
+
+        Args:
+            directions: Of independent changes of 1 sigma each in the columns, shape (n_columns + len(at), n).
+            free: Which of them may be of any size, shape (n,).
+        """
+        if not directions.shape[1]:
+            return self
+        n, k = directions.shape
+        own = np.hstack([np.zeros((k, n)), np.eye(k)])[~free]
+        left = eliminate(
+            np.vstack([np.hstack([self.rows, -self.rows @ directions]), own]),
+            np.append(self.right, np.zeros(len(own))),
+            n,
+        )
+        return Knowledge.of_rows(self.robot, self.unknowns, self.at, left.A, left.b)
+
+    def with_rows(self, A: Floats, b: Floats) -> Knowledge:
+        """The same with more rows about the same place."""
+        return Knowledge.of_rows(
+            self.robot, self.unknowns, self.at, np.vstack([self.rows, A]), np.append(self.right, b)
+        )
+
+    def span(self, name: Name) -> Integers:
+        """Columns of an unknown."""
+        return self.variables.n_columns + SIZE * self.unknowns.index(name) + np.arange(SIZE)
+
+    def place(self, name: Name) -> Floats:
+        """Where an unknown was, shape (3,), [m]."""
+        return self.at[self.span(name) - self.variables.n_columns]
+
+    def follow(self) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+        """How the unknowns follow the arm: derivatives, a root of their covariance at a given arm, which are not known.
+
+        Returns:
+            Shapes (len(at), n_columns), (len(at), rank) and (len(at),).
+        """
+        left = eliminate(self.rows, self.right, self.variables.n_columns)
+        return left.follow, left.inverse, left.unknown
+
+    def step_to(self, variables: Variables, unknowns: Unknowns, parameters: Floats) -> tuple[Floats, Floats]:
+        """The step from where the rows were linearised to a parameter vector, and its derivative.
+
+        Args:
+            variables: Those of a problem of the same arm.
+            unknowns: The problem's unknowns; those of the knowledge's that are none of them stay where they were.
+            parameters: The problem's parameter vector.
+
+        Returns:
+            Shapes (n_columns + len(at),) and (n_columns + len(at), n of all the problem's columns).
+        """
+        own, n = self.variables, self.variables.n_columns
+        values, before = parameters[own.robot_span], self.robot.nominal
+        s, turned = np.zeros(n + len(self.at)), np.eye(n)
+        for v in own.items:
+            of_v = list(v.parameters)
+            if v.is_pose:
+                step = gtsam.Pose3.Logmap(pose_of(before[of_v]).between(pose_of(values[of_v])))
+                s[v.columns], turned[v.columns, v.columns] = step, gtsam.Pose3.LogmapDerivative(step)
+            else:
+                s[v.columns] = values[of_v] - before[of_v]
+        D = np.zeros((len(s), variables.n_columns + variables.n_nuisance))
+        D[:n, : variables.n_columns] = turned @ columns_in(own, variables, values)
+        for i, name in enumerate(self.unknowns):
+            place = coordinates_of(variables, unknowns, name)
+            if place is not None:
+                rows = n + SIZE * i + np.arange(SIZE)
+                s[rows] = parameters[place] - self.at[SIZE * i + np.arange(SIZE)]
+                D[rows, place - variables.nuisance_span.start + variables.n_columns] = 1.0
+        return s, D
+
+    def seen_by(self, variables: Variables, unknowns: Unknowns) -> Knowledge:
+        """The same of what a problem estimates, the other unknowns eliminated."""
+        return self.about([n for n in self.unknowns if coordinates_of(variables, unknowns, n) is not None])
+
+    def at_parameters(self, variables: Variables, unknowns: Unknowns, parameters: Floats) -> tuple[Floats, Floats]:
+        """The rows at a parameter vector and their derivatives, shapes (k,), (k, n of all the problem's columns)."""
+        s, D = self.step_to(variables, unknowns, parameters)
+        return self.right + self.rows @ s, self.rows @ D
+
+    def factor(self, variables: Variables, unknowns: Unknowns) -> gtsam.CustomFactor:
+        """The rows as a factor on all variables of a problem."""
+
+        def rows(values: gtsam.Values) -> tuple[Floats, Floats]:
+            return self.at_parameters(variables, unknowns, variables.parameters(values))
+
+        return custom_factor([*variables.items, *variables.nuisance], self.n, lambda values: rows(values)[0], rows)
+
+
+def coordinates_of(variables: Variables, unknowns: Unknowns, name: Name) -> Integers | None:
+    """Where an unknown's coordinates stand in a parameter vector; None for one that is not there, or not estimated."""
+    names = list(zip(unknowns.letters, unknowns.names, strict=True))
+    if name not in names:
+        return None
+    i = names.index(name)
+    first = sum(unknowns.sizes[:i])
+    place = variables.coordinates[first : first + unknowns.sizes[i]]
+    return place if np.all(place >= 0) else None
+
+
+def columns_in(own: Variables, other: Variables, values: Floats) -> Floats:
+    """The columns of a problem's core in those of other variables of the same arm, shape (n_own, n_other).
+
+    Args:
+        own: Variables whose arm has everything estimated that the other's has, without measurement frames.
+        other: The problem's.
+        values: The robot's parameters, shape (n_parameters,).
+    """
+    by_name = dict(zip(own.names, own.tangent_derivative(values).T, strict=True))
+    poses = {v.symbol: np.eye(own.n_columns)[v.columns] for v in own.items if v.is_pose}
+    out = np.zeros((own.n_columns, other.n_columns))
+    for v in other.items:
+        if v.symbol in poses:
+            out[:, v.columns] = poses[v.symbol].T
+        elif not v.is_pose:
+            columns = [by_name.get(name, np.zeros(own.n_columns)) for name in other.names[v.columns]]
+            out[:, v.columns] = np.array(columns).T
+    return out

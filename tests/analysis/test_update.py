@@ -1,0 +1,173 @@
+"""A calibration with new rows added equals one of all rows, but for what is not linear between the two."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from month import arm, calibrated, measured, placed, slipped
+from simulated import true_robot
+
+from fg_calib import Measurements, Table, calibrate, pose
+from fg_calib.errors import InputError
+from fg_calib.measurements.dataset import Labels
+
+FINE = (5e-8, 1e-7)
+"""Noise so small that nothing bends: a thousandth of an instrument's."""
+
+
+def tables_of(sigma, unknown, model, rng, true, n=(30, 12)):
+    frames = [placed(rng) if unknown else None for _ in n]
+    rows = [measured(true, k, rng, frame=f, sigma=sigma, ids=i) for k, f, i in zip(n, frames, "ab", strict=True)]
+    return [Table(m, model, frame="unknown" if unknown else "known") for m in rows]
+
+
+def difference(updated, batch):
+    """Largest difference of an estimate, in sigma, and of a sigma, as a share of it."""
+    names = [n for n in batch.result.covariance.names if batch.parameters[n].sigma]
+    a, b = ([c.parameters[n] for n in names] for c in (updated, batch))
+    off = [abs(x.estimate - y.estimate) / y.sigma for x, y in zip(a, b, strict=True)]
+    return max(off), max(abs(x.sigma / y.sigma - 1.0) for x, y in zip(a, b, strict=True))
+
+
+@pytest.mark.parametrize("gauge", ["prior", "keep"])
+@pytest.mark.parametrize(("unknown", "model"), [(False, "pose"), (True, "pose"), (False, "distance-rotation")])
+def test_an_update_is_a_calibration_of_all_rows(unknown, model, gauge):
+    rng = np.random.default_rng(0)
+    robot = fine_arm()
+    old, new = tables_of(FINE, unknown, model, rng, true_robot(robot, rng))
+    updated = calibrate(robot, old, gauge=gauge).update(new)
+    off, of_sigma = difference(updated, calibrate(robot, [old, new], gauge=gauge))
+    assert off < 1e-6
+    assert of_sigma < 1e-6
+    assert updated.result.options["gauge"] == gauge
+
+
+def test_at_the_noise_of_an_instrument_the_difference_is_a_thousandth_of_a_sigma():
+    calibration, true, rng = calibrated(0, unknown=True)
+    old = calibration.solution.problem.data.tables[0]
+    new = Table(measured(true, 12, rng, frame=placed(rng), ids="b"), "pose", frame="unknown")
+    off, of_sigma = difference(calibration.update(new), calibrate(arm(), [old, new]))
+    assert 1e-6 < off < 3e-3
+    assert of_sigma < 1e-3
+
+
+def test_three_updates_in_a_row_are_a_calibration_of_all_rows():
+    calibration, true, rng = calibrated(3)
+    tables = [calibration.solution.problem.data.tables[0]]
+    for name in "bcd":
+        tables.append(Table(measured(true, 6, rng, ids=name), "pose"))
+        calibration = calibration.update(tables[-1])
+    off, of_sigma = difference(calibration, calibrate(arm(), tables))
+    assert off < 3e-3
+    assert of_sigma < 1e-3
+    assert [run.n_residuals for run in calibration.runs] == [240, 36, 36, 36]
+
+
+def seen(true, spots, rng, n, ids):
+    """Positions of targets on the tool."""
+    q = rng.uniform(-2.5, 2.5, (n, 6))
+    of = np.arange(n) % len(spots)
+    poses = pose(true, q)
+    at = np.array(list(spots.values()))[of]
+    p = poses.position + np.einsum("nij,nj->ni", poses.rotation, at) + 5e-5 * rng.normal(size=(n, 3))
+    rows = Measurements.from_arrays(q, position=p, sigma_position=5e-5, ids=[f"{ids}{i}" for i in range(n)])
+    return Table(replace(rows, labels={"target": Labels(tuple(spots), of)}), "position")
+
+
+def test_targets_stay_known_although_a_month_does_not_see_them():
+    """Two targets, of which the second table sees one; the third sees the other again."""
+    rng = np.random.default_rng(4)
+    robot = arm()
+    true, spots = true_robot(robot, rng), {"a": [0.03, 0.08, 0.02], "b": [0.1, -0.02, 0.05]}
+    tables = [
+        seen(true, spots, rng, 40, "x"),
+        seen(true, {"a": spots["a"]}, rng, 10, "y"),
+        seen(true, {"b": spots["b"]}, rng, 10, "z"),
+    ]
+    updated = calibrate(robot, tables[0]).update(tables[1]).update(tables[2])
+    batch = calibrate(robot, tables)
+    off, of_sigma = difference(updated, batch)
+    assert off < 3e-3
+    assert of_sigma < 1e-3
+    places = [next(g for g in c.result.groups if g.name == "b") for c in (updated, batch)]
+    assert np.allclose(places[0].xyz, places[1].xyz, rtol=0.0, atol=3e-3 * max(places[1].sigma))
+    assert np.allclose(places[0].sigma, places[1].sigma, rtol=1e-3)
+
+
+def fine_arm():
+    """An arm that is nearly as drawn, so that nothing bends."""
+    robot = arm()
+    tolerance = {p.name: 1e-3 * p.tolerance for p in robot.parameters if p.tolerance}
+    return replace(robot, parameters=tuple(replace(p, tolerance=tolerance.get(p.name)) for p in robot.parameters))
+
+
+def lengths(true, anchors, rng, n, ids):
+    q = rng.uniform(-2.5, 2.5, (n, 6))
+    of = np.arange(n) % len(anchors)
+    d = np.linalg.norm(pose(true, q).position - np.array(list(anchors.values()))[of], axis=1)
+    d = d + 2e-8 * rng.normal(size=n)
+    rows = Measurements.from_arrays(q, ids=[f"{ids}{i}" for i in range(n)])
+    labels = {"anchor": Labels(tuple(anchors), of)}
+    return Table(replace(rows, labels=labels, length=d, sigma_length=np.full(n, 2e-8)), "anchor")
+
+
+def test_anchors_are_those_of_before_only_where_that_is_said():
+    rng = np.random.default_rng(5)
+    robot = fine_arm()
+    true = true_robot(robot, rng)
+    anchors = {"a": [1.5, 0, 0.2], "b": [-0.8, 1.2, 0.5], "c": [0.2, -1.4, 1.0]}
+    old, new = (lengths(true, anchors, rng, n, i) for n, i in ((90, "x"), (45, "y")))
+    calibration = calibrate(robot, old)
+    off, of_sigma = difference(calibration.update(new, anchors_stay=True), calibrate(robot, [old, new]))
+    assert off < 1e-5
+    assert of_sigma < 1e-5
+    others = replace(
+        new.measurements, labels={"anchor": Labels(("d", "e", "f"), new.measurements.labels["anchor"].index)}
+    )
+    off, of_sigma = difference(calibration.update(new), calibrate(robot, [old, replace(new, measurements=others)]))
+    assert off < 1e-5
+    assert of_sigma < 1e-5
+
+
+def test_what_has_changed_is_learned_anew_and_the_check_is_good_again():
+    calibration, true, rng = calibrated(6)
+    true = slipped(true, theta3=5e-3)
+    rows = measured(true, 12, rng)
+    assert calibration.check(rows).explanations[0].parameters == ("theta3",)
+    updated = calibration.update(rows, changed="theta3")
+    off = updated.parameters["theta3"].estimate - true.nominal[true.index("theta3")]
+    assert abs(off) < 4 * updated.parameters["theta3"].sigma
+    assert updated.trustworthy
+    assert updated.check(measured(true, 12, rng)).verdict == "pass"
+
+
+def test_growth_is_added_to_what_was_known():
+    """With hardly any new rows, variances are the old ones and the growth, whatever the correlation."""
+    calibration, true, rng = calibrated(7)
+    later = "2100-01-01"
+    days = (np.datetime64("2100-01-01T00:00:00") - np.datetime64(calibration.result.date[:19])) / np.timedelta64(1, "D")
+    coarse = measured(true, 3, rng, sigma=(10.0, 10.0))
+    updated = calibration.update(coarse, growth={"theta": 1e-6, "theta4": 2e-6}, date=later)
+    for name, rate in (("theta2", 1e-6), ("theta4", 2e-6), ("a2", 0.0)):
+        was, now = calibration.parameters[name].sigma, updated.parameters[name].sigma
+        assert now == pytest.approx(np.hypot(was, rate * np.sqrt(days)), rel=1e-4)
+
+
+def test_an_update_says_what_it_came_from():
+    calibration, true, rng = calibrated(8)
+    updated = calibration.update(measured(true, 6, rng), date="2026-12-24")
+    assert updated.result.date.startswith("2026-12-24")
+    assert updated.result.previous.date == calibration.result.date
+    assert updated.result.parameters[10].nominal == calibration.result.parameters[10].nominal
+    assert updated.result.n_residuals == 36
+
+
+def test_names_that_are_none_are_refused():
+    calibration, true, rng = calibrated(9)
+    rows = measured(true, 6, rng)
+    with pytest.raises(InputError, match="did you mean theta3"):
+        calibration.update(rows, changed="thetta3")
+    with pytest.raises(InputError, match="growth"):
+        calibration.update(rows, growth={"elbow": 1e-6})
+    with pytest.raises(InputError, match="a date such as"):
+        calibration.update(rows, date="yesterday")

@@ -1,0 +1,555 @@
+"""Every format has the forward kinematics of the arm: by pinocchio, yourdfpy and products of matrices."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+import yaml
+from exported import ARMS, TREE, UR10, column, matrix, off, pin_poses, scara, seven, ur10, yourdfpy_poses
+from oracle import dh_joint, frame, random_robot, tool_pose
+from scipy.spatial.transform import Rotation
+from sparing import as_case
+
+from fg_calib import InputError, Robot, export, read_robot, read_urdf
+from fg_calib.exports.fits import drawn, poses
+from fg_calib.exports.tables import in_table
+from fg_calib.robot.model import CONVENTIONS
+
+EXACT = 1e-9  # [m] and [rad], as the issue states
+
+
+def ours(robot, q):
+    at = poses(robot, q)
+    return np.array([matrix(R, p) for R, p in zip(at.rotation, at.position, strict=True)])
+
+
+def names(robot):
+    return [joint.name for joint in robot.joints]
+
+
+def frames(robot, owner):
+    values = {p.kind: p.nominal for p in robot.parameters if p.owner == owner}
+    return frame(*(values[kind] for kind in ("x", "y", "z", "roll", "pitch", "yaw")))
+
+
+@pytest.fixture(params=ARMS)
+def arm(request, tmp_path):
+    """An arm that is a little off, its base and tool as well."""
+    return off(ARMS[request.param](tmp_path), frames=True)
+
+
+def ends(robot):
+    """Links of its URDF at both ends, and what is before and behind them."""
+    if robot.urdf is None:
+        return "base_link", "tool", np.eye(4), np.eye(4)
+    return robot.urdf.base_link, robot.urdf.tip_link, frames(robot, 0), frames(robot, robot.n_joints + 1)
+
+
+@pytest.mark.slow
+def test_pinocchio_computes_the_tool_poses_of_the_urdf(arm):
+    q = drawn(arm, 1000, 3)
+    base, tip, before, behind = ends(arm)
+    found = before @ pin_poses(export(arm, "urdf").text, base, tip, names(arm), q) @ behind
+    assert np.abs(found - ours(arm, q)).max() < EXACT
+
+
+@pytest.mark.parametrize("n", [20, as_case(1000, is_slow=True)])
+def test_yourdfpy_computes_the_tool_poses_of_the_urdf(arm, n, tmp_path):
+    q = drawn(arm, n, 3)
+    base, tip, before, behind = ends(arm)
+    export(arm, "urdf").write(tmp_path / "out.urdf")
+    found = before @ yourdfpy_poses(tmp_path / "out.urdf", base, tip, names(arm), q) @ behind
+    assert np.abs(found - ours(arm, q)).max() < EXACT
+
+
+def test_a_new_urdf_reads_back_as_the_same_arm_with_its_names_and_limits(arm, tmp_path):
+    if arm.urdf is not None:
+        pytest.skip("this arm has a URDF already")
+    export(arm, "urdf").write(tmp_path / "out.urdf")
+    back = read_urdf(tmp_path / "out.urdf")
+    assert (back.name, back.joints) == (arm.name, arm.joints)
+    q = drawn(arm, 1000, 3)
+    assert np.abs(ours(back, q) - ours(arm, q)).max() < EXACT
+
+
+@pytest.mark.parametrize("to", ["hayati", "yaml"])
+def test_hayatis_table_holds_every_arm_exactly(arm, to, tmp_path):
+    made = export(arm, to)
+    if to == "hayati":
+        assert made.details["exact"]
+        assert made.details["reasons"] == []
+    made.write(tmp_path / "out.yaml")
+    back = read_robot(tmp_path / "out.yaml")
+    assert back.joints == pytest.approx(arm.joints) if to == "yaml" else names(back) == names(arm)
+    q = drawn(arm, 1000, 3)
+    assert np.abs(ours(back, q) - ours(arm, q)).max() < EXACT
+
+
+@pytest.mark.parametrize("to", ["dh", "mdh"])
+@pytest.mark.parametrize("name", [as_case(name, is_slow="scara" in name) for name in ARMS])
+def test_tables_of_four_figures_say_what_they_miss_and_by_how_much(name, to, tmp_path):
+    arm = off(ARMS[name](tmp_path), frames=True)
+    made = export(arm, to)
+    made.write(tmp_path / "out.yaml")
+    back = read_robot(tmp_path / "out.yaml")
+    q = drawn(arm, 1000, 3)
+    miss = np.linalg.norm((ours(back, q) - ours(arm, q))[:, :3, 3], axis=1)
+    if made.details["exact"]:
+        assert miss.max() < EXACT
+        return
+    assert all("parallel within" in reason for reason in made.details["reasons"])
+    error = made.details["error"]
+    # Other configurations of the same kind: RMS of 1000 of some 10 independent figures is known to 5 %.
+    assert np.sqrt(np.mean(miss**2)) == pytest.approx(error["position_rms"], rel=0.1)
+    assert miss.max() < 1.5 * error["position_max"]
+    assert f"{1e3 * error['position_rms']:.4g} mm RMS" in made.text
+
+
+def random_arm(seed):
+    """Any convention, 1 to 7 joints; of two in three all angles are quarter turns, of one in three nearly so."""
+    rng = np.random.default_rng(seed)
+    robot = random_robot(["urdf", *CONVENTIONS][seed % 5], int(rng.integers(1, 8)), rng)
+    if seed % 3 == 0:
+        return robot
+    angles = np.array([p.unit == "rad" for p in robot.parameters])
+    values = np.where(angles, np.round(robot.nominal / (np.pi / 2)) * np.pi / 2, robot.nominal)
+    return robot.with_values(values + (seed % 3 == 2) * rng.normal(size=len(values)) * 10.0 ** rng.uniform(-12, -3))
+
+
+EXTREMES = {
+    "one joint": lambda: Robot.from_dh([[0.1, 0.2, 0.3, 0.4]]),
+    "of no length": lambda: Robot.from_dh([[0, 0, 0, 0]] * 3),
+    "back and forth": lambda: Robot.from_dh([[0, np.pi, 0, 0]] * 4, "mdh"),
+    "a gantry": lambda: Robot.from_dh(
+        [[0, np.pi / 2, 0, 0], [0, np.pi / 2, 0, np.pi / 2], [0, 0, 0, 0]], types="prismatic"
+    ),
+    "two slides along a line": lambda: Robot.from_dh([[0, 0, 0, 0]] * 2, types="prismatic"),
+    "slides along turning axes": lambda: Robot.from_dh(
+        [[0, 1e-4, 0, 0, 2e-4]] * 4, "mdh-hayati", types=["revolute", "prismatic"] * 2
+    ),
+    **{f"random {i}": partial(random_arm, i) for i in range(50)},
+}
+
+
+@pytest.mark.parametrize("name", [as_case(n, is_slow=n.startswith("random") and int(n[7:]) > 4) for n in EXTREMES])
+def test_whatever_the_arm_its_exact_formats_are_exact(name, tmp_path):
+    arm = EXTREMES[name]()
+    q = drawn(arm, 50, 0)
+    for to in ("urdf", "hayati", "yaml", "dh", "mdh"):
+        made = export(arm, to)
+        made.write(tmp_path / f"{to}.{'urdf' if to == 'urdf' else 'yaml'}")
+        (file,) = tmp_path.glob(f"{to}.*")
+        if made.details.get("exact", True):
+            assert np.abs(ours(read_robot(file), q) - ours(arm, q)).max() < EXACT, to
+        else:
+            assert to in ("dh", "mdh")
+    zeros = export(arm, "zeros", nominal=arm).details["zeros"].values()
+    assert [zero["reading"] for zero in zeros] == pytest.approx([0.0] * arm.n_joints, abs=EXACT)
+
+
+def test_which_arms_have_exact_tables_of_four_figures(tmp_path):
+    exact = {
+        (name, to): not in_table(off(make(tmp_path)), to).nearly for name, make in ARMS.items() for to in ("dh", "mdh")
+    }
+    parallel = {("ur10", "dh"), ("ur10", "mdh"), ("scara", "dh"), ("scara", "mdh")}
+    # The dh arm is off in what dh has: alpha of its parallel axes, whose common normals stay where they were.
+    assert {key for key, value in exact.items() if not value} == parallel
+
+
+def test_tables_of_arms_as_drawn_are_those_of_the_drawing():
+    drawn_arm = Robot.from_dh([row[:4] for row in UR10], "dh")
+    table = in_table(in_table(drawn_arm, "mdh").robot, "dh").robot
+    assert [[p.nominal for p in table.parameters if p.owner == i + 1] for i in range(6)] == [
+        pytest.approx([theta, d, a, alpha], abs=1e-12) for a, alpha, d, theta, _ in UR10
+    ]
+    assert not any(p.nominal for p in table.parameters if p.owner in (0, 7))
+
+
+def test_tables_are_products_of_their_elementary_transforms():
+    arm = off(seven())
+    for convention in ("dh", "mdh", "dh-hayati"):
+        table = in_table(arm, convention).robot
+        for q in drawn(arm, 5, 0):
+            T = frames(table, 0)
+            for i, joint in enumerate(table.joints):
+                row = {p.kind: p.nominal for p in table.parameters if p.owner == i + 1}
+                T = T @ dh_joint(convention, row, q[i], joint.prismatic)
+            assert T @ frames(table, 8) == pytest.approx(tool_pose(arm, q), abs=EXACT)
+
+
+# --- ur_description ---------------------------------------------------------------------------------------------------
+
+UR_JOINTS = {
+    "shoulder": ("shoulder_pan_joint", "base_link_inertia", "shoulder_link"),
+    "upper_arm": ("shoulder_lift_joint", "shoulder_link", "upper_arm_link"),
+    "forearm": ("elbow_joint", "upper_arm_link", "forearm_link"),
+    "wrist_1": ("wrist_1_joint", "forearm_link", "wrist_1_link"),
+    "wrist_2": ("wrist_2_joint", "wrist_1_link", "wrist_2_link"),
+    "wrist_3": ("wrist_3_joint", "wrist_2_link", "wrist_3_link"),
+}
+
+
+def ur_macro(kinematics):
+    """The chain of ur_macro.xacro with these kinematics, as its xacro expands it."""
+    pi = repr(np.pi)
+    fixed = [
+        ("base_link-base_link_inertia", "base_link", "base_link_inertia", f"0 0 {pi}"),
+        ("base_link-base_fixed_joint", "base_link", "base", f"0 0 {pi}"),
+        ("wrist_3-flange", "wrist_3_link", "flange", f"0 {-np.pi / 2} {-np.pi / 2}"),
+        ("flange-tool0", "flange", "tool0", f"{np.pi / 2} 0 {np.pi / 2}"),
+    ]
+    parts = ['<link name="base_link"/>']
+    for name, parent, child, rpy in fixed[:2]:
+        parts.append(f'<link name="{child}"/><joint name="{name}" type="fixed"><origin xyz="0 0 0" rpy="{rpy}"/>'
+                     f'<parent link="{parent}"/><child link="{child}"/></joint>')  # fmt: skip
+    for link, (name, parent, child) in UR_JOINTS.items():
+        o = kinematics[link]
+        parts.append(
+            f'<link name="{child}"/><joint name="{name}" type="revolute">'
+            f'<parent link="{parent}"/><child link="{child}"/>'
+            f'<origin xyz="{o["x"]} {o["y"]} {o["z"]}" rpy="{o["roll"]} {o["pitch"]} {o["yaw"]}"/><axis xyz="0 0 1"/>'
+            '<limit lower="-6.3" upper="6.3" effort="1" velocity="1"/></joint>'
+        )
+    for name, parent, child, rpy in fixed[2:]:
+        parts.append(f'<link name="{child}"/><joint name="{name}" type="fixed"><origin xyz="0 0 0" rpy="{rpy}"/>'
+                     f'<parent link="{parent}"/><child link="{child}"/></joint>')  # fmt: skip
+    return f'<robot name="ur">{"".join(parts)}</robot>'
+
+
+UR10_DEFAULT = {
+    "shoulder": (0, 0, 0.1273, 0, 0, 0),
+    "upper_arm": (0, 0, 0, 1.570796327, 0, 0),
+    "forearm": (-0.612, 0, 0, 0, 0, 0),
+    "wrist_1": (-0.5723, 0, 0.163941, 0, 0, 0),
+    "wrist_2": (0, -0.1157, -2.373046667922381e-11, 1.570796327, 0, 0),
+    "wrist_3": (0, 0.0922, -1.891053610911353e-11, 1.570796326589793, 3.141592653589793, 3.141592653589793),
+}
+"""ur_description/config/ur10/default_kinematics.yaml of ros-industrial/universal_robot, e30bc2e."""
+
+
+def test_a_ur10_as_drawn_has_the_frames_of_ur_descriptions_own_file():
+    made = yaml.safe_load(export(Robot.from_dh([row[:4] for row in UR10], "dh"), "ur").text)["kinematics"]
+    assert list(made) == [*UR10_DEFAULT, "hash"]
+    for link, default in UR10_DEFAULT.items():
+        found = [made[link][kind] for kind in ("x", "y", "z", "roll", "pitch", "yaw")]
+        assert frame(*found) == pytest.approx(frame(*default), abs=1e-9)  # its figures have nine digits
+
+
+@pytest.fixture
+def ur_urdf(tmp_path):
+    """ur_description's own URDF with joints that are a little off, in the frames that its xacro makes."""
+    kinds = ("x", "y", "z", "roll", "pitch", "yaw")
+    kinematics = {link: dict(zip(kinds, values, strict=True)) for link, values in UR10_DEFAULT.items()}
+    (tmp_path / "ur.urdf").write_text(ur_macro(kinematics))
+    return off(read_urdf(tmp_path / "ur.urdf", base_link="base_link", tip_link="tool0"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("convention", ["dh", "mdh", "dh-hayati", "mdh-hayati", "urdf", "other axes"])
+def test_pinocchio_computes_the_tool_poses_of_ur_description_with_the_file(convention, ur_urdf, tmp_path):
+    if convention == "urdf":
+        robot, base = ur_urdf, "base_link"
+    elif convention == "other axes":  # the same joints about other axes of turned frames, and none of a UR
+        text = TREE.replace('"prismatic"', '"continuous"')
+        (tmp_path / "six.urdf").write_text(text.replace('"flange_fixed" type="fixed"', '"extra" type="continuous"'))
+        robot, base = read_urdf(tmp_path / "six.urdf", base_link="floor", tip_link="tip"), "base"
+    elif convention.startswith("mdh"):
+        robot, base = off(in_table(ur10(), "mdh").robot), "base"
+        if convention == "mdh-hayati":
+            rows = [[*(p.nominal for p in robot.parameters if p.owner == i + 1)] for i in range(6)]
+            robot = off(Robot.from_dh([[a, al, d, th, 1e-3] for a, al, d, th in rows], convention, tool=[0, 0, 0.1]))
+    else:
+        robot, base = off(ur10(convention)), "base"
+    made = export(robot, "ur")
+    document = yaml.safe_load(made.text)
+    assert list(document) == ["kinematics"]
+    q = drawn(robot, 1000, 4)
+    found = pin_poses(ur_macro(document["kinematics"]), base, "tool0", [j for j, _, _ in UR_JOINTS.values()], q)
+    assert np.abs(found @ np.array(made.details["tool0_T_tool"]) - ours(robot, q)).max() < EXACT
+    assert made.details["base"] == base
+
+
+def test_what_ur_description_has_no_place_for_is_said(ur_urdf):
+    made = export(ur10(), "ur")
+    assert (
+        "from tool0 it is at x 10, y -20, z 100, roll 5.72957795, pitch 11.4591559, yaw -17.1887339 (mm"
+        in made.notes[1]
+    )
+    assert made.notes[1] in made.text
+    assert not any("tool0" in note for note in export(ur_urdf, "ur").notes)  # its tip is tool0 itself
+
+
+def test_the_hash_is_the_controllers_or_one_that_no_controller_has():
+    assert yaml.safe_load(export(ur10(), "ur").text)["kinematics"]["hash"].startswith("fg_calib_")
+    made = export(ur10(), "ur", ur_hash="calib_12788084448423163542")
+    assert yaml.safe_load(made.text)["kinematics"]["hash"] == "calib_12788084448423163542"
+    assert not any("hash" in note for note in made.notes)
+    assert export(off(ur10()), "ur").details["hash"] != export(ur10(), "ur").details["hash"]
+
+
+def test_a_base_may_be_said_to_be_the_other_frame():
+    one, other = (yaml.safe_load(export(ur10(), "ur", ur_base=base).text) for base in ("base", "base_link"))
+    assert abs(one["kinematics"]["shoulder"]["yaw"] - other["kinematics"]["shoulder"]["yaw"]) == pytest.approx(np.pi)
+
+
+# --- Tesseract --------------------------------------------------------------------------------------------------------
+
+
+def test_tesseracts_origins_put_into_the_urdf_give_the_tool_poses(arm, tmp_path):
+    joints = yaml.safe_load(export(arm, "tesseract").text)["calibration"]["joints"]
+    origins = {
+        name: matrix(
+            Rotation.from_quat([of["orientation"][k] for k in "xyzw"]).as_matrix(), [of["position"][k] for k in "xyz"]
+        )
+        for name, of in joints.items()
+    }
+    nominal = (
+        export(off(arm, 0.1, frames=True), "urdf")
+        if arm.urdf is None
+        else export(arm.with_values(0 * arm.nominal), "urdf")
+    )
+    nominal.write(tmp_path / "nominal.urdf")
+    q = drawn(arm, 10, 5)
+    base, tip, before, behind = ends(arm)
+    found = before @ yourdfpy_poses(tmp_path / "nominal.urdf", base, tip, names(arm), q, origins) @ behind
+    assert np.abs(found - ours(arm, q)).max() < EXACT
+
+
+# --- URDF -------------------------------------------------------------------------------------------------------------
+
+
+def test_of_a_urdf_only_figures_of_calibrated_origins_change(tmp_path):
+    robot = column(tmp_path)
+    assert export(robot, "urdf").text == TREE
+    values = robot.nominal
+    values[robot.index("bend.yaw")] = 0.2001
+    values[robot.index("turn.z")] = 0.1001
+    expected = TREE.replace('rpy="0 1.5707963267948966 0.2"', 'rpy="0.0 1.5707963267948966 0.2001"')
+    expected = expected.replace('<origin xyz="0 0 0.1"/>', '<origin xyz="0.0 0.0 0.1001"/>')
+    assert export(robot.with_values(values), "urdf").text == expected
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_zeros_in_calibration_elements_and_origins_are_together_the_arm(backwards, tmp_path):
+    nominal = column(tmp_path, backwards)
+    robot = off(nominal)
+    text = export(robot, "urdf", nominal=nominal, calibration_elements=True).text
+    (tmp_path / "out.urdf").write_text(text)
+    back = read_urdf(tmp_path / "out.urdf", base_link=robot.urdf.base_link, tip_link=robot.urdf.tip_link)
+    rising = {line.split('"')[1]: float(line.split('rising="')[1].split('"')[0]) for line in _joint_lines(text)}
+    zeros = np.array([rising[joint.name] for joint in robot.joints])
+    assert np.abs(zeros).min() > 0.0
+    q = drawn(robot, 100, 6)
+    assert np.abs(ours(back, q + zeros) - ours(robot, q)).max() < EXACT
+    assert np.abs(ours(back, q) - ours(robot, q)).max() > 1e-5
+
+
+def _joint_lines(text):
+    parts = text.split("<joint ")[1:]
+    return [part for part in parts if "rising" in part]
+
+
+def test_a_joint_whose_zero_alone_is_off_keeps_its_origin(tmp_path):
+    nominal = column(tmp_path)
+    values = nominal.nominal
+    values[nominal.index("roll.roll")] += 0.01  # about x, its axis
+    text = export(nominal.with_values(values), "urdf", nominal=nominal, calibration_elements=True).text
+    back = read_robot_text(tmp_path, text)
+    assert back.nominal == pytest.approx(nominal.nominal, abs=1e-15)
+    assert float(text.split('rising="')[1].split('"')[0]) == pytest.approx(0.01, abs=1e-15)
+
+
+def read_robot_text(folder, text):
+    (folder / "again.urdf").write_text(text)
+    return read_urdf(folder / "again.urdf", base_link="floor", tip_link="tip")
+
+
+def test_base_and_tool_of_a_urdf_are_told(tmp_path):
+    column(tmp_path)
+    (tmp_path / "robot.yaml").write_text(
+        "urdf: column.urdf\nbase_link: floor\ntip_link: tip\nunits: {length: mm, angle: deg}\n"
+        "base: {z: 10}\ntool: {x: 5, yaw: 90}\n"
+    )
+    for to in ("urdf", "tesseract"):
+        notes = export(read_robot(tmp_path / "robot.yaml"), to).notes
+        assert notes[:2] == (
+            "it has no place for the frame base, which is before link floor: z 10 (mm, deg)",
+            "it has no place for the frame tool, which is behind link tip: x 5, yaw 90 (mm, deg)",
+        )
+
+
+# --- joint zeros ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_zeros_that_are_all_that_is_off_are_found(name, tmp_path):
+    nominal = ARMS[name](tmp_path)
+    wanted = np.linspace(-0.02, 0.03, nominal.n_joints)
+    made = export(shifted(nominal, wanted), "zeros", nominal=nominal)
+    found = [zero["reading"] for zero in made.details["zeros"].values()]
+    assert found == pytest.approx(wanted, abs=1e-10)
+    assert made.details["before"]["workspace"]["position_rms"] > 1e-3
+    assert made.details["after"]["workspace"]["position_max"] < EXACT
+    rows = yaml.safe_load(made.text)["zeros"]
+    for joint, zero in zip(nominal.joints, wanted, strict=True):
+        unit, figure = ("mm", 1e3 * zero) if joint.prismatic else ("deg", np.rad2deg(zero))
+        assert rows[joint.name] == {"zero": pytest.approx(figure, abs=1e-7), "unit": unit}
+
+
+def shifted(robot, zeros):
+    """The robot whose joints stand elsewhere by their zeros: each moved in its own sense."""
+    from dataclasses import replace
+
+    elements = tuple(
+        e if e.joint is None else replace(e, constant=e.constant + e.sign * zeros[e.joint]) for e in robot.elements
+    )
+    return replace(robot, elements=elements)
+
+
+def test_zeros_are_the_best_there_are():
+    """No other zeros bring the tool nearer, at the configurations that they were fitted at."""
+    nominal, robot = ur10(), off(ur10())
+    q = drawn(robot, 40, 7)
+    made = export(robot, "zeros", nominal=nominal, configurations=q)
+    assert "with the tool" not in made.text  # it is the same
+    best = np.array([zero["reading"] for zero in made.details["zeros"].values()])
+
+    def cost(zeros):
+        found, wanted = ours(nominal, q + zeros), ours(robot, q)
+        turn = Rotation.from_matrix(found[:, :3, :3] @ np.swapaxes(wanted[:, :3, :3], 1, 2)).as_rotvec()
+        return np.sum((found - wanted)[:, :3, 3] ** 2) + robot.reach**2 * np.sum(turn**2)
+
+    least = cost(best)
+    assert least < cost(np.zeros(6))
+    for i in range(6):
+        for step in (-1e-5, 1e-5):
+            assert cost(best + step * np.eye(6)[i]) > least
+    assert set(made.details["after"]) == {"measured", "workspace"}
+    assert made.details["after"]["measured"]["n"] == 40
+
+
+def test_errors_of_zeros_are_those_of_the_arm():
+    nominal, robot = ur10(), off(ur10())
+    made = export(robot, "zeros", nominal=nominal)
+    zeros = np.array([zero["reading"] for zero in made.details["zeros"].values()])
+    q = drawn(robot, 1000, 1)
+    for which, readings in (("before", q), ("after", q + zeros)):
+        found, wanted = ours(nominal, readings), ours(robot, q)
+        miss = np.linalg.norm((found - wanted)[:, :3, 3], axis=1)
+        turn = Rotation.from_matrix(found[:, :3, :3] @ np.swapaxes(wanted[:, :3, :3], 1, 2)).magnitude()
+        error = made.details[which]["workspace"]
+        assert error["position_rms"] == pytest.approx(np.sqrt(np.mean(miss**2)))
+        assert error["position_max"] == pytest.approx(miss.max())
+        assert error["rotation_rms"] == pytest.approx(np.sqrt(np.mean(turn**2)))
+        assert error["rotation_max"] == pytest.approx(turn.max())
+        assert f"{which}, over the joint limits: position {1e3 * error['position_rms']:.4g} mm RMS" in made.text
+
+
+def test_a_tool_that_is_set_as_calibrated_is_no_matter_of_zeros():
+    nominal = ur10()
+    values = nominal.nominal
+    values[nominal.index("tool.x")] += 0.01
+    robot = nominal.with_values(values)
+    kept, told = (export(robot, "zeros", nominal=nominal, tool=tool) for tool in ("nominal", "calibrated"))
+    assert max(abs(zero["reading"]) for zero in told.details["zeros"].values()) < 1e-12
+    assert max(abs(zero["reading"]) for zero in kept.details["zeros"].values()) > 1e-3
+    assert "with the tool as drawn: x 10, y -20, z 100" in kept.text
+    assert "with the tool as calibrated: x 20, y -20, z 100" in told.text
+
+
+# --- what cannot be ---------------------------------------------------------------------------------------------------
+
+UR = ur10()
+MISTAKES = {
+    "another format": (
+        lambda: export(UR, "dhh"),
+        "to: found 'dhh', expected one of urdf, ur, tesseract, dh, mdh, hayati,",
+    ),
+    "no arm": (lambda: export("ur10.yaml", "dh"), "arm: found "),
+    "seven joints": (lambda: export(seven(), "ur"), "seven: 7 joints, 0 of which slide, expected six joints that turn"),
+    "a slide": (lambda: export(scara(), "ur"), "scara: 4 joints, 1 of which slide, expected six"),
+    "no drawing": (
+        lambda: export(UR, "zeros"),
+        "zeros: an arm without the one as drawn, expected a RESULT of calibrate",
+    ),
+    "another drawing": (
+        lambda: export(UR, "zeros", nominal=seven()),
+        "nominal: seven has other joints, expected q1, q2",
+    ),
+    "no URDF": (
+        lambda: export(UR, "urdf", calibration_elements=True),
+        "calibration_elements: an arm that is no URDF, expected an arm that was read from a URDF",
+    ),
+    "an idle option": (
+        lambda: export(UR, "dh", tool="nominal"),
+        "tool: means nothing for dh, expected the format zeros",
+    ),
+    "an idle flag": (
+        lambda: export(UR, "hayati", far=True),
+        "far: means nothing for hayati, expected the format dh or mdh",
+    ),
+    "a hash of blanks": (
+        lambda: export(UR, "ur", ur_hash="a b"),
+        "ur_hash: found 'a b', expected a word such as calib_",
+    ),
+    "another base": (
+        lambda: export(UR, "ur", ur_base="flange"),
+        "ur_base: found 'flange', expected one of base, base_link",
+    ),
+    "another tool": (
+        lambda: export(UR, "zeros", tool="gripper"),
+        "tool: found 'gripper', expected one of nominal, cal",
+    ),
+    "other readings": (
+        lambda: export(UR, "zeros", nominal=UR, configurations=np.zeros((3, 5))),
+        "configurations: ",
+    ),
+    "no readings": (
+        lambda: export(UR, "zeros", nominal=UR, configurations=np.zeros((0, 6))),
+        "configurations: none, expected at least one",
+    ),
+    "a name that XML cannot hold": (
+        lambda: export(Robot.from_dh([[0, 0, 0, 0]], names=["a\x1b"]), "urdf"),
+        "robot: a name with letters that XML cannot hold",
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_what_cannot_be_exported_is_a_line(mistake):
+    made, message = MISTAKES[mistake]
+    with pytest.raises(InputError) as caught:
+        made()
+    assert str(caught.value).startswith(message)
+
+
+def test_a_file_that_is_there_is_not_replaced(tmp_path):
+    (tmp_path / "arm.urdf").write_text("mine")
+    with pytest.raises(InputError, match=r"arm\.urdf: is there already"):
+        export(UR, "urdf").write(tmp_path / "arm.urdf")
+    with pytest.raises(InputError, match="there is no folder"):
+        export(UR, "urdf").write(tmp_path / "nowhere" / "arm.urdf")
+    assert (tmp_path / "arm.urdf").read_text() == "mine"
+    assert [file.name for file in tmp_path.iterdir()] == ["arm.urdf"]
+
+
+def test_what_of_limits_a_new_urdf_cannot_hold_is_said():
+    limits = [(-1.0, 2.0), (-np.inf, 1.0), (0.0, np.inf)]
+    robot = Robot.from_dh([[0.1, 0.2, 0.3, 0.4]] * 3, types=["revolute", "revolute", "prismatic"], limits=limits)
+    made = export(robot, "urdf")
+    assert [line.strip() for line in made.text.splitlines() if line.strip().startswith("<limit")] == [
+        '<limit lower="-1.0" upper="2.0" effort="0" velocity="0"/>',
+        '<limit lower="0.0" upper="1000.0" effort="0" velocity="0"/>',
+    ]
+    assert made.notes[1:] == (
+        "slides without limits have 1000 m, as URDF knows none without",
+        "joints that turn and have one limit alone are continuous here, without it",
+        "effort and velocity in <limit> are 0, as nobody has stated them",
+    )
+    assert all(f"<!-- {note.replace('--', '- -')} -->" in made.text for note in made.notes)
+
+
+def test_names_that_are_those_of_a_new_urdfs_frames_are_kept(tmp_path):
+    robot = Robot.from_dh([[0.1, 0.2, 0.3, 0.4]] * 2, names=["base_frame", "tool_frame"])
+    export(robot, "urdf").write(tmp_path / "arm.urdf")
+    assert read_urdf(tmp_path / "arm.urdf").joints == robot.joints

@@ -1,0 +1,56 @@
+"""An arm that was calibrated, and rows of it a month later, for several test files."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from simulated import measure, true_robot
+
+from fg_calib import Robot, calibrate
+
+SIGMA = (5e-5, 1e-4)
+ROWS = [
+    [0, np.pi / 2, 0.1625, 0],
+    [-0.425, 0, 0, 0],
+    [-0.3922, 0, 0, 0],
+    [0, np.pi / 2, 0.1333, 0],
+    [0, -np.pi / 2, 0.0997, 0],
+    [0, 0, 0.0996, 0],
+]
+TOLERANCE = {"a": 5e-4, "d": 5e-4, "alpha": 1e-3, "theta": 2e-3}
+
+
+def arm(**more):
+    """A UR5e."""
+    limits = [[-3.0, 3.0]] * 6
+    return Robot.from_dh(ROWS, "dh", name="ur5e", tool=[0.05, -0.03, 0.12], tolerance=TOLERANCE, limits=limits, **more)
+
+
+def placed(rng):
+    """A measurement frame."""
+    return Rotation.from_rotvec(0.3 * rng.normal(size=3)), rng.normal(size=3)
+
+
+def measured(true, n, rng, *, frame=None, q=None, sigma=SIGMA, ids=""):
+    """Poses at random configurations."""
+    readings = rng.uniform(-2.5, 2.5, (n, true.n_joints)) if q is None else q
+    found = measure(true, n, rng, sigma=sigma, frame=frame, readings=readings)
+    return replace(found, ids=np.array([f"{ids}{i}" for i in range(n)]))
+
+
+def slipped(true, **changes):
+    """The arm with some parameters changed."""
+    values = true.nominal.copy()
+    for name, change in changes.items():
+        values[true.index(name.replace("tool_", "tool."))] += change
+    return true.with_values(values)
+
+
+def calibrated(seed=0, *, n=40, unknown=False, model="pose", robot=None, sigma=SIGMA, **options):
+    """The calibration, the true arm, and a generator to go on with."""
+    rng = np.random.default_rng(seed)
+    robot = robot or arm()
+    true = true_robot(robot, rng)
+    rows = measured(true, n, rng, frame=placed(rng) if unknown else None, sigma=sigma)
+    frame = "unknown" if unknown else "known"
+    return calibrate(robot, rows, model=model, frame=frame, **options), true, rng
