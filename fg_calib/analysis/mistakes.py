@@ -52,6 +52,9 @@ NOTHING = 1e-6
 
 
 _OTHER_TOOL = "the tool is another one, farther off than its tolerance lets it be"
+_OTHER_BASE = (
+    "the measurement frame is not the base (frame: unknown), which is farther off than its tolerance lets it be"
+)
 
 
 @dataclass(frozen=True)
@@ -180,24 +183,43 @@ def check_setup(
             closed_form = SetupCheck(fitted_residuals(setup))
             found = min((found, closed_form), key=lambda check: check.excess) if closed_form.residuals else found
         explanations = _explanations(setup, found)
-        return replace(found, explanations=explanations) if explanations else _tool_held(setup, found) or found
+        return replace(found, explanations=explanations) if explanations else _held(setup, found) or found
 
 
-def _tool_held(setup: Setup, found: SetupCheck) -> SetupCheck | None:
-    """The check with the tool where the robot says, if a tool far beyond its tolerance is what explains the table."""
-    robot = setup.robot
-    owned = [robot.parameters[i] for i in robot.owned_by(robot.n_joints + 1)]
-    tolerances = np.array([np.nan if p.tolerance is None else p.tolerance for p in owned if p.estimated])
-    known, in_m = np.isfinite(tolerances), np.array([p.unit == "m" for p in owned if p.estimated], dtype=np.bool_)
-    if found.far or not known.all() or not known.size:
+def _held(setup: Setup, found: SetupCheck) -> SetupCheck | None:
+    """The check with tool or base where the robot says, if one far beyond its tolerance is what explains the table."""
+    if found.far:
         return None
-    held = replace(setup, tool_rotation=False, tool_translation=np.zeros(3, dtype=np.bool_))
-    slack = {"m": np.linalg.norm(tolerances[in_m]), "rad": np.linalg.norm(tolerances[~in_m])}
+    robot, still = setup.robot, np.zeros(3, dtype=np.bool_)
+    checks = [
+        _beyond(found, replace(setup, tool_rotation=False, tool_translation=still), robot.n_joints + 1, _OTHER_TOOL),
+        _beyond(found, replace(setup, frame=False), 0, _OTHER_BASE) if setup.frame and setup.of_base else None,
+    ]
+    return max((check for check in checks if check is not None), key=lambda check: check.excess, default=None)
+
+
+def _beyond(found: SetupCheck, held: Setup, owner: int, words: str) -> SetupCheck | None:
+    """The check with a frame held within its tolerances, if residuals are far beyond what these let them be.
+
+    Args:
+        found: With the frame fitted freely.
+        held: The set-up with the frame where the robot says.
+        owner: Whose frame it is (see `Robot.owned_by`).
+        words: The mistake that this is.
+    """
+    estimated = [p for p in map(held.robot.parameters.__getitem__, held.robot.owned_by(owner)) if p.estimated]
+    tolerances = np.array([np.nan if p.tolerance is None else p.tolerance for p in estimated])
+    if not tolerances.size or not np.isfinite(tolerances).all():
+        return None
+    lengths = np.array([p.unit == "m" for p in estimated])
+    slack = {"m": float(np.linalg.norm(tolerances[lengths])), "rad": float(np.linalg.norm(tolerances[~lengths]))}
+    if owner == 0:  # what turns the base moves the tool by that times the reach
+        slack["m"] = float(np.hypot(slack["m"], held.robot.reach * slack["rad"]))
     residuals = fitted_residuals(held)
     stated = SetupCheck(tuple(replace(r, expected=float(np.hypot(r.expected, slack[r.unit]))) for r in residuals))
     if not stated.far or found.excess > min(EXPLAINED, stated.excess / REDUCTION):
         return None
-    return replace(stated, explanations=(Explanation((_OTHER_TOOL,), found.residuals),))
+    return replace(stated, explanations=(Explanation((words,), found.residuals),))
 
 
 def _check_placed(robot: Robot, table: Table) -> SetupCheck:

@@ -4,8 +4,8 @@ Distances see a small offset across an axis by its square, so that +5 mm and -5 
 descent finds depends on where it starts. A square shows itself: its derivative, and with it what is known of the
 combination, grows with the distance from the vertex. So where a direction is known better at the estimate than at
 nominal, the descent is repeated from the estimate's mirror image about the vertex; and where one is still weak at the
-estimate, from two tolerances away to either side. The best optimum is kept, and one that the data cannot tell from it
-is told of.
+estimate, from two tolerances (two sigma if that is more) to either side. The best optimum is kept, and one that the
+data cannot tell from it is told of.
 
 Distances and angles near 0, and angles near half a turn, fold: where nominal has a pair on the other side, the descent
 may end there, bending the whole arm. So it is repeated from the optimum of all rows but those that tolerances may fold.
@@ -43,7 +43,8 @@ CURVED = 0.7
 """A direction whose sigma is below this share of what it is at nominal is seen by a square, or nearly so."""
 
 FAR = 2.0
-"""How far away the other starts are, in tolerances (1 mm and 1 mrad where there are none)."""
+"""How far away the other starts are, in tolerances (1 mm and 1 mrad where there are none), or in sigma if that is more:
+of a tool without tolerance these are metres where orientations hardly change."""
 
 APART = 3.0
 """Optima are two if some parameter differs by more than this many sigma."""
@@ -137,9 +138,19 @@ def _steps(solution: Solution) -> list[Floats]:
     weak = V[:, (s < WEAK) & (s > SIGNAL_FLOOR)]
     if weak.size and problem.n_residuals <= MAX_ROWS:
         signs = np.random.default_rng(0).choice([-1.0, 1.0], len(scales))
-        aside = FAR * scales * (weak @ (weak.T @ signs))  # the same whatever basis the weak directions have
+        # Two tolerances or sigma, whichever is more: the same whatever basis the weak directions have.
+        far = np.minimum(FAR / np.minimum(s[(s < WEAK) & (s > SIGNAL_FLOOR)], 1.0), _reaches(problem, weak))
+        aside = scales * (weak @ (far * (weak.T @ signs)))
         steps += [aside, -aside]
     return steps
+
+
+def _reaches(problem: Problem, directions: Floats) -> Floats:
+    """How far directions, as columns, go before a column has changed by 1 rad or by the arm's reach, shape (k,)."""
+    variables = problem.variables
+    most = variables.scales[: len(directions)] / SIGNAL_FLOOR / variables.prior_scales
+    out: Floats = np.min(most[:, None] / np.maximum(np.abs(directions), SIGNAL_FLOOR**2), axis=0)
+    return np.maximum(out, FAR)
 
 
 def _without_folds(solution: Solution, options: SolverOptions | None) -> Floats | None:

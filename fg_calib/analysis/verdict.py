@@ -40,6 +40,9 @@ LEAST_FOLDED, MOST_FOLDED = 0.05, 0.3
 LARGE_NOISE = 0.2
 """Estimated noise over the motions measured, beyond which it is no noise."""
 
+MOST_KEPT = 3.0
+"""Factor on estimated noise beyond which what was stated is no reason to trust the noise that measurements keep."""
+
 LEAST_REDUNDANCY = 3.0
 """Degrees of freedom that a kind must have left for its noise to be estimated."""
 
@@ -175,12 +178,13 @@ def of_estimated_noise(kind: str, sigma: float, motion: float) -> list[Statement
     return [Statement(text, finding=True)]
 
 
-def of_kept_noise(kept: Sequence[str], every: bool) -> list[Statement]:
+def of_kept_noise(kept: Sequence[str], every: bool, off: float = 1.0) -> list[Statement]:
     """What it means that noise was to be estimated, but too few degrees of freedom were left for that.
 
     Args:
         kept: What noise stayed as stated.
         every: Whether these are all there are.
+        off: The largest factor by which other noise was stated too small, where measurements kept theirs.
     """
     if not kept:
         return []
@@ -188,7 +192,9 @@ def of_kept_noise(kept: Sequence[str], every: bool) -> list[Statement]:
         f"the noise of {', '.join(kept)} could not be estimated, for fewer than {LEAST_REDUNDANCY:g} degrees of"
         " freedom are left to it: it is as stated, or 1 mm and 1 mrad where nothing was"
     )
-    return [Statement(text + "; nothing says whether it is right: measure more" * every, finding=every)]
+    wrong = f"; other noise was stated {off:.3g} times too small, and so may this be: measure more"
+    text += "; nothing says whether it is right: measure more" if every else wrong if off > MOST_KEPT else ""
+    return [Statement(text, finding=every or off > MOST_KEPT)]
 
 
 def of_test(fit: PredictedFit | None, of_fitted: float, names: Sequence[str]) -> list[Statement]:

@@ -321,6 +321,12 @@ class PairNoise(RowNoise):
             folds[rows, 1] |= along[:, 1] > np.maximum((np.pi - f[rows, 1]) ** 2 / 4.0, noise[rows, 1])
         return folds[:, self._parts]
 
+    def about_half_a_turn(self) -> Booleans:
+        """Which rows are angles nearer to half a turn than to 0, shape (n, residual_dim)."""
+        near = np.stack([np.zeros(self.series.n, dtype=np.bool_), self.predicted[:, 1] > 0.5 * np.pi], axis=1)
+        out: Booleans = near[:, self._parts]
+        return out
+
     @cached_property
     def _poses(self) -> Poses:
         """Predicted tool poses of the table's configurations."""

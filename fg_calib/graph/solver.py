@@ -88,6 +88,11 @@ WEAKEST = 0.1
 NEAR_ENOUGH = 1e-3
 """What may be left to go when all iterations are spent, [sigma]."""
 
+FOLDED_STEPS, FOLDED_TRIES = 20, 8
+"""Steps after which rows of pairs are whitened anew although their optimum has not been reached, and how often. Where a
+length is measured below 0 or an angle beyond half a turn, but for its noise, rows as they are whitened elsewhere have
+their least cost at the kink itself, where steps arrive at nothing; whitened there they are smooth."""
+
 COARSE = 0.3
 """Rows are whitened anew once the optimum with the present ones is nearer than this, [sigma]."""
 
@@ -341,7 +346,9 @@ def _fit(problem: Problem, options: SolverOptions) -> _Run:
     bends = SPREAD_ROUNDS if problem.pair_series and problem.state.spread is None else 0
     if robust:
         run.go_on_with(reweighted_at(problem, problem.start, _learn(problem, problem.start, weighting)[0]))
-    while run.descend(goal) or robust:
+    tries = FOLDED_TRIES if problem.pair_series else 0
+    while run.descend(goal, FOLDED_STEPS if tries else None) or robust or tries:
+        tries -= not run.converged and tries > 0
         state, final = _learn(run.problem, run.parameters, weighting)
         if bends:
             state, bends = replace(state, spread=run.here.spread), bends - 1
@@ -434,10 +441,10 @@ class _Run:
         self.problem = problem
         self.here = _Linearised(problem, self.here.values)
 
-    def descend(self, goal: float) -> bool:
-        """Step until the optimum of these rows is nearer than `goal`, [sigma]; whether it is."""
-        self.converged, stuck = self.here.decrement <= goal, False
-        while not (self.converged or stuck or self.exhausted):
+    def descend(self, goal: float, most: int | None = None) -> bool:
+        """Step until the optimum of these rows is nearer than `goal`, [sigma]; whether it is, after `most` steps."""
+        self.converged, stuck, first = self.here.decrement <= goal, False, len(self.history)
+        while not (self.converged or stuck or self.exhausted or len(self.history) - first >= (most or np.inf)):
             path, damping = next(filter(None, map(self._undamped, self._first_steps())), []), 0.0
             if not path:
                 path, damping = self._damped(), self._damping

@@ -24,6 +24,9 @@ from fg_calib.measurements.dataset import rotation_angle
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
 
+LEAST_TURN = 1e-6
+"""Turns of the tool that show nothing of where its point is, [rad]: rounding would put that 1e12 m away."""
+
 MAX_ROWS = 2000
 """Poses used for a start: more do not make it better."""
 
@@ -151,7 +154,7 @@ def start_from_distances(
         Q = np.einsum("mki,mkj->mij", dR, dR)
         i, j = np.triu_indices(3)
         A = np.hstack([2.0 * np.einsum("mk,mki->mi", dp, dR), Q[:, i, j] * np.where(i == j, 1.0, 2.0)])
-        starts.append(np.linalg.lstsq(A, distance**2 - np.sum(dp**2, axis=1), rcond=1e-10)[0][:3])
+        starts.append(_seen(A, distance**2 - np.sum(dp**2, axis=1))[:3])
     fits = [_tool_point_by_distances(dR, dp, distance, t, free) for t in starts]
     return Frame(tool.rotation, min(fits, key=lambda fit: fit[1])[0])
 
@@ -174,8 +177,21 @@ def start_from_touches(
         A.append((R - R.mean(axis=0)).reshape(-1, 3))
         b.append(-(at - at.mean(axis=0)).ravel())
     found = nominal.copy()
-    found[free] += np.linalg.lstsq(np.vstack(A)[:, free], np.concatenate(b), rcond=1e-10)[0]
+    found[free] += _seen(np.vstack(A)[:, free], np.concatenate(b))
     return found
+
+
+def _seen(A: Floats, b: Floats) -> Floats:
+    """The least-squares solution of A x = b of least length, nothing of it along what turns of the tool do not show.
+
+    Args:
+        A: Rows of differences of rotations, shape (m, k).
+        b: Shape (m,), [m].
+    """
+    U, s, Vt = np.linalg.svd(A, full_matrices=False)
+    kept = s > max(1e-10 * s.max(initial=0.0), LEAST_TURN * np.sqrt(max(len(A), 1)))
+    out: Floats = Vt[kept].T @ ((U[:, kept].T @ b) / s[kept])
+    return out
 
 
 def _tool_point_by_distances(
@@ -192,7 +208,7 @@ def _tool_point_by_distances(
             best, least = t, cost
         J = np.einsum("mk,mki->mi", v / np.maximum(length, 1e-12)[:, None], dR)[:, free]
         t = t.copy()
-        t[free] -= np.linalg.lstsq(J, r, rcond=1e-10)[0]
+        t[free] -= _seen(J, r)
     return best, least
 
 

@@ -382,6 +382,7 @@ class Robot:
 class RobotBuilder:
     """Collects elements and parameters, base to tool, while a reader walks its file."""
 
+    @checked
     def __init__(self, name: str, convention: str) -> None:
         self._name = name
         self._convention = convention
@@ -389,6 +390,7 @@ class RobotBuilder:
         self._parameters: list[Parameter] = []
         self._elements: list[Element] = []
 
+    @checked
     def add_frame(self, prefix: str, values: Mapping[str, float], owner: int, estimated: bool) -> None:
         """Append a frame: six parameters `prefix.x` ... `prefix.yaw`; missing values are 0, [m] or [rad]."""
         for kind in FRAME_KINDS:
@@ -399,6 +401,7 @@ class RobotBuilder:
         elements = [Element(AXIS_OF_KIND[kind], values.get(kind, 0.0)) for kind in FRAME_KINDS]
         self._elements += _inverse(elements) if backwards else elements
 
+    @checked
     def add_convention_joint(self, joint: Joint, values: Mapping[str, float]) -> None:
         """Append a joint of one of the `CONVENTIONS`; `values` are keyed by kind, [m] or [rad].
 
@@ -415,6 +418,7 @@ class RobotBuilder:
                 f"{kind}{index + 1}", kind, index + 1, values[kind], True, index if kind == moving else None
             )
 
+    @checked
     def add_urdf_joint(
         self, joint: Joint, origin: Mapping[str, float], axis: Floats, *, backwards: bool = False
     ) -> None:
@@ -443,6 +447,7 @@ class RobotBuilder:
         if backwards:
             self._elements[start:] = _inverse(self._elements[start:])
 
+    @checked
     def build(
         self,
         *,

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from jobs import ur5e
 from scipy.stats import chi2
 from simulated import measure, paper_robot, small_arm, true_robot
 
-from fg_calib.analysis.restarts import look_elsewhere
+from fg_calib.analysis.restarts import _steps, look_elsewhere
 from fg_calib.analysis.uncertainty import assess
 from fg_calib.analysis.variance_components import solve_job
 from fg_calib.files.job import read_job
@@ -15,6 +16,7 @@ from fg_calib.graph.build import build_problem, problem_of
 from fg_calib.graph.solver import solve
 from fg_calib.measurements.dataset import Measurements, rotation_angle
 from fg_calib.options import Pairing
+from fg_calib.robot.inverse import solve_inverse
 from fg_calib.robot.kinematics import pose
 
 ROBOT = """\
@@ -141,3 +143,18 @@ def test_an_angle_that_nominal_has_on_the_other_side_of_half_a_turn_bends_no_arm
     assert 2.0 * best.cost < chi2.ppf(0.999, best.problem.n_residuals)
     assert not best.others
     assert best.converged
+
+
+@pytest.mark.slow
+def test_a_tool_point_that_constant_orientation_hardly_shows_is_looked_for_metres_away(tmp_path):
+    """Rounding of the turns put its start 1e12 m away, where nothing converged; other starts were 2 mm apart."""
+    robot = ur5e(tmp_path, estimate=["tool.x", "tool.y", "tool.z"])
+    rng = np.random.default_rng(0)
+    places = rng.uniform([0.3, -0.3, 0.1], [0.5, 0.3, 0.4], (100, 3))
+    found = solve_inverse(robot, places, np.tile(np.diag([1.0, -1.0, -1.0]), (100, 1, 1)))
+    m = measure(true_robot(robot, rng), 60, rng, readings=found.readings[found.reached][:60])
+    solution = solve(build_problem(robot, m, model="distance"))
+    assert np.abs(solution.problem.start[robot.index("tool.z")]) < 1.0
+    assert solution.converged
+    assert np.max(np.abs(_steps(solution)[-1])) > 0.1
+    assert look_elsewhere(solution).cost <= solution.cost

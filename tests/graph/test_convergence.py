@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from oracle import random_robot
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 from simulated import measure, paper_robot, small_arm, true_robot
 from sparing import diagonal
 from touches import TOLERANCE as TOUCH_TOLERANCE
@@ -19,10 +20,11 @@ from fg_calib.files.tables import read_measurements
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.problem import reweighted_at
 from fg_calib.graph.solver import SolverOptions, solve
-from fg_calib.measurements.dataset import Noise
+from fg_calib.measurements.dataset import Noise, rotation_angle
 from fg_calib.measurements.series import Table
 from fg_calib.options import Pairing
-from fg_calib.robot.model import Joint, RobotBuilder
+from fg_calib.robot.kinematics import pose
+from fg_calib.robot.model import Axis, Element, Joint, RobotBuilder
 
 MOST = 15
 """Steps within which everything here arrives; scipy takes as many."""
@@ -227,3 +229,36 @@ def test_touches_and_positions_that_share_joint_noise_arrive_with_robust_losses(
     solution = solve(problem)
     assert solution.message == "converged: less than 3e-07 sigma from the optimum"
     assert solution.iterations < 50
+
+
+@pytest.mark.slow
+def test_angles_about_half_a_turn_converge():
+    """Rows measured beyond it, but for the fold, have their least cost at the kink: there they are whitened anew."""
+    robot, sigma = small_arm(tolerance={"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}), 7e-3
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (20000, robot.n_joints))
+    R = pose(robot, q).rotation
+    off = np.pi - rotation_angle(np.swapaxes(R[:1], 1, 2) @ R)[0]
+    q = q[np.concatenate([[0], np.flatnonzero(off < 3.0 * np.sqrt(2.0) * sigma)[:40]])]
+    for seed in (2, 11, 38):
+        rng = np.random.default_rng(seed)
+        m = measure(true_robot(robot, rng), len(q), rng, sigma=(1e-3, sigma), readings=q)
+        solution = solve(build_problem(robot, m, model="rotation"))
+        assert solution.converged, solution.message
+        assert solution.iterations <= 80
+        assert 2.0 * solution.cost < chi2.ppf(0.999, 40)
+
+
+def test_a_parameter_of_two_elements_is_calibrated_with_both():
+    """Twists add up: one length along two axes, whose derivative is that of both."""
+    rng = np.random.default_rng(3)
+    robot = small_arm(tolerance={"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3})
+    shared = robot.index("a2")
+    again = Element(Axis.TY, parameter=shared)
+    place = next(i for i, e in enumerate(robot.elements) if e.joint == 2)
+    robot = replace(robot, elements=(*robot.elements[:place], again, *robot.elements[place:]))
+    true = true_robot(robot, rng)
+    found = assess(solve(build_problem(robot, measure(true, 60, rng, sigma=(1e-5, 1e-5)), model="pose")))
+    columns = [robot.index(name) for name in found.names]
+    error = (found.robot.nominal - true.nominal)[columns]
+    assert error @ np.linalg.solve(found.covariance, error) < chi2.ppf(0.9999, len(error))
+    assert found.covariance[columns.index(shared), columns.index(shared)] < 1e-10

@@ -61,6 +61,13 @@ def test_every_section_is_there(page):
     assert tuple(page.xpath("//section/h2/text()")) == TITLES
 
 
+def test_where_the_robot_states_no_limits_the_page_says_what_stands_for_them(page):
+    text = text_of(page)
+    assert "the workspace within no joint limits (turns by ±180 deg and slides as far as they were read" in text
+    assert "drawn within no joint limits (turns" in text
+    assert "within the joint limits" not in text
+
+
 def test_the_verdict_comes_first(page, folder):
     first, second, *_ = page.xpath("//main/div[contains(@class, 'verdict')]")
     assert first.findtext("strong") == "NOT EVALUATED: the limits that were set"

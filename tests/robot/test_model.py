@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from tolerances import rounding
 
 from fg_calib import InputError, Robot, pose, read_robot, read_urdf, write_robot
-from fg_calib.robot.model import CONVENTIONS, roll_pitch_yaw
+from fg_calib.robot.model import CONVENTIONS, RobotBuilder, roll_pitch_yaw
 
 ROWS = [[0.0, -1.5, 0.34, 0.1, 0.01], [0.6, 0.0, 0.02, -0.2, 0.02], [0.1, 1.2, 0.0, 0.3, -0.03]]  # a alpha d theta beta
 
@@ -157,6 +157,20 @@ def test_limits_of_many_turns_are_told_of(caplog, limit, told):
     Robot.from_dh([[1.0, 0.0, 0.0, 0.0]], convention="dh", limits=[[-limit, limit]])
     expected = ["robot: joint q1 has limits of -170 to 170 rad; are they in deg?"] if told else []
     assert caplog.messages == expected
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda b: b.build(tolerance=0.003), "tolerance: found 0.003, expected a mapping"),
+        (lambda b: b.add_frame("x", 3, 0, False), "values: found 3, expected a mapping"),
+        (lambda b: b.add_convention_joint(3, {}), "joint: found 3, expected a Joint"),
+        (lambda _: RobotBuilder(3, "dh"), "name: found 3, expected text"),
+    ],
+)
+def test_a_builder_given_something_else_says_so(call, message):
+    with pytest.raises(InputError, match=message):
+        call(RobotBuilder("arm", "dh"))
 
 
 @pytest.mark.parametrize("tilt", [0.0, 1e-15, 1e-12, 1e-10, 1e-8, 1e-4, 0.1])

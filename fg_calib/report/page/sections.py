@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.analysis.folds import wide
+from fg_calib.analysis.workspace import Workspace
 from fg_calib.files.result import Parameter, Rms
 from fg_calib.report.identifiability import format_relation
 from fg_calib.report.page.figures import (
@@ -152,10 +153,20 @@ def joints(run: Run) -> list[Element]:
     if workspace is not None:
         parts += [tag("h3", "Where the joints were measured"), figures([arm_ranges(workspace)])]
         share = 100.0 * float(np.mean(workspace.far))
-        text = f"{share:.0f} % of the workspace within the joint limits has no measured position near it."
+        text = f"{share:.0f} % of the workspace {_drawn_within(workspace)} has no measured position near it."
         parts.append(tag("p", text))
         parts.append(tag("ul", [tag("li", line) for line in _gaps(run)]))
     return parts
+
+
+def _drawn_within(workspace: Workspace) -> str:
+    """Between what the workspace lies, in words: joint limits, or what stands for those not stated."""
+    missing = [joint for joint in workspace.joints if not np.isfinite(joint.limits).all()]
+    if not missing:
+        return "within the joint limits"
+    named = {"rad": "turns by \u00b1180 deg", "m": "slides as far as they were read"}
+    stands = " and ".join(words for unit, words in named.items() if any(joint.unit == unit for joint in missing))
+    return f"within {'the' if len(missing) < len(workspace.joints) else 'no'} joint limits ({stands} without any)"
 
 
 def _gaps(run: Run) -> Iterator[str]:
@@ -287,7 +298,7 @@ def workspace(run: Run) -> list[Element]:
     unknown = float(np.mean(~np.isfinite(found.error)))
     words = (
         f"RMS error of the tool's position expected from the covariance, {where}, at {len(found.error)} configurations"
-        f" drawn within the joint limits: 5 % are below {low}, half below {middle}, 95 % below {high}. It says what is"
+        f" drawn {_drawn_within(found)}: 5 % are below {low}, half below {middle}, 95 % below {high}. It says what is"
         " left of the measurements' noise, not what the model lacks."
     )
     parts = [tag("p", words)]
