@@ -45,7 +45,8 @@ def updated(
         anchors_stay: Whether anchors of the same name are where they were.
 
     Raises:
-        InputError: There is no such parameter, or the calibration holds nothing to go on from.
+        InputError: There is no such parameter, the calibration holds nothing to go on from, or its gauge is none and
+            there are directions that no rows determine.
         ProblemError: The rows lack what their model needs, or do not suffice.
         SolverError: GTSAM could not solve a step at all.
     """
@@ -89,9 +90,28 @@ def _problem(calibrated: Calibrated, robot: Robot, known: Knowledge, rows: Rows,
     whole = problem(robot, None)
     if not whole.n_residuals:
         raise ProblemError(data.source, "no row takes part", "train rows that model and options use")
-    if options.gauge != "keep":
+    if options.gauge == "prior":
         return whole
-    return problem(robot.with_estimated(kept_of(whole, options.prefer)), whole)
+    kept = kept_of(whole, options.prefer)
+    if options.gauge == "none":
+        _require_determined(robot, kept)
+        return whole
+    return problem(robot.with_estimated(kept), whole)
+
+
+def _require_determined(robot: Robot, kept: Sequence[str]) -> None:
+    """Check that rows old and new determine all that is estimated, where neither tolerances nor gauge hold the rest.
+
+    What parameters may do unseen bends as they move, and the old rows stand as they were linearised: new rows would be
+    at odds with them about it, and a miss of one sigma move an arm by metres along it.
+
+    Raises:
+        InputError: They do not.
+    """
+    lost = [p.name for p in robot.parameters if p.estimated and p.name not in kept]
+    if lost:
+        found = f"gauge none, and rows that do not determine {', '.join(lost)} beside the others"
+        raise InputError("update", found, "a calibration with gauge keep or prior")
 
 
 def _with_change(

@@ -31,8 +31,11 @@ _N_STEPS = 30
 _N_HALVINGS = 8
 """How often such a step is halved."""
 
-_N_STARTS = 10
+_N_STARTS = 20
 """Starts for a pose: those after the first one are ever wider about where the arm is to stay."""
+
+_N_AROUND = 20
+"""Starts about where the arm is to stay, of poses that it reached far from there."""
 
 _FREE = 1e-6
 """Singular values of the point's derivative below this share of the largest move it not."""
@@ -103,7 +106,9 @@ def reach(robot: Robot, position: Floats, rotation: Floats | None, near: Floats)
     Returns:
         Within the joint limits; what is missing of a point that is itself out of reach is not 0.
     """
-    found = solve_inverse(robot, position, rotation, near=near, n_starts=_N_STARTS)
+    found = _nearer(
+        robot, position, rotation, near, solve_inverse(robot, position, rotation, near=near, n_starts=_N_STARTS)
+    )
     rows = np.flatnonzero(~found.reached)
     if rotation is None or not len(rows):
         return found
@@ -114,6 +119,29 @@ def reach(robot: Robot, position: Floats, rotation: Floats | None, near: Floats)
     q = found.readings.copy()
     q[rows] = turned.reshape(-1, robot.n_joints)
     return Inverse(q, *misses(robot, q, position, rotation))
+
+
+def _nearer(robot: Robot, position: Floats, rotation: Floats | None, near: Floats, found: Inverse) -> Inverse:
+    """The same, or nearer: beside a singularity the steps from where the arm is to stay may end on another branch."""
+    n, n_joints = _N_AROUND, robot.n_joints
+    changed = np.abs(found.readings - near).max(axis=1)
+    rows = np.flatnonzero(found.reached & (changed > FAR))
+    if not len(rows):
+        return found
+    about = np.random.default_rng(0).normal(size=(len(rows), n, n_joints))
+    starts = near[rows, None] + (changed[rows, None, None] * np.linspace(0.0, 1.0, n)[:, None]) * about
+    starts = np.clip(starts.reshape(-1, n_joints), *robot.limits.T)
+    turned = None if rotation is None else np.repeat(rotation[rows], n, axis=0)
+    others = solve_inverse(robot, np.repeat(position[rows], n, axis=0), turned, near=starts, n_starts=1)
+    of_others = np.abs(others.readings.reshape(len(rows), n, n_joints) - near[rows, None]).max(axis=2)
+    of_others[~others.reached.reshape(len(rows), n)] = np.inf
+    best = of_others.argmin(axis=1)
+    better = of_others[np.arange(len(rows)), best] < changed[rows]
+    rows, chosen = rows[better], (np.arange(len(rows)) * n + best)[better]
+    made = [part.copy() for part in (found.readings, found.miss_position, found.miss_rotation)]
+    for part, other in zip(made, (others.readings, others.miss_position, others.miss_rotation), strict=True):
+        part[rows] = other[chosen]
+    return Inverse(*made)
 
 
 def misses(robot: Robot, readings: Floats, position: Floats, rotation: Floats | None) -> tuple[Floats, Floats]:

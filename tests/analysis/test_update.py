@@ -42,6 +42,26 @@ def test_an_update_is_a_calibration_of_all_rows(unknown, model, gauge):
     assert updated.result.options["gauge"] == gauge
 
 
+@pytest.mark.parametrize("unknown", [False, True])
+def test_without_a_gauge_what_no_rows_determine_is_refused(unknown):
+    """Linearised at the old estimate, d2, d3 and d4 of parallel axes went off by metres, theta2 by 70 sigma."""
+    rng = np.random.default_rng(1)
+    robot = fine_arm()
+    old, new = tables_of(FINE, unknown, "pose", rng, true_robot(robot, rng))
+    with pytest.raises(InputError, match="update: gauge none, and rows that do not determine"):
+        calibrate(robot, old, gauge="none").update(new)
+
+
+def test_without_a_gauge_an_update_of_what_is_determined_is_a_calibration_of_all_rows():
+    rng = np.random.default_rng(2)
+    robot = fine_arm(fixed=["d2", "d3"])
+    old, new = tables_of(FINE, False, "pose", rng, true_robot(robot, rng))
+    updated = calibrate(robot, old, gauge="none").update(new)
+    off, of_sigma = difference(updated, calibrate(robot, [old, new], gauge="none"))
+    assert off < 1e-6
+    assert of_sigma < 1e-6
+
+
 def test_at_the_noise_of_an_instrument_the_difference_is_a_thousandth_of_a_sigma():
     calibration, true, rng = calibrated(0, unknown=True)
     old = calibration.solution.problem.data.tables[0]
@@ -94,9 +114,9 @@ def test_targets_stay_known_although_a_month_does_not_see_them():
     assert np.allclose(places[0].sigma, places[1].sigma, rtol=1e-3)
 
 
-def fine_arm():
+def fine_arm(**more):
     """An arm that is nearly as drawn, so that nothing bends."""
-    robot = arm()
+    robot = arm(**more)
     tolerance = {p.name: 1e-3 * p.tolerance for p in robot.parameters if p.tolerance}
     return replace(robot, parameters=tuple(replace(p, tolerance=tolerance.get(p.name)) for p in robot.parameters))
 
