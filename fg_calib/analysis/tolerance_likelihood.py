@@ -43,7 +43,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
-from scipy.stats import qmc
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -163,6 +162,8 @@ def posterior_of(corrections: Corrections) -> Posterior:
 
 def _sampled(corrections: Corrections, middle: Floats, spread: Floats, n: int) -> tuple[Floats, Floats]:
     """Points of a t-distribution about the middle, and their weights by the posterior, which sum to 1."""
+    from scipy.stats import qmc  # here, for it takes as long to import as a small calibration
+
     k = corrections.n_groups
     uniform = np.clip(qmc.Sobol(k + 1, scramble=True, rng=0).random(n), 1e-9, 1.0 - 1e-9)
     stretch = np.sqrt(HEAVY / special.chdtri(HEAVY, uniform[:, k]))
