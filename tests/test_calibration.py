@@ -255,6 +255,7 @@ def test_everything_fits_a_screen(found, name):
     assert "Fit statistics" in str(result)
 
 
+@pytest.mark.slow
 def test_all_that_functions_hand_back_fits_a_screen(found):
     """Arrays of hundreds of rows, tuples of dozens of parameters, a result of 90 000 characters."""
     robot, m, _ = given("priors")

@@ -84,6 +84,7 @@ def test_positions_alone_take_any_orientation_and_stay_near(calibrated):
     assert np.abs(there - T[:, :3, 3]).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_limits_are_kept_and_what_is_out_of_reach_is_said(calibrated):
     robot, _, found = calibrated
     lower, upper = robot.limits.T
@@ -114,6 +115,7 @@ def test_targets_in_the_measurement_frame_are_reached_there():
     assert by_base.expected_fitted < 5e-5 < by_base.expected[:, 0].max()  # where the base is, priors alone say
 
 
+@pytest.mark.slow
 def test_an_arm_of_four_joints_keeps_the_point_of_a_pose():
     tolerance = {kind: sigma for kind, sigma in TOLERANCE.items() if kind != "beta"}
     robot, rng = small_arm(tolerance), np.random.default_rng(7)

@@ -45,7 +45,7 @@ def given(table, names):
     return replace(table, known={name: KnownPoint(TARGETS[int(name[1:])]) for name in names})
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("instrument", ["targets", "targets stations"])
 def test_unknown_targets_take_up_what_a_known_one_shows(instrument):
     robot, _, table = measured_by(instrument, np.random.default_rng(0))
@@ -129,7 +129,7 @@ def test_touched_points_take_up_the_size_of_the_arm():
     assert max(seen(problem, relation) for relation in reasons["the unknown touched points take it up"]) > 1.0
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("instrument", ["targets", "targets known", "targets stations", "anchors", "anchors known",
                                         "anchors offset", "planes", "board", "pixels"])  # fmt: skip
 def test_every_reason_holds_of_random_configurations_too(instrument):

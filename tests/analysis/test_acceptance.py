@@ -26,6 +26,7 @@ def verdicts(result):
     return [one.verdict for one in result.result.acceptance.judgements]
 
 
+@pytest.mark.slow
 def test_without_limits_nothing_is_judged():
     assert calibrated().result.acceptance is None
     assert calibrated().not_accepted == ()
@@ -75,6 +76,7 @@ def test_without_rows_held_out_nothing_is_evaluated(n_test, words):
     assert words in result.not_accepted[0]
 
 
+@pytest.mark.slow
 def test_pairs_are_judged_by_distances_and_not_by_positions():
     limits = {"position": 1e-3, "distance": 1e-3, "angle": 1e-3}
     assert verdicts(calibrated(model="distance-rotation", accept=limits)) == ["not evaluated", "pass", "pass"]
@@ -160,6 +162,7 @@ def test_test_rows_at_readings_that_are_fitted_do_not_count():
     assert "no measurement of any position was held out" in result.not_accepted[0]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("loss", ["huber", "gnc"])
 def test_few_rows_that_alone_are_why_a_limit_is_not_kept_are_named(loss):
     """A gross error is held out: no loss acts on it, and the arm is not what is wrong."""
@@ -178,6 +181,7 @@ def test_an_arm_that_is_wrong_everywhere_blames_no_row():
     assert (one.verdict, one.reason) == ("fail", "")
 
 
+@pytest.mark.slow
 def test_folds_name_the_rows_that_are_why_too():
     rng = np.random.default_rng(0)
     robot = small_arm(tolerance={"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}, estimate=TOOL)

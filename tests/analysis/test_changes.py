@@ -38,7 +38,7 @@ def moved(what, first, rng, n=45):
     return robot, replace(parts[0], ids=np.arange(n).astype(str), **together)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["tool", "base"])
 @pytest.mark.parametrize("model", ["position", "pose"])
 def test_what_moved_is_said_with_the_row(what, model):
@@ -74,7 +74,7 @@ def test_the_last_few_rows_alone_are_no_change():
         assert set(found.goodness.gross.names) <= {"41", "42", "43", "44"}
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "forgotten", "away"), diagonal(["6R", "scara"], ["frame", "tool"], [1.0, 0.03, 0.003])
 )
@@ -93,7 +93,7 @@ def test_a_frame_or_tool_that_was_forgotten_is_no_change(name, forgotten, away):
     assert find_change(solve(problem)) is None
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_effects_that_are_not_modelled_are_no_change(effect):
     for seed in range(2):
@@ -101,7 +101,7 @@ def test_effects_that_are_not_modelled_are_no_change(effect):
         assert find_change(solve(problem_of(robot, m, "pose"))) is None
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["6R", "scara"])
 def test_noise_has_no_change(name):
     assert find_change(solve(problem_of(*measured(name, np.random.default_rng(1)), "pose"))) is None

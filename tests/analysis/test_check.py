@@ -58,6 +58,7 @@ def test_chi_square_is_that_of_the_covariance_written_out(known):
     assert found.p_value == pytest.approx(stats.chi2.sf(found.chi2, 9))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("joint", [2, 3, 4, 5])
 def test_the_joint_that_slipped_is_named(known, joint):
     calibration, true, _ = known
@@ -86,6 +87,7 @@ def few_rows_of_a_slip(seed=0, slip=4e-3):
     return calibration, slipped(true, theta3=slip), frame, q, np.random.default_rng(seed)
 
 
+@pytest.mark.slow
 def test_what_merely_correlates_is_said_not_to_be_told_apart():
     calibration, new, frame, q, rng = few_rows_of_a_slip()
     found = calibration.check(measured(new, len(q), rng, frame=frame, q=q))
@@ -96,6 +98,7 @@ def test_what_merely_correlates_is_said_not_to_be_told_apart():
     assert all(e.not_told_apart_from for e in found.explanations if e.likely)
 
 
+@pytest.mark.slow
 def test_the_configurations_advised_tell_the_changes_apart():
     """Followed to the letter: the same rows, and the advised ones in the same frame."""
     calibration, new, frame, q, rng = few_rows_of_a_slip()
@@ -184,6 +187,7 @@ def test_what_moves_the_tool_alike_everywhere_is_one():
     assert {"d3", "d4"} <= {*best.parameters, *best.same}
 
 
+@pytest.mark.slow
 def test_limits_decide_where_they_are_set(known):
     calibration, true, _ = known
     rows = measured(slipped(true, theta4=4e-4), 10, np.random.default_rng(12))
@@ -201,6 +205,7 @@ def test_too_few_rows_are_not_judged(unknown):
     assert "at least 3 needed" in found.reasons[0]
 
 
+@pytest.mark.slow
 def test_a_target_keeps_its_place_and_what_is_known_of_it():
     rng = np.random.default_rng(14)
     robot = arm()

@@ -40,7 +40,7 @@ GANTRY = ((0, 90, 0, "slide"), (0, 90, 0, "slide"), (0, 0, 0, "slide"), (0, 90, 
 BENT = ((0, 90, 0.1), (0.3, 80, 0), (0.2, -70, 0.1), (0, 90, 0.2))
 
 
-@pytest.mark.sampled(6)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("convention", "joints", "expected"),
     [
@@ -103,6 +103,7 @@ def test_a_robot_needs_no_frames_of_base_and_tool():
     assert [m.axes for m in missing_motions(builder.build())] == [(2, 3, 4)]
 
 
+@pytest.mark.slow
 def test_units_do_not_matter():
     """A crane of 100 m, an arm of 1 mm."""
     for factor in (1e-3, 1.0, 1e2):
@@ -216,7 +217,7 @@ def test_neither_is_it_of_instruments(error):
     assert any("use mdh-hayati" in caution for caution in found.uncertainty.cautions)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", ["estimate", {"position": 5e-5, "orientation": 1e-4, "estimate": True}])
 def test_estimated_noise_does_not_make_it_good(tmp_path, fg_calib, noise):
     ended = fg_calib("calibrate", textbook_job(tmp_path, noise=noise))
@@ -231,12 +232,14 @@ def test_a_good_fit_has_it_as_a_caution(tmp_path, fg_calib):
     assert SAID in words(ended.out.partition("Notes")[2])
 
 
+@pytest.mark.slow
 def test_the_convention_that_is_named_fits(tmp_path, fg_calib):
     job = textbook_job(tmp_path)
     ur5e(tmp_path)
     assert fg_calib("calibrate", job).code == 0
 
 
+@pytest.mark.slow
 def test_observe_says_it_first(tmp_path, fg_calib):
     path = tmp_path / "dh.yaml"
     path.write_text(yaml.safe_dump(UR5E | DH))
@@ -259,7 +262,7 @@ def stated(factor):
     return {"position": 5e-5 / factor, "orientation": 1e-4 / factor}
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("factor", "offered"), [(1.6, True), (5.0, False)])
 def test_noise_is_offered_to_be_estimated_only_near_what_was_stated(tmp_path, fg_calib, factor, offered):
     m = measure(true_robot(ur5e(tmp_path), np.random.default_rng(0)), 80, np.random.default_rng(1), sigma=(5e-5, 1e-4))

@@ -35,7 +35,7 @@ def touched(what, rng, n=36, n_points=3):
     return robot, Table(data, "anchor", known={"p0": KnownPoint(points[0])})
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_reasons", "without_mistakes")
 @pytest.mark.parametrize(
     "instrument", [*TOUCHED, "board", "targets", *(as_case(x, is_slow=True) for x in ("anchors", "planes"))]

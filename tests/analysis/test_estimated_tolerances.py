@@ -59,6 +59,7 @@ def test_the_estimate_is_that_with_the_tolerances_found_stated():
     assert sigmas_apart(solved().parameters[:n], again.parameters[:n], sigma) < NEGLIGIBLE
 
 
+@pytest.mark.slow
 def test_not_knowing_the_scales_makes_sigmas_larger():
     problem, _ = drawn("distance", n=14, estimate_tolerance="kind")
     solution = estimate_tolerances(problem)
@@ -102,6 +103,7 @@ def test_joints_without_tolerances_start_from_a_millimetre_and_a_milliradian():
     assert set(arm.values()) == {FIRST}
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("model", ["position", "distance", "distance-rotation"])
 def test_rows_of_every_model_tell_the_scales(model):
     found = estimate_tolerances(drawn(model, n=30, estimate_tolerance="kind")[0]).estimated_tolerances

@@ -59,7 +59,7 @@ def test_rows_of_one_configuration_stay_together():
     assert found.kinds["position"].n == 90
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("instrument", ["anchors", "planes", "board"])
 def test_what_few_configurations_know_of_is_spread_over_the_folds(instrument):
     robot, _, table = measured_by(instrument, np.random.default_rng(0), n=40)
@@ -207,6 +207,7 @@ def test_only_what_chance_does_not_explain_is_wide():
     assert wide({"a": 2.0}, 30) == ["a"]
 
 
+@pytest.mark.slow
 def test_repeats_of_one_place_are_held_out_together():
     robot, m = poses(n=20)
     rows = np.repeat(np.arange(20), 3)

@@ -318,6 +318,7 @@ def test_a_kind_with_too_little_left_keeps_its_stated_noise(monkeypatch):
     assert "too few rows to estimate it: as stated" in " ".join(format_report(solution, assess(solution)).split())
 
 
+@pytest.mark.slow
 def test_factors_that_do_not_settle_are_a_finding(monkeypatch):
     monkeypatch.setattr(noise, "MAX_ROUNDS", 1)
     rng = np.random.default_rng(11)
@@ -371,6 +372,7 @@ def test_pairs_that_a_model_of_poses_does_not_use_are_named(caplog):
     assert "pairs is not used: model pose is of poses, not of pairs" in format_report(solution, assess(solution))
 
 
+@pytest.mark.slow
 def test_leverage_in_chunks_is_leverage_at_once(monkeypatch):
     rng = np.random.default_rng(15)
     robot = small_arm(tolerance=TOLERANCE)
@@ -383,6 +385,7 @@ def test_leverage_in_chunks_is_leverage_at_once(monkeypatch):
     assert [fit.p_value for fit in in_chunks.kinds] == pytest.approx(p)
 
 
+@pytest.mark.slow
 def test_a_table_too_long_to_keep_is_judged_nearly_the_same(monkeypatch):
     """Without derivatives kept, independent rows are judged by their variances alone."""
     rng = np.random.default_rng(16)
@@ -609,7 +612,7 @@ def differences(function, x, step=1e-5):
     return np.stack([(function(x + h) - function(x - h)) / (2 * step) for h in step * np.eye(len(x))], axis=-1)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["one table", "two tables", "independent"])
 def test_predicted_pairs_that_share_joint_noise_with_fitted_ones_have_their_covariance_with_the_estimate(what):
     """Against the whole covariance of all rows; to 2 % of a sigma, by which noise lengthens the shortest.
@@ -652,6 +655,7 @@ def test_predicted_pairs_that_share_joint_noise_with_fitted_ones_have_their_cova
     assert uncertainty.goodness.test.chi2 == pytest.approx(r @ np.linalg.solve(A, r), rel=0.02)
 
 
+@pytest.mark.slow
 def test_noise_that_could_not_be_estimated_is_said_and_is_no_good_result():
     rng = np.random.default_rng(3)
     robot = small_arm(tolerance=TOLERANCE)

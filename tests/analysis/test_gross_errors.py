@@ -65,7 +65,7 @@ def test_where_the_problem_is_linearised_is_no_matter():
         assert np.flatnonzero(find_gross_errors(*given)).tolist() == [4, 5]
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("swapped", [3, 4])
 def test_anchors_exchanged_where_the_fit_goes_far_astray_are_outliers(swapped):
     """Half a metre, beside one row too many a parameter."""
@@ -135,7 +135,7 @@ def spoilt(name, by, rng):
 SPOILT = ["pose", "star", "all", "anchors", "planes", "board", "targets"]
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "by"), diagonal(SPOILT, [60.0, 2000.0]))
 def test_one_wrong_measurement_is_named_however_far_it_is_off(name, by):
     problem, wrong = spoilt(name, min(by, 300.0) if name == "all" else by, np.random.default_rng(5))
@@ -184,7 +184,7 @@ def test_a_loud_table_with_outliers_is_both(n):
     assert not found.goodness.spoilt
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("k", [1, 2])
 @pytest.mark.parametrize("error", [lambda _, q: 1e-3 * q, lambda _, q: 1e-3 * np.cos(q)], ids=["gain", "eccentric"])
 def test_what_is_not_modelled_is_no_outlier(error, k):

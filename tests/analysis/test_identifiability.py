@@ -118,6 +118,7 @@ def test_structural_rank_is_the_same_over_200_draws(robot, ranks):
         assert rank_at(robot, model, seed) == ranks[MODELS.index(model)], (model, seed)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("model", ["distance-rotation", "pose"])
 def test_structural_rank_does_not_depend_on_where_limits_lie(model):
     """A slide of 1.5 to 3 m, a joint of 190 to 350 degrees: no draw leaves them, and none freezes a joint."""
@@ -259,7 +260,7 @@ def in_other_units(robot, k):
 TOLERANCES = [None, {"a": 1e-3, "d": 1e-4, "theta": 2e-3}]
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arm", "model", "tolerance"), diagonal(["paper", "small", "scara"], ["pose", "distance-rotation"], TOLERANCES)
 )

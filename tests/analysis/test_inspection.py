@@ -124,7 +124,7 @@ MISTAKES = {
 }
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_in_the_set_up_is_a_finding(arm, mistake):
     found = inspected(arm, MISTAKES[mistake](measured(arm)))

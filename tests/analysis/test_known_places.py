@@ -14,7 +14,7 @@ from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("instrument", "name"), [("targets", "target t0"), ("anchors", "anchor a0")])
 def test_a_place_that_is_twelve_tolerances_off_is_named_and_nothing_else(instrument, name):
     for seed in (0, 1):
@@ -30,6 +30,7 @@ def test_a_place_that_is_twelve_tolerances_off_is_named_and_nothing_else(instrum
         assert 0.0 < beyond.sigma <= 1.0
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("instrument", ["targets nearly", "anchors nearly"])
 def test_sigmas_of_corrections_are_those_of_the_whole_graph(instrument):
     """Variance of the prior residual is 1 less that of the estimate over the tolerance squared, by a dense inverse."""

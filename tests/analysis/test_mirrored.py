@@ -93,7 +93,7 @@ def test_planes_whose_side_nothing_tells_stay_as_they_were_started():
     assert not again.others
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("height", [5e-4, 2e-3])
 def test_an_anchor_above_a_nearly_flat_patch_is_on_its_side(height):
     """The descent from nominal ends on the wrong side for seed 8."""

@@ -104,7 +104,7 @@ def named(check):
     return str(check.explanations[0]) if check.explanations else ""
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "frame", "mistake"), CASES)
 def test_a_mistake_in_the_table_is_named(tmp_path, model, frame, mistake):
     robot = ur5e(tmp_path)
@@ -128,7 +128,7 @@ def stuck(robot, joint, place, seed=0, *, placed=PLACED):
     return replace(m, readings=q)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("stands", "model"), diagonal([(0, 0.4), (3, -2.2), (5, 0.3), (5, 3.0)], ["pose", "position"]))
 def test_a_joint_that_is_stuck_is_not_called_one_in_another_unit(tmp_path, stands, model):
     joint, place = stands
@@ -152,7 +152,7 @@ def test_a_joint_of_a_scara_that_is_stuck_is_named_too(joint, place):
     assert not any("in deg" in str(e) or "in mm" in str(e) for e in check.explanations)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [np.pi / 180, 180 / np.pi])
 def test_readings_of_a_joint_in_another_unit_are_not_called_stuck(tmp_path, factor):
     robot = ur5e(tmp_path)
@@ -209,7 +209,7 @@ ANGLES = {
 }
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("mistake", ANGLES)
 def test_other_angles_than_roll_pitch_yaw_are_named(tmp_path, mistake):
     m = measured(ur5e(tmp_path))
@@ -227,7 +227,7 @@ CHANGED = {
 }
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("mistake", "model"), diagonal(CHANGED, ["pose", "distance-rotation"]))
 def test_a_mistake_in_the_robot_is_named(tmp_path, model, mistake):
     robot = ur5e(tmp_path)
@@ -249,6 +249,7 @@ def test_a_mistake_in_the_robot_is_named(tmp_path, model, mistake):
     assert mistake in named(check)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("model", ["pose", "position"])
 def test_a_wrong_tool_is_named_though_it_is_estimated(tmp_path, fg_calib, model):
     """Its corrections alone were told of, d6 +22 of its tolerances first, where the file had the flange as the tool."""
@@ -263,6 +264,7 @@ def test_a_wrong_tool_is_named_though_it_is_estimated(tmp_path, fg_calib, model)
     assert first.endswith("if the tool is another one, farther off than its tolerance lets it be")
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("model", "kinds"), [("pose", FRAME_KINDS), ("position", FRAME_KINDS[:3])])
 def test_a_forgotten_unknown_frame_is_named_though_the_base_is_estimated(tmp_path, fg_calib, model, kinds):
     """Fitted freely when the set-up was checked, its residuals were small: only corrections were told of."""
@@ -438,7 +440,7 @@ def test_a_solver_that_gives_up_names_the_mistake_too(tmp_path, fg_calib, monkey
     assert "if x, y, z are in mm, not m" in ended.err
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("seed", range(24))
 def test_a_healthy_job_raises_no_alarm(seed):
     """With large but stated tolerances; also where it is looked at although its residuals are as predicted."""

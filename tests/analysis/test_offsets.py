@@ -19,6 +19,7 @@ def lengths(rng, offset, n=60):
     return robot, replace(table, measurements=replace(m, length=m.length + offset))
 
 
+@pytest.mark.slow
 def test_a_forgotten_offset_is_a_reservation_with_its_size():
     robot, table = lengths(np.random.default_rng(1), 5e-3)
     solution = solve(build_problem(robot, [table]))

@@ -55,7 +55,7 @@ def pointer(folder, *, nominal, true, tolerance=0.02, job=JOB, n=40, seed=0):
     return folder / "job.yaml"
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_two_mirrored_optima_are_told_of_and_not_called_good(fg_calib, tmp_path, side):
     """20 mm aside with a tolerance of 20 mm, and 1 mm at nominal: chi-square differs by 0.2."""

@@ -103,7 +103,7 @@ EFFECTS = {
 """What moves the tool of the 6R arm by 2 to 4 sigma."""
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_an_effect_of_a_few_sigma_is_seen_whatever_the_noise_stated(effect):
     for unit in (1.0, 0.2):
@@ -111,7 +111,7 @@ def test_an_effect_of_a_few_sigma_is_seen_whatever_the_noise_stated(effect):
         assert probability_of_noise(solve(problem_of(robot, m, "position"))) < NOT_NOISE
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ARMS)
 @pytest.mark.parametrize("model", ["position", "pose", "pairs"])
 def test_noise_does_not_follow_the_arm(name, model):
@@ -162,7 +162,7 @@ def test_true_errors_are_twice_those_claimed_or_more_where_residuals_follow_the_
 FOLLOW = "the residuals follow the arm, as noise does not: effects that are not modelled"
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", ["estimate", {"position": 5e-5, "joint": 2e-5, "estimate": True}])
 def test_estimated_noise_does_not_hide_what_is_not_modelled(fg_calib, tmp_path, noise):
     robot, m = measured("6R", np.random.default_rng(1), effect=EFFECTS["backlash"])
@@ -182,6 +182,7 @@ def test_estimated_noise_of_a_clean_table_is_good(fg_calib, tmp_path):
     assert "follow the arm" not in ended.out
 
 
+@pytest.mark.slow
 def test_noise_is_not_offered_to_be_estimated_where_the_arm_sags():
     robot, m = measured("6R", np.random.default_rng(1), effect=EFFECTS["gravity"], n_test=15)
     found = assess(solve(problem_of(robot, m, "position")))
@@ -189,6 +190,7 @@ def test_noise_is_not_offered_to_be_estimated_where_the_arm_sags():
     assert not found.noise_may_be_estimated
 
 
+@pytest.mark.slow
 def test_noise_is_not_offered_to_be_estimated_where_test_rows_fail():
     robot, m = measured("6R", np.random.default_rng(1), n_test=15, unit=0.7)
     found = assess(solve(problem_of(robot, m, "position")))
@@ -197,6 +199,7 @@ def test_noise_is_not_offered_to_be_estimated_where_test_rows_fail():
     assert not replace(found, goodness=replace(found.goodness, test=test)).noise_may_be_estimated
 
 
+@pytest.mark.slow
 def test_a_reservation_stands_beside_the_word_good():
     """Where residuals follow the arm a little, chi-square does not say by how much sigmas are too small."""
     robot, m = measured("6R", np.random.default_rng(1), effect=of_joint(1, lambda _, q: 2.25e-4 * np.sin(q + 0.4)))

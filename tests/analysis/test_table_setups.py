@@ -40,6 +40,7 @@ def said(robot, tables, order):
     return [str(check) for check in (found, *found.others)]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_a_forgotten_unknown_frame_of_one_of_two_tables_is_said_of_that_table(tmp_path, order):
     rng = np.random.default_rng(3)
@@ -71,7 +72,7 @@ def three_tables(true, rng, mistake):
     return [first, Table(bar, "distance"), Table(cam, "pose", frame="unknown")]
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("mistake", "order"), diagonal(MISTAKES, [(0, 1, 2), (2, 1, 0)]))
 def test_a_mistake_in_one_of_three_tables_is_said_of_that_table(tmp_path, mistake, order):
     rng = np.random.default_rng(3)

@@ -45,7 +45,7 @@ def test_covariance_of_a_planar_arm_is_the_one_computed_by_hand():
     assert found["theta2"] == pytest.approx(sigma / np.sqrt(n), rel=1e-6)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("model", "frame", "estimate"),
     [
@@ -148,6 +148,7 @@ def test_monte_carlo_agrees_with_the_stated_covariance():
     assert kstest(reduced, chi2(dof).cdf).pvalue > 1e-3
 
 
+@pytest.mark.slow
 def test_chi_square_above_its_bounds_is_a_finding_and_below_them_a_caution():
     rng = np.random.default_rng(5)
     robot = small_arm()
@@ -224,7 +225,7 @@ def test_frame_estimate_is_world_T_base():
     assert found.xyz == pytest.approx(frame[1], abs=0.01)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["distance-rotation", "pose", "position"])
 def test_every_gauge_predicts_the_same_where_prediction_is_possible(model):
     rng = np.random.default_rng(10)

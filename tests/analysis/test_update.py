@@ -29,6 +29,7 @@ def difference(updated, batch):
     return max(off), max(abs(x.sigma / y.sigma - 1.0) for x, y in zip(a, b, strict=True))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("gauge", ["prior", "keep"])
 @pytest.mark.parametrize(("unknown", "model"), [(False, "pose"), (True, "pose"), (False, "distance-rotation")])
 def test_an_update_is_a_calibration_of_all_rows(unknown, model, gauge):
@@ -52,6 +53,7 @@ def test_without_a_gauge_what_no_rows_determine_is_refused(unknown):
         calibrate(robot, old, gauge="none").update(new)
 
 
+@pytest.mark.slow
 def test_without_a_gauge_an_update_of_what_is_determined_is_a_calibration_of_all_rows():
     rng = np.random.default_rng(2)
     robot = fine_arm(fixed=["d2", "d3"])
@@ -62,6 +64,7 @@ def test_without_a_gauge_an_update_of_what_is_determined_is_a_calibration_of_all
     assert of_sigma < 1e-6
 
 
+@pytest.mark.slow
 def test_at_the_noise_of_an_instrument_the_difference_is_a_thousandth_of_a_sigma():
     calibration, true, rng = calibrated(0, unknown=True)
     old = calibration.solution.problem.data.tables[0]
@@ -71,6 +74,7 @@ def test_at_the_noise_of_an_instrument_the_difference_is_a_thousandth_of_a_sigma
     assert of_sigma < 1e-3
 
 
+@pytest.mark.slow
 def test_three_updates_in_a_row_are_a_calibration_of_all_rows():
     calibration, true, rng = calibrated(3)
     tables = [calibration.solution.problem.data.tables[0]]
@@ -94,6 +98,7 @@ def seen(true, spots, rng, n, ids):
     return Table(replace(rows, labels={"target": Labels(tuple(spots), of)}), "position")
 
 
+@pytest.mark.slow
 def test_targets_stay_known_although_a_month_does_not_see_them():
     """Two targets, of which the second table sees one; the third sees the other again."""
     rng = np.random.default_rng(4)
@@ -131,6 +136,7 @@ def lengths(true, anchors, rng, n, ids):
     return Table(replace(rows, labels=labels, length=d, sigma_length=np.full(n, 2e-8)), "anchor")
 
 
+@pytest.mark.slow
 def test_anchors_are_those_of_before_only_where_that_is_said():
     rng = np.random.default_rng(5)
     robot = fine_arm()
@@ -149,6 +155,7 @@ def test_anchors_are_those_of_before_only_where_that_is_said():
     assert of_sigma < 1e-5
 
 
+@pytest.mark.slow
 def test_what_has_changed_is_learned_anew_and_the_check_is_good_again():
     calibration, true, rng = calibrated(6)
     true = slipped(true, theta3=5e-3)

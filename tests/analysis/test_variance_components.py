@@ -240,7 +240,7 @@ def test_estimated_joint_values_tell_of_the_same_noise():
     assert values.scatter == pytest.approx(np.ones(4), abs=4 / np.sqrt(2 * 30))
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [1 / 25, 25.0])
 def test_factors_are_the_same_wherever_they_start(times):
     """To ten times what settles them: they are the optimum's."""

@@ -109,7 +109,7 @@ def drifted(seed=3, degrees=0.03):
 DRIFTED = [{"model": "pose"}, {"model": "distance-rotation", "pairing": "all"}]
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("settings", "estimate"), diagonal(DRIFTED, [False, True]))
 def test_a_joint_that_drifted_before_the_test_rows_is_not_good(fg_calib, tmp_path, settings, estimate):
     robot, m = drifted()
@@ -153,7 +153,7 @@ def test_the_same_arm_without_drift_is_good(fg_calib, tmp_path):
     assert json.loads(ended.out)["test"]["p_value"] > 1e-3
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [{"model": "pose"}, {"model": "distance-rotation", "pairing": "star"}])
 def test_a_wrong_test_row_is_named(fg_calib, tmp_path, settings):
     robot, m = drifted(degrees=0.0)
@@ -260,7 +260,7 @@ def test_healthy_corrections_are_seldom_called_too_large(name):
     assert sums[:, 0].sum() / sums[:, 1].sum() == pytest.approx(1.0, abs=4 * np.sqrt(2 / sums[:, 1].sum()))
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [{"a2": 0.02}, {"alpha3": -0.02}])
 def test_a_correction_far_beyond_its_tolerance_is_a_finding_that_names_it(fg_calib, tmp_path, wrong):
     rng = np.random.default_rng(32)
@@ -338,7 +338,7 @@ EVALUATIONS = (
 )
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EVALUATIONS)
 @pytest.mark.filterwarnings("error")
 def test_a_table_of_test_rows_alone_evaluates_the_arm_as_it_is(fg_calib, tmp_path, name):
@@ -445,7 +445,7 @@ ENCODERS = [(kind, n, wrong) for kind, n in (("pose", 30), ("pose", 120), ("pair
 QUICK = {("pose", 30, 0.0), ("pose", 120, 15.0), ("pairs", 30, 0.0)}
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "n", "wrong"), [as_case(case, is_slow=case not in QUICK) for case in ENCODERS])
 def test_a_wrong_encoder_reading_is_written_and_suspect(fg_calib, tmp_path, kind, n, wrong):
     """Up to 100 configurations joint values are variables, beyond that they are eliminated."""
@@ -474,6 +474,7 @@ def test_a_wrong_encoder_reading_is_written_and_suspect(fg_calib, tmp_path, kind
     assert "too many to carry" not in ended.out
 
 
+@pytest.mark.slow
 def test_without_estimated_joint_values_there_is_no_table_of_them(fg_calib, tmp_path):
     robot, m, job = encoders("pose", 30, np.random.default_rng(62))
     path = write_job(tmp_path, robot, m, **job | {"encoder": "propagated"})

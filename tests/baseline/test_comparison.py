@@ -246,7 +246,7 @@ def test_problem_of_takes_the_jobs_settings_but_for_changes(simulated_job):
 # --- every instrument -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "instrument",
     [
@@ -265,7 +265,7 @@ def test_plain_least_squares_finds_the_graphs_optimum_of_every_instrument(instru
     _same_optimum(compare(Job(tmp_path / "job.yaml", robot, (table,), Options(), true)))
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("instrument", ["anchors", "planes", "board"])
 def test_of_one_row_a_configuration_joint_noise_weighs_as_in_the_graph(instrument, tmp_path):
     robot, true, table = measured_by(instrument, np.random.default_rng(0), sigma_joint=5e-4)

@@ -65,6 +65,7 @@ def run(fg_calib, folder, *arguments, camera=True):
     )
 
 
+@pytest.mark.slow
 def test_images_become_tables_of_corners_and_poses(drawing, job, fg_calib):
     add_wall(job)
     ended = run(fg_calib, job)
@@ -89,6 +90,7 @@ def test_images_become_tables_of_corners_and_poses(drawing, job, fg_calib):
         assert np.sqrt(np.diag(C)[3:]).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_joint_readings_are_joined_by_the_images_name_as_they_are_written(job, fg_calib):
     ended = run(fg_calib, job, "--configurations", job / "poses.csv", "--length", "mm", "--angle", "deg")
     assert ended.code == 0
@@ -361,7 +363,7 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.mark.sampled(5)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("case", CASES)
 def test_what_cannot_be_used_is_named(case, job, fg_calib):
     change, message = CASES[case]

@@ -219,6 +219,7 @@ def test_inputs_are_named_with_their_hashes(calibrated, result):
 # --- how the commands end --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_json_puts_the_result_and_nothing_else_on_stdout(fg_calib, example):
     printed = calibrate(fg_calib, example / JOB, "--out", example / "result")
     written = json.loads((example / "result" / "result.json").read_text())
@@ -306,7 +307,7 @@ def test_noise_stated_too_small_by_5_is_exit_code_3_with_the_reason_and_results(
     assert {f.name for f in (example / "result").iterdir()} == OUTPUTS
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1.3, 5.0])
 def test_noise_stated_too_large_is_a_caution(fg_calib, example, factor):
     """Sigmas are then larger than they need be, not wrong, however much."""
@@ -597,6 +598,7 @@ UNSOLVABLE = {
 }
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("edit", "pattern"), UNSOLVABLE.values(), ids=UNSOLVABLE)
 def test_an_unsolvable_problem_is_one_line_and_writes_nothing(fg_calib, example, edit, pattern):
     edit(example)
@@ -909,7 +911,7 @@ def test_a_job_may_leave_the_noise_to_the_residuals(fg_calib, example, given):
 PAGES = [("40", 40), (None, 100), ("60", 60), ("200", 200)]
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("page", "command"), diagonal(PAGES, ["calibrate", "observe", "compare"]))
 def test_a_report_is_as_wide_as_the_page(fg_calib, example, monkeypatch, command, page):
     """A pipe has no width: 100 columns, in which all tables of the example have room."""

@@ -87,6 +87,7 @@ def test_a_program_of_joint_values_and_json(result, fg_calib, tmp_path):
         )
 
 
+@pytest.mark.slow
 def test_targets_out_of_reach_are_named_and_end_with_3(result, fg_calib, tmp_path):
     (tmp_path / "targets.csv").write_text("id,x,y,z\nmoon,384e6,0,0\nhere,1,2,3\n")
     ended = fg_calib("correct", result, tmp_path / "targets.csv", "--out", tmp_path / "commands.csv")
@@ -96,6 +97,7 @@ def test_targets_out_of_reach_are_named_and_end_with_3(result, fg_calib, tmp_pat
     assert pl.read_csv(tmp_path / "commands.csv")["reached"].to_list() == ["no", "yes"]
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("table", "options", "message"),
     [

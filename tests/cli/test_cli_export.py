@@ -34,6 +34,7 @@ def result(tmp_path_factory):
     return folder
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("to", ["urdf", as_case("dh", is_slow=True), as_case("mdh", is_slow=True), "hayati", "yaml"])
 def test_a_file_is_the_calibrated_arm(result, to, fg_calib, tmp_path):
     out = tmp_path / ("arm.urdf" if to == "urdf" else "arm.yaml")
@@ -46,6 +47,7 @@ def test_a_file_is_the_calibrated_arm(result, to, fg_calib, tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == [out.name]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("to", ["urdf", "ur", "tesseract", as_case("dh", is_slow=True), "hayati", "zeros", "yaml"])
 def test_stdout_is_the_file_or_the_document(result, to, fg_calib):
     text = fg_calib("export", result, "--to", to)
@@ -75,6 +77,7 @@ def test_zeros_where_it_was_measured_are_better_there(result, fg_calib):
     assert cost(there["after"]["workspace"]) > cost(anywhere["after"]["workspace"])
 
 
+@pytest.mark.slow
 def test_a_robot_is_exported_and_compared_with_the_one_as_drawn(fg_calib, tmp_path):
     write_robot(tmp_path / "drawn.yaml", ur10())
     write_robot(tmp_path / "true.yaml", off(ur10()))
@@ -83,6 +86,7 @@ def test_a_robot_is_exported_and_compared_with_the_one_as_drawn(fg_calib, tmp_pa
     assert "# after, over the joint limits: position " in ended.out
 
 
+@pytest.mark.slow
 def test_a_urdf_is_written_as_it_was_but_for_origins(fg_calib, tmp_path):
     nominal = column(tmp_path)
     calibrated(nominal, off(nominal), tmp_path / "result")
@@ -170,6 +174,7 @@ MISTAKES = {
 }
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_is_a_line_and_leaves_no_file(mistake, fg_calib, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

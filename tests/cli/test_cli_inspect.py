@@ -95,6 +95,7 @@ def _refuse(constant):
     raise AssertionError(f"{constant} is no JSON")
 
 
+@pytest.mark.slow
 def test_json_has_every_key_and_nothing_else_is_on_stdout(fg_calib, example):
     ended = fg_calib("inspect", example / JOB, "--json")
     assert (ended.code, ended.err) == (0, "")

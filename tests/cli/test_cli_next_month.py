@@ -67,6 +67,7 @@ def test_a_table_is_read_as_the_job_read_its_own(place):
     assert found["rms"]["position"] < 3 * SIGMA[0]
 
 
+@pytest.mark.slow
 def test_a_slip_fails_is_named_and_is_mended_by_an_update(place):
     code, out = run("check", place / "result", place / "slipped.csv", "--limit", "0.2mm")
     assert code == 3
@@ -99,6 +100,7 @@ def test_a_history_outlives_the_older_folders(place, tmp_path):
     assert "3 runs" in run("history", tmp_path / "third")[1]
 
 
+@pytest.mark.slow
 def test_runs_whose_dates_say_no_order_are_numbered(place):
     """Of one date, or of one that is earlier: whole numbers from 1, as nothing is between runs."""
     (run,) = history_of(place / "result").runs
@@ -134,6 +136,7 @@ BAD = {
 }  # fmt: skip
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("what", BAD)
 def test_bad_input_is_one_line(place, what, monkeypatch):
     monkeypatch.chdir(place)
@@ -160,6 +163,7 @@ def test_a_result_that_is_not_to_be_trusted_is_refused(place, tmp_path):
     assert "it wobbles" in message
 
 
+@pytest.mark.slow
 def test_an_older_result_is_checked_by_a_job_and_not_updated(place, tmp_path):
     folder = changed_result(place, tmp_path, lambda d: d.pop("carried"))
     assert "a job that names the table" in run("check", folder, place / "healthy.csv")[1]

@@ -66,6 +66,7 @@ def nearly(tilt, direction, a, turn):
 CASES = [(direction, a, turn) for direction in (0.0, np.pi / 2, 1.0) for a in (0.4, 0.0) for turn in (0.0, np.pi)]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("tilt", TILTS)
 @pytest.mark.parametrize("convention", ["dh", "mdh", "dh-hayati"])
 def test_nearly_parallel_axes_have_the_table_that_is_claimed(convention, tilt):
@@ -102,6 +103,7 @@ def test_however_far_common_normals_are_they_hold_the_arm(convention, tilt):
     assert away == pytest.approx(0.4 * abs(np.sin(1.0)) / tilt, rel=0.1)  # the distance along the tilt, over it
 
 
+@pytest.mark.slow
 def test_an_export_may_take_far_common_normals():
     robot = nearly(1e-4, 1.0, 0.4, 0.0)
     near, far = (export(robot, "dh", far=far) for far in (False, True))
@@ -127,6 +129,7 @@ def test_axes_that_meet_have_no_distance(convention, alpha):
         assert lengths == pytest.approx([0.0] * 3, abs=1e-12)
 
 
+@pytest.mark.sampled(8)
 @pytest.mark.parametrize("there", CONVENTIONS)
 @pytest.mark.parametrize("back", ["dh", "mdh", "dh-hayati"])
 def test_there_and_back_is_the_same_arm(there, back):
@@ -182,6 +185,7 @@ def test_links_of_an_arm_are_its_chain():
     assert T @ links.between[-1] @ links.tool == pytest.approx(matrix(at.rotation[0], at.position[0]), abs=1e-14)
 
 
+@pytest.mark.slow
 def test_what_a_ur10_misses_in_a_table_of_four_figures_is_what_the_page_says():
     made = export(off(ur10()), "dh")
     assert "axes 2 and 3 are parallel within 0.041 deg, not exactly: their common normal is 429 m away" in made.text

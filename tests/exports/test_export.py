@@ -72,6 +72,7 @@ def test_a_new_urdf_reads_back_as_the_same_arm_with_its_names_and_limits(arm, tm
     assert np.abs(ours(back, q) - ours(arm, q)).max() < EXACT
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("to", ["hayati", "yaml"])
 def test_hayatis_table_holds_every_arm_exactly(arm, to, tmp_path):
     made = export(arm, to)
@@ -85,6 +86,7 @@ def test_hayatis_table_holds_every_arm_exactly(arm, to, tmp_path):
     assert np.abs(ours(back, q) - ours(arm, q)).max() < EXACT
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("to", ["dh", "mdh"])
 @pytest.mark.parametrize("name", [as_case(name, is_slow="scara" in name) for name in ARMS])
 def test_tables_of_four_figures_say_what_they_miss_and_by_how_much(name, to, tmp_path):
@@ -131,6 +133,7 @@ EXTREMES = {
 }
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", [as_case(n, is_slow=n.startswith("random") and int(n[7:]) > 4) for n in EXTREMES])
 def test_whatever_the_arm_its_exact_formats_are_exact(name, tmp_path):
     arm = EXTREMES[name]()
@@ -381,6 +384,7 @@ def test_base_and_tool_of_a_urdf_are_told(tmp_path):
 # --- joint zeros ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ARMS)
 def test_zeros_that_are_all_that_is_off_are_found(name, tmp_path):
     nominal = ARMS[name](tmp_path)

@@ -97,6 +97,7 @@ def test_a_bag_calibrates_the_arm(tmp_path, fg_calib, form):
     assert np.abs(predicted(nominal, motion) - motion.true_position).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_the_command_reports_topics_clocks_and_stops(tmp_path, fg_calib, bags):
     write_robot(tmp_path / "robot.yaml", arm())
     ended = fg_calib("bag", bags["ros1"], "--robot", tmp_path / "robot.yaml")
@@ -137,6 +138,7 @@ def predicted(robot, motion):
     return turn.apply(p - centre[0]) + centre[1]
 
 
+@pytest.mark.slow
 def test_the_table_is_read_as_it_was_averaged(tmp_path):
     motion = record(2, n_stops=6)
     stops = average_stops(*motion.streams(), arm())
@@ -370,7 +372,7 @@ def cut(bag, folder, kept):
     return path
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @LEFT_OPEN
 @pytest.mark.parametrize("form", FORMATS)
 def test_damage_is_one_line_or_nothing(tmp_path, bags, form):

@@ -42,7 +42,7 @@ def drafted(fg_calib, folder, *files):
     return yaml.safe_load((folder / JOB).read_text())
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [pytest.param(n, marks=[pytest.mark.slow] * (n in (*SLOW, "contact", "faces", "sockets"))) for n in INSTRUMENTS],
@@ -184,6 +184,7 @@ def test_the_commented_keys_are_keys_of_a_job(fg_calib, folder):
     assert read_job(folder / JOB).options.loss == "none"
 
 
+@pytest.mark.slow
 def test_columns_of_counts_are_recognised_and_their_scale_is_asked_for(fg_calib, folder):
     folder, write = folder
     counts = {f"q{i}": 1000.0 for i in range(1, 7)}
@@ -196,6 +197,7 @@ def test_columns_of_counts_are_recognised_and_their_scale_is_asked_for(fg_calib,
     assert fg_calib("inspect", folder / JOB).code == 0
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("name", "cells", "found"),
     [
@@ -284,7 +286,7 @@ REFUSED = {
 }
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_cannot_be_used_is_refused_in_one_line(fg_calib, folder, case):
     folder, write = folder

@@ -64,7 +64,7 @@ def test_all_readers_take_part(files):
     assert sum(reader.share for reader in files[1].values()) == pytest.approx(1.0)
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("what", SHARES)
 def test_some_damaged_files_end_in_errors_of_the_package_alone(files, what):
     damage_and_read(files, what, 8)

@@ -65,7 +65,7 @@ def write_files(folder, robot, table, job):
     return folder / "job.yaml"
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("instrument", KEYS)
 def test_a_job_is_what_python_makes_of_the_same_arrays(instrument, tmp_path):
     """Parameters within a hundredth of their sigma: what twelve digits in mm and degrees leave is far less."""
@@ -94,6 +94,7 @@ def test_every_form_of_a_known_point(tmp_path):
     assert (known["a0"].tolerance, known["a1"].tolerance) == pytest.approx((7e-3, 50e-3))
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("top", "entry", "fixed"),
     [
@@ -189,7 +190,11 @@ def test_a_camera_that_is_none_is_named(given, message, tmp_path):
         ("anchors", {"a0": {"x": 1, "y": 2}}, "job.yaml: anchors: a0: missing key 'z'"),
         ("anchors", {"a0": {"x": 1, "y": 2, "z": 3, "tolerance": 0}}, "job.yaml: anchors: a0: tolerance"),
         ("anchors", {"a0": {"x": 1, "y": True, "z": 3}}, "job.yaml: anchors: a0: y: found True, expected a finite n"),
-        ("tolerance", {"anchor": 1}, "job.yaml: tolerance: unknown key 'anchor', expected one of targets, anchors"),
+        (
+            "tolerance",
+            {"anchor": 1},
+            "job.yaml: tolerance: unknown key 'anchor', expected one of estimate, targets, anchors",
+        ),
         ("offset", "yes", "job.yaml: offset"),
     ],
 )
@@ -201,7 +206,7 @@ def test_a_key_that_cannot_be_used_is_named(key, value, message, tmp_path):
     assert str(error.value).startswith(message)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("instrument", ["anchors offset", "targets stations"])
 def test_the_command_compares_instruments(instrument, fg_calib, tmp_path):
     robot, _, table = measured_by(instrument, np.random.default_rng(27))
@@ -232,6 +237,7 @@ def test_a_place_of_a_misspelt_name_is_not_left_out(tmp_path):
     assert str(error.value) == "anchors: no row is of 'A0', expected one of a0, a1, a2; did you mean a0?"
 
 
+@pytest.mark.slow
 def test_a_place_of_what_no_row_is_of_is_told_of(tmp_path, caplog):
     """One list of anchors may serve many jobs."""
     robot, _, table = measured_by("anchors", np.random.default_rng(31))
@@ -281,6 +287,7 @@ def test_a_camera_of_arrays_is_checked_too(figures, message):
     assert str(error.value) == message
 
 
+@pytest.mark.slow
 def test_observe_knows_them_before_and_after_they_are_measured(fg_calib, tmp_path):
     robot, _, table = measured_by("anchors", np.random.default_rng(28))
     write_files(tmp_path, robot, table, {})

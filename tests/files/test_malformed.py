@@ -736,17 +736,19 @@ def test_urdfs(folder, given, message):
     refuses(folder, "arm.urdf", given, read_robot, message)
 
 
+@pytest.mark.sampled(44)
 @cases(JOBS)
 def test_jobs(folder, given, message):
     refuses(folder, "job.yaml", given, read_job, message)
 
 
+@pytest.mark.sampled(48)
 @cases(SCENARIOS)
 def test_scenarios(folder, given, message):
     refuses(folder, "scenario.yaml", given, read_scenario, message)
 
 
-@pytest.mark.sampled(61)
+@pytest.mark.sampled(26)
 @cases(POSES)
 def test_poses(tmp_path, given, message):
     refuses(tmp_path, "poses.csv", given, lambda file: read_measurements(file, ARM), message)
@@ -759,6 +761,7 @@ def test_frames(given, message):
     assert str(caught.value) == message
 
 
+@pytest.mark.sampled(13)
 @cases(PAIRS)
 def test_pairs(folder, given, message):
     read = lambda file: read_measurements(folder / "ids.csv", ARM, pairs=file)  # noqa: E731
@@ -786,7 +789,7 @@ def test_results(tmp_path, document, given, message):
     refuses(tmp_path, "result.json", given, read_result, message)
 
 
-@pytest.mark.sampled(8)
+@pytest.mark.sampled(4)
 @cases(COMMANDS)
 def test_commands(folder, fg_calib, monkeypatch, given, message):
     """Exit code 1 and one line on stderr, nothing on stdout, no folder made."""

@@ -89,6 +89,7 @@ def test_help_without_a_topic_lists_the_topics(fg_calib):
     assert last == "fg-calib COMMAND --help says what a command does"
 
 
+@pytest.mark.slow
 def test_help_of_a_topic_has_every_key_and_fits_a_terminal(fg_calib, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     for topic in ("job", "robot", "tables"):

@@ -75,7 +75,7 @@ def test_what_is_written_reads_back_the_same(calibrations, tmp_path, name):
     assert read_result(tmp_path / "result.json") == found
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_written_has_the_schema(calibrations, tmp_path, name):
     """By a validator that knows nothing of the model."""
@@ -118,6 +118,7 @@ def test_version_1_is_readable_with_no_more_than_it_promised(folder):
         found.predict(q, world=True)
 
 
+@pytest.mark.sampled(20)
 @pytest.mark.parametrize(
     ("damage", "message"),
     [

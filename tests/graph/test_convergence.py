@@ -58,7 +58,7 @@ FITS = [("pose", "unknown"), ("position", "unknown"), ("distance", "known"), ("d
 SETTINGS = diagonal(FITS, ["prior", "none"], [5e-4, 0.0], every=4)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("fit", "gauge", "sigma_joint"), SETTINGS)
 def test_the_unit_of_length_changes_nothing(fit, gauge, sigma_joint):
     """The same arm a thousand times smaller, a hundred (a crane) and a thousand times larger."""
@@ -103,7 +103,7 @@ DRAWS = [(gauge, draws) for gauge in ("prior", "none") for draws in (range(1), r
 """The first draw, with priors, is in the default run."""
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("gauge", "draws"), DRAWS)
 @pytest.mark.parametrize("name", CASES)
 def test_solving_again_from_the_answer_moves_nothing(name, gauge, draws):
@@ -127,6 +127,7 @@ def test_solving_again_from_the_answer_moves_nothing(name, gauge, draws):
         assert np.linalg.norm((direction.T @ (step / scales))[known] / np.sqrt(variance[known])) < 1e-6
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("shift", [[0, 0, 0], [70, -30, 20]])
 def test_the_last_step_is_taken_although_the_cost_no_longer_shows_it(shift):
     """Plain least squares, which asks no cost, is as near as rounding of metres over sigmas lets it be."""
@@ -211,7 +212,7 @@ def test_the_limit_holds_for_all_rounds_together():
     assert nearly.message.startswith(f"converged: {needed - 1} iterations, ")
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("loss", "seed"), diagonal(["huber", "cauchy"], [0, 7]))
 def test_touches_and_positions_that_share_joint_noise_arrive_with_robust_losses(loss, seed):
     """Derivatives of touches leave out a turn that moves no length, but acts on noise that is not the same all round.

@@ -95,7 +95,7 @@ def dense_covariance(solution, n):
     return (inverse @ inverse.T)[:n, :n]
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["in place", "in a copy"])
 def test_factors_on_our_variables_are_solved_and_assessed(way):
     problem = problem_of()
@@ -136,7 +136,7 @@ def test_the_optimum_is_that_of_gtsams_own_optimiser():
     assert graph.error(solution.values) < graph.error(initial)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("gauge", ["prior", "none"])
 def test_a_variable_of_ones_own_is_solved_and_found_again(gauge):
     point = np.array([3.0, -2.0, 1.0])
@@ -172,6 +172,7 @@ def test_a_pose_of_ones_own_is_solved():
     assert assess(solution).dof == assess(solve(problem_of())).dof
 
 
+@pytest.mark.slow
 def test_what_is_added_determines_what_was_not():
     """Classes and rank count it: a length along the first axis, which no pair of positions says anything of."""
     problem, plain = problem_of("none"), assess(solve(problem_of("none")))
@@ -356,6 +357,7 @@ def test_a_factor_whose_rows_have_no_weight_is_refused(factor, found):
         solve(problem)
 
 
+@pytest.mark.slow
 def test_what_was_solved_with_pairs_and_a_tool_can_be_solved_again():
     """Noise that was learned of all columns is not that of frames and tool alone, which are fitted first."""
     rng = np.random.default_rng(0)

@@ -44,6 +44,7 @@ def moved(values, variables, step):
     return values.retract(delta)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("model", ["pose", "position", "orientation", "distance", "rotation", "distance-rotation"])
 def test_derivatives_of_every_model_are_those_along_gtsams_retraction(model):
     problem = problem_of(model)
@@ -89,6 +90,7 @@ def one_by_one(rows, variables):
     return graph
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("model", ["pose", "position", "orientation", "distance", "rotation", "distance-rotation"])
 def test_single_row_factors_and_the_block_have_the_same_cost_and_gradient(model):
     problem = problem_of(model, n=15)
@@ -101,6 +103,7 @@ def test_single_row_factors_and_the_block_have_the_same_cost_and_gradient(model)
     assert H == pytest.approx(G, abs=rounding(np.abs(G).max(), 100))
 
 
+@pytest.mark.slow
 def test_single_row_factors_and_the_block_have_the_same_optimum():
     problem = problem_of(
         "distance-rotation",

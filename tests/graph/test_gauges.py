@@ -65,7 +65,7 @@ CELLS = {
 EVERY_CELL = pytest.mark.parametrize(("robot", "model", "gauge", "options"), CELLS.values(), ids=CELLS.keys())
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_reasons")
 @pytest.mark.parametrize(("robot", "model", "gauge", "options"), CELLS.values(), ids=list(CELLS))
 def test_intervals_hold_the_truth(robot, model, gauge, options):
@@ -106,6 +106,7 @@ def test_a_kept_parameter_is_as_uncertain_as_what_it_stands_for():
     assert ones @ covariance @ ones == pytest.approx(d5.sigma_of_combination**2, rel=1e-3)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("model", ["pose", "distance-rotation"])
 def test_the_covariance_of_a_kept_arm_is_that_of_its_bound(model):
     """`cramer_rao` has the same errors from another formula, at the truth; here the truth is nominal."""
@@ -125,6 +126,7 @@ def test_the_covariance_of_a_kept_arm_is_that_of_its_bound(model):
     )
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("gauge", ["keep", "none"])
 def test_without_a_tolerance_only_what_does_not_depend_on_it_is_known(gauge):
     rng = np.random.default_rng(4)
@@ -146,6 +148,7 @@ def test_without_a_tolerance_only_what_does_not_depend_on_it_is_known(gauge):
         assert sigma[0] == pytest.approx(by_name["d5"].sigma_of_combination, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_a_measurement_frame_is_as_uncertain_as_the_base_that_was_left_out():
     """The first joint's parameters move it along x and z and about them; along y and about it the frame is known."""
     rng = np.random.default_rng(5)
@@ -192,6 +195,7 @@ def job_files(folder, robot, gauge):
     return folder / "job.yaml"
 
 
+@pytest.mark.slow
 def test_results_and_report_name_what_a_kept_parameter_stands_for(tmp_path, fg_calib):
     ended = fg_calib("calibrate", job_files(tmp_path, paper_robot(tolerance=HAYATI), "keep"), "--out", tmp_path / "out")
     assert ended.code == 0
@@ -214,7 +218,7 @@ def test_results_and_report_name_what_a_kept_parameter_stands_for(tmp_path, fg_c
     assert shown["theta6"][3:] == ["theta6", "-", "beta5"]
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("gauge", ["prior", "none"])
 def test_where_nothing_was_left_out_parameters_stand_for_themselves(tmp_path, fg_calib, gauge):
     ended = fg_calib("calibrate", job_files(tmp_path, paper_robot(tolerance=HAYATI), gauge), "--json")

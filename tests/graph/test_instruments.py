@@ -142,7 +142,7 @@ def calibrated(instrument):
     return calibrate(robot, [table])
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @EVERY
 def test_the_front_door_reports_and_saves_it(instrument, tmp_path):
     result = calibrated(instrument)
@@ -158,7 +158,7 @@ def test_the_front_door_reports_and_saves_it(instrument, tmp_path):
     assert {group.kind for group in loaded.groups} >= {wanted}
 
 
-@pytest.mark.sampled(6)
+@pytest.mark.sampled(1)
 @EVERY
 def test_rows_are_in_the_unit_of_their_kind(instrument, tmp_path):
     calibrated(instrument).save(tmp_path / "result")
@@ -170,7 +170,7 @@ def test_rows_are_in_the_unit_of_their_kind(instrument, tmp_path):
 CHOICES = [{"loss": "huber"}, {"encoder": "estimated"}, {"estimate_noise": True}]
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("instrument", "choices"), diagonal(INSTRUMENTS, CHOICES, every=3), ids=str)
 def test_losses_joint_values_and_noise_work_with_it(instrument, choices):
     robot, true, table = measured_by(instrument, np.random.default_rng(6), sigma_joint=2e-4)
@@ -283,7 +283,7 @@ def test_a_camera_is_needed_for_pixels():
 # --- rows say what they are of ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("instrument", "column"), [("targets", "target"), ("targets stations", "target"), ("anchors", "anchor"),
                                ("planes", "plane"), ("pixels", None)]
@@ -345,6 +345,7 @@ def suspicious(report, of="test rows"):
     return report.split(f"Suspicious {of}\n")[1].split("\n\n")[0]
 
 
+@pytest.mark.slow
 def test_the_target_that_is_off_is_named():
     text = suspicious(shifted("targets", [1, 13, 22]))
     assert text.startswith("  all 9 suspicious rows are of t1, as are 30 of all 90 rows\n")
@@ -363,12 +364,13 @@ def test_the_station_that_is_off_is_named():
     assert re.search(r"^c25 +position\.[xyz] of measurements, station s1 +t1 ", text, flags=re.M)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("instrument", "rows"), [("anchors", [7]), ("targets", [4]), ("targets", [0, 13, 26])])
 def test_nothing_is_said_in_common_of_one_measurement_or_of_all_alike(instrument, rows):
     assert "suspicious rows are of" not in suspicious(shifted(instrument, rows))
 
 
+@pytest.mark.slow
 def test_rows_that_were_fitted_are_compared_with_those_that_were_fitted():
     text = suspicious(shifted("anchors", [-59, -32, -20], 0.001), "rows")
     assert text.startswith("  both suspicious rows are of a1, as are 20 of all 60 rows\n")

@@ -451,7 +451,7 @@ def test_pairs_formed_of_one_table_are_mixed_with_poses_of_another():
     assert np.array_equal(at, alone[0].start)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("loss", "encoder"), diagonal(["cauchy", "gnc"], ["propagated", "estimated"]))
 def test_a_loss_weighs_more_pairs_than_positions_that_share_joint_noise(loss, encoder):
     """Lengths lose less than positions: no measurement may count for more than it is by that."""

@@ -208,7 +208,7 @@ def test_its_rows_are_in_its_unit_and_in_no_other(tmp_path):
         assert f"-> {size:.3g} deg" in repr(calibration)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", ["huber", "cauchy", "geman-mcclure", "gnc"])
 def test_robust_losses_leave_gross_errors_out(loss):
     robot, _, table = measured(4, gross=4)
@@ -456,6 +456,7 @@ def test_text_and_other_things_are_no_figures(change, said):
     assert str(found.value) == said
 
 
+@pytest.mark.slow
 def test_plain_least_squares_takes_it_too():
     robot, true, table = measured(5, n_test=10)
     found = compare(Job(None, robot, (table,), Options(), true))

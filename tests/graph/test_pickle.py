@@ -73,7 +73,7 @@ def through_pickle(thing):
     return pickle.loads(pickle.dumps(thing))
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "again"),
     [*((name, through_pickle) for name in CASES), ("touched points", copy.deepcopy)],

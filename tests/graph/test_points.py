@@ -179,7 +179,7 @@ def test_the_optimum_is_that_of_group_means():
     assert solution.parameters[chosen] == pytest.approx(robot.nominal[chosen] + tolerance * found.x, abs=1e-6)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("gauge", ["prior", "none"])
 def test_groups_are_all_their_pairs(gauge):
     robot, _, _, m = case(distances=())
@@ -212,7 +212,7 @@ def test_without_noise_the_information_is_that_of_all_pairs():
     assert grams[0] == pytest.approx(grams[1], abs=1e-8 * np.abs(grams[1]).max())
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("distances", [(), ((0, 1, 1e-4), (2, 3, 1e-4))])
 def test_what_moves_arm_and_points_as_one_body_stays_where_it_is(distances):
     robot, _, points, m = case(distances=distances, tolerance=None)
@@ -636,7 +636,7 @@ def test_groups_and_pairs_work_side_by_side():
     assert np.linalg.slogdet(both.covariance)[1] < np.linalg.slogdet(alone.covariance)[1]
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("gauge", ["keep", "none"])
 def test_other_gauges_predict_the_same(gauge):
     # Tool and arm of ordinary errors; the rows between touches alone are predicted, whatever holds the rest.
@@ -861,7 +861,7 @@ def test_a_job_without_the_noise_of_touches_is_one_line(fg_calib, tmp_path):
     assert ended.err.splitlines() == [f"error: {expected}"] or ended.err.splitlines() == [expected]
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "job",
     [

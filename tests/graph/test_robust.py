@@ -68,6 +68,7 @@ def test_clean_measurements_lose_five_percent(loss, residual_dim):
     assert effect(loss, residual_dim).chi2 == pytest.approx(np.mean((w[:, :, 0] * e**2)[kept]) / residual_dim, rel=0.02)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("loss", LOSSES)
 def test_weights_fall_with_the_residual_and_are_half_where_said(loss):
     c = tuning(loss, 2)
@@ -81,7 +82,7 @@ def test_weights_fall_with_the_residual_and_are_half_where_said(loss):
     assert around.tolist() == [1.0, 0.0] if loss == "gnc" else around == pytest.approx([0.5, 0.5], abs=0.01)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("loss", "model"), diagonal(SMOOTH, ["pose", "distance", "distance-rotation"]))
 def test_the_optimum_is_that_of_gtsams_robust_noise_on_factors_of_one_measurement(loss, model):
     rng = np.random.default_rng(3)
@@ -188,6 +189,7 @@ def test_sigmas_and_chi_square_hold_with_a_robust_loss(loss, share):
     assert chi2 / expected == pytest.approx(1.0, abs=0.2)
 
 
+@pytest.mark.slow
 def test_the_cost_is_that_before_any_weight():
     rng = np.random.default_rng(4)
     robot = small_arm(tolerance=TOLERANCE)
@@ -225,6 +227,7 @@ def test_gnc_starts_convex_and_ends_truncated():
     assert Weighting("gnc").update(np.array([0.5, 1.0]), np.array([1, 1]))[1]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("loss", LOSSES)
 def test_a_measurement_that_takes_no_part_keeps_its_weight(loss):
     weights, _ = Weighting(loss).update(np.array([0.1, 50.0, 0.0, np.nan]), np.array([2, 2, 0, 0]))
@@ -232,7 +235,7 @@ def test_a_measurement_that_takes_no_part_keeps_its_weight(loss):
     assert 0.0 <= weights[1] < weights[0] <= 1.0
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", LOSSES)
 def test_weights_settle_where_rows_are_excluded(loss):
     """Pairs at a kink take no part; the others' weights are those of the residuals at the estimate all the same."""

@@ -190,7 +190,7 @@ def eliminated(monkeypatch):
     return by
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "way", "as_stated"), diagonal(GRAPHS, ["dense", "steps"], [True, False]))
 def test_rows_are_whitened_by_the_dense_covariance_of_all_errors(eliminated, kind, way, as_stated):
     """That of `dense`, which knows plain formulas of rows alone, to 1e-9."""
@@ -233,7 +233,7 @@ def two_tables(kind, robot, rng, *, named=True):
 TABLES = ["pairs", "chain", "touches"]
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("kind", "way", "as_stated"), diagonal(TABLES, ["dense", "steps"], [True, False]))
 def test_tables_share_the_joint_errors_of_configurations_of_one_name(eliminated, kind, way, as_stated):
     """Poses and what another table has of the same configurations: one covariance of all their rows."""
@@ -260,7 +260,7 @@ def test_tables_whose_names_are_made_up_share_nothing():
 ENCODERS = ["star joint", "mixed direct joint", "poses", "two tables"]
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "way", "as_stated"), diagonal(ENCODERS, ["dense", "steps"], [True, False]))
 def test_estimated_joint_values_are_those_that_the_dense_covariance_says(eliminated, kind, way, as_stated):
     """About joint values already taken the rows are still those of the readings, and say the same to first order."""
@@ -308,7 +308,7 @@ def test_what_rows_have_to_themselves_for_safety_is_no_degree_of_freedom():
     assert problem.n_independent == pytest.approx(6 * 12 - 12, abs=1)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["chain", "random joint"])
 def test_a_calibration_in_steps_is_the_dense_one(kind, monkeypatch):
     """Estimates, sigmas and goodness of fit: what steps leave out of the rows is less than 1e-9 of what they say."""
@@ -335,6 +335,7 @@ def test_a_calibration_in_steps_is_the_dense_one(kind, monkeypatch):
     assert abs(steps.problem.n_independent - dense.problem.n_independent) <= bound
 
 
+@pytest.mark.slow
 def test_rows_asked_to_count_as_independent_are_accounted_for_in_the_actual_covariance():
     """Weighted as independent, the covariance is (J^T J)^-1 J^T C J (J^T J)^-1 of the dense covariance."""
     rng = np.random.default_rng(5)

@@ -80,6 +80,7 @@ def test_tool_alone_is_found(T):
     assert found.translation == pytest.approx(T.translation, abs=rounding(1, 100))
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("X", FAR)
 @pytest.mark.parametrize("T", FAR)
 def test_rotations_about_one_axis_only_still_give_a_start_that_explains_the_poses(X, T):

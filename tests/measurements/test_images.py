@@ -32,7 +32,7 @@ def tilted(cosine, rng):
     return R, place
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("distortion", [{}, {"k1": -0.25, "k2": 0.08, "p1": 1e-3, "p2": -5e-4}])
 def test_a_board_from_its_image(distortion):
     """Nearer than 2 mm and 5 mrad at a metre with 0.1 pixel, and exact without noise."""
@@ -73,6 +73,7 @@ def test_a_small_board_is_seen_tilted_either_way():
     assert first < 1e-12 < second < 12 * 0.1**2  # told apart by less than a tenth of a pixel a corner
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("n_off", [1, 3])
 def test_corners_that_are_far_off_do_not_move_a_board(n_off):
     """30 pixels, of 12 corners at 0.1 pixel: where the others alone have it."""

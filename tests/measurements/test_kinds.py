@@ -83,7 +83,7 @@ def chain_of(robot):
     return build_chain(robot, {i: i for i in range(len(robot.parameters))}).with_joint_columns()
 
 
-@pytest.mark.sampled(6)
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize(("kind", "convention"), diagonal(KINDS, CONVENTIONS, every=3))
 def test_derivatives_are_those_of_central_differences(kind, convention):
     """In every parameter, in the joints of each end and in the nuisances, sliding joints among them."""
@@ -131,7 +131,7 @@ def test_compiled_twins_compute_what_numpy_does(kind, convention):
         assert np.abs(found - expected).max() <= 1e-13 * np.abs(expected).max()
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(2)
 @EVERY_KIND
 def test_the_reductions_are_those_of_the_rows(kind):
     rng = np.random.default_rng(20)

@@ -24,7 +24,7 @@ def of_angle(f, along, across, own=0.0):
     return found.excess[0], found.slope[0], found.variance[0]
 
 
-@pytest.mark.sampled(13)
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e3])
 @pytest.mark.parametrize("f", LENGTHS)
 def test_errors_alike_in_all_directions_give_the_noncentral_chi_distribution(f, scale):
@@ -44,7 +44,7 @@ def mean_of_root(of_square, f):
 SPREADS = [(1.0, 0.3, 0.0), (0.2, 1.0, 0.0), (0.05, 1.0, 0.0), (0.0, 0.0, 1.0)]
 
 
-@pytest.mark.sampled(5)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(("f", "spread"), diagonal([0.0, 0.5, 1.0, 3.0, 8.0, 9.0, 30.0], SPREADS, every=2))
 def test_moments_are_those_of_drawn_lengths(f, spread):
     s, t, own = spread
@@ -77,7 +77,7 @@ def small_turns(sigma, n):
 KINKS = [0.0, 0.5, 1.0, 2.0, 5.0, 20.0]
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("from_kink", "pi", "sigma"), diagonal(KINKS, [False, True], [1e-4, 0.02]))
 def test_moments_are_those_of_drawn_rotations(from_kink, pi, sigma):
     n = 100_000

@@ -61,7 +61,7 @@ def pair_formula(robot, measured):
     return formula
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_distance_and_angle_and_their_derivatives(convention):
     rng = np.random.default_rng(11)
@@ -86,6 +86,7 @@ def test_distance_and_angle_and_their_derivatives(convention):
                 assert J[0] == pytest.approx((W @ differences)[rows], abs=2e-7)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_same_point_residual_and_its_derivatives(convention):
     rng = np.random.default_rng(12)
@@ -117,7 +118,7 @@ def test_same_point_residual_and_its_derivatives(convention):
 POSES = [(True, True), (True, False), (False, True)]
 
 
-@pytest.mark.sampled(5)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(("convention", "kinds", "size"), diagonal(CONVENTIONS, POSES, [1e-7, 0.5, 2.9]))
 def test_orientation_and_position_and_their_derivatives(convention, kinds, size):
     rng = np.random.default_rng(13)
@@ -181,7 +182,7 @@ def random_block(kind, n, rng):
     return block, chain_of(robot)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("kind", "n"), diagonal(["pairs", "points", "poses"], [1, LANES + 1, 700, 2 * SPAN + 5], every=2)
 )

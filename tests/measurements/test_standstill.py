@@ -30,6 +30,7 @@ def motion():
     return record(1)
 
 
+@pytest.mark.slow
 def test_every_stop_gives_a_row_of_its_configuration(motion):
     stops = averaged(motion)
     assert stops.ids == tuple(f"stop{k + 1}" for k in range(12))
@@ -40,6 +41,7 @@ def test_every_stop_gives_a_row_of_its_configuration(motion):
     assert nees(stops, motion) == pytest.approx([1.0, 1.0], abs=5.0 * np.sqrt(2.0 / 36.0))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("offset", [0.137, -2.5, 1.6e9])
 def test_the_offset_of_the_clocks_is_found_within_its_sigma(offset):
     """Also of a clock that counts from another day: 1e9 s are known to 2e-7 s."""
@@ -52,12 +54,14 @@ def test_the_offset_of_the_clocks_is_found_within_its_sigma(offset):
     assert found.correlation > 0.98
 
 
+@pytest.mark.slow
 def test_the_offset_needs_no_place_of_the_target_on_the_tool():
     motion = record(3, tool=(0.15, -0.1, 0.05))
     found = averaged(motion).offset
     assert abs(found.seconds - 0.137) < 5.0 * found.sigma < 5e-3
 
 
+@pytest.mark.slow
 def test_the_offset_of_positions_alone():
     joints, poses = record(4, sigma_position=5e-4).streams()
     stops = average_stops(joints, PoseStream(poses.time, poses.position, None, poses.source), arm(1e-3))
@@ -65,12 +69,14 @@ def test_the_offset_of_positions_alone():
     assert abs(stops.offset.seconds - 0.137) < 5.0 * stops.offset.sigma
 
 
+@pytest.mark.slow
 def test_a_stated_offset_is_used_and_compared(motion):
     stops = averaged(motion, offset=0.13)
     assert stops.applied == 0.13
     assert abs(stops.offset.seconds - 0.137) < 5.0 * stops.offset.sigma
 
 
+@pytest.mark.slow
 def test_a_large_offset_is_refused_where_that_is_asked(motion):
     with pytest.raises(InputError, match=r"topic /pose: an offset of 0\.137 \+- .* s .*, expected at most 0\.1 s"):
         averaged(motion, most_offset=0.1)
@@ -104,6 +110,7 @@ def test_poses_of_something_else_are_refused():
         average_stops(joints, poses, arm())
 
 
+@pytest.mark.slow
 def test_short_pauses_are_skipped_and_told():
     rest = np.full(12, 1.5)
     rest[4] = 0.7
@@ -115,6 +122,7 @@ def test_short_pauses_are_skipped_and_told():
     assert len(averaged(motion, still=0.6).ids) == 12
 
 
+@pytest.mark.slow
 def test_stops_without_poses_are_skipped():
     motion = record(9)
     joints, poses = motion.streams()
@@ -125,6 +133,7 @@ def test_stops_without_poses_are_skipped():
     assert [(s.id, s.reason) for s in stops.skipped] == [("stop4", "0 poses, fewer than 8")]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -166,6 +175,7 @@ def test_sigma_of_white_noise_is_that_of_students_t():
     assert sigmas_of_means([x], 1.0)[0] == pytest.approx(np.sqrt(s2 / 20 * 19 / 17), rel=1e-12)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("phi", [0.0, 0.5, 0.8])
 def test_correlation_time_is_that_of_the_noise(phi):
     """Of AR(1) it is (1 + phi) / (1 - phi)."""
@@ -201,6 +211,7 @@ def test_the_sigma_of_the_offset_is_that_of_its_errors():
     assert np.mean(z**2) == pytest.approx(expected, abs=4.0 * np.sqrt(2.0 / 40) * expected)
 
 
+@pytest.mark.slow
 def test_sigmas_of_orientations_are_about_the_tools_axes_and_of_positions_along_the_worlds():
     joints, poses = record(12, sigma_position=1e-9, sigma_orientation=1e-9).streams()
     generator = np.random.default_rng(0)
@@ -228,6 +239,7 @@ def test_slow_noise_is_seen_beneath_white_noise(seconds, most):
     assert np.mean(found) > 0.2
 
 
+@pytest.mark.slow
 def test_white_noise_alone_is_not_called_slow():
     generator = np.random.default_rng(4)
     for n in (12, 70, 500):

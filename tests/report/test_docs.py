@@ -331,7 +331,7 @@ def test_every_snippet_of_every_page_runs():
 EVERY_SNIPPET = [(page, n, how) for page, hows in HOW.items() for n, how in enumerate(hows)]
 
 
-@pytest.mark.sampled(8)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("page", "n", "run"),
     [pytest.param(page, n, *getattr(how, "values", [how]), marks=getattr(how, "marks", ()), id=f"{page}-{n}")
@@ -432,7 +432,7 @@ def test_lines_fit_a_terminal_of_100_columns(page):
     assert [line for line in PAGES[page].read_text().splitlines() if len(line) > 100 and line[0] != "|"] == []
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("page", [page for page in TOPICS if page not in GENERATED])
 def test_help_shows_the_page_of_a_topic(page, fg_calib, monkeypatch):
     """Also where the package is installed without its checkout: its own copy is then what is tested here."""

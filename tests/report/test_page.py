@@ -231,6 +231,7 @@ def test_columns_at_the_ends_hold_what_is_beyond():
     assert not [box for box in _histogram(np.zeros(9), "position").iter("rect") if box.get("class") == "beyond"]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("n", "few"), [(9, True), (60, False)])
 def test_correlations_of_few_rows_are_told_to_be_that(tmp_path, n, few):
     rng = np.random.default_rng(0)
@@ -241,7 +242,7 @@ def test_correlations_of_few_rows_are_told_to_be_that(tmp_path, n, few):
     assert "farther apart" in words or not few
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("instrument", ["anchors", "planes", "board", "targets", "pixels"])
 def test_every_instrument_has_a_page(tmp_path, instrument):
     robot, _, table = measured_by(instrument, np.random.default_rng(1), n=30)
@@ -273,6 +274,7 @@ def test_a_result_without_its_tables_has_a_page_that_says_so(folder, tmp_path):
     assert words.count("The folder holds no residuals.csv") == 1
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("file", "change", "message"),
     [
@@ -297,6 +299,7 @@ def test_damaged_tables_are_one_line(folder, tmp_path, fg_calib, file, change, m
     assert not (tmp_path / "result" / "report.html").exists()
 
 
+@pytest.mark.slow
 def test_another_page_of_that_name_is_not_replaced(folder, tmp_path, fg_calib):
     (tmp_path / "report.html").write_text("mine")
     ended = fg_calib("report", folder, "--out", tmp_path)
@@ -328,6 +331,7 @@ def test_two_results_are_shown_side_by_side(tmp_path, fg_calib):
     assert f"{by_name['theta2']['in_sigma']:+.1f}" in shown.out
 
 
+@pytest.mark.slow
 def test_results_of_different_robots_are_not_compared(folder, tmp_path, fg_calib):
     rng = np.random.default_rng(0)
     other = Robot.from_dh([[0.5, 0.3, 0.1, 0.0], [0.4, 1.3, 0.0, 0.0]], convention="mdh")

@@ -34,6 +34,7 @@ def hits(found):
     return sum(found.stats.cache_hits.values())
 
 
+@pytest.mark.slow
 def test_a_kernel_is_compiled_once(tmp_path):
     first = kernel(tmp_path)
     assert (first(1.5), hits(first)) == (3.0, 0)
@@ -41,7 +42,7 @@ def test_a_kernel_is_compiled_once(tmp_path):
     assert (again(1.5), hits(again)) == (3.0, 1)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
 @pytest.mark.parametrize(
     "damage", [lambda c: b"", lambda c: c[: len(c) // 2], lambda c: c[:-40] + bytes(40), lambda c: b"x" * len(c)]

@@ -68,7 +68,7 @@ def test_a_urdf_joint_moves_about_its_own_axis(prismatic):
         assert tool_pose(builder.build(), np.array([0.7])) == pytest.approx(frame(**origin) @ motion, abs=rounding(1.0))
 
 
-@pytest.mark.sampled(6)
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize(("convention", "n"), diagonal([*CONVENTIONS, "urdf"], [1, 2, 3, 6, 7, 12], every=3))
 def test_derivatives_equal_central_differences(convention, n):
     rng = np.random.default_rng(100 + n)
@@ -204,7 +204,7 @@ def pose_with_coefficients(robot, values, q, given):
     return T
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("convention", [*CONVENTIONS, "urdf"])
 def test_coefficients_times_functions_of_readings(convention):
     rng = np.random.default_rng(7)

@@ -14,6 +14,7 @@ from fg_calib.robot.reaching import misses, reach
 NEAR = np.array([0.3, -0.4, 0.1, 0.5])
 
 
+@pytest.mark.slow
 def test_a_pose_out_of_reach_is_reached_at_its_point_with_the_tool_turned_least():
     """Four joints, one to spare at a point: scipy finds no smaller turn on a curve of configurations there."""
     robot, rng = small_arm(), np.random.default_rng(3)
@@ -32,6 +33,7 @@ def test_a_pose_out_of_reach_is_reached_at_its_point_with_the_tool_turned_least(
     assert found.miss_rotation[0] <= best.fun + 1e-7  # SLSQP's own accuracy, by finite differences
 
 
+@pytest.mark.slow
 def test_what_can_be_reached_is_reached_and_what_cannot_is_missed_by_what_is_said():
     robot = small_arm()
     T = tool_pose(robot, NEAR)
@@ -51,6 +53,7 @@ def wrist():
     return Robot.from_dh(rows, convention="dh", tool=[0.03, -0.02, 0.1], limits=[(-most, most)] * 6)
 
 
+@pytest.mark.slow
 def test_beside_a_singularity_the_nearest_way_to_a_pose_is_taken():
     """The wrist nearly straight: steps from where the arm is to stay ended 1.35 rad away, scipy finds 0.32 rad."""
     robot, rng = wrist(), np.random.default_rng(1)

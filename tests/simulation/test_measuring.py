@@ -121,6 +121,7 @@ def test_a_camera_on_the_tool_sees_boards_before_it():
     assert 5 < len(T) < 40  # the others are behind
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("which", ["pixels", "camera in the room"])
 def test_corners_are_seen_where_a_pinhole_has_them_and_nowhere_else(which):
     s, T = exact(which)
@@ -202,7 +203,7 @@ def test_every_instrument_calibrates_as_it_is_simulated(which):
     assert chi2.cdf(error @ np.linalg.solve(found.covariance, error), len(rows)) < 0.999
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @EVERY
 def test_the_files_say_what_the_tables_do(which, tmp_path):
     s = simulate(scenario(INSTRUMENTS[which], n=300 if which == "pixels" else 12, length_unit="mm", angle_unit="deg",

@@ -120,7 +120,7 @@ def test_written_poses_follow_from_the_written_true_robot(simulation, tmp_path):
 # --- noise ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_noise_has_its_sigma_along_every_axis(shipped, seed):
     n = 1500
@@ -471,7 +471,7 @@ def test_json_is_all_there_is_on_stdout(fg_calib, tmp_path):
 MODELS = ["pose", "position", "orientation", "distance", "rotation"]
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "frame"), diagonal(MODELS, ["unknown", "base"]))
 def test_every_model_runs_as_it_is_written(fg_calib, tmp_path, model, frame):
     """Stated noise is true noise, so the fit is good: 0, and never the 3 of a doubtful one."""
