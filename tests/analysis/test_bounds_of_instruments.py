@@ -74,7 +74,7 @@ WAYS = {
 
 
 @pytest.mark.parametrize("way", WAYS)
-@pytest.mark.slow
+@pytest.mark.long
 def test_realised_errors_are_those_of_the_bound(way):
     """Root of the mean of e^T C^-1 e over its expectation, within 3.3 sigma; 120 draws of each kept within 5 %."""
     base = scenario(*WAYS[way], n=60 if way in ("a board", "pixels") else 30)

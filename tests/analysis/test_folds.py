@@ -73,7 +73,7 @@ def test_what_few_configurations_know_of_is_spread_over_the_folds(instrument):
     assert all(held.after < 3.0 * held.noise for held in found.kinds.values())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_who_alone_knows_of_a_station_is_never_held_out():
     robot, _, table = measured_by("targets stations", np.random.default_rng(0), n=20)
     m = table.measurements
@@ -111,7 +111,7 @@ def test_the_hub_of_measured_pairs_is_never_held_out():
     assert found.of_pairs
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_spread_is_sigma_where_measurements_determine_a_parameter():
     """The mean square of spread / sigma: each is chi-square of 4 degrees of freedom over 4, parameters are correlated.
 

@@ -184,7 +184,7 @@ def test_a_configuration_wrong_by_50_sigma_is_the_first_suspect(name, wrong):
     assert re.search(rf"Suspicious rows\n(  pose {wrong} is in .*\n)?.*\n(\d+ +)?{wrong} ", text)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("without_reasons")
 def test_clean_tables_seldom_have_a_suspect():
     """1 % of tables have a suspect row, as many a suspect configuration: more than 4 of 60 are unlikely (0.1 %)."""

@@ -47,7 +47,7 @@ def test_sigmas_of_corrections_are_those_of_the_whole_graph(instrument):
     assert variance.max() > 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("instrument", ["targets nearly", "anchors nearly"])
 def test_corrections_of_healthy_places_are_as_large_as_they_should_be(instrument):
     """Sums of squares over their mean, and p-values, of 60 draws; none beyond its tolerance but 1 (0.7 %)."""

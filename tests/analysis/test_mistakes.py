@@ -191,7 +191,7 @@ TWO = [
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("two", [as_case((two,), is_slow=i in (0, 2)) for i, two in enumerate(TWO)], ids=" and ".join)
 def test_two_mistakes_at_once_are_named(tmp_path, two):
     robot = ur5e(tmp_path)

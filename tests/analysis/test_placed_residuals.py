@@ -58,7 +58,7 @@ CASES = [
 ]  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("instrument", "mistake", "spoil"), CASES, ids=[f"{case[0]}: {case[1][:20]}" for case in CASES]
 )
@@ -141,7 +141,7 @@ def test_what_could_not_be_checked_is_said(monkeypatch):
     assert not any("was not checked" in said for said in good.cautions)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_calibration_in_one_call_checks_too():
     robot, _, table = measured_by("pixels", np.random.default_rng(7), n=20)
     m = replace(table.measurements, image=table.measurements.image[:, [1, 0, 2, 3]])

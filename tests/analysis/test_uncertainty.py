@@ -125,7 +125,7 @@ def test_a_tool_turned_by_a_quarter_has_no_sigma_for_roll_and_yaw():
     assert all(sigma[f"tool.{k}"] is None or sigma[f"tool.{k}"] > 1e-9 for k in ("roll", "yaw"))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_monte_carlo_agrees_with_the_stated_covariance():
     """NEES and chi-square over repeated calibrations of one arm, joint noise included."""
     rng = np.random.default_rng(4)
@@ -283,7 +283,7 @@ def test_a_sum_is_known_although_its_terms_are_not():
     ).all()  # the base is not known
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_predicted_sigmas_cover_the_truth():
     rng = np.random.default_rng(12)
     robot = small_arm(tolerance={"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3})

@@ -335,7 +335,7 @@ CELLS = {  # how much own and joint noise is stated, as a multiple of what there
 }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", CELLS)
 def test_sigmas_are_honest_with_estimated_noise(name):
     """NEES within 99.9 % of its draws, and 6 % for what is not known of the noise; factors within 4 of their sigmas."""

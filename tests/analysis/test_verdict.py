@@ -486,7 +486,7 @@ def test_without_estimated_joint_values_there_is_no_table_of_them(fg_calib, tmp_
 # --- expected error of the tool -------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("without_reasons")
 @pytest.mark.parametrize(
     ("model", "frame"), [("pose", "known"), ("position", "unknown"), ("distance-rotation", "known")]
@@ -559,7 +559,7 @@ def test_many_configurations_are_looked_at_in_part():
     assert (said.n, said.of) == (1000, 1500)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_noise_estimated_as_large_as_the_motions_is_no_noise(fg_calib, example):
     """Orientations that were never measured, all 0 0 0 1, made 80 degrees of noise and GOOD."""
     file = example / "calibration.yaml"

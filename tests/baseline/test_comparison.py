@@ -133,7 +133,7 @@ def test_a_prediction_is_the_trace_of_the_propagated_covariance(simulated_job):
     assert weighted.predicted_rms == pytest.approx(np.sqrt(total / len(readings)), rel=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_predicted_errors_come_true(tmp_path):
     """RMS over 30 simulated calibrations with known noise, poses in the base frame: within a fifth."""
     rng = np.random.default_rng(8)

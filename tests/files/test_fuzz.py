@@ -70,7 +70,7 @@ def test_some_damaged_files_end_in_errors_of_the_package_alone(files, what):
     damage_and_read(files, what, 8)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("what", SHARES)
 def test_damaged_files_end_in_errors_of_the_package_alone(files, what):
     damage_and_read(files, what, round(CASES * SHARES[what]))

@@ -186,7 +186,7 @@ def test_correlation_time_is_that_of_the_noise(phi):
     assert not is_slow(expected, 100)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("settings", "least"),
     [({}, 0.85), ({"pose_rate": 20.0}, 0.8), ({"phi": 0.8}, 0.7), ({"phi": 0.9}, 0.5), ({"phi": 0.97}, 0.45)],
