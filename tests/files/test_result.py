@@ -94,10 +94,20 @@ def test_the_schema_finds_what_is_missing(calibrations, tmp_path):
         jsonschema.validate({k: v for k, v in document.items() if k != "chi2"}, result_schema())
 
 
+def without_defaults(schema):
+    """A schema without what holds unsaid too: later pydantics write it of any mapping."""
+    if isinstance(schema, list):
+        return [without_defaults(item) for item in schema]
+    if not isinstance(schema, dict):
+        return schema
+    said = {key: value for key, value in schema.items() if (key, value) != ("additionalProperties", True)}
+    return {key: without_defaults(value) for key, value in said.items()}
+
+
 def test_the_schema_that_is_shipped_is_the_models():
     """To write it anew: `json.dumps(result_schema(), indent=1)`."""
     file = Path(fg_calib.files.result.__file__).with_name("result.schema.json")
-    assert json.loads(file.read_text()) == result_schema()
+    assert without_defaults(json.loads(file.read_text())) == without_defaults(result_schema())
 
 
 def test_version_1_is_readable_with_no_more_than_it_promised(folder):
