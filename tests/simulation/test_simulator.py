@@ -29,7 +29,8 @@ from fg_calib.measurements.dataset import Noise
 from fg_calib.simulation.configurations import BoardViews, GivenReadings, Placement, RandomReadings
 from fg_calib.simulation.measuring import FARTHEST_BASE
 from fg_calib.simulation.scenario import Errors, Scenario
-from fg_calib.simulation.simulator import simulate, view_board
+from fg_calib.simulation.simulator import simulate
+from fg_calib.simulation.views import view_board
 
 FILES = ("calibration.yaml", "poses.csv", "robot_nominal.yaml", "robot_true.yaml")
 BOARD = np.array([0.0, 6.5, 2.55])
