@@ -49,12 +49,13 @@ others alone."""
 
 @checked
 @single_threaded
-def simulate(scenario: Scenario, seed: int = 0) -> Simulation:
+def simulate(scenario: Scenario, seed: int = 0, *, leave_out: bool = False) -> Simulation:
     """Run a scenario.
 
     Args:
         scenario: What to simulate.
         seed: Same seed, same simulation.
+        leave_out: Whether stops are left out from which a point to touch is not reached, instead of an error.
 
     Raises:
         InputError: The scenario cannot be: poses that the robot does not reach within its joint limits, names that
@@ -67,7 +68,7 @@ def simulate(scenario: Scenario, seed: int = 0) -> Simulation:
     true_robot = _true_robot(scenario.robot, scenario.errors, draw["errors"], f"{scenario.source}: errors")
     frame = _frame(scenario, draw["frame"])
     if scenario.instruments:
-        return _by_instruments(scenario, seed, true_robot, frame, draw, children[n:])
+        return _by_instruments(scenario, seed, true_robot, frame, draw, children[n:], leave_out)
     return _poses(scenario, seed, true_robot, frame, draw)
 
 
@@ -123,6 +124,7 @@ def _by_instruments(
     frame: Placement,
     draw: Mapping[str, np.random.Generator],
     own: Sequence[np.random.Generator],
+    leave_out: bool,
 ) -> Simulation:
     """What each instrument measures, where it goes itself or where all go."""
     common: list[Stops] = []
@@ -152,6 +154,7 @@ def _by_instruments(
             places=places,
             draws=noise_draws,
             source=scenario.source,
+            leave_out=leave_out,
         )
         table, truth = measure(instrument, scene)
         tables.append(table)

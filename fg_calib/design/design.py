@@ -1,0 +1,329 @@
+"""Which configurations to measure, in which order, and what is to be expected of how many.
+
+    plan = design(read_scenario("scenario.yaml"), n=30)
+    plan.readings, plan.expected.position, plan.curve
+
+The criterion is worked out for all candidates at once (see `criteria`); what is reported of a design is worked out anew
+from the rows of its stops alone, by the very code that assesses a calibration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.analysis.accuracy import PoseRms
+from fg_calib.arguments import checked
+from fg_calib.arrays import FrozenArrays
+from fg_calib.design.candidates import Box, Candidates
+from fg_calib.design.criteria import Criterion, Measure
+from fg_calib.design.cures import Cure, cures_of
+from fg_calib.design.of_job import pool_of_more, pool_of_rows, solved
+from fg_calib.design.order import shortest_way, travel
+from fg_calib.design.pool import Pool, pool_of
+from fg_calib.design.search import Chosen, exchanged, greedy, not_worse_than_random, random_values
+from fg_calib.design.system import System, system_of
+from fg_calib.design.task import N_TASK, Task, is_fitted
+from fg_calib.errors import InputError
+from fg_calib.graph.observability import Observability
+from fg_calib.job import Job
+from fg_calib.options import check, check_flag, check_number
+from fg_calib.progress import tell
+from fg_calib.robot.inverse import random_readings
+from fg_calib.simulation.configurations import Configurations
+from fg_calib.simulation.scenario import Scenario
+from fg_calib.threads import single_threaded
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+N_STOPS = 30
+"""Stops of a design where nobody says how many, or how good it has to be."""
+
+N_CANDIDATES = 2000
+"""Candidates that are drawn where nobody says how many."""
+
+MOST_STOPS = 500
+"""Stops up to which a design is sought that reaches a target."""
+
+N_CURVE = 10
+"""Numbers of stops at which the curve is worked out, about."""
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """What is to be expected of a number of stops.
+
+    Attributes:
+        n: How many.
+        designed: RMS error over the task with as many designed ones, [m].
+        random: The same of random ones: a tenth of them is better than the first, half than the second, a tenth worse
+            than the third, [m].
+    """
+
+    n: int
+    designed: float
+    random: tuple[float, float, float]
+
+
+@dataclass(frozen=True, repr=False)
+class Design(FrozenArrays):
+    """Which configurations to measure.
+
+    Attributes:
+        pool: What was chosen from.
+        criterion: By which criterion.
+        task: What the calibration is for.
+        stops: The stops, numbers in the pool, in the order in which to visit them, shape (n,).
+        expected: Expected errors of the tool over the task, with these and what was given.
+        before: The same with what was given alone; None where nothing was.
+        random: Median of the expected position errors of as many random stops, [m].
+        curve: What is to be expected of how many.
+        target: What was to be reached, [m]; None where a number was stated.
+        reached: Whether it is.
+        observability: What the rows determine of the arm.
+        cures: Directions that stay undetermined, with the measurements that would determine them.
+        unknown: Share of the task that no candidate determines.
+        travel: Joint travel along the stops, [rad].
+        travel_before: The same in the order in which they were chosen.
+    """
+
+    pool: Pool
+    criterion: Criterion
+    task: Task
+    stops: Integers
+    expected: PoseRms
+    before: PoseRms | None
+    random: float
+    curve: tuple[CurvePoint, ...]
+    target: float | None
+    reached: bool
+    observability: Observability
+    cures: tuple[Cure, ...]
+    unknown: float
+    travel: float
+    travel_before: float
+
+    @property
+    def n(self) -> int:
+        """Number of stops."""
+        return len(self.stops)
+
+    @property
+    def readings(self) -> Floats:
+        """The configurations in their order, shape (n, n_joints), [rad] (prismatic: [m])."""
+        return self.pool.readings[self.stops]
+
+    @property
+    def found(self) -> Mapping[str, Candidates]:
+        """How the candidates came about, by the instrument whose own they are."""
+        return self.pool.found
+
+    def __repr__(self) -> str:
+        p = self.expected.position
+        error = "unknown" if p is None else f"{p * 1e3:.3g} mm"
+        return f"Design of {self.n} stops for {self.pool.robot.name!r}: expected RMS {error}, {self.criterion}"
+
+
+@checked
+@single_threaded
+def design(
+    of: Scenario | Job,
+    *,
+    n: int | None = None,
+    target: float | None = None,
+    criterion: Criterion = "I",
+    n_candidates: int = N_CANDIDATES,
+    candidates: Configurations | Literal["rows"] | None = None,
+    given: Floats | None = None,
+    task: Floats | None = None,
+    fitted: bool | None = None,
+    lever: float = 0.0,
+    keep_out: Sequence[Box] = (),
+    apart: float | None = None,
+    seed: int = 0,
+) -> Design:
+    """Choose the configurations to measure.
+
+    Args:
+        of: A scenario: the arm with its tolerances, the instruments with their noise, and where they may measure. Or a
+            job: what was measured counts already, and more is to be measured by the same instruments.
+        n: How many stops; as many as reach the target if None.
+        target: Expected RMS position error over the task that is to be reached, [m].
+        criterion: What is made small: `I` the mean square error over the task, or D, A, E, O1 to O5.
+        n_candidates: How many configurations are drawn to choose from; of a table all are taken.
+        candidates: Where to measure instead: configurations, or with a job `"rows"`, to choose among its train rows.
+        given: With a scenario: readings of stops that were measured already, or will be anyway, shape (n, n_joints).
+        task: Configurations at which the tool is to be right, shape (n, n_joints); random ones within the joint limits
+            if None.
+        fitted: Whether errors count after the best rigid fit, or in the base frame; the former if None where nothing
+            that is measured says where the base is.
+        lever: Length with which orientations count too, [m].
+        keep_out: Boxes that the arm must not reach into.
+        apart: How far candidates are apart at least, see `candidates`.
+        seed: Of all that is drawn.
+
+    Raises:
+        InputError: A figure makes no sense, or nothing can be measured from anywhere.
+        ProblemError: What would be measured determines nothing.
+    """
+    check("criterion", criterion, Criterion)
+    if n is not None and target is not None:
+        raise InputError("target", "beside n", "one of the two")
+    if n is not None:
+        check_number("n", n, least=1, whole=True, most=MOST_STOPS)
+    if target is not None:
+        check_number("target", target, above=True)
+    check_number("n_candidates", n_candidates, least=2, whole=True)
+    check_number("lever", lever)
+    check_number("seed", seed, whole=True)
+    if fitted is not None:
+        check_flag("fitted", fitted)
+    draw = dict(zip(("candidates", "task", "random"), np.random.default_rng(seed).spawn(3), strict=True))
+    tell("looking for candidates")
+    conditions: dict[str, Any] = {"keep_out": tuple(keep_out), "apart": apart}
+    if isinstance(of, Job):
+        pool = _pool_of_job(of, n_candidates, draw["candidates"], candidates, given, conditions)
+    elif candidates == "rows":
+        raise InputError("candidates", "rows of a scenario, which has none", "a job, or configurations")
+    else:
+        scenario = of if candidates is None else replace(of, configurations=candidates)
+        pool = pool_of(scenario, n_candidates, draw["candidates"], given=given, **conditions)
+    there = random_readings(pool.robot, N_TASK, draw["task"]) if task is None else task
+    wanted = Task(there, is_fitted(pool.problem) if fitted is None else fitted, lever)
+    return design_from(pool, wanted, draw["random"], n=n, target=target, criterion=criterion)
+
+
+def _pool_of_job(
+    job: Job,
+    n_candidates: int,
+    generator: np.random.Generator,
+    candidates: Configurations | Literal["rows"] | None,
+    given: Floats | None,
+    conditions: Mapping[str, Any],
+) -> Pool:
+    """The pool of a job."""
+    if given is not None:
+        raise InputError("given", "with a job", "a scenario: what a job measured counts already")
+    source = "job" if job.path is None else job.path.name
+    problem = solved(job)
+    if isinstance(candidates, str):
+        return pool_of_rows(problem, source)
+    return pool_of_more(problem, n_candidates, generator, candidates, source, **conditions)
+
+
+def design_from(
+    pool: Pool,
+    task: Task,
+    generator: np.random.Generator,
+    *,
+    n: int | None = None,
+    target: float | None = None,
+    criterion: Criterion = "I",
+) -> Design:
+    """The design from a pool: see `design`.
+
+    Args:
+        pool: What to choose from.
+        task: What the calibration is for.
+        generator: Draws the random sets that a design is held to.
+        n: How many stops.
+        target: What is to be reached, [m].
+        criterion: What is made small.
+    """
+    system = system_of(pool.rows, pool.known, task.form(pool.problem)).with_known(pool.given)
+    able = np.setdiff1d(np.flatnonzero(np.any(pool.rows.rows, axis=(1, 2))), pool.given)
+    if not len(able):
+        raise InputError("candidates", "none at which anything is measured", "some")
+    chooser = _Chooser(system.select(able), criterion)
+    tell("choosing")
+    found = chooser.best(min(N_STOPS if n is None else n, len(able))) if target is None else chooser.reaching(target)
+    found = not_worse_than_random(chooser.measure, found, generator)
+    chosen = able[found.candidates]
+    tell("working out what to expect")
+    posterior = pool.posterior(np.concatenate([pool.given, chosen]))
+    expected = posterior.error(task)
+    curve = chooser.curve(found, generator)
+    way = shortest_way(pool.robot, pool.readings[chosen])
+    before = pool.posterior(pool.given) if len(pool.given) or pool.before is not None else None
+    return Design(
+        pool=pool,
+        criterion=criterion,
+        task=task,
+        stops=chosen[way],
+        expected=expected,
+        before=None if before is None else before.error(task),
+        random=curve[-1].random[1],
+        curve=curve,
+        target=target,
+        reached=target is None or (expected.position is not None and expected.position <= target * (1.0 + 1e-6)),
+        observability=posterior.observability,
+        cures=cures_of(posterior),
+        unknown=system.unknown,
+        travel=travel(pool.robot, pool.readings[chosen[way]]),
+        travel_before=travel(pool.robot, pool.readings[chosen]),
+    )
+
+
+class _Chooser:
+    """Chooses from a system; the error is always that over the task.
+
+    Args:
+        system: What is chosen from.
+        criterion: By which criterion.
+    """
+
+    def __init__(self, system: System, criterion: Criterion) -> None:
+        self.system, self.criterion = system, criterion
+        self.measure = Measure(criterion, system)
+        self._error = Measure("I", system)
+        self._order: Integers = np.zeros(0, dtype=np.int64)
+
+    def error(self, chosen: Integers) -> float:
+        """Expected RMS error with some candidates, [m]."""
+        return float(np.sqrt(self._error.value(self.system.information(chosen))))
+
+    def first(self, n: int) -> Integers:
+        """What greedy choice takes first."""
+        if len(self._order) < n:
+            self._order = greedy(self.measure, n, self._order)
+        return self._order[:n]
+
+    def best(self, n: int) -> Chosen:
+        """The best n."""
+        return exchanged(self.measure, self.first(n))
+
+    def reaching(self, target: float) -> Chosen:
+        """As few as reach a target, [m]; as many as may be where none do."""
+        most = min(MOST_STOPS, self.system.n_candidates)
+        enough = 1
+        while self.error(self.first(enough)) > target:
+            if enough == most:
+                return self.best(most) if most <= N_STOPS else Chosen(self.first(most), np.inf)
+            enough = min(most, enough + 1 if enough < N_STOPS else enough + 5)
+        low, found = 0, self.best(enough)
+        high = enough
+        while high - low > 1:
+            middle = max(low + 1, high - max(1, (high - low) // 4))
+            better = self.best(middle)
+            if self.error(better.candidates) <= target:
+                high, found = middle, better
+            else:
+                low = middle
+        return found
+
+    def curve(self, found: Chosen, generator: np.random.Generator) -> tuple[CurvePoint, ...]:
+        """What to expect of fewer stops, and of as many."""
+        most = len(found.candidates)
+        numbers = np.unique(np.round(np.geomspace(max(1, most // 10), most, N_CURVE)).astype(np.int64))
+        points = []
+        for k in numbers.tolist():
+            chosen = found.candidates if k == most else self.first(k)
+            values, _ = random_values(self._error, k, generator)
+            low, middle, high = np.sqrt(np.quantile(values, [0.1, 0.5, 0.9])).tolist()
+            points.append(CurvePoint(k, self.error(chosen), (low, middle, high)))
+        return tuple(points)
