@@ -7,7 +7,7 @@ are the eigenvalues of S:
 | name | smaller is better | |
 |---|---|---|
 | `I` | `tr(W C)` | mean square error of the tool over the task (Fedorov 1972) |
-| `D`, `O1` | `-log det S` | volume of the confidence ellipsoid; `O1 = (s_1 ... s_L)^(1/L) / sqrt(m)` (Borm and Menq 1991) |
+| `D`, `O1` | `-log det S` | volume of the ellipsoid; `O1 = (s_1 ... s_L)^(1/L) / sqrt(m)` (Borm and Menq 1991) |
 | `A` | `tr S^-1` | mean variance |
 | `E`, `O3` | `-s_L` | the worst direction (Nahvi et al. 1994) |
 | `O2` | `-s_L / s_1` | inverse condition number (Driels and Pathre 1990) |

@@ -20,7 +20,7 @@ MOST_IMPROVED = 400
 
 
 def travel(robot: Robot, readings: Floats) -> float:
-    """Length of the way along configurations, shape (n, n_joints): the largest joint motion of each step, summed, [rad].
+    """Length of the way along configurations, shape (n, n_joints): the largest joint motions of all steps, [rad].
 
     Motions of prismatic joints count as turns that move the arm's reach by as much.
     """

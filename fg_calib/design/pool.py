@@ -166,7 +166,8 @@ def known_rows_of(before: Problem | None, problem: Problem) -> Floats:
 def _place_of(problem: Problem, columns: Integers) -> Integers:
     """Where nuisance columns stand in the parameter vector."""
     v = problem.variables
-    return columns - v.n_columns + v.nuisance_span.start
+    place: Integers = columns - v.n_columns + v.nuisance_span.start
+    return place
 
 
 def _columns_by_name(variables: Variables, unknowns: Unknowns) -> dict[tuple[str, str], Integers]:
