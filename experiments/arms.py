@@ -85,6 +85,31 @@ def build_arms() -> dict[str, Arm]:
     }
 
 
+def random_arm(n_joints: int, rng: np.random.Generator) -> Robot:
+    """An arm of revolute joints whose axes are parallel or at right angles, links of up to half a metre.
+
+    No three axes in a row are parallel; a link has a length along its axis, across it, or both. All may be off by 1 mm
+    and 1 mrad (1 sigma) but the first, which is where the base is.
+    """
+    builder = RobotBuilder(f"{n_joints}R", "mdh-hayati")
+    turns = [0.0]
+    while len(turns) < n_joints:
+        turn = float(rng.choice([0.0, 0.5 * np.pi, -0.5 * np.pi]))
+        if turn or len(turns) < 2 or turns[-1]:
+            turns.append(turn)
+    for i, alpha in enumerate(turns):
+        kind = rng.integers(3)
+        a = 0.0 if i == 0 or kind == 0 else float(rng.uniform(0.1, 0.5))
+        d = 0.0 if kind == 1 else float(rng.uniform(0.1, 0.5))
+        limit = np.deg2rad(rng.uniform(90.0, 170.0))
+        values = {"alpha": alpha, "a": a, "d": d, "theta": 0.0, "beta": 0.0}
+        builder.add_convention_joint(Joint(f"q{i + 1}", lower=-limit, upper=limit), values)
+    builder.add_frame("tool", {"x": 0.05, "z": float(rng.uniform(0.1, 0.2))}, n_joints + 1, False)
+    tolerance = {"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3}
+    fixed = ("a1", "alpha1", "d1", "theta1", "beta1")
+    return builder.build(tolerance=tolerance, fixed=fixed)
+
+
 def random_rotations(n: int, sigma: float, rng: np.random.Generator) -> Floats:
     """Small random rotations of 1 `sigma` about each axis, [rad], shape (n, 3, 3)."""
     return Rotation.from_rotvec(sigma * rng.normal(size=(n, 3))).as_matrix()

@@ -1,0 +1,449 @@
+"""Is a designed set of measurements worth what the design says, and how much fewer stops does it take than random ones?
+
+Command: python experiments/18_design.py [--quick] [--seed N] [--draws N] [--out FOLDER] [--only PART ...]
+Takes about half an hour of one processor; parts of an earlier run stay where `--only` names others.
+
+- *paper*: the paper's arm, its noise and its tolerances, poses in an unknown frame and distances + angles of pairs:
+  what designs expect, for several seeds of the candidates, beside random sets of as many; how few designed stops equal
+  52 random ones; and 200 draws of true arm, frame and noise measured at the design and calibrated: realised over
+  predicted RMS of the tool's position at the task's configurations after the best rigid fit.
+- *arms*: 90 random arms of 5 to 7 joints, 20 of 500 configurations, positions in an unknown frame: the expected error
+  of designs by each criterion and of random sets, for a task anywhere and for one within a cell.
+- *search*: on the same arms, greedy choice and exchange against the best of 100 random sets, and against exhaustive
+  search on small pools, for every criterion.
+- *ur10*, *panda*: rows of real tables chosen by design against random draws of as many, by the error at rows that are
+  never fitted. The design sees the readings of rows, and the arm as all train rows have it.
+
+Data of the last two: folder FG_CALIB_DATA (default: ../shared/data beside the repository); skipped where it is missing.
+
+References:
+    Jost, Kaltenbach, Kirches et al. (2017), A computational method for key-performance-indicator-based parameter
+    identification of industrial manipulators. Journal of Mathematics in Industry 7:9. doi 10.1186/s13362-017-0039-7.
+    Franzese, Spahn, Kober, Della Santina (2025), MUKCa. arXiv:2503.12584: the Panda's data.
+    Landgraf, Ernst, Schleth, Fabritius, Huber (2021), IEEE CASE: the UR10's data.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from importlib.util import module_from_spec, spec_from_file_location
+from itertools import combinations
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from arms import random_arm
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from space_robot import MM, ROOT, clean, paper_scenario, write_json
+
+import fg_calib
+from fg_calib import Noise, Pairing, Robot, Scenario
+from fg_calib.design.criteria import Criterion, Measure
+from fg_calib.design.design import Design, design
+from fg_calib.design.pool import Pool, pool_of, selected
+from fg_calib.design.search import choose, not_worse_than_random, random_values
+from fg_calib.design.system import System, system_of
+from fg_calib.design.task import Task
+from fg_calib.robot.inverse import random_readings
+from fg_calib.simulation.configurations import GivenReadings, RandomReadings
+from fg_calib.simulation.scenario import Errors
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+NAME = "18_design"
+VIEWS: Mapping[str, dict[str, Any]] = {"camera 0.3-2 m": {"distance": (0.3, 2.0)}, "hemisphere": {}}
+N_VIEWS = 52
+"""Configurations of the paper: A and 51 others."""
+
+CRITERIA: tuple[Criterion, ...] = ("I", "D", "A", "E", "O1", "O2", "O3", "O4", "O5")
+OTHERS: tuple[Criterion, ...] = ("D", "A", "E", "O2", "O4", "O5")
+"""Those that differ from each other: O1 is D, and O3 is E."""
+
+N_STOPS, N_CANDIDATES, CELL = 20, 500, 0.25
+"""Of a random arm: stops, candidates, and the radius of the cell over the arm's reach."""
+
+N_ROWS = {"ur10": (20, 40, 80), "panda": (20, 40, 80, 120)}
+CHOSEN, RANDOM = "#0072B2", "#E69F00"
+
+
+def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
+    """Run the experiment; returns what is written as JSON."""
+    parts: dict[str, Callable[[argparse.Namespace], dict[str, Any]]]
+    parts = {"paper": paper, "arms": arms, "search": search, "ur10": ur10, "panda": panda}
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="few draws, arms and seeds")
+    parser.add_argument("--seed", type=int, default=0, help="of the first design, arm and draw")
+    parser.add_argument("--draws", type=int, help="instead of 200 of the paper's arm")
+    parser.add_argument("--only", nargs="+", choices=parts, default=list(parts), help="these parts")
+    parser.add_argument("--out", type=Path, default=ROOT / "experiments" / "results")
+    given = parser.parse_args(arguments)
+    given.draws = given.draws or (2 if given.quick else 200)
+    given.out.mkdir(parents=True, exist_ok=True)
+    file = given.out / f"{NAME}.json"
+    for part in given.only:
+        clock = time.process_time()
+        of_part = parts[part](given) | {"cpu_seconds": time.process_time() - clock, "quick": given.quick}
+        found = (json.loads(file.read_text()) if file.exists() else {}) | {part: of_part}
+        write_json(file, found)
+        print(f"{part}\n{json.dumps(json.loads(file.read_text())[part], indent=1)}", flush=True)
+    if "paper" in found and "arms" in found:
+        picture(found).savefig(file.with_suffix(".png"), dpi=120)
+    return found
+
+
+# ---- the paper's arm
+
+
+def paper(given: argparse.Namespace) -> dict[str, Any]:
+    """What designs expect of the paper's arm, and what comes of them."""
+    seeds = range(given.seed, given.seed + (1 if given.quick else 5))
+    found: dict[str, Any] = {"n_draws": given.draws, "seeds": list(seeds)}
+    for views, conditions in VIEWS.items():
+        poses = replace(paper_scenario("unknown", **conditions), job={"model": "pose"})
+        pairs = replace(poses, job={"model": "distance-rotation", "pairing": "star"})
+        by_poses = [design(poses, n=N_VIEWS, seed=seed) for seed in seeds]
+        by_star = [design(pairs, n=N_VIEWS - 1, seed=seed) for seed in seeds]
+        random = [
+            random_set(plan, np.random.default_rng([seed, 1])) for plan, seed in zip(by_poses, seeds, strict=True)
+        ]
+        found[views] = {
+            "pose": expectations(by_poses),
+            "distance + rotation, star": expectations(by_star),
+            "stops that equal 52 random ones": {
+                "pose": equal_stops(poses, by_poses, seeds),
+                "distance + rotation, star": equal_stops(pairs, by_star, seeds),
+            },
+            "curve": [[p.n, p.designed, *p.random] for p in by_poses[0].curve],
+            "curve, star": [[p.n + 1, p.designed, *p.random] for p in by_star[0].curve],
+        }
+        sets: dict[str, tuple[Scenario, Design, Floats, Any]] = {
+            "pose, designed": (poses, by_poses[0], by_poses[0].readings, {}),
+            "pose, random": (poses, by_poses[0], random[0], {}),
+            "star, designed": (pairs, by_star[0], with_hub(by_star[0]), {"pairing": Pairing("star")}),
+        }
+        if views != "hemisphere":
+            few = design(poses, target=by_poses[0].random, seed=given.seed)
+            sets |= {
+                "pose, as few designed as equal 52 random": (poses, few, few.readings, {}),
+                "all pairs of the poses' design": (
+                    pairs,
+                    by_poses[0],
+                    by_poses[0].readings,
+                    {"pairing": Pairing("all")},
+                ),
+            }
+        found[views]["realised"] = {
+            name: realised(scenario, plan, readings, options, given)
+            for name, (scenario, plan, readings, options) in sets.items()
+        }
+    return found
+
+
+def expectations(plans: Sequence[Design]) -> dict[str, Any]:
+    """Expected RMS errors, [m], of designs and of as many random stops."""
+    return {"designed": [plan.expected.position for plan in plans], "random": [plan.random for plan in plans]}
+
+
+def equal_stops(scenario: Scenario, plans: Sequence[Design], seeds: range) -> list[int]:
+    """How many configurations of a design equal as many random ones as the plans have, a hub counted."""
+    hub = 1 if plans[0].n < N_VIEWS else 0
+    return [design(scenario, target=plan.random, seed=seed).n + hub for plan, seed in zip(plans, seeds, strict=True)]
+
+
+def random_set(plan: Design, generator: np.random.Generator) -> Floats:
+    """Readings of random stops, as many as a plan has."""
+    return plan.pool.readings[generator.choice(len(plan.pool.readings), plan.n, replace=False)]
+
+
+def with_hub(plan: Design) -> Floats:
+    """The configurations of a plan of pairs behind that which all are measured against."""
+    hub = np.flatnonzero(plan.pool.stop < 0)
+    return np.vstack([plan.pool.problem.data.readings[hub], plan.readings])
+
+
+def realised(
+    scenario: Scenario, plan: Design, readings: Floats, options: Mapping[str, Any], given: argparse.Namespace
+) -> dict[str, Any]:
+    """Predicted RMS error of a set, [m], and that of calibrations of drawn arms, frames and noise."""
+    at = plan.task.readings
+    there = replace(scenario, configurations=GivenReadings(readings), validation=None)
+    model = scenario.job["model"]
+    stops = pool_of(replace(there, job=dict(scenario.job)), len(readings), np.random.default_rng(0))
+    predicted = stops.posterior(np.arange(len(stops.readings)), **options).error(plan.task).position
+    squares, doubtful = [], 0
+    for seed in range(1000 + given.seed, 1000 + given.seed + given.draws):
+        simulation = fg_calib.simulate(there, seed)
+        result = fg_calib.calibrate(simulation.robot, simulation.measurements, model=model, frame="unknown", **options)
+        squares.append(fitted_square(result.robot, simulation.true_robot, at))
+        doubtful += not result.solution.converged
+    rms = float(np.sqrt(np.mean(squares)))
+    return {
+        "n": len(readings),
+        "predicted": predicted,
+        "realised": rms,
+        "ratio": rms / predicted,
+        "ratio_sigma": float(np.std(squares) / np.mean(squares) / np.sqrt(len(squares)) / 2.0 * rms / predicted),
+        "not_converged": doubtful,
+    }
+
+
+def fitted_square(robot: Robot, true_robot: Robot, readings: Floats) -> float:
+    """Mean square of the tool's position error after the best rigid fit, [m^2]."""
+    found, there = (fg_calib.pose(one, readings).position for one in (robot, true_robot))
+    a, b = found - found.mean(axis=0), there - there.mean(axis=0)
+    U, _, Vt = np.linalg.svd(a.T @ b)
+    turn = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt  # a @ turn is nearest to b
+    return float(np.mean(np.sum((a @ turn - b) ** 2, axis=1)))
+
+
+# ---- random arms
+
+
+def pool_of_arm(robot: Robot, n_candidates: int, generator: np.random.Generator) -> Pool:
+    """Positions by a tracker of 0.1 mm somewhere, at random configurations."""
+    noise = Noise(position=1e-4, orientation=1e-4, joint=(np.deg2rad(0.003),) * robot.n_joints)
+    configurations = RandomReadings(n_candidates)
+    scenario = Scenario(robot, Errors("values", {}), configurations, noise, job={"model": "position"})
+    return pool_of(scenario, n_candidates, generator)
+
+
+def tasks_of(pool: Pool, generator: np.random.Generator) -> dict[str, Task]:
+    """Anywhere within the limits, and where the tool is in a ball about one of its places."""
+    anywhere = random_readings(pool.robot, 20000, generator)
+    p = fg_calib.pose(pool.robot, anywhere).position
+    near = np.argsort(np.linalg.norm(p - p[0], axis=1), kind="stable")
+    inside = near[: max(100, int(np.sum(np.linalg.norm(p - p[0], axis=1) < CELL * pool.robot.reach)))][:500]
+    return {"anywhere": Task(anywhere[:500], True), "cell": Task(anywhere[generator.permutation(inside)], True)}
+
+
+def system_for(pool: Pool, task: Task) -> System:
+    return system_of(pool.rows, pool.known, task.form(pool.problem))
+
+
+def error_of(system: System, chosen: Integers) -> float:
+    """Expected RMS error over the task, [m]."""
+    return float(np.sqrt(Measure("I", system).value(system.information(chosen))))
+
+
+def arms(given: argparse.Namespace) -> dict[str, Any]:
+    """Expected errors of designs by each criterion on random arms, and of random sets."""
+    rows: dict[str, list[dict[str, float]]] = {"anywhere": [], "cell": []}
+    for k in range(3 if given.quick else 90):
+        rng = np.random.default_rng([given.seed, k])
+        pool = pool_of_arm(random_arm(5 + k % 3, rng), N_CANDIDATES, rng)
+        systems = {where: system_for(pool, task) for where, task in tasks_of(pool, rng).items()}
+        some = next(iter(systems.values()))
+        chosen = {criterion: choose(some, N_STOPS, criterion).candidates for criterion in OTHERS}
+        for where, system in systems.items():
+            errors = {criterion: error_of(system, stops) for criterion, stops in chosen.items()}
+            values, _ = random_values(Measure("I", system), N_STOPS, rng)
+            best = error_of(system, choose(system, N_STOPS, "I").candidates)
+            rows[where].append(
+                {"I": best, **errors, "random": float(np.sqrt(np.median(values))), "n_joints": pool.robot.n_joints}
+            )
+    return {"n_arms": len(rows["cell"]), "n": N_STOPS, "of": N_CANDIDATES} | {
+        where: gains(of_task) for where, of_task in rows.items()
+    }
+
+
+def gains(rows: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+    """By how much the I-design's error is below those of the others, shares of 1: 5 %, 50 %, 95 % of arms, and mean."""
+    best = np.array([row["I"] for row in rows])
+    others = {name: np.array([row[name] for row in rows]) for name in (*OTHERS, "random")}
+    others["best other"] = np.min([others[name] for name in OTHERS], axis=0)
+    found: dict[str, Any] = {"I, median [m]": float(np.median(best))}
+    for name, error in others.items():
+        gain = 1.0 - best / error
+        p5, median, p95 = np.quantile(gain, [0.05, 0.5, 0.95]).tolist()
+        found[name] = {"p5": p5, "median": median, "p95": p95, "mean": float(gain.mean()), "min": float(gain.min())}
+    found["share of arms 10 % below D"] = float(np.mean(best <= 0.9 * others["D"]))
+    found["share of arms 40 % below random"] = float(np.mean(best <= 0.6 * others["random"]))
+    return found
+
+
+# ---- the search
+
+
+def search(given: argparse.Namespace) -> dict[str, Any]:
+    """Greedy choice and exchange beside random sets and exhaustive search."""
+    over: dict[str, list[float]] = {criterion: [] for criterion in CRITERIA}
+    small: dict[str, dict[str, list[float]]] = {pool: {c: [] for c in CRITERIA} for pool in ("4 of 12", "3 of 15")}
+    for k in range(2 if given.quick else 90):
+        rng = np.random.default_rng([given.seed, 100 + k])
+        pool = pool_of_arm(random_arm(5 + k % 3, rng), 200, rng)
+        system = system_for(pool, tasks_of(pool, rng)["anywhere"])
+        for criterion in CRITERIA:
+            measure = Measure(criterion, system)
+            found = not_worse_than_random(measure, choose(system, 12, criterion), np.random.default_rng(1))
+            values, _ = random_values(measure, 12, rng)
+            over[criterion].append(index(criterion, system, found.value) / index(criterion, system, values.min()))
+            for name, of_pool in small.items():
+                n, of = (int(word) for word in name.split(" of "))
+                part = system.select(np.arange(of))
+                least = Measure(criterion, part)
+                sets = [np.array(one) for one in combinations(range(of), n)]
+                best = min(least.value(part.information(one)) for one in sets)
+                ours = not_worse_than_random(least, choose(part, n, criterion), np.random.default_rng(1))
+                of_pool[criterion].append(index(criterion, part, ours.value) / index(criterion, part, best))
+    return {
+        "n_systems": len(over["I"]),
+        "12 of 200 over the best of 100 random sets": {
+            c: {"largest": max(r), "median": float(np.median(r)), "worse": int(np.sum(np.array(r) > 1.0 + 1e-9))}
+            for c, r in over.items()
+        },
+        "over the best of all sets": {
+            name: {
+                c: {
+                    "largest": max(r),
+                    "within 1 %": float(np.mean(np.array(r) <= 1.01)),
+                    "the best": float(np.mean(np.array(r) <= 1.0 + 1e-9)),
+                }
+                for c, r in of_pool.items()
+            }
+            for name, of_pool in small.items()
+        },
+    }
+
+
+def index(criterion: Criterion, system: System, value: float) -> float:
+    """A positive figure of which less is better, in the unit of the criterion: of D the volume's root."""
+    if criterion in ("D", "O1"):
+        return float(np.exp(value / (2.0 * len(system.core))))
+    return value if criterion in ("I", "A", "O5") else -1.0 / value
+
+
+# ---- real rows
+
+
+def loaded(file: str) -> ModuleType:
+    """Another experiment, whose name is no name of a module."""
+    spec = spec_from_file_location(file.removesuffix(".py"), ROOT / "experiments" / file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def chosen_ids(plan: Design) -> list[str]:
+    """The rows that a plan chose."""
+    stop, names = plan.pool.stop, plan.pool.problem.data.names
+    of_stop = {int(s): names[k] for k, s in enumerate(stop) if s >= 0}
+    return [of_stop[int(s)] for s in plan.stops]
+
+
+def of_rows(
+    job: fg_calib.Job, given: argparse.Namespace, counts: Sequence[int], judge: Callable[[Any], float]
+) -> dict[str, Any]:
+    """Errors of calibrations from rows by design and from random rows, by their number, and from all."""
+    table = job.tables[0]
+    m = table.measurements
+    train, test = m.ids[~m.test], m.ids[m.test].tolist()
+    n_random = 3 if given.quick else 50
+    rng = np.random.default_rng(given.seed)
+
+    def error(ids: Sequence[str]) -> float:
+        order = {name: k for k, name in enumerate([*ids, *test])}
+        part = replace(job, measurements=(selected(table, order),), path=None)
+        return judge(fg_calib.solve(fg_calib.problem_of(part)))
+
+    tasks = {"train rows": m.readings[~m.test][:: max(1, int(np.sum(~m.test)) // 300)], "anywhere": None}
+    found: dict[str, Any] = {"all": error(train.tolist()), "n_all": len(train), "n_random": n_random}
+    for n in counts[:1] if given.quick else counts:
+        random = [error(rng.choice(train, n, replace=False).tolist()) for _ in range(n_random)]
+        low, middle, high = np.quantile(random, [0.1, 0.5, 0.9]).tolist()
+        found[str(n)] = {"random": {"p10": low, "median": middle, "p90": high, "best": min(random)}}
+        for name, task in tasks.items():
+            plan = design(job, n=n, candidates="rows", task=task, seed=given.seed)
+            designed = error(chosen_ids(plan))
+            found[str(n)][f"task {name}"] = {
+                "designed": designed,
+                "share of random ones that are better": float(np.mean(np.array(random) < designed)),
+                "expected": plan.expected.position,
+                "expected of random": plan.random,
+            }
+    return found
+
+
+def ur10(given: argparse.Namespace) -> dict[str, Any]:
+    """Position error of the UR10's test rows, [m], by the rows fitted."""
+    first = loaded("01_ur10_real_data.py")
+    if not first.data_folder().is_dir():
+        return {"skipped": True}
+    with TemporaryDirectory() as folder:
+        job = fg_calib.read_job(first.write_jobs(first.data_folder(), Path(folder), 0, given.quick)["pose"])
+
+    def judge(solution: fg_calib.Solution) -> float:
+        rms = fg_calib.assess(solution).residuals.rms()["test"]["position"]["after"]
+        assert rms is not None
+        return float(rms)
+
+    return of_rows(job, given, N_ROWS["ur10"], judge)
+
+
+def panda(given: argparse.Namespace) -> dict[str, Any]:
+    """Spread of the ball centre at unseen locations, [m], by the touches fitted."""
+    tenth = loaded("10_panda_sockets.py")
+    if not tenth.data_folder().is_dir():
+        return {"skipped": True}
+    rows = tenth.read_rows(tenth.data_folder(), 0, False)
+    readings = np.array([[float(row[f"q{k}"]) for k in range(1, 8)] for row in rows])
+    with TemporaryDirectory() as folder:
+        job = fg_calib.read_job(tenth.write_job(tenth.data_folder(), rows, Path(folder), "groups"))
+
+    def judge(solution: fg_calib.Solution) -> float:
+        p = solution.problem
+        robot = p.robot.with_values(solution.parameters[p.variables.robot_span])
+        return float(tenth.rms(tenth.judge(robot, readings, rows)["test"]["spread"]))
+
+    return of_rows(job, given, N_ROWS["panda"], judge)
+
+
+def picture(found: dict[str, Any]) -> Figure:
+    """Expected error by the number of stops, and gains on random arms."""
+    figure = Figure(figsize=(12, 4.6), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
+    of_paper = found["paper"]
+    for views, line in zip(VIEWS, ("-", "--"), strict=True):
+        curve = np.array(of_paper[views]["curve"])
+        left.fill_between(curve[:, 0], curve[:, 2] / MM, curve[:, 4] / MM, color=RANDOM, alpha=0.3, lw=0)
+        left.plot(curve[:, 0], curve[:, 3] / MM, line, color=RANDOM, label=f"random, {views} (10 to 90 %)")
+        left.plot(curve[:, 0], curve[:, 1] / MM, line, color=CHOSEN, lw=2, label=f"designed, {views}")
+        for name, row in of_paper[views]["realised"].items():
+            if name.startswith("pose"):
+                colour = RANDOM if "random" in name and "as few" not in name else CHOSEN
+                left.plot(row["n"], row["realised"] / MM, "o", color=colour, mec="k", ms=7, zorder=3)
+    left.plot([], [], "o", color="w", mec="k", ms=7, label=f"realised, {of_paper['n_draws']} draws")
+    left.set(xscale="log", yscale="log", xlabel="configurations measured", ylabel="RMS tool position error [mm]")
+    left.set_xticks([5, 10, 20, 52], ["5", "10", "20", "52"])
+    left.set_yticks([1, 2, 5, 10], ["1", "2", "5", "10"])
+    left.minorticks_off()
+    left.set_title("The paper's arm, poses in an unknown frame")
+    left.legend(frameon=False, fontsize=8)
+    names = (*OTHERS, "best other", "random")
+    for where, shift, colour in (("anywhere", -0.15, CHOSEN), ("cell", 0.15, "#009E73")):
+        for k, name in enumerate(names):
+            g = found["arms"][where][name]
+            right.plot([100 * g["p5"], 100 * g["p95"]], [k + shift] * 2, color=colour, lw=2)
+            right.plot(100 * g["median"], k + shift, "o", color=colour, label=f"task: {where}" if k == 0 else None)
+    right.axvline(0.0, color="0.7", lw=0.8)
+    right.set_yticks(range(len(names)), names)
+    right.invert_yaxis()
+    right.set(xlabel="I-design's error below the other's [%], 5 to 95 % of arms")
+    right.set_title(f"{found['arms']['n_arms']} random arms, {N_STOPS} of {N_CANDIDATES}")
+    right.legend(frameon=False, fontsize=8)
+    for axes in (left, right):
+        clean(axes)
+    return figure
+
+
+if __name__ == "__main__":
+    main()
