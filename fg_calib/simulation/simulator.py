@@ -105,12 +105,12 @@ def _poses(
         sigma_joint=_joint_sigma(stated, robot),
         source="poses.csv",
     )
-    pairing = _pairing(scenario.job.get("pairing", "star"))
+    pairing = pairing_of(scenario.job.get("pairing", "star"))
     table = Table(measurements, scenario.job.get("model"), pairing, frame_knowledge(scenario.frame))
     return Simulation(scenario, seed, robot, true_robot, measurements, true_readings, frame, (table,))
 
 
-def _pairing(given: object) -> Pairing:
+def pairing_of(given: object) -> Pairing:
     """A pairing as a job states it."""
     if isinstance(given, Mapping):
         return Pairing("random", given["random"], given.get("seed", 0))
