@@ -359,8 +359,10 @@ def _pairings(pool: Pool, stops: Integers, task: Task) -> dict[str, float]:
     return {one: pool.posterior(stops, Pairing(one)).error(task).position or np.inf for one in strategies}
 
 
-def _other_pairs(pool: Pool, n: int, aim: tuple[Criterion, Task], generator: np.random.Generator) -> Iterator[PairPlan]:
-    """A chain and a tree of as many pairs, where pairs are all that is measured, and by themselves."""
+def _other_pairs(
+    pool: Pool, chosen: Integers, aim: tuple[Criterion, Task], generator: np.random.Generator
+) -> Iterator[PairPlan]:
+    """Other ways to measure as many pairs, where pairs are all that is measured, and by themselves."""
     table = pool.tables[0]
     alone = len(pool.tables) == 1 and not len(pool.given) and pool.before is None and pool.has_hub
     if not alone or table.measurements.pairs is None:
