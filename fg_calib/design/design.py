@@ -9,7 +9,7 @@ from the rows of its stops alone, by the very code that assesses a calibration.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -92,6 +92,7 @@ class Design(FrozenArrays):
         task: What the calibration is for.
         readings: The configurations in the order in which to visit them, that of a hub first, shape (n, n_joints),
             [rad] (prismatic: [m]).
+        ids: Their names: those of rows of a job that were chosen, else s1, s2, ... in that order, shape (n,).
         group: The instrument that alone measures at each; "" where all others do.
         expected: Expected errors of the tool over the task, with these and what was given.
         before: The same with what was given alone; None where nothing was.
@@ -114,6 +115,7 @@ class Design(FrozenArrays):
     criterion: Criterion
     task: Task
     readings: Floats
+    ids: NDArray[np.str_]
     group: NDArray[np.str_]
     expected: PoseRms
     before: PoseRms | None
@@ -288,12 +290,14 @@ def design_from(
             plan = _of_pairs(pool, other)
     expected, curve = plan.posterior.error(task), chooser.curve(found, generator, hubs)
     before = pool.posterior(pool.given) if len(pool.given) or pool.before is not None else None
+    ids = plan.names if pool.scenario is None else [f"s{k + 1}" for k in range(len(plan.readings))]
     return Design(
         pool=pool,
-        tables=tuple(plan.tables),
+        tables=tuple(_named(plan.tables, dict(zip(plan.names, ids, strict=True)))),
         criterion=criterion,
         task=task,
         readings=plan.readings,
+        ids=np.array(ids),
         group=plan.group,
         expected=expected,
         before=None if before is None else before.error(task),
@@ -321,25 +325,37 @@ class _Plan:
 
     tables: list[Table]
     readings: Floats
+    names: list[str]
     group: NDArray[np.str_]
     posterior: Posterior
     pairs: Integers | None
 
 
+def _named(tables: Sequence[Table], names: Mapping[str, str]) -> list[Table]:
+    """Tables with other names of their configurations."""
+    return [
+        replace(t, measurements=replace(t.measurements, ids=np.array([names[i] for i in t.measurements.ids.tolist()])))
+        for t in tables
+    ]
+
+
 def _of_stops(pool: Pool, stops: Integers) -> _Plan:
     """Some stops, in their order; a hub is visited first."""
-    hub = pool.problem.data.readings[pool.stop < 0] if pool.has_hub else np.zeros((0, pool.robot.n_joints))
-    measured = stops[len(pool.given) :]
-    if len(pool.given):
-        hub = hub[:0]
-    readings = np.vstack([hub, pool.readings[measured]])
-    group = np.concatenate([np.full(len(hub), ""), pool.group[measured]])
-    pairs = None
+    measured, data = stops[len(pool.given) :], pool.problem.data
+    number = {stop: k for k, stop in enumerate(pool.stop.tolist())}
+    order = [number[stop] for stop in measured.tolist()]
+    if pool.has_hub and not len(pool.given):
+        order = [number[-1], *order]
     tables = pool.tables_of(measured)
     direct = [t.measurements.pairs for t in tables if t.measurements.pairs is not None]
-    if direct:
-        pairs = np.stack([direct[0].a, direct[0].b], axis=1)
-    return _Plan(tables, readings, group, pool.posterior(stops), pairs)
+    return _Plan(
+        tables=tables,
+        readings=data.readings[order],
+        names=[data.names[k] for k in order],
+        group=np.array(["" if pool.stop[k] < 0 else str(pool.group[pool.stop[k]]) for k in order]),
+        posterior=pool.posterior(stops),
+        pairs=np.stack([direct[0].a, direct[0].b], axis=1) if direct else None,
+    )
 
 
 def _of_pairs(pool: Pool, found: PairPlan) -> _Plan:
@@ -347,7 +363,8 @@ def _of_pairs(pool: Pool, found: PairPlan) -> _Plan:
     m = found.table.measurements
     assert m.pairs is not None
     pairs = np.stack([m.pairs.a, m.pairs.b], axis=1)
-    return _Plan([found.table], m.readings, np.full(len(m.readings), ""), found.posterior, pairs)
+    names = m.ids.tolist()
+    return _Plan([found.table], m.readings, names, np.full(len(names), ""), found.posterior, pairs)
 
 
 def _pairings(pool: Pool, stops: Integers, task: Task) -> dict[str, float]:
