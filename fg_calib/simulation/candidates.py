@@ -44,7 +44,7 @@ HOPELESS = 1000
 """Drawn without finding any, no more are drawn."""
 
 PATIENCE = 50
-"""How many times more are drawn, for both, where a reflector is not turned but waited for: that costs next to nothing."""
+"""How many times more, of both, where a reflector is not turned but waited for: drawing alone costs next to nothing."""
 
 ROUND = 16_384
 """Most that are drawn at once, for memory."""
