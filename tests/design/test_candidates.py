@@ -148,14 +148,14 @@ def test_nothing_is_kept_of_what_enters_a_box_and_as_much_found_as_without():
 def test_all_are_apart_and_none_was_rejected_for_nothing(robot):
     """As one by one: each that is not near one taken before is taken. More than 1024 make several parts."""
     unit = np.array([robot.reach if joint.prismatic else 1.0 for joint in robot.joints])
-    q = random_readings(robot, 1500, np.random.default_rng(2))
+    q = random_readings(robot, 1100, np.random.default_rng(2))
     found = draw(robot, GivenReadings(q), apart=1.2)
     taken = q[:1]
     for row in q[1:]:
         if np.abs((taken - row) / unit).max(axis=1).min() >= 1.2:
             taken = np.concatenate([taken, [row]])
     assert found.readings.tolist() == taken.tolist()
-    assert found.rejected == {"near another": 1500 - len(taken)}
+    assert found.rejected == {"near another": 1100 - len(taken)}
     assert distances(found.readings / unit).min() >= 1.2
 
 
@@ -261,6 +261,7 @@ def test_the_tracker_sees_the_reflector(robot, far):
     assert draw(robot, views).readings.tolist() == found.readings.tolist()
 
 
+@pytest.mark.slow
 def test_turned_reflectors_have_any_roll_and_are_all_over_the_workspace():
     found = draw(ARM, replace(TARGET, distance=(0.0, np.inf), count=300))
     T = poses_of(ARM, found.readings)
@@ -302,8 +303,8 @@ def test_the_reflector_is_in_the_region(robot, region):
 def test_nothing_within_reach_is_said_with_the_reasons():
     far = Placement(np.eye(3), np.array([9.0, 0.0, 0.0]))
     with pytest.raises(InputError) as caught:
-        draw(ARM, replace(VIEWS, board=far, count=4))
-    message = "candidates: none in 100 drawn: 100 % out of reach, expected some that the arm can take"
+        draw(ARM, replace(VIEWS, board=far, count=0))
+    message = "candidates: none in 20 drawn: 100 % out of reach, expected some that the arm can take"
     assert str(caught.value) == message
     with pytest.raises(InputError) as caught:
         draw(ARM, GivenReadings(np.array([[4.0] * 7, [0.0] * 7])), keep_out=[Box([-1, -1, 0.9], [1, 1, 1])])
