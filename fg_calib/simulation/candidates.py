@@ -233,7 +233,12 @@ class Thinning:
     """Takes configurations one after another, each that is not near one taken before."""
 
     def __init__(self, robot: Robot, apart: float | None) -> None:
-        """Args: robot: The robot; apart: least distance, as `Conditions` has it."""
+        """Begin with none taken.
+
+        Args:
+            robot: Whose configurations they are.
+            apart: Least distance of two, as `Conditions` has it; None: any.
+        """
         self._apart = apart
         self._unit = np.array([robot.reach if joint.prismatic else 1.0 for joint in robot.joints])
         self._taken = np.empty((0, robot.n_joints))
