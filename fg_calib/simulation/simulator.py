@@ -275,6 +275,6 @@ def _sifted(robot: Robot, configurations: Configurations, generator: np.random.G
     n = number_of(configurations)
     found = draw_candidates(robot, configurations, generator, n, place)
     if len(found.readings) < n:
-        hint = "ask for fewer, or for less of them"
+        hint = "ask for fewer, or relax what they have to keep to"
         raise InputError(place, f"{len(found.readings)} of {n} found in {found.reasons()}", hint=hint)
     return found.readings
