@@ -84,8 +84,7 @@ MEASURED = (*"xyz", "qx", "qy", "qz", "qw", "distance", "angle", *"uv")
 
 def to_fill_in(columns: Columns) -> Columns:
     """The columns of a table with nothing measured yet; what is touched is at distance 0 before it is measured."""
-    n = len(next(iter(columns.values())))
-    empty = {name: np.full(n, "") for name, v in columns.items() if name in MEASURED and np.any(np.asarray(v) != 0.0)}
+    empty = {name: None for name, v in columns.items() if name in MEASURED and np.any(np.asarray(v) != 0.0)}
     return dict(columns) | empty
 
 

@@ -73,9 +73,7 @@ def design_document(design: Design) -> dict[str, Any]:
         },
         "stops": [
             {"id": name, "table": table or None, "readings": q}
-            for name, table, q in zip(
-                design.ids.tolist(), design.group.tolist(), design.readings.tolist(), strict=True
-            )
+            for name, table, q in zip(design.ids.tolist(), design.group.tolist(), design.readings.tolist(), strict=True)
         ],
         "pairs": None if design.pairs is None else design.ids[design.pairs].tolist(),
         "undetermined": [
@@ -222,6 +220,9 @@ def _notes(design: Design) -> list[str]:
     notes.append(f"joint travel along the stops {turn:.0f} deg, {math.degrees(design.travel_before):.0f} unordered")
     if design.n > _MOST:
         notes.append(f"{design.n - _MOST} more stops: --out writes them all")
+    best = min(design.pairings, key=lambda name: design.pairings[name], default="")
+    if design.pairs is None and best and design.pairings[best] < 0.95 * (design.expected.position or math.inf):
+        notes.append(f"pairing: {best} in the job takes more from the same measurements")
     if design.expected.position is None:
         notes.append("the error over the task depends on what nothing that is measured determines")
     if design.target is not None and not design.reached:
@@ -309,9 +310,7 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
 
     robot = design.pool.robot if design.pool.before is None else design.pool.before.robot
     tables = design.tables if design.pool.scenario is not None else ()
-    files = {
-        name: to_fill_in(columns) for t in tables for name, columns in table_columns(t, robot, units).items()
-    }
+    files = {name: to_fill_in(columns) for t in tables for name, columns in table_columns(t, robot, units).items()}
     figure = draw_designs({"": design})
     urdf = "robot.urdf" if robot.urdf is not None and tables else None
 
