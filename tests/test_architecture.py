@@ -37,6 +37,7 @@ FOLDERS = (
         "graph",
         "analysis",
         "baseline",
+        "design",
         "report",
         "calibration",
         "correction",

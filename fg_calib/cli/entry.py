@@ -27,6 +27,7 @@ from fg_calib.cli.calibrate import calibrate
 from fg_calib.cli.check import check
 from fg_calib.cli.compare import compare
 from fg_calib.cli.correct import correct
+from fg_calib.cli.design import design
 from fg_calib.cli.example import example
 from fg_calib.cli.export import export
 from fg_calib.cli.help import help_
@@ -59,6 +60,7 @@ for command in (
     update,
     history,
     observe,
+    design,
     simulate,
     example,
     bag,

@@ -9,9 +9,9 @@ from the rows of its stops alone, by the very code that assesses a calibration.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,19 +19,21 @@ from numpy.typing import NDArray
 from fg_calib.analysis.accuracy import PoseRms
 from fg_calib.arguments import checked
 from fg_calib.arrays import FrozenArrays
-from fg_calib.design.candidates import Box, Candidates
+from fg_calib.design.candidates import Candidates
 from fg_calib.design.criteria import Criterion, Measure
 from fg_calib.design.cures import Cure, cures_of
 from fg_calib.design.of_job import pool_of_more, pool_of_rows, solved
 from fg_calib.design.order import shortest_way, travel
-from fg_calib.design.pool import Pool, pool_of
+from fg_calib.design.pairs import PairPlan, PairWork, Structure, free_pairs, plan_pairs
+from fg_calib.design.pool import Pool, drawn, pool_of
 from fg_calib.design.search import Chosen, exchanged, greedy, not_worse_than_random, random_values
 from fg_calib.design.system import System, system_of
-from fg_calib.design.task import N_TASK, Task, is_fitted
+from fg_calib.design.task import N_TASK, Posterior, Task, is_fitted
 from fg_calib.errors import InputError
 from fg_calib.graph.observability import Observability
 from fg_calib.job import Job
-from fg_calib.options import check, check_flag, check_number
+from fg_calib.measurements.series import Table
+from fg_calib.options import Pairing, check, check_flag, check_number
 from fg_calib.progress import tell
 from fg_calib.robot.inverse import random_readings
 from fg_calib.simulation.configurations import Configurations
@@ -49,6 +51,15 @@ N_CANDIDATES = 2000
 
 MOST_STOPS = 500
 """Stops up to which a design is sought that reaches a target."""
+
+N_HUBS = 12
+"""Configurations that are tried as the hub of a star."""
+
+N_FEW = 300
+"""Candidates that each is tried with."""
+
+N_HUB_STOPS = 20
+"""Stops that each is tried with, at most."""
 
 N_CURVE = 10
 """Numbers of stops at which the curve is worked out, about."""
@@ -76,11 +87,18 @@ class Design(FrozenArrays):
 
     Attributes:
         pool: What was chosen from.
+        tables: What is to be measured, in order.
         criterion: By which criterion.
         task: What the calibration is for.
-        stops: The stops, numbers in the pool, in the order in which to visit them, shape (n,).
+        readings: The configurations in the order in which to visit them, that of a hub first, shape (n, n_joints),
+            [rad] (prismatic: [m]).
+        ids: Their names: those of rows of a job that were chosen, else s1, s2, ... in that order, shape (n,).
+        group: The instrument that alone measures at each; "" where all others do.
         expected: Expected errors of the tool over the task, with these and what was given.
         before: The same with what was given alone; None where nothing was.
+        pairs: Which pairs are measured, of configurations in their order, shape (n_pairs, 2); None where none are, or
+            where they are formed from what is measured.
+        pairings: Expected position errors by which pairs are measured, or formed, [m].
         random: Median of the expected position errors of as many random stops, [m].
         curve: What is to be expected of how many.
         target: What was to be reached, [m]; None where a number was stated.
@@ -93,11 +111,16 @@ class Design(FrozenArrays):
     """
 
     pool: Pool
+    tables: tuple[Table, ...]
     criterion: Criterion
     task: Task
-    stops: Integers
+    readings: Floats
+    ids: NDArray[np.str_]
+    group: NDArray[np.str_]
     expected: PoseRms
     before: PoseRms | None
+    pairs: Integers | None
+    pairings: Mapping[str, float]
     random: float
     curve: tuple[CurvePoint, ...]
     target: float | None
@@ -111,12 +134,7 @@ class Design(FrozenArrays):
     @property
     def n(self) -> int:
         """Number of stops."""
-        return len(self.stops)
-
-    @property
-    def readings(self) -> Floats:
-        """The configurations in their order, shape (n, n_joints), [rad] (prismatic: [m])."""
-        return self.pool.readings[self.stops]
+        return len(self.readings)
 
     @property
     def found(self) -> Mapping[str, Candidates]:
@@ -143,8 +161,6 @@ def design(
     task: Floats | None = None,
     fitted: bool | None = None,
     lever: float = 0.0,
-    keep_out: Sequence[Box] = (),
-    apart: float | None = None,
     seed: int = 0,
 ) -> Design:
     """Choose the configurations to measure.
@@ -163,8 +179,6 @@ def design(
         fitted: Whether errors count after the best rigid fit, or in the base frame; the former if None where nothing
             that is measured says where the base is.
         lever: Length with which orientations count too, [m].
-        keep_out: Boxes that the arm must not reach into.
-        apart: How far candidates are apart at least, see `candidates`.
         seed: Of all that is drawn.
 
     Raises:
@@ -185,16 +199,17 @@ def design(
         check_flag("fitted", fitted)
     draw = dict(zip(("candidates", "task", "random"), np.random.default_rng(seed).spawn(3), strict=True))
     tell("looking for candidates")
-    conditions: dict[str, Any] = {"keep_out": tuple(keep_out), "apart": apart}
     if isinstance(of, Job):
-        pool = _pool_of_job(of, n_candidates, draw["candidates"], candidates, given, conditions)
+        pool = _pool_of_job(of, n_candidates, draw["candidates"], candidates, given)
     elif candidates == "rows":
         raise InputError("candidates", "rows of a scenario, which has none", "a job, or configurations")
     else:
         scenario = of if candidates is None else replace(of, configurations=candidates)
-        pool = pool_of(scenario, n_candidates, draw["candidates"], given=given, **conditions)
+        pool = pool_of(scenario, drawn(scenario, n_candidates, draw["candidates"]), given=given)
     there = random_readings(pool.robot, N_TASK, draw["task"]) if task is None else task
     wanted = Task(there, is_fitted(pool.problem) if fitted is None else fitted, lever)
+    if pool.has_hub and pool.scenario is not None and not len(pool.given) and pool.before is None:
+        pool = _with_best_hub(pool, wanted, n or N_STOPS, criterion, draw["random"])
     return design_from(pool, wanted, draw["random"], n=n, target=target, criterion=criterion)
 
 
@@ -204,7 +219,6 @@ def _pool_of_job(
     generator: np.random.Generator,
     candidates: Configurations | Literal["rows"] | None,
     given: Floats | None,
-    conditions: Mapping[str, Any],
 ) -> Pool:
     """The pool of a job."""
     if given is not None:
@@ -213,7 +227,24 @@ def _pool_of_job(
     problem = solved(job)
     if isinstance(candidates, str):
         return pool_of_rows(problem, source)
-    return pool_of_more(problem, n_candidates, generator, candidates, source, **conditions)
+    return pool_of_more(problem, n_candidates, generator, candidates, source)
+
+
+def _with_best_hub(pool: Pool, task: Task, n: int, criterion: Criterion, generator: np.random.Generator) -> Pool:
+    """The pool of a star with the hub, of some, whose star is best."""
+    scenario, found = pool.scenario, pool.found
+    assert scenario is not None
+    count = len(found[""].readings)
+    best, least = 0, np.inf
+    for hub in np.unique(np.append(0, generator.integers(count, size=N_HUBS))).tolist():
+        few = generator.permutation(np.delete(np.arange(count), hub))[:N_FEW]
+        some = {**found, "": replace(found[""], readings=found[""].readings[np.append(hub, few)])}
+        one = pool_of(scenario, some)
+        measure = Measure(criterion, system_of(one.rows, one.known, task.form(one.problem)))
+        value = measure.value(measure.system.information(greedy(measure, min(n, N_HUB_STOPS))))
+        if value < least:
+            best, least = hub, value
+    return pool_of(scenario, found, hub=best) if best else pool
 
 
 def design_from(
@@ -239,34 +270,127 @@ def design_from(
     able = np.setdiff1d(np.flatnonzero(np.any(pool.rows.rows, axis=(1, 2))), pool.given)
     if not len(able):
         raise InputError("candidates", "none at which anything is measured", "some")
+    hubs = int(pool.has_hub)
     chooser = _Chooser(system.select(able), criterion)
     tell("choosing")
-    found = chooser.best(min(N_STOPS if n is None else n, len(able))) if target is None else chooser.reaching(target)
+    if target is None:
+        found = chooser.best(max(1, min((N_STOPS if n is None else n) - hubs, len(able))))
+    else:
+        found = chooser.reaching(target)
     found = not_worse_than_random(chooser.measure, found, generator)
     chosen = able[found.candidates]
     tell("working out what to expect")
-    posterior = pool.posterior(np.concatenate([pool.given, chosen]))
-    expected = posterior.error(task)
-    curve = chooser.curve(found, generator)
     way = shortest_way(pool.robot, pool.readings[chosen])
+    stops = np.concatenate([pool.given, chosen[way]])
+    plan = _of_stops(pool, stops)
+    pairings = _pairings(pool, stops, task)
+    for other in _other_pairs(pool, chosen, (criterion, task), generator):
+        pairings[other.structure] = other.posterior.error(task).position or np.inf
+        if pairings[other.structure] < (plan.posterior.error(task).position or np.inf):
+            plan = _of_pairs(pool, other)
+    expected, curve = plan.posterior.error(task), chooser.curve(found, generator, hubs)
     before = pool.posterior(pool.given) if len(pool.given) or pool.before is not None else None
+    ids = plan.names if pool.scenario is None else [f"s{k + 1}" for k in range(len(plan.readings))]
     return Design(
         pool=pool,
+        tables=tuple(_named(plan.tables, dict(zip(plan.names, ids, strict=True)))),
         criterion=criterion,
         task=task,
-        stops=chosen[way],
+        readings=plan.readings,
+        ids=np.array(ids),
+        group=plan.group,
         expected=expected,
         before=None if before is None else before.error(task),
+        pairs=plan.pairs,
+        pairings=pairings,
         random=curve[-1].random[1],
         curve=curve,
         target=target,
-        reached=target is None or (expected.position is not None and expected.position <= target * (1.0 + 1e-6)),
-        observability=posterior.observability,
-        cures=cures_of(posterior),
+        reached=target is None or (expected.position is not None and expected.position <= target * _JUST),
+        observability=plan.posterior.observability,
+        cures=cures_of(plan.posterior),
         unknown=system.unknown,
-        travel=travel(pool.robot, pool.readings[chosen[way]]),
+        travel=travel(pool.robot, plan.readings),
         travel_before=travel(pool.robot, pool.readings[chosen]),
     )
+
+
+_JUST = 1.0 + 1e-6
+"""A target is reached to rounding."""
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What is to be measured, and what would then be known."""
+
+    tables: list[Table]
+    readings: Floats
+    names: list[str]
+    group: NDArray[np.str_]
+    posterior: Posterior
+    pairs: Integers | None
+
+
+def _named(tables: Sequence[Table], names: Mapping[str, str]) -> list[Table]:
+    """Tables with other names of their configurations."""
+    return [
+        replace(t, measurements=replace(t.measurements, ids=np.array([names[i] for i in t.measurements.ids.tolist()])))
+        for t in tables
+    ]
+
+
+def _of_stops(pool: Pool, stops: Integers) -> _Plan:
+    """Some stops, in their order; a hub is visited first."""
+    measured, data = stops[len(pool.given) :], pool.problem.data
+    number = {stop: k for k, stop in enumerate(pool.stop.tolist())}
+    order = [number[stop] for stop in measured.tolist()]
+    if pool.has_hub and not len(pool.given):
+        order = [number[-1], *order]
+    tables = pool.tables_of(measured)
+    direct = [t.measurements.pairs for t in tables if t.measurements.pairs is not None]
+    return _Plan(
+        tables=tables,
+        readings=data.readings[order],
+        names=[data.names[k] for k in order],
+        group=np.array(["" if pool.stop[k] < 0 else str(pool.group[pool.stop[k]]) for k in order]),
+        posterior=pool.posterior(stops),
+        pairs=np.stack([direct[0].a, direct[0].b], axis=1) if direct else None,
+    )
+
+
+def _of_pairs(pool: Pool, found: PairPlan) -> _Plan:
+    """A chain or a tree of pairs; a tree in an order that is short for the joints."""
+    m = found.table.measurements
+    assert m.pairs is not None
+    pairs = np.stack([m.pairs.a, m.pairs.b], axis=1)
+    names = m.ids.tolist()
+    return _Plan([found.table], m.readings, names, np.full(len(names), ""), found.posterior, pairs)
+
+
+def _pairings(pool: Pool, stops: Integers, task: Task) -> dict[str, float]:
+    """Expected errors by how pairs are formed, or by the star that they are measured in."""
+    if not pool.formed:
+        direct = any(t.measurements.pairs is not None for t in pool.tables)
+        return {"star": pool.posterior(stops).error(task).position or np.inf} if direct else {}
+    strategies: tuple[Literal["star", "chain", "all"], ...] = ("star", "chain", "all")
+    return {one: pool.posterior(stops, Pairing(one)).error(task).position or np.inf for one in strategies}
+
+
+def _other_pairs(
+    pool: Pool, chosen: Integers, aim: tuple[Criterion, Task], generator: np.random.Generator
+) -> Iterator[PairPlan]:
+    """Other ways to measure as many pairs, where pairs are all that is measured, and by themselves."""
+    table = pool.tables[0]
+    alone = len(pool.tables) == 1 and not len(pool.given) and pool.before is None and pool.has_hub
+    if not alone or table.measurements.pairs is None:
+        return
+    readings = pool.problem.data.readings
+    first = int(np.flatnonzero(pool.stop < 0)[0])
+    work = PairWork(pool.robot, table, pool.problem.options, readings)
+    structures: tuple[Structure, ...] = ("chain", "tree")
+    for structure in structures:
+        yield plan_pairs(work, first, len(chosen), structure, aim, generator)
+    yield free_pairs(work, np.append(first, np.flatnonzero(np.isin(pool.stop, chosen))), len(chosen), aim)
 
 
 class _Chooser:
@@ -316,14 +440,14 @@ class _Chooser:
                 low = middle
         return found
 
-    def curve(self, found: Chosen, generator: np.random.Generator) -> tuple[CurvePoint, ...]:
-        """What to expect of fewer stops, and of as many."""
+    def curve(self, found: Chosen, generator: np.random.Generator, hubs: int) -> tuple[CurvePoint, ...]:
+        """What to expect of fewer stops, and of as many; hubs count."""
         most = len(found.candidates)
         numbers = np.unique(np.round(np.geomspace(max(1, most // 10), most, N_CURVE)).astype(np.int64))
         points = []
         for k in numbers.tolist():
-            chosen = found.candidates if k == most else self.first(k)
+            chosen = found.candidates if k == most else self.best(k).candidates
             values, _ = random_values(self._error, k, generator)
             low, middle, high = np.sqrt(np.quantile(values, [0.1, 0.5, 0.9])).tolist()
-            points.append(CurvePoint(k, self.error(chosen), (low, middle, high)))
+            points.append(CurvePoint(k + hubs, self.error(chosen), (low, middle, high)))
         return tuple(points)

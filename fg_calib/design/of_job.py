@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.analysis.variance_components import solve_job
 from fg_calib.design.candidates import Candidates
-from fg_calib.design.pool import Pool, pool_of
+from fg_calib.design.pool import Pool, drawn, pool_of
 from fg_calib.design.rows import stop_rows
 from fg_calib.design.scene import scenario_of
 from fg_calib.errors import InputError
 from fg_calib.graph.problem import Problem, reweighted_at
 from fg_calib.job import Job
 from fg_calib.simulation.configurations import Configurations
-from fg_calib.simulation.scenario import Scenario
 
 Integers = NDArray[np.int64]
 
@@ -43,7 +41,6 @@ def pool_of_more(
     generator: np.random.Generator,
     configurations: Configurations | None,
     source: str,
-    **conditions: Any,
 ) -> Pool:
     """Stops for more rows of a solved problem's tables.
 
@@ -53,13 +50,12 @@ def pool_of_more(
         generator: Draws them.
         configurations: Where to measure; see `scenario_of`.
         source: The job's name, for messages.
-        conditions: What candidates have to keep to, see `pool_of`.
 
     Raises:
         InputError: A table holds measurements of a kind of one's own, or nothing can be measured from anywhere.
     """
-    scenario: Scenario = scenario_of(problem, configurations, source)
-    return pool_of(scenario, n_candidates, generator, before=problem, **conditions)
+    scenario = scenario_of(problem, configurations, source)
+    return pool_of(scenario, drawn(scenario, n_candidates, generator), before=problem)
 
 
 def pool_of_rows(problem: Problem, source: str) -> Pool:

@@ -10,7 +10,7 @@ Of pairs a stop is one end: in a star all are measured against a hub, which is t
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arrays import Brief
-from fg_calib.design.candidates import Box, Candidates, candidates
+from fg_calib.design.candidates import Candidates, candidates
 from fg_calib.design.rows import StopRows, stop_rows
 from fg_calib.design.task import Posterior
 from fg_calib.errors import InputError
@@ -30,12 +30,12 @@ from fg_calib.graph.problem import Problem
 from fg_calib.measurements.dataset import Noise
 from fg_calib.measurements.kinds.board_pose import left_jacobian
 from fg_calib.measurements.series import KnownPoint, Table, Unknowns
-from fg_calib.options import Gauge, Options
+from fg_calib.options import PAIR_MODELS, Gauge, Model, Options, Pairing
 from fg_calib.robot.model import Robot
-from fg_calib.simulation.configurations import BoardViews, Configurations, GivenReadings
-from fg_calib.simulation.instruments import BoardCamera, Instrument, with_figures
+from fg_calib.simulation.configurations import BoardViews, Configurations, GivenReadings, Placement
+from fg_calib.simulation.instruments import BoardCamera, Instrument, PairGauge, Tracker, with_figures
 from fg_calib.simulation.scenario import Errors, Scenario, Simulation
-from fg_calib.simulation.simulator import simulate
+from fg_calib.simulation.simulator import pairing_of, simulate
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -60,6 +60,7 @@ class Pool(Brief):
         given: Stops that were measured already, or will be anyway.
         found: How the candidates of each group came about.
         before: What was measured already, as the problem of its rows at its solution; None where nothing was.
+        formed: By the number of a table of poses that pairs are formed of: of which model, and how.
     """
 
     scenario: Scenario | None
@@ -72,6 +73,7 @@ class Pool(Brief):
     given: Integers
     found: Mapping[str, Candidates] = field(default_factory=dict)
     before: Problem | None = None
+    formed: Mapping[int, tuple[Model, Pairing]] = field(default_factory=dict)
 
     @property
     def robot(self) -> Robot:
@@ -85,12 +87,17 @@ class Pool(Brief):
         wide = known_rows_of(self.before, self.problem)
         return np.pad(wide, ((0, 0), (0, len(self.rows.scales) - wide.shape[1])))
 
-    def problem_of(self, stops: Integers, **changes: Any) -> Problem:
-        """The problem of some of the stops, in their order, behind those of hubs.
+    @property
+    def has_hub(self) -> bool:
+        """Whether all pairs are measured against one configuration."""
+        return bool(np.any(self.stop < 0))
+
+    def tables_of(self, stops: Integers, pairing: Pairing | None = None) -> list[Table]:
+        """What would be measured at some of the stops, in their order, behind those of hubs.
 
         Args:
             stops: They.
-            changes: Of the tables, such as another pairing.
+            pairing: How pairs are formed instead, where they are formed of poses.
         """
         names = self.problem.data.names[: self.problem.data.n_configurations]
         of_stop: dict[int, list[int]] = {}
@@ -98,19 +105,21 @@ class Pool(Brief):
             of_stop.setdefault(stop, []).append(k)
         wanted = [*of_stop.get(-1, []), *(k for stop in stops.tolist() for k in of_stop.get(stop, []))]
         order = {names[k]: place for place, k in enumerate(wanted)}
-        tables = [selected(replace(table, **changes), order) for table in self.tables]
-        return true_problem(self.robot, tables, self.problem.options)
+        found = [selected(table, order) for table in self.tables]
+        for number, (model, own) in self.formed.items():
+            found[number] = replace(found[number], model=model, frame="known", pairing=pairing or own)
+        return found
 
-    def posterior(self, stops: Integers, **changes: Any) -> Posterior:
+    def posterior(self, stops: Integers, pairing: Pairing | None = None) -> Posterior:
         """What would be known with some stops measured beside what was, exactly as a calibration would say it.
 
         Args:
             stops: They, and those given among them.
-            changes: Of the tables, such as another pairing.
+            pairing: How pairs are formed instead, where they are formed of poses.
         """
         if not len(stops) and self.before is not None:
             return Posterior(self.before, whitened_jacobian(self.before, self.before.start))
-        problem = self.problem_of(stops, **changes)
+        problem = true_problem(self.robot, self.tables_of(stops, pairing), self.problem.options)
         rows = [whitened_jacobian(problem, problem.start), known_rows_of(self.before, problem)]
         return Posterior(problem, np.vstack(rows))
 
@@ -183,40 +192,51 @@ def _columns_by_name(variables: Variables, unknowns: Unknowns) -> dict[tuple[str
     return found
 
 
+def drawn(scenario: Scenario, n: int, generator: np.random.Generator) -> dict[str, Candidates]:
+    """Candidates for the stops of a scenario's instruments, by the instrument whose own they are, "" for all others.
+
+    Args:
+        scenario: The arm, the instruments, where they may measure, and how well.
+        n: How many are drawn for each; of a table all are taken.
+        generator: Draws them.
+
+    Raises:
+        InputError: None can be had.
+    """
+    return {name: candidates(scenario.robot, of, generator, n=n) for name, of in _groups(scenario).items()}
+
+
 def pool_of(
     scenario: Scenario,
-    n_candidates: int,
-    generator: np.random.Generator,
+    found: Mapping[str, Candidates],
     *,
     given: Floats | None = None,
-    keep_out: Sequence[Box] = (),
-    apart: float | None = None,
     before: Problem | None = None,
+    hub: int = 0,
 ) -> Pool:
     """The stops that a scenario's instruments may measure at.
 
     Args:
         scenario: The arm, the instruments, where they may measure, and how well.
-        n_candidates: How many are drawn of each group; of a table all are taken.
-        generator: Draws them.
+        found: Candidates, see `drawn`.
         given: Readings of stops that were measured already, or will be anyway, shape (n, n_joints).
-        keep_out: Boxes that the arm must not reach into.
-        apart: How far candidates are apart at least.
         before: What was measured already.
+        hub: Which of the common candidates comes first: of a star it is the hub.
 
     Raises:
         InputError: The scenario cannot be, or nothing is seen from anywhere.
     """
-    found = {
-        name: candidates(scenario.robot, of, generator, n=n_candidates, keep_out=keep_out, apart=apart)
-        for name, of in _groups(scenario).items()
-    }
+    scenario = _with_instruments(scenario)
     readings = {name: one.readings for name, one in found.items()}
     if given is not None and "" not in readings:
-        found_ = "where every instrument has configurations of its own"
-        raise InputError("given", found_, "a job with what was measured")
+        reason = "where every instrument has configurations of its own"
+        raise InputError("given", reason, "a job with what was measured")
+    if hub:
+        q = readings[""]
+        readings[""] = np.vstack([q[hub : hub + 1], np.delete(q, hub, axis=0)])
     if given is not None:
         readings[""] = np.vstack([given, readings[""]])
+    formed = _formed(scenario)
     simulation = simulate(_silent(scenario, readings), leave_out=True)
     tables = _as_told(simulation)
     options = Options(tables[0].model or "pose", gauge=_gauge(scenario))
@@ -239,7 +259,17 @@ def pool_of(
         given=np.array([stop[k] for k in kept if names[k][0] == "" and names[k][1] < n_given], dtype=np.int64),
         found=found,
         before=before,
+        formed=formed,
     )
+
+
+def _formed(scenario: Scenario) -> dict[int, tuple[Model, Pairing]]:
+    """Instruments by whose poses pairs are formed, by their numbers."""
+    return {
+        k: (i.model, i.pairing)
+        for k, i in enumerate(scenario.instruments)
+        if isinstance(i, Tracker) and i.model in PAIR_MODELS
+    }
 
 
 def _hubs(problem: Problem) -> Integers:
@@ -250,6 +280,14 @@ def _hubs(problem: Problem) -> Integers:
         if len(ends) and np.all(ends[:, 0] == ends[0, 0]):
             found.append(ends[0, 0])
     return np.unique(np.array(found, dtype=np.int64))
+
+
+def _with_instruments(scenario: Scenario) -> Scenario:
+    """The same with what measures poses, where the scenario names no instrument, as one."""
+    if scenario.instruments:
+        return scenario
+    model, pairing = scenario.job.get("model", "distance-rotation"), pairing_of(scenario.job.get("pairing", "star"))
+    return replace(scenario, instruments=(Tracker(model=model, name="poses", pairing=pairing),))
 
 
 def _groups(scenario: Scenario) -> dict[str, Configurations]:
@@ -276,7 +314,11 @@ def _silent(scenario: Scenario, readings: Mapping[str, Floats]) -> Scenario:
         changes: dict[str, Any] = {"noise": nothing, "stated_noise": told}
         if i.configurations is not None:
             changes["configurations"] = GivenReadings(readings[i.name])
-        if isinstance(i, BoardCamera) and not (i.boards or i.fixed) and isinstance(views, BoardViews):
+        if isinstance(i, Tracker) and i.model in PAIR_MODELS:
+            changes |= _as_poses(i)
+        elif isinstance(i, PairGauge):
+            changes["pairs"] = Pairing("star")
+        elif isinstance(i, BoardCamera) and not (i.boards or i.fixed) and isinstance(views, BoardViews):
             changes["boards"] = {"board": views.board}
         instruments.append(replace(i, **changes))
     return replace(
@@ -288,6 +330,20 @@ def _silent(scenario: Scenario, readings: Mapping[str, Floats]) -> Scenario:
         configurations=GivenReadings(readings.get("", np.zeros((0, scenario.robot.n_joints)))),
         instruments=tuple(instruments),
     )
+
+
+def _as_poses(i: Tracker) -> dict[str, Any]:
+    """What measures poses that pairs are formed of: all pairs together hold what the poses do in an unknown frame.
+
+    Those of a star hold less; they are what they are.
+    """
+    if i.pairing.strategy == "star":
+        return {}
+    return {"model": MEASURED[i.model], "frame": Placement(np.eye(3), np.zeros(3))}
+
+
+MEASURED: Mapping[Model, Model] = {"distance": "position", "rotation": "orientation", "distance-rotation": "pose"}
+"""What is measured for pairs of each model to be formed."""
 
 
 def _as_told(simulation: Simulation) -> tuple[Table, ...]:

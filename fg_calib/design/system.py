@@ -37,6 +37,7 @@ class System(FrozenArrays):
         known: Information that is there already, the weak prior in it, shape (n, n).
         task: W, of which `tr(W C)` is the mean square error of the task, C the covariance, shape (n, n).
         core: P, functions of the core that can be determined, orthonormal in changes of ordinary size, shape (p, n).
+        basis: What is determined, in the columns of rows, shape (n_columns, n).
         unknown: Share of the task's mean square that no candidate determines, in [0, 1].
     """
 
@@ -44,6 +45,7 @@ class System(FrozenArrays):
     known: Floats
     task: Floats
     core: Floats
+    basis: Floats
     unknown: float
 
     @property
@@ -91,5 +93,6 @@ def system_of(stops: StopRows, given: Floats, task: Floats) -> System:
         known=Q.T @ known @ Q + SIGNAL_FLOOR**2 * np.eye(Q.shape[1]),
         task=Q[:n].T @ W @ Q[:n],
         core=able.T @ Q[:n],
+        basis=scales[:, None] * Q,
         unknown=float(np.trace(lost.T @ W @ lost)) / total if total > 0.0 else 0.0,
     )

@@ -88,8 +88,9 @@ def _of_a_kind(file: ConfigurationsFile, robot: Robot, units: Units, folder: Pat
         return read_board(file.board, robot, units, f"{place}: board")
     if file.tracker is not None:
         return _tracker(file.tracker, units, f"{place}: tracker")
-    if file.random is not None:
-        return RandomReadings(file.random.count)
+    drawn = file.random
+    if drawn is not None:
+        return RandomReadings(drawn.count)
     return GivenReadings(read_measurements(folder / str(file.table), robot, units=units).readings)
 
 

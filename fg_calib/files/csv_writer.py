@@ -22,12 +22,12 @@ class Words:
     codes: NDArray[np.integer[Any]]
 
 
-def write_csv(path: Path | str, columns: Mapping[str, ArrayLike | Words]) -> None:
+def write_csv(path: Path | str, columns: Mapping[str, ArrayLike | Words | None]) -> None:
     """Write a CSV, whole or not at all; floats read back exactly.
 
     Args:
         path: The file to write.
-        columns: The columns by name, all of one length.
+        columns: The columns by name, all of one length; None for one that is still to be filled in.
 
     Raises:
         InputError: The folder does not exist or may not be written to.
@@ -35,7 +35,7 @@ def write_csv(path: Path | str, columns: Mapping[str, ArrayLike | Words]) -> Non
     write_csv_parts(path, [columns])
 
 
-def write_csv_parts(path: Path | str, parts: Iterable[Mapping[str, ArrayLike | Words]]) -> None:
+def write_csv_parts(path: Path | str, parts: Iterable[Mapping[str, ArrayLike | Words | None]]) -> None:
     """`write_csv` of a long table, some rows at a time.
 
     Args:
@@ -54,6 +54,8 @@ def write_csv_parts(path: Path | str, parts: Iterable[Mapping[str, ArrayLike | W
                 {
                     name: pl.Series(list(values.words), dtype=pl.String).gather(values.codes)
                     if isinstance(values, Words)
+                    else pl.Series([None], dtype=pl.String)
+                    if values is None
                     else np.asarray(values)
                     for name, values in columns.items()
                 }

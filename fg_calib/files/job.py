@@ -14,7 +14,7 @@ from pydantic import Field, StrictBool
 from fg_calib.arguments import checked
 from fg_calib.errors import InputError
 from fg_calib.files.columns import Column
-from fg_calib.files.disk import noting_reads
+from fg_calib.files.disk import exists, is_folder, noting_reads
 from fg_calib.files.instruments import camera_of, read_camera
 from fg_calib.files.robot_yaml import read_robot, robot_from_mapping
 from fg_calib.files.schema import (
@@ -243,6 +243,26 @@ def read_job(path: Path | str) -> Job:
     with noting_reads() as files:
         job = _job(path)
     return replace(job, inputs={_relative(file, path.parent): digest for file, digest in files.items()})
+
+
+@checked
+def is_job(path: Path | str) -> bool:
+    """Whether a file is a job, by what only jobs name: what was measured.
+
+    Args:
+        path: The file; one that is not there is none.
+    """
+    if not exists(Path(path)) or is_folder(Path(path)):
+        return False
+    given = read_yaml(Path(path))
+    return isinstance(given, dict) and "measurements" in given
+
+
+def units_of(job: Job) -> Units:
+    """The units of a job's tables: of the first, if they have their own."""
+    first = job.document.get("measurements")
+    own = first[0].get("units") if isinstance(first, list) and isinstance(first[0], dict) else None
+    return Units(**(own or job.document.get("units") or {}))
 
 
 def _relative(file: Path, folder: Path) -> str:

@@ -62,6 +62,7 @@ from fg_calib.files.scenario_instruments import InstrumentReader, noise_figures
 from fg_calib.files.schema import NotNegative, Number, Positive, Schema, read_yaml, shown, validate
 from fg_calib.files.units import Units, UnitsOfFile
 from fg_calib.measurements.dataset import Noise
+from fg_calib.options import known_names
 from fg_calib.simulation.configurations import Configurations, Placement
 from fg_calib.simulation.instruments import Instrument
 from fg_calib.simulation.scenario import Errors, Scenario, figures_by_name
@@ -110,11 +111,13 @@ class _Scenario(Schema):
 
 
 @checked
-def read_scenario(path: Path | str) -> Scenario:
+def read_scenario(path: Path | str, *, instruments: Path | str | None = None) -> Scenario:
     """The scenario in a YAML file, or a shipped one.
 
     Args:
         path: The file, or the name of a shipped scenario: `space-robot`.
+        instruments: A file with some keys of a scenario (`INSTRUMENT_KEYS`) that stand in the place of its own: other
+            instruments, in its units.
 
     Raises:
         InputError: There is neither, or it or a file that it names cannot be used.
@@ -126,16 +129,40 @@ def read_scenario(path: Path | str) -> Scenario:
         path = SCENARIOS / path / "scenario.yaml"
     elif not exists(path) and path.suffix not in {".yaml", ".yml"}:
         raise InputError("scenario", f"found {str(path)!r}", f"a file, or one of {', '.join(known)}")
-    return _Reader(path, source).read()
+    if instruments is None:
+        return _Reader(path, source, read_yaml(path)).read()
+    return _Reader(path, Path(instruments).name, _with_instruments(read_yaml(path), Path(instruments))).read()
+
+
+INSTRUMENT_KEYS = ("name", "instruments", "noise", "frame", "configurations", "job")
+"""Keys of a scenario that say what measures, where, and how well."""
+
+
+def _with_instruments(scenario: Any, path: Path) -> Any:
+    """A scenario's mapping with the keys of a file of instruments in the place of its own.
+
+    Raises:
+        InputError: The file has other keys, or none.
+    """
+    given = read_yaml(path)
+    if not isinstance(given, dict) or not isinstance(scenario, dict):
+        raise InputError(path.name, f"found {shown(given)}", f"a mapping with some of {', '.join(INSTRUMENT_KEYS)}")
+    for key in given:
+        if key not in INSTRUMENT_KEYS:
+            raise InputError(path.name, f"unknown key {key!r}", known_names(INSTRUMENT_KEYS))
+    job = scenario.get("job")
+    if given.get("instruments") and isinstance(job, dict):
+        scenario = {**scenario, "job": {key: v for key, v in job.items() if key not in ("model", "pairing", "noise")}}
+    return {**scenario, **given}
 
 
 class _Reader:
     """Reads one scenario file."""
 
-    def __init__(self, path: Path, source: str) -> None:
+    def __init__(self, path: Path, source: str, given: Any) -> None:
         self._source = source
         self._folder = path.parent
-        self._file = validate(_Scenario, read_yaml(path), source)
+        self._file = validate(_Scenario, given, source)
         self._units = self._file.units
         self._robot = robot_of(self._file.robot, f"{source}: robot", self._folder, self._units)
         self._default_name = Path(source).stem

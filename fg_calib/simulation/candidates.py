@@ -43,12 +43,18 @@ ASKED = 20
 HOPELESS = 1000
 """Drawn without finding any, no more are drawn."""
 
+PATIENCE = 50
+"""How many times more, of both, where a reflector is not turned but waited for: drawing alone costs next to nothing."""
+
 ROUND = 16_384
 """Most that are drawn at once, for memory."""
 
-N_STARTS, N_STEPS = 6, 30
-"""Starts of the inverse kinematics for each pose, and steps from each: more find few more, and most of the time goes
-into poses that no start reaches."""
+N_STARTS, N_STEPS = 4, 20
+"""Starts of the inverse kinematics for each view of a board, and steps from each: most of the time goes into poses that
+no start reaches, and more of either find few more."""
+
+N_STARTS_TURNED = 2
+"""Starts for each turned reflector: the first is at its place already, and another place costs less than more."""
 
 
 @dataclass(frozen=True)
@@ -98,18 +104,21 @@ def draw_candidates(robot: Robot, of: Configurations, generator: np.random.Gener
         place: Of the configurations, for messages.
 
     Returns:
-        At most n: fewer of a table whose rows are used up, where `ASKED` times as many were drawn, or where none of
-        the first `HOPELESS` could be had.
+        At most n: fewer of a table whose rows are used up, where `ASKED` n were drawn, or where none of the first
+        `HOPELESS` could be had.
 
     Raises:
         InputError: Self-motion is to be held, and the first view of a board is not reached.
     """
-    draw, given = _draw(robot, of, generator, place), isinstance(of, GivenReadings)
-    most = len(of.readings) if isinstance(of, GivenReadings) else ASKED * n
+    draw = _draw(robot, of, generator, place)
+    patience = PATIENCE if isinstance(of, TargetViews) and not _can_be_turned(robot) else 1
+    most, hopeless = ASKED * patience * n, HOPELESS * patience
+    if isinstance(of, GivenReadings):
+        most = hopeless = len(of.readings)
     thinning = Thinning(robot, of.apart)
     taken, n_taken, asked = [np.empty((0, robot.n_joints))], 0, 0
     counts: Counter[str] = Counter()
-    while n_taken < n and asked < most and (n_taken or asked < HOPELESS or given):
+    while n_taken < n and asked < most and (n_taken or asked < hopeless):
         share = n_taken / asked if n_taken else 1.0
         k = min(int(1.1 * (n - n_taken) / share) + 10 if asked else min(n, HOPELESS), ROUND, most - asked)
         readings, reason = draw(k)
@@ -170,7 +179,7 @@ def _views(robot: Robot, views: BoardViews, generator: np.random.Generator, plac
         rotation, position = rotation[-k:], position[-k:]
         first = False
         seen = sees_board(views, rotation, position)
-        found = _reach(robot, rotation[seen], position[seen], near, generator)
+        found = _reach(robot, rotation[seen], position[seen], near, N_STARTS, generator)
         readings, reason = np.zeros((k, robot.n_joints)), np.where(seen, "", "not seen").astype(WORD)
         readings[seen], reason[seen] = found.readings, np.where(found.reached, "", "out of reach")
         return readings, reason
@@ -184,9 +193,9 @@ def _target(robot: Robot, views: TargetViews, generator: np.random.Generator, k:
     readings, near = random_readings(robot, k, starts), True
     at = forward(build_chain(robot).without_columns(), precompute_trig(robot, readings))
     target, region = at.position + at.rotation @ views.target, views.region
-    faced, can_be_turned = faces(views, at.rotation, target), robot.n_joints >= 6
+    faced = faces(views, at.rotation, target)
     reason = np.full(k, "", dtype=WORD)
-    if region is not None and can_be_turned:
+    if region is not None and _can_be_turned(robot):
         target, faced, near = places.uniform(region.lower, region.upper, (k, 3)), np.zeros(k, dtype=np.bool_), False
     elif region is not None:
         reason[~region.holds(target)] = "outside the region"
@@ -194,27 +203,42 @@ def _target(robot: Robot, views: TargetViews, generator: np.random.Generator, k:
     beyond = (away < views.distance[0]) | (away > views.distance[1]) | (away == 0.0)
     reason[beyond & (reason == "")] = "out of range"
     rest = (reason == "") & ~faced
-    if not can_be_turned:
+    if not _can_be_turned(robot):
         reason[rest] = "not seen"
         return readings, reason
     rotation, position = aim(views, target[rest], turns)
-    found = _reach(robot, rotation, position, readings[rest] if near else None, further)
+    found = _reach(robot, rotation, position, readings[rest] if near else None, N_STARTS_TURNED, further)
     readings[rest], reason[rest] = found.readings, np.where(found.reached, "", "out of reach")
     return readings, reason
 
 
+def _can_be_turned(robot: Robot) -> bool:
+    """Whether an arm may bring its tool to a place with any rotation."""
+    return robot.n_joints >= 6
+
+
 def _reach(
-    robot: Robot, rotation: Floats, position: Floats, near: Floats | None, generator: np.random.Generator
+    robot: Robot,
+    rotation: Floats,
+    position: Floats,
+    near: Floats | None,
+    n_starts: int,
+    generator: np.random.Generator,
 ) -> Inverse:
     """Configurations for poses, the inverse kinematics giving up early."""
-    return solve_inverse(robot, position, rotation, near=near, generator=generator, n_starts=N_STARTS, n_steps=N_STEPS)
+    return solve_inverse(robot, position, rotation, near=near, generator=generator, n_starts=n_starts, n_steps=N_STEPS)
 
 
 class Thinning:
     """Takes configurations one after another, each that is not near one taken before."""
 
     def __init__(self, robot: Robot, apart: float | None) -> None:
-        """Args: robot: The robot; apart: least distance, as `Conditions` has it."""
+        """Begin with none taken.
+
+        Args:
+            robot: Whose configurations they are.
+            apart: Least distance of two, as `Conditions` has it; None: any.
+        """
         self._apart = apart
         self._unit = np.array([robot.reach if joint.prismatic else 1.0 for joint in robot.joints])
         self._taken = np.empty((0, robot.n_joints))

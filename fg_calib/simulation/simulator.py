@@ -105,12 +105,12 @@ def _poses(
         sigma_joint=_joint_sigma(stated, robot),
         source="poses.csv",
     )
-    pairing = _pairing(scenario.job.get("pairing", "star"))
+    pairing = pairing_of(scenario.job.get("pairing", "star"))
     table = Table(measurements, scenario.job.get("model"), pairing, frame_knowledge(scenario.frame))
     return Simulation(scenario, seed, robot, true_robot, measurements, true_readings, frame, (table,))
 
 
-def _pairing(given: object) -> Pairing:
+def pairing_of(given: object) -> Pairing:
     """A pairing as a job states it."""
     if isinstance(given, Mapping):
         return Pairing("random", given["random"], given.get("seed", 0))
@@ -275,6 +275,6 @@ def _sifted(robot: Robot, configurations: Configurations, generator: np.random.G
     n = number_of(configurations)
     found = draw_candidates(robot, configurations, generator, n, place)
     if len(found.readings) < n:
-        hint = "ask for fewer, or for less of them"
+        hint = "ask for fewer, or relax what they have to keep to"
         raise InputError(place, f"{len(found.readings)} of {n} found in {found.reasons()}", hint=hint)
     return found.readings

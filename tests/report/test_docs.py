@@ -175,6 +175,20 @@ def is_scenario(text, folder, fg_calib):
     assert fg_calib("calibrate", folder / "job" / "calibration.yaml").code == 0
 
 
+def are_configurations(text, folder, fg_calib):
+    """Of a scenario of a UR10."""
+    units = "units: {length: m, angle: deg}\n"
+    (folder / "robot.yaml").write_text(snippets("tutorial")[0][1])
+    others = "robot: robot.yaml\nerrors: {values: {}}\nnoise: {position: 0.001, orientation: 0.01}\n"
+    (folder / "scenario.yaml").write_text(units + others + text)
+    assert len(simulate(read_scenario(folder / "scenario.yaml"), seed=0).measurements.readings) == 50
+
+
+def draws_candidates(code, folder, fg_calib):
+    exec(code, made := {})
+    assert made["found"].readings.shape == (200, 7)
+
+
 def are_typed(text, folder, fg_calib):
     """Commands of a shell, parsed to the last option but not run; extras are those that there are."""
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
@@ -315,7 +329,8 @@ HOW = {
     "export": [are_typed, exports_an_arm],
     "next-month": [are_typed, slow(checks_and_updates)],
     "observability": [is_printed],
-    "simulate": [slow(are_run), is_scenario, slow(is_scenario, pytest.mark.long)],
+    "simulate": [slow(are_run), is_scenario, are_configurations, slow(draws_candidates),
+                 slow(is_scenario, pytest.mark.long)],
     "compare": [slow(is_printed)],
     "python": [slow(calibrates_from_arrays), slow(is_a_kind_of_ones_own), slow(extends_the_graph)],
     "layout": [are_typed],
