@@ -20,6 +20,7 @@ from fg_calib.files.robot_yaml import write_robot
 from fg_calib.files.simulated_tables import instrument_keys, table_columns, to_fill_in
 from fg_calib.files.units import Units
 from fg_calib.files.urdf import write_urdf
+from fg_calib.measurements.series import Table
 from fg_calib.report.figures import empty_figure
 from fg_calib.report.shown import SHOWN
 from fg_calib.report.tables import indented, line, plain_table, rounded, section
@@ -347,6 +348,13 @@ def write_designs(folder: Path, designs: Mapping[str, Design], units: Units) -> 
     figure = draw_designs(designs)
     fill_folder(folder, lambda into: figure.savefig(into / "instruments.png", dpi=160), {"instruments.png": b"\x89PNG"})
     return (*names, "instruments.png")
+
+
+def _is_touched(table: Table) -> bool:
+    """Whether something is touched, so that it is the joint readings that are measured."""
+    m = table.measurements
+    contact = table.model in ("anchor", "plane") and not np.any(0.0 if m.length is None else m.length)
+    return m.groups is not None or contact
 
 
 def _configurations(design: Design, robot: Robot, units: Units) -> dict[str, Any]:
