@@ -311,7 +311,11 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
 
     robot = design.pool.robot if design.pool.before is None else design.pool.before.robot
     tables = design.tables if design.pool.scenario is not None else ()
-    files = {name: to_fill_in(columns) for t in tables for name, columns in table_columns(t, robot, units).items()}
+    files = {
+        name: to_fill_in(columns, touched=_is_touched(t))
+        for t in tables
+        for name, columns in table_columns(t, robot, units).items()
+    }
     figure = draw_designs({"": design})
     urdf = "robot.urdf" if robot.urdf is not None and tables else None
 
