@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
     from fg_calib.calibration import Calibration, calibrate, calibrate_job
     from fg_calib.correction import correct
+    from fg_calib.design.design import Design, design_measurements
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
     from fg_calib.exports.export import Export, export
     from fg_calib.files.columns import Column

@@ -264,6 +264,8 @@ def draw_designs(designs: Mapping[str, Design]) -> Figure:
         designs: They, by the instruments' names.
     """
     figure = empty_figure(6.0, 3.8)
+    from matplotlib.ticker import LogLocator, NullFormatter
+
     axes = figure.add_subplot()
     several = len(designs) > 1
     for colour, (name, one) in zip(_COLOURS * len(designs), designs.items(), strict=False):
@@ -280,9 +282,10 @@ def draw_designs(designs: Mapping[str, Design]) -> Figure:
                           fontsize=7, color="0.4")  # fmt: skip
     axes.set_xscale("log")
     axes.set_yscale("log")
-    for axis, fmt in ((axes.xaxis, "{x:g}"), (axes.yaxis, "{x:g}")):
-        axis.set_major_formatter(fmt)
-        axis.set_minor_formatter(fmt)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
     axes.tick_params(labelsize=7, which="both")
     axes.set_xlabel("stops", fontsize=8)
     axes.set_ylabel("expected RMS error over the task [mm]", fontsize=8)
