@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
     from fg_calib.calibration import Calibration, calibrate, calibrate_job
     from fg_calib.correction import correct
-    from fg_calib.design.design import Design, design_measurements
+    from fg_calib.designs.design import Design, design
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
     from fg_calib.exports.export import Export, export
     from fg_calib.files.columns import Column
@@ -68,6 +68,7 @@ if TYPE_CHECKING:
     from fg_calib.robot.kinematics import pose
     from fg_calib.robot.model import Robot
     from fg_calib.robot.reaching import Correction
+    from fg_calib.simulation.configurations import BoardViews, GivenReadings, RandomReadings, TargetViews
     from fg_calib.simulation.scenario import Scenario, Simulation
     from fg_calib.simulation.simulator import simulate
 
@@ -78,6 +79,8 @@ _HOMES = {
     "fg_calib.baseline.comparison": ("Comparison", "compare"),
     "fg_calib.calibration": ("Calibration", "calibrate", "calibrate_job"),
     "fg_calib.correction": ("correct",),
+    "fg_calib.designs.design": ("Design", "design"),
+    "fg_calib.simulation.configurations": ("BoardViews", "GivenReadings", "RandomReadings", "TargetViews"),
     "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
     "fg_calib.exports.export": ("Export", "export"),
     "fg_calib.files.columns": ("Column",),
@@ -131,6 +134,7 @@ _FROM_FILES = {"Robot": ("from_urdf", "read_urdf"), "Measurements": ("from_frame
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
+    "BoardViews",
     "Bound",
     "Calibration",
     "CalibrationError",
@@ -139,9 +143,11 @@ __all__ = [
     "Column",
     "Comparison",
     "Correction",
+    "Design",
     "DistanceFactor",
     "Explanation",
     "Export",
+    "GivenReadings",
     "History",
     "Identifiability",
     "InputError",
@@ -158,6 +164,7 @@ __all__ = [
     "Pairing",
     "Problem",
     "ProblemError",
+    "RandomReadings",
     "Result",
     "Robot",
     "RotationAngleFactor",
@@ -168,6 +175,7 @@ __all__ = [
     "SolverError",
     "SolverOptions",
     "Table",
+    "TargetViews",
     "Targets",
     "Uncertainty",
     "Units",
@@ -180,6 +188,7 @@ __all__ = [
     "comparison_document",
     "correct",
     "cramer_rao",
+    "design",
     "estimate_noise",
     "estimate_tolerances",
     "expand",

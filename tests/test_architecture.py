@@ -37,7 +37,7 @@ FOLDERS = (
         "graph",
         "analysis",
         "baseline",
-        "design",
+        "designs",
         "report",
         "calibration",
         "correction",

@@ -13,7 +13,7 @@ import yaml
 from rich.console import Group, RenderableType
 
 from fg_calib.analysis.accuracy import PoseRms
-from fg_calib.design.design import Design
+from fg_calib.designs.design import Design
 from fg_calib.files.csv_writer import write_csv
 from fg_calib.files.disk import fill_folder, write_text
 from fg_calib.files.robot_yaml import write_robot

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arrays import FrozenArrays
-from fg_calib.design.criteria import Criterion, Measure
-from fg_calib.design.system import System
+from fg_calib.designs.criteria import Criterion, Measure
+from fg_calib.designs.system import System
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -19,16 +19,16 @@ from numpy.typing import NDArray
 from fg_calib.analysis.accuracy import PoseRms
 from fg_calib.arguments import checked
 from fg_calib.arrays import FrozenArrays
-from fg_calib.design.candidates import Candidates
-from fg_calib.design.criteria import Criterion, Measure
-from fg_calib.design.cures import Cure, cures_of
-from fg_calib.design.of_job import pool_of_more, pool_of_rows, solved
-from fg_calib.design.order import shortest_way, travel
-from fg_calib.design.pairs import PairPlan, PairWork, Structure, free_pairs, plan_pairs
-from fg_calib.design.pool import Pool, drawn, pool_of
-from fg_calib.design.search import Chosen, exchanged, greedy, not_worse_than_random, random_values
-from fg_calib.design.system import System, system_of
-from fg_calib.design.task import N_TASK, Posterior, Task, is_fitted
+from fg_calib.designs.candidates import Candidates
+from fg_calib.designs.criteria import Criterion, Measure
+from fg_calib.designs.cures import Cure, cures_of
+from fg_calib.designs.of_job import pool_of_more, pool_of_rows, solved
+from fg_calib.designs.order import shortest_way, travel
+from fg_calib.designs.pairs import PairPlan, PairWork, Structure, free_pairs, plan_pairs
+from fg_calib.designs.pool import Pool, drawn, pool_of
+from fg_calib.designs.search import Chosen, exchanged, greedy, not_worse_than_random, random_values
+from fg_calib.designs.system import System, system_of
+from fg_calib.designs.task import N_TASK, Posterior, Task, is_fitted
 from fg_calib.errors import InputError
 from fg_calib.graph.observability import Observability
 from fg_calib.job import Job
