@@ -40,6 +40,7 @@ FOLDERS = (
         "report",
         "calibration",
         "correction",
+        "prediction",
         "pages",
         "exports",
         "cli",
