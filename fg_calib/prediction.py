@@ -61,7 +61,7 @@ def predict(
     found = calibration if isinstance(calibration, Calibration) else Calibration.load(calibration)
     if found.result.evaluated_only:
         raise InputError(found.result.robot, "the arm was only evaluated: nothing was estimated", "a calibration")
-    there = _readings("measured", measured, found) if measured is not None else _measured(found, folder)
+    there = _readings("measured", measured, found) if measured is not None else measured_of(found, folder)
     at = None if readings is None else _readings("readings", readings, found)
     model = ToolErrorModel.of(found.posterior, there, joint_noise_of(found))
     return predict_errors(found.robot, model, there, at, fitted=found.result.free_of_frame, limit=limit)
@@ -83,8 +83,16 @@ def joint_noise_of(calibration: Calibration) -> Floats | None:
     return sigma if np.any(sigma > 0.0) else None
 
 
-def _measured(found: Calibration, folder: Path | None) -> Floats:
-    """Readings of the measured configurations."""
+def measured_of(found: Calibration, folder: Path | None = None) -> Floats:
+    """Readings of the measured configurations, those held out among them, shape (m, n_joints).
+
+    Args:
+        found: The calibration.
+        folder: What it was loaded from: the folder, or its `result.json`.
+
+    Raises:
+        InputError: Nothing says what was measured.
+    """
     if found.assessed is not None:
         readings: Floats = found.solution.problem.data.readings
         return readings

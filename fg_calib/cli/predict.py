@@ -41,8 +41,8 @@ def predict(
     from fg_calib.calibration import Calibration
     from fg_calib.files.prediction import read_joint_table
     from fg_calib.files.units import Units, quantity
+    from fg_calib.prediction import measured_of, require_prediction, write_prediction
     from fg_calib.prediction import predict as predict_tool
-    from fg_calib.prediction import require_prediction, write_prediction
     from fg_calib.report.prediction import build_prediction_report, prediction_document
 
     most = None if limit is None else quantity(limit, "m", Units(), "--limit")
@@ -51,7 +51,7 @@ def predict(
         require_prediction(out)
     calibration = Calibration.load(result)
     ids, readings = ((), None) if at is None else read_joint_table(at, calibration.robot, units)
-    found = predict_tool(result, readings, limit=most)
+    found = predict_tool(calibration, readings, limit=most, measured=measured_of(calibration, result))
     try:
         if as_json:
             show_json(prediction_document(found, calibration.result, ids))

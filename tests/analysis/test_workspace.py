@@ -47,6 +47,7 @@ def test_after_the_best_fit_measured_configurations_have_the_error_that_is_expec
     found = survey_at(calibrated, m.readings, monkeypatch, fitted=True)
     _, fitted = errors_at(result.uncertainty.whole, m.readings)
     assert np.sqrt(np.mean(found.error**2)) == pytest.approx(fitted.position, rel=1e-7)
+    assert np.sqrt(np.mean(found.errors.fitted[:, 1] ** 2)) == pytest.approx(fitted.orientation, rel=1e-7)
 
 
 @pytest.mark.slow
