@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from fg_calib.analysis.identifiability import Identifiability, observe_configurations, observe_structure
     from fg_calib.analysis.inspection import Inspection, inspect_job
     from fg_calib.analysis.mistakes import SetupCheck, check_setup
+    from fg_calib.analysis.prediction import PredictedErrors
     from fg_calib.analysis.restarts import look_elsewhere
     from fg_calib.analysis.uncertainty import Uncertainty, assess
     from fg_calib.analysis.variance_components import estimate_noise, solve_job
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
     from fg_calib.measurements.series import KnownPoint, Own, Table
     from fg_calib.options import Limits, Options, Pairing
     from fg_calib.pages import write_report
+    from fg_calib.prediction import predict, write_prediction
     from fg_calib.report.comparison import format_comparison
     from fg_calib.report.documents import (
         comparison_document,
@@ -111,6 +113,8 @@ _HOMES = {
     "fg_calib.measurements.kinds.pixel": ("Camera",),
     "fg_calib.measurements.series": ("KnownPoint", "Own", "Table"),
     "fg_calib.pages": ("write_report",),
+    "fg_calib.prediction": ("predict", "write_prediction"),
+    "fg_calib.analysis.prediction": ("PredictedErrors",),
     "fg_calib.options": ("Limits", "Options", "Pairing"),
     "fg_calib.report.comparison": ("format_comparison",),
     "fg_calib.report.identifiability": ("format_identifiability",),
@@ -162,6 +166,7 @@ __all__ = [
     "Options",
     "Own",
     "Pairing",
+    "PredictedErrors",
     "Problem",
     "ProblemError",
     "RandomReadings",
@@ -207,6 +212,7 @@ __all__ = [
     "observe_configurations",
     "observe_structure",
     "pose",
+    "predict",
     "problem_of",
     "read_job",
     "read_measurements",
@@ -223,6 +229,7 @@ __all__ = [
     "solve_job",
     "write_comparison",
     "write_observability",
+    "write_prediction",
     "write_report",
     "write_results",
     "write_robot",

@@ -41,6 +41,7 @@ FOLDERS = (
         "report",
         "calibration",
         "correction",
+        "prediction",
         "pages",
         "exports",
         "cli",

@@ -19,6 +19,7 @@ TOPICS: Mapping[str, str] = {
     "reading-a-report": "what the numbers mean",
     "believe-it": "inspect, limits, folds, the page to show, two results side by side",
     "correct": "what to command so that the calibrated arm reaches its targets",
+    "predict": "how far off the calibrated tool is expected to be, where and why",
     "export": "into the robot: URDF, ROS, Tesseract, tables, joint zeros",
     "next-month": "is a calibration still good, what has moved, and what was learned since",
     "observability": "which parameters measurements can determine at all",

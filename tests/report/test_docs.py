@@ -300,6 +300,14 @@ def corrects_a_program(code, folder, fg_calib):
     exec(code, {})
 
 
+def predicts_an_arm(code, folder, fg_calib):
+    rng, robot = np.random.default_rng(1), small_arm({"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3})
+    calibrate(robot, measure(true_robot(robot, rng), 20, rng), model="position").save(folder / "result")
+    exec(code, made := {})
+    assert made["found"].within is not None
+    assert (folder / "expected" / "predict.png").stat().st_size > 10_000
+
+
 def exports_an_arm(code, folder, fg_calib):
     exec(code, {})
     assert read_robot(folder / "arm_hayati.yaml").n_joints == 2
@@ -326,6 +334,7 @@ HOW = {
     "from-bags-and-images": [are_typed, is_job, are_typed, is_board, is_board],
     "believe-it": [is_key_of_a_job],
     "correct": [are_typed, corrects_a_program],
+    "predict": [are_typed, slow(predicts_an_arm)],
     "export": [are_typed, exports_an_arm],
     "next-month": [are_typed, slow(checks_and_updates)],
     "observability": [is_printed],
