@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from fg_calib.analysis.identifiability import Identifiability, observe_configurations, observe_structure
     from fg_calib.analysis.inspection import Inspection, inspect_job
     from fg_calib.analysis.mistakes import SetupCheck, check_setup
+    from fg_calib.analysis.prediction import PredictedErrors
     from fg_calib.analysis.restarts import look_elsewhere
     from fg_calib.analysis.uncertainty import Uncertainty, assess
     from fg_calib.analysis.variance_components import estimate_noise, solve_job
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
     from fg_calib.calibration import Calibration, calibrate, calibrate_job
     from fg_calib.correction import correct
+    from fg_calib.designs.design import Design, design
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
     from fg_calib.exports.export import Export, export
     from fg_calib.files.columns import Column
@@ -51,6 +53,7 @@ if TYPE_CHECKING:
     from fg_calib.measurements.series import KnownPoint, Own, Table
     from fg_calib.options import Limits, Options, Pairing
     from fg_calib.pages import write_report
+    from fg_calib.prediction import predict, write_prediction
     from fg_calib.report.comparison import format_comparison
     from fg_calib.report.documents import (
         comparison_document,
@@ -67,6 +70,7 @@ if TYPE_CHECKING:
     from fg_calib.robot.kinematics import pose
     from fg_calib.robot.model import Robot
     from fg_calib.robot.reaching import Correction
+    from fg_calib.simulation.configurations import BoardViews, GivenReadings, RandomReadings, TargetViews
     from fg_calib.simulation.scenario import Scenario, Simulation
     from fg_calib.simulation.simulator import simulate
 
@@ -77,6 +81,8 @@ _HOMES = {
     "fg_calib.baseline.comparison": ("Comparison", "compare"),
     "fg_calib.calibration": ("Calibration", "calibrate", "calibrate_job"),
     "fg_calib.correction": ("correct",),
+    "fg_calib.designs.design": ("Design", "design"),
+    "fg_calib.simulation.configurations": ("BoardViews", "GivenReadings", "RandomReadings", "TargetViews"),
     "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
     "fg_calib.exports.export": ("Export", "export"),
     "fg_calib.files.columns": ("Column",),
@@ -107,6 +113,8 @@ _HOMES = {
     "fg_calib.measurements.kinds.pixel": ("Camera",),
     "fg_calib.measurements.series": ("KnownPoint", "Own", "Table"),
     "fg_calib.pages": ("write_report",),
+    "fg_calib.prediction": ("predict", "write_prediction"),
+    "fg_calib.analysis.prediction": ("PredictedErrors",),
     "fg_calib.options": ("Limits", "Options", "Pairing"),
     "fg_calib.report.comparison": ("format_comparison",),
     "fg_calib.report.identifiability": ("format_identifiability",),
@@ -130,6 +138,7 @@ _FROM_FILES = {"Robot": ("from_urdf", "read_urdf"), "Measurements": ("from_frame
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
+    "BoardViews",
     "Bound",
     "Calibration",
     "CalibrationError",
@@ -138,9 +147,11 @@ __all__ = [
     "Column",
     "Comparison",
     "Correction",
+    "Design",
     "DistanceFactor",
     "Explanation",
     "Export",
+    "GivenReadings",
     "History",
     "Identifiability",
     "InputError",
@@ -155,8 +166,10 @@ __all__ = [
     "Options",
     "Own",
     "Pairing",
+    "PredictedErrors",
     "Problem",
     "ProblemError",
+    "RandomReadings",
     "Result",
     "Robot",
     "RotationAngleFactor",
@@ -167,6 +180,7 @@ __all__ = [
     "SolverError",
     "SolverOptions",
     "Table",
+    "TargetViews",
     "Targets",
     "Uncertainty",
     "Units",
@@ -179,6 +193,7 @@ __all__ = [
     "comparison_document",
     "correct",
     "cramer_rao",
+    "design",
     "estimate_noise",
     "estimate_tolerances",
     "expand",
@@ -197,6 +212,7 @@ __all__ = [
     "observe_configurations",
     "observe_structure",
     "pose",
+    "predict",
     "problem_of",
     "read_job",
     "read_measurements",
@@ -213,6 +229,7 @@ __all__ = [
     "solve_job",
     "write_comparison",
     "write_observability",
+    "write_prediction",
     "write_report",
     "write_results",
     "write_robot",

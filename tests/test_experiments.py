@@ -687,3 +687,16 @@ def test_next_month_quick_says_nothing_of_what_did_not_change_and_finds_what_did
     off = [found["updates"][f"unknown {finer}"]["off"][0] for finer in ("1", "0.1", "0.01", "0.001")]
     assert off[-1] < 1e-6
     assert all(a / b == pytest.approx(10.0, rel=0.1) for a, b in pairwise(off))
+
+
+@pytest.mark.long
+def test_predict_expects_the_errors_that_arms_have(tmp_path):
+    """Two draws a case say that figures are of one size; the ledger has those of 200."""
+    found = load("17_predict.py").main(["--quick", "--out", str(tmp_path)])
+    for case in found["cases"].values():
+        assert case["not_converged"] == 0
+        for frame in ("fitted", "base"):
+            # Of two arms with two effective degrees of freedom each, in 99.9 % of cases.
+            assert 0.1 < case[frame]["position"][0] < 2.2
+            assert 0.05 < case[frame]["worst"][0] < 3.0
+            assert case[frame]["worst_expected"] > case[frame]["expected_rms"][0]

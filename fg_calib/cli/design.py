@@ -86,8 +86,8 @@ def design(
     as_json: Json = False,
 ) -> None:
     """Choose which configurations to measure, and say what accuracy to expect of how many."""
-    from fg_calib.design.design import N_STOPS
-    from fg_calib.design.design import design as designed
+    from fg_calib.designs.design import N_STOPS
+    from fg_calib.designs.design import design as designed
     from fg_calib.files.disk import require_writable
     from fg_calib.files.units import Units, quantity
     from fg_calib.report.plan import (

@@ -36,6 +36,7 @@ from fg_calib.cli.init import init
 from fg_calib.cli.inspect import inspect
 from fg_calib.cli.observe import observe
 from fg_calib.cli.output import say
+from fg_calib.cli.predict import predict
 from fg_calib.cli.progress import hide_progress, progress
 from fg_calib.cli.report import report
 from fg_calib.cli.simulate import simulate
@@ -55,6 +56,7 @@ for command in (
     report,
     export,
     correct,
+    predict,
     compare,
     check,
     update,

@@ -54,10 +54,10 @@ def write_csv_parts(path: Path | str, parts: Iterable[Mapping[str, ArrayLike | W
                 {
                     name: pl.Series(list(values.words), dtype=pl.String).gather(values.codes)
                     if isinstance(values, Words)
-                    else pl.Series([None], dtype=pl.String)
-                    if values is None
                     else np.asarray(values)
                     for name, values in columns.items()
+                    if values is not None
                 }
             )
+            frame = frame.with_columns(pl.lit(None).alias(n) for n, v in columns.items() if v is None).select(*columns)
             frame.write_csv(file, include_header=i == 0)

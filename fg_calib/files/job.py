@@ -616,3 +616,24 @@ def joint_noise(given: object, units: Units, robot: Robot, place: str) -> tuple[
             words = " and ".join(f"{given} {units.name(unit)} for {name}" for unit, name in sorted(kinds.items()))
             _log.warning("%s: joint: %s is %s; a list has one figure a joint", place, given, words)
     return tuple(units.sigma(f, j.unit, f"{place}: joint") for f, j in zip(figures, robot.joints, strict=True))
+
+
+def joint_noise_in(document: Mapping[str, Any], robot: Robot, place: str) -> tuple[float, ...]:
+    """Sigma of each joint's readings, [rad] (prismatic: [m]), as a job states it: all its tables have the same.
+
+    Args:
+        document: The job (see `Job.document`).
+        robot: Its robot.
+        place: Where it stands, for messages.
+
+    Raises:
+        InputError: It cannot be used.
+    """
+    file: _JobOfTables = validate(_JobOfTables, {**document, "robot": "."}, place)
+    stated, _ = _noise(file.noise, file.units, robot, f"{place}: noise")
+    if isinstance(file.measurements, list) and file.measurements:
+        entry: _Table = validate(_Table, file.measurements[0], place)
+        if isinstance(entry.noise, dict) and "joint" in entry.noise:
+            stated, _ = _noise(entry.noise, entry.units or file.units, robot, f"{place}: noise")
+    assert isinstance(stated.joint, tuple)
+    return stated.joint

@@ -539,6 +539,14 @@ class Result(Section):
     previous: Previous | None = None
     carried: Carried | None = None
 
+    @property
+    def free_of_frame(self) -> bool:
+        """Whether nothing was measured in the base frame, so that errors count after the best rigid fit."""
+        expected = self.expected_error
+        if expected is not None and expected.relative is not None:
+            return expected.relative
+        return self.frame_estimate is not None or self.pairing is not None
+
 
 def result_schema() -> dict[str, Any]:
     """The JSON schema of `result.json`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -82,10 +83,16 @@ MEASURED = (*"xyz", "qx", "qy", "qz", "qw", "distance", "angle", *"uv")
 """Columns of what is measured."""
 
 
-def to_fill_in(columns: Columns) -> Columns:
-    """The columns of a table with nothing measured yet; what is touched is at distance 0 before it is measured."""
-    empty = {name: None for name, v in columns.items() if name in MEASURED and np.any(np.asarray(v) != 0.0)}
-    return dict(columns) | empty
+def to_fill_in(columns: Columns, *, touched: bool = False) -> Columns:
+    """The columns of a table with nothing measured yet.
+
+    Args:
+        columns: They.
+        touched: Whether something is touched: what is measured are the joint readings then.
+    """
+    measured = {name: None for name, v in columns.items() if name in MEASURED and np.any(np.asarray(v) != 0.0)}
+    joints = {name: None for name in columns if touched and re.fullmatch(r"q\d+", name)}
+    return dict(columns) | measured | joints
 
 
 def instrument_keys(tables: Sequence[Table], units: Units) -> dict[str, Any]:

@@ -13,13 +13,14 @@ import yaml
 from rich.console import Group, RenderableType
 
 from fg_calib.analysis.accuracy import PoseRms
-from fg_calib.design.design import Design
+from fg_calib.designs.design import Design
 from fg_calib.files.csv_writer import write_csv
 from fg_calib.files.disk import fill_folder, write_text
 from fg_calib.files.robot_yaml import write_robot
 from fg_calib.files.simulated_tables import instrument_keys, table_columns, to_fill_in
 from fg_calib.files.units import Units
 from fg_calib.files.urdf import write_urdf
+from fg_calib.measurements.series import Table
 from fg_calib.report.figures import empty_figure
 from fg_calib.report.shown import SHOWN
 from fg_calib.report.tables import indented, line, plain_table, rounded, section
@@ -263,6 +264,8 @@ def draw_designs(designs: Mapping[str, Design]) -> Figure:
         designs: They, by the instruments' names.
     """
     figure = empty_figure(6.0, 3.8)
+    from matplotlib.ticker import LogLocator, NullFormatter
+
     axes = figure.add_subplot()
     several = len(designs) > 1
     for colour, (name, one) in zip(_COLOURS * len(designs), designs.items(), strict=False):
@@ -279,9 +282,10 @@ def draw_designs(designs: Mapping[str, Design]) -> Figure:
                           fontsize=7, color="0.4")  # fmt: skip
     axes.set_xscale("log")
     axes.set_yscale("log")
-    for axis, fmt in ((axes.xaxis, "{x:g}"), (axes.yaxis, "{x:g}")):
-        axis.set_major_formatter(fmt)
-        axis.set_minor_formatter(fmt)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
     axes.tick_params(labelsize=7, which="both")
     axes.set_xlabel("stops", fontsize=8)
     axes.set_ylabel("expected RMS error over the task [mm]", fontsize=8)
@@ -310,7 +314,11 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
 
     robot = design.pool.robot if design.pool.before is None else design.pool.before.robot
     tables = design.tables if design.pool.scenario is not None else ()
-    files = {name: to_fill_in(columns) for t in tables for name, columns in table_columns(t, robot, units).items()}
+    files = {
+        name: to_fill_in(columns, touched=_is_touched(t))
+        for t in tables
+        for name, columns in table_columns(t, robot, units).items()
+    }
     figure = draw_designs({"": design})
     urdf = "robot.urdf" if robot.urdf is not None and tables else None
 
@@ -347,6 +355,13 @@ def write_designs(folder: Path, designs: Mapping[str, Design], units: Units) -> 
     figure = draw_designs(designs)
     fill_folder(folder, lambda into: figure.savefig(into / "instruments.png", dpi=160), {"instruments.png": b"\x89PNG"})
     return (*names, "instruments.png")
+
+
+def _is_touched(table: Table) -> bool:
+    """Whether something is touched, so that it is the joint readings that are measured."""
+    m = table.measurements
+    contact = table.model in ("anchor", "plane") and not np.any(0.0 if m.length is None else m.length)
+    return m.groups is not None or contact
 
 
 def _configurations(design: Design, robot: Robot, units: Units) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from oracle import tool_pose
 from simulated import paper_robot, planar_robot, small_arm
 from tolerances import rounding
 
-from fg_calib.design.candidates import Box, candidates
+from fg_calib.designs.candidates import Box, candidates
 from fg_calib.errors import InputError
 from fg_calib.robot.inverse import REACHED, random_readings
 from fg_calib.robot.model import Joint, RobotBuilder

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arrays import FrozenArrays
-from fg_calib.design.criteria import Criterion, Measure
-from fg_calib.design.rows import StopRows
-from fg_calib.design.search import choose
-from fg_calib.design.system import system_of
-from fg_calib.design.task import Posterior, Task
+from fg_calib.designs.criteria import Criterion, Measure
+from fg_calib.designs.rows import StopRows
+from fg_calib.designs.search import choose
+from fg_calib.designs.system import system_of
+from fg_calib.designs.task import Posterior, Task
 from fg_calib.graph.build import true_problem
 from fg_calib.graph.factors import prior_rows
 from fg_calib.graph.information import whitened_jacobian

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arrays import FrozenArrays
-from fg_calib.design.rows import StopRows
+from fg_calib.designs.rows import StopRows
 from fg_calib.graph.observability import SIGNAL_FLOOR
 
 Floats = NDArray[np.float64]

@@ -44,7 +44,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from fg_calib.design.system import System
+from fg_calib.designs.system import System
 from fg_calib.robot.kinematics import over_processors
 
 Floats = NDArray[np.float64]

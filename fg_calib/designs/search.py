@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arrays import FrozenArrays
-from fg_calib.design.criteria import Criterion, Measure
-from fg_calib.design.system import System
+from fg_calib.designs.criteria import Criterion, Measure
+from fg_calib.designs.system import System
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -84,10 +84,15 @@ def greedy(measure: Measure, n: int, start: Integers | None = None) -> Integers:
     return np.array(chosen[:n], dtype=np.int64)
 
 
-def exchanged(measure: Measure, chosen: Integers) -> Chosen:
+def exchanged(measure: Measure, chosen: Integers, *, quickly: bool = False) -> Chosen:
     """Candidates with each exchanged for a better one, until none is.
 
     Most exchanges are among the few candidates that would help most now: these are tried first, then all.
+
+    Args:
+        measure: The criterion.
+        chosen: What to start from.
+        quickly: Whether these few are all that is tried.
     """
     system = measure.system
     now, value = chosen.copy(), measure.value(system.information(chosen))
@@ -104,6 +109,8 @@ def exchanged(measure: Measure, chosen: Integers) -> Chosen:
                 now = short[places]
                 if last - value <= LEAST_GAIN * abs(last):
                     break
+            if quickly:
+                break
         now, value = _sweep(measure, now, value)
         if before - value <= LEAST_GAIN * abs(before):
             break

@@ -19,16 +19,16 @@ from numpy.typing import NDArray
 from fg_calib.analysis.accuracy import PoseRms
 from fg_calib.arguments import checked
 from fg_calib.arrays import FrozenArrays
-from fg_calib.design.candidates import Candidates
-from fg_calib.design.criteria import Criterion, Measure
-from fg_calib.design.cures import Cure, cures_of
-from fg_calib.design.of_job import pool_of_more, pool_of_rows, solved
-from fg_calib.design.order import shortest_way, travel
-from fg_calib.design.pairs import PairPlan, PairWork, Structure, free_pairs, plan_pairs
-from fg_calib.design.pool import Pool, drawn, pool_of
-from fg_calib.design.search import Chosen, exchanged, greedy, not_worse_than_random, random_values
-from fg_calib.design.system import System, system_of
-from fg_calib.design.task import N_TASK, Posterior, Task, is_fitted
+from fg_calib.designs.candidates import Candidates
+from fg_calib.designs.criteria import Criterion, Measure
+from fg_calib.designs.cures import Cure, cures_of
+from fg_calib.designs.of_job import pool_of_more, pool_of_rows, solved
+from fg_calib.designs.order import shortest_way, travel
+from fg_calib.designs.pairs import PairPlan, PairWork, Structure, free_pairs, plan_pairs
+from fg_calib.designs.pool import Pool, drawn, pool_of
+from fg_calib.designs.search import Chosen, exchanged, greedy, not_worse_than_random, random_values
+from fg_calib.designs.system import System, system_of
+from fg_calib.designs.task import N_TASK, Posterior, Task, is_fitted
 from fg_calib.errors import InputError
 from fg_calib.graph.observability import Observability
 from fg_calib.job import Job
@@ -60,6 +60,9 @@ N_FEW = 300
 
 N_HUB_STOPS = 20
 """Stops that each is tried with, at most."""
+
+LEAST_CURVE = 4
+"""Stops with which the curve begins."""
 
 N_CURVE = 10
 """Numbers of stops at which the curve is worked out, about."""
@@ -396,6 +399,9 @@ def _other_pairs(
 class _Chooser:
     """Chooses from a system; the error is always that over the task.
 
+    Greedy choice does not see that some stops help only together, as the first lengths to an anchor that is unknown do:
+    that by the volume of everything unknown, what is beside the arm too, is another start.
+
     Args:
         system: What is chosen from.
         criterion: By which criterion.
@@ -405,48 +411,52 @@ class _Chooser:
         self.system, self.criterion = system, criterion
         self.measure = Measure(criterion, system)
         self._error = Measure("I", system)
-        self._order: Integers = np.zeros(0, dtype=np.int64)
+        of_all = Measure("D", replace(system, core=np.eye(system.rows.shape[2])))
+        self._orders = [(measure, np.zeros(0, dtype=np.int64)) for measure in (self.measure, of_all)]
 
     def error(self, chosen: Integers) -> float:
         """Expected RMS error with some candidates, [m]."""
         return float(np.sqrt(self._error.value(self.system.information(chosen))))
 
-    def first(self, n: int) -> Integers:
-        """What greedy choice takes first."""
-        if len(self._order) < n:
-            self._order = greedy(self.measure, n, self._order)
-        return self._order[:n]
+    def starts(self, n: int) -> list[Integers]:
+        """What greedy choice takes first, the best start first."""
+        self._orders = [(m, greedy(m, n, order) if len(order) < n else order) for m, order in self._orders]
+        found = [order[:n] for _, order in self._orders]
+        return sorted(found, key=lambda one: self.measure.value(self.system.information(one)))
 
     def best(self, n: int) -> Chosen:
-        """The best n."""
-        return exchanged(self.measure, self.first(n))
+        """The best n that exchange finds."""
+        return min((exchanged(self.measure, one) for one in self.starts(n)), key=lambda chosen: chosen.value)
+
+    def quickly(self, n: int) -> Chosen:
+        """Nearly as good ones, in a small part of the time."""
+        return exchanged(self.measure, self.starts(n)[0], quickly=True)
 
     def reaching(self, target: float) -> Chosen:
         """As few as reach a target, [m]; as many as may be where none do."""
         most = min(MOST_STOPS, self.system.n_candidates)
         enough = 1
-        while self.error(self.first(enough)) > target:
+        while min(map(self.error, self.starts(enough))) > target:
             if enough == most:
-                return self.best(most) if most <= N_STOPS else Chosen(self.first(most), np.inf)
-            enough = min(most, enough + 1 if enough < N_STOPS else enough + 5)
-        low, found = 0, self.best(enough)
-        high = enough
+                return Chosen(self.starts(most)[0], np.inf)
+            enough = min(most, enough + max(1, enough // 10))
+        low, high, found = 0, enough, self.quickly(enough)
         while high - low > 1:
             middle = max(low + 1, high - max(1, (high - low) // 4))
-            better = self.best(middle)
+            better = self.quickly(middle)
             if self.error(better.candidates) <= target:
                 high, found = middle, better
             else:
                 low = middle
-        return found
+        return exchanged(self.measure, found.candidates)
 
     def curve(self, found: Chosen, generator: np.random.Generator, hubs: int) -> tuple[CurvePoint, ...]:
         """What to expect of fewer stops, and of as many; hubs count."""
         most = len(found.candidates)
-        numbers = np.unique(np.round(np.geomspace(max(1, most // 10), most, N_CURVE)).astype(np.int64))
+        numbers = np.round(np.geomspace(LEAST_CURVE, max(most + hubs, LEAST_CURVE), N_CURVE)).astype(np.int64)
         points = []
-        for k in numbers.tolist():
-            chosen = found.candidates if k == most else self.best(k).candidates
+        for k in sorted({n - hubs for n in numbers.tolist() if 0 < n - hubs < most} | {most}):
+            chosen = found.candidates if k == most else self.quickly(k).candidates
             values, _ = random_values(self._error, k, generator)
             low, middle, high = np.sqrt(np.quantile(values, [0.1, 0.5, 0.9])).tolist()
             points.append(CurvePoint(k + hubs, self.error(chosen), (low, middle, high)))

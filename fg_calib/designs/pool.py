@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arrays import Brief
-from fg_calib.design.candidates import Candidates, candidates
-from fg_calib.design.rows import StopRows, stop_rows
-from fg_calib.design.task import Posterior
+from fg_calib.designs.candidates import Candidates, candidates
+from fg_calib.designs.rows import StopRows, stop_rows
+from fg_calib.designs.task import Posterior
 from fg_calib.errors import InputError
 from fg_calib.graph.build import true_problem
 from fg_calib.graph.factors import Variables

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fg_calib.analysis.identifiability import identifiability_of
-from fg_calib.design.task import Posterior
+from fg_calib.designs.task import Posterior
 from fg_calib.graph.build import random_problem
 from fg_calib.graph.information import named_triangle
 from fg_calib.options import FrameKnowledge, Model

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.analysis.variance_components import solve_job
-from fg_calib.design.candidates import Candidates
-from fg_calib.design.pool import Pool, drawn, pool_of
-from fg_calib.design.rows import stop_rows
-from fg_calib.design.scene import scenario_of
+from fg_calib.designs.candidates import Candidates
+from fg_calib.designs.pool import Pool, drawn, pool_of
+from fg_calib.designs.rows import stop_rows
+from fg_calib.designs.scene import scenario_of
 from fg_calib.errors import InputError
 from fg_calib.graph.problem import Problem, reweighted_at
 from fg_calib.job import Job
