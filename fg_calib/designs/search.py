@@ -11,7 +11,10 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import combinations
+from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +40,15 @@ _ROUNDING = 1e-12
 
 N_RANDOM = 100
 """Random sets that a design is held to: if one were better, exchange would start from it."""
+
+MOST_SETS = 2000
+"""Sets up to which all are looked at."""
+
+N_STARTS = 5
+"""Of random sets the best, from which exchange starts too where that takes little."""
+
+_LITTLE = 20_000
+"""Stops times candidates up to which it does."""
 
 
 @dataclass(frozen=True)
@@ -133,17 +145,30 @@ def _sweep(measure: Measure, chosen: Integers, value: float) -> tuple[Integers, 
 def random_values(
     measure: Measure, n: int, generator: np.random.Generator, count: int = N_RANDOM
 ) -> tuple[Floats, Integers]:
-    """The criterion of random sets of n, shape (count,), and the best of them."""
+    """The criterion of random sets of n, shape (count,), and they, shape (count, n)."""
     system = measure.system
-    sets = [generator.choice(system.n_candidates, size=n, replace=False) for _ in range(count)]
-    values = np.array([measure.value(system.information(one)) for one in sets])
-    return values, sets[int(np.argmin(values))].astype(np.int64)
+    sets = np.array([generator.choice(system.n_candidates, size=n, replace=False) for _ in range(count)], np.int64)
+    return np.array([measure.value(system.information(one)) for one in sets]), sets
 
 
 def not_worse_than_random(measure: Measure, found: Chosen, generator: np.random.Generator) -> Chosen:
-    """The same, or what exchange makes of the best of random sets where that is better."""
-    values, best = random_values(measure, len(found.candidates), generator)
-    if values.min() >= found.value:
-        return found
-    other = exchanged(measure, best)
-    return other if other.value < found.value else found
+    """The same, or what is better: of few sets the best, else what exchange makes of the best of random sets.
+
+    Greedy choice is short-sighted while a set determines little, and exchange ends where no single one helps; other
+    starts end elsewhere. Where they take long, only a random set that is better as it is starts one.
+    """
+    system, n = measure.system, len(found.candidates)
+    if comb(system.n_candidates, n) <= MOST_SETS:
+        return min((found, *_every(measure, n)), key=lambda one: one.value)
+    values, sets = random_values(measure, n, generator)
+    order = np.argsort(values, kind="stable")[:N_STARTS]
+    starts = order if n * system.n_candidates <= _LITTLE else order[values[order] < found.value][:1]
+    others = [exchanged(measure, sets[k]) for k in starts.tolist()]
+    return min((found, *others), key=lambda one: one.value)
+
+
+def _every(measure: Measure, n: int) -> Iterator[Chosen]:
+    """All sets of n."""
+    for one in combinations(range(measure.system.n_candidates), n):
+        candidates = np.array(one, dtype=np.int64)
+        yield Chosen(candidates, measure.value(measure.system.information(candidates)))
