@@ -34,7 +34,7 @@ from fg_calib.designs.plans import (
     with_names,
 )
 from fg_calib.designs.pool import Pool, drawn, pool_of
-from fg_calib.designs.search import not_worse_than_random
+from fg_calib.designs.search import Chosen, not_worse_than_random
 from fg_calib.designs.system import system_of
 from fg_calib.designs.task import N_TASK, Task, is_fitted
 from fg_calib.errors import InputError
