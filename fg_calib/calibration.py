@@ -609,19 +609,35 @@ def _saved_knowledge(robot: Robot, saved: SavedKnowledge) -> Knowledge:
     Raises:
         InputError: It is of another robot, or damaged.
     """
+    width = len(saved.columns) + len(saved.at)
     found = Knowledge(
         robot=robot,
         unknowns=saved.unknowns,
         at=np.array(saved.at, dtype=np.float64),
-        rows=_array(saved.rows, len(saved.columns) + len(saved.at)),
+        rows=_array(saved.rows, width),
         right=np.array(saved.right, dtype=np.float64),
+        views=saved.views,
     )
     sizes = len(saved.at) == SIZE * len(saved.unknowns) and len(saved.right) == len(saved.rows)
+    drawn = saved.nominal
+    if drawn is not None:
+        sizes &= len(drawn.at) == len(saved.at) and len(drawn.parameters) == len(robot.parameters)
     if found.variables.names != saved.columns or not sizes:
         raise InputError(
             "result.json: carried", "knowledge of other parameters than those estimated", "that of one run"
         )
-    return found
+    if drawn is None:
+        return found
+    rows = _array(drawn.rows, width)
+    nominal = Knowledge(
+        robot=robot.with_values(drawn.parameters),
+        unknowns=saved.unknowns,
+        at=np.array(drawn.at, dtype=np.float64),
+        rows=rows,
+        right=np.zeros(len(rows)),
+        views=saved.views,
+    )
+    return replace(found, nominal=nominal)
 
 
 def _date(given: str | None) -> str:

@@ -21,6 +21,7 @@ from fg_calib.analysis.folds import Folds
 from fg_calib.analysis.goodness import Goodness, judge_fit
 from fg_calib.analysis.identifiability import Identifiability, identifiability_of
 from fg_calib.analysis.joint_values import JointValues, joint_values
+from fg_calib.analysis.learned import at_nominal
 from fg_calib.analysis.mistakes import SetupCheck
 from fg_calib.analysis.outliers import judged_without_gross_errors
 from fg_calib.analysis.residual_table import ResidualTable, residual_table
@@ -303,7 +304,7 @@ def _assess(solution: Solution) -> Uncertainty:
     variables = problem.variables
     spread = spread_of(solution)
     whole = with_unsure_tolerances(solution, with_left_out(solution, spread))
-    identifiability = identifiability_of(problem.whole or problem, solution.before, "practical")
+    identifiability = identifiability_of(*at_nominal(problem.whole or problem, solution.before), "practical")
     covariance = whole.named()
     frames = _frame_estimates(solution, whole)
     chi2, table = chi_square(solution, spread), residual_table(solution)

@@ -22,6 +22,7 @@ from fg_calib.arrays import NORM_TOLERANCE, brief
 from fg_calib.errors import InputError
 from fg_calib.files.disk import exists, is_folder, read_text
 from fg_calib.files.schema import first_misfit
+from fg_calib.options import FrameKnowledge, Model
 
 MOST_WHOLE = 10**15
 """The most of anything that a result counts: far more than is ever counted, and exact as a float."""
@@ -447,10 +448,19 @@ class Observability(Section):
     with_fixed_known: Observability | None = None
 
 
+class AtNominal(Section):
+    """What rows say of the arm as drawn: its parameters, base and tool as fitted, and the places of what stays."""
+
+    parameters: Annotated[tuple[float, ...], BeforeValidator(_listed)]
+    at: Annotated[tuple[float, ...], BeforeValidator(_listed)] = ()
+    rows: Annotated[tuple[Annotated[tuple[float, ...], BeforeValidator(_listed)], ...], BeforeValidator(_listed)]
+
+
 class Knowledge(Section):
     """What rows say of the arm and of what stays with it, linearised at the estimate (see `graph.knowledge`).
 
     `rows` by the columns of `columns`, those of the arm as in `posterior`, then three of each of `unknowns`.
+    `nominal` are the same rows at the arm as drawn, by which parameters are classed.
     """
 
     columns: tuple[str, ...]
@@ -458,6 +468,8 @@ class Knowledge(Section):
     at: Annotated[tuple[float, ...], BeforeValidator(_listed)] = ()
     rows: Annotated[tuple[Annotated[tuple[float, ...], BeforeValidator(_listed)], ...], BeforeValidator(_listed)]
     right: Annotated[tuple[float, ...], BeforeValidator(_listed)]
+    views: tuple[tuple[Model, FrameKnowledge], ...] = ()
+    nominal: AtNominal | None = None
 
 
 class Carried(Section):

@@ -47,7 +47,8 @@ def elsewhere(problem: Problem, parameters: Floats) -> Problem | None:
     unknowns, coordinates = problem.data.unknowns, problem.variables.at(parameters).coordinates
     parts = np.split(coordinates, np.cumsum(unknowns.sizes)[:-1]) if unknowns.sizes else []
     places = dict(zip(zip(unknowns.letters, unknowns.names, strict=True), parts, strict=True))
-    different = {_says(table): table for table in problem.data.tables if table.model and _named(table)[1]}
+    given = [*problem.data.tables, *_before(problem)]
+    different = {_says(table): table for table in given if table.model and _named(table)[1]}
     if not different:
         return None
     n = max(LEAST, -(-max(300, 10 * len(robot.parameters)) // len(different)))
@@ -60,6 +61,14 @@ def elsewhere(problem: Problem, parameters: Floats) -> Problem | None:
     data = gather(robot, tables)
     variables = variables_of(robot, data, options)
     return problem_at(robot, data, options, variables, start_of(robot.with_estimated([]), data, variables))
+
+
+def _before(problem: Problem) -> list[Table]:
+    """Tables such as those of earlier rows, of which but the models are known: without targets, anchors or boards."""
+    views = () if problem.knowledge is None else problem.knowledge.views
+    q = np.zeros((1, problem.robot.n_joints))
+    nothing = Measurements.from_arrays(q, position=np.zeros((1, 3)), rotation=np.eye(3)[None])
+    return [Table(nothing, model, frame=frame) for model, frame in views if model in (*POSE_MODELS, *PAIR_MODELS)]
 
 
 def _says(table: Table) -> tuple[object, ...]:

@@ -43,6 +43,7 @@ from fg_calib.files.disk import fill_folder, read_bytes, require_own, write_text
 from fg_calib.files.result import (
     SCHEMA,
     Acceptance,
+    AtNominal,
     BeyondTolerance,
     Carried,
     Correlated,
@@ -204,6 +205,10 @@ def _carried(solution: Solution, job: Mapping[str, Any]) -> Carried:
             at=known.at,
             rows=known.rows,
             right=known.right,
+            views=known.views,
+            nominal=None
+            if known.nominal is None
+            else AtNominal.make(parameters=known.nominal.robot.nominal, at=known.nominal.at, rows=known.nominal.rows),
         )
     return Carried.make(job=dict(job), noise=noise, knowledge=document)
 

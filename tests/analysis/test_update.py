@@ -7,7 +7,7 @@ import pytest
 from month import arm, calibrated, measured, placed, slipped
 from simulated import true_robot
 
-from fg_calib import Measurements, Table, calibrate, pose
+from fg_calib import Calibration, Measurements, Table, calibrate, pose
 from fg_calib.errors import InputError
 from fg_calib.measurements.dataset import Labels
 
@@ -198,3 +198,69 @@ def test_names_that_are_none_are_refused():
         calibration.update(rows, growth={"elbow": 1e-6})
     with pytest.raises(InputError, match="a date such as"):
         calibration.update(rows, date="yesterday")
+
+
+def classes(calibration):
+    return {n: calibration.parameters[n].identifiability for n in calibration.result.covariance.names}
+
+
+def reasons(calibration):
+    return [lost.reason for lost in calibration.uncertainty.identifiability.lost]
+
+
+def with_still_joint(model, n, rng, true, joint=5):
+    """Rows in which one joint stands still, so that some parameters are never seen apart."""
+    q = rng.uniform(-2.5, 2.5, (n, 6))
+    q[:, joint] = 0.3
+    return Table(measured(true, n, rng, q=q), model)
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("model", ["pose", "position", "distance-rotation", "distance"])
+def test_classes_and_reasons_of_an_update_are_those_of_all_rows(model):
+    """At the old estimate lost directions have turned a little: theta2, theta3 and theta4 were called relative there,
+    and what parallel axes do `no simple cause found`."""
+    rng = np.random.default_rng(0)
+    true = true_robot(arm(), rng)
+    old, new = (with_still_joint(model, n, rng, true) for n in (30, 10))
+    updated, batch = calibrate(arm(), old).update(new), calibrate(arm(), [old, new])
+    assert classes(updated) == classes(batch)
+    assert reasons(updated) == reasons(batch)
+    assert "independent" in classes(updated).values()
+    assert "relative" in classes(updated).values()
+
+
+@pytest.mark.slow
+def test_classes_of_an_update_know_what_other_instruments_saw_before(tmp_path):
+    """Of distances, then of angles alone: reasons are of both, also once saved and loaded."""
+    rng = np.random.default_rng(1)
+    true = true_robot(arm(), rng)
+    old, new = (with_still_joint(model, n, rng, true) for model, n in (("distance", 30), ("rotation", 10)))
+    batch, first = calibrate(arm(), [old, new]), calibrate(arm(), old)
+    first.save(tmp_path / "first")
+    for calibration in (first, Calibration.load(tmp_path / "first")):
+        updated = calibration.update(new)
+        assert classes(updated) == classes(batch)
+        assert reasons(updated) == reasons(batch)
+
+
+@pytest.mark.parametrize("change", [{"growth": {"theta": 1e-9, "d": 1e-9}}, {"changed": ["theta3"]}])
+def test_what_tolerances_alone_say_is_no_data_of_an_update(change):
+    """With growth the tolerances are part of what is known: d2, d3 and d4 of parallel axes were called independent."""
+    rng = np.random.default_rng(2)
+    true = true_robot(arm(), rng)
+    old, new = (with_still_joint("pose", n, rng, true) for n in (30, 10))
+    updated = calibrate(arm(), old).update(new, date="2100-01-01", **change)
+    assert classes(updated) == classes(calibrate(arm(), [old, new]))
+
+
+@pytest.mark.slow
+def test_what_has_changed_is_determined_by_new_rows_alone():
+    """Of seven parameters nothing is taken over, and one pose says but six figures."""
+    rng = np.random.default_rng(3)
+    true = true_robot(arm(), rng)
+    old, new = Table(measured(true, 30, rng), "pose"), with_still_joint("pose", 1, rng, true, joint=0)
+    updated = calibrate(arm(), old).update(
+        new, changed=["theta1", "theta2", "theta3", "theta4", "theta5", "theta6", "d1"]
+    )
+    assert updated.uncertainty.observability.rank < calibrate(arm(), old).uncertainty.observability.rank
