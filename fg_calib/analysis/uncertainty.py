@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from fg_calib.analysis.acceptance import Acceptance, accept
+from fg_calib.analysis.acceptance import Acceptance, Kinds, accept
 from fg_calib.analysis.accuracy import ExpectedError, expected_error, without_rigid_motion
 from fg_calib.analysis.changes import Change
 from fg_calib.analysis.chi_square import chi_square
@@ -175,10 +175,19 @@ class Uncertainty(FrozenArrays):
             folds: What cross-validation found.
             solution: What was assessed.
         """
+        return replace(self.with_held_out(folds.by_table, solution), folds=folds)
+
+    def with_held_out(self, others: Kinds, solution: Solution) -> Uncertainty:
+        """The same with limits that no test rows speak of judged by other measurements that were predicted.
+
+        Args:
+            others: They, by table and kind of noise.
+            solution: What was assessed.
+        """
         tested = self.residuals.held_out(solution.problem.data.labels)
         kinds = {kind for _, kind in tested}
-        held_out = tested | {key: held for key, held in folds.by_table.items() if key[1] not in kinds}
-        return replace(self, folds=folds, acceptance=accept(solution.problem.options.accept, held_out, self.findings))
+        held_out = tested | {key: held for key, held in others.items() if key[1] not in kinds}
+        return replace(self, acceptance=accept(solution.problem.options.accept, held_out, self.findings))
 
     def __repr__(self) -> str:
         known = sum(p.sigma is not None for p in self.parameters if p.identifiability != "fixed")

@@ -16,8 +16,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.analysis.acceptance import Kinds
 from fg_calib.analysis.learned import with_tolerances
 from fg_calib.analysis.new_rows import Calibrated, Placed, Rows, placed
+from fg_calib.analysis.residual_table import residual_table
 from fg_calib.analysis.suspects import motions, zero_names
 from fg_calib.errors import InputError, ProblemError
 from fg_calib.graph.build import kept_of
@@ -61,6 +63,21 @@ def updated(
         robot = replace(robot, parameters=tuple(replace(p, tolerance=None) for p in robot.parameters))
     at = placed(replace(calibrated, knowledge=known), rows, calibrated.values)
     return solve(_problem(calibrated, robot, known, rows, at))
+
+
+def predicted_before(calibrated: Calibrated, rows: Rows) -> Kinds:
+    """How well the arm as it was calibrated before predicts new rows, by table and kind: it has not seen them.
+
+    Args:
+        calibrated: The arm.
+        rows: The rows; test rows count as the others do.
+    """
+    rows = replace(rows, tables=tuple(table.all_train() for table in rows.tables))
+    solution = placed(calibrated, rows, calibrated.values).solution
+    table = residual_table(solution)
+    tested = replace(table, test=np.ones_like(table.test), n_fitted=0, seen=np.zeros_like(table.seen))
+    found = tested.held_out(solution.problem.data.labels)
+    return {key: replace(held, by="the arm before this update") for key, held in found.items()}
 
 
 def _problem(calibrated: Calibrated, robot: Robot, known: Knowledge, rows: Rows, at: Placed) -> Problem:

@@ -10,6 +10,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Iterator
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -475,20 +476,33 @@ class Knowledge(Section):
 class Carried(Section):
     """What the next calibration of this arm takes over.
 
-    `job` is the job without robot, by which tables like its own are read; `noise` the factors on stated sigmas by table
+    `job` is the job without robot, by which tables like its own are read; `rows` are fingerprints of the fitted rows,
+    which are not to be counted twice; `noise` the factors on stated sigmas by table
     and kind, where noise was estimated.
     """
 
     job: dict[str, Any] = {}
+    rows: tuple[str, ...] = ()
     noise: dict[str, dict[str, float]] = {}
     knowledge: Knowledge | None = None
+
+
+def _dated(date: str) -> str:
+    """Refuse what is no date; the empty one is unknown."""
+    if date:
+        datetime.fromisoformat(date)
+    return date
+
+
+Date = Annotated[str, AfterValidator(_dated)]
+"""A date as ISO 8601 has it."""
 
 
 class Previous(Section):
     """The result that an update came from."""
 
     sha256: str
-    date: str
+    date: Date
 
 
 class Result(Section):
@@ -547,7 +561,7 @@ class Result(Section):
     versions: dict[str, str] = {}
     files: dict[str, str] = {}
     inputs: dict[str, str]
-    date: str = ""
+    date: Date = ""
     previous: Previous | None = None
     carried: Carried | None = None
 

@@ -264,3 +264,89 @@ def test_what_has_changed_is_determined_by_new_rows_alone():
         new, changed=["theta1", "theta2", "theta3", "theta4", "theta5", "theta6", "d1"]
     )
     assert updated.uncertainty.observability.rank < calibrate(arm(), old).uncertainty.observability.rank
+
+
+ACCEPT = {"position": 5e-4, "orientation": 1e-3}
+
+
+def test_a_limit_without_test_rows_is_judged_by_how_the_arm_before_predicts_the_new_rows():
+    calibration, true, rng = calibrated(10, accept=ACCEPT)
+    rows = measured(true, 8, rng)
+    updated = calibration.update(rows)
+    assert updated.not_accepted == ()
+    errors = {one.kind: one.error for one in updated.result.acceptance.judgements}
+    assert errors == pytest.approx(calibration.check(rows).rms, rel=1e-3)  # frames to convergence
+    assert "by the arm before this update" in " ".join(str(updated).split())
+
+
+def test_a_limit_that_the_arm_before_misses_is_not_evaluated():
+    calibration, true, rng = calibrated(11, accept=ACCEPT)
+    rows = measured(slipped(true, theta3=2e-3), 8, rng)
+    assert "the arm before this update misses it" in calibration.update(rows).not_accepted[0]
+    assert "no measurement of any position was held out" in calibration.update(rows, changed="theta3").not_accepted[0]
+
+
+def test_test_rows_of_an_update_judge_its_limits():
+    calibration, true, rng = calibrated(12, accept=ACCEPT)
+    rows = measured(slipped(true, theta3=2e-3), 20, rng)
+    updated = calibration.update(replace(rows, test=np.arange(20) >= 12), changed="theta3")
+    assert updated.not_accepted == ()
+    assert {one.n for one in updated.result.acceptance.judgements} == {8}
+
+
+def test_rows_that_are_counted_already_are_refused_in_memory():
+    """As they are, in another order, with more rows behind them, or from a table of another length unit."""
+    calibration, true, rng = calibrated(13)
+    first = calibration.solution.problem.data.tables[0].measurements
+    more = measured(true, 8, rng, ids="new")
+    longer = Measurements.from_arrays(
+        np.vstack([first.readings, more.readings]),
+        position=np.vstack([first.position, more.position]) * 1e3 * 1e-3,
+        rotation=np.vstack([first.rotation, more.rotation]),
+        sigma_position=5e-5,
+        sigma_orientation=1e-4,
+    )
+    for rows in (first, first.select(np.arange(5)), first.select(np.arange(40)[::-1]), longer):
+        with pytest.raises(InputError, match="its rows are in the calibration already"):
+            calibration.update(rows)
+    updated = calibration.update(more)
+    with pytest.raises(InputError, match="already"):
+        updated.update(more)
+
+
+def test_rows_that_were_only_predicted_may_be_fitted_later():
+    calibration, true, rng = calibrated(14)
+    rows = measured(true, 8, rng)
+    updated = calibration.update(replace(rows, test=np.arange(8) >= 3))
+    assert updated.update(rows.select(np.arange(3, 8))).trustworthy
+
+
+def test_pairs_of_the_same_configurations_measured_again_are_new():
+    """Of a table of pairs the configurations may be those of before: what is measured is between them."""
+    rng = np.random.default_rng(15)
+    true = true_robot(arm(), rng)
+    q = rng.uniform(-2.5, 2.5, (30, 6))
+    p = pose(true, q).position
+
+    def lengths_between():
+        a, b = np.arange(29), np.arange(1, 30)
+        d = np.linalg.norm(p[a] - p[b], axis=1) + 5e-5 * rng.normal(size=29)
+        return Table(
+            Measurements.from_arrays(q, pairs={"a": a, "b": b, "distance": d, "sigma_distance": 5e-5}), "distance"
+        )
+
+    old = lengths_between()
+    calibration = calibrate(arm(), old)
+    assert calibration.update(lengths_between()).result.n_residuals == 29
+    with pytest.raises(InputError, match="already"):
+        calibration.update(old)
+
+
+def test_dates_before_the_calibration_are_refused_and_those_of_the_same_day_are_not():
+    calibration, true, rng = calibrated(16)
+    rows = measured(true, 6, rng)
+    today = calibration.result.date[:10]
+    assert calibration.update(rows, date=today).result.date.startswith(today)
+    for date in ("1999-01-01", "2000-01-01T12:00:00+00:00"):
+        with pytest.raises(InputError, match="is before the calibration"):
+            calibration.update(rows, date=date)
