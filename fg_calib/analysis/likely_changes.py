@@ -92,17 +92,27 @@ def best_refined(
     ]
 
 
-def _motion(calibrated: Calibrated, found: Found) -> Floats | None:
-    """How a change moves the tool at random configurations, shape (n, 2, 3), turn first; None of gross errors."""
+def motion(calibrated: Calibrated, found: Found, readings: Floats) -> Floats:
+    """How a change moves the tool at configurations, shape (n, 2, 3), turn first.
+
+    Args:
+        calibrated: The arm.
+        found: The change; no gross errors.
+        readings: The configurations, shape (n, n_joints).
+    """
     names = found.suspect.names
-    if found.suspect.kind == "row":
-        return None
-    robot = calibrated.robot.with_values(calibrated.values)
-    of, base, tool = motions(robot, random_readings(robot, 200, np.random.default_rng(0)))
+    of, base, tool = motions(calibrated.robot.with_values(calibrated.values), readings)
     whole = {"frame": base, "tool": tool}.get(found.suspect.kind if len(names) == 1 and names[0] in GROUPS else "")
     columns = np.stack([of[name] for name in names], axis=2) if whole is None else whole
     out: Floats = (columns @ found.change).reshape(-1, 2, 3)
     return out
+
+
+def _motion(calibrated: Calibrated, found: Found) -> Floats | None:
+    """The same at random configurations; None of gross errors."""
+    if found.suspect.kind == "row":
+        return None
+    return motion(calibrated, found, random_readings(calibrated.robot, 200, np.random.default_rng(0)))
 
 
 def effect_elsewhere(calibrated: Calibrated, found: Found) -> dict[str, float] | None:

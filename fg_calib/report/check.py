@@ -28,6 +28,11 @@ _KINDS = {
     "parameter": "",
 }
 
+_NO_ADVICE = (
+    "no configurations are advised: of random ones none can be measured like these rows (contacts, fixed lengths), or"
+    " none tells these changes apart; another instrument may"
+)
+
 
 def named(parameters: Sequence[str]) -> str:
     """A change by its name: of several parameters together `theta2 + theta3`."""
@@ -154,6 +159,8 @@ def _words(found: Check) -> list[str]:
     if len(likely) > 1:
         names = ", ".join(named(e.parameters) for e in likely)
         lines += [f"these rows do not tell apart: {names}", "do not deploy any of these changes yet"]
+        if found.advice is None:
+            lines.append(_NO_ADVICE)
     elif found.verdict == "fail" and found.deploy:
         lines.append(
             f"no other single change explains the rows: update with --changed {best.parameters[0]}, check again"
