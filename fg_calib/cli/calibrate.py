@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from fg_calib.cli.output import Json, end, show_json, show_report
+from fg_calib.cli.output import Json, end, show_calibration
 
 
 def calibrate(
@@ -51,12 +51,7 @@ def calibrate(
         given = replace(given, options=replace(given.options, folds=folds))
     found = calibrate_job(given)
     try:
-        if as_json:
-            show_json(found.result.document())
-        else:
-            from fg_calib.report.text import build_report
-
-            show_report(build_report(found.solution, found.uncertainty))
+        show_calibration(found, as_json)
     finally:  # also where nobody takes the report
         if out is not None:
             found.save(out)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -11,6 +11,7 @@ import typer
 from fg_calib.cli.output import Json, end, say, show_json, show_report
 
 if TYPE_CHECKING:
+    from fg_calib.designs.design import Design
     from fg_calib.files.units import Units
     from fg_calib.job import Job
     from fg_calib.robot.model import Robot
@@ -86,18 +87,9 @@ def design(
     as_json: Json = False,
 ) -> None:
     """Choose which configurations to measure, and say what accuracy to expect of how many."""
-    from fg_calib.designs.design import N_STOPS
     from fg_calib.designs.design import design as designed
     from fg_calib.files.disk import require_writable
     from fg_calib.files.units import Units, quantity
-    from fg_calib.report.plan import (
-        build_design_report,
-        build_instruments_report,
-        design_document,
-        designs_document,
-        write_design,
-        write_designs,
-    )
 
     if n is not None and target is not None:
         say("error: --n and --target: one of the two")
@@ -107,7 +99,7 @@ def design(
     if out is not None:
         require_writable(out)
     choices: dict[str, Any] = {
-        "n": N_STOPS if n is None and target is None else n,
+        "n": n,
         "target": None if target is None else quantity(target, "m", Units(), "--target"),
         "lever": 0.0 if lever is None else quantity(lever, "m", Units(), "--lever"),
         "fitted": None if error is None else error == "fitted",
@@ -118,8 +110,23 @@ def design(
         **_candidates(candidates, robot, units),
     }
     found = {name: designed(one, **choices) for name, one in subjects.items()}
-    first = next(iter(found.values()))
-    names: tuple[str, ...] = ()
+    _show(found, units, out, several=bool(several), as_json=as_json)
+    missed = [name for name, one in found.items() if not one.reached]
+    end([f"the target is not reached{f' with {name}' if several else ''}" for name in missed], "doubtful")
+
+
+def _show(found: Mapping[str, Design], units: Units, out: Path | None, *, several: bool, as_json: bool) -> None:
+    """Print designs, and write them."""
+    from fg_calib.report.plan import (
+        build_design_report,
+        build_instruments_report,
+        design_document,
+        designs_document,
+        write_design,
+        write_designs,
+    )
+
+    first, names = next(iter(found.values())), tuple[str, ...]()
     try:
         if as_json:
             show_json(designs_document(found) if several else design_document(first))
@@ -129,8 +136,6 @@ def design(
         if out is not None:
             names = write_designs(out, found, units) if several else write_design(out, first, units)
     say(f"wrote {', '.join(names)} to {out}" if out else "nothing is written: --out DIR writes tables and a job")
-    missed = [name for name, one in found.items() if not one.reached]
-    end([f"the target is not reached{f' with {name}' if several else ''}" for name in missed], "doubtful")
 
 
 def _of_instruments(of: Sequence[str], instruments: Sequence[Path] | None) -> list[Path]:

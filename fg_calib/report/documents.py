@@ -43,6 +43,7 @@ from fg_calib.files.disk import fill_folder, read_bytes, require_own, write_text
 from fg_calib.files.result import (
     SCHEMA,
     Acceptance,
+    AtNominal,
     BeyondTolerance,
     Carried,
     Correlated,
@@ -82,6 +83,7 @@ from fg_calib.graph.noise import JOINT_NOISE
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
 from fg_calib.job import Job
+from fg_calib.measurements.fingerprints import fingerprints
 from fg_calib.report.page.files import FIGURE_FILES, PAGE
 from fg_calib.report.shown import FAMILY_UNIT
 from fg_calib.robot.kinematics import pose
@@ -204,8 +206,13 @@ def _carried(solution: Solution, job: Mapping[str, Any]) -> Carried:
             at=known.at,
             rows=known.rows,
             right=known.right,
+            views=known.views,
+            nominal=None
+            if known.nominal is None
+            else AtNominal.make(parameters=known.nominal.robot.nominal, at=known.nominal.at, rows=known.nominal.rows),
         )
-    return Carried.make(job=dict(job), noise=noise, knowledge=document)
+    rows = fingerprints(problem.data.tables)
+    return Carried.make(job=dict(job), rows=rows, noise=noise, knowledge=document)
 
 
 def _options(problem: Problem) -> dict[str, Any]:
