@@ -3,12 +3,12 @@
 Command: python experiments/18_design.py [--quick] [--seed N] [--draws N] [--out FOLDER] [--only PART ...]
 Takes about half an hour of one processor; parts of an earlier run stay where `--only` names others.
 
-- *paper*: the paper's arm, its noise and its tolerances, poses in an unknown frame and distances + angles of pairs:
-  what designs expect, for several seeds of the candidates, beside random sets of as many; how few designed stops equal
-  52 random ones; and 200 draws of true arm, frame and noise measured at the design and calibrated: realised over
-  predicted RMS of the tool's position at the task's configurations after the best rigid fit.
-- *arms*: 90 random arms of 5 to 7 joints, 20 of 500 configurations, positions in an unknown frame: the expected error
-  of designs by each criterion and of random sets, for a task anywhere and for one within a cell.
+- *camera 0.3-2 m*, *hemisphere*: the paper's arm, its noise and its tolerances, poses in an unknown frame and
+  distances + angles of pairs: what designs expect, for several seeds of the candidates, beside random sets of as many;
+  how few designed stops equal 52 random ones; and 200 draws of true arm, frame and noise measured at the design and
+  calibrated: realised over predicted RMS of the tool's position at the task's configurations after the best rigid fit.
+- *arms*: 90 random arms of 5 to 7 joints, 10 or 20 of 500 configurations, positions in an unknown frame: the expected
+  error of designs by each criterion and of random sets, for a task anywhere, within a cell, and at five places.
 - *search*: on the same arms, greedy choice and exchange against the best of 100 random sets, and against exhaustive
   search on small pools, for every criterion.
 - *ur10*, *panda*: rows of real tables chosen by design against random draws of as many, by the error at rows that are
@@ -30,6 +30,7 @@ import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from importlib.util import module_from_spec, spec_from_file_location
 from itertools import combinations
 from pathlib import Path
@@ -44,13 +45,13 @@ from numpy.typing import NDArray
 from space_robot import MM, ROOT, clean, paper_scenario, write_json
 
 import fg_calib
-from fg_calib import Noise, Pairing, Robot, Scenario
-from fg_calib.design.criteria import Criterion, Measure
-from fg_calib.design.design import Design, design
-from fg_calib.design.pool import Pool, pool_of, selected
-from fg_calib.design.search import choose, not_worse_than_random, random_values
-from fg_calib.design.system import System, system_of
-from fg_calib.design.task import Task
+from fg_calib import Design, Noise, Pairing, Robot, Scenario, design
+from fg_calib.designs.chooser import Chooser
+from fg_calib.designs.criteria import Criterion, Measure
+from fg_calib.designs.pool import Pool, drawn, pool_of, selected
+from fg_calib.designs.search import Chosen, not_worse_than_random, random_values
+from fg_calib.designs.system import System, system_of
+from fg_calib.designs.task import Task
 from fg_calib.robot.inverse import random_readings
 from fg_calib.simulation.configurations import GivenReadings, RandomReadings
 from fg_calib.simulation.scenario import Errors
@@ -63,11 +64,19 @@ VIEWS: Mapping[str, dict[str, Any]] = {"camera 0.3-2 m": {"distance": (0.3, 2.0)
 N_VIEWS = 52
 """Configurations of the paper: A and 51 others."""
 
-CRITERIA: tuple[Criterion, ...] = ("I", "D", "A", "E", "O1", "O2", "O3", "O4", "O5")
-OTHERS: tuple[Criterion, ...] = ("D", "A", "E", "O2", "O4", "O5")
-"""Those that differ from each other: O1 is D, and O3 is E."""
+WAYS: Mapping[str, dict[str, Any]] = {
+    "poses": {"model": "pose"},
+    "star": {"model": "distance-rotation", "pairing": "star"},
+    "all pairs": {"model": "distance-rotation", "pairing": "all"},
+}
+"""What is measured; the latter two are distances and angles of pairs that are formed of poses."""
 
-N_STOPS, N_CANDIDATES, CELL = 20, 500, 0.25
+CRITERIA: tuple[Criterion, ...] = ("I", "D", "A", "E", "O2", "O4", "O5")
+"""Those that differ from each other: O1 is D, and O3 is E."""
+OTHERS: tuple[Criterion, ...] = ("D", "A", "O5")
+"""Those that came nearest to I on the first arms; E, O2 and O4 leave 20 to 30 % more."""
+
+N_STOPS, N_CANDIDATES, CELL = (10, 20), 500, 0.25
 """Of a random arm: stops, candidates, and the radius of the cell over the arm's reach."""
 
 N_ROWS = {"ur10": (20, 40, 80), "panda": (20, 40, 80, 120)}
@@ -77,7 +86,8 @@ CHOSEN, RANDOM = "#0072B2", "#E69F00"
 def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     """Run the experiment; returns what is written as JSON."""
     parts: dict[str, Callable[[argparse.Namespace], dict[str, Any]]]
-    parts = {"paper": paper, "arms": arms, "search": search, "ur10": ur10, "panda": panda}
+    parts = {views: partial(paper, views) for views in VIEWS}
+    parts |= {"arms": arms, "search": search, "ur10": ur10, "panda": panda}
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="few draws, arms and seeds")
     parser.add_argument("--seed", type=int, default=0, help="of the first design, arm and draw")
@@ -94,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
         found = (json.loads(file.read_text()) if file.exists() else {}) | {part: of_part}
         write_json(file, found)
         print(f"{part}\n{json.dumps(json.loads(file.read_text())[part], indent=1)}", flush=True)
-    if "paper" in found and "arms" in found:
+    if {*VIEWS, "arms"} <= set(found):
         picture(found).savefig(file.with_suffix(".png"), dpi=120)
     return found
 
@@ -102,96 +112,67 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
 # ---- the paper's arm
 
 
-def paper(given: argparse.Namespace) -> dict[str, Any]:
-    """What designs expect of the paper's arm, and what comes of them."""
-    seeds = range(given.seed, given.seed + (1 if given.quick else 5))
+def paper(views: str, given: argparse.Namespace) -> dict[str, Any]:
+    """What designs expect of the paper's arm that looks at its board so, and what comes of them."""
+    seeds = range(given.seed, given.seed + (1 if given.quick else 3))
+    here = paper_scenario("unknown", **VIEWS[views])
+    scenarios = {way: replace(here, job=job) for way, job in WAYS.items()}
     found: dict[str, Any] = {"n_draws": given.draws, "seeds": list(seeds)}
-    for views, conditions in VIEWS.items():
-        poses = replace(paper_scenario("unknown", **conditions), job={"model": "pose"})
-        pairs = replace(poses, job={"model": "distance-rotation", "pairing": "star"})
-        by_poses = [design(poses, n=N_VIEWS, seed=seed) for seed in seeds]
-        by_star = [design(pairs, n=N_VIEWS - 1, seed=seed) for seed in seeds]
-        random = [
-            random_set(plan, np.random.default_rng([seed, 1])) for plan, seed in zip(by_poses, seeds, strict=True)
-        ]
-        found[views] = {
-            "pose": expectations(by_poses),
-            "distance + rotation, star": expectations(by_star),
-            "stops that equal 52 random ones": {
-                "pose": equal_stops(poses, by_poses, seeds),
-                "distance + rotation, star": equal_stops(pairs, by_star, seeds),
-            },
-            "curve": [[p.n, p.designed, *p.random] for p in by_poses[0].curve],
-            "curve, star": [[p.n + 1, p.designed, *p.random] for p in by_star[0].curve],
+    plans: dict[str, list[Design]] = {}
+    for way, scenario in scenarios.items():
+        some = seeds[:1] if way == "all pairs" else seeds  # the design is that of poses
+        plans[way] = [design(scenario, n=N_VIEWS, seed=seed) for seed in some]
+        found[way] = {
+            "designed": [plan.expected.position for plan in plans[way]],
+            "random": [plan.random for plan in plans[way]],
+            "designed stops that equal 52 random ones": [
+                design(scenario, target=plan.random, seed=seed).n for plan, seed in zip(plans[way], some, strict=True)
+            ],
+            "curve": [[p.n, p.designed, *p.random] for p in plans[way][0].curve],
         }
-        sets: dict[str, tuple[Scenario, Design, Floats, Any]] = {
-            "pose, designed": (poses, by_poses[0], by_poses[0].readings, {}),
-            "pose, random": (poses, by_poses[0], random[0], {}),
-            "star, designed": (pairs, by_star[0], with_hub(by_star[0]), {"pairing": Pairing("star")}),
-        }
-        if views != "hemisphere":
-            few = design(poses, target=by_poses[0].random, seed=given.seed)
-            sets |= {
-                "pose, as few designed as equal 52 random": (poses, few, few.readings, {}),
-                "all pairs of the poses' design": (
-                    pairs,
-                    by_poses[0],
-                    by_poses[0].readings,
-                    {"pairing": Pairing("all")},
-                ),
-            }
-        found[views]["realised"] = {
-            name: realised(scenario, plan, readings, options, given)
-            for name, (scenario, plan, readings, options) in sets.items()
-        }
+    first = plans["poses"][0]
+    by_volume = design(scenarios["poses"], n=N_VIEWS, seed=given.seed, criterion="D")
+    found["poses, by D"] = by_volume.expected.position
+    few = design(scenarios["poses"], target=first.random, seed=given.seed)
+    rng = np.random.default_rng([given.seed, 1])
+    random = first.pool.readings[rng.choice(len(first.pool.readings), N_VIEWS, replace=False)]
+    sets: dict[str, tuple[str, Design, Floats]] = {
+        "poses, designed": ("poses", first, first.readings),
+        "poses, random": ("poses", first, random),
+        "poses, as few designed as equal 52 random": ("poses", few, few.readings),
+        "star, designed": ("star", plans["star"][0], plans["star"][0].readings),
+    }
+    if views != "hemisphere":  # all pairs hold what poses hold, and take ten times as long
+        sets["all pairs, designed"] = ("all pairs", plans["all pairs"][0], plans["all pairs"][0].readings)
+    found["realised"] = {
+        name: realised(scenarios[way], plan, readings, given) for name, (way, plan, readings) in sets.items()
+    }
     return found
 
 
-def expectations(plans: Sequence[Design]) -> dict[str, Any]:
-    """Expected RMS errors, [m], of designs and of as many random stops."""
-    return {"designed": [plan.expected.position for plan in plans], "random": [plan.random for plan in plans]}
-
-
-def equal_stops(scenario: Scenario, plans: Sequence[Design], seeds: range) -> list[int]:
-    """How many configurations of a design equal as many random ones as the plans have, a hub counted."""
-    hub = 1 if plans[0].n < N_VIEWS else 0
-    return [design(scenario, target=plan.random, seed=seed).n + hub for plan, seed in zip(plans, seeds, strict=True)]
-
-
-def random_set(plan: Design, generator: np.random.Generator) -> Floats:
-    """Readings of random stops, as many as a plan has."""
-    return plan.pool.readings[generator.choice(len(plan.pool.readings), plan.n, replace=False)]
-
-
-def with_hub(plan: Design) -> Floats:
-    """The configurations of a plan of pairs behind that which all are measured against."""
-    hub = np.flatnonzero(plan.pool.stop < 0)
-    return np.vstack([plan.pool.problem.data.readings[hub], plan.readings])
-
-
-def realised(
-    scenario: Scenario, plan: Design, readings: Floats, options: Mapping[str, Any], given: argparse.Namespace
-) -> dict[str, Any]:
+def realised(scenario: Scenario, plan: Design, readings: Floats, given: argparse.Namespace) -> dict[str, Any]:
     """Predicted RMS error of a set, [m], and that of calibrations of drawn arms, frames and noise."""
-    at = plan.task.readings
     there = replace(scenario, configurations=GivenReadings(readings), validation=None)
-    model = scenario.job["model"]
-    stops = pool_of(replace(there, job=dict(scenario.job)), len(readings), np.random.default_rng(0))
-    predicted = stops.posterior(np.arange(len(stops.readings)), **options).error(plan.task).position
-    squares, doubtful = [], 0
+    pairing, model = Pairing(scenario.job.get("pairing", "star")), scenario.job["model"]
+    pool = pool_of(there, drawn(there, len(readings), np.random.default_rng(0)))
+    predicted = pool.posterior(np.arange(len(pool.readings)), pairing).error(plan.task).position
+    squares, not_converged = [], 0
     for seed in range(1000 + given.seed, 1000 + given.seed + given.draws):
         simulation = fg_calib.simulate(there, seed)
-        result = fg_calib.calibrate(simulation.robot, simulation.measurements, model=model, frame="unknown", **options)
-        squares.append(fitted_square(result.robot, simulation.true_robot, at))
-        doubtful += not result.solution.converged
+        m = simulation.measurements
+        problem = fg_calib.build_problem(simulation.robot, m, model=model, frame="unknown", pairing=pairing)
+        solution = fg_calib.solve(problem)
+        robot = simulation.robot.with_values(solution.parameters[problem.variables.robot_span])
+        squares.append(fitted_square(robot, simulation.true_robot, plan.task.readings))
+        not_converged += not solution.converged
     rms = float(np.sqrt(np.mean(squares)))
     return {
         "n": len(readings),
         "predicted": predicted,
         "realised": rms,
         "ratio": rms / predicted,
-        "ratio_sigma": float(np.std(squares) / np.mean(squares) / np.sqrt(len(squares)) / 2.0 * rms / predicted),
-        "not_converged": doubtful,
+        "sigma of ratio": float(0.5 * np.std(squares) / np.mean(squares) / np.sqrt(len(squares)) * rms / predicted),
+        "not_converged": not_converged,
     }
 
 
@@ -212,20 +193,28 @@ def pool_of_arm(robot: Robot, n_candidates: int, generator: np.random.Generator)
     noise = Noise(position=1e-4, orientation=1e-4, joint=(np.deg2rad(0.003),) * robot.n_joints)
     configurations = RandomReadings(n_candidates)
     scenario = Scenario(robot, Errors("values", {}), configurations, noise, job={"model": "position"})
-    return pool_of(scenario, n_candidates, generator)
+    return pool_of(scenario, drawn(scenario, n_candidates, generator))
 
 
 def tasks_of(pool: Pool, generator: np.random.Generator) -> dict[str, Task]:
-    """Anywhere within the limits, and where the tool is in a ball about one of its places."""
+    """Anywhere within the limits, where the tool is in a ball about one of its places, and five configurations."""
     anywhere = random_readings(pool.robot, 20000, generator)
     p = fg_calib.pose(pool.robot, anywhere).position
-    near = np.argsort(np.linalg.norm(p - p[0], axis=1), kind="stable")
-    inside = near[: max(100, int(np.sum(np.linalg.norm(p - p[0], axis=1) < CELL * pool.robot.reach)))][:500]
-    return {"anywhere": Task(anywhere[:500], True), "cell": Task(anywhere[generator.permutation(inside)], True)}
+    distance = np.linalg.norm(p - p[0], axis=1)
+    near = np.argsort(distance, kind="stable")[: max(100, int(np.sum(distance < CELL * pool.robot.reach)))]
+    cell = anywhere[generator.permutation(near)[:500]]
+    return {"anywhere": Task(anywhere[:500], True), "cell": Task(cell, True), "five places": Task(anywhere[:5], True)}
 
 
 def system_for(pool: Pool, task: Task) -> System:
+    """What is chosen from."""
     return system_of(pool.rows, pool.known, task.form(pool.problem))
+
+
+def best_of(system: System, n: int, criterion: Criterion) -> Chosen:
+    """What `design` chooses."""
+    chooser = Chooser(system, criterion)
+    return not_worse_than_random(chooser.measure, chooser.best(n), np.random.default_rng(1))
 
 
 def error_of(system: System, chosen: Integers) -> float:
@@ -235,22 +224,21 @@ def error_of(system: System, chosen: Integers) -> float:
 
 def arms(given: argparse.Namespace) -> dict[str, Any]:
     """Expected errors of designs by each criterion on random arms, and of random sets."""
-    rows: dict[str, list[dict[str, float]]] = {"anywhere": [], "cell": []}
-    for k in range(3 if given.quick else 90):
+    n_arms = 3 if given.quick else 90
+    rows: dict[tuple[int, str], list[dict[str, float]]] = {}
+    for k in range(n_arms):
         rng = np.random.default_rng([given.seed, k])
         pool = pool_of_arm(random_arm(5 + k % 3, rng), N_CANDIDATES, rng)
         systems = {where: system_for(pool, task) for where, task in tasks_of(pool, rng).items()}
-        some = next(iter(systems.values()))
-        chosen = {criterion: choose(some, N_STOPS, criterion).candidates for criterion in OTHERS}
-        for where, system in systems.items():
-            errors = {criterion: error_of(system, stops) for criterion, stops in chosen.items()}
-            values, _ = random_values(Measure("I", system), N_STOPS, rng)
-            best = error_of(system, choose(system, N_STOPS, "I").candidates)
-            rows[where].append(
-                {"I": best, **errors, "random": float(np.sqrt(np.median(values))), "n_joints": pool.robot.n_joints}
-            )
-    return {"n_arms": len(rows["cell"]), "n": N_STOPS, "of": N_CANDIDATES} | {
-        where: gains(of_task) for where, of_task in rows.items()
+        for n in N_STOPS:
+            chosen = {c: best_of(systems["anywhere"], n, c).candidates for c in OTHERS}  # they know no task
+            for where, system in systems.items():
+                values, _ = random_values(Measure("I", system), n, rng)
+                errors = {c: error_of(system, stops) for c, stops in chosen.items()}
+                errors |= {"I": error_of(system, best_of(system, n, "I").candidates)}
+                rows.setdefault((n, where), []).append(errors | {"random": float(np.sqrt(np.median(values)))})
+    return {"n_arms": n_arms, "of": N_CANDIDATES} | {
+        f"{n} stops, {where}": gains(of_task) for (n, where), of_task in rows.items()
     }
 
 
@@ -275,14 +263,17 @@ def gains(rows: Sequence[Mapping[str, float]]) -> dict[str, Any]:
 def search(given: argparse.Namespace) -> dict[str, Any]:
     """Greedy choice and exchange beside random sets and exhaustive search."""
     over: dict[str, list[float]] = {criterion: [] for criterion in CRITERIA}
-    small: dict[str, dict[str, list[float]]] = {pool: {c: [] for c in CRITERIA} for pool in ("4 of 12", "3 of 15")}
-    for k in range(2 if given.quick else 90):
+    keys = [*CRITERIA, *(f"{c} exchange alone" for c in CRITERIA)]
+    small: dict[str, dict[str, list[float]]] = {
+        pool: {c: [] for c in keys} for pool in ("4 of 12", "3 of 15", "5 of 16")
+    }
+    for k in range(2 if given.quick else 30):
         rng = np.random.default_rng([given.seed, 100 + k])
         pool = pool_of_arm(random_arm(5 + k % 3, rng), 200, rng)
         system = system_for(pool, tasks_of(pool, rng)["anywhere"])
         for criterion in CRITERIA:
             measure = Measure(criterion, system)
-            found = not_worse_than_random(measure, choose(system, 12, criterion), np.random.default_rng(1))
+            found = best_of(system, 12, criterion)
             values, _ = random_values(measure, 12, rng)
             over[criterion].append(index(criterion, system, found.value) / index(criterion, system, values.min()))
             for name, of_pool in small.items():
@@ -291,8 +282,12 @@ def search(given: argparse.Namespace) -> dict[str, Any]:
                 least = Measure(criterion, part)
                 sets = [np.array(one) for one in combinations(range(of), n)]
                 best = min(least.value(part.information(one)) for one in sets)
-                ours = not_worse_than_random(least, choose(part, n, criterion), np.random.default_rng(1))
-                of_pool[criterion].append(index(criterion, part, ours.value) / index(criterion, part, best))
+                for key, ours in (
+                    ("", best_of(part, n, criterion)),
+                    ("exchange alone", Chooser(part, criterion).best(n)),
+                ):
+                    ratio = index(criterion, part, ours.value) / index(criterion, part, best)
+                    of_pool[f"{criterion} {key}".strip()].append(ratio)
     return {
         "n_systems": len(over["I"]),
         "12 of 200 over the best of 100 random sets": {
@@ -333,13 +328,6 @@ def loaded(file: str) -> ModuleType:
     return module
 
 
-def chosen_ids(plan: Design) -> list[str]:
-    """The rows that a plan chose."""
-    stop, names = plan.pool.stop, plan.pool.problem.data.names
-    of_stop = {int(s): names[k] for k, s in enumerate(stop) if s >= 0}
-    return [of_stop[int(s)] for s in plan.stops]
-
-
 def of_rows(
     job: fg_calib.Job, given: argparse.Namespace, counts: Sequence[int], judge: Callable[[Any], float]
 ) -> dict[str, Any]:
@@ -363,7 +351,7 @@ def of_rows(
         found[str(n)] = {"random": {"p10": low, "median": middle, "p90": high, "best": min(random)}}
         for name, task in tasks.items():
             plan = design(job, n=n, candidates="rows", task=task, seed=given.seed)
-            designed = error(chosen_ids(plan))
+            designed = error(plan.ids.tolist())
             found[str(n)][f"task {name}"] = {
                 "designed": designed,
                 "share of random ones that are better": float(np.mean(np.array(random) < designed)),
@@ -411,17 +399,16 @@ def picture(found: dict[str, Any]) -> Figure:
     """Expected error by the number of stops, and gains on random arms."""
     figure = Figure(figsize=(12, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
-    of_paper = found["paper"]
     for views, line in zip(VIEWS, ("-", "--"), strict=True):
-        curve = np.array(of_paper[views]["curve"])
+        curve = np.array(found[views]["poses"]["curve"])
         left.fill_between(curve[:, 0], curve[:, 2] / MM, curve[:, 4] / MM, color=RANDOM, alpha=0.3, lw=0)
         left.plot(curve[:, 0], curve[:, 3] / MM, line, color=RANDOM, label=f"random, {views} (10 to 90 %)")
         left.plot(curve[:, 0], curve[:, 1] / MM, line, color=CHOSEN, lw=2, label=f"designed, {views}")
-        for name, row in of_paper[views]["realised"].items():
-            if name.startswith("pose"):
-                colour = RANDOM if "random" in name and "as few" not in name else CHOSEN
+        for name, row in found[views]["realised"].items():
+            if name.startswith("poses"):
+                colour = RANDOM if name == "poses, random" else CHOSEN
                 left.plot(row["n"], row["realised"] / MM, "o", color=colour, mec="k", ms=7, zorder=3)
-    left.plot([], [], "o", color="w", mec="k", ms=7, label=f"realised, {of_paper['n_draws']} draws")
+    left.plot([], [], "o", color="w", mec="k", ms=7, label=f"realised, {found[next(iter(VIEWS))]['n_draws']} draws")
     left.set(xscale="log", yscale="log", xlabel="configurations measured", ylabel="RMS tool position error [mm]")
     left.set_xticks([5, 10, 20, 52], ["5", "10", "20", "52"])
     left.set_yticks([1, 2, 5, 10], ["1", "2", "5", "10"])
@@ -429,16 +416,17 @@ def picture(found: dict[str, Any]) -> Figure:
     left.set_title("The paper's arm, poses in an unknown frame")
     left.legend(frameon=False, fontsize=8)
     names = (*OTHERS, "best other", "random")
-    for where, shift, colour in (("anywhere", -0.15, CHOSEN), ("cell", 0.15, "#009E73")):
+    tasks = (("anywhere", CHOSEN), ("cell", "#009E73"), ("five places", "#CC79A7"))
+    for j, (where, colour) in enumerate(tasks):
         for k, name in enumerate(names):
-            g = found["arms"][where][name]
-            right.plot([100 * g["p5"], 100 * g["p95"]], [k + shift] * 2, color=colour, lw=2)
-            right.plot(100 * g["median"], k + shift, "o", color=colour, label=f"task: {where}" if k == 0 else None)
+            g, y = found["arms"][f"{N_STOPS[0]} stops, {where}"][name], k + 0.22 * (j - 1)
+            right.plot([100 * g["p5"], 100 * g["p95"]], [y, y], color=colour, lw=2)
+            right.plot(100 * g["median"], y, "o", color=colour, label=f"task: {where}" if k == 0 else None)
     right.axvline(0.0, color="0.7", lw=0.8)
     right.set_yticks(range(len(names)), names)
     right.invert_yaxis()
     right.set(xlabel="I-design's error below the other's [%], 5 to 95 % of arms")
-    right.set_title(f"{found['arms']['n_arms']} random arms, {N_STOPS} of {N_CANDIDATES}")
+    right.set_title(f"{found['arms']['n_arms']} random arms, {N_STOPS[0]} of {N_CANDIDATES} stops")
     right.legend(frameon=False, fontsize=8)
     for axes in (left, right):
         clean(axes)

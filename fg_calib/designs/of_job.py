@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fg_calib.analysis.variance_components import solve_job
 from fg_calib.designs.candidates import Candidates
-from fg_calib.designs.pool import Pool, drawn, pool_of
+from fg_calib.designs.pool import HUB, NONE, Pool, drawn, pool_of
 from fg_calib.designs.rows import stop_rows
 from fg_calib.designs.scene import scenario_of
 from fg_calib.errors import InputError
@@ -80,7 +80,8 @@ def pool_of_rows(problem: Problem, source: str) -> Pool:
             hubs = np.union1d(hubs, ends[:, 0])
         used[ends] = True
     used[hubs] = False
-    stop = np.full(data.n_configurations, -1)
+    stop = np.full(data.n_configurations, NONE)  # test rows
+    stop[hubs] = HUB
     stop[used] = np.arange(int(used.sum()))
     kept = np.flatnonzero(used)
     return Pool(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fg_calib.designs.criteria import Criterion, Measure
 from fg_calib.designs.pairs import PairPlan, PairWork, Structure, free_pairs, plan_pairs
-from fg_calib.designs.pool import Pool, pool_of
+from fg_calib.designs.pool import HUB, Pool, pool_of
 from fg_calib.designs.search import greedy
 from fg_calib.designs.system import system_of
 from fg_calib.designs.task import Posterior, Task
@@ -57,14 +57,14 @@ def plan_of_stops(pool: Pool, stops: Integers) -> Plan:
     number = {stop: k for k, stop in enumerate(pool.stop.tolist())}
     order = [number[stop] for stop in measured.tolist()]
     if pool.has_hub and not len(pool.given):
-        order = [number[-1], *order]
+        order = [number[HUB], *order]
     tables = pool.tables_of(measured)
     direct = [t.measurements.pairs for t in tables if t.measurements.pairs is not None]
     return Plan(
         tables=tables,
         readings=data.readings[order],
         names=[data.names[k] for k in order],
-        group=np.array(["" if pool.stop[k] < 0 else str(pool.group[pool.stop[k]]) for k in order]),
+        group=np.array(["" if pool.stop[k] == HUB else str(pool.group[pool.stop[k]]) for k in order]),
         posterior=pool.posterior(stops),
         pairs=np.stack([direct[0].a, direct[0].b], axis=1) if direct else None,
     )
@@ -97,7 +97,7 @@ def other_pairs(
     if not alone or table.measurements.pairs is None:
         return
     readings = pool.problem.data.readings
-    first = int(np.flatnonzero(pool.stop < 0)[0])
+    first = int(np.flatnonzero(pool.stop == HUB)[0])
     work = PairWork(pool.robot, table, pool.problem.options, readings)
     structures: tuple[Structure, ...] = ("chain", "tree")
     for structure in structures:

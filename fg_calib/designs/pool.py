@@ -40,6 +40,9 @@ from fg_calib.simulation.simulator import pairing_of, simulate
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
+HUB, NONE = -1, -2
+"""Instead of the number of a stop: what all pairs of a star are measured against, and a test row."""
+
 _ID = re.compile(r"^(?:(\S+) (?:\S+ )?)?p(\d+)$")
 """How a simulation names a configuration: what instrument it is of, where it is one's own, and its number."""
 
@@ -55,7 +58,8 @@ class Pool(Brief):
         problem: The problem of these.
         readings: Of each stop, shape (n_stops, n_joints), [rad] (prismatic: [m]).
         group: The instrument whose own stop each is; "" for those where all others measure.
-        stop: The stop of each configuration of the problem, shape (n_configurations,); -1 for a hub.
+        stop: The stop of each configuration of the problem, shape (n_configurations,); `HUB`, or `NONE` where nothing
+            is fitted.
         rows: What each stop would add.
         given: Stops that were measured already, or will be anyway.
         found: How the candidates of each group came about.
@@ -90,7 +94,7 @@ class Pool(Brief):
     @property
     def has_hub(self) -> bool:
         """Whether all pairs are measured against one configuration."""
-        return bool(np.any(self.stop < 0))
+        return bool(np.any(self.stop == HUB))
 
     def tables_of(self, stops: Integers, pairing: Pairing | None = None) -> list[Table]:
         """What would be measured at some of the stops, in their order, behind those of hubs.
@@ -103,7 +107,7 @@ class Pool(Brief):
         of_stop: dict[int, list[int]] = {}
         for k, stop in enumerate(self.stop.tolist()):
             of_stop.setdefault(stop, []).append(k)
-        wanted = [*of_stop.get(-1, []), *(k for stop in stops.tolist() for k in of_stop.get(stop, []))]
+        wanted = [*of_stop.get(HUB, []), *(k for stop in stops.tolist() for k in of_stop.get(stop, []))]
         order = {names[k]: place for place, k in enumerate(wanted)}
         found = [selected(table, order) for table in self.tables]
         for number, (model, own) in self.formed.items():
@@ -245,7 +249,7 @@ def pool_of(
     names = [_named(name) for name in data.names[: data.n_configurations]]
     hubs = _hubs(problem)
     kept = np.setdiff1d(np.arange(len(names)), hubs)
-    stop = np.full(len(names), -1)
+    stop = np.full(len(names), HUB)
     stop[kept] = np.arange(len(kept))
     n_given = 0 if given is None else len(given)
     return Pool(

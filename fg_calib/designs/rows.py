@@ -54,7 +54,7 @@ def stop_rows(problem: Problem, of: Integers, hubs: Integers | None = None, *, a
 
     Args:
         problem: The problem, linearised at its start.
-        of: The stop of each configuration, shape (n_configurations,); -1 for a hub, and where it is none.
+        of: The stop of each configuration, shape (n_configurations,); below 0 for a hub, and where it is none.
         hubs: Configurations whose errors others share; none if None.
         alone: Whether nothing was measured before; else what is known of unknowns beside the arm is known from that.
 
