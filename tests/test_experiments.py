@@ -1,6 +1,7 @@
 """The experiments run and the numbers that their ledger claims hold; no time is asserted."""
 
 import importlib.util
+import itertools
 import json
 import multiprocessing
 import shutil
@@ -700,3 +701,25 @@ def test_predict_expects_the_errors_that_arms_have(tmp_path):
             assert 0.1 < case[frame]["position"][0] < 2.2
             assert 0.05 < case[frame]["worst"][0] < 3.0
             assert case[frame]["worst_expected"] > case[frame]["expected_rms"][0]
+
+
+@pytest.mark.long
+def test_designs_are_better_than_random_sets_on_real_rows_and_random_arms(tmp_path):
+    """What a quick run can tell: expected errors, and that what was drawn is near them (2 draws)."""
+    sys.path.insert(0, str(EXPERIMENTS))
+    try:
+        found = load("18_design.py").main(["--quick", "--only", "arms", "search", "ur10", "--out", str(tmp_path)])
+    finally:
+        sys.path.remove(str(EXPERIMENTS))
+    for n, where in itertools.product((10, 20), ("anywhere", "cell", "five places")):
+        gains = found["arms"][f"{n} stops, {where}"]
+        assert gains["random"]["min"] > 0.05, (n, where)
+        assert gains["best other"]["min"] > -0.05, (n, where)
+    for criterion, row in found["search"]["12 of 200 over the best of 100 random sets"].items():
+        assert row["worse"] == 0, criterion
+    for pool in ("4 of 12", "3 of 15"):  # so few sets that all are looked at
+        for criterion, row in found["search"]["over the best of all sets"][pool].items():
+            assert row["largest"] < 1.0 + 1e-9 or "alone" in criterion, (pool, criterion)
+    if "skipped" not in found["ur10"]:
+        row = found["ur10"]["20"]
+        assert row["task train rows"]["designed"] < row["random"]["median"]
