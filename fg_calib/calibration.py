@@ -4,7 +4,8 @@
     data = Measurements.from_arrays(q, position=p, sigma_position=1e-4)
     result = calibrate(robot, data, model="position", frame="unknown")
 
-`calibrate_job` does the same of a job, and the command line calls it.
+`calibrate_job` does the same of a job, and the command line calls it. What only a calibration of before needs (checks
+and updates by new rows, its history) is imported there: that takes as long as to solve a small one.
 """
 
 from __future__ import annotations
@@ -18,25 +19,20 @@ from functools import cached_property
 from hashlib import sha256
 from numbers import Integral
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fg_calib.analysis.check import Check, check_rows
 from fg_calib.analysis.covariance import TangentCovariance
-from fg_calib.analysis.folds import cross_validate
-from fg_calib.analysis.new_rows import Calibrated, Rows
 from fg_calib.analysis.residual_table import ResidualTable
 from fg_calib.analysis.uncertainty import FrameEstimate, Uncertainty, assess
-from fg_calib.analysis.update import updated
 from fg_calib.analysis.variance_components import solve_job
 from fg_calib.arguments import checked
 from fg_calib.arrays import as_floats, shape_of
 from fg_calib.errors import InputError, escaped, shown
 from fg_calib.files.disk import exists, is_folder, noting_reads
-from fg_calib.files.history import HISTORY, History, Run, history_of, run_of
 from fg_calib.files.job import UNSTATED, read_job, read_table_like
 from fg_calib.files.result import Carried, KindGoodness, Parameter, Posterior, Previous, Result, read_result
 from fg_calib.files.result import Knowledge as SavedKnowledge
@@ -57,6 +53,11 @@ from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import forward, precompute_trig
 from fg_calib.robot.model import Robot, names_of
 from fg_calib.threads import single_threaded
+
+if TYPE_CHECKING:
+    from fg_calib.analysis.check import Check
+    from fg_calib.analysis.new_rows import Calibrated, Rows
+    from fg_calib.files.history import Run
 
 Floats = NDArray[np.float64]
 
@@ -116,6 +117,8 @@ def calibrate_job(job: Job | Path | str) -> Calibration:
     tell("judging the result")
     uncertainty = assess(solution)
     if given.options.folds is not None:
+        from fg_calib.analysis.folds import cross_validate
+
         uncertainty = uncertainty.with_folds(cross_validate(given, given.options.folds), solution)
     return Calibration.of(solution, uncertainty, given.inputs, job=given.document)
 
@@ -247,6 +250,8 @@ class Calibration:
         Raises:
             InputError: There is none, or it is damaged.
         """
+        from fg_calib.files.history import history_of
+
         result, folder = read_result(path), Path(path) if is_folder(Path(path)) else Path(path).parent
         robot = _saved_robot(folder, result)
         nominal = robot.with_values([p.nominal for p in result.parameters])  # by its reach columns are scaled
@@ -264,12 +269,16 @@ class Calibration:
 
     def _history(self, digest: str) -> dict[str, str]:
         """What is written of the runs that it came from, with itself."""
+        from fg_calib.files.history import HISTORY, History, run_of
+
         runs = (*self.history, run_of(self.result, digest, self.history[-1]))
         return {HISTORY: History(robot=self.result.robot, runs=runs).text()}
 
     @property
     def runs(self) -> tuple[Run, ...]:
         """The runs that it came from, and itself."""
+        from fg_calib.files.history import run_of
+
         if self.assessed is None:
             return self.history
         digest = sha256(json.dumps(self.result.document()).encode()).hexdigest()
@@ -278,6 +287,8 @@ class Calibration:
     @property
     def calibrated(self) -> Calibrated:
         """What is known of the arm, for new rows."""
+        from fg_calib.analysis.new_rows import Calibrated
+
         of_result = {p.name: p.prior_sigma for p in self.result.parameters}  # as they were estimated, perhaps
         nominal = self.posterior.variables.robot
         nominal = replace(
@@ -315,6 +326,8 @@ class Calibration:
             InputError: The rows cannot be read, or are of another robot; or the calibration is not to be trusted.
             ProblemError: The rows lack what their model needs.
         """
+        from fg_calib.analysis.check import check_rows
+
         self._require_trust()
         new, _ = self._rows(rows, pairs, like)
         between = all(table.model not in ("pose", "position", "orientation", "board") for table in new.tables)
@@ -354,6 +367,8 @@ class Calibration:
             ProblemError: The rows lack what their model needs, or do not suffice.
             SolverError: GTSAM could not solve a step at all.
         """
+        from fg_calib.analysis.update import updated
+
         self._require_trust()
         history = self.runs
         new, before = _date(date), history[-1]
@@ -388,6 +403,8 @@ class Calibration:
         Raises:
             InputError: They are of another robot, or cannot be read.
         """
+        from fg_calib.analysis.new_rows import Rows
+
         options, robot = _saved_options(self.result), self.posterior.variables.robot
         if isinstance(given, Path | str) and Path(given).suffix.lower() not in (".yaml", ".yml"):
             path, of_pairs = Path(given), None if pairs is None else Path(pairs)
