@@ -8,6 +8,7 @@ With U the few errors and P, and K = S^-1 + U^T B^-1 U, the inverse is `B^-1 - B
 from __future__ import annotations
 
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -128,9 +129,9 @@ class LowRank:
         B[block, place, place] = self._d + floor
         pairs = C.tocoo()
         B[block[pairs.row], place[pairs.row], place[pairs.col]] += pairs.data
-        inverse: Floats = np.linalg.inv(B)
+        inverse = np.linalg.inv(B)
 
-        def through(matrices: Floats, columns: Floats) -> Floats:
+        def through(matrices: NDArray[Any], columns: Floats) -> Floats:
             padded = np.zeros((n_blocks, m, columns.shape[1]))
             padded[block, place] = columns
             out: Floats = (matrices @ padded)[block, place]
