@@ -8,12 +8,14 @@ import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
 from datetime import UTC, datetime
+from functools import cache
 from hashlib import sha256
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from fg_calib import __version__
@@ -181,7 +183,7 @@ def _origin(
     """What a result came from, and what the next one takes over."""
     return {
         "options": _options(solution.problem),
-        "versions": _versions(),
+        "versions": dict(_versions()),
         "inputs": dict(inputs),
         "date": date or datetime.now(UTC).isoformat(timespec="seconds"),
         "previous": previous,
@@ -216,9 +218,10 @@ def _options(problem: Problem) -> dict[str, Any]:
     return given | words
 
 
+@cache
 def _versions() -> dict[str, str]:
     """What the figures were computed with."""
-    libraries = {name: metadata.version(name) for name in ("gtsam", "numpy", "scipy")}
+    libraries = {"gtsam": metadata.version("gtsam"), "numpy": np.__version__, "scipy": scipy.__version__}
     return {"fg-calib": __version__, "python": platform.python_version(), **libraries}
 
 
