@@ -234,7 +234,7 @@ def test_the_command_line_is_there_before_the_heavy_libraries():
 
 @pytest.mark.slow
 def test_a_calibration_loads_only_what_it_uses(example):
-    """No figures, no URDFs, no baseline, and of scipy not the heaviest."""
+    """No figures, pages, URDFs or baseline, of scipy not the heaviest, and nothing that is for new rows or folds."""
     code = f"""
 import contextlib, io, sys
 from fg_calib import cli
@@ -247,7 +247,9 @@ print(sorted(sys.modules))
     loaded = set(ast.literal_eval(run_python(code)))
     assert {"fg_calib.analysis.uncertainty", "fg_calib.report.text", "gtsam", "numba", "polars"} <= loaded
     idle = {"matplotlib", "lxml", "yourdfpy", "scipy.optimize", "scipy.stats", "fg_calib.files.urdf"}
-    idle |= {"fg_calib.baseline", "fg_calib.report.figures"}
+    idle |= {"fg_calib.baseline", "fg_calib.report.figures", "fg_calib.report.page.page", "jinja2", "cv2", "rosbags"}
+    idle |= {f"fg_calib.analysis.{name}" for name in ("check", "folds", "new_rows", "separation", "suspects", "update")}
+    idle |= {"fg_calib.files.history", "fg_calib.files.bag", "fg_calib.simulation", "rich.progress", "rich.markdown"}
     assert loaded & idle == set()
 
 
