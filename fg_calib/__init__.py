@@ -26,9 +26,11 @@ if TYPE_CHECKING:
     from fg_calib.analysis.variance_components import estimate_noise, solve_job
     from fg_calib.baseline.comparison import Comparison, compare
     from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
+    from fg_calib.batch import calibrate_jobs
     from fg_calib.calibration import Calibration, calibrate, calibrate_job
     from fg_calib.correction import correct
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
+    from fg_calib.executors import Failure, dask_executor, local_processes, map_jobs
     from fg_calib.exports.export import Export, export
     from fg_calib.files.columns import Column
     from fg_calib.files.history import History, history_of
@@ -75,9 +77,11 @@ __version__ = "0.1.0"
 _HOMES = {
     "fg_calib.analysis.bounds": ("Bound", "cramer_rao"),
     "fg_calib.baseline.comparison": ("Comparison", "compare"),
+    "fg_calib.batch": ("calibrate_jobs",),
     "fg_calib.calibration": ("Calibration", "calibrate", "calibrate_job"),
     "fg_calib.correction": ("correct",),
     "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
+    "fg_calib.executors": ("Failure", "dask_executor", "local_processes", "map_jobs"),
     "fg_calib.exports.export": ("Export", "export"),
     "fg_calib.files.columns": ("Column",),
     "fg_calib.analysis.check": ("Check", "Explanation"),
@@ -141,6 +145,7 @@ __all__ = [
     "DistanceFactor",
     "Explanation",
     "Export",
+    "Failure",
     "History",
     "Identifiability",
     "InputError",
@@ -174,11 +179,13 @@ __all__ = [
     "build_problem",
     "calibrate",
     "calibrate_job",
+    "calibrate_jobs",
     "check_setup",
     "compare",
     "comparison_document",
     "correct",
     "cramer_rao",
+    "dask_executor",
     "estimate_noise",
     "estimate_tolerances",
     "expand",
@@ -192,7 +199,9 @@ __all__ = [
     "inspect_job",
     "inspection_document",
     "levenberg_marquardt_params",
+    "local_processes",
     "look_elsewhere",
+    "map_jobs",
     "observability_document",
     "observe_configurations",
     "observe_structure",
