@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from fg_calib.analysis.identifiability import Identifiability, observe_configurations, observe_structure
     from fg_calib.analysis.inspection import Inspection, inspect_job
     from fg_calib.analysis.mistakes import SetupCheck, check_setup
+    from fg_calib.analysis.parts import PartsSolution, cut, reduce_parts, solve_parts
     from fg_calib.analysis.restarts import look_elsewhere
     from fg_calib.analysis.uncertainty import Uncertainty, assess
     from fg_calib.analysis.variance_components import estimate_noise, solve_job
@@ -123,6 +124,7 @@ _HOMES = {
     "fg_calib.robot.model": ("Robot",),
     "fg_calib.simulation.scenario": ("Scenario", "Simulation"),
     "fg_calib.simulation.simulator": ("simulate",),
+    "fg_calib.analysis.parts": ("PartsSolution", "cut", "reduce_parts", "solve_parts"),
     "fg_calib.analysis.restarts": ("look_elsewhere",),
     "fg_calib.graph.extension": ("DistanceFactor", "RotationAngleFactor", "expand"),
     "fg_calib.graph.solver": ("Solution", "SolverOptions", "levenberg_marquardt_params", "solve"),
@@ -160,6 +162,7 @@ __all__ = [
     "Options",
     "Own",
     "Pairing",
+    "PartsSolution",
     "Problem",
     "ProblemError",
     "Result",
@@ -185,6 +188,7 @@ __all__ = [
     "comparison_document",
     "correct",
     "cramer_rao",
+    "cut",
     "dask_executor",
     "estimate_noise",
     "estimate_tolerances",
@@ -214,12 +218,14 @@ __all__ = [
     "read_scenario",
     "read_targets",
     "read_urdf",
+    "reduce_parts",
     "result_document",
     "result_schema",
     "simulate",
     "solve",
     "solve_inverse",
     "solve_job",
+    "solve_parts",
     "write_comparison",
     "write_observability",
     "write_report",
