@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -26,6 +27,8 @@ from fg_calib import (
     local_processes,
     map_jobs,
     read_job,
+    read_scenario,
+    simulate,
 )
 from fg_calib.analysis.folds import cross_validate
 from fg_calib.batch import job_names
@@ -250,6 +253,17 @@ def test_folds_are_the_same_to_the_last_bit_on_other_processes(example):
     assert {k: (v.n, v.before, v.after) for k, v in there.kinds.items()} == {
         k: (v.n, v.before, v.after) for k, v in here.kinds.items()
     }
+
+
+@pytest.mark.slow
+def test_draws_of_a_simulation_are_the_same_to_the_last_bit_on_other_processes():
+    draw = partial(simulate, read_scenario("space-robot"))
+    here = map_jobs(draw, range(3))
+    with local_processes(2) as executor:
+        there = map_jobs(draw, range(3), executor)
+    for one, other in zip(here, there, strict=True):
+        assert one.measurements.position.tobytes() == other.measurements.position.tobytes()
+        assert one.true_robot.nominal.tobytes() == other.true_robot.nominal.tobytes()
 
 
 @pytest.mark.slow

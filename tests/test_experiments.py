@@ -4,6 +4,7 @@ import importlib.util
 import json
 import multiprocessing
 import shutil
+import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -329,6 +330,18 @@ def test_calibrate_quick_times_the_bundled_example(tmp_path, capsys):
     results = json.loads((tmp_path / "calibrate.json").read_text())
     assert results["n_pairs"] == 51
     assert {"fg-calib calibrate", "fg-calib --help", "solve and assess"} <= set(results["seconds"])
+
+
+def test_fleet_quick_has_a_result_of_every_job(tmp_path):
+    script = EXPERIMENTS / "benchmarks" / "fleet.py"  # whose functions its workers import
+    command = [sys.executable, str(script), "--quick", "--out", str(tmp_path)]
+    ended = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "2 processes: " in ended.stdout
+    found = json.loads((tmp_path / "fleet.json").read_text())
+    assert found["processes"][0]["jobs"] == 2
+    small, large = found["fleet"]
+    assert small["core_hours"] == large["core_hours"] > 0.0
+    assert found["here"]["result_written"] > 1e5
 
 
 def test_inverse_quick_reaches_every_pose(tmp_path, capsys):
