@@ -202,10 +202,12 @@ class _Run(Generic[T, R]):
 
     def _has_workers(self) -> bool:
         """Whether the executor still does something."""
-        try:
-            return self._executor.submit(int).result() == 0
-        except BrokenExecutor:
-            return False
+        for _ in range(1 + RESUBMISSIONS):
+            try:
+                return self._executor.submit(int).result() == 0
+            except BrokenExecutor:
+                pass
+        return False
 
 
 class LocalProcesses(Executor):
