@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import get_ident
 
+from fg_calib.arguments import checked
 from fg_calib.calibration import Calibration, calibrate_job
 from fg_calib.errors import InputError, escaped, shown
 from fg_calib.executors import Failure, map_jobs
@@ -27,6 +28,7 @@ from fg_calib.report.batch import JOBS_FILES, JobSummary, summary_of
 from fg_calib.report.documents import require_no_input
 
 
+@checked
 def calibrate_jobs(jobs: Sequence[Job | Path | str], executor: Executor | None = None) -> list[Calibration | Failure]:
     """`calibrate_job` of many jobs; one that fails is no matter to the others.
 

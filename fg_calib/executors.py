@@ -23,6 +23,7 @@ from multiprocessing import get_context
 from threading import Lock, Thread
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar
 
+from fg_calib.arguments import checked
 from fg_calib.errors import CalibrationError, InputError, printable, shown
 from fg_calib.options import check_number
 from fg_calib.progress import tell
@@ -74,6 +75,7 @@ class Failure:
         return found
 
 
+@checked
 def map_jobs(
     function: Callable[[T], R],
     jobs: Iterable[T],
@@ -263,6 +265,7 @@ class LocalProcesses(Executor):
         self._theirs.close()
 
 
+@checked
 def local_processes(n_workers: int) -> LocalProcesses:
     """An executor of worker processes on this machine, for a `with` block.
 
@@ -296,6 +299,7 @@ def _end_with(lifeline: Connection) -> None:
         os._exit(1)
 
 
+@checked
 @contextmanager
 def dask_executor(address: str) -> Iterator[Executor]:
     """An executor of a Dask cluster, for a `with` block.
