@@ -21,14 +21,19 @@ if TYPE_CHECKING:
     from fg_calib.analysis.identifiability import Identifiability, observe_configurations, observe_structure
     from fg_calib.analysis.inspection import Inspection, inspect_job
     from fg_calib.analysis.mistakes import SetupCheck, check_setup
+    from fg_calib.analysis.parts import PartsSolution, cut, reduce_parts, solve_parts
+    from fg_calib.analysis.prediction import PredictedErrors
     from fg_calib.analysis.restarts import look_elsewhere
     from fg_calib.analysis.uncertainty import Uncertainty, assess
     from fg_calib.analysis.variance_components import estimate_noise, solve_job
     from fg_calib.baseline.comparison import Comparison, compare
     from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
+    from fg_calib.batch import calibrate_jobs
     from fg_calib.calibration import Calibration, calibrate, calibrate_job
     from fg_calib.correction import correct
+    from fg_calib.designs.design import Design, design
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
+    from fg_calib.executors import Failure, dask_executor, local_processes, map_jobs
     from fg_calib.exports.export import Export, export
     from fg_calib.files.columns import Column
     from fg_calib.files.history import History, history_of
@@ -51,6 +56,7 @@ if TYPE_CHECKING:
     from fg_calib.measurements.series import KnownPoint, Own, Table
     from fg_calib.options import Limits, Options, Pairing
     from fg_calib.pages import write_report
+    from fg_calib.prediction import predict, write_prediction
     from fg_calib.report.comparison import format_comparison
     from fg_calib.report.documents import (
         comparison_document,
@@ -67,6 +73,7 @@ if TYPE_CHECKING:
     from fg_calib.robot.kinematics import pose
     from fg_calib.robot.model import Robot
     from fg_calib.robot.reaching import Correction
+    from fg_calib.simulation.configurations import BoardViews, GivenReadings, RandomReadings, TargetViews
     from fg_calib.simulation.scenario import Scenario, Simulation
     from fg_calib.simulation.simulator import simulate
 
@@ -75,9 +82,13 @@ __version__ = "0.1.0"
 _HOMES = {
     "fg_calib.analysis.bounds": ("Bound", "cramer_rao"),
     "fg_calib.baseline.comparison": ("Comparison", "compare"),
+    "fg_calib.batch": ("calibrate_jobs",),
     "fg_calib.calibration": ("Calibration", "calibrate", "calibrate_job"),
     "fg_calib.correction": ("correct",),
+    "fg_calib.designs.design": ("Design", "design"),
+    "fg_calib.simulation.configurations": ("BoardViews", "GivenReadings", "RandomReadings", "TargetViews"),
     "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
+    "fg_calib.executors": ("Failure", "dask_executor", "local_processes", "map_jobs"),
     "fg_calib.exports.export": ("Export", "export"),
     "fg_calib.files.columns": ("Column",),
     "fg_calib.analysis.check": ("Check", "Explanation"),
@@ -107,6 +118,8 @@ _HOMES = {
     "fg_calib.measurements.kinds.pixel": ("Camera",),
     "fg_calib.measurements.series": ("KnownPoint", "Own", "Table"),
     "fg_calib.pages": ("write_report",),
+    "fg_calib.prediction": ("predict", "write_prediction"),
+    "fg_calib.analysis.prediction": ("PredictedErrors",),
     "fg_calib.options": ("Limits", "Options", "Pairing"),
     "fg_calib.report.comparison": ("format_comparison",),
     "fg_calib.report.identifiability": ("format_identifiability",),
@@ -119,6 +132,7 @@ _HOMES = {
     "fg_calib.robot.model": ("Robot",),
     "fg_calib.simulation.scenario": ("Scenario", "Simulation"),
     "fg_calib.simulation.simulator": ("simulate",),
+    "fg_calib.analysis.parts": ("PartsSolution", "cut", "reduce_parts", "solve_parts"),
     "fg_calib.analysis.restarts": ("look_elsewhere",),
     "fg_calib.graph.extension": ("DistanceFactor", "RotationAngleFactor", "expand"),
     "fg_calib.graph.solver": ("Solution", "SolverOptions", "levenberg_marquardt_params", "solve"),
@@ -130,6 +144,7 @@ _FROM_FILES = {"Robot": ("from_urdf", "read_urdf"), "Measurements": ("from_frame
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
+    "BoardViews",
     "Bound",
     "Calibration",
     "CalibrationError",
@@ -138,9 +153,12 @@ __all__ = [
     "Column",
     "Comparison",
     "Correction",
+    "Design",
     "DistanceFactor",
     "Explanation",
     "Export",
+    "Failure",
+    "GivenReadings",
     "History",
     "Identifiability",
     "InputError",
@@ -155,8 +173,11 @@ __all__ = [
     "Options",
     "Own",
     "Pairing",
+    "PartsSolution",
+    "PredictedErrors",
     "Problem",
     "ProblemError",
+    "RandomReadings",
     "Result",
     "Robot",
     "RotationAngleFactor",
@@ -167,6 +188,7 @@ __all__ = [
     "SolverError",
     "SolverOptions",
     "Table",
+    "TargetViews",
     "Targets",
     "Uncertainty",
     "Units",
@@ -174,11 +196,15 @@ __all__ = [
     "build_problem",
     "calibrate",
     "calibrate_job",
+    "calibrate_jobs",
     "check_setup",
     "compare",
     "comparison_document",
     "correct",
     "cramer_rao",
+    "cut",
+    "dask_executor",
+    "design",
     "estimate_noise",
     "estimate_tolerances",
     "expand",
@@ -192,11 +218,14 @@ __all__ = [
     "inspect_job",
     "inspection_document",
     "levenberg_marquardt_params",
+    "local_processes",
     "look_elsewhere",
+    "map_jobs",
     "observability_document",
     "observe_configurations",
     "observe_structure",
     "pose",
+    "predict",
     "problem_of",
     "read_job",
     "read_measurements",
@@ -205,14 +234,17 @@ __all__ = [
     "read_scenario",
     "read_targets",
     "read_urdf",
+    "reduce_parts",
     "result_document",
     "result_schema",
     "simulate",
     "solve",
     "solve_inverse",
     "solve_job",
+    "solve_parts",
     "write_comparison",
     "write_observability",
+    "write_prediction",
     "write_report",
     "write_results",
     "write_robot",

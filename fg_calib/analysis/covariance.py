@@ -138,11 +138,7 @@ def spread_of(solution: Solution) -> Spread:
     scales = variables.prior_scales
 
     def decomposed(parameters: Floats) -> tuple[Floats, Floats, int]:
-        data = whitened_triangle(problem, parameters, with_loss=True)
-        rows = [data, prior_rows(variables, parameters)[1]]
-        stacked = np.vstack([*rows, np.zeros((variables.n_columns, variables.n_columns))]) * scales
-        _, s, Vt = np.linalg.svd(stacked, full_matrices=False)
-        return s, Vt * scales, determined(s)
+        return _decomposed(variables, parameters, whitened_triangle(problem, parameters, with_loss=True))
 
     found = s, directions, rank = decomposed(solution.parameters)
     _, directions_nominal, rank_nominal = (
@@ -162,6 +158,27 @@ def spread_of(solution: Solution) -> Spread:
         rank=rank,
         excess=float(np.trace(middle)),
     )
+
+
+def covariance_of_rows(variables: Variables, parameters: Floats, rows: Floats) -> TangentCovariance:
+    """The covariance that whitened rows and the robot's tolerances make, both at one parameter vector.
+
+    Args:
+        variables: The variables.
+        parameters: The parameter vector.
+        rows: Derivatives in the core, nuisances eliminated, shape (m, n_columns).
+    """
+    s, directions, rank = _decomposed(variables, parameters, rows)
+    half, loose = directions[:rank].T / s[:rank], _orthonormal(directions[rank:], variables.scales)
+    return TangentCovariance(variables, parameters, half @ half.T, loose, loose)
+
+
+def _decomposed(variables: Variables, parameters: Floats, rows: Floats) -> tuple[Floats, Floats, int]:
+    """Singular values of rows and priors by how far columns may be off, their directions, how many are determined."""
+    n, scales = variables.n_columns, variables.prior_scales
+    stacked = np.vstack([rows, prior_rows(variables, parameters)[1], np.zeros((n, n))]) * scales
+    _, s, Vt = np.linalg.svd(stacked, full_matrices=False)
+    return s, Vt * scales, determined(s)
 
 
 def _held(loose: Floats, loose_at_nominal: Floats, scales: Floats, n_robot: int) -> Floats:

@@ -26,7 +26,7 @@ from fg_calib.errors import escaped
 from fg_calib.graph.build import problem_of
 from fg_calib.graph.information import eliminated
 from fg_calib.graph.problem import Problem, tables_of
-from fg_calib.graph.solver import Solution
+from fg_calib.graph.solver import unsolved
 from fg_calib.job import Job
 from fg_calib.measurements.limits import outside_limits
 from fg_calib.measurements.series import Table
@@ -150,7 +150,7 @@ def inspect_job(job: Job) -> Inspection:
     problem = problem_of(job)
     tables = tables_of(job.measurements, job.options)
     every, setups, disagreements = _of_set_up(problem, job, tables)
-    at_nominal = _unsolved(problem)
+    at_nominal = unsolved(problem)
     spread = spread_of(at_nominal)
     expected = None if problem.evaluated else expected_error(at_nominal, with_left_out(at_nominal, spread))
     n_directions = spread.rank + eliminated(problem, problem.start).rank
@@ -190,20 +190,6 @@ def _of_set_up(
     if fit is None or any(check.explanations for check in setups):
         return every, setups, Disagreements((), 0, 0)
     return every, setups, find_disagreements(fit, problem.data.labels if len(tables) > 1 else ("",))
-
-
-def _unsolved(problem: Problem) -> Solution:
-    """A problem at its start as if that were its solution: what could be known there."""
-    return Solution(
-        *(problem, problem.initial, problem.start, problem.start),
-        converged=False,
-        message="not solved",
-        history=(),
-        initial_cost=np.nan,
-        cost=np.nan,
-        weighted_cost=np.nan,
-        seconds=0.0,
-    )
 
 
 def _joints(problem: Problem, robot: Robot) -> tuple[JointRange, ...]:

@@ -1,9 +1,6 @@
 """How far off the tool is expected to be all over the workspace, and where nothing was measured.
 
-Configurations are drawn evenly within the joint limits. The expected error at each is that of `accuracy`, in the base
-frame; *fitted* it is what is left after the one rotation and shift that fit the measured configurations best, and then
-hold all over the workspace: the part of the derivatives v at the measured points that rigid motions G can make is G v,
-and the same motion is taken away everywhere else.
+Configurations are drawn evenly within the joint limits. The expected error at each is that of `tool_error`.
 """
 
 from __future__ import annotations
@@ -14,12 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from fg_calib.analysis.accuracy import without_rigid_motion
-from fg_calib.analysis.covariance import TangentCovariance
+from fg_calib.analysis.tool_error import ToolErrorModel, ToolErrors
 from fg_calib.arrays import FrozenArrays
-from fg_calib.graph.factors import build_variables
 from fg_calib.robot.inverse import random_readings
-from fg_calib.robot.kinematics import forward, precompute_trig
+from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Joint, Robot
 
 Floats = NDArray[np.float64]
@@ -27,9 +22,6 @@ Booleans = NDArray[np.bool_]
 
 N_DRAWN = 12_000
 """Configurations that are drawn."""
-
-_MOST_MEASURED = 1000
-"""Measured configurations that the rigid motion is fitted to; of more, so many that are evenly spaced."""
 
 FAR = 0.15
 """Distance from the nearest measured position, in the radius of the workspace, beyond which nothing was measured."""
@@ -59,23 +51,40 @@ class Workspace(FrozenArrays):
     """Expected errors of the tool over the workspace.
 
     Attributes:
-        position: Where the tool is at configurations that were drawn, shape (n, 3), [m], from the base.
-        error: RMS error expected of each, shape (n,), [m]; nan where it depends on what is not determined.
-        far: Whether no measured position is near, shape (n,).
+        errors: At configurations that were drawn.
+        radius: From the mean of the drawn positions to the farthest, [m].
         measured: Where the tool was measured, shape (m, 3), [m].
-        fitted: Whether errors are after the best rigid fit, instead of in the base frame.
+        fitted: Whether errors count after the best rigid fit, instead of in the base frame.
         joints: Joint by joint.
     """
 
-    position: Floats
-    error: Floats
-    far: Booleans
+    errors: ToolErrors
+    radius: float
     measured: Floats
     fitted: bool
     joints: tuple[JointRange, ...]
 
+    @property
+    def position(self) -> Floats:
+        """Where the tool is at configurations that were drawn, shape (n, 3), [m], from the base."""
+        return self.errors.position
 
-def survey(robot: Robot, spread: TangentCovariance, readings: Floats, *, fitted: bool, n: int = N_DRAWN) -> Workspace:
+    @property
+    def error(self) -> Floats:
+        """RMS position error expected of each, shape (n,), [m]; nan where it depends on what is not determined."""
+        return self.errors.of(self.fitted)[:, 0]
+
+    @property
+    def far(self) -> Booleans:
+        """Whether no measured position is near the drawn ones, shape (n,)."""
+        return self.far_from_measured(self.position)
+
+    def far_from_measured(self, points: Floats) -> Booleans:
+        """Whether no measured position is near points, shape (n, 3): shape (n,)."""
+        return np.asarray(cKDTree(self.measured).query(points)[0] > FAR * self.radius)
+
+
+def survey(robot: Robot, model: ToolErrorModel, readings: Floats, *, fitted: bool, n: int = N_DRAWN) -> Workspace:
     """Expected errors over the workspace, and where nothing was measured.
 
     A joint that turns without limits is taken to turn by +-180 degrees, one that slides without them between its lowest
@@ -83,38 +92,15 @@ def survey(robot: Robot, spread: TangentCovariance, readings: Floats, *, fitted:
 
     Args:
         robot: The calibrated robot, with its limits.
-        spread: The covariance of its parameters.
+        model: What is expected of its tool.
         readings: Of the measured configurations, shape (m, n_joints), [rad] (prismatic: [m]).
-        fitted: Whether errors are wanted after the best rigid fit.
+        fitted: Whether errors count after the best rigid fit.
         n: Number of configurations that are drawn.
     """
-    drawn = random_readings(_bounded(robot, readings), n, np.random.default_rng(0))
-    some = readings[np.unique(np.linspace(0, len(readings) - 1, min(_MOST_MEASURED, len(readings))).astype(np.int64))]
-    position, v = _shifts(spread, drawn)
-    measured, v_measured = _shifts(spread, some)
-    if fitted:
-        left, turn = without_rigid_motion(measured, v_measured)
-        moved = v_measured - left  # a rigid motion of the measured points: turn, and shift of their mean
-        centre, shift = measured.mean(axis=0), moved.mean(axis=0)
-        v = v - shift - np.cross(turn[None], (position - centre)[:, :, None], axis=1)
-    variance = spread.variance(v.reshape(-1, v.shape[2])).reshape(-1, 3).sum(axis=1)
-    with np.errstate(invalid="ignore"):
-        error = np.sqrt(np.where(variance >= 0.0, variance, np.nan))
-    points, _ = _shifts(spread, readings)
-    radius = float(np.max(np.linalg.norm(position - position.mean(axis=0), axis=1), initial=0.0))
-    far = np.asarray(cKDTree(points).query(position)[0] > FAR * radius)
+    errors = model.at(random_readings(_bounded(robot, readings), n, np.random.default_rng(0)))
+    radius = float(np.max(np.linalg.norm(errors.position - errors.position.mean(axis=0), axis=1), initial=0.0))
     joints = tuple(_range(joint, readings[:, i]) for i, joint in enumerate(robot.joints))
-    return Workspace(position, error, far, points, fitted, joints)
-
-
-def _shifts(spread: TangentCovariance, readings: Floats) -> tuple[Floats, Floats]:
-    """Tool points from the base, shape (n, 3), and their derivatives in the columns, shape (n, 3, n_columns)."""
-    variables = spread.variables
-    chain = build_variables(variables.robot, [False]).chains[0].at(spread.parameters)
-    at = forward(chain, precompute_trig(variables.robot, readings))
-    v = np.zeros((len(readings), 3, variables.n_columns))
-    v[:, :, : at.jacobian.shape[2]] = at.jacobian[:, 3:]
-    return at.position, v
+    return Workspace(errors, radius, pose(robot, readings).position, fitted, joints)
 
 
 def _bounded(robot: Robot, readings: Floats) -> Robot:

@@ -27,6 +27,7 @@ from fg_calib.cli.calibrate import calibrate
 from fg_calib.cli.check import check
 from fg_calib.cli.compare import compare
 from fg_calib.cli.correct import correct
+from fg_calib.cli.design import design
 from fg_calib.cli.example import example
 from fg_calib.cli.export import export
 from fg_calib.cli.help import help_
@@ -35,6 +36,7 @@ from fg_calib.cli.init import init
 from fg_calib.cli.inspect import inspect
 from fg_calib.cli.observe import observe
 from fg_calib.cli.output import say
+from fg_calib.cli.predict import predict
 from fg_calib.cli.progress import hide_progress, progress
 from fg_calib.cli.report import report
 from fg_calib.cli.simulate import simulate
@@ -54,11 +56,13 @@ for command in (
     report,
     export,
     correct,
+    predict,
     compare,
     check,
     update,
     history,
     observe,
+    design,
     simulate,
     example,
     bag,

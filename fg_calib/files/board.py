@@ -10,7 +10,7 @@ from pydantic import Field
 
 from fg_calib.errors import InputError
 from fg_calib.files.robot_yaml import FrameValues
-from fg_calib.files.schema import Count, Number, Positive, Schema, shown, validate
+from fg_calib.files.schema import Count, NotNegative, Number, Positive, Schema, shown, validate
 from fg_calib.files.units import Units
 from fg_calib.measurements.limits import LIMIT_SLACK
 from fg_calib.robot.model import Robot
@@ -30,6 +30,8 @@ class Board(Schema):
     roll: Any = "random"  # or an `_Angle`
     self_motion: Literal["random", "held"] = "random"
     posture: list[Number] | None = None
+    field_of_view: NotNegative | None = None
+    board_size: Annotated[list[Positive], Field(min_length=2, max_length=2)] | None = None
 
 
 class _Angle(Schema):
@@ -62,6 +64,10 @@ def read_board(file: Board, robot: Robot, units: Units, place: str) -> BoardView
         given["distance"] = (nearest * length, farthest * length)
     if file.cone is not None:
         given["cone"] = _cone(file.cone, units, place)
+    if file.field_of_view is not None:
+        given["field_of_view"] = _half_angle(file.field_of_view, units, f"{place}: field_of_view")
+    if file.board_size is not None:
+        given["board_size"] = tuple(figure * length for figure in file.board_size)
     if file.roll != "random":
         given["roll"] = _roll(file.roll, units, place)
     if file.posture is not None:
@@ -74,6 +80,7 @@ def _check_keys(file: Board, place: str) -> None:
     for key, idle, needs in (
         ("radius", file.radius is not None and file.distance is not None, "none beside distance"),
         ("cone", file.cone is not None and file.distance is None, "none without distance"),
+        ("board_size", file.board_size is not None and not file.field_of_view, "none without field_of_view"),
         ("posture", file.posture is not None and file.self_motion != "held", "none unless self_motion is held"),
     ):
         if idle:
@@ -85,6 +92,13 @@ def _cone(cone: float, units: Units, place: str) -> float:
     if angle > 0.5 * math.pi + 1e-9:
         raise InputError(f"{place}: cone", f"found {shown(cone)}", "at most a quarter turn")
     return min(angle, 0.5 * math.pi)
+
+
+def _half_angle(given: float, units: Units, place: str) -> float:
+    angle = given * units.factor("rad")
+    if angle >= 0.5 * math.pi:
+        raise InputError(place, f"found {shown(given)}", "less than a quarter turn: it is half of what is seen")
+    return angle
 
 
 def _roll(roll: Any, units: Units, place: str) -> float:

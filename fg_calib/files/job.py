@@ -14,7 +14,7 @@ from pydantic import Field, StrictBool
 from fg_calib.arguments import checked
 from fg_calib.errors import InputError
 from fg_calib.files.columns import Column
-from fg_calib.files.disk import noting_reads
+from fg_calib.files.disk import exists, is_folder, noting_reads
 from fg_calib.files.instruments import camera_of, read_camera
 from fg_calib.files.robot_yaml import read_robot, robot_from_mapping
 from fg_calib.files.schema import (
@@ -243,6 +243,26 @@ def read_job(path: Path | str) -> Job:
     with noting_reads() as files:
         job = _job(path)
     return replace(job, inputs={_relative(file, path.parent): digest for file, digest in files.items()})
+
+
+@checked
+def is_job(path: Path | str) -> bool:
+    """Whether a file is a job, by what only jobs name: what was measured.
+
+    Args:
+        path: The file; one that is not there is none.
+    """
+    if not exists(Path(path)) or is_folder(Path(path)):
+        return False
+    given = read_yaml(Path(path))
+    return isinstance(given, dict) and "measurements" in given
+
+
+def units_of(job: Job) -> Units:
+    """The units of a job's tables: of the first, if they have their own."""
+    first = job.document.get("measurements")
+    own = first[0].get("units") if isinstance(first, list) and isinstance(first[0], dict) else None
+    return Units(**(own or job.document.get("units") or {}))
 
 
 def _relative(file: Path, folder: Path) -> str:
@@ -596,3 +616,24 @@ def joint_noise(given: object, units: Units, robot: Robot, place: str) -> tuple[
             words = " and ".join(f"{given} {units.name(unit)} for {name}" for unit, name in sorted(kinds.items()))
             _log.warning("%s: joint: %s is %s; a list has one figure a joint", place, given, words)
     return tuple(units.sigma(f, j.unit, f"{place}: joint") for f, j in zip(figures, robot.joints, strict=True))
+
+
+def joint_noise_in(document: Mapping[str, Any], robot: Robot, place: str) -> tuple[float, ...]:
+    """Sigma of each joint's readings, [rad] (prismatic: [m]), as a job states it: all its tables have the same.
+
+    Args:
+        document: The job (see `Job.document`).
+        robot: Its robot.
+        place: Where it stands, for messages.
+
+    Raises:
+        InputError: It cannot be used.
+    """
+    file: _JobOfTables = validate(_JobOfTables, {**document, "robot": "."}, place)
+    stated, _ = _noise(file.noise, file.units, robot, f"{place}: noise")
+    if isinstance(file.measurements, list) and file.measurements:
+        entry: _Table = validate(_Table, file.measurements[0], place)
+        if isinstance(entry.noise, dict) and "joint" in entry.noise:
+            stated, _ = _noise(entry.noise, entry.units or file.units, robot, f"{place}: noise")
+    assert isinstance(stated.joint, tuple)
+    return stated.joint

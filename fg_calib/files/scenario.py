@@ -19,14 +19,29 @@ configurations:                       # where the calibration measures; one of
     roll: random                      #     about the optical axis: random (default) or an angle
     self_motion: random               #     random (default), or held: all continue from A's configuration
     posture: [0, 30, 0, 90, 0, 60, 0] #     where A's is sought if held; default: drawn
+    field_of_view: 20                 #     turned away, the centre within this of the axis; default 0: it is on it
+    board_size: [0.4, 0.3]            #     and all four corners of the board; default: the centre alone
+  tracker:                            #   a tracker sees a reflector on the tool: see `TargetViews`
+    station: {x: 3, y: 0, z: 1.5}     #     where it is, in the base frame
+    target: {x: 0, y: 0.05, z: 0.1}   #     the reflector in the tool frame
+    axis: [0, 0, 1]                   #     where it looks, in the tool frame; default z
+    acceptance: 30                    #     it returns light from within this angle of its axis; default 30 degrees
+    distance: [1, 8]                  #     from the tracker; default: any
+    region: {lower: [0, -1, 0], upper: [1, 1, 1]}   # where the reflector may be, in the base frame; default: anywhere
+    count: 50
   random: {count: 500}                #   drawn within the joint limits, +-180 degrees or +-1 m where there are none
   table: configurations.csv           #   the joint readings of a table
+  keep_out: [{lower: [-1, -1, -1], upper: [1, 1, 0]}]   # beside any of them: boxes in the base frame that nothing of
+                                      #   the arm may be inside: its joints, the lines between them, the tool point
+  apart: 5                            #   and by how much some joint must differ between two; default: nothing
 noise: {position: 0.001, orientation: 0.01, joint: 0.005}   # 1 sigma; joint noise moves the arm, not the table
 frame: unknown                        # world_T_base: base, unknown (default, drawn), or x y z roll pitch yaw
 validation: {random: {count: 500}}    # the same choice as configurations, for test rows; default: none
 job: {model: distance-rotation, pairing: star}   # keys of calibration.yaml; noise: {...} there states another noise
 instruments: [{model: anchor, anchors: 3}]       # what measures, instead of poses: see `scenario_instruments`
 ```
+Where `tracker`, `keep_out`, `apart` or `board_size` stand, configurations are drawn until all are found, and what is in
+the way is said if they are not. In `apart` a joint that slides counts as its share of the arm's reach, in rad.
 With `instruments` the figures of `noise` are those that they need, and `job` has no model or pairing of its own.
 """
 
@@ -34,26 +49,23 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-from pydantic import Field
+from typing import Any, Literal
 
 from fg_calib.arguments import checked
 from fg_calib.errors import InputError
-from fg_calib.files.board import Board, placement, read_board
+from fg_calib.files.board import placement
+from fg_calib.files.configurations import ConfigurationsFile, only_one, read_configurations
 from fg_calib.files.disk import exists, is_folder
 from fg_calib.files.job import check_choices, joint_noise, robot_of
 from fg_calib.files.robot_yaml import FrameValues, unit_of_key
 from fg_calib.files.scenario_instruments import InstrumentReader, noise_figures
-from fg_calib.files.schema import Count, FilePath, NotNegative, Number, Positive, Schema, read_yaml, shown, validate
-from fg_calib.files.tables import read_measurements
+from fg_calib.files.schema import NotNegative, Number, Positive, Schema, read_yaml, shown, validate
 from fg_calib.files.units import Units, UnitsOfFile
 from fg_calib.measurements.dataset import Noise
 from fg_calib.options import known_names
-from fg_calib.simulation.configurations import Configurations, GivenReadings, Placement, RandomReadings
+from fg_calib.simulation.configurations import Configurations, Placement
 from fg_calib.simulation.instruments import Instrument
 from fg_calib.simulation.scenario import Errors, Scenario, figures_by_name
-from fg_calib.sizes import MOST_DRAWN
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 """The shipped scenarios, a folder each."""
@@ -67,16 +79,6 @@ class _Errors(Schema):
 
 class _Sigmas(Schema):
     normal: dict[str, NotNegative]
-
-
-class _Random(Schema):
-    count: Annotated[Count, Field(gt=0, le=MOST_DRAWN)]
-
-
-class _Configurations(Schema):
-    board: Board | None = None
-    random: _Random | None = None
-    table: FilePath | None = None
 
 
 class _Noise(Schema):
@@ -100,20 +102,22 @@ class _Scenario(Schema):
     robot: Any  # a path, or the mapping of a robot file
     units: UnitsOfFile = Units()
     errors: _Errors
-    configurations: _Configurations
+    configurations: ConfigurationsFile
     noise: Any  # a `_Noise`; with instruments the figures that these need
     frame: Any = "unknown"  # `base`, or `FrameValues`
-    validation: _Configurations | None = None
+    validation: ConfigurationsFile | None = None
     job: dict[str, Any] | None = None
     instruments: Any = None  # see `scenario_instruments`
 
 
 @checked
-def read_scenario(path: Path | str) -> Scenario:
+def read_scenario(path: Path | str, *, instruments: Path | str | None = None) -> Scenario:
     """The scenario in a YAML file, or a shipped one.
 
     Args:
         path: The file, or the name of a shipped scenario: `space-robot`.
+        instruments: A file with some keys of a scenario (`INSTRUMENT_KEYS`) that stand in the place of its own: other
+            instruments, in its units.
 
     Raises:
         InputError: There is neither, or it or a file that it names cannot be used.
@@ -125,16 +129,40 @@ def read_scenario(path: Path | str) -> Scenario:
         path = SCENARIOS / path / "scenario.yaml"
     elif not exists(path) and path.suffix not in {".yaml", ".yml"}:
         raise InputError("scenario", f"found {str(path)!r}", f"a file, or one of {', '.join(known)}")
-    return _Reader(path, source).read()
+    if instruments is None:
+        return _Reader(path, source, read_yaml(path)).read()
+    return _Reader(path, Path(instruments).name, _with_instruments(read_yaml(path), Path(instruments))).read()
+
+
+INSTRUMENT_KEYS = ("name", "instruments", "noise", "frame", "configurations", "job")
+"""Keys of a scenario that say what measures, where, and how well."""
+
+
+def _with_instruments(scenario: Any, path: Path) -> Any:
+    """A scenario's mapping with the keys of a file of instruments in the place of its own.
+
+    Raises:
+        InputError: The file has other keys, or none.
+    """
+    given = read_yaml(path)
+    if not isinstance(given, dict) or not isinstance(scenario, dict):
+        raise InputError(path.name, f"found {shown(given)}", f"a mapping with some of {', '.join(INSTRUMENT_KEYS)}")
+    for key in given:
+        if key not in INSTRUMENT_KEYS:
+            raise InputError(path.name, f"unknown key {key!r}", known_names(INSTRUMENT_KEYS))
+    job = scenario.get("job")
+    if given.get("instruments") and isinstance(job, dict):
+        scenario = {**scenario, "job": {key: v for key, v in job.items() if key not in ("model", "pairing", "noise")}}
+    return {**scenario, **given}
 
 
 class _Reader:
     """Reads one scenario file."""
 
-    def __init__(self, path: Path, source: str) -> None:
+    def __init__(self, path: Path, source: str, given: Any) -> None:
         self._source = source
         self._folder = path.parent
-        self._file = validate(_Scenario, read_yaml(path), source)
+        self._file = validate(_Scenario, given, source)
         self._units = self._file.units
         self._robot = robot_of(self._file.robot, f"{source}: robot", self._folder, self._units)
         self._default_name = Path(source).stem
@@ -184,7 +212,7 @@ class _Reader:
             self._folder,
             units,
             replace(given, joint=0.0),
-            lambda one, at: self._configurations(validate(_Configurations, one, at), at),
+            lambda one, at: self._configurations(validate(ConfigurationsFile, one, at), at),
             self._frame,
         )
         found = reader.read(file.instruments)
@@ -201,7 +229,7 @@ class _Reader:
 
     def _errors(self) -> Errors:
         place, file, robot = f"{self._source}: errors", self._file.errors, self._robot
-        law = _only_one(file, place)
+        law = only_one(file, list(_Errors.model_fields), place)
         if law == "normal" and file.normal == "tolerance":
             for p in robot.parameters:
                 if p.estimated and p.tolerance is None:
@@ -225,15 +253,8 @@ class _Reader:
                 return Errors("normal", by_name)
         return Errors("values", by_name)
 
-    def _configurations(self, file: _Configurations, place: str) -> Configurations:
-        _only_one(file, place)
-        if file.board is not None:
-            return read_board(file.board, self._robot, self._units, f"{place}: board")
-        drawn = file.random
-        if drawn is not None:
-            return RandomReadings(drawn.count)
-        table = read_measurements(self._folder / str(file.table), self._robot, units=self._units)
-        return GivenReadings(table.readings)
+    def _configurations(self, file: ConfigurationsFile, place: str) -> Configurations:
+        return read_configurations(file, self._robot, self._units, self._folder, place)
 
     def _frame(self, given: object, place: str) -> Literal["base", "unknown"] | Placement:
         match given:
@@ -272,16 +293,3 @@ class _Reader:
                 hint = "it follows from the scenario" if key in {"frame", "units"} else "the simulation writes it"
                 raise InputError(place, f"found key {key!r}", "none", hint)
         return given
-
-
-def _only_one(file: Schema, place: str) -> str:
-    """The only key that is given.
-
-    Raises:
-        InputError: None or several are.
-    """
-    keys = list(type(file).model_fields)
-    given = [key for key in keys if getattr(file, key) is not None]
-    if len(given) != 1:
-        raise InputError(place, f"found {' and '.join(given) or 'none'}", known_names(keys))
-    return given[0]

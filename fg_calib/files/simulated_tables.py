@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -78,10 +79,26 @@ def table_columns(table: Table, robot: Robot, units: Units) -> dict[str, Columns
     return found
 
 
-def instrument_keys(simulation: Simulation, units: Units) -> dict[str, Any]:
-    """What the job of a simulation says of its tables, and of the points that it knows."""
-    found: dict[str, Any] = {"measurements": [_entry(table, units) for table in simulation.tables]}
-    for table in simulation.tables:
+MEASURED = (*"xyz", "qx", "qy", "qz", "qw", "distance", "angle", *"uv")
+"""Columns of what is measured."""
+
+
+def to_fill_in(columns: Columns, *, touched: bool = False) -> Columns:
+    """The columns of a table with nothing measured yet.
+
+    Args:
+        columns: They.
+        touched: Whether something is touched: what is measured are the joint readings then.
+    """
+    measured = {name: None for name, v in columns.items() if name in MEASURED and np.any(np.asarray(v) != 0.0)}
+    joints = {name: None for name in columns if touched and re.fullmatch(r"q\d+", name)}
+    return dict(columns) | measured | joints
+
+
+def instrument_keys(tables: Sequence[Table], units: Units) -> dict[str, Any]:
+    """What a job says of its tables, and of the points that it knows."""
+    found: dict[str, Any] = {"measurements": [_entry(table, units) for table in tables]}
+    for table in tables:
         if table.known:
             key = "anchors" if table.model == "anchor" else "targets"
             found[key] = {name: _told(point, units) for name, point in table.known.items()}

@@ -132,7 +132,7 @@ def _job_text(simulation: Simulation, units: Units) -> str:
     if simulation.scenario.instruments:
         keys = {key: value for key, value in simulation.scenario.job.items() if key not in ("model", "pairing")}
         job |= {"truth": "robot_true.yaml", **keys, "units": asdict(units), "noise": of_joints}
-        job |= instrument_keys(simulation, units)
+        job |= instrument_keys(simulation.tables, units)
     else:
         if m.sigma_position is None or m.sigma_orientation is None:
             raise ValueError("a simulation states its noise")

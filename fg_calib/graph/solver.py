@@ -204,6 +204,20 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
         return _solution(run, before, run.initial_cost, clock)
 
 
+def unsolved(problem: Problem) -> Solution:
+    """A problem at its start as if that were its solution: what could be known there."""
+    return Solution(
+        *(problem, problem.initial, problem.start, problem.start),
+        converged=False,
+        message="not solved",
+        history=(),
+        initial_cost=np.nan,
+        cost=np.nan,
+        weighted_cost=np.nan,
+        seconds=0.0,
+    )
+
+
 def _before(problem: Problem, options: SolverOptions) -> Floats:
     """The parameter vector with measurement frame, base, tool and unknowns fitted, the arm as it is at the start."""
     frames = frames_only(problem)

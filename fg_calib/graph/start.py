@@ -30,6 +30,9 @@ HERE = Frame(np.eye(3), np.zeros(3))
 MOST_CHOICES = 2
 """Poses of a board that one image may leave, at most."""
 
+MOST_IMAGES = 60
+"""Images of a board that it is started from: more would not make the start better."""
+
 GOOD_SHARE = 0.5
 """Share of the points of a board's fullest image from which another is good for a start: a few corners say little."""
 
@@ -177,8 +180,9 @@ class _Start:
         shown = np.bincount(of.ravel(), minlength=len(image))
         most = {name: shown[image[:, 1] == name].max() for name in image[:, 1].tolist()}
         share = shown / np.array([most[name] for name in image[:, 1].tolist()])
+        looked_at = _spread_out(image[:, 1], share >= GOOD_SHARE)
         for k, mine in enumerate(np.split(train, np.cumsum(shown)[:-1])):
-            found = boards_from_image(s.kind.camera, s.data[mine], s.sigma[mine]) if share[k] >= GOOD_SHARE else []
+            found = boards_from_image(s.kind.camera, s.data[mine], s.sigma[mine]) if looked_at[k] else []
             if found:
                 rows.append(s.ends[mine[0], 0])
                 boards.append(image[k, 1])
@@ -230,6 +234,15 @@ class _Start:
     def _put(self, number: int, X: Frame) -> None:
         if number in self._frames:
             self.parameters[list(self._frames[number].parameters)] = _coordinates(X)
+
+
+def _spread_out(board: Integers, good: Booleans) -> Booleans:
+    """Of each board's good images `MOST_IMAGES` at most, evenly spread, shape (n,)."""
+    found = np.zeros(len(good), dtype=np.bool_)
+    for name in np.unique(board):
+        mine = np.flatnonzero(good & (board == name))
+        found[mine[np.unique(np.linspace(0, len(mine) - 1, min(MOST_IMAGES, len(mine))).round().astype(int))]] = True
+    return found
 
 
 def _board_poses(s: Series) -> tuple[Integers, Integers, tuple[Floats, Floats]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -236,7 +237,7 @@ def _measured_by(table: Table) -> dict[str, Floats]:
         figures = {"orientations": m.rotation if turned else None, "positions": m.position if placed else None}
         for name, v in figures.items():
             if v is not None:
-                found[name] = (m.readings, v.reshape(len(v), -1))
+                found[name] = (m.readings, v.reshape(len(v), math.prod(v.shape[1:])))
     else:
         ends = (m.readings[pairs.a], m.readings[pairs.b])
         for name, wanted, v in (("distances", distance, pairs.distance), ("angles", angle, pairs.angle)):

@@ -85,6 +85,7 @@ def solve_inverse(
     near: ArrayLike | None = None,
     generator: np.random.Generator | None = None,
     n_starts: int = N_STARTS,
+    n_steps: int = N_STEPS,
 ) -> Inverse:
     """Configurations within the joint limits that bring the tool to poses, or its point to positions.
 
@@ -96,6 +97,7 @@ def solve_inverse(
             solutions that stay near it; further starts are drawn ever wider about it. Random starts if None.
         generator: Draws the starts; one seeded with 0 if None.
         n_starts: How many starts are tried for each pose.
+        n_steps: How many steps are made from each.
 
     Raises:
         InputError: A target, or where to start, is not of such a shape, not finite, or no rotation.
@@ -109,6 +111,7 @@ def solve_inverse(
         rotation = as_rotations("rotation", rotation if np.ndim(rotation) == 3 else [rotation], len(position))
     generator = np.random.default_rng(0) if generator is None else generator
     check_number("n_starts", n_starts, least=1, whole=True)
+    check_number("n_steps", n_steps, least=1, whole=True)
     n_poses = len(position)
     starts = _starts(robot, near, (n_poses, n_starts, robot.n_joints), generator)
     search = _Search(robot, rotation, position)
@@ -123,7 +126,7 @@ def solve_inverse(
         best[pending[nearer]], smallest[pending[nearer]] = q[pending[nearer]], size[nearer]
         missed[pending[nearer]] = miss[nearer]
         finished = (size < FINISHED) | ((smallest[pending] < search.good_enough) & ~nearer)
-        again = ~finished & (steps[pending] >= N_STEPS)
+        again = ~finished & (steps[pending] >= n_steps)
         tried[pending[again]] += 1
         finished |= tried[pending] >= n_starts
         again &= ~finished

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.arrays import as_floats
+from fg_calib.arrays import FrozenArrays, as_floats
 from fg_calib.errors import InputError
 from fg_calib.measurements.dataset import Noise
 from fg_calib.measurements.kinds import Camera
@@ -95,6 +95,17 @@ class Corners:
         """Coordinates x and y of each, row by row, shape (rows * columns, 2), [m]."""
         x, y = (self.square * (np.arange(n) - 0.5 * (n - 1)) for n in (self.columns, self.rows))
         return np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
+
+
+@dataclass(frozen=True)
+class BoardPoints(FrozenArrays):
+    """Points of a board anywhere in its plane.
+
+    Attributes:
+        points: Coordinates x and y of each, shape (n, 2), [m].
+    """
+
+    points: Floats
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,7 +238,7 @@ class BoardCamera(Instrument):
 
     boards: Mapping[str, Placement] = field(default_factory=dict)
     camera: Camera | None = None
-    corners: Corners | None = None
+    corners: Corners | BoardPoints | None = None
     fixed: bool = False
     frame: Placement | None = None
 

@@ -102,6 +102,7 @@ class Scene:
         places: Draws where things are.
         draws: Draws noise.
         source: The scenario, for messages.
+        leave_out: Whether stops are left out from which a point to touch is not reached.
     """
 
     robot: Robot
@@ -116,6 +117,7 @@ class Scene:
     places: np.random.Generator
     draws: np.random.Generator
     source: str = "scenario"
+    leave_out: bool = False
 
 
 def measure(instrument: Instrument, scene: Scene) -> tuple[Table, Truth]:
@@ -251,12 +253,19 @@ class _Work:
         self.stops = Stops(readings, found.readings, ids, before.test)
         return found.reached
 
-    def require_reached(self, reached: Booleans, names: tuple[str, ...], which: Integers) -> None:
-        """Raise where a point was not reached."""
-        if not reached.all():
+    def touched(self, reached: Booleans, names: tuple[str, ...], which: Integers) -> Integers:
+        """The point that each stop is at, of which some may be left out.
+
+        Raises:
+            InputError: A point was not reached, and none is to be left out, or none was reached at all.
+        """
+        if self.scene.leave_out and reached.any():
+            self.stops = self.stops.select(reached)
+        elif not reached.all():
             missed = sorted({names[i] for i in which[~reached]})
             found = f"{', '.join(missed)} not reached from {np.sum(~reached)} of {len(reached)} configurations"
             raise InputError(self.place, found, "points within the joint limits")
+        return which[reached]
 
     # --- one instrument after the other ---
 
@@ -332,15 +341,15 @@ class _Work:
         which = np.arange(len(self.stops)) % len(anchors)
         places, n = np.array([a.xyz for a in anchors.values()])[which], len(self.stops)
         if i.contact:
-            self.require_reached(self.touching(places + self.noise("distance", n, 3)), tuple(anchors), which)
-            length = np.zeros(n)
+            which = self.touched(self.touching(places + self.noise("distance", n, 3)), tuple(anchors), which)
+            length = np.zeros(len(which))
         else:
             length = np.linalg.norm(self.at().position - places, axis=1)
             length = np.abs(length + (i.offset or 0.0) + self.noise("distance", n))
         m = self.rows(
             labels={"anchor": Labels(tuple(anchors), which)},
             length=length,
-            sigma_length=self.stated("distance", n),
+            sigma_length=self.stated("distance", len(which)),
         )
         table = Table(m, "anchor", known=self.told(anchors), offset=i.offset is not None)
         return table, {"anchors": anchors, "offsets": {} if i.offset is None else {self.name: i.offset}}
@@ -476,7 +485,7 @@ class _Work:
         names, n = tuple(sockets), len(self.stops)
         which = np.arange(n) % len(names)
         places = np.array([s.xyz for s in sockets.values()])
-        self.require_reached(self.touching(places[which] + self.noise("point", n, 3)), names, which)
+        which = self.touched(self.touching(places[which] + self.noise("point", n, 3)), names, which)
         pairs, source = no_pairs(f"{self.name}.csv"), f"{self.name}_pairs.csv"
         if len(names) > 1:
             a, b = np.triu_indices(len(names), 1)
@@ -484,7 +493,7 @@ class _Work:
             d, sigma = np.abs(d + self.noise("distance", len(a))), self.stated("distance", len(a))
             fitted = np.zeros(len(a), dtype=np.bool_)
             pairs = Pairs(a, b, d, unmeasured, sigma, unmeasured, fitted, source)
-        m = self.rows(groups=Groups(names, which, pairs), sigma_point=self.stated("point", n))
+        m = self.rows(groups=Groups(names, which, pairs), sigma_point=self.stated("point", len(which)))
         return Table(m, "distance"), {"sockets": sockets}
 
 

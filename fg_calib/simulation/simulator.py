@@ -22,13 +22,22 @@ from fg_calib.errors import InputError
 from fg_calib.measurements.dataset import Measurements, Noise
 from fg_calib.measurements.series import Table
 from fg_calib.options import Pairing, check_number
-from fg_calib.robot.inverse import Inverse, random_readings, solve_inverse
+from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
 from fg_calib.robot.model import Robot
-from fg_calib.simulation.configurations import BoardViews, Configurations, GivenReadings, Placement, RandomReadings
+from fg_calib.simulation.candidates import draw_candidates, number_of, sifted
+from fg_calib.simulation.configurations import (
+    BoardViews,
+    Configurations,
+    GivenReadings,
+    Placement,
+    RandomReadings,
+    TargetViews,
+)
 from fg_calib.simulation.instruments import frame_knowledge, with_figures
 from fg_calib.simulation.measuring import Scene, Stops, drawn_frame, measure, share_knowledge, together
 from fg_calib.simulation.scenario import Errors, Scenario, Simulation, figures_by_name
+from fg_calib.simulation.views import reach_all, view_board
 from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
@@ -40,12 +49,13 @@ others alone."""
 
 @checked
 @single_threaded
-def simulate(scenario: Scenario, seed: int = 0) -> Simulation:
+def simulate(scenario: Scenario, seed: int = 0, *, leave_out: bool = False) -> Simulation:
     """Run a scenario.
 
     Args:
         scenario: What to simulate.
         seed: Same seed, same simulation.
+        leave_out: Whether stops are left out from which a point to touch is not reached, instead of an error.
 
     Raises:
         InputError: The scenario cannot be: poses that the robot does not reach within its joint limits, names that
@@ -58,7 +68,7 @@ def simulate(scenario: Scenario, seed: int = 0) -> Simulation:
     true_robot = _true_robot(scenario.robot, scenario.errors, draw["errors"], f"{scenario.source}: errors")
     frame = _frame(scenario, draw["frame"])
     if scenario.instruments:
-        return _by_instruments(scenario, seed, true_robot, frame, draw, children[n:])
+        return _by_instruments(scenario, seed, true_robot, frame, draw, children[n:], leave_out)
     return _poses(scenario, seed, true_robot, frame, draw)
 
 
@@ -95,12 +105,12 @@ def _poses(
         sigma_joint=_joint_sigma(stated, robot),
         source="poses.csv",
     )
-    pairing = _pairing(scenario.job.get("pairing", "star"))
+    pairing = pairing_of(scenario.job.get("pairing", "star"))
     table = Table(measurements, scenario.job.get("model"), pairing, frame_knowledge(scenario.frame))
     return Simulation(scenario, seed, robot, true_robot, measurements, true_readings, frame, (table,))
 
 
-def _pairing(given: object) -> Pairing:
+def pairing_of(given: object) -> Pairing:
     """A pairing as a job states it."""
     if isinstance(given, Mapping):
         return Pairing("random", given["random"], given.get("seed", 0))
@@ -114,6 +124,7 @@ def _by_instruments(
     frame: Placement,
     draw: Mapping[str, np.random.Generator],
     own: Sequence[np.random.Generator],
+    leave_out: bool,
 ) -> Simulation:
     """What each instrument measures, where it goes itself or where all go."""
     common: list[Stops] = []
@@ -143,6 +154,7 @@ def _by_instruments(
             places=places,
             draws=noise_draws,
             source=scenario.source,
+            leave_out=leave_out,
         )
         table, truth = measure(instrument, scene)
         tables.append(table)
@@ -242,6 +254,8 @@ def _joint_sigma(noise: Noise, robot: Robot) -> Floats:
 
 def _readings(robot: Robot, configurations: Configurations, generator: np.random.Generator, place: str) -> Floats:
     """The configurations, shape (n, n_joints), [rad] (prismatic: [m])."""
+    if isinstance(configurations, TargetViews) or sifted(configurations):
+        return _sifted(robot, configurations, generator, place)
     match configurations:
         case RandomReadings(count):
             return random_readings(robot, count, generator)
@@ -249,95 +263,18 @@ def _readings(robot: Robot, configurations: Configurations, generator: np.random
             return np.asarray(readings, dtype=np.float64)
         case BoardViews():
             rotation, position = view_board(configurations, generator)
-            return _reach(robot, configurations, rotation, position, generator, f"{place}: board")
+            return reach_all(robot, configurations, rotation, position, generator, f"{place}: board")
 
 
-def view_board(views: BoardViews, generator: np.random.Generator) -> tuple[Floats, Floats]:
-    """Poses of a camera that looks at a board's centre, A first.
-
-    Args:
-        views: Where from.
-        generator: Draws what is left open.
-
-    Returns:
-        base_R_tool, shape (1 + count, 3, 3), and base_p_tool, shape (1 + count, 3), [m].
-    """
-    from scipy.spatial.transform import Rotation
-
-    places, rolls = generator.spawn(2)
-    A = np.array([[0.0, 0.0, views.height]])
-    if views.distance is None:
-        others = A + views.radius * _half_sphere(views.count)
-    else:
-        drawn = places.uniform(size=(views.count, 3))  # one row a view: more views leave the first as they are
-        cosine = 1.0 - drawn[:, 0] * (1.0 - np.cos(views.cone))
-        away = views.distance[0] + drawn[:, 1] * (views.distance[1] - views.distance[0])
-        others = away[:, None] * _directions(cosine, 2.0 * np.pi * drawn[:, 2])
-    board_p_tool = np.concatenate([A, others])  # (n, 3)
-    drawn_roll = rolls.uniform(-np.pi, np.pi, len(board_p_tool))
-    roll = drawn_roll if views.roll is None else np.full(len(drawn_roll), views.roll)
-    # At A the camera is the board's frame turned about its x axis by half a turn; from there the shortest way.
-    up, away = np.array([0.0, 0.0, 1.0]), np.linalg.norm(board_p_tool, axis=1, keepdims=True)
-    axis = np.cross(up, board_p_tool / away)  # (n, 3), of length sin(tilt)
-    sine = np.linalg.norm(axis, axis=1, keepdims=True)
-    tilt = np.arctan2(sine, board_p_tool[:, 2:] / away)
-    turn = Rotation.from_rotvec(axis * np.where(sine > 0.0, tilt / np.where(sine > 0.0, sine, 1.0), 0.0))
-    over = Rotation.from_rotvec([np.pi, 0.0, 0.0])
-    board_R_tool = (turn * over * Rotation.from_rotvec(roll[:, None] * up)).as_matrix()
-    base_R_board = views.board.rotation
-    return base_R_board @ board_R_tool, board_p_tool @ base_R_board.T + views.board.position
-
-
-def _half_sphere(n: int) -> Floats:
-    """Unit vectors spread evenly over the half sphere z >= 0, shape (n, 3): a spiral in golden steps.
-
-    Equal steps in z cut equal areas, and turns by the golden angle keep neighbouring turns apart.
-    """
-    k = np.arange(n) + 0.5
-    return _directions(1.0 - k / max(n, 1), np.pi * (1.0 + np.sqrt(5.0)) * k)
-
-
-def _directions(cosine: Floats, azimuth: Floats) -> Floats:
-    """Unit vectors by the cosine of their angle to z and their azimuth, shape (n, 3)."""
-    sine = np.sqrt(1.0 - cosine**2)
-    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine], axis=1)
-
-
-def _reach(
-    robot: Robot, views: BoardViews, rotation: Floats, position: Floats, generator: np.random.Generator, place: str
-) -> Floats:
-    """Configurations that bring the camera to poses, shape (n_poses, n_joints)."""
-    if views.self_motion == "random":
-        return _require(solve_inverse(robot, position, rotation, generator=generator), place)
-    near = None if views.posture is None else np.array(views.posture)
-    first = _require(
-        solve_inverse(robot, position[:1], rotation[:1], generator=generator, near=near), place, len(rotation)
-    )
-    others = solve_inverse(robot, position[1:], rotation[1:], generator=generator, near=first[0])
-    return np.concatenate([first, _require(others, place, len(rotation), 1)])
-
-
-def _require(found: Inverse, place: str, n: int | None = None, first: int = 0) -> Floats:
-    """The solutions.
+def _sifted(robot: Robot, configurations: Configurations, generator: np.random.Generator, place: str) -> Floats:
+    """As many configurations as are asked for, all of which keep to their conditions.
 
     Raises:
-        InputError: One of the poses was not reached.
+        InputError: There are not so many.
     """
-    missed = np.flatnonzero(~found.reached)
-    if len(missed) == 0:
-        return found.readings
-    n = len(found.readings) if n is None else n
-    names = ["A" if first + i == 0 else f"view {first + i}" for i in range(len(found.readings))]
-    listed = ", ".join([*(names[i] for i in missed[:12]), *(["..."] if len(missed) > 12 else [])])
-    nearest = missed[np.argmin(found.miss_position[missed])]
-    farthest = missed[np.argmax(found.miss_position[missed])]
-    spans = [
-        f"{names[i]} by {found.miss_position[i]:.3g} m and {np.rad2deg(found.miss_rotation[i]):.3g} deg"
-        for i in dict.fromkeys([nearest, farthest])
-    ]
-    raise InputError(
-        place,
-        f"{len(missed)} of {n} views not reached within the joint limits ({listed}): "
-        f"the nearest configurations found miss {' and '.join(spans)}",
-        hint="move the board nearer or widen the limits",
-    )
+    n = number_of(configurations)
+    found = draw_candidates(robot, configurations, generator, n, place)
+    if len(found.readings) < n:
+        hint = "ask for fewer, or relax what they have to keep to"
+        raise InputError(place, f"{len(found.readings)} of {n} found in {found.reasons()}", hint=hint)
+    return found.readings

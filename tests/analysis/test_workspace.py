@@ -8,6 +8,7 @@ from tolerances import rounding
 from fg_calib import calibrate
 from fg_calib.analysis import workspace
 from fg_calib.analysis.accuracy import errors_at
+from fg_calib.analysis.tool_error import ToolErrorModel
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Joint, RobotBuilder
 
@@ -25,7 +26,11 @@ def calibrated():
 def survey_at(calibrated, readings, monkeypatch, **options):
     result, m = calibrated
     monkeypatch.setattr(workspace, "random_readings", lambda *_: readings)
-    return workspace.survey(result.robot, result.posterior, m.readings, **options)
+    return surveyed(result, m.readings, **options)
+
+
+def surveyed(result, readings, **options):
+    return workspace.survey(result.robot, ToolErrorModel.of(result.posterior, readings), readings, **options)
 
 
 def test_errors_in_the_base_frame_are_those_of_predicted_poses(calibrated, monkeypatch):
@@ -42,6 +47,7 @@ def test_after_the_best_fit_measured_configurations_have_the_error_that_is_expec
     found = survey_at(calibrated, m.readings, monkeypatch, fitted=True)
     _, fitted = errors_at(result.uncertainty.whole, m.readings)
     assert np.sqrt(np.mean(found.error**2)) == pytest.approx(fitted.position, rel=1e-7)
+    assert np.sqrt(np.mean(found.errors.fitted[:, 1] ** 2)) == pytest.approx(fitted.orientation, rel=1e-7)
 
 
 @pytest.mark.slow
@@ -73,7 +79,7 @@ def test_the_best_fit_holds_all_over_the_workspace(calibrated, monkeypatch):
 def test_where_nothing_was_measured_is_far(calibrated):
     result, m = calibrated
     few = m.readings[:1]
-    found = workspace.survey(result.robot, result.posterior, few, fitted=False, n=500)
+    found = surveyed(result, few, fitted=False, n=500)
     radius = np.linalg.norm(found.position - found.position.mean(axis=0), axis=1).max()
     away = np.linalg.norm(found.position - found.measured[0], axis=1)
     assert np.array_equal(found.far, away > workspace.FAR * radius)
@@ -91,7 +97,7 @@ def test_gaps_are_between_limits_and_readings():
     q[10, 1] = 0.9
     rng = np.random.default_rng(0)
     result = calibrate(robot, measure(robot, 25, rng, readings=q), model="pose", gauge="none")
-    found = workspace.survey(result.robot, result.posterior, q, fitted=False, n=200)
+    found = surveyed(result, q, fitted=False, n=200)
     assert found.joints[0].gap == (-2.0, -0.5)
     assert found.joints[1].gap == pytest.approx((0.3, 0.9))
     assert found.joints[1].range == (0.1, 0.9)

@@ -12,7 +12,7 @@ from fg_calib.errors import InputError
 from fg_calib.files.robot_yaml import read_robot
 from fg_calib.files.scenario import SCENARIOS, read_scenario
 from fg_calib.measurements.dataset import Noise
-from fg_calib.simulation.configurations import BoardViews, GivenReadings, Placement, RandomReadings
+from fg_calib.simulation.configurations import BoardViews, GivenReadings, Placement, RandomReadings, TargetViews
 from fg_calib.simulation.scenario import Errors
 
 ROBOT = """\
@@ -186,6 +186,43 @@ def test_a_job_may_state_another_noise_than_the_true_one(folder):
     assert s.stated_noise.joint == pytest.approx((math.radians(1), 2e-3))
 
 
+def test_a_tracker_has_every_figure_in_the_units_of_the_file(folder):
+    text = """
+configurations:
+  tracker:
+    station: {x: 3000, z: 1500}
+    target: {y: 50}
+    axis: [0, 1, 0]
+    acceptance: 40
+    distance: [1000, 8000]
+    region: {lower: [0, -500, 0], upper: [1000, 500, 2000]}
+    count: 7
+  keep_out: [{lower: [-1000, -1000, -1000], upper: [1000, 1000, 0]}]
+  apart: 5
+validation: {tracker: {station: {x: 3000}, count: 8}}
+"""
+    s = read(folder, "units: {length: mm, angle: deg}\n" + SHORT.replace(RANDOM, text))
+    t = s.configurations
+    assert isinstance(t, TargetViews)
+    assert (t.station.tolist(), t.target.tolist(), t.axis.tolist()) == ([3, 0, 1.5], [0, 0.05, 0], [0, 1, 0])
+    assert (t.acceptance, t.distance, t.count) == (pytest.approx(math.radians(40)), (1, 8), 7)
+    assert (t.region.lower.tolist(), t.region.upper.tolist()) == ([0, -0.5, 0], [1, 0.5, 2])
+    assert [(box.lower.tolist(), box.upper.tolist()) for box in t.keep_out] == [([-1, -1, -1], [1, 1, 0])]
+    assert t.apart == pytest.approx(math.radians(5))
+    t = s.validation
+    assert (t.target.tolist(), t.axis.tolist(), t.acceptance) == ([0, 0, 0], [0, 0, 1], math.pi / 6)
+    assert (t.distance, t.region, t.keep_out, t.apart, t.count) == ((0.0, math.inf), None, (), None, 8)
+
+
+def test_a_board_may_be_anywhere_in_a_field_of_view(folder):
+    more = "field_of_view: 20, board_size: [400, 300]"
+    views = read(folder, "units: {length: mm, angle: deg}\n" + with_board(more)).configurations
+    assert views.field_of_view == pytest.approx(math.radians(20))
+    assert views.board_size == pytest.approx((0.4, 0.3))
+    views = read(folder, with_board("roll: 0")).configurations
+    assert (views.field_of_view, views.board_size) == (0.0, None)
+
+
 KEYS = "one of name, robot, units, errors, configurations, noise, frame, validation, job, instruments"
 KINDS = "one of a, alpha, base, d, theta, tool"
 S = "scenario.yaml: "
@@ -197,6 +234,14 @@ def with_errors(errors):
 
 def with_board(more):
     return SHORT.replace(RANDOM, f"{BOARD}, {more}}}}}\n")
+
+
+def with_tracker(more):
+    return SHORT.replace(RANDOM, f"configurations: {{tracker: {{station: {{x: 3}}, count: 5, {more}}}}}\n")
+
+
+def with_conditions(more):
+    return SHORT.replace(RANDOM, f"configurations: {{random: {{count: 3}}, {more}}}\n")
 
 
 MISTAKES = [
@@ -217,15 +262,15 @@ MISTAKES = [
      S + "errors: normal: found 'tolerances', expected tolerance, or figures by kind or by parameter name"),
     (with_errors("{values: {b2: 1}}"), S + f"errors: values: unknown parameter or kind 'b2', expected {KINDS}"),
     (SHORT.replace("{random: {count: 3}}", "{}"),
-     S + "configurations: found none, expected one of board, random, table"),
+     S + "configurations: found none, expected one of board, tracker, random, table"),
     (SHORT.replace("{count: 3}}", "{count: 3}, table: t.csv}"),
-     S + "configurations: found random and table, expected one of board, random, table"),
+     S + "configurations: found random and table, expected one of board, tracker, random, table"),
     (SHORT.replace("count: 3", "count: -3"),
      S + "configurations: random: count: found -3, expected a number not below 0"),
     (SHORT.replace("count: 3", "count: 0"), S + "configurations: random: count: found 0, expected a number above 0"),
     (SHORT.replace("count: 3", "count: 2.5"), S + "configurations: random: count: found 2.5, expected a whole number"),
     (SHORT.replace("count: 3", "n: 3"), S + "configurations: random: unknown key 'n', expected one of count"),
-    (SHORT + "validation: {}\n", S + "validation: found none, expected one of board, random, table"),
+    (SHORT + "validation: {}\n", S + "validation: found none, expected one of board, tracker, random, table"),
     (SHORT + "validation: none\n", S + "validation: found 'none', expected a mapping"),
     (SHORT.replace(RANDOM, "configurations: {board: {pose: {}}}\n"),
      S + "configurations: board: missing key 'count'"),
@@ -252,6 +297,25 @@ MISTAKES = [
      S + "configurations: board: posture: 1 figures, expected 2, one a joint"),
     (with_board("self_motion: held, posture: [3, 0]"),
      S + "configurations: board: posture 1: found 3.0, expected within [-2, 2]"),
+    (with_board("field_of_view: 1.6"), S + "configurations: board: field_of_view: found 1.6, expected less than a "
+     "quarter turn: it is half of what is seen"),
+    (with_board("board_size: [1, 1]"),
+     S + "configurations: board: board_size: found [1.0, 1.0], expected none without field_of_view"),
+    (with_tracker("axis: [0, 0, 0]"), S + "configurations: tracker: axis: found 0, 0, 0, expected a direction"),
+    (with_tracker("acceptance: 4"),
+     S + "configurations: tracker: acceptance: found 4.0, expected at most half a turn"),
+    (with_tracker("distance: [2, 1]"),
+     S + "configurations: tracker: distance: found [2.0, 1.0], expected the smaller one first"),
+    (with_tracker("region: {lower: [0, 0, 0]}"), S + "configurations: tracker: region: missing key 'upper'"),
+    (SHORT.replace(RANDOM, "configurations: {tracker: {count: 1}}\n"),
+     S + "configurations: tracker: missing key 'station'"),
+    (with_conditions("keep_out: [{lower: [0, 0, 0], upper: [1, 1, -1]}]"), S + "configurations: keep_out 1: upper: "
+     "found [1.0, 1.0, -1.0], expected more than lower, [0.0, 0.0, 0.0], in x, y and z"),
+    (with_conditions("keep_out: {lower: [0, 0, 0], upper: [1, 1, 1]}"),
+     S + "configurations: keep_out: found {'lower': [0, 0, 0], 'upper': [1, 1, 1]}, expected a list"),
+    (with_conditions("apart: 0"), S + "configurations: apart: found 0, expected a number above 0"),
+    (SHORT.replace(RANDOM, "configurations: {apart: 1}\n"),
+     S + "configurations: found none, expected one of board, tracker, random, table"),
     (SHORT.replace(NOISE, "noise: {position: 1}\n"), S + "noise: missing key 'orientation'"),
     (SHORT.replace("position: 0.001", "position: -1"), S + "noise: position: found -1, expected a number not below 0"),
     (SHORT.replace("orientation: 0.002", "orientation: 0, joint: [1]"),

@@ -137,7 +137,7 @@ MISTAKES = [
      "orientation, distance, angle, point, pixel"),
     ("{model: anchor, noise: {distance: -1}}", f"{S} 1: noise: distance: found -1, expected a number not below 0"),
     ("{model: anchor, configurations: {}}",
-     f"{S} 1: configurations: found none, expected one of board, random, table"),
+     f"{S} 1: configurations: found none, expected one of board, tracker, random, table"),
     ("{model: plane, planes: {a: {normal: [0, 0, 0], distance: 1}}}",
      f"{S} 1: planes: a: normal: found 0, 0, 0, expected a direction"),
     ("{model: orientation, targets: 2}", f"{S} 1: targets: with model orientation, expected model position or pose"),

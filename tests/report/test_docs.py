@@ -175,6 +175,20 @@ def is_scenario(text, folder, fg_calib):
     assert fg_calib("calibrate", folder / "job" / "calibration.yaml").code == 0
 
 
+def are_configurations(text, folder, fg_calib):
+    """Of a scenario of a UR10."""
+    units = "units: {length: m, angle: deg}\n"
+    (folder / "robot.yaml").write_text(snippets("tutorial")[0][1])
+    others = "robot: robot.yaml\nerrors: {values: {}}\nnoise: {position: 0.001, orientation: 0.01}\n"
+    (folder / "scenario.yaml").write_text(units + others + text)
+    assert len(simulate(read_scenario(folder / "scenario.yaml"), seed=0).measurements.readings) == 50
+
+
+def draws_candidates(code, folder, fg_calib):
+    exec(code, made := {})
+    assert made["found"].readings.shape == (200, 7)
+
+
 def are_typed(text, folder, fg_calib):
     """Commands of a shell, parsed to the last option but not run; extras are those that there are."""
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
@@ -286,9 +300,33 @@ def corrects_a_program(code, folder, fg_calib):
     exec(code, {})
 
 
+def predicts_an_arm(code, folder, fg_calib):
+    rng, robot = np.random.default_rng(1), small_arm({"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3})
+    calibrate(robot, measure(true_robot(robot, rng), 20, rng), model="position").save(folder / "result")
+    exec(code, made := {})
+    assert made["found"].within is not None
+    assert (folder / "expected" / "predict.png").stat().st_size > 10_000
+
+
 def exports_an_arm(code, folder, fg_calib):
     exec(code, {})
     assert read_robot(folder / "arm_hayati.yaml").n_joints == 2
+
+
+def are_instruments(text, folder, fg_calib):
+    joints = [{"a": 0.3, "alpha": 0.1 * k, "d": 0.1, "theta": 0} for k in range(6)]
+    plan = {"robot": {"name": "arm", "convention": "dh", "joints": joints}, "units": {"length": "mm", "angle": "deg"},
+            "errors": {"values": {}}, "configurations": {"random": {"count": 1}},
+            "noise": {"position": 1, "orientation": 1}}  # fmt: skip
+    (folder / "plan.yaml").write_text(yaml.safe_dump(plan))
+    (folder / "camera.yaml").write_text(text)
+    scenario = read_scenario(folder / "plan.yaml", instruments=folder / "camera.yaml")
+    assert [i.model for i in scenario.instruments] == ["pixels"]
+
+
+def designs_a_calibration(code, folder, fg_calib):
+    exec(code, made := {})
+    assert made["plan"].expected.position < made["plan"].random
 
 
 def checks_and_updates(code, folder, fg_calib):
@@ -298,6 +336,28 @@ def checks_and_updates(code, folder, fg_calib):
     assert made["found"].verdict == "fail"
     assert [e.parameters for e in made["found"].explanations if e.likely] == [("theta3",)]
     assert len(made["updated"].runs) == 2
+
+
+def names_each_job(text, folder, fg_calib):
+    """The command of the page before, on the bundled example and a copy of it that makes no sense; seconds differ."""
+    for name in ("arm1", "arm2"):
+        assert fg_calib("example", "space-robot", "--out", Path("arms") / name).code == 0
+    other = Path("arms/arm2/calibration.yaml")
+    other.write_text(other.read_text().replace("model: distance-rotation", "model: nonsense"))
+    command = shlex.split(snippets("many-jobs")[0][1])[1:]
+    assert command[1] == "arms/*/calibration.yaml"
+    ended = fg_calib(command[0], *sorted(Path("arms").glob("*/calibration.yaml")), *command[2:4])  # in this process
+    assert ended.code == 1
+    seconds = re.compile(r"(?<= )\d+\.\d(?= *$| s: )", flags=re.M)
+    assert_shows(seconds.sub("0", text), seconds.sub("0", ended.out))
+
+
+def calibrates_many(code, folder, fg_calib):
+    assert fg_calib("example", "space-robot", "--out", folder).code == 0
+    (folder / "other.yaml").write_text("robot: nowhere.yaml\nmeasurements: poses.csv\n")
+    figure, reason = run_python(folder, code).splitlines()
+    assert float(figure) == pytest.approx(0.863, rel=0.01)
+    assert reason == "other.yaml: missing key 'model'"
 
 
 def slow(function, mark=pytest.mark.slow):
@@ -312,10 +372,14 @@ HOW = {
     "from-bags-and-images": [are_typed, is_job, are_typed, is_board, is_board],
     "believe-it": [is_key_of_a_job],
     "correct": [are_typed, corrects_a_program],
+    "design": [are_typed, are_instruments, slow(designs_a_calibration)],
+    "predict": [are_typed, slow(predicts_an_arm)],
     "export": [are_typed, exports_an_arm],
     "next-month": [are_typed, slow(checks_and_updates)],
     "observability": [is_printed],
-    "simulate": [slow(are_run), is_scenario, slow(is_scenario, pytest.mark.long)],
+    "many-jobs": [are_typed, slow(names_each_job), slow(calibrates_many)],
+    "simulate": [slow(are_run), is_scenario, are_configurations, slow(draws_candidates),
+                 slow(is_scenario, pytest.mark.long)],
     "compare": [slow(is_printed)],
     "python": [slow(calibrates_from_arrays), slow(is_a_kind_of_ones_own), slow(extends_the_graph)],
     "layout": [are_typed],

@@ -17,12 +17,13 @@ from simulated import measure, plus, small_arm, true_robot, write_job
 from fg_calib import KnownPoint, Measurements, Robot, Table, calibrate, write_report
 from fg_calib.analysis.seen import Seen
 from fg_calib.pages import load_run
-from fg_calib.report.page.arm import link_points, scene
+from fg_calib.report.page.arm import scene
 from fg_calib.report.page.charts import Scale, limits_of, short
 from fg_calib.report.page.figures import _histogram
 from fg_calib.report.page.files import FIGURES
 from fg_calib.report.page.sections import correlations, tiles
 from fg_calib.robot.kinematics import pose
+from fg_calib.robot.shape import link_points
 
 LARGE = {"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}
 TITLES = (

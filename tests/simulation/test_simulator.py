@@ -26,10 +26,12 @@ from fg_calib.files.robot_yaml import read_robot
 from fg_calib.files.scenario import SCENARIOS, read_scenario
 from fg_calib.files.simulation import write_simulation
 from fg_calib.measurements.dataset import Noise
-from fg_calib.simulation.configurations import BoardViews, GivenReadings, Placement, RandomReadings
+from fg_calib.robot.shape import Box, enters
+from fg_calib.simulation.configurations import BoardViews, GivenReadings, Placement, RandomReadings, TargetViews
 from fg_calib.simulation.measuring import FARTHEST_BASE
 from fg_calib.simulation.scenario import Errors, Scenario
-from fg_calib.simulation.simulator import simulate, view_board
+from fg_calib.simulation.simulator import simulate
+from fg_calib.simulation.views import view_board
 
 FILES = ("calibration.yaml", "poses.csv", "robot_nominal.yaml", "robot_true.yaml")
 BOARD = np.array([0.0, 6.5, 2.55])
@@ -294,6 +296,35 @@ def test_a_table_is_where_the_arm_goes(shipped):
     s = simulate(replace(shipped, configurations=GivenReadings(q), validation=GivenReadings(q[:2])))
     assert s.measurements.readings.tolist() == [*q.tolist(), *q[:2].tolist()]
     assert s.measurements.test.tolist() == [False] * 5 + [True] * 2
+
+
+def test_configurations_keep_out_of_boxes_and_apart(shipped):
+    """As many as are asked for, of any kind; poses of the tool above the floor say so themselves."""
+    floor, gap = (Box([-20.0, -20.0, -20.0], [20.0, 20.0, -1.0]),), 0.8
+    few = replace(shipped, configurations=RandomReadings(40, keep_out=floor, apart=gap),
+                  validation=TargetViews([20.0, 0.0, 5.0], [0.0, 0.0, 0.1], 10, keep_out=floor))  # fmt: skip
+    s = simulate(exact(few), 3)
+    q, heights = s.measurements.readings, poses_of(s.robot, s.measurements.readings)[:, 2, 3]
+    assert (len(q), np.sum(s.measurements.test)) == (50, 10)
+    assert heights.min() >= -1.0
+    assert not enters(s.robot, q, floor).any()
+    assert np.abs(q[:40, None] - q[:40])[~np.eye(40, dtype=bool)].reshape(-1, 7).max(axis=1).min() >= gap
+    assert poses_of(s.robot, simulate(replace(exact(few), configurations=RandomReadings(40)), 3).measurements.readings)[
+        :, 2, 3].min() < -1.0  # fmt: skip
+
+
+def test_configurations_that_are_not_to_be_had_are_reported(shipped):
+    everywhere = (Box([-20.0, -20.0, -20.0], [20.0, 20.0, 20.0]),)
+    with pytest.raises(InputError) as caught:
+        simulate(replace(shipped, configurations=RandomReadings(2, keep_out=everywhere)))
+    assert str(caught.value) == (
+        "space-robot: configurations: 0 of 2 found in 40 drawn: 100 % in a box; "
+        "ask for fewer, or relax what they have to keep to"
+    )
+    with pytest.raises(InputError, match=r"^space-robot: validation: 1 of 2 found in 2 drawn: 50 % near another; "):
+        simulate(
+            replace(shipped, configurations=RandomReadings(2), validation=GivenReadings(np.zeros((2, 7)), apart=1))
+        )
 
 
 # --- frames -----------------------------------------------------------------------------------------------------------

@@ -57,7 +57,7 @@ def _of_rows(table: Table, number: int, rows: Integers, position: Kind, nuisance
             continue
         if values is None:
             raise ProblemError(m.source, f"no columns {columns}", f"measured {noise}s for model {table.model}")
-        parts.append((kind, values.reshape(m.n_configurations, -1)[rows], stated(table, sigma, noise, rows)))
+        parts.append((kind, values.reshape(m.n_configurations, kind.width)[rows], stated(table, sigma, noise, rows)))
     n, kind = len(rows), stack(*(kind for kind, _, _ in parts))
     return Series(
         kind=kind,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fg_calib.report.page.run import Run
 from fg_calib.report.shown import SHOWN
-from fg_calib.robot.model import Axis, Robot
+from fg_calib.robot.shape import link_points
 
 Floats = NDArray[np.float64]
 
@@ -47,39 +47,3 @@ def scene(run: Run) -> dict[str, Any] | None:
         for k, value, points in zip(chosen.tolist(), values, links, strict=True)
     ]
     return {"unit": unit, "family": family, "low": low, "high": high, "items": items}
-
-
-def link_points(robot: Robot, readings: Floats) -> Floats:
-    """Points along the arm from the base to the tool, shape (n, m, 3), [m]: where straight pieces begin and end.
-
-    Args:
-        robot: The robot.
-        readings: Shape (n, n_joints), [rad] (prismatic: [m]).
-    """
-    n, values = len(readings), robot.nominal
-    R, p = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3))
-    points, moved = [p.copy()], False
-    for e in robot.elements:
-        value = np.full(n, 0.0 if e.parameter is None else values[e.parameter])
-        if e.basis is not None:
-            continue  # what gravity and gears add is not seen at this size
-        value = e.constant + e.sign * (value + (0.0 if e.joint is None else readings[:, e.joint]))
-        if e.axis < Axis.RX:
-            p = p + R[:, :, int(e.axis)] * value[:, None]
-            moved = moved or bool(np.any(value != 0.0))
-            continue
-        if moved:
-            points.append(p.copy())
-            moved = False
-        R = R @ _turns(int(e.axis) - 3, value)
-    return np.stack([*points, p], axis=1)
-
-
-def _turns(axis: int, angle: Floats) -> Floats:
-    """Rotations about a coordinate axis, shape (n, 3, 3)."""
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    out = np.tile(np.eye(3), (len(angle), 1, 1))
-    out[:, i, i] = out[:, j, j] = np.cos(angle)
-    out[:, j, i] = np.sin(angle)
-    out[:, i, j] = -out[:, j, i]
-    return out

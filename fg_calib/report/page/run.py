@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.analysis.covariance import TangentCovariance
+from fg_calib.analysis.tool_error import ToolErrorModel
 from fg_calib.analysis.workspace import Workspace, survey
 from fg_calib.files.result import Result
 from fg_calib.files.saved import SavedConfigurations, SavedResiduals
@@ -66,17 +67,16 @@ class Run:
     @property
     def free_of_frame(self) -> bool:
         """Whether nothing was measured in the base frame, so that errors count after the best rigid fit."""
-        expected = self.result.expected_error
-        if expected is not None and expected.relative is not None:
-            return expected.relative
-        return self.result.frame_estimate is not None or self.result.pairing is not None
+        return self.result.free_of_frame
 
     @cached_property
     def workspace(self) -> Workspace | None:
         """Expected errors over the workspace; None where nothing says what was measured."""
         if self.configurations is None or not len(self.configurations.ids):
             return None
-        return survey(self.robot, self.posterior, self.configurations.readings, fitted=self.free_of_frame)
+        measured = self.configurations.readings
+        model = ToolErrorModel.of(self.posterior, measured)
+        return survey(self.robot, model, measured, fitted=self.free_of_frame)
 
     @property
     def family(self) -> str | None:

@@ -1,0 +1,183 @@
+"""`fg-calib design`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from fg_calib.cli.output import Json, end, say, show_json, show_report
+
+if TYPE_CHECKING:
+    from fg_calib.designs.design import Design
+    from fg_calib.files.units import Units
+    from fg_calib.job import Job
+    from fg_calib.robot.model import Robot
+    from fg_calib.simulation.scenario import Scenario
+
+_Of = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="SCENARIO|JOB",
+        help="What measures, and how well: a scenario (a file, or space-robot); or a job, whose rows count already.",
+    ),
+]
+_N = Annotated[int | None, typer.Option("--n", metavar="N", help="How many stops; 30 if neither this nor --target.")]
+_Target = Annotated[
+    str | None, typer.Option("--target", metavar="LENGTH", help="As few as reach this RMS error, such as 0.5mm.")
+]
+_Given = Annotated[
+    Path | None,
+    typer.Option("--given", metavar="TABLE", readable=False, help="Configurations that are measured in any case."),
+]
+_Candidates = Annotated[
+    str | None,
+    typer.Option(
+        "--candidates", metavar="N|TABLE|rows", help="How many are drawn, 2000 if not given; a table; or a job's rows."
+    ),
+]
+_Task = Annotated[
+    Path | None,
+    typer.Option(
+        "--task", metavar="TABLE", readable=False, help="Where the tool is to be right; anywhere within limits if none."
+    ),
+]
+_Criterion = Annotated[
+    Literal["I", "D", "A", "E", "O1", "O2", "O3", "O4", "O5"],
+    typer.Option("--criterion", help="What is made small: I, the error over the task, or one of the literature's."),
+]
+_Frame = Annotated[
+    Literal["base", "fitted"] | None,
+    typer.Option("--error", help="Errors in the base frame, or after the best rigid fit; by what is measured if none."),
+]
+_Lever = Annotated[
+    str | None,
+    typer.Option("--lever", metavar="LENGTH", help="Orientations count too, by what they move at this distance."),
+]
+_Instruments = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--instruments",
+        metavar="FILE ...",
+        readable=False,
+        help="Instruments to compare: files with keys of a scenario that stand in the place of its own.",
+    ),
+]
+_Out = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", readable=False, help="Write tables and a job to fill in there.")
+]
+_Seed = Annotated[int, typer.Option("--seed", min=0, help="Of all that is drawn.")]
+
+
+def design(
+    of: _Of,
+    n: _N = None,
+    target: _Target = None,
+    given: _Given = None,
+    candidates: _Candidates = None,
+    task: _Task = None,
+    criterion: _Criterion = "I",
+    error: _Frame = None,
+    lever: _Lever = None,
+    instruments: _Instruments = None,
+    out: _Out = None,
+    seed: _Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Choose which configurations to measure, and say what accuracy to expect of how many."""
+    from fg_calib.designs.design import design as designed
+    from fg_calib.files.disk import require_writable
+    from fg_calib.files.units import Units, quantity
+
+    if n is not None and target is not None:
+        say("error: --n and --target: one of the two")
+        raise typer.Exit(2)
+    several = _of_instruments(of, instruments)
+    subjects, units, robot = _read(of[0], several)
+    if out is not None:
+        require_writable(out)
+    choices: dict[str, Any] = {
+        "n": n,
+        "target": None if target is None else quantity(target, "m", Units(), "--target"),
+        "lever": 0.0 if lever is None else quantity(lever, "m", Units(), "--lever"),
+        "fitted": None if error is None else error == "fitted",
+        "criterion": criterion,
+        "seed": seed,
+        "given": None if given is None else _readings(given, robot, units),
+        "task": None if task is None else _readings(task, robot, units),
+        **_candidates(candidates, robot, units),
+    }
+    found = {name: designed(one, **choices) for name, one in subjects.items()}
+    _show(found, units, out, several=bool(several), as_json=as_json)
+    missed = [name for name, one in found.items() if not one.reached]
+    end([f"the target is not reached{f' with {name}' if several else ''}" for name in missed], "doubtful")
+
+
+def _show(found: Mapping[str, Design], units: Units, out: Path | None, *, several: bool, as_json: bool) -> None:
+    """Print designs, and write them."""
+    from fg_calib.report.plan import (
+        build_design_report,
+        build_instruments_report,
+        design_document,
+        designs_document,
+        write_design,
+        write_designs,
+    )
+
+    first, names = next(iter(found.values())), tuple[str, ...]()
+    try:
+        if as_json:
+            show_json(designs_document(found) if several else design_document(first))
+        else:
+            show_report(build_instruments_report(found) if several else build_design_report(first))
+    finally:  # also where nobody takes the report
+        if out is not None:
+            names = write_designs(out, found, units) if several else write_design(out, first, units)
+    say(f"wrote {', '.join(names)} to {out}" if out else "nothing is written: --out DIR writes tables and a job")
+
+
+def _of_instruments(of: Sequence[str], instruments: Sequence[Path] | None) -> list[Path]:
+    """The files of instruments to compare: those after the option too that typer takes for arguments."""
+    if len(of) > 1 and not instruments:
+        say(f"error: {of[1]}: one SCENARIO or JOB")
+        raise typer.Exit(2)
+    return [*(instruments or []), *map(Path, of[1:])] if instruments else []
+
+
+def _read(of: str, instruments: Sequence[Path]) -> tuple[dict[str, Scenario | Job], Units, Robot]:
+    """What is to be designed, by the instruments' names, the units of its tables, and the arm."""
+    from fg_calib.files.job import is_job, read_job, units_of
+    from fg_calib.files.scenario import read_scenario
+    from fg_calib.files.units import Units
+    from fg_calib.report.plan import names_of_files
+
+    if is_job(of):
+        if instruments:
+            say("error: --instruments has no effect with a job: they stand in the place of a scenario's")
+            raise typer.Exit(2)
+        job = read_job(of)
+        return {"": job}, units_of(job), job.robot
+    scenarios: dict[str, Scenario | Job] = {}
+    for name, path in zip(names_of_files(instruments), instruments, strict=True):
+        scenarios[name] = read_scenario(of, instruments=path)
+    scenario = read_scenario(of)
+    return scenarios or {"": scenario}, Units(scenario.length_unit, scenario.angle_unit), scenario.robot
+
+
+def _readings(path: Path, robot: Robot, units: Units) -> Any:
+    from fg_calib.files.tables import read_measurements
+
+    return read_measurements(path, robot, units=units).readings
+
+
+def _candidates(given: str | None, robot: Robot, units: Units) -> dict[str, Any]:
+    """Where the candidates come from."""
+    from fg_calib.simulation.configurations import GivenReadings
+
+    if given is None:
+        return {}
+    if given.isdecimal():
+        return {"n_candidates": int(given)}
+    return {"candidates": given if given == "rows" else GivenReadings(_readings(Path(given), robot, units))}

@@ -1,0 +1,107 @@
+"""Chooses stops from a system: so many, or as few as reach a target; and what to expect of how many."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.designs.criteria import Criterion, Measure
+from fg_calib.designs.search import Chosen, exchanged, greedy, random_values
+from fg_calib.designs.system import System
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+MOST_STOPS = 500
+"""Stops up to which a design is sought that reaches a target."""
+
+LEAST_CURVE = 4
+"""Stops with which the curve begins."""
+
+N_CURVE = 10
+"""Numbers of stops at which the curve is worked out, about."""
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """What is to be expected of a number of stops.
+
+    Attributes:
+        n: How many.
+        designed: RMS error over the task with as many designed ones, [m].
+        random: The same of random ones: a tenth of them is better than the first, half than the second, a tenth worse
+            than the third, [m].
+    """
+
+    n: int
+    designed: float
+    random: tuple[float, float, float]
+
+
+class Chooser:
+    """Chooses from a system; the error is always that over the task.
+
+    Greedy choice does not see that some stops help only together, as the first lengths to an anchor that is unknown do:
+    that by the volume of everything unknown, what is beside the arm too, is another start.
+
+    Args:
+        system: What is chosen from.
+        criterion: By which criterion.
+    """
+
+    def __init__(self, system: System, criterion: Criterion) -> None:
+        self.system, self.criterion = system, criterion
+        self.measure = Measure(criterion, system)
+        self._error = Measure("I", system)
+        of_all = Measure("D", replace(system, core=np.eye(system.rows.shape[2])))
+        self._orders = [(measure, np.zeros(0, dtype=np.int64)) for measure in (self.measure, of_all)]
+
+    def error(self, chosen: Integers) -> float:
+        """Expected RMS error with some candidates, [m]."""
+        return float(np.sqrt(self._error.value(self.system.information(chosen))))
+
+    def starts(self, n: int) -> list[Integers]:
+        """What greedy choice takes first, the best start first."""
+        self._orders = [(m, greedy(m, n, order) if len(order) < n else order) for m, order in self._orders]
+        found = [order[:n] for _, order in self._orders]
+        return sorted(found, key=lambda one: self.measure.value(self.system.information(one)))
+
+    def best(self, n: int) -> Chosen:
+        """The best n that exchange finds."""
+        return min((exchanged(self.measure, one) for one in self.starts(n)), key=lambda chosen: chosen.value)
+
+    def quickly(self, n: int) -> Chosen:
+        """Nearly as good ones, in a small part of the time."""
+        return exchanged(self.measure, self.starts(n)[0], quickly=True)
+
+    def reaching(self, target: float) -> Chosen:
+        """As few as reach a target, [m]; as many as may be where none do."""
+        most = min(MOST_STOPS, self.system.n_candidates)
+        enough = 1
+        while min(map(self.error, self.starts(enough))) > target:
+            if enough == most:
+                return Chosen(self.starts(most)[0], np.inf)
+            enough = min(most, enough + max(1, enough // 10))
+        low, high, found = 0, enough, self.quickly(enough)
+        while high - low > 1:
+            middle = max(low + 1, high - max(1, (high - low) // 4))
+            better = self.quickly(middle)
+            if self.error(better.candidates) <= target:
+                high, found = middle, better
+            else:
+                low = middle
+        return exchanged(self.measure, found.candidates)
+
+    def curve(self, found: Chosen, generator: np.random.Generator, hubs: int) -> tuple[CurvePoint, ...]:
+        """What to expect of fewer stops, and of as many; hubs count."""
+        most = len(found.candidates)
+        numbers = np.round(np.geomspace(LEAST_CURVE, max(most + hubs, LEAST_CURVE), N_CURVE)).astype(np.int64)
+        points = []
+        for k in sorted({n - hubs for n in numbers.tolist() if 0 < n - hubs < most} | {most}):
+            chosen = found.candidates if k == most else self.quickly(k).candidates
+            values, _ = random_values(self._error, k, generator)
+            low, middle, high = np.sqrt(np.quantile(values, [0.1, 0.5, 0.9])).tolist()
+            points.append(CurvePoint(k + hubs, self.error(chosen), (low, middle, high)))
+        return tuple(points)

@@ -1,0 +1,206 @@
+"""Criteria of designs, as each was published, and what candidates would gain by them.
+
+With C the covariance of what can be determined, W the task's quadratic form, `S = (P C P^T)^-1` the information of the
+core with the nuisances eliminated, in changes of ordinary size, and s_1 >= ... >= s_L the singular values whose squares
+are the eigenvalues of S:
+
+| name | smaller is better | |
+|---|---|---|
+| `I` | `tr(W C)` | mean square error of the tool over the task (Fedorov 1972) |
+| `D`, `O1` | `-log det S` | volume of the ellipsoid; `O1 = (s_1 ... s_L)^(1/L) / sqrt(m)` (Borm and Menq 1991) |
+| `A` | `tr S^-1` | mean variance |
+| `E`, `O3` | `-s_L` | the worst direction (Nahvi et al. 1994) |
+| `O2` | `-s_L / s_1` | inverse condition number (Driels and Pathre 1990) |
+| `O4` | `-s_L^2 / s_1` | noise amplification (Nahvi and Hollerbach 1996) |
+| `O5` | `sum 1 / s_i` | (Sun and Hollerbach 2008) |
+
+A candidate's rows A change C by `-C A^T (1 + G)^-1 A C` with `G = A C A^T` (Woodbury), its determinant by
+`det(1 + G)`: with U = A L, `C = L L^T`, and V = A C X,
+
+    I, A: tr (1 + G)^-1 V V^T,   X X^T = W;   D: log det(1 + G) - log det(1 + G - V V^T),   X X^T = P^T S P.
+
+Of the others a bound is cheap: S grows by at most `B^T B` with `B = A C P^T S`, for nuisances held where they are best
+now; so s_L^2 grows by no more than `|B v_L|^2`, s_1 does not shrink, and the convex `sum 1 / s_i` falls by no more than
+its derivative, `|B S^-3/4|^2 / 2`. Candidates are worked out in the order of the bound, until none is left that could
+be better.
+
+References:
+    Fedorov (1972), Theory of Optimal Experiments. Academic Press.
+    Borm, Menq (1991), Determination of optimal measurement configurations for robot calibration based on observability
+    measure. International Journal of Robotics Research 10(1).
+    Driels, Pathre (1990), Significance of observation strategy on the design of robot calibration experiments. Journal
+    of Robotic Systems 7(2).
+    Nahvi, Hollerbach, Hayward (1994), Calibration of a parallel robot using multiple kinematic closed loops. ICRA.
+    Nahvi, Hollerbach (1996), The noise amplification index for optimal pose selection in robot calibration. ICRA.
+    Sun, Hollerbach (2008), Observability index selection for robot calibration. ICRA.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from fg_calib.designs.system import System
+from fg_calib.robot.kinematics import over_processors
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+Criterion = Literal["I", "D", "A", "E", "O1", "O2", "O3", "O4", "O5"]
+
+_SPAN = 512
+"""Candidates that are looked at together."""
+
+_BATCH = 32
+"""Candidates whose singular values are worked out together."""
+
+MOST_EXACT = 128
+"""Candidates of a step whose singular values are worked out at most: those of the best bounds."""
+
+_TINY = 1e-300
+
+
+class Measure:
+    """A criterion on a system: smaller is better.
+
+    Args:
+        criterion: Which.
+        system: The system.
+    """
+
+    def __init__(self, criterion: Criterion, system: System) -> None:
+        self.criterion, self.system = criterion, system
+        self._linear = criterion in ("I", "A")
+        if criterion == "I":
+            self._half = _root(system.task)
+        elif criterion == "A":
+            self._half = system.core.T
+
+    def value(self, information: Floats) -> float:
+        """The criterion with some information, shape (n, n)."""
+        if self._linear:
+            L = np.linalg.cholesky(information)
+            return float(np.sum(scipy.linalg.solve_triangular(L, self._half, lower=True) ** 2))
+        s = self._singular_values(_covariance(information)[None])[0]
+        return float(_of_values(self.criterion, s))
+
+    def best(self, information: Floats, allowed: NDArray[np.bool_]) -> tuple[int, float]:
+        """The candidate that makes the criterion smallest, and its value with that.
+
+        Args:
+            information: What is there, shape (n, n).
+            allowed: Candidates that may be taken, shape (n_candidates,); at least one.
+        """
+        C = _covariance(information)
+        if self._is_cheap:
+            values = self.value(information) - self._gains(C)
+            values[~allowed] = np.inf
+            k = int(np.argmin(values))
+            return k, float(values[k])
+        return self._best_exactly(C, allowed)
+
+    def most_helpful(self, information: Floats, n: int) -> Integers:
+        """The n candidates that promise to make the criterion smallest, beside what is there."""
+        C = _covariance(information)
+        promise = -self._gains(C) if self._is_cheap else self._bounds(C)
+        return np.argsort(promise, kind="stable")[:n]
+
+    @property
+    def _is_cheap(self) -> bool:
+        """Whether the criterion of all candidates takes no eigenvalues."""
+        return self._linear or self.criterion in ("D", "O1")
+
+    def _gains(self, C: Floats) -> Floats:
+        """By how much each candidate would make the criterion smaller, shape (n_candidates,)."""
+        L = np.linalg.cholesky(C)
+        if self._linear:
+            X = C @ self._half
+        else:
+            P = self.system.core
+            X = C @ P.T @ np.linalg.inv(np.linalg.cholesky(P @ C @ P.T)).T
+        rows, (n, h, m) = self.system.rows, self.system.rows.shape
+
+        def span(k: int) -> Floats:
+            A = rows[k * _SPAN : (k + 1) * _SPAN]
+            U, V = (np.reshape(A.reshape(-1, m) @ B, (len(A), h, -1)) for B in (L, X))
+            F, T = np.eye(h) + U @ np.swapaxes(U, 1, 2), V @ np.swapaxes(V, 1, 2)
+            if self._linear:
+                return np.asarray(np.trace(np.linalg.solve(F, T), axis1=1, axis2=2))
+            return np.asarray(np.linalg.slogdet(F)[1] - np.linalg.slogdet(F - T)[1])
+
+        return np.concatenate(list(over_processors(span, -(-n // _SPAN))))
+
+    def _best_exactly(self, C: Floats, allowed: NDArray[np.bool_]) -> tuple[int, float]:
+        bounds = np.where(allowed, self._bounds(C), np.inf)
+        order, best, least = np.argsort(bounds, kind="stable"), -1, np.inf
+        for start in range(0, min(len(order), MOST_EXACT), _BATCH):
+            some = order[start : start + _BATCH]
+            some = some[bounds[some] < least]
+            if not len(some):
+                break
+            values = self._with(C, some)
+            k = int(np.argmin(values))
+            if values[k] < least:
+                best, least = int(some[k]), float(values[k])
+        return best, least
+
+    def _bounds(self, C: Floats) -> Floats:
+        """Less than which each candidate cannot make the criterion."""
+        P, rows = self.system.core, self.system.rows
+        w, V = np.linalg.eigh(P @ C @ P.T)  # ascending: the last is the worst direction
+        s = 1.0 / np.sqrt(np.maximum(w, _TINY))
+        B = C @ P.T @ V / w  # C P^T S in the basis of eigenvectors
+        if self.criterion == "O5":
+            grown = np.sum((rows @ (B * s ** (-1.5))) ** 2, axis=(1, 2))
+            return np.asarray(np.sum(1.0 / s) - 0.5 * grown)
+        last = np.sqrt(s[-1] ** 2 + np.sum((rows @ B[:, -1]) ** 2, axis=1))
+        return np.asarray(_of_values(self.criterion, np.stack([np.full(len(last), s[0]), last], axis=1)))
+
+    def _with(self, C: Floats, candidates: Integers) -> Floats:
+        """The criterion with each of some candidates, shape (n,)."""
+        A = self.system.rows[candidates]
+        K = A @ C
+        G = np.eye(A.shape[1]) + K @ np.swapaxes(A, 1, 2)
+        after = C - np.swapaxes(K, 1, 2) @ np.linalg.solve(G, K)
+        return np.asarray(_of_values(self.criterion, self._singular_values(after)))
+
+    def _singular_values(self, C: Floats) -> Floats:
+        """Those of the core's information, descending, of covariances of shape (k, n, n): shape (k, p)."""
+        P = self.system.core
+        w = np.linalg.eigvalsh(P @ C @ P.T)
+        out: Floats = 1.0 / np.sqrt(np.maximum(w, _TINY))
+        return out
+
+
+def _of_values(criterion: Criterion, s: Floats) -> Floats:
+    """A criterion by singular values, descending along the last axis."""
+    first, last = s[..., 0], s[..., -1]
+    formula: dict[str, Callable[[], Floats]] = {
+        "D": lambda: -2.0 * np.sum(np.log(s), axis=-1),
+        "O1": lambda: -2.0 * np.sum(np.log(s), axis=-1),
+        "A": lambda: np.sum(s**-2.0, axis=-1),
+        "E": lambda: -last,
+        "O3": lambda: -last,
+        "O2": lambda: -last / first,
+        "O4": lambda: -(last**2) / first,
+        "O5": lambda: np.sum(1.0 / s, axis=-1),
+    }
+    return formula[criterion]()
+
+
+def _covariance(information: Floats) -> Floats:
+    half = scipy.linalg.solve_triangular(np.linalg.cholesky(information), np.eye(len(information)), lower=True)
+    out: Floats = half.T @ half
+    return out
+
+
+def _root(W: Floats) -> Floats:
+    """X with `X X^T = W`, of as many columns as W has directions."""
+    w, V = np.linalg.eigh(W)
+    kept = w > 1e-15 * w[-1]
+    out: Floats = V[:, kept] * np.sqrt(w[kept])
+    return out

@@ -1,0 +1,297 @@
+"""Which configurations to measure, in which order, and what is to be expected of how many.
+
+    plan = design(read_scenario("scenario.yaml"), n=30)
+    plan.readings, plan.expected.position, plan.curve
+
+The criterion is worked out for all candidates at once (see `criteria`); what is reported of a design is worked out anew
+from the rows of its stops alone, by the very code that assesses a calibration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.analysis.accuracy import PoseRms
+from fg_calib.arguments import checked
+from fg_calib.arrays import FrozenArrays
+from fg_calib.designs.candidates import Candidates
+from fg_calib.designs.chooser import MOST_STOPS, Chooser, CurvePoint
+from fg_calib.designs.criteria import Criterion
+from fg_calib.designs.cures import Cure, cures_of
+from fg_calib.designs.of_job import pool_of_more, pool_of_rows, solved
+from fg_calib.designs.order import shortest_way, travel
+from fg_calib.designs.plans import (
+    errors_by_pairing,
+    other_pairs,
+    plan_of_pairs,
+    plan_of_stops,
+    with_best_hub,
+    with_names,
+)
+from fg_calib.designs.pool import Pool, drawn, pool_of
+from fg_calib.designs.search import Chosen, not_worse_than_random
+from fg_calib.designs.system import system_of
+from fg_calib.designs.task import N_TASK, Task, is_fitted
+from fg_calib.errors import InputError
+from fg_calib.graph.observability import Observability
+from fg_calib.job import Job
+from fg_calib.measurements.series import Table
+from fg_calib.options import check, check_flag, check_number
+from fg_calib.progress import tell
+from fg_calib.robot.inverse import random_readings
+from fg_calib.simulation.configurations import Configurations
+from fg_calib.simulation.scenario import Scenario
+from fg_calib.sizes import MOST_DRAWN
+from fg_calib.threads import single_threaded
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+N_STOPS = 30
+"""Stops of a design where nobody says how many, or how good it has to be."""
+
+N_CANDIDATES = 2000
+"""Candidates that are drawn where nobody says how many."""
+
+
+@dataclass(frozen=True, repr=False)
+class Design(FrozenArrays):
+    """Which configurations to measure.
+
+    Attributes:
+        pool: What was chosen from.
+        tables: What is to be measured, in order.
+        criterion: By which criterion.
+        task: What the calibration is for.
+        readings: The configurations in the order in which to visit them, that of a hub first, shape (n, n_joints),
+            [rad] (prismatic: [m]).
+        ids: Their names: those of rows of a job that were chosen, else s1, s2, ... in that order, shape (n,).
+        group: The instrument that alone measures at each; "" where all others do.
+        expected: Expected errors of the tool over the task, with these and what was given.
+        before: The same with what was given alone; None where nothing was.
+        pairs: Which pairs are measured, of configurations in their order, shape (n_pairs, 2); None where none are, or
+            where they are formed from what is measured.
+        pairings: Expected position errors by which pairs are measured, or formed, [m].
+        random: Median of the expected position errors of as many random stops, [m].
+        curve: What is to be expected of how many.
+        target: What was to be reached, [m]; None where a number was stated.
+        reached: Whether it is.
+        observability: What the rows determine of the arm.
+        cures: Directions that stay undetermined, with the measurements that would determine them.
+        unknown: Share of the task that no candidate determines.
+        travel: Joint travel along the stops, [rad].
+        travel_before: The same in the order in which they were chosen.
+    """
+
+    pool: Pool
+    tables: tuple[Table, ...]
+    criterion: Criterion
+    task: Task
+    readings: Floats
+    ids: NDArray[np.str_]
+    group: NDArray[np.str_]
+    expected: PoseRms
+    before: PoseRms | None
+    pairs: Integers | None
+    pairings: Mapping[str, float]
+    random: float
+    curve: tuple[CurvePoint, ...]
+    target: float | None
+    reached: bool
+    observability: Observability
+    cures: tuple[Cure, ...]
+    unknown: float
+    travel: float
+    travel_before: float
+
+    @property
+    def n(self) -> int:
+        """Number of stops."""
+        return len(self.readings)
+
+    @property
+    def found(self) -> Mapping[str, Candidates]:
+        """How the candidates came about, by the instrument whose own they are."""
+        return self.pool.found
+
+    def __repr__(self) -> str:
+        p = self.expected.position
+        error = "unknown" if p is None else f"{p * 1e3:.3g} mm"
+        return f"Design of {self.n} stops for {self.pool.robot.name!r}: expected RMS {error}, {self.criterion}"
+
+
+@checked
+@single_threaded
+def design(
+    of: Scenario | Job,
+    *,
+    n: int | None = None,
+    target: float | None = None,
+    criterion: Criterion = "I",
+    n_candidates: int = N_CANDIDATES,
+    candidates: Configurations | Literal["rows"] | None = None,
+    given: Floats | None = None,
+    task: Floats | None = None,
+    fitted: bool | None = None,
+    lever: float = 0.0,
+    seed: int = 0,
+) -> Design:
+    """Choose the configurations to measure.
+
+    Args:
+        of: A scenario: the arm with its tolerances, the instruments with their noise, and where they may measure. Or a
+            job: what was measured counts already, and more is to be measured by the same instruments.
+        n: How many stops; as many as reach the target if None.
+        target: Expected RMS position error over the task that is to be reached, [m].
+        criterion: What is made small: `I` the mean square error over the task, or D, A, E, O1 to O5.
+        n_candidates: How many configurations are drawn to choose from; of a table all are taken.
+        candidates: Where to measure instead: configurations, or with a job `"rows"`, to choose among its train rows.
+        given: With a scenario: readings of stops that were measured already, or will be anyway, shape (n, n_joints).
+        task: Configurations at which the tool is to be right, shape (n, n_joints); random ones within the joint limits
+            if None.
+        fitted: Whether errors count after the best rigid fit, or in the base frame; the former if None where nothing
+            that is measured says where the base is.
+        lever: Length with which orientations count too, [m].
+        seed: Of all that is drawn.
+
+    Raises:
+        InputError: A figure makes no sense, or nothing can be measured from anywhere.
+        ProblemError: What would be measured determines nothing.
+    """
+    check("criterion", criterion, Criterion)
+    _check_figures(n, target, n_candidates, lever, seed, fitted)
+    draw = dict(zip(("candidates", "task", "random"), np.random.default_rng(seed).spawn(3), strict=True))
+    tell("looking for candidates")
+    if isinstance(of, Job):
+        pool = _pool_of_job(of, n_candidates, draw["candidates"], candidates, given)
+    elif candidates == "rows":
+        raise InputError("candidates", "rows of a scenario, which has none", "a job, or configurations")
+    else:
+        scenario = of if candidates is None else replace(of, configurations=candidates)
+        pool = pool_of(scenario, drawn(scenario, n_candidates, draw["candidates"]), given=given)
+    there = random_readings(pool.robot, N_TASK, draw["task"]) if task is None else task
+    wanted = Task(there, is_fitted(pool.problem) if fitted is None else fitted, lever)
+    if pool.has_hub and pool.scenario is not None and not len(pool.given) and pool.before is None:
+        pool = with_best_hub(pool, wanted, n or N_STOPS, criterion, draw["random"])
+    return design_from(pool, wanted, draw["random"], n=n, target=target, criterion=criterion)
+
+
+def _check_figures(
+    n: int | None, target: float | None, n_candidates: int, lever: float, seed: int, fitted: bool | None
+) -> None:
+    """Check the figures of a design.
+
+    Raises:
+        InputError: One makes no sense.
+    """
+    if n is not None and target is not None:
+        raise InputError("target", "beside n", "one of the two")
+    if n is not None:
+        check_number("n", n, least=1, whole=True, most=MOST_STOPS)
+    if target is not None:
+        check_number("target", target, above=True)
+    check_number("n_candidates", n_candidates, least=2, whole=True, most=MOST_DRAWN)
+    check_number("lever", lever)
+    check_number("seed", seed, whole=True)
+    if fitted is not None:
+        check_flag("fitted", fitted)
+
+
+def _pool_of_job(
+    job: Job,
+    n_candidates: int,
+    generator: np.random.Generator,
+    candidates: Configurations | Literal["rows"] | None,
+    given: Floats | None,
+) -> Pool:
+    """The pool of a job."""
+    if given is not None:
+        raise InputError("given", "with a job", "a scenario: what a job measured counts already")
+    source = "job" if job.path is None else job.path.name
+    problem = solved(job)
+    if isinstance(candidates, str):
+        return pool_of_rows(problem, source)
+    return pool_of_more(problem, n_candidates, generator, candidates, source)
+
+
+def design_from(
+    pool: Pool,
+    task: Task,
+    generator: np.random.Generator,
+    *,
+    n: int | None = None,
+    target: float | None = None,
+    criterion: Criterion = "I",
+) -> Design:
+    """The design from a pool: see `design`.
+
+    Args:
+        pool: What to choose from.
+        task: What the calibration is for.
+        generator: Draws the random sets that a design is held to.
+        n: How many stops.
+        target: What is to be reached, [m].
+        criterion: What is made small.
+    """
+    chooser, found, able = _choose(pool, task, generator, n, target, criterion)
+    chosen = able[found.candidates]
+    tell("working out what to expect")
+    way = shortest_way(pool.robot, pool.readings[chosen])
+    stops = np.concatenate([pool.given, chosen[way]])
+    plan = plan_of_stops(pool, stops)
+    pairings = errors_by_pairing(pool, stops, task)
+    for other in other_pairs(pool, chosen, (criterion, task), generator):
+        pairings[other.structure] = other.posterior.error(task).position or np.inf
+        if pairings[other.structure] < (plan.posterior.error(task).position or np.inf):
+            plan = plan_of_pairs(pool, other)
+    expected, curve = plan.posterior.error(task), chooser.curve(found, generator, int(pool.has_hub))
+    before = pool.posterior(pool.given) if len(pool.given) or pool.before is not None else None
+    ids = plan.names if pool.scenario is None else [f"s{k + 1}" for k in range(len(plan.readings))]
+    return Design(
+        pool=pool,
+        tables=tuple(with_names(plan.tables, dict(zip(plan.names, ids, strict=True)))),
+        criterion=criterion,
+        task=task,
+        readings=plan.readings,
+        ids=np.array(ids),
+        group=plan.group,
+        expected=expected,
+        before=None if before is None else before.error(task),
+        pairs=plan.pairs,
+        pairings=pairings,
+        random=curve[-1].random[1],
+        curve=curve,
+        target=target,
+        reached=target is None or (expected.position is not None and expected.position <= target * _JUST),
+        observability=plan.posterior.observability,
+        cures=cures_of(plan.posterior),
+        unknown=chooser.system.unknown,
+        travel=travel(pool.robot, plan.readings),
+        travel_before=travel(pool.robot, pool.readings[chosen]),
+    )
+
+
+_JUST = 1.0 + 1e-6
+"""A target is reached to rounding."""
+
+
+def _choose(
+    pool: Pool, task: Task, generator: np.random.Generator, n: int | None, target: float | None, criterion: Criterion
+) -> tuple[Chooser, Chosen, Integers]:
+    """What chooses, what it chose, and which stops of the pool its candidates are."""
+    system = system_of(pool.rows, pool.known, task.form(pool.problem)).with_known(pool.given)
+    able = np.setdiff1d(np.flatnonzero(np.any(pool.rows.rows, axis=(1, 2))), pool.given)
+    if not len(able):
+        raise InputError("candidates", "none at which anything is measured", "some")
+    chooser = Chooser(system.select(able), criterion)
+    tell("choosing")
+    if target is None:
+        found = chooser.best(max(1, min((N_STOPS if n is None else n) - int(pool.has_hub), len(able))))
+    else:
+        found = chooser.reaching(target)
+    return chooser, not_worse_than_random(chooser.measure, found, generator), able

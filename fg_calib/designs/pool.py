@@ -1,0 +1,375 @@
+"""Stops to choose from: what the instruments of a scenario would measure at many configurations, row by row.
+
+Every instrument of the scenario measures at all candidates what the arm as drawn would show it, without noise but with
+the sigmas that it states: so the rows, and what is not seen, are those of `simulate`. Instruments with configurations
+of their own, and what the tool has to touch, have stops of their own.
+
+Of pairs a stop is one end: in a star all are measured against a hub, which is the first configuration.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.arrays import Brief
+from fg_calib.designs.candidates import Candidates, candidates
+from fg_calib.designs.rows import StopRows, stop_rows
+from fg_calib.designs.task import Posterior
+from fg_calib.errors import InputError
+from fg_calib.graph.build import true_problem
+from fg_calib.graph.factors import Variables
+from fg_calib.graph.information import whitened_jacobian
+from fg_calib.graph.knowledge import coordinates_of
+from fg_calib.graph.problem import Problem
+from fg_calib.measurements.dataset import Noise
+from fg_calib.measurements.kinds.board_pose import left_jacobian
+from fg_calib.measurements.series import KnownPoint, Table, Unknowns
+from fg_calib.options import PAIR_MODELS, Gauge, Model, Options, Pairing
+from fg_calib.robot.model import Robot
+from fg_calib.simulation.configurations import BoardViews, Configurations, GivenReadings, Placement
+from fg_calib.simulation.instruments import BoardCamera, Instrument, PairGauge, Tracker, with_figures
+from fg_calib.simulation.scenario import Errors, Scenario, Simulation
+from fg_calib.simulation.simulator import pairing_of, simulate
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+_ID = re.compile(r"^(?:(\S+) (?:\S+ )?)?p(\d+)$")
+"""How a simulation names a configuration: what instrument it is of, where it is one's own, and its number."""
+
+
+@dataclass(frozen=True)
+class Pool(Brief):
+    """Stops to choose from.
+
+    Attributes:
+        scenario: What measures, with all that it leaves to be drawn as it was drawn; None where rows of tables are
+            chosen.
+        tables: What it would measure at all of them.
+        problem: The problem of these.
+        readings: Of each stop, shape (n_stops, n_joints), [rad] (prismatic: [m]).
+        group: The instrument whose own stop each is; "" for those where all others measure.
+        stop: The stop of each configuration of the problem, shape (n_configurations,); -1 for a hub.
+        rows: What each stop would add.
+        given: Stops that were measured already, or will be anyway.
+        found: How the candidates of each group came about.
+        before: What was measured already, as the problem of its rows at its solution; None where nothing was.
+        formed: By the number of a table of poses that pairs are formed of: of which model, and how.
+    """
+
+    scenario: Scenario | None
+    tables: tuple[Table, ...]
+    problem: Problem
+    readings: Floats
+    group: NDArray[np.str_]
+    stop: Integers
+    rows: StopRows
+    given: Integers
+    found: Mapping[str, Candidates] = field(default_factory=dict)
+    before: Problem | None = None
+    formed: Mapping[int, tuple[Model, Pairing]] = field(default_factory=dict)
+
+    @property
+    def robot(self) -> Robot:
+        """The arm, where the rows are linearised."""
+        p = self.problem
+        return p.robot.with_values(p.start[p.variables.robot_span])
+
+    @property
+    def known(self) -> Floats:
+        """What was measured already, whitened, by the columns of the stops' rows, shape (m, n_columns)."""
+        wide = known_rows_of(self.before, self.problem)
+        return np.pad(wide, ((0, 0), (0, len(self.rows.scales) - wide.shape[1])))
+
+    @property
+    def has_hub(self) -> bool:
+        """Whether all pairs are measured against one configuration."""
+        return bool(np.any(self.stop < 0))
+
+    def tables_of(self, stops: Integers, pairing: Pairing | None = None) -> list[Table]:
+        """What would be measured at some of the stops, in their order, behind those of hubs.
+
+        Args:
+            stops: They.
+            pairing: How pairs are formed instead, where they are formed of poses.
+        """
+        names = self.problem.data.names[: self.problem.data.n_configurations]
+        of_stop: dict[int, list[int]] = {}
+        for k, stop in enumerate(self.stop.tolist()):
+            of_stop.setdefault(stop, []).append(k)
+        wanted = [*of_stop.get(-1, []), *(k for stop in stops.tolist() for k in of_stop.get(stop, []))]
+        order = {names[k]: place for place, k in enumerate(wanted)}
+        found = [selected(table, order) for table in self.tables]
+        for number, (model, own) in self.formed.items():
+            found[number] = replace(found[number], model=model, frame="known", pairing=pairing or own)
+        return found
+
+    def posterior(self, stops: Integers, pairing: Pairing | None = None) -> Posterior:
+        """What would be known with some stops measured beside what was, exactly as a calibration would say it.
+
+        Args:
+            stops: They, and those given among them.
+            pairing: How pairs are formed instead, where they are formed of poses.
+        """
+        if not len(stops) and self.before is not None:
+            return Posterior(self.before, whitened_jacobian(self.before, self.before.start))
+        problem = true_problem(self.robot, self.tables_of(stops, pairing), self.problem.options)
+        rows = [whitened_jacobian(problem, problem.start), known_rows_of(self.before, problem)]
+        return Posterior(problem, np.vstack(rows))
+
+
+def selected(table: Table, order: Mapping[str, int]) -> Table:
+    """The rows of a table at some configurations, in an order by their names."""
+    m = table.measurements
+    ids = m.ids.tolist()
+    rows = np.array(sorted((k for k, n in enumerate(ids) if n in order), key=lambda k: order[ids[k]]), dtype=np.int64)
+    part = m.select(rows)
+    if m.groups is not None:
+        part = replace(part, groups=replace(m.groups, index=m.groups.index[rows]))
+    if m.pairs is not None:
+        place = np.full(len(ids), -1)
+        place[rows] = np.arange(len(rows))
+        a, b = place[m.pairs.a], place[m.pairs.b]
+        there = np.flatnonzero((a >= 0) & (b >= 0))
+        part = replace(part, pairs=replace(m.pairs.select(there), a=a[there], b=b[there]))
+    return replace(table, measurements=part)
+
+
+def known_rows_of(before: Problem | None, problem: Problem) -> Floats:
+    """What a problem's rows say, whitened, by the columns of another problem of the same arm and tables.
+
+    Unknowns that the other has not are eliminated.
+
+    Returns:
+        Shape (m, n_columns + n_nuisance) of the other's.
+    """
+    v = problem.variables
+    n = v.n_columns + v.n_nuisance
+    if before is None:
+        return np.zeros((0, n))
+    A, own = whitened_jacobian(before, before.start), before.variables
+    there = _columns_by_name(v, problem.data.unknowns)
+    of_own = _columns_by_name(own, before.data.unknowns)
+    both = [name for name in of_own if name in there]
+    mine = np.concatenate([of_own[name] for name in both])
+    place = np.concatenate([there[name] for name in both])
+    for name in both:
+        if name[0] == "B":  # turned by the same, about the base's axes
+            turns = [left_jacobian(p.start[_place_of(p, columns[:3])][None])[0] for p, columns in
+                     ((before, of_own[name]), (problem, there[name]))]  # fmt: skip
+            A[:, of_own[name][:3]] = A[:, of_own[name][:3]] @ np.linalg.solve(*turns)
+    others = np.setdiff1d(np.arange(A.shape[1]), mine)
+    Q = np.linalg.qr(A[:, others])[0] if len(others) else np.zeros((len(A), 0))
+    left = A[:, mine] - Q @ (Q.T @ A[:, mine])
+    out = np.zeros((len(left), n))
+    out[:, place] = left
+    return out
+
+
+def _place_of(problem: Problem, columns: Integers) -> Integers:
+    """Where nuisance columns stand in the parameter vector."""
+    v = problem.variables
+    place: Integers = columns - v.n_columns + v.nuisance_span.start
+    return place
+
+
+def _columns_by_name(variables: Variables, unknowns: Unknowns) -> dict[tuple[str, str], Integers]:
+    """Columns of each variable: of the core's by its symbol, of the unknowns' by letter and name.
+
+    Planes are left out: their coordinates are about a point that depends on what was measured.
+    """
+    found = {("", v.symbol): np.arange(v.columns.start, v.columns.stop) for v in variables.items}
+    for letter, name in zip(unknowns.letters, unknowns.names, strict=True):
+        place = coordinates_of(variables, unknowns, (letter, name))
+        if place is not None and letter != "F":
+            found[letter, name] = place - variables.nuisance_span.start + variables.n_columns
+    return found
+
+
+def drawn(scenario: Scenario, n: int, generator: np.random.Generator) -> dict[str, Candidates]:
+    """Candidates for the stops of a scenario's instruments, by the instrument whose own they are, "" for all others.
+
+    Args:
+        scenario: The arm, the instruments, where they may measure, and how well.
+        n: How many are drawn for each; of a table all are taken.
+        generator: Draws them.
+
+    Raises:
+        InputError: None can be had.
+    """
+    return {name: candidates(scenario.robot, of, generator, n=n) for name, of in _groups(scenario).items()}
+
+
+def pool_of(
+    scenario: Scenario,
+    found: Mapping[str, Candidates],
+    *,
+    given: Floats | None = None,
+    before: Problem | None = None,
+    hub: int = 0,
+) -> Pool:
+    """The stops that a scenario's instruments may measure at.
+
+    Args:
+        scenario: The arm, the instruments, where they may measure, and how well.
+        found: Candidates, see `drawn`.
+        given: Readings of stops that were measured already, or will be anyway, shape (n, n_joints).
+        before: What was measured already.
+        hub: Which of the common candidates comes first: of a star it is the hub.
+
+    Raises:
+        InputError: The scenario cannot be, or nothing is seen from anywhere.
+    """
+    scenario = _with_instruments(scenario)
+    readings = {name: one.readings for name, one in found.items()}
+    if given is not None and "" not in readings:
+        reason = "where every instrument has configurations of its own"
+        raise InputError("given", reason, "a job with what was measured")
+    if hub:
+        q = readings[""]
+        readings[""] = np.vstack([q[hub : hub + 1], np.delete(q, hub, axis=0)])
+    if given is not None:
+        readings[""] = np.vstack([given, readings[""]])
+    formed = _formed(scenario)
+    simulation = simulate(_silent(scenario, readings), leave_out=True)
+    tables = _as_told(simulation)
+    options = Options(tables[0].model or "pose", gauge=_gauge(scenario))
+    problem = true_problem(scenario.robot, tables, options)
+    data = problem.data
+    names = [_named(name) for name in data.names[: data.n_configurations]]
+    hubs = _hubs(problem)
+    kept = np.setdiff1d(np.arange(len(names)), hubs)
+    stop = np.full(len(names), -1)
+    stop[kept] = np.arange(len(kept))
+    n_given = 0 if given is None else len(given)
+    return Pool(
+        scenario=_placed(scenario, simulation),
+        tables=tables,
+        problem=problem,
+        readings=data.readings[kept],
+        group=np.array([names[k][0] for k in kept], dtype=np.str_),
+        stop=stop,
+        rows=stop_rows(problem, stop, hubs, alone=before is None),
+        given=np.array([stop[k] for k in kept if names[k][0] == "" and names[k][1] < n_given], dtype=np.int64),
+        found=found,
+        before=before,
+        formed=formed,
+    )
+
+
+def _formed(scenario: Scenario) -> dict[int, tuple[Model, Pairing]]:
+    """Instruments by whose poses pairs are formed, by their numbers."""
+    return {
+        k: (i.model, i.pairing)
+        for k, i in enumerate(scenario.instruments)
+        if isinstance(i, Tracker) and i.model in PAIR_MODELS
+    }
+
+
+def _hubs(problem: Problem) -> Integers:
+    """Configurations that all pairs of a star have in common."""
+    found = []
+    for s in problem.pair_series:
+        ends = problem.data.places[s.table][s.ends[s.train]]
+        if len(ends) and np.all(ends[:, 0] == ends[0, 0]):
+            found.append(ends[0, 0])
+    return np.unique(np.array(found, dtype=np.int64))
+
+
+def _with_instruments(scenario: Scenario) -> Scenario:
+    """The same with what measures poses, where the scenario names no instrument, as one."""
+    if scenario.instruments:
+        return scenario
+    model, pairing = scenario.job.get("model", "distance-rotation"), pairing_of(scenario.job.get("pairing", "star"))
+    return replace(scenario, instruments=(Tracker(model=model, name="poses", pairing=pairing),))
+
+
+def _groups(scenario: Scenario) -> dict[str, Configurations]:
+    """Where measures who: the common configurations, and those that an instrument has for itself."""
+    own = {i.name: i.configurations for i in scenario.instruments if i.configurations is not None}
+    return own if len(own) == len(scenario.instruments) > 0 else {"": scenario.configurations} | own
+
+
+def _named(name: str) -> tuple[str, int]:
+    """The group and the number of a configuration."""
+    found = _ID.match(name)
+    assert found is not None, name
+    return found[1] or "", int(found[2])
+
+
+def _silent(scenario: Scenario, readings: Mapping[str, Floats]) -> Scenario:
+    """A scenario whose arm is as drawn, without noise, though what is stated of noise stays, at some readings."""
+    nothing = Noise(**{f.name: 0.0 for f in fields(Noise)})
+    stated = scenario.stated_noise or scenario.noise
+    instruments: list[Instrument] = []
+    for i in scenario.instruments:
+        views = i.configurations or scenario.configurations
+        told = with_figures(with_figures(stated, i.noise), i.stated_noise)
+        changes: dict[str, Any] = {"noise": nothing, "stated_noise": told}
+        if i.configurations is not None:
+            changes["configurations"] = GivenReadings(readings[i.name])
+        if isinstance(i, Tracker) and i.model in PAIR_MODELS:
+            changes |= _as_poses(i)
+        elif isinstance(i, PairGauge):
+            changes["pairs"] = Pairing("star")
+        elif isinstance(i, BoardCamera) and not (i.boards or i.fixed) and isinstance(views, BoardViews):
+            changes["boards"] = {"board": views.board}
+        instruments.append(replace(i, **changes))
+    return replace(
+        scenario,
+        errors=Errors("values", {}),
+        noise=nothing,
+        stated_noise=stated,
+        validation=None,
+        configurations=GivenReadings(readings.get("", np.zeros((0, scenario.robot.n_joints)))),
+        instruments=tuple(instruments),
+    )
+
+
+def _as_poses(i: Tracker) -> dict[str, Any]:
+    """What measures poses that pairs are formed of: all pairs together hold what the poses do in an unknown frame.
+
+    Those of a star hold less; they are what they are.
+    """
+    if i.pairing.strategy == "star":
+        return {}
+    return {"model": MEASURED[i.model], "frame": Placement(np.eye(3), np.zeros(3))}
+
+
+MEASURED: Mapping[Model, Model] = {"distance": "position", "rotation": "orientation", "distance-rotation": "pose"}
+"""What is measured for pairs of each model to be formed."""
+
+
+def _as_told(simulation: Simulation) -> tuple[Table, ...]:
+    """The tables; what is told of points is where they are, without an error."""
+    places = {name: spot for kind in ("targets", "anchors") for name, spot in simulation.truth.get(kind, {}).items()}
+    return tuple(
+        replace(t, known={name: KnownPoint(places[name].xyz, known.tolerance) for name, known in t.known.items()})
+        for t in simulation.tables
+    )
+
+
+def _placed(scenario: Scenario, simulation: Simulation) -> Scenario:
+    """The scenario with what it leaves to be drawn where it was drawn."""
+    truth, instruments = simulation.truth, []
+    for i in scenario.instruments:
+        changes: dict[str, Any] = {}
+        for key in ("targets", "anchors", "planes", "sockets"):
+            count = getattr(i, key, None)
+            if isinstance(count, int) and count:
+                changes[key] = {n: thing for n, thing in truth[key].items() if n.startswith(i.name)}
+        instruments.append(replace(i, **changes))
+    frame = simulation.frame if scenario.frame == "unknown" else scenario.frame
+    return replace(scenario, frame=frame, instruments=tuple(instruments))
+
+
+def _gauge(scenario: Scenario) -> Gauge:
+    """Whether tolerances count: they do unless the scenario's job says that nothing does."""
+    job = scenario.job
+    return "none" if job.get("gauge") == "none" or job.get("prior") is False else "prior"

@@ -1,0 +1,98 @@
+"""The linear system that stops are chosen by: what any of them could determine, in as many coordinates.
+
+Rows A of stops, information `M = M_0 + sum A^T A`. Directions that all candidates together leave undetermined are left
+out: no choice among them changes anything there. What is left has a weak prior (1 rad, or the arm's reach), so that a
+set which does not yet determine everything has a covariance too, a large one.
+
+What counts is the core's part: the task `W`, and of the core the functions that can be determined, P.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.arrays import FrozenArrays
+from fg_calib.designs.rows import StopRows
+from fg_calib.graph.observability import SIGNAL_FLOOR
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+_ROUNDING = 1e-13
+"""Eigenvalues of information below this share of the largest are rounding."""
+
+_SHARE = 1e-6
+"""Share of a task, or of a function, in undetermined directions above which it is not determined."""
+
+
+@dataclass(frozen=True)
+class System(FrozenArrays):
+    """What is chosen from, in coordinates that can be determined.
+
+    Attributes:
+        rows: Of each candidate, shape (n_candidates, h, n).
+        known: Information that is there already, the weak prior in it, shape (n, n).
+        task: W, of which `tr(W C)` is the mean square error of the task, C the covariance, shape (n, n).
+        core: P, functions of the core that can be determined, orthonormal in changes of ordinary size, shape (p, n).
+        basis: What is determined, in the columns of rows, shape (n_columns, n).
+        unknown: Share of the task's mean square that no candidate determines, in [0, 1].
+    """
+
+    rows: Floats
+    known: Floats
+    task: Floats
+    core: Floats
+    basis: Floats
+    unknown: float
+
+    @property
+    def n_candidates(self) -> int:
+        """Number of candidates."""
+        return len(self.rows)
+
+    def with_known(self, candidates: Integers) -> System:
+        """The same with some candidates measured already."""
+        return replace(self, known=self.information(candidates))
+
+    def select(self, candidates: Integers) -> System:
+        """The same with some of the candidates."""
+        return replace(self, rows=self.rows[candidates])
+
+    def information(self, chosen: Integers) -> Floats:
+        """Information with some candidates measured, shape (n, n)."""
+        A = self.rows[chosen].reshape(-1, self.rows.shape[2])
+        out: Floats = self.known + A.T @ A
+        return out
+
+
+def system_of(stops: StopRows, given: Floats, task: Floats) -> System:
+    """The system of stops.
+
+    Args:
+        stops: What they would add.
+        given: Rows that were measured already, shape (m, n_columns).
+        task: Mean square error of the task as a quadratic form of the core, shape (n_core, n_core).
+    """
+    scales, n = stops.scales, stops.n_core
+    rows, before = stops.rows * scales, np.vstack([stops.always, given]) * scales
+    flat = rows.reshape(-1, len(scales))
+    known = before.T @ before
+    values, vectors = np.linalg.eigh(known + flat.T @ flat)
+    there = values > max(SIGNAL_FLOOR**2, _ROUNDING * values[-1])
+    Q, lost = vectors[:, there], vectors[:n, ~there]
+    W = task * np.outer(scales[:n], scales[:n])
+    total = float(np.trace(W))
+    # Functions of the core that no undetermined direction has a share in.
+    U, s, _ = np.linalg.svd(lost, full_matrices=True) if lost.shape[1] else (np.eye(n), np.zeros(0), None)
+    able = U[:, int(np.sum(s > _SHARE)) :]
+    return System(
+        rows=rows @ Q,
+        known=Q.T @ known @ Q + SIGNAL_FLOOR**2 * np.eye(Q.shape[1]),
+        task=Q[:n].T @ W @ Q[:n],
+        core=able.T @ Q[:n],
+        basis=scales[:, None] * Q,
+        unknown=float(np.trace(lost.T @ W @ lost)) / total if total > 0.0 else 0.0,
+    )

@@ -1,0 +1,142 @@
+"""`fg-calib predict`: what to expect of a calibration that was done."""
+
+import json
+
+import numpy as np
+import polars as pl
+import pytest
+from simulated import measure, small_arm, true_robot
+
+import fg_calib as package
+from fg_calib import Calibration, calibrate
+from fg_calib.analysis import prediction
+from fg_calib.files.prediction import Prediction, prediction_schema
+
+TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
+JOINTS = ["q1", "q2", "q3", "q4"]
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    """The folder of a small arm's result."""
+    folder, rng = tmp_path_factory.mktemp("result"), np.random.default_rng(1)
+    robot = small_arm(tolerance=TOLERANCE)
+    calibrate(robot, measure(true_robot(robot, rng), 20, rng, sigma=(1e-4, 1e-4)), model="pose").save(folder)
+    return folder
+
+
+@pytest.fixture
+def few(monkeypatch):
+    """Few configurations all over the workspace."""
+    monkeypatch.setattr(prediction, "N_DRAWN", 400)
+
+
+def in_degrees(q, robot):
+    """As a table of degrees and metres has it."""
+    return q * [1.0 if joint.prismatic else 180.0 / np.pi for joint in robot.joints]
+
+
+def test_configurations_in_their_units_get_a_row_each(result, fg_calib, tmp_path):
+    found = Calibration.load(result)
+    q = np.random.default_rng(2).uniform(-1.0, 1.0, (3, 4))
+    columns = {"id": ["a", "b", "b"]} | dict(zip(JOINTS, in_degrees(q, found.robot).T, strict=True))
+    pl.DataFrame(columns).write_csv(tmp_path / "program.csv")
+    out = tmp_path / "out"
+    ended = fg_calib("predict", result, "--at", tmp_path / "program.csv", "--angle", "deg", "--out", out, "--json")
+    assert ended.code == 0, ended.err
+    document = json.loads(ended.out)
+    assert (document["schema"], document["at"], document["n"], document["counts"]) == (
+        *("fg-calib/predict/1", "configurations", 3),
+        "base",
+    )
+    poses = found.predict(q)
+    for k, one in enumerate(document["configurations"]):
+        assert one["readings"] == pytest.approx(q[k], rel=1e-12)
+        assert one["base"]["position"] == pytest.approx(np.linalg.norm(poses.sigma_position[k]), rel=1e-9)
+        assert one["base"]["orientation"] == pytest.approx(np.linalg.norm(poses.sigma_rotation[k]), rel=1e-9)
+    written = pl.read_csv(out / "predict.csv")
+    assert written["id"].to_list() == ["a", "b", "b"]
+    assert written["base_position_mm"].to_list() == pytest.approx(
+        [1e3 * one["base"]["position"] for one in document["configurations"]], rel=1e-12
+    )
+    assert written.select("x", "y", "z").to_numpy() == pytest.approx(poses.position, abs=1e-12)
+    assert sorted(file.name for file in out.iterdir()) == ["predict.csv", "predict.json"]
+    assert Prediction.model_validate(json.loads((out / "predict.json").read_text())).n == 3
+
+
+@pytest.mark.slow
+def test_the_workspace_is_drawn_and_written(result, fg_calib, tmp_path, few):
+    ended = fg_calib("predict", result, "--limit", "0.5mm", "--out", tmp_path / "out", "--json")
+    assert ended.code == 0, ended.err
+    document = json.loads(ended.out)
+    assert (document["at"], document["n"], document["configurations"]) == ("workspace", 400, [])
+    assert document["limit"] == pytest.approx(5e-4)
+    written = pl.read_csv(tmp_path / "out" / "predict.csv")
+    error = written["base_position_mm"].to_numpy()
+    assert document["within"] == pytest.approx(np.mean(error <= 0.5))
+    assert document["expected"]["base"]["position"]["rms"] == pytest.approx(np.sqrt(np.mean(error**2)) / 1e3)
+    worst = document["worst"]
+    assert worst["base"]["position"] == pytest.approx(np.linalg.norm(worst["sigma"]), rel=1e-9)
+    assert worst["base"]["position"] * 1e3 >= error.max()
+    files = {file.name: file.read_bytes()[:5] for file in (tmp_path / "out").iterdir()}
+    assert set(files) == {"predict.csv", "predict.json", "predict.png", "predict.svg"}
+    assert (files["predict.png"][1:4], files["predict.svg"]) == (b"PNG", b"<?xml")
+
+
+@pytest.mark.slow
+def test_the_report_says_how_far_where_and_why(result, fg_calib, few):
+    said = fg_calib("predict", result, "--limit", "0.5").out
+    for words in ("expected error of the tool over the workspace", "the calibration was GOOD", "in the base frame",
+                  "after the best rigid fit", "within 500 mm at 100 % of them", "Where it is largest",
+                  "1 sigma is", "What it comes from", "400 configurations were drawn"):  # fmt: skip
+        assert words in " ".join(said.split())
+
+
+def test_a_calibration_that_is_not_to_be_trusted_ends_with_3(result, fg_calib, tmp_path):
+    document = json.loads((result / "result.json").read_text())
+    document |= {"trustworthy": False, "findings": ["rows do not fit"]}
+    for file in result.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    (tmp_path / "result.json").write_text(json.dumps(document))
+    (tmp_path / "program.csv").write_text("q1,q2,q3,q4\n0,0,0,0\n")
+    ended = fg_calib("predict", tmp_path, "--at", tmp_path / "program.csv")
+    assert ended.code == 3
+    assert ended.err.splitlines() == ["not to be trusted: rows do not fit"]
+    assert "DOUBTFUL" in ended.out
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize(
+    ("text", "options", "message"),
+    [
+        ("a\n1\n", [], "no joint columns"),
+        ("q1,q2,q3\n0,0,0\n", [], "3 joint columns"),
+        ("q1,q2,q3,q4\n0,0,0,x\n", [], "program.csv:2"),
+        ("q1,q2,q3,q4\n", [], "program.csv"),
+        ("q1,q2,q3,q4\n0,0,0,0\n", ["--limit", "0.5deg"], "--limit"),
+        ("q1,q2,q3,q4\n0,0,0,0\n", ["--limit", "0"], "--limit"),
+    ],
+)
+def test_what_cannot_be_used_is_one_line(result, fg_calib, tmp_path, monkeypatch, text, options, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "program.csv").write_text(text)
+    ended = fg_calib("predict", result, "--at", "program.csv", "--out", "out", *options)
+    assert ended.code == 1
+    assert message in ended.err
+    assert len(ended.err.splitlines()) == 1
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["program.csv"]
+
+
+def test_what_is_no_prediction_is_not_replaced(result, fg_calib, tmp_path):
+    (tmp_path / "predict.csv").write_text("mine\n")
+    ended = fg_calib("predict", result, "--out", tmp_path)
+    assert ended.code == 1
+    assert "not written by this command" in ended.err
+    assert [file.name for file in tmp_path.iterdir()] == ["predict.csv"]
+
+
+def test_the_schema_that_is_shipped_is_the_models():
+    """To write it anew: `json.dumps(prediction_schema(), indent=1)`."""
+    file = package.files.result.__file__.replace("result.py", "predict.schema.json")
+    with open(file) as shipped:
+        assert json.load(shipped) == prediction_schema()

@@ -1,0 +1,344 @@
+"""Candidates: what is said of them is computed again from forward kinematics by 4x4 products."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from oracle import tool_pose
+from simulated import paper_robot, planar_robot, small_arm
+from tolerances import rounding
+
+from fg_calib.designs.candidates import Box, candidates
+from fg_calib.errors import InputError
+from fg_calib.robot.inverse import REACHED, random_readings
+from fg_calib.robot.model import Joint, RobotBuilder
+from fg_calib.robot.shape import enters, link_points
+from fg_calib.simulation.configurations import BoardViews, GivenReadings, Placement, RandomReadings, TargetViews
+
+LIMIT = 170.0
+
+
+def arm(limit=LIMIT):
+    """Seven joints, 1.3 m from the base to the tool; all turn +-limit degrees."""
+    rows = [(0, -90, 0.36), (0, 90, 0), (0, 90, 0.42), (0, -90, 0), (0, -90, 0.4), (0, 90, 0), (0, 0, 0.126)]
+    builder = RobotBuilder("arm", "dh")
+    builder.add_frame("base", {}, 0, False)
+    for i, (a, alpha, d) in enumerate(rows):
+        joint = Joint(f"q{i + 1}", lower=-np.deg2rad(limit), upper=np.deg2rad(limit))
+        builder.add_convention_joint(joint, {"a": a, "alpha": np.deg2rad(alpha), "d": d, "theta": 0.0})
+    builder.add_frame("tool", {"z": 0.1, "pitch": 0.2}, 8, False)
+    return builder.build()
+
+
+ARM = arm()
+BOARD = Placement(np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]).T, np.array([0.7, 0.1, 0.4]))
+VIEWS = BoardViews(BOARD, 99, height=0.4, distance=(0.3, 0.6), cone=0.7)  # its normal is the base's -x
+TARGET = TargetViews(
+    np.array([3.0, 0.5, 1.2]), np.array([0.0, 0.03, 0.05]), 100,
+    axis=np.array([0.0, 1.0, 1.0]), acceptance=0.5, distance=(2.0, 3.2),
+)  # fmt: skip
+
+
+def draw(robot, of, seed=0, **options):
+    found = candidates(robot, of, np.random.default_rng(seed), **options)
+    assert found.asked == len(found.readings) + sum(found.rejected.values())
+    lower, upper = robot.limits.T
+    if not isinstance(of, GivenReadings):
+        assert (found.readings >= lower).all()
+        assert (found.readings <= upper).all()
+    return found
+
+
+def poses_of(robot, readings):
+    return np.stack([tool_pose(robot, q) for q in readings])
+
+
+def angle(a, b):
+    """Between vectors along the last axis."""
+    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1))
+
+
+def distances(readings):
+    """The largest joint difference of each two, shape (n, n); infinite on the diagonal."""
+    apart = np.abs(readings[:, None] - readings).max(axis=2)
+    np.fill_diagonal(apart, np.inf)
+    return apart
+
+
+# --- random, and of a table -------------------------------------------------------------------------------------------
+
+
+def test_random_candidates_are_within_the_limits_and_the_same_for_a_seed():
+    found = draw(ARM, RandomReadings(50), 3)
+    assert (len(found.readings), found.asked, found.rejected) == (50, 50, {})
+    assert draw(ARM, RandomReadings(50), 3).readings.tolist() == found.readings.tolist()
+    assert draw(ARM, RandomReadings(50), 4).readings.tolist() != found.readings.tolist()
+    assert len(draw(ARM, RandomReadings(50), n=7).readings) == 7
+    with pytest.raises(ValueError, match="read-only"):
+        found.readings[0] = 0.0
+
+
+def test_rows_of_a_table_outside_the_limits_are_rejected_and_the_order_kept():
+    q = np.linspace(-2.0, 2.0, 5)[:, None] * np.ones(7) * np.deg2rad(LIMIT) / 1.5
+    found = draw(ARM, GivenReadings(q))
+    assert found.readings.tolist() == q[1:4].tolist()
+    assert (found.asked, found.rejected) == (5, {"outside the joint limits": 2})
+    assert draw(ARM, GivenReadings(q), n=2).readings.tolist() == q[1:3].tolist()
+
+
+def test_a_table_is_looked_through_to_its_end():
+    q = np.full((3000, 7), 4.0)
+    q[-1] = 0.0
+    assert draw(ARM, GivenReadings(q)).rejected == {"outside the joint limits": 2999}
+
+
+# --- boxes ------------------------------------------------------------------------------------------------------------
+
+BOXES = [Box([-2.0, 0.2, -1.0], [2.0, 0.5, 2.0]), Box([0.3, -2.0, 0.1], [0.9, -0.4, 0.4])]
+
+
+@pytest.mark.parametrize("robot", [ARM, small_arm(), paper_robot(), planar_robot()], ids=lambda robot: robot.name)
+def test_boxes_are_entered_where_points_along_the_links_are_inside(robot):
+    """A thousand points along each line; a cut of a corner shorter than the steps may be missed: none of these is."""
+    q = random_readings(robot, 60, np.random.default_rng(1))
+    size = robot.reach
+    boxes = [Box(box.lower * size, box.upper * size) for box in BOXES]
+    links, steps = link_points(robot, q), np.linspace(0.0, 1.0, 1000)[:, None]
+    inside = np.zeros(len(q), dtype=bool)
+    for row, points in enumerate(links):
+        along = np.concatenate([a + steps * (b - a) for a, b in pairwise(points)])
+        inside[row] = any(((along > box.lower) & (along < box.upper)).all(axis=1).any() for box in boxes)
+    assert 5 < inside.sum() < 55
+    assert enters(robot, q, boxes).tolist() == inside.tolist()
+
+
+def test_the_lines_end_at_the_tool_point():
+    q = random_readings(ARM, 20, np.random.default_rng(1))
+    tool = poses_of(ARM, q)[:, :3, 3]
+    assert np.abs(link_points(ARM, q)[:, -1] - tool).max() < rounding(20, 2.0)
+    boxes = [Box(tool[0] - 1e-6, tool[0] + 1e-6)]
+    assert enters(ARM, q, boxes).tolist() == [True] + [False] * 19
+
+
+def test_what_no_joint_moves_and_what_touches_is_not_in_the_way():
+    """The column up to the shoulder stands in one box, and on the floor."""
+    q = np.zeros((1, 7))
+    assert not enters(ARM, q, [Box([-0.1, -0.1, -0.1], [0.1, 0.1, 0.35])]).any()
+    assert enters(ARM, q, [Box([-0.1, -0.1, -0.1], [0.1, 0.1, 0.37])]).all()
+    flat = planar_robot()
+    on_the_floor = random_readings(flat, 10, np.random.default_rng(0))
+    assert not enters(flat, on_the_floor, [Box([-9, -9, -1], [9, 9, 0])]).any()
+    assert enters(flat, on_the_floor, [Box([-9, -9, -1], [9, 9, 1e-6])]).all()
+
+
+def test_nothing_is_kept_of_what_enters_a_box_and_as_much_found_as_without():
+    found = draw(ARM, RandomReadings(200), keep_out=BOXES)
+    assert len(found.readings) == 200
+    assert not enters(ARM, found.readings, BOXES).any()
+    assert list(found.rejected) == ["in a box"]
+    both = draw(ARM, RandomReadings(200, keep_out=tuple(BOXES[:1])), keep_out=BOXES[1:])
+    assert both.readings.tolist() == found.readings.tolist()
+
+
+# --- apart ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("robot", [ARM, small_arm()], ids=lambda robot: robot.name)
+def test_all_are_apart_and_none_was_rejected_for_nothing(robot):
+    """As one by one: each that is not near one taken before is taken. More than 1024 make several parts."""
+    unit = np.array([robot.reach if joint.prismatic else 1.0 for joint in robot.joints])
+    q = random_readings(robot, 1100, np.random.default_rng(2))
+    found = draw(robot, GivenReadings(q), apart=1.2)
+    taken = q[:1]
+    for row in q[1:]:
+        if np.abs((taken - row) / unit).max(axis=1).min() >= 1.2:
+            taken = np.concatenate([taken, [row]])
+    assert found.readings.tolist() == taken.tolist()
+    assert found.rejected == {"near another": 1100 - len(taken)}
+    assert distances(found.readings / unit).min() >= 1.2
+
+
+def test_drawing_goes_on_until_enough_are_apart_or_gives_up():
+    found = draw(ARM, RandomReadings(300), apart=1.0)
+    assert len(found.readings) == 300
+    assert found.asked > 310
+    few = draw(planar_robot(), RandomReadings(300), apart=1.0)  # +-180 degrees hold 7 x 7 at most
+    assert few.asked == 20 * 300
+    assert len(few.readings) <= 49
+
+
+# --- what a camera sees -----------------------------------------------------------------------------------------------
+
+
+def test_a_camera_looks_at_the_board_from_within_the_range_and_the_cone():
+    found = draw(ARM, VIEWS, n=100)
+    T = poses_of(ARM, found.readings)
+    assert len(found.readings) == 100
+    assert set(found.rejected) == {"out of reach"}
+    away = T[:, :3, 3] - BOARD.position
+    length = np.linalg.norm(away, axis=1)
+    assert length.min() >= 0.3 - REACHED
+    assert length.max() <= 0.6 + REACHED
+    assert angle(away, BOARD.rotation[:, 2]).max() <= 0.7 + 1e-8  # REACHED over the least distance
+    assert angle(-away, T[:, :3, 2]).max() < 1e-8
+    again = draw(ARM, VIEWS, n=100)
+    assert again.readings.tolist() == found.readings.tolist()
+    assert again.rejected == found.rejected
+
+
+def test_the_centre_is_anywhere_in_the_field_of_view_evenly():
+    """Evenly in solid angle: 1 - cosine of the angle to the axis is even in [0, 1 - cos f], so is the azimuth.
+
+    Of 200 even numbers in [0, 1] the mean is 0.5 +- 0.0204 (1 sigma); 4 sigma.
+    """
+    wide = BoardViews(BOARD, 199, distance=(0.3, 0.6), cone=0.7, field_of_view=0.4)
+    huge = replace(wide, board=Placement(np.eye(3), np.array([6.0, 0.0, 3.0])))
+    robot = paper_robot()  # reaches nearly any of these, so that reach does not favour some
+    found = draw(robot, huge)
+    assert found.asked < 1.2 * 200
+    T = poses_of(robot, found.readings)
+    seen = np.einsum("nji,nj->ni", T[:, :3, :3], huge.board.position - T[:, :3, 3])
+    off = angle(seen, np.array([0.0, 0.0, 1.0]))
+    assert off.max() <= 0.4 + 1e-8
+    even = (1.0 - np.cos(off)) / (1.0 - np.cos(0.4))
+    assert abs(even.mean() - 0.5) < 4 * 0.0204
+    around = np.arctan2(seen[:, 1], seen[:, 0]) / (2 * np.pi) + 0.5
+    assert abs(around.mean() - 0.5) < 4 * 0.0204
+
+
+def test_the_whole_board_is_in_the_field_of_view():
+    views = replace(VIEWS, field_of_view=0.4, board_size=(0.2, 0.1))
+    found = draw(ARM, views, n=60)
+    T = poses_of(ARM, found.readings)
+    corners = [BOARD.position + BOARD.rotation @ (x, y, 0.0) for x in (-0.1, 0.1) for y in (-0.05, 0.05)]
+    off = np.array([angle(corner - T[:, :3, 3], T[:, :3, 2]) for corner in corners])
+    assert off.max() <= 0.4 + 1e-8
+    assert off.max(axis=0).min() < 0.35  # not only those with the board in a corner
+    assert set(found.rejected) == {"not seen", "out of reach"}
+    assert angle(BOARD.position - T[:, :3, 3], T[:, :3, 2]).max() > 0.05
+
+
+def test_held_self_motion_stays_near_that_of_the_first():
+    held = replace(VIEWS, self_motion="held", roll=0.0, count=30)
+    spread = [np.median(np.ptp(draw(ARM, of).readings, axis=0)) for of in (held, replace(held, self_motion="random"))]
+    assert spread[0] < 0.7 * spread[1]
+
+
+@pytest.mark.slow
+def test_a_first_view_that_is_not_reached_cannot_be_held():
+    away = replace(VIEWS, self_motion="held", board=Placement(np.eye(3), np.array([9.0, 0.0, 0.0])))
+    with pytest.raises(InputError, match=r"^candidates: board: 1 of 1 views not reached within the joint limits \(A\)"):
+        draw(ARM, away)
+
+
+# --- what a tracker sees ----------------------------------------------------------------------------------------------
+
+
+def seen_by(views, robot, readings):
+    """Range and angle of incidence."""
+    T = poses_of(robot, readings)
+    target = np.einsum("nij,j->ni", T[:, :3, :3], views.target) + T[:, :3, 3]
+    return (
+        np.linalg.norm(views.station - target, axis=1),
+        angle(views.station - target, T[:, :3, :3] @ views.axis),
+        target,
+    )
+
+
+@pytest.mark.parametrize(("robot", "far"), [(ARM, 3.2), (small_arm(), 4.2)], ids=["arm", "small-arm"])
+def test_the_tracker_sees_the_reflector(robot, far):
+    """Within its range and the reflector's acceptance; an arm of four joints is not turned, but drawn until it is."""
+    views = replace(TARGET, distance=(2.0, far))
+    found = draw(robot, views)
+    away, off, _ = seen_by(views, robot, found.readings)
+    assert len(found.readings) == 100
+    assert away.min() >= 2.0 - REACHED
+    assert away.max() <= far + REACHED
+    assert off.max() <= 0.5 + 1e-8
+    assert off.max() > 0.4  # to the edge of what it accepts
+    assert set(found.rejected) == {"out of range", "out of reach" if robot is ARM else "not seen"}
+    assert draw(robot, views).readings.tolist() == found.readings.tolist()
+
+
+@pytest.mark.slow
+def test_turned_reflectors_have_any_roll_and_are_all_over_the_workspace():
+    found = draw(ARM, replace(TARGET, distance=(0.0, np.inf), count=300))
+    T = poses_of(ARM, found.readings)
+    anywhere = poses_of(ARM, random_readings(ARM, 300, np.random.default_rng(1)))
+    ratio = T[:, :3, 3].std(axis=0) / anywhere[:, :3, 3].std(axis=0)
+    assert ratio.min() > 0.7
+    _, _, target = seen_by(TARGET, ARM, found.readings)
+    towards = (TARGET.station - target) / np.linalg.norm(TARGET.station - target, axis=1)[:, None]
+    x = T[:, :3, 0]  # across the reflector's axis
+    up = np.cross(towards, np.cross([0.0, 0.0, 1.0], towards))
+    roll = np.arctan2(np.sum(np.cross(up, x) * towards, axis=1), np.sum(up * x, axis=1))
+    assert (np.histogram(roll, bins=6, range=(-np.pi, np.pi))[0] > 15).all()  # of 50 each
+
+
+def test_most_are_turned_to_the_tracker_and_not_waited_for():
+    """Of 1 in 400 random configurations the reflector faces the tracker within 0.1 rad."""
+    narrow = replace(TARGET, acceptance=0.1)
+    found = draw(ARM, narrow)
+    assert found.asked < 8 * 100
+    assert seen_by(narrow, ARM, found.readings)[1].max() <= 0.1 + 1e-8
+
+
+@pytest.mark.parametrize(
+    ("robot", "region"),
+    [(ARM, Box([0.1, -0.4, 0.0], [0.8, 0.4, 0.9])), (small_arm(), Box([-1.6, -0.7, -0.8], [-0.2, 1.0, 0.8]))],
+    ids=["arm", "small-arm"],
+)
+def test_the_reflector_is_in_the_region(robot, region):
+    found = draw(robot, replace(TARGET, distance=(1.0, 9.0), region=region, count=30))
+    _, off, target = seen_by(TARGET, robot, found.readings)
+    assert len(target) == 30
+    assert ((target >= region.lower - REACHED) & (target <= region.upper + REACHED)).all()
+    assert off.max() <= 0.5 + 1e-8
+
+
+# --- what cannot be ---------------------------------------------------------------------------------------------------
+
+
+def test_nothing_within_reach_is_said_with_the_reasons():
+    far = Placement(np.eye(3), np.array([9.0, 0.0, 0.0]))
+    with pytest.raises(InputError) as caught:
+        draw(ARM, replace(VIEWS, board=far, count=0))
+    message = "candidates: none in 20 drawn: 100 % out of reach, expected some that the arm can take"
+    assert str(caught.value) == message
+    with pytest.raises(InputError) as caught:
+        draw(ARM, GivenReadings(np.array([[4.0] * 7, [0.0] * 7])), keep_out=[Box([-1, -1, 0.9], [1, 1, 1])])
+    message = "candidates: none in 2 drawn: 50 % outside the joint limits, 50 % in a box"
+    assert str(caught.value) == f"{message}, expected some that the arm can take"
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: draw(ARM, RandomReadings(3), n=0), "n: found 0, expected a whole number above 0"),
+        (lambda: draw(ARM, RandomReadings(3), n=10**7), "n: found 10000000, expected at most 1000000"),
+        (lambda: draw(ARM, RandomReadings(3), apart=0.0), "apart: found 0.0, expected a finite number above 0"),
+        (lambda: draw(ARM, RandomReadings(3), keep_out=["box"]), "keep_out[0]: found 'box', expected a Box"),
+        (lambda: RandomReadings(3, keep_out=("box",)), "keep_out[0]: found 'box', expected a Box"),
+        (lambda: draw(ARM, GivenReadings(np.zeros((3, 6)))), "candidates: table: shape (3, 6), expected (n, 7)"),
+        (lambda: Box([0, 0, 0], [1, 0, 1]), "box: upper: found [1.0, 0.0, 1.0] above a lower of [0.0, 0.0, 0.0], "
+         "expected more than lower in x, y and z"),
+        (lambda: Box([0, 0], [1, 0, 1]), "box: lower: shape (2,), expected (3,)"),
+        (lambda: replace(VIEWS, field_of_view=2.0), "board: field_of_view: found 2, expected less than a quarter turn"),
+        (lambda: replace(VIEWS, field_of_view=-1.0), "board: field_of_view: found -1.0, expected a finite number not "
+         "below 0"),
+        (lambda: replace(VIEWS, board_size=(1.0, 1.0)), "board: board_size: found (1.0, 1.0), expected none without "
+         "field_of_view"),
+        (lambda: replace(TARGET, axis=[0, 0, 0]), "tracker: axis: found 0, 0, 0, expected a direction"),
+        (lambda: replace(TARGET, acceptance=4.0), "tracker: acceptance: found 4, expected at most half a turn"),
+        (lambda: replace(TARGET, distance=(2.0, 1.0)), "tracker: distance: found 1.0, expected a number not below 2"),
+        (lambda: replace(TARGET, count=0), "tracker: count: found 0, expected a whole number above 0"),
+        (lambda: replace(TARGET, region="here"), "tracker: region: found 'here', expected a Box"),
+        (lambda: replace(TARGET, station=[np.nan, 0, 0]), "tracker: station: row 0: found nan, expected a finite "
+         "number"),
+    ],
+)  # fmt: skip
+def test_a_figure_that_makes_no_sense_is_one_line(make, message):
+    with pytest.raises(InputError) as caught:
+        make()
+    assert str(caught.value) == message
