@@ -290,7 +290,18 @@ class Calibration:
         known = None
         if carried.knowledge is not None and not self.result.evaluated_only:
             known = _saved_knowledge(nominal.with_values(values), carried.knowledge)
-        return Calibrated(nominal, values, self.posterior, known, _saved_options(self.result), carried.noise)
+        kept = {*self.result.noise_kept, "joint"}
+        estimated = [kind for kind in self.result.noise_factors or () if kind not in kept]
+        degrees = sum(self.result.goodness[kind].expected or 0.0 for kind in estimated)
+        return Calibrated(
+            robot=nominal,
+            values=values,
+            posterior=self.posterior,
+            knowledge=known,
+            options=_saved_options(self.result),
+            noise=carried.noise,
+            noise_degrees=degrees or None,
+        )
 
     @checked
     def check(
