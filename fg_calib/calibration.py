@@ -605,7 +605,10 @@ def _saved_posterior(robot: Robot, result: Result, place: str) -> TangentCovaria
     matrices = (saved.covariance, saved.undetermined, saved.undetermined_at_nominal)
     if saved.variables != wanted or len(saved.covariance) != n or any(len(row) != n for m in matrices for row in m):
         raise InputError(place, "other variables than the robot and the covariance have", f"{n} columns of them")
-    return TangentCovariance(variables, parameters, *(_array(matrix, n) for matrix in matrices))
+    arrays = [_array(matrix, n) for matrix in matrices]
+    if not all(np.isfinite(array).all() for array in arrays):
+        raise InputError(place, "figures that are not finite", "covariances, and directions that are not determined")
+    return TangentCovariance(variables, parameters, *arrays)
 
 
 def _saved_options(result: Result) -> Options:
