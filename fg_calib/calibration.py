@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -70,6 +71,8 @@ def calibrate(
     robot: Robot,
     measurements: Measurements | Table | Sequence[Measurements | Table],
     options: Options | None = None,
+    *,
+    executor: Executor | None = None,
     **choices: Any,
 ) -> Calibration:
     """Estimate a robot's parameters from measurements, with their uncertainties.
@@ -83,6 +86,7 @@ def calibrate(
         measurements: What was measured: a table, or several; those that are no `Table` are understood as the options
             say. With `estimate_noise` sigmas that are not stated start at 1 mm and 1 mrad.
         options: What is estimated from what.
+        executor: Where folds are calibrated, such as `local_processes(4)`; in this process if None.
         choices: Instead of `options`, any of theirs as keywords: model, frame, pairing, loss, ...
 
     Raises:
@@ -96,15 +100,16 @@ def calibrate(
         check_readings(table.measurements.readings, robot, table.measurements.source)
         first = _with_first_sigmas(table.measurements) if options.estimate_noise else table.measurements
         tables.append(replace(table, measurements=first))
-    return calibrate_job(Job(None, robot, tuple(tables), options))
+    return calibrate_job(Job(None, robot, tuple(tables), options), executor)
 
 
 @checked
-def calibrate_job(job: Job | Path | str) -> Calibration:
+def calibrate_job(job: Job | Path | str, executor: Executor | None = None) -> Calibration:
     """`calibrate` of a job: what `fg-calib calibrate` does.
 
     Args:
         job: The job, or the path of its file.
+        executor: Where folds are calibrated; in this process if None. For many jobs see `calibrate_jobs`.
 
     Raises:
         InputError: The job, or a file that it names, cannot be used.
@@ -117,7 +122,7 @@ def calibrate_job(job: Job | Path | str) -> Calibration:
     tell("judging the result")
     uncertainty = assess(solution)
     if given.options.folds is not None:
-        uncertainty = uncertainty.with_folds(cross_validate(given, given.options.folds), solution)
+        uncertainty = uncertainty.with_folds(cross_validate(given, given.options.folds, executor=executor), solution)
     return Calibration.of(solution, uncertainty, given.inputs, job=given.document)
 
 

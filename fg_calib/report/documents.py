@@ -88,6 +88,7 @@ from fg_calib.report.page.files import FIGURE_FILES, PAGE
 from fg_calib.report.shown import FAMILY_UNIT
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
+from fg_calib.threads import single_threaded
 
 if TYPE_CHECKING:  # a calibration is written without the baseline
     from fg_calib.baseline.comparison import Comparison, Estimate, RealErrors
@@ -100,6 +101,7 @@ _ROWS_AT_ONCE = 200_000
 """Rows of `residuals.csv` that are turned into text at once."""
 
 
+@single_threaded
 def result_of(
     solution: Solution,
     uncertainty: Uncertainty,
