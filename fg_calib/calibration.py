@@ -306,7 +306,18 @@ class Calibration:
         known = None
         if carried.knowledge is not None and not self.result.evaluated_only:
             known = _saved_knowledge(nominal.with_values(values), carried.knowledge)
-        return Calibrated(nominal, values, self.posterior, known, _saved_options(self.result), carried.noise)
+        kept = {*self.result.noise_kept, "joint"}
+        estimated = [kind for kind in self.result.noise_factors or () if kind not in kept]
+        degrees = sum(self.result.goodness[kind].expected or 0.0 for kind in estimated)
+        return Calibrated(
+            robot=nominal,
+            values=values,
+            posterior=self.posterior,
+            knowledge=known,
+            options=_saved_options(self.result),
+            noise=carried.noise,
+            noise_degrees=degrees or None,
+        )
 
     @checked
     def check(
@@ -616,7 +627,10 @@ def _saved_posterior(robot: Robot, result: Result, place: str) -> TangentCovaria
     matrices = (saved.covariance, saved.undetermined, saved.undetermined_at_nominal)
     if saved.variables != wanted or len(saved.covariance) != n or any(len(row) != n for m in matrices for row in m):
         raise InputError(place, "other variables than the robot and the covariance have", f"{n} columns of them")
-    return TangentCovariance(variables, parameters, *(_array(matrix, n) for matrix in matrices))
+    arrays = [_array(matrix, n) for matrix in matrices]
+    if not all(np.isfinite(array).all() for array in arrays):
+        raise InputError(place, "figures that are not finite", "covariances, and directions that are not determined")
+    return TangentCovariance(variables, parameters, *arrays)
 
 
 def _saved_options(result: Result) -> Options:

@@ -213,3 +213,12 @@ def test_another_robots_job_is_refused(place, tmp_path):
     code, message = run("check", place / "result", tmp_path / "job.yaml")
     assert code == 1
     assert "that of the result, ur5e" in message
+
+
+def test_a_posterior_that_is_infinite_is_refused(place, tmp_path):
+    """Check ended in a traceback, and update went on."""
+    folder = changed_result(place, tmp_path, lambda d: d["posterior"]["covariance"][0].__setitem__(0, float("inf")))
+    for words in (["check"], ["update", "--out", tmp_path / "new"]):
+        code, message = run(words[0], folder, place / "healthy.csv", *words[1:])
+        assert code == 1
+        assert "posterior: figures that are not finite" in message
