@@ -175,6 +175,14 @@ def test_an_older_result_is_checked_by_a_job_and_not_updated(place, tmp_path):
     assert "does not hold what its rows say" in message
 
 
+@pytest.mark.parametrize("job", [{"units": 5}, {"measurements": 5}, {"measurements": [{"model": "pose"}]}], ids=str)
+def test_a_damaged_job_is_told_of(place, tmp_path, job):
+    folder = changed_result(place, tmp_path, lambda d: d["carried"].update(job=job))
+    code, message = run("check", folder, place / "healthy.csv")
+    assert (code, message.count("\n")) == (1, 1)
+    assert "carried: job" in message
+
+
 def test_a_damaged_history_is_told_of(place, tmp_path):
     folder = shutil.copytree(place / "result", tmp_path / "copy")
     for text, expected in (
