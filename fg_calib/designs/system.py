@@ -1,8 +1,9 @@
 """The linear system that stops are chosen by: what any of them could determine, in as many coordinates.
 
 Rows A of stops, information `M = M_0 + sum A^T A`. Directions that all candidates together leave undetermined are left
-out: no choice among them changes anything there. What is left has a weak prior (1 rad, or the arm's reach), so that a
-set which does not yet determine everything has a covariance too, a large one.
+out: no choice among them changes anything there. In the coordinates of what is left all candidates together leave
+variances of 1. There is a weak prior (1 rad, or the arm's reach, or what rounding can tell from all candidates), so
+that a set which does not yet determine everything has a covariance too, a large one.
 
 What counts is the arm's part: the task `W`, and of its parameters the functions that can be determined, P; where the
 measurement frames are is unknown in both.
@@ -23,7 +24,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 _ROUNDING = 1e-13
-"""Eigenvalues of information below this share of the largest are rounding."""
+"""Singular values of all rows below this share of the largest are rounding, and so is information below this share."""
 
 _SHARE = 1e-6
 """Share of a task, or of a function, in undetermined directions above which it is not determined."""
@@ -81,10 +82,12 @@ def system_of(stops: StopRows, given: Floats, task: Floats) -> System:
     scales, n, n_arm = stops.scales, stops.n_core, stops.n_arm
     rows, before = stops.rows * scales, np.vstack([stops.always, given]) * scales
     flat = rows.reshape(-1, len(scales))
-    known = before.T @ before
-    values, vectors = np.linalg.eigh(known + flat.T @ flat)
-    there = values > max(SIGNAL_FLOOR**2, _ROUNDING * values[-1])
-    Q, lost = vectors[:, there], vectors[:n, ~there]
+    # By singular values: those of the information itself are lost in rounding where noise is tiny.
+    _, s, Vt = np.linalg.svd(np.linalg.qr(np.vstack([before, flat]), mode="r"))
+    values, vectors = np.append(s, np.zeros(len(scales) - len(s))), Vt.T
+    there = values > max(SIGNAL_FLOOR, _ROUNDING * values[0])
+    Q, lost = vectors[:, there] / values[there], vectors[:n, ~there]
+    weak = np.maximum((SIGNAL_FLOOR / values[there]) ** 2, _ROUNDING)
     W = task * np.outer(scales[:n], scales[:n])
     total = float(np.trace(W))
     # Functions of the arm that no undetermined direction has a share in.
@@ -92,7 +95,7 @@ def system_of(stops: StopRows, given: Floats, task: Floats) -> System:
     able = U[:, int(np.sum(s > _SHARE)) :]
     return System(
         rows=rows @ Q,
-        known=Q.T @ known @ Q + SIGNAL_FLOOR**2 * np.eye(Q.shape[1]),
+        known=(before @ Q).T @ (before @ Q) + np.diag(weak),
         task=Q[:n].T @ W @ Q[:n],
         core=able.T @ Q[:n_arm],
         basis=scales[:, None] * Q,
