@@ -294,4 +294,7 @@ def _choose(
         found = chooser.best(max(1, min((N_STOPS if n is None else n) - int(pool.has_hub), len(able))))
     else:
         found = chooser.reaching(target)
-    return chooser, not_worse_than_random(chooser.measure, found, generator), able
+    better = not_worse_than_random(chooser.measure, found, generator)
+    if target is not None and chooser.error(better.candidates) > max(target, chooser.error(found.candidates)):
+        better = found  # better by its criterion, but no longer good enough
+    return chooser, better, able
