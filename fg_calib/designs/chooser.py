@@ -84,15 +84,17 @@ class Chooser:
             if enough == most:
                 return Chosen(self.starts(most)[0], np.inf)
             enough = min(most, enough + max(1, enough // 10))
-        low, high, found = 0, enough, self.quickly(enough)
+        low, high, found = 0, enough, min(self.starts(enough), key=self.error)
         while high - low > 1:
             middle = max(low + 1, high - max(1, (high - low) // 4))
-            better = self.quickly(middle)
-            if self.error(better.candidates) <= target:
+            better = self.quickly(middle).candidates
+            if self.error(better) <= target:
                 high, found = middle, better
             else:
                 low = middle
-        return exchanged(self.measure, found.candidates)
+        last = exchanged(self.measure, found)  # by another criterion it may miss the target again
+        reached = self.error(last.candidates) <= target
+        return last if reached else Chosen(found, self.measure.value(self.system.information(found)))
 
     def curve(self, found: Chosen, generator: np.random.Generator, hubs: int) -> tuple[CurvePoint, ...]:
         """What to expect of fewer stops, and of as many; hubs count."""

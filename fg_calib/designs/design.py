@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from fg_calib.analysis.accuracy import PoseRms
 from fg_calib.arguments import checked
-from fg_calib.arrays import FrozenArrays
+from fg_calib.arrays import FrozenArrays, as_floats
 from fg_calib.designs.candidates import Candidates
 from fg_calib.designs.chooser import MOST_STOPS, Chooser, CurvePoint
 from fg_calib.designs.criteria import Criterion
@@ -44,6 +44,7 @@ from fg_calib.measurements.series import Table
 from fg_calib.options import check, check_flag, check_number
 from fg_calib.progress import tell
 from fg_calib.robot.inverse import random_readings
+from fg_calib.robot.model import Robot
 from fg_calib.simulation.configurations import Configurations
 from fg_calib.simulation.scenario import Scenario
 from fg_calib.sizes import MOST_DRAWN
@@ -165,6 +166,7 @@ def design(
     """
     check("criterion", criterion, Criterion)
     _check_figures(n, target, n_candidates, lever, seed, fitted)
+    given, task = (_readings(name, q, of.robot) for name, q in (("given", given), ("task", task)))
     draw = dict(zip(("candidates", "task", "random"), np.random.default_rng(seed).spawn(3), strict=True))
     tell("looking for candidates")
     if isinstance(of, Job):
@@ -200,6 +202,20 @@ def _check_figures(
     check_number("seed", seed, whole=True)
     if fitted is not None:
         check_flag("fitted", fitted)
+
+
+def _readings(name: str, given: object, robot: Robot) -> Floats | None:
+    """Configurations from outside.
+
+    Raises:
+        InputError: They are no readings of the arm's joints, or none.
+    """
+    if given is None:
+        return None
+    q = as_floats(name, given, f"(n, {robot.n_joints})")
+    if not len(q):
+        raise InputError(name, "no configurations", "at least one")
+    return q
 
 
 def _pool_of_job(
@@ -294,4 +310,7 @@ def _choose(
         found = chooser.best(max(1, min((N_STOPS if n is None else n) - int(pool.has_hub), len(able))))
     else:
         found = chooser.reaching(target)
-    return chooser, not_worse_than_random(chooser.measure, found, generator), able
+    better = not_worse_than_random(chooser.measure, found, generator)
+    if target is not None and chooser.error(better.candidates) > max(target, chooser.error(found.candidates)):
+        better = found  # better by its criterion, but no longer good enough
+    return chooser, better, able

@@ -38,6 +38,9 @@ _ROUNDING = 1e-12
 N_RANDOM = 100
 """Random sets that a design is held to: if one were better, exchange would start from it."""
 
+SMALL = 4000
+"""Stops times candidates up to which exchange starts from random sets too: from all of them with a hundredth."""
+
 
 @dataclass(frozen=True)
 class Chosen(FrozenArrays):
@@ -133,17 +136,23 @@ def _sweep(measure: Measure, chosen: Integers, value: float) -> tuple[Integers, 
 def random_values(
     measure: Measure, n: int, generator: np.random.Generator, count: int = N_RANDOM
 ) -> tuple[Floats, Integers]:
-    """The criterion of random sets of n, shape (count,), and the best of them."""
+    """The criterion of random sets of n, ascending, shape (count,), and the sets, shape (count, n)."""
     system = measure.system
-    sets = [generator.choice(system.n_candidates, size=n, replace=False) for _ in range(count)]
+    sets = np.array([generator.choice(system.n_candidates, size=n, replace=False) for _ in range(count)])
     values = np.array([measure.value(system.information(one)) for one in sets])
-    return values, sets[int(np.argmin(values))].astype(np.int64)
+    order = np.argsort(values, kind="stable")
+    return values[order], sets[order].astype(np.int64)
 
 
 def not_worse_than_random(measure: Measure, found: Chosen, generator: np.random.Generator) -> Chosen:
-    """The same, or what exchange makes of the best of random sets where that is better."""
-    values, best = random_values(measure, len(found.candidates), generator)
-    if values.min() >= found.value:
-        return found
-    other = exchanged(measure, best)
-    return other if other.value < found.value else found
+    """The same, or what exchange makes of random sets where that is better.
+
+    Of large pools exchange starts from the best of them alone, and only if that is better. Of small ones, where a set
+    that no single exchange makes better may yet be far from the best, from several.
+    """
+    n, of = len(found.candidates), measure.system.n_candidates
+    values, sets = random_values(measure, n, generator)
+    starts = sets[: SMALL // (n * of)]
+    if not len(starts) and values[0] < found.value:
+        starts = sets[:1]
+    return min((found, *(exchanged(measure, one) for one in starts)), key=lambda one: one.value)
