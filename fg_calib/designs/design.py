@@ -9,7 +9,7 @@ from the rows of its stops alone, by the very code that assesses a calibration.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -55,6 +55,9 @@ Integers = NDArray[np.int64]
 
 N_STOPS = 30
 """Stops of a design where nobody says how many, or how good it has to be."""
+
+LEAST_FITTED = 4
+"""Configurations of a task that a rigid fit does not bring on top of each other, wherever they are."""
 
 N_CANDIDATES = 2000
 """Candidates that are drawn where nobody says how many."""
@@ -178,6 +181,9 @@ def design(
         pool = pool_of(scenario, drawn(scenario, n_candidates, draw["candidates"]), given=given)
     there = random_readings(pool.robot, N_TASK, draw["task"]) if task is None else task
     wanted = Task(there, is_fitted(pool.problem) if fitted is None else fitted, lever)
+    if wanted.fitted and len(there) < LEAST_FITTED:
+        found = f"{len(there)} configuration{'s' * (len(there) > 1)}, of which a rigid fit leaves next to nothing"
+        raise InputError("task", found, f"{LEAST_FITTED} or more, or errors in the base frame")
     if pool.has_hub and pool.scenario is not None and not len(pool.given) and pool.before is None:
         pool = with_best_hub(pool, wanted, n or N_STOPS, criterion, draw["random"])
     return design_from(pool, wanted, draw["random"], n=n, target=target, criterion=criterion)
@@ -304,7 +310,7 @@ def _choose(
     able = np.setdiff1d(np.flatnonzero(np.any(pool.rows.rows, axis=(1, 2))), pool.given)
     if not len(able):
         raise InputError("candidates", "none at which anything is measured", "some")
-    chooser = Chooser(system.select(able), criterion)
+    chooser = Chooser(system.select(able), criterion, _exactly(pool, task, able))
     tell("choosing")
     if target is None:
         found = chooser.best(max(1, min((N_STOPS if n is None else n) - int(pool.has_hub), len(able))))
@@ -314,3 +320,20 @@ def _choose(
     if target is not None and chooser.error(better.candidates) > max(target, chooser.error(found.candidates)):
         better = found  # better by its criterion, but no longer good enough
     return chooser, better, able
+
+
+def _exactly(pool: Pool, task: Task, able: Integers) -> Callable[[Integers], float] | None:
+    """The error with some candidates where pairs are formed otherwise than in a star; None elsewhere.
+
+    There candidates are chosen as poses in an unknown frame, which hold at least as much.
+    """
+    if not any(pairing.strategy != "star" for _, pairing in pool.formed.values()):
+        return None
+
+    def error(candidates: Integers) -> float:
+        chosen = able[candidates]
+        stops = chosen[shortest_way(pool.robot, pool.readings[chosen])]
+        found = pool.posterior(np.concatenate([pool.given, stops])).error(task).position
+        return np.inf if found is None else found
+
+    return error

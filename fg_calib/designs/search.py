@@ -38,7 +38,7 @@ _ROUNDING = 1e-12
 N_RANDOM = 100
 """Random sets that a design is held to: if one were better, exchange would start from it."""
 
-SMALL = 4000
+SMALL = 40_000
 """Stops times candidates up to which exchange starts from random sets too: from all of them with a hundredth."""
 
 
