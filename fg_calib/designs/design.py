@@ -9,6 +9,7 @@ from the rows of its stops alone, by the very code that assesses a calibration.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -39,6 +40,7 @@ from fg_calib.designs.system import system_of
 from fg_calib.designs.task import N_TASK, Task, is_fitted
 from fg_calib.errors import InputError
 from fg_calib.graph.observability import Observability
+from fg_calib.graph.problem import Problem
 from fg_calib.job import Job
 from fg_calib.measurements.series import Table
 from fg_calib.options import check, check_flag, check_number
@@ -65,12 +67,13 @@ class Design(FrozenArrays):
 
     Attributes:
         pool: What was chosen from.
-        tables: What is to be measured, in order.
+        tables: What is to be measured, in order; none of an instrument none of whose own stops was chosen.
         criterion: By which criterion.
         task: What the calibration is for.
         readings: The configurations in the order in which to visit them, that of a hub first, shape (n, n_joints),
             [rad] (prismatic: [m]).
-        ids: Their names: those of rows of a job that were chosen, else s1, s2, ... in that order, shape (n,).
+        ids: Their names: those of rows of a job that were chosen, else s1, s2, ... in that order, behind such names
+            that a job has already, shape (n,).
         group: The instrument that alone measures at each; "" where all others do.
         expected: Expected errors of the tool over the task, with these and what was given.
         before: The same with what was given alone; None where nothing was.
@@ -251,10 +254,14 @@ def design_from(
             plan = plan_of_pairs(pool, other)
     expected, curve = plan.posterior.error(task), chooser.curve(found, generator, int(pool.has_hub))
     before = pool.posterior(pool.given) if len(pool.given) or pool.before is not None else None
-    ids = plan.names if pool.scenario is None else [f"s{k + 1}" for k in range(len(plan.readings))]
+    ids = plan.names if pool.scenario is None else _new_names(len(plan.readings), pool.before)
     return Design(
         pool=pool,
-        tables=tuple(with_names(plan.tables, dict(zip(plan.names, ids, strict=True)))),
+        tables=tuple(
+            table
+            for table in with_names(plan.tables, dict(zip(plan.names, ids, strict=True)))
+            if table.measurements.n_configurations
+        ),
         criterion=criterion,
         task=task,
         readings=plan.readings,
@@ -275,6 +282,15 @@ def design_from(
         travel_before=travel(pool.robot, pool.readings[chosen]),
     )
 
+
+def _new_names(n: int, before: Problem | None) -> list[str]:
+    """Names s1, s2, ... of stops: those that configurations have already are left out."""
+    taken = () if before is None else before.data.names
+    first = max((int(name[1:]) for name in taken if _OURS.fullmatch(name)), default=0) + 1
+    return [f"s{k}" for k in range(first, first + n)]
+
+
+_OURS = re.compile(r"s[0-9]{1,9}")
 
 _JUST = 1.0 + 1e-6
 """A target is reached to rounding."""

@@ -14,10 +14,11 @@ from rich.console import Group, RenderableType
 
 from fg_calib.analysis.accuracy import PoseRms
 from fg_calib.designs.design import Design
+from fg_calib.errors import InputError
 from fg_calib.files.csv_writer import write_csv
 from fg_calib.files.disk import fill_folder, write_text
 from fg_calib.files.robot_yaml import write_robot
-from fg_calib.files.simulated_tables import instrument_keys, table_columns, to_fill_in
+from fg_calib.files.simulated_tables import instrument_keys, is_filled_in, table_columns, to_fill_in
 from fg_calib.files.units import Units
 from fg_calib.files.urdf import write_urdf
 from fg_calib.measurements.series import Table
@@ -26,6 +27,7 @@ from fg_calib.report.shown import SHOWN
 from fg_calib.report.tables import indented, line, plain_table, rounded, section
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
+from fg_calib.simulation.configurations import RandomReadings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -36,6 +38,9 @@ CONFIGURATIONS = "configurations.csv"
 
 _MOST = 40
 """Stops that the report lists; the table has them all."""
+
+_SHOWN_CHANGE = 0.005
+"""Part of a direction's largest change below which the report leaves one out; design.json has them all."""
 
 _JOB_WORDS = "# fg-calib design\n# What to measure: fill in the tables, then `fg-calib calibrate` this file.\n"
 
@@ -206,7 +211,7 @@ def _stops(design: Design) -> RenderableType:
 def _cures(design: Design) -> RenderableType:
     table = plain_table(("direction", "left"), ("why", "left"), ("would be determined by", "left"), wrap=True)
     for cure in design.cures:
-        what = " ".join(f"{change:+g} {name}" for name, change in cure.relation.items())
+        what = " ".join(f"{v:+.3g} {name}" for name, v in cure.relation.items() if abs(v) >= _SHOWN_CHANGE)
         by = cure.by[0] if cure.by else "nothing: the arm moves the same whatever it is"
         table.add_row(line(what), line(cure.reason), by)
     return table
@@ -217,6 +222,9 @@ def _notes(design: Design) -> list[str]:
     for name, one in design.found.items():
         of = f" of {name}" if name else ""
         notes.append(f"candidates{of}: {one.reasons()}")
+    notes += [f"{name}: none of its own stops was chosen, and it gets no table" for name in _without_stops(design)]
+    if _is_anywhere(design):
+        notes.append("a job says of no boxes and no lines of sight: --candidates SCENARIO takes those of a scenario")
     turn = math.degrees(design.travel)
     notes.append(f"joint travel along the stops {turn:.0f} deg, {math.degrees(design.travel_before):.0f} unordered")
     if design.n > _MOST:
@@ -235,6 +243,19 @@ def _notes(design: Design) -> list[str]:
     return notes
 
 
+def _without_stops(design: Design) -> list[str]:
+    """Instruments that have stops of their own, none of which was chosen."""
+    return sorted(set(design.pool.group.tolist()).difference(design.group.tolist(), [""]))
+
+
+def _is_anywhere(design: Design) -> bool:
+    """Whether more rows of a job were chosen anywhere within the joint limits."""
+    scenario = design.pool.scenario
+    if design.pool.before is None or scenario is None:
+        return False
+    return isinstance(scenario.configurations, RandomReadings) and not scenario.configurations.keep_out
+
+
 def _is_flat(design: Design) -> bool:
     """Whether the last half of the stops gained less than a tenth."""
     half = min(design.curve, key=lambda p: abs(p.n - design.n / 2))
@@ -251,7 +272,9 @@ def _mm(value: float | None) -> str:
 
 
 def _figure(value: float) -> str:
-    return f"{value * 1e3:.3g}" if value < 10.0 else "unknown"
+    if value >= 10.0:
+        return "unknown"
+    return f"{value * 1e3:.3g}" if value < 0.9995 else f"{value * 1e3:.0f}"
 
 
 # --- pictures and files ---
@@ -308,7 +331,8 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
         The names of the files.
 
     Raises:
-        InputError: The folder cannot be written, or holds files of these names that are no design's.
+        InputError: The folder cannot be written, or holds files of these names that are no design's, or tables that
+            have been filled in.
     """
     import json
 
@@ -338,6 +362,9 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
     names = [CONFIGURATIONS, "design.json", "design.png"]
     if tables:
         names += [*files, "robot.yaml", *([urdf] if urdf else []), "calibration.yaml"]
+    for name in files:
+        if is_filled_in(folder / name):
+            raise InputError(str(folder / name), "a table that has been filled in", "another folder")
     own = {"calibration.yaml": _JOB_WORDS.encode(), "design.json": b"{"}
     fill_folder(folder, write, dict.fromkeys(names, b"") | own)
     return tuple(names)
