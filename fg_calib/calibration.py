@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -30,7 +31,7 @@ from fg_calib.analysis.folds import cross_validate
 from fg_calib.analysis.new_rows import Calibrated, Rows
 from fg_calib.analysis.residual_table import ResidualTable
 from fg_calib.analysis.uncertainty import FrameEstimate, Uncertainty, assess
-from fg_calib.analysis.update import updated
+from fg_calib.analysis.update import predicted_before, updated
 from fg_calib.analysis.variance_components import solve_job
 from fg_calib.arguments import checked
 from fg_calib.arrays import as_floats, shape_of
@@ -48,6 +49,7 @@ from fg_calib.graph.solver import Solution
 from fg_calib.job import Job
 from fg_calib.measurements.checks import check_readings
 from fg_calib.measurements.dataset import Measurements
+from fg_calib.measurements.fingerprints import counted_before
 from fg_calib.measurements.series import Table
 from fg_calib.options import NEAR, Options, Pairing, check_flag, check_names, did_you_mean, listed
 from fg_calib.progress import tell
@@ -69,6 +71,8 @@ def calibrate(
     robot: Robot,
     measurements: Measurements | Table | Sequence[Measurements | Table],
     options: Options | None = None,
+    *,
+    executor: Executor | None = None,
     **choices: Any,
 ) -> Calibration:
     """Estimate a robot's parameters from measurements, with their uncertainties.
@@ -82,6 +86,7 @@ def calibrate(
         measurements: What was measured: a table, or several; those that are no `Table` are understood as the options
             say. With `estimate_noise` sigmas that are not stated start at 1 mm and 1 mrad.
         options: What is estimated from what.
+        executor: Where folds are calibrated, such as `local_processes(4)`; in this process if None.
         choices: Instead of `options`, any of theirs as keywords: model, frame, pairing, loss, ...
 
     Raises:
@@ -95,15 +100,16 @@ def calibrate(
         check_readings(table.measurements.readings, robot, table.measurements.source)
         first = _with_first_sigmas(table.measurements) if options.estimate_noise else table.measurements
         tables.append(replace(table, measurements=first))
-    return calibrate_job(Job(None, robot, tuple(tables), options))
+    return calibrate_job(Job(None, robot, tuple(tables), options), executor)
 
 
 @checked
-def calibrate_job(job: Job | Path | str) -> Calibration:
+def calibrate_job(job: Job | Path | str, executor: Executor | None = None) -> Calibration:
     """`calibrate` of a job: what `fg-calib calibrate` does.
 
     Args:
         job: The job, or the path of its file.
+        executor: Where folds are calibrated; in this process if None. For many jobs see `calibrate_jobs`.
 
     Raises:
         InputError: The job, or a file that it names, cannot be used.
@@ -116,7 +122,7 @@ def calibrate_job(job: Job | Path | str) -> Calibration:
     tell("judging the result")
     uncertainty = assess(solution)
     if given.options.folds is not None:
-        uncertainty = uncertainty.with_folds(cross_validate(given, given.options.folds), solution)
+        uncertainty = uncertainty.with_folds(cross_validate(given, given.options.folds, executor=executor), solution)
     return Calibration.of(solution, uncertainty, given.inputs, job=given.document)
 
 
@@ -358,23 +364,27 @@ class Calibration:
         history = self.runs
         new, before = _date(date), history[-1]
         growth = {} if growth is None else growth
-        days = _days(before.date, new) if growth else 0.0
+        days = _days(before.date, new, needed=bool(growth))
         table, inputs = self._rows(rows, pairs, like)
-        before_now = {digest for run in history for digest in run.inputs.values()}
-        sources = {one.measurements.source.partition(", station ")[0] for one in table.tables}
-        for name, file_digest in inputs.items():
-            if Path(name).name in sources and file_digest in before_now:
-                raise InputError(name, "its rows are in the calibration already", "new rows")
+        counted = {mark for run in history for mark in run.rows}
+        for one in table.tables:
+            if counted_before(one, counted):
+                source = one.measurements.source
+                raise InputError(source, "its rows are in the calibration already", "new rows")
+        names = listed("changed", changed)
         found = updated(
             self.calibrated,
             table,
             growth={name: size * float(np.sqrt(days)) for name, size in growth.items()},
-            changed=listed("changed", changed),
+            changed=names,
             anchors_stay=anchors_stay,
         )
+        uncertainty = assess(found)
+        if uncertainty.acceptance is not None and not names:
+            uncertainty = uncertainty.with_held_out(predicted_before(self.calibrated, table), found)
         job = {} if self.result.carried is None else self.result.carried.job
         previous = Previous(sha256=before.sha256, date=before.date)
-        made = Calibration.of(found, assess(found), inputs, job=job, date=new, previous=previous)
+        made = Calibration.of(found, uncertainty, inputs, job=job, date=new, previous=previous)
         return replace(made, history=history)
 
     def _require_trust(self) -> None:
@@ -609,19 +619,35 @@ def _saved_knowledge(robot: Robot, saved: SavedKnowledge) -> Knowledge:
     Raises:
         InputError: It is of another robot, or damaged.
     """
+    width = len(saved.columns) + len(saved.at)
     found = Knowledge(
         robot=robot,
         unknowns=saved.unknowns,
         at=np.array(saved.at, dtype=np.float64),
-        rows=_array(saved.rows, len(saved.columns) + len(saved.at)),
+        rows=_array(saved.rows, width),
         right=np.array(saved.right, dtype=np.float64),
+        views=saved.views,
     )
     sizes = len(saved.at) == SIZE * len(saved.unknowns) and len(saved.right) == len(saved.rows)
+    drawn = saved.nominal
+    if drawn is not None:
+        sizes &= len(drawn.at) == len(saved.at) and len(drawn.parameters) == len(robot.parameters)
     if found.variables.names != saved.columns or not sizes:
         raise InputError(
             "result.json: carried", "knowledge of other parameters than those estimated", "that of one run"
         )
-    return found
+    if drawn is None:
+        return found
+    rows = _array(drawn.rows, width)
+    nominal = Knowledge(
+        robot=robot.with_values(drawn.parameters),
+        unknowns=saved.unknowns,
+        at=np.array(drawn.at, dtype=np.float64),
+        rows=rows,
+        right=np.zeros(len(rows)),
+        views=saved.views,
+    )
+    return replace(found, nominal=nominal)
 
 
 def _date(given: str | None) -> str:
@@ -638,20 +664,23 @@ def _date(given: str | None) -> str:
         raise InputError("date", f"found {shown(given)}", "a date such as 2026-03-01") from None
 
 
-def _days(before: str, now: str) -> float:
-    """Days from one date to another.
+def _days(before: str, now: str, *, needed: bool) -> float:
+    """Days from one date to another; 0 where the second has no time zone, and may be of the same day.
 
     Raises:
-        InputError: The first is not known, or after the other.
+        InputError: The first is not known although it is needed, or after the other.
     """
     if not before:
-        raise InputError("growth", "the calibration has no date", "one that this version of fg-calib wrote")
+        if needed:
+            raise InputError("growth", "the calibration has no date", "one that this version of fg-calib wrote")
+        return 0.0
     dates = [datetime.fromisoformat(date) for date in (before, now)]
     first, second = (d if d.tzinfo else d.replace(tzinfo=UTC) for d in dates)
     days = (second - first).total_seconds() / 86400.0
-    if days < 0.0:
+    same_day = dates[1].tzinfo is None and days > -1.0
+    if days < 0.0 and not same_day:
         raise InputError("date", f"{now} is before the calibration, {before}", "a later one")
-    return days
+    return max(days, 0.0)
 
 
 def _posterior_of_names(robot: Robot, parameters: Floats, result: Result) -> TangentCovariance:

@@ -46,7 +46,8 @@ def correct(
             poses of the nominal arm at `near`: what a program of joint values was meant to reach.
         rotation: How the tool is to be turned, shape (n, 3, 3), or (3, 3); any if None.
         near: Joint values to stay near, shape (n, n_joints) or (n_joints,), [rad] (prismatic: [m]): of an arm that
-            reaches a target in several ways they choose one. The middle of the limits if None.
+            reaches a target in several ways they choose one. If None that is the first that is found, searched for from
+            the middle of the limits and, where that leads nowhere, from anywhere.
         world: Whether the targets are in the measurement frame, instead of the base frame.
         table: Number of the table whose measurement frame it is, from 0; there must be one if there are several.
 
@@ -60,7 +61,7 @@ def correct(
         raise InputError("world", "joint values reach poses in the base frame", "targets with positions")
     if world:
         target, turned = _from_base(calibration, target, turned, table)
-    first = reach(nominal, target, turned, start) if position is not None else None
+    first = reach(nominal, target, turned, start, anywhere=near is None) if position is not None else None
     uncorrected = start if first is None else first.readings
     off = np.column_stack(misses(robot, uncorrected, target, turned))
     if first is not None:

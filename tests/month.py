@@ -3,10 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
+from scenarios import INSTRUMENTS, scenario
 from scipy.spatial.transform import Rotation
 from simulated import measure, true_robot
 
-from fg_calib import Robot, calibrate
+from fg_calib import Robot, calibrate, simulate
+from fg_calib.simulation.scenario import Errors
 
 SIGMA = (5e-5, 1e-4)
 ROWS = [
@@ -54,3 +56,44 @@ def calibrated(seed=0, *, n=40, unknown=False, model="pose", robot=None, sigma=S
     rows = measured(true, n, rng, frame=placed(rng) if unknown else None, sigma=sigma)
     frame = "unknown" if unknown else "known"
     return calibrate(robot, rows, model=model, frame=frame, **options), true, rng
+
+
+OF_INSTRUMENTS = {kind: INSTRUMENTS[kind] for kind in INSTRUMENTS if kind not in ("pose", "targets")}
+"""Of every kind but poses of the tool, which other tests have; targets are those of the stations, at places given."""
+
+
+def months_of(kind, seed, *, n=60, n_new=40, slip=None, **changes):
+    """The robot, the true one, and tables of an instrument at first and of the month after: tables, anchors, planes,
+    boards and points of their own.
+
+    Args:
+        kind: Which instrument.
+        seed: Of what is drawn.
+        n: Configurations at first.
+        n_new: Those of the month after.
+        slip: What changes in between, by parameter.
+        changes: Of the scenario.
+    """
+    first = simulate(scenario(OF_INSTRUMENTS[kind], n=n, **changes), seed=seed)
+    robot, true = first.robot, first.true_robot
+    off = {p.name: x for p, x in zip(robot.parameters, true.nominal - robot.nominal, strict=True) if x}
+    for name, size in (slip or {}).items():
+        off[name] = off.get(name, 0.0) + size
+    after = simulate(
+        scenario(OF_INSTRUMENTS[kind], n=n_new, **changes | {"errors": Errors("values", off)}), seed=10_000 + seed
+    )
+    return robot, true, first.tables, tuple(map(_of_another_month, after.tables))
+
+
+def _of_another_month(table):
+    """The same with other names of all but targets: what has the same name in two tables of a job is the same."""
+    m = table.measurements
+    labels = {
+        what: label if what == "target" else replace(label, names=tuple(f"{name} later" for name in label.names))
+        for what, label in m.labels.items()
+    }
+    groups = m.groups and replace(m.groups, names=tuple(f"{name} later" for name in m.groups.names))
+    known = {name if "target" in labels else f"{name} later": place for name, place in table.known.items()}
+    ids = np.array([f"{name} later" for name in m.ids])
+    later = replace(m, ids=ids, labels=labels, groups=groups, source=f"{m.source} later")
+    return replace(table, measurements=later, known=known)

@@ -26,6 +26,7 @@ FOLDERS = (
         "arrays",
         "options",
         "progress",
+        "executors",
         "robot",
         "measurements",
         "job",
@@ -43,6 +44,7 @@ FOLDERS = (
         "correction",
         "prediction",
         "pages",
+        "batch",
         "exports",
         "cli",
     ),
@@ -153,7 +155,8 @@ def test_no_input_can_run_code_or_reach_a_network(name, path):
             for alias in node.names}  # fmt: skip
     used |= {(node.module or "").partition(".")[0] for node in nodes(path) if isinstance(node, ast.ImportFrom)}
     forbidden = {"pickle", "marshal", "shelve", "subprocess", "urllib", "http", "requests", "ctypes", "multiprocessing"}
-    allowed = {"robot/cache": {"pickle"}, "files/parquet": {"subprocess"}}  # the latter starts this Python alone
+    allowed = {"robot/cache": {"pickle"}, "files/parquet": {"subprocess"}, "executors": {"multiprocessing"}}
+    # the latter two start this Python alone
     assert used & forbidden == allowed.get(name, set())
 
 
@@ -219,7 +222,8 @@ def test_all_that_is_imported_is_installed_with_the_package():
                 modules = [node.module] if isinstance(node, ast.ImportFrom) else []
             for module in modules:
                 used.setdefault(module.partition(".")[0], set()).add(name)
-    extras = {"camera": ("opencv-python-headless", "cv2", "camera/opencv"), "ros": ("rosbags", "rosbags", "files/bag")}
+    extras = {"camera": ("opencv-python-headless", "cv2", "camera/opencv"), "ros": ("rosbags", "rosbags", "files/bag"),
+              "distributed": ("distributed", "distributed", "executors")}  # fmt: skip
     for extra, (distribution, module, name) in extras.items():
         assert [re.match(r"[\w-]+", line)[0] for line in project["optional-dependencies"][extra]] == [distribution]
         assert used.pop(module) == {name}

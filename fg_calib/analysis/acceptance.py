@@ -38,7 +38,8 @@ class Judgement:
         noise: RMS noise stated of these rows.
         n: Number of measurements held out.
         verdict: Whether the arm keeps to it.
-        reason: Why that was not evaluated, or which few measurements alone are why it failed; empty otherwise.
+        reason: Why that was not evaluated, which few measurements alone are why it failed, or which arm it was that
+            passed, where it was not the calibrated one; empty otherwise.
         table: Which table it is of; empty where there is one alone.
     """
 
@@ -115,10 +116,11 @@ def _judge(kind: str, table: str, limit: float, held: HeldOut | None, findings: 
     if held.after > limit and held.after**2 - held.noise**2 <= limit**2:
         return judgement("not evaluated", "the noise of the measurements hides it")
     if held.after > limit:
-        return judgement("fail", _because_of(held) if held.rest <= limit else "")
+        missed = judgement("fail", _because_of(held) if held.rest <= limit else "")
+        return judgement("not evaluated", f"{held.by} misses it: mark some rows as test") if held.by else missed
     if findings or not np.isfinite(held.after):
         return judgement("not evaluated", "within the limit, but the result is not to be trusted")
-    return judgement("pass")
+    return judgement("pass", f"new rows, by {held.by}" if held.by else "")
 
 
 def _because_of(held: HeldOut) -> str:

@@ -78,7 +78,7 @@ def expected_error(solution: Solution, spread: Spread) -> ExpectedError:
     there, at = judged_configurations(data)
     chosen = there[np.unique(np.linspace(0, len(there) - 1, MOST).round().astype(np.int64))]
     base, fitted = errors_at(spread, data.readings[chosen])
-    relative = Seen.by(data.tables).blind_to_base
+    relative = Seen.of(solution.problem).blind_to_base
     return ExpectedError(base, fitted, at, len(chosen), len(there), relative)
 
 

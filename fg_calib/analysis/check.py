@@ -16,34 +16,26 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from fg_calib.analysis.acceptance import LEAST
 from fg_calib.analysis.chi_square import FACTOR
+from fg_calib.analysis.likely_changes import (
+    best_refined,
+    effect_elsewhere,
+    excludes,
+    explains,
+    likely_changes,
+    merged,
+    suspects_of,
+    within,
+)
 from fg_calib.analysis.new_rows import Calibrated, Linear, Rows, linear, placed
 from fg_calib.analysis.residual_table import residual_table
 from fg_calib.analysis.separation import Advice, separating
-from fg_calib.analysis.suspects import (
-    CERTAIN,
-    GROUPS,
-    MOST_REFINED,
-    WRONG,
-    Found,
-    all_suspects,
-    columns_of,
-    gross_rows,
-    motions,
-    pairs_of_zeros,
-    quantile,
-    refined,
-    tried,
-    zero_names,
-)
+from fg_calib.analysis.suspects import CERTAIN, WRONG, Found, quantile, zero_names
+from fg_calib.analysis.table_setups import check_tables
 from fg_calib.options import LIMITED, Limits
-from fg_calib.robot.inverse import random_readings
-
-Floats = NDArray[np.float64]
 
 Verdict = Literal["pass", "fail", "not_evaluated"]
 
@@ -155,13 +147,13 @@ def check_rows(calibrated: Calibrated, rows: Rows, limits: Limits) -> Check:
     found: list[Found] = []
     at = whole
     if not few:
-        found = _suspects_of(calibrated, at)
-        best = _likely(found, at)
+        found = suspects_of(calibrated, at)
+        best = likely_changes(found, at)
         while len(best) == 1 and best[0].suspect.kind == "row" and len(gross) < _most_gross(whole):
             gross += best[0].suspect.names
             at = at.without(best[0].suspect.columns)
-            found = [f for f in _suspects_of(calibrated, at) if f.suspect.names[0] not in gross]
-            best = _likely(found, at)
+            found = [f for f in suspects_of(calibrated, at) if f.suspect.names[0] not in gross]
+            best = likely_changes(found, at)
     return _judged(calibrated, rows, limits, at, found, gross, few)
 
 
@@ -179,49 +171,6 @@ def _too_few(rows: Linear) -> str:
     return ""
 
 
-def _suspects_of(calibrated: Calibrated, rows: Linear) -> list[Found]:
-    """What each suspect explains, pairs of zeros among them where no single change explains the rows."""
-    suspects = [*all_suspects(calibrated, rows), *gross_rows(rows)]
-    found = [f for s in suspects if (f := tried(s, rows, len(suspects))) is not None]
-    if not found:
-        return []
-    best = min(found, key=lambda f: f.left)
-    if special.chdtrc(max(rows.dof - best.k, 1), best.left / max(1.0, FACTOR)) >= CERTAIN:
-        return found
-    pairs = pairs_of_zeros(suspects)
-    n = len(suspects) + len(pairs)
-    return [f for s in [*suspects, *pairs] if (f := tried(s, rows, n)) is not None]
-
-
-def _likely(found: Sequence[Found], rows: Linear) -> list[Found]:
-    """The suspects that no other tells from itself, those left out that have more in them than another that is likely.
-
-    Empty where the best explains nothing for certain.
-    """
-    if not found:
-        return []
-    best = min(found, key=lambda f: f.left)
-    scale = max(1.0, best.left / max(rows.dof - best.k, 1))
-    likely = [f for f in found if not any(_excludes(g, f, scale, len(found)) for g in found)]
-    if not any(f.certain for f in likely):
-        return []
-    return sorted((f for f in likely if not any(_within(g, f) for g in likely)), key=lambda f: (f.left, f.k))
-
-
-def _excludes(other: Found, found: Found, scale: float, n: int) -> bool:
-    """Whether the rows tell another suspect from one, were it that."""
-    return (found.left - other.left) / scale > quantile(WRONG / n, other.k)
-
-
-def _within(smaller: Found, larger: Found) -> bool:
-    """Whether a suspect has all that another has, and more."""
-    if smaller is larger or smaller.k >= larger.k:
-        return False
-    a, b = smaller.suspect.columns, larger.suspect.columns
-    Q, _ = np.linalg.qr(b / np.maximum(np.linalg.norm(b, axis=0), 1e-300))
-    return bool(np.linalg.norm(a - Q @ (Q.T @ a)) < 1e-6 * np.linalg.norm(a))
-
-
 def _judged(
     calibrated: Calibrated,
     rows: Rows,
@@ -232,16 +181,16 @@ def _judged(
     few: str,
 ) -> Check:
     p_value = float(special.chdtrc(at.dof, at.chi2)) if at.dof > 0 else None
-    likely = _likely(found, at)
+    likely = likely_changes(found, at)
     if any(f.suspect.kind != "row" for f in likely):
-        found = _refined(calibrated, rows, at, found, likely) if not gross else found
-        likely = _likely(found, at) or likely
+        found = best_refined(calibrated, rows, at, found, likely) if not gross else found
+        likely = likely_changes(found, at) or likely
     rms, noise, counts = _rms(calibrated, rows, at, gross)
     alike = {f.suspect.names for f in likely}
-    likely = _merged(calibrated, likely, noise)
+    likely = merged(calibrated, likely, noise)
     alike -= {f.suspect.names for f in likely}
     stated = {kind: limit for kind in LIMITED if (limit := getattr(limits, kind)) is not None}
-    elsewhere = _elsewhere(calibrated, likely[0]) if likely else None
+    elsewhere = effect_elsewhere(calibrated, likely[0]) if likely else None
     reasons, cautions = _reasons(at, p_value, likely, rms, noise, counts, stated, elsewhere, few)
     if gross:
         names = ", ".join(gross)
@@ -252,8 +201,9 @@ def _judged(
         what = missing or [kind for kind in stated if counts[kind] < LEAST]
         verdict, reasons = "not_evaluated", [f"a limit of {what[0]}, and fewer than {LEAST} rows to judge it by"]
     alone = len(likely) == 1 and likely[0].suspect.kind != "row"
+    explained = bool(likely) and explains(likely[0], at)
     advice = separating(calibrated, at, likely, WRONG / max(len(found), 1)) if len(likely) > 1 else None
-    return Check(
+    made = Check(
         verdict=verdict,
         reasons=(few,) if few else tuple(reasons),
         cautions=tuple(cautions),
@@ -266,10 +216,22 @@ def _judged(
         limits=stated,
         explanations=_explanations([f for f in found if f.suspect.names not in alike], likely, at),
         gross_rows=tuple(gross),
-        deploy=verdict == "pass" or (verdict == "fail" and alone and _explains(likely[0], at)),
+        deploy=verdict == "pass" or (verdict == "fail" and alone and explained),
         detectable=_detectable(calibrated, at, found),
         advice=advice,
     )
+    return made if explained or verdict != "fail" else _unless_misread(made, at)
+
+
+def _unless_misread(found: Check, at: Linear) -> Check:
+    """A check that failed, but by a usual mistake in how the table is read, such as its units: then it says nothing."""
+    solution = at.placed.solution
+    _, far = check_tables(solution.problem, solution.parameters, doubtful=True, placed=True)
+    named = tuple(str(one) for one in far if one.explanations)
+    if not named:
+        return found
+    nothing = replace(found, cautions=(), explanations=(), gross_rows=(), advice=None)
+    return replace(nothing, verdict="not_evaluated", reasons=named, deploy=False)
 
 
 def _detectable(calibrated: Calibrated, at: Linear, found: Sequence[Found]) -> dict[str, float | None]:
@@ -278,22 +240,6 @@ def _detectable(calibrated: Calibrated, at: Linear, found: Sequence[Found]) -> d
     least = np.sqrt(quantile(CERTAIN / max(len(found), 1), 1)) + special.ndtri(POWER)
     sizes = {name: least * sigma.get(name, np.nan) for name in zero_names(calibrated.robot)}
     return {name: float(size) if np.isfinite(size) else None for name, size in sizes.items()}
-
-
-def _explains(found: Found, rows: Linear) -> bool:
-    """Whether a suspect leaves no more than noise does, or at most `FACTOR` times that."""
-    dof = max(rows.dof - found.k, 1)
-    return found.left <= FACTOR * dof or float(special.chdtrc(dof, found.left)) > CERTAIN
-
-
-def _refined(calibrated: Calibrated, rows: Rows, at: Linear, found: list[Found], likely: list[Found]) -> list[Found]:
-    """The best suspects linearised where they lead to."""
-    ranked = sorted((f for f in found if f.suspect.kind != "row"), key=lambda f: f.left)[:MOST_REFINED]
-    chosen = {f.suspect.names for f in (*ranked, *likely[:MOST_REFINED]) if f.suspect.kind != "row"}
-    return [
-        refined(f, calibrated, rows, len(found), columns_of(f.suspect, calibrated)) if f.suspect.names in chosen else f
-        for f in found
-    ]
 
 
 def _rms(
@@ -318,49 +264,6 @@ def _rms(
             rms[family], noise[family] = (float(np.sqrt(np.sum(v[mine] ** 2) / n)) for v in (table.after, table.sigma))
             counts[family] = n
     return rms, noise, counts
-
-
-def _motion(calibrated: Calibrated, found: Found) -> Floats | None:
-    """How a change moves the tool at random configurations, shape (n, 2, 3), turn first; None of gross errors."""
-    names = found.suspect.names
-    if found.suspect.kind == "row":
-        return None
-    robot = calibrated.robot.with_values(calibrated.values)
-    of, base, tool = motions(robot, random_readings(robot, 200, np.random.default_rng(0)))
-    whole = {"frame": base, "tool": tool}.get(found.suspect.kind if len(names) == 1 and names[0] in GROUPS else "")
-    columns = np.stack([of[name] for name in names], axis=2) if whole is None else whole
-    out: Floats = (columns @ found.change).reshape(-1, 2, 3)
-    return out
-
-
-def _elsewhere(calibrated: Calibrated, found: Found) -> dict[str, float] | None:
-    """RMS error of the tool that a change makes at random configurations; None where it is none of the arm."""
-    motion = _motion(calibrated, found)
-    if motion is None or found.suspect.kind == "frame":
-        return None
-    return dict(zip(("orientation", "position"), _size(motion).tolist(), strict=True))
-
-
-def _size(motion: Floats) -> Floats:
-    """RMS turn and shift, shape (2,)."""
-    out: Floats = np.sqrt(np.mean(np.sum(motion**2, axis=2), axis=0))
-    return out
-
-
-def _merged(calibrated: Calibrated, likely: Sequence[Found], noise: dict[str, float]) -> list[Found]:
-    """Explanations by which the tool is the same everywhere but for less than the noise of one row, as one."""
-    least = np.array([noise.get("orientation", np.inf), noise.get("position", noise.get("distance", 0.0))])
-    kept: list[tuple[Found, Floats | None]] = []
-    for f in likely:
-        motion = _motion(calibrated, f)
-        for i, (other, theirs) in enumerate(kept):
-            if motion is not None and theirs is not None and np.all(_size(motion - theirs) < least):
-                same = tuple(dict.fromkeys((*other.suspect.same, *f.suspect.names, *f.suspect.same)))
-                kept[i] = replace(other, suspect=replace(other.suspect, same=same)), theirs
-                break
-        else:
-            kept.append((f, motion))
-    return [f for f, _ in kept]
 
 
 def _reasons(
@@ -415,13 +318,13 @@ def _explanations(found: Sequence[Found], likely: Sequence[Found], at: Linear) -
         return ()
     names = {f.suspect.names for f in likely}
     others = sorted((f for f in found if f.suspect.names not in names), key=lambda f: f.left)
-    others = [f for f in others if not any(_within(g, f) for g in likely)][:ALSO_SHOWN]
+    others = [f for f in others if not any(within(g, f) for g in likely)][:ALSO_SHOWN]
     scale = max(1.0, likely[0].left / max(at.dof - likely[0].k, 1))
     shown = [*likely, *others]
 
     def explanation(f: Found) -> Explanation:
-        apart = tuple(g.suspect.names for g in shown if g is not f and _excludes(f, g, scale, len(found)))
-        rivals = tuple(g.suspect.names for g in likely if g is not f and not _excludes(f, g, scale, len(found)))
+        apart = tuple(g.suspect.names for g in shown if g is not f and excludes(f, g, scale, len(found)))
+        rivals = tuple(g.suspect.names for g in likely if g is not f and not excludes(f, g, scale, len(found)))
         sized = f.suspect.kind != "row"
         return Explanation(
             parameters=f.suspect.names,

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.analysis.seen import Seen
 from fg_calib.graph.factors import eliminate, prior_rows, unknown_prior_rows
 from fg_calib.graph.information import row_triangles
 from fg_calib.graph.knowledge import SIZE, STAYING, Knowledge, Name, coordinates_of
@@ -31,12 +32,40 @@ def knowledge_of(solution: Solution) -> Knowledge | None:
         return None
     if problem.whole is not None:  # all parameters, those left out among them
         problem = replace(problem, variables=problem.whole.variables)
-    v, x = problem.variables, solution.parameters
+    as_drawn, x = at_nominal(problem, solution.before)
+    nominal = _known_at(as_drawn, x, with_loss=False)
+    views = Seen.of(problem).views
+    nominal = replace(nominal, right=np.zeros(nominal.n), views=views)
+    return replace(_known_at(problem, solution.parameters, with_loss=True), views=views, nominal=nominal)
+
+
+def at_nominal(problem: Problem, before: Floats) -> tuple[Problem, Floats]:
+    """A problem and the parameter vector at which one asks what its rows, and those before, determine.
+
+    Args:
+        problem: It.
+        before: The parameter vector with frame, base and tool fitted, the arm at nominal; of an update where that
+            started, which is as calibrated.
+    """
+    if problem.knowledge is None or problem.knowledge.nominal is None:
+        return problem, before
+    known, v, x = problem.knowledge.nominal, problem.variables, before.copy()
+    x[v.robot_span] = known.robot.nominal
+    for name in known.unknowns:
+        place = _place(problem, name)
+        if place is not None:
+            x[place] = known.place(name)
+    return replace(problem, knowledge=known), x
+
+
+def _known_at(problem: Problem, x: Floats, *, with_loss: bool) -> Knowledge:
+    """What the rows of a problem, and those before, say, linearised at a parameter vector."""
+    v = problem.variables
     robot = v.robot.with_values(x[v.robot_span])
     places = {name: place for name in _staying(problem) if (place := _place(problem, name)) is not None}
     before = problem.knowledge
     unseen = [] if before is None else [name for name in before.unknowns if name not in places]
-    A, b = _rows(problem, x, unseen)
+    A, b = _rows(problem, x, unseen, with_loss=with_loss)
     columns = [place - v.nuisance_span.start + v.n_columns for place in places.values()]
     wide = np.arange(A.shape[1])
     kept = np.concatenate([wide[: v.n_robot_columns], *columns, wide[v.n_columns + v.n_nuisance :]])
@@ -56,11 +85,11 @@ def _place(problem: Problem, name: Name) -> NDArray[np.int64] | None:
     return coordinates_of(problem.variables, problem.data.unknowns, name)
 
 
-def _rows(problem: Problem, parameters: Floats, unseen: list[Name]) -> tuple[Floats, Floats]:
+def _rows(problem: Problem, parameters: Floats, unseen: list[Name], *, with_loss: bool) -> tuple[Floats, Floats]:
     """All rows but the arm's tolerances, by the problem's columns, then by those of what was known and is not seen."""
     v, extra = problem.variables, SIZE * len(unseen)
     r, J = unknown_prior_rows(v, parameters)
-    blocks = [np.column_stack([J, r]), *row_triangles(problem, parameters, with_loss=True)]
+    blocks = [np.column_stack([J, r]), *row_triangles(problem, parameters, with_loss=with_loss)]
     wide = [np.column_stack([B[:, :-1], np.zeros((len(B), extra)), B[:, -1]]) for B in blocks]
     known = problem.knowledge
     if known is not None:

@@ -250,7 +250,7 @@ class Linear:
 def linear(calibrated: Calibrated, at: Placed) -> Linear:
     """The rows and what is known as a linear system."""
     problem = at.problem
-    J, joints, r = _linearised(problem)
+    J, joints, r = linearised(problem)
     known, free = _fitted(calibrated, at)
     stated, prior_of_free = _stated(at, free)
     m, k = len(r), known.shape[1]
@@ -274,7 +274,7 @@ def linear(calibrated: Calibrated, at: Placed) -> Linear:
     )
 
 
-def _linearised(problem: Problem) -> tuple[Floats, Floats, Floats]:
+def linearised(problem: Problem) -> tuple[Floats, Floats, Floats]:
     """Whitened rows: derivatives in all columns, in the joints' zeros, and residuals."""
     at = problem.variables.at(problem.start)
     n = at.n_columns + at.n_nuisance

@@ -51,7 +51,7 @@ def explain(problem: Problem, observability: Observability, parameters: Floats) 
     if not lost:
         return ()
     tables = problem.data.tables
-    motion = _Motion(problem, parameters, Seen.by(tables))
+    motion = _Motion(problem, parameters, Seen.of(problem))
     directions = np.array([[relation.get(name, 0.0) for name in observability.names] for relation in lost]).T
     absorbed, anywhere = Absorbed(problem, parameters, directions), elsewhere(problem, parameters)
     # What kinds of one's own would show elsewhere is not known.

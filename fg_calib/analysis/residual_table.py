@@ -57,6 +57,7 @@ class HeldOut:
         few: Whether they are few for the frame, base or tool that were fitted to them.
         far: Names of the few that are far off beside the others, the farthest first; empty if none is.
         rest: With the calibrated arm, without those.
+        by: What arm it was if not the calibrated one: errors of that one say no more than that it was good enough.
     """
 
     n: int
@@ -66,6 +67,7 @@ class HeldOut:
     few: bool = False
     far: tuple[str, ...] = ()
     rest: float = np.nan
+    by: str = ""
 
 
 _ROWS_PER_UNKNOWN = 10
@@ -82,7 +84,7 @@ def pooled(parts: Sequence[HeldOut]) -> HeldOut:
 
     far = tuple(dict.fromkeys(name for part in parts for name in part.far))
     few = any(part.few for part in parts)
-    return HeldOut(int(n.sum()), rms("before"), rms("after"), rms("noise"), few, far, rms("rest", near))
+    return HeldOut(int(n.sum()), rms("before"), rms("after"), rms("noise"), few, far, rms("rest", near), parts[0].by)
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from fg_calib.graph.problem import Problem
 from fg_calib.measurements.series import Table
 from fg_calib.options import PAIR_MODELS, FrameKnowledge, Model
 
@@ -34,6 +35,13 @@ class Seen:
             if t.model is not None
         ]
         return cls(tuple(dict.fromkeys(views)), any(t.own for t in tables))  # type: ignore[arg-type]
+
+    @classmethod
+    def of(cls, problem: Problem) -> Seen:
+        """By the tables of a problem, and those that what is known before is of."""
+        found = cls.by(problem.data.tables)
+        before = () if problem.knowledge is None else problem.knowledge.views
+        return replace(found, views=tuple(dict.fromkeys((*found.views, *before))))
 
     def any_of(self, models: Sequence[Model]) -> bool:
         """Whether a model is among these, or might be."""

@@ -1,9 +1,10 @@
 """Which configurations to measure beside those there are, so that explanations that these leave open are told apart.
 
-Of random configurations within the joint limits those are taken, one after the other, that make the least difference of
-two explanations largest: with a_i d_i what explanation i makes of all rows, old and new, and what is known and free
-fitted, `D_ij` is what is left of it when j has been fitted. If i is true, chi-square with j is above that with i by
-about `D_ij + 1 +- 2 sqrt(D_ij)`; so D must reach `(sqrt(threshold) + MARGIN)^2`.
+Of random configurations that could be measured like the rows there are (see `candidates`) those are taken, one after
+the other, that make the least difference of two explanations largest: with a_i d_i what explanation i makes of all
+rows, old and new, and what is known and free fitted, `D_ij` is what is left of it when j has been fitted. If i is true,
+chi-square with j is above that with i by about `D_ij + 1 +- 2 sqrt(D_ij)`; so D must reach
+`(sqrt(threshold) + MARGIN)^2`.
 """
 
 from __future__ import annotations
@@ -14,22 +15,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.analysis.candidates import candidates
+from fg_calib.analysis.likely_changes import motion
 from fg_calib.analysis.new_rows import Calibrated, Linear
 from fg_calib.analysis.suspects import Found, columns_of, quantile
 from fg_calib.arrays import FrozenArrays
-from fg_calib.graph.factors import build_variables
-from fg_calib.options import POSE_MODELS
-from fg_calib.robot.inverse import random_readings
-from fg_calib.robot.kinematics import forward, precompute_trig
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-N_CANDIDATES = 200
-"""Random configurations to choose from."""
-
 MOST_ADVISED = 12
 """Configurations that are advised at most."""
+
+LEAST = 0.1
+"""Sigma that the first configuration must tell explanations apart by; else more of them do not either."""
 
 MARGIN = 2.5
 """Sigma by which the difference is to exceed what tells apart: so a difference is missed less often than 1 in 100."""
@@ -57,7 +56,7 @@ class Advice(FrozenArrays):
 
 
 def separating(calibrated: Calibrated, rows: Linear, likely: Sequence[Found], probability: float) -> Advice | None:
-    """What to measure to tell the likely explanations apart; None where no configuration of the arm helps.
+    """What to measure to tell the likely explanations apart; None where nothing measured like them helps.
 
     Args:
         calibrated: The arm.
@@ -66,11 +65,10 @@ def separating(calibrated: Calibrated, rows: Linear, likely: Sequence[Found], pr
         probability: Of calling the true one told apart, one of them.
     """
     known = [f for f in likely if f.suspect.kind != "row"]
-    table = _table_to_add_to(rows)
-    if len(known) < 2 or table is None:
+    new = candidates(rows) if len(known) > 1 else None
+    if new is None:
         return None
-    q = random_readings(calibrated.robot, N_CANDIDATES, np.random.default_rng(0))
-    new = _Rows(calibrated, rows, q, table)
+    fitted = new.columns @ rows.directions
     needed = float(np.sqrt(quantile(probability, max(f.k for f in known)))) + MARGIN
     X = rows.system
     N = X.T @ X
@@ -78,22 +76,35 @@ def separating(calibrated: Calibrated, rows: Linear, likely: Sequence[Found], pr
     G = [rows.stacked(c) for c in own]
     cross = [X.T @ g for g in G]
     square = [[a.T @ b for b in G] for a in G]
-    of_new = [new.columns(f) for f in known]
+    of_new = [_columns(calibrated, rows, f, new.columns, new.joints) for f in known]
     chosen: list[int] = []
     sigma, between = [], (known[0].suspect.names, known[1].suspect.names)
     while len(chosen) < MOST_ADVISED:
         best, best_k, pair = -1.0, -1, (0, 1)
-        for k in range(N_CANDIDATES):
+        for k in range(len(fitted)):
             at = [*chosen, k]
-            D, worst = _least(N, cross, square, new.fitted[at], [c[at] for c in of_new], known)
+            D, worst = _least(N, cross, square, fitted[at], [c[at] for c in of_new], known)
             if best < D:
                 best, best_k, pair = D, k, worst
         chosen.append(best_k)
         sigma.append(float(np.sqrt(max(best, 0.0))))
         between = known[pair[0]].suspect.names, known[pair[1]].suspect.names
+        if sigma[0] < LEAST:
+            return None
         if sigma[-1] >= needed:
             break
-    return Advice(q[chosen], between, new.apart(known, between)[chosen], np.array(sigma), needed, sigma[-1] >= needed)
+    q = new.readings[chosen]
+    apart = _apart(calibrated, known, between, q)
+    return Advice(q, between, apart, np.array(sigma), needed, sigma[-1] >= needed)
+
+
+def _apart(
+    calibrated: Calibrated, known: Sequence[Found], between: Sequence[tuple[str, ...]], readings: Floats
+) -> Floats:
+    """How far the tool is apart by two explanations, shape (n,), [m]."""
+    one, other = (motion(calibrated, next(f for f in known if f.suspect.names == names), readings) for names in between)
+    out: Floats = np.linalg.norm((one - other)[:, 1], axis=1)
+    return out
 
 
 def _least(
@@ -125,61 +136,17 @@ def _least(
     return best, pair
 
 
-def _table_to_add_to(rows: Linear) -> int | None:
-    """The first table of poses; None without any."""
-    for number, table in enumerate(rows.placed.problem.data.tables):
-        if table.model in POSE_MODELS:
-            return number
-    return None
-
-
-class _Rows:
-    """Candidate configurations as rows that would be added to a table.
+def _columns(calibrated: Calibrated, rows: Linear, found: Found, columns: Floats, joints: Floats) -> Floats:
+    """Derivatives of candidates in a suspect, shape (n, h, k).
 
     Args:
         calibrated: The arm.
         rows: The rows there are.
-        q: The candidates, shape (n, n_joints).
-        table: Number of the table.
-
-    Attributes:
-        fitted: Their derivatives in what is fitted, shape (n, 6, n_fitted).
+        found: The suspect.
+        columns: Derivatives in their columns, shape (n, h, n_columns + n_nuisance).
+        joints: Derivatives in the joints' zeros, shape (n, h, n_joints).
     """
-
-    def __init__(self, calibrated: Calibrated, rows: Linear, q: Floats, table: int) -> None:
-        self._calibrated, self._rows = calibrated, rows
-        problem = rows.placed.problem
-        v, t = problem.variables, problem.data.tables[table]
-        m = t.measurements
-        turned, placed = POSE_MODELS[t.model]  # type: ignore[index]
-        sigma = (m.sigma_orientation if turned else None, m.sigma_position if placed else None)
-        weight = [0.0 if s is None else 1.0 / float(np.sqrt(np.nanmean(np.asarray(s) ** 2))) for s in sigma]
-        self._robot, self._trig = v.robot, precompute_trig(v.robot, q)
-        at = forward(v.chains[table].at(problem.start).with_joint_columns(), self._trig)
-        weighted = at.jacobian * np.repeat(weight, 3)[:, None]
-        self._columns = np.zeros((len(q), 6, v.n_columns + v.n_nuisance))
-        self._columns[:, :, : v.n_columns] = weighted[:, :, : v.n_columns]
-        self._joints = weighted[:, :, v.n_columns :]
-        self.fitted = self._columns @ rows.directions
-
-    def columns(self, found: Found) -> Floats:
-        """Derivatives of the candidates in a suspect, shape (n, 6, k)."""
-        n, _, wide = self._columns.shape
-        flat = replace(self._rows, columns=self._columns.reshape(-1, wide), joints=self._joints.reshape(6 * n, -1))
-        out: Floats = columns_of(found.suspect, self._calibrated)(flat).reshape(n, 6, -1)
-        return out
-
-    def apart(self, known: Sequence[Found], between: Sequence[tuple[str, ...]]) -> Floats:
-        """How far the tool is apart by two explanations, shape (n,), [m]."""
-        v = build_variables(self._robot, [False], False)
-        x = np.append(self._robot.nominal, np.zeros(6))
-        J = forward(v.chains[0].at(x).with_joint_columns(), self._trig).jacobian
-        n = v.n_columns
-        flat = replace(self._rows, columns=J[:, :, :n].reshape(-1, n), joints=J[:, :, n:].reshape(6 * len(J), -1))
-        total = np.zeros((len(J), 6))
-        for sign, names in zip((1.0, -1.0), between, strict=True):
-            found = next(f for f in known if f.suspect.names == names)
-            columns = columns_of(found.suspect, self._calibrated)(flat).reshape(len(J), 6, -1)
-            total += sign * columns @ found.change
-        out: Floats = np.linalg.norm(total[:, 3:], axis=1)
-        return out
+    n, h, wide = columns.shape
+    flat = replace(rows, columns=columns.reshape(-1, wide), joints=joints.reshape(n * h, -1))
+    out: Floats = columns_of(found.suspect, calibrated)(flat).reshape(n, h, -1)
+    return out

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from fg_calib.analysis.acceptance import Acceptance, accept
+from fg_calib.analysis.acceptance import Acceptance, Kinds, accept
 from fg_calib.analysis.accuracy import ExpectedError, expected_error, without_rigid_motion
 from fg_calib.analysis.changes import Change
 from fg_calib.analysis.chi_square import chi_square
@@ -21,6 +21,7 @@ from fg_calib.analysis.folds import Folds
 from fg_calib.analysis.goodness import Goodness, judge_fit
 from fg_calib.analysis.identifiability import Identifiability, identifiability_of
 from fg_calib.analysis.joint_values import JointValues, joint_values
+from fg_calib.analysis.learned import at_nominal
 from fg_calib.analysis.mistakes import SetupCheck
 from fg_calib.analysis.outliers import judged_without_gross_errors
 from fg_calib.analysis.residual_table import ResidualTable, residual_table
@@ -174,10 +175,19 @@ class Uncertainty(FrozenArrays):
             folds: What cross-validation found.
             solution: What was assessed.
         """
+        return replace(self.with_held_out(folds.by_table, solution), folds=folds)
+
+    def with_held_out(self, others: Kinds, solution: Solution) -> Uncertainty:
+        """The same with limits that no test rows speak of judged by other measurements that were predicted.
+
+        Args:
+            others: They, by table and kind of noise.
+            solution: What was assessed.
+        """
         tested = self.residuals.held_out(solution.problem.data.labels)
         kinds = {kind for _, kind in tested}
-        held_out = tested | {key: held for key, held in folds.by_table.items() if key[1] not in kinds}
-        return replace(self, folds=folds, acceptance=accept(solution.problem.options.accept, held_out, self.findings))
+        held_out = tested | {key: held for key, held in others.items() if key[1] not in kinds}
+        return replace(self, acceptance=accept(solution.problem.options.accept, held_out, self.findings))
 
     def __repr__(self) -> str:
         known = sum(p.sigma is not None for p in self.parameters if p.identifiability != "fixed")
@@ -303,7 +313,7 @@ def _assess(solution: Solution) -> Uncertainty:
     variables = problem.variables
     spread = spread_of(solution)
     whole = with_unsure_tolerances(solution, with_left_out(solution, spread))
-    identifiability = identifiability_of(problem.whole or problem, solution.before, "practical")
+    identifiability = identifiability_of(*at_nominal(problem.whole or problem, solution.before), "practical")
     covariance = whole.named()
     frames = _frame_estimates(solution, whole)
     chi2, table = chi_square(solution, spread), residual_table(solution)

@@ -16,8 +16,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.analysis.acceptance import Kinds
 from fg_calib.analysis.learned import with_tolerances
 from fg_calib.analysis.new_rows import Calibrated, Placed, Rows, placed
+from fg_calib.analysis.residual_table import residual_table
 from fg_calib.analysis.suspects import motions, zero_names
 from fg_calib.errors import InputError, ProblemError
 from fg_calib.graph.build import kept_of
@@ -61,6 +63,21 @@ def updated(
         robot = replace(robot, parameters=tuple(replace(p, tolerance=None) for p in robot.parameters))
     at = placed(replace(calibrated, knowledge=known), rows, calibrated.values)
     return solve(_problem(calibrated, robot, known, rows, at))
+
+
+def predicted_before(calibrated: Calibrated, rows: Rows) -> Kinds:
+    """How well the arm as it was calibrated before predicts new rows, by table and kind: it has not seen them.
+
+    Args:
+        calibrated: The arm.
+        rows: The rows; test rows count as the others do.
+    """
+    rows = replace(rows, tables=tuple(table.all_train() for table in rows.tables))
+    solution = placed(calibrated, rows, calibrated.values).solution
+    table = residual_table(solution)
+    tested = replace(table, test=np.ones_like(table.test), n_fitted=0, seen=np.zeros_like(table.seen))
+    found = tested.held_out(solution.problem.data.labels)
+    return {key: replace(held, by="the arm before this update") for key, held in found.items()}
 
 
 def _problem(calibrated: Calibrated, robot: Robot, known: Knowledge, rows: Rows, at: Placed) -> Problem:
@@ -122,17 +139,31 @@ def _with_change(
     if calibrated.options.has_priors:
         tolerances = {p.name: p.tolerance for p in robot.parameters if p.estimated and p.tolerance is not None}
         known = with_tolerances(known, robot.nominal, tolerances)
-    E = known.variables.tangent_derivative(np.append(calibrated.values, np.zeros(6)))
-    by_name = dict(zip(known.variables.names, E.T, strict=True))
     sigma = _growth_of(robot, known, growth)
-    directions = [by_name[name] * size for name, size in sigma.items()]
-    free = [False] * len(directions)
-    for direction in _changes(calibrated, known, changed, by_name):
-        directions.append(direction)
-        free.append(True)
-    wide = np.zeros((known.rows.shape[1], len(directions)))
-    wide[: len(E)] = np.array(directions).T
-    return known.grown(wide, np.array(free))
+    named = _named_columns(known)
+    directions = [named[name] * size for name, size in sigma.items()]
+    free = _changes(known, changed)
+    every = _wide(known, [*directions, *free])
+    grown = known.grown(every, np.arange(len(directions) + len(free)) >= len(directions))
+    if known.nominal is None:
+        return grown
+    free = _changes(known.nominal, changed)
+    nominal = known.nominal.grown(_wide(known.nominal, free), np.ones(len(free), dtype=np.bool_))
+    return replace(grown, nominal=nominal)
+
+
+def _named_columns(known: Knowledge) -> dict[str, Floats]:
+    """A change of each parameter in the arm's columns."""
+    E = known.variables.tangent_derivative(np.append(known.robot.nominal, np.zeros(6)))
+    return dict(zip(known.variables.names, E.T, strict=True))
+
+
+def _wide(known: Knowledge, directions: Sequence[Floats]) -> Floats:
+    """Directions of the arm as columns by all that is known, shape (n_columns + len(at), n)."""
+    n = known.variables.n_columns
+    out = np.zeros((known.rows.shape[1], len(directions)))
+    out[:n] = np.array(directions).reshape(len(directions), n).T
+    return out
 
 
 def _growth_of(robot: Robot, known: Knowledge, growth: Mapping[str, float]) -> dict[str, float]:
@@ -145,11 +176,9 @@ def _growth_of(robot: Robot, known: Knowledge, growth: Mapping[str, float]) -> d
     return {name: size for name, size in found.items() if size > 0.0}
 
 
-def _changes(
-    calibrated: Calibrated, known: Knowledge, changed: Sequence[str], by_name: Mapping[str, Floats]
-) -> list[Floats]:
+def _changes(known: Knowledge, changed: Sequence[str]) -> list[Floats]:
     """Directions of what has changed, in the arm's columns."""
-    robot = calibrated.robot.with_values(calibrated.values)
+    by_name, robot = _named_columns(known), known.robot
     zeros = [name for name in zero_names(robot) if name not in names_of(robot.parameters)]
     tool = [name for name in by_name if name.startswith("tool.")]
     possible = [*by_name, *zeros, *(["tool"] if tool else [])]
@@ -161,11 +190,11 @@ def _changes(
         elif name in by_name:
             found.append(by_name[name])
         else:
-            found.append(_zero(robot, known, name, by_name))
+            found.append(_zero(robot, name, by_name))
     return found
 
 
-def _zero(robot: Robot, known: Knowledge, name: str, by_name: Mapping[str, Floats]) -> Floats:
+def _zero(robot: Robot, name: str, by_name: Mapping[str, Floats]) -> Floats:
     """A joint's zero as a combination of what was estimated of its origin.
 
     Raises:
@@ -173,7 +202,7 @@ def _zero(robot: Robot, known: Knowledge, name: str, by_name: Mapping[str, Float
     """
     of, _, _ = motions(robot, random_readings(robot, 20, np.random.default_rng(0)))
     owner = f"{name.removesuffix('.zero')}."
-    own = [n for n in known.variables.names if n.startswith(owner)]
+    own = [n for n in by_name if n.startswith(owner)]
     A, b = np.array([of[n].ravel() for n in own]).T, of[name].ravel()
     v = np.linalg.lstsq(A, b, rcond=None)[0] if own else np.zeros(0)
     if not own or np.linalg.norm(A @ v - b) > 1e-6 * np.linalg.norm(b):

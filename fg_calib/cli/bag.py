@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from fg_calib.cli.output import Json, say, show_json, show_report
+from fg_calib.cli.output import BaseLink, Json, TipLink, say, show_json, show_report
 
 _Bag = Annotated[Path, typer.Argument(metavar="BAG", help="A ROS bag: .bag, .db3, .mcap, or a folder of ROS 2.")]
 _Robot = Annotated[Path, typer.Option("--robot", metavar="ROBOT", help="The robot: robot.yaml or a URDF.")]
@@ -27,8 +27,6 @@ _Names = Annotated[
 ]
 _Parent = Annotated[str | None, typer.Option("--parent", metavar="FRAME", help="Frame in which poses are measured.")]
 _Child = Annotated[str | None, typer.Option("--child", metavar="FRAME", help="Frame on the tool that is measured.")]
-_BaseLink = Annotated[str | None, typer.Option("--base-link", metavar="LINK", help="Where the chain of a URDF starts.")]
-_TipLink = Annotated[str | None, typer.Option("--tip-link", metavar="LINK", help="Where the chain of a URDF ends.")]
 
 
 def bag(
@@ -43,8 +41,8 @@ def bag(
     names: _Names = "",
     parent: _Parent = None,
     child: _Child = None,
-    base_link: _BaseLink = None,
-    tip_link: _TipLink = None,
+    base_link: BaseLink = None,
+    tip_link: TipLink = None,
     as_json: Json = False,
 ) -> None:
     """Make a table of poses from a ROS bag: joint readings and poses while the arm stands still, with their sigmas."""

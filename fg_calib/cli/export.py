@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from fg_calib.cli.output import Json, end, say, show_json
+from fg_calib.cli.output import BaseLink, Json, TipLink, end, say, show_json
 from fg_calib.cli.progress import hide_progress
 from fg_calib.errors import escaped
 
@@ -46,8 +46,6 @@ _UrBase = Annotated[
     typer.Option("--ur-base", help="Of ur: which frame of ur_description the arm's base is."),
 ]
 _UrHash = Annotated[str | None, typer.Option("--ur-hash", metavar="HASH", help="Of ur: the controller's own hash.")]
-_BaseLink = Annotated[str | None, typer.Option("--base-link", metavar="LINK", help="Where the chain of a URDF starts.")]
-_TipLink = Annotated[str | None, typer.Option("--tip-link", metavar="LINK", help="Where the chain of a URDF ends.")]
 
 
 def export(
@@ -61,8 +59,8 @@ def export(
     calibration_elements: _Elements = False,
     ur_base: _UrBase = None,
     ur_hash: _UrHash = None,
-    base_link: _BaseLink = None,
-    tip_link: _TipLink = None,
+    base_link: BaseLink = None,
+    tip_link: TipLink = None,
     as_json: Json = False,
 ) -> None:
     """Write the calibrated arm as others read it: URDF, ROS, Tesseract, tables, joint zeros."""

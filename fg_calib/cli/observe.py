@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from fg_calib.cli.output import Json, say, show_json, show_report
+from fg_calib.cli.output import BaseLink, Json, TipLink, say, show_json, show_report
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, AngleUnit, FrameKnowledge, LengthUnit, Model, check_number
 
 if TYPE_CHECKING:  # imported where it is used: `--help` need not wait for it
@@ -40,8 +40,6 @@ _Frame = Annotated[FrameKnowledge, typer.Option("--frame", help="Whether world_T
 _Pairing = Annotated[
     Literal["star", "chain", "all"], typer.Option("--pairing", help="Pairs of TABLE's configurations.")
 ]
-_BaseLink = Annotated[str | None, typer.Option("--base-link", metavar="LINK", help="Where the chain of a URDF starts.")]
-_TipLink = Annotated[str | None, typer.Option("--tip-link", metavar="LINK", help="Where the chain of a URDF ends.")]
 _Prefer = Annotated[
     str, typer.Option("--prefer", metavar="NAMES", help="Parameters to keep, first choice first: theta2,d5.")
 ]
@@ -63,8 +61,8 @@ def observe(
     out: _Out = None,
     frame: _Frame = "known",
     pairing: _Pairing = "star",
-    base_link: _BaseLink = None,
-    tip_link: _TipLink = None,
+    base_link: BaseLink = None,
+    tip_link: TipLink = None,
     prefer: _Prefer = "",
     length: _Length = "m",
     angle: _Angle = "rad",

@@ -1,4 +1,4 @@
-"""What the commands share: the option `--json`, and how a report or document is shown and a command ends."""
+"""What the commands share: options of several of them, and how a report or document is shown and a command ends."""
 
 from __future__ import annotations
 
@@ -18,7 +18,12 @@ from fg_calib.errors import printable
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
+    from fg_calib.calibration import Calibration
+
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout, and nothing else there.")]
+
+BaseLink = Annotated[str | None, typer.Option("--base-link", metavar="LINK", help="Where the chain of a URDF starts.")]
+TipLink = Annotated[str | None, typer.Option("--tip-link", metavar="LINK", help="Where the chain of a URDF ends.")]
 
 
 def say(text: str) -> None:
@@ -43,6 +48,16 @@ def show_report(report: RenderableType) -> None:
     given = Console().is_terminal or "COLUMNS" in os.environ
     width = width_for(report, Console().width if given else WIDTH)
     Console(highlight=False, width=width).print(report)
+
+
+def show_calibration(found: Calibration, as_json: bool) -> None:
+    """Print a calibration that was just made: its report, or its result as JSON."""
+    if as_json:
+        show_json(found.result.document())
+    else:
+        from fg_calib.report.text import build_report
+
+        show_report(build_report(found.solution, found.uncertainty))
 
 
 def end(findings: Sequence[str], what: str = "not to be trusted", not_accepted: Sequence[str] = ()) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fg_calib.cli.check import Like, NewTable, Pairs, Result
-from fg_calib.cli.output import Json, end, show_json, show_report
+from fg_calib.cli.output import Json, end, show_calibration
 
 if TYPE_CHECKING:
     from fg_calib.robot.model import Robot
@@ -61,12 +61,7 @@ def update(
         like=like,
     )
     try:
-        if as_json:
-            show_json(found.result.document())
-        else:
-            from fg_calib.report.text import build_report
-
-            show_report(build_report(found.solution, found.uncertainty))
+        show_calibration(found, as_json)
     finally:  # also where nobody takes the report
         found.save(out)
     end(found.findings, not_accepted=found.not_accepted)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fg_calib.errors import InputError
 from fg_calib.exports.links import Links, inverse, links_of, rigid, transform
-from fg_calib.files.urdf import urdf_text
+from fg_calib.files.urdf import ROUNDING, urdf_text
 from fg_calib.robot.model import FRAME_KINDS, Joint, Robot, frame_values, roll_pitch_yaw
 
 Floats = NDArray[np.float64]
@@ -138,7 +138,7 @@ def zeros_of_origins(nominal: Robot, calibrated: Robot) -> tuple[dict[str, float
     for i, joint in enumerate(calibrated.joints):
         drawn, found = _origin(nominal, joint), _origin(calibrated, joint)
         zeros[joint.name], origins[joint.name] = 0.0, found
-        if drawn == found:
+        if all(abs(drawn[kind] - found[kind]) <= ROUNDING for kind in drawn):
             continue
         before, after = frame_matrix(drawn), frame_matrix(found)
         axis = _axis(calibrated, i)

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fg_calib.files.disk import replacing
+from fg_calib.errors import InputError
+from fg_calib.files.disk import replacing, require_own
 from fg_calib.libraries import require_polars
 
 
@@ -20,6 +21,23 @@ class Words:
 
     words: Sequence[str]
     codes: NDArray[np.integer[Any]]
+
+
+def require_own_csv(path: Path, beginning: bytes) -> None:
+    """Check that a table can be written: a CSV that is not there yet, or was written as one of that kind.
+
+    Args:
+        path: Where.
+        beginning: How tables of that kind begin.
+
+    Raises:
+        InputError: It cannot.
+    """
+    if path.suffix.lower() != ".csv":
+        raise InputError(str(path), f"ending {path.suffix!r}", ".csv")
+    if not path.parent.is_dir():
+        raise InputError(str(path), f"there is no folder {path.parent}")
+    require_own(path.parent, {path.name: beginning})
 
 
 def write_csv(path: Path | str, columns: Mapping[str, ArrayLike | Words | None]) -> None:

@@ -12,7 +12,7 @@ from pydantic import Field, ValidationError
 from fg_calib.arguments import checked
 from fg_calib.errors import InputError
 from fg_calib.files.disk import exists, is_folder, read_bytes, read_text
-from fg_calib.files.result import Figure, Result, Section, Sigma, Whole, read_result
+from fg_calib.files.result import Date, Figure, Result, Section, Sigma, Whole, read_result
 from fg_calib.files.schema import first_misfit
 
 HISTORY = "history.json"
@@ -50,10 +50,11 @@ class Run(Section):
         moved: What changed most; None of the first run.
         parameters: What was estimated, by name.
         inputs: SHA-256 of the files of its rows, by path.
+        rows: Fingerprints of its rows.
     """
 
     sha256: str
-    date: str
+    date: Date
     n_residuals: Whole
     chi2: Figure
     dof: int
@@ -62,6 +63,7 @@ class Run(Section):
     moved: Moved | None = None
     parameters: dict[str, Known]
     inputs: dict[str, str] = Field(default_factory=dict)
+    rows: tuple[str, ...] = ()
 
 
 class History(Section):
@@ -100,6 +102,7 @@ def run_of(result: Result, digest: str, before: Run | None = None) -> Run:
         moved=None if before is None else _moved(parameters, before),
         parameters=parameters,
         inputs=result.inputs,
+        rows=() if result.carried is None else result.carried.rows,
     )
 
 

@@ -10,6 +10,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Iterator
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -22,6 +23,7 @@ from fg_calib.arrays import NORM_TOLERANCE, brief
 from fg_calib.errors import InputError
 from fg_calib.files.disk import exists, is_folder, read_text
 from fg_calib.files.schema import first_misfit
+from fg_calib.options import FrameKnowledge, Model
 
 MOST_WHOLE = 10**15
 """The most of anything that a result counts: far more than is ever counted, and exact as a float."""
@@ -447,10 +449,19 @@ class Observability(Section):
     with_fixed_known: Observability | None = None
 
 
+class AtNominal(Section):
+    """What rows say of the arm as drawn: its parameters, base and tool as fitted, and the places of what stays."""
+
+    parameters: Annotated[tuple[float, ...], BeforeValidator(_listed)]
+    at: Annotated[tuple[float, ...], BeforeValidator(_listed)] = ()
+    rows: Annotated[tuple[Annotated[tuple[float, ...], BeforeValidator(_listed)], ...], BeforeValidator(_listed)]
+
+
 class Knowledge(Section):
     """What rows say of the arm and of what stays with it, linearised at the estimate (see `graph.knowledge`).
 
     `rows` by the columns of `columns`, those of the arm as in `posterior`, then three of each of `unknowns`.
+    `nominal` are the same rows at the arm as drawn, by which parameters are classed.
     """
 
     columns: tuple[str, ...]
@@ -458,25 +469,40 @@ class Knowledge(Section):
     at: Annotated[tuple[float, ...], BeforeValidator(_listed)] = ()
     rows: Annotated[tuple[Annotated[tuple[float, ...], BeforeValidator(_listed)], ...], BeforeValidator(_listed)]
     right: Annotated[tuple[float, ...], BeforeValidator(_listed)]
+    views: tuple[tuple[Model, FrameKnowledge], ...] = ()
+    nominal: AtNominal | None = None
 
 
 class Carried(Section):
     """What the next calibration of this arm takes over.
 
-    `job` is the job without robot, by which tables like its own are read; `noise` the factors on stated sigmas by table
+    `job` is the job without robot, by which tables like its own are read; `rows` are fingerprints of the fitted rows,
+    which are not to be counted twice; `noise` the factors on stated sigmas by table
     and kind, where noise was estimated.
     """
 
     job: dict[str, Any] = {}
+    rows: tuple[str, ...] = ()
     noise: dict[str, dict[str, float]] = {}
     knowledge: Knowledge | None = None
+
+
+def _dated(date: str) -> str:
+    """Refuse what is no date; the empty one is unknown."""
+    if date:
+        datetime.fromisoformat(date)
+    return date
+
+
+Date = Annotated[str, AfterValidator(_dated)]
+"""A date as ISO 8601 has it."""
 
 
 class Previous(Section):
     """The result that an update came from."""
 
     sha256: str
-    date: str
+    date: Date
 
 
 class Result(Section):
@@ -535,7 +561,7 @@ class Result(Section):
     versions: dict[str, str] = {}
     files: dict[str, str] = {}
     inputs: dict[str, str]
-    date: str = ""
+    date: Date = ""
     previous: Previous | None = None
     carried: Carried | None = None
 

@@ -307,7 +307,7 @@ def _check_written(robot: Robot, mapping: Mapping[str, Any], place: str) -> None
     try:
         again = robot_from_mapping(mapping, place, Path())
     except InputError:
-        return  # a figure that no drawing has, of a fit that went astray: it is written, and its reader says so
+        return  # figures of a fit that went astray: a result is written whole, and readers refuse such a robot
     names = [p.name for p in robot.parameters]
     if [p.name for p in again.parameters] != names or again.elements != robot.elements:
         raise InputError(place, "the robot has elements or parameters of its own", expected)

@@ -9,9 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fg_calib.arguments import checked
-from fg_calib.errors import InputError
-from fg_calib.files.csv_writer import write_csv
-from fg_calib.files.disk import require_own
+from fg_calib.files.csv_writer import require_own_csv, write_csv
 from fg_calib.files.tables import joint_columns
 from fg_calib.measurements.standstill import Stops
 from fg_calib.robot.model import Robot
@@ -26,11 +24,7 @@ def require_replaceable(path: Path) -> None:
     Raises:
         InputError: It cannot.
     """
-    if path.suffix.lower() != ".csv":
-        raise InputError(str(path), f"ending {path.suffix!r}", ".csv")
-    if not path.parent.is_dir():
-        raise InputError(str(path), f"there is no folder {path.parent}")
-    require_own(path.parent, {path.name: _BEGINNING})
+    require_own_csv(path, _BEGINNING)
 
 
 @checked

@@ -22,8 +22,8 @@ from fg_calib.arguments import checked
 from fg_calib.arrays import FrozenArrays
 from fg_calib.errors import InputError
 from fg_calib.files.columns import Table
-from fg_calib.files.csv_writer import write_csv
-from fg_calib.files.disk import require_own, within_memory
+from fg_calib.files.csv_writer import require_own_csv, write_csv
+from fg_calib.files.disk import within_memory
 from fg_calib.files.poses import PoseColumns
 from fg_calib.files.tables import find_joint_columns, header_for, joint_columns, read_ids, read_readings
 from fg_calib.files.units import Units
@@ -91,11 +91,7 @@ def require_commands(path: Path) -> None:
     Raises:
         InputError: It cannot.
     """
-    if path.suffix.lower() != ".csv":
-        raise InputError(str(path), f"ending {path.suffix!r}", ".csv")
-    if not path.parent.is_dir():
-        raise InputError(str(path), f"there is no folder {path.parent}")
-    require_own(path.parent, {path.name: _BEGINNING})
+    require_own_csv(path, _BEGINNING)
 
 
 def write_commands(path: Path, ids: tuple[str, ...], correction: Correction, robot: Robot, units: Units) -> None:

@@ -34,6 +34,9 @@ _log = logging.getLogger(__name__)
 _ORIGIN = {"xyz": ("x", "y", "z"), "rpy": ("roll", "pitch", "yaw")}
 """The attributes of `<origin>` and the kinds of parameters that they hold."""
 
+ROUNDING = 1e-13
+"""Change of an origin's figure, [m] and [rad], that is rounding of the solution: parameters that nothing moves."""
+
 _ATTRIBUTES = {"origin": ("xyz", "rpy"), "axis": ("xyz",), "limit": ("lower", "upper", "effort", "velocity")}
 """What is read of a joint on the chain, and the attributes that it may have."""
 
@@ -205,7 +208,7 @@ _DECLARED = re.compile(r"""\ufeff?<\?xml[^>]*?\sencoding\s*=\s*["']([\w.-]+)["']
 def urdf_text(text: str, origins: Mapping[str, Mapping[str, float]], zeros: Mapping[str, float] | None = None) -> str:
     """A URDF with other origins of some joints and nothing else changed: comments, blanks and quotes stay.
 
-    An attribute of `<origin>` whose figures are those wanted stays as it is written.
+    A figure of `<origin>` that is the one wanted but for `ROUNDING` stays, an attribute of such figures as written.
 
     Args:
         text: The URDF, as it was read.
@@ -219,7 +222,7 @@ def urdf_text(text: str, origins: Mapping[str, Mapping[str, float]], zeros: Mapp
         if name in origins:
             wanted = {attribute: [origins[name][kind] for kind in kinds] for attribute, kinds in _ORIGIN.items()}
             edits += _edits(data, place, "origin", wanted)
-        if zeros is not None and zeros.get(name, 0.0) != 0.0:
+        if zeros is not None and abs(zeros.get(name, 0.0)) > ROUNDING:
             before = _figures(_attributes(data, place.get("calibration")).get("rising", (0, 0, "0"))[2])
             edits += _edits(data, place, "calibration", {"rising": [sum(before) + zeros[name]]})
     for start, end, instead in sorted(edits, reverse=True):
@@ -270,12 +273,14 @@ def _edits(
     data: bytes, place: Mapping[str, int], tag: str, wanted: Mapping[str, Sequence[float]]
 ) -> list[tuple[int, int, str]]:
     """What to write where so that a joint's element has attributes with these figures; 0 is what is left out."""
-    words = {name: " ".join(repr(float(figure)) for figure in figures) for name, figures in wanted.items()}
     present = _attributes(data, place.get(tag))
-    changed = {}
+    words, changed = {}, {}
     for name, figures in wanted.items():
         read = _figures(present[name][2]) if name in present else [0.0] * len(figures)
-        if read != [float(figure) for figure in figures]:
+        pairs = zip(read or [math.nan] * len(figures), figures, strict=True)
+        kept = [was if abs(was - figure) <= ROUNDING else float(figure) for was, figure in pairs]
+        words[name] = " ".join(map(repr, kept))
+        if kept != read:
             changed[name] = words[name]
     if not changed:
         return []

@@ -44,22 +44,29 @@ def elsewhere(problem: Problem, parameters: Floats) -> Problem | None:
         A problem of the same parameters, noise assumed as `Robot.scale_of` says; None where nothing is left.
     """
     robot = problem.robot.with_values(parameters[problem.variables.robot_span])
-    unknowns, coordinates = problem.data.unknowns, problem.variables.at(parameters).coordinates
-    parts = np.split(coordinates, np.cumsum(unknowns.sizes)[:-1]) if unknowns.sizes else []
-    places = dict(zip(zip(unknowns.letters, unknowns.names, strict=True), parts, strict=True))
-    different = {_says(table): table for table in problem.data.tables if table.model and _named(table)[1]}
+    places = places_of(problem, parameters)
+    given = [*problem.data.tables, *_before(problem)]
+    different = {_says(table): table for table in given if table.model and _named(table)[1]}
     if not different:
         return None
     n = max(LEAST, -(-max(300, 10 * len(robot.parameters)) // len(different)))
     generator = np.random.default_rng(0)
     tables = [
-        _at(robot, table, random_readings(robot, n, generator), places, f"elsewhere {i}")
+        at_configurations(robot, table, random_readings(robot, n, generator), places, f"elsewhere {i}")
         for i, table in enumerate(different.values())
     ]
     options = Options(gauge="none", pair_errors="independent")
     data = gather(robot, tables)
     variables = variables_of(robot, data, options)
     return problem_at(robot, data, options, variables, start_of(robot.with_estimated([]), data, variables))
+
+
+def _before(problem: Problem) -> list[Table]:
+    """Tables such as those of earlier rows, of which but the models are known: without targets, anchors or boards."""
+    views = () if problem.knowledge is None else problem.knowledge.views
+    q = np.zeros((1, problem.robot.n_joints))
+    nothing = Measurements.from_arrays(q, position=np.zeros((1, 3)), rotation=np.eye(3)[None])
+    return [Table(nothing, model, frame=frame) for model, frame in views if model in (*POSE_MODELS, *PAIR_MODELS)]
 
 
 def _says(table: Table) -> tuple[object, ...]:
@@ -87,8 +94,23 @@ def _named(table: Table) -> tuple[str, list[str | None]]:
     return column, [labels.names[k] if k >= 0 else None for k in np.unique(labels.index[train]).tolist()]
 
 
-def _at(robot: Robot, table: Table, q: Floats, places: Places, source: str) -> Table:
-    """A table of what the arm predicts at configurations, shape (n, n_joints), named things in turn."""
+def places_of(problem: Problem, parameters: Floats) -> Places:
+    """Where targets, anchors, planes and boards are, by letter and name."""
+    unknowns, coordinates = problem.data.unknowns, problem.variables.at(parameters).coordinates
+    parts = np.split(coordinates, np.cumsum(unknowns.sizes)[:-1]) if unknowns.sizes else []
+    return dict(zip(zip(unknowns.letters, unknowns.names, strict=True), parts, strict=True))
+
+
+def at_configurations(robot: Robot, table: Table, q: Floats, places: Places, source: str) -> Table:
+    """A table of what the arm predicts at configurations, shape (n, n_joints), named things in turn.
+
+    Args:
+        robot: The arm.
+        table: What instrument it is; for pixels boards are seen, or the tool from the room.
+        q: The configurations.
+        places: Of what the table names.
+        source: What the table is called.
+    """
     poses, model = forward(build_chain(robot), precompute_trig(robot, q)), _model(table)
     column, names = _named(table)
     real = [name for name in names if name is not None]

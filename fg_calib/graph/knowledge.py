@@ -6,6 +6,9 @@ variables. What the rows depended on besides, such as measurement frames, is eli
 
 Growth: where x may have wandered since by g with 1 sigma G, `|z + R (s - G h)|^2 + |h|^2` with h eliminated; where G is
 unlimited h has no row of its own.
+
+What rows determine at all is asked where the arm is as drawn: there lost directions are exact. So they are kept as
+linearised there, too (`nominal`), without what tolerances say.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.factors import Variables, build_variables, custom_factor, eliminate, pose_of
 from fg_calib.graph.observability import determined
 from fg_calib.measurements.series import Unknowns
+from fg_calib.options import FrameKnowledge, Model
 from fg_calib.robot.model import Robot
 
 Floats = NDArray[np.float64]
@@ -36,6 +40,9 @@ SIZE = 3
 Name = tuple[str, str]
 """Letter and name of an unknown."""
 
+View = tuple[Model, FrameKnowledge]
+"""A model, and whether the measurement frame is known."""
+
 
 @dataclass(frozen=True)
 class Knowledge(FrozenArrays):
@@ -47,6 +54,9 @@ class Knowledge(FrozenArrays):
         at: Where these were, one after the other, shape (3 * len(unknowns),), [m].
         rows: R, shape (k, n_columns + len(at)): columns of the arm's variables, then of the unknowns.
         right: z, shape (k,).
+        views: Models of the tables that they are of with the knowledge of their frames, each once.
+        nominal: The same rows linearised at the arm as drawn, z = 0: by them parameters are classed; None where that
+            was not kept.
     """
 
     robot: Robot
@@ -54,6 +64,8 @@ class Knowledge(FrozenArrays):
     at: Floats
     rows: Floats
     right: Floats
+    views: tuple[View, ...] = ()
+    nominal: Knowledge | None = None
 
     @cached_property
     def variables(self) -> Variables:
@@ -93,12 +105,13 @@ class Knowledge(FrozenArrays):
         n = self.variables.n_columns
         if list(self.unknowns) == kept:
             return self
+        nominal = None if self.nominal is None else self.nominal.about(unknowns)
         spans = [np.arange(SIZE) + SIZE * self.unknowns.index(name) for name in kept]
         chosen = np.concatenate([np.zeros(0, dtype=np.int64), *spans])
         others = np.setdiff1d(np.arange(len(self.at)), chosen)
         order = np.concatenate([np.arange(n), n + chosen, n + others])
         left = eliminate(self.rows[:, order], self.right, n + len(chosen))
-        return Knowledge.of_rows(self.robot, kept, self.at[chosen], left.A, left.b)
+        return self._with(Knowledge.of_rows(self.robot, kept, self.at[chosen], left.A, left.b), nominal)
 
     def grown(self, directions: Floats, free: NDArray[np.bool_]) -> Knowledge:
         """The same of an arm that may have changed since.
@@ -106,6 +119,9 @@ class Knowledge(FrozenArrays):
         Args:
             directions: Of independent changes of 1 sigma each in the columns, shape (n_columns + len(at), n).
             free: Which of them may be of any size, shape (n,).
+
+        Returns:
+            It, with `nominal` as it was: its columns are others.
         """
         if not directions.shape[1]:
             return self
@@ -116,13 +132,16 @@ class Knowledge(FrozenArrays):
             np.append(self.right, np.zeros(len(own))),
             n,
         )
-        return Knowledge.of_rows(self.robot, self.unknowns, self.at, left.A, left.b)
+        return self._with(Knowledge.of_rows(self.robot, self.unknowns, self.at, left.A, left.b), self.nominal)
 
     def with_rows(self, A: Floats, b: Floats) -> Knowledge:
-        """The same with more rows about the same place."""
-        return Knowledge.of_rows(
-            self.robot, self.unknowns, self.at, np.vstack([self.rows, A]), np.append(self.right, b)
-        )
+        """The same with more rows about the same place, none of them measured: `nominal` stays."""
+        A, b = np.vstack([self.rows, A]), np.append(self.right, b)
+        return self._with(Knowledge.of_rows(self.robot, self.unknowns, self.at, A, b), self.nominal)
+
+    def _with(self, rows: Knowledge, nominal: Knowledge | None) -> Knowledge:
+        """Other rows of the same tables."""
+        return replace(rows, views=self.views, nominal=nominal)
 
     def span(self, name: Name) -> Integers:
         """Columns of an unknown."""

@@ -9,13 +9,14 @@ import numpy as np
 from rich.console import Group, RenderableType
 
 from fg_calib.analysis.check import Check, Explanation
+from fg_calib.analysis.verdict import probability
 from fg_calib.options import LIMITED
 from fg_calib.report.shown import SHOWN
 from fg_calib.report.tables import indented, line, plain_table, section
 
 SCHEMA = "fg-calib/check/1"
 
-_WORDS = {"pass": "GOOD", "fail": "NOT GOOD ANY MORE", "not_evaluated": "NOT EVALUATED"}
+_WORDS = {"pass": "PASS", "fail": "FAIL", "not_evaluated": "NOT EVALUATED"}
 _STYLES = {"pass": "bold green", "fail": "bold red", "not_evaluated": "bold yellow"}
 
 _KINDS = {
@@ -26,6 +27,11 @@ _KINDS = {
     "row": "gross errors of one configuration",
     "parameter": "",
 }
+
+_NO_ADVICE = (
+    "no configurations are advised: of random ones none can be measured like these rows (contacts, fixed lengths), or"
+    " none tells these changes apart; another instrument may"
+)
 
 
 def named(parameters: Sequence[str]) -> str:
@@ -89,7 +95,7 @@ def build_check_report(found: Check, joint_units: Sequence[str]) -> RenderableTy
     """
     parts: list[RenderableType] = [line(_WORDS[found.verdict], _STYLES[found.verdict])]
     parts += indented([*found.reasons, *found.cautions])
-    p = "" if found.p_value is None else f", p = {found.p_value:.3g}"
+    p = "" if found.p_value is None else f", p-value {probability(found.p_value)}"
     parts += indented([f"chi-square {found.chi2:.5g} with {found.dof} degrees of freedom{p}, {found.n} measurements"])
     parts += section("Errors with the calibrated arm (RMS)", _errors(found))
     if found.verdict != "not_evaluated":
@@ -134,10 +140,12 @@ def _amounts(e: Explanation) -> tuple[str, str]:
 
 def _changes(explanations: Sequence[Explanation]) -> RenderableType:
     headings = (("", "left"), ("", "left"), ("change", "right"), ("sigma", "right"), ("chi-square falls by", "right"))
-    table = plain_table(*headings, ("p", "right"), ("", "left"), wrap=True)
+    table = plain_table(*headings, ("p-value", "right"), ("", "left"), wrap=True)
     for e in explanations:
         word = "may be" if e.likely and e.not_told_apart_from else "is" if e.likely else "is not: told apart"
-        table.add_row(named(e.parameters), _KINDS[e.kind], *_amounts(e), f"{e.chi2_drop:.4g}", f"{e.p_value:.1g}", word)
+        table.add_row(
+            named(e.parameters), _KINDS[e.kind], *_amounts(e), f"{e.chi2_drop:.4g}", probability(e.p_value), word
+        )
     return table
 
 
@@ -151,6 +159,8 @@ def _words(found: Check) -> list[str]:
     if len(likely) > 1:
         names = ", ".join(named(e.parameters) for e in likely)
         lines += [f"these rows do not tell apart: {names}", "do not deploy any of these changes yet"]
+        if found.advice is None:
+            lines.append(_NO_ADVICE)
     elif found.verdict == "fail" and found.deploy:
         lines.append(
             f"no other single change explains the rows: update with --changed {best.parameters[0]}, check again"

@@ -43,6 +43,7 @@ from fg_calib.files.disk import fill_folder, read_bytes, require_own, write_text
 from fg_calib.files.result import (
     SCHEMA,
     Acceptance,
+    AtNominal,
     BeyondTolerance,
     Carried,
     Correlated,
@@ -82,10 +83,12 @@ from fg_calib.graph.noise import JOINT_NOISE
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
 from fg_calib.job import Job
+from fg_calib.measurements.fingerprints import fingerprints
 from fg_calib.report.page.files import FIGURE_FILES, PAGE
 from fg_calib.report.shown import FAMILY_UNIT
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
+from fg_calib.threads import single_threaded
 
 if TYPE_CHECKING:  # a calibration is written without the baseline
     from fg_calib.baseline.comparison import Comparison, Estimate, RealErrors
@@ -98,6 +101,7 @@ _ROWS_AT_ONCE = 200_000
 """Rows of `residuals.csv` that are turned into text at once."""
 
 
+@single_threaded
 def result_of(
     solution: Solution,
     uncertainty: Uncertainty,
@@ -204,8 +208,13 @@ def _carried(solution: Solution, job: Mapping[str, Any]) -> Carried:
             at=known.at,
             rows=known.rows,
             right=known.right,
+            views=known.views,
+            nominal=None
+            if known.nominal is None
+            else AtNominal.make(parameters=known.nominal.robot.nominal, at=known.nominal.at, rows=known.nominal.rows),
         )
-    return Carried.make(job=dict(job), noise=noise, knowledge=document)
+    rows = fingerprints(problem.data.tables)
+    return Carried.make(job=dict(job), rows=rows, noise=noise, knowledge=document)
 
 
 def _options(problem: Problem) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.console import Group, RenderableType
 
+from fg_calib.analysis.verdict import probability
 from fg_calib.files.disk import fill_folder
 from fg_calib.files.history import SCHEMA, History, Run
 from fg_calib.report.figures import empty_figure
@@ -33,11 +34,11 @@ def history_document(history: History) -> dict[str, Any]:
 def build_history(history: History) -> RenderableType:
     """A history for the terminal."""
     table = plain_table(
-        *(("date", "left"), ("residuals", "right"), ("chi-square", "right"), ("of", "right"), ("p", "right")),
+        *(("date", "left"), ("residuals", "right"), ("chi-square", "right"), ("of", "right"), ("p-value", "right")),
         *(("", "left"), ("changed most", "left"), ("by", "right"), ("in sigma", "right")),
     )
     for run in history.runs:
-        p = "" if run.p_value is None else f"{run.p_value:.2g}"
+        p = "" if run.p_value is None else probability(run.p_value)
         chi2 = "" if run.chi2 is None else f"{run.chi2:.4g}"
         table.add_row(run.date[:10], str(run.n_residuals), chi2, str(run.dof), p, run.verdict, *_moved(run))
     return Group(line(f"{history.robot}: {len(history.runs)} runs", "bold"), *section("Runs", table))
@@ -84,10 +85,7 @@ def draw_history(history: History) -> Figure:
 
 
 def _when(date: str) -> datetime:
-    try:
-        found = datetime.fromisoformat(date)
-    except ValueError:
-        return datetime(1970, 1, 1, tzinfo=UTC)
+    found = datetime.fromisoformat(date or "1970-01-01")  # of results of version 1 no date is known
     return found if found.tzinfo else found.replace(tzinfo=UTC)
 
 

@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arrays import FrozenArrays
-from fg_calib.robot.inverse import REACHED, Inverse, rotation_vector, solve_inverse
+from fg_calib.progress import tell
+from fg_calib.robot.inverse import N_STARTS, REACHED, Inverse, rotation_vector, solve_inverse
 from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
 from fg_calib.robot.model import Robot
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
+Integers = NDArray[np.int64]
 
 FAR = 0.1
 """A joint that a correction turns by more, [rad] (prismatic: [m]), is near a singularity or on another branch."""
@@ -33,6 +35,9 @@ _N_HALVINGS = 8
 
 _N_STARTS = 20
 """Starts for a pose: those after the first one are ever wider about where the arm is to stay."""
+
+_AT_ONCE = 5000
+"""Targets at once: so many fit caches and memory, and between them it is told how far it is."""
 
 _N_AROUND = 20
 """Starts about where the arm is to stay, of poses that it reached far from there."""
@@ -94,7 +99,7 @@ class Correction(FrozenArrays):
         return f"Correction, {n} targets, {reached} reached"
 
 
-def reach(robot: Robot, position: Floats, rotation: Floats | None, near: Floats) -> Inverse:
+def reach(robot: Robot, position: Floats, rotation: Floats | None, near: Floats, *, anywhere: bool = False) -> Inverse:
     """Configurations at poses, near given ones; where a pose is out of reach at its point, the tool turned nearest.
 
     Args:
@@ -102,13 +107,28 @@ def reach(robot: Robot, position: Floats, rotation: Floats | None, near: Floats)
         position: base_p_tool, shape (n, 3), [m].
         rotation: base_R_tool, shape (n, 3, 3); any if None.
         near: Configurations to stay near, shape (n, n_joints), [rad] (prismatic: [m]).
+        anywhere: Whether they are where to start alone, and any configuration will do.
 
     Returns:
         Within the joint limits; what is missing of a point that is itself out of reach is not 0.
     """
-    found = _nearer(
-        robot, position, rotation, near, solve_inverse(robot, position, rotation, near=near, n_starts=_N_STARTS)
+    n = len(position)
+    parts = []
+    for first in range(0, max(n, 1), _AT_ONCE):
+        tell("reaching targets", first, n)
+        rows = slice(first, first + _AT_ONCE)
+        turned = None if rotation is None else rotation[rows]
+        found = _reach(robot, position[rows], turned, near[rows], anywhere)
+        parts.append((found.readings, found.miss_position, found.miss_rotation))
+    return Inverse(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def _reach(robot: Robot, position: Floats, rotation: Floats | None, near: Floats, anywhere: bool) -> Inverse:
+    n_starts = 1 if anywhere else _N_STARTS
+    found = _else_from_anywhere(
+        robot, position, rotation, solve_inverse(robot, position, rotation, near=near, n_starts=n_starts)
     )
+    found = found if anywhere else _nearer(robot, position, rotation, near, found)
     rows = np.flatnonzero(~found.reached)
     if rotation is None or not len(rows):
         return found
@@ -119,6 +139,24 @@ def reach(robot: Robot, position: Floats, rotation: Floats | None, near: Floats)
     q = found.readings.copy()
     q[rows] = turned.reshape(-1, robot.n_joints)
     return Inverse(q, *misses(robot, q, position, rotation))
+
+
+def _else_from_anywhere(robot: Robot, position: Floats, rotation: Floats | None, found: Inverse) -> Inverse:
+    """The same, and what was not reached from where it was to stay reached from random starts all over the limits."""
+    rows = np.flatnonzero(~found.reached)
+    if not len(rows):
+        return found
+    turned = None if rotation is None else rotation[rows]
+    others = solve_inverse(robot, position[rows], turned, n_starts=N_STARTS)
+    return _exchanged(found, rows, others, others.reached)
+
+
+def _exchanged(found: Inverse, rows: Integers, others: Inverse, better: Booleans) -> Inverse:
+    """Some rows exchanged for others, where these are better."""
+    made = [part.copy() for part in (found.readings, found.miss_position, found.miss_rotation)]
+    for part, other in zip(made, (others.readings, others.miss_position, others.miss_rotation), strict=True):
+        part[rows[better]] = other[better]
+    return Inverse(*made)
 
 
 def _nearer(robot: Robot, position: Floats, rotation: Floats | None, near: Floats, found: Inverse) -> Inverse:
@@ -137,11 +175,9 @@ def _nearer(robot: Robot, position: Floats, rotation: Floats | None, near: Float
     of_others[~others.reached.reshape(len(rows), n)] = np.inf
     best = of_others.argmin(axis=1)
     better = of_others[np.arange(len(rows)), best] < changed[rows]
-    rows, chosen = rows[better], (np.arange(len(rows)) * n + best)[better]
-    made = [part.copy() for part in (found.readings, found.miss_position, found.miss_rotation)]
-    for part, other in zip(made, (others.readings, others.miss_position, others.miss_rotation), strict=True):
-        part[rows] = other[chosen]
-    return Inverse(*made)
+    chosen = np.arange(len(rows)) * n + best
+    nearest = Inverse(others.readings[chosen], others.miss_position[chosen], others.miss_rotation[chosen])
+    return _exchanged(found, rows, nearest, better)
 
 
 def misses(robot: Robot, readings: Floats, position: Floats, rotation: Floats | None) -> tuple[Floats, Floats]:

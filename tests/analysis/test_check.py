@@ -236,3 +236,35 @@ def test_zeros_of_a_urdf_are_called_by_their_joints():
     assert zero_names(arm())[:2] == ("theta1", "theta2")
     sliding = Robot.from_dh([[0, 0, 0.1, 0], [0, 0, 0.2, 0]], "dh", types=["revolute", "prismatic"])
     assert zero_names(sliding) == ("theta1", "d2")
+
+
+MISREAD = {
+    "x, y, z are in mm, not m": {"position": 1e3},
+    "x, y, z are in m, not mm": {"position": 1e-3},
+    "joint readings are in rad, not deg": {"readings": np.pi / 180},
+    "joint 4 turns the other way": {"readings": np.array([1, 1, 1, -1, 1, 1])},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("frame", ["known", "unknown"])
+@pytest.mark.parametrize("words", MISREAD)
+def test_a_table_that_is_misread_is_told_of_before_anything_else(known, unknown, words, frame):
+    """In wrong units no change of the arm is named, and the calibration is not blamed."""
+    calibration, true, rng = known if frame == "known" else unknown
+    rows = measured(true, 12, np.random.default_rng(1), frame=placed(rng) if frame == "unknown" else None)
+    wrong = replace(rows, **{name: getattr(rows, name) * by for name, by in MISREAD[words].items()})
+    found = calibration.check(Table(wrong, "pose", frame=frame))
+    assert found.verdict == "not_evaluated"
+    assert words in found.reasons[0]
+    assert found.explanations == ()
+    assert not found.deploy
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("slip", [{"theta3": 0.5}, {"theta4": np.pi / 2}])
+def test_a_large_slip_is_no_table_that_is_misread(known, slip):
+    calibration, true, _ = known
+    found = calibration.check(measured(slipped(true, **slip), 12, np.random.default_rng(2)))
+    assert found.verdict == "fail"
+    assert likely(found) == [tuple(slip)]

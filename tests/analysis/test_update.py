@@ -7,7 +7,7 @@ import pytest
 from month import arm, calibrated, measured, placed, slipped
 from simulated import true_robot
 
-from fg_calib import Measurements, Table, calibrate, pose
+from fg_calib import Calibration, Measurements, Table, calibrate, pose
 from fg_calib.errors import InputError
 from fg_calib.measurements.dataset import Labels
 
@@ -198,3 +198,155 @@ def test_names_that_are_none_are_refused():
         calibration.update(rows, growth={"elbow": 1e-6})
     with pytest.raises(InputError, match="a date such as"):
         calibration.update(rows, date="yesterday")
+
+
+def classes(calibration):
+    return {n: calibration.parameters[n].identifiability for n in calibration.result.covariance.names}
+
+
+def reasons(calibration):
+    return [lost.reason for lost in calibration.uncertainty.identifiability.lost]
+
+
+def with_still_joint(model, n, rng, true, joint=5):
+    """Rows in which one joint stands still, so that some parameters are never seen apart."""
+    q = rng.uniform(-2.5, 2.5, (n, 6))
+    q[:, joint] = 0.3
+    return Table(measured(true, n, rng, q=q), model)
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("model", ["pose", "position", "distance-rotation", "distance"])
+def test_classes_and_reasons_of_an_update_are_those_of_all_rows(model):
+    """At the old estimate lost directions have turned a little: theta2, theta3 and theta4 were called relative there,
+    and what parallel axes do `no simple cause found`."""
+    rng = np.random.default_rng(0)
+    true = true_robot(arm(), rng)
+    old, new = (with_still_joint(model, n, rng, true) for n in (30, 10))
+    updated, batch = calibrate(arm(), old).update(new), calibrate(arm(), [old, new])
+    assert classes(updated) == classes(batch)
+    assert reasons(updated) == reasons(batch)
+    assert "independent" in classes(updated).values()
+    assert "relative" in classes(updated).values()
+
+
+@pytest.mark.slow
+def test_classes_of_an_update_know_what_other_instruments_saw_before(tmp_path):
+    """Of distances, then of angles alone: reasons are of both, also once saved and loaded."""
+    rng = np.random.default_rng(1)
+    true = true_robot(arm(), rng)
+    old, new = (with_still_joint(model, n, rng, true) for model, n in (("distance", 30), ("rotation", 10)))
+    batch, first = calibrate(arm(), [old, new]), calibrate(arm(), old)
+    first.save(tmp_path / "first")
+    for calibration in (first, Calibration.load(tmp_path / "first")):
+        updated = calibration.update(new)
+        assert classes(updated) == classes(batch)
+        assert reasons(updated) == reasons(batch)
+
+
+@pytest.mark.parametrize("change", [{"growth": {"theta": 1e-9, "d": 1e-9}}, {"changed": ["theta3"]}])
+def test_what_tolerances_alone_say_is_no_data_of_an_update(change):
+    """With growth the tolerances are part of what is known: d2, d3 and d4 of parallel axes were called independent."""
+    rng = np.random.default_rng(2)
+    true = true_robot(arm(), rng)
+    old, new = (with_still_joint("pose", n, rng, true) for n in (30, 10))
+    updated = calibrate(arm(), old).update(new, date="2100-01-01", **change)
+    assert classes(updated) == classes(calibrate(arm(), [old, new]))
+
+
+@pytest.mark.slow
+def test_what_has_changed_is_determined_by_new_rows_alone():
+    """Of seven parameters nothing is taken over, and one pose says but six figures."""
+    rng = np.random.default_rng(3)
+    true = true_robot(arm(), rng)
+    old, new = Table(measured(true, 30, rng), "pose"), with_still_joint("pose", 1, rng, true, joint=0)
+    updated = calibrate(arm(), old).update(
+        new, changed=["theta1", "theta2", "theta3", "theta4", "theta5", "theta6", "d1"]
+    )
+    assert updated.uncertainty.observability.rank < calibrate(arm(), old).uncertainty.observability.rank
+
+
+ACCEPT = {"position": 5e-4, "orientation": 1e-3}
+
+
+def test_a_limit_without_test_rows_is_judged_by_how_the_arm_before_predicts_the_new_rows():
+    calibration, true, rng = calibrated(10, accept=ACCEPT)
+    rows = measured(true, 8, rng)
+    updated = calibration.update(rows)
+    assert updated.not_accepted == ()
+    errors = {one.kind: one.error for one in updated.result.acceptance.judgements}
+    assert errors == pytest.approx(calibration.check(rows).rms, rel=1e-3)  # frames to convergence
+    assert "by the arm before this update" in " ".join(str(updated).split())
+
+
+def test_a_limit_that_the_arm_before_misses_is_not_evaluated():
+    calibration, true, rng = calibrated(11, accept=ACCEPT)
+    rows = measured(slipped(true, theta3=2e-3), 8, rng)
+    assert "the arm before this update misses it" in calibration.update(rows).not_accepted[0]
+    assert "no measurement of any position was held out" in calibration.update(rows, changed="theta3").not_accepted[0]
+
+
+def test_test_rows_of_an_update_judge_its_limits():
+    calibration, true, rng = calibrated(12, accept=ACCEPT)
+    rows = measured(slipped(true, theta3=2e-3), 20, rng)
+    updated = calibration.update(replace(rows, test=np.arange(20) >= 12), changed="theta3")
+    assert updated.not_accepted == ()
+    assert {one.n for one in updated.result.acceptance.judgements} == {8}
+
+
+def test_rows_that_are_counted_already_are_refused_in_memory():
+    """As they are, in another order, with more rows behind them, or from a table of another length unit."""
+    calibration, true, rng = calibrated(13)
+    first = calibration.solution.problem.data.tables[0].measurements
+    more = measured(true, 8, rng, ids="new")
+    longer = Measurements.from_arrays(
+        np.vstack([first.readings, more.readings]),
+        position=np.vstack([first.position, more.position]) * 1e3 * 1e-3,
+        rotation=np.vstack([first.rotation, more.rotation]),
+        sigma_position=5e-5,
+        sigma_orientation=1e-4,
+    )
+    for rows in (first, first.select(np.arange(5)), first.select(np.arange(40)[::-1]), longer):
+        with pytest.raises(InputError, match="its rows are in the calibration already"):
+            calibration.update(rows)
+    updated = calibration.update(more)
+    with pytest.raises(InputError, match="already"):
+        updated.update(more)
+
+
+def test_rows_that_were_only_predicted_may_be_fitted_later():
+    calibration, true, rng = calibrated(14)
+    rows = measured(true, 8, rng)
+    updated = calibration.update(replace(rows, test=np.arange(8) >= 3))
+    assert updated.update(rows.select(np.arange(3, 8))).trustworthy
+
+
+def test_pairs_of_the_same_configurations_measured_again_are_new():
+    """Of a table of pairs the configurations may be those of before: what is measured is between them."""
+    rng = np.random.default_rng(15)
+    true = true_robot(arm(), rng)
+    q = rng.uniform(-2.5, 2.5, (30, 6))
+    p = pose(true, q).position
+
+    def lengths_between():
+        a, b = np.arange(29), np.arange(1, 30)
+        d = np.linalg.norm(p[a] - p[b], axis=1) + 5e-5 * rng.normal(size=29)
+        return Table(
+            Measurements.from_arrays(q, pairs={"a": a, "b": b, "distance": d, "sigma_distance": 5e-5}), "distance"
+        )
+
+    old = lengths_between()
+    calibration = calibrate(arm(), old)
+    assert calibration.update(lengths_between()).result.n_residuals == 29
+    with pytest.raises(InputError, match="already"):
+        calibration.update(old)
+
+
+def test_dates_before_the_calibration_are_refused_and_those_of_the_same_day_are_not():
+    calibration, true, rng = calibrated(16)
+    rows = measured(true, 6, rng)
+    today = calibration.result.date[:10]
+    assert calibration.update(rows, date=today).result.date.startswith(today)
+    for date in ("1999-01-01", "2000-01-01T12:00:00+00:00"):
+        with pytest.raises(InputError, match="is before the calibration"):
+            calibration.update(rows, date=date)

@@ -71,7 +71,7 @@ def test_a_table_is_read_as_the_job_read_its_own(place):
 def test_a_slip_fails_is_named_and_is_mended_by_an_update(place):
     code, out = run("check", place / "result", place / "slipped.csv", "--limit", "0.2mm")
     assert code == 3
-    assert "NOT GOOD ANY MORE" in out
+    assert out.startswith("FAIL")
     assert "theta3" in out
     code, _ = run("update", place / "result", place / "slipped.csv", "--changed", "theta3", "--out", place / "second",
                   "--date", "2100-01-01")  # fmt: skip
@@ -129,7 +129,7 @@ BAD = {
     "no parameter": (["update", "result", "healthy.csv", "--changed", "theta9", "--out", "new"], "theta9"),
     "a bare growth": (["update", "result", "healthy.csv", "--growth", "theta", "--out", "new"], "NAME=FIGURE"),
     "a date before": (
-        ["update", "result", "healthy.csv", "--growth", "theta=1deg", "--date", "1999-01-01", "--out", "new"],
+        ["update", "result", "healthy.csv", "--date", "1999-01-01", "--out", "new"],
         "is before the calibration",
     ),
     "a date that is none": (["update", "result", "healthy.csv", "--date", "May", "--out", "new"], "a date such as"),
@@ -185,6 +185,23 @@ def test_a_damaged_history_is_told_of(place, tmp_path):
         (folder / "history.json").write_text(text)
         code, message = run("history", folder)
         assert (code, expected in message) == (1, True)
+
+
+def test_a_result_whose_date_is_none_is_refused(place, tmp_path):
+    folder = changed_result(place, tmp_path, lambda d: d.update(date="last May"))
+    code, message = run("update", folder, place / "healthy.csv", "--out", tmp_path / "new")
+    assert code == 1
+    assert "result.json: date" in message
+    assert "\n" not in message
+
+
+@pytest.mark.slow
+def test_no_probability_is_said_to_be_0(place):
+    """Of a slip so large that its probability is below what numbers hold."""
+    out = run("check", place / "result", place / "slipped.csv")[1]
+    assert json.loads(run("check", place / "result", place / "slipped.csv", "--json")[1])["p_value"] == 0.0
+    assert "p-value < 0.001" in out
+    assert not any(line.split()[-2:-1] == ["0"] for line in out.splitlines())
 
 
 def test_another_robots_job_is_refused(place, tmp_path):

@@ -332,6 +332,20 @@ def test_of_a_urdf_only_figures_of_calibrated_origins_change(tmp_path):
     assert export(robot.with_values(values), "urdf").text == expected
 
 
+def test_a_joint_that_has_moved_by_rounding_alone_stays_as_it_is_written(tmp_path):
+    """What no row and no drawing error moves ends 6e-18 m from where it was."""
+    robot = column(tmp_path)
+    values = robot.nominal
+    values[robot.index("turn.z")] = 0.1001
+    values[robot.index("bend.yaw")] += 3e-17
+    values[robot.index("turn.x")] += 6e-18
+    values[robot.index("roll.roll")] -= 1e-17
+    expected = TREE.replace('<origin xyz="0 0 0.1"/>', '<origin xyz="0.0 0.0 0.1001"/>')
+    assert export(robot.with_values(values), "urdf").text == expected
+    elements = export(robot.with_values(values), "urdf", nominal=robot, calibration_elements=True).text
+    assert elements.count("<calibration") == TREE.count("<calibration")
+
+
 @pytest.mark.parametrize("backwards", [False, True])
 def test_zeros_in_calibration_elements_and_origins_are_together_the_arm(backwards, tmp_path):
     nominal = column(tmp_path, backwards)
@@ -465,65 +479,46 @@ def test_a_tool_that_is_set_as_calibrated_is_no_matter_of_zeros():
 
 UR = ur10()
 MISTAKES = {
-    "another format": (
-        lambda: export(UR, "dhh"),
-        "to: found 'dhh', expected one of urdf, ur, tesseract, dh, mdh, hayati,",
-    ),
-    "no arm": (lambda: export("ur10.yaml", "dh"), "arm: found "),
-    "seven joints": (lambda: export(seven(), "ur"), "seven: 7 joints, 0 of which slide, expected six joints that turn"),
-    "a slide": (lambda: export(scara(), "ur"), "scara: 4 joints, 1 of which slide, expected six"),
-    "no drawing": (
-        lambda: export(UR, "zeros"),
-        "zeros: an arm without the one as drawn, expected a RESULT of calibrate",
-    ),
-    "another drawing": (
-        lambda: export(UR, "zeros", nominal=seven()),
-        "nominal: seven has other joints, expected q1, q2",
-    ),
-    "no URDF": (
-        lambda: export(UR, "urdf", calibration_elements=True),
-        "calibration_elements: an arm that is no URDF, expected an arm that was read from a URDF",
-    ),
-    "an idle option": (
-        lambda: export(UR, "dh", tool="nominal"),
-        "tool: means nothing for dh, expected the format zeros",
-    ),
-    "an idle flag": (
-        lambda: export(UR, "hayati", far=True),
-        "far: means nothing for hayati, expected the format dh or mdh",
-    ),
-    "a hash of blanks": (
-        lambda: export(UR, "ur", ur_hash="a b"),
-        "ur_hash: found 'a b', expected a word such as calib_",
-    ),
-    "another base": (
-        lambda: export(UR, "ur", ur_base="flange"),
-        "ur_base: found 'flange', expected one of base, base_link",
-    ),
-    "another tool": (
-        lambda: export(UR, "zeros", tool="gripper"),
-        "tool: found 'gripper', expected one of nominal, cal",
-    ),
-    "other readings": (
-        lambda: export(UR, "zeros", nominal=UR, configurations=np.zeros((3, 5))),
-        "configurations: ",
-    ),
-    "no readings": (
-        lambda: export(UR, "zeros", nominal=UR, configurations=np.zeros((0, 6))),
+    "dhh": [UR, {}, "to: found 'dhh', expected one of urdf, ur, tesseract, dh, mdh, hayati,"],
+    "dh of no arm": ["ur10.yaml", {}, "arm: found "],
+    "ur of seven joints": [seven(), {}, "seven: 7 joints, 0 of which slide, expected six joints that turn"],
+    "ur of a slide": [scara(), {}, "scara: 4 joints, 1 of which slide, expected six"],
+    "zeros of no drawing": [UR, {}, "zeros: an arm without the one as drawn, expected a RESULT of calibrate"],
+    "zeros of another drawing": [UR, {"nominal": seven()}, "nominal: seven has other joints, expected q1, q2"],
+    "zeros of other readings": [UR, {"nominal": UR, "configurations": np.zeros((3, 5))}, "configurations: "],
+    "zeros of no readings": [
+        UR,
+        {"nominal": UR, "configurations": np.zeros((0, 6))},
         "configurations: none, expected at least one",
-    ),
-    "a name that XML cannot hold": (
-        lambda: export(Robot.from_dh([[0, 0, 0, 0]], names=["a\x1b"]), "urdf"),
+    ],
+    "zeros of another tool": [UR, {"tool": "gripper"}, "tool: found 'gripper', expected one of nominal, cal"],
+    "urdf of no URDF": [
+        UR,
+        {"calibration_elements": True},
+        "calibration_elements: an arm that is no URDF, expected an arm that was read from a URDF",
+    ],
+    "urdf of a name that XML cannot hold": [
+        Robot.from_dh([[0, 0, 0, 0]], names=["a\x1b"]),
+        {},
         "robot: a name with letters that XML cannot hold",
-    ),
+    ],
+    "dh with an idle option": [UR, {"tool": "nominal"}, "tool: means nothing for dh, expected the format zeros"],
+    "hayati with an idle flag": [UR, {"far": True}, "far: means nothing for hayati, expected the format dh or mdh"],
+    "ur with a hash of blanks": [UR, {"ur_hash": "a b"}, "ur_hash: found 'a b', expected a word such as calib_"],
+    "ur with another base": [
+        UR,
+        {"ur_base": "flange"},
+        "ur_base: found 'flange', expected one of base, base_link",
+    ],
 }
+"""Of a format and what is wrong: the arm, the options, and how the message begins."""
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_what_cannot_be_exported_is_a_line(mistake):
-    made, message = MISTAKES[mistake]
+    arm, options, message = MISTAKES[mistake]
     with pytest.raises(InputError) as caught:
-        made()
+        export(arm, mistake.partition(" ")[0], **options)
     assert str(caught.value).startswith(message)
 
 

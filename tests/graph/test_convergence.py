@@ -246,7 +246,10 @@ def test_angles_about_half_a_turn_converge():
         solution = solve(build_problem(robot, m, model="rotation"))
         assert solution.converged, solution.message
         assert solution.iterations <= 80
-        assert 2.0 * solution.cost < chi2.ppf(0.999, 40) or assess(solution).findings  # nowhere else without a word
+        if seed == 11:  # its least cost, which a start from the truth finds, is beyond what noise makes too
+            assert assess(solution).findings
+        else:
+            assert 2.0 * solution.cost < chi2.ppf(0.999, 40)
 
 
 def test_a_parameter_of_two_elements_is_calibrated_with_both():
