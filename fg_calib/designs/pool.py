@@ -23,7 +23,7 @@ from fg_calib.designs.rows import StopRows, stop_rows
 from fg_calib.designs.task import Posterior
 from fg_calib.errors import InputError
 from fg_calib.graph.build import true_problem
-from fg_calib.graph.factors import Variables
+from fg_calib.graph.factors import Variables, unknown_prior_rows
 from fg_calib.graph.information import whitened_jacobian
 from fg_calib.graph.knowledge import coordinates_of
 from fg_calib.graph.problem import Problem
@@ -124,8 +124,10 @@ class Pool(Brief):
         if not len(stops) and self.before is not None:
             return Posterior(self.before, whitened_jacobian(self.before, self.before.start))
         problem = true_problem(self.robot, self.tables_of(stops, pairing), self.problem.options)
-        rows = [whitened_jacobian(problem, problem.start), known_rows_of(self.before, problem)]
-        return Posterior(problem, np.vstack(rows))
+        rows = whitened_jacobian(problem, problem.start)
+        if self.before is not None:  # what is told of points is in what was measured, and counts once
+            rows = rows[len(unknown_prior_rows(problem.variables, problem.start)[0]) :]
+        return Posterior(problem, np.vstack([rows, known_rows_of(self.before, problem)]))
 
 
 def selected(table: Table, order: Mapping[str, int]) -> Table:

@@ -2,7 +2,7 @@
 
 Both look at all candidates at every step, by updates of rank h (see `criteria`): a candidate is never factorised anew.
 Exchange takes out one of the chosen at a time and puts in what is best in its place (Fedorov 1972; Mitchell 1974), so
-its end is a set that no single exchange makes better.
+its end is a set that single exchanges make hardly better: a round of them gains less than `LEAST_GAIN`.
 
 References:
     Fedorov (1972), Theory of Optimal Experiments. Academic Press.
@@ -11,10 +11,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import combinations
-from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,14 +38,8 @@ _ROUNDING = 1e-12
 N_RANDOM = 100
 """Random sets that a design is held to: if one were better, exchange would start from it."""
 
-MOST_SETS = 2000
-"""Sets up to which all are looked at."""
-
-N_STARTS = 5
-"""Of random sets the best, from which exchange starts too where that takes little."""
-
-_LITTLE = 20_000
-"""Stops times candidates up to which it does."""
+SMALL = 40_000
+"""Stops times candidates up to which exchange starts from random sets too: from all of them with a hundredth."""
 
 
 @dataclass(frozen=True)
@@ -145,30 +136,23 @@ def _sweep(measure: Measure, chosen: Integers, value: float) -> tuple[Integers, 
 def random_values(
     measure: Measure, n: int, generator: np.random.Generator, count: int = N_RANDOM
 ) -> tuple[Floats, Integers]:
-    """The criterion of random sets of n, shape (count,), and they, shape (count, n)."""
+    """The criterion of random sets of n, ascending, shape (count,), and the sets, shape (count, n)."""
     system = measure.system
-    sets = np.array([generator.choice(system.n_candidates, size=n, replace=False) for _ in range(count)], np.int64)
-    return np.array([measure.value(system.information(one)) for one in sets]), sets
+    sets = np.array([generator.choice(system.n_candidates, size=n, replace=False) for _ in range(count)])
+    values = np.array([measure.value(system.information(one)) for one in sets])
+    order = np.argsort(values, kind="stable")
+    return values[order], sets[order].astype(np.int64)
 
 
 def not_worse_than_random(measure: Measure, found: Chosen, generator: np.random.Generator) -> Chosen:
-    """The same, or what is better: of few sets the best, else what exchange makes of the best of random sets.
+    """The same, or what exchange makes of random sets where that is better.
 
-    Greedy choice is short-sighted while a set determines little, and exchange ends where no single one helps; other
-    starts end elsewhere. Where they take long, only a random set that is better as it is starts one.
+    Of large pools exchange starts from the best of them alone, and only if that is better. Of small ones, where a set
+    that no single exchange makes better may yet be far from the best, from several.
     """
-    system, n = measure.system, len(found.candidates)
-    if comb(system.n_candidates, n) <= MOST_SETS:
-        return min((found, *_every(measure, n)), key=lambda one: one.value)
+    n, of = len(found.candidates), measure.system.n_candidates
     values, sets = random_values(measure, n, generator)
-    order = np.argsort(values, kind="stable")[:N_STARTS]
-    starts = order if n * system.n_candidates <= _LITTLE else order[values[order] < found.value][:1]
-    others = [exchanged(measure, sets[k]) for k in starts.tolist()]
-    return min((found, *others), key=lambda one: one.value)
-
-
-def _every(measure: Measure, n: int) -> Iterator[Chosen]:
-    """All sets of n."""
-    for one in combinations(range(measure.system.n_candidates), n):
-        candidates = np.array(one, dtype=np.int64)
-        yield Chosen(candidates, measure.value(measure.system.information(candidates)))
+    starts = sets[: SMALL // (n * of)]
+    if not len(starts) and values[0] < found.value:
+        starts = sets[:1]
+    return min((found, *(exchanged(measure, one) for one in starts)), key=lambda one: one.value)

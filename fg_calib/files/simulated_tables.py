@@ -6,6 +6,7 @@ import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -93,6 +94,27 @@ def to_fill_in(columns: Columns, *, touched: bool = False) -> Columns:
     measured = {name: None for name, v in columns.items() if name in MEASURED and np.any(np.asarray(v) != 0.0)}
     joints = {name: None for name in columns if touched and re.fullmatch(r"q\d+", name)}
     return dict(columns) | measured | joints
+
+
+def is_filled_in(path: Path) -> bool:
+    """Whether something was written into a table that was to be filled in; a file that is no such table counts.
+
+    Args:
+        path: The file, which need not exist.
+    """
+    import polars as pl
+
+    if not path.exists():
+        return False
+    try:
+        table = pl.read_csv(path, infer_schema=False)
+    except (pl.exceptions.PolarsError, OSError):
+        return True
+    for of_table in (r"q\d+", "|".join(MEASURED)):
+        columns = [c for c in table.columns if re.fullmatch(of_table, c)]
+        if columns and all((table[c].is_null() | (table[c] == "")).all() for c in columns):
+            return False
+    return True
 
 
 def instrument_keys(tables: Sequence[Table], units: Units) -> dict[str, Any]:

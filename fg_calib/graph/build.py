@@ -208,10 +208,10 @@ def true_problem(robot: Robot, tables: Table | Sequence[Table], options: Options
 
     Args:
         robot: The robot.
-        tables: What was measured.
+        tables: What it would measure, without noise.
         options: Whether pairs share errors; the tables' own choices count for the rest.
     """
-    data = gather(robot, tables_of(tables, options))
+    data = gather(robot, tables_of(tables, options), predicted=True)
     variables = variables_of(robot, data, options)
     start = start_of(robot.with_estimated([]), data, variables)  # the arm as it is, what it measures where it is
     return problem_at(robot, data, options, variables, start)

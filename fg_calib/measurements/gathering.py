@@ -112,7 +112,7 @@ class Dataset(Brief):
         return seen[first] & ~np.array(self.unknowns.known) if len(first) else np.zeros(0, dtype=np.bool_)
 
 
-def gather(robot: Robot, tables: Sequence[Table]) -> Dataset:
+def gather(robot: Robot, tables: Sequence[Table], *, predicted: bool = False) -> Dataset:
     """All tables together.
 
     Where tables state ids, the same id is the same configuration.
@@ -120,6 +120,7 @@ def gather(robot: Robot, tables: Sequence[Table]) -> Dataset:
     Args:
         robot: The nominal robot: unknowns are started where it says that they are.
         tables: The tables.
+        predicted: Whether nothing of them was measured: what predicts the same is no measurement counted twice.
 
     Raises:
         ProblemError: A table lacks what its model needs, or two tables contradict each other.
@@ -130,7 +131,7 @@ def gather(robot: Robot, tables: Sequence[Table]) -> Dataset:
     found: dict[str, tuple[int, int]] = {}
     for number, table in enumerate(tables):
         m = table.measurements
-        for before in tables[:number]:
+        for before in () if predicted else tables[:number]:
             _check_once(table, before)
         place = np.empty(m.n_configurations, dtype=np.int64)
         for k, name in enumerate(m.ids.tolist()):

@@ -203,7 +203,7 @@ def _unit_solution(A: Floats, b: Floats) -> Floats:
     values, V = np.linalg.svd(np.vstack([A, np.zeros((3, 3))]), full_matrices=False)[1:]
     above = values**2 - values[2] ** 2
     g = V @ (A.T @ b)
-    least = 1e-15 * max(values[0] ** 2, 1e-200)  # rounding: where b says nothing along the third axis n is along it
+    least = 1e-15 * max(values[0] ** 2, 1e-60)  # rounding: where b says nothing along the third axis n is along it
     g[2] = np.copysign(max(abs(g[2]), least), g[2])
     bounds = 0.5 * abs(g[2]), 2.0 * float(np.linalg.norm(g))
     from scipy.optimize import brentq  # here, for it takes as long to import as a small calibration

@@ -100,6 +100,16 @@ def test_a_plane_whose_side_no_distance_tells_faces_away_from_the_base(height):
         assert found @ f == pytest.approx(0.7 - height, abs=0.01)
 
 
+@pytest.mark.parametrize("n", [1, 3])
+@pytest.mark.parametrize("distance", [0.0, 0.1])
+def test_a_plane_that_one_point_alone_is_at_goes_through_it(n, distance):
+    """Any direction will do; what rounding leaves of three readings of one point is none."""
+    points = np.tile([1.1, 2.1, 0.4], (n, 1)) / 3.0
+    c, f = plane_from_distances(points, np.full(n, distance))
+    normal = (f - c) / np.linalg.norm(f - c)
+    assert (points - f) @ normal == pytest.approx(distance, abs=1e-12)
+
+
 def test_a_plane_near_the_base_is_where_the_distances_say():
     """They fix the side, although the normal then points to the base."""
     rng = np.random.default_rng(0)

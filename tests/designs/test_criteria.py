@@ -1,0 +1,168 @@
+"""Criteria against their published formulas, worked out anew from the whole information with numpy alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from systems import random_stops, random_system, system_with_less
+from tolerances import rounding
+
+from fg_calib.designs.criteria import MOST_EXACT, Measure
+from fg_calib.designs.system import system_of
+
+CRITERIA = ("I", "D", "A", "E", "O1", "O2", "O3", "O4", "O5")
+
+
+def formula(criterion, system, M):
+    """The table of `criteria`: S by a Schur complement of the information in a basis of core and rest, then its SVD."""
+    P = system.core
+    rest = np.linalg.svd(P)[2][len(P) :]
+    T = np.vstack([np.linalg.pinv(P).T, rest])  # columns of T^T: the functions P, then whatever is beside them
+    B = np.linalg.inv(np.vstack([P, rest]))
+    N, p = B.T @ M @ B, len(P)
+    assert np.allclose(T @ np.vstack([P, rest]).T, np.eye(len(T)))
+    S = N[:p, :p] - N[:p, p:] @ np.linalg.inv(N[p:, p:]) @ N[p:, :p] if len(rest) else N
+    s = np.sqrt(np.linalg.svd(S)[1])
+    match criterion:
+        case "I":
+            return np.trace(system.task @ np.linalg.inv(M))
+        case "D" | "O1":
+            return -np.log(np.linalg.det(S))
+        case "A":
+            return np.trace(np.linalg.inv(S))
+        case "E" | "O3":
+            return -s[-1]
+        case "O2":
+            return -s[-1] / s[0]
+        case "O4":
+            return -(s[-1] ** 2) / s[0]
+        case "O5":
+            return np.sum(1.0 / s)
+
+
+def information(system, chosen):
+    M = system.known.copy()
+    for k in chosen:
+        M += system.rows[k].T @ system.rows[k]
+    return M
+
+
+def systems():
+    """Of few and many rows a stop, with and without nuisances, and of something undetermined."""
+    rng = np.random.default_rng(3)
+    shapes = [{}, {"h": 1, "nuisances": 0}, {"h": 6, "p": 3, "nuisances": 5}, {"h": 1, "p": 6}, {"p": 1}]
+    return [random_system(rng, **shape) for shape in shapes] + [system_with_less(rng)]
+
+
+SYSTEMS = systems()
+SETS = ([], [0], [3, 1], [0, 1, 2, 3, 4, 5, 6])
+
+
+@pytest.mark.parametrize("criterion", CRITERIA)
+@pytest.mark.parametrize("number", range(len(SYSTEMS)))
+def test_values_are_the_published_formulas(number, criterion):
+    """To the rounding of two inverses of the information."""
+    system = SYSTEMS[number]
+    for chosen in SETS:
+        M = information(system, chosen)
+        expected = formula(criterion, system, M)
+        found = Measure(criterion, system).value(system.information(np.array(chosen, dtype=np.int64)))
+        assert found == pytest.approx(expected, rel=rounding(1.0, np.linalg.cond(M)), abs=rounding())
+
+
+@pytest.mark.parametrize("criterion", CRITERIA)
+@pytest.mark.parametrize("number", range(len(SYSTEMS)))
+def test_the_best_candidate_is_the_best_when_each_is_tried(number, criterion):
+    system = SYSTEMS[number]
+    allowed = np.ones(system.n_candidates, dtype=np.bool_)
+    allowed[[2, 5]] = False
+    for chosen in SETS:
+        M = information(system, chosen)
+        each = np.array([formula(criterion, system, M + A.T @ A) for A in system.rows])
+        k, value = Measure(criterion, system).best(M, allowed)
+        condition = max(np.linalg.cond(M + A.T @ A) for A in system.rows)
+        tolerance = rounding(np.abs(each), condition) + rounding()
+        assert allowed[k]
+        assert each[k] <= each[allowed].min() + tolerance
+        assert value == pytest.approx(each[k], abs=tolerance)
+
+
+@pytest.mark.parametrize("criterion", ["I", "D", "A", "O1"])
+def test_gains_are_differences_of_values(criterion):
+    for system in SYSTEMS:
+        M = information(system, [1, 4])
+        C = np.linalg.inv(M)
+        each = np.array([formula(criterion, system, M + A.T @ A) for A in system.rows])
+        found = formula(criterion, system, M) - Measure(criterion, system)._gains(C)
+        size = max(np.abs(each).max(), abs(formula(criterion, system, M)))
+        assert np.abs(found - each).max() < rounding(size, np.linalg.cond(M)) + rounding()
+
+
+@pytest.mark.parametrize("criterion", ["E", "O2", "O3", "O4", "O5"])
+@pytest.mark.parametrize("seed", range(20))
+def test_bounds_are_never_above_what_a_candidate_makes(criterion, seed):
+    """A bound that is none would leave out the best: these are of all sizes, from next to nothing to far too much."""
+    rng = np.random.default_rng(seed)
+    system = random_system(rng, 40, h=1 + seed % 3, p=2 + seed % 4, nuisances=seed % 4)
+    system = replace(system, rows=system.rows * np.exp(2.0 * rng.normal(size=(40, 1, 1))))
+    M = information(system, rng.permutation(40)[: seed % 7])
+    each = np.array([formula(criterion, system, M + A.T @ A) for A in system.rows])
+    bounds = Measure(criterion, system)._bounds(np.linalg.inv(M))
+    assert (bounds <= each + rounding(np.abs(each), np.linalg.cond(M))).all()
+    assert bounds.min() > -np.inf
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("criterion", ["E", "O2", "O4", "O5"])
+def test_of_many_candidates_the_best_is_found_among_those_of_the_best_bounds(criterion):
+    """So that no more than some are worked out, whatever the pool; a percent is what that may cost."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        system = random_system(rng, 4 * MOST_EXACT)
+        M = information(system, rng.permutation(system.n_candidates)[:8])
+        each = np.array([formula(criterion, system, M + A.T @ A) for A in system.rows])
+        _, value = Measure(criterion, system).best(M, np.ones(system.n_candidates, dtype=np.bool_))
+        assert value <= each.min() + 0.01 * abs(each.min())
+
+
+def test_what_helps_most_comes_first():
+    for criterion in ("I", "D"):
+        system = SYSTEMS[0]
+        M = information(system, [0, 1])
+        each = np.array([formula(criterion, system, M + A.T @ A) for A in system.rows])
+        assert Measure(criterion, system).most_helpful(M, 5).tolist() == np.argsort(each)[:5].tolist()
+
+
+# --- the system -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_the_task_counts_in_its_own_units_and_without_what_none_determines(lost):
+    """`tr(W C)` by the pseudo-inverse in changes of ordinary size, the weak prior being 1e-8 of what is measured."""
+    stops, direction, W = random_stops(np.random.default_rng(5), lost=lost)
+    given = np.random.default_rng(6).normal(size=(1, 5)) / stops.scales
+    if lost:
+        u = direction / stops.scales
+        given -= (given * stops.scales @ u / (u @ u))[:, None] * (u / stops.scales)
+    system = system_of(stops, given, W)
+    chosen = np.array([0, 3, 4, 9, 11])
+    A = np.vstack([stops.rows[chosen].reshape(-1, 5), stops.always, given]) * stops.scales
+    C = np.linalg.pinv(A.T @ A, rcond=1e-12, hermitian=True)[:3, :3] * np.outer(stops.scales[:3], stops.scales[:3])
+    found = Measure("I", system).value(system.information(chosen))
+    assert system.rows.shape == (15, 2, 4 if lost else 5)
+    assert found == pytest.approx(np.trace(W @ C), rel=1e-4)
+    share = 0.0
+    if lost:
+        u = direction / stops.scales / np.linalg.norm(direction / stops.scales)
+        at = u[:3] * stops.scales[:3]
+        share = at @ W @ at / np.sum(np.diag(W) * stops.scales[:3] ** 2)
+    assert system.unknown == pytest.approx(share, abs=1e-9)
+    assert len(system.core) == (2 if lost else 3)
+
+
+def test_what_was_measured_already_is_no_longer_to_be_chosen():
+    system = SYSTEMS[0]
+    more = system.with_known(np.array([2, 7]))
+    assert np.abs(more.known - information(system, [2, 7])).max() < rounding(more.known)
+    some = more.select(np.array([4, 1]))
+    assert np.abs(some.information(np.array([1])) - information(system, [2, 7, 1])).max() < rounding(more.known)

@@ -1,0 +1,328 @@
+"""What a design expects is what a calibration of its stops says of itself; what it chooses is what is asked for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenarios import INSTRUMENTS, SIGMA, WALL, scenario
+from simulated import small_arm
+
+from fg_calib import Pairing
+from fg_calib.analysis.accuracy import errors_at
+from fg_calib.analysis.covariance import spread_of
+from fg_calib.designs.design import design
+from fg_calib.errors import InputError
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.solver import solve
+from fg_calib.job import Job
+from fg_calib.measurements.dataset import Noise
+from fg_calib.options import Options
+from fg_calib.simulation.configurations import GivenReadings, RandomReadings
+from fg_calib.simulation.instruments import BoardCamera, LengthGauge, PairGauge, Spot, Tracker
+from fg_calib.simulation.scenario import Errors
+from fg_calib.simulation.simulator import simulate
+
+NOISE = replace(SIGMA, joint=2e-4)
+STAR = Tracker(model="distance-rotation", name="it")
+EXPECTED = {name: INSTRUMENTS[name] for name in
+            ("pose", "targets", "anchors", "offset", "contact", "planes", "board", "sockets")} | {
+    "formed star": STAR,
+    "all formed pairs": replace(STAR, pairing=Pairing("all")),
+    "lengths of pairs": PairGauge(model="distance", name="it"),
+    "pixels": INSTRUMENTS["pixels"],
+}  # fmt: skip
+
+SAME = 1e-6
+"""Share by which expected errors may differ: an estimate from figures without noise is so near to the arm as drawn."""
+
+
+def error_of(robot, tables, task):
+    """Expected errors at a task, by a calibration of tables that hold what the arm as drawn would show."""
+    solution = solve(build_problem(robot, list(tables), Options(tables[0].model, gauge="prior")))
+    base, fitted = errors_at(spread_of(solution), task.readings)
+    return fitted if task.fitted else base
+
+
+def planned(instrument, n=12, n_candidates=40, **options):
+    of = scenario(instrument, n=20, noise=NOISE)
+    return design(of, n=n, n_candidates=n_candidates, **options)
+
+
+# --- what is expected -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", EXPECTED)
+def test_expected_errors_are_those_of_a_calibration_of_the_stops(kind):
+    plan = planned(EXPECTED[kind], n_candidates=80 if kind == "pixels" else 40, fitted=True)
+    expected = error_of(plan.pool.robot, plan.tables, plan.task)
+    assert plan.expected.position == pytest.approx(expected.position, rel=SAME)
+    assert plan.expected.orientation == pytest.approx(expected.orientation, rel=SAME)
+    if kind not in ("all formed pairs", "lengths of pairs"):  # chosen by poses, and by a star
+        assert plan.curve[-1].n == plan.n
+        assert plan.curve[-1].designed == pytest.approx(plan.expected.position, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_the_task_is_what_is_asked_for():
+    """A task at one place of the arm is served better by a design for it than by one for everywhere."""
+    near = np.array([0.3, -0.5, 0.1, 0.8]) + 0.1 * np.random.default_rng(0).normal(size=(20, 4))
+    everywhere, there = planned(INSTRUMENTS["pose"], n=4), planned(INSTRUMENTS["pose"], n=4, task=near)
+    assert there.task.readings.tolist() == near.tolist()
+    of_other = everywhere.pool.posterior(np.arange(4)).error(there.task).position
+    assert there.expected.position < of_other
+    assert there.expected.position < everywhere.expected.position
+
+
+@pytest.mark.slow
+def test_errors_count_in_the_base_where_something_says_where_it_is():
+    base = design(scenario(replace(INSTRUMENTS["pose"], frame="base"), n=20), n=5, n_candidates=30)
+    assert not base.task.fitted
+    of = scenario(replace(INSTRUMENTS["pose"], frame="unknown"), n=20)
+    fitted = design(of, n=5, n_candidates=30)
+    assert fitted.task.fitted
+    assert design(of, n=5, n_candidates=30, fitted=False).expected.position > fitted.expected.position
+
+
+@pytest.mark.slow
+def test_a_lever_makes_orientations_count():
+    of = scenario(INSTRUMENTS["pose"], n=20)
+    plain, weighed = (design(of, n=4, n_candidates=60, lever=lever) for lever in (0.0, 100.0))
+    assert weighed.expected.orientation <= plain.expected.orientation
+    assert plain.expected.position <= weighed.expected.position
+
+
+# --- given, targets, what is undetermined -----------------------------------------------------------------------------
+
+
+def test_given_stops_count_and_are_not_to_be_measured_again():
+    of = scenario(INSTRUMENTS["pose"], n=20, noise=NOISE)
+    rng = np.random.default_rng(5)
+    given = rng.uniform(-1.0, 1.0, (6, 4))
+    plan = design(of, n=4, n_candidates=40, given=given)
+    assert (plan.n, len(plan.pool.given)) == (4, 6)
+    assert plan.pool.readings[plan.pool.given].tolist() == given.tolist()
+    assert not (plan.readings[:, None] == given).all(axis=2).any()
+    of_given, of_all = (
+        simulate(replace(of, errors=Errors("values", {}), noise=Noise(0.0, 0.0, 0.0), stated_noise=NOISE,
+                         configurations=GivenReadings(q))).tables
+        for q in (given, np.vstack([given, plan.readings]))
+    )  # fmt: skip
+    for tables, found in ((of_given, plan.before), (of_all, plan.expected)):
+        assert found.position == pytest.approx(error_of(of.robot, tables, plan.task).position, rel=SAME)
+    assert plan.expected.position < plan.before.position
+
+
+@pytest.mark.slow
+def test_a_target_is_reached_with_as_few_as_a_scan_of_all_numbers_finds():
+    for instrument in (INSTRUMENTS["pose"], STAR):
+        of = scenario(instrument, n=20)
+        errors = {n: design(of, n=n, n_candidates=40).expected.position for n in range(5, 9)}
+        target = errors[7] * 1.0001
+        fewest = min(n for n, error in errors.items() if error <= target)
+        plan = design(of, target=target, n_candidates=40)
+        assert plan.reached
+        assert plan.expected.position <= target * (1.0 + 1e-5)
+        assert abs(plan.n - fewest) <= 1
+
+
+@pytest.mark.slow
+def test_a_target_that_is_not_reached_is_said():
+    plan = design(scenario(INSTRUMENTS["pose"], n=20), target=1e-9, n_candidates=25)
+    assert not plan.reached
+    assert plan.n == 25
+    assert plan.expected.position > 1e-9
+
+
+@pytest.mark.slow
+def test_what_no_candidate_determines_is_said_with_what_would():
+    """Nothing of lengths between configurations says where the base is, or how the tool is turned."""
+    plan = design(scenario(PairGauge(model="distance", name="it"), n=20, job={"gauge": "none"}), n=20, n_candidates=60)
+    assert plan.task.fitted
+    names = {name for cure in plan.cures for name in cure.relation}
+    assert "theta1" in names
+    one = next(cure for cure in plan.cures if "theta1" in cure.relation)
+    assert "positions in the base frame" in one.by
+    assert "distances between configurations" not in one.by
+    in_base = design(
+        scenario(PairGauge(model="distance", name="it"), n=20, job={"gauge": "none"}),
+        n=20, n_candidates=60, fitted=False,
+    )  # fmt: skip
+    assert in_base.expected.position is None
+    assert in_base.unknown > 0.1
+
+
+# --- more of a job ----------------------------------------------------------------------------------------------------
+
+
+def job_of(instrument, q, **changes):
+    """A job of what the arm as drawn shows at some configurations."""
+    silent = Noise(position=0.0, orientation=0.0, distance=0.0, angle=0.0, point=0.0, pixel=0.0)
+    of = scenario(instrument, errors=Errors("values", {}), noise=silent, stated_noise=NOISE,
+                  configurations=GivenReadings(q), **changes)  # fmt: skip
+    tables = simulate(of).tables
+    return Job(None, of.robot, tables, Options(tables[0].model))
+
+
+def selected(job, rows):
+    table = job.tables[0]
+    return [replace(table, measurements=table.measurements.select(rows))]
+
+
+MORE = {
+    "pose": Tracker(model="pose", name="it", frame="unknown"),
+    "position of one target": Tracker(model="position", name="it", frame="unknown",
+                                      targets={"a": Spot([0.1, 0.05, 0.2])}),
+    "a target known nearly": Tracker(model="position", name="it", frame="base",
+                                     targets={"a": Spot([0.1, 0.05, 0.2], 1e-4)}),
+    "an anchor": LengthGauge(name="it", anchors={"a": Spot([1.0, -2.0, 0.5])}),
+    "an anchor known nearly": LengthGauge(name="it", anchors={"a": Spot([1.0, -2.0, 0.5], 1e-4)}),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", MORE)
+def test_more_of_a_job_counts_with_what_was_measured(kind):
+    """As in a calibration of all rows in one table: what the first rows say of unknowns is neither lost nor doubled."""
+    q = np.random.default_rng(4).uniform(-1.5, 1.5, (40, 4))
+    every = job_of(MORE[kind], q)
+    old = replace(every, measurements=tuple(selected(every, np.arange(15))))
+    plan = design(old, n=5, candidates=GivenReadings(q[15:]))
+    same = 1e-4 if "nearly" in kind else SAME  # what is told is off, and the arm as estimated by a little of that
+    chosen = [int(np.flatnonzero((q == one).all(axis=1))[0]) for one in plan.readings]
+    assert min(chosen) >= 15
+    before = error_of(every.robot, selected(every, np.arange(15)), plan.task)
+    assert plan.before.position == pytest.approx(before.position, rel=same)
+    expected = error_of(every.robot, selected(every, np.array([*range(15), *chosen])), plan.task)
+    assert plan.expected.position == pytest.approx(expected.position, rel=same)
+    assert plan.curve[-1].designed == pytest.approx(plan.expected.position, rel=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["planes", "faces", "board", "pixels", "sockets"])
+def test_more_of_every_instrument_is_planned(kind):
+    rng = np.random.default_rng(4)
+    q = rng.uniform(-1.5, 1.5, (80 if kind in ("board", "pixels") else 30, 4))
+    # An arm of four joints cannot look at the middle of a board: it sees what it sees.
+    plan = design(job_of(INSTRUMENTS[kind], q), n=4, n_candidates=80, candidates=RandomReadings(1))
+    assert plan.n == 4
+    assert 0.0 < plan.expected.position <= plan.before.position
+
+
+@pytest.mark.slow
+def test_a_board_seen_from_below_is_seen_from_below_again():
+    q = np.random.default_rng(4).uniform(-1.5, 1.5, (80, 4))
+    job = job_of(BoardCamera(model="board", name="it", boards=WALL), q)
+    m = job.tables[0].measurements
+    flip = np.diag([1.0, -1.0, -1.0])
+    below = replace(job, measurements=(replace(job.tables[0], measurements=replace(m, rotation=m.rotation @ flip)),))
+    above, under = (design(one, n=4, candidates=RandomReadings(1), n_candidates=60) for one in (job, below))
+    assert np.allclose(under.readings, above.readings)
+    assert under.expected.position == pytest.approx(above.expected.position, rel=1e-5)
+
+
+@pytest.mark.slow
+def test_rows_of_a_job_are_chosen_among_themselves():
+    q = np.random.default_rng(4).uniform(-1.5, 1.5, (30, 4))
+    job = job_of(MORE["pose"], q)
+    plan = design(job, n=8, candidates="rows")
+    names = job.tables[0].measurements.ids.tolist()
+    rows = np.array([names.index(name) for name in plan.ids.tolist()])
+    assert np.abs(plan.readings - q[rows]).max() == 0.0
+    assert plan.before is None
+    expected = error_of(job.robot, selected(job, np.sort(rows)), plan.task)
+    assert plan.expected.position == pytest.approx(expected.position, rel=SAME)
+
+
+# --- pairs ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_best_of_a_star_a_chain_a_tree_and_free_pairs_is_taken():
+    plan = planned(PairGauge(model="distance", name="it"), n=14, n_candidates=60)
+    assert set(plan.pairings) == {"star", "chain", "tree", "free"}
+    assert plan.expected.position == pytest.approx(min(plan.pairings.values()), rel=1e-9)
+    assert len(plan.pairs) == 13
+    assert plan.pairs.max() < plan.n
+    assert np.all(plan.pairs[:, 0] != plan.pairs[:, 1])
+    assert len({tuple(sorted(pair)) for pair in plan.pairs.tolist()}) == 13
+    expected = error_of(plan.pool.robot, plan.tables, plan.task)
+    assert plan.expected.position == pytest.approx(expected.position, rel=SAME)
+
+
+@pytest.mark.slow
+def test_all_pairs_that_can_be_formed_hold_the_most():
+    plan = planned(STAR, n=10)
+    assert set(plan.pairings) == {"star", "chain", "all"}
+    assert plan.pairings["all"] == min(plan.pairings.values())
+    assert plan.pairings["star"] == pytest.approx(plan.expected.position, rel=1e-9)
+    assert plan.pairs is None
+
+
+# --- all of it --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_same_seed_is_the_same_design_and_another_another():
+    one, same, other = (planned(INSTRUMENTS["pose"], n=5, seed=seed) for seed in (3, 3, 4))
+    assert one.readings.tolist() == same.readings.tolist()
+    assert one.curve == same.curve
+    assert one.readings.tolist() != other.readings.tolist()
+
+
+@pytest.mark.slow
+def test_the_curve_falls_and_designed_stops_are_better_than_random_ones():
+    plan = planned(INSTRUMENTS["targets"], n=20, n_candidates=60)
+    designed = np.array([p.designed for p in plan.curve])
+    low, middle, high = np.array([p.random for p in plan.curve]).T
+    assert (np.diff(designed) < 0.0).all()
+    assert (np.diff(middle) < 0.0).all()
+    assert (designed <= low).all()
+    assert (low <= middle).all()
+    assert (middle <= high).all()
+    assert plan.curve[0].n == 4
+    assert plan.random == middle[-1]
+
+
+@pytest.mark.slow
+def test_as_many_as_there_are_and_one():
+    q = np.random.default_rng(4).uniform(-1.5, 1.5, (5, 4))
+    of = scenario(INSTRUMENTS["pose"], n=20)
+    every = design(of, n=9, candidates=GivenReadings(q))
+    assert sorted(every.readings.tolist()) == sorted(q.tolist())
+    one = design(of, n=1, candidates=GivenReadings(q))
+    assert one.n == 1
+    alone = design(of, n=3, candidates=GivenReadings(q[:1]))
+    assert alone.readings.tolist() == q[:1].tolist()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"n": 3, "target": 1e-3}, "target"),
+        ({"n": 0}, "n"),
+        ({"n": 501}, "n"),
+        ({"target": 0.0}, "target"),
+        ({"n_candidates": 1}, "n_candidates"),
+        ({"lever": -1.0}, "lever"),
+        ({"seed": -1}, "seed"),
+        ({"candidates": "rows"}, "rows of a scenario"),
+        ({"criterion": "G"}, "criterion"),
+        ({"task": np.zeros((3, 5))}, "task"),
+        ({"task": np.zeros((0, 4))}, "task"),
+        ({"given": np.zeros((3, 5))}, "given"),
+        ({"task": np.full((3, 4), np.nan)}, "task"),
+        ({"given": np.full((3, 4), np.inf)}, "given"),
+    ],
+)
+def test_figures_that_make_no_sense_are_refused(options, message):
+    of = scenario(INSTRUMENTS["pose"], n=20)
+    with pytest.raises(InputError, match=message):
+        design(of, **{"n_candidates": 5} | options)
+
+
+@pytest.mark.slow
+def test_a_design_in_a_line():
+    plan = planned(INSTRUMENTS["pose"], n=5)
+    figure = f"{plan.expected.position * 1e3:.3g} mm"
+    assert repr(plan) == f"Design of 5 stops for {small_arm().name!r}: expected RMS {figure}, I"

@@ -1,0 +1,169 @@
+"""Rows by stop: their sum is the information of the same measurements taken as a calibration takes them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenarios import CAMERA, GRID, INSTRUMENTS, SIGMA, WALL, scenario
+from simulated import measure, small_arm
+from tolerances import rounding
+
+from fg_calib import Pairing
+from fg_calib.designs.pool import drawn, pool_of
+from fg_calib.designs.rows import stop_rows
+from fg_calib.errors import InputError
+from fg_calib.graph.build import build_problem, true_problem
+from fg_calib.graph.factors import prior_rows
+from fg_calib.graph.information import whitened_jacobian
+from fg_calib.simulation.configurations import Placement, RandomReadings
+from fg_calib.simulation.instruments import BoardCamera, LengthGauge, PairGauge, Sockets, Tracker
+
+N = 20
+"""Candidates; of cameras, which see few, twice as many."""
+
+NOISE = replace(SIGMA, joint=1e-3)
+"""Joint noise that moves the tool ten times as far as what measures errs: what is shared counts."""
+
+FLOOR = {"floor": Placement(np.eye(3), np.array([0.0, 0.0, -2.5]))}
+STAR = Tracker(model="distance-rotation", name="formed")
+LENGTHS = PairGauge(model="distance", name="lengths")
+ANCHORS = LengthGauge(name="anchors")
+POSES = Tracker(model="pose", name="poses")
+BOARDS = BoardCamera(model="pixels", name="boards", boards=WALL | FLOOR, camera=CAMERA, corners=GRID)
+
+KINDS = {name: (instrument,) for name, instrument in INSTRUMENTS.items()} | {
+    "formed star": (STAR,),
+    "formed lengths": (Tracker(model="distance", name="it", pairing=Pairing("all")),),
+    "two boards": (BOARDS,),
+    "poses and lengths at the same stops": (POSES, ANCHORS),
+    "two that would measure the same": (POSES, replace(POSES, name="others")),
+    "a star whose hub others measure": (LENGTHS, POSES),
+    "a star whose hub has lengths to anchors": (LENGTHS, ANCHORS),
+    "two stars of one hub": (STAR, LENGTHS),
+    "two stars": (LENGTHS, replace(LENGTHS, name="more", configurations=RandomReadings(8))),
+    "stops of its own": (replace(POSES, configurations=RandomReadings(8)), ANCHORS),
+    "some that see nothing": (BOARDS, ANCHORS),
+}
+
+
+def kinds(*others):
+    """All kinds but some; what takes long is slow."""
+    slow = ("camera in the room", "some that see nothing", "two boards")
+    return [pytest.param(k, marks=pytest.mark.slow) if k in slow else k for k in KINDS if k not in others]
+
+
+def pool_with(*instruments, n=N, **changes):
+    n = 2 * n if any(isinstance(i, BoardCamera) for i in instruments) else n
+    of = scenario(*instruments, n=n, noise=NOISE, **changes)
+    return pool_of(of, drawn(of, n, np.random.default_rng(0)))
+
+
+def square(rows):
+    return rows.T @ rows
+
+
+def information_of(problem):
+    """What the rows of a problem say, and its tolerances: shape (n_columns + n_nuisance,) * 2."""
+    v = problem.variables
+    priors = np.pad(prior_rows(v, problem.start)[1], ((0, 0), (0, v.n_nuisance)))
+    return square(whitened_jacobian(problem, problem.start)) + square(priors)
+
+
+def without_last(M, n):
+    """Information of the first n, the others unknown; what is not determined of these says nothing."""
+    d = np.sqrt(np.diag(M))
+    d = np.where(d > 0.0, d, 1.0)
+    C = M / np.outer(d, d)
+    left = C[:n, :n] - C[:n, n:] @ np.linalg.pinv(C[n:, n:], rcond=1e-13, hermitian=True) @ C[n:, :n]
+    return left * np.outer(d, d)[:n, :n]
+
+
+def apart(a, b):
+    """The largest difference of two informations, each column in the units of its own sigma."""
+    d = np.sqrt(np.diag(a))
+    d = np.where(d > 0.0, d, 1.0)
+    return np.abs((a - b) / np.outer(d, d)).max()
+
+
+def of_stops(rows, chosen=slice(None)):
+    return square(rows.rows[chosen].reshape(-1, rows.rows.shape[2])) + square(rows.always)
+
+
+@pytest.mark.parametrize("kind", kinds())
+def test_all_stops_together_hold_what_their_problem_holds(kind):
+    """Column by column, nuisances too: to the rounding of sums, of a triangle, and of one Schur complement."""
+    pool = pool_with(*KINDS[kind])
+    expected = information_of(pool.problem)
+    found = without_last(of_stops(pool.rows), len(expected))
+    assert apart(expected, found) < rounding()
+    assert len(pool.rows.rows) == len(pool.readings) == len(pool.group) == pool.stop.max() + 1
+
+
+@pytest.mark.parametrize("kind", kinds("formed pairs", "formed lengths"))
+def test_some_stops_hold_what_a_problem_of_them_alone_holds(kind):
+    """Of the arm and its frames: what is beside it may be started elsewhere, and is eliminated."""
+    pool = pool_with(*KINDS[kind])
+    n = pool.problem.variables.n_columns
+    some = np.random.default_rng(1).permutation(len(pool.readings))[: max(2, 3 * len(pool.readings) // 5)]
+    alone = true_problem(pool.robot, pool.tables_of(some), pool.problem.options)
+    assert alone.variables.n_columns == n
+    expected, found = without_last(information_of(alone), n), without_last(of_stops(pool.rows, some), n)
+    assert apart(expected, found) < 1e-6  # eliminating unknowns that so few stops hardly hold takes half the digits
+
+
+def test_positions_in_a_frame_of_their_own_hold_what_all_distances_between_them_do():
+    """Within what pairs spare of their variance, 1e-3 of it, so that too many of them can be whitened."""
+    of = scenario(Tracker(model="distance", name="it", pairing=Pairing("all")), n=N)
+    pool = pool_of(of, drawn(of, N, np.random.default_rng(0)))
+    some = np.arange(2, 14)
+    formed = true_problem(pool.robot, pool.tables_of(some), pool.problem.options)
+    n = formed.variables.n_columns
+    assert apart(information_of(formed), without_last(of_stops(pool.rows, some), n)) < 2e-2
+
+
+def test_hubs_errors_are_unknowns_of_one_sigma():
+    pool = pool_with(LENGTHS)
+    shared = len(pool.rows.scales) - pool.problem.variables.n_columns
+    assert shared == pool.robot.n_joints
+    assert pool.rows.scales[-shared:].tolist() == [1.0] * shared
+    assert pool.rows.always[-shared:, -shared:].tolist() == np.eye(shared).tolist()
+
+
+def test_no_joint_noise_leaves_nothing_to_share():
+    of = scenario(LENGTHS, n=N)
+    pool = pool_of(of, drawn(of, N, np.random.default_rng(0)))
+    assert len(pool.rows.scales) == pool.problem.variables.n_columns
+
+
+def test_stops_without_train_rows_add_nothing():
+    arm = small_arm(tolerance={"a": 2e-3, "theta": 2e-3})
+    data = measure(arm, 6, np.random.default_rng(0), n_test=3)
+    problem = build_problem(arm, data, model="pose", frame="known")
+    rows = stop_rows(problem, np.arange(9))
+    assert rows.measured.tolist() == [1] * 6 + [0] * 3
+    assert not rows.rows[6:].any()
+    assert rows.rows[:6].any(axis=(1, 2)).all()
+    assert apart(information_of(problem), of_stops(rows)) < rounding()
+
+
+@pytest.mark.parametrize("kind", kinds(*KINDS.keys() - {"pixels", "two boards", "camera in the room"}))
+def test_many_rows_are_reduced_to_no_more_than_they_determine(kind):
+    """An image says of a stop's frame what a pose says; of two boards in sight twice that."""
+    pool = pool_with(*KINDS[kind])
+    assert pool.rows.measured.max() >= GRID.rows * GRID.columns / 2
+    boards = len(pool.problem.data.unknowns.names) or 1
+    assert pool.rows.rows.shape[1] <= 12 * boards < 2 * pool.rows.measured.max()
+
+
+def test_pairs_that_share_errors_but_no_hub_are_refused():
+    arm = small_arm(tolerance={"a": 2e-3, "theta": 2e-3})
+    data = measure(arm, 8, np.random.default_rng(0), sigma_joint=1e-3)
+    problem = build_problem(arm, data, model="distance", pairing=Pairing("chain"))
+    with pytest.raises(InputError, match=r"each shares an end with others.*pairing star"):
+        stop_rows(problem, np.arange(8))
+
+
+def test_sockets_of_known_distances_count_once():
+    """Distances between touched points are of no stop: they are there whatever is measured."""
+    pool = pool_with(Sockets(name="it", sockets=3))
+    assert len(pool.rows.always) > len(prior_rows(pool.problem.variables, pool.problem.start)[1])
