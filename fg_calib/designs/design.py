@@ -87,6 +87,7 @@ class Design(FrozenArrays):
         pairings: Expected position errors by which pairs are measured, or formed, [m].
         random: Median of the expected position errors of as many random stops, [m].
         curve: What is to be expected of how many.
+        asked: How many stops were asked for; None where a target was stated.
         target: What was to be reached, [m]; None where a number was stated.
         reached: Whether it is.
         observability: What the rows determine of the arm.
@@ -110,6 +111,7 @@ class Design(FrozenArrays):
     pairings: Mapping[str, float]
     random: float
     curve: tuple[CurvePoint, ...]
+    asked: int | None
     target: float | None
     reached: bool
     observability: Observability
@@ -305,6 +307,7 @@ def design_from(
         pairings=pairings,
         random=curve[-1].random[1],
         curve=curve,
+        asked=n if target is None else None,
         target=target,
         reached=target is None or (expected.position is not None and expected.position <= target * _JUST),
         observability=plan.posterior.observability,
@@ -337,8 +340,6 @@ def _choose(
     if not len(able):
         raise InputError("candidates", "none at which anything is measured", "some")
     hubs = int(pool.has_hub)
-    if n is not None and n > len(able) + hubs:
-        raise InputError("n", f"found {n}", f"at most {len(able) + hubs}: as many candidates measure something")
     chooser = Chooser(system.select(able), criterion, _exactly(pool, task, able))
     tell("choosing")
     if target is None:
