@@ -26,14 +26,7 @@ from fg_calib.designs.criteria import Criterion
 from fg_calib.designs.cures import Cure, cures_of
 from fg_calib.designs.of_job import pool_of_more, pool_of_rows, solved
 from fg_calib.designs.order import shortest_way, travel
-from fg_calib.designs.plans import (
-    errors_by_pairing,
-    other_pairs,
-    plan_of_pairs,
-    plan_of_stops,
-    with_best_hub,
-    with_names,
-)
+from fg_calib.designs.plans import best_plan, with_best_hub, with_names
 from fg_calib.designs.pool import Pool, drawn, pool_of
 from fg_calib.designs.search import Chosen, not_worse_than_random
 from fg_calib.designs.system import system_of
@@ -277,14 +270,7 @@ def design_from(
     chooser, found, able = _choose(pool, task, generator, n, target, criterion)
     chosen = able[found.candidates]
     tell("working out what to expect")
-    way = shortest_way(pool.robot, pool.readings[chosen])
-    stops = np.concatenate([pool.given, chosen[way]])
-    plan = plan_of_stops(pool, stops)
-    pairings = errors_by_pairing(pool, stops, task)
-    for other in other_pairs(pool, chosen, (criterion, task), generator):
-        pairings[other.structure] = other.posterior.error(task).position or np.inf
-        if pairings[other.structure] < (plan.posterior.error(task).position or np.inf):
-            plan = plan_of_pairs(pool, other)
+    plan, pairings = best_plan(pool, chosen, (criterion, task), generator)
     expected, curve = plan.posterior.error(task), chooser.curve(found, generator, int(pool.has_hub))
     before = pool.posterior(pool.given) if len(pool.given) or pool.before is not None else None
     ids = plan.names if pool.scenario is None else _new_names(len(plan.readings), pool.before)
