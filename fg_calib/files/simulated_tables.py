@@ -6,11 +6,13 @@ import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.errors import InputError
 from fg_calib.files.units import Units
 from fg_calib.measurements.dataset import Measurements, Pairs
 from fg_calib.measurements.series import KnownPoint, Table
@@ -93,6 +95,30 @@ def to_fill_in(columns: Columns, *, touched: bool = False) -> Columns:
     measured = {name: None for name, v in columns.items() if name in MEASURED and np.any(np.asarray(v) != 0.0)}
     joints = {name: None for name in columns if touched and re.fullmatch(r"q\d+", name)}
     return dict(columns) | measured | joints
+
+
+def require_empty(path: Path, columns: Columns) -> None:
+    """Check that what was measured is not lost where a table to fill in is written once more.
+
+    Args:
+        path: Where the table would be.
+        columns: Its columns, None for those that are still to be filled in.
+
+    Raises:
+        InputError: One is there of which any of these has a figure, or which cannot be read.
+    """
+    import polars as pl
+
+    expected = "another folder, or the file moved away"
+    try:
+        there = pl.read_csv(path, infer_schema=False, truncate_ragged_lines=True)
+    except FileNotFoundError:
+        return
+    except (OSError, pl.exceptions.PolarsError):  # nobody knows what it holds
+        raise InputError(str(path), "is there already and cannot be read", expected) from None
+    empty = [name for name, values in columns.items() if values is None and name in there.columns]
+    if any(there[name].null_count() < len(there) for name in empty):
+        raise InputError(str(path), "has figures filled in", expected)
 
 
 def instrument_keys(tables: Sequence[Table], units: Units) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from fg_calib.designs.design import Design
 from fg_calib.files.csv_writer import write_csv
 from fg_calib.files.disk import fill_folder, write_text
 from fg_calib.files.robot_yaml import write_robot
-from fg_calib.files.simulated_tables import instrument_keys, table_columns, to_fill_in
+from fg_calib.files.simulated_tables import instrument_keys, require_empty, table_columns, to_fill_in
 from fg_calib.files.units import Units
 from fg_calib.files.urdf import write_urdf
 from fg_calib.measurements.series import Table
@@ -31,6 +31,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SCHEMA = "fg-calib/design/1"
+
+_BEGINNING = f'{{\n "schema": "{SCHEMA}"'.encode()
+"""How `design.json` begins."""
 
 CONFIGURATIONS = "configurations.csv"
 
@@ -308,7 +311,8 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
         The names of the files.
 
     Raises:
-        InputError: The folder cannot be written, or holds files of these names that are no design's.
+        InputError: The folder cannot be written, or holds files of these names that are no design's, or tables that
+            were filled in.
     """
     import json
 
@@ -338,8 +342,11 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
     names = [CONFIGURATIONS, "design.json", "design.png"]
     if tables:
         names += [*files, "robot.yaml", *([urdf] if urdf else []), "calibration.yaml"]
-    own = {"calibration.yaml": _JOB_WORDS.encode(), "design.json": b"{"}
-    fill_folder(folder, write, dict.fromkeys(names, b"") | own)
+    for name, columns in files.items():
+        require_empty(folder / name, columns)
+    whose = {"design.json": _BEGINNING}  # first: by that the others are this command's too
+    own = whose | dict.fromkeys(names, b"") | {"calibration.yaml": _JOB_WORDS.encode()} | whose
+    fill_folder(folder, write, own)
     return tuple(names)
 
 
