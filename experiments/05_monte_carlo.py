@@ -1,6 +1,6 @@
 """Do the paper's claims hold over many draws, and how far is each estimator from what the measurements allow?
 
-Command: python experiments/05_monte_carlo.py [--quick] [--seed N] [--draws N] [--out FOLDER] [--processes N]
+Command: python experiments/05_monte_carlo.py [--quick] [--seed N] [--draws N] [--out FOLDER] [--workers N]
 Takes two minutes on two cores.
 
 200 draws of errors (uniform within Table 6's bounds), configurations (self-motion, roll), noise and 500 validation
@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from draws import over_draws
 from matplotlib.figure import Figure
 from space_robot import (
     COLOURS,
@@ -31,7 +32,6 @@ from space_robot import (
     clean,
     fit,
     one_draw,
-    over_draws,
     paper_scenario,
     papers_names,
     position_bound,
@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     """Run the experiment; returns what is written as JSON."""
     given = arguments_of(__doc__, NAME, arguments, 200, 4)
     clock = time.perf_counter()
-    draws = over_draws(draw_once, range(given.seed, given.seed + given.draws), given.processes)
+    draws = over_draws(draw_once, range(given.seed, given.seed + given.draws), given.workers)
     found = summary(draws)
     found |= {"seed": given.seed, "n_draws": given.draws, "seconds": time.perf_counter() - clock}
     write_json(given.file, found)

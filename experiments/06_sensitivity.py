@@ -1,6 +1,6 @@
 """Which of the choices that the paper leaves open matters most for the accuracy it reports?
 
-Command: python experiments/06_sensitivity.py [--quick] [--draws N] [--seed N] [--out FOLDER] [--processes N]
+Command: python experiments/06_sensitivity.py [--quick] [--draws N] [--seed N] [--out FOLDER] [--workers N]
 Takes about five minutes on two cores (12 draws: one).
 
 One change at a time against the shipped scenario (hemisphere of 0.5 m, random roll and self-motion, 52 configurations,
@@ -22,6 +22,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from draws import over_draws
 from matplotlib.figure import Figure
 from space_robot import (
     COLOURS,
@@ -32,7 +33,6 @@ from space_robot import (
     clean,
     fit,
     one_draw,
-    over_draws,
     paper_scenario,
     papers_names,
     position_bound,
@@ -85,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     clock = time.perf_counter()
     n_draws = {name: max(2, int(variant.share_of_draws * given.draws)) for name, variant in VARIANTS.items()}
     tasks = [(name, seed) for name, n in n_draws.items() for seed in range(given.seed, given.seed + n)]
-    draws = iter(over_draws(draw_once, tasks, given.processes))
+    draws = iter(over_draws(draw_once, tasks, given.workers))
     found: dict[str, Any] = {"seed": given.seed, "n_draws": n_draws, "variants": {}}
     for name, n in n_draws.items():
         found["variants"][name] = summary([next(draws) for _ in range(n)])

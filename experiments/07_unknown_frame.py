@@ -1,6 +1,6 @@
 """What do pairs hold of the poses they are formed from, and what is lost when nobody knows where the base is?
 
-Command: python experiments/07_unknown_frame.py [--quick] [--seed N] [--draws N] [--out FOLDER] [--processes N]
+Command: python experiments/07_unknown_frame.py [--quick] [--seed N] [--draws N] [--out FOLDER] [--workers N]
 Takes some five minutes on two free cores.
 
 200 draws of the paper's scenario as it is (hemisphere of 0.5 m), and 60 with the camera 0.3 to 2 m from the board,
@@ -22,13 +22,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from draws import over_draws
 from matplotlib.figure import Figure
 from space_robot import (
     MM,
     arguments_of,
     clean,
     one_draw,
-    over_draws,
     paper_scenario,
     position_bound,
     position_errors,
@@ -94,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     clock = time.perf_counter()
     n_draws = {views: max(3, int(share * given.draws)) for views, share in SHARE_OF_DRAWS.items()}
     tasks = [(views, seed) for views, n in n_draws.items() for seed in range(given.seed, given.seed + n)]
-    draws = iter(over_draws(draw_once, tasks, given.processes))
+    draws = iter(over_draws(draw_once, tasks, given.workers))
     found: dict[str, Any] = {"seed": given.seed, "n_draws": n_draws, "views": {}}
     for v, (views, n) in enumerate(n_draws.items()):
         rows = [next(draws) for _ in range(n)]

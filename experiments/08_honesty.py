@@ -30,22 +30,16 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import cache
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-if __name__ in {"__main__", "__mp_main__"}:  # before numpy: two workers, one thread each
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ[name] = "1"
-
 import numpy as np
 from arms import Arm, build_arms, random_rotations
+from draws import Over, add_workers, draws_on, here
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
@@ -401,16 +395,17 @@ def unmeasured_problem(setting: Setting) -> Problem:
     return _UNMEASURED[id(setting)]
 
 
-def run_cells(cells: Sequence[Cell], n_draws: int, seed: int, pool: ProcessPoolExecutor | None) -> Iterator[dict]:
+def run_cells(cells: Sequence[Cell], n_draws: int, seed: int, over: Over = here) -> Iterator[dict]:
     """Every cell's figures."""
-    if not cells:
-        return
     chunks = [range(i, min(i + CHUNK, n_draws)) for i in range(0, n_draws, CHUNK)]
-    tasks = [(cell, seed, chunk) for cell in cells for chunk in chunks]
-    results = iter((pool.map if pool else map)(run_draws, *zip(*tasks, strict=True)))
     for cell in cells:
-        parts = [next(results) for _ in chunks]
+        parts = over(run_chunk, [(cell, seed, chunk) for chunk in chunks])
         yield summary(cell, {key: np.concatenate([part[key] for part in parts]) for key in parts[0]})
+
+
+def run_chunk(task: tuple[Cell, int, range]) -> dict[str, Floats]:
+    """`run_draws` of one task."""
+    return run_draws(*task)
 
 
 def summary(cell: Cell, d: dict[str, Floats]) -> dict[str, Any]:
@@ -463,33 +458,32 @@ def run(out: Path, seed: int = 0, quick: bool = False, n_draws: int | None = Non
     cells = [CELLS[i] for i in (1, 13, 22)] if quick else CELLS
     breaking = {"direct pairs of small motions": BREAKING["direct pairs of small motions"][::4]} if quick else BREAKING
     found: dict[str, Any] = {"seed": seed, "n_draws": n_draws, "n_configurations": N_CONFIGURATIONS, "cells": []}
-    pool = None if quick else ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
-    print(HEADER)
-    for row in run_cells(cells, n_draws, seed, pool):
-        row["meets"] = judge(row, len(cells))
-        found["cells"].append(row)
-        print(line(row), flush=True)
-    for name, more in OTHERS.items():
-        found[name] = []
-        for row in run_cells([] if quick else more, max(10, (2 * n_draws) // 5), seed, pool):
-            row["meets"] = judge(row, len(more))
-            found[name].append(row)
+    with draws_on(1 if quick else workers) as over:
+        print(HEADER)
+        for row in run_cells(cells, n_draws, seed, over):
+            row["meets"] = judge(row, len(cells))
+            found["cells"].append(row)
             print(line(row), flush=True)
-    found["breaking"] = {}
-    print()
-    for name, of_name in breaking.items():
-        found["breaking"][name] = []
-        for row in run_cells(of_name, max(10, n_draws // 5), seed, pool):
-            found["breaking"][name].append(row)
-            print(
-                f"{name:30} noise x{row['noise']:3}: NEES {row['nees']:6.3f},"
-                f" tool covered {row['coverage']['tool']:.3f},"
-                f" RMSE/bound {row['rmse_over_bound']:.3f}, chi2/dof {row['reduced_chi2']:.3f},"
-                f" warned {row['warned']:.2f}, excluded {row['excluded']:.2f}, not conv. {row['not_converged']:.2f}",
-                flush=True,
-            )
-    if pool:
-        pool.shutdown()
+        for name, more in OTHERS.items():
+            found[name] = []
+            for row in run_cells([] if quick else more, max(10, (2 * n_draws) // 5), seed, over):
+                row["meets"] = judge(row, len(more))
+                found[name].append(row)
+                print(line(row), flush=True)
+        found["breaking"] = {}
+        print()
+        for name, of_name in breaking.items():
+            found["breaking"][name] = []
+            for row in run_cells(of_name, max(10, n_draws // 5), seed, over):
+                found["breaking"][name].append(row)
+                print(
+                    f"{name:30} noise x{row['noise']:3}: NEES {row['nees']:6.3f},"
+                    f" tool covered {row['coverage']['tool']:.3f},"
+                    f" RMSE/bound {row['rmse_over_bound']:.3f}, chi2/dof {row['reduced_chi2']:.3f},"
+                    f" warned {row['warned']:.2f}, excluded {row['excluded']:.2f},"
+                    f" not conv. {row['not_converged']:.2f}",
+                    flush=True,
+                )
     found["seconds"] = round(time.perf_counter() - clock)
     out.mkdir(parents=True, exist_ok=True)
     (out / f"{NAME}.json").write_text(json.dumps(found, indent=1) + "\n")
@@ -503,20 +497,19 @@ def run_only(out: Path, text: str, seed: int = 0, n_draws: int = 500, workers: i
     found = json.loads(file.read_text())
     chosen = {name: [c for c in of_name if text in f"{name}: {c.arm}, {c.way}"] for name, of_name in
               {"cells": CELLS, **OTHERS}.items()}  # fmt: skip
-    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
     print(HEADER)
-    for name, cells in chosen.items():
-        found.setdefault(name, [])
-        draws = n_draws if name == "cells" else max(10, (2 * n_draws) // 5)
-        for cell, row in zip(cells, run_cells(cells, draws, seed, pool), strict=True):
-            row["meets"] = judge(row, len({"cells": CELLS, **OTHERS}[name]))
-            print(line(row), flush=True)
-            same = [{**asdict(cell), **old} == {**old, **asdict(cell)} for old in found[name]]
-            if any(same):
-                found[name][same.index(True)] = row
-            else:
-                found[name].append(row)
-    pool.shutdown()
+    with draws_on(workers) as over:
+        for name, cells in chosen.items():
+            found.setdefault(name, [])
+            draws = n_draws if name == "cells" else max(10, (2 * n_draws) // 5)
+            for cell, row in zip(cells, run_cells(cells, draws, seed, over), strict=True):
+                row["meets"] = judge(row, len({"cells": CELLS, **OTHERS}[name]))
+                print(line(row), flush=True)
+                same = [{**asdict(cell), **old} == {**old, **asdict(cell)} for old in found[name]]
+                if any(same):
+                    found[name][same.index(True)] = row
+                else:
+                    found[name].append(row)
     file.write_text(json.dumps(found, indent=1) + "\n")
     draw(found).savefig(out / f"{NAME}.png", dpi=120)
     return found
@@ -601,7 +594,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--draws", type=int, help="calibrations a cell; default 500")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", metavar="TEXT", help="run these cells again, such as 'SCARA, star'")
-    parser.add_argument("--workers", type=int, default=2, help="processes")
+    add_workers(parser)
     parser.add_argument("--out", type=Path, default=ROOT / "experiments" / "results", help="folder for the results")
     given = parser.parse_args(arguments)
     if given.only is not None:

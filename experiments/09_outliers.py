@@ -18,22 +18,16 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import cache
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-if __name__ in {"__main__", "__mp_main__"}:  # before numpy: two workers, one thread each
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ[name] = "1"
-
 import numpy as np
 from arms import Arm, build_arms, random_rotations
+from draws import add_workers, draws_on
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -197,6 +191,11 @@ def one_draw(arm_name: str, way: str, seed: int, draw: int) -> dict[str, dict[st
     return out
 
 
+def one_task(task: tuple[str, str, int, int]) -> dict[str, dict[str, float]]:
+    """`one_draw` of one task."""
+    return one_draw(*task)
+
+
 def run(out: Path, seed: int = 0, quick: bool = False, n_draws: int | None = None, workers: int = 2) -> dict[str, Any]:
     """The whole experiment; quick takes one arm, two ways, few draws and this process alone."""
     clock = time.perf_counter()
@@ -205,18 +204,14 @@ def run(out: Path, seed: int = 0, quick: bool = False, n_draws: int | None = Non
     if quick:
         cells = [("UR10", "pose, frame known"), ("UR10", "direct pairs")]
     found: dict[str, Any] = {"seed": seed, "n_draws": n_draws, "cells": []}
-    pool = None if quick else ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
-    tasks = [(*cell, seed, draw) for cell in cells for draw in range(n_draws)]
-    results = iter((pool.map if pool else map)(one_draw, *zip(*tasks, strict=True)))
-    for arm, way in cells:
-        draws = [next(results) for _ in range(n_draws)]
-        for row in summaries(arm, way, draws):
-            found["cells"].append(row)
-            print(line(row), flush=True)
-        found["seconds"] = round(time.perf_counter() - clock)
-        write(found, out)  # after each, for the whole takes long
-    if pool:
-        pool.shutdown()
+    with draws_on(1 if quick else workers) as over:
+        for arm, way in cells:
+            draws = over(one_task, [(arm, way, seed, draw) for draw in range(n_draws)])
+            for row in summaries(arm, way, draws):
+                found["cells"].append(row)
+                print(line(row), flush=True)
+            found["seconds"] = round(time.perf_counter() - clock)
+            write(found, out)  # after each, for the whole takes long
     return found
 
 
@@ -315,7 +310,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="one arm, two ways, 5 draws")
     parser.add_argument("--draws", type=int, help="draws a cell; default 40")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=2, help="processes")
+    add_workers(parser)
     parser.add_argument("--out", type=Path, default=ROOT / "experiments" / "results", help="folder for the results")
     given = parser.parse_args(arguments)
     run(given.out, given.seed, given.quick, given.draws, given.workers)

@@ -1,6 +1,6 @@
 """Do lengths to three anchors of unknown place calibrate a 6R arm as well as they can?
 
-Command: python experiments/11_anchors.py [--quick] [--seed N] [--draws N] [--processes N] [--out FOLDER]
+Command: python experiments/11_anchors.py [--quick] [--seed N] [--draws N] [--workers N] [--out FOLDER]
 Takes a minute on two free cores.
 
 A UR10-like arm (experiment 08's, tolerances 1 mm and 1 mrad), 120 random configurations, 40 lengths to each of three
@@ -25,7 +25,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from arms import ENCODER, build_arms
-from space_robot import arguments_of, over_draws, write_json
+from draws import over_draws
+from space_robot import arguments_of, write_json
 
 import fg_calib
 from fg_calib import Noise, Scenario
@@ -119,7 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     print(f"{'encoders':8} kept  RMS/bound (sd by chance)  single parameters     mm    mrad  not converged")
     for encoders in ENCODERS:
         tasks = [Task(encoders, given.seed + k) for k in range(given.draws)]
-        row = summary(over_draws(one_draw, tasks, given.processes))
+        row = summary(over_draws(one_draw, tasks, given.workers))
         found["encoders"][encoders] = row
         print(
             f"{encoders:8} {len(row['kept']):4d} {row['rms_over_bound']:10.3f} ({row['sd_by_chance']:.3f})"
@@ -130,7 +131,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     found["finer"] = []
     for gauge, errors in FINER:
         tasks = [Task("exact", given.seed + k, FINE, gauge, errors) for k in range(max(given.draws // 2, 2))]
-        row = summary(over_draws(one_draw, tasks, given.processes))
+        row = summary(over_draws(one_draw, tasks, given.workers))
         keys = ("n_draws", "not_converged", "rms_over_bound", "sd_by_chance")
         found["finer"].append({"gauge": gauge, "errors": errors, "sigma": FINE} | {key: row[key] for key in keys})
         print(f"finer, {gauge:5}, errors times {errors:<4g} {row['rms_over_bound']:.3f} ({row['sd_by_chance']:.3f})")

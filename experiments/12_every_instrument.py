@@ -1,6 +1,6 @@
 """Which instrument for how many stops: one simulated UR10, measured by every instrument the package knows.
 
-Command: python experiments/12_every_instrument.py [--quick] [--seed N] [--draws N] [--processes N] [--out FOLDER]
+Command: python experiments/12_every_instrument.py [--quick] [--seed N] [--draws N] [--workers N] [--out FOLDER]
 Takes five minutes on one free core; the ledger's --draws 40 twice that.
 
 The same arm (UR10-like, errors and priors of 1 mm and 1 mrad, encoders 0.002 deg) is calibrated from 10, 20, 40 and 80
@@ -22,9 +22,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from arms import UR10
+from draws import over_draws
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from space_robot import arguments_of, clean, over_draws, write_json
+from space_robot import arguments_of, clean, write_json
 
 import fg_calib
 from fg_calib import Camera, Noise, Pairing, Robot, Scenario
@@ -224,7 +225,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
         found["ways"][way] = {}
         for n in stops:
             tasks = [Task(way, n, given.seed + k) for k in range(given.draws)]
-            found["ways"][way][str(n)] = summary(over_draws(one_draw, tasks, given.processes))
+            found["ways"][way][str(n)] = summary(over_draws(one_draw, tasks, given.workers))
         rows = found["ways"][way].values()
         print(
             f"{way:32}" + "".join(f"{r['predicted'] / MM:15.4f} / {r['realised'] / MM:.4f}" for r in rows), flush=True

@@ -1,6 +1,6 @@
 """The paper's camera and board: what do poses, and the board's corners themselves, gain over pairs?
 
-Command: python experiments/13_from_pairs_to_pixels.py [--quick] [--seed N] [--draws N] [--processes N] [--out FOLDER]
+Command: python experiments/13_from_pairs_to_pixels.py [--quick] [--seed N] [--draws N] [--workers N] [--out FOLDER]
 Takes four minutes on one free core.
 
 The paper's scenario (52 views of a board, encoders 0.005 deg), tolerances as priors, three calibrations of the same arm
@@ -22,7 +22,8 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from space_robot import MM, arguments_of, over_draws, paper_scenario, write_json
+from draws import over_draws
+from space_robot import MM, arguments_of, paper_scenario, write_json
 
 import fg_calib
 from fg_calib import Camera, Noise, Robot, Scenario
@@ -108,7 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     print("RMS [mm], realised / bound  over +-180 deg, base       after rigid fit     new views, fitted  not converged")
     for way in WAYS:
         tasks = [Task(way, given.seed + k) for k in range(given.draws)]
-        row = found["ways"][way] = summary(over_draws(one_draw, tasks, given.processes))
+        row = found["ways"][way] = summary(over_draws(one_draw, tasks, given.workers))
         figures = [f"{row['realised'][w] / MM:12.3f} / {row['predicted'][w] / MM:.3f}" for w in WHERE]
         print(f"{way:24}" + "  ".join(figures) + f" {row['not_converged']:8d}", flush=True)
         write_json(given.file, found)

@@ -1,6 +1,6 @@
 """Next month: is what `check` and `update` say of a calibration true?
 
-Command: python experiments/15_next_month.py [--quick] [--seed N] [--draws N] [--processes N] [--out FOLDER]
+Command: python experiments/15_next_month.py [--quick] [--seed N] [--draws N] [--workers N] [--out FOLDER]
 Takes about half an hour of processor time.
 
 A UR10-like arm (experiment 08's, tolerances 1 mm and 1 mrad), calibrated by 40 poses (0.05 mm, 0.1 mrad), or by 6
@@ -22,9 +22,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from arms import Arm, build_arms
+from draws import over_draws
 from scipy import stats
 from scipy.spatial.transform import Rotation
-from space_robot import arguments_of, over_draws, write_json
+from space_robot import arguments_of, write_json
 
 import fg_calib
 from fg_calib import Calibration, Measurements, Robot, Table
@@ -185,18 +186,18 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     seeds = [given.seed + k for k in range(given.draws)]
     found: dict[str, Any] = {"seed": given.seed, "healthy": {}, "slips": {}, "updates": {}}
     for case in HEALTHY:
-        found["healthy"][case] = of_healthy(over_draws(healthy, [Task(case, s) for s in seeds], given.processes))
+        found["healthy"][case] = of_healthy(over_draws(healthy, [Task(case, s) for s in seeds], given.workers))
         print("healthy", case, found["healthy"][case], flush=True)
     for case in ("known", "unknown"):
         for slip in SLIPS:
             tasks = [Task(case, s, slip) for s in seeds]
-            found["slips"][f"{case} {slip:g}"] = of_slips(over_draws(slipped, tasks, given.processes))
+            found["slips"][f"{case} {slip:g}"] = of_slips(over_draws(slipped, tasks, given.workers))
             print("slip", case, slip, found["slips"][f"{case} {slip:g}"], flush=True)
     for case in ("known", "unknown", "pairs", "unknown weak"):
         for finer in FINER if case == "unknown" else FINER[:1]:
             few = seeds[: max(len(seeds) // (2 if finer == 1.0 else 10), 1)]
             tasks = [Task(case, s, finer=finer) for s in few]
-            found["updates"][f"{case} {finer:g}"] = of_updates(over_draws(updated, tasks, given.processes))
+            found["updates"][f"{case} {finer:g}"] = of_updates(over_draws(updated, tasks, given.workers))
             print("update", case, finer, found["updates"][f"{case} {finer:g}"], flush=True)
     write_json(given.file, found)
     return found

@@ -1,6 +1,6 @@
 """Is `tolerance: estimate` as good as knowing how far an arm is off, and never worse than no priors at all?
 
-Command: python experiments/16_unknown_tolerances.py [--quick] [--seed N] [--draws N] [--processes N] [--out FOLDER]
+Command: python experiments/16_unknown_tolerances.py [--quick] [--seed N] [--draws N] [--workers N] [--out FOLDER]
 
 Four arms (UR10 in dh-hayati and as a URDF, the 7R of the paper, a SCARA) are measured as poses in an unknown frame, by
 distances and angles of a star of pairs, or by lengths to three unknown anchors, at 10 or 100 stops. The true errors are
@@ -24,9 +24,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from arms import build_arms
+from draws import over_draws
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from space_robot import arguments_of, clean, over_draws, write_json
+from space_robot import arguments_of, clean, write_json
 
 import fg_calib
 from fg_calib import Noise, ProblemError, Robot, Scenario
@@ -196,7 +197,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
         for seed in range(given.seed, given.seed + given.draws)
     ]
     clock = time.perf_counter()
-    rows = over_draws(one_draw, tasks, given.processes)
+    rows = over_draws(one_draw, tasks, given.workers)
     found: dict[str, Any] = {"cells": [], "seed": given.seed}
     for first in range(0, len(rows), given.draws):
         found["cells"].append(summary(rows[first : first + given.draws]))

@@ -9,18 +9,16 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
+from draws import add_workers
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from fg_calib import Bound, Robot, Scenario, Simulation, build_problem, fit_least_squares, read_scenario, solve
 from fg_calib.baseline.comparison import real_errors
@@ -28,7 +26,6 @@ from fg_calib.options import Model
 from fg_calib.simulation.configurations import BoardViews
 
 Floats = NDArray[np.float64]
-T, R = TypeVar("T"), TypeVar("R")
 
 ROOT = Path(__file__).resolve().parents[1]
 MM = 1e-3
@@ -200,32 +197,19 @@ def one_draw(scenario: Scenario, seed: int) -> Simulation:
     return simulate(scenario, seed)
 
 
-def over_draws(work: Callable[[T], R], tasks: Iterable[T], processes: int) -> list[R]:
-    """Results of many draws in order, in this process or in several; BLAS has one thread in each."""
-    if processes <= 1:
-        with threadpool_limits(limits=1):
-            return [work(task) for task in tasks]
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_one_thread) as pool:
-        return list(pool.map(work, tasks, chunksize=2))
-
-
-def _one_thread() -> None:
-    threadpool_limits(limits=1)
-
-
 def arguments_of(
     docstring: str | None, name: str, given: Sequence[str] | None, n_draws: int, n_quick: int
 ) -> argparse.Namespace:
-    """Quick, seed (the first), draws, processes and output folder, which is made; `file` is results without suffix."""
+    """Quick, seed (the first), draws, workers and output folder, which is made; `file` is results without suffix."""
     parser = argparse.ArgumentParser(description=(docstring or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help=f"{n_quick} draws instead of {n_draws}")
     parser.add_argument("--seed", type=int, default=0, help="of the first draw")
     parser.add_argument("--draws", type=int, help=f"instead of {n_draws}")
-    parser.add_argument("--processes", type=int, default=2)
+    add_workers(parser)
     parser.add_argument("--out", type=Path, default=ROOT / "experiments" / "results")
     found = parser.parse_args(given)
     found.draws = found.draws or (n_quick if found.quick else n_draws)
-    found.processes = 1 if found.quick else found.processes
+    found.workers = 1 if found.quick else found.workers
     found.out.mkdir(parents=True, exist_ok=True)
     found.file = found.out / name
     return found

@@ -21,16 +21,19 @@ if TYPE_CHECKING:
     from fg_calib.analysis.identifiability import Identifiability, observe_configurations, observe_structure
     from fg_calib.analysis.inspection import Inspection, inspect_job
     from fg_calib.analysis.mistakes import SetupCheck, check_setup
+    from fg_calib.analysis.parts import PartsSolution, cut, reduce_parts, solve_parts
     from fg_calib.analysis.prediction import PredictedErrors
     from fg_calib.analysis.restarts import look_elsewhere
     from fg_calib.analysis.uncertainty import Uncertainty, assess
     from fg_calib.analysis.variance_components import estimate_noise, solve_job
     from fg_calib.baseline.comparison import Comparison, compare
     from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
+    from fg_calib.batch import calibrate_jobs
     from fg_calib.calibration import Calibration, calibrate, calibrate_job
     from fg_calib.correction import correct
     from fg_calib.designs.design import Design, design
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
+    from fg_calib.executors import Failure, dask_executor, local_processes, map_jobs
     from fg_calib.exports.export import Export, export
     from fg_calib.files.columns import Column
     from fg_calib.files.history import History, history_of
@@ -79,11 +82,13 @@ __version__ = "0.1.0"
 _HOMES = {
     "fg_calib.analysis.bounds": ("Bound", "cramer_rao"),
     "fg_calib.baseline.comparison": ("Comparison", "compare"),
+    "fg_calib.batch": ("calibrate_jobs",),
     "fg_calib.calibration": ("Calibration", "calibrate", "calibrate_job"),
     "fg_calib.correction": ("correct",),
     "fg_calib.designs.design": ("Design", "design"),
     "fg_calib.simulation.configurations": ("BoardViews", "GivenReadings", "RandomReadings", "TargetViews"),
     "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
+    "fg_calib.executors": ("Failure", "dask_executor", "local_processes", "map_jobs"),
     "fg_calib.exports.export": ("Export", "export"),
     "fg_calib.files.columns": ("Column",),
     "fg_calib.analysis.check": ("Check", "Explanation"),
@@ -127,6 +132,7 @@ _HOMES = {
     "fg_calib.robot.model": ("Robot",),
     "fg_calib.simulation.scenario": ("Scenario", "Simulation"),
     "fg_calib.simulation.simulator": ("simulate",),
+    "fg_calib.analysis.parts": ("PartsSolution", "cut", "reduce_parts", "solve_parts"),
     "fg_calib.analysis.restarts": ("look_elsewhere",),
     "fg_calib.graph.extension": ("DistanceFactor", "RotationAngleFactor", "expand"),
     "fg_calib.graph.solver": ("Solution", "SolverOptions", "levenberg_marquardt_params", "solve"),
@@ -151,6 +157,7 @@ __all__ = [
     "DistanceFactor",
     "Explanation",
     "Export",
+    "Failure",
     "GivenReadings",
     "History",
     "Identifiability",
@@ -166,6 +173,7 @@ __all__ = [
     "Options",
     "Own",
     "Pairing",
+    "PartsSolution",
     "PredictedErrors",
     "Problem",
     "ProblemError",
@@ -188,11 +196,14 @@ __all__ = [
     "build_problem",
     "calibrate",
     "calibrate_job",
+    "calibrate_jobs",
     "check_setup",
     "compare",
     "comparison_document",
     "correct",
     "cramer_rao",
+    "cut",
+    "dask_executor",
     "design",
     "estimate_noise",
     "estimate_tolerances",
@@ -207,7 +218,9 @@ __all__ = [
     "inspect_job",
     "inspection_document",
     "levenberg_marquardt_params",
+    "local_processes",
     "look_elsewhere",
+    "map_jobs",
     "observability_document",
     "observe_configurations",
     "observe_structure",
@@ -221,12 +234,14 @@ __all__ = [
     "read_scenario",
     "read_targets",
     "read_urdf",
+    "reduce_parts",
     "result_document",
     "result_schema",
     "simulate",
     "solve",
     "solve_inverse",
     "solve_job",
+    "solve_parts",
     "write_comparison",
     "write_observability",
     "write_prediction",

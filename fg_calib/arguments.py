@@ -51,17 +51,18 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 
     It raises `InputError` for an argument that is something else, and named as the parameter is.
     """
-    takes = signature(function)
-    named = [name for name, p in takes.parameters.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
 
     @wraps(function)
     def with_checked(*args: P.args, **kwargs: P.kwargs) -> R:
+        takes = _signature(function)
         try:
             given = takes.bind(*args, **kwargs)
         except TypeError:  # as Python itself says it
             return function(*args, **kwargs)
         hints = _hints(function)
-        for name in named:
+        for name, p in takes.parameters.items():
+            if p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD):
+                continue
             if name in given.arguments and name in hints:
                 given.arguments[name] = as_hinted(name, given.arguments[name], hints[name])
         return function(*given.args, **given.kwargs)
@@ -103,6 +104,10 @@ def as_hinted(name: str, value: Any, hint: Any) -> Any:
         for i, entry in enumerate(value if isinstance(value, list | tuple) else ()):
             as_hinted(f"{name}[{i}]", entry, get_args(one)[0])
     raise InputError(name, f"found {shown(value)}", _expected(hint))
+
+
+_signature = cache(signature)
+"""Of a function when it is first called: those of all functions would be a twentieth of a small calibration."""
 
 
 @cache

@@ -4,7 +4,8 @@
     data = Measurements.from_arrays(q, position=p, sigma_position=1e-4)
     result = calibrate(robot, data, model="position", frame="unknown")
 
-`calibrate_job` does the same of a job, and the command line calls it.
+`calibrate_job` does the same of a job, and the command line calls it. What only a calibration of before needs (checks
+and updates by new rows, its history) is imported there: that takes as long as to solve a small one.
 """
 
 from __future__ import annotations
@@ -12,31 +13,27 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from hashlib import sha256
 from numbers import Integral
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fg_calib.analysis.check import Check, check_rows
 from fg_calib.analysis.covariance import TangentCovariance
-from fg_calib.analysis.folds import cross_validate
-from fg_calib.analysis.new_rows import Calibrated, Rows
 from fg_calib.analysis.residual_table import ResidualTable
 from fg_calib.analysis.uncertainty import FrameEstimate, Uncertainty, assess
-from fg_calib.analysis.update import predicted_before, updated
 from fg_calib.analysis.variance_components import solve_job
 from fg_calib.arguments import checked
 from fg_calib.arrays import as_floats, shape_of
 from fg_calib.errors import InputError, escaped, shown
 from fg_calib.files.disk import exists, is_folder, noting_reads
-from fg_calib.files.history import HISTORY, History, Run, history_of, run_of
 from fg_calib.files.job import UNSTATED, read_job, read_table_like
 from fg_calib.files.result import Carried, KindGoodness, Parameter, Posterior, Previous, Result, read_result
 from fg_calib.files.result import Knowledge as SavedKnowledge
@@ -59,6 +56,11 @@ from fg_calib.robot.kinematics import forward, precompute_trig
 from fg_calib.robot.model import Robot, names_of
 from fg_calib.threads import single_threaded
 
+if TYPE_CHECKING:
+    from fg_calib.analysis.check import Check
+    from fg_calib.analysis.new_rows import Calibrated, Rows
+    from fg_calib.files.history import Run
+
 Floats = NDArray[np.float64]
 
 SAME = 1e-12
@@ -70,6 +72,8 @@ def calibrate(
     robot: Robot,
     measurements: Measurements | Table | Sequence[Measurements | Table],
     options: Options | None = None,
+    *,
+    executor: Executor | None = None,
     **choices: Any,
 ) -> Calibration:
     """Estimate a robot's parameters from measurements, with their uncertainties.
@@ -83,6 +87,7 @@ def calibrate(
         measurements: What was measured: a table, or several; those that are no `Table` are understood as the options
             say. With `estimate_noise` sigmas that are not stated start at 1 mm and 1 mrad.
         options: What is estimated from what.
+        executor: Where folds are calibrated, such as `local_processes(4)`; in this process if None.
         choices: Instead of `options`, any of theirs as keywords: model, frame, pairing, loss, ...
 
     Raises:
@@ -96,15 +101,16 @@ def calibrate(
         check_readings(table.measurements.readings, robot, table.measurements.source)
         first = _with_first_sigmas(table.measurements) if options.estimate_noise else table.measurements
         tables.append(replace(table, measurements=first))
-    return calibrate_job(Job(None, robot, tuple(tables), options))
+    return calibrate_job(Job(None, robot, tuple(tables), options), executor)
 
 
 @checked
-def calibrate_job(job: Job | Path | str) -> Calibration:
+def calibrate_job(job: Job | Path | str, executor: Executor | None = None) -> Calibration:
     """`calibrate` of a job: what `fg-calib calibrate` does.
 
     Args:
         job: The job, or the path of its file.
+        executor: Where folds are calibrated; in this process if None. For many jobs see `calibrate_jobs`.
 
     Raises:
         InputError: The job, or a file that it names, cannot be used.
@@ -117,7 +123,9 @@ def calibrate_job(job: Job | Path | str) -> Calibration:
     tell("judging the result")
     uncertainty = assess(solution)
     if given.options.folds is not None:
-        uncertainty = uncertainty.with_folds(cross_validate(given, given.options.folds), solution)
+        from fg_calib.analysis.folds import cross_validate
+
+        uncertainty = uncertainty.with_folds(cross_validate(given, given.options.folds, executor=executor), solution)
     return Calibration.of(solution, uncertainty, given.inputs, job=given.document)
 
 
@@ -248,6 +256,8 @@ class Calibration:
         Raises:
             InputError: There is none, or it is damaged.
         """
+        from fg_calib.files.history import history_of
+
         result, folder = read_result(path), Path(path) if is_folder(Path(path)) else Path(path).parent
         robot = _saved_robot(folder, result)
         nominal = robot.with_values([p.nominal for p in result.parameters])  # by its reach columns are scaled
@@ -265,12 +275,16 @@ class Calibration:
 
     def _history(self, digest: str) -> dict[str, str]:
         """What is written of the runs that it came from, with itself."""
+        from fg_calib.files.history import HISTORY, History, run_of
+
         runs = (*self.history, run_of(self.result, digest, self.history[-1]))
         return {HISTORY: History(robot=self.result.robot, runs=runs).text()}
 
     @property
     def runs(self) -> tuple[Run, ...]:
         """The runs that it came from, and itself."""
+        from fg_calib.files.history import run_of
+
         if self.assessed is None:
             return self.history
         digest = sha256(json.dumps(self.result.document()).encode()).hexdigest()
@@ -279,6 +293,8 @@ class Calibration:
     @property
     def calibrated(self) -> Calibrated:
         """What is known of the arm, for new rows."""
+        from fg_calib.analysis.new_rows import Calibrated
+
         of_result = {p.name: p.prior_sigma for p in self.result.parameters}  # as they were estimated, perhaps
         nominal = self.posterior.variables.robot
         nominal = replace(
@@ -290,7 +306,18 @@ class Calibration:
         known = None
         if carried.knowledge is not None and not self.result.evaluated_only:
             known = _saved_knowledge(nominal.with_values(values), carried.knowledge)
-        return Calibrated(nominal, values, self.posterior, known, _saved_options(self.result), carried.noise)
+        kept = {*self.result.noise_kept, "joint"}
+        estimated = [kind for kind in self.result.noise_factors or () if kind not in kept]
+        degrees = sum(self.result.goodness[kind].expected or 0.0 for kind in estimated)
+        return Calibrated(
+            robot=nominal,
+            values=values,
+            posterior=self.posterior,
+            knowledge=known,
+            options=_saved_options(self.result),
+            noise=carried.noise,
+            noise_degrees=degrees or None,
+        )
 
     @checked
     def check(
@@ -316,6 +343,8 @@ class Calibration:
             InputError: The rows cannot be read, or are of another robot; or the calibration is not to be trusted.
             ProblemError: The rows lack what their model needs.
         """
+        from fg_calib.analysis.check import check_rows
+
         self._require_trust()
         new, _ = self._rows(rows, pairs, like)
         between = all(table.model not in ("pose", "position", "orientation", "board") for table in new.tables)
@@ -355,6 +384,8 @@ class Calibration:
             ProblemError: The rows lack what their model needs, or do not suffice.
             SolverError: GTSAM could not solve a step at all.
         """
+        from fg_calib.analysis.update import predicted_before, updated
+
         self._require_trust()
         history = self.runs
         new, before = _date(date), history[-1]
@@ -393,6 +424,8 @@ class Calibration:
         Raises:
             InputError: They are of another robot, or cannot be read.
         """
+        from fg_calib.analysis.new_rows import Rows
+
         options, robot = _saved_options(self.result), self.posterior.variables.robot
         if isinstance(given, Path | str) and Path(given).suffix.lower() not in (".yaml", ".yml"):
             path, of_pairs = Path(given), None if pairs is None else Path(pairs)
@@ -594,7 +627,10 @@ def _saved_posterior(robot: Robot, result: Result, place: str) -> TangentCovaria
     matrices = (saved.covariance, saved.undetermined, saved.undetermined_at_nominal)
     if saved.variables != wanted or len(saved.covariance) != n or any(len(row) != n for m in matrices for row in m):
         raise InputError(place, "other variables than the robot and the covariance have", f"{n} columns of them")
-    return TangentCovariance(variables, parameters, *(_array(matrix, n) for matrix in matrices))
+    arrays = [_array(matrix, n) for matrix in matrices]
+    if not all(np.isfinite(array).all() for array in arrays):
+        raise InputError(place, "figures that are not finite", "covariances, and directions that are not determined")
+    return TangentCovariance(variables, parameters, *arrays)
 
 
 def _saved_options(result: Result) -> Options:

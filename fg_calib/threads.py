@@ -1,4 +1,4 @@
-"""BLAS on one thread, so that a result does not depend on how many there are.
+"""How many processors this process may use, and BLAS on one thread: a result does not depend on how many there are.
 
 BLAS sums in another order with every number of threads, which changes the last digits. What is worth several
 processors is spread over them in fixed parts (`kinematics.over_spans`), so more threads in BLAS would gain little.
@@ -6,12 +6,16 @@ processors is spread over them in fixed parts (`kinematics.over_spans`), so more
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 from collections.abc import Callable
 from functools import cache, wraps
 from typing import Any, ParamSpec, TypeVar
 
-from threadpoolctl import ThreadpoolController
+from threadpoolctl import ThreadpoolController, threadpool_limits
+
+from fg_calib.errors import InputError, shown
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -61,6 +65,35 @@ def _take_control() -> None:
         clear = getattr(library, "clear_controlling_thread", None)
         if clear is not None:
             clear(force=True)
+
+
+THREADS = "FG_CALIB_THREADS"
+"""The environment variable that says on how many threads kernels run: fewer where processes share a machine."""
+
+_OF_LIBRARIES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""What BLAS looks at when it is loaded."""
+
+
+@cache
+def processors() -> int:
+    """Processors that this process may use: those that the system lets it have, or as many as `THREADS` says.
+
+    Raises:
+        InputError: `THREADS` is no number above 0.
+    """
+    given = os.environ.get(THREADS, "")
+    if not given:
+        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+    if not given.isdecimal() or not int(given):
+        raise InputError(f"{THREADS} in the environment", f"found {shown(given)}", "a number above 0")
+    return int(given)
+
+
+def limit_threads(n: int) -> None:
+    """Let this process, in which nothing has been computed yet, have so many threads for kernels, and one for BLAS."""
+    os.environ |= dict.fromkeys(_OF_LIBRARIES, "1") | {THREADS: str(n), "POLARS_MAX_THREADS": str(n)}
+    if "numpy" in sys.modules:  # whose BLAS has looked already
+        threadpool_limits(1, user_api="blas")
 
 
 @cache

@@ -26,6 +26,7 @@ FOLDERS = (
         "arrays",
         "options",
         "progress",
+        "executors",
         "robot",
         "measurements",
         "job",
@@ -43,6 +44,7 @@ FOLDERS = (
         "correction",
         "prediction",
         "pages",
+        "batch",
         "exports",
         "cli",
     ),
@@ -153,7 +155,8 @@ def test_no_input_can_run_code_or_reach_a_network(name, path):
             for alias in node.names}  # fmt: skip
     used |= {(node.module or "").partition(".")[0] for node in nodes(path) if isinstance(node, ast.ImportFrom)}
     forbidden = {"pickle", "marshal", "shelve", "subprocess", "urllib", "http", "requests", "ctypes", "multiprocessing"}
-    allowed = {"robot/cache": {"pickle"}, "files/parquet": {"subprocess"}}  # the latter starts this Python alone
+    allowed = {"robot/cache": {"pickle"}, "files/parquet": {"subprocess"}, "executors": {"multiprocessing"}}
+    # the latter two start this Python alone
     assert used & forbidden == allowed.get(name, set())
 
 
@@ -219,7 +222,8 @@ def test_all_that_is_imported_is_installed_with_the_package():
                 modules = [node.module] if isinstance(node, ast.ImportFrom) else []
             for module in modules:
                 used.setdefault(module.partition(".")[0], set()).add(name)
-    extras = {"camera": ("opencv-python-headless", "cv2", "camera/opencv"), "ros": ("rosbags", "rosbags", "files/bag")}
+    extras = {"camera": ("opencv-python-headless", "cv2", "camera/opencv"), "ros": ("rosbags", "rosbags", "files/bag"),
+              "distributed": ("distributed", "distributed", "executors")}  # fmt: skip
     for extra, (distribution, module, name) in extras.items():
         assert [re.match(r"[\w-]+", line)[0] for line in project["optional-dependencies"][extra]] == [distribution]
         assert used.pop(module) == {name}
@@ -236,7 +240,7 @@ def test_the_command_line_is_there_before_the_heavy_libraries():
 
 @pytest.mark.slow
 def test_a_calibration_loads_only_what_it_uses(example):
-    """No figures, no URDFs, no baseline, and of scipy not the heaviest."""
+    """No figures, pages, URDFs or baseline, of scipy not the heaviest, and nothing that is for new rows or folds."""
     code = f"""
 import contextlib, io, sys
 from fg_calib import cli
@@ -249,7 +253,9 @@ print(sorted(sys.modules))
     loaded = set(ast.literal_eval(run_python(code)))
     assert {"fg_calib.analysis.uncertainty", "fg_calib.report.text", "gtsam", "numba", "polars"} <= loaded
     idle = {"matplotlib", "lxml", "yourdfpy", "scipy.optimize", "scipy.stats", "fg_calib.files.urdf"}
-    idle |= {"fg_calib.baseline", "fg_calib.report.figures"}
+    idle |= {"fg_calib.baseline", "fg_calib.report.figures", "fg_calib.report.page.page", "jinja2", "cv2", "rosbags"}
+    idle |= {f"fg_calib.analysis.{name}" for name in ("check", "folds", "new_rows", "separation", "suspects", "update")}
+    idle |= {"fg_calib.files.history", "fg_calib.files.bag", "fg_calib.simulation", "rich.progress", "rich.markdown"}
     assert loaded & idle == set()
 
 

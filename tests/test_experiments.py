@@ -4,6 +4,7 @@ import importlib.util
 import json
 import multiprocessing
 import shutil
+import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -331,6 +332,18 @@ def test_calibrate_quick_times_the_bundled_example(tmp_path, capsys):
     assert {"fg-calib calibrate", "fg-calib --help", "solve and assess"} <= set(results["seconds"])
 
 
+def test_fleet_quick_has_a_result_of_every_job(tmp_path):
+    script = EXPERIMENTS / "benchmarks" / "fleet.py"  # whose functions its workers import
+    command = [sys.executable, str(script), "--quick", "--out", str(tmp_path)]
+    ended = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "2 processes: " in ended.stdout
+    found = json.loads((tmp_path / "fleet.json").read_text())
+    assert found["processes"][0]["jobs"] == 2
+    small, large = found["fleet"]
+    assert small["core_hours"] == large["core_hours"] > 0.0
+    assert found["here"]["result_written"] > 1e5
+
+
 def test_inverse_quick_reaches_every_pose(tmp_path, capsys):
     assert inverse.main(["--quick", "--out", str(tmp_path)]) == 0
     assert "ms a pose" in capsys.readouterr().out
@@ -509,7 +522,7 @@ def test_honesty_quick_finds_errors_where_the_result_says(honesty, tmp_path, cap
 @pytest.mark.long
 def test_chains_kinks_and_gauges_are_honest(honesty):
     """NEES within 4 sigma; the ledger has 200 draws of each."""
-    for row in honesty.run_cells([*honesty.CHAINS[::3], *honesty.KINKS[::5], *honesty.GAUGES[::3]], 12, 1, None):
+    for row in honesty.run_cells([*honesty.CHAINS[::3], *honesty.KINKS[::5], *honesty.GAUGES[::3]], 12, 1):
         k = row["n_draws"] * row["n_parameters"]
         assert row["nees"] == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / k)), row["way"]
 
@@ -522,7 +535,7 @@ def test_honesty_notices_noise_that_is_stated_half_as_large(honesty, monkeypatch
         return replace(m, sigma_position=m.sigma_position / 2, sigma_orientation=m.sigma_orientation / 2)
 
     monkeypatch.setattr(honesty, "measure", understated)
-    row = next(honesty.run_cells([honesty.CELLS[8]], 5, 0, None))
+    row = next(honesty.run_cells([honesty.CELLS[8]], 5, 0))
     meets = honesty.judge(row, n_cells=1)
     assert row["nees"] > 1.5
     assert not any(meets[of] for of in ("nees", "coverage of parameters", "coverage of tool", "chi2"))
@@ -563,7 +576,7 @@ def test_the_anchors_on_record_are_within_5_percent():
 def test_instruments_of_the_honesty_experiment_are_honest(honesty):
     """NEES within 4 sigma, of the two that take the least time; the ledger has 80 draws of each."""
     cells = [cell for cell in honesty.OF_INSTRUMENTS if cell.way in ("planes", "board") and cell.encoder]
-    for row in honesty.run_cells(cells, 8, 1, None):
+    for row in honesty.run_cells(cells, 8, 1):
         k = row["n_draws"] * row["n_parameters"]
         assert row["nees"] == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / k)), row["way"]
         assert row["not_converged"] == 0.0

@@ -26,7 +26,7 @@ import fg_calib as fg
 
 def hexadecimal(found):
     if isinstance(found, dict):
-        return {k: hexadecimal(v) for k, v in found.items() if k != "seconds"}
+        return {k: hexadecimal(v) for k, v in found.items() if k not in ("seconds", "date")}
     if isinstance(found, list):
         return [hexadecimal(v) for v in found]
     return found.hex() if isinstance(found, float) else found

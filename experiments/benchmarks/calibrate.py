@@ -1,18 +1,21 @@
 """How long does a whole calibration take, from the shell and in process?
 
-Command: python experiments/benchmarks/calibrate.py [--quick] [--out FOLDER]
+Command: python experiments/benchmarks/calibrate.py [--quick] [--out FOLDER] [--before FOLDER]
 Takes about 20 s; the first run on a machine compiles the kernels, which takes some more and is not counted. Nothing
 here is random, so there is no seed.
 
 - `fg-calib calibrate` on the bundled space robot (51 pairs), a new process each time, median of 5: 2.5 to 3 s;
 - `fg-calib --help` in the same way: 0.2 to 0.3 s;
-- in process, on the same job: building the problem, 2 ms; solving it, with covariance and identifiability, 30 to 50 ms.
+- in process, on the same job: building the problem, 2 ms; solving it, with covariance and identifiability, 30 to 50 ms;
+- with another checkout's root as `--before`, the same process of that one, in turn with ours, and the ratio of both.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
+import resource
 import subprocess
 import sys
 import time
@@ -29,19 +32,20 @@ NAME = "calibrate"
 JOB = Path(fg_calib.__file__).parent / "examples" / "space-robot" / "calibration.yaml"
 
 
-def in_a_process(*arguments: str) -> float:
-    """Seconds of one run of the command line, from start to exit.
+def in_a_process(*arguments: str, root: Path = ROOT) -> tuple[float, float]:
+    """Seconds of one run of a checkout's command line, from start to exit: by the clock, and of processors.
 
     Raises:
         RuntimeError: It did not end with 0.
     """
-    clock = time.perf_counter()
+    before, clock = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     command = [sys.executable, "-P", "-m", "fg_calib.cli", *arguments]  # -P: the package that is timed here too
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
-    seconds = time.perf_counter() - clock
+    env = os.environ | {"PYTHONPATH": str(root)}
+    done = subprocess.run(command, check=False, capture_output=True, text=True, env=env)
+    seconds, after = time.perf_counter() - clock, resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode != 0:
         raise RuntimeError(f"fg-calib {arguments[0]} ended with {done.returncode}: {done.stderr.strip()}")
-    return seconds
+    return seconds, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def timed(work: Callable[[], object]) -> float:
@@ -55,8 +59,8 @@ def summary(seconds: list[float]) -> dict[str, Any]:
     return {"median": median(seconds), "min": min(seconds), "max": max(seconds), "repeats": len(seconds)}
 
 
-def run(out: Path, quick: bool = False) -> dict[str, Any]:
-    """The benchmark; writes the numbers into `out`."""
+def run(out: Path, quick: bool = False, other: Path | None = None) -> dict[str, Any]:
+    """The benchmark, beside another checkout if one is given; writes the numbers into `out`."""
     job = fg_calib.read_job(JOB)
 
     def build() -> fg_calib.Problem:
@@ -73,11 +77,17 @@ def run(out: Path, quick: bool = False) -> dict[str, Any]:
         solving.append(time.perf_counter() - clock)
         assessing.append(timed(lambda solution=solution: fg_calib.assess(solution)))
     with TemporaryDirectory() as folder:
-        in_a_process("calibrate", str(JOB), "--out", folder)  # the system's file cache
-        calibrating, helping = [], []
+        command = ("calibrate", str(JOB), "--out", folder)
+        roots = [ROOT] if other is None else [ROOT, other]
+        found: dict[Path, list[tuple[float, float]]] = {root: [] for root in roots}
+        for root in roots:
+            in_a_process(*command, root=root)  # the system's file cache, and the kernels
+        helping = []
         for _ in range(n_processes):
-            calibrating.append(in_a_process("calibrate", str(JOB), "--out", folder))
-            helping.append(in_a_process("--help"))
+            for root in roots:
+                found[root].append(in_a_process(*command, root=root))
+            helping.append(in_a_process("--help")[0])
+        calibrating, of_processors = (list(seconds) for seconds in zip(*found[ROOT], strict=True))
     results = {
         "quick": quick,
         "n_pairs": solution.problem.n_pairs,
@@ -85,6 +95,7 @@ def run(out: Path, quick: bool = False) -> dict[str, Any]:
         "iterations": solution.iterations,
         "seconds": {
             "fg-calib calibrate": summary(calibrating),
+            "its processor time": summary(of_processors),
             "fg-calib --help": summary(helping),
             "build_problem": summary(building),
             "solve": summary(solving),
@@ -92,6 +103,10 @@ def run(out: Path, quick: bool = False) -> dict[str, Any]:
             "solve and assess": summary([s + a for s, a in zip(solving, assessing, strict=True)]),
         },
     }
+    if other is not None:
+        least = {root: [min(seconds) for seconds in zip(*found[root], strict=True)] for root in roots}
+        clock, processors = (before / now for now, before in zip(least[ROOT], least[other], strict=True))
+        results["before over now, least"] = {"clock": clock, "processors": processors}
     out.mkdir(parents=True, exist_ok=True)
     (out / f"{NAME}.json").write_text(json.dumps(results, indent=1) + "\n")
     return results
@@ -106,6 +121,8 @@ def describe(results: dict[str, Any]) -> str:
     for what, s in results["seconds"].items():
         cells = "".join(f"{s[key] * 1e3:10.1f}" for key in ("median", "min", "max"))
         lines.append(f"{what:24}{cells}{s['repeats']:6}")
+    if ratios := results.get("before over now, least"):
+        lines.append(f"before over now, least of each: {ratios['clock']:.2f}, of processors {ratios['processors']:.2f}")
     return "\n".join(lines)
 
 
@@ -114,8 +131,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="one process each, few repeats")
     parser.add_argument("--out", type=Path, default=ROOT / "experiments" / "results", help="folder for the results")
+    parser.add_argument("--before", type=Path, help="another checkout's root, to compare with")
     given = parser.parse_args(arguments)
-    print(describe(run(given.out, given.quick)))
+    print(describe(run(given.out, given.quick, given.before)))
     return 0
 
 

@@ -54,8 +54,8 @@ from fg_calib.graph.rows import Part, RowSet
 from fg_calib.measurements import residuals
 from fg_calib.measurements.kinds import Distance, RotationAngle, stack
 from fg_calib.measurements.residuals import Block
-from fg_calib.robot.kinematics import build_chain, forward, precompute_trig, processors
-from fg_calib.threads import one_blas_thread
+from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.threads import one_blas_thread, processors
 
 Floats = NDArray[np.float64]
 

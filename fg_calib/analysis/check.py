@@ -180,7 +180,7 @@ def _judged(
     gross: list[str],
     few: str,
 ) -> Check:
-    p_value = float(special.chdtrc(at.dof, at.chi2)) if at.dof > 0 else None
+    p_value = _p_value(calibrated, at) if at.dof > 0 else None
     likely = likely_changes(found, at)
     if any(f.suspect.kind != "row" for f in likely):
         found = best_refined(calibrated, rows, at, found, likely) if not gross else found
@@ -191,7 +191,7 @@ def _judged(
     alike -= {f.suspect.names for f in likely}
     stated = {kind: limit for kind in LIMITED if (limit := getattr(limits, kind)) is not None}
     elsewhere = effect_elsewhere(calibrated, likely[0]) if likely else None
-    reasons, cautions = _reasons(at, p_value, likely, rms, noise, counts, stated, elsewhere, few)
+    reasons, cautions = _reasons(at, p_value, found, likely, rms, noise, counts, stated, elsewhere, few)
     if gross:
         names = ", ".join(gross)
         cautions.insert(0, f"gross errors at {names}: left out here; measure again")
@@ -221,6 +221,13 @@ def _judged(
         advice=advice,
     )
     return made if explained or verdict != "fail" else _unless_misread(made, at)
+
+
+def _p_value(calibrated: Calibrated, at: Linear) -> float:
+    """Probability of chi-square as large; of noise that was estimated by F, as that may itself be off."""
+    if calibrated.noise_degrees is None:
+        return float(special.chdtrc(at.dof, at.chi2))
+    return float(special.fdtrc(at.dof, calibrated.noise_degrees, at.chi2 / at.dof))
 
 
 def _unless_misread(found: Check, at: Linear) -> Check:
@@ -269,6 +276,7 @@ def _rms(
 def _reasons(
     at: Linear,
     p_value: float | None,
+    found: Sequence[Found],
     likely: Sequence[Found],
     rms: dict[str, float],
     noise: dict[str, float],
@@ -298,15 +306,23 @@ def _reasons(
     elif changed:
         cautions.append("the rows show a change, within the limits everywhere")
     elif p_value < CERTAIN and reduced > FACTOR and not limits:
-        reasons.append(
-            f"residuals are {np.sqrt(reduced):.2g} times as large as noise and calibration allow, and no change of the"
-            " arm explains that: is the noise of these rows stated too small?"
-        )
+        what = f"residuals are {np.sqrt(reduced):.2g} times as large as noise and calibration allow"
+        reasons.append(f"{what}{_without_change(found, at)}")
     elif p_value < CERTAIN:
         cautions.append(
             f"residuals are {np.sqrt(reduced):.3g} times as large as noise and calibration allow, like noise"
         )
     return reasons, cautions
+
+
+def _without_change(found: Sequence[Found], at: Linear) -> str:
+    """What residuals mean that are too large where no change is certain whatever the noise."""
+    of_arm = [f for f in found if f.suspect.kind != "row"]
+    best = min(of_arm, key=lambda f: (not explains(f, at), f.k, f.left), default=None)
+    if best is None or best.p_value >= CERTAIN or not explains(best, at):
+        return ", and no change of the arm explains that: is the noise of these rows stated too small?"
+    change = " and ".join(best.suspect.names)
+    return f": their noise is stated too small, or a change such as of {change}; they are too few to say which"
 
 
 def _shown(value: float, unit: str) -> str:

@@ -19,6 +19,7 @@ References:
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +89,7 @@ def end_of_link(robot: Robot, owner: int) -> int:
     return max(filter(of_link, range(len(robot.elements))), default=-1) + 1
 
 
+@lru_cache(maxsize=16)  # folds and simulations ask of one robot again and again
 def missing_motions(robot: Robot) -> tuple[MissingMotion, ...]:
     """What a robot's parameters leave out at its nominal values; what is fixed in a convention counts as there."""
     return (*_of_convention(robot), *_of_frames(robot))

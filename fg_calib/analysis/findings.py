@@ -112,6 +112,7 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
     """
     problem, kinds = solution.problem, fit.goodness.kinds
     estimated_noise = solution.estimated_noise is not None
+    updated = problem.knowledge is not None
     of_priors_alone = fit.priors is not None and fit.chi2.too_large and not _too_large(fit)
     too_large = {kind.verdict for kind in kinds} & {"too small", "both", "many"}
     asked = not problem.evaluated and (too_large or estimated_noise)
@@ -123,7 +124,7 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
     statements = [
         *_of_solver(solution),
         *of_change(change, problem.end_names),
-        *(() if of_priors_alone else of_chi2(fit.chi2, problem.evaluated, follow=follow, gross=gross)),
+        *(() if of_priors_alone else of_chi2(fit.chi2, problem.evaluated, follow=follow, gross=gross, updated=updated)),
         *of_evaluation(problem.evaluated, estimated_noise),
         *_of_kept_noise(solution, fit.goodness),
         *of_test(fit.goodness.test, fit.chi2.ratio, problem.end_names),
@@ -142,7 +143,8 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
         statements += [s for found in forgotten_offsets(solution) for s in of_offset(found, labels, fit.chi2.too_large)]
     fits = not (doubts or estimated_noise)
     high = gross is None and (fit.chi2.too_large or follow)
-    certain = high and bool(missing) and not setup.explanations and excess_left(solution, missing) <= EXPLAINED
+    asked = high and bool(missing) and not setup.explanations and not updated  # the convention did before
+    certain = asked and excess_left(solution, missing) <= EXPLAINED
     findings, cautions = _of_model(setup, missing, fits=fits, high=high, certain=certain)
     statements += [] if setup.explanations else structure  # of a wrong set-up they are the consequence
     findings += [s.text for s in statements if s.finding]

@@ -20,7 +20,9 @@ References:
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,15 +32,14 @@ from fg_calib.analysis.residual_table import DIGITS, HeldOut, pooled, residual_t
 from fg_calib.analysis.variance_components import solve_job
 from fg_calib.arguments import checked
 from fg_calib.arrays import FrozenArrays
-from fg_calib.errors import CalibrationError, InputError, ProblemError
+from fg_calib.errors import InputError, ProblemError
+from fg_calib.executors import Failure, map_jobs
 from fg_calib.graph.build import problem_of
-from fg_calib.graph.solver import Solution
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import Measurements, Pairs
 from fg_calib.measurements.gathering import Dataset
 from fg_calib.measurements.series import Table
 from fg_calib.options import check_number
-from fg_calib.progress import tell
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -98,13 +99,14 @@ def wide(ratio: Mapping[str, float], n: int) -> list[str]:
 
 
 @checked
-def cross_validate(job: Job, n: int = 5, seed: int = 0) -> Folds:
+def cross_validate(job: Job, n: int = 5, seed: int = 0, *, executor: Executor | None = None) -> Folds:
     """Hold every configuration out once, and calibrate without it.
 
     Args:
         job: The job; its test rows take no part.
         n: Number of folds; one of all configurations is held out at a time.
         seed: What deals the configurations.
+        executor: Where the folds are calibrated; one after the other in this process if None.
 
     Raises:
         InputError: There are more folds than configurations to hold out.
@@ -123,16 +125,21 @@ def cross_validate(job: Job, n: int = 5, seed: int = 0) -> Folds:
     fold = _dealt(data, n, np.random.default_rng(seed))
     if len(np.unique(fold[fold >= 0])) < n:
         raise InputError("folds", f"found {n}", f"at most {np.sum(fold >= 0)}: so many configurations can be held out")
-    solutions = []
-    for k in range(n):
-        tell("calibrating without one fold after the other", k, n)
-        held = [_held_out(table, fold[place], k) for table, place in zip(data.tables, data.places, strict=True)]
-        try:
-            solutions.append(solve_job(replace(whole, measurements=tuple(held))))
-        except CalibrationError as error:
-            raise ProblemError("folds", f"without fold {k + 1} of {n}: {error}") from error
-    of_arm = [solution.parameters[solution.problem.variables.robot_span] for solution in solutions]
-    by_table = _by_table(solutions)
+    without = [
+        tuple(_held_out(table, fold[place], k) for table, place in zip(data.tables, data.places, strict=True))
+        for k in range(n)
+    ]
+    names = [f"without fold {k + 1} of {n}" for k in range(n)]
+    jobs = [replace(whole, measurements=tables) for tables in without]
+    found = map_jobs(_calibrated, jobs, executor, names=names, what="calibrating without one fold after the other")
+    folds = []
+    for one in found:
+        if isinstance(one, Failure):
+            if one.trace:
+                raise one.error()
+            raise ProblemError("folds", f"{one.job}: {one.reason}")
+        folds.append(one)
+    by_table = _by_table([fold.held for fold in folds])
     kinds = dict.fromkeys(kind for _, kind in by_table)
     return Folds(
         n=n,
@@ -141,9 +148,23 @@ def cross_validate(job: Job, n: int = 5, seed: int = 0) -> Folds:
         kinds={kind: pooled([held for (_, of), held in by_table.items() if of == kind]) for kind in kinds},
         of_pairs=any(table.uses_pairs for table in data.tables),
         names=tuple(p.name for p in job.robot.parameters),
-        spread=np.sqrt((n - 1) * np.var(of_arm, axis=0)),
-        not_converged=sum(not solution.converged for solution in solutions),
+        spread=np.sqrt((n - 1) * np.var([fold.of_arm for fold in folds], axis=0)),
+        not_converged=sum(not fold.converged for fold in folds),
     )
+
+
+class _Fold(NamedTuple):
+    """What a calibration without a fold found: the arm's parameters, held-out residuals, and whether it arrived."""
+
+    of_arm: Floats
+    held: dict[tuple[str, str], HeldOut]
+    converged: bool
+
+
+def _calibrated(job: Job) -> _Fold:
+    solution = solve_job(job)
+    of_arm = solution.parameters[solution.problem.variables.robot_span]
+    return _Fold(of_arm, residual_table(solution).held_out(solution.problem.data.labels), solution.converged)
 
 
 def _train(tables: Sequence[Table]) -> tuple[Table, ...]:
@@ -259,8 +280,7 @@ def _hubs(data: Dataset) -> Booleans:
     return found
 
 
-def _by_table(solutions: Sequence[Solution]) -> dict[tuple[str, str], HeldOut]:
+def _by_table(by_fold: Sequence[dict[tuple[str, str], HeldOut]]) -> dict[tuple[str, str], HeldOut]:
     """Held-out residuals of all folds together, by table and kind."""
-    by_fold = [residual_table(solution).held_out(solution.problem.data.labels) for solution in solutions]
     keys = dict.fromkeys(key for held in by_fold for key in held)
     return {key: pooled([held[key] for held in by_fold if key in held]) for key in keys}

@@ -44,7 +44,8 @@ from scipy import special
 
 from fg_calib.analysis.covariance import Spread
 from fg_calib.analysis.gross_errors import MOST_FEW, find_gross_errors
-from fg_calib.analysis.residual_covariance import Dense, Errors, LowRank, Nuisances
+from fg_calib.analysis.low_rank import Dense, LowRank
+from fg_calib.analysis.residual_covariance import Errors, Nuisances
 from fg_calib.analysis.residual_table import ResidualTable
 from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.factors import prior_rows
@@ -567,18 +568,8 @@ class _Rows:
         chosen = np.unique(np.linspace(0, len(part.rows) - 1, MAX_WHITENED).round().astype(np.int64))
         if not isinstance(part.covariance, LowRank) or not len(part.rows):
             return float(np.sum(part.squares)), float(np.sum(part.means)), part.degrees(np.arange(len(part.rows)))
-        A, floor = part.covariance.dense(chosen)
         z = np.sign(self._table.after[part.rows[chosen]]) * np.sqrt(part.squares[chosen])
-        factor = scipy.linalg.cholesky(A + np.diag(floor), lower=True)
-        white = scipy.linalg.solve_triangular(factor, z, lower=True)
-        expected = nu = float(len(chosen))
-        if floor.any():  # less what was added: of tr B and tr B^2, B = 1 - (A + floor)^-1 floor
-            lower = np.tril(scipy.linalg.lapack.dpotri(factor, lower=True)[0])  # of the inverse
-            lower *= np.sqrt(floor)[:, None] * np.sqrt(floor)
-            added, squared = float(np.trace(lower)), float(2.0 * np.vdot(lower, lower) - np.sum(np.diag(lower) ** 2))
-            expected, square = expected - added, expected - 2.0 * added + squared
-            nu = expected**2 / square
-        return float(white @ white), expected, nu
+        return part.covariance.at(chosen).whitened(z)
 
     def _part(self, rows: Integers, squares: Floats, means: Floats, covariance: LowRank | Dense | None) -> _Part:
         behind = np.full(len(self._table.groups), np.inf)

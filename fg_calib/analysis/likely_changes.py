@@ -38,7 +38,7 @@ def suspects_of(calibrated: Calibrated, rows: Linear) -> list[Found]:
     if not found:
         return []
     best = min(found, key=lambda f: f.left)
-    if special.chdtrc(max(rows.dof - best.k, 1), best.left / max(1.0, FACTOR)) >= CERTAIN:
+    if special.chdtrc(max(rows.dof - best.k, 1), best.left) >= CERTAIN:
         return found
     pairs = pairs_of_zeros(suspects)
     n = len(suspects) + len(pairs)

@@ -52,6 +52,7 @@ class Calibrated:
         knowledge: What the calibration's rows say; None where that was not saved.
         options: Its options.
         noise: What stated sigmas are multiplied by, by table and kind, where noise was estimated.
+        noise_degrees: Degrees of freedom that it was estimated by; None where it was stated, or is not known.
     """
 
     robot: Robot
@@ -60,6 +61,7 @@ class Calibrated:
     knowledge: Knowledge | None
     options: Options
     noise: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    noise_degrees: float | None = None
 
     def state_for(self, tables: Sequence[Table], like: Sequence[str]) -> NoiseState:
         """The noise of new tables: as it was found, of the only table if there was one.

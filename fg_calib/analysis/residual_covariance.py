@@ -12,8 +12,9 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from fg_calib.analysis.low_rank import Loadings, LowRank
 from fg_calib.graph.information import eliminated, felt
-from fg_calib.graph.noise import PRIVATE_SHARE, RowNoise
+from fg_calib.graph.noise import RowNoise
 from fg_calib.graph.problem import Problem, at_parameters, says_where
 from fg_calib.graph.rows import ErrorColumns
 from fg_calib.measurements import residuals
@@ -21,7 +22,6 @@ from fg_calib.measurements import residuals
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
 Integers = NDArray[np.int64]
-Loadings = scipy.sparse.csr_array
 
 
 @dataclass(frozen=True)
@@ -176,64 +176,6 @@ class Nuisances:
         L = scipy.sparse.csr_array((L.data, L.indices, L.indptr), shape=own.shape) + own
         none = np.zeros((n * residual_dim, 0))
         return Errors(of_core, none, private, L, none), N
-
-
-class LowRank:
-    """Covariance `D + L L^T + P S P^T` of standardised residuals.
-
-    Args:
-        P: Shape (n, n_columns).
-        L: Sparse, shape (n, n_errors).
-        own: Diagonal of D, shape (n,).
-        sign: Diagonal of S, 1 or -1, shape (n_columns,).
-    """
-
-    def __init__(self, P: Floats, L: Loadings, own: Floats, sign: Floats) -> None:
-        self._P, self._L, self._d, self._sign = P, L, own, sign
-        self._p = (P * P) @ sign
-        self._l = np.asarray(L.power(2).sum(axis=1)).ravel()
-
-    @property
-    def diagonal(self) -> Floats:
-        """Variances, shape (n,)."""
-        out: Floats = self._d + self._l + self._p
-        return out
-
-    def over(self, scale: Floats) -> LowRank:
-        """The same of rows divided by a scale, shape (n,)."""
-        by = 1.0 / scale
-        L = scipy.sparse.csr_array(scipy.sparse.diags_array(by) @ self._L)
-        return LowRank(self._P * by[:, None], L, self._d * by**2, self._sign)
-
-    def dense(self, rows: Integers) -> tuple[Floats, Floats]:
-        """The part at `rows`, and what its D lacks to be `PRIVATE_SHARE` of the noise."""
-        P, d, of_l = self._P[rows], self._d[rows], self._l[rows]
-        A = np.diag(d) + (P * self._sign) @ P.T + (self._L[rows] @ self._L[rows].T).toarray()
-        return A, np.maximum(PRIVATE_SHARE * (d + of_l) - d, 0.0)
-
-    def moments(self, rows: Integers) -> tuple[float, float]:
-        """Trace, and trace of the square, of the part at `rows`."""
-        P, L, p, of_l, d = self._P[rows], self._L[rows], self._p[rows], self._l[rows], self._d[rows]
-        square = np.sum(d * d) + 2.0 * np.sum(d * (of_l + p)) + self._sign @ (P.T @ P) ** 2 @ self._sign
-        square += (L.T @ L).power(2).sum() + 2.0 * np.sum((L.T @ P) ** 2 @ self._sign)
-        return float(np.sum(d + of_l + p)), float(square)
-
-
-class Dense:
-    """Covariance of standardised residuals, shape (n, n)."""
-
-    def __init__(self, A: Floats) -> None:
-        self._A = A
-
-    @property
-    def diagonal(self) -> Floats:
-        """Variances, shape (n,)."""
-        return np.diag(self._A).copy()
-
-    def moments(self, rows: Integers) -> tuple[float, float]:
-        """Trace, and trace of the square, of the part at `rows`."""
-        A = self._A[np.ix_(rows, rows)]
-        return float(np.trace(A)), float(np.sum(A * A))
 
 
 def _half(covariance: Floats) -> Floats:

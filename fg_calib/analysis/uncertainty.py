@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
@@ -17,7 +18,6 @@ from fg_calib.analysis.chi_square import chi_square
 from fg_calib.analysis.corrections import PriorFit, judge_priors
 from fg_calib.analysis.covariance import Spread, spread_of, with_left_out, with_unsure_tolerances
 from fg_calib.analysis.findings import MOST_ESTIMATED, Fit, judge
-from fg_calib.analysis.folds import Folds
 from fg_calib.analysis.goodness import Goodness, judge_fit
 from fg_calib.analysis.identifiability import Identifiability, identifiability_of
 from fg_calib.analysis.joint_values import JointValues, joint_values
@@ -36,6 +36,9 @@ from fg_calib.graph.observability import IdentifiabilityClass, Observability
 from fg_calib.graph.solver import Solution
 from fg_calib.robot.model import Robot
 from fg_calib.threads import one_blas_thread, single_threaded
+
+if TYPE_CHECKING:
+    from fg_calib.analysis.folds import Folds
 
 Floats = NDArray[np.float64]
 

@@ -73,7 +73,12 @@ class Statement:
 
 
 def of_chi2(
-    found: ChiSquare, evaluated: bool = False, *, follow: bool = False, gross: GrossErrors | None = None
+    found: ChiSquare,
+    evaluated: bool = False,
+    *,
+    follow: bool = False,
+    gross: GrossErrors | None = None,
+    updated: bool = False,
 ) -> list[Statement]:
     """What chi-square of the fitted rows and priors says.
 
@@ -82,6 +87,7 @@ def of_chi2(
         evaluated: Whether the arm was taken as it is.
         follow: Whether residuals follow the arm: sigmas are then too small by more than residuals are too large.
         gross: The gross errors that are all that is wrong; None if there are none, or more than these is.
+        updated: Whether the rows were added to an earlier calibration.
     """
     if found.dof <= 0:
         text = "no degree of freedom is left: nothing says whether the fit is right, or the noise; measure more"
@@ -94,6 +100,8 @@ def of_chi2(
             who = f"{'outlier' if gross.n == 1 else f'{gross.n} outliers'} ({_listed(gross.names)})"
             them = "it" if gross.n == 1 else "them"
             cause = f"{who}, {gross.ratio:.3g} without {them}: look at {them}, or let a robust loss do so (loss: gnc)"
+        elif updated:
+            cause = "new rows are at odds with the calibration before: has the arm changed? `fg-calib check` says"
         if evaluated:
             cause = "the arm does not predict these test rows, noise stated too small, or outliers"
         return [Statement(f"{outside}: {cause}", finding=True)]

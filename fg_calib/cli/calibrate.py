@@ -2,24 +2,42 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import signal
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fg_calib.cli.output import Json, end, show_calibration
+from fg_calib.cli.output import Json, end, say, show_calibration, show_json, show_report
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from fg_calib.batch import Order
+
+_Workers = Annotated[
+    int | None, typer.Option("--workers", min=1, metavar="N", help="Run jobs, or folds, on so many processes.")
+]
+_Scheduler = Annotated[
+    str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Run them on a Dask cluster: tcp://host:8786.")
+]
 
 
 def calibrate(
-    job: Annotated[Path, typer.Argument(metavar="JOB", readable=False, help="The job, such as calibration.yaml.")],
+    jobs: Annotated[
+        list[Path],
+        typer.Argument(metavar="JOB", readable=False, help="The job, such as calibration.yaml; or many."),
+    ],
     out: Annotated[
         Path | None,
         typer.Option(
             "--out",
             metavar="DIR",
             readable=False,
-            help="Write result.json, the calibrated robot and residuals.csv there.",
+            help="Write result.json, the calibrated robot and residuals.csv there; of many jobs to a folder each.",
         ),
     ] = None,
     folds: Annotated[
@@ -31,32 +49,87 @@ def calibrate(
     figures: Annotated[
         bool, typer.Option("--figures", help="Write the page's figures there too, as SVG files.")
     ] = False,
+    workers: _Workers = None,
+    scheduler: _Scheduler = None,
     as_json: Json = False,
 ) -> None:
     """Estimate a robot's parameters from measurements, with their uncertainties."""
-    from fg_calib.calibration import calibrate_job
-    from fg_calib.files.disk import require_writable
-    from fg_calib.files.job import read_job
-    from fg_calib.report.documents import require_no_input
+    from fg_calib.batch import Order, job_names, require_place
 
     if out is None and (report or figures):
         option = "--report" if report else "--figures"
         raise typer.BadParameter("needs --out, the folder to write to", param_hint=option)
+    if workers is not None and scheduler is not None:
+        raise typer.BadParameter("is of this machine: either this or --scheduler", param_hint="--workers")
+    if len(jobs) == 1:
+        with _executor(workers, scheduler) as executor:
+            _calibrate_one(Order("", jobs[0], out, folds, report, figures), executor, as_json)
+        return
+    names = job_names(jobs)
     if out is not None:
-        require_writable(out)
-    given = read_job(job)
-    if out is not None:
-        require_no_input(out, given)
-    if folds is not None:
-        given = replace(given, options=replace(given.options, folds=folds))
-    found = calibrate_job(given)
+        require_place(out)
+    if scheduler is not None:  # whose workers run elsewhere
+        jobs, out = [job.absolute() for job in jobs], None if out is None else out.absolute()
+    orders = [
+        Order(name, job, None if out is None else out / name, folds, report, figures)
+        for name, job in zip(names, jobs, strict=True)
+    ]
+    with _executor(workers, scheduler) as executor:
+        _calibrate_many(orders, out, executor, as_json)
+
+
+def _calibrate_one(order: Order, executor: Executor | None, as_json: bool) -> None:
+    from fg_calib.batch import ordered_job, save_ordered
+    from fg_calib.calibration import calibrate_job
+
+    found = calibrate_job(ordered_job(order), executor)
     try:
         show_calibration(found, as_json)
     finally:  # also where nobody takes the report
-        if out is not None:
-            found.save(out)
-            if report or figures:
-                from fg_calib.pages import write_report
-
-                write_report(out, page=report, figures=figures)
+        save_ordered(order, found)
     end(found.findings, not_accepted=found.not_accepted)
+
+
+def _calibrate_many(orders: Sequence[Order], out: Path | None, executor: Executor | None, as_json: bool) -> None:
+    from fg_calib.batch import calibrate_into
+    from fg_calib.report.batch import build_jobs_table, exit_code, jobs_document, write_jobs
+
+    clock = time.perf_counter()
+    found = calibrate_into(orders, executor)
+    seconds = time.perf_counter() - clock
+    try:
+        if as_json:
+            show_json(jobs_document(found, seconds))
+        else:
+            show_report(build_jobs_table(found, seconds))
+    finally:
+        if out is not None:
+            write_jobs(out, found, seconds)
+    for job in found:
+        for warning in job.warnings:
+            say(f"{job.name}: {warning}")
+        for what, reason in job.reasons:
+            say(f"{job.name}: {what}: {reason}")
+    if code := exit_code(found):
+        raise typer.Exit(code)
+
+
+@contextmanager
+def _executor(workers: int | None, scheduler: str | None) -> Iterator[Executor | None]:
+    """What was asked for; while it works, Ctrl-C is an exception, which ends the workers too."""
+    from fg_calib.executors import dask_executor, local_processes
+
+    if workers is None and scheduler is None:
+        yield None
+        return
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        if before is signal.SIG_DFL:  # what `main` has made of it
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        with dask_executor(scheduler) if scheduler is not None else local_processes(workers or 1) as executor:
+            yield executor
+    except KeyboardInterrupt:
+        say("interrupted; the results of jobs that were done have been written")
+        raise typer.Exit(128 + signal.SIGINT) from None
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -35,7 +35,9 @@ _Given = Annotated[
 _Candidates = Annotated[
     str | None,
     typer.Option(
-        "--candidates", metavar="N|TABLE|rows", help="How many are drawn, 2000 if not given; a table; or a job's rows."
+        "--candidates",
+        metavar="N|TABLE|SCENARIO|rows",
+        help="How many are drawn, 2000 if not given; a table; where a scenario says (.yaml); or a job's rows.",
     ),
 ]
 _Task = Annotated[
@@ -122,9 +124,8 @@ def _show(found: Mapping[str, Design], units: Units, out: Path | None, *, severa
         build_instruments_report,
         design_document,
         designs_document,
-        write_design,
-        write_designs,
     )
+    from fg_calib.report.plan_files import write_design, write_designs
 
     first, names = next(iter(found.values())), tuple[str, ...]()
     try:
@@ -151,7 +152,7 @@ def _read(of: str, instruments: Sequence[Path]) -> tuple[dict[str, Scenario | Jo
     from fg_calib.files.job import is_job, read_job, units_of
     from fg_calib.files.scenario import read_scenario
     from fg_calib.files.units import Units
-    from fg_calib.report.plan import names_of_files
+    from fg_calib.report.plan_files import names_of_files
 
     if is_job(of):
         if instruments:
@@ -174,10 +175,13 @@ def _readings(path: Path, robot: Robot, units: Units) -> Any:
 
 def _candidates(given: str | None, robot: Robot, units: Units) -> dict[str, Any]:
     """Where the candidates come from."""
+    from fg_calib.files.scenario import read_scenario
     from fg_calib.simulation.configurations import GivenReadings
 
     if given is None:
         return {}
     if given.isdecimal():
         return {"n_candidates": int(given)}
+    if given.endswith((".yaml", ".yml")):
+        return {"candidates": read_scenario(given).configurations}
     return {"candidates": given if given == "rows" else GivenReadings(_readings(Path(given), robot, units))}

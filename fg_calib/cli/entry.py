@@ -84,6 +84,8 @@ def run() -> None:
     gc.set_threshold(_OBJECTS_BEFORE_GARBAGE)
     atexit.register(gc.freeze)
     os.environ["MPLBACKEND"] = "agg"  # figures are only written, and what Jupyter asks for need not be installed here
+    os.environ["PYDANTIC_DISABLE_PLUGINS"] = "__all__"  # of all that is installed here; finding them takes a while
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # all that it is asked for (`threads`): starting more takes CPU
     _open_streams()
     _show_log()
     _limit_widths()

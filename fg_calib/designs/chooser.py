@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +17,12 @@ Integers = NDArray[np.int64]
 
 MOST_STOPS = 500
 """Stops up to which a design is sought that reaches a target."""
+
+UNKNOWN = 1e-9
+"""Share of a task that no candidate determines from which its error is unknown."""
+
+N_EXACT = 20
+"""Random sets where each takes a posterior of its own."""
 
 LEAST_CURVE = 4
 """Stops with which the curve begins."""
@@ -49,17 +56,22 @@ class Chooser:
     Args:
         system: What is chosen from.
         criterion: By which criterion.
+        error: Expected RMS error with some candidates, [m], where the system does not say it; inf if not determined.
     """
 
-    def __init__(self, system: System, criterion: Criterion) -> None:
-        self.system, self.criterion = system, criterion
+    def __init__(self, system: System, criterion: Criterion, error: Callable[[Integers], float] | None = None) -> None:
+        self.system, self.criterion, self._exact = system, criterion, error
         self.measure = Measure(criterion, system)
         self._error = Measure("I", system)
         of_all = Measure("D", replace(system, core=np.eye(system.rows.shape[2])))
         self._orders = [(measure, np.zeros(0, dtype=np.int64)) for measure in (self.measure, of_all)]
 
     def error(self, chosen: Integers) -> float:
-        """Expected RMS error with some candidates, [m]."""
+        """Expected RMS error with some candidates, [m]; inf where no candidates determine it."""
+        if self.system.unknown > UNKNOWN:
+            return float("inf")
+        if self._exact is not None:
+            return self._exact(chosen)
         return float(np.sqrt(self._error.value(self.system.information(chosen))))
 
     def starts(self, n: int) -> list[Integers]:
@@ -79,6 +91,8 @@ class Chooser:
     def reaching(self, target: float) -> Chosen:
         """As few as reach a target, [m]; as many as may be where none do."""
         most = min(MOST_STOPS, self.system.n_candidates)
+        if self.system.unknown > UNKNOWN:  # no number of stops would do
+            return self.best(min(LEAST_CURVE, most))
         enough = 1
         while min(map(self.error, self.starts(enough))) > target:
             if enough == most:
@@ -103,7 +117,17 @@ class Chooser:
         points = []
         for k in sorted({n - hubs for n in numbers.tolist() if 0 < n - hubs < most} | {most}):
             chosen = found.candidates if k == most else self.quickly(k).candidates
-            values, _ = random_values(self._error, k, generator)
-            low, middle, high = np.sqrt(np.quantile(values, [0.1, 0.5, 0.9])).tolist()
-            points.append(CurvePoint(k + hubs, self.error(chosen), (low, middle, high)))
+            points.append(CurvePoint(k + hubs, self.error(chosen), self._band(k, generator)))
         return tuple(points)
+
+    def _band(self, n: int, generator: np.random.Generator) -> tuple[float, float, float]:
+        """Error that a tenth, half and nine tenths of random sets of n do not exceed."""
+        if self.system.unknown > UNKNOWN:
+            return (float("inf"),) * 3
+        if self._exact is None:
+            errors = np.sqrt(random_values(self._error, n, generator)[0])
+        else:
+            of = self.system.n_candidates
+            errors = np.array([self._exact(generator.choice(of, size=n, replace=False)) for _ in range(N_EXACT)])
+        low, middle, high = np.quantile(errors, [0.1, 0.5, 0.9], method="nearest").tolist()
+        return low, middle, high

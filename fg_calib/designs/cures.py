@@ -1,7 +1,7 @@
 """What would still be undetermined, and which kind of measurement would cure it.
 
-A direction that the rows leave undetermined is moved at random configurations; a kind of measurement cures it if it
-would see that.
+Directions that no kind of measurement sees are told first; of the others as many as are left beside these. A kind cures
+a direction if what would still be undetermined with it, at random configurations, has no share of that direction.
 """
 
 from __future__ import annotations
@@ -9,12 +9,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fg_calib.analysis.identifiability import identifiability_of
 from fg_calib.designs.task import Posterior
 from fg_calib.graph.build import random_problem
-from fg_calib.graph.information import named_triangle
+from fg_calib.graph.information import named_triangle, observability_of
+from fg_calib.graph.observability import Observability
+from fg_calib.graph.problem import Problem
 from fg_calib.options import FrameKnowledge, Model
+
+Floats = NDArray[np.float64]
+Booleans = NDArray[np.bool_]
+Relation = dict[str, float]
 
 KINDS: tuple[tuple[str, Model, FrameKnowledge], ...] = (
     ("distances between configurations", "distance", "known"),
@@ -29,6 +36,9 @@ KINDS: tuple[tuple[str, Model, FrameKnowledge], ...] = (
 
 SEEN = 1e-6
 """Part of the largest effect of any parameter above which a direction is seen."""
+
+_SHARE = 1e-4
+"""Share of a direction above which another is not independent of it; far above the rounding of both."""
 
 
 @dataclass(frozen=True)
@@ -56,19 +66,57 @@ def cures_of(posterior: Posterior) -> tuple[Cure, ...]:
     if not observability.lost:
         return ()
     problem = posterior.problem
-    reasons = {
-        tuple(one.relation.items()): one.reason for one in identifiability_of(problem, problem.start, "practical").lost
-    }
     robot = problem.robot.with_values(problem.start[problem.variables.robot_span])
     scales = np.array([robot.scale_of(p.unit) for p in problem.estimated])
-    effects = []
-    for name, model, frame in KINDS:
-        anywhere = random_problem(robot, model, frame)
-        effects.append((name, named_triangle(anywhere, anywhere.start) * scales))
-    found = []
-    for relation in observability.lost:
-        moved = np.array([relation.get(name, 0.0) for name in observability.names]) / scales
-        moved /= np.linalg.norm(moved)
-        by = [name for name, J in effects if np.linalg.norm(J @ moved) > SEEN * np.linalg.norm(J, axis=0).max()]
-        found.append(Cure(relation, reasons.get(tuple(relation.items()), ""), tuple(by)))
-    return tuple(found)
+    kinds = [(name, random_problem(robot, model, frame)) for name, model, frame in KINDS]
+    relations, by = _with_unseen_first(observability, kinds[-1][1], scales), dict[str, Booleans]()
+    directions = np.array([_direction(one, observability, scales) for one in relations])
+    for name, anywhere in kinds:
+        J = named_triangle(anywhere, anywhere.start) * scales
+        by[name] = _cured(J @ directions.T, SEEN * float(np.linalg.norm(J, axis=0).max()))
+    reasons = {
+        tuple(one.relation.items()): one.reason
+        for where in (problem, kinds[-1][1])
+        for one in identifiability_of(where, where.start, "practical").lost
+    }
+    return tuple(
+        Cure(relation, reasons.get(tuple(relation.items()), ""), tuple(name for name in by if by[name][k]))
+        for k, relation in enumerate(relations)
+    )
+
+
+def _direction(relation: Relation, observability: Observability, scales: Floats) -> Floats:
+    """A relation as a unit vector, in changes of ordinary size."""
+    moved = np.array([relation.get(name, 0.0) for name in observability.names]) / scales
+    out: Floats = moved / np.linalg.norm(moved)
+    return out
+
+
+def _with_unseen_first(observability: Observability, poses: Problem, scales: Floats) -> list[Relation]:
+    """As many relations, of the same directions: what poses do not see, then what is left of the others.
+
+    Of shifts along parallel axes that are all lost, base and all, poses would still see their sum alone: named one by
+    one, each would seem to be cured.
+    """
+    unseen = observability_of(poses, poses.start).lost
+    lost = np.array([_direction(one, observability, scales) for one in observability.lost])
+    inside = np.linalg.qr(lost.T)[0]
+    kept: list[Relation] = []
+    basis = np.zeros((0, len(scales)))
+    for relation in (*unseen, *observability.lost):
+        v = _direction(relation, observability, scales)
+        if np.linalg.norm(v - inside @ (inside.T @ v)) > _SHARE:
+            continue
+        v = v - basis.T @ (basis @ v)
+        if np.linalg.norm(v) > _SHARE:
+            basis = np.vstack([basis, v / np.linalg.norm(v)])
+            kept.append(relation)
+    return kept
+
+
+def _cured(effects: Floats, floor: float) -> Booleans:
+    """Which directions, of these effects in the columns, have no share in what has no effect."""
+    _, s, Vt = np.linalg.svd(effects)
+    left = Vt[int(np.sum(s > floor)) :]
+    out: Booleans = np.linalg.norm(left, axis=0) <= _SHARE
+    return out

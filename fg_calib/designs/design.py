@@ -9,7 +9,8 @@ from the rows of its stops alone, by the very code that assesses a calibration.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -37,8 +38,9 @@ from fg_calib.designs.pool import Pool, drawn, pool_of
 from fg_calib.designs.search import Chosen, not_worse_than_random
 from fg_calib.designs.system import system_of
 from fg_calib.designs.task import N_TASK, Task, is_fitted
-from fg_calib.errors import InputError
+from fg_calib.errors import InputError, ProblemError
 from fg_calib.graph.observability import Observability
+from fg_calib.graph.problem import Problem
 from fg_calib.job import Job
 from fg_calib.measurements.series import Table
 from fg_calib.options import check, check_flag, check_number
@@ -56,6 +58,9 @@ Integers = NDArray[np.int64]
 N_STOPS = 30
 """Stops of a design where nobody says how many, or how good it has to be."""
 
+LEAST_FITTED = 4
+"""Configurations of a task that a rigid fit does not bring on top of each other, wherever they are."""
+
 N_CANDIDATES = 2000
 """Candidates that are drawn where nobody says how many."""
 
@@ -66,14 +71,16 @@ class Design(FrozenArrays):
 
     Attributes:
         pool: What was chosen from.
-        tables: What is to be measured, in order.
+        tables: What is to be measured, in order; none of an instrument none of whose own stops was chosen.
         criterion: By which criterion.
         task: What the calibration is for.
         readings: The configurations in the order in which to visit them, that of a hub first, shape (n, n_joints),
             [rad] (prismatic: [m]).
-        ids: Their names: those of rows of a job that were chosen, else s1, s2, ... in that order, shape (n,).
+        ids: Their names: those of rows of a job that were chosen, else s1, s2, ... in that order, behind such names
+            that a job has already, shape (n,).
         group: The instrument that alone measures at each; "" where all others do.
         expected: Expected errors of the tool over the task, with these and what was given.
+        after_fit: The same after the best rigid fit, where they are in the base frame; None where they are fitted.
         before: The same with what was given alone; None where nothing was.
         pairs: Which pairs are measured, of configurations in their order, shape (n_pairs, 2); None where none are, or
             where they are formed from what is measured.
@@ -97,6 +104,7 @@ class Design(FrozenArrays):
     ids: NDArray[np.str_]
     group: NDArray[np.str_]
     expected: PoseRms
+    after_fit: PoseRms | None
     before: PoseRms | None
     pairs: Integers | None
     pairings: Mapping[str, float]
@@ -114,6 +122,11 @@ class Design(FrozenArrays):
     def n(self) -> int:
         """Number of stops."""
         return len(self.readings)
+
+    @property
+    def n_candidates(self) -> int:
+        """Number of stops to choose from."""
+        return len(self.pool.readings)
 
     @property
     def found(self) -> Mapping[str, Candidates]:
@@ -168,6 +181,8 @@ def design(
     _check_figures(n, target, n_candidates, lever, seed, fitted)
     given, task = (_readings(name, q, of.robot) for name, q in (("given", given), ("task", task)))
     draw = dict(zip(("candidates", "task", "random"), np.random.default_rng(seed).spawn(3), strict=True))
+    if not any(p.estimated for p in of.robot.parameters):
+        raise ProblemError(f"robot {of.robot.name}", "nothing to estimate", "at least one parameter that is not fixed")
     tell("looking for candidates")
     if isinstance(of, Job):
         pool = _pool_of_job(of, n_candidates, draw["candidates"], candidates, given)
@@ -178,6 +193,9 @@ def design(
         pool = pool_of(scenario, drawn(scenario, n_candidates, draw["candidates"]), given=given)
     there = random_readings(pool.robot, N_TASK, draw["task"]) if task is None else task
     wanted = Task(there, is_fitted(pool.problem) if fitted is None else fitted, lever)
+    if wanted.fitted and len(there) < LEAST_FITTED:
+        found = f"{len(there)} configuration{'s' * (len(there) > 1)}, of which a rigid fit leaves next to nothing"
+        raise InputError("task", found, f"{LEAST_FITTED} or more, or errors in the base frame")
     if pool.has_hub and pool.scenario is not None and not len(pool.given) and pool.before is None:
         pool = with_best_hub(pool, wanted, n or N_STOPS, criterion, draw["random"])
     return design_from(pool, wanted, draw["random"], n=n, target=target, criterion=criterion)
@@ -267,16 +285,21 @@ def design_from(
             plan = plan_of_pairs(pool, other)
     expected, curve = plan.posterior.error(task), chooser.curve(found, generator, int(pool.has_hub))
     before = pool.posterior(pool.given) if len(pool.given) or pool.before is not None else None
-    ids = plan.names if pool.scenario is None else [f"s{k + 1}" for k in range(len(plan.readings))]
+    ids = plan.names if pool.scenario is None else _new_names(len(plan.readings), pool.before)
     return Design(
         pool=pool,
-        tables=tuple(with_names(plan.tables, dict(zip(plan.names, ids, strict=True)))),
+        tables=tuple(
+            table
+            for table in with_names(plan.tables, dict(zip(plan.names, ids, strict=True)))
+            if table.measurements.n_configurations
+        ),
         criterion=criterion,
         task=task,
         readings=plan.readings,
         ids=np.array(ids),
         group=plan.group,
         expected=expected,
+        after_fit=None if task.fitted else plan.posterior.error(replace(task, fitted=True)),
         before=None if before is None else before.error(task),
         pairs=plan.pairs,
         pairings=pairings,
@@ -292,6 +315,15 @@ def design_from(
     )
 
 
+def _new_names(n: int, before: Problem | None) -> list[str]:
+    """Names s1, s2, ... of stops: those that configurations have already are left out."""
+    taken = () if before is None else before.data.names
+    first = max((int(name[1:]) for name in taken if _OURS.fullmatch(name)), default=0) + 1
+    return [f"s{k}" for k in range(first, first + n)]
+
+
+_OURS = re.compile(r"s[0-9]{1,9}")
+
 _JUST = 1.0 + 1e-6
 """A target is reached to rounding."""
 
@@ -304,13 +336,33 @@ def _choose(
     able = np.setdiff1d(np.flatnonzero(np.any(pool.rows.rows, axis=(1, 2))), pool.given)
     if not len(able):
         raise InputError("candidates", "none at which anything is measured", "some")
-    chooser = Chooser(system.select(able), criterion)
+    hubs = int(pool.has_hub)
+    if n is not None and n > len(able) + hubs:
+        raise InputError("n", f"found {n}", f"at most {len(able) + hubs}: as many candidates measure something")
+    chooser = Chooser(system.select(able), criterion, _exactly(pool, task, able))
     tell("choosing")
     if target is None:
-        found = chooser.best(max(1, min((N_STOPS if n is None else n) - int(pool.has_hub), len(able))))
+        found = chooser.best(max(1, min((N_STOPS if n is None else n) - hubs, len(able))))
     else:
         found = chooser.reaching(target)
     better = not_worse_than_random(chooser.measure, found, generator)
     if target is not None and chooser.error(better.candidates) > max(target, chooser.error(found.candidates)):
         better = found  # better by its criterion, but no longer good enough
     return chooser, better, able
+
+
+def _exactly(pool: Pool, task: Task, able: Integers) -> Callable[[Integers], float] | None:
+    """The error with some candidates where pairs are formed otherwise than in a star; None elsewhere.
+
+    There candidates are chosen as poses in an unknown frame, which hold at least as much.
+    """
+    if not any(pairing.strategy != "star" for _, pairing in pool.formed.values()):
+        return None
+
+    def error(candidates: Integers) -> float:
+        chosen = able[candidates]
+        stops = chosen[shortest_way(pool.robot, pool.readings[chosen])]
+        found = pool.posterior(np.concatenate([pool.given, stops])).error(task).position
+        return np.inf if found is None else found
+
+    return error

@@ -39,6 +39,7 @@ class StopRows(FrozenArrays):
         always: Rows that are there whatever is measured: priors, and shared errors of 1 sigma, shape (m, n_columns).
         scales: A change of ordinary size in each column, shape (n_columns,).
         n_core: How many columns, the first ones, are the core's.
+        n_arm: How many of these, the first ones, are the arm's; the others are those of measurement frames.
         measured: Measurements of each stop, shape (n_stops,); 0 where it has none.
     """
 
@@ -46,6 +47,7 @@ class StopRows(FrozenArrays):
     always: Floats
     scales: Floats
     n_core: int
+    n_arm: int
     measured: Integers
 
 
@@ -86,7 +88,7 @@ def stop_rows(problem: Problem, of: Integers, hubs: Integers | None = None, *, a
     wide = np.vstack([*(np.pad(rows, ((0, 0), (0, n_shared))) for rows in fixed), of_hubs])
     errors = np.hstack([np.zeros((n_shared, n_columns)), np.eye(n_shared)])
     scales = np.append(v.all_scales, np.ones(n_shared))
-    return StopRows(of_stops, np.vstack([wide, errors]), scales, v.n_columns, measured)
+    return StopRows(of_stops, np.vstack([wide, errors]), scales, v.n_columns, v.n_robot_columns, measured)
 
 
 def _of_set(

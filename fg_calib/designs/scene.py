@@ -217,4 +217,5 @@ def _typical(sigma: Floats | None) -> float | None:
     """Root mean square of sigmas that are stated."""
     if sigma is None or not np.isfinite(sigma).any():
         return None
-    return float(np.sqrt(np.nanmean(np.square(sigma))))
+    largest = float(np.nanmax(sigma)) or 1.0  # equal figures stay what they are, to the last digit
+    return largest * float(np.sqrt(np.nanmean(np.square(sigma / largest))))

@@ -2,7 +2,7 @@
 
 Both look at all candidates at every step, by updates of rank h (see `criteria`): a candidate is never factorised anew.
 Exchange takes out one of the chosen at a time and puts in what is best in its place (Fedorov 1972; Mitchell 1974), so
-its end is a set that no single exchange makes better.
+its end is a set that single exchanges make hardly better: a round of them gains less than `LEAST_GAIN`.
 
 References:
     Fedorov (1972), Theory of Optimal Experiments. Academic Press.
@@ -38,7 +38,7 @@ _ROUNDING = 1e-12
 N_RANDOM = 100
 """Random sets that a design is held to: if one were better, exchange would start from it."""
 
-SMALL = 4000
+SMALL = 40_000
 """Stops times candidates up to which exchange starts from random sets too: from all of them with a hundredth."""
 
 

@@ -379,11 +379,18 @@ def _read_parquet(header: Header, numbers: Sequence[str], texts: Sequence[str]) 
 def _columns(
     frame: pl.DataFrame, numbers: Sequence[str], texts: Sequence[str], *, decimal_comma: bool = False
 ) -> pl.DataFrame:
-    """Columns of numbers, and of texts."""
+    """Columns of numbers, and of texts: all at once, as polars takes a while for every question."""
     import polars as pl
 
-    read = {c: _number(cells(frame, c), decimal_comma) for c in numbers} | {c: _text(cells(frame, c)) for c in texts}
-    return pl.DataFrame(read)
+    given = {c: cells(frame, c) for c in (*numbers, *texts)}
+    numbered = pl.DataFrame({str(k): column for k, column in enumerate(given.values())})  # no name means more
+    read = [
+        _text(column, pl.col(name)) if c in texts else _number(column, pl.col(name), decimal_comma)
+        for (c, column), name in zip(given.items(), numbered.columns, strict=True)
+    ]
+    found = numbered.select(read)
+    found.columns = list(given)
+    return found
 
 
 def _with_newlines(content: bytes) -> bytes:
@@ -407,25 +414,31 @@ def _start_of_header(content: bytes) -> int:
     return start
 
 
-def _text(cells: pl.Series) -> pl.Series:
-    """Text without blanks around it, whole numbers without a fraction; null if nothing is left."""
+def _text(cells: pl.Series, column: pl.Expr) -> pl.Expr:
+    """Text without blanks around it, whole numbers without a fraction; null if nothing is left.
+
+    Args:
+        cells: The cells.
+        column: What stands for them.
+    """
     import polars as pl
 
     if cells.dtype.is_float() and bool(((cells % 1 == 0) & (cells.abs() <= MOST_SIZE)).all()):
-        cells = cells.cast(pl.Int64)  # pandas has floats beside nan
-    return cells.cast(pl.String).str.strip_chars().replace("", None)
+        column = column.cast(pl.Int64)  # pandas has floats beside nan
+    return column.cast(pl.String).str.strip_chars().replace("", None)
 
 
-def _number(cells: pl.Series, decimal_comma: bool) -> pl.Series:
+def _number(cells: pl.Series, column: pl.Expr, decimal_comma: bool) -> pl.Expr:
     """Numbers, also from text: nan where it is none, null where it is empty."""
     import polars as pl
 
     if cells.dtype != pl.String:
-        return cells.cast(pl.Float64)
-    texts = _text(cells)
+        return column.cast(pl.Float64)
+    texts = _text(cells, column)
     if decimal_comma:  # in a text with a point too one of them groups thousands, or it is no number
         texts = texts.str.replace(r"^([^.,]*),([^.,]*)$", "$1.$2")
-    return texts.cast(pl.Float64, strict=False).fill_null(float("nan")).set(texts.is_null(), None)
+    numbers = texts.cast(pl.Float64, strict=False).fill_null(float("nan"))
+    return pl.when(texts.is_not_null()).then(numbers)
 
 
 def _check_same_rows(header: Header, n_rows: int) -> None:

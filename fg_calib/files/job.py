@@ -322,8 +322,12 @@ def read_table_like(
     Raises:
         InputError: A file is missing or cannot be used, or it is not clear which table it is like.
     """
-    given = document["measurements"]
+    given = document.get("measurements")
     entries = given if isinstance(given, list) else [{"table": given, "pairs": document.get("pairs")}]
+    if not all(isinstance(entry, dict) and isinstance(entry.get("table"), str) for entry in entries):
+        raise InputError(
+            "result.json: carried: job", f"measurements {shown(given)}", "those of the job, as it was saved"
+        )
     entry = _entry_like(entries, path, like)
     if (pairs is None) != (entry.get("pairs") is None):
         found = "no table of pairs" if pairs is None else f"a table of pairs, {pairs.name}"

@@ -100,7 +100,12 @@ class Section(BaseModel):
     """A part of a result; it may be made of any object that has its fields as attributes."""
 
     model_config = ConfigDict(
-        frozen=True, from_attributes=True, populate_by_name=True, protected_namespaces=(), allow_inf_nan=False
+        frozen=True,
+        from_attributes=True,
+        populate_by_name=True,
+        protected_namespaces=(),
+        allow_inf_nan=False,
+        defer_build=True,  # of the sections that a result has, not of all at import
     )
 
     def __repr__(self) -> str:

@@ -88,7 +88,7 @@ def refuse_unknown_keys(*known: str) -> Callable[[object], object]:
 class Schema(BaseModel):
     """A mapping with known keys and finite numbers; base of all schemas."""
 
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True, defer_build=True)
 
     @model_validator(mode="before")
     @classmethod

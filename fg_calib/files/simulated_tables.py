@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.errors import InputError
 from fg_calib.files.units import Units
 from fg_calib.measurements.dataset import Measurements, Pairs
 from fg_calib.measurements.series import KnownPoint, Table
@@ -97,28 +96,25 @@ def to_fill_in(columns: Columns, *, touched: bool = False) -> Columns:
     return dict(columns) | measured | joints
 
 
-def require_empty(path: Path, columns: Columns) -> None:
-    """Check that what was measured is not lost where a table to fill in is written once more.
+def is_filled_in(path: Path) -> bool:
+    """Whether something was written into a table that was to be filled in; a file that is no such table counts.
 
     Args:
-        path: Where the table would be.
-        columns: Its columns, None for those that are still to be filled in.
-
-    Raises:
-        InputError: One is there of which any of these has a figure, or which cannot be read.
+        path: The file, which need not exist.
     """
     import polars as pl
 
-    expected = "another folder, or the file moved away"
+    if not path.exists():
+        return False
     try:
-        there = pl.read_csv(path, infer_schema=False, truncate_ragged_lines=True)
-    except FileNotFoundError:
-        return
-    except (OSError, pl.exceptions.PolarsError):  # nobody knows what it holds
-        raise InputError(str(path), "is there already and cannot be read", expected) from None
-    empty = [name for name, values in columns.items() if values is None and name in there.columns]
-    if any(there[name].null_count() < len(there) for name in empty):
-        raise InputError(str(path), "has figures filled in", expected)
+        table = pl.read_csv(path, infer_schema=False)
+    except (pl.exceptions.PolarsError, OSError):
+        return True
+    for of_table in (r"q\d+", "|".join(MEASURED)):
+        columns = [c for c in table.columns if re.fullmatch(of_table, c)]
+        if columns and all((table[c].is_null() | (table[c] == "")).all() for c in columns):
+            return False
+    return True
 
 
 def instrument_keys(tables: Sequence[Table], units: Units) -> dict[str, Any]:

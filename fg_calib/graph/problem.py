@@ -411,9 +411,8 @@ def pair_noises(problem: Problem, parameters: Floats) -> list[PairNoise]:
 
 def frames_only(problem: Problem) -> Problem | None:
     """The same problem with the arm at nominal: measurement frame, base and tool alone; None if none is estimated."""
-    n = problem.robot.n_joints
-    parameters = tuple(replace(p, estimated=p.estimated and not 1 <= p.owner <= n) for p in problem.robot.parameters)
-    robot = replace(problem.robot, parameters=parameters)
+    robot, n = problem.robot, problem.robot.n_joints
+    robot = robot.with_estimated([p.name for p in robot.parameters if p.estimated and not 1 <= p.owner <= n])
     variables = variables_of(robot, problem.data, problem.options)
     if not variables.items:
         return None

@@ -13,6 +13,7 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import permutations, product
 
@@ -88,8 +89,7 @@ def start_from_poses(
             candidates += [(R, _tool_rotation(R_F, R_M, R)) for R in aligned]
     elif unknown.frame and p_M is not None:
         candidates = [(R, T.rotation) for R in _frame_rotations(R_F, p_F, p_M, T.translation, unknown)]
-    fits = [_translations(R_F, p_F, p_M, R_X, R_T, X, T, unknown) for R_X, R_T in candidates]
-    return min(fits, key=lambda fit: fit[1])[0]
+    return _with_translations(R_F, p_F, p_M, candidates, X, T, unknown)
 
 
 def start_from_most_poses(
@@ -240,7 +240,7 @@ def _rotations(R_F: Floats, R_M: Floats, R_X: Floats, R_T: Floats, unknown: Unkn
     best = int(np.argmax(np.round(reached, 9)))
     R_X, R_T = all_X[best], all_T[best]
     axis = _common_axis(R_F)
-    turns = [_about(axis, angle) for angle in np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)]
+    turns = _about(axis, np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False))
     return [(R_X @ turn, turn.T @ R_T) for turn in turns]
 
 
@@ -277,11 +277,12 @@ def _common_axis(R_F: Floats) -> Floats:
     return axis
 
 
-def _about(axis: Floats, angle: float) -> Floats:
-    """The rotation about a unit axis (Rodrigues)."""
+def _about(axis: Floats, angles: Floats) -> Floats:
+    """The rotations about a unit axis (Rodrigues), shape (n, 3, 3)."""
     K = np.cross(np.eye(3), axis)
-    turn: Floats = np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * (K @ K)
-    return turn
+    sine, cosine = np.sin(angles)[:, None, None], np.cos(angles)[:, None, None]
+    turns: Floats = np.eye(3) + sine * K + (1.0 - cosine) * (K @ K)
+    return turns
 
 
 def _quarter_turns() -> list[Floats]:
@@ -314,22 +315,34 @@ def _frame_rotations(R_F: Floats, p_F: Floats, p_M: Floats, t: Floats, unknown: 
     return candidates
 
 
-def _translations(
-    R_F: Floats, p_F: Floats, p_M: Floats | None, R_X: Floats, R_T: Floats, X: Frame, T: Frame, unknown: Unknown
-) -> tuple[tuple[Frame, Frame], float]:
-    """Translations for given rotations: linear, from the nominal ones in the minimum-norm sense; and the cost.
+def _with_translations(
+    R_F: Floats,
+    p_F: Floats,
+    p_M: Floats | None,
+    candidates: Sequence[tuple[Floats, Floats]],
+    X: Frame,
+    T: Frame,
+    unknown: Unknown,
+) -> tuple[Frame, Frame]:
+    """The candidates' rotations that fit best, with their translations; the first where positions say nothing.
 
-    Where frame and tool act together the frame takes it all: the tool is near nominal, the frame may be anywhere.
+    Translations are linear, from the nominal ones in the minimum-norm sense. Where frame and tool act together the
+    frame takes it all: the tool is near nominal, the frame may be anywhere. Seen from the base, with R_X^T t_X in place
+    of t_X, all candidates have one matrix.
     """
     if p_M is None:
-        return (Frame(R_X, X.translation), Frame(R_T, T.translation)), 0.0
-    rest = p_M - X.translation - (p_F + R_F @ T.translation) @ R_X.T  # what is left to explain, (n, 3)
-    A = np.concatenate([np.broadcast_to(np.eye(3), R_F.shape), R_X @ R_F], axis=2)  # (n, 3, 6)
+        R_X, R_T = candidates[0]
+        return Frame(R_X, X.translation), Frame(R_T, T.translation)
+    turned = np.array([R_X for R_X, _ in candidates])
+    # What is left to explain, of each candidate, (k, n, 3).
+    rest = (p_M - X.translation) @ turned - (p_F + R_F @ T.translation)
+    A = np.concatenate([np.broadcast_to(np.eye(3), R_F.shape), R_F], axis=2).reshape(-1, 6)  # (3 n, 6)
+    rest = rest.reshape(len(candidates), -1).T
     free = np.concatenate([np.full(3, unknown.frame), unknown.tool_translation])
-    step = np.zeros(6)
+    steps = np.zeros((6, len(candidates)))
     if free.any():
         reluctance = np.where(np.arange(6) < 3, 1.0, 1e-3)[free]
-        scaled = A.reshape(-1, 6)[:, free] * reluctance
-        step[free] = reluctance * np.linalg.lstsq(scaled, rest.ravel(), rcond=1e-10)[0]
-    left = rest.ravel() - A.reshape(-1, 6) @ step
-    return (Frame(R_X, X.translation + step[:3]), Frame(R_T, T.translation + step[3:])), float(left @ left)
+        steps[free] = reluctance[:, None] * np.linalg.lstsq(A[:, free] * reluctance, rest, rcond=1e-10)[0]
+    best = int(np.argmin(np.sum((rest - A @ steps) ** 2, axis=0)))
+    (R_X, R_T), step = candidates[best], steps[:, best]
+    return Frame(R_X, X.translation + R_X @ step[:3]), Frame(R_T, T.translation + step[3:])

@@ -8,12 +8,14 @@ import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
 from datetime import UTC, datetime
+from functools import cache
 from hashlib import sha256
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from fg_calib import __version__
@@ -88,6 +90,7 @@ from fg_calib.report.page.files import FIGURE_FILES, PAGE
 from fg_calib.report.shown import FAMILY_UNIT
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
+from fg_calib.threads import single_threaded
 
 if TYPE_CHECKING:  # a calibration is written without the baseline
     from fg_calib.baseline.comparison import Comparison, Estimate, RealErrors
@@ -100,6 +103,7 @@ _ROWS_AT_ONCE = 200_000
 """Rows of `residuals.csv` that are turned into text at once."""
 
 
+@single_threaded
 def result_of(
     solution: Solution,
     uncertainty: Uncertainty,
@@ -183,7 +187,7 @@ def _origin(
     """What a result came from, and what the next one takes over."""
     return {
         "options": _options(solution.problem),
-        "versions": _versions(),
+        "versions": dict(_versions()),
         "inputs": dict(inputs),
         "date": date or datetime.now(UTC).isoformat(timespec="seconds"),
         "previous": previous,
@@ -223,9 +227,10 @@ def _options(problem: Problem) -> dict[str, Any]:
     return given | words
 
 
+@cache
 def _versions() -> dict[str, str]:
     """What the figures were computed with."""
-    libraries = {name: metadata.version(name) for name in ("gtsam", "numpy", "scipy")}
+    libraries = {"gtsam": metadata.version("gtsam"), "numpy": np.__version__, "scipy": scipy.__version__}
     return {"fg-calib": __version__, "python": platform.python_version(), **libraries}
 
 

@@ -24,6 +24,7 @@ TOPICS: Mapping[str, str] = {
     "next-month": "is a calibration still good, what has moved, and what was learned since",
     "observability": "which parameters measurements can determine at all",
     "design": "where to measure: how many stops, which ones, what accuracy, which instrument",
+    "many-jobs": "on one process, on several, on a cluster; one huge table",
     "simulate": "a robot and measurements to try things on",
     "compare": "beside plain least squares, and against the truth",
     "python": "from arrays, the single steps, measurements and factors of your own",

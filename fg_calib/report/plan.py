@@ -1,48 +1,31 @@
-"""The report of `fg-calib design`: what to measure, what to expect of it, and the job to be filled in."""
+"""The report of `fg-calib design`: what to measure, and what to expect of it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import yaml
 from rich.console import Group, RenderableType
 
 from fg_calib.analysis.accuracy import PoseRms
 from fg_calib.designs.design import Design
-from fg_calib.files.csv_writer import write_csv
-from fg_calib.files.disk import fill_folder, write_text
-from fg_calib.files.robot_yaml import write_robot
-from fg_calib.files.simulated_tables import instrument_keys, require_empty, table_columns, to_fill_in
-from fg_calib.files.units import Units
-from fg_calib.files.urdf import write_urdf
-from fg_calib.measurements.series import Table
-from fg_calib.report.figures import empty_figure
 from fg_calib.report.shown import SHOWN
 from fg_calib.report.tables import indented, line, plain_table, rounded, section
-from fg_calib.robot.kinematics import pose
-from fg_calib.robot.model import Robot
+from fg_calib.simulation.configurations import RandomReadings
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 SCHEMA = "fg-calib/design/1"
-
-_BEGINNING = f'{{\n "schema": "{SCHEMA}"'.encode()
-"""How `design.json` begins."""
-
-CONFIGURATIONS = "configurations.csv"
 
 _MOST = 40
 """Stops that the report lists; the table has them all."""
 
-_JOB_WORDS = "# fg-calib design\n# What to measure: fill in the tables, then `fg-calib calibrate` this file.\n"
-
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+_SHOWN_CHANGE = 0.005
+"""Part of a direction's largest change below which the report leaves one out; design.json has them all."""
 
 
 # --- for programs ---
@@ -209,7 +192,7 @@ def _stops(design: Design) -> RenderableType:
 def _cures(design: Design) -> RenderableType:
     table = plain_table(("direction", "left"), ("why", "left"), ("would be determined by", "left"), wrap=True)
     for cure in design.cures:
-        what = " ".join(f"{change:+g} {name}" for name, change in cure.relation.items())
+        what = " ".join(f"{v:+.3g} {name}" for name, v in cure.relation.items() if abs(v) >= _SHOWN_CHANGE)
         by = cure.by[0] if cure.by else "nothing: the arm moves the same whatever it is"
         table.add_row(line(what), line(cure.reason), by)
     return table
@@ -220,6 +203,9 @@ def _notes(design: Design) -> list[str]:
     for name, one in design.found.items():
         of = f" of {name}" if name else ""
         notes.append(f"candidates{of}: {one.reasons()}")
+    notes += [f"{name}: none of its own stops was chosen, and it gets no table" for name in _without_stops(design)]
+    if _is_anywhere(design):
+        notes.append("a job says of no boxes and no lines of sight: --candidates SCENARIO takes those of a scenario")
     turn = math.degrees(design.travel)
     notes.append(f"joint travel along the stops {turn:.0f} deg, {math.degrees(design.travel_before):.0f} unordered")
     if design.n > _MOST:
@@ -233,9 +219,30 @@ def _notes(design: Design) -> list[str]:
         notes.append(
             "more stops would not do: lower noise, other kinds of measurement or a wider range of stops would"
             if _is_flat(design)
+            else "all candidates are taken: --candidates draws more"
+            if design.n >= design.n_candidates
             else "more stops may do: state them with --n"
         )
+    after = math.inf if design.after_fit is None else design.after_fit.position or math.inf
+    if design.after_fit is not None and after < 0.5 * (design.expected.position or 0.0):
+        notes.append(
+            f"most of it is where the base stands: after the best rigid fit {_pose(design.after_fit)}; "
+            "--error fitted chooses for that"
+        )
     return notes
+
+
+def _without_stops(design: Design) -> list[str]:
+    """Instruments that have stops of their own, none of which was chosen."""
+    return sorted(set(design.pool.group.tolist()).difference(design.group.tolist(), [""]))
+
+
+def _is_anywhere(design: Design) -> bool:
+    """Whether more rows of a job were chosen anywhere within the joint limits."""
+    scenario = design.pool.scenario
+    if design.pool.before is None or scenario is None:
+        return False
+    return isinstance(scenario.configurations, RandomReadings) and not scenario.configurations.keep_out
 
 
 def _is_flat(design: Design) -> bool:
@@ -254,148 +261,6 @@ def _mm(value: float | None) -> str:
 
 
 def _figure(value: float) -> str:
-    return f"{value * 1e3:.3g}" if value < 10.0 else "unknown"
-
-
-# --- pictures and files ---
-
-
-def draw_designs(designs: Mapping[str, Design]) -> Figure:
-    """Expected errors against the number of stops, with the band of random ones.
-
-    Args:
-        designs: They, by the instruments' names.
-    """
-    figure = empty_figure(6.0, 3.8)
-    from matplotlib.ticker import LogLocator, NullFormatter
-
-    axes = figure.add_subplot()
-    several = len(designs) > 1
-    for colour, (name, one) in zip(_COLOURS * len(designs), designs.items(), strict=False):
-        n = np.array([p.n for p in one.curve])
-        low, middle, high = np.array([p.random for p in one.curve]).T * 1e3
-        designed = np.array([p.designed for p in one.curve]) * 1e3
-        label = name if several else "designed"
-        axes.plot(n, designed, "o-", color=colour, markersize=4, label=label)
-        axes.fill_between(n, low, high, color=colour, alpha=0.12, linewidth=0)
-        axes.plot(n, middle, "--", color=colour, linewidth=1.0, label=None if several else "random, and 80 % of them")
-        if one.target is not None and name == next(iter(designs)):
-            axes.axhline(one.target * 1e3, color="0.5", linewidth=0.9)
-            axes.annotate(f"{one.target * 1e3:g} mm", (n[0], one.target * 1e3), (0, 3), textcoords="offset points",
-                          fontsize=7, color="0.4")  # fmt: skip
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.set_major_formatter("{x:g}")
-        axis.set_minor_formatter(NullFormatter())
-    axes.tick_params(labelsize=7, which="both")
-    axes.set_xlabel("stops", fontsize=8)
-    axes.set_ylabel("expected RMS error over the task [mm]", fontsize=8)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=7.5)
-    first = next(iter(designs.values()))
-    axes.set_title(f"{first.pool.robot.name}: what to expect of how many stops", fontsize=9, loc="left")
-    return figure
-
-
-def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
-    """Write where to measure, the job to be filled in, and what to expect.
-
-    Args:
-        folder: Where to.
-        design: The design.
-        units: Of the tables and the job.
-
-    Returns:
-        The names of the files.
-
-    Raises:
-        InputError: The folder cannot be written, or holds files of these names that are no design's, or tables that
-            were filled in.
-    """
-    import json
-
-    robot = design.pool.robot if design.pool.before is None else design.pool.before.robot
-    tables = design.tables if design.pool.scenario is not None else ()
-    files = {
-        name: to_fill_in(columns, touched=_is_touched(t))
-        for t in tables
-        for name, columns in table_columns(t, robot, units).items()
-    }
-    figure = draw_designs({"": design})
-    urdf = "robot.urdf" if robot.urdf is not None and tables else None
-
-    def write(into: Path) -> None:
-        write_csv(into / CONFIGURATIONS, _configurations(design, robot, units))
-        write_text(into / "design.json", json.dumps(design_document(design), indent=1) + "\n")
-        figure.savefig(into / "design.png", dpi=160)
-        if not tables:
-            return
-        for name, columns in files.items():
-            write_csv(into / name, columns)
-        if urdf is not None:
-            write_urdf(into / urdf, robot)
-        write_robot(into / "robot.yaml", robot, units=units, urdf_name=urdf)
-        write_text(into / "calibration.yaml", _JOB_WORDS + _job_text(design, units))
-
-    names = [CONFIGURATIONS, "design.json", "design.png"]
-    if tables:
-        names += [*files, "robot.yaml", *([urdf] if urdf else []), "calibration.yaml"]
-    for name, columns in files.items():
-        require_empty(folder / name, columns)
-    whose = {"design.json": _BEGINNING}  # first: by that the others are this command's too
-    own = whose | dict.fromkeys(names, b"") | {"calibration.yaml": _JOB_WORDS.encode()} | whose
-    fill_folder(folder, write, own)
-    return tuple(names)
-
-
-def write_designs(folder: Path, designs: Mapping[str, Design], units: Units) -> tuple[str, ...]:
-    """Write designs of several instruments, a folder each, and their picture.
-
-    Args:
-        folder: Where to.
-        designs: They, by the instruments' names.
-        units: Of the tables and jobs.
-    """
-    names = [f"{name}/{file}" for name, one in designs.items() for file in write_design(folder / name, one, units)]
-    figure = draw_designs(designs)
-    fill_folder(folder, lambda into: figure.savefig(into / "instruments.png", dpi=160), {"instruments.png": b"\x89PNG"})
-    return (*names, "instruments.png")
-
-
-def _is_touched(table: Table) -> bool:
-    """Whether something is touched, so that it is the joint readings that are measured."""
-    m = table.measurements
-    contact = table.model in ("anchor", "plane") and not np.any(0.0 if m.length is None else m.length)
-    return m.groups is not None or contact
-
-
-def _configurations(design: Design, robot: Robot, units: Units) -> dict[str, Any]:
-    """Where to go, in order, and where the tool then is by the arm as it is known."""
-    at = pose(design.pool.robot, design.readings).position
-    return {
-        "id": design.ids,
-        **{f"q{i + 1}": design.readings[:, i] / units.factor(joint.unit) for i, joint in enumerate(robot.joints)},
-        "table": np.where(design.group == "", "all" if np.any(design.group != "") else "", design.group),
-        **{f"tool_{axis}": at[:, k] / units.factor("m") for k, axis in enumerate("xyz")},
-    }
-
-
-def _job_text(design: Design, units: Units) -> str:
-    """The job of the tables that are to be filled in."""
-    scenario = design.pool.scenario
-    assert scenario is not None
-    robot, sigma = design.pool.robot, design.tables[0].measurements.sigma_joint
-    joint = [units.from_si(s, j.unit) for s, j in zip(sigma, robot.joints, strict=True)]
-    keys = {key: value for key, value in scenario.job.items() if key not in ("model", "pairing", "noise")}
-    job: dict[str, Any] = {"robot": "robot.yaml", **keys, "units": asdict(units)}
-    job |= {"noise": {"joint": joint[0] if len(set(joint)) == 1 else joint}}
-    job |= instrument_keys(design.tables, units)
-    return yaml.safe_dump(job, sort_keys=False, default_flow_style=None, allow_unicode=True, width=math.inf)
-
-
-def names_of_files(paths: Sequence[Path]) -> list[str]:
-    """A name for each file: its own without the ending, with a number where others have the same."""
-    stems = [path.stem for path in paths]
-    return [s if stems.count(s) == 1 else f"{s}_{stems[: k + 1].count(s)}" for k, s in enumerate(stems)]
+    if value >= 10.0:
+        return "unknown"
+    return f"{value * 1e3:.3g}" if value < 0.9995 else f"{value * 1e3:.0f}"

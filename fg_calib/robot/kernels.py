@@ -51,21 +51,30 @@ class _CompileNotice(event.Listener):  # type: ignore[misc]
         """Numba is done with one function."""
 
 
-def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
-    """Compile a kernel with numba: without the GIL, with fused multiply-adds, cached where a folder can be written."""
-    options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}} | options
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
+"""Of all kernels: without the GIL, with fused multiply-adds."""
+
+
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a kernel with numba, cached where a folder can be written."""
     _CompileNotice.kept &= has_cache_folder()
     try:
-        kernel: Callable[..., Any] = numba.njit(cache=has_cache_folder(), **options)(function)
+        kernel: Callable[..., Any] = numba.njit(cache=has_cache_folder(), **_OPTIONS)(function)
     except RuntimeError:  # neither the package's folder nor the user's cache can be written
         _CompileNotice.kept = False
-        return numba.njit(**options)(function)  # type: ignore[no-any-return]
+        return numba.njit(**_OPTIONS)(function)  # type: ignore[no-any-return]
     check_cache(kernel)
     return kernel
 
 
-inlined = partial(compiled, forceinline=True)
-"""As `compiled`, for a part of a kernel that must see its caller's constants, or is faster in its place."""
+def part(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+    """Compile a part that kernels call, and Python does not: it is kept in their caches, without ways in of its own."""
+    options = _OPTIONS | {"no_cpython_wrapper": True, "no_cfunc_wrapper": True} | options
+    return numba.njit(**options)(function)  # type: ignore[no-any-return]
+
+
+inlined = partial(part, forceinline=True)
+"""As `part`, where it must see its caller's constants, or is faster in its place."""
 
 
 event.register("numba:compile", _CompileNotice())
@@ -179,7 +188,7 @@ def _write_translation_twist(sign, R, k, twist):  # type: ignore[no-untyped-def]
             twist[3 + c, i] = sign * R[(3 * k + c) * LANES + i]
 
 
-@compiled
+@part
 def _add_twist(sign, R, k, p, twist):  # type: ignore[no-untyped-def]
     """The twist of a further element of a column: it moves with all of them."""
     more = np.zeros((6, LANES))
@@ -251,7 +260,7 @@ def _turn_about_by_reading(k, reading, R):  # type: ignore[no-untyped-def]
         _turn_by_reading(reading, R, 0, 1)
 
 
-@compiled
+@part
 def _walk_basis(k, coefficient, sign, trig, row, basis, column, own, reading, R, p, twist, written):  # type: ignore[no-untyped-def]
     """An element whose value is a coefficient times a basis function, which `trig` has with its slope."""
     for target, which in ((column, 0), (own, 1)):
@@ -371,7 +380,7 @@ def _gather_whitening(whitening, first, weight):  # type: ignore[no-untyped-def]
             weight[k, i] = weight[k, i - LANES]
 
 
-@compiled
+@part
 def _gather(given, first, r, D):  # type: ignore[no-untyped-def]
     """Residuals and wrench rows that numpy computed, lane by lane."""
     residual, wrenches, _ = given
@@ -385,7 +394,7 @@ def _gather(given, first, r, D):  # type: ignore[no-untyped-def]
                     D[e, h, c, i] = wrenches[min(first + i, n - 1), e, h, c]
 
 
-@compiled
+@part
 def _turn_back(r, D):  # type: ignore[no-untyped-def]
     """Wrench rows of a turn a of the base by which a residual of three coordinates is turned back: -a x r."""
     for c in range(3):
@@ -481,7 +490,7 @@ def _add_product(turns, D, T, out):  # type: ignore[no-untyped-def]
             )  # fmt: skip
 
 
-@compiled
+@part
 def _fill_nuisances(derivatives, weight, first, panel):  # type: ignore[no-untyped-def]
     """Whitened derivatives in the nuisances, which stand before the residual."""
     n, residual_dim, n_nuisances = derivatives.shape
@@ -576,7 +585,7 @@ def _position(p, data, first, column, r, D):  # type: ignore[no-untyped-def]
             D[c, 3 + c, i] = 1.0
 
 
-@compiled
+@part
 def _same_point(p, r, D_A, D_B):  # type: ignore[no-untyped-def]
     D_A[:3] = 0.0
     D_B[:3] = 0.0
@@ -594,7 +603,7 @@ def _negate(D_B, D_A):  # type: ignore[no-untyped-def]
             D_A[c, i] = -D_B[c, i]
 
 
-@compiled
+@part
 def _orientation(R, data, i, derived, r, D):  # type: ignore[no-untyped-def]
     """Log(measured^T R) of lane i, and Jr^-1 R^T, which maps w to its derivative; data are measured, row by row."""
     E = np.empty((3, 3))

@@ -18,7 +18,6 @@ References:
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -33,6 +32,7 @@ from fg_calib.arrays import Brief, as_figures, check_sizes, shape_of
 from fg_calib.errors import InputError
 from fg_calib.robot.kernels import ChainArrays, walk_all
 from fg_calib.robot.model import AXIS_OF_KIND, FRAME_KINDS, Axis, Element, Robot
+from fg_calib.threads import processors
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -351,12 +351,6 @@ def over_processors(run: Callable[[int], T], n: int) -> Iterator[T]:
     if n <= 1 or processors() == 1:
         return (run(k) for k in range(n))
     return _pool().map(run, range(n))
-
-
-@cache
-def processors() -> int:
-    """Processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
 @cache

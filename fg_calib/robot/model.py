@@ -359,7 +359,10 @@ class Robot:
         names = (names,) if isinstance(names, str) else listed(self.name, names)
         check_names(self.name, names, names_of(self.parameters))
         wanted = set(names)
-        return replace(self, parameters=tuple(replace(p, estimated=p.name in wanted) for p in self.parameters))
+        changed = (
+            p if p.estimated == (p.name in wanted) else replace(p, estimated=not p.estimated) for p in self.parameters
+        )
+        return replace(self, parameters=tuple(changed))
 
     @checked
     def with_values(self, values: Floats | Sequence[float]) -> Robot:

@@ -13,6 +13,9 @@ from fg_calib.analysis.suspects import zero_names
 from fg_calib.errors import InputError
 from fg_calib.measurements.dataset import Labels
 
+SMALL = 2.5e-4
+"""A slip of some sigma in an unknown frame, [rad]."""
+
 
 @pytest.fixture(scope="module")
 def known():
@@ -177,6 +180,33 @@ def test_two_joints_that_slipped_together_are_found(known):
     calibration, true, _ = known
     found = calibration.check(measured(slipped(true, theta3=3e-3, theta5=-4e-3), 12, np.random.default_rng(10)))
     assert ("theta3", "theta5") in likely(found)
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("seed", [0, 2, 3])
+def test_two_small_slips_are_not_taken_for_noise_that_is_a_little_too_small(unknown, seed):
+    """The better of the two alone leaves a reduced chi-square below 2, which is more than chance."""
+    calibration, true, _ = unknown
+    rng = np.random.default_rng(seed)
+    found = calibration.check(measured(slipped(true, theta2=SMALL, theta5=-SMALL), 8, rng, frame=placed(rng)))
+    assert ("theta2", "theta5") in likely(found)
+
+
+def test_few_rows_that_a_slip_explains_are_not_said_to_be_explained_by_none(known):
+    """Too few to tell it from noise stated too small."""
+    calibration, true, _ = known
+    found = calibration.check(measured(slipped(true, theta4=2.5e-4), 2, np.random.default_rng(1)))
+    assert found.explanations == ()
+    assert "too small, or a change such as of theta4" in found.reasons[0]
+
+
+def test_a_p_value_counts_that_noise_was_estimated_by_few_rows():
+    """Chi-square over its degrees of freedom is then F; by chi-square 6 of 50 healthy arms had a p-value below 0.01."""
+    calibration, true, rng = calibrated(4, n=10, estimate_noise=True)
+    found = calibration.check(measured(true, 8, rng))
+    degrees = sum(kind.expected for kind in calibration.goodness.values())
+    assert degrees < 60 - 20  # of 60 figures all but those that the arm takes
+    assert found.p_value == pytest.approx(stats.f.sf(found.chi2 / found.dof, found.dof, degrees))
 
 
 def test_what_moves_the_tool_alike_everywhere_is_one():

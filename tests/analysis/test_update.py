@@ -168,6 +168,14 @@ def test_what_has_changed_is_learned_anew_and_the_check_is_good_again():
     assert updated.check(measured(true, 12, rng)).verdict == "pass"
 
 
+def test_an_update_at_odds_with_what_was_known_points_to_the_check():
+    """After a slip that nobody declared; not to the convention, which fitted before."""
+    calibration, true, rng = calibrated(78)
+    updated = calibration.update(measured(slipped(true, theta3=1e-3), 8, rng))
+    assert "`fg-calib check` says" in updated.findings[0]
+    assert not any("parallel" in text for text in updated.findings)
+
+
 def test_growth_is_added_to_what_was_known():
     """With hardly any new rows, variances are the old ones and the growth, whatever the correlation."""
     calibration, true, rng = calibrated(7)

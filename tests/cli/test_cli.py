@@ -325,7 +325,7 @@ def test_noise_stated_too_large_is_a_caution(fg_calib, example, factor):
     "arguments",
     [
         ("calibrate",),
-        ("calibrate", "job.yaml", "more.yaml"),
+        ("inspect", "job.yaml", "more.yaml"),
         ("calibrate", "job.yaml", "--out"),
         ("calibrate", "job.yaml", "--nonsense"),
         ("recalibrate", "job.yaml"),

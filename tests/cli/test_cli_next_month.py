@@ -175,6 +175,14 @@ def test_an_older_result_is_checked_by_a_job_and_not_updated(place, tmp_path):
     assert "does not hold what its rows say" in message
 
 
+@pytest.mark.parametrize("job", [{"units": 5}, {"measurements": 5}, {"measurements": [{"model": "pose"}]}], ids=str)
+def test_a_damaged_job_is_told_of(place, tmp_path, job):
+    folder = changed_result(place, tmp_path, lambda d: d["carried"].update(job=job))
+    code, message = run("check", folder, place / "healthy.csv")
+    assert (code, message.count("\n")) == (1, 0)
+    assert "carried: job" in message
+
+
 def test_a_damaged_history_is_told_of(place, tmp_path):
     folder = shutil.copytree(place / "result", tmp_path / "copy")
     for text, expected in (
@@ -213,3 +221,12 @@ def test_another_robots_job_is_refused(place, tmp_path):
     code, message = run("check", place / "result", tmp_path / "job.yaml")
     assert code == 1
     assert "that of the result, ur5e" in message
+
+
+def test_a_posterior_that_is_infinite_is_refused(place, tmp_path):
+    """Check ended in a traceback, and update went on."""
+    folder = changed_result(place, tmp_path, lambda d: d["posterior"]["covariance"][0].__setitem__(0, float("inf")))
+    for words in (["check"], ["update", "--out", tmp_path / "new"]):
+        code, message = run(words[0], folder, place / "healthy.csv", *words[1:])
+        assert code == 1
+        assert "posterior: figures that are not finite" in message

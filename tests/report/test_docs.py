@@ -338,6 +338,28 @@ def checks_and_updates(code, folder, fg_calib):
     assert len(made["updated"].runs) == 2
 
 
+def names_each_job(text, folder, fg_calib):
+    """The command of the page before, on the bundled example and a copy of it that makes no sense; seconds differ."""
+    for name in ("arm1", "arm2"):
+        assert fg_calib("example", "space-robot", "--out", Path("arms") / name).code == 0
+    other = Path("arms/arm2/calibration.yaml")
+    other.write_text(other.read_text().replace("model: distance-rotation", "model: nonsense"))
+    command = shlex.split(snippets("many-jobs")[0][1])[1:]
+    assert command[1] == "arms/*/calibration.yaml"
+    ended = fg_calib(command[0], *sorted(Path("arms").glob("*/calibration.yaml")), *command[2:4])  # in this process
+    assert ended.code == 1
+    seconds = re.compile(r"(?<= )\d+\.\d(?= *$| s: )", flags=re.M)
+    assert_shows(seconds.sub("0", text), seconds.sub("0", ended.out))
+
+
+def calibrates_many(code, folder, fg_calib):
+    assert fg_calib("example", "space-robot", "--out", folder).code == 0
+    (folder / "other.yaml").write_text("robot: nowhere.yaml\nmeasurements: poses.csv\n")
+    figure, reason = run_python(folder, code).splitlines()
+    assert float(figure) == pytest.approx(0.863, rel=0.01)
+    assert reason == "other.yaml: missing key 'model'"
+
+
 def slow(function, mark=pytest.mark.slow):
     return pytest.param(function, marks=mark)
 
@@ -355,6 +377,7 @@ HOW = {
     "export": [are_typed, exports_an_arm],
     "next-month": [are_typed, slow(checks_and_updates)],
     "observability": [is_printed],
+    "many-jobs": [are_typed, slow(names_each_job), slow(calibrates_many)],
     "simulate": [slow(are_run), is_scenario, are_configurations, slow(draws_candidates),
                  slow(is_scenario, pytest.mark.long)],
     "compare": [slow(is_printed)],

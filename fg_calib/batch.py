@@ -1,0 +1,201 @@
+"""Many jobs, one after the other or on any executor: in Python, and each with a folder of its own.
+
+with local_processes(4) as executor:
+found = calibrate_jobs(["arm1.yaml", "arm2.yaml"], executor)
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from threading import get_ident
+
+from fg_calib.arguments import checked
+from fg_calib.calibration import Calibration, calibrate_job
+from fg_calib.errors import InputError, escaped, shown
+from fg_calib.executors import Failure, map_jobs
+from fg_calib.files.disk import require_own, require_writable
+from fg_calib.files.job import read_job
+from fg_calib.job import Job
+from fg_calib.report.batch import JOBS_FILES, JobSummary, summary_of
+from fg_calib.report.documents import require_no_input
+
+
+@checked
+def calibrate_jobs(jobs: Sequence[Job | Path | str], executor: Executor | None = None) -> list[Calibration | Failure]:
+    """`calibrate_job` of many jobs; one that fails is no matter to the others.
+
+    Each is the same to the last bit wherever it runs. A job that is a path is read where it runs.
+
+    Args:
+        jobs: The jobs, or the paths of their files.
+        executor: Where they run, such as `local_processes(4)`; one after the other in this process if None.
+
+    Returns:
+        In the order of the jobs a calibration, or a failure that says why there is none.
+
+    Raises:
+        InputError: The jobs are no list of them, or the executor is none.
+    """
+    expected = "a list of jobs, such as ['job.yaml', read_job('other.yaml')]"
+    if isinstance(jobs, str | bytes | os.PathLike | Job) or not hasattr(jobs, "__iter__"):
+        raise InputError("jobs", f"found {shown(jobs)}", expected)
+    given = list(jobs)
+    for k, job in enumerate(given):
+        if not isinstance(job, Job | str | os.PathLike):
+            raise InputError(f"jobs[{k}]", f"found {shown(job)}", "a job, or the path of its file")
+    paths = [job.path if isinstance(job, Job) else job for job in given]
+    names = [f"job {k + 1}" if path is None else str(path) for k, path in enumerate(paths)]
+    return map_jobs(calibrate_job, given, executor, names=names)
+
+
+@dataclass(frozen=True)
+class Order:
+    """A job whose result is written to a folder.
+
+    Attributes:
+        name: Its name among others.
+        job: The job's file.
+        folder: Where the result is written; nowhere if None.
+        folds: Number of folds instead of the job's; None for those.
+        report: Whether `report.html` is written too.
+        figures: Whether the page's figures are written as files too.
+    """
+
+    name: str
+    job: Path
+    folder: Path | None
+    folds: int | None = None
+    report: bool = False
+    figures: bool = False
+
+
+def ordered_job(order: Order) -> Job:
+    """The job of an order, read and checked, before anything is calculated.
+
+    Raises:
+        InputError: It cannot be read, or its result cannot be written.
+    """
+    if order.folder is not None:
+        require_writable(order.folder)
+    given = read_job(order.job)
+    if order.folder is not None:
+        require_no_input(order.folder, given)
+    return given if order.folds is None else replace(given, options=replace(given.options, folds=order.folds))
+
+
+def save_ordered(order: Order, found: Calibration) -> None:
+    """Write what an order asks for to its folder, if it has one.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    if order.folder is None:
+        return
+    found.save(order.folder)
+    if order.report or order.figures:
+        from fg_calib.pages import write_report
+
+        write_report(order.folder, page=order.report, figures=order.figures)
+
+
+def carry_out(order: Order) -> JobSummary:
+    """Calibrate and save one of many jobs: what runs on a worker, which sees the files.
+
+    Raises:
+        InputError: The job cannot be read, or its folder not be written.
+        ProblemError: The measurements lack what the model needs, or do not suffice.
+        SolverError: GTSAM could not solve a step at all.
+    """
+    clock = time.perf_counter()
+    with _warnings() as said:
+        found = calibrate_job(ordered_job(order))
+        save_ordered(order, found)
+    seconds = time.perf_counter() - clock
+    return summary_of(order.name, order.job, found.result, found.not_accepted, seconds, said)
+
+
+def calibrate_into(orders: Sequence[Order], executor: Executor | None = None) -> list[JobSummary]:
+    """Carry out many orders; one that fails is no matter to the others.
+
+    Args:
+        orders: The orders.
+        executor: Where they run; one after the other in this process if None.
+    """
+    found = map_jobs(carry_out, orders, executor, names=[order.name for order in orders])
+    return [
+        JobSummary(order.name, str(order.job), "failed", one.reason) if isinstance(one, Failure) else one
+        for order, one in zip(orders, found, strict=True)
+    ]
+
+
+@contextmanager
+def _warnings() -> Iterator[list[str]]:
+    """What the package's log warns of, kept for whoever asked for the job instead of the worker's own streams."""
+    said: list[str] = []
+    thread = get_ident()
+
+    class Keep(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            if record.thread == thread:
+                said.append(record.getMessage())
+
+    log, keep = logging.getLogger("fg_calib"), Keep(logging.WARNING)
+    before, log.propagate = log.propagate, False
+    log.addHandler(keep)
+    try:
+        yield said
+    finally:
+        log.removeHandler(keep)
+        log.propagate = before
+
+
+def job_names(jobs: Sequence[Path]) -> list[str]:
+    """A name for each of many jobs, of which no two are alike: what their folders are called.
+
+    The names of the files without their ending, if these all differ (`a.yaml b.yaml`); else the names of the folders
+    that the files are in (`a/job.yaml b/job.yaml`); else both (`a-cold b-cold a-warm` of `a/cold.yaml ...`).
+
+    Args:
+        jobs: The jobs' files.
+
+    Raises:
+        InputError: Two have the same name nevertheless.
+    """
+    rules: tuple[Callable[[Path], str], ...] = (
+        lambda path: path.stem,
+        lambda path: path.absolute().parent.name,
+        lambda path: f"{path.absolute().parent.name}-{path.stem}",
+    )
+    names: list[str] = []
+    for rule in rules:
+        names = [rule(path) for path in jobs]
+        if not _clash(names):
+            return names
+    name = _clash(names)
+    alike = [str(path) for path, other in zip(jobs, names, strict=True) if other.casefold() == name.casefold()]
+    found = f"{', '.join(map(escaped, alike[:3]))} would be written to the same folder {name}"
+    raise InputError("JOB", found, "files, or folders, of different names")
+
+
+def _clash(names: Sequence[str]) -> str:
+    """A name that two have, on file systems that tell no capitals apart too, or that no folder can have; else empty."""
+    times = Counter(name.casefold() for name in (*names, *JOBS_FILES))
+    return next((name or "without a name" for name in names if not name or times[name.casefold()] > 1), "")
+
+
+def require_place(folder: Path) -> None:
+    """Check that results of many jobs can be written to a folder.
+
+    Raises:
+        InputError: They cannot, or files would be replaced that are not of many jobs.
+    """
+    require_writable(folder)
+    require_own(folder, JOBS_FILES)

@@ -1,0 +1,178 @@
+"""What `fg-calib design --out` writes: where to go, the tables and the job to be filled in, and a picture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import yaml
+
+from fg_calib.designs.design import Design
+from fg_calib.errors import InputError
+from fg_calib.files.csv_writer import write_csv
+from fg_calib.files.disk import fill_folder, write_text
+from fg_calib.files.robot_yaml import write_robot
+from fg_calib.files.simulated_tables import instrument_keys, is_filled_in, table_columns, to_fill_in
+from fg_calib.files.units import Units
+from fg_calib.files.urdf import write_urdf
+from fg_calib.measurements.series import Table
+from fg_calib.report.figures import empty_figure
+from fg_calib.report.plan import design_document
+from fg_calib.robot.kinematics import pose
+from fg_calib.robot.model import Robot
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+CONFIGURATIONS = "configurations.csv"
+
+_JOB_WORDS = "# fg-calib design\n# What to measure: fill in the tables, then `fg-calib calibrate` this file.\n"
+
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+
+
+def draw_designs(designs: Mapping[str, Design]) -> Figure:
+    """Expected errors against the number of stops, with the band of random ones.
+
+    Args:
+        designs: They, by the instruments' names.
+    """
+    figure = empty_figure(6.0, 3.8)
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    axes = figure.add_subplot()
+    several = len(designs) > 1
+    for colour, (name, one) in zip(_COLOURS * len(designs), designs.items(), strict=False):
+        n = np.array([p.n for p in one.curve])
+        low, middle, high = np.array([p.random for p in one.curve]).T * 1e3
+        designed = np.array([p.designed for p in one.curve]) * 1e3
+        label = name if several else "designed"
+        axes.plot(n, designed, "o-", color=colour, markersize=4, label=label)
+        axes.fill_between(n, low, high, color=colour, alpha=0.12, linewidth=0)
+        axes.plot(n, middle, "--", color=colour, linewidth=1.0, label=None if several else "random, and 80 % of them")
+        if one.target is not None and name == next(iter(designs)):
+            axes.axhline(one.target * 1e3, color="0.5", linewidth=0.9)
+            axes.annotate(f"{one.target * 1e3:g} mm", (n[0], one.target * 1e3), (0, 3), textcoords="offset points",
+                          fontsize=7, color="0.4")  # fmt: skip
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
+    axes.tick_params(labelsize=7, which="both")
+    axes.set_xlabel("stops", fontsize=8)
+    axes.set_ylabel("expected RMS error over the task [mm]", fontsize=8)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=7.5)
+    first = next(iter(designs.values()))
+    axes.set_title(f"{first.pool.robot.name}: what to expect of how many stops", fontsize=9, loc="left")
+    return figure
+
+
+def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
+    """Write where to measure, the job to be filled in, and what to expect.
+
+    Args:
+        folder: Where to.
+        design: The design.
+        units: Of the tables and the job.
+
+    Returns:
+        The names of the files.
+
+    Raises:
+        InputError: The folder cannot be written, or holds files of these names that are no design's, or tables that
+            have been filled in.
+    """
+    import json
+
+    robot = design.pool.robot if design.pool.before is None else design.pool.before.robot
+    tables = design.tables if design.pool.scenario is not None else ()
+    files = {
+        name: to_fill_in(columns, touched=_is_touched(t))
+        for t in tables
+        for name, columns in table_columns(t, robot, units).items()
+    }
+    figure = draw_designs({"": design})
+    urdf = "robot.urdf" if robot.urdf is not None and tables else None
+
+    def write(into: Path) -> None:
+        write_csv(into / CONFIGURATIONS, _configurations(design, robot, units))
+        write_text(into / "design.json", json.dumps(design_document(design), indent=1) + "\n")
+        figure.savefig(into / "design.png", dpi=160)
+        if not tables:
+            return
+        for name, columns in files.items():
+            write_csv(into / name, columns)
+        if urdf is not None:
+            write_urdf(into / urdf, robot)
+        write_robot(into / "robot.yaml", robot, units=units, urdf_name=urdf)
+        write_text(into / "calibration.yaml", _JOB_WORDS + _job_text(design, units))
+
+    names = [CONFIGURATIONS, "design.json", "design.png"]
+    if tables:
+        names += [*files, "robot.yaml", *([urdf] if urdf else []), "calibration.yaml"]
+    for name in files:
+        if name in (CONFIGURATIONS, "robot.yaml", "calibration.yaml"):
+            raise InputError(f"instruments: {Path(name).stem}", "the name of a file of the plan", "another name")
+        if is_filled_in(folder / name):
+            raise InputError(str(folder / name), "a table that has been filled in", "another folder")
+    own = {"calibration.yaml": _JOB_WORDS.encode(), "design.json": b"{"}
+    fill_folder(folder, write, dict.fromkeys(names, b"") | own)
+    return tuple(names)
+
+
+def write_designs(folder: Path, designs: Mapping[str, Design], units: Units) -> tuple[str, ...]:
+    """Write designs of several instruments, a folder each, and their picture.
+
+    Args:
+        folder: Where to.
+        designs: They, by the instruments' names.
+        units: Of the tables and jobs.
+    """
+    names = [f"{name}/{file}" for name, one in designs.items() for file in write_design(folder / name, one, units)]
+    figure = draw_designs(designs)
+    fill_folder(folder, lambda into: figure.savefig(into / "instruments.png", dpi=160), {"instruments.png": b"\x89PNG"})
+    return (*names, "instruments.png")
+
+
+def _is_touched(table: Table) -> bool:
+    """Whether something is touched, so that it is the joint readings that are measured."""
+    m = table.measurements
+    contact = table.model in ("anchor", "plane") and not np.any(0.0 if m.length is None else m.length)
+    return m.groups is not None or contact
+
+
+def _configurations(design: Design, robot: Robot, units: Units) -> dict[str, Any]:
+    """Where to go, in order, and where the tool then is by the arm as it is known."""
+    at = pose(design.pool.robot, design.readings).position
+    return {
+        "id": design.ids,
+        **{f"q{i + 1}": design.readings[:, i] / units.factor(joint.unit) for i, joint in enumerate(robot.joints)},
+        "table": np.where(design.group == "", "all" if np.any(design.group != "") else "", design.group),
+        **{f"tool_{axis}": at[:, k] / units.factor("m") for k, axis in enumerate("xyz")},
+    }
+
+
+def _job_text(design: Design, units: Units) -> str:
+    """The job of the tables that are to be filled in."""
+    scenario = design.pool.scenario
+    assert scenario is not None
+    robot, sigma = design.pool.robot, design.tables[0].measurements.sigma_joint
+    joint = [units.from_si(s, j.unit) for s, j in zip(sigma, robot.joints, strict=True)]
+    keys = {key: value for key, value in scenario.job.items() if key not in ("model", "pairing", "noise")}
+    job: dict[str, Any] = {"robot": "robot.yaml", **keys, "units": asdict(units)}
+    job |= {"noise": {"joint": joint[0] if len(set(joint)) == 1 else joint}}
+    job |= instrument_keys(design.tables, units)
+    return yaml.safe_dump(job, sort_keys=False, default_flow_style=None, allow_unicode=True, width=math.inf)
+
+
+def names_of_files(paths: Sequence[Path]) -> list[str]:
+    """A name for each file: its own without the ending, with a number where others have the same."""
+    stems = [path.stem for path in paths]
+    return [s if stems.count(s) == 1 else f"{s}_{stems[: k + 1].count(s)}" for k, s in enumerate(stems)]

@@ -1,0 +1,118 @@
+"""`fg-calib design`: what is there is not lost, and what is written can be filled in and used."""
+
+import polars as pl
+import pytest
+import yaml
+
+ROBOT = """
+name: scara
+convention: dh
+units: {length: mm, angle: deg}
+joints:
+  - {a: 325, alpha: 0, d: 400, theta: 0, limits: [-150, 150]}
+  - {a: 275, alpha: 180, d: 0, theta: 0, limits: [-140, 140]}
+  - {a: 0, alpha: 0, d: 50, theta: 0, type: prismatic, limits: [0, 200]}
+tolerance: {a: 0.5, d: 0.5, alpha: 0.1, theta: 0.3}
+"""
+
+TRACKER = {"model": "position", "name": "tracker"}
+
+SOCKETS = {"a": {"x": 400, "y": 0, "z": 200}, "b": {"x": 300, "y": 200, "z": 200}}
+
+FEW = ("--candidates", 12)
+
+
+@pytest.fixture
+def plan(tmp_path):
+    """`plan(instruments, **keys)`: a scenario file of a small arm."""
+    (tmp_path / "robot.yaml").write_text(ROBOT)
+
+    def write(*instruments, name="plan.yaml", **keys):
+        scenario = {
+            "robot": "robot.yaml",
+            "units": {"length": "mm", "angle": "deg"},
+            "errors": {"normal": "tolerance"},
+            "configurations": {"random": {"count": 9}},
+            "noise": {"position": 0.05, "distance": 0.01, "point": 0.05, "joint": 0.0},
+            "frame": "unknown",
+            "instruments": [*(instruments or [TRACKER])],
+            **keys,
+        }
+        (tmp_path / name).write_text(yaml.safe_dump(scenario))
+        return tmp_path / name
+
+    return write
+
+
+@pytest.fixture
+def measured(plan, fg_calib, tmp_path):
+    """A job whose rows were measured at the stops of a design."""
+    scenario, out = plan(), tmp_path / "plan"
+    assert fg_calib("design", scenario, "--n", 8, *FEW, "--out", out).code == 0
+    truth = plan(name="truth.yaml", configurations={"table": "plan/configurations.csv"})
+    assert fg_calib("simulate", truth, "--seed", 1, "--out", tmp_path / "seen").code == 0
+    seen = pl.read_csv(tmp_path / "seen" / "tracker.csv")
+    table = pl.read_csv(out / "tracker.csv").with_columns(seen[axis] for axis in "xyz")
+    table.write_csv(out / "tracker.csv")
+    return out / "calibration.yaml"
+
+
+@pytest.mark.slow
+def test_a_table_that_was_filled_in_is_not_replaced_by_another_plan(measured, plan, fg_calib):
+    table = measured.parent / "tracker.csv"
+    before = {file.name: file.read_bytes() for file in measured.parent.iterdir()}
+    ended = fg_calib("design", plan(), "--n", 4, *FEW, "--out", measured.parent)
+    assert ended.code == 1
+    assert f"error: {table}: a table that has been filled in, expected another folder\n" in ended.err
+    assert {file.name: file.read_bytes() for file in measured.parent.iterdir()} == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "instrument",
+    [
+        TRACKER,
+        {"model": "anchor", "name": "pin", "anchors": {"b": {"x": 500, "y": 100, "z": 150}}, "contact": True},
+        {"model": "distance", "name": "sockets", "sockets": SOCKETS},
+    ],
+    ids=["measured", "touched", "sockets"],
+)  # fmt: skip
+def test_a_plan_that_nobody_filled_in_is_replaced(instrument, plan, fg_calib, tmp_path):
+    scenario = plan(instrument)
+    for n in (6, 4):
+        assert fg_calib("design", scenario, "--n", n, *FEW, "--out", tmp_path / "plan").code == 0
+    assert len(pl.read_csv(tmp_path / "plan" / "configurations.csv")) == 4
+
+
+@pytest.mark.slow
+def test_an_instrument_none_of_whose_stops_was_chosen_gets_no_table(plan, fg_calib, tmp_path):
+    wild = {"model": "distance", "name": "sockets", "sockets": 2, "noise": {"point": 1e6, "distance": 1e6}}
+    out = tmp_path / "plan"
+    ended = fg_calib("design", plan(TRACKER, wild), "--n", 5, *FEW, "--out", out)
+    assert ended.code == 0
+    assert "sockets: none of its own stops was chosen" in ended.out
+    assert [one["table"] for one in yaml.safe_load((out / "calibration.yaml").read_text())["measurements"]] == [
+        "tracker.csv"
+    ]
+    assert not (out / "sockets.csv").exists()
+
+
+@pytest.mark.slow
+def test_more_rows_of_a_job_have_new_names_and_the_noise_that_it_states(measured, fg_calib, tmp_path):
+    ended = fg_calib("design", measured, "--n", 3, *FEW, "--out", tmp_path / "more")
+    assert ended.code == 0
+    assert pl.read_csv(tmp_path / "more" / "tracker.csv")["id"].to_list() == ["s9", "s10", "s11"]
+    job = yaml.safe_load((tmp_path / "more" / "calibration.yaml").read_text())
+    assert job["measurements"][0]["noise"] == {"position": 0.05}
+    assert "--candidates SCENARIO" in ended.out
+
+
+@pytest.mark.slow
+def test_more_rows_of_a_job_are_where_a_scenario_says(measured, plan, fg_calib, tmp_path):
+    wall = {"lower": [200, -900, -900], "upper": [900, 900, 900]}  # the arm reaches 600 mm to all sides
+    where = plan(name="where.yaml", configurations={"random": {"count": 9}, "keep_out": [wall]})
+    out = tmp_path / "more"
+    ended = fg_calib("design", measured, "--n", 6, "--candidates", where, "--out", out)
+    assert ended.code == 0, ended.err
+    assert pl.read_csv(out / "configurations.csv")["tool_x"].max() < 200
+    assert "--candidates SCENARIO" not in ended.out
