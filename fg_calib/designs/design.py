@@ -26,14 +26,7 @@ from fg_calib.designs.criteria import Criterion
 from fg_calib.designs.cures import Cure, cures_of
 from fg_calib.designs.of_job import pool_of_more, pool_of_rows, solved
 from fg_calib.designs.order import shortest_way, travel
-from fg_calib.designs.plans import (
-    errors_by_pairing,
-    other_pairs,
-    plan_of_pairs,
-    plan_of_stops,
-    with_best_hub,
-    with_names,
-)
+from fg_calib.designs.plans import best_plan, with_best_hub, with_names
 from fg_calib.designs.pool import Pool, drawn, pool_of
 from fg_calib.designs.search import Chosen, not_worse_than_random
 from fg_calib.designs.system import system_of
@@ -87,6 +80,7 @@ class Design(FrozenArrays):
         pairings: Expected position errors by which pairs are measured, or formed, [m].
         random: Median of the expected position errors of as many random stops, [m].
         curve: What is to be expected of how many.
+        asked: How many stops were asked for; None where a target was stated.
         target: What was to be reached, [m]; None where a number was stated.
         reached: Whether it is.
         observability: What the rows determine of the arm.
@@ -110,6 +104,7 @@ class Design(FrozenArrays):
     pairings: Mapping[str, float]
     random: float
     curve: tuple[CurvePoint, ...]
+    asked: int | None
     target: float | None
     reached: bool
     observability: Observability
@@ -275,14 +270,7 @@ def design_from(
     chooser, found, able = _choose(pool, task, generator, n, target, criterion)
     chosen = able[found.candidates]
     tell("working out what to expect")
-    way = shortest_way(pool.robot, pool.readings[chosen])
-    stops = np.concatenate([pool.given, chosen[way]])
-    plan = plan_of_stops(pool, stops)
-    pairings = errors_by_pairing(pool, stops, task)
-    for other in other_pairs(pool, chosen, (criterion, task), generator):
-        pairings[other.structure] = other.posterior.error(task).position or np.inf
-        if pairings[other.structure] < (plan.posterior.error(task).position or np.inf):
-            plan = plan_of_pairs(pool, other)
+    plan, pairings = best_plan(pool, chosen, (criterion, task), generator)
     expected, curve = plan.posterior.error(task), chooser.curve(found, generator, int(pool.has_hub))
     before = pool.posterior(pool.given) if len(pool.given) or pool.before is not None else None
     ids = plan.names if pool.scenario is None else _new_names(len(plan.readings), pool.before)
@@ -305,6 +293,7 @@ def design_from(
         pairings=pairings,
         random=curve[-1].random[1],
         curve=curve,
+        asked=n if target is None else None,
         target=target,
         reached=target is None or (expected.position is not None and expected.position <= target * _JUST),
         observability=plan.posterior.observability,
@@ -337,8 +326,6 @@ def _choose(
     if not len(able):
         raise InputError("candidates", "none at which anything is measured", "some")
     hubs = int(pool.has_hub)
-    if n is not None and n > len(able) + hubs:
-        raise InputError("n", f"found {n}", f"at most {len(able) + hubs}: as many candidates measure something")
     chooser = Chooser(system.select(able), criterion, _exactly(pool, task, able))
     tell("choosing")
     if target is None:

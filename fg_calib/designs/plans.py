@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.designs.criteria import Criterion, Measure
+from fg_calib.designs.order import shortest_way
 from fg_calib.designs.pairs import PairPlan, PairWork, Structure, free_pairs, plan_pairs
 from fg_calib.designs.pool import Pool, pool_of
 from fg_calib.designs.search import greedy
@@ -103,6 +104,27 @@ def other_pairs(
     for structure in structures:
         yield plan_pairs(work, first, len(chosen), structure, aim, generator)
     yield free_pairs(work, np.append(first, np.flatnonzero(np.isin(pool.stop, chosen))), len(chosen), aim)
+
+
+def best_plan(
+    pool: Pool, chosen: Integers, aim: tuple[Criterion, Task], generator: np.random.Generator
+) -> tuple[Plan, dict[str, float]]:
+    """The plan of stops that were chosen, with the best pairs of as many; and what each way of pairing would give.
+
+    Args:
+        pool: What they were chosen from.
+        chosen: The stops.
+        aim: What is made small, and for what.
+        generator: Draws which pairs of a tree are looked at.
+    """
+    task = aim[1]
+    stops = np.concatenate([pool.given, chosen[shortest_way(pool.robot, pool.readings[chosen])]])
+    plan, pairings = plan_of_stops(pool, stops), errors_by_pairing(pool, stops, task)
+    for other in other_pairs(pool, chosen, aim, generator):
+        pairings[other.structure] = other.posterior.error(task).position or np.inf
+        if pairings[other.structure] < (plan.posterior.error(task).position or np.inf):
+            plan = plan_of_pairs(pool, other)
+    return plan, pairings
 
 
 def with_best_hub(pool: Pool, task: Task, n: int, criterion: Criterion, generator: np.random.Generator) -> Pool:

@@ -223,6 +223,8 @@ def _notes(design: Design) -> list[str]:
             if design.n >= design.n_candidates
             else "more stops may do: state them with --n"
         )
+    if design.asked is not None and design.n < design.asked and design.pairs is None:
+        notes.append(f"no more than {design.n} stops were found of {design.asked}: --candidates draws more")
     after = math.inf if design.after_fit is None else design.after_fit.position or math.inf
     if design.after_fit is not None and after < 0.5 * (design.expected.position or 0.0):
         notes.append(
