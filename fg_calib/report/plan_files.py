@@ -21,7 +21,7 @@ from fg_calib.files.units import Units
 from fg_calib.files.urdf import write_urdf
 from fg_calib.measurements.series import Table
 from fg_calib.report.figures import empty_figure
-from fg_calib.report.plan import design_document
+from fg_calib.report.plan import SCHEMA, design_document
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
 
@@ -122,8 +122,9 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
             raise InputError(f"instruments: {Path(name).stem}", "the name of a file of the plan", "another name")
         if is_filled_in(folder / name):
             raise InputError(str(folder / name), "a table that has been filled in", "another folder")
-    own = {"calibration.yaml": _JOB_WORDS.encode(), "design.json": b"{"}
-    fill_folder(folder, write, dict.fromkeys(names, b"") | own)
+    whose = {"design.json": f'{{\n "schema": "{SCHEMA}"'.encode()}  # first: it says of the others whose they are
+    own = whose | dict.fromkeys(names, b"") | {"calibration.yaml": _JOB_WORDS.encode()} | whose
+    fill_folder(folder, write, own)
     return tuple(names)
 
 

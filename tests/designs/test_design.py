@@ -54,11 +54,12 @@ def planned(instrument, n=12, n_candidates=40, **options):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", EXPECTED)
 def test_expected_errors_are_those_of_a_calibration_of_the_stops(kind):
-    plan = planned(EXPECTED[kind], n_candidates=80 if kind == "pixels" else 40, fitted=True)
+    few = {"n": 6, "n_candidates": 80} if kind == "pixels" else {}  # few of them see the board
+    plan = planned(EXPECTED[kind], **few, fitted=True)
     expected = error_of(plan.pool.robot, plan.tables, plan.task)
     assert plan.expected.position == pytest.approx(expected.position, rel=SAME)
     assert plan.expected.orientation == pytest.approx(expected.orientation, rel=SAME)
-    if kind not in ("all formed pairs", "lengths of pairs"):  # chosen by poses, and by a star
+    if kind != "lengths of pairs":  # whose curve is that of a star
         assert plan.curve[-1].n == plan.n
         assert plan.curve[-1].designed == pytest.approx(plan.expected.position, rel=1e-3)
 
@@ -288,11 +289,13 @@ def test_the_curve_falls_and_designed_stops_are_better_than_random_ones():
 def test_as_many_as_there_are_and_one():
     q = np.random.default_rng(4).uniform(-1.5, 1.5, (5, 4))
     of = scenario(INSTRUMENTS["pose"], n=20)
-    every = design(of, n=9, candidates=GivenReadings(q))
+    every = design(of, n=5, candidates=GivenReadings(q))
     assert sorted(every.readings.tolist()) == sorted(q.tolist())
     one = design(of, n=1, candidates=GivenReadings(q))
     assert one.n == 1
-    alone = design(of, n=3, candidates=GivenReadings(q[:1]))
+    with pytest.raises(InputError, match="as many candidates"):
+        design(of, n=6, candidates=GivenReadings(q))
+    alone = design(of, n=1, candidates=GivenReadings(q[:1]))
     assert alone.readings.tolist() == q[:1].tolist()
 
 

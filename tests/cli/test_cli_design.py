@@ -1,0 +1,327 @@
+"""`fg-calib design`: what it prints and writes, and that the job it writes calibrates once it is filled in."""
+
+import json
+
+import numpy as np
+import polars as pl
+import pytest
+import yaml
+from oracle import tool_pose
+from scipy.spatial.transform import Rotation
+from simulated import small_arm, true_robot
+
+from fg_calib.files.robot_yaml import write_robot
+from fg_calib.files.units import Units
+
+TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
+ARM = small_arm(tolerance=TOLERANCE)
+JOINTS = ["q1", "q2", "q3", "q4"]
+UNITS = {"length": "mm", "angle": "deg"}
+IN_SI = np.array([1e-3 if joint.prismatic else np.pi / 180.0 for joint in ARM.joints])
+
+SCENARIO = {
+    "robot": "robot.yaml",
+    "units": UNITS,
+    "errors": {"normal": "tolerance"},
+    "configurations": {"random": {"count": 20}},
+    "noise": {"position": 0.1, "orientation": 0.01, "joint": 0.001},
+    "frame": "unknown",
+    "job": {"model": "pose"},
+}
+BOLTS = {"bolt": [1000.0, -2000.0, 500.0], "pin": [2000.0, 1000.0, 500.0], "nut": [-500.0, 300.0, 2500.0]}
+WIRE = {"model": "anchor", "name": "wire", "anchors": {n: dict(zip("xyz", p, strict=True)) for n, p in BOLTS.items()}}
+TABLE = {"normal": [0.0, 0.0, 1.0], "distance": -100.0}
+
+DOCUMENT = {
+    "schema", "robot", "criterion", "n", "n_given", "target", "reached", "fitted", "expected", "before", "random",
+    "undetermined_share", "curve", "pairings", "candidates", "stops", "pairs", "undetermined", "travel",
+    "travel_unordered",
+}  # fmt: skip
+FEW = ("--candidates", 25)
+
+
+@pytest.fixture
+def plan(tmp_path):
+    """A scenario's file, with some keys changed."""
+    write_robot(tmp_path / "robot.yaml", ARM, units=Units(**UNITS))
+
+    def write(name="plan.yaml", **changes):
+        (tmp_path / name).write_text(yaml.safe_dump(SCENARIO | changes))
+        return tmp_path / name
+
+    return write
+
+
+def table_of(path, readings):
+    """A table of configurations, in degrees and millimetres."""
+    pl.DataFrame(dict(zip(JOINTS, (np.asarray(readings) / IN_SI).T, strict=True))).write_csv(path)
+    return path
+
+
+def readings_in(path):
+    return pl.read_csv(path).select(JOINTS).to_numpy() * IN_SI
+
+
+# --- what it prints ---------------------------------------------------------------------------------------------------
+
+
+def test_the_document_has_its_keys_in_si(plan, fg_calib):
+    ended = fg_calib("design", plan(), "--n", 4, *FEW, "--json")
+    assert ended.code == 0, ended.err
+    assert ended.err.splitlines()[-1] == "nothing is written: --out DIR writes tables and a job"
+    found = json.loads(ended.out)
+    assert found.keys() == DOCUMENT
+    assert (found["schema"], found["robot"], found["criterion"]) == ("fg-calib/design/1", "small-arm", "I")
+    assert (found["n"], found["n_given"], found["target"], found["reached"]) == (4, 0, None, True)
+    assert (found["before"], found["pairs"], found["pairings"]) == (None, None, {})
+    assert found["expected"].keys() == {"position", "orientation"}
+    assert 1e-5 < found["expected"]["position"] < found["random"] < 1e-2
+    assert found["candidates"] == {"all": {"asked": 25, "taken": 25, "rejected": {}}}
+    assert [stop["id"] for stop in found["stops"]] == ["s1", "s2", "s3", "s4"]
+    q = np.array([stop["readings"] for stop in found["stops"]])
+    lower, upper = ARM.limits.T
+    assert ((q >= lower) & (q <= upper)).all()
+    moved = np.abs(np.diff(q, axis=0)) / [ARM.reach if joint.prismatic else 1.0 for joint in ARM.joints]
+    assert found["travel"] == pytest.approx(moved.max(axis=1).sum(), rel=1e-12)
+    assert found["curve"][-1]["n"] == 4
+    assert all(point.keys() == {"n", "designed", "random"} for point in found["curve"])
+    assert all(point["random"] == sorted(point["random"]) for point in found["curve"])
+
+
+@pytest.mark.slow
+def test_the_report_says_what_to_expect_and_where_to_measure(plan, fg_calib):
+    said = " ".join(
+        fg_calib("design", plan(job={"model": "distance-rotation", "gauge": "none"}), "--n", 6, *FEW).out.split()
+    )
+    for words in ("small-arm: where to measure at 6 stops", "after the best rigid fit", "Stops and accuracy",
+                  "80 % of random", "Which pairs", "all that can be formed", "Where to measure", "Still undetermined",
+                  "candidates: ", "joint travel along the stops"):  # fmt: skip
+        assert words in said
+
+
+@pytest.mark.slow
+def test_what_can_be_asked_for_is_done(plan, fg_calib, tmp_path):
+    q = np.random.default_rng(0).uniform(-1.0, 1.0, (12, 4))
+    some, task = table_of(tmp_path / "some.csv", q), table_of(tmp_path / "task.csv", q[:3])
+    given = table_of(tmp_path / "given.csv", q[:2] + 0.1)
+    ended = fg_calib("design", plan(), "--n", 3, "--candidates", some, "--given", given, "--task", task,
+                     "--criterion", "D", "--error", "base", "--lever", "200mm", "--seed", 5, "--json")  # fmt: skip
+    assert ended.code == 0, ended.err
+    found = json.loads(ended.out)
+    assert (found["criterion"], found["fitted"], found["n_given"]) == ("D", False, 2)
+    assert found["before"]["position"] > found["expected"]["position"]
+    assert found["candidates"]["all"]["taken"] == 12
+    for stop in found["stops"]:
+        assert np.abs(q - stop["readings"]).max(axis=1).min() < 1e-9
+
+
+@pytest.mark.slow
+def test_a_target_that_is_missed_ends_with_3(plan, fg_calib, tmp_path):
+    missed = fg_calib("design", plan(), "--target", "0.000001mm", *FEW, "--out", tmp_path / "out")
+    assert missed.code == 3
+    assert "25 stops do not reach an expected RMS error of" in missed.out
+    assert "doubtful: the target is not reached" in missed.err.splitlines()[-1]
+    assert (tmp_path / "out" / "design.json").is_file()
+
+
+def test_a_target_that_is_reached_says_with_how_many(plan, fg_calib):
+    reached = fg_calib("design", plan(), "--target", "1mm", *FEW, "--json")
+    assert reached.code == 0
+    found = json.loads(reached.out)
+    assert found["reached"]
+    assert found["target"] == pytest.approx(1e-3)
+    assert found["expected"]["position"] <= 1e-3
+
+
+# --- what it writes, filled in ----------------------------------------------------------------------------------------
+
+
+def measured(table, true, frame):
+    """The columns of a table with what the true arm shows there, in mm, without noise."""
+    q = table.select(JOINTS).to_numpy().astype(float) * IN_SI
+    T = np.array([tool_pose(true, one) for one in q])
+    p, found = 1e3 * T[:, :3, 3], {}
+    if "qw" in table.columns:
+        turn, shift = frame
+        found |= dict(zip("xyz", (turn.apply(p) + shift).T, strict=True))
+        rotation = turn * Rotation.from_matrix(T[:, :3, :3])
+        found |= dict(zip(("qx", "qy", "qz", "qw"), rotation.as_quat().T, strict=True))
+    if "anchor" in table.columns:
+        found["distance"] = np.linalg.norm(p - [BOLTS[name] for name in table["anchor"]], axis=1)
+    if "plane" in table.columns:
+        found["distance"] = p @ TABLE["normal"] - TABLE["distance"]
+    return found
+
+
+def fill_in(folder, true, frame):
+    """Fill the empty cells of all tables of a job; the names of those with any."""
+    stops, q = pl.read_csv(folder / "configurations.csv"), readings_in(folder / "configurations.csv")
+    at = {k: tool_pose(true, one)[:3, 3] for k, one in zip(stops["id"], q, strict=True)}
+    tables = {path: pl.read_csv(path) for path in folder.glob("*.csv") if path.name != "configurations.csv"}
+    for table in tables.values():
+        if "group" in table.columns:
+            at |= {group: at[one] for one, group in table.select("id", "group").rows()}
+    filled = []
+    for path, table in tables.items():
+        empty = [name for name in table.columns if table[name].null_count() == len(table)]
+        if set(JOINTS) <= set(empty):  # touched: the readings are what is measured
+            found = table.select("id").join(stops.select("id", *JOINTS), on="id", how="left", maintain_order="left")
+        elif {"a", "b"} <= set(table.columns):
+            found = {"distance": [1e3 * np.linalg.norm(at[a] - at[b]) for a, b in table.select("a", "b").rows()]}
+        else:
+            found = measured(table, true, frame)
+        table.with_columns(**{name: pl.Series(found[name]) for name in empty}).write_csv(path)
+        filled += [path.name] if empty else []
+    return filled
+
+
+OF_ALL = {"position": 0.1, "orientation": 0.01, "distance": 0.1, "point": 0.1, "joint": 0.001}
+INSTRUMENTS = {
+    "poses": {},
+    "wire": {"instruments": [WIRE]},
+    "plane and poses": {"instruments": [{"model": "plane", "name": "table", "planes": {"floor": TABLE}},
+                                        {"model": "pose", "name": "tracker"}]},
+    "lengths of pairs": {"instruments": [{"model": "distance", "name": "bar", "pairs": "star"}]},
+    "sockets": {"instruments": [{"model": "distance", "name": "sockets", "sockets": 2}],},
+    "formed pairs": {"job": {"model": "distance-rotation"}},
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", INSTRUMENTS)
+def test_the_job_calibrates_when_it_is_filled_in(kind, plan, fg_calib, tmp_path):
+    out = tmp_path / "out"
+    changes = INSTRUMENTS[kind]
+    changes = changes | {"job": {}, "noise": OF_ALL} if "instruments" in changes else changes
+    ended = fg_calib("design", plan(**changes), "--n", 16, "--candidates", 40, "--out", out)
+    assert ended.code == 0, ended.err
+    assert f"to {out}" in ended.err
+    document = json.loads((out / "design.json").read_text())
+    assert (out / "design.png").read_bytes()[1:4] == b"PNG"
+    stops = pl.read_csv(out / "configurations.csv")
+    assert stops["id"].to_list() == [stop["id"] for stop in document["stops"]]
+    q = readings_in(out / "configurations.csv")
+    assert q == pytest.approx(np.array([stop["readings"] for stop in document["stops"]]), abs=1e-9)
+    at = np.array([1e3 * tool_pose(ARM, one)[:3, 3] for one in q])
+    assert stops.select("tool_x", "tool_y", "tool_z").to_numpy() == pytest.approx(at, abs=1e-6)
+    rng = np.random.default_rng(1)
+    true = ARM if kind == "sockets" else true_robot(ARM, rng)
+    filled = fill_in(out, true, (Rotation.random(random_state=3), np.array([900.0, -200.0, 300.0])))
+    assert filled
+    calibrated = fg_calib("calibrate", out / "calibration.yaml", "--out", tmp_path / "result")
+    assert calibrated.code == 0, calibrated.out + calibrated.err
+    result = json.loads((tmp_path / "result" / "result.json").read_text())
+    expected = result["expected_error"]["position"]["fitted" if document["fitted"] else "base"]
+    # Over the stops instead of the task, and at another arm: the same size.
+    assert 0.3 < expected / document["expected"]["position"] < 3.0
+
+
+@pytest.mark.slow
+def test_more_of_a_job_is_written_as_a_table_to_fill_in(plan, fg_calib, tmp_path):
+    """Of a job made by `simulate`; rows of its own are a table of configurations alone."""
+    fg_calib("simulate", plan(), "--out", tmp_path / "demo")
+    job = tmp_path / "demo" / "calibration.yaml"
+    more = fg_calib("design", job, "--n", 5, *FEW, "--out", tmp_path / "more", "--json")
+    assert more.code == 0, more.err
+    found = json.loads(more.out)
+    assert found["before"]["position"] > found["expected"]["position"]
+    table = pl.read_csv(tmp_path / "more" / "poses.csv")
+    assert len(table) == 5
+    assert table["x"].null_count() == table["qw"].null_count() == 5
+    rows = fg_calib("design", job, "--n", 5, "--candidates", "rows", "--out", tmp_path / "rows", "--json")
+    assert rows.code == 0, rows.err
+    ids = pl.read_csv(tmp_path / "demo" / "poses.csv")["id"].to_list()
+    assert {stop["id"] for stop in json.loads(rows.out)["stops"]} <= set(ids)
+    assert sorted(f.name for f in (tmp_path / "rows").iterdir()) == ["configurations.csv", "design.json", "design.png"]
+
+
+@pytest.mark.slow
+def test_instruments_are_compared_in_folders_of_their_own(plan, fg_calib, tmp_path):
+    good, poor = tmp_path / "good.yaml", tmp_path / "poor.yaml"
+    good.write_text(yaml.safe_dump({"noise": {"position": 0.01, "orientation": 0.001, "joint": 0.0}}))
+    poor.write_text(yaml.safe_dump({"noise": {"position": 1.0, "orientation": 0.1, "joint": 0.0}}))
+    out = tmp_path / "out"
+    ended = fg_calib("design", plan(), "--n", 5, *FEW, "--instruments", good, poor, "--out", out, "--json")
+    assert ended.code == 0, ended.err
+    found = json.loads(ended.out)
+    assert found.keys() == {"schema", "instruments"}
+    errors = {name: one["expected"]["position"] for name, one in found["instruments"].items()}
+    assert list(errors) == ["good", "poor"]
+    assert errors["good"] < errors["poor"]
+    assert (out / "instruments.png").read_bytes()[1:4] == b"PNG"
+    for name in ("good", "poor"):
+        assert json.loads((out / name / "design.json").read_text())["expected"]["position"] == errors[name]
+        assert (out / name / "calibration.yaml").is_file()
+    said = fg_calib("design", plan(), "--target", "0.3mm", *FEW, "--instruments", good, poor)
+    assert said.code == 3
+    assert "the target is not reached with poor" in said.err
+    assert "good" in said.out
+    assert "more than 25" in said.out
+
+
+# --- what it refuses --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "message"),
+    [
+        (["--n", 3, "--target", "1mm"], 2, "--n and --target"),
+        (["--criterion", "G"], 2, "--criterion"),
+        (["--error", "tool"], 2, "--error"),
+        (["--n", 0], 1, "n: "),
+        (["--n", 100000], 1, "n: "),
+        (["--target", "5deg"], 1, "--target"),
+        (["--target", "-1mm"], 1, "target"),
+        (["--lever", "one"], 1, "--lever"),
+        (["--candidates", "nowhere.csv"], 1, "nowhere.csv"),
+        (["--candidates", "1"], 1, "n_candidates"),
+        (["--candidates", "rows"], 1, "rows of a scenario"),
+        (["--task", "nowhere.csv"], 1, "nowhere.csv"),
+        (["--task", "bad.csv"], 1, "bad.csv"),
+        (["--given", "bad.csv"], 1, "bad.csv"),
+        (["--instruments", "nowhere.yaml"], 1, "nowhere.yaml"),
+        (["--instruments", "bad.yaml"], 1, "bad.yaml"),
+        (["other.yaml"], 2, "other.yaml"),
+    ],
+)
+def test_what_cannot_be_used_is_one_line_and_writes_nothing(
+    options, code, message, plan, fg_calib, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    of = plan()
+    (tmp_path / "bad.csv").write_text("q1,q2,q3\n0,0,0\n")
+    (tmp_path / "bad.yaml").write_text("noise: {position: -1}\nnothing: 3\n")
+    before = sorted(tmp_path.iterdir())
+    ended = fg_calib("design", of, *options, "--out", "out")
+    assert ended.code == code, ended.err
+    assert message in ended.err
+    if code == 1:
+        assert len(ended.err.splitlines()) == 1
+    assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("name", ["poses.csv", "calibration.yaml", "design.json", "robot.yaml", "configurations.csv"])
+def test_a_folder_with_files_of_others_is_left_alone(name, plan, fg_calib, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / name).write_text("mine\n")
+    ended = fg_calib("design", plan(), "--n", 3, *FEW, "--out", out)
+    assert ended.code == 1
+    assert "expected another folder" in ended.err
+    assert [(file.name, file.read_text()) for file in out.iterdir()] == [(name, "mine\n")]
+
+
+@pytest.mark.slow
+def test_tables_that_were_filled_in_are_not_emptied(plan, fg_calib, tmp_path):
+    """A second design in the same folder would lose what was measured."""
+    out = tmp_path / "out"
+    fg_calib("design", plan(), "--n", 4, *FEW, "--out", out)
+    fill_in(out, ARM, (Rotation.identity(), np.zeros(3)))
+    before = (out / "poses.csv").read_bytes()
+    ended = fg_calib("design", plan(), "--n", 3, *FEW, "--out", out)
+    assert (ended.code, (out / "poses.csv").read_bytes() == before) == (1, True)
+    assert ended.err.splitlines()[-1].endswith("poses.csv: a table that has been filled in, expected another folder")
+    (out / "poses.csv").unlink()
+    assert fg_calib("design", plan(), "--n", 3, *FEW, "--out", out).code == 0
+    assert fg_calib("design", plan(), "--n", 3, *FEW, "--out", out).code == 0
