@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from schemas import without_defaults
 from simulated import measure, small_arm, true_robot, write_job
 
 import fg_calib.files.result
@@ -92,16 +93,6 @@ def test_the_schema_finds_what_is_missing(calibrations, tmp_path):
     document = json.loads((tmp_path / "result.json").read_text())
     with pytest.raises(jsonschema.ValidationError, match="'chi2' is a required property"):
         jsonschema.validate({k: v for k, v in document.items() if k != "chi2"}, result_schema())
-
-
-def without_defaults(schema):
-    """A schema without what holds unsaid too: later pydantics write it of any mapping."""
-    if isinstance(schema, list):
-        return [without_defaults(item) for item in schema]
-    if not isinstance(schema, dict):
-        return schema
-    said = {key: value for key, value in schema.items() if (key, value) != ("additionalProperties", True)}
-    return {key: without_defaults(value) for key, value in said.items()}
 
 
 def test_the_schema_that_is_shipped_is_the_models():
