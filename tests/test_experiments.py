@@ -718,7 +718,7 @@ def test_predict_expects_the_errors_that_arms_have(tmp_path):
 
 @pytest.mark.long
 def test_designs_are_better_than_random_sets_on_real_rows_and_random_arms(tmp_path):
-    """What a quick run can tell: expected errors, and that what was drawn is near them (2 draws)."""
+    """Three arms, two systems, three draws of real rows; the ledger has 90, 30 and 50."""
     sys.path.insert(0, str(EXPERIMENTS))
     try:
         found = load("18_design.py").main(["--quick", "--only", "arms", "search", "ur10", "--out", str(tmp_path)])
@@ -730,9 +730,9 @@ def test_designs_are_better_than_random_sets_on_real_rows_and_random_arms(tmp_pa
         assert gains["best other"]["min"] > -0.05, (n, where)
     for criterion, row in found["search"]["12 of 200 over the best of 100 random sets"].items():
         assert row["worse"] == 0, criterion
-    for pool in ("4 of 12", "3 of 15"):  # so few sets that all are looked at
+    for pool in ("4 of 12", "3 of 15"):  # exchange starts from random sets too
         for criterion, row in found["search"]["over the best of all sets"][pool].items():
-            assert row["largest"] < 1.0 + 1e-9 or "alone" in criterion, (pool, criterion)
+            assert row["largest"] < 1.01 or "alone" in criterion, (pool, criterion)
     if "skipped" not in found["ur10"]:
         row = found["ur10"]["20"]
         assert row["task train rows"]["designed"] < row["random"]["median"]
