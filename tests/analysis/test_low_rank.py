@@ -15,7 +15,7 @@ N = 120
 
 def star(rng, private=1.0):
     """Pairs of rows with two errors of their own, and three errors and four parameters that all of them have."""
-    own = scipy.sparse.block_diag([rng.normal(size=(2, 2)) for _ in range(N // 2)])
+    own = scipy.sparse.block_diag([scipy.sparse.coo_array(rng.normal(size=(2, 2))) for _ in range(N // 2)])
     L = scipy.sparse.csr_array(scipy.sparse.hstack([rng.normal(size=(N, 3)), own]))
     P = np.hstack([rng.normal(size=(N, 2)), 0.1 * rng.normal(size=(N, 2))])
     return LowRank(P, L, private * rng.uniform(0.5, 1.0, N), np.array([1.0, 1.0, -1.0, -1.0]))
