@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from fg_calib.batch import calibrate_jobs
     from fg_calib.calibration import Calibration, calibrate, calibrate_job
     from fg_calib.correction import correct
+    from fg_calib.designs.comparison import compare_designs
     from fg_calib.designs.design import Design, design
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
     from fg_calib.executors import Failure, dask_executor, local_processes, map_jobs
@@ -85,6 +86,7 @@ _HOMES = {
     "fg_calib.batch": ("calibrate_jobs",),
     "fg_calib.calibration": ("Calibration", "calibrate", "calibrate_job"),
     "fg_calib.correction": ("correct",),
+    "fg_calib.designs.comparison": ("compare_designs",),
     "fg_calib.designs.design": ("Design", "design"),
     "fg_calib.simulation.configurations": ("BoardViews", "GivenReadings", "RandomReadings", "TargetViews"),
     "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
@@ -199,6 +201,7 @@ __all__ = [
     "calibrate_jobs",
     "check_setup",
     "compare",
+    "compare_designs",
     "comparison_document",
     "correct",
     "cramer_rao",

@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-import signal
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fg_calib.cli.output import Json, end, say, show_calibration, show_json, show_report
+from fg_calib.cli.workers import Scheduler, Workers, executor_for, require_one
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from fg_calib.batch import Order
 
-_Workers = Annotated[
-    int | None, typer.Option("--workers", min=1, metavar="N", help="Run jobs, or folds, on so many processes.")
-]
-_Scheduler = Annotated[
-    str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Run them on a Dask cluster: tcp://host:8786.")
-]
+_WRITTEN = "the results of jobs that were done have been written"
 
 
 def calibrate(
@@ -49,8 +43,8 @@ def calibrate(
     figures: Annotated[
         bool, typer.Option("--figures", help="Write the page's figures there too, as SVG files.")
     ] = False,
-    workers: _Workers = None,
-    scheduler: _Scheduler = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:
     """Estimate a robot's parameters from measurements, with their uncertainties."""
@@ -59,10 +53,9 @@ def calibrate(
     if out is None and (report or figures):
         option = "--report" if report else "--figures"
         raise typer.BadParameter("needs --out, the folder to write to", param_hint=option)
-    if workers is not None and scheduler is not None:
-        raise typer.BadParameter("is of this machine: either this or --scheduler", param_hint="--workers")
+    require_one(workers, scheduler)
     if len(jobs) == 1:
-        with _executor(workers, scheduler) as executor:
+        with executor_for(workers, scheduler, _WRITTEN) as executor:
             _calibrate_one(Order("", jobs[0], out, folds, report, figures), executor, as_json)
         return
     names = job_names(jobs)
@@ -74,7 +67,7 @@ def calibrate(
         Order(name, job, None if out is None else out / name, folds, report, figures)
         for name, job in zip(names, jobs, strict=True)
     ]
-    with _executor(workers, scheduler) as executor:
+    with executor_for(workers, scheduler, _WRITTEN) as executor:
         _calibrate_many(orders, out, executor, as_json)
 
 
@@ -112,24 +105,3 @@ def _calibrate_many(orders: Sequence[Order], out: Path | None, executor: Executo
             say(f"{job.name}: {what}: {reason}")
     if code := exit_code(found):
         raise typer.Exit(code)
-
-
-@contextmanager
-def _executor(workers: int | None, scheduler: str | None) -> Iterator[Executor | None]:
-    """What was asked for; while it works, Ctrl-C is an exception, which ends the workers too."""
-    from fg_calib.executors import dask_executor, local_processes
-
-    if workers is None and scheduler is None:
-        yield None
-        return
-    before = signal.getsignal(signal.SIGINT)
-    try:
-        if before is signal.SIG_DFL:  # what `main` has made of it
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-        with dask_executor(scheduler) if scheduler is not None else local_processes(workers or 1) as executor:
-            yield executor
-    except KeyboardInterrupt:
-        say("interrupted; the results of jobs that were done have been written")
-        raise typer.Exit(128 + signal.SIGINT) from None
-    finally:
-        signal.signal(signal.SIGINT, before)

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from fg_calib.cli.output import Json, end, say, show_json, show_report
+from fg_calib.cli.workers import Scheduler, Workers, executor_for, require_one
 
 if TYPE_CHECKING:
     from fg_calib.designs.design import Design
+    from fg_calib.executors import Failure
     from fg_calib.files.units import Units
     from fg_calib.job import Job
     from fg_calib.robot.model import Robot
@@ -86,10 +88,11 @@ def design(
     instruments: _Instruments = None,
     out: _Out = None,
     seed: _Seed = 0,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:
     """Choose which configurations to measure, and say what accuracy to expect of how many."""
-    from fg_calib.designs.design import design as designed
     from fg_calib.files.disk import require_writable
     from fg_calib.files.units import Units, quantity
 
@@ -97,6 +100,8 @@ def design(
         say("error: --n and --target: one of the two")
         raise typer.Exit(2)
     several = _of_instruments(of, instruments)
+    require_one(workers, scheduler)
+    _require_several(several, workers, scheduler)
     subjects, units, robot = _read(of[0], several)
     if out is not None:
         require_writable(out)
@@ -111,13 +116,55 @@ def design(
         "task": None if task is None else _readings(task, robot, units),
         **_candidates(candidates, robot, units),
     }
-    found = {name: designed(one, **choices) for name, one in subjects.items()}
-    _show(found, units, out, several=bool(several), as_json=as_json)
+    found, failed = _found(subjects, choices, workers, scheduler, several=bool(several))
+    if found:
+        _show(found, units, out, failed, several=bool(several), as_json=as_json)
+    for failure in failed:
+        say(f"{failure.job}: error: {failure.reason}")
     missed = [name for name, one in found.items() if not one.reached]
+    if failed:
+        raise typer.Exit(1)
     end([f"the target is not reached{f' with {name}' if several else ''}" for name in missed], "doubtful")
 
 
-def _show(found: Mapping[str, Design], units: Units, out: Path | None, *, several: bool, as_json: bool) -> None:
+def _require_several(instruments: Sequence[Path], workers: int | None, scheduler: str | None) -> None:
+    """End with a line on stderr where nothing could run side by side."""
+    for option, asked in (("--workers", workers), ("--scheduler", scheduler)):
+        if asked is not None and len(instruments) < 2:
+            say(f"error: {option} has no effect without several --instruments: it is they that run side by side")
+            raise typer.Exit(2)
+
+
+def _found(
+    subjects: Mapping[str, Scenario | Job],
+    choices: Mapping[str, Any],
+    workers: int | None,
+    scheduler: str | None,
+    *,
+    several: bool,
+) -> tuple[dict[str, Design], list[Failure]]:
+    """The designs, and why others of several are missing; what is wrong with the only one is raised."""
+    from fg_calib.designs.comparison import compare_designs
+    from fg_calib.designs.design import design as designed
+    from fg_calib.executors import Failure
+
+    if not several:
+        return {name: designed(one, **choices) for name, one in subjects.items()}, []
+    with executor_for(workers, scheduler, "nothing has been written") as executor:
+        outcomes = compare_designs(subjects, executor, **choices)
+    found = {name: one for name, one in outcomes.items() if not isinstance(one, Failure)}
+    return found, [one for one in outcomes.values() if isinstance(one, Failure)]
+
+
+def _show(
+    found: Mapping[str, Design],
+    units: Units,
+    out: Path | None,
+    failed: Sequence[Failure],
+    *,
+    several: bool,
+    as_json: bool,
+) -> None:
     """Print designs, and write them."""
     from fg_calib.report.plan import (
         build_design_report,
@@ -130,9 +177,9 @@ def _show(found: Mapping[str, Design], units: Units, out: Path | None, *, severa
     first, names = next(iter(found.values())), tuple[str, ...]()
     try:
         if as_json:
-            show_json(designs_document(found) if several else design_document(first))
+            show_json(designs_document(found, failed) if several else design_document(first))
         else:
-            show_report(build_instruments_report(found) if several else build_design_report(first))
+            show_report(build_instruments_report(found, failed) if several else build_design_report(first))
     finally:  # also where nobody takes the report
         if out is not None:
             names = write_designs(out, found, units) if several else write_design(out, first, units)

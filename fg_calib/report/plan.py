@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from rich.console import Group, RenderableType
 
 from fg_calib.analysis.accuracy import PoseRms
 from fg_calib.designs.design import Design
+from fg_calib.executors import Failure
 from fg_calib.report.shown import SHOWN
 from fg_calib.report.tables import indented, line, plain_table, rounded, section
 from fg_calib.simulation.configurations import RandomReadings
-
-if TYPE_CHECKING:
-    pass
 
 SCHEMA = "fg-calib/design/1"
 
@@ -71,13 +69,18 @@ def design_document(design: Design) -> dict[str, Any]:
     }
 
 
-def designs_document(designs: Mapping[str, Design]) -> dict[str, Any]:
+def designs_document(designs: Mapping[str, Design], failed: Sequence[Failure] = ()) -> dict[str, Any]:
     """Designs of several instruments for programs.
 
     Args:
         designs: They, by the instruments' names.
+        failed: Why others are missing.
     """
-    return {"schema": SCHEMA, "instruments": {name: design_document(one) for name, one in designs.items()}}
+    return {
+        "schema": SCHEMA,
+        "instruments": {name: design_document(one) for name, one in designs.items()},
+        "failed": {one.job: one.reason for one in failed},
+    }
 
 
 def _finite(value: float) -> float | None:
@@ -104,19 +107,23 @@ def build_design_report(design: Design) -> RenderableType:
     return Group(*parts, *section("Notes", *indented(_notes(design))))
 
 
-def build_instruments_report(designs: Mapping[str, Design]) -> RenderableType:
+def build_instruments_report(designs: Mapping[str, Design], failed: Sequence[Failure] = ()) -> RenderableType:
     """Designs of several instruments beside each other.
 
     Args:
-        designs: They, by the instruments' names.
+        designs: They, by the instruments' names; at least one.
+        failed: Why others are missing.
     """
     first = next(iter(designs.values()))
-    parts: list[RenderableType] = [line(f"{first.pool.robot.name}: {len(designs)} instruments", "bold")]
+    title = f"{first.pool.robot.name}: {len(designs) + len(failed)} instruments"
+    parts: list[RenderableType] = [line(title, "bold")]
     parts += section("RMS error over the task in mm", _curve(designs, random=False))
     table = plain_table(("instrument", "left"), ("stops", "right"), ("expected", "right"), ("undetermined", "right"))
     for name, one in designs.items():
         reached = str(one.n) if one.reached else f"more than {one.n}"
         table.add_row(line(name), reached, _mm(one.expected.position), str(len(one.cures)))
+    for failure in failed:
+        table.add_row(line(failure.job), "failed", "", "")
     return Group(*parts, *section("With so many stops", table))
 
 

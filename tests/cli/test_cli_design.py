@@ -259,6 +259,28 @@ def test_instruments_are_compared_in_folders_of_their_own(plan, fg_calib, tmp_pa
     assert "more than 25" in said.out
 
 
+def test_instruments_side_by_side_give_the_same_bits_and_one_that_fails_is_no_matter(plan, fg_calib, tmp_path):
+    """One of them may measure nowhere: a box that the arm cannot leave. JSON has every bit of a figure."""
+    everywhere = {"lower": [-9e4, -9e4, -9e4], "upper": [9e4, 9e4, 9e4]}
+    files = {
+        "good": {"noise": {"position": 0.01, "orientation": 0.001, "joint": 0.0}},
+        "caged": {"configurations": {"random": {"count": 20}, "keep_out": [everywhere]}},
+        "poor": {"noise": {"position": 1.0, "orientation": 0.1, "joint": 0.0}},
+    }
+    for name, keys in files.items():
+        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(keys))
+    asked = ("design", plan(), "--n", 4, *FEW, "--instruments", *(tmp_path / f"{name}.yaml" for name in files), "--json")
+    here, there = fg_calib(*asked), fg_calib(*asked, "--workers", 2, "--out", tmp_path / "out")
+    assert (here.code, there.code) == (1, 1)
+    assert here.out == there.out
+    found = json.loads(here.out)
+    assert list(found["instruments"]) == ["good", "poor"]
+    assert list(found["failed"]) == ["caged"]
+    for ended in (here, there):
+        assert ended.err.splitlines()[-1] == f"caged: error: {found['failed']['caged']}"
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["good", "instruments.png", "poor"]
+
+
 # --- what it refuses --------------------------------------------------------------------------------------------------
 
 
@@ -282,6 +304,8 @@ def test_instruments_are_compared_in_folders_of_their_own(plan, fg_calib, tmp_pa
         (["--instruments", "nowhere.yaml"], 1, "nowhere.yaml"),
         (["--instruments", "bad.yaml"], 1, "bad.yaml"),
         (["other.yaml"], 2, "other.yaml"),
+        (["--workers", 2], 2, "error: --workers has no effect without several --instruments"),
+        (["--scheduler", "tcp://127.0.0.1:1", "--instruments", "fine.yaml"], 2, "error: --scheduler has no effect"),
     ],
 )
 def test_what_cannot_be_used_is_one_line_and_writes_nothing(
@@ -291,6 +315,7 @@ def test_what_cannot_be_used_is_one_line_and_writes_nothing(
     of = plan()
     (tmp_path / "bad.csv").write_text("q1,q2,q3\n0,0,0\n")
     (tmp_path / "bad.yaml").write_text("noise: {position: -1}\nnothing: 3\n")
+    (tmp_path / "fine.yaml").write_text("noise: {position: 1}\n")
     before = sorted(tmp_path.iterdir())
     ended = fg_calib("design", of, *options, "--out", "out")
     assert ended.code == code, ended.err
