@@ -19,10 +19,10 @@ A candidate's rows A change C by `-C A^T (1 + G)^-1 A C` with `G = A C A^T` (Woo
 
     I, A: tr (1 + G)^-1 V V^T,   X X^T = W;   D: log det(1 + G) - log det(1 + G - V V^T),   X X^T = P^T S P.
 
-Of the others a bound is cheap: S grows by at most `B^T B` with `B = A C P^T S`, for nuisances held where they are best
-now; so s_L^2 grows by no more than `|B v_L|^2`, s_1 does not shrink, and the convex `sum 1 / s_i` falls by no more than
-its derivative, `|B S^-3/4|^2 / 2`. Candidates are worked out in the order of the bound, until none is left that could
-be better.
+Candidates are worked out in the order of a bound that is cheap, until none is left that could be better. I, D and A are
+convex in the information, so that none gains more than its derivative says, `|A C X|^2`. Of the others S grows by at
+most `B^T B` with `B = A C P^T S`, for nuisances held where they are best now; so s_L^2 grows by no more than
+`|B v_L|^2`, s_1 does not shrink, and the convex `sum 1 / s_i` falls by no more than its derivative, `|B S^-3/4|^2 / 2`.
 
 References:
     Fedorov (1972), Theory of Optimal Experiments. Academic Press.
@@ -55,8 +55,8 @@ Criterion = Literal["I", "D", "A", "E", "O1", "O2", "O3", "O4", "O5"]
 _SPAN = 512
 """Candidates that are looked at together."""
 
-_BATCH = 32
-"""Candidates whose singular values are worked out together."""
+_BATCH, _FEW = 32, 16
+"""Candidates whose singular values are worked out before the next bound is looked at, and by one processor."""
 
 MOST_EXACT = 128
 """Candidates of a step whose singular values are worked out at most: those of the best bounds."""
@@ -85,60 +85,22 @@ class Measure:
         if self._linear:
             L = np.linalg.cholesky(information)
             return float(np.sum(scipy.linalg.solve_triangular(L, self._half, lower=True) ** 2))
-        s = self._singular_values(_covariance(information)[None])[0]
-        return float(_of_values(self.criterion, s))
+        return self._now(_covariance(information))
 
-    def best(self, information: Floats, allowed: NDArray[np.bool_]) -> tuple[int, float]:
+    def best(self, information: Floats, allowed: NDArray[np.bool_], below: float = np.inf) -> tuple[int, float]:
         """The candidate that makes the criterion smallest, and its value with that.
 
         Args:
             information: What is there, shape (n, n).
             allowed: Candidates that may be taken, shape (n_candidates,); at least one.
+            below: Less than which the criterion must become; where no candidate makes it so, -1 and this are returned.
         """
         C = _covariance(information)
-        if self._is_cheap:
-            values = self.value(information) - self._gains(C)
-            values[~allowed] = np.inf
-            k = int(np.argmin(values))
-            return k, float(values[k])
-        return self._best_exactly(C, allowed)
-
-    def most_helpful(self, information: Floats, n: int) -> Integers:
-        """The n candidates that promise to make the criterion smallest, beside what is there."""
-        C = _covariance(information)
-        promise = -self._gains(C) if self._is_cheap else self._bounds(C)
-        return np.argsort(promise, kind="stable")[:n]
-
-    @property
-    def _is_cheap(self) -> bool:
-        """Whether the criterion of all candidates takes no eigenvalues."""
-        return self._linear or self.criterion in ("D", "O1")
-
-    def _gains(self, C: Floats) -> Floats:
-        """By how much each candidate would make the criterion smaller, shape (n_candidates,)."""
-        L = np.linalg.cholesky(C)
-        if self._linear:
-            X = C @ self._half
-        else:
-            P = self.system.core
-            X = C @ P.T @ np.linalg.inv(np.linalg.cholesky(P @ C @ P.T)).T
-        rows, (n, h, m) = self.system.rows, self.system.rows.shape
-
-        def span(k: int) -> Floats:
-            A = rows[k * _SPAN : (k + 1) * _SPAN]
-            U, V = (np.reshape(A.reshape(-1, m) @ B, (len(A), h, -1)) for B in (L, X))
-            F, T = np.eye(h) + U @ np.swapaxes(U, 1, 2), V @ np.swapaxes(V, 1, 2)
-            if self._linear:
-                return np.asarray(np.trace(np.linalg.solve(F, T), axis1=1, axis2=2))
-            return np.asarray(np.linalg.slogdet(F)[1] - np.linalg.slogdet(F - T)[1])
-
-        return np.concatenate(list(over_processors(span, -(-n // _SPAN))))
-
-    def _best_exactly(self, C: Floats, allowed: NDArray[np.bool_]) -> tuple[int, float]:
         bounds = np.where(allowed, self._bounds(C), np.inf)
-        order, best, least = np.argsort(bounds, kind="stable"), -1, np.inf
-        for start in range(0, min(len(order), MOST_EXACT), _BATCH):
-            some = order[start : start + _BATCH]
+        most, at_once = (len(bounds), _SPAN) if self._is_cheap else (MOST_EXACT, _BATCH)
+        order, best, least = np.argsort(bounds, kind="stable")[: int(np.sum(allowed))], -1, below
+        for start in range(0, min(len(order), most), at_once):
+            some = order[start : start + at_once]
             some = some[bounds[some] < least]
             if not len(some):
                 break
@@ -148,32 +110,91 @@ class Measure:
                 best, least = int(some[k]), float(values[k])
         return best, least
 
+    def most_helpful(self, information: Floats, n: int) -> Integers:
+        """The n candidates that promise to make the criterion smallest, beside what is there."""
+        C = _covariance(information)
+        promise = self._with(C, np.arange(self.system.n_candidates)) if self._is_cheap else self._bounds(C)
+        return np.argsort(promise, kind="stable")[:n]
+
+    @property
+    def _is_cheap(self) -> bool:
+        """Whether the criterion of a candidate takes no eigenvalues."""
+        return self._linear or self.criterion in ("D", "O1")
+
     def _bounds(self, C: Floats) -> Floats:
         """Less than which each candidate cannot make the criterion."""
-        P, rows = self.system.core, self.system.rows
+        P = self.system.core
+        if self._is_cheap:
+            return self._now(C) - self._squares(self._slope(C))
         w, V = np.linalg.eigh(P @ C @ P.T)  # ascending: the last is the worst direction
         s = 1.0 / np.sqrt(np.maximum(w, _TINY))
         B = C @ P.T @ V / w  # C P^T S in the basis of eigenvectors
         if self.criterion == "O5":
-            grown = np.sum((rows @ (B * s ** (-1.5))) ** 2, axis=(1, 2))
-            return np.asarray(np.sum(1.0 / s) - 0.5 * grown)
-        last = np.sqrt(s[-1] ** 2 + np.sum((rows @ B[:, -1]) ** 2, axis=1))
+            return np.asarray(np.sum(1.0 / s) - 0.5 * self._squares(B * s ** (-1.5)))
+        last = np.sqrt(s[-1] ** 2 + self._squares(B[:, -1:]))
         return np.asarray(_of_values(self.criterion, np.stack([np.full(len(last), s[0]), last], axis=1)))
+
+    def _squares(self, X: Floats) -> Floats:
+        """`|A X|^2` of all candidates, shape (n_candidates,)."""
+        rows, (n, _, m) = self.system.rows, self.system.rows.shape
+
+        def span(k: int) -> Floats:
+            A = rows[k * _SPAN : (k + 1) * _SPAN]
+            product = (A.reshape(-1, m) @ X).reshape(len(A), -1)
+            return np.asarray(np.einsum("ij,ij->i", product, product))
+
+        return np.concatenate(list(over_processors(span, -(-n // _SPAN))))
+
+    def _slope(self, C: Floats) -> Floats:
+        """X of which `|A X|^2` is the derivative of a cheap criterion, shape (n, r): see the module."""
+        P = self.system.core
+        half = self._half if self._linear else P.T @ np.linalg.inv(np.linalg.cholesky(P @ C @ P.T)).T
+        out: Floats = C @ half
+        return out
+
+    def _now(self, C: Floats) -> float:
+        """The criterion."""
+        if self._linear:
+            return float(np.sum(self._half * (C @ self._half)))
+        P = self.system.core
+        return float(_of_values(self.criterion, _singular_values(P @ C @ P.T)))
+
+    def _gains(self, C: Floats, candidates: Integers) -> Floats:
+        """By how much each of some candidates would make a cheap criterion smaller, shape (n,)."""
+        L, X, m = np.linalg.cholesky(C), self._slope(C), self.system.rows.shape[2]
+
+        def span(k: int) -> Floats:
+            A = self.system.rows[candidates[k * _SPAN : (k + 1) * _SPAN]]
+            h = A.shape[1]
+            U, V = (np.reshape(A.reshape(-1, m) @ B, (len(A), h, -1)) for B in (L, X))
+            F, T = np.eye(h) + U @ np.swapaxes(U, 1, 2), V @ np.swapaxes(V, 1, 2)
+            if self._linear:
+                return np.asarray(np.trace(np.linalg.solve(F, T), axis1=1, axis2=2))
+            return np.asarray(np.linalg.slogdet(F)[1] - np.linalg.slogdet(F - T)[1])
+
+        return np.concatenate(list(over_processors(span, -(-len(candidates) // _SPAN))))
 
     def _with(self, C: Floats, candidates: Integers) -> Floats:
         """The criterion with each of some candidates, shape (n,)."""
-        A = self.system.rows[candidates]
-        K = A @ C
-        G = np.eye(A.shape[1]) + K @ np.swapaxes(A, 1, 2)
-        after = C - np.swapaxes(K, 1, 2) @ np.linalg.solve(G, K)
-        return np.asarray(_of_values(self.criterion, self._singular_values(after)))
-
-    def _singular_values(self, C: Floats) -> Floats:
-        """Those of the core's information, descending, of covariances of shape (k, n, n): shape (k, p)."""
+        if self._is_cheap:
+            return self._now(C) - self._gains(C, candidates)
         P = self.system.core
-        w = np.linalg.eigvalsh(P @ C @ P.T)
-        out: Floats = 1.0 / np.sqrt(np.maximum(w, _TINY))
-        return out
+        S, K = P @ C @ P.T, C @ P.T
+
+        def span(k: int) -> Floats:
+            A = self.system.rows[candidates[k * _FEW : (k + 1) * _FEW]]
+            G, B = np.eye(A.shape[1]) + A @ C @ np.swapaxes(A, 1, 2), A @ K
+            after = S - np.swapaxes(B, 1, 2) @ np.linalg.solve(G, B)
+            return np.asarray(_of_values(self.criterion, _singular_values(after)))
+
+        return np.concatenate(list(over_processors(span, -(-len(candidates) // _FEW))))
+
+
+def _singular_values(S: Floats) -> Floats:
+    """Those of the core's information, descending, of its covariances of shape (..., p, p): shape (..., p)."""
+    w = np.linalg.eigvalsh(S)
+    out: Floats = 1.0 / np.sqrt(np.maximum(w, _TINY))
+    return out
 
 
 def _of_values(criterion: Criterion, s: Floats) -> Floats:

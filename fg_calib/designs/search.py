@@ -126,8 +126,9 @@ def _sweep(measure: Measure, chosen: Integers, value: float) -> tuple[Integers, 
     allowed = np.ones(system.n_candidates, dtype=np.bool_)
     allowed[now] = False
     for place in range(len(now)):
-        k, found = measure.best(system.information(np.delete(now, place)), allowed)
-        if found < value - _ROUNDING * abs(value):
+        better = value - _ROUNDING * abs(value)
+        k, found = measure.best(system.information(np.delete(now, place)), allowed, better)
+        if k >= 0:
             allowed[now[place]], allowed[k] = True, False
             now[place], value = k, found
     return now, value

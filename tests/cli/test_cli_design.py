@@ -269,7 +269,16 @@ def test_instruments_side_by_side_give_the_same_bits_and_one_that_fails_is_no_ma
     }
     for name, keys in files.items():
         (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(keys))
-    asked = ("design", plan(), "--n", 4, *FEW, "--instruments", *(tmp_path / f"{name}.yaml" for name in files), "--json")
+    asked = (
+        "design",
+        plan(),
+        "--n",
+        4,
+        *FEW,
+        "--instruments",
+        *(tmp_path / f"{name}.yaml" for name in files),
+        "--json",
+    )
     here, there = fg_calib(*asked), fg_calib(*asked, "--workers", 2, "--out", tmp_path / "out")
     assert (here.code, there.code) == (1, 1)
     assert here.out == there.out

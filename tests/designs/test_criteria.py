@@ -93,12 +93,12 @@ def test_gains_are_differences_of_values(criterion):
         M = information(system, [1, 4])
         C = np.linalg.inv(M)
         each = np.array([formula(criterion, system, M + A.T @ A) for A in system.rows])
-        found = formula(criterion, system, M) - Measure(criterion, system)._gains(C)
+        found = formula(criterion, system, M) - Measure(criterion, system)._gains(C, np.arange(len(each)))
         size = max(np.abs(each).max(), abs(formula(criterion, system, M)))
         assert np.abs(found - each).max() < rounding(size, np.linalg.cond(M)) + rounding()
 
 
-@pytest.mark.parametrize("criterion", ["E", "O2", "O3", "O4", "O5"])
+@pytest.mark.parametrize("criterion", CRITERIA)
 @pytest.mark.parametrize("seed", range(20))
 def test_bounds_are_never_above_what_a_candidate_makes(criterion, seed):
     """A bound that is none would leave out the best: these are of all sizes, from next to nothing to far too much."""
@@ -123,6 +123,17 @@ def test_of_many_candidates_the_best_is_found_among_those_of_the_best_bounds(cri
         each = np.array([formula(criterion, system, M + A.T @ A) for A in system.rows])
         _, value = Measure(criterion, system).best(M, np.ones(system.n_candidates, dtype=np.bool_))
         assert value <= each.min() + 0.01 * abs(each.min())
+
+
+@pytest.mark.parametrize("criterion", CRITERIA)
+def test_where_no_candidate_does_better_than_asked_there_is_none(criterion):
+    """What all of them make of it at best is just not better than itself."""
+    system = SYSTEMS[0]
+    M, allowed = information(system, [0, 1]), np.ones(system.n_candidates, dtype=np.bool_)
+    k, value = Measure(criterion, system).best(M, allowed)
+    assert Measure(criterion, system).best(M, allowed, value) == (-1, value)
+    just = value + 1e-9 * abs(value)
+    assert Measure(criterion, system).best(M, allowed, just) == (k, value)
 
 
 def test_what_helps_most_comes_first():
