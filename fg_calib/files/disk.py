@@ -8,9 +8,10 @@ import os
 import shutil
 import socket
 import stat
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
 from tempfile import mkdtemp
@@ -235,6 +236,42 @@ def fill_folder(folder: Path, write: Callable[[Path], None], own: Mapping[str, b
         if temporary is not None:
             shutil.rmtree(temporary, ignore_errors=True)
             _remove_empty(missing)
+
+
+@dataclass(frozen=True)
+class Filling:
+    """What is to appear in a folder: see `fill_folder`.
+
+    Attributes:
+        folder: Where.
+        write: Writes the files to the folder that it is given.
+        own: What may be written, and replaced.
+    """
+
+    folder: Path
+    write: Callable[[Path], None]
+    own: Mapping[str, bytes]
+
+
+def fill_folders(fillings: Sequence[Filling]) -> None:
+    """Fill several folders, all of them or none: the files of all are written before any of them appear.
+
+    Args:
+        fillings: What is to appear where.
+
+    Raises:
+        InputError: A folder cannot be written, or holds other files in their places.
+    """
+    for one in fillings:
+        require_own(one.folder, one.own)
+    if fillings:
+        first, *others = fillings
+
+        def write(into: Path) -> None:
+            first.write(into)
+            fill_folders(others)
+
+        fill_folder(first.folder, write, first.own)
 
 
 def _made_in(folder: Path, prefix: str) -> Path:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,7 @@ import yaml
 from fg_calib.designs.design import Design
 from fg_calib.errors import InputError
 from fg_calib.files.csv_writer import write_csv
-from fg_calib.files.disk import fill_folder, write_text
+from fg_calib.files.disk import Filling, exists, fill_folders, read_bytes, read_text, write_text
 from fg_calib.files.robot_yaml import write_robot
 from fg_calib.files.simulated_tables import instrument_keys, is_filled_in, table_columns, to_fill_in
 from fg_calib.files.units import Units
@@ -28,7 +29,10 @@ from fg_calib.robot.model import Robot
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-CONFIGURATIONS = "configurations.csv"
+CONFIGURATIONS, _DOCUMENT, _PICTURE = "configurations.csv", "design.json", "instruments.png"
+
+_BEGINS = f'{{\n "schema": "{SCHEMA}"'.encode()
+"""How the document of a plan begins."""
 
 _JOB_WORDS = "# fg-calib design\n# What to measure: fill in the tables, then `fg-calib calibrate` this file.\n"
 
@@ -77,6 +81,8 @@ def draw_designs(designs: Mapping[str, Design]) -> Figure:
 def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
     """Write where to measure, the job to be filled in, and what to expect.
 
+    Files of an earlier plan that this one has not are removed.
+
     Args:
         folder: Where to.
         design: The design.
@@ -89,6 +95,38 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
         InputError: The folder cannot be written, or holds files of these names that are no design's, or tables that
             have been filled in.
     """
+    names, filling = _filling(folder, design, units)
+    fill_folders([filling])
+    return names
+
+
+def write_designs(folder: Path, designs: Mapping[str, Design], units: Units) -> tuple[str, ...]:
+    """Write designs of several instruments, a folder each, and their picture; all of it or nothing.
+
+    Args:
+        folder: Where to.
+        designs: They, by the instruments' names.
+        units: Of the tables and jobs.
+
+    Returns:
+        The names of the files.
+
+    Raises:
+        InputError: A folder cannot be written: see `write_design`.
+    """
+    each = {name: _filling(folder / name, one, units) for name, one in designs.items()}
+    figure = draw_designs(designs)
+    picture = Filling(folder, lambda into: figure.savefig(into / _PICTURE, dpi=160), {_PICTURE: b"\x89PNG"})
+    fill_folders([picture, *(filling for _, filling in each.values())])
+    return (*(f"{name}/{file}" for name, (files, _) in each.items() for file in files), _PICTURE)
+
+
+def _filling(folder: Path, design: Design, units: Units) -> tuple[tuple[str, ...], Filling]:
+    """The names of a plan's files, and what writes them.
+
+    Raises:
+        InputError: A table of this or an earlier plan has been filled in, or has the name of another file.
+    """
     import json
 
     robot = design.pool.robot if design.pool.before is None else design.pool.before.robot
@@ -100,10 +138,13 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
     }
     figure = draw_designs({"": design})
     urdf = "robot.urdf" if robot.urdf is not None and tables else None
+    names = [CONFIGURATIONS, _DOCUMENT, "design.png"]
+    if tables:
+        names += [*files, "robot.yaml", *([urdf] if urdf else []), "calibration.yaml"]
 
     def write(into: Path) -> None:
         write_csv(into / CONFIGURATIONS, _configurations(design, robot, units))
-        write_text(into / "design.json", json.dumps(design_document(design), indent=1) + "\n")
+        write_text(into / _DOCUMENT, json.dumps(design_document(design) | {"files": names}, indent=1) + "\n")
         figure.savefig(into / "design.png", dpi=160)
         if not tables:
             return
@@ -114,32 +155,28 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
         write_robot(into / "robot.yaml", robot, units=units, urdf_name=urdf)
         write_text(into / "calibration.yaml", _JOB_WORDS + _job_text(design, units))
 
-    names = [CONFIGURATIONS, "design.json", "design.png"]
-    if tables:
-        names += [*files, "robot.yaml", *([urdf] if urdf else []), "calibration.yaml"]
     for name in files:
         if name in (CONFIGURATIONS, "robot.yaml", "calibration.yaml"):
             raise InputError(f"instruments: {Path(name).stem}", "the name of a file of the plan", "another name")
-        if is_filled_in(folder / name):
+    before = _files_before(folder)
+    for name in (*files, *before):
+        if name.endswith(".csv") and name != CONFIGURATIONS and is_filled_in(folder / name):
             raise InputError(str(folder / name), "a table that has been filled in", "another folder")
-    whose = {"design.json": f'{{\n "schema": "{SCHEMA}"'.encode()}  # first: it says of the others whose they are
-    own = whose | dict.fromkeys(names, b"") | {"calibration.yaml": _JOB_WORDS.encode()} | whose
-    fill_folder(folder, write, own)
-    return tuple(names)
+    whose = {_DOCUMENT: _BEGINS}  # first: it says of the others whose they are
+    own = whose | dict.fromkeys([*before, *names], b"") | {"calibration.yaml": _JOB_WORDS.encode()} | whose
+    return tuple(names), Filling(folder, write, own)
 
 
-def write_designs(folder: Path, designs: Mapping[str, Design], units: Units) -> tuple[str, ...]:
-    """Write designs of several instruments, a folder each, and their picture.
+def _files_before(folder: Path) -> list[str]:
+    """Names of the files of an earlier plan in a folder; none where there was none."""
+    import json
 
-    Args:
-        folder: Where to.
-        designs: They, by the instruments' names.
-        units: Of the tables and jobs.
-    """
-    names = [f"{name}/{file}" for name, one in designs.items() for file in write_design(folder / name, one, units)]
-    figure = draw_designs(designs)
-    fill_folder(folder, lambda into: figure.savefig(into / "instruments.png", dpi=160), {"instruments.png": b"\x89PNG"})
-    return (*names, "instruments.png")
+    path = folder / _DOCUMENT
+    if not exists(path) or not read_bytes(path).startswith(_BEGINS):
+        return []
+    with suppress(ValueError, TypeError, AttributeError):  # changed by hand
+        return [name for name in json.loads(read_text(path)).get("files", ()) if Path(name).name == name]
+    return []
 
 
 def _is_touched(table: Table) -> bool:

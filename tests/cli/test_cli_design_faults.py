@@ -84,6 +84,37 @@ def test_a_plan_that_nobody_filled_in_is_replaced(instrument, plan, fg_calib, tm
     assert len(pl.read_csv(tmp_path / "plan" / "configurations.csv")) == 4
 
 
+PIN = {"model": "anchor", "name": "pin", "anchors": {"b": {"x": 500, "y": 100, "z": 150}}}
+
+
+def test_no_table_of_an_earlier_plan_stays_beside_a_new_one(plan, fg_calib, tmp_path):
+    """A table of one's own stays, and one of the plan's that was filled in keeps the next plan out."""
+    out = tmp_path / "plan"
+    assert fg_calib("design", plan(TRACKER, PIN), "--n", 6, *FEW, "--out", out).code == 0
+    (out / "mine.csv").write_text("id\n")
+    assert fg_calib("design", plan(TRACKER), "--n", 6, *FEW, "--out", out).code == 0
+    assert sorted(file.name for file in out.glob("*.csv")) == ["configurations.csv", "mine.csv", "tracker.csv"]
+    assert fg_calib("design", plan(TRACKER, PIN), "--n", 6, *FEW, "--out", out).code == 0
+    filled = pl.read_csv(out / "pin.csv").with_columns(distance=pl.lit(300.0))
+    filled.write_csv(out / "pin.csv")
+    before = {file.name: file.read_bytes() for file in out.iterdir()}
+    ended = fg_calib("design", plan(TRACKER), "--n", 4, *FEW, "--out", out)
+    assert ended.err.splitlines()[-1].endswith("pin.csv: a table that has been filled in, expected another folder")
+    assert {file.name: file.read_bytes() for file in out.iterdir()} == before
+
+
+def test_plans_of_several_instruments_are_all_written_or_none(plan, fg_calib, tmp_path):
+    out = tmp_path / "plans"
+    (out / "b").mkdir(parents=True)
+    (out / "b" / "tracker.csv").write_text("id,x\na,1\n")
+    for name in "ab":
+        (tmp_path / f"{name}.yaml").write_text("noise: {position: 0.1}\n")
+    instruments = ("--instruments", tmp_path / "a.yaml", tmp_path / "b.yaml")
+    ended = fg_calib("design", plan(), "--n", 5, *FEW, *instruments, "--out", out)
+    assert ended.code == 1
+    assert sorted(file.name for file in out.rglob("*")) == ["b", "tracker.csv"]
+
+
 @pytest.mark.slow
 def test_an_instrument_none_of_whose_stops_was_chosen_gets_no_table(plan, fg_calib, tmp_path):
     wild = {"model": "distance", "name": "sockets", "sockets": 2, "noise": {"point": 1e6, "distance": 1e6}}

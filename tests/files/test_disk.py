@@ -13,7 +13,15 @@ import pytest
 
 from fg_calib import Calibration, InputError, calibrate_job
 from fg_calib.files import disk
-from fg_calib.files.disk import exists, fill_folder, read_bytes, require_writable, write_text
+from fg_calib.files.disk import (
+    Filling,
+    exists,
+    fill_folder,
+    fill_folders,
+    read_bytes,
+    require_writable,
+    write_text,
+)
 
 FILES = ("one", "two", "three")
 OWN = dict.fromkeys((*FILES, "four"), b"")
@@ -124,6 +132,25 @@ def test_a_failure_leaves_nothing_and_no_folder(tmp_path):
     with pytest.raises(InputError, match="cannot be written: No space left on device"):
         fill_folder(tmp_path / "a" / "b", fail)
     assert [*tmp_path.iterdir()] == []
+
+
+def test_of_several_folders_all_are_filled_or_none(tmp_path):
+    """What the last cannot write, and what is in its way, leave nothing in the first."""
+
+    def fail(into):
+        raise OSError(28, "No space left on device")
+
+    first = Filling(tmp_path, write("new"), OWN)
+    with pytest.raises(InputError, match="cannot be written: No space left on device"):
+        fill_folders([first, Filling(tmp_path / "a" / "b", fail, OWN)])
+    assert [*tmp_path.iterdir()] == []
+    (tmp_path / "a" / "two").mkdir(parents=True)
+    with pytest.raises(InputError, match="two: is no file, expected a place for a file"):
+        fill_folders([first, Filling(tmp_path / "a", write("new"), OWN)])
+    assert [*tmp_path.iterdir()] == [tmp_path / "a"]
+    (tmp_path / "a" / "two").rmdir()
+    fill_folders([first, Filling(tmp_path / "a", write("new"), OWN)])
+    assert [(folder / "one").read_text() for folder in (tmp_path, tmp_path / "a")] == ["new", "new"]
 
 
 def test_a_folder_in_the_way_is_named_before_anything_is_replaced(tmp_path):
