@@ -442,7 +442,10 @@ def _within(tolerance: float | None) -> str:
 
 
 def by_station(table: Table) -> tuple[Table, ...]:
-    """A table apart by the stations that its rows were measured from, if their frames are unknown: each has its own."""
+    """A table apart by the stations that its rows were measured from, if their frames are unknown: each has its own.
+
+    A station that rows might have been measured from, but none were, has none.
+    """
     m = table.measurements
     labels = m.labels.get("station")
     if labels is None or not table.unknown_frame:
@@ -450,8 +453,10 @@ def by_station(table: Table) -> tuple[Table, ...]:
     parts = []
     for k, name in enumerate(labels.names):
         rows = np.flatnonzero(labels.index == k)
+        if not len(rows):
+            continue
         part = m.select(rows)
         labels_left = {what: of for what, of in part.labels.items() if what != "station"}
         part = replace(part, labels=labels_left, source=f"{m.source}, station {name}", part=rows)
         parts.append(replace(table, measurements=part))
-    return tuple(parts)
+    return tuple(parts) or (table,)

@@ -389,3 +389,15 @@ def test_a_board_and_a_base_of_six_unknowns_are_two_variables():
     problem = build_problem(robot.with_estimated(names), table)
     assert {"B(0)", "B(1)"} <= {v.symbol for v in (*problem.variables.items, *problem.variables.nuisance)}
     assert solve(problem).converged
+
+
+def test_a_station_that_no_rows_were_measured_from_has_no_frame():
+    """Of a table of two stations those rows alone that are of one: what that station measured, and nothing more."""
+    robot, _, table = measured_by("targets stations", np.random.default_rng(5))
+    m = table.measurements
+    first = m.select(np.flatnonzero(m.labels["station"].index == 0))
+    assert first.labels["station"].names == ("s0", "s1")
+    both = build_problem(robot, table)
+    alone = build_problem(robot, replace(table, measurements=first))
+    assert [t.measurements.source for t in alone.data.tables] == ["measurements, station s0"]
+    assert len(both.variables.frames) - len(alone.variables.frames) == 1
