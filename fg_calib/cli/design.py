@@ -94,7 +94,7 @@ def design(
 ) -> None:
     """Choose which configurations to measure, and say what accuracy to expect of how many."""
     from fg_calib.files.disk import require_writable
-    from fg_calib.files.units import Units, quantity
+    from fg_calib.files.units import quantity
 
     if n is not None and target is not None:
         say("error: --n and --target: one of the two")
@@ -107,8 +107,8 @@ def design(
         require_writable(out)
     choices: dict[str, Any] = {
         "n": n,
-        "target": None if target is None else quantity(target, "m", Units(), "--target"),
-        "lever": 0.0 if lever is None else quantity(lever, "m", Units(), "--lever"),
+        "target": None if target is None else quantity(target, "m", None, "--target"),
+        "lever": 0.0 if lever is None else quantity(lever, "m", None, "--lever"),
         "fitted": None if error is None else error == "fitted",
         "criterion": criterion,
         "seed": seed,

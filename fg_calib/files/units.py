@@ -69,29 +69,31 @@ class Units:
         return short if short * factor == value else figure
 
 
-def quantity(given: object, unit: str, units: Units, place: str) -> float:
+def quantity(given: object, unit: str, units: Units | None, place: str) -> float:
     """A positive figure in [m] or [rad] from a number in the file's units, or from text with its own: `0.5 mm`.
 
     Args:
         given: What the file holds.
         unit: `m` or `rad`.
-        units: Of the file.
+        units: Of the file; None where a figure must have its own.
         place: File and key, for messages.
 
     Raises:
         InputError: It is neither.
     """
     known = LENGTHS if unit == "m" else ANGLES
-    number, name = given, units.name(unit)
+    number, name = given, "" if units is None else units.name(unit)
     if isinstance(given, str) and (read := _QUANTITY.fullmatch(given)):
         number, name = read["number"], read["unit"] or name
+        if not name:
+            raise InputError(place, number, hint=f"give a unit, such as {number}{'mm' if unit == 'm' else 'deg'}")
     if name not in known:
         expected = f"a number with one of {', '.join(known)}"
         raise InputError(place, f"found {shown(given)}", expected, did_you_mean(name, known))
     try:
         return validate(_Figure, {"figure": number}, "").figure * known[name]
     except InputError as error:
-        expected = f"{error.expected}, with its unit or without"
+        expected = f"{error.expected}, with its unit{'' if units is None else ' or without'}"
         raise InputError(place, f"found {shown(given)}", expected, error.hint) from None
 
 

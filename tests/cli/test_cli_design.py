@@ -302,6 +302,8 @@ def test_instruments_side_by_side_give_the_same_bits_and_one_that_fails_is_no_ma
         (["--n", 0], 1, "n: "),
         (["--n", 100000], 1, "n: "),
         (["--target", "5deg"], 1, "--target"),
+        (["--target", "0.3"], 1, "error: --target: 0.3; give a unit, such as 0.3mm"),
+        (["--lever", "200"], 1, "error: --lever: 200; give a unit, such as 200mm"),
         (["--target", "-1mm"], 1, "target"),
         (["--lever", "one"], 1, "--lever"),
         (["--candidates", "nowhere.csv"], 1, "nowhere.csv"),
