@@ -311,13 +311,12 @@ def _named(name: str) -> tuple[str, int]:
 
 def _silent(scenario: Scenario, readings: Mapping[str, Floats]) -> Scenario:
     """A scenario whose arm is as drawn, without noise, though what is stated of noise stays, at some readings."""
-    nothing = Noise(**{f.name: 0.0 for f in fields(Noise)})
     stated = scenario.stated_noise or scenario.noise
     instruments: list[Instrument] = []
     for i in scenario.instruments:
         views = i.configurations or scenario.configurations
         told = with_figures(with_figures(stated, i.noise), i.stated_noise)
-        changes: dict[str, Any] = {"noise": nothing, "stated_noise": told}
+        changes: dict[str, Any] = {"noise": _without(told), "stated_noise": told}
         if i.configurations is not None:
             changes["configurations"] = GivenReadings(readings[i.name])
         if isinstance(i, Tracker) and i.model in PAIR_MODELS:
@@ -330,12 +329,17 @@ def _silent(scenario: Scenario, readings: Mapping[str, Floats]) -> Scenario:
     return replace(
         scenario,
         errors=Errors("values", {}),
-        noise=nothing,
+        noise=_without(stated),
         stated_noise=stated,
         validation=None,
         configurations=GivenReadings(readings.get("", np.zeros((0, scenario.robot.n_joints)))),
         instruments=tuple(instruments),
     )
+
+
+def _without(noise: Noise) -> Noise:
+    """No noise of the kinds that are stated; of others there is still none stated."""
+    return Noise(**{f.name: None if getattr(noise, f.name) is None else 0.0 for f in fields(Noise)})
 
 
 def _as_poses(i: Tracker) -> dict[str, Any]:

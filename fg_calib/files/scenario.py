@@ -43,6 +43,7 @@ instruments: [{model: anchor, anchors: 3}]       # what measures, instead of pos
 Where `tracker`, `keep_out`, `apart` or `board_size` stand, configurations are drawn until all are found, and what is in
 the way is said if they are not. In `apart` a joint that slides counts as its share of the arm's reach, in rad.
 With `instruments` the figures of `noise` are those that they need, and `job` has no model or pairing of its own.
+A design needs no `errors`, and of `noise` what its model measures; poses are simulated whole.
 """
 
 from __future__ import annotations
@@ -82,8 +83,8 @@ class _Sigmas(Schema):
 
 
 class _Noise(Schema):
-    position: NotNegative
-    orientation: NotNegative
+    position: NotNegative | None = None
+    orientation: NotNegative | None = None
     joint: Any = 0.0  # one figure, or one a joint
 
 
@@ -101,7 +102,7 @@ class _Scenario(Schema):
     name: str | None = None
     robot: Any  # a path, or the mapping of a robot file
     units: UnitsOfFile = Units()
-    errors: _Errors
+    errors: _Errors | None = None
     configurations: ConfigurationsFile
     noise: Any  # a `_Noise`; with instruments the figures that these need
     frame: Any = "unknown"  # `base`, or `FrameValues`
@@ -172,18 +173,19 @@ class _Reader:
         place, instruments = f"{source}: noise", tuple[Instrument, ...]()
         if file.instruments is None:
             figures = validate(_Noise, file.noise, place)
-            noise = Noise(
-                position=units.sigma(figures.position, "m", f"{place}: position"),
-                orientation=units.sigma(figures.orientation, "rad", f"{place}: orientation"),
-                joint=joint_noise(figures.joint, units, self._robot, place),
-            )
+            noise = Noise(joint=joint_noise(figures.joint, units, self._robot, place))
+            if figures.position is not None:
+                noise = replace(noise, position=units.sigma(figures.position, "m", f"{place}: position"))
+            if figures.orientation is not None:
+                orientation = units.sigma(figures.orientation, "rad", f"{place}: orientation")
+                noise = replace(noise, orientation=orientation)
             stated, job = self._job(noise)
         else:
             noise, stated, job, instruments = self._instruments()
         validation = file.validation
         return Scenario(
             robot=self._robot,
-            errors=self._errors(),
+            errors=None if file.errors is None else self._errors(file.errors),
             configurations=self._configurations(file.configurations, f"{source}: configurations"),
             noise=noise,
             frame=self._frame(file.frame, f"{source}: frame"),
@@ -227,8 +229,8 @@ class _Reader:
         joint = joint_noise(validate(_JointNoise, own, place).joint, self._units, self._robot, place)
         return replace(noise_figures(others, self._units, place, stated=stated), joint=joint)
 
-    def _errors(self) -> Errors:
-        place, file, robot = f"{self._source}: errors", self._file.errors, self._robot
+    def _errors(self, file: _Errors) -> Errors:
+        place, robot = f"{self._source}: errors", self._robot
         law = only_one(file, list(_Errors.model_fields), place)
         if law == "normal" and file.normal == "tolerance":
             for p in robot.parameters:

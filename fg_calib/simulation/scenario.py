@@ -50,9 +50,10 @@ class Scenario(Brief):
 
     Attributes:
         robot: The nominal robot.
-        errors: True minus nominal parameters.
+        errors: True minus nominal parameters; None where nothing is to be simulated, as for a design.
         configurations: Where the robot is measured to be calibrated, as the nominal robot would get there.
-        noise: What truly disturbs, 1 sigma; `position` and `orientation` are needed where there are no instruments.
+        noise: What truly disturbs, 1 sigma; to simulate, `position` and `orientation` are needed where there are no
+            instruments.
         frame: world_T_base, in whose world the poses are measured: `base` is the base itself, `unknown` an arbitrary
             one, drawn.
         validation: Where it is measured to test the calibration; None without test rows.
@@ -66,7 +67,7 @@ class Scenario(Brief):
     """
 
     robot: Robot
-    errors: Errors
+    errors: Errors | None
     configurations: Configurations
     noise: Noise
     frame: Literal["base", "unknown"] | Placement = "unknown"

@@ -187,7 +187,9 @@ def _names(n: int, prefix: str = "p", first: int = 0) -> NDArray[np.str_]:
     return np.array([f"{prefix}{first + i}" for i in range(n)])
 
 
-def _true_robot(robot: Robot, errors: Errors, generator: np.random.Generator, place: str) -> Robot:
+def _true_robot(robot: Robot, errors: Errors | None, generator: np.random.Generator, place: str) -> Robot:
+    if errors is None:
+        raise InputError(place, "found none", "one of uniform, normal, values: what the arm that moves has")
     figures = figures_by_name(robot, errors.figures, f"{place}: {errors.law}")
     figure = np.array([figures.get(p.name, 0.0) for p in robot.parameters])
     n = len(figure)
@@ -238,7 +240,9 @@ def _sigmas(noise: Noise, place: str, *, stated: bool = False) -> tuple[float, f
     """Sigma of positions, [m], and of orientations, [rad]; above 0 where a calibration is told them (`stated`)."""
     sigmas = []
     for key, figure in (("position", noise.position), ("orientation", noise.orientation)):
-        if figure is None or not np.isfinite(figure) or figure < 0.0:
+        if figure is None:
+            raise InputError(f"{place}: {key}", "found none", "1 sigma: poses are simulated whole")
+        if not np.isfinite(figure) or figure < 0.0:
             raise InputError(f"{place}: {key}", f"found {figure}", "a number not below 0")
         if stated and figure == 0.0:
             hint = f"a calibration takes nothing for exact: tell it what to assume under job: noise: {key}"

@@ -2,18 +2,21 @@
 
 import importlib.resources
 import math
+import re
 
 import numpy as np
 import pytest
 from simulated import paper_robot
 from tolerances import rounding
 
+from fg_calib.designs.design import design
 from fg_calib.errors import InputError
 from fg_calib.files.robot_yaml import read_robot
 from fg_calib.files.scenario import SCENARIOS, read_scenario
 from fg_calib.measurements.dataset import Noise
 from fg_calib.simulation.configurations import BoardViews, GivenReadings, Placement, RandomReadings, TargetViews
 from fg_calib.simulation.scenario import Errors
+from fg_calib.simulation.simulator import simulate
 
 ROBOT = """\
 convention: mdh
@@ -246,7 +249,7 @@ def with_conditions(more):
 
 MISTAKES = [
     ("", S + "an empty file, expected a mapping, key: value"),
-    ("robot: robot.yaml\n", S + "missing keys 'errors', 'configurations', 'noise'"),
+    ("robot: robot.yaml\n", S + "missing keys 'configurations', 'noise'"),
     (SHORT + "eror: 1\n", S + f"unknown key 'eror', expected {KEYS}; did you mean errors?"),
     (SHORT.replace("robot.yaml", "[]"), S + "robot: found [], expected a path, or the mapping of a robot file"),
     (with_errors("{}"), S + "errors: found none, expected one of uniform, normal, values"),
@@ -316,7 +319,6 @@ MISTAKES = [
     (with_conditions("apart: 0"), S + "configurations: apart: found 0, expected a number above 0"),
     (SHORT.replace(RANDOM, "configurations: {apart: 1}\n"),
      S + "configurations: found none, expected one of board, tracker, random, table"),
-    (SHORT.replace(NOISE, "noise: {position: 1}\n"), S + "noise: missing key 'orientation'"),
     (SHORT.replace("position: 0.001", "position: -1"), S + "noise: position: found -1, expected a number not below 0"),
     (SHORT.replace("orientation: 0.002", "orientation: 0, joint: [1]"),
      S + "noise: joint: 1 figures, expected one for all or 2, one a joint"),
@@ -381,3 +383,30 @@ def test_what_is_no_scenario_is_one_line(folder, kind):
 
 def test_the_shipped_robot_can_be_read_alone():
     assert read_robot(SCENARIOS / "space-robot" / "robot.yaml").name == "space-robot"
+
+
+@pytest.mark.parametrize(
+    ("text", "job", "lacks"),
+    [
+        (SHORT.replace(ERRORS, ""), "",
+         "errors: found none, expected one of uniform, normal, values: what the arm that moves has"),
+        (SHORT.replace(NOISE, "noise: {position: 0.001}\n"), "job: {model: position}\n",
+         "noise: orientation: found none, expected 1 sigma: poses are simulated whole"),
+        (SHORT.replace(NOISE, "noise: {orientation: 0.002}\n"), "job: {model: rotation}\n",
+         "noise: position: found none, expected 1 sigma: poses are simulated whole"),
+    ],
+    ids=["errors", "orientation", "position"],
+)  # fmt: skip
+def test_a_design_needs_what_it_uses_and_a_simulation_the_rest(text, job, lacks, folder):
+    """Its stops are those of a scenario that has what a simulation needs too."""
+    whole = read(folder, SHORT + job)
+    found = read(folder, text + job)
+    assert np.array_equal(design(found, n=3, n_candidates=20).readings, design(whole, n=3, n_candidates=20).readings)
+    with pytest.raises(InputError, match=f"^{re.escape(S + lacks)}$"):
+        simulate(found)
+
+
+def test_a_design_says_which_noise_it_misses(folder):
+    found = read(folder, SHORT.replace(NOISE, "noise: {orientation: 0.002}\n") + "job: {model: position}\n")
+    with pytest.raises(InputError, match=r"noise: position: found none, expected 1 sigma, for model position$"):
+        design(found, n=3, n_candidates=20)

@@ -423,7 +423,8 @@ def test_one_pose_out_of_reach_is_named_and_no_other(shipped):
          "expected one of a, alpha, base, beta, d, theta, tool"),
         ({"errors": Errors("normal", {"a": -1.0})}, "space-robot: errors: normal: found -1, "
          "expected numbers not below 0"),
-        ({"noise": Noise(1e-3, None)}, "space-robot: noise: orientation: found None, expected a number not below 0"),
+        ({"noise": Noise(1e-3, None)}, "space-robot: noise: orientation: found none, expected 1 sigma: poses are "
+         "simulated whole"),
         ({"noise": Noise(0.0, 1e-4)}, "space-robot: noise: position: found 0, expected a number above 0; a "
          "calibration takes nothing for exact: tell it what to assume under job: noise: position"),
     ],
