@@ -339,7 +339,8 @@ def _silent(scenario: Scenario, readings: Mapping[str, Floats]) -> Scenario:
 
 def _without(noise: Noise) -> Noise:
     """No noise of the kinds that are stated; of others there is still none stated."""
-    return Noise(**{f.name: None if getattr(noise, f.name) is None else 0.0 for f in fields(Noise)})
+    nothing: dict[str, Any] = {f.name: None if getattr(noise, f.name) is None else 0.0 for f in fields(Noise)}
+    return Noise(**nothing)
 
 
 def _as_poses(i: Tracker) -> dict[str, Any]:
