@@ -52,6 +52,22 @@ def with_names(tables: Sequence[Table], names: Mapping[str, str]) -> list[Table]
     ]
 
 
+def of_used_points(table: Table) -> Table:
+    """A table of touched points with distances between those alone that are touched, unless there are none.
+
+    Args:
+        table: It, or any other, which stays as it is.
+    """
+    groups = table.measurements.groups
+    if groups is None:
+        return table
+    pairs = groups.pairs
+    used = np.flatnonzero(np.isin(pairs.a, groups.index) & np.isin(pairs.b, groups.index))
+    if not len(used):
+        return table
+    return replace(table, measurements=replace(table.measurements, groups=replace(groups, pairs=pairs.select(used))))
+
+
 def plan_of_stops(pool: Pool, stops: Integers) -> Plan:
     """Some stops, in their order; a hub is visited first."""
     measured, data = stops[len(pool.given) :], pool.problem.data

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -211,6 +212,7 @@ def _notes(design: Design) -> list[str]:
         of = f" of {name}" if name else ""
         notes.append(f"candidates{of}: {one.reasons()}")
     notes += [f"{name}: none of its own stops was chosen, and it gets no table" for name in _without_stops(design)]
+    notes += [f"{name}: lengths of {_mm(low)} to {_mm(high)}" for name, (low, high) in _lengths(design).items()]
     if _is_anywhere(design):
         notes.append("a job says of no boxes and no lines of sight: --candidates SCENARIO takes those of a scenario")
     turn = math.degrees(design.travel)
@@ -239,6 +241,18 @@ def _notes(design: Design) -> list[str]:
             "--error fitted chooses for that"
         )
     return notes
+
+
+def _lengths(design: Design) -> dict[str, tuple[float, float]]:
+    """The shortest and the longest length that each instrument would measure, [m]: of bars, wires and the like."""
+    found = {}
+    for table in design.tables:
+        m = table.measurements
+        between = m.pairs if m.groups is None else m.groups.pairs
+        lengths = m.length if between is None else between.distance
+        if lengths is not None and table.model != "plane" and np.nan_to_num(lengths).any():
+            found[Path(m.source).stem] = (float(np.nanmin(lengths)), float(np.nanmax(lengths)))
+    return found
 
 
 def _without_stops(design: Design) -> list[str]:

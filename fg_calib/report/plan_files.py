@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from fg_calib.designs.design import Design
 from fg_calib.errors import InputError
@@ -28,6 +29,8 @@ from fg_calib.robot.model import Robot
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
 
 CONFIGURATIONS, _DOCUMENT, _PICTURE = "configurations.csv", "design.json", "instruments.png"
 
@@ -132,7 +135,7 @@ def _filling(folder: Path, design: Design, units: Units) -> tuple[tuple[str, ...
     robot = design.pool.robot if design.pool.before is None else design.pool.before.robot
     tables = design.tables if design.pool.scenario is not None else ()
     files = {
-        name: to_fill_in(columns, touched=_is_touched(t))
+        name: to_fill_in(dict(columns) | _told(t.measurements.readings, robot, units, columns), touched=_is_touched(t))
         for t in tables
         for name, columns in table_columns(t, robot, units).items()
     }
@@ -153,7 +156,7 @@ def _filling(folder: Path, design: Design, units: Units) -> tuple[tuple[str, ...
         if urdf is not None:
             write_urdf(into / urdf, robot)
         write_robot(into / "robot.yaml", robot, units=units, urdf_name=urdf)
-        write_text(into / "calibration.yaml", _JOB_WORDS + _job_text(design, units))
+        write_text(into / "calibration.yaml", _JOB_WORDS + _job_text(design, tables, units))
 
     for name in files:
         if name in (CONFIGURATIONS, "robot.yaml", "calibration.yaml"):
@@ -189,24 +192,42 @@ def _is_touched(table: Table) -> bool:
 def _configurations(design: Design, robot: Robot, units: Units) -> dict[str, Any]:
     """Where to go, in order, and where the tool then is by the arm as it is known."""
     at = pose(design.pool.robot, design.readings).position
-    return {
-        "id": design.ids,
-        **{f"q{i + 1}": design.readings[:, i] / units.factor(joint.unit) for i, joint in enumerate(robot.joints)},
-        "table": np.where(design.group == "", "all" if np.any(design.group != "") else "", design.group),
-        **{f"tool_{axis}": at[:, k] / units.factor("m") for k, axis in enumerate("xyz")},
-    }
+    names = [f"q{i + 1}" for i in range(robot.n_joints)]
+    tables = {"table": np.where(design.group == "", "all", design.group)} if np.any(design.group != "") else {}
+    tool = {f"tool_{axis}": _shortened(at[:, k], units.factor("m"), "m") for k, axis in enumerate("xyz")}
+    return {"id": design.ids, **_told(design.readings, robot, units, names), **tables, **tool}
 
 
-def _job_text(design: Design, units: Units) -> str:
+def _told(readings: Floats, robot: Robot, units: Units, names: Collection[str]) -> dict[str, Floats]:
+    """The columns of joint readings among these names, shortened; such as would be beyond a limit then are whole."""
+    found = {}
+    for i, (joint, (lower, upper)) in enumerate(zip(robot.joints, robot.limits, strict=True)):
+        q, factor = readings[:, i], units.factor(joint.unit)
+        short = _shortened(q, factor, joint.unit)
+        found[f"q{i + 1}"] = np.where((short < lower / factor) | (short > upper / factor), q / factor, short)
+    return {name: column for name, column in found.items() if name in names}
+
+
+def _shortened(values: Floats, factor: float, unit: str) -> Floats:
+    """Values in another unit, in as many decimals as `FINEST` needs."""
+    out: Floats = np.round(values / factor, round(math.log10(factor / FINEST[unit])))
+    return out
+
+
+FINEST = {"rad": 1e-8, "m": 1e-9}
+"""What a figure that an arm is to be moved by is rounded to: far below what encoders and trackers tell apart."""
+
+
+def _job_text(design: Design, tables: Sequence[Table], units: Units) -> str:
     """The job of the tables that are to be filled in."""
     scenario = design.pool.scenario
     assert scenario is not None
-    robot, sigma = design.pool.robot, design.tables[0].measurements.sigma_joint
+    robot, sigma = design.pool.robot, tables[0].measurements.sigma_joint
     joint = [units.from_si(s, j.unit) for s, j in zip(sigma, robot.joints, strict=True)]
     keys = {key: value for key, value in scenario.job.items() if key not in ("model", "pairing", "noise")}
     job: dict[str, Any] = {"robot": "robot.yaml", **keys, "units": asdict(units)}
     job |= {"noise": {"joint": joint[0] if len(set(joint)) == 1 else joint}}
-    job |= instrument_keys(design.tables, units)
+    job |= instrument_keys(tables, units)
     return yaml.safe_dump(job, sort_keys=False, default_flow_style=None, allow_unicode=True, width=math.inf)
 
 

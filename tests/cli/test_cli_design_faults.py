@@ -1,5 +1,8 @@
 """`fg-calib design`: what is there is not lost, and what is written can be filled in and used."""
 
+import math
+import re
+
 import polars as pl
 import pytest
 import yaml
@@ -82,6 +85,34 @@ def test_a_plan_that_nobody_filled_in_is_replaced(instrument, plan, fg_calib, tm
     for n in (6, 4):
         assert fg_calib("design", scenario, "--n", n, *FEW, "--out", tmp_path / "plan").code == 0
     assert len(pl.read_csv(tmp_path / "plan" / "configurations.csv")) == 4
+
+
+def test_where_to_go_is_written_as_finely_as_an_arm_is_told(plan, fg_calib, tmp_path):
+    """Six decimals of degrees and millimetres, the same in all tables, within the limits, and no column of nothing."""
+    out, edge = tmp_path / "plan", tmp_path / "edge.csv"
+    low = math.degrees(math.nextafter(math.radians(-150.0), 0.0))  # which six decimals would put at the limit
+    edge.write_text(f"q1,q2,q3\n{low!r},1.23456789,20\n150,-7.7777777777,199.99999999\n1,2,3\n")
+    assert fg_calib("design", plan(TRACKER, PIN), "--n", 3, "--candidates", edge, "--out", out).code == 0
+    stops = pl.read_csv(out / "configurations.csv")
+    assert stops.columns == ["id", "q1", "q2", "q3", "tool_x", "tool_y", "tool_z"]
+    joints = stops.select("q1", "q2", "q3")
+    assert sorted(joints["q2"].to_list()) == [-7.777778, 1.234568, 2.0]
+    assert sorted(joints["q3"].to_list()) == [3.0, 20.0, 200.0]
+    assert joints["q1"].min() >= -150.0
+    assert pl.read_csv(out / "tracker.csv").select("q1", "q2", "q3").equals(joints)
+    assert pl.read_csv(out / "pin.csv").select("q1", "q2", "q3").equals(joints)
+
+
+def test_lengths_are_planned_between_points_that_are_touched_alone(plan, fg_calib, tmp_path):
+    out = tmp_path / "plan"
+    sockets = {"model": "distance", "name": "sockets", "sockets": 5}
+    ended = fg_calib("design", plan(sockets), "--n", 4, "--candidates", 20, "--out", out)
+    assert ended.code == 0
+    touched = set(pl.read_csv(out / "sockets.csv")["group"].to_list())
+    pairs = pl.read_csv(out / "sockets_pairs.csv")
+    assert 1 < len(touched) < 5
+    assert set(pairs["a"].to_list()) | set(pairs["b"].to_list()) == touched
+    assert re.search(r"sockets: lengths of \d+ mm to \d+ mm", ended.out)
 
 
 PIN = {"model": "anchor", "name": "pin", "anchors": {"b": {"x": 500, "y": 100, "z": 150}}}
