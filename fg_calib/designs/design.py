@@ -119,6 +119,11 @@ class Design(FrozenArrays):
         return len(self.readings)
 
     @property
+    def structure(self) -> str:
+        """Which pairs are measured directly: star, chain, tree or free; the curve is that of stars. Else empty."""
+        return "" if self.pairs is None else min(self.pairings, key=lambda name: self.pairings[name])
+
+    @property
     def n_candidates(self) -> int:
         """Number of stops to choose from."""
         return len(self.pool.readings)

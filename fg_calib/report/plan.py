@@ -23,6 +23,9 @@ SCHEMA = "fg-calib/design/1"
 _MOST = 40
 """Stops that the report lists; the table has them all."""
 
+UNKNOWN_ABOVE = 10.0
+"""Errors [m] that are called unknown: they say how weak the weakest prior is."""
+
 _SHOWN_CHANGE = 0.005
 """Part of a direction's largest change below which the report leaves one out; design.json has them all."""
 
@@ -99,7 +102,7 @@ def build_design_report(design: Design) -> RenderableType:
     """
     parts: list[RenderableType] = [line(_headline(design), "bold")]
     parts += section("Expected", *indented(_expected(design)))
-    parts += section("Stops and accuracy", _curve({"designed": design}))
+    parts += section("Stops and accuracy", _curve({_curve_of(design): design}))
     if design.pairings:
         parts += section("Which pairs", _pairs(design))
     parts += section("Where to measure", _stops(design))
@@ -131,6 +134,8 @@ def build_instruments_report(designs: Mapping[str, Design], failed: Sequence[Fai
 def _headline(design: Design) -> str:
     n, name = design.n, design.pool.robot.name
     stops = f"{n} stop{'s' * (n > 1)}"
+    if design.pairs is not None:
+        stops += f" in {len(design.pairs)} pair{'s' * (len(design.pairs) > 1)}"
     if design.target is None:
         return f"{name}: where to measure at {stops}"
     what = f"expected RMS error of {_mm(design.target)}"
@@ -144,20 +149,26 @@ def _expected(design: Design) -> list[str]:
     lines = [f"RMS error of the tool over the task, {where}: {_pose(design.expected)}"]
     if design.before is not None:
         lines.append(f"with what there is already: {_pose(design.before)}")
-    better = f"random stops, as many: {_mm(design.random)}"
+    last = design.curve[-1].n
+    random = "random stops, as many" if design.structure in ("", "star") else f"stars of {last} random stops"
+    better = f"{random}: {_mm(design.random)}"
     if design.expected.position:
         better += f" ({design.random / design.expected.position:.2f} times that)"
     lines.append(better)
     equal = next((p.n for p in design.curve if p.designed <= design.random), None)
-    if equal is not None and equal < design.n:
-        lines.append(f"{equal} designed stops do what {design.n} random ones do")
+    if equal is not None and equal < last:
+        lines.append(f"{equal} designed stops do what {last} random ones do")
     return lines
+
+
+def _curve_of(design: Design) -> str:
+    """What the curve is of."""
+    return "designed" if design.structure in ("", "star") else "designed star"
 
 
 def _curve(designs: Mapping[str, Design], *, random: bool = True) -> RenderableType:
     """Expected errors by the number of stops."""
-    several = len(designs) > 1
-    headings = [(f"{name} mm" if several else "designed mm", "right") for name in designs]
+    headings = [(f"{name} mm", "right") for name in designs]
     headings += [("random mm", "right"), ("80 % of random", "right")] if random else []
     table = plain_table(("stops", "right"), *headings)
     numbers = sorted({p.n for one in designs.values() for p in one.curve})
@@ -173,7 +184,6 @@ def _curve(designs: Mapping[str, Design], *, random: bool = True) -> RenderableT
 
 def _pairs(design: Design) -> RenderableType:
     table = plain_table(("pairs", "left"), ("expected mm", "right"), ("", "left"))
-    chosen = min(design.pairings, key=lambda name: design.pairings[name]) if design.pairs is not None else None
     words = {
         "star": "each with the first",
         "chain": "each with the one before",
@@ -182,7 +192,7 @@ def _pairs(design: Design) -> RenderableType:
         "all": "all that can be formed",
     }
     for name, error in design.pairings.items():
-        table.add_row(name, _figure(error), words[name] + (", chosen" if name == chosen else ""))
+        table.add_row(name, _figure(error), words[name] + (", chosen" if name == design.structure else ""))
     return table
 
 
@@ -284,6 +294,6 @@ def _mm(value: float | None) -> str:
 
 
 def _figure(value: float) -> str:
-    if value >= 10.0:
+    if value >= UNKNOWN_ABOVE:
         return "unknown"
     return f"{value * 1e3:.3g}" if value < 0.9995 else f"{value * 1e3:.0f}"

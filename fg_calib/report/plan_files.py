@@ -23,7 +23,7 @@ from fg_calib.files.units import Units
 from fg_calib.files.urdf import write_urdf
 from fg_calib.measurements.series import Table
 from fg_calib.report.figures import empty_figure
-from fg_calib.report.plan import SCHEMA, design_document
+from fg_calib.report.plan import SCHEMA, UNKNOWN_ABOVE, design_document
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
 
@@ -49,36 +49,62 @@ def draw_designs(designs: Mapping[str, Design]) -> Figure:
         designs: They, by the instruments' names.
     """
     figure = empty_figure(6.0, 3.8)
-    from matplotlib.ticker import LogLocator, NullFormatter
+    from matplotlib.ticker import LogLocator, NullFormatter, NullLocator
 
     axes = figure.add_subplot()
-    several = len(designs) > 1
+    several, first = len(designs) > 1, next(iter(designs.values()))
     for colour, (name, one) in zip(_COLOURS * len(designs), designs.items(), strict=False):
         n = np.array([p.n for p in one.curve])
-        low, middle, high = np.array([p.random for p in one.curve]).T * 1e3
-        designed = np.array([p.designed for p in one.curve]) * 1e3
-        label = name if several else "designed"
-        axes.plot(n, designed, "o-", color=colour, markersize=4, label=label)
+        low, middle, high = _shown([p.random for p in one.curve]).T
+        label = name if several else "designed" if one.structure in ("", "star") else "designed stars"
+        axes.plot(n, _shown([p.designed for p in one.curve]), "o-", color=colour, markersize=4, label=label)
         axes.fill_between(n, low, high, color=colour, alpha=0.12, linewidth=0)
-        axes.plot(n, middle, "--", color=colour, linewidth=1.0, label=None if several else "random, and 80 % of them")
-        if one.target is not None and name == next(iter(designs)):
-            axes.axhline(one.target * 1e3, color="0.5", linewidth=0.9)
-            axes.annotate(f"{one.target * 1e3:g} mm", (n[0], one.target * 1e3), (0, 3), textcoords="offset points",
-                          fontsize=7, color="0.4")  # fmt: skip
+        axes.plot(n, middle, "--", color=colour, linewidth=1.0)
+        if one.structure not in ("", "star"):
+            words = f"{one.structure}: {len(one.pairs if one.pairs is not None else ())} pairs, chosen"
+            axes.plot(one.n, _shown([one.expected.position]), "D", color=colour, markersize=6, markerfacecolor="none",
+                      label=f"{name}, {words}" if several else words)  # fmt: skip
+    if first.target is not None:
+        axes.axhline(first.target * 1e3, color="0.5", linewidth=0.9)
+        axes.annotate(f"{first.target * 1e3:g} mm", (0.0, first.target * 1e3), (2, 3), fontsize=7, color="0.4",
+                      xycoords=axes.get_yaxis_transform(), textcoords="offset points")  # fmt: skip
+    grey = "0.4" if several else _COLOURS[0]
+    axes.plot([], [], "--", color=grey, linewidth=1.0, label="random: half are better")
+    axes.fill_between([], [], [], color=grey, alpha=0.25, linewidth=0, label="random: 80 % of them")
     axes.set_xscale("log")
     axes.set_yscale("log")
+    axes.set_xticks(_apart(sorted({p.n for one in designs.values() for p in one.curve})))
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter(NullFormatter())
+    axes.xaxis.set_minor_locator(NullLocator())
     axes.tick_params(labelsize=7, which="both")
     axes.set_xlabel("stops", fontsize=8)
     axes.set_ylabel("expected RMS error over the task [mm]", fontsize=8)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=7.5)
-    first = next(iter(designs.values()))
     axes.set_title(f"{first.pool.robot.name}: what to expect of how many stops", fontsize=9, loc="left")
     return figure
+
+
+def _apart(numbers: Sequence[int]) -> list[int]:
+    """Some of ascending numbers of stops, as far apart as figures beneath an axis must be."""
+    found = [numbers[0]]
+    for n in numbers[1:]:
+        if n / found[-1] > (numbers[-1] / numbers[0]) ** _TICK:
+            found.append(n)
+    return found
+
+
+_TICK = 0.04
+"""Least part of an axis between two figures."""
+
+
+def _shown(errors: Sequence[object]) -> Floats:
+    """Errors [mm] for a picture, NaN where they are unknown."""
+    found: Floats = np.array(errors, dtype=np.float64)
+    return np.where(found < UNKNOWN_ABOVE, 1e3 * found, np.nan)
 
 
 def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
