@@ -110,6 +110,17 @@ class Chooser:
         reached = self.error(last.candidates) <= target
         return last if reached else Chosen(found, self.measure.value(self.system.information(found)))
 
+    def held(self, found: Chosen, generator: np.random.Generator) -> Chosen:
+        """The same, or the best of some random sets where that is better by an error that the system does not say."""
+        if self._exact is None or self.system.unknown > UNKNOWN:
+            return found
+        sets = [self._drawn(len(found.candidates), generator) for _ in range(N_EXACT)]
+        best = min((found.candidates, *sets), key=self._exact)
+        return Chosen(best, self.measure.value(self.system.information(best)))
+
+    def _drawn(self, n: int, generator: np.random.Generator) -> Integers:
+        return generator.choice(self.system.n_candidates, size=n, replace=False).astype(np.int64)
+
     def curve(self, found: Chosen, generator: np.random.Generator, hubs: int) -> tuple[CurvePoint, ...]:
         """What to expect of fewer stops, and of as many; hubs count."""
         most = len(found.candidates)
@@ -127,7 +138,6 @@ class Chooser:
         if self._exact is None:
             errors = np.sqrt(random_values(self._error, n, generator)[0])
         else:
-            of = self.system.n_candidates
-            errors = np.array([self._exact(generator.choice(of, size=n, replace=False)) for _ in range(N_EXACT)])
+            errors = np.array([self._exact(self._drawn(n, generator)) for _ in range(N_EXACT)])
         low, middle, high = np.quantile(errors, [0.1, 0.5, 0.9], method="nearest").tolist()
         return low, middle, high

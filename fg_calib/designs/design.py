@@ -337,7 +337,7 @@ def _choose(
         found = chooser.best(max(1, min((N_STOPS if n is None else n) - hubs, len(able))))
     else:
         found = chooser.reaching(target)
-    better = not_worse_than_random(chooser.measure, found, generator)
+    better = chooser.held(not_worse_than_random(chooser.measure, found, generator), generator)
     if target is not None and chooser.error(better.candidates) > max(target, chooser.error(found.candidates)):
         better = found  # better by its criterion, but no longer good enough
     return chooser, better, able
@@ -346,7 +346,8 @@ def _choose(
 def _exactly(pool: Pool, task: Task, able: Integers) -> Callable[[Integers], float] | None:
     """The error with some candidates where pairs are formed otherwise than in a star; None elsewhere.
 
-    There candidates are chosen as poses in an unknown frame, which hold at least as much.
+    There candidates are chosen as poses in an unknown frame, which hold at least as much (see `MEASURED`), and held to
+    random ones by this error: a chain of pairs may hold far less, and of other stops more.
     """
     if not any(pairing.strategy != "star" for _, pairing in pool.formed.values()):
         return None

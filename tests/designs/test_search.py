@@ -9,7 +9,7 @@ from systems import random_system, system_with_less
 from tolerances import rounding
 
 from fg_calib.designs import search
-from fg_calib.designs.chooser import Chooser
+from fg_calib.designs.chooser import N_EXACT, Chooser
 from fg_calib.designs.criteria import Measure
 from fg_calib.designs.search import choose, exchanged, greedy, not_worse_than_random, random_values
 
@@ -69,6 +69,20 @@ def test_what_is_drawn_better_is_where_exchange_starts_from():
     assert found.value <= values[0]
     good = exchanged(measure, greedy(measure, 5))
     assert not_worse_than_random(measure, good, np.random.default_rng(3)).value <= good.value
+
+
+def test_no_random_set_is_better_by_an_error_that_the_system_does_not_say():
+    """As of chains of pairs, for which stops are chosen as poses; an error by the candidates' numbers here."""
+    system = random_system(np.random.default_rng(2), 40)
+    chooser = Chooser(system, "I", lambda chosen: float(np.sum(chosen)))
+    drawn = np.random.default_rng(3)
+    sets = [drawn.choice(40, size=5, replace=False) for _ in range(N_EXACT)]
+    poor, good = (search.Chosen(np.arange(k, k + 5), 1.0) for k in (35, 0))
+    found = chooser.held(poor, np.random.default_rng(3))
+    assert found.candidates.tolist() == min(sets, key=np.sum).tolist()
+    assert found.value == chooser.measure.value(system.information(found.candidates))
+    assert chooser.held(good, np.random.default_rng(3)).candidates.tolist() == good.candidates.tolist()
+    assert Chooser(system, "I").held(poor, np.random.default_rng(3)) is poor
 
 
 @pytest.mark.parametrize("criterion", CRITERIA)
