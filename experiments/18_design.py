@@ -7,6 +7,8 @@ Takes 35 minutes of one processor; parts of an earlier run stay where `--only` n
   distances + angles of pairs: what designs expect, for several seeds of the candidates, beside random sets of as many;
   how few designed stops equal 52 random ones; and 200 draws of true arm, frame and noise measured at the design and
   calibrated: realised over predicted RMS of the tool's position at the task's configurations after the best rigid fit.
+- *formed pairs*: the paper's arm, stops chosen among 300 within the joint limits as poses in an unknown frame: expected
+  error of all pairs of these stops over that of the poses, which is a bound on what other stops could gain.
 - *arms*: 90 random arms of 5 to 7 joints, 10 or 20 of 500 configurations, positions in an unknown frame: the expected
   error of designs by each criterion and of random sets, for a task anywhere, within a cell, and at five places.
 - *search*: on the same arms, greedy choice and exchange against the best of 100 random sets, and against exhaustive
@@ -90,6 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     parts: dict[str, Callable[[argparse.Namespace], dict[str, Any]]]
     parts = {views: partial(paper, views) for views in VIEWS}
     parts |= {
+        "formed pairs": formed_pairs,
         "arms": arms,
         "search": search,
         "ur10": ur10,
@@ -155,6 +158,30 @@ def paper(views: str, given: argparse.Namespace) -> dict[str, Any]:
     found["realised"] = {
         name: realised(scenarios[way], plan, readings, given) for name, (way, plan, readings) in sets.items()
     }
+    return found
+
+
+def formed_pairs(given: argparse.Namespace) -> dict[str, Any]:
+    """How much less all pairs hold than the poses that they are formed of, at stops chosen by the latter."""
+    here = replace(paper_scenario("unknown"), configurations=RandomReadings(300))
+    models = {"distance": "position", "distance-rotation": "pose"}
+    found: dict[str, Any] = {}
+    for n in (8, 20) if given.quick else (8, 12, 20, 30):
+        found[f"{n} stops"] = {}
+        for model, measured in models.items():
+            pairs, poses = (
+                design(replace(here, job=job), n=n, n_candidates=300, seed=given.seed)
+                for job in ({"model": model, "pairing": "all"}, {"model": measured})
+            )
+            assert np.isin(pairs.readings, poses.readings).all(), "held to random sets, other stops were taken"
+            found[f"{n} stops"][f"all pairs over poses, {model}"] = error(pairs) / error(poses)
+    return found
+
+
+def error(plan: Design) -> float:
+    """Expected position error of a design [m], which must be known."""
+    found = plan.expected.position
+    assert found is not None
     return found
 
 

@@ -721,9 +721,13 @@ def test_designs_are_better_than_random_sets_on_real_rows_and_random_arms(tmp_pa
     """Three arms, two systems, three draws of real rows; the ledger has 90, 30 and 50."""
     sys.path.insert(0, str(EXPERIMENTS))
     try:
-        found = load("18_design.py").main(["--quick", "--only", "arms", "search", "ur10", "--out", str(tmp_path)])
+        found = load("18_design.py").main(
+            ["--quick", "--only", "formed pairs", "arms", "search", "ur10", "--out", str(tmp_path)]
+        )
     finally:
         sys.path.remove(str(EXPERIMENTS))
+    for model, most in (("distance", 1.001), ("distance-rotation", 1.01)):
+        assert 1.0 <= found["formed pairs"]["20 stops"][f"all pairs over poses, {model}"] < most
     for n, where in itertools.product((10, 20), ("anywhere", "cell", "five places")):
         gains = found["arms"][f"{n} stops, {where}"]
         assert gains["random"]["min"] > 0.05, (n, where)
