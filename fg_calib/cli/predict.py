@@ -24,7 +24,9 @@ _Out = Annotated[
     Path | None,
     typer.Option("--out", metavar="DIR", readable=False, help="Write predict.json, predict.csv and pictures there."),
 ]
-_Length = Annotated[LengthUnit, typer.Option("--length", help="Unit of lengths in TABLE and predict.csv.")]
+_Length = Annotated[
+    LengthUnit, typer.Option("--length", help="Unit of lengths in TABLE and predict.csv, and of positions.")
+]
 _Angle = Annotated[AngleUnit, typer.Option("--angle", help="Unit of joint values in TABLE and predict.csv.")]
 
 
@@ -56,7 +58,7 @@ def predict(
         if as_json:
             show_json(prediction_document(found, calibration.result, ids))
         else:
-            show_report(build_prediction_report(found, calibration.result, calibration.robot, ids))
+            show_report(build_prediction_report(found, calibration.result, calibration.robot, ids, length))
     finally:  # also where nobody takes the report
         if out is not None:
             write_prediction(out, found, calibration, ids=ids, units=units)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from fg_calib.files.csv_writer import write_csv
 from fg_calib.files.result import Result
 from fg_calib.files.tables import joint_columns
 from fg_calib.files.units import Units
+from fg_calib.options import LengthUnit
 from fg_calib.report.shown import SHOWN
 from fg_calib.report.summary import good
 from fg_calib.report.tables import indented, line, plain_table, rounded, section
@@ -151,7 +153,7 @@ def write_prediction_table(
 
 
 def build_prediction_report(
-    found: PredictedErrors, result: Result, robot: Robot, ids: Sequence[str] = ()
+    found: PredictedErrors, result: Result, robot: Robot, ids: Sequence[str] = (), length: LengthUnit = "m"
 ) -> RenderableType:
     """A prediction for the terminal.
 
@@ -160,6 +162,7 @@ def build_prediction_report(
         result: What it is of.
         robot: The calibrated robot.
         ids: Names of the configurations, where they were given.
+        length: Unit of positions; errors are in mm.
     """
     n = len(found.errors.readings)
     where = f"at {n} configurations" if found.given else "over the workspace"
@@ -173,7 +176,7 @@ def build_prediction_report(
     parts += section(title, _sizes(found), *indented(_shares_in_words(found)))
     if found.worst is not None:
         title = "Where it is largest" + ", as far as it is known" * bool(found.unknown)
-        parts += section(title, *indented(_worst_in_words(found.worst, robot, _names(found, ids))))
+        parts += section(title, *indented(_worst_in_words(found.worst, robot, _names(found, ids), length)))
     if found.responsible:
         parts += section("What it comes from", _parameters(found, result))
         parts += indented(["the mean square falls by that share where the parameter alone is known exactly"])
@@ -224,9 +227,10 @@ def _percent(share: float) -> str:
     )
 
 
-def _worst_in_words(worst: WorstConfiguration, robot: Robot, names: Sequence[str]) -> list[str]:
-    errors = worst.errors
-    x, y, z = errors.position[0].tolist()
+def _worst_in_words(worst: WorstConfiguration, robot: Robot, names: Sequence[str], length: LengthUnit) -> list[str]:
+    errors, factor = worst.errors, Units(length).factor("m")
+    decimals = max(0, 4 + round(math.log10(factor)))
+    x, y, z = (f"{v / factor:.{decimals}f}" for v in errors.position[0].tolist())
     size = np.sqrt(np.sum(worst.sigma**2)) * 1e3
     at = "" if worst.row is None else f"{names[worst.row]}: "
     words = []
@@ -234,7 +238,7 @@ def _worst_in_words(worst: WorstConfiguration, robot: Robot, names: Sequence[str
         factor, unit, _ = SHOWN[joint.unit]
         words.append(f"{joint.name} {value * factor:.2f} {unit}")
     lines = [
-        f"{at}{size:.4f} mm with the tool at x {x:.4f}, y {y:.4f}, z {z:.4f} m from the base",
+        f"{at}{size:.4f} mm with the tool at x {x}, y {y}, z {z} {length} from the base",
         f"joints: {', '.join(words)}",
     ]
     axis = ", ".join(f"{v:+.2f}" for v in worst.axes[0].tolist())

@@ -1,6 +1,7 @@
 """`fg-calib predict`: what to expect of a calibration that was done."""
 
 import json
+import re
 
 import numpy as np
 import polars as pl
@@ -91,6 +92,16 @@ def test_the_report_says_how_far_where_and_why(result, fg_calib, few):
                   "after the best rigid fit", "within 500 mm at 100 % of them", "Where it is largest",
                   "1 sigma is", "What it comes from", "400 configurations were drawn"):  # fmt: skip
         assert words in " ".join(said.split())
+
+
+def test_positions_are_said_in_the_unit_that_was_asked_for(result, fg_calib, tmp_path):
+    """Those of one configuration, to 0.1 mm."""
+    (tmp_path / "at.csv").write_text("q1,q2,q3,q4\n0.1,0.2,0,0.4\n")  # the third slides
+    found = []
+    for length in ("m", "mm"):
+        said = fg_calib("predict", result, "--at", tmp_path / "at.csv", "--length", length).out
+        found.append(re.search(rf"the tool at x (\S+), y (\S+), z (\S+) {length} from the base", said).groups())
+    assert [f"{1e3 * float(v):.1f}" for v in found[0]] == list(found[1])
 
 
 def test_a_calibration_that_is_not_to_be_trusted_ends_with_3(result, fg_calib, tmp_path):
