@@ -7,6 +7,7 @@ Where no check succeeds the reason is `NO_CAUSE`, never a guess.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,12 +48,18 @@ class LostDirection:
 
 def explain(problem: Problem, observability: Observability, parameters: Floats) -> tuple[LostDirection, ...]:
     """The reason for every lost direction of an observability found for a problem at a parameter vector."""
-    lost = observability.lost
+    return explain_relations(problem, observability.names, observability.lost, parameters)
+
+
+def explain_relations(
+    problem: Problem, names: Sequence[str], lost: Sequence[dict[str, float]], parameters: Floats
+) -> tuple[LostDirection, ...]:
+    """The reason for every one of some relations of a problem's parameters, by these names, at a parameter vector."""
     if not lost:
         return ()
     tables = problem.data.tables
     motion = _Motion(problem, parameters, Seen.of(problem))
-    directions = np.array([[relation.get(name, 0.0) for name in observability.names] for relation in lost]).T
+    directions = np.array([[relation.get(name, 0.0) for name in names] for relation in lost]).T
     absorbed, anywhere = Absorbed(problem, parameters, directions), elsewhere(problem, parameters)
     # What kinds of one's own would show elsewhere is not known.
     effect = np.zeros((1, len(directions))) if anywhere is None else named_triangle(anywhere, anywhere.start)

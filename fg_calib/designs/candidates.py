@@ -11,7 +11,7 @@ from fg_calib.arguments import checked
 from fg_calib.errors import InputError
 from fg_calib.options import check_number
 from fg_calib.robot.model import Robot
-from fg_calib.robot.shape import Box
+from fg_calib.robot.shape import Box, foot_in
 from fg_calib.simulation.candidates import Candidates, draw_candidates, number_of
 from fg_calib.simulation.configurations import Configurations
 from fg_calib.sizes import MOST_DRAWN
@@ -55,5 +55,6 @@ def candidates(
     of = replace(of, keep_out=(*of.keep_out, *keep_out), apart=of.apart if apart is None else apart)
     found = draw_candidates(robot, of, generator, n, "candidates")
     if len(found.readings) == 0:
-        raise InputError("candidates", f"none in {found.reasons()}", "some that the arm can take")
+        hint = foot_in(robot, of.keep_out)
+        raise InputError("candidates", f"none in {found.reasons()}", "some that the arm can take", hint)
     return found

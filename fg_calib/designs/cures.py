@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.analysis.identifiability import identifiability_of
+from fg_calib.analysis.reasons import NOT_EXCITED, explain_relations
 from fg_calib.designs.task import Posterior
 from fg_calib.graph.build import random_problem
 from fg_calib.graph.information import named_triangle, observability_of
@@ -34,11 +34,23 @@ KINDS: tuple[tuple[str, Model, FrameKnowledge], ...] = (
 )
 """Kinds of measurement that are asked, what is easier to have first."""
 
-SEEN = 1e-6
-"""Part of the largest effect of any parameter above which a direction is seen."""
+SEEN = 1e-4
+"""Part of the largest effect of any parameter above which a direction is seen.
+
+What is lost has less than a thousandth of a sigma; of axes that a calibration left parallel within some millionths of
+a radian, poses would see shifts along them as little. Where the largest effect is some ten sigma, this is the same.
+"""
 
 _SHARE = 1e-4
 """Share of a direction above which another is not independent of it; far above the rounding of both."""
+
+
+NEARLY = "others move the arm nearly the same"
+"""Why a direction that poses see a little is not determined by them either."""
+
+_LEFT = 0.05
+"""Share of a direction that may stay undetermined of one that is cured: of axes that are nearly parallel, a little of
+many directions goes with what hardly anything sees."""
 
 
 @dataclass(frozen=True)
@@ -74,14 +86,14 @@ def cures_of(posterior: Posterior) -> tuple[Cure, ...]:
     for name, anywhere in kinds:
         J = named_triangle(anywhere, anywhere.start) * scales
         by[name] = _cured(J @ directions.T, SEEN * float(np.linalg.norm(J, axis=0).max()))
-    reasons = {
-        tuple(one.relation.items()): one.reason
-        for where in (problem, kinds[-1][1])
-        for one in identifiability_of(where, where.start, "practical").lost
-    }
+    here, of_poses = (
+        explain_relations(one, observability.names, relations, one.start) for one in (problem, kinds[-1][1])
+    )
+    cures = [tuple(name for name in by if by[name][k]) for k in range(len(relations))]
+    reasons = (one if found else other for one, other, found in zip(here, of_poses, cures, strict=True))
     return tuple(
-        Cure(relation, reasons.get(tuple(relation.items()), ""), tuple(name for name in by if by[name][k]))
-        for k, relation in enumerate(relations)
+        Cure(relation, NEARLY if why.reason == NOT_EXCITED and not found else why.reason, found)
+        for relation, why, found in zip(relations, reasons, cures, strict=True)
     )
 
 
@@ -118,5 +130,5 @@ def _cured(effects: Floats, floor: float) -> Booleans:
     """Which directions, of these effects in the columns, have no share in what has no effect."""
     _, s, Vt = np.linalg.svd(effects)
     left = Vt[int(np.sum(s > floor)) :]
-    out: Booleans = np.linalg.norm(left, axis=0) <= _SHARE
+    out: Booleans = np.linalg.norm(left, axis=0) <= _LEFT
     return out

@@ -12,6 +12,7 @@ import numpy as np
 from rich.console import Group, RenderableType
 
 from fg_calib.analysis.accuracy import PoseRms
+from fg_calib.analysis.conventions import missing_motions
 from fg_calib.designs.design import Design
 from fg_calib.executors import Failure
 from fg_calib.report.shown import SHOWN
@@ -223,6 +224,7 @@ def _notes(design: Design) -> list[str]:
         notes.append(f"candidates{of}: {one.reasons()}")
     notes += [f"{name}: none of its own stops was chosen, and it gets no table" for name in _without_stops(design)]
     notes += [f"{name}: lengths of {_mm(low)} to {_mm(high)}" for name, (low, high) in _lengths(design).items()]
+    notes += [str(one) for one in missing_motions(design.pool.robot)]
     if _is_anywhere(design):
         notes.append("a job says of no boxes and no lines of sight: --candidates SCENARIO takes those of a scenario")
     turn = math.degrees(design.travel)

@@ -93,16 +93,44 @@ def enters(robot: Robot, readings: Floats, boxes: Sequence[Box]) -> Booleans:
         readings: Shape (n, n_joints), [rad] (prismatic: [m]).
         boxes: What must stay free.
     """
-    # Two configurations besides show what stands still in all of them.
-    probes = np.outer([0.3, 1.1], np.linspace(0.7, 1.0, robot.n_joints))
-    points = link_points(robot, np.concatenate([probes, readings]))  # (2 + n, m, 3)
-    moves = np.abs(points[0] - points[1]).max(axis=1) > TOUCHING  # (m,)
+    points = link_points(robot, np.concatenate([_probes(robot), readings]))  # (2 + n, m, 3)
+    moves = _moves(points)
     lines = moves[:-1] | moves[1:]
     start, end = points[2:, :-1][:, lines], points[2:, 1:][:, lines]  # (n, n_lines, 3)
     hit = np.zeros(len(readings), dtype=np.bool_)
     for box in boxes:
         hit |= _pass(start, end, box).any(axis=1)
     return hit
+
+
+def foot_in(robot: Robot, boxes: Sequence[Box]) -> str:
+    """Which of some boxes keeps every configuration out, as the moving arm begins inside it; empty if none does.
+
+    Args:
+        robot: The robot, at its nominal values.
+        boxes: What must stay free.
+    """
+    points = link_points(robot, _probes(robot))
+    moves = _moves(points)
+    begins = np.flatnonzero(~moves[:-1] & moves[1:])
+    for number, box in enumerate(boxes, start=1):
+        for k in begins.tolist():
+            p = points[0, k]
+            if np.all((p > box.lower + TOUCHING) & (p < box.upper - TOUCHING)):
+                at = ", ".join(f"{v:.4g}" for v in p.tolist())
+                return f"keep_out {number} holds the foot of the moving arm, ({at}) m, in every configuration"
+    return ""
+
+
+def _probes(robot: Robot) -> Floats:
+    """Two configurations that show what stands still in all of them."""
+    return np.outer([0.3, 1.1], np.linspace(0.7, 1.0, robot.n_joints))
+
+
+def _moves(points: Floats) -> Booleans:
+    """Which points, shape (n, m, 3), of which the first two are of probes, some joint moves: shape (m,)."""
+    found: Booleans = np.abs(points[0] - points[1]).max(axis=1) > TOUCHING
+    return found
 
 
 def _pass(start: Floats, end: Floats, box: Box) -> Booleans:

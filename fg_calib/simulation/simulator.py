@@ -25,6 +25,7 @@ from fg_calib.options import Pairing, check_number
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
 from fg_calib.robot.model import Robot
+from fg_calib.robot.shape import foot_in
 from fg_calib.simulation.candidates import draw_candidates, number_of, sifted
 from fg_calib.simulation.configurations import (
     BoardViews,
@@ -279,6 +280,6 @@ def _sifted(robot: Robot, configurations: Configurations, generator: np.random.G
     n = number_of(configurations)
     found = draw_candidates(robot, configurations, generator, n, place)
     if len(found.readings) < n:
-        hint = "ask for fewer, or relax what they have to keep to"
+        hint = foot_in(robot, configurations.keep_out) or "ask for fewer, or relax what they have to keep to"
         raise InputError(place, f"{len(found.readings)} of {n} found in {found.reasons()}", hint=hint)
     return found.readings

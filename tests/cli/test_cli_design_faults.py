@@ -118,6 +118,23 @@ def test_lengths_are_planned_between_points_that_are_touched_alone(plan, fg_cali
     assert re.search(r"sockets: lengths of \d+ mm to \d+ mm", ended.out)
 
 
+def test_a_box_about_the_arms_own_foot_is_named(plan, fg_calib, tmp_path):
+    """The second of two; the first is beside the arm. A simulation says it too."""
+    beside = {"lower": [900, 900, -100], "upper": [950, 950, 50]}
+    floor = {"lower": [-900, -900, -100], "upper": [900, 900, 50]}
+    scenario = plan(configurations={"random": {"count": 9}, "keep_out": [beside, floor]})
+    for command, more in (("design", FEW), ("simulate", ("--out", tmp_path / "demo"))):
+        ended = fg_calib(command, scenario, *more)
+        assert ended.code == 1
+        foot = "keep_out 2 holds the foot of the moving arm, (0, 0, 0) m, in every configuration"
+        assert ended.err.splitlines()[-1].endswith(f"; {foot}")
+
+
+def test_a_convention_that_cannot_say_a_tilt_is_warned_of(plan, fg_calib):
+    said = " ".join(fg_calib("design", plan(), "--n", 5, *FEW).out.split())
+    assert "axes 1, 2 and 3 are parallel and convention dh has no parameter for a tilt about y between them" in said
+
+
 PIN = {"model": "anchor", "name": "pin", "anchors": {"b": {"x": 500, "y": 100, "z": 150}}}
 
 
