@@ -196,7 +196,7 @@ def design(
     if wanted.fitted and len(there) < LEAST_FITTED:
         found = f"{len(there)} configuration{'s' * (len(there) > 1)}, of which a rigid fit leaves next to nothing"
         raise InputError("task", found, f"{LEAST_FITTED} or more, or errors in the base frame")
-    if pool.has_hub and pool.scenario is not None and not len(pool.given) and pool.before is None:
+    if pool.has_hub and pool.scenario is not None and given is None and pool.before is None:
         pool = with_best_hub(pool, wanted, n or N_STOPS, criterion, draw["random"])
     return design_from(pool, wanted, draw["random"], n=n, target=target, criterion=criterion)
 

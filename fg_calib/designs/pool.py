@@ -248,6 +248,10 @@ def pool_of(
     options = Options(tables[0].model or "pose", gauge=_gauge(scenario))
     problem = true_problem(scenario.robot, tables, options)
     data = problem.data
+    if not problem.rows:
+        n = data.n_configurations
+        found_there = "one, of which no pair is made" if n == 1 else f"{n}, at none of which anything is measured"
+        raise InputError("candidates", found_there, "more configurations")
     names = [_named(name) for name in data.names[: data.n_configurations]]
     hubs = _hubs(problem)
     kept = np.setdiff1d(np.arange(len(names)), hubs)

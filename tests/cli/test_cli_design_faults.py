@@ -135,6 +135,34 @@ def test_a_convention_that_cannot_say_a_tilt_is_warned_of(plan, fg_calib):
     assert "axes 1, 2 and 3 are parallel and convention dh has no parameter for a tilt about y between them" in said
 
 
+BAR = {"model": "distance", "name": "bar", "pairs": "star"}
+
+
+@pytest.mark.parametrize("instrument", [TRACKER, BAR], ids=["positions", "pairs"])
+def test_of_one_configuration_a_plan_is_made_or_it_is_said_why_not(instrument, plan, fg_calib, tmp_path):
+    (tmp_path / "one.csv").write_text("q1,q2,q3\n10,20,30\n")
+    scenario = plan(instrument)
+    ended = fg_calib("design", scenario, "--n", 1, "--candidates", tmp_path / "one.csv")
+    if instrument is BAR:
+        message = "error: candidates: one, of which no pair is made, expected more configurations"
+        assert (ended.code, ended.err.splitlines()) == (1, [message])
+    else:
+        assert "where to measure at 1 stop\n" in ended.out
+    given = fg_calib("design", scenario, "--n", 1, "--given", tmp_path / "one.csv", "--candidates", 12)
+    assert (given.code, given.err.splitlines()[1:]) == (0, [])
+
+
+def test_a_given_configuration_is_an_end_of_pairs(plan, fg_calib, tmp_path):
+    """The hub, whichever of the candidates would make a better one."""
+    (tmp_path / "one.csv").write_text("q1,q2,q3\n1,2,3\n")
+    for seed in range(4):
+        out = tmp_path / f"plan{seed}"
+        asked = ("--n", 5, "--seed", seed, "--given", tmp_path / "one.csv", "--candidates", 40)
+        assert fg_calib("design", plan(BAR), *asked, "--out", out).code == 0
+        stops = pl.read_csv(out / "configurations.csv").select("q1", "q2", "q3")
+        assert (1.0, 2.0, 3.0) in stops.rows()
+
+
 PIN = {"model": "anchor", "name": "pin", "anchors": {"b": {"x": 500, "y": 100, "z": 150}}}
 
 
