@@ -42,7 +42,8 @@ class Identifiability(Brief):
         kind: On random configurations, or on the user's.
         n_configurations: How many.
         observability: Rank, classes, groups, indices.
-        looked_at: The problem and the parameter vector that it is of, for the reasons.
+        looked_at: The problem and the parameter vector that it is of, for the reasons; None of what was pickled, which
+            has them.
         with_fixed_known: The same where the parameters that the robot's file calls fixed are known; None if it calls
             none fixed, or if only the others were looked at anyway.
         fixed: Those parameters.
@@ -54,7 +55,7 @@ class Identifiability(Brief):
     kind: Literal["structural", "practical"]
     n_configurations: int
     observability: Observability
-    looked_at: tuple[Problem, Floats] = field(repr=False, compare=False)
+    looked_at: tuple[Problem, Floats] | None = field(repr=False, compare=False)
     with_fixed_known: Identifiability | None = None
     fixed: tuple[str, ...] = ()
     missing: tuple[MissingMotion, ...] = ()
@@ -62,6 +63,7 @@ class Identifiability(Brief):
     @cached_property
     def lost(self) -> tuple[LostDirection, ...]:
         """Every lost direction with its reason, looked for when they are first asked for."""
+        assert self.looked_at is not None
         return explain(*self.looked_at, self.observability)
 
     def __getstate__(self) -> dict[str, Any]:
