@@ -37,7 +37,7 @@ from fg_calib.analysis.verdict import (
     of_tolerances,
 )
 from fg_calib.graph.noise import JOINT_NOISE, PairNoise
-from fg_calib.graph.problem import at_parameters, noises_at
+from fg_calib.graph.problem import at_parameters
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements.kinds import AnchorContact
 from fg_calib.robot.kinematics import forward, precompute_trig
@@ -180,10 +180,9 @@ def _of_bent_rows(
     """
     values, V = np.linalg.eigh(spread.tangent)
     half, scales = V * np.sqrt(np.maximum(values, 0.0)), np.diag(solution.problem.variables.prior_scales)
-    noises = noises_at(solution.problem, solution.parameters, at_readings=True)
     leverage = np.nan_to_num(goodness.leverage)
     bent, folded, turned, lengths = (np.zeros(table.n, dtype=np.bool_) for _ in range(4))
-    for number, noise in enumerate(noises):
+    for number, noise in enumerate(solution.noises):
         if isinstance(noise, PairNoise):
             rows = np.flatnonzero(table.used & (table.series == number))
             place = (table.measurement[rows], table.row[rows])

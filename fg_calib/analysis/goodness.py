@@ -455,7 +455,7 @@ class _Rows:
         self._table = table
         self._spread = spread
         self._solution = solution
-        self._noises = noises_at(problem, solution.parameters, at_readings=True)
+        self._noises = solution.noises
         self._robust = problem.state.weights is not None
         self.weight = np.ones(table.n)
         for number, weights in enumerate(problem.state.weights or ()):

@@ -309,11 +309,10 @@ def residual_table(solution: Solution) -> ResidualTable:
     """Every scalar residual, train and test, with the arm at nominal and at the estimate."""
     problem = solution.problem
     before = noises_at(problem, solution.before, at_readings=True)
-    after = noises_at(problem, solution.parameters, at_readings=True)
     kinds: dict[RowKind, int] = {}
     reasons, labels = [""], {"": 0}
     columns: list[dict[str, NDArray[Any]]] = []
-    for number, (s, old, new) in enumerate(zip(problem.data.series, before, after, strict=True)):
+    for number, (s, old, new) in enumerate(zip(problem.data.series, before, solution.noises, strict=True)):
         names = zip(s.kind.names, s.kind.units, strict=True)
         codes = np.array([kinds.setdefault(RowKind(*name, s.table), len(kinds)) for name in names])
         excluded = np.zeros(s.n, dtype=np.int16)

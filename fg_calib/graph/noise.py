@@ -159,6 +159,11 @@ class RowNoise:
             self.own = self.series.covariance * np.outer(self.factors, self.factors)
         self.sources = self._of_joints(self.rows)
 
+    @property
+    def same_everywhere(self) -> bool:
+        """Whether the noise is the same at all parameters."""
+        return not self.sources
+
     @cached_property
     def total(self) -> Floats:
         """Covariance of each measurement's rows, all noise together, shape (n, residual_dim, residual_dim)."""
@@ -265,6 +270,11 @@ class PairNoise(RowNoise):
             self.sources += (self._of_poses(),)
         left = variance - of_joints - of_poses - 0.5 * self._bent_variance * s.formed
         self.own = self._diagonal(left)
+
+    @property
+    def same_everywhere(self) -> bool:
+        """Whether the noise is the same at all parameters: what lengthens vectors is not."""
+        return False
 
     def more_if_redundant(self, shared: frozenset[str]) -> Floats | float:
         """What is added to the diagonal of `own` where there are more rows than errors that they share."""
