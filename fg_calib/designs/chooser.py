@@ -121,15 +121,47 @@ class Chooser:
     def _drawn(self, n: int, generator: np.random.Generator) -> Integers:
         return generator.choice(self.system.n_candidates, size=n, replace=False).astype(np.int64)
 
-    def curve(self, found: Chosen, generator: np.random.Generator, hubs: int) -> tuple[CurvePoint, ...]:
-        """What to expect of fewer stops, and of as many; hubs count."""
+    def curve(
+        self,
+        found: Chosen,
+        generator: np.random.Generator,
+        hubs: int,
+        other: Callable[[Integers], float],
+    ) -> tuple[CurvePoint, ...]:
+        """What to expect of fewer stops, and of as many.
+
+        Args:
+            found: As many.
+            generator: Draws random sets.
+            hubs: How many there are beside, which count.
+            other: Expected error of other pairs beside those of a star of some candidates, [m].
+        """
         most = len(found.candidates)
         numbers = np.round(np.geomspace(LEAST_CURVE, max(most + hubs, LEAST_CURVE), N_CURVE)).astype(np.int64)
         points = []
         for k in sorted({n - hubs for n in numbers.tolist() if 0 < n - hubs < most} | {most}):
             chosen = found.candidates if k == most else self.quickly(k).candidates
-            points.append(CurvePoint(k + hubs, self.error(chosen), self._band(k, generator)))
+            error = min(self.error(chosen), other(chosen))
+            points.append(CurvePoint(k + hubs, error, self._band(k, generator)))
         return tuple(points)
+
+    def fewer(self, found: Chosen, target: float, other: Callable[[Integers], float]) -> Chosen:
+        """As few as reach a target, [m], by other pairs beside those of a star; as many as were found if none do.
+
+        Args:
+            found: Those that a star reaches it with.
+            target: It.
+            other: Expected error of other pairs of some candidates, [m].
+        """
+        low, high = 0, len(found.candidates)
+        while high - low > 1:
+            middle = (low + high) // 2
+            some = self.quickly(middle)
+            if min(self.error(some.candidates), other(some.candidates)) <= target:
+                high, found = middle, some
+            else:
+                low = middle
+        return found
 
     def _band(self, n: int, generator: np.random.Generator) -> tuple[float, float, float]:
         """Error that a tenth, half and nine tenths of random sets of n do not exceed."""

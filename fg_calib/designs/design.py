@@ -26,7 +26,7 @@ from fg_calib.designs.criteria import Criterion
 from fg_calib.designs.cures import Cure, cures_of
 from fg_calib.designs.of_job import pool_of_more, pool_of_rows, solved
 from fg_calib.designs.order import shortest_way, travel
-from fg_calib.designs.plans import best_plan, of_used_points, with_best_hub, with_names
+from fg_calib.designs.plans import best_plan, of_used_points, other_pairs, with_best_hubs, with_names
 from fg_calib.designs.pool import Pool, drawn, pool_of
 from fg_calib.designs.search import Chosen, not_worse_than_random
 from fg_calib.designs.system import system_of
@@ -120,7 +120,7 @@ class Design(FrozenArrays):
 
     @property
     def structure(self) -> str:
-        """Which pairs are measured directly: star, chain, tree or free; the curve is that of stars. Else empty."""
+        """Which pairs are measured directly: star, chain, tree or free; empty where none are."""
         return "" if self.pairs is None else min(self.pairings, key=lambda name: self.pairings[name])
 
     @property
@@ -196,8 +196,8 @@ def design(
     if wanted.fitted and len(there) < LEAST_FITTED:
         found = f"{len(there)} configuration{'s' * (len(there) > 1)}, of which a rigid fit leaves next to nothing"
         raise InputError("task", found, f"{LEAST_FITTED} or more, or errors in the base frame")
-    if pool.has_hub and pool.scenario is not None and given is None and pool.before is None:
-        pool = with_best_hub(pool, wanted, n or N_STOPS, criterion, draw["random"])
+    if len(pool.hubs) and pool.scenario is not None and given is None:
+        pool = with_best_hubs(pool, wanted, n or N_STOPS, criterion, draw["random"])
     return design_from(pool, wanted, draw["random"], n=n, target=target, criterion=criterion)
 
 
@@ -273,10 +273,17 @@ def design_from(
         criterion: What is made small.
     """
     chooser, found, able = _choose(pool, task, generator, n, target, criterion)
-    chosen = able[found.candidates]
     tell("working out what to expect")
-    plan, pairings = best_plan(pool, chosen, (criterion, task), generator)
-    expected, curve = plan.posterior.error(task), chooser.curve(found, generator, int(pool.has_hub))
+    others = other_pairs(pool, len(found.candidates), (criterion, task), generator)
+
+    def least(candidates: Integers) -> float:
+        return np.inf if others is None else others.least(able[candidates])
+
+    if target is not None and others is not None:
+        found = chooser.fewer(found, target, least)
+    chosen = able[found.candidates]
+    plan, pairings = best_plan(pool, chosen, task, others)
+    expected, curve = plan.posterior.error(task), chooser.curve(found, generator, len(pool.hubs), least)
     before = pool.posterior(pool.given) if len(pool.given) or pool.before is not None else None
     ids = plan.names if pool.scenario is None else _new_names(len(plan.readings), pool.before)
     return Design(
@@ -330,7 +337,7 @@ def _choose(
     able = np.setdiff1d(np.flatnonzero(np.any(pool.rows.rows, axis=(1, 2))), pool.given)
     if not len(able):
         raise InputError("candidates", "none at which anything is measured", "some")
-    hubs = int(pool.has_hub)
+    hubs = len(pool.hubs)
     chooser = Chooser(system.select(able), criterion, _exactly(pool, task, able))
     tell("choosing")
     if target is None:

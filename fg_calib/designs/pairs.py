@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from fg_calib.arrays import FrozenArrays
 from fg_calib.designs.criteria import Criterion, Measure
+from fg_calib.designs.pool import selected
 from fg_calib.designs.rows import StopRows
 from fg_calib.designs.search import choose
 from fg_calib.designs.system import system_of
@@ -150,6 +151,12 @@ class PairWork:
         """What would be known of pairs, with the errors that they share."""
         problem = true_problem(self._robot, table, self._own)
         return Posterior(problem, whitened_jacobian(problem, problem.start))
+
+    def first_of(self, plan: PairPlan, n: int) -> PairPlan:
+        """The first n pairs of a chain or a tree, in the order in which they were taken, and their stops."""
+        order = {name: k for k, name in enumerate(plan.table.measurements.ids[: n + 1].tolist())}
+        found = selected(plan.table, order)
+        return PairPlan(plan.structure, found, self.posterior(found))
 
     def table_of(self, chosen: Integers, pairs: Integers) -> Table:
         """A table of pairs, numbers of the chosen configurations, shape (n, 2)."""

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from fg_calib.arrays import Brief
 from fg_calib.designs.candidates import Candidates, candidates
 from fg_calib.designs.rows import StopRows, stop_rows
-from fg_calib.designs.task import Posterior
+from fg_calib.designs.task import Posterior, n_measured
 from fg_calib.errors import InputError
 from fg_calib.graph.build import true_problem
+from fg_calib.graph.elsewhere import Places, places_of
 from fg_calib.graph.factors import Variables, unknown_prior_rows
 from fg_calib.graph.information import whitened_jacobian
 from fg_calib.graph.knowledge import coordinates_of
@@ -92,9 +93,15 @@ class Pool(Brief):
         return np.pad(wide, ((0, 0), (0, len(self.rows.scales) - wide.shape[1])))
 
     @property
-    def has_hub(self) -> bool:
-        """Whether all pairs are measured against one configuration."""
-        return bool(np.any(self.stop == HUB))
+    def hubs(self) -> Integers:
+        """Configurations of the problem that all pairs of a star are measured against, of each star one."""
+        return np.flatnonzero(self.stop == HUB)
+
+    def groups_of(self, configurations: Integers) -> NDArray[np.str_]:
+        """The instrument whose own some configurations of the problem are, hubs among them; "" for common ones."""
+        names = self.problem.data.names
+        own = [_named(names[k])[0] if self.scenario is not None else "" for k in configurations.tolist()]
+        return np.array(own, dtype=np.str_)
 
     def tables_of(self, stops: Integers, pairing: Pairing | None = None) -> list[Table]:
         """What would be measured at some of the stops, in their order, behind those of hubs.
@@ -107,7 +114,7 @@ class Pool(Brief):
         of_stop: dict[int, list[int]] = {}
         for k, stop in enumerate(self.stop.tolist()):
             of_stop.setdefault(stop, []).append(k)
-        wanted = [*of_stop.get(HUB, []), *(k for stop in stops.tolist() for k in of_stop.get(stop, []))]
+        wanted = [*self.hubs.tolist(), *(k for stop in stops.tolist() for k in of_stop.get(stop, []))]
         order = {names[k]: place for place, k in enumerate(wanted)}
         found = [selected(table, order) for table in self.tables]
         for number, (model, own) in self.formed.items():
@@ -123,11 +130,16 @@ class Pool(Brief):
         """
         if not len(stops) and self.before is not None:
             return Posterior(self.before, whitened_jacobian(self.before, self.before.start))
-        problem = true_problem(self.robot, self.tables_of(stops, pairing), self.problem.options)
+        places = places_of(self.problem, self.problem.start)
+        problem = true_problem(self.robot, self.tables_of(stops, pairing), self.problem.options, places)
         rows = whitened_jacobian(problem, problem.start)
-        if self.before is not None:  # what is told of points is in what was measured, and counts once
-            rows = rows[len(unknown_prior_rows(problem.variables, problem.start)[0]) :]
-        return Posterior(problem, np.vstack([rows, known_rows_of(self.before, problem)]))
+        if self.before is None:
+            return Posterior(problem, rows)
+        if not problem.rows:  # one end of a pair
+            return Posterior(self.before, whitened_jacobian(self.before, self.before.start))
+        # What is told of points is in what was measured, and counts once.
+        rows = rows[len(unknown_prior_rows(problem.variables, problem.start)[0]) :]
+        return Posterior(problem, np.vstack([rows, known_rows_of(self.before, problem)]), n_measured(self.before))
 
 
 def selected(table: Table, order: Mapping[str, int]) -> Table:
@@ -186,16 +198,18 @@ def _place_of(problem: Problem, columns: Integers) -> Integers:
 
 
 def _columns_by_name(variables: Variables, unknowns: Unknowns) -> dict[tuple[str, str], Integers]:
-    """Columns of each variable: of the core's by its symbol, of the unknowns' by letter and name.
-
-    Planes are left out: their coordinates are about a point that depends on what was measured.
-    """
+    """Columns of each variable: of the core's by its symbol, of the unknowns' by letter and name."""
     found = {("", v.symbol): np.arange(v.columns.start, v.columns.stop) for v in variables.items}
     for letter, name in zip(unknowns.letters, unknowns.names, strict=True):
         place = coordinates_of(variables, unknowns, (letter, name))
-        if place is not None and letter != "F":
+        if place is not None:
             found[letter, name] = place - variables.nuisance_span.start + variables.n_columns
     return found
+
+
+def _staying(before: Problem) -> Places:
+    """Where things are by what was measured already, boards left out: those may be turned over (see `scene`)."""
+    return {name: place for name, place in places_of(before, before.start).items() if name[0] != "B"}
 
 
 def drawn(scenario: Scenario, n: int, generator: np.random.Generator) -> dict[str, Candidates]:
@@ -218,7 +232,7 @@ def pool_of(
     *,
     given: Floats | None = None,
     before: Problem | None = None,
-    hub: int = 0,
+    hubs: Mapping[str, int] | None = None,
 ) -> Pool:
     """The stops that a scenario's instruments may measure at.
 
@@ -227,7 +241,7 @@ def pool_of(
         found: Candidates, see `drawn`.
         given: Readings of stops that were measured already, or will be anyway, shape (n, n_joints).
         before: What was measured already.
-        hub: Which of the common candidates comes first: of a star it is the hub.
+        hubs: Which of the candidates comes first, by whose they are: of a star it is the hub.
 
     Raises:
         InputError: The scenario cannot be, or nothing is seen from anywhere.
@@ -237,24 +251,24 @@ def pool_of(
     if given is not None and "" not in readings:
         reason = "where every instrument has configurations of its own"
         raise InputError("given", reason, "a job with what was measured")
-    if hub:
-        q = readings[""]
-        readings[""] = np.vstack([q[hub : hub + 1], np.delete(q, hub, axis=0)])
+    for name, first in (hubs or {}).items():
+        q = readings[name]
+        readings[name] = np.vstack([q[first : first + 1], np.delete(q, first, axis=0)])
     if given is not None:
         readings[""] = np.vstack([given, readings[""]])
     formed = _formed(scenario)
     simulation = simulate(_silent(scenario, readings), leave_out=True)
     tables = _as_told(simulation)
-    options = Options(tables[0].model or "pose", gauge=_gauge(scenario))
-    problem = true_problem(scenario.robot, tables, options)
+    options = Options(tables[0].model or "pose", gauge=_gauge(scenario)) if before is None else before.options
+    problem = true_problem(scenario.robot, tables, options, None if before is None else _staying(before))
     data = problem.data
     if not problem.rows:
         n = data.n_configurations
         found_there = "one, of which no pair is made" if n == 1 else f"{n}, at none of which anything is measured"
         raise InputError("candidates", found_there, "more configurations")
     names = [_named(name) for name in data.names[: data.n_configurations]]
-    hubs = _hubs(problem)
-    kept = np.setdiff1d(np.arange(len(names)), hubs)
+    common = _hubs(problem)
+    kept = np.setdiff1d(np.arange(len(names)), common)
     stop = np.full(len(names), HUB)
     stop[kept] = np.arange(len(kept))
     n_given = 0 if given is None else len(given)
@@ -265,7 +279,7 @@ def pool_of(
         readings=data.readings[kept],
         group=np.array([names[k][0] for k in kept], dtype=np.str_),
         stop=stop,
-        rows=stop_rows(problem, stop, hubs, alone=before is None),
+        rows=stop_rows(problem, stop, common, alone=before is None),
         given=np.array([stop[k] for k in kept if names[k][0] == "" and names[k][1] < n_given], dtype=np.int64),
         found=found,
         before=before,

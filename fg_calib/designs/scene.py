@@ -123,19 +123,27 @@ class _Table:
         return self._camera(given, configurations)
 
     def _noise(self) -> Noise:
+        """The noise as it is stated, times the factors that were found where it was estimated."""
         m, pairs = self._m, self._m.pairs if self._m.pairs is not None else None
         if pairs is None and m.groups is not None and m.groups.pairs.n_pairs:
             pairs = m.groups.pairs
         of_pose = None if m.covariance is None else np.sqrt(np.einsum("nii->ni", m.covariance))
         lengths = m.sigma_length if pairs is None else pairs.sigma_distance
+        formed = self._table.model in PAIR_MODELS and pairs is None
+        position = _typical(m.sigma_position if of_pose is None else of_pose[:, 3:])
+        orientation = _typical(m.sigma_orientation if of_pose is None else of_pose[:, :3])
         return Noise(
-            position=_typical(m.sigma_position if of_pose is None else of_pose[:, 3:]),
-            orientation=_typical(m.sigma_orientation if of_pose is None else of_pose[:, :3]),
-            distance=_typical(lengths),
-            angle=_typical(None if pairs is None else pairs.sigma_angle),
-            point=_typical(m.sigma_point),
-            pixel=_typical(m.sigma_pixel),
+            position=self._found("distance" if formed else "position", position),
+            orientation=self._found("angle" if formed else "orientation", orientation),
+            distance=self._found("distance", _typical(lengths)),
+            angle=self._found("angle", _typical(None if pairs is None else pairs.sigma_angle)),
+            point=self._found("point", _typical(m.sigma_point)),
+            pixel=self._found("pixel", _typical(m.sigma_pixel)),
         )
+
+    def _found(self, kind: str, stated: float | None) -> float | None:
+        """A sigma of one of the table's kinds as it was found to be."""
+        return None if stated is None else stated * self._problem.state.factors.get((self._number, kind), 1.0)
 
     def _frame(self) -> Placement:
         """world_T_base of the table."""

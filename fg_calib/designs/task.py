@@ -64,10 +64,12 @@ class Posterior(Brief):
     Attributes:
         problem: Their problem, at its start.
         rows: Whitened derivatives in all its columns, those of what is known beside them too, shape (m, n).
+        n_before: How many measurements what is known beside them is of.
     """
 
     problem: Problem
     rows: Floats
+    n_before: int = 0
 
     @cached_property
     def covariance(self) -> TangentCovariance:
@@ -90,8 +92,13 @@ class Posterior(Brief):
             left.A @ v.tangent_derivative(p.start)[: v.n_robot_columns, : v.n_robot_columns],
             p.estimated,
             scales=np.array([p.robot.scale_of(one.unit) for one in p.estimated]),
-            n_measurements=sum(len(s.train) for s in p.data.series),
+            n_measurements=self.n_before + n_measured(p),
         )
+
+
+def n_measured(problem: Problem) -> int:
+    """How many measurements a problem's rows are of."""
+    return sum(len(s.train) for s in problem.data.series)
 
 
 def is_fitted(problem: Problem) -> bool:

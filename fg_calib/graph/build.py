@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
 from fg_calib.errors import ProblemError
+from fg_calib.graph.elsewhere import Places, frame_names
 from fg_calib.graph.factors import Variables, prior_rows
 from fg_calib.graph.information import observability_of, whitened_triangle
+from fg_calib.graph.knowledge import coordinates_of
 from fg_calib.graph.observability import determined, singular_values
 from fg_calib.graph.problem import Problem, problem_at, tables_of, variables_of
 from fg_calib.graph.start import start_of
@@ -203,17 +205,31 @@ def predicted_problem(
 
 
 @single_threaded
-def true_problem(robot: Robot, tables: Table | Sequence[Table], options: Options) -> Problem:
-    """The problem of tables at a robot that is the true one: its unknowns alone are where the tables put them.
+def true_problem(
+    robot: Robot, tables: Table | Sequence[Table], options: Options, places: Places | None = None
+) -> Problem:
+    """The problem of tables at a robot that is the true one: what is unknown beside it is where the tables put it.
 
     Args:
         robot: The robot.
         tables: What it would measure, without noise.
         options: Whether pairs share errors; the tables' own choices count for the rest.
+        places: Where frames and unknowns are, of which a few rows may not tell (see `places_of`).
     """
-    data = gather(robot, tables_of(tables, options), predicted=True)
+    data, places = gather(robot, tables_of(tables, options), predicted=True), places or {}
+    unknowns = data.unknowns
+    for i, name in enumerate(zip(unknowns.letters, unknowns.names, strict=True)):
+        if name in places:
+            unknowns.starts[i] = places[name].copy()
     variables = variables_of(robot, data, options)
     start = start_of(robot.with_estimated([]), data, variables)  # the arm as it is, what it measures where it is
+    for name in places:
+        place = coordinates_of(variables, unknowns, name)
+        if place is not None:
+            start[place] = places[name]
+    for v, name in zip(variables.frames, frame_names(data, variables), strict=True):
+        if name in places:
+            start[list(v.parameters)] = places[name]
     return problem_at(robot, data, options, variables, start)
 
 

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from fg_calib.graph.factors import Variables
 from fg_calib.graph.problem import Problem, problem_at, variables_of
 from fg_calib.graph.start import start_of
 from fg_calib.measurements.dataset import Labels, Measurements
-from fg_calib.measurements.gathering import gather
+from fg_calib.measurements.gathering import Dataset, gather
 from fg_calib.measurements.series import Table
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, Model, Options, Pairing
 from fg_calib.robot.inverse import random_readings
@@ -94,11 +95,18 @@ def _named(table: Table) -> tuple[str, list[str | None]]:
     return column, [labels.names[k] if k >= 0 else None for k in np.unique(labels.index[train]).tolist()]
 
 
-def places_of(problem: Problem, parameters: Floats) -> Places:
-    """Where targets, anchors, planes and boards are, by letter and name."""
+def places_of(problem: Problem, parameters: Floats) -> dict[tuple[str, str], Floats]:
+    """Where targets, anchors, planes and boards are, by letter and name, and unknown frames, as `frame_names` says."""
     unknowns, coordinates = problem.data.unknowns, problem.variables.at(parameters).coordinates
     parts = np.split(coordinates, np.cumsum(unknowns.sizes)[:-1]) if unknowns.sizes else []
-    return dict(zip(zip(unknowns.letters, unknowns.names, strict=True), parts, strict=True))
+    places = dict(zip(zip(unknowns.letters, unknowns.names, strict=True), parts, strict=True))
+    frames = [parameters[list(v.parameters)] for v in problem.variables.frames]
+    return places | dict(zip(frame_names(problem.data, problem.variables), frames, strict=True))
+
+
+def frame_names(data: Dataset, variables: Variables) -> list[tuple[str, str]]:
+    """Letter and name of each unknown measurement frame: it is called as its table."""
+    return [("X", data.labels[int(v.symbol[2:-1])]) for v in variables.frames]
 
 
 def at_configurations(robot: Robot, table: Table, q: Floats, places: Places, source: str) -> Table:

@@ -218,7 +218,7 @@ class RowNoise:
             return ()
         chain = p.chain.without_columns().with_joint_columns()
         J = residuals.linearise(rows, chain)[1][:, :, : s.kind.ends * p.chain.n_joints]
-        J = J.reshape(s.n, s.kind.residual_dim, s.kind.ends, -1)[..., p.joints]
+        J = J.reshape(s.n, s.kind.residual_dim, s.kind.ends, p.chain.n_joints)[..., p.joints]
         loading = J * p.measurements.sigma_joint[p.joints] * self.joint_factor
         return (Source("joints", p.configurations[s.ends], np.ascontiguousarray(loading)),)
 

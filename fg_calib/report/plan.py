@@ -103,7 +103,7 @@ def build_design_report(design: Design) -> RenderableType:
     """
     parts: list[RenderableType] = [line(_headline(design), "bold")]
     parts += section("Expected", *indented(_expected(design)))
-    parts += section("Stops and accuracy", _curve({_curve_of(design): design}))
+    parts += section("Stops and accuracy", _curve({"designed": design}))
     if design.pairings:
         parts += section("Which pairs", _pairs(design))
     parts += section("Where to measure", _stops(design))
@@ -160,11 +160,6 @@ def _expected(design: Design) -> list[str]:
     if equal is not None and equal < last:
         lines.append(f"{equal} designed stops do what {last} random ones do")
     return lines
-
-
-def _curve_of(design: Design) -> str:
-    """What the curve is of."""
-    return "designed" if design.structure in ("", "star") else "designed star"
 
 
 def _curve(designs: Mapping[str, Design], *, random: bool = True) -> RenderableType:

@@ -56,14 +56,10 @@ def draw_designs(designs: Mapping[str, Design]) -> Figure:
     for colour, (name, one) in zip(_COLOURS * len(designs), designs.items(), strict=False):
         n = np.array([p.n for p in one.curve])
         low, middle, high = _shown([p.random for p in one.curve]).T
-        label = name if several else "designed" if one.structure in ("", "star") else "designed stars"
+        label = name if several else "designed"
         axes.plot(n, _shown([p.designed for p in one.curve]), "o-", color=colour, markersize=4, label=label)
         axes.fill_between(n, low, high, color=colour, alpha=0.12, linewidth=0)
         axes.plot(n, middle, "--", color=colour, linewidth=1.0)
-        if one.structure not in ("", "star"):
-            words = f"{one.structure}: {len(one.pairs if one.pairs is not None else ())} pairs, chosen"
-            axes.plot(one.n, _shown([one.expected.position]), "D", color=colour, markersize=6, markerfacecolor="none",
-                      label=f"{name}, {words}" if several else words)  # fmt: skip
     if first.target is not None:
         axes.axhline(first.target * 1e3, color="0.5", linewidth=0.9)
         axes.annotate(f"{first.target * 1e3:g} mm", (0.0, first.target * 1e3), (2, 3), fontsize=7, color="0.4",
