@@ -1,6 +1,6 @@
 """Is the error that `predict` expects the error that calibrated arms have?
 
-Command: python experiments/17_predict.py [--quick] [--seed N] [--draws N] [--processes N] [--out FOLDER]
+Command: python experiments/17_predict.py [--quick] [--seed N] [--draws N] [--workers N] [--out FOLDER]
 
 200 arms of the paper's scenario `space-robot` (distances and angles of a star of pairs near the board, predicted all
 over the workspace) and 200 of a UR10 (40 poses in an unknown frame, or in the base frame) are drawn within their
@@ -22,9 +22,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from arms import build_arms
+from draws import over_draws
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from space_robot import arguments_of, clean, over_draws, paper_scenario, write_json
+from space_robot import arguments_of, clean, paper_scenario, write_json
 
 import fg_calib
 from fg_calib import Noise, Robot, Scenario, pose
@@ -181,7 +182,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     found: dict[str, Any] = {"seed": given.seed, "cases": {}}
     for case in CASES:
         tasks = [Task(case, seed, n_at) for seed in range(given.seed, given.seed + given.draws)]
-        found["cases"][case] = summary(case, over_draws(one_draw, tasks, given.processes), n_at)
+        found["cases"][case] = summary(case, over_draws(one_draw, tasks, given.workers), n_at)
         found["seconds"] = time.perf_counter() - clock
         write_json(given.file, found)
     if not given.quick:
