@@ -26,7 +26,7 @@ from fg_calib.designs.criteria import Criterion
 from fg_calib.designs.cures import Cure, cures_of
 from fg_calib.designs.of_job import pool_of_more, pool_of_rows, solved
 from fg_calib.designs.order import shortest_way, travel
-from fg_calib.designs.plans import best_plan, of_used_points, other_pairs, with_best_hubs, with_names
+from fg_calib.designs.plans import OtherPairs, best_plan, of_used_points, other_pairs, with_best_hubs, with_names
 from fg_calib.designs.pool import Pool, drawn, pool_of
 from fg_calib.designs.search import Chosen, not_worse_than_random
 from fg_calib.designs.system import system_of
@@ -272,18 +272,10 @@ def design_from(
         target: What is to be reached, [m].
         criterion: What is made small.
     """
-    chooser, found, able = _choose(pool, task, generator, n, target, criterion)
+    choice = _choose(pool, task, generator, n, target, criterion)
     tell("working out what to expect")
-    others = other_pairs(pool, len(found.candidates), (criterion, task), generator)
-
-    def least(candidates: Integers) -> float:
-        return np.inf if others is None else others.least(able[candidates])
-
-    if target is not None and others is not None:
-        found = chooser.fewer(found, target, least)
-    chosen = able[found.candidates]
-    plan, pairings = best_plan(pool, chosen, task, others)
-    expected, curve = plan.posterior.error(task), chooser.curve(found, generator, len(pool.hubs), least)
+    plan, pairings = best_plan(pool, choice.stops, task, choice.others)
+    expected, curve = plan.posterior.error(task), choice.curve(generator, len(pool.hubs))
     before = pool.posterior(pool.given) if len(pool.given) or pool.before is not None else None
     ids = plan.names if pool.scenario is None else _new_names(len(plan.readings), pool.before)
     return Design(
@@ -310,9 +302,9 @@ def design_from(
         reached=target is None or (expected.position is not None and expected.position <= target * _JUST),
         observability=plan.posterior.observability,
         cures=cures_of(plan.posterior),
-        unknown=chooser.system.unknown,
+        unknown=choice.chooser.system.unknown,
         travel=travel(pool.robot, plan.readings),
-        travel_before=travel(pool.robot, pool.readings[chosen]),
+        travel_before=travel(pool.robot, pool.readings[choice.stops]),
     )
 
 
@@ -329,25 +321,58 @@ _JUST = 1.0 + 1e-6
 """A target is reached to rounding."""
 
 
+@dataclass(frozen=True)
+class _Choice:
+    """What was chosen.
+
+    Attributes:
+        chooser: What chose it.
+        found: Its candidates.
+        able: Which stop of the pool each of its candidates is.
+        others: Other ways to measure as many pairs; None where there are none.
+    """
+
+    chooser: Chooser
+    found: Chosen
+    able: Integers
+    others: OtherPairs | None
+
+    @property
+    def stops(self) -> Integers:
+        """The stops that were chosen."""
+        return self.able[self.found.candidates]
+
+    def of_others(self, candidates: Integers) -> float:
+        """Expected error of other pairs beside those of a star of some candidates, [m]; inf if there are none."""
+        return np.inf if self.others is None else self.others.least(self.able[candidates])
+
+    def curve(self, generator: np.random.Generator, hubs: int) -> tuple[CurvePoint, ...]:
+        """What to expect of fewer stops, and of as many; hubs count."""
+        return self.chooser.curve(self.found, generator, hubs, self.of_others)
+
+
 def _choose(
     pool: Pool, task: Task, generator: np.random.Generator, n: int | None, target: float | None, criterion: Criterion
-) -> tuple[Chooser, Chosen, Integers]:
-    """What chooses, what it chose, and which stops of the pool its candidates are."""
+) -> _Choice:
+    """So many stops, or as few as reach a target."""
     system = system_of(pool.rows, pool.known, task.form(pool.problem)).with_known(pool.given)
     able = np.setdiff1d(np.flatnonzero(np.any(pool.rows.rows, axis=(1, 2))), pool.given)
     if not len(able):
         raise InputError("candidates", "none at which anything is measured", "some")
-    hubs = len(pool.hubs)
     chooser = Chooser(system.select(able), criterion, _exactly(pool, task, able))
     tell("choosing")
     if target is None:
-        found = chooser.best(max(1, min((N_STOPS if n is None else n) - hubs, len(able))))
+        found = chooser.best(max(1, min((N_STOPS if n is None else n) - len(pool.hubs), len(able))))
     else:
         found = chooser.reaching(target)
     better = chooser.held(not_worse_than_random(chooser.measure, found, generator), generator)
     if target is not None and chooser.error(better.candidates) > max(target, chooser.error(found.candidates)):
         better = found  # better by its criterion, but no longer good enough
-    return chooser, better, able
+    others = other_pairs(pool, len(better.candidates), (criterion, task), generator)
+    choice = _Choice(chooser, better, able, others)
+    if target is None or others is None:
+        return choice
+    return replace(choice, found=chooser.fewer(better, target, choice.of_others))
 
 
 def _exactly(pool: Pool, task: Task, able: Integers) -> Callable[[Integers], float] | None:

@@ -376,7 +376,7 @@ def s(old, new):
 SCENARIOS = [
     (s("robot.yaml","''"), "scenario.yaml: robot: found '', expected a path, or the mapping of a robot file"),
     (s("robot.yaml","nowhere.yaml"), '{folder}/nowhere.yaml: no such file'),
-    (s("{uniform: {a: 0.01}}",""), 'scenario.yaml: errors: found nothing, expected a mapping'),
+    (s("{uniform: {a: 0.01}}","[]"), 'scenario.yaml: errors: found [], expected a mapping'),
     (s("{uniform: {a: 0.01}}","uniform"), "scenario.yaml: errors: found 'uniform', expected a mapping"),
     (s("{uniform: {a: 0.01}}","{normal: tolerance}"), 'scenario.yaml: errors: normal: a1 of the robot has no tolerance, expected one for all that is estimated'),
     (s("{a: 0.01}","{a: 0,01}"), 'scenario.yaml:2: key 01, expected a word; is it a decimal comma? numbers have a decimal point'),
