@@ -14,7 +14,11 @@ from spatialmath import SE3, Twist3
 
 
 class Robotkinecal(protocol.Peer):
-    """Its one way. Axes and the zero pose are free, so frames that are not known need no unknowns of their own."""
+    """Its one way.
+
+    Axes and the zero pose are free, so frames that are not known need no unknowns of their own. Poses are brought to
+    where the base is at the start, as it wants them in the base frame: its residuals are twists about the origin.
+    """
 
     @staticmethod
     def unable(work: dict) -> str | None:
@@ -24,12 +28,13 @@ class Robotkinecal(protocol.Peer):
     def __init__(self, work: dict) -> None:
         np.random.seed(0)  # noqa: NPY002 - it draws the basis of its parameters from the global generator
         with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "arm.urdf"
-            path.write_text(chain.urdf(work["values"]))
+            path, values = Path(folder) / "arm.urdf", work["values"].copy()
+            self.base, values[:6] = chain.frame_matrix(values[:6]), 0.0
+            path.write_text(chain.urdf(values))
             self.calibration = SerialRobotKineCal(roboticstoolbox.ERobot.URDF(str(path)), ee_name="tool")
         T = np.tile(np.eye(4), (len(work["q"]), 1, 1))
         T[:, :3, :3], T[:, :3, 3] = work["rotation"], work["position"]
-        self.calibration.set_observations(list(work["q"]), [SE3(t, check=False) for t in T])
+        self.calibration.set_observations(list(work["q"]), [SE3(t, check=False) for t in np.linalg.inv(self.base) @ T])
 
     def solve(self) -> None:
         """With its defaults; it takes no weights."""
@@ -44,7 +49,7 @@ class Robotkinecal(protocol.Peer):
             for axis, angle in zip(axes, row, strict=True):
                 there = there @ Twist3(axis).exp(angle).A
             T.append(there @ last)
-        T = np.array(T)
+        T = self.base @ np.array(T)
         return T[:, :3, 3], T[:, :3, :3]
 
     def says(self, q: np.ndarray) -> dict:
