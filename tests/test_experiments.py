@@ -392,7 +392,7 @@ def test_a_peer_that_takes_too_long_or_does_not_install_says_so(tmp_path):
     work.write(tmp_path / "work.npz")
     slow = next(peer for peer in peers.PEERS if peer.name == "scipy, finite differences")
     found = peers.run_peer(slow, Path(sys.executable), tmp_path / "work.npz", 1, cap=1e-4)
-    assert peers.judged(work, found)["reason"] == "more than 0.0001 s"
+    assert peers.judged(work, found)["reason"] == "ended after 0.0001 s"
     python, reason = peers.environment(("peer==1.0",), tmp_path, versions=((2, 0), (2, 7)))
     assert python is None
     assert reason == "no Python 2.0 to 2.7 found"
@@ -405,8 +405,8 @@ def test_the_peers_on_record_are_as_the_ledger_says():
     for work in ("poses", "pairs", "many", "real"):
         ours = found["works"][work]["fg_calib, calibrate()"]
         assert ours["over optimum"][f"position {peers.HOW[work]}"] < 1.02, work
-        others = [row for name, row in found["works"][work].items() if name.startswith(("figaroh", "robot", "pybot"))]
-        assert all(row["over optimum"][f"position {peers.HOW[work]}"] > 0.98 for row in others if row["draws"])
+    # The median over some 20 parameters of spreads over 20 draws, each of which chance moves by 16 %.
+    assert found["works"]["repeats"]["fg_calib, calibrate()"]["spread over sigma"][1] == pytest.approx(1.0, abs=0.2)
 
 
 def test_fleet_quick_has_a_result_of_every_job(tmp_path):
