@@ -12,9 +12,8 @@ what is called of each in `side_by_side/in_*.py`. Packages are installed into vi
 work, says why. Every process has one BLAS thread, and about `--cap` seconds of processors for a work. On a machine that
 others use read the processor time: the clock counts what they did.
 
-Expected: fg_calib at the optimum on every work; figaroh within 15 % of it on absolute poses in 0.3 to 0.7 s;
-robotkinecal 1.6 and pybotics 1.6 to 1.9 times the optimum; numpy by hand as good, and quicker than `calibrate()`, which
-also judges.
+Expected: fg_calib within 1 % of the optimum on every work; figaroh within 10 % of it, 0.4 s for 60 poses; robotkinecal
+1.2 to 1.4 times and pybotics 1.0 (distances) to 1.5 times the optimum; numpy by hand as good, and quicker than ours.
 
 `--quick` runs what needs no other package, on one draw of poses and of pairs.
 """
