@@ -32,6 +32,7 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -45,14 +46,15 @@ from scipy import special
 from fg_calib.analysis.covariance import Spread
 from fg_calib.analysis.gross_errors import MOST_FEW, find_gross_errors
 from fg_calib.analysis.low_rank import Dense, LowRank
-from fg_calib.analysis.residual_covariance import Errors, Nuisances
+from fg_calib.analysis.residual_covariance import Errors, Nuisances, half_of
 from fg_calib.analysis.residual_table import ResidualTable
 from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.factors import prior_rows
-from fg_calib.graph.noise import JOINT_NOISE, NoiseName
+from fg_calib.graph.noise import JOINT_NOISE, NoiseName, RowNoise
 from fg_calib.graph.problem import noises_at
 from fg_calib.graph.robust import tuning, weight
 from fg_calib.graph.solver import Solution
+from fg_calib.measurements.residuals import squares_along
 from fg_calib.robot.kinematics import SPAN
 
 Floats = NDArray[np.float64]
@@ -309,15 +311,18 @@ def suspect_level(n: int) -> float:
     return float(special.ndtri(0.5 + 0.5 * (1.0 - ALARM) ** (1.0 / max(1, n))))
 
 
-def judge_fit(solution: Solution, spread: Spread, table: ResidualTable) -> Goodness:
+def judge_fit(
+    solution: Solution, spread: Spread, table: ResidualTable, noises: Sequence[RowNoise] | None = None
+) -> Goodness:
     """Goodness of fit by kind, by row and by configuration.
 
     Args:
         solution: The solution.
         spread: Its covariance.
         table: Its residuals.
+        noises: Its rows and their noise at the estimate and the readings, where these are there already.
     """
-    rows = _Rows(solution, spread, table)
+    rows = _Rows(solution, spread, table, noises)
     weight = rows.weight
     level = suspect_level(int(np.sum(table.reason_code == 0)))
     with np.errstate(invalid="ignore"):
@@ -450,12 +455,14 @@ class _Rows:
         predicted: The rows predicted that can be judged.
     """
 
-    def __init__(self, solution: Solution, spread: Spread, table: ResidualTable) -> None:
+    def __init__(
+        self, solution: Solution, spread: Spread, table: ResidualTable, noises: Sequence[RowNoise] | None = None
+    ) -> None:
         problem = self._problem = solution.problem
         self._table = table
         self._spread = spread
         self._solution = solution
-        self._noises = noises_at(problem, solution.parameters, at_readings=True)
+        self._noises = noises_at(problem, solution.parameters, at_readings=True) if noises is None else noises
         self._robust = problem.state.weights is not None
         self.weight = np.ones(table.n)
         for number, weights in enumerate(problem.state.weights or ()):
@@ -699,13 +706,20 @@ class _Rows:
         table = self._table
         nuisances = Nuisances(self._problem, self._solution.parameters, self._noises)
         self.leverage = np.full(table.n, np.nan)
-        kept = []
+        kept, half = [], half_of(self._spread.tangent)
+        asked = keep | table.test
         for number, noise in enumerate(self._noises):
             of_series = np.flatnonzero(table.series == number)
             for start in range(0, noise.rows.n, _CHUNK):
                 chunk = np.arange(start, min(start + _CHUNK, noise.rows.n))
                 first, last = np.searchsorted(table.measurement[of_series], (start, start + len(chunk)))
                 rows = of_series[first:last]
+                if nuisances.none_in(number) and not asked[rows].any():  # they follow from the core and own noise alone
+                    place = (table.measurement[rows] - start, table.row[rows])
+                    squares = squares_along(noise.rows_at(chunk), nuisances.chain(number), half)[place]
+                    own = np.einsum("nii->ni", noise.own[chunk])[place]
+                    self.leverage[rows] = (squares + np.maximum(own, 0.0)) / table.sigma[rows] ** 2 - 1.0
+                    continue
                 grid = (table.measurement[rows] - start) * noise.rows.residual_dim + table.row[rows]
                 found = nuisances.errors(number, chunk).at(grid).over(table.sigma[rows])
                 leverage = np.einsum("ij,ij->i", found.J @ self._spread.tangent, found.J)
@@ -713,7 +727,7 @@ class _Rows:
                 self.leverage[rows] = leverage + np.sum(found.own**2, axis=1) + (found.of_noise - 1.0)
                 kept.append(found.at(np.flatnonzero(keep[rows])))
         self.leverage[~np.isfinite(self.leverage)] = np.nan
-        return Errors.of_all(kept)
+        return Errors.of_all(kept or [nuisances.nothing()])
 
     def _residual_covariance(self, fitted: Integers, found: Errors) -> LowRank | Dense:
         """Of the fitted rows, from what they follow from."""

@@ -13,6 +13,7 @@ from scipy import special
 
 from fg_calib.analysis.gross_errors import CHANCE, MOST_FEW
 from fg_calib.arrays import FrozenArrays
+from fg_calib.graph.noise import RowNoise
 from fg_calib.graph.problem import noises_at
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements.dataset import Labels
@@ -305,11 +306,16 @@ class ResidualTable(FrozenArrays):
         return first
 
 
-def residual_table(solution: Solution) -> ResidualTable:
-    """Every scalar residual, train and test, with the arm at nominal and at the estimate."""
+def residual_table(solution: Solution, after: Sequence[RowNoise] | None = None) -> ResidualTable:
+    """Every scalar residual, train and test, with the arm at nominal and at the estimate.
+
+    Args:
+        solution: The solution.
+        after: Its rows and their noise at the estimate and the readings, where these are there already.
+    """
     problem = solution.problem
-    before = noises_at(problem, solution.before, at_readings=True)
-    after = noises_at(problem, solution.parameters, at_readings=True)
+    before = [noise.residual() for noise in noises_at(problem, solution.before, at_readings=True)]
+    after = noises_at(problem, solution.parameters, at_readings=True) if after is None else after
     kinds: dict[RowKind, int] = {}
     reasons, labels = [""], {"": 0}
     columns: list[dict[str, NDArray[Any]]] = []
@@ -338,7 +344,7 @@ def residual_table(solution: Solution) -> ResidualTable:
                 "test": s.test[of],
                 "reason_code": excluded[of],
                 "measured": checked_figures(s.kind, s.data, s.source)[of, row],
-                "before": old.residual()[of, row],
+                "before": old[of, row],
                 "after": new.residual()[of, row],
                 "excess": new.excess[of, row],
                 "sigma": new.sigma[of, row],

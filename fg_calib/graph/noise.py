@@ -23,9 +23,19 @@ from fg_calib.measurements.dataset import Measurements, rotation_angle
 from fg_calib.measurements.frames import nearest_rotation
 from fg_calib.measurements.kinds import Distance, RotationAngle
 from fg_calib.measurements.moments import Moments, angle_moments, length_moments
-from fg_calib.measurements.residuals import Block, pack
+from fg_calib.measurements.residuals import Block, unit_whitening
 from fg_calib.measurements.series import Series
-from fg_calib.robot.kinematics import SPAN, Chain, Poses, common_axes, forward, turning_of_base, turning_of_points
+from fg_calib.robot.kernels import whiten_small
+from fg_calib.robot.kinematics import (
+    SPAN,
+    Chain,
+    Poses,
+    common_axes,
+    forward,
+    over_spans,
+    turning_of_base,
+    turning_of_points,
+)
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -204,8 +214,10 @@ class RowNoise:
 
     def _block(self, data: Floats, slope: Floats | None = None) -> Block:
         s, p = self.series, self.place
-        unit = np.tile(np.eye(s.kind.residual_dim), (s.n, 1, 1)) if slope is None else self._diagonal(slope)
-        return Block(s.kind, p.trig, s.ends, data, pack(unit), p.coordinates[s.nuisances], s.source)
+        whitening = unit_whitening(s.n, s.kind.residual_dim)
+        if slope is not None:
+            whitening[:, np.cumsum(np.arange(1, s.kind.residual_dim + 1)) - 1] = slope
+        return Block(s.kind, p.trig, s.ends, data, whitening, p.coordinates[s.nuisances], s.source)
 
     def _of_joints(self, rows: Block) -> tuple[Source, ...]:
         p, s = self.place, self.series
@@ -228,7 +240,6 @@ class PairNoise(RowNoise):
     """The same of distances and angles of pairs, whose vectors noise lengthens (see `moments`).
 
     Attributes:
-        moments: Mean and variance of each distance and angle under the noise of its vector, shapes (n, 2).
         predicted: Distance and angle as the arm predicts them, shape (n, 2).
     """
 
@@ -248,23 +259,36 @@ class PairNoise(RowNoise):
         self._own = np.nan_to_num(self._formed_variance() if s.formed else stated) * wide**2
         joints = self._of_joints(plain)
         linear = self._wide(sum((source.variance for source in joints), np.zeros((s.n, 1, 1))))
-        self.moments = self._moments(linear)
-        slope = self._narrow(np.maximum(self.moments.slope, LEAST_SLOPE))
-        self.excess = self._narrow(self.moments.excess)
-        predicted = self._narrow(self.predicted)
-        data = s.data + (predicted - s.data) * (1.0 - 1.0 / slope) - self.excess / slope
-        self.rows = self._block(np.ascontiguousarray(data), slope)
-        true = self._narrow(self.moments.slope)[:, :, None, None]
-        self.sources = tuple(source._replace(loading=source.loading * true) for source in joints)
-        of_poses = self._narrow(self.moments.slope**2 * self._own) if s.formed else 0.0
-        of_joints = 0.0 if self.place.joints_estimated else self._diagonals(self.sources)
-        direct = 0.0 if s.formed else self._narrow(self.moments.slope**2 * self._own)
-        variance = self._narrow(self.moments.variance)
-        self._bent_variance = np.maximum(variance - of_poses - direct - of_joints, 0.0)
+        bending, of_joints = self._bending(), self._joint_trace()
+        data, slope = np.empty(s.data.shape), np.empty(s.data.shape)
+        variance, self._slope = np.empty(s.data.shape), np.empty((s.n, 2))
+
+        def run(start: int, stop: int) -> None:
+            rows = slice(start, stop)
+            moments = self._moments(rows, linear[rows], bending[rows], of_joints)
+            self._slope[rows], self.excess[rows] = moments.slope, moments.excess[:, self._parts]
+            slope[rows] = np.maximum(moments.slope, LEAST_SLOPE)[:, self._parts]
+            predicted, variance[rows] = self.predicted[rows][:, self._parts], moments.variance[:, self._parts]
+            data[rows] = s.data[rows] + (predicted - s.data[rows]) * (1.0 - 1.0 / slope[rows])
+            data[rows] -= self.excess[rows] / slope[rows]
+
+        for _ in over_spans(run, s.n):
+            pass
+        self.rows = self._block(data, slope)
+        true = self._narrow(self._slope)
+        self.sources = tuple(source._replace(loading=source.loading * true[:, :, None, None]) for source in joints)
+        of_measured, zero = true**2 * self._narrow(self._own), np.zeros(s.data.shape)
+        of_joints = zero if self.place.joints_estimated else self._diagonals(self.sources)
+        self._bent_variance = np.maximum(variance - of_measured - of_joints, 0.0)
+        left = variance - of_joints
         if s.formed:
             self.sources += (self._of_poses(),)
-        left = variance - of_joints - of_poses - 0.5 * self._bent_variance * s.formed
+            left = left - of_measured - 0.5 * self._bent_variance
         self.own = self._diagonal(left)
+
+    def residual(self) -> Floats:
+        """Of all rows, shape (n, residual_dim), [m] and [rad]."""
+        return self._narrow(self.predicted) - self.series.data + self.excess
 
     def more_if_redundant(self, shared: frozenset[str]) -> Floats | float:
         """What is added to the diagonal of `own` where there are more rows than errors that they share."""
@@ -346,20 +370,28 @@ class PairNoise(RowNoise):
         zero = np.zeros((self.series.n, self.series.kind.residual_dim))
         return sum((np.einsum("nii->ni", source.variance) for source in sources), zero)
 
-    def _moments(self, of_joints: Floats) -> Moments:
-        """Mean and variance of each distance and angle, shapes (n, 2); of no meaning where not wanted."""
+    def _moments(self, rows: slice, linear: Floats, bending: Floats, of_joints: Floats) -> Moments:
+        """Mean and variance of each distance and angle, shapes (n, 2); of no meaning where not wanted.
+
+        Args:
+            rows: The pairs.
+            linear: Variance of each distance and angle by joint noise, to first order, shape (n, 2).
+            bending: From `_bending`, shape (n, 2).
+            of_joints: From `_joint_trace`.
+        """
         s, m, factors = self.series, self.place.measurements, self._both**2
-        along, trace, own = np.zeros((s.n, 2)), np.zeros((s.n, 2)), self._own
+        ends, own = s.ends[rows], self._own[rows]
+        along, trace = np.zeros_like(own), np.zeros_like(own)
         if s.formed:
-            along, own = self._own, np.zeros_like(self._own)
-            trace = np.stack([_trace(m.sigma_position, s.ends), _trace(m.sigma_orientation, s.ends)], axis=1) * factors
-        if len(self.place.joints) and not self.place.joints_estimated:
-            along = along + of_joints
-            trace = trace + self._joint_trace() * self.joint_factor**2
-        across = np.maximum(trace - along, 0.0) / 2.0 + self._bending()
+            along, own = own, np.zeros_like(own)
+            trace = np.stack([_trace(m.sigma_position, ends), _trace(m.sigma_orientation, ends)], axis=1) * factors
+        if len(of_joints):
+            along = along + linear
+            trace = trace + of_joints[ends].sum(axis=1)
+        across = np.maximum(trace - along, 0.0) / 2.0 + bending
         along, across, own = (np.where(self._wanted, v, 0.0) for v in (along, across, own))
         found = [
-            of(self.predicted[:, k], along[:, k], across[:, k], own[:, k])
+            of(self.predicted[rows, k], along[:, k], across[:, k], own[:, k])
             for k, of in enumerate((length_moments, angle_moments))
         ]
         return Moments(*(np.stack(pair, axis=1) for pair in zip(*map(astuple, found), strict=True)))
@@ -403,7 +435,7 @@ class PairNoise(RowNoise):
         bent = np.sqrt(self._bent_variance)
         for i, k in enumerate(self._parts):
             sigma = (m.sigma_position, m.sigma_orientation)[k]
-            slope = self.moments.slope[:, k, None, None]
+            slope = self._slope[:, k, None, None]
             if sigma is not None:
                 G[:, i, :, i, :3] = self._both[k] * slope * sign * self._directions[k][:, None] * sigma[s.ends]
             G[:, i, :, i, 3] = -0.5 * bent[:, i, None]
@@ -417,7 +449,7 @@ class PairNoise(RowNoise):
         """
         if self._spread is None:
             return np.zeros((self.series.n, 2))
-        return np.minimum(self._noticed(self._spread, LEAST_BEND), MOST_BEND * self._straight())
+        return np.minimum(self._noticed(self._spread, LEAST_BEND), MOST_BEND * self._straight(slice(None)))
 
     def _noticed(self, spread: Floats, sigmas: float) -> Floats:
         """Variance across where it bends a row by so many sigma, else 0, shape (n, 2).
@@ -427,21 +459,24 @@ class PairNoise(RowNoise):
         across, train = np.zeros((self.series.n, 2)), np.flatnonzero(~self.series.test)
         if not len(train):
             return across
-        least = sigmas * self._straight()
         most = 4.0 * self._spread_across(_evenly(train), spread).max(axis=0)
-        rows = np.flatnonzero(np.any(most >= least, axis=1))
-        for start in range(0, len(rows), SPAN):
-            chunk = rows[start : start + SPAN]
-            across[chunk] = self._spread_across(chunk, spread)
-        return np.where(across >= least, across, 0.0)
+        for start in range(0, self.series.n, SPAN):
+            rows = slice(start, start + SPAN)
+            least = sigmas * self._straight(rows)
+            near = np.flatnonzero(np.any(most >= least, axis=1))
+            if len(near):
+                found = self._spread_across(start + near, spread)
+                across[start + near] = np.where(found >= least[near], found, 0.0)
+        return across
 
-    def _straight(self) -> Floats:
+    def _straight(self, rows: slice) -> Floats:
         """Variance across that bends a row by one sigma, shape (n, 2); infinite where there is none to bend.
 
         Nearer to 0 than one sigma it is that of the noise itself.
         """
-        sigma = np.sqrt(self._own)
-        return np.where((self._own > 0.0) & self._wanted, sigma * np.maximum(self.predicted, sigma), np.inf)
+        own, predicted = self._own[rows], self.predicted[rows]
+        sigma = np.sqrt(own)
+        return np.where((own > 0.0) & self._wanted, sigma * np.maximum(predicted, sigma), np.inf)
 
     def _spread_across(self, rows: Integers, spread: Floats) -> Floats:
         """What `_bending` is about at `rows`, shape (n, 2)."""
@@ -475,12 +510,15 @@ class PairNoise(RowNoise):
         return np.maximum(everything - along, 0.0) / 2.0, along
 
     def _joint_trace(self) -> Floats:
-        """Variance that joint noise gives each vector, all directions together, shape (n, 2)."""
+        """Variance that joint noise gives each vector at one end, all directions together, shape (n_configurations, 2).
+
+        No rows where there is none, or where true joint values are estimated.
+        """
+        if self.place.joints_estimated or not len(self.place.joints):
+            return np.zeros((0, 2))
         J = forward(self.place.chain.without_columns().with_joint_columns(), self.place.trig).jacobian
-        J = J * self.place.measurements.sigma_joint
-        of_each = np.stack([np.sum(J[:, 3:] ** 2, axis=(1, 2)), np.sum(J[:, :3] ** 2, axis=(1, 2))], axis=1)
-        both: Floats = of_each[self.series.ends].sum(axis=1)
-        return both
+        J = J * self.place.measurements.sigma_joint * self.joint_factor
+        return np.stack([np.sum(J[:, 3:] ** 2, axis=(1, 2)), np.sum(J[:, :3] ** 2, axis=(1, 2))], axis=1)
 
 
 _QUANTITY: dict[type, int] = {Distance: 0, RotationAngle: 1}
@@ -500,15 +538,14 @@ def whitening_of(covariance: Floats, used: Booleans) -> Floats:
         covariance: S, shape (n, residual_dim, residual_dim).
         used: Shape (n, residual_dim).
     """
-    residual_dim = used.shape[1]
-    if residual_dim == 1:
+    if used.shape[1] == 1:
         with np.errstate(divide="ignore"):
             return np.where(used[:, :, None], 1.0 / np.sqrt(covariance), 0.0)
-    if not used.all():
-        both = used[:, :, None] & used[:, None, :]
-        covariance = np.where(both, covariance, np.eye(residual_dim))
-    W: Floats = np.tril(np.linalg.inv(np.linalg.cholesky(covariance)))
-    return W if used.all() else W * used[:, :, None]
+    W = np.empty(covariance.shape)
+    C, mine = (np.require(given, requirements=["C", "W"]) for given in (covariance, used))  # as the kernel takes them
+    if not all(over_spans(lambda start, stop: whiten_small(C, mine, start, stop, W), len(used))):
+        raise np.linalg.LinAlgError("Matrix is not positive definite")
+    return W
 
 
 def _evenly(rows: Integers) -> Integers:

@@ -13,6 +13,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from hashlib import sha256
 
 import numpy as np
 import scipy.sparse
@@ -29,6 +31,9 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Booleans = NDArray[np.bool_]
 Sparse = scipy.sparse.csr_array
+
+REMEMBERED = 4
+"""Triangles of a set of rows that are kept: many ask what rows say at the start, at nominal and at the estimate."""
 
 LEAST_WEIGHT = 1e-12
 """A robust weight below this is taken for this."""
@@ -51,6 +56,13 @@ class At(Brief):
     columns: Integers
     n_columns: int
     n_nuisance: int
+
+    @cached_property
+    def mark(self) -> bytes:
+        """What tells it from others."""
+        arrays = [array for chain in self.chains for array in (*chain.arrays[:7], *chain.arrays[9:])]
+        marks = [array.tobytes() for array in (*arrays, self.coordinates, self.columns)]
+        return sha256(b"|".join([*marks, repr((self.n_columns, self.n_nuisance)).encode()])).digest()
 
     def without_columns(self) -> At:
         """The same without derivatives."""
@@ -137,6 +149,7 @@ class RowSet(Brief):
     configurations: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     joints: int = 0
     spare: Sparse | None = None
+    _triangles: dict[bytes, Floats] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
     def n_rows(self) -> int:
@@ -175,7 +188,14 @@ class RowSet(Brief):
         return float(r @ r)
 
     def triangle(self, at: At) -> Floats:
-        """R of a thin QR of [J r], shape (n_columns + n_nuisance + 1,) * 2."""
+        """R of a thin QR of [J r], shape (n_columns + n_nuisance + 1,) * 2; the last ones are remembered."""
+        if at.mark not in self._triangles:
+            for mark in list(self._triangles)[: 1 - REMEMBERED]:
+                self._triangles.pop(mark, None)
+            self._triangles[at.mark] = self._triangle(at)
+        return self._triangles[at.mark].copy()
+
+    def _triangle(self, at: At) -> Floats:
         if self._kernel_alone:
             return _padded(residuals.triangle(self.parts[0].block, at.chains[self.parts[0].table]), at.n_nuisance)
         chunks = self.parts[0].linearise(at) if self._one_by_one else iter([self._whitened(at)])
