@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -49,6 +49,10 @@ def calibrate(
     figures: Annotated[
         bool, typer.Option("--figures", help="Write the page's figures there too, as SVG files.")
     ] = False,
+    residuals: Annotated[
+        Literal["csv", "parquet", "none"],
+        typer.Option("--residuals", help="How single residuals are written: of millions of rows a CSV is large."),
+    ] = "csv",
     workers: _Workers = None,
     scheduler: _Scheduler = None,
     as_json: Json = False,
@@ -63,7 +67,7 @@ def calibrate(
         raise typer.BadParameter("is of this machine: either this or --scheduler", param_hint="--workers")
     if len(jobs) == 1:
         with _executor(workers, scheduler) as executor:
-            _calibrate_one(Order("", jobs[0], out, folds, report, figures), executor, as_json)
+            _calibrate_one(Order("", jobs[0], out, folds, report, figures, residuals), executor, as_json)
         return
     names = job_names(jobs)
     if out is not None:
@@ -71,7 +75,7 @@ def calibrate(
     if scheduler is not None:  # whose workers run elsewhere
         jobs, out = [job.absolute() for job in jobs], None if out is None else out.absolute()
     orders = [
-        Order(name, job, None if out is None else out / name, folds, report, figures)
+        Order(name, job, None if out is None else out / name, folds, report, figures, residuals)
         for name, job in zip(names, jobs, strict=True)
     ]
     with _executor(workers, scheduler) as executor:

@@ -10,8 +10,8 @@ measured, with its slope and variance (see `moments`). At given parameters that 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import astuple, dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import astuple, dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -212,12 +212,10 @@ class RowNoise:
         """Some of the rows, not whitened."""
         return residuals.rows_of(self.rows, rows)
 
-    def _block(self, data: Floats, slope: Floats | None = None) -> Block:
+    def _block(self, data: Floats) -> Block:
         s, p = self.series, self.place
-        whitening = unit_whitening(s.n, s.kind.residual_dim)
-        if slope is not None:
-            whitening[:, np.cumsum(np.arange(1, s.kind.residual_dim + 1)) - 1] = slope
-        return Block(s.kind, p.trig, s.ends, data, whitening, p.coordinates[s.nuisances], s.source)
+        unit = unit_whitening(s.n, s.kind.residual_dim)
+        return Block(s.kind, p.trig, s.ends, data, unit, p.coordinates[s.nuisances], s.source)
 
     def _of_joints(self, rows: Block) -> tuple[Source, ...]:
         p, s = self.place, self.series
@@ -252,39 +250,45 @@ class PairNoise(RowNoise):
         wide[self._parts] = self.factors
         self._both = wide  # factors of distance and angle
         plain = self._block(s.data)
-        self.predicted = np.zeros((s.n, 2))
-        self.predicted[:, self._parts] = residuals.residual(plain, self.place.chain) + s.data
-        stated = np.zeros((s.n, 2))
-        stated[:, self._parts] = s.sigma**2
-        self._own = np.nan_to_num(self._formed_variance() if s.formed else stated) * wide**2
+        self.predicted, self._own = np.zeros((s.n, 2)), np.zeros((s.n, 2))
+        r = residuals.residual(plain, self.place.chain)
+
+        def predict(rows: slice) -> None:
+            self.predicted[rows, self._parts] = r[rows] + s.data[rows]
+            if not s.formed:
+                self._own[rows, self._parts] = np.nan_to_num(s.sigma[rows]) ** 2 * self.factors**2
+
+        _over_rows(predict, s.n)
+        if s.formed:
+            self._own = np.nan_to_num(self._formed_variance()) * wide**2
         joints = self._of_joints(plain)
         linear = self._wide(sum((source.variance for source in joints), np.zeros((s.n, 1, 1))))
         bending, of_joints = self._bending(), self._joint_trace()
-        data, slope = np.empty(s.data.shape), np.empty(s.data.shape)
-        variance, self._slope = np.empty(s.data.shape), np.empty((s.n, 2))
+        data, whitening, true = np.empty(s.data.shape), np.zeros(plain.whitening.shape), np.empty(s.data.shape)
+        d = np.arange(s.kind.residual_dim)
+        self.own = np.zeros((s.n, len(d), len(d)))
+        self._bent_variance = np.zeros(s.data.shape if s.formed else (0, len(d)))
 
-        def run(start: int, stop: int) -> None:
-            rows = slice(start, stop)
+        def bend(rows: slice) -> None:
             moments = self._moments(rows, linear[rows], bending[rows], of_joints)
-            self._slope[rows], self.excess[rows] = moments.slope, moments.excess[:, self._parts]
-            slope[rows] = np.maximum(moments.slope, LEAST_SLOPE)[:, self._parts]
-            predicted, variance[rows] = self.predicted[rows][:, self._parts], moments.variance[:, self._parts]
-            data[rows] = s.data[rows] + (predicted - s.data[rows]) * (1.0 - 1.0 / slope[rows])
-            data[rows] -= self.excess[rows] / slope[rows]
+            true[rows], self.excess[rows] = moments.slope[:, self._parts], moments.excess[:, self._parts]
+            slope, off = np.maximum(true[rows], LEAST_SLOPE), self.predicted[rows, self._parts] - s.data[rows]
+            data[rows] = s.data[rows] + off * (1.0 - 1.0 / slope) - self.excess[rows] / slope
+            whitening[rows, np.cumsum(d + 1) - 1] = slope
+            left = moments.variance[:, self._parts].copy()
+            if not self.place.joints_estimated:
+                left -= true[rows] ** 2 * self._diagonals(joints, rows)
+            if s.formed:
+                of_measured = true[rows] ** 2 * self._own[rows, self._parts]
+                self._bent_variance[rows] = np.maximum(left - of_measured, 0.0)
+                left -= of_measured + 0.5 * self._bent_variance[rows]
+            self.own[rows, d, d] = left
 
-        for _ in over_spans(run, s.n):
-            pass
-        self.rows = self._block(data, slope)
-        true = self._narrow(self._slope)
+        _over_rows(bend, s.n)
+        self.rows = replace(plain, data=data, whitening=whitening)
         self.sources = tuple(source._replace(loading=source.loading * true[:, :, None, None]) for source in joints)
-        of_measured, zero = true**2 * self._narrow(self._own), np.zeros(s.data.shape)
-        of_joints = zero if self.place.joints_estimated else self._diagonals(self.sources)
-        self._bent_variance = np.maximum(variance - of_measured - of_joints, 0.0)
-        left = variance - of_joints
         if s.formed:
-            self.sources += (self._of_poses(),)
-            left = left - of_measured - 0.5 * self._bent_variance
-        self.own = self._diagonal(left)
+            self.sources += (self._of_poses(true),)
 
     def residual(self) -> Floats:
         """Of all rows, shape (n, residual_dim), [m] and [rad]."""
@@ -366,9 +370,11 @@ class PairNoise(RowNoise):
         out[:, self._parts] = np.einsum("nii->ni", covariance)
         return out
 
-    def _diagonals(self, sources: tuple[Source, ...]) -> Floats:
-        zero = np.zeros((self.series.n, self.series.kind.residual_dim))
-        return sum((np.einsum("nii->ni", source.variance) for source in sources), zero)
+    def _diagonals(self, sources: tuple[Source, ...], rows: slice) -> Floats:
+        """What sources add to the variance of some rows, shape (n, residual_dim)."""
+        some = [source._replace(ends=source.ends[rows], loading=source.loading[rows]) for source in sources]
+        zero = np.zeros(self.series.data[rows].shape)
+        return sum((np.einsum("nii->ni", source.variance) for source in some), zero)
 
     def _moments(self, rows: slice, linear: Floats, bending: Floats, of_joints: Floats) -> Moments:
         """Mean and variance of each distance and angle, shapes (n, 2); of no meaning where not wanted.
@@ -422,12 +428,15 @@ class PairNoise(RowNoise):
         measured, p = m.position[~m.test], self._poses.position[~m.test]
         return nearest_rotation((measured - measured.mean(axis=0)).T @ (p - p.mean(axis=0)))
 
-    def _of_poses(self) -> Source:
+    def _of_poses(self, slopes: Floats) -> Source:
         """How the rows follow from the errors of the measured poses that the pairs were formed from.
 
         Of each kind a pose has three errors, along the axes, and a fourth, the square of its errors across: the latter
         lengthen all pairs of the pose. Of what the squares at both ends add to the variance of a pair half is theirs,
         a quarter at either end, and half that of their product, the pair's own.
+
+        Args:
+            slopes: Of the mean of each row, shape (n, residual_dim).
         """
         m, s, n_parts = self.place.measurements, self.series, len(self._parts)
         G = np.zeros((s.n, n_parts, 2, n_parts, 4))  # row, quantity, end, its source, (axes, square)
@@ -435,7 +444,7 @@ class PairNoise(RowNoise):
         bent = np.sqrt(self._bent_variance)
         for i, k in enumerate(self._parts):
             sigma = (m.sigma_position, m.sigma_orientation)[k]
-            slope = self._slope[:, k, None, None]
+            slope = slopes[:, i, None, None]
             if sigma is not None:
                 G[:, i, :, i, :3] = self._both[k] * slope * sign * self._directions[k][:, None] * sigma[s.ends]
             G[:, i, :, i, 3] = -0.5 * bent[:, i, None]
@@ -546,6 +555,12 @@ def whitening_of(covariance: Floats, used: Booleans) -> Floats:
     if not all(over_spans(lambda start, stop: whiten_small(C, mine, start, stop, W), len(used))):
         raise np.linalg.LinAlgError("Matrix is not positive definite")
     return W
+
+
+def _over_rows(run: Callable[[slice], None], n: int) -> None:
+    """Work out something of n rows in spans, so that what it takes on the way stays in the processor's cache."""
+    for _ in over_spans(lambda start, stop: run(slice(start, stop)), n):
+        pass
 
 
 def _evenly(rows: Integers) -> Integers:

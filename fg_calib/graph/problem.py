@@ -353,6 +353,25 @@ def reweighted_at(problem: Problem, parameters: Floats, state: NoiseState | None
     return assembled(problem, parameters, state)
 
 
+def some_rows(problem: Problem, share: float) -> Problem | None:
+    """The same problem with some of its train rows, drawn evenly, whitened at its start.
+
+    Args:
+        problem: The problem.
+        share: Which share of each series.
+
+    Returns:
+        None where single rows count for more than others do: where they have robust weights, or depend on unknowns of
+        their own.
+    """
+    if problem.variables.nuisance or problem.options.loss != "none" or problem.state.weights is not None:
+        return None
+    rng, series = np.random.default_rng(0), []
+    for s in problem.data.series:
+        series.append(s.select(np.sort(rng.permutation(s.train)[: round(share * len(s.train))])))
+    return assembled(replace(problem, data=replace(problem.data, series=tuple(series))), problem.start)
+
+
 def started_at(problem: Problem, start: Floats) -> Problem:
     """The same problem, its rows as they are whitened, with another start: a parameter vector."""
     return replace(problem, start=start, initial=problem.variables.values(start))

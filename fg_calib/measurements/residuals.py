@@ -90,8 +90,8 @@ def unpack(whitening: Floats, residual_dim: int) -> Floats:
 
 
 def unit_whitening(n: int, residual_dim: int) -> Floats:
-    """For rows that are not whitened."""
-    return np.tile(pack(np.eye(residual_dim)[None]), (n, 1))
+    """For rows that are not whitened; all of them are the same in memory."""
+    return np.broadcast_to(pack(np.eye(residual_dim)[None]), (n, residual_dim * (residual_dim + 1) // 2))
 
 
 def rows_of(block: Block, rows: slice | Integers) -> Block:
@@ -213,7 +213,7 @@ def _panels(block: Block, chain: Chain, start: int, stop: int) -> Iterator[tuple
         width = -(-(last - first) // LANES) * LANES
         panel = whole if width == size else np.zeros((*whole.shape[:2], width))
         ends = np.ascontiguousarray(block.ends[first:last])
-        data, whitening = (np.ascontiguousarray(a[first:last]) for a in (block.data, block.whitening))
+        data, whitening = (np.array(a[first:last], order="C") for a in (block.data, block.whitening))
         given = _NOTHING if len(twins) else _given(block, free, slice(first, last))
         fill(arrays, block.trig, ends, data, whitening, twins, given, _turning(block, chain, ends), panel)
         yield first, last, panel
