@@ -350,7 +350,7 @@ def residual_table(solution: Solution, after: Sequence[RowNoise] | None = None) 
                 "sigma": new.sigma[of, row],
             }
         )
-    together = {name: np.concatenate([c[name] for c in columns]) for name in columns[0]}
+    together = {name: np.concatenate([c.pop(name) for c in columns]) for name in list(columns[0])}  # never all twice
     return ResidualTable(
         kinds=tuple(kinds),
         names=problem.data.names,
