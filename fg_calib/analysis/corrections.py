@@ -147,9 +147,9 @@ def _beyond(names: tuple[str, ...], z: Floats, A: Floats, n_parameters: int) -> 
     while left and np.abs(rest).max() < _NO_CORRECTION:
         found = []
         for name, rows in left.items():
-            values, V = np.linalg.eigh(C[np.ix_(rows, rows)])
-            square = float(np.sum((V.T @ rest[rows]) ** 2 / np.maximum(values, LEAST_SIGMA**2)))
             if np.linalg.norm(rest[rows]) > LEAST:
+                values, V = np.linalg.eigh(C[np.ix_(rows, rows)])
+                square = float(np.sum((V.T @ rest[rows]) ** 2 / np.maximum(values, LEAST_SIGMA**2)))
                 found.append((float(special.gammaincc(len(rows) / 2.0, square / 2.0)), -square, name))
         if not found or min(found)[0] >= level:
             return

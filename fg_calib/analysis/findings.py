@@ -36,7 +36,7 @@ from fg_calib.analysis.verdict import (
     of_test,
     of_tolerances,
 )
-from fg_calib.graph.noise import JOINT_NOISE, PairNoise, RowNoise
+from fg_calib.graph.noise import JOINT_NOISE, PairNoise
 from fg_calib.graph.problem import at_parameters
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements.kinds import AnchorContact
@@ -101,13 +101,7 @@ class Verdict:
     change: Change | None = None
 
 
-def judge(
-    solution: Solution,
-    spread: Spread,
-    fit: Fit,
-    missing: Sequence[MissingMotion],
-    noises: Sequence[RowNoise],
-) -> Verdict:
+def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[MissingMotion]) -> Verdict:
     """The verdict on a solution.
 
     Args:
@@ -115,7 +109,6 @@ def judge(
         spread: The covariance of what was estimated.
         fit: How well it fits.
         missing: What the robot's convention has no parameter for.
-        noises: Its rows and their noise at the estimate and the readings.
     """
     problem, kinds = solution.problem, fit.goodness.kinds
     estimated_noise = solution.estimated_noise is not None
@@ -137,7 +130,7 @@ def judge(
         *of_test(fit.goodness.test, fit.chi2.ratio, problem.end_names),
         *of_priors(fit.priors),
         *_of_tolerances(solution, fit),
-        *_of_bent_rows(solution, spread, fit, noises),
+        *_of_bent_rows(solution, spread, fit.table, fit.goodness, too_large=fit.chi2.too_large),
         *_of_noise(solution, fit.table, fit.goodness),
     ]
     setup, structure = SetupCheck(), of_structure(noise_like)
@@ -176,7 +169,9 @@ def _of_tolerances(solution: Solution, fit: Fit) -> list[Statement]:
     return [] if found is None else of_tolerances(found.scales, _too_large(fit))
 
 
-def _of_bent_rows(solution: Solution, spread: Spread, fit: Fit, noises: Sequence[RowNoise]) -> list[Statement]:
+def _of_bent_rows(
+    solution: Solution, spread: Spread, table: ResidualTable, goodness: Goodness, *, too_large: bool
+) -> list[Statement]:
     """Whether the result rests on lengths and angles that are far from linear in what is still unknown.
 
     About half a turn a vector has one other side only: where there are more rows than they determine, wrong sides show
@@ -185,9 +180,9 @@ def _of_bent_rows(solution: Solution, spread: Spread, fit: Fit, noises: Sequence
     """
     values, V = np.linalg.eigh(spread.tangent)
     half, scales = V * np.sqrt(np.maximum(values, 0.0)), np.diag(solution.problem.variables.prior_scales)
-    table, leverage = fit.table, np.nan_to_num(fit.goodness.leverage)
+    leverage = np.nan_to_num(goodness.leverage)
     bent, folded, turned, lengths = (np.zeros(table.n, dtype=np.bool_) for _ in range(4))
-    for number, noise in enumerate(noises):
+    for number, noise in enumerate(solution.noises):
         if isinstance(noise, PairNoise):
             rows = np.flatnonzero(table.used & (table.series == number))
             place = (table.measurement[rows], table.row[rows])
@@ -197,7 +192,7 @@ def _of_bent_rows(solution: Solution, spread: Spread, fit: Fit, noises: Sequence
     if not lengths.any():
         return []
     turned &= folded
-    if not fit.chi2.too_large and leverage[turned].sum() < 0.5 * turned.sum():
+    if not too_large and leverage[turned].sum() < 0.5 * turned.sum():
         folded &= ~turned
     n_rows = int(lengths.sum())
     share = float(leverage[folded].sum() / max(leverage[table.used].sum(), 1e-300))

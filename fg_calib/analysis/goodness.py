@@ -32,7 +32,6 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -50,7 +49,7 @@ from fg_calib.analysis.residual_covariance import Errors, Nuisances, half_of
 from fg_calib.analysis.residual_table import ResidualTable
 from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.factors import prior_rows
-from fg_calib.graph.noise import JOINT_NOISE, NoiseName, RowNoise
+from fg_calib.graph.noise import JOINT_NOISE, NoiseName
 from fg_calib.graph.problem import noises_at
 from fg_calib.graph.robust import tuning, weight
 from fg_calib.graph.solver import Solution
@@ -311,18 +310,15 @@ def suspect_level(n: int) -> float:
     return float(special.ndtri(0.5 + 0.5 * (1.0 - ALARM) ** (1.0 / max(1, n))))
 
 
-def judge_fit(
-    solution: Solution, spread: Spread, table: ResidualTable, noises: Sequence[RowNoise] | None = None
-) -> Goodness:
+def judge_fit(solution: Solution, spread: Spread, table: ResidualTable) -> Goodness:
     """Goodness of fit by kind, by row and by configuration.
 
     Args:
         solution: The solution.
         spread: Its covariance.
         table: Its residuals.
-        noises: Its rows and their noise at the estimate and the readings, where these are there already.
     """
-    rows = _Rows(solution, spread, table, noises)
+    rows = _Rows(solution, spread, table)
     weight = rows.weight
     level = suspect_level(int(np.sum(table.reason_code == 0)))
     with np.errstate(invalid="ignore"):
@@ -455,14 +451,12 @@ class _Rows:
         predicted: The rows predicted that can be judged.
     """
 
-    def __init__(
-        self, solution: Solution, spread: Spread, table: ResidualTable, noises: Sequence[RowNoise] | None = None
-    ) -> None:
+    def __init__(self, solution: Solution, spread: Spread, table: ResidualTable) -> None:
         problem = self._problem = solution.problem
         self._table = table
         self._spread = spread
         self._solution = solution
-        self._noises = noises_at(problem, solution.parameters, at_readings=True) if noises is None else noises
+        self._noises = solution.noises
         self._robust = problem.state.weights is not None
         self.weight = np.ones(table.n)
         for number, weights in enumerate(problem.state.weights or ()):

@@ -8,8 +8,9 @@ may be weak.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +42,8 @@ class Identifiability(Brief):
         kind: On random configurations, or on the user's.
         n_configurations: How many.
         observability: Rank, classes, groups, indices.
-        lost: Every lost direction with its reason.
+        looked_at: The problem and the parameter vector that it is of, for the reasons; None of what was pickled, which
+            has them.
         with_fixed_known: The same where the parameters that the robot's file calls fixed are known; None if it calls
             none fixed, or if only the others were looked at anyway.
         fixed: Those parameters.
@@ -53,10 +55,20 @@ class Identifiability(Brief):
     kind: Literal["structural", "practical"]
     n_configurations: int
     observability: Observability
-    lost: tuple[LostDirection, ...]
+    looked_at: tuple[Problem, Floats] | None = field(repr=False, compare=False)
     with_fixed_known: Identifiability | None = None
     fixed: tuple[str, ...] = ()
     missing: tuple[MissingMotion, ...] = ()
+
+    @cached_property
+    def lost(self) -> tuple[LostDirection, ...]:
+        """Every lost direction with its reason, looked for when they are first asked for."""
+        assert self.looked_at is not None
+        return explain(*self.looked_at, self.observability)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the problem, the reasons among it."""
+        return {**self.__dict__, "lost": self.lost, "looked_at": None}
 
 
 @checked
@@ -157,6 +169,6 @@ def identifiability_of(
         kind=kind,
         n_configurations=problem.n_configurations,
         observability=observability,
-        lost=explain(problem, observability, parameters),
+        looked_at=(problem, parameters),
         missing=missing_motions(problem.robot),
     )

@@ -45,7 +45,7 @@ class LowRank:
     def __init__(self, P: Floats, L: Loadings, own: Floats, sign: Floats) -> None:
         self._P, self._L, self._d, self._sign = P, L, own, sign
         self._p = (P * P) @ sign
-        self._l = np.asarray(L.power(2).sum(axis=1)).ravel()
+        self._l = squares_of_rows(L)
 
     @property
     def diagonal(self) -> Floats:
@@ -56,8 +56,7 @@ class LowRank:
     def over(self, scale: Floats) -> LowRank:
         """The same of rows divided by a scale, shape (n,)."""
         by = 1.0 / scale
-        L = scipy.sparse.csr_array(scipy.sparse.diags_array(by) @ self._L)
-        return LowRank(self._P * by[:, None], L, self._d * by**2, self._sign)
+        return LowRank(self._P * by[:, None], times(self._L, by), self._d * by**2, self._sign)
 
     def at(self, rows: Integers) -> LowRank:
         """The part at some rows."""
@@ -180,6 +179,18 @@ class Dense:
         """Trace, and trace of the square, of the part at `rows`."""
         A = self._A[np.ix_(rows, rows)]
         return float(np.trace(A)), float(np.sum(A * A))
+
+
+def times(L: Loadings, by: Floats) -> Loadings:
+    """Rows of a sparse matrix, each times something, shape (n,)."""
+    return Loadings((L.data * np.repeat(by, np.diff(L.indptr)), L.indices, L.indptr), shape=L.shape)
+
+
+def squares_of_rows(L: Loadings) -> Floats:
+    """Sum of the squares of each row of a sparse matrix, shape (n,)."""
+    row = np.repeat(np.arange(L.shape[0]), np.diff(L.indptr))
+    out: Floats = np.bincount(row, L.data**2, L.shape[0])  # type: ignore[assignment] # of floats where there are weights
+    return out
 
 
 def _squared_norm_of_square(N: Loadings) -> float:

@@ -19,7 +19,7 @@ from fg_calib.analysis.goodness import Goodness, GrossErrors, gross_errors, judg
 from fg_calib.analysis.gross_errors import MOST_FEW
 from fg_calib.analysis.residual_table import ResidualTable, residual_table
 from fg_calib.errors import SolverError
-from fg_calib.graph.problem import Problem, reweighted_at
+from fg_calib.graph.problem import Problem, assembled
 from fg_calib.graph.solver import Solution, solve
 
 Booleans = NDArray[np.bool_]
@@ -100,7 +100,7 @@ def _without(solution: Solution, table: ResidualTable, out: Booleans) -> Problem
         test = s.test.copy()
         test[table.measurement[out & (table.series == number)]] = True
         series.append(replace(s, test=test))
-    return reweighted_at(replace(solution.problem, data=replace(data, series=tuple(series))), solution.before)
+    return assembled(solution.problem, solution.before, data=replace(data, series=tuple(series)))
 
 
 def _missed(table: ResidualTable, out: Booleans, rest: Goodness) -> Booleans:

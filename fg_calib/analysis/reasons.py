@@ -21,6 +21,7 @@ from fg_calib.graph.problem import Problem
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
 from fg_calib.robot.model import Parameter
+from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
 
@@ -45,7 +46,8 @@ class LostDirection:
     reason: str
 
 
-def explain(problem: Problem, observability: Observability, parameters: Floats) -> tuple[LostDirection, ...]:
+@single_threaded
+def explain(problem: Problem, parameters: Floats, observability: Observability) -> tuple[LostDirection, ...]:
     """The reason for every lost direction of an observability found for a problem at a parameter vector."""
     lost = observability.lost
     if not lost:

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from fg_calib.analysis.low_rank import Loadings, LowRank
+from fg_calib.analysis.low_rank import Loadings, LowRank, squares_of_rows, times
 from fg_calib.graph.information import eliminated, felt
 from fg_calib.graph.noise import RowNoise
 from fg_calib.graph.problem import Problem, at_parameters, says_where
@@ -47,8 +47,7 @@ class Errors:
     @property
     def of_noise(self) -> Floats:
         """Variance of rows by noise alone, shape (n,)."""
-        out: Floats = self.private + np.asarray(self.L.power(2).sum(axis=1)).ravel()
-        return out
+        return self.private + squares_of_rows(self.L)
 
     def of_estimate(self, covariance: Floats) -> Floats:
         """P with P P^T the covariance of rows by what the estimate is off, shape (n, n_columns + n_nuisance).
@@ -93,8 +92,8 @@ class Errors:
     def over(self, sigma: Floats) -> Errors:
         """Those of rows divided by something, shape (n,)."""
         by = 1.0 / sigma
-        L = scipy.sparse.csr_array(scipy.sparse.diags_array(by) @ self.L)
-        return Errors(self.J * by[:, None], self.own * by[:, None], self.private * by**2, L, self.felt * by[:, None])
+        J, own, felt = (values * by[:, None] for values in (self.J, self.own, self.felt))
+        return Errors(J, own, self.private * by**2, times(self.L, by), felt)
 
     @classmethod
     def of_all(cls, parts: Sequence[Errors]) -> Errors:

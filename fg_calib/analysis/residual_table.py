@@ -13,7 +13,6 @@ from scipy import special
 
 from fg_calib.analysis.gross_errors import CHANCE, MOST_FEW
 from fg_calib.arrays import FrozenArrays
-from fg_calib.graph.noise import RowNoise
 from fg_calib.graph.problem import noises_at
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements.dataset import Labels
@@ -306,20 +305,14 @@ class ResidualTable(FrozenArrays):
         return first
 
 
-def residual_table(solution: Solution, after: Sequence[RowNoise] | None = None) -> ResidualTable:
-    """Every scalar residual, train and test, with the arm at nominal and at the estimate.
-
-    Args:
-        solution: The solution.
-        after: Its rows and their noise at the estimate and the readings, where these are there already.
-    """
+def residual_table(solution: Solution) -> ResidualTable:
+    """Every scalar residual, train and test, with the arm at nominal and at the estimate."""
     problem = solution.problem
     before = [noise.residual() for noise in noises_at(problem, solution.before, at_readings=True)]
-    after = noises_at(problem, solution.parameters, at_readings=True) if after is None else after
     kinds: dict[RowKind, int] = {}
     reasons, labels = [""], {"": 0}
     columns: list[dict[str, NDArray[Any]]] = []
-    for number, (s, old, new) in enumerate(zip(problem.data.series, before, after, strict=True)):
+    for number, (s, old, new) in enumerate(zip(problem.data.series, before, solution.noises, strict=True)):
         names = zip(s.kind.names, s.kind.units, strict=True)
         codes = np.array([kinds.setdefault(RowKind(*name, s.table), len(kinds)) for name in names])
         excluded = np.zeros(s.n, dtype=np.int16)

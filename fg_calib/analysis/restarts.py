@@ -30,7 +30,7 @@ from fg_calib.graph.factors import prior_rows
 from fg_calib.graph.information import whitened_triangle
 from fg_calib.graph.noise import NoiseState, PairNoise
 from fg_calib.graph.observability import SIGNAL_FLOOR
-from fg_calib.graph.problem import Problem, noises_at, reweighted_at
+from fg_calib.graph.problem import Problem, assembled, noises_at, reweighted_at
 from fg_calib.graph.solver import Solution, SolverOptions, solve, solve_from, solve_image
 from fg_calib.threads import one_blas_thread
 
@@ -175,8 +175,8 @@ def _without_folds(solution: Solution, options: SolverOptions | None) -> Floats 
         return None
     if problem.state.joint_errors is not None:
         state = replace(state, joint_errors=np.zeros_like(problem.state.joint_errors))
-    without = replace(problem, data=replace(problem.data, series=tuple(series)))
-    return solve(reweighted_at(without, solution.before, state), options).parameters
+    without = assembled(problem, solution.before, state, data=replace(problem.data, series=tuple(series)))
+    return solve(without, options).parameters
 
 
 def _nominal(solution: Solution) -> Floats:

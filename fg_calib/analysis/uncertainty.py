@@ -33,7 +33,6 @@ from fg_calib.errors import InputError, escaped
 from fg_calib.graph.extension import check_graph
 from fg_calib.graph.factors import corrections_of, pose_of
 from fg_calib.graph.observability import IdentifiabilityClass, Observability
-from fg_calib.graph.problem import noises_at
 from fg_calib.graph.solver import Solution
 from fg_calib.robot.model import Robot
 from fg_calib.threads import one_blas_thread, single_threaded
@@ -320,12 +319,11 @@ def _assess(solution: Solution) -> Uncertainty:
     identifiability = identifiability_of(*at_nominal(problem.whole or problem, solution.before), "practical")
     covariance = whole.named()
     frames = _frame_estimates(solution, whole)
-    noises = noises_at(problem, solution.parameters, at_readings=True)
-    chi2, table = chi_square(solution, spread), residual_table(solution, noises)
-    goodness = judged_without_gross_errors(solution, spread, table, judge_fit(solution, spread, table, noises))
+    chi2, table = chi_square(solution, spread), residual_table(solution)
+    goodness = judged_without_gross_errors(solution, spread, table, judge_fit(solution, spread, table))
     table = table.without(goodness.unknown(table))
     fit = Fit(chi2, table, goodness, judge_priors(solution, spread))
-    verdict = judge(solution, spread, fit, identifiability.missing, noises)
+    verdict = judge(solution, spread, fit, identifiability.missing)
     return Uncertainty(
         names=whole.variables.names[: whole.variables.n_robot_columns],
         covariance=covariance,

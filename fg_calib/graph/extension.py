@@ -7,7 +7,6 @@ A factor is added with `problem.graph.add(factor)`; a variable that it brings wi
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import chain
 from numbers import Real
 
@@ -20,7 +19,7 @@ from fg_calib.arguments import checked
 from fg_calib.arrays import as_floats
 from fg_calib.errors import CalibrationError, InputError, ProblemError, shown
 from fg_calib.graph.factors import Variable, Variables, custom_factor, factor_columns, prior_factors, row_factor
-from fg_calib.graph.problem import Problem, known_factors, reweighted_at
+from fg_calib.graph.problem import Problem, assembled, known_factors
 from fg_calib.graph.rows import Part, RowSet
 from fg_calib.measurements.kinds import Distance, Kind, RotationAngle
 from fg_calib.measurements.residuals import Block
@@ -60,7 +59,7 @@ def with_added(problem: Problem) -> Problem:
         _check_start(factor, problem.initial)
     variables = variables.with_own(own)
     start = variables.parameters(problem.initial)
-    return reweighted_at(replace(problem, variables=variables, added=added), start)
+    return assembled(problem, start, variables=variables, added=added)
 
 
 def _check_initial(problem: Problem) -> None:

@@ -156,7 +156,7 @@ class Variables(Brief):
         """Number of columns without the measurement frames', which come last."""
         return self.n_columns - 6 * len(self.frames)
 
-    @property
+    @cached_property
     def scales(self) -> Floats:
         """A change of ordinary size in each column (see `Robot.scale_of`), shape (n_columns,)."""
         angle, length = self.robot.scale_of("rad"), self.robot.scale_of("m")
@@ -169,10 +169,10 @@ class Variables(Brief):
         ]
         return np.concatenate([np.zeros(0), *parts])
 
-    @property
+    @cached_property
     def prior_scales(self) -> Floats:
         """`scales`, but where there is a prior its sigma: how far each column may be off, shape (n_columns,)."""
-        scales = self.scales
+        scales = self.scales.copy()
         for v in self.items if self.priors else ():
             if v.kind != "frame":
                 order = [v.parameters[i] for i in _ALONG_TANGENT] if v.is_pose else v.parameters
@@ -718,22 +718,20 @@ def prior_rows(variables: Variables, parameters: Floats, only: Variable | None =
         only: The variable whose priors are wanted; all if None.
     """
     nominal = variables.nominal()
-    r: list[Floats] = [np.zeros(0)]
-    J: list[Floats] = [np.zeros((0, variables.n_columns))]
-    for v in variables.items if only is None else (only,):
+    items = variables.items if only is None else (only,)
+    n = sum(len(variables.stated[v.symbol][0]) for v in items)
+    r, J, first = np.zeros(n), np.zeros((n, variables.n_columns)), 0
+    for v in items:
         stated, weight = variables.stated[v.symbol]
         if not stated:
             continue
-        of_v = list(v.parameters)
+        of_v, rows = list(v.parameters), slice(first, first + len(stated))
         if v.is_pose:
             off, D = _off_nominal(parameters[of_v], nominal[of_v])
         else:
             off, D = parameters[of_v] - nominal[of_v], np.eye(len(of_v))
-        rows = np.zeros((len(stated), variables.n_columns))
-        rows[:, v.columns] = weight[:, None] * D[stated]
-        r.append(weight * off[stated])
-        J.append(rows)
-    return np.concatenate(r), np.vstack(J)
+        r[rows], J[rows, v.columns], first = weight * off[stated], weight[:, None] * D[stated], rows.stop
+    return r, J
 
 
 def _off_nominal(frame: Floats, nominal: Floats) -> tuple[Floats, Floats]:
@@ -754,7 +752,7 @@ def prior_factors(variables: Variables) -> list[gtsam.NonlinearFactor]:
     """One factor for each variable that has parameters with a tolerance, or that was said to be somewhere."""
     factors: list[gtsam.NonlinearFactor] = []
     for v in variables.items:
-        n_rows = len(prior_rows(variables, variables.nominal(), v)[0])
+        n_rows = len(variables.stated[v.symbol][0])
         if n_rows:
             factors.append(_prior_factor(variables, v, n_rows))
     for v in variables.nuisance:

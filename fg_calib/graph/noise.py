@@ -169,6 +169,11 @@ class RowNoise:
             self.own = self.series.covariance * np.outer(self.factors, self.factors)
         self.sources = self._of_joints(self.rows)
 
+    @property
+    def same_everywhere(self) -> bool:
+        """Whether the noise is the same at all parameters."""
+        return not self.sources
+
     @cached_property
     def total(self) -> Floats:
         """Covariance of each measurement's rows, all noise together, shape (n, residual_dim, residual_dim)."""
@@ -293,6 +298,11 @@ class PairNoise(RowNoise):
     def residual(self) -> Floats:
         """Of all rows, shape (n, residual_dim), [m] and [rad]."""
         return self._narrow(self.predicted) - self.series.data + self.excess
+
+    @property
+    def same_everywhere(self) -> bool:
+        """Whether the noise is the same at all parameters: what lengthens vectors is not."""
+        return False
 
     def more_if_redundant(self, shared: frozenset[str]) -> Floats | float:
         """What is added to the diagonal of `own` where there are more rows than errors that they share."""

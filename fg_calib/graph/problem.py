@@ -27,7 +27,7 @@ from fg_calib.graph.factors import (
     unknown_prior_rows,
 )
 from fg_calib.graph.knowledge import Knowledge
-from fg_calib.graph.noise import JOINT_NOISE, NoiseState, PairNoise, Place, RowNoise, row_noise
+from fg_calib.graph.noise import JOINT_NOISE, NoiseState, Place, RowNoise, row_noise
 from fg_calib.graph.rows import At, RowSet, share_errors, whitened_rows
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.gathering import Dataset
@@ -350,6 +350,8 @@ def reweighted_at(problem: Problem, parameters: Floats, state: NoiseState | None
         parameters: The parameter vector.
         state: What has been learned of the noise; None for what the problem has.
     """
+    if (state is None or state is problem.state) and all(noise.same_everywhere for noise in problem.noises):
+        return replace(started_at(problem, parameters), noises=noises_at(problem, parameters))
     return assembled(problem, parameters, state)
 
 
@@ -429,11 +431,6 @@ def joint_errors(problem: Problem, parameters: Floats) -> Floats:
             z = rows.most_likely(at)[:, rows.joints : rows.joints + len(joints)]
             found[np.ix_(rows.configurations, joints)] = -sigma[joints] * z
     return found
-
-
-def pair_noises(problem: Problem, parameters: Floats) -> list[PairNoise]:
-    """The distances and angles of all pairs at a parameter vector, at their readings."""
-    return [n for n in noises_at(problem, parameters, at_readings=True) if isinstance(n, PairNoise)]
 
 
 def frames_only(problem: Problem) -> Problem | None:

@@ -23,6 +23,8 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -33,7 +35,7 @@ from fg_calib.arrays import FrozenArrays
 from fg_calib.errors import CalibrationError, SolverError
 from fg_calib.graph.extension import with_added
 from fg_calib.graph.factors import Variables, dense, eliminate
-from fg_calib.graph.noise import NoiseState
+from fg_calib.graph.noise import NoiseState, RowNoise
 from fg_calib.graph.observability import determined
 from fg_calib.graph.problem import (
     Problem,
@@ -41,6 +43,7 @@ from fg_calib.graph.problem import (
     frames_only,
     joint_errors,
     mahalanobis_distances,
+    noises_at,
     reweighted_at,
     same_rows,
     some_rows,
@@ -172,6 +175,10 @@ class Solution(FrozenArrays):
     estimated_tolerances: ToleranceScales | None = None
     others: tuple[Floats, ...] = ()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what follows from the rest."""
+        return {name: value for name, value in self.__dict__.items() if name != "noises"}
+
     def __repr__(self) -> str:
         costs = f"{self.iterations} iterations, cost {self.initial_cost:.6g} -> {self.cost:.6g}"
         return f"Solution of {self.problem.robot.name!r}: {self.message}\n  {costs}"
@@ -180,6 +187,11 @@ class Solution(FrozenArrays):
     def iterations(self) -> int:
         """Number of steps."""
         return len(self.history)
+
+    @cached_property
+    def noises(self) -> tuple[RowNoise, ...]:
+        """The rows of each series and their noise at the estimate, at the readings."""
+        return noises_at(self.problem, self.parameters, at_readings=True)
 
 
 @checked
@@ -389,7 +401,9 @@ def _fit(problem: Problem, options: SolverOptions) -> _Run:
             state, bends = replace(state, spread=run.here.spread), bends - 1
         anew = reweighted_at(problem, run.parameters, state)
         unchanged = same_rows(anew, run.problem)
-        if not unchanged:
+        if unchanged:
+            run.problem = anew
+        else:
             run.go_on_with(anew)
         # Where no step could be taken and what is left falls no more, rows whitened anew differ by rounding alone.
         moved = len(run.history) > n_steps
