@@ -25,7 +25,7 @@ from fg_calib.files.disk import require_own, require_writable
 from fg_calib.files.job import read_job
 from fg_calib.job import Job
 from fg_calib.report.batch import JOBS_FILES, JobSummary, summary_of
-from fg_calib.report.documents import require_no_input
+from fg_calib.report.documents import ResidualFile, require_no_input
 
 
 @checked
@@ -67,6 +67,7 @@ class Order:
         folds: Number of folds instead of the job's; None for those.
         report: Whether `report.html` is written too.
         figures: Whether the page's figures are written as files too.
+        residuals: How single residuals are written.
     """
 
     name: str
@@ -75,6 +76,7 @@ class Order:
     folds: int | None = None
     report: bool = False
     figures: bool = False
+    residuals: ResidualFile = "csv"
 
 
 def ordered_job(order: Order) -> Job:
@@ -99,7 +101,7 @@ def save_ordered(order: Order, found: Calibration) -> None:
     """
     if order.folder is None:
         return
-    found.save(order.folder)
+    found.save(order.folder, residuals=order.residuals)
     if order.report or order.figures:
         from fg_calib.pages import write_report
 

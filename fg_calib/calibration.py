@@ -49,7 +49,7 @@ from fg_calib.measurements.fingerprints import counted_before
 from fg_calib.measurements.series import Table
 from fg_calib.options import NEAR, Options, Pairing, check_flag, check_names, did_you_mean, listed
 from fg_calib.progress import tell
-from fg_calib.report.documents import result_of, write_result
+from fg_calib.report.documents import ResidualFile, result_of, write_result
 from fg_calib.report.summary import format_result, html, judged, summary
 from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import forward, precompute_trig
@@ -265,13 +265,18 @@ class Calibration:
         return cls(robot, result, posterior, history=history_of(path).runs)
 
     @checked
-    def save(self, folder: Path | str) -> None:
+    def save(self, folder: Path | str, *, residuals: ResidualFile = "csv") -> None:
         """Write what `calibrate --out` writes: `result.json`, the calibrated robot and the residuals.
+
+        Args:
+            folder: Where to.
+            residuals: How single residuals are written: `csv`, `parquet`, or `none` where there are millions.
 
         Raises:
             InputError: The folder cannot be written, or the calibration was itself loaded from one.
         """
-        write_result(folder, self.result, self.solution, self.uncertainty, self._history if self.history else None)
+        history = self._history if self.history else None
+        write_result(folder, self.result, self.solution, self.uncertainty, history, residuals)
 
     def _history(self, digest: str) -> dict[str, str]:
         """What is written of the runs that it came from, with itself."""

@@ -47,6 +47,7 @@ calibrate = load("benchmarks/calibrate.py")
 inverse = load("benchmarks/inverse.py")
 sharing = load("benchmarks/sharing.py")
 peers = load("benchmarks/peers.py")
+million = load("benchmarks/million.py")
 panda = load("10_panda_sockets.py")
 fuzz = load("fuzz.py")
 
@@ -419,6 +420,28 @@ def test_fleet_quick_has_a_result_of_every_job(tmp_path):
     small, large = found["fleet"]
     assert small["core_hours"] == large["core_hours"] > 0.0
     assert found["here"]["result_written"] > 1e5
+
+
+def test_million_quick_times_every_command_and_fits_every_growth(tmp_path):
+    script = EXPERIMENTS / "benchmarks" / "million.py"
+    command = [sys.executable, str(script), "--quick", "--out", str(tmp_path)]
+    ended = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "2000 pairs, 500 poses" in ended.stdout
+    found = json.loads((tmp_path / "million.json").read_text())
+    assert [run["what"] for run in found["commands"]][:3] == ["pairs, parquet", "pairs, csv", "poses, parquet"]
+    assert all(run["peak_MiB"] > 50.0 and run["processor_seconds"] > 0.1 for run in found["commands"])
+    assert set(found["growth"]["exponents"]) == set(found["growth"]["seconds of processors"])
+    assert (tmp_path / "million.png").stat().st_size > 1000
+
+
+def test_million_counts_operations_and_fits_power_laws():
+    assert million.exponent([(1.0, 3.0), (10.0, 300.0), (100.0, 30_000.0)]) == pytest.approx(2.0, rel=1e-12)
+    case = linearise.build_case(100, 0)
+    count = million.operations_a_pair(case)
+    assert count["gram"] == 2 * 2 * 36**2  # rows, a multiply and an add, 35 parameters and the residual
+    # Two rows, two ends, 35 columns of which 14 only shift: each product and sum of the contraction.
+    assert count["panel"] > 2 * (21 * 23 + 14 * 11)
+    assert count["bytes"] == 8 * (2 + 2 + 3 + 2 * 7 * 2)
 
 
 def test_inverse_quick_reaches_every_pose(tmp_path, capsys):

@@ -45,7 +45,7 @@ from scipy import special
 from fg_calib.analysis.covariance import Spread
 from fg_calib.analysis.gross_errors import MOST_FEW, find_gross_errors
 from fg_calib.analysis.low_rank import Dense, LowRank
-from fg_calib.analysis.residual_covariance import Errors, Nuisances
+from fg_calib.analysis.residual_covariance import Errors, Nuisances, half_of
 from fg_calib.analysis.residual_table import ResidualTable
 from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.factors import prior_rows
@@ -53,6 +53,7 @@ from fg_calib.graph.noise import JOINT_NOISE, NoiseName
 from fg_calib.graph.problem import noises_at
 from fg_calib.graph.robust import tuning, weight
 from fg_calib.graph.solver import Solution
+from fg_calib.measurements.residuals import squares_along
 from fg_calib.robot.kinematics import SPAN
 
 Floats = NDArray[np.float64]
@@ -699,13 +700,20 @@ class _Rows:
         table = self._table
         nuisances = Nuisances(self._problem, self._solution.parameters, self._noises)
         self.leverage = np.full(table.n, np.nan)
-        kept = []
+        kept, half = [], half_of(self._spread.tangent)
+        asked = keep | table.test
         for number, noise in enumerate(self._noises):
             of_series = np.flatnonzero(table.series == number)
             for start in range(0, noise.rows.n, _CHUNK):
                 chunk = np.arange(start, min(start + _CHUNK, noise.rows.n))
                 first, last = np.searchsorted(table.measurement[of_series], (start, start + len(chunk)))
                 rows = of_series[first:last]
+                if nuisances.none_in(number) and not asked[rows].any():  # they follow from the core and own noise alone
+                    place = (table.measurement[rows] - start, table.row[rows])
+                    squares = squares_along(noise.rows_at(chunk), nuisances.chain(number), half)[place]
+                    own = np.einsum("nii->ni", noise.own[chunk])[place]
+                    self.leverage[rows] = (squares + np.maximum(own, 0.0)) / table.sigma[rows] ** 2 - 1.0
+                    continue
                 grid = (table.measurement[rows] - start) * noise.rows.residual_dim + table.row[rows]
                 found = nuisances.errors(number, chunk).at(grid).over(table.sigma[rows])
                 leverage = np.einsum("ij,ij->i", found.J @ self._spread.tangent, found.J)
@@ -713,7 +721,7 @@ class _Rows:
                 self.leverage[rows] = leverage + np.sum(found.own**2, axis=1) + (found.of_noise - 1.0)
                 kept.append(found.at(np.flatnonzero(keep[rows])))
         self.leverage[~np.isfinite(self.leverage)] = np.nan
-        return Errors.of_all(kept)
+        return Errors.of_all(kept or [nuisances.nothing()])
 
     def _residual_covariance(self, fitted: Integers, found: Errors) -> LowRank | Dense:
         """Of the fitted rows, from what they follow from."""

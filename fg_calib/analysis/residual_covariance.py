@@ -18,6 +18,7 @@ from fg_calib.graph.noise import RowNoise
 from fg_calib.graph.problem import Problem, at_parameters, says_where
 from fg_calib.graph.rows import ErrorColumns
 from fg_calib.measurements import residuals
+from fg_calib.robot.kinematics import Chain
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -54,7 +55,7 @@ class Errors:
         Args:
             covariance: Of the core.
         """
-        return np.hstack([self.J @ _half(covariance), self.own])
+        return np.hstack([self.J @ half_of(covariance), self.own])
 
     def of_prediction(self, tangent: Floats, actual: Floats) -> LowRank:
         """Covariance of predicted rows, whose noise the estimate may have felt: `C + J K J^T - J Q^T - Q J^T`.
@@ -69,7 +70,7 @@ class Errors:
         P = self.of_estimate(actual)
         sign = np.ones(P.shape[1])
         if self.felt.shape[1]:
-            half, n = _half(tangent), len(tangent)
+            half, n = half_of(tangent), len(tangent)
             A, B = self.of_estimate(tangent), np.hstack([self.felt[:, :n] @ half, self.felt[:, n:]])
             P = np.hstack([P, (A - B) / np.sqrt(2.0), (A + B) / np.sqrt(2.0)])
             sign = np.concatenate([sign, np.ones(A.shape[1]), -np.ones(A.shape[1])])
@@ -145,6 +146,23 @@ class Nuisances:
                 self._follow += np.asarray(B @ found.J)
                 self._averaged = self._averaged + B @ found.L
 
+    def none_in(self, number: int) -> bool:
+        """Whether rows of a series follow from the core and from noise of their own alone."""
+        noise = self._noises[number]
+        return not (noise.sources or noise.series.nuisances.shape[1])
+
+    def chain(self, number: int) -> Chain:
+        """The chain of a series at the estimate."""
+        return self._at.chains[self._noises[number].series.table]
+
+    def nothing(self) -> Errors:
+        """What no rows follow from."""
+        felt = self._felt.shape[0] if len(self._wanted) else 0
+        L = scipy.sparse.csr_array((0, int(self._first[-1])))
+        return Errors(
+            np.zeros((0, self._n)), np.zeros((0, self._inverse.shape[1])), np.zeros(0), L, np.zeros((0, felt))
+        )
+
     def errors(self, number: int, rows: Integers) -> Errors:
         """What rows of a series follow from."""
         known, N = self._nuisances_known(number, rows)
@@ -177,7 +195,7 @@ class Nuisances:
         return Errors(of_core, none, private, L, none), N
 
 
-def _half(covariance: Floats) -> Floats:
+def half_of(covariance: Floats) -> Floats:
     """H with H H^T a covariance, shape (n, n)."""
     values, vectors = np.linalg.eigh(covariance)
     out: Floats = vectors * np.sqrt(np.maximum(values, 0.0))

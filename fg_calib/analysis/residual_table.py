@@ -308,7 +308,7 @@ class ResidualTable(FrozenArrays):
 def residual_table(solution: Solution) -> ResidualTable:
     """Every scalar residual, train and test, with the arm at nominal and at the estimate."""
     problem = solution.problem
-    before = noises_at(problem, solution.before, at_readings=True)
+    before = [noise.residual() for noise in noises_at(problem, solution.before, at_readings=True)]
     kinds: dict[RowKind, int] = {}
     reasons, labels = [""], {"": 0}
     columns: list[dict[str, NDArray[Any]]] = []
@@ -337,13 +337,13 @@ def residual_table(solution: Solution) -> ResidualTable:
                 "test": s.test[of],
                 "reason_code": excluded[of],
                 "measured": checked_figures(s.kind, s.data, s.source)[of, row],
-                "before": old.residual()[of, row],
+                "before": old[of, row],
                 "after": new.residual()[of, row],
                 "excess": new.excess[of, row],
                 "sigma": new.sigma[of, row],
             }
         )
-    together = {name: np.concatenate([c[name] for c in columns]) for name in columns[0]}
+    together = {name: np.concatenate([c.pop(name) for c in columns]) for name in list(columns[0])}  # never all twice
     return ResidualTable(
         kinds=tuple(kinds),
         names=problem.data.names,

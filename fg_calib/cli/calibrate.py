@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -43,6 +43,10 @@ def calibrate(
     figures: Annotated[
         bool, typer.Option("--figures", help="Write the page's figures there too, as SVG files.")
     ] = False,
+    residuals: Annotated[
+        Literal["csv", "parquet", "none"],
+        typer.Option("--residuals", help="How single residuals are written: of millions of rows a CSV is large."),
+    ] = "csv",
     workers: Workers = None,
     scheduler: Scheduler = None,
     as_json: Json = False,
@@ -56,7 +60,7 @@ def calibrate(
     require_one(workers, scheduler)
     if len(jobs) == 1:
         with executor_for(workers, scheduler, _WRITTEN) as executor:
-            _calibrate_one(Order("", jobs[0], out, folds, report, figures), executor, as_json)
+            _calibrate_one(Order("", jobs[0], out, folds, report, figures, residuals), executor, as_json)
         return
     names = job_names(jobs)
     if out is not None:
@@ -64,7 +68,7 @@ def calibrate(
     if scheduler is not None:  # whose workers run elsewhere
         jobs, out = [job.absolute() for job in jobs], None if out is None else out.absolute()
     orders = [
-        Order(name, job, None if out is None else out / name, folds, report, figures)
+        Order(name, job, None if out is None else out / name, folds, report, figures, residuals)
         for name, job in zip(names, jobs, strict=True)
     ]
     with executor_for(workers, scheduler, _WRITTEN) as executor:

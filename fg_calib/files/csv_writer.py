@@ -1,11 +1,12 @@
-"""CSV files as they are written."""
+"""Tables as they are written: CSV, and Parquet."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from fg_calib.errors import InputError
 from fg_calib.files.disk import replacing, require_own
 from fg_calib.libraries import require_polars
+
+if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it
+    import polars as pl
 
 
 @dataclass(frozen=True)
@@ -64,18 +68,47 @@ def write_csv_parts(path: Path | str, parts: Iterable[Mapping[str, ArrayLike | W
         InputError: The folder does not exist or may not be written to.
     """
     require_polars(str(path))
+    with replacing(Path(path)) as temporary, temporary.open("wb") as file:
+        for i, frame in enumerate(_frames(parts)):
+            frame.write_csv(file, include_header=i == 0)
+
+
+def write_parquet_parts(path: Path | str, parts: Iterable[Mapping[str, ArrayLike | Words | None]]) -> None:
+    """The same as a Parquet file, each part a group of rows.
+
+    Args:
+        path: The file to write.
+        parts: The columns of some rows after the other, at least once.
+
+    Raises:
+        InputError: The folder does not exist or may not be written to.
+    """
+    require_polars(str(path))
+    from polars.io.plugins import register_io_source
+
+    frames = _frames(parts)
+    first = next(frames)
+
+    def source(columns: list[str] | None, *_: object) -> Iterator[pl.DataFrame]:
+        for frame in chain([first], frames):
+            yield frame if columns is None else frame.select(columns)
+
+    with replacing(Path(path)) as temporary:
+        rows = max(first.height, 1)
+        register_io_source(source, schema=first.schema).sink_parquet(temporary, row_group_size=rows)
+
+
+def _frames(parts: Iterable[Mapping[str, ArrayLike | Words | None]]) -> Iterator[pl.DataFrame]:
     import polars as pl
 
-    with replacing(Path(path)) as temporary, temporary.open("wb") as file:
-        for i, columns in enumerate(parts):
-            frame = pl.DataFrame(
-                {
-                    name: pl.Series(list(values.words), dtype=pl.String).gather(values.codes)
-                    if isinstance(values, Words)
-                    else np.asarray(values)
-                    for name, values in columns.items()
-                    if values is not None
-                }
-            )
-            frame = frame.with_columns(pl.lit(None).alias(n) for n, v in columns.items() if v is None).select(*columns)
-            frame.write_csv(file, include_header=i == 0)
+    for columns in parts:
+        frame = pl.DataFrame(
+            {
+                name: pl.Series(list(values.words), dtype=pl.String).gather(values.codes)
+                if isinstance(values, Words)
+                else np.asarray(values)
+                for name, values in columns.items()
+                if values is not None
+            }
+        )
+        yield frame.with_columns(pl.lit(None).alias(n) for n, v in columns.items() if v is None).select(*columns)

@@ -87,6 +87,19 @@ def read_bytes(path: Path) -> bytes:
     return content
 
 
+def digest_of(path: Path) -> str:
+    """SHA-256 of a file that was written, read piece by piece.
+
+    Raises:
+        InputError: There is no such file, or it may not be read.
+    """
+    try:
+        with _newest(path).open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(_short(str(path)), f"cannot be read: {error.strerror or error}", "a file") from None
+
+
 def _content(found: Path, path: Path) -> bytes:
     """The bytes of what stands for a path."""
     try:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from fg_calib.arrays import FrozenArrays
 from fg_calib.errors import InputError
 from fg_calib.files.columns import Header, Table
-from fg_calib.files.disk import exists, read_bytes
+from fg_calib.files.disk import digest_of, exists
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -43,12 +42,13 @@ class SavedConfigurations(FrozenArrays):
 
 @dataclass(frozen=True)
 class SavedResiduals(FrozenArrays):
-    """What `residuals.csv` holds of the rows that count.
+    """What `residuals.csv` or `residuals.parquet` holds of the rows that count.
 
     Attributes:
+        file: Which of the two it is.
         kinds: What rows are of, by code.
         kind: Of each row, in `kinds`, shape (n,).
-        line: Line of the file that each row stands in, the header being line 1, shape (n,).
+        row: Row of the file that each is, counted from 0, shape (n,).
         a: Name of the (first) configuration.
         b: Name of the second, empty where there is none.
         of: What a row is of by name, such as a target; empty where nothing says.
@@ -59,9 +59,10 @@ class SavedResiduals(FrozenArrays):
         units: Of each kind.
     """
 
+    file: str
     kinds: tuple[str, ...]
     kind: Integers
-    line: Integers
+    row: Integers
     a: tuple[str, ...]
     b: tuple[str, ...]
     of: tuple[str, ...]
@@ -70,6 +71,10 @@ class SavedResiduals(FrozenArrays):
     studentised: Floats
     suspect: Booleans
     units: tuple[str, ...]
+
+    def place(self, k: int) -> str:
+        """Where a row stands: in a CSV its line, the header being line 1; in a Parquet file its row, from 0."""
+        return f"{self.file}:{self.row[k] + 2}" if self.file.endswith(".csv") else f"{self.file}: row {self.row[k]}"
 
 
 def require_unchanged(folder: Path, digests: Mapping[str, str]) -> None:
@@ -83,7 +88,7 @@ def require_unchanged(folder: Path, digests: Mapping[str, str]) -> None:
         InputError: One is another.
     """
     for name, digest in digests.items():
-        if exists(folder / name) and sha256(read_bytes(folder / name)).hexdigest() != digest:
+        if exists(folder / name) and digest_of(folder / name) != digest:
             raise InputError(str(folder / name), "changed, or of another calibration", "the files of one calibration")
 
 
@@ -120,7 +125,8 @@ def read_residuals(folder: Path) -> SavedResiduals | None:
     Raises:
         InputError: The file is damaged.
     """
-    header = _header(folder / "residuals.csv")
+    files = [folder / f"residuals.{ending}" for ending in ("csv", "parquet")]
+    header = next(filter(None, map(_header, files)), None)
     if header is None:
         return None
     texts = ["kind", "a", "b", "split", "excluded", "unit", "suspect", *header.present("of")]
@@ -134,9 +140,10 @@ def read_residuals(folder: Path) -> SavedResiduals | None:
     kinds, kind = np.unique(np.array(words("kind") or ("",)), return_inverse=True)
     units = dict(zip(words("kind"), words("unit"), strict=True))
     return SavedResiduals(
+        file=header.name,
         kinds=tuple(kinds.tolist()),
         kind=kind[: int(counts.sum())],
-        line=table.rows[counts] + 2,
+        row=table.rows[counts],
         a=words("a"),
         b=words("b"),
         of=words("of") if "of" in texts else ("",) * int(counts.sum()),

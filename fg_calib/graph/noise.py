@@ -10,8 +10,8 @@ measured, with its slope and variance (see `moments`). At given parameters that 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import astuple, dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import astuple, dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -23,9 +23,19 @@ from fg_calib.measurements.dataset import Measurements, rotation_angle
 from fg_calib.measurements.frames import nearest_rotation
 from fg_calib.measurements.kinds import Distance, RotationAngle
 from fg_calib.measurements.moments import Moments, angle_moments, length_moments
-from fg_calib.measurements.residuals import Block, pack
+from fg_calib.measurements.residuals import Block, unit_whitening
 from fg_calib.measurements.series import Series
-from fg_calib.robot.kinematics import SPAN, Chain, Poses, common_axes, forward, turning_of_base, turning_of_points
+from fg_calib.robot.kernels import whiten_small
+from fg_calib.robot.kinematics import (
+    SPAN,
+    Chain,
+    Poses,
+    common_axes,
+    forward,
+    over_spans,
+    turning_of_base,
+    turning_of_points,
+)
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -207,10 +217,10 @@ class RowNoise:
         """Some of the rows, not whitened."""
         return residuals.rows_of(self.rows, rows)
 
-    def _block(self, data: Floats, slope: Floats | None = None) -> Block:
+    def _block(self, data: Floats) -> Block:
         s, p = self.series, self.place
-        unit = np.tile(np.eye(s.kind.residual_dim), (s.n, 1, 1)) if slope is None else self._diagonal(slope)
-        return Block(s.kind, p.trig, s.ends, data, pack(unit), p.coordinates[s.nuisances], s.source)
+        unit = unit_whitening(s.n, s.kind.residual_dim)
+        return Block(s.kind, p.trig, s.ends, data, unit, p.coordinates[s.nuisances], s.source)
 
     def _of_joints(self, rows: Block) -> tuple[Source, ...]:
         p, s = self.place, self.series
@@ -233,7 +243,6 @@ class PairNoise(RowNoise):
     """The same of distances and angles of pairs, whose vectors noise lengthens (see `moments`).
 
     Attributes:
-        moments: Mean and variance of each distance and angle under the noise of its vector, shapes (n, 2).
         predicted: Distance and angle as the arm predicts them, shape (n, 2).
     """
 
@@ -246,30 +255,49 @@ class PairNoise(RowNoise):
         wide[self._parts] = self.factors
         self._both = wide  # factors of distance and angle
         plain = self._block(s.data)
-        self.predicted = np.zeros((s.n, 2))
-        self.predicted[:, self._parts] = residuals.residual(plain, self.place.chain) + s.data
-        stated = np.zeros((s.n, 2))
-        stated[:, self._parts] = s.sigma**2
-        self._own = np.nan_to_num(self._formed_variance() if s.formed else stated) * wide**2
+        self.predicted, self._own = np.zeros((s.n, 2)), np.zeros((s.n, 2))
+        r = residuals.residual(plain, self.place.chain)
+
+        def predict(rows: slice) -> None:
+            self.predicted[rows, self._parts] = r[rows] + s.data[rows]
+            if not s.formed:
+                self._own[rows, self._parts] = np.nan_to_num(s.sigma[rows]) ** 2 * self.factors**2
+
+        _over_rows(predict, s.n)
+        if s.formed:
+            self._own = np.nan_to_num(self._formed_variance()) * wide**2
         joints = self._of_joints(plain)
         linear = self._wide(sum((source.variance for source in joints), np.zeros((s.n, 1, 1))))
-        self.moments = self._moments(linear)
-        slope = self._narrow(np.maximum(self.moments.slope, LEAST_SLOPE))
-        self.excess = self._narrow(self.moments.excess)
-        predicted = self._narrow(self.predicted)
-        data = s.data + (predicted - s.data) * (1.0 - 1.0 / slope) - self.excess / slope
-        self.rows = self._block(np.ascontiguousarray(data), slope)
-        true = self._narrow(self.moments.slope)[:, :, None, None]
-        self.sources = tuple(source._replace(loading=source.loading * true) for source in joints)
-        of_poses = self._narrow(self.moments.slope**2 * self._own) if s.formed else 0.0
-        of_joints = 0.0 if self.place.joints_estimated else self._diagonals(self.sources)
-        direct = 0.0 if s.formed else self._narrow(self.moments.slope**2 * self._own)
-        variance = self._narrow(self.moments.variance)
-        self._bent_variance = np.maximum(variance - of_poses - direct - of_joints, 0.0)
+        bending, of_joints = self._bending(), self._joint_trace()
+        data, whitening, true = np.empty(s.data.shape), np.zeros(plain.whitening.shape), np.empty(s.data.shape)
+        d = np.arange(s.kind.residual_dim)
+        self.own = np.zeros((s.n, len(d), len(d)))
+        self._bent_variance = np.zeros(s.data.shape if s.formed else (0, len(d)))
+
+        def bend(rows: slice) -> None:
+            moments = self._moments(rows, linear[rows], bending[rows], of_joints)
+            true[rows], self.excess[rows] = moments.slope[:, self._parts], moments.excess[:, self._parts]
+            slope, off = np.maximum(true[rows], LEAST_SLOPE), self.predicted[rows, self._parts] - s.data[rows]
+            data[rows] = s.data[rows] + off * (1.0 - 1.0 / slope) - self.excess[rows] / slope
+            whitening[rows, np.cumsum(d + 1) - 1] = slope
+            left = moments.variance[:, self._parts].copy()
+            if not self.place.joints_estimated:
+                left -= true[rows] ** 2 * self._diagonals(joints, rows)
+            if s.formed:
+                of_measured = true[rows] ** 2 * self._own[rows, self._parts]
+                self._bent_variance[rows] = np.maximum(left - of_measured, 0.0)
+                left -= of_measured + 0.5 * self._bent_variance[rows]
+            self.own[rows, d, d] = left
+
+        _over_rows(bend, s.n)
+        self.rows = replace(plain, data=data, whitening=whitening)
+        self.sources = tuple(source._replace(loading=source.loading * true[:, :, None, None]) for source in joints)
         if s.formed:
-            self.sources += (self._of_poses(),)
-        left = variance - of_joints - of_poses - 0.5 * self._bent_variance * s.formed
-        self.own = self._diagonal(left)
+            self.sources += (self._of_poses(true),)
+
+    def residual(self) -> Floats:
+        """Of all rows, shape (n, residual_dim), [m] and [rad]."""
+        return self._narrow(self.predicted) - self.series.data + self.excess
 
     @property
     def same_everywhere(self) -> bool:
@@ -352,24 +380,34 @@ class PairNoise(RowNoise):
         out[:, self._parts] = np.einsum("nii->ni", covariance)
         return out
 
-    def _diagonals(self, sources: tuple[Source, ...]) -> Floats:
-        zero = np.zeros((self.series.n, self.series.kind.residual_dim))
-        return sum((np.einsum("nii->ni", source.variance) for source in sources), zero)
+    def _diagonals(self, sources: tuple[Source, ...], rows: slice) -> Floats:
+        """What sources add to the variance of some rows, shape (n, residual_dim)."""
+        some = [source._replace(ends=source.ends[rows], loading=source.loading[rows]) for source in sources]
+        zero = np.zeros(self.series.data[rows].shape)
+        return sum((np.einsum("nii->ni", source.variance) for source in some), zero)
 
-    def _moments(self, of_joints: Floats) -> Moments:
-        """Mean and variance of each distance and angle, shapes (n, 2); of no meaning where not wanted."""
+    def _moments(self, rows: slice, linear: Floats, bending: Floats, of_joints: Floats) -> Moments:
+        """Mean and variance of each distance and angle, shapes (n, 2); of no meaning where not wanted.
+
+        Args:
+            rows: The pairs.
+            linear: Variance of each distance and angle by joint noise, to first order, shape (n, 2).
+            bending: From `_bending`, shape (n, 2).
+            of_joints: From `_joint_trace`.
+        """
         s, m, factors = self.series, self.place.measurements, self._both**2
-        along, trace, own = np.zeros((s.n, 2)), np.zeros((s.n, 2)), self._own
+        ends, own = s.ends[rows], self._own[rows]
+        along, trace = np.zeros_like(own), np.zeros_like(own)
         if s.formed:
-            along, own = self._own, np.zeros_like(self._own)
-            trace = np.stack([_trace(m.sigma_position, s.ends), _trace(m.sigma_orientation, s.ends)], axis=1) * factors
-        if len(self.place.joints) and not self.place.joints_estimated:
-            along = along + of_joints
-            trace = trace + self._joint_trace() * self.joint_factor**2
-        across = np.maximum(trace - along, 0.0) / 2.0 + self._bending()
+            along, own = own, np.zeros_like(own)
+            trace = np.stack([_trace(m.sigma_position, ends), _trace(m.sigma_orientation, ends)], axis=1) * factors
+        if len(of_joints):
+            along = along + linear
+            trace = trace + of_joints[ends].sum(axis=1)
+        across = np.maximum(trace - along, 0.0) / 2.0 + bending
         along, across, own = (np.where(self._wanted, v, 0.0) for v in (along, across, own))
         found = [
-            of(self.predicted[:, k], along[:, k], across[:, k], own[:, k])
+            of(self.predicted[rows, k], along[:, k], across[:, k], own[:, k])
             for k, of in enumerate((length_moments, angle_moments))
         ]
         return Moments(*(np.stack(pair, axis=1) for pair in zip(*map(astuple, found), strict=True)))
@@ -400,12 +438,15 @@ class PairNoise(RowNoise):
         measured, p = m.position[~m.test], self._poses.position[~m.test]
         return nearest_rotation((measured - measured.mean(axis=0)).T @ (p - p.mean(axis=0)))
 
-    def _of_poses(self) -> Source:
+    def _of_poses(self, slopes: Floats) -> Source:
         """How the rows follow from the errors of the measured poses that the pairs were formed from.
 
         Of each kind a pose has three errors, along the axes, and a fourth, the square of its errors across: the latter
         lengthen all pairs of the pose. Of what the squares at both ends add to the variance of a pair half is theirs,
         a quarter at either end, and half that of their product, the pair's own.
+
+        Args:
+            slopes: Of the mean of each row, shape (n, residual_dim).
         """
         m, s, n_parts = self.place.measurements, self.series, len(self._parts)
         G = np.zeros((s.n, n_parts, 2, n_parts, 4))  # row, quantity, end, its source, (axes, square)
@@ -413,7 +454,7 @@ class PairNoise(RowNoise):
         bent = np.sqrt(self._bent_variance)
         for i, k in enumerate(self._parts):
             sigma = (m.sigma_position, m.sigma_orientation)[k]
-            slope = self.moments.slope[:, k, None, None]
+            slope = slopes[:, i, None, None]
             if sigma is not None:
                 G[:, i, :, i, :3] = self._both[k] * slope * sign * self._directions[k][:, None] * sigma[s.ends]
             G[:, i, :, i, 3] = -0.5 * bent[:, i, None]
@@ -427,7 +468,7 @@ class PairNoise(RowNoise):
         """
         if self._spread is None:
             return np.zeros((self.series.n, 2))
-        return np.minimum(self._noticed(self._spread, LEAST_BEND), MOST_BEND * self._straight())
+        return np.minimum(self._noticed(self._spread, LEAST_BEND), MOST_BEND * self._straight(slice(None)))
 
     def _noticed(self, spread: Floats, sigmas: float) -> Floats:
         """Variance across where it bends a row by so many sigma, else 0, shape (n, 2).
@@ -437,21 +478,24 @@ class PairNoise(RowNoise):
         across, train = np.zeros((self.series.n, 2)), np.flatnonzero(~self.series.test)
         if not len(train):
             return across
-        least = sigmas * self._straight()
         most = 4.0 * self._spread_across(_evenly(train), spread).max(axis=0)
-        rows = np.flatnonzero(np.any(most >= least, axis=1))
-        for start in range(0, len(rows), SPAN):
-            chunk = rows[start : start + SPAN]
-            across[chunk] = self._spread_across(chunk, spread)
-        return np.where(across >= least, across, 0.0)
+        for start in range(0, self.series.n, SPAN):
+            rows = slice(start, start + SPAN)
+            least = sigmas * self._straight(rows)
+            near = np.flatnonzero(np.any(most >= least, axis=1))
+            if len(near):
+                found = self._spread_across(start + near, spread)
+                across[start + near] = np.where(found >= least[near], found, 0.0)
+        return across
 
-    def _straight(self) -> Floats:
+    def _straight(self, rows: slice) -> Floats:
         """Variance across that bends a row by one sigma, shape (n, 2); infinite where there is none to bend.
 
         Nearer to 0 than one sigma it is that of the noise itself.
         """
-        sigma = np.sqrt(self._own)
-        return np.where((self._own > 0.0) & self._wanted, sigma * np.maximum(self.predicted, sigma), np.inf)
+        own, predicted = self._own[rows], self.predicted[rows]
+        sigma = np.sqrt(own)
+        return np.where((own > 0.0) & self._wanted, sigma * np.maximum(predicted, sigma), np.inf)
 
     def _spread_across(self, rows: Integers, spread: Floats) -> Floats:
         """What `_bending` is about at `rows`, shape (n, 2)."""
@@ -485,12 +529,15 @@ class PairNoise(RowNoise):
         return np.maximum(everything - along, 0.0) / 2.0, along
 
     def _joint_trace(self) -> Floats:
-        """Variance that joint noise gives each vector, all directions together, shape (n, 2)."""
+        """Variance that joint noise gives each vector at one end, all directions together, shape (n_configurations, 2).
+
+        No rows where there is none, or where true joint values are estimated.
+        """
+        if self.place.joints_estimated or not len(self.place.joints):
+            return np.zeros((0, 2))
         J = forward(self.place.chain.without_columns().with_joint_columns(), self.place.trig).jacobian
-        J = J * self.place.measurements.sigma_joint
-        of_each = np.stack([np.sum(J[:, 3:] ** 2, axis=(1, 2)), np.sum(J[:, :3] ** 2, axis=(1, 2))], axis=1)
-        both: Floats = of_each[self.series.ends].sum(axis=1)
-        return both
+        J = J * self.place.measurements.sigma_joint * self.joint_factor
+        return np.stack([np.sum(J[:, 3:] ** 2, axis=(1, 2)), np.sum(J[:, :3] ** 2, axis=(1, 2))], axis=1)
 
 
 _QUANTITY: dict[type, int] = {Distance: 0, RotationAngle: 1}
@@ -510,15 +557,20 @@ def whitening_of(covariance: Floats, used: Booleans) -> Floats:
         covariance: S, shape (n, residual_dim, residual_dim).
         used: Shape (n, residual_dim).
     """
-    residual_dim = used.shape[1]
-    if residual_dim == 1:
+    if used.shape[1] == 1:
         with np.errstate(divide="ignore"):
             return np.where(used[:, :, None], 1.0 / np.sqrt(covariance), 0.0)
-    if not used.all():
-        both = used[:, :, None] & used[:, None, :]
-        covariance = np.where(both, covariance, np.eye(residual_dim))
-    W: Floats = np.tril(np.linalg.inv(np.linalg.cholesky(covariance)))
-    return W if used.all() else W * used[:, :, None]
+    W = np.empty(covariance.shape)
+    C, mine = (np.require(given, requirements=["C", "W"]) for given in (covariance, used))  # as the kernel takes them
+    if not all(over_spans(lambda start, stop: whiten_small(C, mine, start, stop, W), len(used))):
+        raise np.linalg.LinAlgError("Matrix is not positive definite")
+    return W
+
+
+def _over_rows(run: Callable[[slice], None], n: int) -> None:
+    """Work out something of n rows in spans, so that what it takes on the way stays in the processor's cache."""
+    for _ in over_spans(lambda start, stop: run(slice(start, stop)), n):
+        pass
 
 
 def _evenly(rows: Integers) -> Integers:

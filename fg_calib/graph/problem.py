@@ -153,13 +153,13 @@ class Problem(FrozenArrays):
     @property
     def n_pairs(self) -> int:
         """Train pairs that give at least one row."""
-        found = [(s.table, k) for s in self.pair_series for k in s.number[s.train].tolist()]
-        return len(set(found))
+        tables = {s.table for s in self.pair_series}
+        return sum(_n_different([s.number[s.train] for s in self.pair_series if s.table == t]) for t in tables)
 
     @property
     def n_configurations(self) -> int:
         """Configurations that the train rows come from."""
-        return len(np.unique(np.concatenate([self._train_configurations(s) for s in self.data.series])))
+        return _n_different([self._train_configurations(s) for s in self.data.series])
 
     def _train_configurations(self, series: Series) -> Integers:
         return self.data.places[series.table][series.ends[series.train]].ravel()
@@ -222,6 +222,14 @@ class Problem(FrozenArrays):
     def missing_correlation(self) -> bool:
         """Whether measurements share errors but were asked to count as independent."""
         return self.options.pair_errors == "independent" and share_errors(self.noises)
+
+
+def _n_different(numbers: Sequence[Integers]) -> int:
+    """How many different numbers, from 0, there are."""
+    seen = np.zeros(1 + max((int(some.max(initial=-1)) for some in numbers), default=-1), dtype=np.bool_)
+    for some in numbers:
+        seen[some] = True
+    return int(np.sum(seen))
 
 
 def assembled(problem: Problem, start: Floats, state: NoiseState | None = None, **changes: Any) -> Problem:
@@ -345,6 +353,25 @@ def reweighted_at(problem: Problem, parameters: Floats, state: NoiseState | None
     if (state is None or state is problem.state) and all(noise.same_everywhere for noise in problem.noises):
         return replace(started_at(problem, parameters), noises=noises_at(problem, parameters))
     return assembled(problem, parameters, state)
+
+
+def some_rows(problem: Problem, share: float) -> Problem | None:
+    """The same problem with some of its train rows, drawn evenly, whitened at its start.
+
+    Args:
+        problem: The problem.
+        share: Which share of each series.
+
+    Returns:
+        None where single rows count for more than others do: where they have robust weights, or depend on unknowns of
+        their own.
+    """
+    if problem.variables.nuisance or problem.options.loss != "none" or problem.state.weights is not None:
+        return None
+    rng, series = np.random.default_rng(0), []
+    for s in problem.data.series:
+        series.append(s.select(np.sort(rng.permutation(s.train)[: round(share * len(s.train))])))
+    return assembled(replace(problem, data=replace(problem.data, series=tuple(series))), problem.start)
 
 
 def started_at(problem: Problem, start: Floats) -> Problem:

@@ -13,6 +13,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from hashlib import sha256
 
 import numpy as np
 import scipy.sparse
@@ -23,12 +25,15 @@ from fg_calib.graph.noise import RowNoise, Source, whitening_of
 from fg_calib.measurements import residuals
 from fg_calib.measurements.residuals import Block, pack, unpack
 from fg_calib.measurements.sharing import SharedErrors
-from fg_calib.robot.kinematics import SPAN, Chain
+from fg_calib.robot.kinematics import SPAN, Chain, over_spans
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Booleans = NDArray[np.bool_]
 Sparse = scipy.sparse.csr_array
+
+REMEMBERED = 4
+"""Triangles of a set of rows that are kept: many ask what rows say at the start, at nominal and at the estimate."""
 
 LEAST_WEIGHT = 1e-12
 """A robust weight below this is taken for this."""
@@ -51,6 +56,13 @@ class At(Brief):
     columns: Integers
     n_columns: int
     n_nuisance: int
+
+    @cached_property
+    def mark(self) -> bytes:
+        """What tells it from others."""
+        arrays = [array for chain in self.chains for array in (*chain.arrays[:7], *chain.arrays[9:])]
+        marks = [array.tobytes() for array in (*arrays, self.coordinates, self.columns)]
+        return sha256(b"|".join([*marks, repr((self.n_columns, self.n_nuisance)).encode()])).digest()
 
     def without_columns(self) -> At:
         """The same without derivatives."""
@@ -137,6 +149,7 @@ class RowSet(Brief):
     configurations: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     joints: int = 0
     spare: Sparse | None = None
+    _triangles: dict[bytes, Floats] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
     def n_rows(self) -> int:
@@ -175,7 +188,14 @@ class RowSet(Brief):
         return float(r @ r)
 
     def triangle(self, at: At) -> Floats:
-        """R of a thin QR of [J r], shape (n_columns + n_nuisance + 1,) * 2."""
+        """R of a thin QR of [J r], shape (n_columns + n_nuisance + 1,) * 2; the last ones are remembered."""
+        if at.mark not in self._triangles:
+            for mark in list(self._triangles)[: 1 - REMEMBERED]:
+                self._triangles.pop(mark, None)
+            self._triangles[at.mark] = self._triangle(at)
+        return self._triangles[at.mark].copy()
+
+    def _triangle(self, at: At) -> Floats:
         if self._kernel_alone:
             return _padded(residuals.triangle(self.parts[0].block, at.chains[self.parts[0].table]), at.n_nuisance)
         chunks = self.parts[0].linearise(at) if self._one_by_one else iter([self._whitened(at)])
@@ -323,21 +343,31 @@ def _part(
     n, residual_dim = len(train), series.kind.residual_dim
     masks = {source.name: shares.mask(source)[train] for source in noise.sources}
     carried = frozenset(name for name, mask in masks.items() if mask.any())
-    base = noise.own[train].copy()
-    diagonal = np.einsum("nii->ni", base).copy()
+    rows: Integers | slice = slice(None) if n == series.n else train
+    private, diagonal = noise.own[rows], np.einsum("nii->ni", noise.own[rows])
     if carried:
         raised = np.maximum(diagonal + _at(noise.more_if_redundant(carried), train), _at(noise.least(), train))
-        base += (raised - diagonal)[:, :, None] * np.eye(residual_dim)
+        private = private + (raised - diagonal)[:, :, None] * np.eye(residual_dim)
         diagonal = raised
-    private = base
     for source in noise.sources:
         own = np.where(masks[source.name][:, None, :, None], 0.0, source.loading[train]).reshape(n, residual_dim, -1)
         private = private + own @ np.swapaxes(own, 1, 2)
     if weights is not None:  # noise of its own on top, so much that a measurement says no more than its weight
         private = private + (1.0 / np.maximum(weights[train], LEAST_WEIGHT) - 1.0)[:, None, None] * noise.total[train]
-    W = whitening_of(private, series.used[train])
-    rows = noise.rows_at(train)
-    block = replace(rows, whitening=pack(W @ unpack(rows.whitening, residual_dim)))
+    plain, used = residuals.rows_of(noise.rows, rows), series.used[rows]
+    W_is_wanted = bool(noise.sources) or joint_errors is not None
+    W, whitening = np.empty(private.shape if W_is_wanted else (0, 0, 0)), np.empty(plain.whitening.shape)
+
+    def whiten(start: int, stop: int) -> None:
+        some = slice(start, stop)
+        white = whitening_of(private[some], used[some])
+        whitening[some] = pack(white @ unpack(plain.whitening[some], residual_dim))
+        if W_is_wanted:
+            W[some] = white
+
+    for _ in over_spans(whiten, n):
+        pass
+    block = replace(plain, whitening=whitening)
     offset = None if joint_errors is None else _offset(noise, train, W, joint_errors)
     E = scipy.sparse.csr_array((n * residual_dim, 0))
     if any(name != "joints" for name in carried):
@@ -435,6 +465,8 @@ class ErrorColumns:
         n, residual_dim = len(rows), noise.series.kind.residual_dim
         places, columns, figures = [], [], []
         for source in noise.sources if sources is None else sources:
+            if masks is not None and not masks[source.name].any():
+                continue
             ends, w = source.loading.shape[2:]
             flat = source.loading[rows].reshape(n, residual_dim, ends * w)
             G = (flat if W is None else W @ flat).reshape(n, residual_dim, ends, w)

@@ -46,6 +46,7 @@ from fg_calib.graph.problem import (
     noises_at,
     reweighted_at,
     same_rows,
+    some_rows,
     started_at,
 )
 from fg_calib.graph.robust import Weighting
@@ -95,6 +96,9 @@ FOLDED_STEPS, FOLDED_TRIES = 20, 8
 """Steps after which rows of pairs are whitened anew although their optimum has not been reached, and how often. Where a
 length is measured below 0 or an angle beyond half a turn, but for its noise, rows as they are whitened elsewhere have
 their least cost at the kink itself, where steps arrive at nothing; whitened there they are smooth."""
+
+MANY_ROWS, FEW = 200_000, 0.1
+"""Of more residuals than the first this share of the measurements is solved before all are."""
 
 COARSE = 0.3
 """Rows are whitened anew once the optimum with the present ones is nearer than this, [sigma]."""
@@ -194,7 +198,8 @@ class Solution(FrozenArrays):
 def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
     """Estimate the parameters.
 
-    First measurement frame, base and tool alone with the arm at nominal, then everything. Each time that the optimum is
+    First measurement frame, base and tool alone with the arm at nominal, then everything; of very many measurements at
+    first some, drawn evenly, whose steps are not counted. Each time that the optimum is
     near, the rows are judged and whitened at the estimate, robust weights follow from the residuals there and joint
     errors, where they are estimated, from what the rows say of them; the solver goes on with the new rows until they
     leave nothing to go.
@@ -212,8 +217,23 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
             problem = reweighted_at(problem, before)
         if not problem.variables.keys:
             return _taken_as_it_is(problem, clock)
-        run = _fit(problem, options)
-        return _solution(run, before, run.initial_cost, clock)
+        started = _started_near(problem, options)
+        run = _fit(started, options)
+        initial_cost = run.initial_cost if started is problem else problem.graph.error(problem.initial)
+        return _solution(run, before, initial_cost, clock)
+
+
+def _started_near(problem: Problem, options: SolverOptions) -> Problem:
+    """A problem of very many rows, started at the optimum of a few of them: some ten sigma away."""
+    few = some_rows(problem, FEW) if problem.n_residuals > MANY_ROWS else None
+    if few is None:
+        return problem
+    try:
+        options = replace(options, decrement=max(options.decrement, NEAR_ENOUGH))
+        run = _fit(_started_near(few, options), options)
+    except SolverError:
+        return problem
+    return reweighted_at(problem, run.parameters) if run.converged else problem
 
 
 def unsolved(problem: Problem) -> Solution:
@@ -235,7 +255,8 @@ def _before(problem: Problem, options: SolverOptions) -> Floats:
     frames = frames_only(problem)
     if frames is None:
         return problem.start
-    found = _fit(frames, replace(options, decrement=max(options.decrement, COARSE))).parameters
+    options = replace(options, decrement=max(options.decrement, COARSE))
+    found = _fit(_started_near(frames, options), options).parameters
     return np.concatenate([found, problem.start[len(found) :]])
 
 

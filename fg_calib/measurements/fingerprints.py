@@ -7,13 +7,14 @@ the same ones.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.measurements.dataset import Labels, Measurements, Pairs
 from fg_calib.measurements.series import Table
+from fg_calib.robot.kinematics import over_spans
 
 Floats = NDArray[np.float64]
 Words = NDArray[np.uint64]
@@ -33,7 +34,7 @@ def fingerprints(tables: Sequence[Table]) -> tuple[str, ...]:
     """Of the train rows of tables, 12 hexadecimal digits each, sorted; at most `MOST` a table."""
     found: set[str] = set()
     for table in tables:
-        marks = np.unique(_hashes(table.measurements))[:MOST]
+        marks = _smallest(_hashes(table.measurements))
         found |= {f"{mark:012x}" for mark in marks.tolist()}
     return tuple(sorted(found))
 
@@ -42,6 +43,17 @@ def counted_before(table: Table, known: Collection[str]) -> bool:
     """Whether half of a table's rows are among fingerprints."""
     mine = fingerprints([table])
     return bool(mine) and sum(mark in known for mark in mine) >= SAME * len(mine)
+
+
+def _smallest(hashes: Words) -> Words:
+    """The `MOST` smallest different ones."""
+    some = hashes
+    for n in (2 * MOST, 16 * MOST):
+        if len(hashes) > n:
+            some = np.unique(np.partition(hashes, n)[:n])
+            if len(some) >= MOST:
+                return some[:MOST]
+    return np.unique(hashes)[:MOST]
 
 
 def _hashes(m: Measurements) -> Words:
@@ -55,7 +67,7 @@ def _hashes(m: Measurements) -> Words:
     touched = m.groups is not None
     if m.groups is not None:
         there = ~m.test & (there | (m.groups.index >= 0))
-    hashes = _mixed(columns)
+    hashes = _mixed(_rounded(columns).T, n)
     for column in ("target", "anchor", "plane", "board"):
         if column in m.labels:
             hashes = _with_names(hashes, m.labels[column])
@@ -69,9 +81,17 @@ def _hashes(m: Measurements) -> Words:
 
 
 def _of_pairs(readings: Floats, pairs: Pairs) -> Words:
-    train = ~pairs.test
-    ends = readings[pairs.a[train]], readings[pairs.b[train]]
-    return _mixed(np.column_stack([*ends, pairs.distance[train], pairs.angle[train]]))
+    found, bits = np.zeros(pairs.n_pairs, dtype=np.uint64), _rounded(readings)
+    figures = [_rounded(values) for values in (pairs.distance, pairs.angle)]
+
+    def run(start: int, stop: int) -> None:
+        rows = slice(start, stop)
+        ends = [bits[end[rows]].T for end in (pairs.a, pairs.b)]
+        found[rows] = _mixed([*ends[0], *ends[1], *(values[rows] for values in figures)], stop - start)
+
+    for _ in over_spans(run, pairs.n_pairs):
+        pass
+    return found[~pairs.test]
 
 
 def _with_names(hashes: Words, labels: Labels) -> Words:
@@ -82,11 +102,16 @@ def _with_names(hashes: Words, labels: Labels) -> Words:
     return _stirred(hashes ^ codes[labels.index])
 
 
-def _mixed(columns: Floats) -> Words:
-    """One hash a row, shape (n,)."""
-    bits = (np.round(columns, _DECIMALS) + 0.0).view(np.uint64)  # + 0.0: no negative zeros
-    found = np.zeros(len(columns), dtype=np.uint64)
-    for column in bits.T:
+def _rounded(figures: Floats) -> Words:
+    """The bits of figures that count, of the same shape."""
+    bits: Words = (np.round(figures, _DECIMALS) + 0.0).view(np.uint64)  # + 0.0: no negative zeros
+    return bits
+
+
+def _mixed(columns: Iterable[Words], n: int) -> Words:
+    """One hash a row of columns of n rows, shape (n,)."""
+    found = np.zeros(n, dtype=np.uint64)
+    for column in columns:
         found = _stirred(found ^ column)
     return found
 

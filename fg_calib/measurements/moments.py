@@ -91,15 +91,15 @@ def angle_moments(f: Floats, along: Floats, across: Floats, own: Floats) -> Mome
     """
     along, across, own = (np.minimum(v, WIDE) for v in (along, across, own))
     vector = _vector_length(f, along, across)
-    half = np.clip(0.5 * f, 1e-4, 0.5 * np.pi)
-    # What cot(f / 2) / 2 is less than 1 / f: -f / 12 to first order.
-    vector = Moments(
-        vector.excess + across * (0.5 / np.tan(half) - 0.5 / half),
-        vector.slope + across * (0.5 / half**2 - 0.5 / np.sin(half) ** 2) / 2.0,
-        np.maximum(
-            vector.variance + across**2 * (0.25 / np.tan(half) ** 2 - 0.25 / half**2), LEAST_VARIANCE * vector.variance
-        ),
-    )
+    if across.any():
+        half = np.clip(0.5 * f, 1e-4, 0.5 * np.pi)
+        # What cot(f / 2) / 2 is less than 1 / f: -f / 12 to first order.
+        more = across**2 * (0.25 / np.tan(half) ** 2 - 0.25 / half**2)
+        vector = Moments(
+            vector.excess + across * (0.5 / np.tan(half) - 0.5 / half),
+            vector.slope + across * (0.5 / half**2 - 0.5 / np.sin(half) ** 2) / 2.0,
+            np.maximum(vector.variance + more, LEAST_VARIANCE * vector.variance),
+        )
     near_zero = _folded(f, vector, own)
     x = np.pi - f - near_zero.excess
     fold = _fold(np.maximum(x, 0.0), near_zero.variance)
@@ -109,6 +109,8 @@ def angle_moments(f: Floats, along: Floats, across: Floats, own: Floats) -> Mome
 
 def _vector_length(f: Floats, along: Floats, across: Floats) -> Moments:
     """Of the length of a vector in error."""
+    if not (along.any() or across.any()):
+        return Moments(np.zeros_like(f), np.ones_like(f), np.zeros_like(f))
     near = (f < FAR * np.sqrt(np.maximum(along, across))) & (across > 0.0)
     relative = np.divide(across, f**2, out=np.zeros_like(f), where=(f > 0.0) & ~near)
     excess, slope, variance = relative * f, 1.0 - relative, along + (across - 2.0 * along) * relative

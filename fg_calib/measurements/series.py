@@ -88,6 +88,17 @@ class Series(Brief):
         """Measurements with a row to fit."""
         return np.flatnonzero(self.used.any(axis=1) & ~self.test)
 
+    def select(self, rows: Integers) -> Series:
+        """Some of the measurements."""
+        each = ("ends", "data", "sigma", "measured", "test", "number", "nuisances")
+        return replace(
+            self,
+            **{name: getattr(self, name)[rows] for name in each},
+            covariance=None if self.covariance is None else self.covariance[rows],
+            excluded={reason: mask[rows] for reason, mask in self.excluded.items()},
+            of=None if self.of is None else self.of.of(rows),
+        )
+
     def __post_init__(self) -> None:
         n, kind = len(self.test), self.kind
         shapes = {"ends": (n, kind.ends), "data": (n, kind.width), "sigma": (n, kind.residual_dim)}

@@ -12,7 +12,7 @@ from functools import cache
 from hashlib import sha256
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import scipy
@@ -40,8 +40,8 @@ from fg_calib.analysis.typical_residuals import TypicalResidual
 from fg_calib.analysis.uncertainty import ParameterEstimate, Uncertainty
 from fg_calib.arguments import checked
 from fg_calib.errors import InputError
-from fg_calib.files.csv_writer import Words, write_csv_parts
-from fg_calib.files.disk import fill_folder, read_bytes, require_own, write_text
+from fg_calib.files.csv_writer import Words, write_csv_parts, write_parquet_parts
+from fg_calib.files.disk import digest_of, fill_folder, require_own, write_text
 from fg_calib.files.result import (
     SCHEMA,
     Acceptance,
@@ -86,6 +86,7 @@ from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
 from fg_calib.job import Job
 from fg_calib.measurements.fingerprints import fingerprints
+from fg_calib.options import check
 from fg_calib.report.page.files import FIGURE_FILES, PAGE
 from fg_calib.report.shown import FAMILY_UNIT
 from fg_calib.robot.kinematics import pose
@@ -99,8 +100,11 @@ OBSERVABILITY_SCHEMA = "fg-calib/observability/1"
 COMPARISON_SCHEMA = "fg-calib/comparison/1"
 KINDS = ("position", "orientation", "distance", "angle")
 
-_ROWS_AT_ONCE = 200_000
-"""Rows of `residuals.csv` that are turned into text at once."""
+_ROWS_AT_ONCE = 100_000
+"""Rows of residuals that are turned into text, or into a group of rows of a Parquet file, at once."""
+
+ResidualFile = Literal["csv", "parquet", "none"]
+"""How single residuals are written, if at all."""
 
 
 @single_threaded
@@ -668,6 +672,7 @@ def write_comparison(folder: Path | str, comparison: Comparison, *, figures: boo
 RESULT_FILES = {
     "result.json": b'{\n "schema": "fg-calib/result/',
     "residuals.csv": b"kind,a,b,split,used,excluded,",
+    "residuals.parquet": b"PAR1",
     "configurations.csv": b"id,split,q1,",
     **PAGE,
     **FIGURE_FILES,
@@ -681,7 +686,11 @@ RESULT_FILES = {
 
 @checked
 def write_results(
-    folder: Path | str, solution: Solution, uncertainty: Uncertainty, inputs: Mapping[str, str] | None = None
+    folder: Path | str,
+    solution: Solution,
+    uncertainty: Uncertainty,
+    inputs: Mapping[str, str] | None = None,
+    residuals: ResidualFile = "csv",
 ) -> None:
     """Write `result.json`, the calibrated robot, `residuals.csv` and `configurations.csv` into a folder, all or none.
 
@@ -690,10 +699,17 @@ def write_results(
     A robot from a URDF gives `robot_calibrated.urdf`; where base or tool have values of their own, which a URDF cannot
     hold, a `robot_calibrated.yaml` beside it names them.
 
+    Args:
+        folder: Where to.
+        solution: The solution.
+        uncertainty: Its assessment.
+        inputs: SHA-256 of the files it came from, by path.
+        residuals: How single residuals are written, if at all: `residuals.csv` or `residuals.parquet`.
+
     Raises:
         InputError: The folder cannot be written.
     """
-    write_result(folder, result_of(solution, uncertainty, inputs), solution, uncertainty)
+    write_result(folder, result_of(solution, uncertainty, inputs), solution, uncertainty, residuals=residuals)
 
 
 def write_result(
@@ -702,6 +718,7 @@ def write_result(
     solution: Solution,
     uncertainty: Uncertainty,
     more: Callable[[str], dict[str, str]] | None = None,
+    residuals: ResidualFile = "csv",
 ) -> None:
     """`write_results` of a result that has been made.
 
@@ -711,23 +728,28 @@ def write_result(
         solution: The solution.
         uncertainty: Its assessment.
         more: Text of other files by name, of the SHA-256 of `result.json`.
+        residuals: See `write_results`.
 
     Raises:
         InputError: The folder cannot be written.
     """
+    check("residuals", residuals, ResidualFile)
     robot = solution.problem.robot
     calibrated = robot.with_values(solution.parameters[solution.problem.variables.robot_span])
     document = result.document()
 
     def write(into: Path) -> None:
         write_calibrated_robot(into, calibrated)
-        _write_residuals(into / "residuals.csv", solution, uncertainty)
         _write_configurations(into / "configurations.csv", solution, uncertainty)
+        tables = ["configurations.csv"]
+        if residuals != "none":
+            tables.append(f"residuals.{residuals}")
+            _write_residuals(into / tables[-1], solution, uncertainty)
         if uncertainty.joint_values is not None:
             units = [robot.joints[j].unit for j in uncertainty.joint_values.joints]
             _write_joint_values(into / "joints.csv", uncertainty.joint_values, solution.problem.end_names, units)
-        tables = {name: sha256(read_bytes(into / name)).hexdigest() for name in ("configurations.csv", "residuals.csv")}
-        text = json.dumps(document | {"files": tables}, indent=1, allow_nan=False) + "\n"
+        digests = {name: digest_of(into / name) for name in tables}
+        text = json.dumps(document | {"files": digests}, indent=1, allow_nan=False) + "\n"
         write_text(into / "result.json", text)
         for name, content in ({} if more is None else more(sha256(text.encode()).hexdigest())).items():
             write_text(into / name, content)
@@ -821,7 +843,8 @@ def _write_residuals(path: Path, solution: Solution, uncertainty: Uncertainty) -
         }
 
     starts = range(0, max(table.n, 1), _ROWS_AT_ONCE)
-    write_csv_parts(path, (columns(slice(start, start + _ROWS_AT_ONCE)) for start in starts))
+    write = write_csv_parts if path.suffix == ".csv" else write_parquet_parts
+    write(path, (columns(slice(start, start + _ROWS_AT_ONCE)) for start in starts))
 
 
 def _write_configurations(path: Path, solution: Solution, uncertainty: Uncertainty) -> None:

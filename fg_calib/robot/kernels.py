@@ -369,6 +369,45 @@ def fill(chain, trig, ends, data, whitening, twins, given, turning, panel):  # t
             _fill_nuisances(given[2], weight, first, panel)
 
 
+@compiled
+def whiten_small(covariances, used, start, stop, out):  # type: ignore[no-untyped-def]
+    """Inverse Cholesky factors of many small covariances, by the rows in use; whether all of them have one.
+
+    Args:
+        covariances: Shape (n, d, d).
+        used: Shape (n, d).
+        start: First of those that are wanted.
+        stop: The one after the last.
+        out: Filled: lower triangles, zero in what is not in use, shape (n, d, d).
+    """
+    d = used.shape[1]
+    L = np.zeros((d, d))
+    for n in range(start, stop):
+        C, W, mine = covariances[n], out[n], used[n]
+        W[:] = 0.0
+        for i in range(d):
+            for j in range(i + 1):
+                left = C[i, j] if mine[i] and mine[j] else 0.0
+                for k in range(j):
+                    left -= L[i, k] * L[j, k]
+                if i > j:
+                    L[i, j] = left / L[j, j]
+                elif not mine[i]:
+                    L[i, i] = 1.0
+                elif left > 0.0:
+                    L[i, i] = np.sqrt(left)
+                else:
+                    return False
+            if mine[i]:
+                for j in range(i):
+                    total = 0.0
+                    for k in range(j, i):
+                        total -= L[i, k] * W[k, j]
+                    W[i, j] = total / L[i, i]
+                W[i, i] = 1.0 / L[i, i]
+    return True
+
+
 @inlined
 def _gather_whitening(whitening, first, weight):  # type: ignore[no-untyped-def]
     """Whitening of each lane, zero where there is no measurement, once for each component of a wrench."""

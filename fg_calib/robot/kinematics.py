@@ -215,9 +215,11 @@ def precompute_trig(robot: Robot, readings: Floats, given: Floats | None = None)
     if len(shape) != 2 or shape[1] != robot.n_joints:
         raise InputError("readings", f"shape {shape}", expected)
     prismatic = np.array([j.prismatic for j in robot.joints])
-    trig = np.stack(
-        [np.where(prismatic, readings, np.cos(readings)), np.where(prismatic, 0.0, np.sin(readings))], axis=2
-    )
+    trig = np.empty((*shape, 2))
+    np.cos(readings, out=trig[:, :, 0])
+    np.sin(readings, out=trig[:, :, 1])
+    if prismatic.any():
+        trig[:, prismatic, 0], trig[:, prismatic, 1] = np.asarray(readings)[:, prismatic], 0.0
     if not robot.bases:
         return trig
     return np.concatenate([trig, np.stack([b.values(readings, given) for b in robot.bases], axis=1)], axis=1)

@@ -68,6 +68,19 @@ def calibrate(fg_calib, job, *arguments):
     return json.loads(ended.out, parse_constant=_refuse)
 
 
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [("parquet", "in the order of residuals.parquet"), ("none", "The folder holds no residuals.csv")],
+)
+def test_residuals_are_written_as_asked_for_and_the_page_reads_them(example, fg_calib, how, said):
+    ended = fg_calib("calibrate", example / JOB, "--out", example / "out", "--residuals", how, "--report")
+    assert (ended.code, ended.err) == (0, "")
+    names = {file.name for file in (example / "out").iterdir()}
+    table = {"residuals.parquet"} if how == "parquet" else set()
+    assert names == (OUTPUTS - {"residuals.csv"}) | {"report.html"} | table
+    assert said in (example / "out" / "report.html").read_text()
+
+
 def test_calibrating_the_example_ends_well_and_writes_its_files(calibrated):
     folder, ended = calibrated
     assert (ended.exit_code, ended.stderr) == (0, "")

@@ -1,15 +1,18 @@
 """Results read back: version 1 and 2, against their schema, and damaged ones refused in a line."""
 
 import json
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 from schemas import without_defaults
 from simulated import measure, small_arm, true_robot, write_job
 
 import fg_calib.files.result
 from fg_calib import Calibration, InputError, Pairing, calibrate, calibrate_job, read_result, read_urdf, result_schema
+from fg_calib.files.saved import read_residuals, require_unchanged
 
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3}
 
@@ -74,6 +77,35 @@ def test_what_is_written_reads_back_the_same(calibrations, tmp_path, name):
     assert found.model_copy(update={"files": {}}) == calibrations[name].result
     assert found.document() == json.loads((tmp_path / "result.json").read_text())
     assert read_result(tmp_path / "result.json") == found
+
+
+def test_residuals_are_the_same_as_csv_and_as_parquet_or_not_there(calibrations, tmp_path):
+    found = calibrations[next(iter(CASES))]
+    for how in ("csv", "parquet", "none"):
+        found.save(tmp_path / how, residuals=how)
+        tables = {file.name for file in (tmp_path / how).glob("residuals.*")}
+        assert tables == {"csv": {"residuals.csv"}, "parquet": {"residuals.parquet"}, "none": set()}[how]
+        assert set(read_result(tmp_path / how).files) == tables | {"configurations.csv"}
+    of_csv, of_parquet = (read_residuals(tmp_path / how) for how in ("csv", "parquet"))
+    assert (of_csv.place(0), of_parquet.place(0)) == ("residuals.csv:2", "residuals.parquet: row 0")
+    for field in fields(of_csv):
+        a, b = getattr(of_csv, field.name), getattr(of_parquet, field.name)
+        if field.name != "file":
+            np.testing.assert_array_equal(a, b)
+    assert read_residuals(tmp_path / "none") is None
+    found.save(tmp_path / "csv", residuals="parquet")  # in place of the other
+    assert [file.name for file in (tmp_path / "csv").glob("residuals.*")] == ["residuals.parquet"]
+    with pytest.raises(InputError, match="residuals: found 'xlsx', expected one of csv, parquet, none"):
+        found.save(tmp_path / "other", residuals="xlsx")
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_parquet_table_of_residuals_that_was_changed_is_refused(calibrations, tmp_path):
+    calibrations[next(iter(CASES))].save(tmp_path, residuals="parquet")
+    table = tmp_path / "residuals.parquet"
+    pl.read_parquet(table).with_columns(residual=0.0).write_parquet(table)
+    with pytest.raises(InputError, match=r"residuals\.parquet: changed, or of another calibration"):
+        require_unchanged(tmp_path, read_result(tmp_path).files)
 
 
 @pytest.mark.slow

@@ -176,7 +176,7 @@ def residual_charts(run: Run) -> list[Figure]:
             charts.append((about, _histogram(values, family)))
     shown = np.clip(found.studentised, -12.0, 12.0)
     order = np.arange(len(shown), dtype=np.float64)
-    about = "Residuals in the order of residuals.csv"
+    about = f"Residuals in the order of {found.file}"
     chart = Chart((0.0, max(len(shown), 2)), limits_of(shown, [-4.0, 4.0]), ("row", "in its sigma"), about)
     for level in (-3.0, 3.0):
         chart.level(level)

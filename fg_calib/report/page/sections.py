@@ -36,7 +36,7 @@ _FEW = 3
 """Residuals a parameter, below which strong correlations may come from that alone."""
 
 _MOST_ROWS = 40
-"""Suspicious rows that the page lists; `residuals.csv` has all."""
+"""Suspicious rows that the page lists; the table of residuals has all."""
 
 
 def verdict(run: Run) -> list[Element]:
@@ -278,11 +278,11 @@ def residuals(run: Run) -> list[Element]:
         of = f"{found.a[k]} {found.b[k]}".strip()
         split = "test" if found.test[k] else "train"
         shown = f"{found.residual[k] * factor:+.{decimals}f} {unit}", f"{found.studentised[k]:+.1f}"
-        rows.append([found.kinds[found.kind[k]], of, found.of[k], split, *shown, f"residuals.csv:{found.line[k]}"])
+        rows.append([found.kinds[found.kind[k]], of, found.of[k], split, *shown, found.place(k)])
     heading = ["what", "configuration", "of", "split", "residual", "in its sigma", "where"]
     parts += [tag("h3", f"Suspicious rows ({len(suspects)})"), table(heading, rows)]
     if len(suspects) > _MOST_ROWS:
-        parts.append(tag("p", f"and {len(suspects) - _MOST_ROWS} more: suspect in residuals.csv", class_="soft"))
+        parts.append(tag("p", f"and {len(suspects) - _MOST_ROWS} more: suspect in {found.file}", class_="soft"))
     return parts
 
 

@@ -1,0 +1,145 @@
+"""Tables of very many rows: a start from some of them, what is remembered, the same bits on any number of threads."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from simulated import small_arm, true_robot
+from tolerances import rounding
+
+from fg_calib import Calibration, Measurements, assess, solve
+from fg_calib.graph import solver
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.information import row_triangles
+from fg_calib.graph.noise import whitening_of
+from fg_calib.graph.problem import reweighted_at, some_rows
+from fg_calib.measurements import fingerprints, residuals
+from fg_calib.robot import kinematics
+from fg_calib.robot.kinematics import SPAN, pose
+from fg_calib.threads import processors
+
+TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3}
+
+
+def pairs_of(n, robot, rng, n_configurations=200):
+    """Pairs measured directly, some near a fold."""
+    true = true_robot(robot, rng)
+    q = rng.uniform(-3.0, 3.0, (n_configurations, robot.n_joints))
+    at = pose(true, q)
+    a = rng.integers(0, len(q), n)
+    b = (a + rng.integers(1, len(q), n)) % len(q)
+    distance = np.linalg.norm(at.position[a] - at.position[b], axis=1) + 1e-3 * rng.normal(size=n)
+    turn = Rotation.from_matrix(at.rotation[a]).inv() * Rotation.from_matrix(at.rotation[b])
+    angle = np.abs(turn.magnitude() + 1e-3 * rng.normal(size=n))
+    pairs = {"a": a, "b": b, "distance": np.abs(distance), "angle": np.minimum(angle, 2.0 * np.pi - angle)}
+    return Measurements.from_arrays(q, pairs=pairs | {"sigma_distance": 1e-3, "sigma_angle": 1e-3})
+
+
+@pytest.fixture(scope="module")
+def problem():
+    robot = small_arm(TOLERANCE)
+    return build_problem(robot, pairs_of(3000, robot, np.random.default_rng(0)), model="distance-rotation")
+
+
+def test_a_start_from_some_rows_leads_to_the_optimum_of_all(problem, monkeypatch):
+    expected = solve(problem)
+    monkeypatch.setattr(solver, "MANY_ROWS", 1000)
+    found = solve(problem)
+    assert found.converged
+    assert found.history[0].decrement < 0.1 * expected.history[0].decrement  # it began nearer
+    assert found.initial_cost == expected.initial_cost
+    sigma = np.sqrt(np.diag(assess(expected).covariance))
+    change = (found.parameters - expected.parameters)[problem.variables.robot_span]
+    estimated = [p.estimated for p in problem.robot.parameters]
+    # Both are nearer to the optimum than 3e-7 sigma.
+    assert np.max(np.abs(change[estimated] / sigma)) < 1e-6
+
+
+def test_some_rows_are_train_rows_and_as_many_as_asked_for(problem):
+    (s,) = problem.data.series
+    test = np.arange(s.n) % 3 == 0
+    held_out = replace(problem, data=replace(problem.data, series=(replace(s, test=test),)))
+    few = some_rows(held_out, 0.1)
+    (drawn,) = few.data.series
+    assert drawn.n == round(0.1 * np.sum(~test))
+    assert not test[drawn.number].any()
+    assert np.array_equal(drawn.data, s.data[drawn.number])
+    assert len(few.start) == len(problem.start)
+
+
+@pytest.mark.parametrize("change", [{"loss": "huber"}, {"loss": "gnc"}])
+def test_rows_with_weights_of_their_own_are_all_taken(problem, change):
+    assert some_rows(replace(problem, options=replace(problem.options, **change)), 0.1) is None
+
+
+def test_a_triangle_that_is_remembered_is_that_of_its_parameters_and_columns(problem):
+    (rows,), at = problem.rows, problem.variables.at
+    first, other = problem.start, problem.start + 1e-3 * np.arange(len(problem.start))
+    (there,) = row_triangles(problem, first)
+    (anew,) = reweighted_at(problem, first).rows
+    for parameters in (other, first, other):
+        # The same rows by another way: LAPACK's products are exact to some rounding of each of 6000 rows.
+        expected, found = rows.gram(at(parameters)), rows.triangle(at(parameters))
+        assert np.abs(found.T @ found - expected).max() < 1e-12 * expected.max()
+    assert np.array_equal(rows.triangle(at(first)), there)
+    assert np.array_equal(anew.triangle(at(first)), there)
+    assert rows.triangle(at(first).without_columns()).shape == (1, 1)
+    there[:] = 0.0  # what was handed out is the caller's own
+    assert rows.triangle(at(first)).any()
+
+
+def test_squares_along_directions_are_those_of_the_derivatives(problem):
+    block, chain = problem.rows[0].parts[0].block, problem.variables.at(problem.start).chains[0]
+    _, J = residuals.linearise(block, chain)
+    directions = np.random.default_rng(1).normal(size=(J.shape[2], 3))
+    expected = np.sum((J @ directions) ** 2, axis=2)
+    found = residuals.squares_along(block, chain, directions)
+    assert np.abs(found - expected).max() < rounding(1000, expected.max())
+
+
+@pytest.mark.parametrize("d", [2, 3, 6])
+def test_small_covariances_are_whitened_by_the_rows_in_use(d):
+    rng = np.random.default_rng(d)
+    A = rng.normal(size=(50, d, d))
+    C, used = A @ np.swapaxes(A, 1, 2) + np.eye(d), rng.random((50, d)) < 0.7
+    W = whitening_of(C, used)
+    both = used[:, :, None] & used[:, None, :]
+    assert np.array_equal(W, np.tril(W) * both)
+    # W C W^T = 1 where rows are in use; condition numbers up to 1e3
+    assert np.abs(W @ (C * both) @ np.swapaxes(W, 1, 2) - np.eye(d) * both).max() < 1e-12
+    with pytest.raises(np.linalg.LinAlgError):
+        whitening_of(-C, np.ones_like(used))
+
+
+def test_fingerprints_of_many_rows_are_the_smallest_different_ones():
+    rng = np.random.default_rng(0)
+    for n, most in ((500, 10**15), (40_000, 10**15), (40_000, 1500), (40_000, 700)):
+        hashes = rng.integers(0, most, n).astype(np.uint64)
+        assert np.array_equal(fingerprints._smallest(hashes), np.unique(hashes)[: fingerprints.MOST])
+
+
+def test_every_bit_is_the_same_on_any_number_of_threads(monkeypatch):
+    robot = small_arm(TOLERANCE)
+    table = pairs_of(3 * SPAN + 17, robot, np.random.default_rng(1))
+    monkeypatch.setattr(solver, "MANY_ROWS", SPAN)  # so that some rows are solved first
+    found = {}
+    try:
+        for n in (1, 2, 3, 4):
+            monkeypatch.setenv("FG_CALIB_THREADS", str(n))
+            for cached in (processors, kinematics._pool):
+                cached.cache_clear()
+            assert processors() == n
+            solution = solve(build_problem(robot, table, model="distance-rotation"))
+            result = Calibration.of(solution, assess(solution), date="2026-01-01T00:00:00+00:00").result
+            document = result.document()
+            document["solver"].pop("seconds")
+            goodness = assess(solution).goodness
+            arrays = (solution.parameters, solution.problem.rows[0].parts[0].block.data, goodness.leverage)
+            found[n] = pickle.dumps((document, [array.tobytes() for array in arrays]))
+    finally:
+        monkeypatch.undo()
+        for cached in (processors, kinematics._pool):
+            cached.cache_clear()
+    assert all(found[n] == found[1] for n in found)
