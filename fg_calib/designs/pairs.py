@@ -209,5 +209,4 @@ def _stops(problem: Problem, n: int) -> StopRows:
     """Pairs as stops."""
     v = problem.variables
     known = np.pad(prior_rows(v, problem.start)[1], ((0, 0), (0, v.n_nuisance)))
-    measured = np.ones(n, dtype=np.int64)
-    return StopRows(_rows(problem, n), known, v.all_scales, v.n_columns, v.n_robot_columns, measured)
+    return StopRows(_rows(problem, n), known, v.all_scales, v.n_columns, v.n_robot_columns)

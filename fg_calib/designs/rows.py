@@ -40,7 +40,6 @@ class StopRows(FrozenArrays):
         scales: A change of ordinary size in each column, shape (n_columns,).
         n_core: How many columns, the first ones, are the core's.
         n_arm: How many of these, the first ones, are the arm's; the others are those of measurement frames.
-        measured: Measurements of each stop, shape (n_stops,); 0 where it has none.
     """
 
     rows: Floats
@@ -48,7 +47,6 @@ class StopRows(FrozenArrays):
     scales: Floats
     n_core: int
     n_arm: int
-    measured: Integers
 
 
 def stop_rows(problem: Problem, of: Integers, hubs: Integers | None = None, *, alone: bool = True) -> StopRows:
@@ -73,10 +71,6 @@ def stop_rows(problem: Problem, of: Integers, hubs: Integers | None = None, *, a
         A.append(np.hstack([J, hub]))
         loadings.append(L)
         stop.append(which)
-    measured = np.zeros(n_stops, dtype=np.int64)
-    for s in problem.data.series:
-        at = of[problem.data.places[s.table][s.ends[s.train]]].max(axis=1) if s.kind.ends else np.zeros(0, np.int64)
-        measured += np.bincount(at[at >= 0], minlength=n_stops)
     whole, own, which = np.concatenate(A), np.concatenate(loadings), np.concatenate(stop)
     stacked = _stacked(np.hstack([whole, own]), which, n_stops)
     of_stops = _whitened(stacked[:, :, : whole.shape[1]], stacked[:, :, whole.shape[1] :])
@@ -88,7 +82,7 @@ def stop_rows(problem: Problem, of: Integers, hubs: Integers | None = None, *, a
     wide = np.vstack([*(np.pad(rows, ((0, 0), (0, n_shared))) for rows in fixed), of_hubs])
     errors = np.hstack([np.zeros((n_shared, n_columns)), np.eye(n_shared)])
     scales = np.append(v.all_scales, np.ones(n_shared))
-    return StopRows(of_stops, np.vstack([wide, errors]), scales, v.n_columns, v.n_robot_columns, measured)
+    return StopRows(of_stops, np.vstack([wide, errors]), scales, v.n_columns, v.n_robot_columns)
 
 
 def _of_set(

@@ -140,7 +140,6 @@ def test_stops_without_train_rows_add_nothing():
     data = measure(arm, 6, np.random.default_rng(0), n_test=3)
     problem = build_problem(arm, data, model="pose", frame="known")
     rows = stop_rows(problem, np.arange(9))
-    assert rows.measured.tolist() == [1] * 6 + [0] * 3
     assert not rows.rows[6:].any()
     assert rows.rows[:6].any(axis=(1, 2)).all()
     assert apart(information_of(problem), of_stops(rows)) < rounding()
@@ -150,9 +149,11 @@ def test_stops_without_train_rows_add_nothing():
 def test_many_rows_are_reduced_to_no_more_than_they_determine(kind):
     """An image says of a stop's frame what a pose says; of two boards in sight twice that."""
     pool = pool_with(*KINDS[kind])
-    assert pool.rows.measured.max() >= GRID.rows * GRID.columns / 2
+    (series,) = pool.problem.data.series
+    most = np.bincount(series.ends[series.train].ravel()).max()
+    assert most >= GRID.rows * GRID.columns / 2
     boards = len(pool.problem.data.unknowns.names) or 1
-    assert pool.rows.rows.shape[1] <= 12 * boards < 2 * pool.rows.measured.max()
+    assert pool.rows.rows.shape[1] <= 12 * boards < 2 * most
 
 
 def test_pairs_that_share_errors_but_no_hub_are_refused():

@@ -1,19 +1,10 @@
 """A design of measurements that are 1e5 times better than the tolerances."""
 
 import pytest
+from three_joints import ROBOT
 
 from fg_calib import design, read_scenario
 
-ROBOT = """\
-convention: dh
-units: {length: m, angle: deg}
-joints:
-  - {a: 0.1, alpha: -90, d: 0.4, theta: 0, limits: [-150, 150]}
-  - {a: 0.4, alpha: 30, d: 0.1, theta: 0, limits: [-150, 150]}
-  - {a: 0.3, alpha: 80, d: 0.2, theta: 0, limits: [-150, 150]}
-tool: {x: 0.05, y: 0.02, z: 0.1}
-tolerance: {a: 0.001, d: 0.001, alpha: 0.05, theta: 0.1}
-"""
 SCENARIO = """\
 robot: robot.yaml
 units: {length: m, angle: deg}
