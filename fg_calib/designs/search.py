@@ -55,21 +55,16 @@ class Chosen(FrozenArrays):
     value: float
 
 
-def choose(
-    system: System, n: int, criterion: Criterion = "I", *, start: Integers | None = None, exchanges: bool = True
-) -> Chosen:
+def choose(system: System, n: int, criterion: Criterion = "I") -> Chosen:
     """The best n candidates that greedy choice and exchange find.
 
     Args:
         system: What is chosen from.
         n: How many, each at most once.
         criterion: What is made small.
-        start: Candidates that were taken already, in their order; none if None.
-        exchanges: Whether exchange follows.
     """
     measure = Measure(criterion, system)
-    chosen = greedy(measure, n, start)
-    return exchanged(measure, chosen) if exchanges else Chosen(chosen, measure.value(system.information(chosen)))
+    return exchanged(measure, greedy(measure, n))
 
 
 def greedy(measure: Measure, n: int, start: Integers | None = None) -> Integers:
