@@ -149,8 +149,9 @@ def test_stops_without_train_rows_add_nothing():
 def test_many_rows_are_reduced_to_no_more_than_they_determine(kind):
     """An image says of a stop's frame what a pose says; of two boards in sight twice that."""
     pool = pool_with(*KINDS[kind])
-    (series,) = pool.problem.data.series
-    most = np.bincount(series.ends[series.train].ravel()).max()
+    data = pool.problem.data
+    (series,) = data.series
+    most = np.bincount(data.places[series.table][series.ends[series.train]].ravel()).max()
     assert most >= GRID.rows * GRID.columns / 2
     boards = len(pool.problem.data.unknowns.names) or 1
     assert pool.rows.rows.shape[1] <= 12 * boards < 2 * most
