@@ -344,7 +344,9 @@ class _Choice:
 
     def of_others(self, candidates: Integers) -> float:
         """Expected error of other pairs beside those of a star of some candidates, [m]; inf if there are none."""
-        return np.inf if self.others is None else self.others.least(self.able[candidates])
+        if self.others is None:
+            return np.inf
+        return self.others.least(self.able[candidates], quickly=len(candidates) < len(self.found.candidates))
 
     def curve(self, generator: np.random.Generator, hubs: int) -> tuple[CurvePoint, ...]:
         """What to expect of fewer stops, and of as many; hubs count."""

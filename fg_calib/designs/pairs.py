@@ -21,7 +21,7 @@ from fg_calib.arrays import FrozenArrays
 from fg_calib.designs.criteria import Criterion, Measure
 from fg_calib.designs.pool import selected
 from fg_calib.designs.rows import StopRows
-from fg_calib.designs.search import choose
+from fg_calib.designs.search import choose, not_worse_than_random
 from fg_calib.designs.system import system_of
 from fg_calib.designs.task import Posterior, Task
 from fg_calib.graph.build import true_problem
@@ -104,7 +104,7 @@ def plan_pairs(
     return PairPlan(structure, found, work.posterior(found))
 
 
-def free_pairs(work: PairWork, stops: Integers, n: int, aim: tuple[Criterion, Task]) -> PairPlan:
+def free_pairs(work: PairWork, stops: Integers, n: int, aim: tuple[Criterion, Task], *, quickly: bool) -> PairPlan:
     """The best n of all pairs of some stops.
 
     Args:
@@ -112,12 +112,16 @@ def free_pairs(work: PairWork, stops: Integers, n: int, aim: tuple[Criterion, Ta
         stops: Numbers of candidates.
         n: How many pairs.
         aim: What is made small, and for what.
+        quickly: Whether they are not held to random sets.
     """
     asked = np.column_stack([stops[ends] for ends in np.triu_indices(len(stops), 1)])
     base, (criterion, task) = work.problem(asked), aim
     v = base.variables
     system = system_of(_stops(base, len(asked)), np.zeros((0, v.n_columns + v.n_nuisance)), task.form(base))
-    pairs = asked[choose(system, n, criterion).candidates]
+    best = choose(system, n, criterion)
+    if not quickly:
+        best = not_worse_than_random(Measure(criterion, system), best, np.random.default_rng(0))
+    pairs = asked[best.candidates]
     used = np.array([k for k in stops.tolist() if (pairs == k).any()])
     place = {k: i for i, k in enumerate(used.tolist())}
     found = work.table_of(used, np.array([(place[a], place[b]) for a, b in pairs.tolist()]))

@@ -131,16 +131,21 @@ class OtherPairs:
         structures: tuple[Structure, ...] = ("chain", "tree")
         self._taken = [plan_pairs(self._work, self._hub, most, one, aim, generator) for one in structures]
 
-    def beside(self, chosen: Integers) -> list[PairPlan]:
-        """A chain, a tree, and the best pairs of the star's stops, of as many pairs as a star of some stops has."""
+    def beside(self, chosen: Integers, *, quickly: bool = False) -> list[PairPlan]:
+        """A chain, a tree, and the best pairs of the star's stops, of as many pairs as a star of some stops has.
+
+        Args:
+            chosen: These stops.
+            quickly: Whether the best pairs may be nearly the best.
+        """
         stops = np.append(self._hub, np.flatnonzero(np.isin(self._pool.stop, chosen)))
         found = [self._work.first_of(one, len(chosen)) for one in self._taken]
-        return [*found, free_pairs(self._work, stops, len(chosen), self._aim)]
+        return [*found, free_pairs(self._work, stops, len(chosen), self._aim, quickly=quickly)]
 
-    def least(self, chosen: Integers) -> float:
+    def least(self, chosen: Integers, *, quickly: bool = False) -> float:
         """The least of their expected errors, [m]; inf where none is determined."""
         task = self._aim[1]
-        return min(one.posterior.error(task).position or np.inf for one in self.beside(chosen))
+        return min(one.posterior.error(task).position or np.inf for one in self.beside(chosen, quickly=quickly))
 
 
 def other_pairs(

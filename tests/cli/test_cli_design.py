@@ -261,6 +261,7 @@ def test_instruments_are_compared_in_folders_of_their_own(plan, fg_calib, tmp_pa
     assert "more than 25" in said.out
 
 
+@pytest.mark.slow
 def test_instruments_side_by_side_give_the_same_bits_and_one_that_fails_is_no_matter(plan, fg_calib, tmp_path):
     """One of them may measure nowhere: a box that the arm cannot leave. JSON has every bit of a figure."""
     everywhere = {"lower": [-9e4, -9e4, -9e4], "upper": [9e4, 9e4, 9e4]}

@@ -106,6 +106,7 @@ def test_where_to_go_is_written_as_finely_as_an_arm_is_told(plan, fg_calib, tmp_
     assert pl.read_csv(out / "pin.csv").select("q1", "q2", "q3").equals(joints)
 
 
+@pytest.mark.slow
 def test_lengths_are_planned_between_points_that_are_touched_alone(plan, fg_calib, tmp_path):
     out = tmp_path / "plan"
     sockets = {"model": "distance", "name": "sockets", "sockets": 5}
@@ -152,6 +153,7 @@ def test_of_one_configuration_a_plan_is_made_or_it_is_said_why_not(instrument, p
     assert (given.code, given.err.splitlines()[1:]) == (0, [])
 
 
+@pytest.mark.slow
 def test_a_given_configuration_is_an_end_of_pairs(plan, fg_calib, tmp_path):
     """The hub, whichever of the candidates would make a better one."""
     (tmp_path / "one.csv").write_text("q1,q2,q3\n1,2,3\n")
@@ -166,6 +168,7 @@ def test_a_given_configuration_is_an_end_of_pairs(plan, fg_calib, tmp_path):
 PIN = {"model": "anchor", "name": "pin", "anchors": {"b": {"x": 500, "y": 100, "z": 150}}}
 
 
+@pytest.mark.slow
 def test_no_table_of_an_earlier_plan_stays_beside_a_new_one(plan, fg_calib, tmp_path):
     """A table of one's own stays, and one of the plan's that was filled in keeps the next plan out."""
     out = tmp_path / "plan"
@@ -182,6 +185,7 @@ def test_no_table_of_an_earlier_plan_stays_beside_a_new_one(plan, fg_calib, tmp_
     assert {file.name: file.read_bytes() for file in out.iterdir()} == before
 
 
+@pytest.mark.slow
 def test_plans_of_several_instruments_are_all_written_or_none(plan, fg_calib, tmp_path):
     out = tmp_path / "plans"
     (out / "b").mkdir(parents=True)
@@ -228,6 +232,7 @@ def test_more_rows_of_a_job_are_where_a_scenario_says(measured, plan, fg_calib, 
     assert "--candidates SCENARIO" not in ended.out
 
 
+@pytest.mark.slow
 def test_a_curve_ends_with_the_pairs_that_are_chosen(plan, fg_calib):
     """All that is drawn is explained, and a target is reached with as few as a plan of so many does."""
     scenario = plan({"model": "distance", "name": "bar", "pairs": "star"})
