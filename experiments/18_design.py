@@ -1,6 +1,6 @@
 """Is a designed set of measurements worth what the design says, and how much fewer stops does it take than random ones?
 
-Command: python experiments/18_design.py [--quick] [--seed N] [--draws N] [--out FOLDER] [--only PART ...]
+Command: python experiments/18_design.py [--quick] [--seed N] [--draws N] [--out FOLDER] [--only PART ...] [--workers N]
 Takes 35 minutes of one processor; parts of an earlier run stay where `--only` names others.
 
 - *camera 0.3-2 m*, *hemisphere*: the paper's arm, its noise and its tolerances, poses in an unknown frame and
@@ -30,7 +30,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import time
+import resource
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -43,6 +43,7 @@ from typing import Any
 
 import numpy as np
 from arms import random_arm
+from draws import add_workers, over_draws
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -56,6 +57,7 @@ from fg_calib.designs.pool import Pool, drawn, pool_of, selected
 from fg_calib.designs.search import Chosen, not_worse_than_random, random_values
 from fg_calib.designs.system import System, system_of
 from fg_calib.designs.task import Task
+from fg_calib.options import Model
 from fg_calib.robot.inverse import random_readings
 from fg_calib.simulation.configurations import GivenReadings, RandomReadings
 from fg_calib.simulation.scenario import Errors
@@ -105,19 +107,26 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--draws", type=int, help="instead of 200 of the paper's arm")
     parser.add_argument("--only", nargs="+", choices=parts, default=list(parts), help="these parts")
     parser.add_argument("--out", type=Path, default=ROOT / "experiments" / "results")
+    add_workers(parser)
     given = parser.parse_args(arguments)
+    given.workers = 1 if given.quick else given.workers
     given.draws = given.draws or (2 if given.quick else 200)
     given.out.mkdir(parents=True, exist_ok=True)
     file = given.out / f"{NAME}.json"
     for part in given.only:
-        clock = time.process_time()
-        of_part = parts[part](given) | {"cpu_seconds": time.process_time() - clock, "quick": given.quick}
+        before = processor_seconds()
+        of_part = parts[part](given) | {"cpu_seconds": processor_seconds() - before, "quick": given.quick}
         found = (json.loads(file.read_text()) if file.exists() else {}) | {part: of_part}
         write_json(file, found)
         print(f"{part}\n{json.dumps(json.loads(file.read_text())[part], indent=1)}", flush=True)
     if {*VIEWS, "arms"} <= set(found):
         picture(found).savefig(file.with_suffix(".png"), dpi=120)
     return found
+
+
+def processor_seconds() -> float:
+    """Of this process and of workers that have ended."""
+    return sum(sum(resource.getrusage(whose)[:2]) for whose in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
 
 
 # ---- the paper's arm
@@ -191,15 +200,9 @@ def realised(scenario: Scenario, plan: Design, readings: Floats, given: argparse
     pairing, model = Pairing(scenario.job.get("pairing", "star")), scenario.job["model"]
     pool = pool_of(there, drawn(there, len(readings), np.random.default_rng(0)))
     predicted = pool.posterior(np.arange(len(pool.readings)), pairing).error(plan.task).position
-    squares, not_converged = [], 0
-    for seed in range(1000 + given.seed, 1000 + given.seed + given.draws):
-        simulation = fg_calib.simulate(there, seed)
-        m = simulation.measurements
-        problem = fg_calib.build_problem(simulation.robot, m, model=model, frame="unknown", pairing=pairing)
-        solution = fg_calib.solve(problem)
-        robot = simulation.robot.with_values(solution.parameters[problem.variables.robot_span])
-        squares.append(fitted_square(robot, simulation.true_robot, plan.task.readings))
-        not_converged += not solution.converged
+    draw = partial(drawn_square, there, plan.task.readings, model, pairing)
+    seeds = range(1000 + given.seed, 1000 + given.seed + given.draws)
+    squares, converged = zip(*over_draws(draw, seeds, given.workers), strict=True)
     rms = float(np.sqrt(np.mean(squares)))
     return {
         "n": len(readings),
@@ -207,8 +210,18 @@ def realised(scenario: Scenario, plan: Design, readings: Floats, given: argparse
         "realised": rms,
         "ratio": rms / predicted,
         "sigma of ratio": float(0.5 * np.std(squares) / np.mean(squares) / np.sqrt(len(squares)) * rms / predicted),
-        "not_converged": not_converged,
+        "not_converged": len(converged) - sum(converged),
     }
+
+
+def drawn_square(scenario: Scenario, readings: Floats, model: Model, pairing: Pairing, seed: int) -> tuple[float, bool]:
+    """Mean square error of one drawn arm's calibration, [m^2], and whether it converged."""
+    simulation = fg_calib.simulate(scenario, seed)
+    m = simulation.measurements
+    problem = fg_calib.build_problem(simulation.robot, m, model=model, frame="unknown", pairing=pairing)
+    solution = fg_calib.solve(problem)
+    robot = simulation.robot.with_values(solution.parameters[problem.variables.robot_span])
+    return fitted_square(robot, simulation.true_robot, readings), solution.converged
 
 
 def fitted_square(robot: Robot, true_robot: Robot, readings: Floats) -> float:
@@ -260,21 +273,24 @@ def error_of(system: System, chosen: Integers) -> float:
 def arms(given: argparse.Namespace) -> dict[str, Any]:
     """Expected errors of designs by each criterion on random arms, and of random sets."""
     n_arms = 3 if given.quick else 90
-    rows: dict[tuple[int, str], list[dict[str, float]]] = {}
-    for k in range(n_arms):
-        rng = np.random.default_rng([given.seed, k])
-        pool = pool_of_arm(random_arm(5 + k % 3, rng), N_CANDIDATES, rng)
-        systems = {where: system_for(pool, task) for where, task in tasks_of(pool, rng).items()}
-        for n in N_STOPS:
-            chosen = {c: best_of(systems["anywhere"], n, c).candidates for c in OTHERS}  # they know no task
-            for where, system in systems.items():
-                values, _ = random_values(Measure("I", system), n, rng)
-                errors = {c: error_of(system, stops) for c, stops in chosen.items()}
-                errors |= {"I": error_of(system, best_of(system, n, "I").candidates)}
-                rows.setdefault((n, where), []).append(errors | {"random": float(np.sqrt(np.median(values)))})
-    return {"n_arms": n_arms, "of": N_CANDIDATES} | {
-        f"{n} stops, {where}": gains(of_task) for (n, where), of_task in rows.items()
-    }
+    rows = over_draws(partial(errors_of_arm, given.seed), range(n_arms), given.workers)
+    return {"n_arms": n_arms, "of": N_CANDIDATES} | {of: gains([row[of] for row in rows]) for of in rows[0]}
+
+
+def errors_of_arm(seed: int, k: int) -> dict[str, dict[str, float]]:
+    """Expected errors of designs of one arm, [m], by criterion, and the median of random sets; by stops and task."""
+    rng = np.random.default_rng([seed, k])
+    pool = pool_of_arm(random_arm(5 + k % 3, rng), N_CANDIDATES, rng)
+    systems = {where: system_for(pool, task) for where, task in tasks_of(pool, rng).items()}
+    found = {}
+    for n in N_STOPS:
+        chosen = {c: best_of(systems["anywhere"], n, c).candidates for c in OTHERS}  # they know no task
+        for where, system in systems.items():
+            values, _ = random_values(Measure("I", system), n, rng)
+            errors = {c: error_of(system, stops) for c, stops in chosen.items()}
+            errors |= {"I": error_of(system, best_of(system, n, "I").candidates)}
+            found[f"{n} stops, {where}"] = errors | {"random": float(np.sqrt(np.median(values)))}
+    return found
 
 
 def gains(rows: Sequence[Mapping[str, float]]) -> dict[str, Any]:
