@@ -192,3 +192,16 @@ def test_gross_errors_of_a_job_that_leaves_them_out_are_no_noise_of_more_rows():
     found, plan = calibrate_job(job), design(job, n=4, n_candidates=20)
     said = errors_at(found.posterior, plan.task.readings)[plan.task.fitted].position
     assert plan.before.position == pytest.approx(said, rel=0.1)
+
+
+def test_tolerances_of_a_plan_are_those_that_its_job_found():
+    """The arm is ten times better than its tolerances say."""
+    rng, arm = np.random.default_rng(1), small_arm(tolerance=TOLERANCE)
+    q = rng.uniform(-1.5, 1.5, (60, 4))
+    off = [0.1 * p.tolerance * rng.normal() if p.estimated else 0.0 for p in arm.parameters]
+    position = pose(arm.with_values(arm.nominal + off), q).position + 1e-4 * rng.normal(size=(60, 3))
+    data = Measurements.from_arrays(q, position=position, sigma_position=1e-4)
+    job = Job(None, arm, data, Options("position", estimate_tolerance="kind"))
+    found, plan = calibrate_job(job), design(job, n=4, n_candidates=20)
+    said = errors_at(found.posterior, plan.task.readings)[plan.task.fitted].position
+    assert plan.before.position == pytest.approx(said, rel=0.02)
