@@ -1,0 +1,207 @@
+"""Plans that do not say what a job of all rows says of itself, or that do not do what was asked."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenarios import SIGMA, TOLERANCE, scenario
+from scipy.spatial.transform import Rotation
+from simulated import small_arm
+
+from fg_calib import InputError, Job, Measurements, Options, Robot, calibrate_job, predict
+from fg_calib.analysis.accuracy import errors_at
+from fg_calib.designs.design import design
+from fg_calib.designs.of_job import solved
+from fg_calib.designs.plans import with_names
+from fg_calib.designs.task import Posterior
+from fg_calib.graph.information import whitened_jacobian
+from fg_calib.measurements.dataset import Noise
+from fg_calib.options import Pairing
+from fg_calib.robot.kinematics import pose
+from fg_calib.simulation.configurations import GivenReadings, RandomReadings
+from fg_calib.simulation.instruments import Indicator, LengthGauge, PairGauge, Plane, Sockets, Spot, Tracker
+from fg_calib.simulation.scenario import Errors
+from fg_calib.simulation.simulator import simulate
+
+NOISE = replace(SIGMA, joint=2e-4)
+SILENT = Noise(0.0, 0.0, 0.0, distance=0.0, angle=0.0, point=0.0, pixel=0.0)
+GIVEN = np.random.default_rng(8).uniform(-1.0, 1.0, (5, 4))
+
+
+@pytest.mark.parametrize(
+    "instrument",
+    [PairGauge(model="distance", name="it"), Tracker(model="distance-rotation", name="it", pairing=Pairing("star"))],
+    ids=["measured", "formed"],
+)
+def test_given_configurations_of_a_star_count(instrument):
+    """The first of them is the hub."""
+    plan = design(scenario(instrument, n=20, noise=NOISE), n=6, given=GIVEN, n_candidates=40)
+    assert plan.before is not None
+    assert plan.expected.position < plan.before.position
+    assert not (plan.readings[:, None] == GIVEN).all(axis=2).any()
+
+
+@pytest.mark.parametrize(
+    "instrument",
+    [
+        Sockets(name="it", sockets=3),
+        LengthGauge(name="it", anchors=3, contact=True),
+        Indicator(name="it", contact=True),
+    ],
+    ids=["sockets", "anchors", "faces"],
+)
+def test_given_configurations_that_are_not_used_are_refused(instrument):
+    """What touches has configurations of its own: with those of others nothing is measured."""
+    with pytest.raises(InputError, match="given"):
+        design(scenario(instrument, n=20, noise=NOISE), n=6, given=GIVEN, n_candidates=40)
+
+
+SCARA = Robot.from_dh(
+    [[0.4, 0.02, 0.35, 0.0], [0.35, np.pi - 0.01, 0.05, 0.2], [0.0, 0.015, 0.1, 0.0], [0.02, 0.01, 0.06, 0.1]],
+    types=("revolute", "revolute", "prismatic", "revolute"),
+    limits=[(-2.3, 2.3), (-2.4, 2.4), (0.0, 0.3), (-3.0, 3.0)],
+    tool={"x": 0.05, "y": 0.02, "z": 0.04},
+    tolerance={"a": 8e-4, "alpha": 2e-3, "d": 1e-3, "theta": 1.5e-3},
+)
+
+
+def job_of(instrument, n, stated=NOISE, **changes):
+    """A job of what an arm as drawn shows at random configurations."""
+    given = {"configurations": RandomReadings(n), "errors": Errors("values", {}), "noise": SILENT}
+    of = scenario(instrument, stated_noise=stated, **given | changes)
+    tables = simulate(of).tables
+    return Job(None, of.robot, tables, Options(tables[0].model))
+
+
+def said_by_all_rows(job, plan):
+    """Expected error over the plan's task of one job of all rows."""
+    every = solved(replace(job, measurements=(*job.tables, *plan.tables)))
+    return Posterior(every, whitened_jacobian(every, every.start)).error(plan.task).position
+
+
+def test_a_plan_of_bent_rows_expects_what_a_job_of_all_rows_says_of_itself():
+    """Lengths of a SCARA are bent by what its parameters may be off, and so weigh more when more is known of these."""
+    job = job_of(PairGauge(model="distance", name="it"), 40, robot=SCARA, stated=Noise(distance=5e-5, joint=2e-5))
+    plan = design(job, n=8, n_candidates=60)
+    assert plan.expected.position == pytest.approx(said_by_all_rows(job, plan), rel=0.02)
+
+
+@pytest.mark.parametrize("n", [1, 5])
+def test_a_plan_of_touches_expects_what_a_job_of_all_rows_says_of_itself(n):
+    """Distances between sockets that the plan asks for count, and no others."""
+    job = job_of(Sockets(name="it", sockets=5), 12)
+    plan = design(job, n=n, n_candidates=40)
+    assert plan.expected.position == pytest.approx(said_by_all_rows(job, plan), rel=1e-6)
+
+
+def test_the_curve_of_more_touches_ends_with_the_plan():
+    plan = design(job_of(Sockets(name="it", sockets=3), 20), n=5, n_candidates=40)
+    assert plan.curve[-1].designed == pytest.approx(plan.expected.position, rel=1e-3)
+
+
+def test_the_noise_of_test_rows_is_not_that_of_more_rows():
+    rng, arm = np.random.default_rng(0), small_arm(tolerance=TOLERANCE)
+    q = rng.uniform(-1.5, 1.5, (40, 4))
+    at, test = pose(arm, q), np.arange(40) >= 30
+    data = Measurements.from_arrays(
+        q,
+        position=at.position,
+        rotation=at.rotation,
+        sigma_position=np.where(test, 1e-2, 1e-4),
+        sigma_orientation=2e-4,
+        test=test,
+    )
+    plan = design(Job(None, arm, data, Options("pose")), n=4, n_candidates=20)
+    assert plan.tables[0].measurements.sigma_position == pytest.approx(np.full((4, 3), 1e-4))
+
+
+def test_more_rows_are_as_noisy_along_each_axis_as_those_of_the_job():
+    """A tracker that says how well it measures along the beam and across goes on doing so."""
+    rng, arm = np.random.default_rng(0), small_arm(tolerance=TOLERANCE)
+    q = rng.uniform(-1.5, 1.5, (30, 4))
+    at, sigma = pose(arm, q), np.array([1e-5, 1e-3, 1e-5])
+    data = Measurements.from_arrays(
+        q,
+        position=at.position,
+        rotation=at.rotation,
+        sigma_position=np.tile(sigma, (30, 1)),
+        sigma_orientation=2e-4,
+    )
+    plan = design(Job(None, arm, data, Options("pose")), n=4, n_candidates=20)
+    assert plan.tables[0].measurements.sigma_position == pytest.approx(np.tile(sigma, (4, 1)))
+
+
+def test_a_target_takes_no_more_stops_than_a_plan_of_fewer_that_reaches_it():
+    """One more is what its search may miss."""
+    of = scenario(LengthGauge(name="it"), n=20, noise=NOISE)
+    goal = 1.02 * design(of, n=14, n_candidates=60).expected.position
+    assert design(of, target=goal, n_candidates=60).n <= 15
+
+
+def test_a_table_of_pairs_has_pairs():
+    """Of two stars, of which one stop of one is chosen, the other is left out with its hub."""
+    q = np.random.default_rng(0).uniform(-1.5, 1.5, (2, 20, 4))
+    one, two = (
+        job_of(PairGauge(model="distance", name=name), 20, configurations=GivenReadings(at))
+        for name, at in zip(("it", "two"), q, strict=True)
+    )
+    renamed = with_names(two.tables, {f"p{k}": f"two{k}" for k in range(20)})
+    plan = design(replace(one, measurements=(*one.tables, *renamed)), n=3, n_candidates=20)
+    assert [len(table.measurements.pairs.a) > 0 for table in plan.tables] == [True] * len(plan.tables)
+
+
+@pytest.mark.parametrize(
+    "instrument",
+    [
+        Tracker(model="pose", name="it", frame="unknown"),
+        LengthGauge(name="it", anchors={"a": Spot([1.0, -2.0, 0.5]), "b": Spot([-1.5, 1.0, 1.0])}),
+        Indicator(name="it", planes={"floor": Plane([0, 0, 1], -1.0), "wall": Plane([1, 0.1, 0], 2.0)}),
+    ],
+    ids=["poses", "anchors", "planes"],
+)
+def test_a_plan_of_more_rows_expects_what_an_update_by_them_says(instrument):
+    """The page of designs says that `update` adds the rows of a plan: so it is told to, or knows what stayed."""
+    job = job_of(instrument, 30)
+    plan = design(job, n=6, n_candidates=40)
+    found = calibrate_job(job).update(replace(job, measurements=plan.tables))
+    assert plan.expected.position == pytest.approx(errors_at(found.posterior, plan.task.readings)[1].position, rel=1e-3)
+
+
+def test_what_is_predicted_after_an_update_is_fitted_to_all_that_was_measured():
+    """Not to the few rows of the update alone, which say next to nothing of the motion that they are fitted by."""
+    tracker, rng = Tracker(model="pose", name="it", frame="unknown"), np.random.default_rng(0)
+    far, near = rng.uniform(-1.5, 1.5, (40, 4)), rng.uniform(0.5, 0.7, (6, 4))
+    before = calibrate_job(job_of(tracker, 40, configurations=GivenReadings(far)))
+    after = before.update(job_of(tracker, 6, configurations=GivenReadings(near)))
+    found, all_rows = predict(after, far), predict(after, far, measured=np.vstack([far, near]))
+    assert found.errors.fitted == pytest.approx(all_rows.errors.fitted, rel=1e-3)
+
+
+def test_gross_errors_of_a_job_that_leaves_them_out_are_no_noise_of_more_rows():
+    """The noise of one tenth of gross errors would be 67 times that of the rows."""
+    rng, arm = np.random.default_rng(0), small_arm(tolerance=TOLERANCE)
+    q = rng.uniform(-1.5, 1.5, (60, 4))
+    at = pose(arm, q)
+    position = at.position + 1e-4 * rng.normal(size=(60, 3))
+    position[:6] += 0.02 * rng.normal(size=(6, 3))
+    rotation = at.rotation @ Rotation.from_rotvec(2e-4 * rng.normal(size=(60, 3))).as_matrix()
+    data = Measurements.from_arrays(
+        q, position=position, rotation=rotation, sigma_position=1e-4, sigma_orientation=2e-4
+    )
+    job = Job(None, arm, data, Options("pose", loss="gnc", estimate_noise=True))
+    found, plan = calibrate_job(job), design(job, n=4, n_candidates=20)
+    said = errors_at(found.posterior, plan.task.readings)[plan.task.fitted].position
+    assert plan.before.position == pytest.approx(said, rel=0.1)
+
+
+def test_tolerances_of_a_plan_are_those_that_its_job_found():
+    """The arm is ten times better than its tolerances say."""
+    rng, arm = np.random.default_rng(1), small_arm(tolerance=TOLERANCE)
+    q = rng.uniform(-1.5, 1.5, (60, 4))
+    off = [0.1 * p.tolerance * rng.normal() if p.estimated else 0.0 for p in arm.parameters]
+    position = pose(arm.with_values(arm.nominal + off), q).position + 1e-4 * rng.normal(size=(60, 3))
+    data = Measurements.from_arrays(q, position=position, sigma_position=1e-4)
+    job = Job(None, arm, data, Options("position", estimate_tolerance="kind"))
+    found, plan = calibrate_job(job), design(job, n=4, n_candidates=20)
+    said = errors_at(found.posterior, plan.task.readings)[plan.task.fitted].position
+    assert plan.before.position == pytest.approx(said, rel=0.02)
