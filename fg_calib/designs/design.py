@@ -26,7 +26,7 @@ from fg_calib.designs.criteria import Criterion
 from fg_calib.designs.cures import Cure, cures_of
 from fg_calib.designs.of_job import pool_of_more, pool_of_rows, solved
 from fg_calib.designs.order import shortest_way, travel
-from fg_calib.designs.plans import OtherPairs, best_plan, of_used_points, other_pairs, with_best_hubs, with_names
+from fg_calib.designs.plans import OtherPairs, best_plan, other_pairs, with_best_hubs, with_names
 from fg_calib.designs.pool import Pool, drawn, pool_of
 from fg_calib.designs.search import Chosen, not_worse_than_random
 from fg_calib.designs.system import system_of
@@ -281,7 +281,7 @@ def design_from(
     return Design(
         pool=pool,
         tables=tuple(
-            of_used_points(table)
+            table
             for table in with_names(plan.tables, dict(zip(plan.names, ids, strict=True)))
             if table.measurements.n_configurations
         ),

@@ -28,7 +28,7 @@ def solved(job: Job) -> Problem:
         SolverError: GTSAM could not solve a step at all.
     """
     gauge = "prior" if job.options.gauge == "keep" else job.options.gauge
-    options = replace(job.options, gauge=gauge, folds=None, estimate_tolerance=None, loss="none", encoder="propagated")
+    options = replace(job.options, gauge=gauge, folds=None, encoder="propagated")
     solution = solve_job(replace(job, options=options))
     if solution.problem.evaluated:
         raise InputError(str(job.path or "job"), "test rows alone", "train rows: what was measured is what counts")

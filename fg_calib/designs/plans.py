@@ -52,30 +52,15 @@ def with_names(tables: Sequence[Table], names: Mapping[str, str]) -> list[Table]
     ]
 
 
-def of_used_points(table: Table) -> Table:
-    """A table of touched points with distances between those alone that are touched, unless there are none.
-
-    Args:
-        table: It, or any other, which stays as it is.
-    """
-    groups = table.measurements.groups
-    if groups is None:
-        return table
-    pairs = groups.pairs
-    used = np.flatnonzero(np.isin(pairs.a, groups.index) & np.isin(pairs.b, groups.index))
-    if not len(used):
-        return table
-    return replace(table, measurements=replace(table.measurements, groups=replace(groups, pairs=pairs.select(used))))
-
-
 def plan_of_stops(pool: Pool, stops: Integers) -> Plan:
     """Some stops, in their order; a hub is visited first."""
     measured, data = stops[len(pool.given) :], pool.problem.data
     number = {stop: k for k, stop in enumerate(pool.stop.tolist())}
-    order = [number[stop] for stop in measured.tolist()]
-    if not len(pool.given):
-        order = [*pool.hubs.tolist(), *order]
-    names, tables = [data.names[k] for k in order], pool.tables_of(measured)
+    tables = pool.tables_of(measured)
+    there = {name for table in tables for name in table.measurements.ids.tolist()}
+    hubs = [k for k in pool.hubs.tolist() if data.names[k] in there]
+    order = [*hubs, *(number[stop] for stop in measured.tolist())]
+    names = [data.names[k] for k in order]
     return Plan(
         tables=tables,
         readings=data.readings[order],

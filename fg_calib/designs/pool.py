@@ -104,7 +104,7 @@ class Pool(Brief):
         return np.array(own, dtype=np.str_)
 
     def tables_of(self, stops: Integers, pairing: Pairing | None = None) -> list[Table]:
-        """What would be measured at some of the stops, in their order, behind those of hubs.
+        """What would be measured at some of the stops, in their order, behind those of hubs; of stars without pairs none.
 
         Args:
             stops: They.
@@ -116,10 +116,16 @@ class Pool(Brief):
             of_stop.setdefault(stop, []).append(k)
         wanted = [*self.hubs.tolist(), *(k for stop in stops.tolist() for k in of_stop.get(stop, []))]
         order = {names[k]: place for place, k in enumerate(wanted)}
-        found = [selected(table, order) for table in self.tables]
+        found = [_between_used(selected(table, order), known=self.before is not None) for table in self.tables]
         for number, (model, own) in self.formed.items():
             found[number] = replace(found[number], model=model, frame="known", pairing=pairing or own)
-        return found
+        return [table if _says_something(table) else selected(table, {}) for table in found]
+
+    @property
+    def _as_it_is(self) -> Posterior:
+        """What is known of what was measured already."""
+        assert self.before is not None
+        return Posterior(self.before, whitened_jacobian(self.before, self.before.start, with_loss=True))
 
     def posterior(self, stops: Integers, pairing: Pairing | None = None) -> Posterior:
         """What would be known with some stops measured beside what was, exactly as a calibration would say it.
@@ -129,14 +135,14 @@ class Pool(Brief):
             pairing: How pairs are formed instead, where they are formed of poses.
         """
         if not len(stops) and self.before is not None:
-            return Posterior(self.before, whitened_jacobian(self.before, self.before.start))
+            return self._as_it_is
         places = places_of(self.problem, self.problem.start)
         problem = true_problem(self.robot, self.tables_of(stops, pairing), self.problem.options, places)
         rows = whitened_jacobian(problem, problem.start)
         if self.before is None:
             return Posterior(problem, rows)
         if not problem.rows:  # one end of a pair
-            return Posterior(self.before, whitened_jacobian(self.before, self.before.start))
+            return self._as_it_is
         # What is told of points is in what was measured, and counts once.
         rows = rows[len(unknown_prior_rows(problem.variables, problem.start)[0]) :]
         return Posterior(problem, np.vstack([rows, known_rows_of(self.before, problem)]), n_measured(self.before))
@@ -159,6 +165,29 @@ def selected(table: Table, order: Mapping[str, int]) -> Table:
     return replace(table, measurements=part)
 
 
+def _between_used(table: Table, *, known: bool) -> Table:
+    """A table of touched points with lengths between those alone that are touched, and with none that are known.
+
+    Args:
+        table: It, or any other, which stays as it is.
+        known: Whether lengths were measured already: they count once.
+    """
+    m = table.measurements
+    if m.groups is None:
+        return table
+    pairs = m.groups.pairs
+    used = np.isin(pairs.a, m.groups.index) & np.isin(pairs.b, m.groups.index) & (not known)
+    return replace(table, measurements=replace(m, groups=replace(m.groups, pairs=pairs.select(np.flatnonzero(used)))))
+
+
+def _says_something(table: Table) -> bool:
+    """Whether a table holds more than the hub of a star that has no other stop."""
+    m = table.measurements
+    if m.pairs is not None:
+        return bool(m.pairs.n_pairs)
+    return table.model not in PAIR_MODELS or m.groups is not None or m.n_configurations > 1
+
+
 def known_rows_of(before: Problem | None, problem: Problem) -> Floats:
     """What a problem's rows say, whitened, by the columns of another problem of the same arm and tables.
 
@@ -171,7 +200,7 @@ def known_rows_of(before: Problem | None, problem: Problem) -> Floats:
     n = v.n_columns + v.n_nuisance
     if before is None:
         return np.zeros((0, n))
-    A, own = whitened_jacobian(before, before.start), before.variables
+    A, own = whitened_jacobian(before, before.start, with_loss=True), before.variables
     there = _columns_by_name(v, problem.data.unknowns)
     of_own = _columns_by_name(own, before.data.unknowns)
     both = [name for name in of_own if name in there]
@@ -259,6 +288,8 @@ def pool_of(
     formed = _formed(scenario)
     simulation = simulate(_silent(scenario, readings), leave_out=True)
     tables = _as_told(simulation)
+    if before is not None:
+        tables = tuple(map(as_noisy, tables, before.data.tables, range(len(tables)), repeat(before.state)))
     options = Options(tables[0].model or "pose", gauge=_gauge(scenario)) if before is None else before.options
     problem = true_problem(scenario.robot, tables, options, None if before is None else _staying(before))
     data = problem.data
@@ -272,6 +303,8 @@ def pool_of(
     stop = np.full(len(names), HUB)
     stop[kept] = np.arange(len(kept))
     n_given = 0 if given is None else len(given)
+    if n_given and not any(name == "" and k < n_given for name, k in names):
+        raise InputError("given", "configurations at which nothing is measured", "a job with what was touched")
     return Pool(
         scenario=_placed(scenario, simulation),
         tables=tables,
