@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.errors import InputError
 from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Measurements, rotation_angle
 from fg_calib.measurements.frames import nearest_rotation
@@ -509,6 +510,9 @@ def whitening_of(covariance: Floats, used: Booleans) -> Floats:
     Args:
         covariance: S, shape (n, residual_dim, residual_dim).
         used: Shape (n, residual_dim).
+
+    Raises:
+        InputError: Rounding leaves nothing of the noise along some direction.
     """
     residual_dim = used.shape[1]
     if residual_dim == 1:
@@ -517,7 +521,12 @@ def whitening_of(covariance: Floats, used: Booleans) -> Floats:
     if not used.all():
         both = used[:, :, None] & used[:, None, :]
         covariance = np.where(both, covariance, np.eye(residual_dim))
-    W: Floats = np.tril(np.linalg.inv(np.linalg.cholesky(covariance)))
+    try:
+        W: Floats = np.tril(np.linalg.inv(np.linalg.cholesky(covariance)))
+    except np.linalg.LinAlgError:
+        found = "lost in rounding beside what errors of the joint readings do"
+        hint = "is a length of the arm or of a table far too large, or that noise far too small?"
+        raise InputError("noise", found, "figures nearer to each other", hint) from None
     return W if used.all() else W * used[:, :, None]
 
 
