@@ -19,7 +19,7 @@ from fg_calib.arguments import checked
 from fg_calib.arrays import as_floats
 from fg_calib.calibration import Calibration
 from fg_calib.errors import InputError
-from fg_calib.files.disk import fill_folder, is_folder, require_own, write_text
+from fg_calib.files.disk import fill_folder, is_folder, require_own, require_writable, write_text
 from fg_calib.files.job import joint_noise_in
 from fg_calib.files.saved import read_configurations, require_unchanged
 from fg_calib.files.units import Units
@@ -126,11 +126,12 @@ FILES = {
 
 
 def require_prediction(folder: Path) -> None:
-    """Check that a prediction written to a folder would not replace what is of none.
+    """Check that a prediction can be written to a folder, and would not replace what is of none.
 
     Raises:
-        InputError: It would.
+        InputError: It cannot, or it would.
     """
+    require_writable(folder)
     require_own(folder, FILES)
 
 

@@ -17,7 +17,7 @@ from fg_calib.analysis.absorbed import Absorbed
 from fg_calib.analysis.seen import SEES_ORIENTATION, SEES_POSITION, Seen
 from fg_calib.graph.elsewhere import elsewhere
 from fg_calib.graph.information import named_triangle
-from fg_calib.graph.observability import Observability
+from fg_calib.graph.observability import SUPPORT_TOLERANCE, Observability
 from fg_calib.graph.problem import Problem
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
@@ -31,7 +31,8 @@ NOT_EXCITED = "not excited by these configurations"
 BASE = "the measurement is blind to the base: the whole arm moves as one body"
 
 _NOTHING = 1e-7
-"""A motion below this part of what its members do one by one is none: relations are rounded to nine digits."""
+"""A motion below this part of what its members do one by one is none: relations are rounded to nine digits, and what
+`SUPPORT_TOLERANCE` left out of them may move as much as it could."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,7 @@ class _Motion:
         n = len(self._parameters)
         self._R, self._p = poses.rotation, poses.position
         self._J = poses.jacobian[:, :, :n]
+        self._scales = np.array([robot.scale_of(p.unit) for p in self._parameters])
         axes = np.moveaxis(poses.jacobian[:, :3, n:], 2, 1)[:, [not j.prismatic for j in robot.joints]]
         axes = axes * np.where(np.sum(axes * axes[:1, :1], axis=2, keepdims=True) < 0.0, -1.0, 1.0)
         self._common_axis = axes[:, 0] if axes.size and self._constant(axes.reshape(-1, 3)) else None
@@ -138,7 +140,9 @@ class _Motion:
         size_p = float(np.abs(self._J[:, 3:] * direction).sum(axis=2).max())
         turns = float(np.abs(w).max()) > _NOTHING * max(size_w, 1e-3 * size_p)
         moves = float(np.abs(dp).max()) > _NOTHING * max(size_p, 1e-3 * size_w)
-        return w, dp, turns, moves
+        share = SUPPORT_TOLERANCE * float(np.abs(direction / self._scales).max())
+        left_w, left_p = (share * float(np.abs(J * self._scales).max()) for J in (self._J[:, :3], self._J[:, 3:]))
+        return w, dp, turns and float(np.abs(w).max()) > left_w, moves and float(np.abs(dp).max()) > left_p
 
     def _tilts(self, w: Floats, dp: Floats, axis: Floats) -> bool:
         """Whether the tool moves along the common axis of the joints only, and turns across it only."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.designs.criteria import Criterion, Measure
-from fg_calib.designs.search import Chosen, exchanged, greedy, random_values
+from fg_calib.designs.search import Chosen, exchanged, greedy, not_worse_than_random, random_values
 from fg_calib.designs.system import System
 
 Floats = NDArray[np.float64]
@@ -26,6 +26,9 @@ N_EXACT = 20
 
 LEAST_CURVE = 4
 """Stops with which the curve begins."""
+
+MOST_FEWER = 4
+"""How many stops less than were found quickly are tried for a target at most, each time that less will do."""
 
 N_CURVE = 10
 """Numbers of stops at which the curve is worked out, about."""
@@ -84,11 +87,15 @@ class Chooser:
         """The best n that exchange finds."""
         return min((exchanged(self.measure, one) for one in self.starts(n)), key=lambda chosen: chosen.value)
 
+    def thoroughly(self, n: int, generator: np.random.Generator) -> Chosen:
+        """The best n that exchange finds, never worse than the best of the random sets that they are held to."""
+        return self.held(not_worse_than_random(self.measure, self.best(n), generator), generator)
+
     def quickly(self, n: int) -> Chosen:
         """Nearly as good ones, in a small part of the time."""
         return exchanged(self.measure, self.starts(n)[0], quickly=True)
 
-    def reaching(self, target: float) -> Chosen:
+    def reaching(self, target: float, generator: np.random.Generator) -> Chosen:
         """As few as reach a target, [m]; as many as may be where none do."""
         most = min(MOST_STOPS, self.system.n_candidates)
         if self.system.unknown > UNKNOWN:  # no number of stops would do
@@ -108,7 +115,18 @@ class Chooser:
                 low = middle
         last = exchanged(self.measure, found)  # by another criterion it may miss the target again
         reached = self.error(last.candidates) <= target
-        return last if reached else Chosen(found, self.measure.value(self.system.information(found)))
+        last = last if reached else Chosen(found, self.measure.value(self.system.information(found)))
+        return self._still_fewer(last, generator, lambda candidates: self.error(candidates) <= target)
+
+    def _still_fewer(
+        self, found: Chosen, generator: np.random.Generator, reaches: Callable[[Integers], bool]
+    ) -> Chosen:
+        """A few less than were found quickly, where the best of so few reach a target too."""
+        for n in range(len(found.candidates) - 1, max(0, len(found.candidates) - 1 - MOST_FEWER), -1):
+            fewer = self.thoroughly(n, generator)
+            if reaches(fewer.candidates):
+                return self._still_fewer(fewer, generator, reaches)
+        return found
 
     def held(self, found: Chosen, generator: np.random.Generator) -> Chosen:
         """The same, or the best of some random sets where that is better by an error that the system does not say."""
@@ -145,13 +163,16 @@ class Chooser:
             points.append(CurvePoint(k + hubs, error, self._band(k, generator)))
         return tuple(points)
 
-    def fewer(self, found: Chosen, target: float, other: Callable[[Integers], float]) -> Chosen:
+    def fewer(
+        self, found: Chosen, target: float, other: Callable[[Integers], float], generator: np.random.Generator
+    ) -> Chosen:
         """As few as reach a target, [m], by other pairs beside those of a star; as many as were found if none do.
 
         Args:
             found: Those that a star reaches it with.
             target: It.
             other: Expected error of other pairs of some candidates, [m].
+            generator: Draws random sets.
         """
         low, high = 0, len(found.candidates)
         while high - low > 1:
@@ -161,7 +182,7 @@ class Chooser:
                 high, found = middle, some
             else:
                 low = middle
-        return found
+        return self._still_fewer(found, generator, lambda some: min(self.error(some), other(some)) <= target)
 
     def _band(self, n: int, generator: np.random.Generator) -> tuple[float, float, float]:
         """Error that a tenth, half and nine tenths of random sets of n do not exceed."""

@@ -28,7 +28,7 @@ from fg_calib.designs.of_job import pool_of_more, pool_of_rows, solved
 from fg_calib.designs.order import shortest_way, travel
 from fg_calib.designs.plans import OtherPairs, best_plan, other_pairs, with_best_hubs, with_names
 from fg_calib.designs.pool import Pool, drawn, pool_of
-from fg_calib.designs.search import Chosen, not_worse_than_random
+from fg_calib.designs.search import Chosen
 from fg_calib.designs.system import system_of
 from fg_calib.designs.task import N_TASK, Task, is_fitted
 from fg_calib.errors import InputError, ProblemError
@@ -364,17 +364,15 @@ def _choose(
     chooser = Chooser(system.select(able), criterion, _exactly(pool, task, able))
     tell("choosing")
     if target is None:
-        found = chooser.best(max(1, min((N_STOPS if n is None else n) - len(pool.hubs), len(able))))
+        of = max(1, min((N_STOPS if n is None else n) - len(pool.hubs), len(able)))
+        found = chooser.thoroughly(of, generator)
     else:
-        found = chooser.reaching(target)
-    better = chooser.held(not_worse_than_random(chooser.measure, found, generator), generator)
-    if target is not None and chooser.error(better.candidates) > max(target, chooser.error(found.candidates)):
-        better = found  # better by its criterion, but no longer good enough
-    others = other_pairs(pool, len(better.candidates), (criterion, task), generator)
-    choice = _Choice(chooser, better, able, others)
+        found = chooser.reaching(target, generator)
+    others = other_pairs(pool, len(found.candidates), (criterion, task), generator)
+    choice = _Choice(chooser, found, able, others)
     if target is None or others is None:
         return choice
-    return replace(choice, found=chooser.fewer(better, target, choice.of_others))
+    return replace(choice, found=chooser.fewer(found, target, choice.of_others, generator))
 
 
 def _exactly(pool: Pool, task: Task, able: Integers) -> Callable[[Integers], float] | None:

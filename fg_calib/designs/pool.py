@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from fg_calib.arrays import Brief
 from fg_calib.designs.candidates import Candidates, candidates
 from fg_calib.designs.rows import StopRows, stop_rows
+from fg_calib.designs.scene import along_axes
 from fg_calib.designs.task import Posterior, n_measured
 from fg_calib.errors import InputError
 from fg_calib.graph.build import true_problem
@@ -104,7 +105,7 @@ class Pool(Brief):
         return np.array(own, dtype=np.str_)
 
     def tables_of(self, stops: Integers, pairing: Pairing | None = None) -> list[Table]:
-        """What would be measured at some of the stops, in their order, behind those of hubs; of stars without pairs none.
+        """What would be measured at some of the stops, in their order, behind hubs that have pairs.
 
         Args:
             stops: They.
@@ -289,7 +290,7 @@ def pool_of(
     simulation = simulate(_silent(scenario, readings), leave_out=True)
     tables = _as_told(simulation)
     if before is not None:
-        tables = tuple(map(as_noisy, tables, before.data.tables, range(len(tables)), repeat(before.state)))
+        tables = tuple(map(along_axes, tables, before.data.tables))
     options = Options(tables[0].model or "pose", gauge=_gauge(scenario)) if before is None else before.options
     problem = true_problem(scenario.robot, tables, options, None if before is None else _staying(before))
     data = problem.data

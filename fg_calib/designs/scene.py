@@ -7,6 +7,7 @@ own, in the frame in which it measured: a tracker stays where it stood.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -123,22 +124,23 @@ class _Table:
         return self._camera(given, configurations)
 
     def _noise(self) -> Noise:
-        """The noise as it is stated, times the factors that were found where it was estimated."""
+        """The noise of train rows as it is stated, times the factors that were found where it was estimated."""
         m, pairs = self._m, self._m.pairs if self._m.pairs is not None else None
         if pairs is None and m.groups is not None and m.groups.pairs.n_pairs:
             pairs = m.groups.pairs
+        train, between = ~m.test, None if pairs is None else ~pairs.test
         of_pose = None if m.covariance is None else np.sqrt(np.einsum("nii->ni", m.covariance))
-        lengths = m.sigma_length if pairs is None else pairs.sigma_distance
+        lengths = _typical(m.sigma_length, train) if pairs is None else _typical(pairs.sigma_distance, between)
         formed = self._table.model in PAIR_MODELS and pairs is None
-        position = _typical(m.sigma_position if of_pose is None else of_pose[:, 3:])
-        orientation = _typical(m.sigma_orientation if of_pose is None else of_pose[:, :3])
+        position = _typical(m.sigma_position if of_pose is None else of_pose[:, 3:], train)
+        orientation = _typical(m.sigma_orientation if of_pose is None else of_pose[:, :3], train)
         return Noise(
             position=self._found("distance" if formed else "position", position),
             orientation=self._found("angle" if formed else "orientation", orientation),
-            distance=self._found("distance", _typical(lengths)),
-            angle=self._found("angle", _typical(None if pairs is None else pairs.sigma_angle)),
-            point=self._found("point", _typical(m.sigma_point)),
-            pixel=self._found("pixel", _typical(m.sigma_pixel)),
+            distance=self._found("distance", lengths),
+            angle=self._found("angle", None if pairs is None else _typical(pairs.sigma_angle, between)),
+            point=self._found("point", _typical(m.sigma_point, train)),
+            pixel=self._found("pixel", _typical(m.sigma_pixel, train)),
         )
 
     def _found(self, kind: str, stated: float | None) -> float | None:
@@ -221,9 +223,28 @@ class _Table:
         return BoardViews(board, count=1, distance=range_, cone=max(WIDEST, float(np.quantile(aslant, 0.9))))
 
 
-def _typical(sigma: Floats | None) -> float | None:
-    """Root mean square of sigmas that are stated."""
-    if sigma is None or not np.isfinite(sigma).any():
+def along_axes(table: Table, like: Table) -> Table:
+    """A table whose poses are as noisy along each axis, beside the others, as the train rows of another table.
+
+    Args:
+        table: It, as noisy along all of them.
+        like: The other.
+    """
+    m, of = table.measurements, like.measurements
+    changes = {}
+    for name in ("sigma_position", "sigma_orientation"):
+        sigma, stated = getattr(m, name), getattr(of, name)
+        whole = _typical(stated, ~of.test)
+        if sigma is not None and whole and np.isfinite(stated[~of.test]).any(axis=0).all():
+            axes = [_typical(stated[:, k], ~of.test) for k in range(stated.shape[1])]
+            changes[name] = sigma * (np.array(axes, dtype=np.float64) / whole)
+    return replace(table, measurements=replace(m, **changes))
+
+
+def _typical(sigma: Floats | None, chosen: NDArray[np.bool_] | None) -> float | None:
+    """Root mean square of sigmas that are stated, of those chosen."""
+    if sigma is None or not np.isfinite(sigma[chosen]).any():
         return None
+    sigma = sigma[chosen]
     largest = float(np.nanmax(sigma)) or 1.0  # equal figures stay what they are, to the last digit
     return largest * float(np.sqrt(np.nanmean(np.square(sigma / largest))))

@@ -217,9 +217,7 @@ def fill_folder(folder: Path, write: Callable[[Path], None], own: Mapping[str, b
     missing = _missing(folder)
     temporary = None
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        _clear_dead(folder)
-        temporary = _made_in(folder, f"{_WRITING}{_here()}-")
+        temporary = _begun(folder)
         write(temporary)
         names = [file.name for file in temporary.iterdir()]
         for name in names:
@@ -285,6 +283,21 @@ def fill_folders(fillings: Sequence[Filling]) -> None:
             fill_folders(others)
 
         fill_folder(first.folder, write, first.own)
+
+
+def _begun(folder: Path) -> Path:
+    """A new folder to write to, in a folder that is made if it is not there."""
+    for _ in range(_TRIES):
+        with suppress(FileNotFoundError):  # another writer has made it, looked whether it can, and removed it
+            folder.mkdir(parents=True, exist_ok=True)
+            _clear_dead(folder)
+            return _made_in(folder, f"{_WRITING}{_here()}-")
+    folder.mkdir(parents=True, exist_ok=True)
+    return _made_in(folder, f"{_WRITING}{_here()}-")
+
+
+_TRIES = 10
+"""How often a folder that is gone is made again."""
 
 
 def _made_in(folder: Path, prefix: str) -> Path:

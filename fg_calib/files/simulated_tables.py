@@ -69,6 +69,9 @@ def table_columns(table: Table, robot: Robot, units: Units) -> dict[str, Columns
     if m.image is not None:
         columns |= {axis: m.image[:, k] for k, axis in enumerate("uv")}
         columns |= {f"corner_{axis}": m.image[:, 2 + k] / length for k, axis in enumerate("xy")}
+    for along, sigma, unit in ((SIGMAS, m.sigma_position, "m"), (SIGMAS_OF_TURNS, m.sigma_orientation, "rad")):
+        if sigma is not None and _differs(sigma):
+            columns |= {name: sigma[:, k] / units.factor(unit) for k, name in enumerate(along)}
     columns["split"] = np.where(m.test, "test", "train")
     found: dict[str, Columns] = {m.source: columns}
     between = _pairs(m)
@@ -79,6 +82,9 @@ def table_columns(table: Table, robot: Robot, units: Units) -> dict[str, Columns
         found[pairs.source] = ends | {name: v for name, v in measured.items() if np.isfinite(v).any()}
     return found
 
+
+SIGMAS, SIGMAS_OF_TURNS = ("sigma_x", "sigma_y", "sigma_z"), ("sigma_rx", "sigma_ry", "sigma_rz")
+"""Columns of sigmas along axes and about them, where these differ."""
 
 MEASURED = (*"xyz", "qx", "qy", "qz", "qw", "distance", "angle", *"uv")
 """Columns of what is measured."""
@@ -159,9 +165,14 @@ def _noise(m: Measurements, units: Units) -> dict[str, float]:
     figures = {
         name: units.from_si(float(sigma.flat[0]), unit)
         for name, (sigma, unit) in stated.items()
-        if sigma is not None and np.isfinite(sigma).any()
+        if sigma is not None and np.isfinite(sigma).any() and not _differs(sigma)
     }
     return figures if m.sigma_pixel is None else figures | {"pixel": float(m.sigma_pixel[0, 0])}
+
+
+def _differs(sigma: Floats) -> bool:
+    """Whether sigmas are not the same along all axes."""
+    return sigma.ndim == 2 and bool(np.any(sigma != sigma[:, :1]))
 
 
 def _pairing(pairing: Pairing) -> Any:

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.errors import InputError
 from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Measurements, rotation_angle
 from fg_calib.measurements.frames import nearest_rotation
@@ -556,6 +557,9 @@ def whitening_of(covariance: Floats, used: Booleans) -> Floats:
     Args:
         covariance: S, shape (n, residual_dim, residual_dim).
         used: Shape (n, residual_dim).
+
+    Raises:
+        InputError: Rounding leaves nothing of the noise along some direction.
     """
     if used.shape[1] == 1:
         with np.errstate(divide="ignore"):
@@ -563,7 +567,9 @@ def whitening_of(covariance: Floats, used: Booleans) -> Floats:
     W = np.empty(covariance.shape)
     C, mine = (np.require(given, requirements=["C", "W"]) for given in (covariance, used))  # as the kernel takes them
     if not all(over_spans(lambda start, stop: whiten_small(C, mine, start, stop, W), len(used))):
-        raise np.linalg.LinAlgError("Matrix is not positive definite")
+        found = "lost in rounding beside what errors of the joint readings do"
+        hint = "is a length of the arm or of a table far too large, or that noise far too small?"
+        raise InputError("noise", found, "figures nearer to each other", hint)
     return W
 
 

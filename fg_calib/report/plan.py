@@ -123,13 +123,24 @@ def build_instruments_report(designs: Mapping[str, Design], failed: Sequence[Fai
     title = f"{first.pool.robot.name}: {len(designs) + len(failed)} instruments"
     parts: list[RenderableType] = [line(title, "bold")]
     parts += section("RMS error over the task in mm", _curve(designs, random=False))
-    table = plain_table(("instrument", "left"), ("stops", "right"), ("expected", "right"), ("undetermined", "right"))
+    columns = [("stops", "right"), ("expected", "right"), ("error", "left"), ("undetermined", "right")]
+    table = plain_table(("instrument", "left"), *columns)
     for name, one in designs.items():
         reached = str(one.n) if one.reached else f"more than {one.n}"
-        table.add_row(line(name), reached, _mm(one.expected.position), str(len(one.cures)))
+        where = error_counts(one)
+        table.add_row(line(name), reached, _mm(one.expected.position), where, str(len(one.cures)))
     for failure in failed:
-        table.add_row(line(failure.job), "failed", "", "")
-    return Group(*parts, *section("With so many stops", table))
+        table.add_row(line(failure.job), "failed", "", "", "")
+    parts += section("With so many stops", table)
+    if len({one.task.fitted for one in designs.values()}) > 1:
+        note = "not the same error of all: --error fitted, or base, compares them by one"
+        parts += section("Notes", *indented([note]))
+    return Group(*parts)
+
+
+def error_counts(design: Design) -> str:
+    """Where a design's errors count."""
+    return "after the best rigid fit" if design.task.fitted else "in the base frame"
 
 
 def _headline(design: Design) -> str:
@@ -146,8 +157,7 @@ def _headline(design: Design) -> str:
 
 
 def _expected(design: Design) -> list[str]:
-    where = "after the best rigid fit" if design.task.fitted else "in the base frame"
-    lines = [f"RMS error of the tool over the task, {where}: {_pose(design.expected)}"]
+    lines = [f"RMS error of the tool over the task, {error_counts(design)}: {_pose(design.expected)}"]
     if design.before is not None:
         lines.append(f"with what there is already: {_pose(design.before)}")
     last = design.curve[-1].n

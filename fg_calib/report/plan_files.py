@@ -23,7 +23,7 @@ from fg_calib.files.units import Units
 from fg_calib.files.urdf import write_urdf
 from fg_calib.measurements.series import Table
 from fg_calib.report.figures import empty_figure
-from fg_calib.report.plan import SCHEMA, UNKNOWN_ABOVE, design_document
+from fg_calib.report.plan import SCHEMA, UNKNOWN_ABOVE, design_document, error_counts
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
 
@@ -37,7 +37,8 @@ CONFIGURATIONS, _DOCUMENT, _PICTURE = "configurations.csv", "design.json", "inst
 _BEGINS = f'{{\n "schema": "{SCHEMA}"'.encode()
 """How the document of a plan begins."""
 
-_JOB_WORDS = "# fg-calib design\n# What to measure: fill in the tables, then `fg-calib calibrate` this file.\n"
+_JOB_BEGINS = "# fg-calib design\n# What to measure: fill in the tables, then `fg-calib "
+_CALIBRATE, _UPDATE = "calibrate` this file.\n", "update RESULT` this file: RESULT is of what there was.\n"
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
@@ -53,10 +54,11 @@ def draw_designs(designs: Mapping[str, Design]) -> Figure:
 
     axes = figure.add_subplot()
     several, first = len(designs) > 1, next(iter(designs.values()))
+    mixed = len({one.task.fitted for one in designs.values()}) > 1
     for colour, (name, one) in zip(_COLOURS * len(designs), designs.items(), strict=False):
         n = np.array([p.n for p in one.curve])
         low, middle, high = _shown([p.random for p in one.curve]).T
-        label = name if several else "designed"
+        label = (f"{name}, {error_counts(one)}" if mixed else name) if several else "designed"
         axes.plot(n, _shown([p.designed for p in one.curve]), "o-", color=colour, markersize=4, label=label)
         axes.fill_between(n, low, high, color=colour, alpha=0.12, linewidth=0)
         axes.plot(n, middle, "--", color=colour, linewidth=1.0)
@@ -178,7 +180,8 @@ def _filling(folder: Path, design: Design, units: Units) -> tuple[tuple[str, ...
         if urdf is not None:
             write_urdf(into / urdf, robot)
         write_robot(into / "robot.yaml", robot, units=units, urdf_name=urdf)
-        write_text(into / "calibration.yaml", _JOB_WORDS + _job_text(design, tables, units))
+        then = _CALIBRATE if design.pool.before is None else _UPDATE
+        write_text(into / "calibration.yaml", _JOB_BEGINS + then + _job_text(design, tables, units))
 
     for name in files:
         if name in (CONFIGURATIONS, "robot.yaml", "calibration.yaml"):
@@ -188,7 +191,7 @@ def _filling(folder: Path, design: Design, units: Units) -> tuple[tuple[str, ...
         if name.endswith(".csv") and name != CONFIGURATIONS and is_filled_in(folder / name):
             raise InputError(str(folder / name), "a table that has been filled in", "another folder")
     whose = {_DOCUMENT: _BEGINS}  # first: it says of the others whose they are
-    own = whose | dict.fromkeys([*before, *names], b"") | {"calibration.yaml": _JOB_WORDS.encode()} | whose
+    own = whose | dict.fromkeys([*before, *names], b"") | {"calibration.yaml": _JOB_BEGINS.encode()} | whose
     return tuple(names), Filling(folder, write, own)
 
 

@@ -360,7 +360,12 @@ class _Work:
             return given
         if within_reach:
             inside = self.well_within_reach()
-            places = inside[self.scene.places.integers(len(inside), size=given)]
+            chosen = self.scene.places.integers(len(inside), size=given)
+            again = np.setdiff1d(np.arange(given), np.unique(chosen, return_index=True)[1])
+            rest = np.setdiff1d(np.arange(len(inside)), chosen)
+            if 0 < len(again) <= len(rest):  # no two in one place
+                chosen[again] = self.scene.places.choice(rest, len(again), replace=False)
+            places = inside[chosen]
         else:
             middle, radius = self.workspace()
             away = self.scene.places.uniform(0.5, 1.5, (given, 1))

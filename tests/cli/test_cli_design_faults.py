@@ -212,6 +212,26 @@ def test_an_instrument_none_of_whose_stops_was_chosen_gets_no_table(plan, fg_cal
 
 
 @pytest.mark.slow
+def test_more_rows_of_a_job_are_to_update_its_result(measured, fg_calib, tmp_path):
+    """As the job that is written for them says: by themselves they would be a calibration without the others."""
+    more, result, new = tmp_path / "more" / "calibration.yaml", tmp_path / "result", tmp_path / "new"
+    assert fg_calib("design", measured, "--n", 3, *FEW, "--out", more.parent).code == 0
+    assert "`fg-calib update RESULT` this file" in more.read_text().splitlines()[1]
+    assert "`fg-calib calibrate` this file" in measured.read_text().splitlines()[1]
+    assert fg_calib("design", measured, "--n", 4, *FEW, "--out", more.parent).code == 0  # known as a plan's own
+    table = pl.read_csv(more.parent / "tracker.csv")
+    seen = pl.read_csv(measured.parent / "tracker.csv").head(len(table))
+    joints, places = ["q1", "q2", "q3"], ["x", "y", "z"]
+    table.with_columns(seen[name] + 1e-3 * (name in places) for name in joints + places).write_csv(
+        more.parent / "tracker.csv"
+    )
+    assert fg_calib("calibrate", measured, "--out", result).code in (0, 3)
+    ended = fg_calib("update", result, more, "--out", new)
+    assert ended.code in (0, 3), ended.err
+    assert (new / "result.json").is_file()
+
+
+@pytest.mark.slow
 def test_more_rows_of_a_job_have_new_names_and_the_noise_that_it_states(measured, fg_calib, tmp_path):
     ended = fg_calib("design", measured, "--n", 3, *FEW, "--out", tmp_path / "more")
     assert ended.code == 0
@@ -251,3 +271,36 @@ def test_a_curve_ends_with_the_pairs_that_are_chosen(plan, fg_calib):
     reached = design(read_scenario(scenario), target=target, n_candidates=60)
     assert reached.reached
     assert len(reached.pairs) <= 8
+
+
+@pytest.mark.slow
+def test_a_comparison_says_where_the_errors_of_each_instrument_count(plan, fg_calib, tmp_path):
+    """A tracker in the base frame against one anywhere: two errors, of which neither is the better by its figure."""
+    for frame in ("base", "unknown"):
+        (tmp_path / f"{frame}.yaml").write_text(f"frame: {frame}\n")
+    files = [tmp_path / "base.yaml", tmp_path / "unknown.yaml"]
+    ended = fg_calib("design", plan(), "--n", 4, *FEW, "--instruments", *files)
+    rows = {row.split()[0]: row for row in ended.out.split("With so many stops")[1].splitlines() if row}
+    assert "in the base frame" in rows["base"]
+    assert "after the best rigid fit" in rows["unknown"]
+    assert "not the same error of all: --error fitted, or base, compares them by one" in ended.out
+    same = fg_calib("design", plan(), "--n", 4, *FEW, "--error", "fitted", "--instruments", *files).out
+    assert same.count("after the best rigid fit") == 2
+    assert "not the same error" not in same
+
+
+@pytest.mark.slow
+def test_a_picture_of_errors_that_are_not_the_same_says_which_is_which(plan):
+    designs = {frame: design(read_scenario(plan(frame=frame)), n=4, n_candidates=12) for frame in ("base", "unknown")}
+    labels = [text.get_text() for text in draw_designs(designs).axes[0].get_legend().get_texts()]
+    assert labels[:2] == ["base, in the base frame", "unknown, after the best rigid fit"]
+    alike = {"one": designs["base"], "other": designs["base"]}
+    assert [text.get_text() for text in draw_designs(alike).axes[0].get_legend().get_texts()][:2] == ["one", "other"]
+
+
+def test_an_arm_too_long_for_its_noise_is_one_line(plan, fg_calib, tmp_path):
+    scenario = plan({"model": "position"}, noise={"position": 0.05, "joint": [0.003, 0.003, 0.01]})
+    (tmp_path / "robot.yaml").write_text(ROBOT.replace("a: 275", "a: 1.0e+14"))
+    ended = fg_calib("design", scenario, "--n", 4, *FEW)
+    assert ended.code == 1
+    assert "error: noise: lost in rounding beside what errors of the joint readings do" in ended.err

@@ -147,6 +147,13 @@ def test_what_is_no_prediction_is_not_replaced(result, fg_calib, tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["predict.csv"]
 
 
+def test_a_place_that_is_a_file_is_refused_before_anything_is_worked_out(result, fg_calib, tmp_path):
+    (tmp_path / "out").write_text("mine\n")
+    ended = fg_calib("predict", result, "--out", tmp_path / "out")
+    assert (ended.code, ended.out) == (1, "")
+    assert ended.err == f"error: {tmp_path / 'out'}: cannot be written: File exists, expected a folder that can be\n"
+
+
 def test_the_schema_that_is_shipped_is_the_models():
     """To write it anew: `json.dumps(prediction_schema(), indent=1)`."""
     file = package.files.result.__file__.replace("result.py", "predict.schema.json")

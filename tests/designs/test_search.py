@@ -156,24 +156,27 @@ def test_as_few_as_reach_a_target():
         errors = {n: min(np.sqrt(value(system, "I", one)) for one in combinations(range(11), n)) for n in range(1, 6)}
         for n in (2, 4):
             target = errors[n] * 1.0001
-            found = Chooser(system, "I").reaching(target)
+            found = Chooser(system, "I").reaching(target, np.random.default_rng(0))
             assert np.sqrt(found.value) <= target
             assert n <= len(found.candidates) <= n + 1
 
 
 def test_a_target_that_none_reaches_takes_all_there_are():
     system = random_system(np.random.default_rng(0), 9)
-    assert len(Chooser(system, "I").reaching(1e-9).candidates) == 9
+    assert len(Chooser(system, "I").reaching(1e-9, np.random.default_rng(0)).candidates) == 9
 
 
 def test_a_target_reached_before_anything_is_measured_takes_one():
     system = random_system(np.random.default_rng(0), 9)
-    assert len(Chooser(replace(system, known=1e12 * np.eye(6)), "I").reaching(1.0).candidates) == 1
+    assert (
+        len(Chooser(replace(system, known=1e12 * np.eye(6)), "I").reaching(1.0, np.random.default_rng(0)).candidates)
+        == 1
+    )
 
 
 @pytest.mark.parametrize("criterion", ["D", "O2"])
 def test_a_target_is_of_the_error_whatever_the_criterion(criterion):
     system = random_system(np.random.default_rng(5), 40)
     target = np.sqrt(value(system, "I", choose(system, 10).candidates)) * 1.1
-    found = Chooser(system, criterion).reaching(target)
+    found = Chooser(system, criterion).reaching(target, np.random.default_rng(0))
     assert np.sqrt(value(system, "I", found.candidates)) <= target

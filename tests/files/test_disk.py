@@ -170,6 +170,36 @@ def test_asking_whether_a_folder_can_be_written_leaves_no_trace(tmp_path):
         require_writable(tmp_path / "file")
 
 
+def test_a_folder_that_another_writer_only_asked_about_is_made_again(tmp_path, monkeypatch):
+    """The other made it, and removes it as it was, before anything of ours is in it."""
+    out, times, made = tmp_path / "out", 3, disk.mkdtemp
+
+    def after_the_other(prefix, dir):
+        nonlocal times
+        if times:
+            times -= 1
+            out.rmdir()
+        return made(prefix=prefix, dir=dir)
+
+    monkeypatch.setattr(disk, "mkdtemp", after_the_other)
+    fill_folder(out, write("new"), OWN)
+    assert times == 0
+    assert content(out) == (dict.fromkeys(FILES, "new"), 0)
+
+
+def test_a_folder_that_is_always_gone_is_said(tmp_path, monkeypatch):
+    out, made = tmp_path / "out", disk.mkdtemp
+
+    def after_the_other(prefix, dir):
+        out.rmdir()
+        return made(prefix=prefix, dir=dir)
+
+    monkeypatch.setattr(disk, "mkdtemp", after_the_other)
+    with pytest.raises(InputError, match="out: cannot be written: No such file or directory"):
+        fill_folder(out, write("new"), OWN)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_what_another_machine_is_writing_is_left_alone(tmp_path):
     others = tmp_path / ".fg-calib-writing-another-machine-1-x"
     others.mkdir()

@@ -8,7 +8,7 @@ from scenarios import SIGMA, TOLERANCE, scenario
 from scipy.spatial.transform import Rotation
 from simulated import small_arm
 
-from fg_calib import InputError, Job, Measurements, Options, Robot, calibrate_job, predict
+from fg_calib import InputError, Job, Measurements, Options, calibrate_job
 from fg_calib.analysis.accuracy import errors_at
 from fg_calib.designs.design import design
 from fg_calib.designs.of_job import solved
@@ -19,7 +19,7 @@ from fg_calib.measurements.dataset import Noise
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 from fg_calib.simulation.configurations import GivenReadings, RandomReadings
-from fg_calib.simulation.instruments import Indicator, LengthGauge, PairGauge, Plane, Sockets, Spot, Tracker
+from fg_calib.simulation.instruments import Indicator, LengthGauge, PairGauge, Sockets, Tracker
 from fg_calib.simulation.scenario import Errors
 from fg_calib.simulation.simulator import simulate
 
@@ -57,15 +57,6 @@ def test_given_configurations_that_are_not_used_are_refused(instrument):
         design(scenario(instrument, n=20, noise=NOISE), n=6, given=GIVEN, n_candidates=40)
 
 
-SCARA = Robot.from_dh(
-    [[0.4, 0.02, 0.35, 0.0], [0.35, np.pi - 0.01, 0.05, 0.2], [0.0, 0.015, 0.1, 0.0], [0.02, 0.01, 0.06, 0.1]],
-    types=("revolute", "revolute", "prismatic", "revolute"),
-    limits=[(-2.3, 2.3), (-2.4, 2.4), (0.0, 0.3), (-3.0, 3.0)],
-    tool={"x": 0.05, "y": 0.02, "z": 0.04},
-    tolerance={"a": 8e-4, "alpha": 2e-3, "d": 1e-3, "theta": 1.5e-3},
-)
-
-
 def job_of(instrument, n, stated=NOISE, **changes):
     """A job of what an arm as drawn shows at random configurations."""
     given = {"configurations": RandomReadings(n), "errors": Errors("values", {}), "noise": SILENT}
@@ -78,13 +69,6 @@ def said_by_all_rows(job, plan):
     """Expected error over the plan's task of one job of all rows."""
     every = solved(replace(job, measurements=(*job.tables, *plan.tables)))
     return Posterior(every, whitened_jacobian(every, every.start)).error(plan.task).position
-
-
-def test_a_plan_of_bent_rows_expects_what_a_job_of_all_rows_says_of_itself():
-    """Lengths of a SCARA are bent by what its parameters may be off, and so weigh more when more is known of these."""
-    job = job_of(PairGauge(model="distance", name="it"), 40, robot=SCARA, stated=Noise(distance=5e-5, joint=2e-5))
-    plan = design(job, n=8, n_candidates=60)
-    assert plan.expected.position == pytest.approx(said_by_all_rows(job, plan), rel=0.02)
 
 
 @pytest.mark.parametrize("n", [1, 5])
@@ -149,33 +133,6 @@ def test_a_table_of_pairs_has_pairs():
     renamed = with_names(two.tables, {f"p{k}": f"two{k}" for k in range(20)})
     plan = design(replace(one, measurements=(*one.tables, *renamed)), n=3, n_candidates=20)
     assert [len(table.measurements.pairs.a) > 0 for table in plan.tables] == [True] * len(plan.tables)
-
-
-@pytest.mark.parametrize(
-    "instrument",
-    [
-        Tracker(model="pose", name="it", frame="unknown"),
-        LengthGauge(name="it", anchors={"a": Spot([1.0, -2.0, 0.5]), "b": Spot([-1.5, 1.0, 1.0])}),
-        Indicator(name="it", planes={"floor": Plane([0, 0, 1], -1.0), "wall": Plane([1, 0.1, 0], 2.0)}),
-    ],
-    ids=["poses", "anchors", "planes"],
-)
-def test_a_plan_of_more_rows_expects_what_an_update_by_them_says(instrument):
-    """The page of designs says that `update` adds the rows of a plan: so it is told to, or knows what stayed."""
-    job = job_of(instrument, 30)
-    plan = design(job, n=6, n_candidates=40)
-    found = calibrate_job(job).update(replace(job, measurements=plan.tables))
-    assert plan.expected.position == pytest.approx(errors_at(found.posterior, plan.task.readings)[1].position, rel=1e-3)
-
-
-def test_what_is_predicted_after_an_update_is_fitted_to_all_that_was_measured():
-    """Not to the few rows of the update alone, which say next to nothing of the motion that they are fitted by."""
-    tracker, rng = Tracker(model="pose", name="it", frame="unknown"), np.random.default_rng(0)
-    far, near = rng.uniform(-1.5, 1.5, (40, 4)), rng.uniform(0.5, 0.7, (6, 4))
-    before = calibrate_job(job_of(tracker, 40, configurations=GivenReadings(far)))
-    after = before.update(job_of(tracker, 6, configurations=GivenReadings(near)))
-    found, all_rows = predict(after, far), predict(after, far, measured=np.vstack([far, near]))
-    assert found.errors.fitted == pytest.approx(all_rows.errors.fitted, rel=1e-3)
 
 
 def test_gross_errors_of_a_job_that_leaves_them_out_are_no_noise_of_more_rows():
