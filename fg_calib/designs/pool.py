@@ -277,27 +277,14 @@ def pool_of(
         InputError: The scenario cannot be, or nothing is seen from anywhere.
     """
     scenario = _with_instruments(scenario)
-    readings = {name: one.readings for name, one in found.items()}
-    if given is not None and "" not in readings:
-        reason = "where every instrument has configurations of its own"
-        raise InputError("given", reason, "a job with what was measured")
-    for name, first in (hubs or {}).items():
-        q = readings[name]
-        readings[name] = np.vstack([q[first : first + 1], np.delete(q, first, axis=0)])
-    if given is not None:
-        readings[""] = np.vstack([given, readings[""]])
-    formed = _formed(scenario)
-    simulation = simulate(_silent(scenario, readings), leave_out=True)
+    simulation = simulate(_silent(scenario, _in_order(found, given, hubs or {})), leave_out=True)
     tables = _as_told(simulation)
     if before is not None:
         tables = tuple(map(along_axes, tables, before.data.tables))
     options = Options(tables[0].model or "pose", gauge=_gauge(scenario)) if before is None else before.options
     problem = true_problem(scenario.robot, tables, options, None if before is None else _staying(before))
     data = problem.data
-    if not problem.rows:
-        n = data.n_configurations
-        found_there = "one, of which no pair is made" if n == 1 else f"{n}, at none of which anything is measured"
-        raise InputError("candidates", found_there, "more configurations")
+    _check_rows(problem)
     names = [_named(name) for name in data.names[: data.n_configurations]]
     common = _hubs(problem)
     kept = np.setdiff1d(np.arange(len(names)), common)
@@ -317,8 +304,30 @@ def pool_of(
         given=np.array([stop[k] for k in kept if names[k][0] == "" and names[k][1] < n_given], dtype=np.int64),
         found=found,
         before=before,
-        formed=formed,
+        formed=_formed(scenario),
     )
+
+
+def _in_order(found: Mapping[str, Candidates], given: Floats | None, hubs: Mapping[str, int]) -> dict[str, Floats]:
+    """Readings of candidates by whose they are, hubs first, and before those in common the ones that are given."""
+    readings = {name: one.readings for name, one in found.items()}
+    if given is not None and "" not in readings:
+        reason = "where every instrument has configurations of its own"
+        raise InputError("given", reason, "a job with what was measured")
+    for name, first in hubs.items():
+        q = readings[name]
+        readings[name] = np.vstack([q[first : first + 1], np.delete(q, first, axis=0)])
+    if given is not None:
+        readings[""] = np.vstack([given, readings[""]])
+    return readings
+
+
+def _check_rows(problem: Problem) -> None:
+    """Check that anything is measured at any candidate."""
+    if not problem.rows:
+        n = problem.data.n_configurations
+        found = "one, of which no pair is made" if n == 1 else f"{n}, at none of which anything is measured"
+        raise InputError("candidates", found, "more configurations")
 
 
 def _formed(scenario: Scenario) -> dict[int, tuple[Model, Pairing]]:

@@ -116,6 +116,7 @@ def test_more_rows_are_as_noisy_along_each_axis_as_those_of_the_job():
     assert plan.tables[0].measurements.sigma_position == pytest.approx(np.tile(sigma, (4, 1)))
 
 
+@pytest.mark.slow
 def test_a_target_takes_no_more_stops_than_a_plan_of_fewer_that_reaches_it():
     """One more is what its search may miss."""
     of = scenario(LengthGauge(name="it"), n=20, noise=NOISE)
