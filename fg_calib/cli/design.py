@@ -196,6 +196,7 @@ def _of_instruments(of: Sequence[str], instruments: Sequence[Path] | None) -> li
 
 def _read(of: str, instruments: Sequence[Path]) -> tuple[dict[str, Scenario | Job], Units, Robot]:
     """What is to be designed, by the instruments' names, the units of its tables, and the arm."""
+    from fg_calib.errors import InputError
     from fg_calib.files.job import is_job, read_job, units_of
     from fg_calib.files.scenario import read_scenario
     from fg_calib.files.units import Units
@@ -207,6 +208,8 @@ def _read(of: str, instruments: Sequence[Path]) -> tuple[dict[str, Scenario | Jo
             raise typer.Exit(2)
         job = read_job(of)
         return {"": job}, units_of(job), job.robot
+    if "result.json" in (Path(of).name, *(file.name for file in Path(of).glob("*.json"))):
+        raise InputError(of, "a result", "a scenario, or the job that the result came from")
     scenarios: dict[str, Scenario | Job] = {}
     for name, path in zip(names_of_files(instruments), instruments, strict=True):
         scenarios[name] = read_scenario(of, instruments=path)

@@ -211,6 +211,14 @@ def test_an_instrument_none_of_whose_stops_was_chosen_gets_no_table(plan, fg_cal
     assert not (out / "sockets.csv").exists()
 
 
+def test_a_result_is_no_job(fg_calib, tmp_path):
+    (tmp_path / "result.json").write_text("{}")
+    for of in (tmp_path, tmp_path / "result.json"):
+        ended = fg_calib("design", of, "--n", 3)
+        assert ended.code == 1
+        assert f"{of}: a result, expected a scenario, or the job that the result came from" in ended.err
+
+
 @pytest.mark.slow
 def test_more_rows_of_a_job_are_to_update_its_result(measured, fg_calib, tmp_path):
     """As the job that is written for them says: by themselves they would be a calibration without the others."""
