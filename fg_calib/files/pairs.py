@@ -68,7 +68,8 @@ def read_pairs(
         The pairs of configurations and those of groups.
 
     Raises:
-        InputError: The file is missing, is no table, lacks a column or holds a cell that cannot be used.
+        InputError: The file is missing, is no table, lacks a column or holds a cell that cannot be used; or several
+            configurations have one id.
     """
     header = Header.read(path, "frame of pairs").understood(PAIR_COLUMNS)
     for column in ("a", "b"):
@@ -78,10 +79,20 @@ def read_pairs(
     if not measured:
         raise InputError(header.name, "neither distance nor angle", "at least one of the columns")
     sigmas = header.present("sigma_distance", "sigma_angle")
+    _check_different(configurations)
     texts = ("a", "b", *header.present("split"))
     pieces = Table.pieces(header, (*measured, *sigmas), texts)
     found = [_read_piece(piece, configurations, units, noise) for piece in pieces]
     return joined([of_configurations for of_configurations, _ in found]), joined([of_groups for _, of_groups in found])
+
+
+def _check_different(configurations: Configurations) -> None:
+    """Raise for the first configuration that has an id of one before it: no pair could say which is meant."""
+    again = (~configurations.ids.is_first_distinct()).arg_true()
+    if len(again):
+        row = again[0]
+        found = f"id = {shown(configurations.ids[row])} of a second row"
+        raise InputError(configurations.table.place(row), found, "different ids where pairs name them")
 
 
 def _read_piece(table: Table, configurations: Configurations, units: Units, noise: Noise) -> tuple[Pairs, Pairs]:
