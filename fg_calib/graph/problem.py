@@ -291,10 +291,10 @@ def noises_at(problem: Problem, parameters: Floats, *, at_readings: bool = False
 
 def _places(problem: Problem, parameters: Floats, at_readings: bool) -> list[Place]:
     data, errors = problem.data, problem.state.joint_errors
-    trigs = []
-    for table, place in zip(data.tables, data.places, strict=True):
-        moved = 0.0 if errors is None or at_readings else errors[place]
-        trigs.append(precompute_trig(problem.robot, table.measurements.readings + moved))
+    trigs = data.trigs(problem.robot)
+    if errors is not None and not at_readings:
+        moved = [t.measurements.readings + errors[place] for t, place in zip(data.tables, data.places, strict=True)]
+        trigs = tuple(precompute_trig(problem.robot, readings) for readings in moved)
     at = at_parameters(problem, parameters, trigs)
     estimated = problem.options.encoder == "estimated"
     return [
@@ -314,7 +314,7 @@ def at_parameters(problem: Problem, parameters: Floats, trigs: Sequence[Floats] 
     at = problem.variables.at(parameters)
     if np.all(at.columns >= 0):
         return at
-    trigs = trigs or [precompute_trig(problem.robot, t.measurements.readings) for t in problem.data.tables]
+    trigs = trigs or problem.data.trigs(problem.robot)
     return problem.variables.at(parameters, contact_points(problem.data, at.chains, trigs))
 
 

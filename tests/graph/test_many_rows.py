@@ -184,3 +184,14 @@ def test_where_such_steps_lead_nowhere_the_ordinary_descent_goes_on(problem, mon
     run = solver._fit(near, solver.SolverOptions(), near=True)
     assert run.converged
     assert run.here.decrement_to(expected.values) < 1e-6
+
+
+def test_readings_are_prepared_for_the_kernels_once_and_left_out_of_pickles(problem):
+    data, robot = problem.data, problem.robot
+    (trig,) = data.trigs(robot)
+    assert np.array_equal(trig, kinematics.precompute_trig(robot, data.tables[0].measurements.readings))
+    assert problem.rows[0].parts[0].block.trig is trig
+    assert data.trigs(robot.with_values(robot.nominal + 0.1))[0] is trig  # parameters change nothing of it
+    again = pickle.loads(pickle.dumps(data))
+    assert again._trigs == {}
+    assert np.array_equal(again.trigs(robot)[0], trig)
