@@ -1,13 +1,13 @@
 """What does `fg-calib calibrate` of a million pairs cost, as a process, and how do its parts grow?
 
 Command: python experiments/benchmarks/million.py [--quick] [--pairs N] [--poses N] [--most N] [--before FOLDER]
-Takes about five minutes on two cores; the first run on a machine compiles the kernels, which is not counted.
+Takes some four minutes on two cores; the first run on a machine compiles the kernels, which is not counted.
 
 - Tables: pairs of configurations of the space robot, distance and angle measured directly (1 mm, 1 mrad), a hundredth
   as many configurations as pairs; and poses in an unknown frame, with joint noise. Both are written here, to a
   temporary folder, as Parquet and CSV.
-- The command: seconds by the clock and of processors, and peak memory of the process (`os.wait4`); with another
-  checkout's root as `--before`, the same of that one, in turn with ours.
+- The command: seconds by the clock and of processors, and peak memory of the process by its own account (`VmHWM`);
+  with another checkout's root as `--before`, the same of that one, in turn with ours.
 - Parts: the pairs in files of 200 000 each, read and reduced one after the other by `solve_parts`; with `--most` also
   more of them.
 - Growth: seconds of processors of a linearisation against pairs, joints (three arms) and estimated parameters; and of
@@ -27,6 +27,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from inspect import getsource
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -114,6 +115,18 @@ def write_parts(folder: Path, n: int, seed: int) -> None:
         pairs.slice(k, PART).sink_parquet(folder / f"part{k // PART:04}.parquet")
 
 
+_COMMAND = """
+import atexit, resource, sys
+from pathlib import Path
+peak = Path(sys.argv.pop(1))
+{peak_of_this}
+atexit.register(lambda: peak.write_text(str(_peak_of_this())))
+from fg_calib.cli import main
+main()
+"""
+"""What a process does that is told where to write its peak memory: `fg-calib`."""
+
+
 def solve_folder(folder: Path) -> dict[str, float]:
     """What a calibration of those parts takes, each read where it is reduced: in a process of its own."""
     job = fg_calib.read_job(folder / "small.yaml")
@@ -172,8 +185,10 @@ def command(job: Path, *options: str, root: Path = ROOT) -> dict[str, float]:
     Raises:
         RuntimeError: It did not end with 0.
     """
-    with TemporaryDirectory() as out:
-        arguments = [sys.executable, "-P", "-m", "fg_calib.cli", "calibrate", str(job), "--out", out, *options]
+    with TemporaryDirectory() as folder:
+        peak, out = Path(folder) / "peak", Path(folder) / "out"
+        given = [str(peak), "calibrate", str(job), "--out", str(out), *options]
+        arguments = [sys.executable, "-P", "-c", _COMMAND.format(peak_of_this=getsource(_peak_of_this)), *given]
         clock = time.perf_counter()
         child = subprocess.Popen(
             arguments,
@@ -188,8 +203,8 @@ def command(job: Path, *options: str, root: Path = ROOT) -> dict[str, float]:
         if child.returncode:
             raise RuntimeError(f"fg-calib calibrate {job.name} ended with {child.returncode}: {child.stderr.read()}")
         child.stderr.close()
-    peak = used.ru_maxrss * (1.0 if sys.platform == "darwin" else 1024.0)
-    return {"seconds": seconds, "processor_seconds": used.ru_utime + used.ru_stime, "peak_MiB": peak / MIB}
+        found = float(peak.read_text()) / MIB
+    return {"seconds": seconds, "processor_seconds": used.ru_utime + used.ru_stime, "peak_MiB": found}
 
 
 def growth(quick: bool, seed: int) -> dict[str, Any]:

@@ -421,9 +421,13 @@ class _Part:
         there = ends >= 0
         chi2, expected, count = (
             np.sum(
-                [np.bincount(end[use], values[use], self.n_ends) for end, use in zip(ends, there, strict=True)], axis=0
+                [
+                    np.bincount(end[use], None if values is None else values[use], self.n_ends)
+                    for end, use in zip(ends, there, strict=True)
+                ],
+                axis=0,
             )
-            for values in (self.squares, self.means, np.ones(len(self.rows)))
+            for values in (self.squares, self.means, None)
         )
         looked_at = np.flatnonzero(expected > 1e-3)
         limit = ALARM / max(1, len(looked_at))
@@ -458,7 +462,9 @@ class _Rows:
         self._solution = solution
         self._noises = solution.noises
         self._robust = problem.state.weights is not None
-        self.weight = np.ones(table.n)
+        self.weight: Floats = np.broadcast_to(1.0, table.n)
+        if self._robust:
+            self.weight = np.ones(table.n)
         for number, weights in enumerate(problem.state.weights or ()):
             mine = table.series == number
             self.weight[mine] = weights[table.measurement[mine]]
@@ -472,17 +478,22 @@ class _Rows:
         of_kept = np.flatnonzero(keep)
         all_kept = self._read(keep)
         w, q = self.weight, self.leverage
-        variance = 1.0 + q * (1.0 - 2.0 * np.where(table.used, w, 0.0))
+        variance = np.where(table.used, 1.0 - 2.0 * w, 1.0)  # in place, as of a million rows each array counts
+        variance *= q
+        variance += 1.0
         covariance, self._errors = None, None
         if keep[fitted].all():
             self._errors = all_kept.at(np.searchsorted(of_kept, fitted))
             covariance = self._residual_covariance(fitted, self._errors)
         if isinstance(covariance, Dense):
             variance[fitted] = covariance.diagonal
+        self.studentised = np.sqrt(np.maximum(variance, 1e-12))
         with np.errstate(invalid="ignore", divide="ignore"):
-            self.studentised = table.after / (table.sigma * np.sqrt(np.maximum(variance, 1e-12)))
+            self.studentised *= table.sigma
+            np.divide(table.after, self.studentised, out=self.studentised)
         self.studentised[variance < LEAST_VARIANCE] = np.nan
-        squares = (table.after / table.sigma) ** 2
+        squares = table.after / table.sigma
+        squares *= squares
         self.fitted = self._part(fitted, w[fitted] * squares[fitted], w[fitted] * variance[fitted], covariance)
         self.predicted, self._outliers, self._n_unknown = self._predict(test, squares, of_kept, all_kept)
 
@@ -704,17 +715,17 @@ class _Rows:
         asked = keep | table.test
         for number, noise in enumerate(self._noises):
             of_series = np.flatnonzero(table.series == number)
-            for start in range(0, noise.rows.n, _CHUNK):
-                chunk = np.arange(start, min(start + _CHUNK, noise.rows.n))
+            for start in range(0, noise.series.n, _CHUNK):
+                chunk = np.arange(start, min(start + _CHUNK, noise.series.n))
                 first, last = np.searchsorted(table.measurement[of_series], (start, start + len(chunk)))
                 rows = of_series[first:last]
                 if nuisances.none_in(number) and not asked[rows].any():  # they follow from the core and own noise alone
                     place = (table.measurement[rows] - start, table.row[rows])
                     squares = squares_along(noise.rows_at(chunk), nuisances.chain(number), half)[place]
-                    own = np.einsum("nii->ni", noise.own[chunk])[place]
+                    own = noise.variance[chunk][place]
                     self.leverage[rows] = (squares + np.maximum(own, 0.0)) / table.sigma[rows] ** 2 - 1.0
                     continue
-                grid = (table.measurement[rows] - start) * noise.rows.residual_dim + table.row[rows]
+                grid = (table.measurement[rows] - start) * noise.series.kind.residual_dim + table.row[rows]
                 found = nuisances.errors(number, chunk).at(grid).over(table.sigma[rows])
                 leverage = np.einsum("ij,ij->i", found.J @ self._spread.tangent, found.J)
                 leverage[table.test[rows]] = self._spread.variance(found.J[table.test[rows]])

@@ -183,7 +183,7 @@ def _of_part(noise: RowNoise, part: Part, name: NoiseName, shares: ErrorColumns)
     else:
         mine = np.array([(noise.series.table, family) == name for family in _families(noise)])
         sources = [_of_rows(source, mine) for source in noise.sources if source.name != "joints" and mine.any()]
-        blocks += [W @ _root(noise.own[train])[:, :, mine]]
+        blocks += [W @ _root(noise.own_at(train))[:, :, mine]]
     masks = {source.name: shares.mask(source)[train] for source in sources}
     for source in sources:
         alone = np.where(masks[source.name][:, None, :, None], 0.0, source.loading[train]).reshape(n, h, -1)

@@ -343,7 +343,8 @@ def residual_table(solution: Solution) -> ResidualTable:
                 "sigma": new.sigma[of, row],
             }
         )
-    together = {name: np.concatenate([c.pop(name) for c in columns]) for name in list(columns[0])}  # never all twice
+    called = list(columns[0])
+    together = {name: _short(np.concatenate([c.pop(name) for c in columns])) for name in called}  # never all twice
     return ResidualTable(
         kinds=tuple(kinds),
         names=problem.data.names,
@@ -354,6 +355,12 @@ def residual_table(solution: Solution) -> ResidualTable:
         n_fitted=len(problem.variables.all_scales) if problem.evaluated else 0,
         **together,
     )
+
+
+def _short(values: NDArray[Any]) -> NDArray[Any]:
+    """Values, one figure in memory where all are the same."""
+    same = len(values) > 0 and np.all(values == values[0])
+    return np.broadcast_to(values[:1].copy(), values.shape) if same else values
 
 
 def _seen(readings: Floats, rows: dict[str, NDArray[Any]]) -> Booleans:

@@ -33,6 +33,9 @@ _log = logging.getLogger(__name__)
 _BYTES_A_CELL = 48
 """What polars needs of memory for a short text, the same without blanks, the number that it makes of it, and more."""
 
+PIECE = 200_000
+"""Rows of a Parquet file that are read together where it is read by pieces."""
+
 _ENDINGS = (".csv", ".parquet", ".pq")
 
 
@@ -93,8 +96,12 @@ class Header:
         """Whether it is a CSV, else a Parquet file or a frame."""
         return self.frame is None and self.path.suffix.lower() == ".csv"
 
-    def parquet(self, columns: Sequence[str]) -> pl.DataFrame:
+    def parquet(self, columns: Sequence[str], span: tuple[int, int] | None = None) -> pl.DataFrame:
         """Columns of a Parquet file or a frame.
+
+        Args:
+            columns: Their names.
+            span: Of a file, the first row and how many at most; all if None.
 
         Raises:
             InputError: It cannot be read.
@@ -102,7 +109,7 @@ class Header:
         if self.frame is not None:
             return select(self.frame, columns)
         chosen = sorted(self.columns.index(c) for c in columns)
-        frame = read_parquet(self.content, chosen, self.name)
+        frame = read_parquet(self.content, chosen, self.name, span)
         frame.columns = [self.columns[i] for i in chosen]  # without blanks around them
         return select(frame, columns)
 
@@ -250,6 +257,23 @@ class Table:
             raise InputError(header.name, "no rows", "at least one")
         return cls(header, frame, rows)
 
+    @classmethod
+    def pieces(cls, header: Header, numbers: Sequence[str], texts: Sequence[str]) -> Iterator[Table]:
+        """The same some rows at a time, as polars keeps the memory that it once took for all."""
+        if header.is_csv or header.frame is not None:
+            yield cls.read(header, numbers, texts)
+            return
+        first = 0
+        while True:
+            frame, rows = _read_parquet(header, numbers, texts, (first, PIECE))
+            if frame.height == 0 and first == 0:
+                raise InputError(header.name, "no rows", "at least one")
+            if frame.height:
+                yield cls(header, frame, rows)
+            first += frame.height
+            if frame.height < PIECE:
+                return
+
     @property
     def n_rows(self) -> int:
         """Number of rows."""
@@ -366,14 +390,16 @@ def _read_csv(header: Header, numbers: Sequence[str], texts: Sequence[str]) -> t
     return _columns(frame, numbers, texts, decimal_comma=header.separator != ","), rows
 
 
-def _read_parquet(header: Header, numbers: Sequence[str], texts: Sequence[str]) -> tuple[pl.DataFrame, Integers]:
-    frame = header.parquet(list(dict.fromkeys((*numbers, *texts))))
+def _read_parquet(
+    header: Header, numbers: Sequence[str], texts: Sequence[str], span: tuple[int, int] | None = None
+) -> tuple[pl.DataFrame, Integers]:
+    frame, first = header.parquet(list(dict.fromkeys((*numbers, *texts))), span), 0 if span is None else span[0]
     for column, kind in frame.schema.items():
         if column in numbers and not (kind.is_numeric() or str(kind) in ("String", "Null")):
             raise InputError(f"{header.name}: {column}", f"type {kind}", "numbers")
         if kind.is_nested() or str(kind) == "Object":
             raise InputError(f"{header.name}: {column}", f"type {kind}", "text")
-    return of_polars(header.name, lambda: _columns(frame, numbers, texts)), np.arange(frame.height)
+    return of_polars(header.name, lambda: _columns(frame, numbers, texts)), np.arange(first, first + frame.height)
 
 
 def _columns(
@@ -425,6 +451,8 @@ def _text(cells: pl.Series, column: pl.Expr) -> pl.Expr:
 
     if cells.dtype.is_float() and bool(((cells % 1 == 0) & (cells.abs() <= MOST_SIZE)).all()):
         column = column.cast(pl.Int64)  # pandas has floats beside nan
+    if cells.dtype.is_integer():
+        return column.cast(pl.String)
     return column.cast(pl.String).str.strip_chars().replace("", None)
 
 

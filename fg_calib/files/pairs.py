@@ -14,7 +14,7 @@ from fg_calib.files.disk import within_memory
 from fg_calib.files.schema import shown
 from fg_calib.files.units import Units
 from fg_calib.measurements.checks import ANGLE_SLACK
-from fg_calib.measurements.dataset import Booleans, Floats, Integers, Noise, Pairs
+from fg_calib.measurements.dataset import Booleans, Floats, Integers, Noise, Pairs, joined
 
 if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it
     import polars as pl
@@ -68,7 +68,8 @@ def read_pairs(
         The pairs of configurations and those of groups.
 
     Raises:
-        InputError: The file is missing, is no table, lacks a column or holds a cell that cannot be used.
+        InputError: The file is missing, is no table, lacks a column or holds a cell that cannot be used; or several
+            configurations have one id.
     """
     header = Header.read(path, "frame of pairs").understood(PAIR_COLUMNS)
     for column in ("a", "b"):
@@ -78,8 +79,24 @@ def read_pairs(
     if not measured:
         raise InputError(header.name, "neither distance nor angle", "at least one of the columns")
     sigmas = header.present("sigma_distance", "sigma_angle")
-    table = Table.read(header, (*measured, *sigmas), ("a", "b", *header.present("split")))
+    _check_different(configurations)
+    texts = ("a", "b", *header.present("split"))
+    pieces = Table.pieces(header, (*measured, *sigmas), texts)
+    found = [_read_piece(piece, configurations, units, noise) for piece in pieces]
+    return joined([of_configurations for of_configurations, _ in found]), joined([of_groups for _, of_groups in found])
 
+
+def _check_different(configurations: Configurations) -> None:
+    """Raise for the first configuration that has an id of one before it: no pair could say which is meant."""
+    again = (~configurations.ids.is_first_distinct()).arg_true()
+    if len(again):
+        row = again[0]
+        found = f"id = {shown(configurations.ids[row])} of a second row"
+        raise InputError(configurations.table.place(row), found, "different ids where pairs name them")
+
+
+def _read_piece(table: Table, configurations: Configurations, units: Units, noise: Noise) -> tuple[Pairs, Pairs]:
+    """The pairs of configurations and those of groups among the rows of a table."""
     ends = _ends(table, configurations)
     length, turn = units.factor("m"), units.factor("rad")
     distance, angle = _measured(table, "distance", length), _measured(table, "angle", turn)
@@ -94,7 +111,7 @@ def read_pairs(
         sigma_distance=_sigma(table, "sigma_distance", noise.distance, length),
         sigma_angle=_sigma(table, "sigma_angle", noise.angle, turn),
         test=table.test_rows() | _has_test_end(ends, configurations),
-        source=header.name,
+        source=table.header.name,
     )
     return pairs.select(~ends.of_groups), pairs.select(ends.of_groups)
 
@@ -164,10 +181,10 @@ def _rows_named(table: Table, column: str, configurations: Configurations) -> tu
     kind = "an id" if by_id else "a row"
 
     def look_up(known: pl.Series) -> pl.Series:
-        return names.replace_strict(known, pl.int_range(len(known), eager=True), default=None, return_dtype=pl.Int64)
+        return names.cast(pl.Enum(known), strict=False).to_physical()
 
     names = table.texts(column, "a configuration")
-    if not by_id:
+    if not by_id and names.str.contains(".", literal=True).any():
         names = names.str.replace(r"^(\d+)\.0+$", "$1")  # so pandas writes whole numbers that were beside an empty cell
     row_of, group_of = look_up(ids), look_up(pl.Series(group_names, dtype=pl.String))
     both, neither = row_of.is_not_null() & group_of.is_not_null(), row_of.is_null() & group_of.is_null()

@@ -43,13 +43,17 @@ from io import BytesIO
 import polars as pl
 source, sink = sys.stdin.buffer, sys.stdout.buffer
 while head := source.readline():
-    columns, size = json.loads(head)
-    content, found, error = BytesIO(source.read(size)), BytesIO(), ""
+    columns, span, size = json.loads(head)
+    if size is not None:
+        content = BytesIO(source.read(size))
+    found, error = BytesIO(), ""
     try:
         if columns is None:
             found.write(json.dumps(list(pl.read_parquet_schema(content))).encode())
-        else:
+        elif span is None:
             pl.read_parquet(content, columns=columns).write_ipc(found)
+        else:
+            pl.scan_parquet(content).select(pl.nth(*columns)).slice(*span).collect().write_ipc(found)
     except MemoryError:
         error = "memory"
     except BaseException as caught:
@@ -62,7 +66,10 @@ while head := source.readline():
     sink.write(answer)
     sink.flush()
 """
-"""What the process does: a line `[columns, size]` and the file in, a line `[error, size]` and the answer out."""
+"""What the process does: a line `[columns, span, size]` and the file in, a line `[error, size]` and the answer out.
+
+A span is the first row and how many at most, or null for all. No size means the file of the question before.
+"""
 
 
 def parquet_columns(content: bytes, name: str) -> list[str]:
@@ -78,22 +85,28 @@ def parquet_columns(content: bytes, name: str) -> list[str]:
     return list(json.loads(_READER.ask(None, content, name)))
 
 
-def read_parquet(content: bytes, columns: Sequence[int], name: str) -> pl.DataFrame:
+def read_parquet(
+    content: bytes, columns: Sequence[int], name: str, span: tuple[int, int] | None = None
+) -> pl.DataFrame:
     """Columns of a Parquet file, by their numbers in ascending order.
 
     Args:
         content: Its bytes.
         columns: Numbers of the columns.
         name: Its name, for messages.
+        span: The first row and how many at most; all if None. The file is kept for the next rows until there are less.
 
     Raises:
         InputError: It is damaged, or memory does not suffice for it.
     """
     import polars as pl
 
-    answer = _READER.ask(list(columns), content, name)
+    answer = _READER.ask(list(columns), content, name, span)
     require_memory(name, 2 * len(answer))
-    return pl.read_ipc(BytesIO(answer))
+    frame = pl.read_ipc(BytesIO(answer))
+    if span is not None and frame.height < span[1]:
+        _READER.forget()
+    return frame
 
 
 class _Reader:
@@ -102,10 +115,15 @@ class _Reader:
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
         self._said: IO[bytes] = BytesIO()  # what the process says on stderr
+        self._kept: bytes | None = None  # the file that the process is to keep
         self._owner = 0  # a fork of the owner has its pipes, but is not to be answered
         self._lock = Lock()
 
-    def ask(self, columns: list[int] | None, content: bytes, name: str) -> bytes:
+    def forget(self) -> None:
+        """Keep no file."""
+        self._kept = None
+
+    def ask(self, columns: list[int] | None, content: bytes, name: str, span: tuple[int, int] | None = None) -> bytes:
         """Columns as Arrow's IPC file, or the names of all as JSON if None."""
         require_polars(name)  # which also keeps a fork from a lock that nobody opens
         with self._lock:
@@ -119,7 +137,8 @@ class _Reader:
             waiting = Timer(seconds, end)
             waiting.start()
             try:
-                error, answer = _exchange(process, columns, content)
+                error, answer = _exchange(process, columns, span, None if content is self._kept else content)
+                self._kept = None if span is None else content
             except (OSError, ValueError):  # it has ended
                 no_memory = self._ended_for_memory(process)
                 self.stop()
@@ -152,7 +171,7 @@ class _Reader:
             except OSError as error:
                 found = f"cannot be read: no process can be started for it: {error.strerror or error}"
                 raise InputError(name, found, hint="a CSV needs none") from None
-            self._owner = os.getpid()
+            self._owner, self._kept = os.getpid(), None
         return self._process
 
     def _ended_for_memory(self, process: subprocess.Popen[bytes]) -> bool:
@@ -165,7 +184,7 @@ class _Reader:
 
     def stop(self) -> None:
         """End the process, if there is one."""
-        process, self._process = self._process, None
+        process, self._process, self._kept = self._process, None, None
         self._said.close()
         if process is not None and self._owner == os.getpid():
             process.kill()
@@ -176,8 +195,10 @@ class _Reader:
                         pipe.close()
 
 
-def _exchange(process: subprocess.Popen[bytes], columns: list[int] | None, content: bytes) -> tuple[str, bytes]:
-    """Question and answer.
+def _exchange(
+    process: subprocess.Popen[bytes], columns: list[int] | None, span: tuple[int, int] | None, content: bytes | None
+) -> tuple[str, bytes]:
+    """Question and answer; of the file of the question before where there is no content.
 
     Raises:
         OSError: The process has ended, or ends while it reads.
@@ -186,7 +207,8 @@ def _exchange(process: subprocess.Popen[bytes], columns: list[int] | None, conte
     source, sink = process.stdin, process.stdout
     if source is None or sink is None:
         raise ValueError("a process without pipes")
-    source.write(json.dumps([columns, len(content)]).encode() + b"\n" + content)
+    source.write(json.dumps([columns, span, None if content is None else len(content)]).encode() + b"\n")
+    source.write(content or b"")
     source.flush()
     error, size = json.loads(sink.readline())
     answer = sink.read(size)

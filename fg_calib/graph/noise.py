@@ -110,6 +110,10 @@ class Source(NamedTuple):
         out: Floats = flat @ np.swapaxes(flat, 1, 2)
         return out
 
+    def at(self, rows: Integers | slice) -> Source:
+        """That of some of the rows."""
+        return self._replace(ends=self.ends[rows], loading=self.loading[rows])
+
 
 @dataclass(frozen=True)
 class Place:
@@ -146,8 +150,7 @@ class RowNoise:
         state: What has been learned of the noise.
 
     Attributes:
-        rows: All its rows, not whitened, in [m] and [rad].
-        own: Covariance of what is each measurement's alone, shape (n, residual_dim, residual_dim).
+        variance: Of what is each measurement's alone, row by row, shape (n, residual_dim), [m^2] and [rad^2].
         sources: What errors of configurations add to it.
         excess: What noise adds to the measured values on average, shape (n, residual_dim), [m] and [rad].
         factors: What the stated noise of each row's own kind is multiplied by, shape (residual_dim,).
@@ -164,27 +167,42 @@ class RowNoise:
         self._prepare(state)
 
     def _prepare(self, state: NoiseState) -> None:
-        self.rows = self._block(self.series.data)
-        self.own: Floats = self._diagonal((self.series.sigma * self.factors) ** 2)
-        if self.series.covariance is not None:
-            self.own = self.series.covariance * np.outer(self.factors, self.factors)
+        self.variance: Floats = (self.series.sigma * self.factors) ** 2
         self.sources = self._of_joints(self.rows)
 
-    @property
-    def same_everywhere(self) -> bool:
-        """Whether the noise is the same at all parameters."""
-        return not self.sources
+    @cached_property
+    def rows(self) -> Block:
+        """All rows, not whitened, in [m] and [rad]."""
+        return self.rows_at(slice(None))
+
+    def own_at(self, rows: Integers | slice) -> Floats:
+        """Covariance of what is each measurement's alone, of some, shape (m, residual_dim, residual_dim)."""
+        if self.series.covariance is not None:
+            covariance: Floats = self.series.covariance[rows] * np.outer(self.factors, self.factors)
+            return covariance
+        variance = self.variance[rows]
+        out: Floats = variance[:, :, None] * np.eye(variance.shape[1])
+        return out
+
+    def total_at(self, rows: Integers | slice) -> Floats:
+        """Covariance of some measurements' rows, all noise together, shape (m, residual_dim, residual_dim)."""
+        out: Floats = self.own_at(rows) + sum(source.at(rows).variance for source in self.sources)
+        return out
 
     @cached_property
     def total(self) -> Floats:
         """Covariance of each measurement's rows, all noise together, shape (n, residual_dim, residual_dim)."""
-        out: Floats = self.own + sum(source.variance for source in self.sources)
-        return out
+        return self.total_at(slice(None))
 
     @property
     def sigma(self) -> Floats:
         """1 sigma of each row, all noise together, shape (n, residual_dim), [m] and [rad]."""
-        out: Floats = np.sqrt(np.einsum("nii->ni", self.total))
+        out = np.empty(self.variance.shape)
+
+        def run(rows: slice) -> None:
+            out[rows] = np.sqrt(np.einsum("nii->ni", self.total_at(rows)))
+
+        _over_rows(run, len(out))
         return out
 
     def residual(self) -> Floats:
@@ -211,17 +229,19 @@ class RowNoise:
 
     def bare(self, rows: Integers) -> Floats:
         """Diagonal of what is private to measurements, but for what is there for numerical safety alone."""
-        out: Floats = np.einsum("nii->ni", self.own[rows])
+        out: Floats = self.variance[rows]
         return out
 
-    def rows_at(self, rows: Integers) -> Block:
+    def rows_at(self, rows: Integers | slice) -> Block:
         """Some of the rows, not whitened."""
-        return residuals.rows_of(self.rows, rows)
+        return residuals.rows_of(self._plain, rows)
 
-    def _block(self, data: Floats) -> Block:
+    @property
+    def _plain(self) -> Block:
+        """All rows as they were measured."""
         s, p = self.series, self.place
         unit = unit_whitening(s.n, s.kind.residual_dim)
-        return Block(s.kind, p.trig, s.ends, data, unit, p.coordinates[s.nuisances], s.source)
+        return Block(s.kind, p.trig, s.ends, s.data, unit, p.coordinates[s.nuisances], s.source)
 
     def _of_joints(self, rows: Block) -> tuple[Source, ...]:
         p, s = self.place, self.series
@@ -233,18 +253,13 @@ class RowNoise:
         loading = J * p.measurements.sigma_joint[p.joints] * self.joint_factor
         return (Source("joints", p.configurations[s.ends], np.ascontiguousarray(loading)),)
 
-    @staticmethod
-    def _diagonal(values: Floats) -> Floats:
-        """Diagonal matrices, shape (n, residual_dim, residual_dim)."""
-        out: Floats = values[:, :, None] * np.eye(values.shape[1])
-        return out
-
 
 class PairNoise(RowNoise):
     """The same of distances and angles of pairs, whose vectors noise lengthens (see `moments`).
 
     Attributes:
         predicted: Distance and angle as the arm predicts them, shape (n, 2).
+        slope: Derivative of each row's mean in what is predicted, shape (n, residual_dim).
     """
 
     def _prepare(self, state: NoiseState) -> None:
@@ -255,55 +270,62 @@ class PairNoise(RowNoise):
         wide = np.ones(2)
         wide[self._parts] = self.factors
         self._both = wide  # factors of distance and angle
-        plain = self._block(s.data)
-        self.predicted, self._own = np.zeros((s.n, 2)), np.zeros((s.n, 2))
-        r = residuals.residual(plain, self.place.chain)
-
-        def predict(rows: slice) -> None:
-            self.predicted[rows, self._parts] = r[rows] + s.data[rows]
-            if not s.formed:
-                self._own[rows, self._parts] = np.nan_to_num(s.sigma[rows]) ** 2 * self.factors**2
-
-        _over_rows(predict, s.n)
-        if s.formed:
-            self._own = np.nan_to_num(self._formed_variance()) * wide**2
-        joints = self._of_joints(plain)
-        linear = self._wide(sum((source.variance for source in joints), np.zeros((s.n, 1, 1))))
+        self.predicted = self._predict()
+        self._formed = np.nan_to_num(self._formed_variance()) * wide**2 if s.formed else None
+        joints = self._of_joints(self._plain)
+        linear = self._wide(sum((source.variance for source in joints), np.zeros((s.n, 1, 1)))) if joints else None
         bending, of_joints = self._bending(), self._joint_trace()
-        data, whitening, true = np.empty(s.data.shape), np.zeros(plain.whitening.shape), np.empty(s.data.shape)
-        d = np.arange(s.kind.residual_dim)
-        self.own = np.zeros((s.n, len(d), len(d)))
-        self._bent_variance = np.zeros(s.data.shape if s.formed else (0, len(d)))
+        self.slope, self.variance = np.empty(s.data.shape), np.empty(s.data.shape)
+        self._bent_variance = np.zeros(s.data.shape if s.formed else (0, s.kind.residual_dim))
 
         def bend(rows: slice) -> None:
-            moments = self._moments(rows, linear[rows], bending[rows], of_joints)
-            true[rows], self.excess[rows] = moments.slope[:, self._parts], moments.excess[:, self._parts]
-            slope, off = np.maximum(true[rows], LEAST_SLOPE), self.predicted[rows, self._parts] - s.data[rows]
-            data[rows] = s.data[rows] + off * (1.0 - 1.0 / slope) - self.excess[rows] / slope
-            whitening[rows, np.cumsum(d + 1) - 1] = slope
-            left = moments.variance[:, self._parts].copy()
+            moments = self._moments(rows, linear, bending, of_joints)
+            slope, left = moments.slope[:, self._parts], moments.variance[:, self._parts].copy()
+            self.slope[rows], self.excess[rows] = slope, moments.excess[:, self._parts]
             if not self.place.joints_estimated:
-                left -= true[rows] ** 2 * self._diagonals(joints, rows)
+                left -= slope**2 * self._diagonals(joints, rows)
             if s.formed:
-                of_measured = true[rows] ** 2 * self._own[rows, self._parts]
+                of_measured = slope**2 * self._own(rows)[:, self._parts]
                 self._bent_variance[rows] = np.maximum(left - of_measured, 0.0)
                 left -= of_measured + 0.5 * self._bent_variance[rows]
-            self.own[rows, d, d] = left
+            self.variance[rows] = left
 
         _over_rows(bend, s.n)
-        self.rows = replace(plain, data=data, whitening=whitening)
-        self.sources = tuple(source._replace(loading=source.loading * true[:, :, None, None]) for source in joints)
+        slope = self.slope[:, :, None, None]
+        self.sources = tuple(source._replace(loading=source.loading * slope) for source in joints)
         if s.formed:
-            self.sources += (self._of_poses(true),)
+            self.sources += (self._of_poses(self.slope),)
+
+    def _predict(self) -> Floats:
+        """Distance and angle as the arm predicts them, 0 where not wanted, shape (n, 2)."""
+        s, predicted = self.series, np.zeros((self.series.n, 2))
+        r = residuals.residual(self._plain, self.place.chain)
+
+        def predict(rows: slice) -> None:
+            predicted[rows, self._parts] = r[rows] + s.data[rows]
+
+        _over_rows(predict, s.n)
+        return predicted
+
+    def rows_at(self, rows: Integers | slice) -> Block:
+        """Some of the rows, not whitened, but scaled and shifted as their means are."""
+        plain = residuals.rows_of(self._plain, rows)
+        predicted, excess, slopes = self.predicted[rows], self.excess[rows], self.slope[rows]
+        data, whitening = np.empty_like(plain.data), np.zeros(plain.whitening.shape)
+        diagonal = np.cumsum(np.arange(1, 1 + self.series.kind.residual_dim)) - 1
+
+        def shift(some: slice) -> None:
+            slope, measured = np.maximum(slopes[some], LEAST_SLOPE), plain.data[some]
+            off = predicted[some][:, self._parts] - measured
+            data[some] = measured + off * (1.0 - 1.0 / slope) - excess[some] / slope
+            whitening[some, diagonal] = slope
+
+        _over_rows(shift, plain.n)
+        return replace(plain, data=data, whitening=whitening)
 
     def residual(self) -> Floats:
         """Of all rows, shape (n, residual_dim), [m] and [rad]."""
         return self._narrow(self.predicted) - self.series.data + self.excess
-
-    @property
-    def same_everywhere(self) -> bool:
-        """Whether the noise is the same at all parameters: what lengthens vectors is not."""
-        return False
 
     def more_if_redundant(self, shared: frozenset[str]) -> Floats | float:
         """What is added to the diagonal of `own` where there are more rows than errors that they share."""
@@ -346,18 +368,24 @@ class PairNoise(RowNoise):
         Args:
             spread: A square root of the parameters' covariance, shape (n_columns, k).
         """
-        f, noise, train = self.predicted, 4.0 * self._own, np.flatnonzero(~self.series.test)
-        folds = np.zeros(f.shape, dtype=np.bool_)
+        f, train = self.predicted, np.flatnonzero(~self.series.test)
+        folds, is_near = np.zeros(f.shape, dtype=np.bool_), np.zeros(len(f), dtype=np.bool_)
         if not len(train):
             return folds[:, self._parts]
-        from_kink = np.stack([f[:, 0], np.minimum(f[:, 1], np.pi - f[:, 1])], axis=1)
         largest = 4.0 * np.sum(self._spread_of(_evenly(train), spread), axis=0).max(axis=0)
-        near = np.flatnonzero(np.any((from_kink**2 / 4.0 < largest) & self._wanted, axis=1))
+
+        def look(rows: slice) -> None:
+            from_kink = np.stack([f[rows, 0], np.minimum(f[rows, 1], np.pi - f[rows, 1])], axis=1)
+            is_near[rows] = np.any((from_kink**2 / 4.0 < largest) & self._wanted, axis=1)
+
+        _over_rows(look, len(f))
+        near = np.flatnonzero(is_near)
         for start in range(0, len(near), SPAN):
             rows = near[start : start + SPAN]
             across, along = self._spread_of(rows, spread)
-            folds[rows] = across + along > np.maximum(f[rows] ** 2 / 4.0, noise[rows])
-            folds[rows, 1] |= along[:, 1] > np.maximum((np.pi - f[rows, 1]) ** 2 / 4.0, noise[rows, 1])
+            noise = 4.0 * self._own(rows)
+            folds[rows] = across + along > np.maximum(f[rows] ** 2 / 4.0, noise)
+            folds[rows, 1] |= along[:, 1] > np.maximum((np.pi - f[rows, 1]) ** 2 / 4.0, noise[:, 1])
         return folds[:, self._parts]
 
     def about_half_a_turn(self) -> Booleans:
@@ -383,29 +411,37 @@ class PairNoise(RowNoise):
 
     def _diagonals(self, sources: tuple[Source, ...], rows: slice) -> Floats:
         """What sources add to the variance of some rows, shape (n, residual_dim)."""
-        some = [source._replace(ends=source.ends[rows], loading=source.loading[rows]) for source in sources]
         zero = np.zeros(self.series.data[rows].shape)
-        return sum((np.einsum("nii->ni", source.variance) for source in some), zero)
+        return sum((np.einsum("nii->ni", source.at(rows).variance) for source in sources), zero)
 
-    def _moments(self, rows: slice, linear: Floats, bending: Floats, of_joints: Floats) -> Moments:
+    def _own(self, rows: Integers | slice) -> Floats:
+        """Variance of some distances and angles as measured, 0 where not wanted, shape (m, 2)."""
+        if self._formed is not None:
+            return self._formed[rows]
+        sigma = np.nan_to_num(self.series.sigma[rows])
+        own = np.zeros((len(sigma), 2))
+        own[:, self._parts] = sigma**2 * self.factors**2
+        return own
+
+    def _moments(self, rows: slice, linear: Floats | None, bending: Floats | None, of_joints: Floats) -> Moments:
         """Mean and variance of each distance and angle, shapes (n, 2); of no meaning where not wanted.
 
         Args:
             rows: The pairs.
-            linear: Variance of each distance and angle by joint noise, to first order, shape (n, 2).
-            bending: From `_bending`, shape (n, 2).
+            linear: Variance of each distance and angle by joint noise, to first order, shape (n, 2); None for 0.
+            bending: From `_bending`, shape (n, 2); None for 0.
             of_joints: From `_joint_trace`.
         """
         s, m, factors = self.series, self.place.measurements, self._both**2
-        ends, own = s.ends[rows], self._own[rows]
+        ends, own = s.ends[rows], self._own(rows)
         along, trace = np.zeros_like(own), np.zeros_like(own)
         if s.formed:
             along, own = own, np.zeros_like(own)
             trace = np.stack([_trace(m.sigma_position, ends), _trace(m.sigma_orientation, ends)], axis=1) * factors
         if len(of_joints):
-            along = along + linear
+            along = along + (0.0 if linear is None else linear[rows])
             trace = trace + of_joints[ends].sum(axis=1)
-        across = np.maximum(trace - along, 0.0) / 2.0 + bending
+        across = np.maximum(trace - along, 0.0) / 2.0 + (0.0 if bending is None else bending[rows])
         along, across, own = (np.where(self._wanted, v, 0.0) for v in (along, across, own))
         found = [
             of(self.predicted[rows, k], along[:, k], across[:, k], own[:, k])
@@ -461,14 +497,14 @@ class PairNoise(RowNoise):
             G[:, i, :, i, 3] = -0.5 * bent[:, i, None]
         return Source(f"poses of table {s.table}", self.place.configurations[s.ends], G.reshape(s.n, n_parts, 2, -1))
 
-    def _bending(self) -> Floats:
-        """Variance in each direction across that the parameters' own gives each vector, shape (n, 2).
+    def _bending(self) -> Floats | None:
+        """Variance in each direction across that the parameters' own gives each vector, shape (n, 2); None for 0.
 
         Along the vector it is what is estimated; across it lengthens the vector as noise does, and bends the row. Zero
         where it does not matter.
         """
         if self._spread is None:
-            return np.zeros((self.series.n, 2))
+            return None
         return np.minimum(self._noticed(self._spread, LEAST_BEND), MOST_BEND * self._straight(slice(None)))
 
     def _noticed(self, spread: Floats, sigmas: float) -> Floats:
@@ -494,7 +530,7 @@ class PairNoise(RowNoise):
 
         Nearer to 0 than one sigma it is that of the noise itself.
         """
-        own, predicted = self._own[rows], self.predicted[rows]
+        own, predicted = self._own(rows), self.predicted[rows]
         sigma = np.sqrt(own)
         return np.where((own > 0.0) & self._wanted, sigma * np.maximum(predicted, sigma), np.inf)
 
@@ -546,9 +582,17 @@ _QUANTITY: dict[type, int] = {Distance: 0, RotationAngle: 1}
 
 def row_noise(series: Series, place: Place, state: NoiseState) -> RowNoise:
     """The rows of a series and their noise."""
-    parts = getattr(series.kind, "parts", (series.kind,))
-    kind = PairNoise if all(type(part) in _QUANTITY for part in parts) else RowNoise
-    return kind(series, place, state)
+    return (PairNoise if _is_lengthened(series) else RowNoise)(series, place, state)
+
+
+def same_everywhere(series: Series, sigma_joint: Floats) -> bool:
+    """Whether the noise is the same at all parameters: what lengthens vectors, or comes from joint readings, is not."""
+    return not _is_lengthened(series) and not (series.kind.ends and np.any(sigma_joint > 0.0))
+
+
+def _is_lengthened(series: Series) -> bool:
+    """Whether all its rows are distances and angles of pairs."""
+    return all(type(part) in _QUANTITY for part in getattr(series.kind, "parts", (series.kind,)))
 
 
 def whitening_of(covariance: Floats, used: Booleans) -> Floats:

@@ -27,7 +27,7 @@ from fg_calib.graph.factors import (
     unknown_prior_rows,
 )
 from fg_calib.graph.knowledge import Knowledge
-from fg_calib.graph.noise import JOINT_NOISE, NoiseState, Place, RowNoise, row_noise
+from fg_calib.graph.noise import JOINT_NOISE, NoiseState, Place, RowNoise, row_noise, same_everywhere
 from fg_calib.graph.rows import At, RowSet, share_errors, whitened_rows
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.gathering import Dataset
@@ -53,7 +53,6 @@ class Problem(FrozenArrays):
         variables: The GTSAM variables and their columns.
         start: Initial parameter vector (see `Variables`).
         state: What has been learned of the measurements' noise.
-        noises: The rows of each series and their noise at `start`.
         rows: The whitened train rows.
         graph: Factors and priors, as GTSAM's own tools take them. Factors added to it are solved and assessed with it.
         initial: GTSAM's initial values; those of variables that added factors bring with them are inserted here.
@@ -71,7 +70,6 @@ class Problem(FrozenArrays):
     variables: Variables
     start: Floats
     state: NoiseState
-    noises: tuple[RowNoise, ...]
     rows: tuple[RowSet, ...]
     graph: gtsam.NonlinearFactorGraph
     initial: gtsam.Values
@@ -89,7 +87,7 @@ class Problem(FrozenArrays):
         """
         if self.added or self.graph.size() != self.factors.size():
             raise ProblemError("problem.graph", "added factors", "none: GTSAM's factors cannot be written")
-        left = ("graph", "factors", "initial", "known")
+        left = ("graph", "factors", "initial", "known", "noises")
         return {name: value for name, value in self.__dict__.items() if name not in left}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -107,6 +105,11 @@ class Problem(FrozenArrays):
             f"  {self.n_residuals} residuals and {self.n_priors} priors on {v.n_columns + v.n_nuisance} unknowns in"
             f" {len(v.keys)} variables"
         )
+
+    @cached_property
+    def noises(self) -> tuple[RowNoise, ...]:
+        """The rows of each series and their noise at `start`: of a million pairs as large as everything else."""
+        return noises_at(self, self.start)
 
     @property
     def measurements(self) -> Measurements:
@@ -242,9 +245,8 @@ def assembled(problem: Problem, start: Floats, state: NoiseState | None = None, 
         changes: What else of the problem is to change.
     """
     p = replace(problem, start=start, state=state or problem.state, **changes)
-    noises = noises_at(p, start)
-    rows = _row_sets(noises, p.state, sharing=p.options.pair_errors == "shared")
-    bare = replace(p, noises=noises, rows=rows, initial=p.variables.values(start))
+    rows = _row_sets(noises_at(p, start), p.state, sharing=p.options.pair_errors == "shared")
+    bare = replace(p, rows=rows, initial=p.variables.values(start))
     graph = _graph_of(bare)
     return replace(bare, graph=graph, factors=gtsam.NonlinearFactorGraph(graph))
 
@@ -289,10 +291,10 @@ def noises_at(problem: Problem, parameters: Floats, *, at_readings: bool = False
 
 def _places(problem: Problem, parameters: Floats, at_readings: bool) -> list[Place]:
     data, errors = problem.data, problem.state.joint_errors
-    trigs = []
-    for table, place in zip(data.tables, data.places, strict=True):
-        moved = 0.0 if errors is None or at_readings else errors[place]
-        trigs.append(precompute_trig(problem.robot, table.measurements.readings + moved))
+    trigs = data.trigs(problem.robot)
+    if errors is not None and not at_readings:
+        moved = [t.measurements.readings + errors[place] for t, place in zip(data.tables, data.places, strict=True)]
+        trigs = tuple(precompute_trig(problem.robot, readings) for readings in moved)
     at = at_parameters(problem, parameters, trigs)
     estimated = problem.options.encoder == "estimated"
     return [
@@ -312,7 +314,7 @@ def at_parameters(problem: Problem, parameters: Floats, trigs: Sequence[Floats] 
     at = problem.variables.at(parameters)
     if np.all(at.columns >= 0):
         return at
-    trigs = trigs or [precompute_trig(problem.robot, t.measurements.readings) for t in problem.data.tables]
+    trigs = trigs or problem.data.trigs(problem.robot)
     return problem.variables.at(parameters, contact_points(problem.data, at.chains, trigs))
 
 
@@ -350,8 +352,9 @@ def reweighted_at(problem: Problem, parameters: Floats, state: NoiseState | None
         parameters: The parameter vector.
         state: What has been learned of the noise; None for what the problem has.
     """
-    if (state is None or state is problem.state) and all(noise.same_everywhere for noise in problem.noises):
-        return replace(started_at(problem, parameters), noises=noises_at(problem, parameters))
+    same = all(same_everywhere(s, problem.data.sigma_joint) for s in problem.data.series)
+    if (state is None or state is problem.state) and same:
+        return started_at(problem, parameters)
     return assembled(problem, parameters, state)
 
 
@@ -477,5 +480,5 @@ def problem_at(
     estimated = options.encoder == "estimated" and bool(np.any(data.sigma_joint > 0.0))
     state = NoiseState(joint_errors=np.zeros_like(data.readings) if estimated else None)
     empty = gtsam.NonlinearFactorGraph()
-    bare = Problem(robot, data, options, variables, start, state, (), (), empty, gtsam.Values(), **more)
+    bare = Problem(robot, data, options, variables, start, state, (), empty, gtsam.Values(), **more)
     return assembled(bare, start)

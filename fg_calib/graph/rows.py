@@ -344,23 +344,28 @@ def _part(
     masks = {source.name: shares.mask(source)[train] for source in noise.sources}
     carried = frozenset(name for name, mask in masks.items() if mask.any())
     rows: Integers | slice = slice(None) if n == series.n else train
-    private, diagonal = noise.own[rows], np.einsum("nii->ni", noise.own[rows])
+    diagonal = noise.variance[rows]
     if carried:
-        raised = np.maximum(diagonal + _at(noise.more_if_redundant(carried), train), _at(noise.least(), train))
-        private = private + (raised - diagonal)[:, :, None] * np.eye(residual_dim)
-        diagonal = raised
-    for source in noise.sources:
-        own = np.where(masks[source.name][:, None, :, None], 0.0, source.loading[train]).reshape(n, residual_dim, -1)
-        private = private + own @ np.swapaxes(own, 1, 2)
-    if weights is not None:  # noise of its own on top, so much that a measurement says no more than its weight
-        private = private + (1.0 / np.maximum(weights[train], LEAST_WEIGHT) - 1.0)[:, None, None] * noise.total[train]
-    plain, used = residuals.rows_of(noise.rows, rows), series.used[rows]
-    W_is_wanted = bool(noise.sources) or joint_errors is not None
-    W, whitening = np.empty(private.shape if W_is_wanted else (0, 0, 0)), np.empty(plain.whitening.shape)
+        diagonal = np.maximum(diagonal + _at(noise.more_if_redundant(carried), train), _at(noise.least(), train))
+    plain, used = noise.rows_at(rows), series.used[rows]
+    W_is_wanted = bool(carried) or joint_errors is not None
+    W = np.empty((n * W_is_wanted, residual_dim, residual_dim))
+    whitening = np.require(plain.whitening, requirements="W")  # in place where it can be
 
     def whiten(start: int, stop: int) -> None:
         some = slice(start, stop)
-        white = whitening_of(private[some], used[some])
+        these = some if n == series.n else train[some]
+        private = noise.own_at(these)
+        if carried:
+            private = private + (diagonal[some] - noise.variance[these])[:, :, None] * np.eye(residual_dim)
+        for source in noise.sources:
+            own = np.where(masks[source.name][some][:, None, :, None], 0.0, source.loading[these])
+            own = own.reshape(stop - start, residual_dim, -1)
+            private = private + own @ np.swapaxes(own, 1, 2)
+        if weights is not None:  # noise of its own on top, so much that a measurement says no more than its weight
+            more = 1.0 / np.maximum(weights[these], LEAST_WEIGHT) - 1.0
+            private = private + more[:, None, None] * noise.total_at(these)
+        white = whitening_of(private, used[some])
         whitening[some] = pack(white @ unpack(plain.whitening[some], residual_dim))
         if W_is_wanted:
             W[some] = white

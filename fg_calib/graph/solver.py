@@ -218,7 +218,7 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
         if not problem.variables.keys:
             return _taken_as_it_is(problem, clock)
         started = _started_near(problem, options)
-        run = _fit(started, options)
+        run = _fit(started, options, near=started is not problem)
         initial_cost = run.initial_cost if started is problem else problem.graph.error(problem.initial)
         return _solution(run, before, initial_cost, clock)
 
@@ -230,7 +230,8 @@ def _started_near(problem: Problem, options: SolverOptions) -> Problem:
         return problem
     try:
         options = replace(options, decrement=max(options.decrement, NEAR_ENOUGH))
-        run = _fit(_started_near(few, options), options)
+        started = _started_near(few, options)
+        run = _fit(started, options, near=started is not few)
     except SolverError:
         return problem
     return reweighted_at(problem, run.parameters) if run.converged else problem
@@ -256,7 +257,8 @@ def _before(problem: Problem, options: SolverOptions) -> Floats:
     if frames is None:
         return problem.start
     options = replace(options, decrement=max(options.decrement, COARSE))
-    found = _fit(_started_near(frames, options), options).parameters
+    started = _started_near(frames, options)
+    found = _fit(started, options, near=started is not frames).parameters
     return np.concatenate([found, problem.start[len(found) :]])
 
 
@@ -381,16 +383,26 @@ def _taken_as_it_is(problem: Problem, clock: float) -> Solution:
     )
 
 
-def _fit(problem: Problem, options: SolverOptions) -> _Run:
+def _fit(problem: Problem, options: SolverOptions, *, near: bool = False) -> _Run:
     """Least squares from the problem's start, to the optimum of the rows as they are whitened there.
 
     With a robust loss the first weights are those of the residuals at the start: gross errors would lead least squares
     astray. Where the weights of a round lead nowhere, those that follow may.
+
+    Args:
+        problem: The problem.
+        options: Settings of the solver.
+        near: Whether the start is so near that the rows are to be whitened anew after every step.
     """
     robust = problem.options.loss != "none"
     weighting = Weighting(problem.options.loss)
     run, goal, was, n_steps = _Run(problem, options), COARSE, np.inf, 0
     bends = SPREAD_ROUNDS if problem.pair_series and problem.state.spread is None else 0
+    if near:
+        bends = _stride(run, bends)
+        if run.converged:
+            run.judge_rounding()
+            return run
     if robust:
         run.go_on_with(reweighted_at(problem, problem.start, _learn(problem, problem.start, weighting)[0]))
     tries = FOLDED_TRIES if problem.pair_series else 0
@@ -420,6 +432,38 @@ def _fit(problem: Problem, options: SolverOptions) -> _Run:
         goal = run.least if unchanged else min(COARSE, max(run.least, 0.1 * left))
     run.judge_rounding()
     return run
+
+
+def _stride(run: _Run, bends: int) -> int:
+    """Steps to rows that are whitened anew where each leads, as long as each brings the optimum much nearer.
+
+    That spares linearising rows that are whitened elsewhere, and judges all the same.
+
+    Args:
+        run: The descent, which has converged where these steps end at the optimum.
+        bends: How often the rows are to be bent by what the parameters may be off.
+
+    Returns:
+        How often they still are.
+    """
+    left = np.inf
+    while (bends or left > run.least) and not run.exhausted:
+        here, variables = run.here, run.problem.variables
+        values = variables.moved(here.values, here.step)
+        parameters = variables.parameters(values)
+        state = _learn(run.problem, parameters, Weighting(run.problem.options.loss))[0]
+        try:
+            anew = reweighted_at(run.problem, parameters, replace(state, spread=here.spread) if bends else state)
+            there = _Linearised(anew, values)
+        except SolverError:
+            return bends
+        if there.decrement > max(SHORTER * here.decrement, there.rounding):
+            return bends
+        run.arrive(anew, there)
+        left, bends = run.left_after(here.decrement), max(bends - 1, 0)
+    if left <= run.least:
+        run.descend(run.least)
+    return bends
 
 
 def _learn(problem: Problem, parameters: Floats, weighting: Weighting) -> tuple[NoiseState, bool]:
@@ -484,6 +528,12 @@ class _Run:
         """How far the optimum still is, [sigma], where whitening anew left `was` the last time, and goes on."""
         left = self.here.decrement
         return left if left <= self.here.rounding else left / (1.0 - min(left / was, SLOWEST))
+
+    def arrive(self, problem: Problem, there: _Linearised) -> None:
+        """Take the Gauss-Newton step, to other rows."""
+        length = float(np.linalg.norm(self.here.step / problem.variables.all_scales))
+        self.history.append(Iteration(there.cost, 0.0, length, self.here.decrement))
+        self.problem, self.here = problem, there
 
     def go_on_with(self, problem: Problem) -> None:
         """The same place with other rows."""

@@ -18,7 +18,7 @@ from fg_calib.measurements.kinds import BoardPose, Pixel, RoomPixel, TargetPosit
 from fg_calib.measurements.places import targets_from_positions
 from fg_calib.measurements.series import Series
 from fg_calib.options import POSE_MODELS
-from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot
 
 Floats = NDArray[np.float64]
@@ -43,7 +43,7 @@ def start_of(robot: Robot, data: Dataset, variables: Variables) -> Floats:
     Raises:
         ProblemError: No image shows enough of a board.
     """
-    trigs = [precompute_trig(robot, t.measurements.readings) for t in data.tables]
+    trigs = data.trigs(robot)
     begun = _Start(robot, data, variables, trigs)
     begun.all_tables()
     start = begun.parameters
@@ -63,7 +63,7 @@ class _Start:
         places: The measurements' unknown coordinates, nan where nothing is known of them yet.
     """
 
-    def __init__(self, robot: Robot, data: Dataset, variables: Variables, trigs: list[Floats]) -> None:
+    def __init__(self, robot: Robot, data: Dataset, variables: Variables, trigs: tuple[Floats, ...]) -> None:
         self._robot, self._data, self._trigs = robot, data, trigs
         self.parameters = variables.nominal()
         self.places: Floats = np.concatenate([np.zeros(0), *data.unknowns.starts])

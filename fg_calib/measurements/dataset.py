@@ -111,6 +111,12 @@ class Pairs(FrozenArrays):
         )
 
 
+def joined(parts: Sequence[Pairs]) -> Pairs:
+    """Pairs of one table, one part after the other."""
+    names = [f.name for f in fields(Pairs) if f.name != "source"]
+    return Pairs(source=parts[0].source, **{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
+
+
 @dataclass(frozen=True)
 class Labels(FrozenArrays):
     """What each row is of, by name: the target that was seen, the station it was seen from.

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from fg_calib.measurements.models import SERIES_OF, own_series, touch_series
 from fg_calib.measurements.models.starts import check_fitted, start_places
 from fg_calib.measurements.series import Series, Table, Unknowns
 from fg_calib.options import NEAR, PAIR_MODELS, POSE_MODELS, Model, did_you_mean
+from fg_calib.robot.kinematics import precompute_trig
 from fg_calib.robot.model import Robot
 
 _log = logging.getLogger(__name__)
@@ -53,6 +55,18 @@ class Dataset(Brief):
     unknowns: Unknowns
     places: tuple[Integers, ...]
     names: tuple[str, ...]
+    _trigs: dict[Any, tuple[Floats, ...]] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what follows from the rest."""
+        return self.__dict__ | {"_trigs": {}}
+
+    def trigs(self, robot: Robot) -> tuple[Floats, ...]:
+        """Readings of each table for the kernels, remembered, as parameters change nothing of them."""
+        key = (tuple(joint.prismatic for joint in robot.joints), robot.bases)
+        if key not in self._trigs:
+            self._trigs[key] = tuple(precompute_trig(robot, table.measurements.readings) for table in self.tables)
+        return self._trigs[key]
 
     @property
     def n_configurations(self) -> int:

@@ -9,7 +9,7 @@ import pytest
 from simulated import planar_robot
 
 from fg_calib import InputError
-from fg_calib.files import pairs, parquet, tables
+from fg_calib.files import columns, pairs, parquet, tables
 from fg_calib.files.tables import read_measurements
 from fg_calib.measurements.dataset import Noise
 
@@ -152,3 +152,44 @@ def test_no_code_beside_the_files_runs(content, reader, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend("")
     assert parquet.parquet_columns(content, "table.parquet") == NAMES
+
+
+def test_pairs_are_the_same_read_by_pieces_and_at_once(tmp_path, monkeypatch):
+    rng, file = np.random.default_rng(0), tmp_path / "pairs.parquet"
+    robot, n = planar_robot(), 10
+    q = pl.DataFrame(rng.uniform(-1.0, 1.0, (20, robot.n_joints)), schema=[f"q{k + 1}" for k in range(robot.n_joints)])
+    a = rng.integers(0, 20, n)
+    pairs_of_rows = {"a": a, "b": (a + 1) % 20, "distance": rng.uniform(0.1, 1.0, n)}
+    pl.DataFrame(pairs_of_rows).write_parquet(file, row_group_size=3)
+    noise = Noise(distance=1e-3)
+    whole = read_measurements(q, robot, pairs=file, noise=noise).pairs
+    for piece in (4, 5, n):  # with a rest, and without one
+        monkeypatch.setattr(columns, "PIECE", piece)
+        found = read_measurements(q, robot, pairs=file, noise=noise).pairs
+        assert found.source == whole.source
+        for name in ("a", "b", "distance", "angle", "sigma_distance", "sigma_angle", "test"):
+            assert np.array_equal(getattr(found, name), getattr(whole, name), equal_nan=name.endswith("angle"))
+    assert parquet._READER._kept is None  # the file is let go of with its last rows
+
+
+def test_a_mistake_in_a_later_piece_is_named_by_its_row(tmp_path, monkeypatch):
+    monkeypatch.setattr(columns, "PIECE", 2)
+    file, robot = tmp_path / "pairs.parquet", planar_robot()
+    pl.DataFrame({"a": [0, 1, 2, 0], "b": [1, 2, 0, 2], "distance": [0.1, 0.2, 0.3, -1.0]}).write_parquet(file)
+    q = pl.DataFrame({f"q{k + 1}": [0.0, 0.1, 0.2] for k in range(robot.n_joints)})
+    with pytest.raises(InputError) as caught:
+        read_measurements(q, robot, pairs=file, noise=Noise(distance=1e-3))
+    assert str(caught.value) == "pairs.parquet: row 3: distance: found -1.0, expected a number not below 0"
+
+
+def test_two_files_read_by_pieces_in_turn_are_not_mistaken_for_each_other(tmp_path, reader):
+    contents = []
+    for k in range(2):
+        pl.DataFrame({"a": [10.0 * k + i for i in range(4)]}).write_parquet(tmp_path / f"{k}.parquet")
+        contents.append((tmp_path / f"{k}.parquet").read_bytes())
+    found = [
+        parquet.read_parquet(contents[k], [0], "table.parquet", (first, 2))["a"].to_list()
+        for first in (0, 2)
+        for k in range(2)
+    ]
+    assert found == [[0.0, 1.0], [10.0, 11.0], [2.0, 3.0], [12.0, 13.0]]

@@ -447,3 +447,12 @@ def test_noise_of_the_joints_must_fit(write, joint, message):
     with pytest.raises(InputError) as caught:
         read_measurements(write(POSES), ARM, noise=Noise(joint=joint))
     assert str(caught.value) == message
+
+
+def test_pairs_cannot_name_configurations_that_have_one_id():
+    readings = pl.DataFrame({"id": ["a", "b", "a"], "target": ["t", "t", "u"], "x": 1.0, "y": 1.0, "z": 1.0})
+    readings = readings.with_columns(q1=pl.lit(0.1), q2=pl.lit(0.2), q3=pl.lit(0.3))
+    pairs = pl.DataFrame({"a": ["a"], "b": ["b"], "distance": [0.1]})
+    with pytest.raises(InputError) as caught:
+        read_measurements(readings, ARM, pairs=pairs, noise=Noise(distance=1e-3, position=1e-3))
+    assert str(caught.value) == "frame: row 2: id = 'a' of a second row, expected different ids where pairs name them"

@@ -113,7 +113,7 @@ def everything_given_the_noise(solution):
     columns = np.flatnonzero(scale)
     n, n_frame, residual_dim = len(columns), 6 * len(problem.variables.frames), series.kind.residual_dim
 
-    private = noise.own.copy()
+    private = noise.own_at(slice(None))
     carried = frozenset(source.name for source in noise.sources)
     diagonal = np.einsum("nii->ni", private)
     raised = np.maximum(diagonal + noise.more_if_redundant(carried), noise.least())

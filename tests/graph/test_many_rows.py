@@ -15,7 +15,9 @@ from fg_calib.graph.build import build_problem
 from fg_calib.graph.information import row_triangles
 from fg_calib.graph.noise import whitening_of
 from fg_calib.graph.problem import reweighted_at, some_rows
+from fg_calib.graph.solver import _Linearised as Linearised
 from fg_calib.measurements import fingerprints, residuals
+from fg_calib.measurements.residuals import pack, unpack
 from fg_calib.robot import kinematics
 from fg_calib.robot.kinematics import SPAN, pose
 from fg_calib.threads import processors
@@ -143,3 +145,53 @@ def test_every_bit_is_the_same_on_any_number_of_threads(monkeypatch):
         for cached in (processors, kinematics._pool):
             cached.cache_clear()
     assert all(found[n] == found[1] for n in found)
+
+
+def test_noise_is_that_of_the_start_where_rows_were_whitened(problem):
+    (noise,), (rows,) = problem.noises, problem.rows
+    W = whitening_of(noise.own_at(noise.series.train), noise.series.used[noise.series.train])
+    plain = noise.rows_at(noise.series.train)
+    assert np.array_equal(rows.parts[0].block.data, plain.data)
+    assert np.array_equal(rows.parts[0].block.whitening, pack(W @ unpack(plain.whitening, 2)))
+    assert "noises" not in pickle.loads(pickle.dumps(problem)).__dict__
+
+
+def displaced(problem, solution, n_sigma):
+    """A parameter vector off the solution by so many sigma of each parameter's own."""
+    there = solution.parameters.copy()
+    sigma = np.sqrt(np.diag(assess(solution).covariance))
+    there[[i for i, p in enumerate(problem.robot.parameters) if p.estimated]] += n_sigma * sigma
+    return there
+
+
+def test_near_the_optimum_rows_are_linearised_once_for_every_time_that_they_are_whitened(problem, monkeypatch):
+    expected, counted = solve(problem), []
+    near = reweighted_at(problem, displaced(problem, expected, 3.0))
+    monkeypatch.setattr(solver, "_Linearised", lambda *given: counted.append(given[0]) or Linearised(*given))
+    run = solver._fit(near, solver.SolverOptions(), near=True)
+    assert run.converged
+    assert run.here.decrement <= 3e-7
+    assert len(counted) == 1 + len(run.history)
+    assert len(set(map(id, counted))) == len(counted)
+    # Both are nearer to the optimum than 3e-7 sigma.
+    assert run.here.decrement_to(expected.values) < 1e-6
+
+
+def test_where_such_steps_lead_nowhere_the_ordinary_descent_goes_on(problem, monkeypatch):
+    expected = solve(problem)
+    near = reweighted_at(problem, displaced(problem, expected, 3.0))
+    monkeypatch.setattr(solver, "SHORTER", 0.0)
+    run = solver._fit(near, solver.SolverOptions(), near=True)
+    assert run.converged
+    assert run.here.decrement_to(expected.values) < 1e-6
+
+
+def test_readings_are_prepared_for_the_kernels_once_and_left_out_of_pickles(problem):
+    data, robot = problem.data, problem.robot
+    (trig,) = data.trigs(robot)
+    assert np.array_equal(trig, kinematics.precompute_trig(robot, data.tables[0].measurements.readings))
+    assert problem.rows[0].parts[0].block.trig is trig
+    assert data.trigs(robot.with_values(robot.nominal + 0.1))[0] is trig  # parameters change nothing of it
+    again = pickle.loads(pickle.dumps(data))
+    assert again._trigs == {}
+    assert np.array_equal(again.trigs(robot)[0], trig)
