@@ -175,7 +175,7 @@ def squares_along(block: Block, chain: Chain, directions: Floats) -> Floats:
 
     def run(start: int, stop: int) -> None:
         for first, last, panel in _panels(block, chain, start, stop):
-            found = along @ panel[:-1].reshape(len(panel) - 1, -1)
+            found = along @ panel[:-1].reshape(len(panel) - 1, panel[0].size)
             out[first:last] = np.einsum("kn,kn->n", found, found).reshape(panel.shape[1:])[:, : last - first].T
 
     with one_blas_thread:

@@ -585,7 +585,8 @@ def test_rows_that_count_as_independent_but_are_not_have_their_covariance_with_t
         (part,), residual_dim = rows.parts, rows.parts[0].block.residual_dim
         shaped = [residuals.unpack(block.whitening, residual_dim) for block in (part.block, given.rows)]
         W.append(block_diag(*(shaped[0] @ np.linalg.inv(shaped[1]))))
-        C.append((errors.loading(given, np.arange(given.series.n)).toarray(), block_diag(*given.own)))
+        every = np.arange(given.series.n)
+        C.append((errors.loading(given, every).toarray(), block_diag(*given.own_at(every))))
     L, W = np.vstack([L for L, _ in C]), block_diag(*W)
     C = W @ (L @ L.T + block_diag(*(own for _, own in C))) @ W.T
     assert np.abs(C - np.diag(np.diag(C))).max() > 0.1  # much is shared

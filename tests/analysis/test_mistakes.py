@@ -428,7 +428,7 @@ def test_what_no_usual_mistake_explains_is_said_plainly(tmp_path, fg_calib):
 
 @pytest.mark.slow
 def test_a_solver_that_gives_up_names_the_mistake_too(tmp_path, fg_calib, monkeypatch):
-    def gives_up(*_):
+    def gives_up(*_, **__):
         raise SolverError("no step can be solved")
 
     m = measured(ur5e(tmp_path))
