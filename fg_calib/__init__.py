@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from fg_calib.baseline.comparison import Comparison, compare
     from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
     from fg_calib.batch import calibrate_jobs
-    from fg_calib.calibration import Calibration, calibrate, calibrate_job
+    from fg_calib.calibration import Calibration, calibrate, calibrate_job, calibrate_parts
     from fg_calib.correction import correct
     from fg_calib.designs.comparison import compare_designs
     from fg_calib.designs.design import Design, design
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from fg_calib.files.columns import Column
     from fg_calib.files.history import History, history_of
     from fg_calib.files.job import read_job
+    from fg_calib.files.parts import JobInParts, read_parts
     from fg_calib.files.result import Result, read_result, result_schema
     from fg_calib.files.robot_yaml import read_robot, write_robot
     from fg_calib.files.scenario import read_scenario
@@ -84,7 +85,7 @@ _HOMES = {
     "fg_calib.analysis.bounds": ("Bound", "cramer_rao"),
     "fg_calib.baseline.comparison": ("Comparison", "compare"),
     "fg_calib.batch": ("calibrate_jobs",),
-    "fg_calib.calibration": ("Calibration", "calibrate", "calibrate_job"),
+    "fg_calib.calibration": ("Calibration", "calibrate", "calibrate_job", "calibrate_parts"),
     "fg_calib.correction": ("correct",),
     "fg_calib.designs.comparison": ("compare_designs",),
     "fg_calib.designs.design": ("Design", "design"),
@@ -96,6 +97,7 @@ _HOMES = {
     "fg_calib.analysis.check": ("Check", "Explanation"),
     "fg_calib.files.history": ("History", "history_of"),
     "fg_calib.files.job": ("read_job",),
+    "fg_calib.files.parts": ("JobInParts", "read_parts"),
     "fg_calib.job": ("Job",),
     "fg_calib.files.result": ("Result", "read_result", "result_schema"),
     "fg_calib.files.urdf": ("read_urdf",),
@@ -167,6 +169,7 @@ __all__ = [
     "Inspection",
     "Inverse",
     "Job",
+    "JobInParts",
     "KnownPoint",
     "LeastSquares",
     "Limits",
@@ -199,6 +202,7 @@ __all__ = [
     "calibrate",
     "calibrate_job",
     "calibrate_jobs",
+    "calibrate_parts",
     "check_setup",
     "compare",
     "compare_designs",
@@ -232,6 +236,7 @@ __all__ = [
     "problem_of",
     "read_job",
     "read_measurements",
+    "read_parts",
     "read_result",
     "read_robot",
     "read_scenario",

@@ -148,7 +148,7 @@ def _is_list(hint: Any) -> bool:
     parts = get_args(hint)
     if get_origin(hint) is not Sequence and not (get_origin(hint) is tuple and parts[1:] == (...,)):
         return False
-    return all(_is_class(one) and one is not str for one in _alternatives(parts[0]))
+    return all((_is_class(one) and one is not str) or get_origin(one) is Callable for one in _alternatives(parts[0]))
 
 
 def _is_mapping(hint: Any) -> bool:

@@ -77,6 +77,17 @@ class FrozenArrays(Brief):
         FrozenArrays.__post_init__(self)  # arrays come writable out of a pickle
 
 
+def once(values: NDArray[Any]) -> NDArray[Any]:
+    """Values, in memory only once where all rows are the same: of a long table that is most of it."""
+    same = len(values) > 0 and (is_one(values) or np.all(values == values[0]))
+    return np.broadcast_to(values[:1].copy(), values.shape) if same else values
+
+
+def is_one(values: NDArray[Any]) -> bool:
+    """Whether all rows are the same place in memory."""
+    return len(values) > 0 and values.strides[0] == 0
+
+
 def _read_only(value: object) -> object:
     if not isinstance(value, np.ndarray) or not value.flags.writeable:
         return value

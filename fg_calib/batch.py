@@ -6,24 +6,23 @@ found = calibrate_jobs(["arm1.yaml", "arm2.yaml"], executor)
 
 from __future__ import annotations
 
-import logging
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from threading import get_ident
 
 from fg_calib.arguments import checked
 from fg_calib.calibration import Calibration, calibrate_job
 from fg_calib.errors import InputError, escaped, shown
 from fg_calib.executors import Failure, map_jobs
-from fg_calib.files.disk import require_own, require_writable
+from fg_calib.files.disk import clear_dead, require_own, require_writable
 from fg_calib.files.job import read_job
+from fg_calib.files.parts import JobInParts, read_parts
 from fg_calib.job import Job
+from fg_calib.progress import keeping_warnings
 from fg_calib.report.batch import JOBS_FILES, JobSummary, summary_of
 from fg_calib.report.documents import ResidualFile, require_no_input
 
@@ -89,8 +88,26 @@ def ordered_job(order: Order) -> Job:
         require_writable(order.folder)
     given = read_job(order.job)
     if order.folder is not None:
-        require_no_input(order.folder, given)
+        require_no_input(order.folder, given.path, given.inputs)
     return given if order.folds is None else replace(given, options=replace(given.options, folds=order.folds))
+
+
+def ordered_parts(order: Order, n_rows: int) -> JobInParts:
+    """The job of an order, its table in parts, read and checked as far as its first rows.
+
+    Args:
+        order: The order.
+        n_rows: Rows of a part.
+
+    Raises:
+        InputError: It cannot be read, or not in parts, or its result cannot be written.
+    """
+    if order.folder is not None:
+        require_writable(order.folder)
+    given = read_parts(order.job, n_rows)
+    if order.folder is not None:
+        require_no_input(order.folder, given.path, given.inputs)
+    return given
 
 
 def save_ordered(order: Order, found: Calibration) -> None:
@@ -117,7 +134,7 @@ def carry_out(order: Order) -> JobSummary:
         SolverError: GTSAM could not solve a step at all.
     """
     clock = time.perf_counter()
-    with _warnings() as said:
+    with keeping_warnings() as said:
         found = calibrate_job(ordered_job(order))
         save_ordered(order, found)
     seconds = time.perf_counter() - clock
@@ -132,31 +149,13 @@ def calibrate_into(orders: Sequence[Order], executor: Executor | None = None) ->
         executor: Where they run; one after the other in this process if None.
     """
     found = map_jobs(carry_out, orders, executor, names=[order.name for order in orders])
+    for order, one in zip(orders, found, strict=True):
+        if isinstance(one, Failure) and order.folder is not None:
+            clear_dead(order.folder)
     return [
         JobSummary(order.name, str(order.job), "failed", one.reason) if isinstance(one, Failure) else one
         for order, one in zip(orders, found, strict=True)
     ]
-
-
-@contextmanager
-def _warnings() -> Iterator[list[str]]:
-    """What the package's log warns of, kept for whoever asked for the job instead of the worker's own streams."""
-    said: list[str] = []
-    thread = get_ident()
-
-    class Keep(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
-            if record.thread == thread:
-                said.append(record.getMessage())
-
-    log, keep = logging.getLogger("fg_calib"), Keep(logging.WARNING)
-    before, log.propagate = log.propagate, False
-    log.addHandler(keep)
-    try:
-        yield said
-    finally:
-        log.removeHandler(keep)
-        log.propagate = before
 
 
 def job_names(jobs: Sequence[Path]) -> list[str]:

@@ -35,6 +35,7 @@ from fg_calib.arrays import as_floats, shape_of
 from fg_calib.errors import InputError, escaped, shown
 from fg_calib.files.disk import exists, is_folder, noting_reads
 from fg_calib.files.job import UNSTATED, read_job, read_table_like
+from fg_calib.files.parts import JobInParts, read_parts
 from fg_calib.files.result import Carried, KindGoodness, Parameter, Posterior, Previous, Result, read_result
 from fg_calib.files.result import Knowledge as SavedKnowledge
 from fg_calib.files.robot_yaml import read_robot
@@ -57,6 +58,7 @@ from fg_calib.robot.model import Robot, names_of
 from fg_calib.threads import single_threaded
 
 if TYPE_CHECKING:
+    from fg_calib.analysis.assessed_parts import AssessedParts
     from fg_calib.analysis.check import Check
     from fg_calib.analysis.new_rows import Calibrated, Rows
     from fg_calib.files.history import Run
@@ -127,6 +129,32 @@ def calibrate_job(job: Job | Path | str, executor: Executor | None = None) -> Ca
 
         uncertainty = uncertainty.with_folds(cross_validate(given, given.options.folds, executor=executor), solution)
     return Calibration.of(solution, uncertainty, given.inputs, job=given.document)
+
+
+@checked
+def calibrate_parts(job: JobInParts | Path | str, executor: Executor | None = None) -> Calibration:
+    """Calibrate a job whose table is read in parts: what `fg-calib calibrate --parts` does.
+
+    Memory does not grow with the number of rows. No single row is judged, and no outlier, mistake or other optimum
+    looked for: the result says so, and not that it is to be trusted. There is no residual table.
+
+    Args:
+        job: The job, from `read_parts`, or the path of its file.
+        executor: Where parts are reduced; one after the other in this process if None.
+
+    Raises:
+        InputError: The job, or a file that it names, cannot be used, or its table not be cut.
+        ProblemError: Rows of a part share errors with those of others, or cannot be used.
+    """
+    from fg_calib.analysis.assessed_parts import assess_parts
+    from fg_calib.analysis.parts import solve_parts
+    from fg_calib.report.parts import result_of_parts
+
+    given = job if isinstance(job, JobInParts) else read_parts(job)
+    solution = solve_parts(given.robot, given.parts, given.options, executor)
+    tell("judging the result")
+    assessed = assess_parts(solution, given.n_configurations, given.parts[0])
+    return Calibration(solution.robot, result_of_parts(given, assessed), solution.posterior, assessed)
 
 
 def _with_first_sigmas(m: Measurements) -> Measurements:
@@ -216,14 +244,14 @@ class Calibration:
         robot: The calibrated robot.
         result: All that `result.json` holds.
         posterior: The covariance of all parameters in the tangent space of the variables.
-        assessed: The solution and its assessment; None of a calibration that was loaded.
+        assessed: The solution and its assessment; of one in parts what is known of it; None of one that was loaded.
         history: The runs that it came from, itself not among them; of one that was loaded itself the last.
     """
 
     robot: Robot
     result: Result
     posterior: TangentCovariance
-    assessed: tuple[Solution, Uncertainty] | None = None
+    assessed: tuple[Solution, Uncertainty] | AssessedParts | None = None
     history: tuple[Run, ...] = ()
 
     @classmethod
@@ -266,7 +294,7 @@ class Calibration:
 
     @checked
     def save(self, folder: Path | str, *, residuals: ResidualFile = "csv") -> None:
-        """Write what `calibrate --out` writes: `result.json`, the calibrated robot and the residuals.
+        """Write what `calibrate --out` writes: `result.json`, the calibrated robot and the residuals, if there are any.
 
         Args:
             folder: Where to.
@@ -275,6 +303,11 @@ class Calibration:
         Raises:
             InputError: The folder cannot be written, or the calibration was itself loaded from one.
         """
+        if self.assessed is not None and not isinstance(self.assessed, tuple):
+            from fg_calib.report.parts import write_result_of_parts
+
+            write_result_of_parts(folder, self.result, self.assessed)
+            return
         history = self._history if self.history else None
         write_result(folder, self.result, self.solution, self.uncertainty, history, residuals)
 
@@ -392,6 +425,9 @@ class Calibration:
         from fg_calib.analysis.update import predicted_before, updated
 
         self._require_trust()
+        if self.result.in_parts:
+            in_parts = "a calibration in parts, which does not hold what its rows say"
+            raise InputError("update", in_parts, "one that was calibrated whole, without --parts")
         history = self.runs
         new, before = _date(date), history[-1]
         growth = {} if growth is None else growth
@@ -419,7 +455,7 @@ class Calibration:
         return replace(made, history=history)
 
     def _require_trust(self) -> None:
-        if not self.trustworthy:
+        if self.trustworthy is False:
             reason = (*self.findings, self.result.solver.message)[0]
             raise InputError(self.result.robot, f"the calibration is not to be trusted: {reason}", "one that is")
 
@@ -462,7 +498,7 @@ class Calibration:
         """The solution.
 
         Raises:
-            InputError: The calibration was loaded: a folder does not hold it.
+            InputError: The calibration was loaded, or is one in parts: these do not hold it.
         """
         return self._assessed[0]
 
@@ -471,7 +507,7 @@ class Calibration:
         """The assessment of the solution.
 
         Raises:
-            InputError: The calibration was loaded: a folder does not hold it.
+            InputError: The calibration was loaded, or is one in parts: these do not hold it.
         """
         return self._assessed[1]
 
@@ -480,16 +516,17 @@ class Calibration:
         """Every residual, before and after.
 
         Raises:
-            InputError: The calibration was loaded: its residuals are in `residuals.csv`.
+            InputError: The calibration was loaded (its residuals are in `residuals.csv`), or is one in parts.
         """
         return self.uncertainty.residuals
 
     @property
     def _assessed(self) -> tuple[Solution, Uncertainty]:
-        if self.assessed is None:
-            found = "it was loaded from a folder, which holds no solution, assessment or residual table"
-            raise InputError("calibration", found, hint="calibrate again to have them")
-        return self.assessed
+        if isinstance(self.assessed, tuple):
+            return self.assessed
+        found = "it was loaded from a folder, which holds no solution, assessment or residual table"
+        found = "it was calibrated in parts, without assessment or residual table" if self.result.in_parts else found
+        raise InputError("calibration", found, hint="calibrate again to have them")
 
     @cached_property
     def parameters(self) -> Parameters:
@@ -536,9 +573,11 @@ class Calibration:
         return tuple(judged(one for one in found if one.verdict != "pass"))
 
     @property
-    def trustworthy(self) -> bool:
-        """Whether nothing speaks against it."""
-        return not self.findings and self.result.solver.converged
+    def trustworthy(self) -> bool | None:
+        """Whether nothing speaks against it; None of one in parts, where no single row was asked."""
+        if self.findings or not self.result.solver.converged:
+            return False
+        return None if self.result.in_parts else True
 
     @single_threaded
     def predict(self, readings: ArrayLike, *, world: bool = False, table: int | None = None) -> PredictedPoses:
@@ -580,7 +619,7 @@ class Calibration:
         return "\n".join(summary(self.result))
 
     def __str__(self) -> str:
-        return format_result(self.result) if self.assessed is None else format_report(*self.assessed)
+        return format_report(*self.assessed) if isinstance(self.assessed, tuple) else format_result(self.result)
 
     def _repr_html_(self) -> str:
         return html(self.result)

@@ -11,12 +11,21 @@ Dask does the same by itself.
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing import get_context
@@ -27,10 +36,12 @@ from fg_calib.arguments import checked
 from fg_calib.errors import CalibrationError, InputError, printable, shown
 from fg_calib.options import check_number
 from fg_calib.progress import tell
-from fg_calib.threads import limit_threads, processors
+from fg_calib.threads import MOST, limit_threads, processors
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
+
+_log = logging.getLogger(__name__)
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -47,6 +58,7 @@ PATIENCE = 30.0
 
 KILLED = f"the process that it ran on died, {1 + RESUBMISSIONS} times of {1 + RESUBMISSIONS}"
 HINT_KILLED = "is there enough memory for it?"
+CANCELLED = "the executor gave it up, as where a scheduler ends"
 NO_WORKERS = "worker processes died, and no others can be started"
 HINT_NO_WORKERS = 'local_processes has fresh ones; a script needs `if __name__ == "__main__":`'
 
@@ -189,7 +201,14 @@ class _Run(Generic[T, R]):
         self._found[k] = Failure(self._names[k], f"{KILLED}; {HINT_KILLED}")
 
     def _submit(self, k: int) -> Future[R | Failure]:
-        return self._executor.submit(_attempt, self._function, self._jobs[k], self._names[k])
+        try:
+            return self._executor.submit(_attempt, self._function, self._jobs[k], self._names[k])
+        except BrokenExecutor:
+            raise
+        except Exception as error:  # it takes no more, after it was shut down say; what is done stays
+            refused: Future[R | Failure] = Future()
+            refused.set_exception(error)
+            return refused
 
     def _settled(self, k: int, future: Future[R | Failure]) -> bool:
         """Wait for a job's outcome; False if its worker has died."""
@@ -197,6 +216,8 @@ class _Run(Generic[T, R]):
             self._found[k] = future.result()
         except BrokenExecutor:
             return False
+        except CancelledError:
+            self._found[k] = Failure(self._names[k], CANCELLED)
         except Exception as error:  # of the executor, or of what cannot be pickled
             self._found[k] = Failure(self._names[k], _reason(error))
         tell(self._what, len(self._found), len(self._jobs))
@@ -223,7 +244,7 @@ class LocalProcesses(Executor):
     """
 
     def __init__(self, n_workers: int) -> None:
-        check_number("workers", n_workers, above=True, whole=True)
+        check_number("workers", n_workers, above=True, whole=True, most=MOST)
         self.n_workers = n_workers
         self._context, self._lock = get_context("spawn"), Lock()
         self._start()
@@ -240,7 +261,7 @@ class LocalProcesses(Executor):
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
         """See `concurrent.futures.Executor.submit`; where worker processes have died there are fresh ones."""
-        with self._lock:
+        with self._lock, _interrupts_later():
             try:
                 return self._pool.submit(fn, *args, **kwargs)
             except BrokenExecutor:
@@ -265,6 +286,16 @@ class LocalProcesses(Executor):
         self._theirs.close()
 
 
+@contextmanager
+def _interrupts_later() -> Iterator[None]:
+    """Within, processes start that Ctrl-C does not reach, which says it to all: they end with the one that it ends."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 @checked
 def local_processes(n_workers: int) -> LocalProcesses:
     """An executor of worker processes on this machine, for a `with` block.
@@ -275,7 +306,7 @@ def local_processes(n_workers: int) -> LocalProcesses:
         n_workers: Number of processes.
 
     Raises:
-        InputError: That is no number above 0.
+        InputError: That is no number from 1 to 1000.
     """
     return LocalProcesses(n_workers)
 
@@ -287,7 +318,6 @@ def _begin(lifeline: Connection, n_threads: int) -> None:
         lifeline: Ends when the process that started it ends, or wants it to.
         n_threads: Its share of the machine's processors.
     """
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C reaches all processes: no traceback of each
     limit_threads(n_threads)
     Thread(target=_end_with, args=(lifeline,), daemon=True).start()
 
@@ -324,4 +354,6 @@ def dask_executor(address: str) -> Iterator[Executor]:
         found = printable(str(error)) or "no answer"
         raise InputError(f"scheduler {address}", found, "a Dask scheduler, such as tcp://10.0.0.5:8786") from None
     with client:
+        if not client.scheduler_info()["workers"]:
+            _log.warning("scheduler %s has no workers yet: jobs wait for some", address)
         yield client.get_executor()

@@ -1,10 +1,12 @@
-"""What long work tells of how far it is, to whoever listens: the command line, which shows a bar."""
+"""What long work tells of how far it is, to whoever listens (the command line shows a bar), and what it warns of."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from threading import get_ident
 
 Listener = Callable[[str, int, int], None]
 """Takes what is being done, how many parts of it are done, and how many there are (0: nobody knows)."""
@@ -33,3 +35,24 @@ def listening(listener: Listener) -> Iterator[None]:
         yield
     finally:
         _LISTENER.reset(token)
+
+
+@contextmanager
+def keeping_warnings() -> Iterator[list[str]]:
+    """What the package's log warns of in this thread, kept for whoever asks instead of the process's own streams."""
+    said: list[str] = []
+    thread = get_ident()
+
+    class Keep(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            if record.thread == thread:
+                said.append(record.getMessage())
+
+    log, keep = logging.getLogger("fg_calib"), Keep(logging.WARNING)
+    before, log.propagate = log.propagate, False
+    log.addHandler(keep)
+    try:
+        yield said
+    finally:
+        log.removeHandler(keep)
+        log.propagate = before

@@ -70,6 +70,9 @@ def _take_control() -> None:
 THREADS = "FG_CALIB_THREADS"
 """The environment variable that says on how many threads kernels run: fewer where processes share a machine."""
 
+MOST = 1000
+"""Threads of a process at most, and processes: libraries that are asked for more start for minutes."""
+
 _OF_LIBRARIES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """What BLAS looks at when it is loaded."""
 
@@ -79,13 +82,13 @@ def processors() -> int:
     """Processors that this process may use: those that the system lets it have, or as many as `THREADS` says.
 
     Raises:
-        InputError: `THREADS` is no number above 0.
+        InputError: `THREADS` is no number above 0, or more than `MOST`.
     """
     given = os.environ.get(THREADS, "")
     if not given:
         return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
-    if not given.isdecimal() or not int(given):
-        raise InputError(f"{THREADS} in the environment", f"found {shown(given)}", "a number above 0")
+    if not given.isdecimal() or not 0.0 < float(given) <= MOST:
+        raise InputError(f"{THREADS} in the environment", f"found {shown(given)}", f"a number from 1 to {MOST}")
     return int(given)
 
 

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -31,7 +31,7 @@ from fg_calib import (
     simulate,
 )
 from fg_calib.analysis.folds import cross_validate
-from fg_calib.batch import job_names
+from fg_calib.batch import Order, calibrate_into, job_names
 from fg_calib.progress import listening
 from fg_calib.threads import THREADS, processors
 
@@ -87,6 +87,28 @@ def test_an_executor_has_some_jobs_at_a_time_only():
     assert executor.most == 3
 
 
+def test_jobs_that_an_executor_does_not_take_or_gives_up_are_no_matter_to_the_others():
+    class Ending(ThreadPoolExecutor):
+        n = 0
+
+        def submit(self, *args, **kwargs):
+            self.n += 1
+            if self.n == 3:
+                self.shutdown()
+            if self.n == 2:
+                given_up = Future()
+                given_up.cancel()
+                given_up.set_running_or_notify_cancel()
+                return given_up
+            return super().submit(*args, **kwargs)
+
+    first, second, *others = map_jobs(work, range(5), Ending(2))
+    assert first == 0
+    assert second == Failure("job 2", "the executor gave it up, as where a scheduler ends")
+    reason = "RuntimeError: cannot schedule new futures after shutdown"
+    assert others == [Failure(f"job {k}", reason) for k in (3, 4, 5)]
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
@@ -104,7 +126,7 @@ def test_what_is_no_executor_is_refused(arguments, expected):
     assert str(refused.value) == expected
 
 
-@pytest.mark.parametrize("n", [0, -1, 1.5, "2"])
+@pytest.mark.parametrize("n", [0, -1, 1.5, "2", 1001, 2**31])
 def test_processes_are_counted(n):
     with pytest.raises(InputError, match=r"^workers: found "):
         local_processes(n)
@@ -129,7 +151,7 @@ def test_kernels_have_as_many_threads_as_the_environment_says(monkeypatch):
             monkeypatch.setenv(THREADS, given)
             processors.cache_clear()
             assert processors() == (expected or len(os.sched_getaffinity(0)))
-        for given in ("0", "many", "-1"):
+        for given in ("0", "many", "-1", "1001", "99999999999"):
             monkeypatch.setenv(THREADS, given)
             processors.cache_clear()
             with pytest.raises(InputError, match=f"^{THREADS} in the environment: found '{given}', expected a number"):
@@ -267,6 +289,28 @@ def test_draws_of_a_simulation_are_the_same_to_the_last_bit_on_other_processes()
 
 
 @pytest.mark.slow
+def test_a_scheduler_without_workers_is_warned_of():
+    pytest.importorskip("distributed", reason="Dask is not installed: pip install 'fg-calib[distributed]'")
+    ended = subprocess.run(
+        [sys.executable, "-c", WITHOUT_WORKERS], capture_output=True, text=True, check=False,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "DASK_DISTRIBUTED__LOGGING__DISTRIBUTED": "error"},
+    )  # fmt: skip
+    assert (ended.returncode, ended.stdout) == (0, "")
+    assert re.fullmatch(r"scheduler tcp://\S+ has no workers yet: jobs wait for some\n", ended.stderr)
+
+
+WITHOUT_WORKERS = """
+import logging
+from distributed import LocalCluster
+from fg_calib import dask_executor
+if __name__ == "__main__":
+    logging.basicConfig(format="%(message)s")
+    with LocalCluster(n_workers=0, dashboard_address=None) as cluster, dask_executor(cluster.scheduler_address):
+        pass
+"""
+
+
+@pytest.mark.slow
 def test_no_scheduler_is_one_line(monkeypatch):
     pytest.importorskip("distributed", reason="Dask is not installed: pip install 'fg-calib[distributed]'")
     monkeypatch.setattr("fg_calib.executors.PATIENCE", 0.5)
@@ -357,6 +401,29 @@ def test_a_folder_with_jobs_of_somebody_else_is_left_alone(fg_calib, two_arms, t
     assert (tmp_path / "jobs.csv").read_text() == "my own\n"
 
 
+WRITE_AND_DIE = """
+import os, signal, sys
+from pathlib import Path
+from fg_calib.files.disk import fill_folder
+def write(into):
+    (into / "result.json").write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+fill_folder(Path(sys.argv[1]), write)
+"""
+
+
+@pytest.mark.slow
+def test_a_job_whose_process_is_killed_while_it_writes_leaves_nothing(tmp_path):
+    class Deadly(Executor):
+        def submit(self, *_):
+            subprocess.run([sys.executable, "-c", WRITE_AND_DIE, str(tmp_path)], check=False)
+            raise BrokenExecutor
+
+    (found,) = calibrate_into([Order("arm", Path("arm.yaml"), tmp_path)], Deadly())
+    assert found.verdict == "failed"
+    assert list(tmp_path.iterdir()) == []
+
+
 def started(jobs, out):
     """`calibrate` of many jobs on two processes, in a group of its own, once one of them is done."""
     command = [sys.executable, "-m", "fg_calib.cli", "calibrate", *map(str, jobs), "--workers", "2", "--out", str(out)]
@@ -394,6 +461,19 @@ def test_an_interrupt_ends_the_workers_too_in_one_line(example, tmp_path, all_of
     until(lambda: nobody_left(process.pid))
     assert len(list((tmp_path / "out").glob("*/result.json"))) < 9
     assert not (tmp_path / "out" / "jobs.json").exists()
+
+
+@pytest.mark.slow
+def test_processes_that_start_do_not_hear_of_an_interrupt(capfd):
+    with local_processes(1) as executor:
+        future = executor.submit(os.getpid)
+        for _ in range(20):
+            for process in list(executor._pool._processes):
+                os.kill(process, signal.SIGINT)
+            time.sleep(0.01)
+        assert future.result() in executor._pool._processes
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.slow

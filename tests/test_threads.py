@@ -3,9 +3,11 @@
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from threading import Barrier
 
 import numpy as np
@@ -14,7 +16,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from fg_calib.files.job import read_job
 from fg_calib.robot.kinematics import SPAN
-from fg_calib.threads import one_blas_thread, single_threaded
+from fg_calib.threads import THREADS, one_blas_thread, single_threaded
 
 EVERYTHING = """
 import os, sys
@@ -178,3 +180,29 @@ def test_the_limit_is_lifted_after_an_error(before):
     with pytest.raises(ValueError, match=r"^$"):
         fails()
     assert blas_threads() == before
+
+
+FORK = """
+import os
+from fg_calib.robot.kinematics import over_processors
+print(sum(over_processors(abs, 8)), flush=True)
+if os.fork() == 0:
+    print(sum(over_processors(abs, 8)), flush=True)
+    os._exit(0)
+os.wait()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no forks on this system")
+def test_a_fork_has_threads_of_its_own():
+    command = [sys.executable, "-c", FORK]
+    with subprocess.Popen(
+        command, env=os.environ | {THREADS: "2"}, stdout=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        try:
+            shown, _ = process.communicate(timeout=60)
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+    assert shown == "28\n28\n"

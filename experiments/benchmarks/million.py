@@ -8,8 +8,8 @@ Takes some four minutes on two cores; the first run on a machine compiles the ke
   temporary folder, as Parquet and CSV.
 - The command: seconds by the clock and of processors, and peak memory of the process by its own account (`VmHWM`);
   with another checkout's root as `--before`, the same of that one, in turn with ours.
-- Parts: the pairs in files of 200 000 each, read and reduced one after the other by `solve_parts`; with `--most` also
-  more of them.
+- Parts: the command with `--parts 200000`: one Parquet file of the pairs, of which so many are read at a time; with
+  `--most` also more of them.
 - Growth: seconds of processors of a linearisation against pairs, joints (three arms) and estimated parameters; and of
   a whole calibration in this process against pairs and configurations; the exponent of a power law through each.
 - Roofline: floating-point operations that a pair takes, counted from the kernel's loops; what this machine's matrix
@@ -26,7 +26,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from inspect import getsource
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -57,7 +56,10 @@ SIGMA = 1e-3
 """1 sigma of distances [m], angles [rad], positions [m] and orientations [rad]."""
 
 PART = 200_000
-"""Pairs of a part."""
+"""Pairs of a part, and of a group of rows of the file."""
+
+WARM = 101_000
+"""Pairs of the first calibration, which is not counted: enough that all kernels are compiled in it."""
 
 SIGMA_JOINT = 1e-5
 """1 sigma of joint readings where poses are measured, [rad]."""
@@ -72,8 +74,10 @@ def true_robot(rng: np.random.Generator) -> fg_calib.Robot:
     return robot.with_values(robot.nominal + 0.5 * tolerance * rng.normal(size=len(tolerance)))
 
 
-def write_pairs(folder: Path, n: int, seed: int, n_configurations: int = 0) -> None:
-    """A table of `n` pairs, of a hundredth as many configurations unless said, and a job of it in either format."""
+def write_pairs(
+    folder: Path, n: int, seed: int, n_configurations: int = 0, formats: Sequence[str] = ("parquet", "csv")
+) -> None:
+    """A table of `n` pairs, of a hundredth as many configurations unless said, and a job of it in each format."""
     rng = np.random.default_rng(seed)
     robot = true_robot(rng)
     q = rng.uniform(-np.pi, np.pi, (n_configurations or max(50, n // 100), robot.n_joints))
@@ -86,7 +90,7 @@ def write_pairs(folder: Path, n: int, seed: int, n_configurations: int = 0) -> N
     pairs = {"a": a, "b": b, "distance": np.abs(distance), "angle": np.minimum(angle, 2.0 * np.pi - angle)}
     tables = {"q": {f"q{k + 1}": q[:, k] for k in range(q.shape[1])}, "pairs": pairs}
     job = "measurements: q.{0}\npairs: pairs.{0}\nmodel: distance-rotation\nnoise: {{distance: {1}, angle: {1}}}\n"
-    _write(folder, tables, job)
+    _write(folder, tables, job, formats)
 
 
 def write_poses(folder: Path, n: int, seed: int) -> None:
@@ -107,14 +111,6 @@ def write_poses(folder: Path, n: int, seed: int) -> None:
     _write(folder, {"poses": poses | {"qx": x, "qy": y, "qz": z, "qw": w}}, job)
 
 
-def write_parts(folder: Path, n: int, seed: int) -> None:
-    """As many pairs in tables of their own of `PART` pairs each, all of the same configurations."""
-    write_pairs(folder, n, seed, 10_000)
-    pairs = pl.scan_parquet(folder / "pairs.parquet")
-    for k in range(0, n, PART):
-        pairs.slice(k, PART).sink_parquet(folder / f"part{k // PART:04}.parquet")
-
-
 _COMMAND = """
 import atexit, resource, sys
 from pathlib import Path
@@ -127,27 +123,6 @@ main()
 """What a process does that is told where to write its peak memory: `fg-calib`."""
 
 
-def solve_folder(folder: Path) -> dict[str, float]:
-    """What a calibration of those parts takes, each read where it is reduced: in a process of its own."""
-    job = fg_calib.read_job(folder / "small.yaml")
-    noise = fg_calib.Noise(distance=SIGMA, angle=SIGMA)
-    parts = [
-        partial(fg_calib.read_measurements, folder / "q.parquet", job.robot, pairs=path, noise=noise)
-        for path in sorted(folder.glob("part*.parquet"))
-    ]
-    clock = time.perf_counter()
-    found = fg_calib.solve_parts(job.robot, parts, model="distance-rotation")
-    seconds = time.perf_counter() - clock
-    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return {
-        "converged": float(found.converged),
-        "iterations": found.iterations,
-        "seconds": seconds,
-        "processor_seconds": used[0].ru_utime + used[0].ru_stime,
-        "peak_MiB": _peak_of_this() / MIB,
-    }
-
-
 def _peak_of_this() -> float:
     """Bytes that this process took at most; on Linux `ru_maxrss` starts at that of the process that started it."""
     status = Path("/proc/self/status")
@@ -157,24 +132,24 @@ def _peak_of_this() -> float:
 
 
 def in_parts(n: int, seed: int) -> dict[str, float]:
-    """`solve_folder` of so many pairs."""
+    """What the command takes with so many pairs of 10 000 configurations in one file, read in parts."""
     with TemporaryDirectory() as name:
-        folder = Path(name) / "parts"
-        write_parts(folder, n, seed)
-        (folder / "small.yaml").write_text((folder / "parquet.yaml").read_text().replace("pairs.p", "part0000.p"))
-        arguments = [sys.executable, __file__, "--parts", str(folder)]
-        ended = subprocess.run(arguments, capture_output=True, text=True, check=True)
-    return {"pairs": n, **json.loads(ended.stdout)}
+        folder = Path(name) / "pairs"
+        write_pairs(folder, n, seed, 10_000, ("parquet",))
+        return {"pairs": n, **command(folder / "parquet.yaml", "--parts", str(PART))}
 
 
-def _write(folder: Path, tables: dict[str, dict[str, Any]], job: str) -> None:
+def _write(
+    folder: Path, tables: dict[str, dict[str, Any]], job: str, formats: Sequence[str] = ("parquet", "csv")
+) -> None:
     folder.mkdir(parents=True)
     (folder / "robot.yaml").write_bytes((EXAMPLE / "robot_nominal.yaml").read_bytes())
     for name, columns in tables.items():
         frame = pl.DataFrame(columns)
-        frame.write_parquet(folder / f"{name}.parquet", row_group_size=200_000)
-        frame.write_csv(folder / f"{name}.csv")
-    for ending in ("parquet", "csv"):
+        frame.write_parquet(folder / f"{name}.parquet", row_group_size=PART)
+        if "csv" in formats:
+            frame.write_csv(folder / f"{name}.csv")
+    for ending in formats:
         head = "robot: robot.yaml\nunits: {length: m, angle: rad}\n"
         (folder / f"{ending}.yaml").write_text(head + job.format(ending, SIGMA))
 
@@ -368,11 +343,13 @@ def run(
     results: dict[str, Any] = {"quick": quick, "seed": seed, "pairs": n_pairs, "poses": n_poses}
     with TemporaryDirectory() as name:
         folder = Path(name)
-        write_pairs(folder / "warm", 1000, seed)
+        write_pairs(folder / "warm", min(n_pairs, WARM), seed)
+        write_poses(folder / "warm poses", min(n_poses, 1000), seed)
         write_pairs(folder / "pairs", n_pairs, seed)
         write_poses(folder / "poses", n_poses, seed)
         for root in roots.values():
-            command(folder / "warm" / "parquet.yaml", root=root)  # the kernels
+            for warm in ("warm", "warm poses"):
+                command(folder / warm / "parquet.yaml", root=root)  # the kernels
         jobs = [(f"pairs, {ending}", folder / "pairs" / f"{ending}.yaml") for ending in ("parquet", "csv")]
         jobs.append(("poses, parquet", folder / "poses" / "parquet.yaml"))
         runs: list[dict[str, Any]] = []
@@ -399,7 +376,7 @@ def describe(results: dict[str, Any]) -> str:
         lines.append(f"{r['what']:42}{r['of']:8}{figures}")
     for p in results["parts"]:
         figures = f"{p['seconds']:8.2f}{p['processor_seconds']:8.2f}{p['peak_MiB']:8.0f}"
-        lines.append(f"{p['pairs']} pairs in parts, {p['iterations']} iterations".ljust(50) + figures)
+        lines.append(f"{p['pairs']} pairs, --parts {PART}".ljust(50) + figures)
     lines += [f"{what:28} exponent {law:.2f}" for what, law in results["growth"]["exponents"].items()]
     for what, figure in results["roofline"].items():
         parts = figure.items() if isinstance(figure, dict) else [("", figure)]
@@ -417,11 +394,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--before", type=Path, help="root of another checkout, to be timed in turn")
     parser.add_argument("--out", type=Path, default=ROOT / "experiments" / "results", help="folder for the results")
-    parser.add_argument("--parts", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args(arguments)
-    if given.parts is not None:
-        print(json.dumps(solve_folder(given.parts)))
-        return 0
     n_pairs, n_poses = (
         given.pairs or (2_000 if given.quick else 1_000_000),
         given.poses or (500 if given.quick else 100_000),

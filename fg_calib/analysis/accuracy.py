@@ -17,9 +17,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.analysis.covariance import Spread, TangentCovariance
+from fg_calib.analysis.covariance import TangentCovariance
 from fg_calib.analysis.seen import Seen
-from fg_calib.graph.solver import Solution
+from fg_calib.graph.problem import Problem
 from fg_calib.measurements.gathering import Dataset
 from fg_calib.robot.kinematics import forward, precompute_trig
 
@@ -67,18 +67,18 @@ class ExpectedError:
     relative: bool = False
 
 
-def expected_error(solution: Solution, spread: Spread) -> ExpectedError:
+def expected_error(problem: Problem, spread: TangentCovariance) -> ExpectedError:
     """Expected errors of the tool at the test configurations; at the train configurations without any.
 
     Args:
-        solution: The solution.
-        spread: Its covariance, what was left out to fix the gauge included.
+        problem: What was solved.
+        spread: The covariance of its solution, what was left out to fix the gauge included.
     """
-    data = solution.problem.data
+    data = problem.data
     there, at = judged_configurations(data)
     chosen = there[np.unique(np.linspace(0, len(there) - 1, MOST).round().astype(np.int64))]
     base, fitted = errors_at(spread, data.readings[chosen])
-    relative = Seen.of(solution.problem).blind_to_base
+    relative = Seen.of(problem).blind_to_base
     return ExpectedError(base, fitted, at, len(chosen), len(there), relative)
 
 

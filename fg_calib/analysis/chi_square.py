@@ -89,6 +89,18 @@ def chi2_bounds(dof: int, expected: float | None = None, independent: int | None
     return ratio * min(float(low), 1.0 / FACTOR), max(1.0, ratio) * max(float(high), FACTOR)
 
 
+def chi_square_of(value: float, dof: int, *, independent: bool) -> ChiSquare:
+    """Chi-square of rows whose noise is as they are weighted by.
+
+    Args:
+        value: Sum of squared whitened residuals and priors.
+        dof: Residuals and priors, less the determined directions.
+        independent: Whether no rows share errors: where some may, nothing says how probable it is.
+    """
+    p_value = float(special.gammaincc(dof / 2.0, value / 2.0)) if independent and dof > 0 else None
+    return ChiSquare(value, dof, float(max(dof, 0)), chi2_bounds(dof), p_value)
+
+
 def _weighted_chi2(solution: Solution) -> tuple[float, int, float]:
     """Chi-square, the independent residuals in it, and what a robust loss makes of the mean of one of them.
 

@@ -33,7 +33,7 @@ from scipy import special
 from fg_calib.analysis.covariance import Spread
 from fg_calib.analysis.unknowns import KINDS
 from fg_calib.arrays import FrozenArrays
-from fg_calib.graph.factors import prior_rows, unknown_prior_rows
+from fg_calib.graph.factors import Variables, prior_rows, unknown_prior_rows
 from fg_calib.graph.information import eliminated
 from fg_calib.graph.solver import Solution
 
@@ -97,7 +97,22 @@ def judge_priors(solution: Solution, spread: Spread) -> PriorFit | None:
         solution: The solution.
         spread: Its covariance.
     """
-    names, z, A, n_places = _corrections(solution, spread)
+    return _judged(*_corrections(solution, spread))
+
+
+def judge_tolerances(variables: Variables, parameters: Floats, covariance: Floats) -> PriorFit | None:
+    """The same of the robot's parameters alone.
+
+    Args:
+        variables: The variables.
+        parameters: The estimate.
+        covariance: Its covariance in the columns, shape (n_columns, n_columns).
+    """
+    names, z, P = _of_parameters(variables, parameters)
+    return _judged(names, z, np.eye(len(z)) - P @ covariance @ P.T, 0)
+
+
+def _judged(names: tuple[str, ...], z: Floats, A: Floats, n_places: int) -> PriorFit | None:
     if not len(z):
         return None
     chi2, expected, square = float(z @ z), float(np.trace(A)), float(np.sum(A * A))
@@ -116,9 +131,8 @@ def judge_priors(solution: Solution, spread: Spread) -> PriorFit | None:
 def _corrections(solution: Solution, spread: Spread) -> tuple[tuple[str, ...], Floats, Floats, int]:
     """What prior rows are of, z, its covariance A, and how many rows at their end are of places."""
     problem, variables = solution.problem, solution.problem.variables
-    z, P = prior_rows(variables, solution.parameters)
-    owned = [variables.robot.parameters[i] for v in variables.items if v.kind != "frame" for i in v.parameters]
-    names = [p.name for p in owned if p.tolerance is not None] if len(z) else []
+    of_parameters, z, P = _of_parameters(variables, solution.parameters)
+    names = list(of_parameters)
     z_places, P_places = unknown_prior_rows(variables, solution.parameters)
     own = np.zeros((len(z) + len(z_places), 0))
     if len(z_places):
@@ -133,6 +147,13 @@ def _corrections(solution: Solution, spread: Spread) -> tuple[tuple[str, ...], F
                 names += [f"{KINDS[unknowns.letters[i]]} {unknowns.names[i]}"] * len(v.prior[0])
     A = np.eye(len(own)) - P @ (2.0 * spread.tangent - spread.actual) @ P.T - own @ own.T
     return tuple(names), np.concatenate([z, z_places]), A, len(z_places)
+
+
+def _of_parameters(variables: Variables, parameters: Floats) -> tuple[tuple[str, ...], Floats, Floats]:
+    """What the robot's prior rows are of, z, and its derivatives, shape (n, n_columns)."""
+    z, P = prior_rows(variables, parameters)
+    owned = [variables.robot.parameters[i] for v in variables.items if v.kind != "frame" for i in v.parameters]
+    return tuple(p.name for p in owned if p.tolerance is not None) if len(z) else (), z, P
 
 
 _NO_CORRECTION = 1e50

@@ -127,7 +127,7 @@ def spread_of(solution: Solution) -> Spread:
     """The covariance: that of the weighted least-squares estimate under the noise as it is taken to be.
 
     Parameters that were left out to fix the gauge count as known; see `with_left_out`. Where nothing determines frames,
-    what follows them as they are held is in it: see `_held`.
+    what follows them as they are held is in it: see `held_frames`.
 
     Where rows share errors but are asked to count as independent, with H = J^T J and C their covariance, the `actual`
     one is H^-1 (J^T C J) H^-1 (priors are rows of their own). The mean of chi-square, tr C - tr(H^-1 J^T C J), is then
@@ -144,7 +144,7 @@ def spread_of(solution: Solution) -> Spread:
     _, directions_nominal, rank_nominal = (
         found if solution.before is solution.parameters else decomposed(solution.before)
     )
-    held = _held(directions[rank:], directions_nominal[rank_nominal:], scales, variables.n_robot_columns)
+    held = held_frames(directions[rank:], directions_nominal[rank_nominal:], scales, variables.n_robot_columns)
     half = directions[:rank].T / s[:rank]
     added = correlation(problem, solution.parameters)
     middle = np.zeros((rank, rank)) if added is None else half.T @ added @ half
@@ -181,7 +181,7 @@ def _decomposed(variables: Variables, parameters: Floats, rows: Floats) -> tuple
     return s, Vt * scales, determined(s)
 
 
-def _held(loose: Floats, loose_at_nominal: Floats, scales: Floats, n_robot: int) -> Floats:
+def held_frames(loose: Floats, loose_at_nominal: Floats, scales: Floats, n_robot: int) -> Floats:
     """Errors of frames that nothing determines, with what follows them; shape (n_columns, k).
 
     No nominal value says where frames are: they stay where they were started. Where nothing at nominal determines one

@@ -184,11 +184,11 @@ def _of_bent_rows(
     bent, folded, turned, lengths = (np.zeros(table.n, dtype=np.bool_) for _ in range(4))
     for number, noise in enumerate(solution.noises):
         if isinstance(noise, PairNoise):
-            rows = np.flatnonzero(table.used & (table.series == number))
-            place = (table.measurement[rows], table.row[rows])
-            lengths[rows] = True
-            bent[rows], folded[rows] = noise.bent_by(half, BENT)[place], noise.may_fold(scales)[place]
-            turned[rows] = noise.about_half_a_turn()[place]
+            rows, measured = table.rows_of(number), noise.series.measured
+            used = lengths[rows] = table.used[rows]
+            bent[rows] = noise.bent_by(half, BENT)[measured] & used
+            folded[rows] = noise.may_fold(scales)[measured] & used
+            turned[rows] = noise.about_half_a_turn()[measured] & used
     if not lengths.any():
         return []
     turned &= folded

@@ -46,7 +46,7 @@ from fg_calib.analysis.covariance import Spread
 from fg_calib.analysis.gross_errors import MOST_FEW, find_gross_errors
 from fg_calib.analysis.low_rank import Dense, LowRank
 from fg_calib.analysis.residual_covariance import Errors, Nuisances, half_of
-from fg_calib.analysis.residual_table import ResidualTable
+from fg_calib.analysis.residual_table import ResidualTable, sum_by_end
 from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.factors import prior_rows
 from fg_calib.graph.noise import JOINT_NOISE, NoiseName
@@ -60,6 +60,7 @@ Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
 Integers = NDArray[np.int64]
 Codes = NDArray[np.int8]
+Indices = NDArray[np.int32]
 Loadings = scipy.sparse.csr_array
 
 MAX_DENSE = 3000
@@ -89,7 +90,7 @@ MAX_TOGETHER = 200
 LEAST_GAIN = 0.3
 """Part of the excess of chi-square that is left at most without outliers, where more than these is wrong."""
 
-_CHUNK = 4 * SPAN
+_CHUNK, _FEW = 4 * SPAN, SPAN // 4
 
 _MEDIAN = 0.6744897501960817
 """Median of the size of a standard normal figure."""
@@ -398,7 +399,9 @@ class _Part:
             trace, square = self.covariance.moments(chosen)
         else:
             v = self.means[chosen]
-            trace, square = float(np.sum(v)), float(np.sum(v * v))
+            trace = float(np.sum(v))
+            v *= v
+            square = float(np.sum(v))
         nu = trace**2 / square if square > 0.0 else 1.0
         return nu if self.covariance is not None or not self.shared else min(nu, 3.0)
 
@@ -409,6 +412,8 @@ class _Part:
 
     def degrees_behind(self, chosen: Integers) -> float:
         """Degrees of freedom behind the noise that some rows were divided by."""
+        if not np.isfinite(self.behind).any():
+            return np.inf
         by_kind = np.bincount(self.table.group[self.rows[chosen]], self.means[chosen], len(self.table.groups))
         variance = float(np.sum(by_kind**2 / self.behind))
         return float(np.sum(by_kind)) ** 2 / variance if variance > 0.0 else np.inf
@@ -417,24 +422,21 @@ class _Part:
         """Configurations whose rows are too large together, the least likely first."""
         if not self.judged:
             return ()  # outliers have been found already
-        ends = np.stack([self.table.a[self.rows], self.table.b[self.rows]])
-        there = ends >= 0
+        a, b, n = self.table.a, self.table.b, len(self.rows)
+
+        def ends(some: slice) -> tuple[Indices, Indices]:
+            return a[self.rows[some]], b[self.rows[some]]
+
         chi2, expected, count = (
-            np.sum(
-                [
-                    np.bincount(end[use], None if values is None else values[use], self.n_ends)
-                    for end, use in zip(ends, there, strict=True)
-                ],
-                axis=0,
-            )
-            for values in (self.squares, self.means, None)
+            sum_by_end(ends, n, self.n_ends, values)
+            for values in (lambda some: self.squares[some], lambda some: self.means[some], lambda _: None)
         )
         looked_at = np.flatnonzero(expected > 1e-3)
         limit = ALARM / max(1, len(looked_at))
         # No effective number of degrees of freedom is below 1, where the tail is heaviest.
         found = []
         for k in looked_at[special.gammaincc(0.5, 0.5 * chi2[looked_at] / expected[looked_at]) < limit]:
-            nu = max(1.0, self.degrees(np.flatnonzero(np.any(ends == k, axis=0))))
+            nu = max(1.0, self.degrees(np.flatnonzero(((a == k) | (b == k))[self.rows])))
             ratio = chi2[k] / expected[k]
             if special.gammaincc(nu / 2.0, nu / 2.0 * ratio) < limit:
                 strength = 0.5 * nu * (ratio - 1.0 - np.log(ratio))  # -log p, nearly; never underflows
@@ -477,9 +479,9 @@ class _Rows:
         keep[test] = len(test) <= MAX_KEPT
         of_kept = np.flatnonzero(keep)
         all_kept = self._read(keep)
-        w, q = self.weight, self.leverage
+        w = self.weight
         variance = np.where(table.used, 1.0 - 2.0 * w, 1.0)  # in place, as of a million rows each array counts
-        variance *= q
+        variance *= self.leverage
         variance += 1.0
         covariance, self._errors = None, None
         if keep[fitted].all():
@@ -494,17 +496,22 @@ class _Rows:
         self.studentised[variance < LEAST_VARIANCE] = np.nan
         squares = table.after / table.sigma
         squares *= squares
-        self.fitted = self._part(fitted, w[fitted] * squares[fitted], w[fitted] * variance[fitted], covariance)
-        self.predicted, self._outliers, self._n_unknown = self._predict(test, squares, of_kept, all_kept)
+        of_test = squares[test]
+        if self._robust:
+            squares, variance = w * squares, w * variance
+        if len(fitted) < table.n:
+            squares, variance = squares[fitted], variance[fitted]
+        self.fitted = self._part(fitted, squares, variance, covariance)
+        self.predicted, self._outliers, self._n_unknown = self._predict(test, of_test, of_kept, all_kept)
 
     def kinds(self) -> tuple[KindFit, ...]:
         """The fit of the fitted rows by kind."""
-        part, leverage = self.fitted, self.weight[self.fitted.rows] * self.leverage[self.fitted.rows]
-        groups = range(len(self._table.groups))
+        part, groups = self.fitted, range(len(self._table.groups))
         excess = np.zeros(len(groups))
-        if not self._carried and part.covariance is None and np.nansum(leverage) > 0.0:
-            by_kind = [np.nansum(leverage[part.of_kind(code)]) for code in groups]
-            excess = self._spread.excess * np.array(by_kind) / np.nansum(leverage)
+        if not self._carried and part.covariance is None:
+            leverage = self.weight[part.rows] * self.leverage[part.rows]
+            by_kind = np.array([np.nansum(leverage[part.of_kind(code)]) for code in groups])
+            excess = self._spread.excess * by_kind / by_kind.sum() if by_kind.sum() > 0.0 else excess
         known = not self._robust and self._solution.estimated_noise is None
         known &= part.covariance is not None or not self._shared
         found = (self._kind(part, code, float(excess[code]), known) for code in groups)
@@ -613,7 +620,7 @@ class _Rows:
             largest=float(np.nanmax(size)) if enough else np.nan,
             degrees=degrees,
             n_beyond=int(np.sum(size > suspect_level(len(rows)))),
-            own_sigma_rms=float(np.sqrt(np.mean(self._stated[1][rows]))),
+            own_sigma_rms=float(np.sqrt(np.mean(self._stated[1][rows] ** 2))),
             own_factor=self._problem.state.factors.get((table, family), 1.0),
         )
 
@@ -621,7 +628,7 @@ class _Rows:
         """What the sigmas of rows of one group were multiplied by: RMS sigma as taken over RMS sigma as stated."""
         if group not in self._with_joint_noise:
             return self._problem.state.factors.get(group, 1.0)
-        as_taken, as_stated = (float(np.mean(v[rows])) for v in (self._table.sigma**2, self._stated[0]))
+        as_taken, as_stated = (float(np.mean(sigma[rows] ** 2)) for sigma in (self._table.sigma, self._stated[0]))
         return float(np.sqrt(as_taken / as_stated))
 
     @cached_property
@@ -636,20 +643,20 @@ class _Rows:
 
     @cached_property
     def _stated(self) -> tuple[Floats, Floats]:
-        """Variance of each row of the table with all noise as stated, and that without the joints', shapes (n,)."""
-        problem, table, noises = self._problem, self._table, self._noises
+        """1 sigma of each row of the table with all noise as stated, and that without the joints', shapes (n,)."""
+        problem, table, noises, total = self._problem, self._table, self._noises, self._table.sigma
         if problem.state.factors:
             as_stated = replace(problem, state=replace(problem.state, factors={}))
             noises = noises_at(as_stated, self._solution.parameters, at_readings=True)
-        total, of_joints = np.zeros(table.n), np.zeros(table.n)
+            total = np.concatenate([noise.sigma[noise.series.measured] for noise in noises])
+        if not self._with_joint_noise:
+            return total, total
+        own = total**2
         for number, noise in enumerate(noises):
-            mine = table.series == number
-            place = (table.measurement[mine], table.row[mine])
-            total[mine] = noise.sigma[place] ** 2
             for source in noise.sources:
                 if source.name == "joints":
-                    of_joints[mine] += np.einsum("nii->ni", source.variance)[place]
-        return total, np.maximum(total - of_joints, 0.0)
+                    own[table.rows_of(number)] -= np.einsum("nii->ni", source.variance)[noise.series.measured]
+        return total, np.sqrt(np.maximum(own, 0.0))
 
     def _predict(
         self, test: Integers, squares: Floats, kept: Integers, of_kept: Errors
@@ -658,7 +665,7 @@ class _Rows:
 
         Args:
             test: Predicted rows of the table.
-            squares: Squared residuals over sigma of all rows.
+            squares: Their squared residuals over sigma.
             kept: Rows of the table that `of_kept` is of.
             of_kept: What these follow from.
         """
@@ -669,7 +676,8 @@ class _Rows:
             fitted = self.fitted.rows
             counted = (test[outlier], test, fitted[self.weight[fitted] < OUTLIER_WEIGHT], fitted)
             outliers = OutlierCounts(*(len(np.unique(self._measurement(rows))) for rows in counted))
-        rows = test[~unknown & ~outlier & ~(self.leverage[test] < LEAST_VARIANCE - 1.0)]
+        judged = ~unknown & ~outlier & ~(self.leverage[test] < LEAST_VARIANCE - 1.0)
+        rows = test[judged]
         means, covariance = 1.0 + self.leverage[rows], None
         if np.isin(rows, kept).all():
             found = of_kept.at(np.searchsorted(kept, rows))
@@ -679,7 +687,7 @@ class _Rows:
             with np.errstate(invalid="ignore"):
                 size = self._table.sigma[rows] * np.sqrt(means)
             self.studentised[rows] = self._table.after[rows] / size
-        part = self._part(rows, squares[rows] / means, np.ones(len(rows)), covariance)
+        part = self._part(rows, squares[judged] / means, np.ones(len(rows)), covariance)
         estimated = set(self._solution.estimated_noise or ())
         for code, group in enumerate(self._table.groups):
             if group in estimated or (JOINT_NOISE in estimated and group in self._with_joint_noise):
@@ -714,19 +722,20 @@ class _Rows:
         kept, half = [], half_of(self._spread.tangent)
         asked = keep | table.test
         for number, noise in enumerate(self._noises):
-            of_series = np.flatnonzero(table.series == number)
-            for start in range(0, noise.series.n, _CHUNK):
-                chunk = np.arange(start, min(start + _CHUNK, noise.series.n))
-                first, last = np.searchsorted(table.measurement[of_series], (start, start + len(chunk)))
-                rows = of_series[first:last]
+            measured, last = noise.series.measured, table.rows_of(number).start
+            step = _CHUNK if nuisances.none_in(number) else _FEW
+            for start in range(0, noise.series.n, step):
+                chunk = slice(start, min(start + step, noise.series.n))
+                first, last = last, last + int(np.sum(measured[chunk]))
+                rows = slice(first, last)
                 if nuisances.none_in(number) and not asked[rows].any():  # they follow from the core and own noise alone
-                    place = (table.measurement[rows] - start, table.row[rows])
-                    squares = squares_along(noise.rows_at(chunk), nuisances.chain(number), half)[place]
-                    own = noise.variance[chunk][place]
-                    self.leverage[rows] = (squares + np.maximum(own, 0.0)) / table.sigma[rows] ** 2 - 1.0
+                    moments = noise.moments_at(chunk)
+                    squares = squares_along(noise.rows_at(chunk, moments), nuisances.chain(number), half)
+                    of_rows = (squares + np.maximum(moments.variance, 0.0))[measured[chunk]]
+                    self.leverage[rows] = of_rows / table.sigma[rows] ** 2 - 1.0
                     continue
-                grid = (table.measurement[rows] - start) * noise.series.kind.residual_dim + table.row[rows]
-                found = nuisances.errors(number, chunk).at(grid).over(table.sigma[rows])
+                grid = np.flatnonzero(measured[chunk])
+                found = nuisances.errors(number, np.arange(chunk.start, chunk.stop)).at(grid).over(table.sigma[rows])
                 leverage = np.einsum("ij,ij->i", found.J @ self._spread.tangent, found.J)
                 leverage[table.test[rows]] = self._spread.variance(found.J[table.test[rows]])
                 self.leverage[rows] = leverage + np.sum(found.own**2, axis=1) + (found.of_noise - 1.0)

@@ -152,7 +152,7 @@ def inspect_job(job: Job) -> Inspection:
     every, setups, disagreements = _of_set_up(problem, job, tables)
     at_nominal = unsolved(problem)
     spread = spread_of(at_nominal)
-    expected = None if problem.evaluated else expected_error(at_nominal, with_left_out(at_nominal, spread))
+    expected = None if problem.evaluated else expected_error(problem, with_left_out(at_nominal, spread))
     n_directions = spread.rank + eliminated(problem, problem.start).rank
     found = Inspection(
         robot=job.robot.name,

@@ -184,7 +184,7 @@ class Nuisances:
         row = np.broadcast_to(np.arange(n * residual_dim).reshape(n, residual_dim, 1), in_nuisances.shape).ravel()
         place = np.broadcast_to(noise.series.nuisances[rows][:, None], in_nuisances.shape).ravel()
         N = scipy.sparse.csr_array((in_nuisances.ravel(), (row, place)), shape=(n * residual_dim, len(self._follow)))
-        private = np.maximum(noise.variance[rows], 0.0).ravel()
+        private = np.maximum(noise.moments_at(rows).variance, 0.0).ravel()
         apart = np.flatnonzero(np.repeat(self._apart[number][rows], residual_dim))
         column = self._first[number] + (rows[:, None] * residual_dim + np.arange(residual_dim)).ravel()[apart]
         own = scipy.sparse.csr_array((np.sqrt(private[apart]), (apart, column)), shape=(n * residual_dim, width))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from fg_calib.analysis.gross_errors import CHANCE, MOST_FEW
-from fg_calib.arrays import FrozenArrays
+from fg_calib.arrays import FrozenArrays, is_one, once
 from fg_calib.graph.problem import noises_at
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements.dataset import Labels
@@ -232,21 +232,22 @@ class ResidualTable(FrozenArrays):
             Rows, shape (n,); sum of squares in sigma, shape (n,); by kind of noise the RMS of the length of a
             measurement's rows at the estimate, shape (n,), nan where there are none.
         """
-        counted, first = self.reason_code == 0, self.is_first_of_family()
-        ends = [(end, counted & (end >= 0) & (end < n)) for end in (self.a, self.b)]
+        counted, first, of_family = self.reason_code == 0, self.is_first_of_family(), self.family
 
-        def summed(values: Floats, of: Booleans) -> Floats:
-            found = [np.bincount(end[at & of], values[at & of], n).astype(np.float64) for end, at in ends]
-            return found[0] + found[1]
+        def summed(values: Callable[[slice], Floats], mine: Booleans = counted) -> Floats:
+            def ends(some: slice) -> tuple[Indices, Indices]:
+                return self.a[some], self.b[some]
 
-        whole = np.ones(self.n, dtype=np.bool_)
+            return sum_by_end(ends, self.n, n, lambda some: np.where(mine[some], values(some), 0.0))
+
         rms = {}
         for k, family in enumerate(self.families):
-            mine = self.family == k
+            mine = counted & (of_family == k)
+            squares = summed(lambda some: self.after[some] ** 2, mine)
             with np.errstate(invalid="ignore"):
-                rms[family] = np.sqrt(summed(self.after**2, mine) / summed(first.astype(np.float64), mine))
-        rows = summed(np.ones(self.n), whole).astype(np.int64)
-        return rows, summed((self.after / self.sigma) ** 2, whole), rms
+                rms[family] = np.sqrt(squares / summed(lambda some: first[some].astype(np.float64), mine))
+        rows = summed(lambda some: np.ones(len(counted[some]))).astype(np.int64)
+        return rows, summed(lambda some: (self.after[some] / self.sigma[some]) ** 2), rms
 
     def held_out(self, labels: Sequence[str]) -> dict[tuple[str, str], HeldOut]:
         """Test rows that count, by table and kind of noise; where there are none there is nothing.
@@ -288,6 +289,11 @@ class ResidualTable(FrozenArrays):
         names = tuple("-".join(self.names[end] for end in pair if end >= 0) for pair in ends)
         return names, float(np.sqrt(squares[~far].sum() / (n - np.sum(far))))
 
+    def rows_of(self, number: int) -> slice:
+        """The rows of a series: those that were measured, one measurement's after the other."""
+        first, last = np.searchsorted(self.series, np.array([number, number + 1], dtype=self.series.dtype)).tolist()
+        return slice(first, last)
+
     def without(self, unknown: Booleans) -> ResidualTable:
         """The same where some rows take no part, for nothing determines what they depend on."""
         if not unknown.any():
@@ -305,46 +311,71 @@ class ResidualTable(FrozenArrays):
         return first
 
 
+def sum_by_end(
+    ends: Callable[[slice], tuple[Indices, Indices]], n_rows: int, n: int, values: Callable[[slice], Floats | None]
+) -> Floats:
+    """Sum of rows over those that each configuration takes part in, some rows at a time, shape (n,).
+
+    Args:
+        ends: The configuration at either end of some rows; below 0, or n and more, for none.
+        n_rows: Number of rows.
+        n: Number of configurations.
+        values: Figures of some rows; None for 1 each.
+    """
+    total = np.zeros(n)
+    for start in range(0, n_rows, _AT_ONCE):
+        some = slice(start, start + _AT_ONCE)
+        figures = values(some)
+        for end in ends(some):
+            there = (end >= 0) & (end < n)
+            total += np.bincount(end[there], None if figures is None else figures[there], n)
+    return total
+
+
+_AT_ONCE = 2**18
+
+
 def residual_table(solution: Solution) -> ResidualTable:
     """Every scalar residual, train and test, with the arm at nominal and at the estimate."""
     problem = solution.problem
-    before = [noise.residual() for noise in noises_at(problem, solution.before, at_readings=True)]
+    before = noises_at(problem, solution.before, at_readings=True)
     kinds: dict[RowKind, int] = {}
     reasons, labels = [""], {"": 0}
     columns: list[dict[str, NDArray[Any]]] = []
     for number, (s, old, new) in enumerate(zip(problem.data.series, before, solution.noises, strict=True)):
         names = zip(s.kind.names, s.kind.units, strict=True)
-        codes = np.array([kinds.setdefault(RowKind(*name, s.table), len(kinds)) for name in names])
+        codes = np.array([kinds.setdefault(RowKind(*name, s.table), len(kinds)) for name in names], dtype=np.int16)
         excluded = np.zeros(s.n, dtype=np.int16)
         for reason, mask in s.excluded.items():
             reasons += [] if reason in reasons else [reason]
             excluded[mask] = reasons.index(reason)
-        of, row = np.nonzero(s.measured)
+        rows = _MeasuredRows(s.measured)
         place = problem.data.places[s.table]
         a, b = _ends(place[s.ends], problem.data.unknowns.owners[s.nuisances], problem.data.n_configurations)
-        label = _codes(s.of, labels, s.n)
-        table_row = _table_rows(s, problem.data.tables[s.table].measurements.part)
+        after, excess, sigma = new.figures()
         columns.append(
             {
-                "kind_code": codes[row].astype(np.int16),
-                "series": np.full(len(of), number, dtype=np.int16),
-                "measurement": of.astype(np.int32),
-                "row": row.astype(np.int16),
-                "a": a[of],
-                "b": b[of],
-                "label_code": label[of],
-                "table_row": table_row[of],
-                "test": s.test[of],
-                "reason_code": excluded[of],
-                "measured": checked_figures(s.kind, s.data, s.source)[of, row],
-                "before": old[of, row],
-                "after": new.residual()[of, row],
-                "excess": new.excess[of, row],
-                "sigma": new.sigma[of, row],
+                "kind_code": rows.of_each(codes),
+                "series": np.full(rows.n, number, dtype=np.int16),
+                "measurement": rows.of_measurements(np.arange(s.n, dtype=np.int32)),
+                "row": rows.of_each(np.arange(s.kind.residual_dim, dtype=np.int16)),
+                "a": rows.of_measurements(a),
+                "b": rows.of_measurements(b),
+                "label_code": rows.of_measurements(_codes(s.of, labels, s.n)),
+                "table_row": rows.of_measurements(
+                    _table_rows(s, problem.data.tables[s.table].measurements.part),
+                ),
+                "test": rows.of_measurements(s.test),
+                "reason_code": rows.of_measurements(excluded),
+                "measured": rows.of(checked_figures(s.kind, s.data, s.source)),
+                "before": rows.of(old.residual()),
+                "after": rows.of(after),
+                "excess": rows.of(excess),
+                "sigma": rows.of(sigma),
             }
         )
     called = list(columns[0])
-    together = {name: _short(np.concatenate([c.pop(name) for c in columns])) for name in called}  # never all twice
+    together = {name: _joined([c.pop(name) for c in columns]) for name in called}  # never all twice
     return ResidualTable(
         kinds=tuple(kinds),
         names=problem.data.names,
@@ -357,10 +388,36 @@ def residual_table(solution: Solution) -> ResidualTable:
     )
 
 
-def _short(values: NDArray[Any]) -> NDArray[Any]:
-    """Values, one figure in memory where all are the same."""
-    same = len(values) > 0 and np.all(values == values[0])
-    return np.broadcast_to(values[:1].copy(), values.shape) if same else values
+class _MeasuredRows:
+    """The scalar rows of a series that were measured, one measurement's after the other.
+
+    Args:
+        measured: Which were, shape (n_measurements, residual_dim).
+    """
+
+    def __init__(self, measured: Booleans) -> None:
+        self._measured = None if measured.all() else measured
+        self._shape = measured.shape
+        self._counts = self._shape[1] if self._measured is None else np.sum(measured, axis=1)
+        self.n = measured.size if self._measured is None else int(np.sum(measured))
+
+    def of(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Those of figures of all rows, shape (n_measurements, residual_dim)."""
+        return values.reshape(-1) if self._measured is None else values[self._measured]
+
+    def of_each(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Figures that are the same of every measurement, shape (residual_dim,)."""
+        return self.of(np.broadcast_to(values, self._shape))
+
+    def of_measurements(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Figures that all rows of a measurement share, shape (n_measurements,)."""
+        values = once(values)
+        return np.broadcast_to(values[:1], self.n) if is_one(values) else np.repeat(values, self._counts)
+
+
+def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Values of all series, one figure in memory where all are the same."""
+    return once(parts[0] if len(parts) == 1 else np.concatenate(parts))
 
 
 def _seen(readings: Floats, rows: dict[str, NDArray[Any]]) -> Booleans:

@@ -31,11 +31,13 @@ from scipy import special
 from fg_calib.analysis.new_rows import Calibrated, Linear, Placed, Rows, linear, placed
 from fg_calib.errors import CalibrationError
 from fg_calib.graph.factors import build_variables
+from fg_calib.graph.rows import RowSet
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.kinematics import forward, precompute_trig
 from fg_calib.robot.model import Robot
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
 WRONG = 0.01
 """Probability with which the true change is at most called told apart from another."""
@@ -61,6 +63,9 @@ MOST_REFINED = 6
 
 MOST_CONFIGURATIONS = 400
 """Configurations up to which each is a suspect."""
+
+MOST_FIGURES = 10**8
+"""Figures up to which the columns of all their rows together are made: they grow with the square of the rows."""
 
 GROUPS = ("tool", "frame")
 """Suspects that are a pose: any turn and shift of it."""
@@ -265,15 +270,13 @@ def pairs_of_zeros(suspects: Sequence[Suspect]) -> list[Suspect]:
 
 
 def gross_rows(rows: Linear) -> list[Suspect]:
-    """The rows of each configuration that few others share measurements with."""
+    """The rows of each configuration that few others share measurements with; none of very many."""
     problem = rows.placed.problem
     places = problem.data.places
-    of_configuration: dict[int, list[Floats]] = {}
-    start, m = 0, len(rows.columns)
+    of_configuration: dict[int, list[tuple[RowSet, int, Integers]]] = {}
+    start, m, n_columns = 0, len(rows.columns), 0
     for row_set in problem.rows:
-        n_private = sum(part.n_rows for part in row_set.parts)
         first = 0
-        n_rows = n_private if row_set.shared is None else row_set.shared.n
         for part in row_set.parts:
             ends = places[part.table][part.block.ends]
             h = part.block.residual_dim
@@ -281,23 +284,37 @@ def gross_rows(rows: Linear) -> list[Suspect]:
                 measured = np.flatnonzero((ends == k).any(axis=1))
                 if 4 * len(measured) > max(part.block.n, 4):
                     continue
-                unit = np.zeros((n_private, h * len(measured)))
                 at = (first + measured[:, None] * h + np.arange(h)).ravel()
-                unit[at, np.arange(len(at))] = 1.0
-                wide = np.zeros((m, len(at)))
-                wide[start : start + n_rows] = unit if row_set.shared is None else row_set.shared.whiten(unit)
-                of_configuration.setdefault(int(k), []).append(wide)
+                of_configuration.setdefault(int(k), []).append((row_set, start, at))
+                n_columns += len(at)
+                if len(of_configuration) > MOST_CONFIGURATIONS or m * n_columns > MOST_FIGURES:
+                    return []
             first += part.n_rows
-        start += n_rows
-    if len(of_configuration) > MOST_CONFIGURATIONS:
-        return []
+        start += first if row_set.shared is None else row_set.shared.n
     names = problem.data.names
     found = []
     for k, blocks in of_configuration.items():
-        columns = np.hstack(blocks)
+        columns = np.hstack([_of_errors(*block, m) for block in blocks])
         columns = columns[:, np.any(columns != 0.0, axis=0)]
         found.append(Suspect((names[k],), "row", ("",) * columns.shape[1], columns, configuration=k))
     return found
+
+
+def _of_errors(row_set: RowSet, start: int, at: Integers, m: int) -> Floats:
+    """Columns of errors of some whitened rows of a set, shape (m, n).
+
+    Args:
+        row_set: The set.
+        start: Its first row of all.
+        at: Which of its rows, before what they share is taken out, shape (n,).
+        m: Number of all rows.
+    """
+    unit = np.zeros((sum(part.n_rows for part in row_set.parts), len(at)))
+    unit[at, np.arange(len(at))] = 1.0
+    whitened = unit if row_set.shared is None else row_set.shared.whiten(unit)
+    out = np.zeros((m, len(at)))
+    out[start : start + len(whitened)] = whitened
+    return out
 
 
 def refined(

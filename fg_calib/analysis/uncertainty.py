@@ -16,7 +16,7 @@ from fg_calib.analysis.accuracy import ExpectedError, expected_error, without_ri
 from fg_calib.analysis.changes import Change
 from fg_calib.analysis.chi_square import chi_square
 from fg_calib.analysis.corrections import PriorFit, judge_priors
-from fg_calib.analysis.covariance import Spread, spread_of, with_left_out, with_unsure_tolerances
+from fg_calib.analysis.covariance import Spread, TangentCovariance, spread_of, with_left_out, with_unsure_tolerances
 from fg_calib.analysis.findings import MOST_ESTIMATED, Fit, judge
 from fg_calib.analysis.goodness import Goodness, judge_fit
 from fg_calib.analysis.identifiability import Identifiability, identifiability_of
@@ -31,7 +31,7 @@ from fg_calib.arguments import checked
 from fg_calib.arrays import FrozenArrays, as_figures
 from fg_calib.errors import InputError, escaped
 from fg_calib.graph.extension import check_graph
-from fg_calib.graph.factors import corrections_of, pose_of
+from fg_calib.graph.factors import Variables, corrections_of, pose_of
 from fg_calib.graph.observability import IdentifiabilityClass, Observability
 from fg_calib.graph.solver import Solution
 from fg_calib.robot.model import Robot
@@ -318,7 +318,7 @@ def _assess(solution: Solution) -> Uncertainty:
     whole = with_unsure_tolerances(solution, with_left_out(solution, spread))
     identifiability = identifiability_of(*at_nominal(problem.whole or problem, solution.before), "practical")
     covariance = whole.named()
-    frames = _frame_estimates(solution, whole)
+    frames = frame_estimates(variables, solution.parameters, whole)
     chi2, table = chi_square(solution, spread), residual_table(solution)
     goodness = judged_without_gross_errors(solution, spread, table, judge_fit(solution, spread, table))
     table = table.without(goodness.unknown(table))
@@ -338,7 +338,7 @@ def _assess(solution: Solution) -> Uncertainty:
         residuals=table,
         goodness=fit.goodness,
         priors=fit.priors,
-        expected_error=None if problem.evaluated else expected_error(solution, whole),
+        expected_error=None if problem.evaluated else expected_error(problem, whole),
         identifiability=identifiability,
         robot=problem.robot.with_values(solution.parameters[variables.robot_span]),
         spread=spread,
@@ -355,11 +355,17 @@ def _assess(solution: Solution) -> Uncertainty:
     )
 
 
-def _frame_estimates(solution: Solution, whole: Spread) -> tuple[FrameEstimate, ...]:
-    """Every measurement frame that was estimated."""
+def frame_estimates(variables: Variables, parameters: Floats, whole: TangentCovariance) -> tuple[FrameEstimate, ...]:
+    """Every measurement frame that was estimated.
+
+    Args:
+        variables: The variables.
+        parameters: The estimate.
+        whole: The covariance of all parameters.
+    """
     found = []
-    for k, v in enumerate(solution.problem.variables.frames):
-        world_T_base = pose_of(solution.parameters[list(v.parameters)])
+    for k, v in enumerate(variables.frames):
+        world_T_base = pose_of(parameters[list(v.parameters)])
         first = whole.variables.n_robot_columns + 6 * k
         found.append(
             FrameEstimate(
@@ -399,17 +405,18 @@ def _parameter_estimates(
                 nominal=p.nominal,
                 estimate=float(solution.parameters[i]),
                 correction=float(corrections[i]),
-                sigma=_known(sigmas.get(p.name, 0.0)),
+                sigma=known(sigmas.get(p.name, 0.0)),
                 prior_sigma=p.tolerance if p.estimated and problem.options.has_priors else None,
                 identifiability=classes.get(p.name, "fixed"),
                 stands_for=combinations.get(p.name),
-                sigma_of_combination=_known(of_combinations[p.name]) if p.name in combinations else None,
+                sigma_of_combination=known(of_combinations[p.name]) if p.name in combinations else None,
             )
         )
     return tuple(found)
 
 
-def _known(sigma: float) -> float | None:
+def known(sigma: float) -> float | None:
+    """A sigma; None for one that nothing tells."""
     return float(sigma) if np.isfinite(sigma) else None
 
 

@@ -47,6 +47,10 @@ def calibrate(
         Literal["csv", "parquet", "none"],
         typer.Option("--residuals", help="How single residuals are written: of millions of rows a CSV is large."),
     ] = "csv",
+    parts: Annotated[
+        int | None,
+        typer.Option("--parts", min=1, metavar="ROWS", help="Read one huge Parquet table in parts of so many rows."),
+    ] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
     as_json: Json = False,
@@ -58,9 +62,11 @@ def calibrate(
         option = "--report" if report else "--figures"
         raise typer.BadParameter("needs --out, the folder to write to", param_hint=option)
     require_one(workers, scheduler)
+    if parts is not None:
+        _require_parts_alone(len(jobs), folds, residuals)
     if len(jobs) == 1:
         with executor_for(workers, scheduler, _WRITTEN) as executor:
-            _calibrate_one(Order("", jobs[0], out, folds, report, figures, residuals), executor, as_json)
+            _calibrate_one(Order("", jobs[0], out, folds, report, figures, residuals), parts, executor, as_json)
         return
     names = job_names(jobs)
     if out is not None:
@@ -75,16 +81,31 @@ def calibrate(
         _calibrate_many(orders, out, executor, as_json)
 
 
-def _calibrate_one(order: Order, executor: Executor | None, as_json: bool) -> None:
-    from fg_calib.batch import ordered_job, save_ordered
-    from fg_calib.calibration import calibrate_job
+def _calibrate_one(order: Order, n_rows: int | None, executor: Executor | None, as_json: bool) -> None:
+    """Calibrate one job, its table in parts of so many rows unless that is None."""
+    from fg_calib.batch import ordered_job, ordered_parts, save_ordered
+    from fg_calib.calibration import calibrate_job, calibrate_parts
 
-    found = calibrate_job(ordered_job(order), executor)
+    if n_rows is None:
+        found = calibrate_job(ordered_job(order), executor)
+    else:
+        found = calibrate_parts(ordered_parts(order, n_rows), executor)
     try:
         show_calibration(found, as_json)
     finally:  # also where nobody takes the report
         save_ordered(order, found)
     end(found.findings, not_accepted=found.not_accepted)
+
+
+def _require_parts_alone(n_jobs: int, folds: int | None, residuals: str) -> None:
+    """End with a line on stderr where something was asked for that a table in parts does not give."""
+    for given, why in (
+        (n_jobs > 1, "is of one job"),
+        (folds is not None, "holds no rows out: without --folds"),
+        (residuals == "parquet", "keeps no residuals: without --residuals"),
+    ):
+        if given:
+            raise typer.BadParameter(why, param_hint="--parts")
 
 
 def _calibrate_many(orders: Sequence[Order], out: Path | None, executor: Executor | None, as_json: bool) -> None:

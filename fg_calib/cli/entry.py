@@ -7,6 +7,7 @@ is printed, as of other commands before `head`.
 from __future__ import annotations
 
 import atexit
+import ctypes
 import gc
 import io
 import logging
@@ -76,12 +77,27 @@ _OBJECTS_BEFORE_GARBAGE = 500_000
 """New objects after which garbage is looked for: twice what a calibration and its imports make."""
 
 
+_LARGE_ARRAY = 2**23
+"""Bytes of an array from which on its memory is the system's again when it goes."""
+
+_M_MMAP_THRESHOLD = -3
+"""What glibc calls that setting."""
+
+
+def _return_memory() -> None:
+    """Have glibc give back the memory of large arrays: what it keeps between others made a tenth of a million rows'."""
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:  # elsewhere it is not there to be asked
+        mallopt(_M_MMAP_THRESHOLD, _LARGE_ARRAY)
+
+
 def run() -> None:
     """Run the command line.
 
     Garbage is looked for seldom, and not at the end: among all that imports keep, it took a quarter of a short command.
     """
     gc.set_threshold(_OBJECTS_BEFORE_GARBAGE)
+    _return_memory()
     atexit.register(gc.freeze)
     os.environ["MPLBACKEND"] = "agg"  # figures are only written, and what Jupyter asks for need not be installed here
     os.environ["PYDANTIC_DISABLE_PLUGINS"] = "__all__"  # of all that is installed here; finding them takes a while

@@ -54,6 +54,9 @@ def show_calibration(found: Calibration, as_json: bool) -> None:
     """Print a calibration that was just made: its report, or its result as JSON."""
     if as_json:
         show_json(found.result.document())
+    elif found.result.in_parts:
+        hide_progress()
+        print(found)
     else:
         from fg_calib.report.text import build_report
 

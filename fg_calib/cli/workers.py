@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fg_calib.cli import end_at_once
 from fg_calib.cli.output import say
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ def executor_for(workers: int | None, scheduler: str | None, left: str) -> Itera
         return
     before = signal.getsignal(signal.SIGINT)
     try:
-        if before is signal.SIG_DFL:  # what `main` has made of it
+        if before is end_at_once:  # what `main` has made of it
             signal.signal(signal.SIGINT, signal.default_int_handler)
         with dask_executor(scheduler) if scheduler is not None else local_processes(workers or 1) as executor:
             yield executor

@@ -198,7 +198,7 @@ def export(
 
 def _findings(calibration: Calibration) -> tuple[str, ...]:
     """Why it is not to be trusted."""
-    if calibration.trustworthy or calibration.findings:
+    if calibration.trustworthy is not False or calibration.findings:
         return calibration.findings
     return ("the solver did not converge",)
 

@@ -6,6 +6,7 @@ import csv
 import logging
 import os
 import re
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from io import BytesIO, TextIOWrapper
@@ -16,9 +17,9 @@ import numpy as np
 
 from fg_calib.arrays import NOTHING, as_figures, check_different
 from fg_calib.errors import InputError
-from fg_calib.files.disk import decoded, read_bytes, require_memory
+from fg_calib.files.disk import decoded, file_at, read_bytes, require_memory
 from fg_calib.files.frames import as_polars, cells, of_polars, select
-from fg_calib.files.parquet import parquet_columns, read_parquet
+from fg_calib.files.parquet import parquet_columns, parquet_rows, read_parquet
 from fg_calib.files.schema import number_hint, shown
 from fg_calib.files.units import ANGLES, LENGTHS, Units
 from fg_calib.measurements.dataset import Booleans, Floats, Integers
@@ -73,7 +74,7 @@ class Header:
     Attributes:
         path: Its file; what it is called where it is in none.
         columns: Names of the columns.
-        content: The bytes of the file.
+        content: The bytes of the file; where it stands if it is read some rows at a time.
         frame: The table, where it is in no file.
         separator: What stands between the cells of a CSV. Where it is no comma, numbers may have decimal commas.
         meant: By column, how its figures are meant, where that is not as they stand.
@@ -81,7 +82,7 @@ class Header:
 
     path: Path
     columns: tuple[str, ...]
-    content: bytes = field(default=b"", repr=False)
+    content: bytes | Path = field(default=b"", repr=False)
     frame: pl.DataFrame | None = None
     separator: str = ","
     meant: Mapping[str, Column] = field(default_factory=dict)
@@ -114,41 +115,84 @@ class Header:
         return select(frame, columns)
 
     @classmethod
-    def read(cls, table: Path | str | Any, name: str) -> Header:
-        """Read the header of a file, or of a frame by this name."""
+    def read(cls, table: Path | str | Any, name: str, *, by_rows: bool = False) -> Header:
+        """Read the header of a file, or of a frame by this name.
+
+        Args:
+            table: The file, or the frame.
+            name: What the frame is called.
+            by_rows: Whether some rows are to be read at a time, without the file as a whole: of a Parquet file.
+
+        Raises:
+            InputError: It cannot be read, or not so.
+        """
         if isinstance(table, str) and not table:
             raise InputError(name, "found ''", "a path, or a frame of polars or pandas")
         if not isinstance(table, os.PathLike | str):
             frame = as_polars(table, name)
+            if by_rows:
+                raise InputError(name, "a frame in memory", "a Parquet file, where some rows are read at a time")
             return cls(Path(name), tuple(frame.columns), frame=frame)
         path = Path(table)
+        if by_rows:
+            return cls._of_rows(path)
         if path.suffix.lower() not in _ENDINGS:
             read_bytes(path)
             raise InputError(path.name, f"ending {path.suffix!r}", f"one of {', '.join(_ENDINGS)}")
-        header = cls(path, (), read_bytes(path))
-        place = header.name
-        if header.is_csv:
-            header = replace(header, content=_with_newlines(header.content))
-            header = replace(header, separator=_separator(decoded(header.content, header.name)))
-            line, columns = next(header.csv_rows(), (1, []))
-            place = f"{place}:{line}"
-        else:
-            columns = parquet_columns(header.content, place)
+        content = read_bytes(path)
+        header = cls(path, (), content)
+        if not header.is_csv:
+            return header._named(header.name, parquet_columns(content, header.name))
+        content = _with_newlines(content)
+        header = replace(header, content=content, separator=_separator(decoded(content, header.name)))
+        line, columns = next(header.csv_rows(), (1, []))
+        return header._named(f"{header.name}:{line}", columns)
+
+    @classmethod
+    def _of_rows(cls, path: Path) -> Header:
+        """The header of a Parquet file that is read some rows at a time."""
+        found = file_at(path)
+        if path.suffix.lower() not in _ENDINGS[1:]:
+            expected = "a Parquet file, where some rows are read at a time"
+            raise InputError(path.name, f"ending {path.suffix!r}", expected, "polars: scan_csv(...).sink_parquet(...)")
+        return cls(path, (), found)._named(path.name, parquet_columns(found, path.name))
+
+    def _named(self, place: str, columns: Sequence[str]) -> Header:
+        """The same with the names of its columns, which stand at a place."""
         columns = [column.strip() for column in columns]
         if not any(columns):
             raise InputError(place, "no names of columns" if columns else "an empty file", "a header and rows")
         if len(columns) == 1 and "|" in columns[0]:
             raise InputError(place, f"one column {shown(columns[0])}", "columns with , ; or tab between", "not '|'")
         check_different(place, columns)
-        return replace(header, columns=tuple(columns))
+        return replace(self, columns=tuple(columns))
+
+    @property
+    def by_rows(self) -> bool:
+        """Whether some rows are read at a time."""
+        return isinstance(self.content, Path)
+
+    @property
+    def text(self) -> bytes:
+        """The bytes of a CSV."""
+        assert isinstance(self.content, bytes)
+        return self.content
+
+    def n_rows(self) -> int:
+        """Number of rows of a Parquet file.
+
+        Raises:
+            InputError: It cannot be read.
+        """
+        return parquet_rows(self.content, self.name)
 
     def csv_rows(self) -> Iterator[tuple[int, list[str]]]:
         """Cells of the header and of each row, with the line where it begins.
 
         Blank lines count from the header on, as in polars.
         """
-        file = TextIOWrapper(BytesIO(self.content), encoding="utf-8-sig", errors="replace", newline="")
-        csv.field_size_limit(max(len(self.content), csv.field_size_limit()))
+        file = TextIOWrapper(BytesIO(self.text), encoding="utf-8-sig", errors="replace", newline="")
+        csv.field_size_limit(max(len(self.text), csv.field_size_limit()))
         reader = csv.reader(file, delimiter=self.separator)
         started, line = False, 1
         try:
@@ -250,29 +294,47 @@ class Table:
     rows: Integers
 
     @classmethod
-    def read(cls, header: Header, numbers: Sequence[str], texts: Sequence[str]) -> Table:
-        """Read the columns of `numbers` and `texts`."""
-        frame, rows = (_read_csv if header.is_csv else _read_parquet)(header, numbers, texts)
+    def read(
+        cls, header: Header, numbers: Sequence[str], texts: Sequence[str], span: tuple[int, int] | None = None
+    ) -> Table:
+        """Read the columns of `numbers` and `texts`.
+
+        Args:
+            header: Of the table.
+            numbers: Columns of numbers.
+            texts: Columns of words.
+            span: Of a Parquet file, the first row and how many at most; all if None.
+
+        Raises:
+            InputError: It cannot be read, or there is no row.
+        """
+        frame, rows = (
+            _read_csv(header, numbers, texts) if header.is_csv else _read_parquet(header, numbers, texts, span)
+        )
         if frame.height == 0:
             raise InputError(header.name, "no rows", "at least one")
         return cls(header, frame, rows)
 
     @classmethod
-    def pieces(cls, header: Header, numbers: Sequence[str], texts: Sequence[str]) -> Iterator[Table]:
+    def pieces(
+        cls, header: Header, numbers: Sequence[str], texts: Sequence[str], span: tuple[int, int] | None = None
+    ) -> Iterator[Table]:
         """The same some rows at a time, as polars keeps the memory that it once took for all."""
         if header.is_csv or header.frame is not None:
             yield cls.read(header, numbers, texts)
             return
-        first = 0
-        while True:
-            frame, rows = _read_parquet(header, numbers, texts, (first, PIECE))
-            if frame.height == 0 and first == 0:
+        first, left = span or (0, sys.maxsize)
+        begun = False
+        while left > 0:
+            wanted = min(PIECE, left)
+            frame, rows = _read_parquet(header, numbers, texts, (first, wanted))
+            if frame.height == 0 and not begun:
                 raise InputError(header.name, "no rows", "at least one")
             if frame.height:
                 yield cls(header, frame, rows)
-            first += frame.height
-            if frame.height < PIECE:
+            if frame.height < wanted:
                 return
+            first, left, begun = first + wanted, left - wanted, True
 
     @property
     def n_rows(self) -> int:
@@ -340,7 +402,8 @@ class Table:
         if self.header.is_csv:
             line, row_of_file = next(found for i, found in enumerate(self.header.csv_rows()) if i == wanted + 1)
             return f"{name}:{line}", row_of_file[columns.index(column)].strip()
-        return f"{name}: row {wanted}", self.header.parquet([column])[column][wanted]
+        span = (wanted, 1) if self.header.by_rows else None
+        return f"{name}: row {wanted}", self.header.parquet([column], span)[column][0 if span else wanted]
 
 
 _SIGMA = "sigma_"
@@ -364,13 +427,13 @@ def _read_csv(header: Header, numbers: Sequence[str], texts: Sequence[str]) -> t
     last = header.columns[-1]
     wanted = list(dict.fromkeys((*numbers, *texts, last)))
     chosen = sorted(header.columns.index(c) for c in wanted)
-    start = _start_of_header(header.content)
-    require_memory(header.name, _BYTES_A_CELL * len(chosen) * header.content.count(b"\n"))
+    start = _start_of_header(header.text)
+    require_memory(header.name, _BYTES_A_CELL * len(chosen) * header.text.count(b"\n"))
     try:
         frame = of_polars(
             header.name,
             lambda: pl.read_csv(
-                BytesIO(header.content[start:]), columns=chosen, infer_schema=False, separator=header.separator
+                BytesIO(header.text[start:]), columns=chosen, infer_schema=False, separator=header.separator
             ),
         )
     except InputError:
@@ -471,7 +534,7 @@ def _number(cells: pl.Series, column: pl.Expr, decimal_comma: bool) -> pl.Expr:
 
 def _check_same_rows(header: Header, n_rows: int) -> None:
     """Raise where polars and the standard library do not read the same rows, which only quotes can make them do."""
-    if b'"' in header.content and sum(1 for _ in header.csv_rows()) != n_rows + 1:
+    if b'"' in header.text and sum(1 for _ in header.csv_rows()) != n_rows + 1:
         _check_lengths(header)
         _check_quotes(header)
         raise InputError(header.name, "quotes within cells", "whole cells in quotes, or none")
@@ -489,7 +552,7 @@ def _check_lengths(header: Header) -> None:
 
 def _check_quotes(header: Header) -> None:
     """Raise for the first line of a CSV with a quote that is not closed in it."""
-    for line, text in enumerate(header.content.split(b"\n"), start=1):
+    for line, text in enumerate(header.text.split(b"\n"), start=1):
         if text.count(b'"') % 2:
             raise InputError(f"{header.name}:{line}", "a quote that is not closed", "whole cells in quotes, or none")
 

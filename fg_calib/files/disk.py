@@ -70,8 +70,38 @@ def read_bytes(path: Path) -> bytes:
     Raises:
         InputError: There is no such file, it may not be read, or it is a folder, a pipe or a device.
     """
+    content = _looked_into(path, Path.read_bytes)
+    noted = _noted.get()
+    if noted is not None:
+        noted[path] = hashlib.sha256(content).hexdigest()
+    return content
+
+
+def file_at(path: Path) -> Path:
+    """Where a file stands that somebody else is to read, some of it at a time.
+
+    Raises:
+        InputError: There is no such file, it may not be read, or it is a folder, a pipe or a device.
+    """
+    noted = _noted.get()
+
+    def look(found: Path) -> Path:
+        with found.open("rb") as file:
+            if noted is not None:
+                noted[path] = hashlib.file_digest(file, "sha256").hexdigest()
+        return found
+
+    return _looked_into(path, look)
+
+
+def _looked_into(path: Path, look: Callable[[Path], R]) -> R:
+    """What is found in a file, wherever it stands.
+
+    Raises:
+        InputError: There is no such file, it may not be read, or it is a folder, a pipe or a device.
+    """
     try:
-        content = _content(_newest(path), path)
+        return _content(_newest(path), path, look)
     except FileNotFoundError:
         raise InputError(_short(str(path)), "no such file") from None
     except PermissionError:
@@ -81,10 +111,6 @@ def read_bytes(path: Path) -> bytes:
     except (OSError, ValueError) as error:  # ValueError: a path with a null character
         found = f"cannot be read: {getattr(error, 'strerror', None) or error}"
         raise InputError(_short(str(path)), found, "a file") from None
-    noted = _noted.get()
-    if noted is not None:
-        noted[path] = hashlib.sha256(content).hexdigest()
-    return content
 
 
 def digest_of(path: Path) -> str:
@@ -100,19 +126,19 @@ def digest_of(path: Path) -> str:
         raise InputError(_short(str(path)), f"cannot be read: {error.strerror or error}", "a file") from None
 
 
-def _content(found: Path, path: Path) -> bytes:
-    """The bytes of what stands for a path."""
+def _content(found: Path, path: Path, look: Callable[[Path], R]) -> R:
+    """What is found in what stands for a path."""
     try:
         mode = found.stat().st_mode
         if stat.S_ISDIR(mode):
             raise InputError(str(path), "is a folder", "a file")
         if not stat.S_ISREG(mode):
             raise InputError(str(path), "is a pipe or a device", "a file")
-        return found.read_bytes()
+        return look(found)
     except FileNotFoundError:
         if found.parent.name != _WRITTEN:
             raise
-        return path.read_bytes()  # it was moved to its place in the meantime
+        return look(path)  # it was moved to its place in the meantime
 
 
 def _short(text: str) -> str:
@@ -290,7 +316,7 @@ def _begun(folder: Path) -> Path:
     for _ in range(_TRIES):
         with suppress(FileNotFoundError):  # another writer has made it, looked whether it can, and removed it
             folder.mkdir(parents=True, exist_ok=True)
-            _clear_dead(folder)
+            clear_dead(folder)
             return _made_in(folder, f"{_WRITING}{_here()}-")
     folder.mkdir(parents=True, exist_ok=True)
     return _made_in(folder, f"{_WRITING}{_here()}-")
@@ -529,7 +555,7 @@ def _unlink(name: str, folder: int) -> None:
         os.unlink(name, dir_fd=folder)
 
 
-def _clear_dead(folder: Path) -> None:
+def clear_dead(folder: Path) -> None:
     """Remove what this user's processes of this machine, or container, left half written when they were killed."""
     for left in folder.glob(f"{_WRITING}{_host()}-*"):
         process = left.name.rpartition("-")[0].rpartition("-")[2]

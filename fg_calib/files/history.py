@@ -19,6 +19,8 @@ HISTORY = "history.json"
 
 SCHEMA: Literal["fg-calib/history/1"] = "fg-calib/history/1"
 
+Verdict = Literal["good", "doubtful", "not judged"]
+
 
 class Known(Section):
     """A parameter at the end of a run."""
@@ -46,7 +48,7 @@ class Run(Section):
         chi2: Of its rows and what was known before.
         dof: Its degrees of freedom.
         p_value: Probability of one as large.
-        verdict: `good`, or `doubtful`.
+        verdict: `good`, `doubtful`, or `not judged` row by row, as of one in parts.
         moved: What changed most; None of the first run.
         parameters: What was estimated, by name.
         inputs: SHA-256 of the files of its rows, by path.
@@ -59,7 +61,7 @@ class Run(Section):
     chi2: Figure
     dof: int
     p_value: Figure
-    verdict: Literal["good", "doubtful"]
+    verdict: Verdict
     moved: Moved | None = None
     parameters: dict[str, Known]
     inputs: dict[str, str] = Field(default_factory=dict)
@@ -98,12 +100,18 @@ def run_of(result: Result, digest: str, before: Run | None = None) -> Run:
         chi2=result.chi2,
         dof=result.dof,
         p_value=result.chi2_p_value,
-        verdict="good" if result.trustworthy else "doubtful",
+        verdict=_verdict_of(result),
         moved=None if before is None else _moved(parameters, before),
         parameters=parameters,
         inputs=result.inputs,
         rows=() if result.carried is None else result.carried.rows,
     )
+
+
+def _verdict_of(result: Result) -> Verdict:
+    if result.in_parts and result.trustworthy is None:
+        return "not judged"
+    return "good" if result.trustworthy else "doubtful"
 
 
 def _moved(parameters: dict[str, Known], before: Run) -> Moved | None:

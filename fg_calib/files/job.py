@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -34,7 +34,7 @@ from fg_calib.files.schema import (
 from fg_calib.files.tables import read_measurements, read_points
 from fg_calib.files.units import UNITS, Units, UnitsOfFile, quantity
 from fg_calib.job import Job
-from fg_calib.measurements.dataset import Noise
+from fg_calib.measurements.dataset import Measurements, Noise
 from fg_calib.measurements.kinds import Camera
 from fg_calib.measurements.series import KnownPoint, Table
 from fg_calib.options import (
@@ -239,9 +239,17 @@ def read_job(path: Path | str) -> Job:
     Raises:
         InputError: It or a file that it names is missing or cannot be used.
     """
-    path = Path(path)
+    return read_job_by(Path(path), read_measurements)
+
+
+def read_job_by(path: Path, read: Callable[..., Measurements]) -> Job:
+    """The same with its tables read by a function that takes what `read_measurements` does.
+
+    Raises:
+        InputError: The job or a file that it names is missing or cannot be used.
+    """
     with noting_reads() as files:
-        job = _job(path)
+        job = _job(path, read)
     return replace(job, inputs={_relative(file, path.parent): digest for file, digest in files.items()})
 
 
@@ -270,7 +278,7 @@ def _relative(file: Path, folder: Path) -> str:
     return str(file.relative_to(folder)) if file.is_relative_to(folder) else str(file)
 
 
-def _job(path: Path) -> Job:
+def _job(path: Path, read: Callable[..., Measurements]) -> Job:
     folder = path.parent
     given = read_yaml(path)
     several = isinstance(given, dict) and isinstance(given.get("measurements"), list)
@@ -278,7 +286,7 @@ def _job(path: Path) -> Job:
     robot = robot_of(file.robot, f"{path.name}: robot", folder, file.units)
     _check_preferred(file, robot, path.name)
     _, estimate_noise = _noise(file.noise, file.units, robot, f"{path.name}: noise")
-    tables = _tables(file, robot, path)
+    tables = _tables(file, robot, path, read)
     plain = isinstance(file.measurements, str) and tables[0].is_plain
     alone = tables[0].measurements if plain else tuple(tables)
     truth = None if file.truth is None else _truth(folder / file.truth, robot)
@@ -352,7 +360,9 @@ def _entry_like(entries: Sequence[Mapping[str, Any]], path: Path, like: str | No
     return entries[0]
 
 
-def _tables(file: _JobOfTables, robot: Robot, path: Path) -> list[Table]:
+def _tables(
+    file: _JobOfTables, robot: Robot, path: Path, read_table: Callable[..., Measurements] = read_measurements
+) -> list[Table]:
     """The tables of a job; what an entry leaves out is as the job says for all."""
     given, folder = file.measurements, path.parent
     if not given or not isinstance(given, str | list):
@@ -389,7 +399,7 @@ def _tables(file: _JobOfTables, robot: Robot, path: Path) -> list[Table]:
             stated = replace(stated, **figures)
         pairing = pairing_of(file.pairing if entry.pairing is None else entry.pairing, f"{place}: pairing")
         pairs = None if entry.pairs is None else folder / entry.pairs
-        measurements = read_measurements(
+        measurements = read_table(
             *(folder / entry.table, robot), pairs=pairs, units=units, noise=stated, points=points, model=model,
             columns=called,
         )  # fmt: skip

@@ -54,7 +54,11 @@ class _Ends:
 
 @within_memory
 def read_pairs(
-    path: Path | str | Any, configurations: Configurations, units: Units, noise: Noise
+    path: Path | str | Any,
+    configurations: Configurations,
+    units: Units,
+    noise: Noise,
+    rows: tuple[int, int] | None = None,
 ) -> tuple[Pairs, Pairs]:
     """Read a table of pairs.
 
@@ -63,6 +67,7 @@ def read_pairs(
         configurations: What it refers to.
         units: Of the table.
         noise: Sigmas where the table states none, [m] and [rad].
+        rows: Of a Parquet file, the first row that is read and how many at most; all if None.
 
     Returns:
         The pairs of configurations and those of groups.
@@ -71,7 +76,7 @@ def read_pairs(
         InputError: The file is missing, is no table, lacks a column or holds a cell that cannot be used; or several
             configurations have one id.
     """
-    header = Header.read(path, "frame of pairs").understood(PAIR_COLUMNS)
+    header = Header.read(path, "frame of pairs", by_rows=rows is not None).understood(PAIR_COLUMNS)
     for column in ("a", "b"):
         if column not in header.columns:
             raise InputError(header.name, f"no column {column}", "a and b, the two configurations of a pair")
@@ -81,7 +86,7 @@ def read_pairs(
     sigmas = header.present("sigma_distance", "sigma_angle")
     _check_different(configurations)
     texts = ("a", "b", *header.present("split"))
-    pieces = Table.pieces(header, (*measured, *sigmas), texts)
+    pieces = Table.pieces(header, (*measured, *sigmas), texts, rows)
     found = [_read_piece(piece, configurations, units, noise) for piece in pieces]
     return joined([of_configurations for of_configurations, _ in found]), joined([of_groups for _, of_groups in found])
 

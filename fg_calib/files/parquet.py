@@ -2,7 +2,8 @@
 
 Some damaged files make polars abort, or allocate without end, and the process that it is in with it: no error, no line.
 So another process reads them, one for all files. It is handed the bytes of a file and hands back columns; where it ends
-instead, or takes too long, the file is named.
+instead, or takes too long, the file is named. Of a file that is larger than memory should be it is told the place, and
+reads there what the rows that are asked for take.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from io import BytesIO
+from pathlib import Path
 from tempfile import TemporaryFile
 from threading import Event, Lock, Timer
 from typing import IO, TYPE_CHECKING
@@ -45,15 +47,18 @@ source, sink = sys.stdin.buffer, sys.stdout.buffer
 while head := source.readline():
     columns, span, size = json.loads(head)
     if size is not None:
-        content = BytesIO(source.read(size))
+        content = BytesIO(source.read(size)) if type(size) is int else size
     found, error = BytesIO(), ""
     try:
+        file = open(content, "rb") if type(content) is str else content
         if columns is None:
-            found.write(json.dumps(list(pl.read_parquet_schema(content))).encode())
+            found.write(json.dumps(list(pl.read_parquet_schema(file))).encode())
+        elif not columns:
+            found.write(json.dumps(pl.scan_parquet(file).select(pl.len()).collect().item()).encode())
         elif span is None:
-            pl.read_parquet(content, columns=columns).write_ipc(found)
+            pl.read_parquet(file, columns=columns).write_ipc(found)
         else:
-            pl.scan_parquet(content).select(pl.nth(*columns)).slice(*span).collect().write_ipc(found)
+            pl.scan_parquet(file).select(pl.nth(*columns)).slice(*span).collect().write_ipc(found)
     except MemoryError:
         error = "memory"
     except BaseException as caught:
@@ -68,15 +73,29 @@ while head := source.readline():
 """
 """What the process does: a line `[columns, span, size]` and the file in, a line `[error, size]` and the answer out.
 
-A span is the first row and how many at most, or null for all. No size means the file of the question before.
+A span is the first row and how many at most, or null for all. A path instead of a size means the file that is there,
+no size that of the question before. No columns ask for the number of rows, null for the names of all columns.
 """
 
 
-def parquet_columns(content: bytes, name: str) -> list[str]:
+def parquet_rows(content: bytes | Path, name: str) -> int:
+    """Number of rows of a Parquet file.
+
+    Args:
+        content: Its bytes, or where it stands.
+        name: Its name, for messages.
+
+    Raises:
+        InputError: It is damaged.
+    """
+    return int(json.loads(_READER.ask([], content, name)))
+
+
+def parquet_columns(content: bytes | Path, name: str) -> list[str]:
     """Names of the columns of a Parquet file.
 
     Args:
-        content: Its bytes.
+        content: Its bytes, or where it stands.
         name: Its name, for messages.
 
     Raises:
@@ -86,12 +105,12 @@ def parquet_columns(content: bytes, name: str) -> list[str]:
 
 
 def read_parquet(
-    content: bytes, columns: Sequence[int], name: str, span: tuple[int, int] | None = None
+    content: bytes | Path, columns: Sequence[int], name: str, span: tuple[int, int] | None = None
 ) -> pl.DataFrame:
     """Columns of a Parquet file, by their numbers in ascending order.
 
     Args:
-        content: Its bytes.
+        content: Its bytes, or where it stands.
         columns: Numbers of the columns.
         name: Its name, for messages.
         span: The first row and how many at most; all if None. The file is kept for the next rows until there are less.
@@ -115,7 +134,7 @@ class _Reader:
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
         self._said: IO[bytes] = BytesIO()  # what the process says on stderr
-        self._kept: bytes | None = None  # the file that the process is to keep
+        self._kept: bytes | Path | None = None  # the file that the process is to keep
         self._owner = 0  # a fork of the owner has its pipes, but is not to be answered
         self._lock = Lock()
 
@@ -123,12 +142,14 @@ class _Reader:
         """Keep no file."""
         self._kept = None
 
-    def ask(self, columns: list[int] | None, content: bytes, name: str, span: tuple[int, int] | None = None) -> bytes:
-        """Columns as Arrow's IPC file, or the names of all as JSON if None."""
+    def ask(
+        self, columns: list[int] | None, content: bytes | Path, name: str, span: tuple[int, int] | None = None
+    ) -> bytes:
+        """Columns as Arrow's IPC file; as JSON the names of all if None, and the number of rows if there are none."""
         require_polars(name)  # which also keeps a fork from a lock that nobody opens
         with self._lock:
             process = self._started(name)
-            seconds, late = _SECONDS + _SECONDS_A_BYTE * len(content), Event()
+            seconds, late = _SECONDS + _SECONDS_A_BYTE * _size_of(content), Event()
 
             def end() -> None:
                 late.set()
@@ -196,7 +217,10 @@ class _Reader:
 
 
 def _exchange(
-    process: subprocess.Popen[bytes], columns: list[int] | None, span: tuple[int, int] | None, content: bytes | None
+    process: subprocess.Popen[bytes],
+    columns: list[int] | None,
+    span: tuple[int, int] | None,
+    content: bytes | Path | None,
 ) -> tuple[str, bytes]:
     """Question and answer; of the file of the question before where there is no content.
 
@@ -207,14 +231,22 @@ def _exchange(
     source, sink = process.stdin, process.stdout
     if source is None or sink is None:
         raise ValueError("a process without pipes")
-    source.write(json.dumps([columns, span, None if content is None else len(content)]).encode() + b"\n")
-    source.write(content or b"")
+    where = len(content) if isinstance(content, bytes) else None if content is None else str(content.absolute())
+    source.write(json.dumps([columns, span, where]).encode() + b"\n")
+    source.write(content if isinstance(content, bytes) else b"")
     source.flush()
     error, size = json.loads(sink.readline())
     answer = sink.read(size)
     if len(answer) != size:
         raise ValueError("an answer that is cut off")
     return error, answer
+
+
+def _size_of(content: bytes | Path) -> int:
+    """Bytes of a file; none of one that is gone, which the process says."""
+    if isinstance(content, bytes):
+        return len(content)
+    return content.stat().st_size if content.exists() else 0
 
 
 _READER = _Reader()

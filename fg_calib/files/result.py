@@ -31,6 +31,9 @@ MOST_WHOLE = 10**15
 Whole = Annotated[int, Field(ge=0, le=MOST_WHOLE)]
 """A count."""
 
+IN_PARTS = "gauss-newton in parts"
+"""Name of the solver of a table in parts."""
+
 SCHEMA: Literal["fg-calib/result/2"] = "fg-calib/result/2"
 
 
@@ -569,6 +572,11 @@ class Result(Section):
     date: Date = ""
     previous: Previous | None = None
     carried: Carried | None = None
+
+    @property
+    def in_parts(self) -> bool:
+        """Whether it is of a table in parts, of which no single row was judged."""
+        return self.solver.name == IN_PARTS
 
     @property
     def free_of_frame(self) -> bool:

@@ -61,6 +61,7 @@ def read_measurements(
     points: Sequence[str] = (),
     model: Model | None = None,
     columns: Mapping[str, Column] | None = None,
+    rows: tuple[int, int] | None = None,
 ) -> Measurements:
     """Configurations and what was measured at them and, with a table of pairs, between them.
 
@@ -73,31 +74,30 @@ def read_measurements(
         points: Names of points that other tables touch: pairs may say how far apart they are.
         model: The model whose columns are read; those of all models if None.
         columns: By name as above, what the table of configurations calls a column.
+        rows: Of the pairs, or of the configurations without such, the first row to read and how many: of Parquet alone.
 
     Raises:
         InputError: A file is missing, is no table, lacks a column or holds a cell that cannot be used; the message
             names its line and column.
     """
     units, noise = units or Units(), noise or Noise()
-    _check_noise(noise)
-    header = header_for(path, robot, columns or {})
-    joints = find_joint_columns(header, robot)
-    of_poses = PoseColumns.of(header)
+    _check_given(noise, rows)
+    header = header_for(path, robot, columns or {}, by_rows=rows is not None and pairs is None)
+    joints, of_poses = find_joint_columns(header, robot), PoseColumns.of(header)
     sigma_point = header.present("sigma_point") if "group" in header.columns else ()
     of_instrument = InstrumentColumns.of(header, model)
     table = Table.read(
         header,
         numbers=(*joints, *of_poses.numbers, *sigma_point, *of_instrument.numbers),
         texts=(*header.present("id", "split", "group"), *of_instrument.labels),
+        span=rows if header.by_rows else None,
     )
     ids, test = read_ids(table, repeated=of_instrument.several_rows), table.test_rows()
-    names, group = _groups(table)
-    between, between_groups = None, no_pairs(header.name)
+    (names, group), between, between_groups = _groups(table), None, no_pairs(header.name)
     if pairs is not None:
-        known = tuple(dict.fromkeys((*names, *points)))
-        configurations = Configurations(table, ids, test, known, group)
-        between, between_groups = read_pairs(pairs, configurations, units, noise)
-        names = known if between_groups.n_pairs else names
+        every = Configurations(table, ids, test, tuple(dict.fromkeys((*names, *points))), group)
+        between, between_groups = read_pairs(pairs, every, units, noise, rows)
+        names = every.group_names if between_groups.n_pairs else names
     return Measurements(
         readings=read_readings(table, joints, robot, units),
         ids=ids.to_numpy().astype(np.str_),
@@ -113,15 +113,17 @@ def read_measurements(
     )
 
 
-def header_for(path: Path | str | Any, robot: Robot, columns: Mapping[str, Column]) -> Header:
-    """The header of a table, its columns called as they are known."""
+def header_for(path: Path | str | Any, robot: Robot, columns: Mapping[str, Column], *, by_rows: bool = False) -> Header:
+    """The header of a table, its columns called as they are known; for `by_rows` see `Header.read`."""
     meant = {*KNOWN, *(f"q{i + 1}" for i in range(robot.n_joints))}
     called = {joint.name for joint in robot.joints}
-    return Header.read(path, "frame").renamed(columns, meant | called).understood(meant, called)
+    return Header.read(path, "frame", by_rows=by_rows).renamed(columns, meant | called).understood(meant, called)
 
 
-def _check_noise(noise: Noise) -> None:
-    """Raise for a sigma that is not above 0, for nothing is measured exactly; joint readings may be exact."""
+def _check_given(noise: Noise, rows: tuple[int, int] | None) -> None:
+    """Raise for a sigma that is not above 0, as nothing is measured exactly but joint readings; and for no rows."""
+    for name, number in zip(("first", "how many"), rows or (), strict=False):
+        check_number(f"rows: {name}", number, above=name == "how many", whole=True)
     for f in fields(noise):
         if f.name != "joint" and (figure := getattr(noise, f.name)) is not None:
             check_number(f"noise: {f.name}", figure, above=True)
@@ -192,7 +194,8 @@ def read_ids(table: Table, *, repeated: bool) -> pl.Series:
     import polars as pl
 
     if "id" not in table.header.columns:
-        return pl.int_range(table.n_rows, eager=True).cast(pl.String)
+        first = int(table.rows[0]) if table.header.by_rows else 0
+        return pl.int_range(first, first + table.n_rows, eager=True).cast(pl.String)
     table.names("id", "an id")
     ids = table.texts("id", "an id")
     commented = ids.str.starts_with("#").to_numpy()

@@ -775,7 +775,11 @@ def unknown_prior_rows(variables: Variables, parameters: Floats) -> tuple[Floats
     return np.concatenate(r), np.vstack(J)
 
 
-def _prior_factor(variables: Variables, variable: Variable, n_rows: int) -> gtsam.CustomFactor:
+def _prior_factor(variables: Variables, variable: Variable, n_rows: int) -> gtsam.NonlinearFactor:
+    """GTSAM's own, which calls no Python, of a vector all of which has a prior; of poses, and of parts, ours."""
+    if not variable.is_pose and n_rows == len(variable.parameters):
+        mean, sigma = variables.nominal()[list(variable.parameters)], 1.0 / variables.stated[variable.symbol][1]
+        return gtsam.PriorFactorVector(variable.key, mean, gtsam.noiseModel.Diagonal.Sigmas(sigma))
     local = Variable(
         variable.key, variable.symbol, variable.kind, variable.parameters, slice(0, len(variable.parameters))
     )

@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.graph.factors import Eliminated, dense, eliminate, unknown_prior_rows
+from fg_calib.graph.factors import Eliminated, Variables, dense, eliminate, unknown_prior_rows
 from fg_calib.graph.observability import RANK_TOLERANCE, SIGNAL_FLOOR, Observability, observability_of_rows
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.robust import effect
@@ -114,9 +114,12 @@ def named_triangle(problem: Problem, parameters: Floats) -> Floats:
 
     At a pitch of a quarter turn of base or tool the columns of yaw and roll are parallel: only their sum acts.
     """
-    variables = problem.variables
+    return named_rows(problem.variables, parameters, whitened_triangle(problem, parameters))
+
+
+def named_rows(variables: Variables, parameters: Floats, J: Floats) -> Floats:
+    """Whitened rows of the core, shape (m, n_columns), as `named_triangle` has them."""
     n = variables.n_robot_columns
-    J = whitened_triangle(problem, parameters)
     out: Floats = J @ variables.tangent_derivative(parameters)[:, :n]
     if n == variables.n_columns:
         return out

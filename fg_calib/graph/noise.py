@@ -105,8 +105,8 @@ class Source(NamedTuple):
     @property
     def variance(self) -> Floats:
         """What the source adds to the covariance of each measurement's rows, shape (n, residual_dim, residual_dim)."""
-        n, residual_dim = self.loading.shape[:2]
-        flat = self.loading.reshape(n, residual_dim, -1)
+        n, residual_dim, ends, width = self.loading.shape
+        flat = self.loading.reshape(n, residual_dim, ends * width)
         out: Floats = flat @ np.swapaxes(flat, 1, 2)
         return out
 
@@ -150,9 +150,7 @@ class RowNoise:
         state: What has been learned of the noise.
 
     Attributes:
-        variance: Of what is each measurement's alone, row by row, shape (n, residual_dim), [m^2] and [rad^2].
-        sources: What errors of configurations add to it.
-        excess: What noise adds to the measured values on average, shape (n, residual_dim), [m] and [rad].
+        sources: What errors of configurations add to the noise that is each measurement's alone.
         factors: What the stated noise of each row's own kind is multiplied by, shape (residual_dim,).
         joint_factor: What that of the joint readings is multiplied by.
     """
@@ -163,11 +161,9 @@ class RowNoise:
         families = [name.partition(".")[0] for name in series.kind.names]
         self.factors: Floats = np.array([state.factors.get((series.table, family), 1.0) for family in families])
         self.joint_factor = state.factors.get(JOINT_NOISE, 1.0)
-        self.excess: Floats = np.zeros((series.n, series.kind.residual_dim))
         self._prepare(state)
 
     def _prepare(self, state: NoiseState) -> None:
-        self.variance: Floats = (self.series.sigma * self.factors) ** 2
         self.sources = self._of_joints(self.rows)
 
     @cached_property
@@ -175,18 +171,31 @@ class RowNoise:
         """All rows, not whitened, in [m] and [rad]."""
         return self.rows_at(slice(None))
 
-    def own_at(self, rows: Integers | slice) -> Floats:
-        """Covariance of what is each measurement's alone, of some, shape (m, residual_dim, residual_dim)."""
+    def moments_at(self, rows: Integers | slice) -> Moments:
+        """Of some measurements' rows what noise adds on average, the slope of their means, and variance of their own.
+
+        Shapes (m, residual_dim), [m] and [rad]; the variance is of what is each measurement's alone.
+        """
+        variance: Floats = (self.series.sigma[rows] * self.factors) ** 2
+        return Moments(np.zeros_like(variance), np.ones_like(variance), variance)
+
+    def own_at(self, rows: Integers | slice, moments: Moments | None = None) -> Floats:
+        """Covariance of what is each measurement's alone, of some, shape (m, residual_dim, residual_dim).
+
+        Args:
+            rows: Which.
+            moments: Their `moments_at`, where they are known.
+        """
         if self.series.covariance is not None:
             covariance: Floats = self.series.covariance[rows] * np.outer(self.factors, self.factors)
             return covariance
-        variance = self.variance[rows]
+        variance = (moments or self.moments_at(rows)).variance
         out: Floats = variance[:, :, None] * np.eye(variance.shape[1])
         return out
 
-    def total_at(self, rows: Integers | slice) -> Floats:
-        """Covariance of some measurements' rows, all noise together, shape (m, residual_dim, residual_dim)."""
-        out: Floats = self.own_at(rows) + sum(source.at(rows).variance for source in self.sources)
+    def total_at(self, rows: Integers | slice, moments: Moments | None = None) -> Floats:
+        """The same of all their noise together, shape (m, residual_dim, residual_dim)."""
+        out: Floats = self.own_at(rows, moments) + sum(source.at(rows).variance for source in self.sources)
         return out
 
     @cached_property
@@ -197,17 +206,46 @@ class RowNoise:
     @property
     def sigma(self) -> Floats:
         """1 sigma of each row, all noise together, shape (n, residual_dim), [m] and [rad]."""
-        out = np.empty(self.variance.shape)
+        out = self._empty()
 
         def run(rows: slice) -> None:
-            out[rows] = np.sqrt(np.einsum("nii->ni", self.total_at(rows)))
+            out[rows] = self._sigma_at(rows, self.moments_at(rows))
 
         _over_rows(run, len(out))
         return out
 
     def residual(self) -> Floats:
         """Of all rows, shape (n, residual_dim), [m] and [rad]."""
-        return residuals.residual(self.rows, self.place.chain)
+        out = self._empty()
+
+        def run(rows: slice) -> None:
+            out[rows] = self._residual_at(rows, self.moments_at(rows))
+
+        _over_rows(run, len(out))
+        return out
+
+    def figures(self) -> tuple[Floats, Floats, Floats]:
+        """Residual of each row, what noise adds to it on average, and its 1 sigma, shapes (n, residual_dim)."""
+        residual, excess, sigma = self._empty(), self._empty(), self._empty()
+
+        def run(rows: slice) -> None:
+            moments = self.moments_at(rows)
+            residual[rows], excess[rows] = self._residual_at(rows, moments), moments.excess
+            sigma[rows] = self._sigma_at(rows, moments)
+
+        _over_rows(run, self.series.n)
+        return residual, excess, sigma
+
+    def _residual_at(self, rows: slice, moments: Moments) -> Floats:
+        return residuals.residual(self.rows_at(rows, moments), self.place.chain)
+
+    def _sigma_at(self, rows: slice, moments: Moments) -> Floats:
+        sigma: Floats = np.sqrt(np.einsum("nii->ni", self.total_at(rows, moments)))
+        return sigma
+
+    def _empty(self) -> Floats:
+        """A figure of each row, to be filled."""
+        return np.empty((self.series.n, self.series.kind.residual_dim))
 
     def lengths(self) -> tuple[Floats, Integers]:
         """Length of each measurement's residual whitened by all its noise, and its number of rows, shapes (n,).
@@ -229,15 +267,19 @@ class RowNoise:
 
     def bare(self, rows: Integers) -> Floats:
         """Diagonal of what is private to measurements, but for what is there for numerical safety alone."""
-        out: Floats = self.variance[rows]
-        return out
+        return self.moments_at(rows).variance
 
-    def rows_at(self, rows: Integers | slice) -> Block:
-        """Some of the rows, not whitened."""
-        return residuals.rows_of(self._plain, rows)
+    def rows_at(self, rows: Integers | slice, moments: Moments | None = None) -> Block:
+        """Some of the rows, not whitened.
+
+        Args:
+            rows: Which.
+            moments: Their `moments_at`, where they are known.
+        """
+        return residuals.rows_of(self.as_measured, rows)
 
     @property
-    def _plain(self) -> Block:
+    def as_measured(self) -> Block:
         """All rows as they were measured."""
         s, p = self.series, self.place
         unit = unit_whitening(s.n, s.kind.residual_dim)
@@ -248,10 +290,15 @@ class RowNoise:
         if not len(p.joints) or not s.kind.ends:
             return ()
         chain = p.chain.without_columns().with_joint_columns()
-        J = residuals.linearise(rows, chain)[1][:, :, : s.kind.ends * p.chain.n_joints]
-        J = J.reshape(s.n, s.kind.residual_dim, s.kind.ends, p.chain.n_joints)[..., p.joints]
-        loading = J * p.measurements.sigma_joint[p.joints] * self.joint_factor
-        return (Source("joints", p.configurations[s.ends], np.ascontiguousarray(loading)),)
+        sigma = p.measurements.sigma_joint[p.joints] * self.joint_factor
+        loading = np.empty((s.n, s.kind.residual_dim, s.kind.ends, len(sigma)))
+
+        def load(some: slice) -> None:
+            J = residuals.linearise(residuals.rows_of(rows, some), chain)[1][:, :, : s.kind.ends * p.chain.n_joints]
+            loading[some] = J.reshape(*loading[some].shape[:3], p.chain.n_joints)[..., p.joints] * sigma
+
+        _over_rows(load, s.n)
+        return (Source("joints", p.configurations[s.ends], loading),)
 
 
 class PairNoise(RowNoise):
@@ -259,7 +306,6 @@ class PairNoise(RowNoise):
 
     Attributes:
         predicted: Distance and angle as the arm predicts them, shape (n, 2).
-        slope: Derivative of each row's mean in what is predicted, shape (n, residual_dim).
     """
 
     def _prepare(self, state: NoiseState) -> None:
@@ -272,60 +318,81 @@ class PairNoise(RowNoise):
         self._both = wide  # factors of distance and angle
         self.predicted = self._predict()
         self._formed = np.nan_to_num(self._formed_variance()) * wide**2 if s.formed else None
-        joints = self._of_joints(self._plain)
-        linear = self._wide(sum((source.variance for source in joints), np.zeros((s.n, 1, 1)))) if joints else None
-        bending, of_joints = self._bending(), self._joint_trace()
-        self.slope, self.variance = np.empty(s.data.shape), np.empty(s.data.shape)
-        self._bent_variance = np.zeros(s.data.shape if s.formed else (0, s.kind.residual_dim))
-
-        def bend(rows: slice) -> None:
-            moments = self._moments(rows, linear, bending, of_joints)
-            slope, left = moments.slope[:, self._parts], moments.variance[:, self._parts].copy()
-            self.slope[rows], self.excess[rows] = slope, moments.excess[:, self._parts]
-            if not self.place.joints_estimated:
-                left -= slope**2 * self._diagonals(joints, rows)
+        joints = self._joint_sources = self._of_joints(self.as_measured)
+        self._linear = self._wide(sum((of.variance for of in joints), np.zeros((s.n, 1, 1)))) if joints else None
+        self._bent, self._traces = self._where_bent(), self._joint_trace()
+        self.sources = ()
+        self._kept: tuple[Moments, Floats] | None = None
+        if s.n <= SPAN or s.formed or self._joint_sources:  # few, or asked for at once
+            self._kept = self._all_moments()
+            slope = self._kept[0].slope
+            self.sources = tuple(
+                source._replace(loading=source.loading * slope[:, :, None, None]) for source in self._joint_sources
+            )
             if s.formed:
-                of_measured = slope**2 * self._own(rows)[:, self._parts]
-                self._bent_variance[rows] = np.maximum(left - of_measured, 0.0)
-                left -= of_measured + 0.5 * self._bent_variance[rows]
-            self.variance[rows] = left
-
-        _over_rows(bend, s.n)
-        slope = self.slope[:, :, None, None]
-        self.sources = tuple(source._replace(loading=source.loading * slope) for source in joints)
-        if s.formed:
-            self.sources += (self._of_poses(self.slope),)
+                self.sources += (self._of_poses(slope),)
+            self._joint_sources, self._linear = (), None  # which nothing is worked out from any more
 
     def _predict(self) -> Floats:
         """Distance and angle as the arm predicts them, 0 where not wanted, shape (n, 2)."""
-        s, predicted = self.series, np.zeros((self.series.n, 2))
-        r = residuals.residual(self._plain, self.place.chain)
+        s, predicted, plain, chain = self.series, np.zeros((self.series.n, 2)), self.as_measured, self.place.chain
 
         def predict(rows: slice) -> None:
-            predicted[rows, self._parts] = r[rows] + s.data[rows]
+            predicted[rows, self._parts] = residuals.residual(residuals.rows_of(plain, rows), chain) + s.data[rows]
 
         _over_rows(predict, s.n)
         return predicted
 
-    def rows_at(self, rows: Integers | slice) -> Block:
+    def moments_at(self, rows: Integers | slice) -> Moments:
+        """Of some rows; of very many they are worked out where they are asked for, or they would fill the memory."""
+        if self._kept is None:
+            return self._work_out(rows)[0]
+        moments = self._kept[0]
+        return Moments(moments.excess[rows], moments.slope[rows], moments.variance[rows])
+
+    def _all_moments(self) -> tuple[Moments, Floats]:
+        """`_work_out` of all rows."""
+        excess, slope, variance, of_bending = (self._empty() for _ in range(4))
+
+        def run(rows: slice) -> None:
+            found, of_bending[rows] = self._work_out(rows)
+            excess[rows], slope[rows], variance[rows] = found.excess, found.slope, found.variance
+
+        _over_rows(run, self.series.n)
+        return Moments(excess, slope, variance), of_bending
+
+    def _work_out(self, rows: Integers | slice) -> tuple[Moments, Floats]:
+        """`moments_at`, and of pairs formed from poses the variance that is not linear in their errors (else 0)."""
+        moments = self._moments(rows)
+        excess, slope, left = (self._narrow(v) for v in (moments.excess, moments.slope, moments.variance))
+        of_bending = np.zeros(left.shape if self.series.formed else (1, left.shape[1]))
+        if not self.place.joints_estimated:
+            left -= slope**2 * self._diagonals(self._joint_sources, rows)
+        if self.series.formed:
+            of_measured = slope**2 * self._own(rows)[:, self._parts]
+            of_bending = np.maximum(left - of_measured, 0.0)
+            left -= of_measured + 0.5 * of_bending
+        return Moments(excess, slope, left), of_bending
+
+    @property
+    def _bent_variance(self) -> Floats:
+        """Variance of pairs formed from poses that is not linear in their errors, shape (n, residual_dim)."""
+        assert self._kept is not None
+        return self._kept[1]
+
+    def rows_at(self, rows: Integers | slice, moments: Moments | None = None) -> Block:
         """Some of the rows, not whitened, but scaled and shifted as their means are."""
-        plain = residuals.rows_of(self._plain, rows)
-        predicted, excess, slopes = self.predicted[rows], self.excess[rows], self.slope[rows]
-        data, whitening = np.empty_like(plain.data), np.zeros(plain.whitening.shape)
+        moments, plain = moments or self.moments_at(rows), residuals.rows_of(self.as_measured, rows)
+        whitening = np.zeros(plain.whitening.shape)
         diagonal = np.cumsum(np.arange(1, 1 + self.series.kind.residual_dim)) - 1
+        slope = np.maximum(moments.slope, LEAST_SLOPE)
+        off = self._narrow(self.predicted[rows]) - plain.data
+        whitening[:, diagonal] = slope
+        return replace(plain, data=plain.data + off * (1.0 - 1.0 / slope) - moments.excess / slope, whitening=whitening)
 
-        def shift(some: slice) -> None:
-            slope, measured = np.maximum(slopes[some], LEAST_SLOPE), plain.data[some]
-            off = predicted[some][:, self._parts] - measured
-            data[some] = measured + off * (1.0 - 1.0 / slope) - excess[some] / slope
-            whitening[some, diagonal] = slope
-
-        _over_rows(shift, plain.n)
-        return replace(plain, data=data, whitening=whitening)
-
-    def residual(self) -> Floats:
-        """Of all rows, shape (n, residual_dim), [m] and [rad]."""
-        return self._narrow(self.predicted) - self.series.data + self.excess
+    def _residual_at(self, rows: slice, moments: Moments) -> Floats:
+        out: Floats = self._narrow(self.predicted[rows]) - self.series.data[rows] + moments.excess
+        return out
 
     def more_if_redundant(self, shared: frozenset[str]) -> Floats | float:
         """What is added to the diagonal of `own` where there are more rows than errors that they share."""
@@ -356,8 +423,11 @@ class PairNoise(RowNoise):
             spread: A square root of the parameters' covariance, shape (n_columns, k).
             sigmas: By how many sigma at least.
         """
-        bent: Booleans = self._noticed(spread, sigmas)[:, self._parts] > 0.0
-        return bent
+        bent = np.zeros((self.series.n, 2), dtype=np.bool_)
+        rows, across = self._noticed(spread, sigmas)
+        bent[rows] = across > 0.0
+        out: Booleans = bent[:, self._parts]
+        return out
 
     def may_fold(self, spread: Floats) -> Booleans:
         """Which rows some uncertainty of the parameters may fold, shape (n, residual_dim).
@@ -372,7 +442,8 @@ class PairNoise(RowNoise):
         folds, is_near = np.zeros(f.shape, dtype=np.bool_), np.zeros(len(f), dtype=np.bool_)
         if not len(train):
             return folds[:, self._parts]
-        largest = 4.0 * np.sum(self._spread_of(_evenly(train), spread), axis=0).max(axis=0)
+        spread_of = self._spread_by(spread)
+        largest = 4.0 * np.sum(spread_of(_evenly(train)), axis=0).max(axis=0)
 
         def look(rows: slice) -> None:
             from_kink = np.stack([f[rows, 0], np.minimum(f[rows, 1], np.pi - f[rows, 1])], axis=1)
@@ -382,7 +453,7 @@ class PairNoise(RowNoise):
         near = np.flatnonzero(is_near)
         for start in range(0, len(near), SPAN):
             rows = near[start : start + SPAN]
-            across, along = self._spread_of(rows, spread)
+            across, along = spread_of(rows)
             noise = 4.0 * self._own(rows)
             folds[rows] = across + along > np.maximum(f[rows] ** 2 / 4.0, noise)
             folds[rows, 1] |= along[:, 1] > np.maximum((np.pi - f[rows, 1]) ** 2 / 4.0, noise[:, 1])
@@ -409,7 +480,7 @@ class PairNoise(RowNoise):
         out[:, self._parts] = np.einsum("nii->ni", covariance)
         return out
 
-    def _diagonals(self, sources: tuple[Source, ...], rows: slice) -> Floats:
+    def _diagonals(self, sources: tuple[Source, ...], rows: Integers | slice) -> Floats:
         """What sources add to the variance of some rows, shape (n, residual_dim)."""
         zero = np.zeros(self.series.data[rows].shape)
         return sum((np.einsum("nii->ni", source.at(rows).variance) for source in sources), zero)
@@ -423,25 +494,18 @@ class PairNoise(RowNoise):
         own[:, self._parts] = sigma**2 * self.factors**2
         return own
 
-    def _moments(self, rows: slice, linear: Floats | None, bending: Floats | None, of_joints: Floats) -> Moments:
-        """Mean and variance of each distance and angle, shapes (n, 2); of no meaning where not wanted.
-
-        Args:
-            rows: The pairs.
-            linear: Variance of each distance and angle by joint noise, to first order, shape (n, 2); None for 0.
-            bending: From `_bending`, shape (n, 2); None for 0.
-            of_joints: From `_joint_trace`.
-        """
+    def _moments(self, rows: Integers | slice) -> Moments:
+        """Mean and variance of each distance and angle, shapes (n, 2); of no meaning where not wanted."""
         s, m, factors = self.series, self.place.measurements, self._both**2
         ends, own = s.ends[rows], self._own(rows)
         along, trace = np.zeros_like(own), np.zeros_like(own)
         if s.formed:
             along, own = own, np.zeros_like(own)
             trace = np.stack([_trace(m.sigma_position, ends), _trace(m.sigma_orientation, ends)], axis=1) * factors
-        if len(of_joints):
-            along = along + (0.0 if linear is None else linear[rows])
-            trace = trace + of_joints[ends].sum(axis=1)
-        across = np.maximum(trace - along, 0.0) / 2.0 + (0.0 if bending is None else bending[rows])
+        if len(self._traces):
+            along = along + (0.0 if self._linear is None else self._linear[rows])
+            trace = trace + self._traces[ends].sum(axis=1)
+        across = np.maximum(trace - along, 0.0) / 2.0 + self._bending(rows)
         along, across, own = (np.where(self._wanted, v, 0.0) for v in (along, across, own))
         found = [
             of(self.predicted[rows, k], along[:, k], across[:, k], own[:, k])
@@ -495,37 +559,54 @@ class PairNoise(RowNoise):
             if sigma is not None:
                 G[:, i, :, i, :3] = self._both[k] * slope * sign * self._directions[k][:, None] * sigma[s.ends]
             G[:, i, :, i, 3] = -0.5 * bent[:, i, None]
-        return Source(f"poses of table {s.table}", self.place.configurations[s.ends], G.reshape(s.n, n_parts, 2, -1))
+        loading = G.reshape(s.n, n_parts, 2, 4 * n_parts)
+        return Source(f"poses of table {s.table}", self.place.configurations[s.ends], loading)
 
-    def _bending(self) -> Floats | None:
-        """Variance in each direction across that the parameters' own gives each vector, shape (n, 2); None for 0.
+    def _bending(self, rows: Integers | slice) -> Floats | float:
+        """Variance in each direction across that the parameters' own gives some vectors, shape (m, 2).
 
         Along the vector it is what is estimated; across it lengthens the vector as noise does, and bends the row. Zero
         where it does not matter.
         """
-        if self._spread is None:
-            return None
-        return np.minimum(self._noticed(self._spread, LEAST_BEND), MOST_BEND * self._straight(slice(None)))
+        bent, across = self._bent
+        if not len(bent):
+            return 0.0
+        index = np.arange(*rows.indices(self.series.n)) if isinstance(rows, slice) else rows
+        place = np.minimum(np.searchsorted(bent, index), len(bent) - 1)
+        return np.where((bent[place] == index)[:, None], across[place], 0.0)
 
-    def _noticed(self, spread: Floats, sigmas: float) -> Floats:
-        """Variance across where it bends a row by so many sigma, else 0, shape (n, 2).
+    def _where_bent(self) -> tuple[Integers, Floats]:
+        """The rows that what the parameters may be off bends, in ascending order, and `_bending` there."""
+        if self._spread is None:
+            return np.zeros(0, dtype=np.int64), np.zeros((0, 2))
+        rows, across = self._noticed(self._spread, LEAST_BEND)
+        return rows, np.minimum(across, MOST_BEND * self._straight(rows))
+
+    def _noticed(self, spread: Floats, sigmas: float) -> tuple[Integers, Floats]:
+        """Rows that may be bent by so many sigma, in ascending order; variance across where it does so, else 0.
 
         Where four times the largest of some pairs, evenly chosen, would not, it is not even worked out.
         """
-        across, train = np.zeros((self.series.n, 2)), np.flatnonzero(~self.series.test)
+        train = np.flatnonzero(~self.series.test)
         if not len(train):
-            return across
-        most = 4.0 * self._spread_across(_evenly(train), spread).max(axis=0)
+            return train, np.zeros((0, 2))
+        some, spread_of = _evenly(train), self._spread_by(spread)
+        of_some = BEND_MARGIN * spread_of(some)[0]
+        most, found, variances = 4.0 * of_some.max(axis=0), [train[:0]], [np.zeros((0, 2))]
         for start in range(0, self.series.n, SPAN):
-            rows = slice(start, start + SPAN)
-            least = sigmas * self._straight(rows)
-            near = np.flatnonzero(np.any(most >= least, axis=1))
-            if len(near):
-                found = self._spread_across(start + near, spread)
-                across[start + near] = np.where(found >= least[near], found, 0.0)
-        return across
+            least = sigmas * self._straight(slice(start, start + SPAN))
+            rows = start + (near := np.flatnonzero(np.any(most >= least, axis=1)))
+            if not len(rows):
+                continue
+            place = np.minimum(np.searchsorted(some, rows), len(some) - 1)
+            across, new = of_some[place], some[place] != rows
+            if new.any():
+                across[new] = BEND_MARGIN * spread_of(rows[new])[0]
+            found.append(rows)
+            variances.append(np.where(across >= least[near], across, 0.0))
+        return np.concatenate(found), np.concatenate(variances)
 
-    def _straight(self, rows: slice) -> Floats:
+    def _straight(self, rows: Integers | slice) -> Floats:
         """Variance across that bends a row by one sigma, shape (n, 2); infinite where there is none to bend.
 
         Nearer to 0 than one sigma it is that of the noise itself.
@@ -534,36 +615,44 @@ class PairNoise(RowNoise):
         sigma = np.sqrt(own)
         return np.where((own > 0.0) & self._wanted, sigma * np.maximum(predicted, sigma), np.inf)
 
-    def _spread_across(self, rows: Integers, spread: Floats) -> Floats:
-        """What `_bending` is about at `rows`, shape (n, 2)."""
-        return BEND_MARGIN * self._spread_of(rows, spread)[0]
+    def _spread_by(self, spread: Floats) -> Callable[[Integers], tuple[Floats, Floats]]:
+        """Variance that the parameters' own gives vectors: in each direction across, and along, shapes (m, 2), of rows.
 
-    def _spread_of(self, rows: Integers, spread: Floats) -> tuple[Floats, Floats]:
-        """Variance that the parameters' own gives vectors: in each direction across, and along, shapes (n, 2).
+        With Q the rotation from a to b, R_b R_a^T, turns w_a and w_b of the tool turn Q by w_b - Q w_a: in b itself by
+        R_b^T w_b - R_a^T w_a. Motions of the base, and of the tool in itself, carry vector and rotation with them and
+        bend nothing: they are taken out. About an axis that all rotations have in common orientations cannot tell the
+        two apart: there points do.
 
-        With Q the rotation from a to b, R_b R_a^T, turns w_a and w_b of the tool turn Q by w_b - Q w_a. Motions of the
-        base, and of the tool in itself, carry vector and rotation with them and bend nothing: they are taken out. About
-        an axis that all rotations have in common orientations cannot tell the two apart: there points do.
+        Args:
+            spread: A square root of the parameters' covariance, shape (n_columns, k).
         """
-        n, ends = len(rows), self.series.ends[rows]
-        at = forward(self.place.chain, self.place.trig, np.concatenate([ends[:, 0], ends[:, 1]]))
-        base = turning_of_base(at.jacobian[:, :3], at.rotation) @ spread  # (3, k)
-        of_points = turning_of_points(at.position, at.jacobian[:, 3:]) @ spread
-        carried = base + common_axes(at.rotation) @ (of_points - base)
-        turn, shift = np.split(at.jacobian @ spread, 2, axis=1)  # (2 n, 3, k) each
-        Q = at.rotation[n:] @ np.swapaxes(at.rotation[:n], 1, 2)
-        vector, turn = at.position[n:] - at.position[:n], turn - base
-        change = (shift[n:] - shift[:n] - np.cross(carried[None], vector[:, :, None], axis=1), turn[n:] - Q @ turn[:n])
-        directions = (vector, rotation_angle(Q)[1])
-        along = np.stack(
-            [
-                np.sum(np.einsum("nc,nck->nk", _unit(u), D) ** 2, axis=1)
-                for u, D in zip(directions, change, strict=True)
-            ],
-            axis=1,
-        )
-        everything = np.stack([np.sum(D**2, axis=(1, 2)) for D in change], axis=1)
-        return np.maximum(everything - along, 0.0) / 2.0, along
+        at, which = self._moved(_evenly(np.flatnonzero(~self.series.test)), spread)
+        everywhere = which.ravel()
+        R, p, (turn, shift) = at.rotation[everywhere], at.position[everywhere], np.split(at.jacobian[everywhere], 2, 1)
+        base = turning_of_base(turn, R)  # (3, k)
+        carried = base + common_axes(R) @ (turning_of_points(p, shift) - base)
+
+        def spread_of(rows: Integers) -> tuple[Floats, Floats]:
+            at, which = self._moved(rows, spread)
+            (turn, shift), (a, b) = np.split(at.jacobian, 2, axis=1), which.T
+            turn = np.swapaxes(at.rotation, 1, 2) @ (turn - base)
+            shift = shift + _skew(at.position) @ carried
+            across, along = np.empty((len(rows), 2)), np.empty((len(rows), 2))
+            Q = np.swapaxes(at.rotation[a], 1, 2) @ at.rotation[b]
+            directions = at.position[b] - at.position[a], rotation_angle(Q)[1]
+            for k, (u, moved) in enumerate(zip(directions, (shift, turn), strict=True)):
+                change = moved[b] - moved[a]
+                along[:, k] = np.sum((_unit(u)[:, None] @ change)[:, 0] ** 2, axis=1)
+                across[:, k] = np.maximum(np.sum(change**2, axis=(1, 2)) - along[:, k], 0.0) / 2.0
+            return across, along
+
+        return spread_of
+
+    def _moved(self, rows: Integers, spread: Floats) -> tuple[Poses, Integers]:
+        """Where some rows have their ends: poses, with what they move along `spread`; which of them, shape (m, 2)."""
+        where, which = np.unique(self.series.ends[rows], return_inverse=True)
+        at = forward(self.place.chain, self.place.trig, where)
+        return replace(at, jacobian=at.jacobian @ spread), which.reshape(-1, 2)
 
     def _joint_trace(self) -> Floats:
         """Variance that joint noise gives each vector at one end, all directions together, shape (n_configurations, 2).
@@ -634,6 +723,14 @@ def _trace(sigma: Floats | None, ends: Integers) -> Floats:
         return np.zeros(len(ends))
     both: Floats = np.sum(sigma**2, axis=1)[ends].sum(axis=1)
     return both
+
+
+def _skew(vectors: Floats) -> Floats:
+    """Matrices K with `K w = v x w`, shape (n, 3, 3)."""
+    out = np.zeros((len(vectors), 3, 3))
+    x, y, z = vectors.T
+    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -z, y, -x
+    return out - np.swapaxes(out, 1, 2)
 
 
 def _unit(vectors: Floats) -> Floats:

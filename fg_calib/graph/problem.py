@@ -245,8 +245,7 @@ def assembled(problem: Problem, start: Floats, state: NoiseState | None = None, 
         changes: What else of the problem is to change.
     """
     p = replace(problem, start=start, state=state or problem.state, **changes)
-    rows = _row_sets(noises_at(p, start), p.state, sharing=p.options.pair_errors == "shared")
-    bare = replace(p, rows=rows, initial=p.variables.values(start))
+    bare = replace(p, rows=_row_sets(p, start), initial=p.variables.values(start))
     graph = _graph_of(bare)
     return replace(bare, graph=graph, factors=gtsam.NonlinearFactorGraph(graph))
 
@@ -273,20 +272,30 @@ def known_factors(problem: Problem) -> list[gtsam.CustomFactor]:
     return [] if known is None else [known.factor(problem.variables, problem.data.unknowns)]
 
 
-def _row_sets(noises: Sequence[RowNoise], state: NoiseState, *, sharing: bool) -> tuple[RowSet, ...]:
-    return whitened_rows(noises, sharing=sharing, joint_errors=state.joint_errors, weights=state.weights)
+def _row_sets(problem: Problem, start: Floats) -> tuple[RowSet, ...]:
+    """The train rows whitened at a parameter vector."""
+    state, sharing = problem.state, problem.options.pair_errors == "shared"
+    weights = None
+    if state.weights is not None:
+        weights = [w[s.train] for w, s in zip(state.weights, problem.data.series, strict=True)]
+    noises = noises_at(problem, start, fitted=True)
+    return whitened_rows(noises, sharing=sharing, joint_errors=state.joint_errors, weights=weights)
 
 
-def noises_at(problem: Problem, parameters: Floats, *, at_readings: bool = False) -> tuple[RowNoise, ...]:
-    """The rows of each series, train and test, and their noise at a parameter vector.
+def noises_at(
+    problem: Problem, parameters: Floats, *, at_readings: bool = False, fitted: bool = False
+) -> tuple[RowNoise, ...]:
+    """The rows of each series and their noise at a parameter vector.
 
     Args:
         problem: The problem.
         parameters: The parameter vector.
         at_readings: Whether they are those of the readings also where true joint values are estimated.
+        fitted: Whether they are the train rows alone; else train and test.
     """
     places = _places(problem, parameters, at_readings)
-    return tuple(row_noise(s, places[s.table], problem.state) for s in problem.data.series)
+    series = [s.fitted if fitted else s for s in problem.data.series]
+    return tuple(row_noise(s, places[s.table], problem.state) for s in series)
 
 
 def _places(problem: Problem, parameters: Floats, at_readings: bool) -> list[Place]:
@@ -477,8 +486,14 @@ def problem_at(
     robot: Robot, data: Dataset, options: Options, variables: Variables, start: Floats, **more: Any
 ) -> Problem:
     """A problem with its rows whitened at a start."""
+    return assembled(unassembled(robot, data, options, variables, start, **more), start)
+
+
+def unassembled(
+    robot: Robot, data: Dataset, options: Options, variables: Variables, start: Floats, **more: Any
+) -> Problem:
+    """A problem that has no rows and no graph yet."""
     estimated = options.encoder == "estimated" and bool(np.any(data.sigma_joint > 0.0))
     state = NoiseState(joint_errors=np.zeros_like(data.readings) if estimated else None)
     empty = gtsam.NonlinearFactorGraph()
-    bare = Problem(robot, data, options, variables, start, state, (), empty, gtsam.Values(), **more)
-    return assembled(bare, start)
+    return Problem(robot, data, options, variables, start, state, (), empty, gtsam.Values(), **more)

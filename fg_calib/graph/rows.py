@@ -344,20 +344,24 @@ def _part(
     masks = {source.name: shares.mask(source)[train] for source in noise.sources}
     carried = frozenset(name for name, mask in masks.items() if mask.any())
     rows: Integers | slice = slice(None) if n == series.n else train
-    diagonal = noise.variance[rows]
+    diagonal = np.zeros((0, residual_dim))
     if carried:
-        diagonal = np.maximum(diagonal + _at(noise.more_if_redundant(carried), train), _at(noise.least(), train))
-    plain, used = noise.rows_at(rows), series.used[rows]
+        variance = noise.moments_at(rows).variance
+        diagonal = np.maximum(variance + _at(noise.more_if_redundant(carried), train), _at(noise.least(), train))
+    used = series.used[rows]
     W_is_wanted = bool(carried) or joint_errors is not None
     W = np.empty((n * W_is_wanted, residual_dim, residual_dim))
-    whitening = np.require(plain.whitening, requirements="W")  # in place where it can be
+    measured = residuals.rows_of(noise.as_measured, rows)
+    data, whitening = np.empty(measured.data.shape), np.empty(measured.whitening.shape)
 
     def whiten(start: int, stop: int) -> None:
         some = slice(start, stop)
         these = some if n == series.n else train[some]
-        private = noise.own_at(these)
+        moments = noise.moments_at(these)
+        plain = noise.rows_at(these, moments)
+        private = noise.own_at(these, moments)
         if carried:
-            private = private + (diagonal[some] - noise.variance[these])[:, :, None] * np.eye(residual_dim)
+            private = private + (diagonal[some] - moments.variance)[:, :, None] * np.eye(residual_dim)
         for source in noise.sources:
             own = np.where(masks[source.name][some][:, None, :, None], 0.0, source.loading[these])
             own = own.reshape(stop - start, residual_dim, -1)
@@ -366,13 +370,13 @@ def _part(
             more = 1.0 / np.maximum(weights[these], LEAST_WEIGHT) - 1.0
             private = private + more[:, None, None] * noise.total_at(these)
         white = whitening_of(private, used[some])
-        whitening[some] = pack(white @ unpack(plain.whitening[some], residual_dim))
+        data[some], whitening[some] = plain.data, pack(white @ unpack(plain.whitening, residual_dim))
         if W_is_wanted:
             W[some] = white
 
     for _ in over_spans(whiten, n):
         pass
-    block = replace(plain, whitening=whitening)
+    block = replace(measured, data=data, whitening=whitening)
     offset = None if joint_errors is None else _offset(noise, train, W, joint_errors)
     E = scipy.sparse.csr_array((n * residual_dim, 0))
     if any(name != "joints" for name in carried):
@@ -491,10 +495,26 @@ class ErrorColumns:
 
     def row_set(self, together: Sequence[tuple[Part, Sparse, Sparse]]) -> RowSet:
         """The rows of several series that share errors."""
-        L = scipy.sparse.csr_array(scipy.sparse.vstack([L for _, L, _ in together], format="csr"))
-        used = np.unique(L.indices // self.width).astype(np.int64)
-        L = scipy.sparse.csr_array(L[:, (used[:, None] * self.width + np.arange(self.width)).ravel()])
-        spares = [E for _, _, E in together]
-        spare = scipy.sparse.csr_array(scipy.sparse.block_diag(spares)) if any(E.nnz for E in spares) else None
+        L = _stacked([L for _, L, _ in together])
+        place = np.zeros(self._n, dtype=L.indices.dtype)
+        place[L.indices // self.width] = 1
+        used = np.flatnonzero(place)
+        place[used] = np.arange(len(used))
+        columns = place[L.indices // self.width] * self.width + L.indices % self.width
+        L = scipy.sparse.csr_array((L.data, columns, L.indptr), shape=(L.shape[0], len(used) * self.width))
+        spare = _stacked([E for _, _, E in together], apart=True)
         joints = self._first.get("joints", 0)
-        return RowSet(tuple(part for part, _, _ in together), SharedErrors(L, self.width), used, joints, spare)
+        parts = tuple(part for part, _, _ in together)
+        return RowSet(parts, SharedErrors(L, self.width), used, joints, spare if spare.nnz else None)
+
+
+def _stacked(matrices: Sequence[Sparse], *, apart: bool = False) -> Sparse:
+    """Sparse matrices one below the other, with the same columns or, `apart`, each with its own."""
+    widths = [M.shape[1] * apart for M in matrices]
+    rows, figures, first = (
+        [0, *np.cumsum(n)] for n in ([M.shape[0] for M in matrices], [M.nnz for M in matrices], widths)
+    )
+    columns = np.concatenate([M.indices + c for M, c in zip(matrices, first, strict=False)])
+    starts = np.concatenate([[0], *(M.indptr[1:] + k for M, k in zip(matrices, figures, strict=False))])
+    shape = (rows[-1], first[-1] if apart else matrices[0].shape[1])
+    return scipy.sparse.csr_array((np.concatenate([M.data for M in matrices]), columns, starts), shape=shape)

@@ -51,7 +51,7 @@ from fg_calib.graph.problem import (
 )
 from fg_calib.graph.robust import Weighting
 from fg_calib.graph.tolerances import ToleranceScales
-from fg_calib.options import check_number
+from fg_calib.options import Options, check_number
 from fg_calib.threads import one_blas_thread
 
 Floats = NDArray[np.float64]
@@ -209,7 +209,7 @@ def solve(problem: Problem, options: SolverOptions | None = None) -> Solution:
         SolverError: GTSAM could not solve a step at all.
     """
     problem = with_added(problem)
-    options = options or _options_of(problem)
+    options = options or options_of(problem.options)
     clock = time.perf_counter()
     with one_blas_thread:
         before = _before(problem, options)
@@ -262,8 +262,9 @@ def _before(problem: Problem, options: SolverOptions) -> Floats:
     return np.concatenate([found, problem.start[len(found) :]])
 
 
-def _options_of(problem: Problem) -> SolverOptions:
-    most = problem.options.max_iterations
+def options_of(options: Options) -> SolverOptions:
+    """The solver's settings that a calibration's options ask for."""
+    most = options.max_iterations
     return SolverOptions() if most is None else SolverOptions(max_iterations=most)
 
 
@@ -282,7 +283,7 @@ def solve_from(solution: Solution, start: Floats, most: float, options: SolverOp
     Raises:
         SolverError: GTSAM could not solve a step at all.
     """
-    clock, options = time.perf_counter(), options or _options_of(solution.problem)
+    clock, options = time.perf_counter(), options or options_of(solution.problem.options)
     with one_blas_thread:
         problem = started_at(solution.problem, start)
         rough = _Run(problem, replace(options, max_iterations=min(SHORT, options.max_iterations)))
@@ -313,7 +314,7 @@ def solve_image(
     Raises:
         SolverError: GTSAM could not solve a step at all.
     """
-    clock, options = time.perf_counter(), options or _options_of(problem)
+    clock, options = time.perf_counter(), options or options_of(problem.options)
     with one_blas_thread:
         rough = _Run(problem, replace(options, max_iterations=min(SHORT, options.max_iterations)))
         if rough.here.cost - 0.5 * rough.here.decrement**2 >= most:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import FrozenArrays, as_floats
+from fg_calib.arrays import FrozenArrays, as_floats, once
 from fg_calib.errors import InputError
 from fg_calib.measurements.checks import (
     checked_covariance,
@@ -26,6 +26,7 @@ from fg_calib.measurements.checks import (
     checked_sigma,
 )
 from fg_calib.options import Pairing, check_number, listed
+from fg_calib.robot.kinematics import over_spans
 from fg_calib.sizes import MOST_PAIRS
 
 Floats = NDArray[np.float64]
@@ -114,7 +115,22 @@ class Pairs(FrozenArrays):
 def joined(parts: Sequence[Pairs]) -> Pairs:
     """Pairs of one table, one part after the other."""
     names = [f.name for f in fields(Pairs) if f.name != "source"]
-    return Pairs(source=parts[0].source, **{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
+    columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
+    for name in ("sigma_distance", "sigma_angle", "test"):
+        columns[name] = once(columns[name])
+    return Pairs(source=parts[0].source, **columns)
+
+
+def are_same(places: Integers | Floats, a: Integers, b: Integers) -> Booleans:
+    """Which pairs have both ends at the same place, shape (n_pairs,).
+
+    Args:
+        places: Of all that they may be between, shape (n, width).
+        a: The first of each, shape (n_pairs,).
+        b: The second.
+    """
+    spans = over_spans(lambda start, stop: np.all(places[a[start:stop]] == places[b[start:stop]], axis=1), len(a))
+    return np.concatenate([np.zeros(0, dtype=np.bool_), *spans])
 
 
 @dataclass(frozen=True)

@@ -88,6 +88,12 @@ class Series(Brief):
         """Measurements with a row to fit."""
         return np.flatnonzero(self.used.any(axis=1) & ~self.test)
 
+    @property
+    def fitted(self) -> Series:
+        """The train measurements alone."""
+        train = self.train
+        return self if len(train) == self.n else self.select(train)
+
     def select(self, rows: Integers) -> Series:
         """Some of the measurements."""
         each = ("ends", "data", "sigma", "measured", "test", "number", "nuisances")

@@ -84,12 +84,11 @@ from fg_calib.files.robot_yaml import write_robot
 from fg_calib.graph.noise import JOINT_NOISE
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
-from fg_calib.job import Job
 from fg_calib.measurements.fingerprints import fingerprints
-from fg_calib.options import check
+from fg_calib.options import Options, check
 from fg_calib.report.page.files import FIGURE_FILES, PAGE
 from fg_calib.report.shown import FAMILY_UNIT
-from fg_calib.robot.kinematics import pose
+from fg_calib.robot.kinematics import SPAN, pose
 from fg_calib.robot.model import Robot
 from fg_calib.threads import single_threaded
 
@@ -155,13 +154,13 @@ def result_of(
         test=_test_rows(u, names),
         acceptance=None if u.acceptance is None else Acceptance.model_validate(u.acceptance),
         folds=_folds(u),
-        priors=_priors(u.priors),
-        expected_error=_expected_error(u.expected_error),
+        priors=priors_of(u.priors),
+        expected_error=expected_error_of(u.expected_error),
         **_noise_and_tolerances(solution, goodness.kinds),
         suspect_configurations=_suspects(goodness.configurations, names),
         residual_rms=_residual_rms(u),
         **_estimates(problem, u),
-        observability=_observability(u.identifiability),
+        observability=observability_of(u.identifiability),
         **_origin(solution, inputs or {}, **origin),
     )
 
@@ -170,9 +169,9 @@ def _estimates(problem: Problem, u: Uncertainty) -> dict[str, Any]:
     """What was estimated, and of which links of a URDF."""
     urdf, frames = problem.robot.urdf, problem.variables.frames
     return {
-        "parameters": tuple(map(_parameter, u.parameters)),
+        "parameters": tuple(map(parameter_of, u.parameters)),
         "covariance": Covariance.make(names=u.names, matrix=u.covariance),
-        "posterior": _posterior(u.whole),
+        "posterior": posterior_of(u.whole),
         "links": None if urdf is None else (urdf.base_link, urdf.tip_link),
         "frame_estimate": None if u.frame is None else Frame.model_validate(u.frame),
         "frames": {v.symbol: Frame.model_validate(f) for v, f in zip(frames, u.frames, strict=True)},
@@ -190,8 +189,8 @@ def _origin(
 ) -> dict[str, Any]:
     """What a result came from, and what the next one takes over."""
     return {
-        "options": _options(solution.problem),
-        "versions": dict(_versions()),
+        "options": choices_of(solution.problem.options),
+        "versions": dict(versions()),
         "inputs": dict(inputs),
         "date": date or datetime.now(UTC).isoformat(timespec="seconds"),
         "previous": previous,
@@ -223,16 +222,16 @@ def _carried(solution: Solution, job: Mapping[str, Any]) -> Carried:
     return Carried.make(job=dict(job), rows=rows, noise=noise, knowledge=document)
 
 
-def _options(problem: Problem) -> dict[str, Any]:
+def choices_of(options: Options) -> dict[str, Any]:
     """Every choice by name; of what is accepted the limits that were set."""
-    given = {f.name: getattr(problem.options, f.name) for f in fields(problem.options)}
-    limits = {key: limit for key, limit in asdict(problem.options.accept).items() if limit is not None}
-    words = {"pairing": str(problem.options.pairing), "prefer": list(problem.options.prefer), "accept": limits}
+    given = {f.name: getattr(options, f.name) for f in fields(options)}
+    limits = {key: limit for key, limit in asdict(options.accept).items() if limit is not None}
+    words = {"pairing": str(options.pairing), "prefer": list(options.prefer), "accept": limits}
     return given | words
 
 
 @cache
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
     """What the figures were computed with."""
     libraries = {"gtsam": metadata.version("gtsam"), "numpy": np.__version__, "scipy": scipy.__version__}
     return {"fg-calib": __version__, "python": platform.python_version(), **libraries}
@@ -286,7 +285,7 @@ def _residual_rms(uncertainty: Uncertainty) -> dict[str, dict[str, Any]]:
     return {split: {kind: document(split, kind) for kind in kinds} for split in ("train", "test")}
 
 
-def _parameter(p: ParameterEstimate) -> Parameter:
+def parameter_of(p: ParameterEstimate) -> Parameter:
     """A parameter; what it stands for only where others were left out to fix the gauge."""
     own = {f.name: getattr(p, f.name) for f in fields(p)}
     if p.stands_for is None:
@@ -294,7 +293,8 @@ def _parameter(p: ParameterEstimate) -> Parameter:
     return Parameter(**own)
 
 
-def _posterior(found: TangentCovariance) -> Posterior:
+def posterior_of(found: TangentCovariance) -> Posterior:
+    """The covariance in the tangent space, and what nothing determines."""
     v = found.variables
     return Posterior.make(
         variables={item.symbol: v.names[item.columns] for item in v.items},
@@ -409,7 +409,7 @@ def _folds(uncertainty: Uncertainty) -> FoldsDocument | None:
     )
 
 
-def _expected_error(expected: ExpectedError | None) -> ExpectedErrorDocument | None:
+def expected_error_of(expected: ExpectedError | None) -> ExpectedErrorDocument | None:
     """Expected RMS errors of the tool."""
     if expected is None:
         return None
@@ -446,7 +446,7 @@ def _joint_values(found: JointValues | None, names: Sequence[str]) -> JointValue
     )
 
 
-def _priors(fit: PriorFit | None) -> Priors | None:
+def priors_of(fit: PriorFit | None) -> Priors | None:
     """Corrections against tolerances; None without priors."""
     if fit is None:
         return None
@@ -479,7 +479,7 @@ def _setup(check: SetupCheck) -> Setup:
     )
 
 
-def _observability(found: Identifiability) -> Observability:
+def observability_of(found: Identifiability) -> Observability:
     """What `observability.json` holds: sigmas, correlations and weak directions only where the noise is the user's."""
     o, more = found.observability, dict[str, Any]()
     if found.kind == "practical":
@@ -488,7 +488,7 @@ def _observability(found: Identifiability) -> Observability:
         more["weak"] = tuple(map(Weak.model_validate, o.weak))
     if found.with_fixed_known is not None:
         more["fixed"] = found.fixed
-        more["with_fixed_known"] = _observability(found.with_fixed_known)
+        more["with_fixed_known"] = observability_of(found.with_fixed_known)
     return Observability.make(
         schema_=OBSERVABILITY_SCHEMA,
         robot=found.robot,
@@ -525,8 +525,8 @@ def _missing(m: MissingMotion) -> Missing:
 
 @checked
 def observability_document(found: Identifiability) -> dict[str, Any]:
-    """`_observability` as it is written to `observability.json`."""
-    return _observability(found).document()
+    """`observability_of` as it is written to `observability.json`."""
+    return observability_of(found).document()
 
 
 @checked
@@ -757,15 +757,20 @@ def write_result(
     fill_folder(Path(folder), write, RESULT_FILES)
 
 
-def require_no_input(folder: Path, job: Job) -> None:
+def require_no_input(folder: Path, path: Path | None, inputs: Mapping[str, str]) -> None:
     """Check that results written to a folder would not replace what a job was read from, nor what is of no result.
+
+    Args:
+        folder: Where to.
+        path: The job's file, if it is in one.
+        inputs: What it was read from, by path relative to the job.
 
     Raises:
         InputError: They would.
     """
-    inputs = set() if job.path is None else {(job.path.parent / name).resolve() for name in job.inputs}
+    files = set() if path is None else {(path.parent / name).resolve() for name in inputs}
     for name in RESULT_FILES:
-        if (folder / name).resolve() in inputs:
+        if (folder / name).resolve() in files:
             raise InputError(str(folder / name), "the job was read from it", "another folder for the results")
     require_own(folder, RESULT_FILES)
 
@@ -852,7 +857,7 @@ def _write_configurations(path: Path, solution: Solution, uncertainty: Uncertain
     data, robot = solution.problem.data, uncertainty.robot
     readings, n = data.readings, data.n_configurations
     rows, chi2, rms = uncertainty.residuals.of_configurations(n)
-    tool = pose(robot, readings).position
+    tool = np.concatenate([pose(robot, readings[k : k + SPAN]).position for k in range(0, max(n, 1), SPAN)])
     columns: dict[str, Any] = {
         "id": Words(data.names[:n], np.arange(n)),
         "split": Words(("train", "test"), (data.tested | solution.problem.evaluated).astype(np.int64)),

@@ -39,9 +39,10 @@ def build_history(history: History) -> RenderableType:
     )
     for run in history.runs:
         p = "" if run.p_value is None else probability(run.p_value)
-        chi2 = "" if run.chi2 is None else f"{run.chi2:.4g}"
+        chi2 = "" if run.chi2 is None else f"{run.chi2:.6g}"
         table.add_row(run.date[:10], str(run.n_residuals), chi2, str(run.dof), p, run.verdict, *_moved(run))
-    return Group(line(f"{history.robot}: {len(history.runs)} runs", "bold"), *section("Runs", table))
+    n = len(history.runs)
+    return Group(line(f"{history.robot}: {n} run{'s' * (n > 1)}", "bold"), *section("Runs", table))
 
 
 def _moved(run: Run) -> tuple[str, str, str]:

@@ -21,7 +21,7 @@ from fg_calib.files.tables import joint_columns
 from fg_calib.files.units import Units
 from fg_calib.options import LengthUnit
 from fg_calib.report.shown import SHOWN
-from fg_calib.report.summary import good
+from fg_calib.report.summary import verdict_word
 from fg_calib.report.tables import indented, line, plain_table, rounded, section
 from fg_calib.robot.model import Robot
 
@@ -58,7 +58,7 @@ def prediction_document(found: PredictedErrors, result: Result, ids: Sequence[st
         schema_=document.SCHEMA,
         version=__version__,
         robot=result.robot,
-        trustworthy=not result.findings,
+        trustworthy=not (result.findings or result.in_parts),
         findings=result.findings,
         reservations=result.reservations,
         at="configurations" if found.given else "workspace",
@@ -166,7 +166,7 @@ def build_prediction_report(
     """
     n = len(found.errors.readings)
     where = f"at {n} configurations" if found.given else "over the workspace"
-    verdict = good(result.reservations) if not result.findings else "DOUBTFUL"
+    verdict = verdict_word(result) if not result.findings else "DOUBTFUL"
     parts: list[RenderableType] = [line(f"{result.robot}: expected error of the tool {where}", "bold")]
     parts += [line(f"the calibration was {verdict}", "bold green" if not result.findings else "bold red")]
     parts += indented([*result.findings, *result.reservations])

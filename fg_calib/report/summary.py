@@ -8,8 +8,9 @@ from html import escape
 from fg_calib.analysis.acceptance import Judgement
 from fg_calib.errors import escaped
 from fg_calib.files.result import Judgement as JudgementDocument
-from fg_calib.files.result import Parameter, Result, Rms
+from fg_calib.files.result import Lost, Parameter, Result, Rms
 from fg_calib.options import LIMITED
+from fg_calib.report.identifiability import format_relation
 from fg_calib.report.shown import FAMILY_UNIT, SHOWN
 from fg_calib.report.tolerances import TITLE, tolerance_rows
 
@@ -21,6 +22,11 @@ _HEADINGS = ("", "estimate", "± sigma", "", "correction", "nominal", "prior", "
 def good(reservations: Sequence[str]) -> str:
     """The word for a result that may be trusted, although perhaps not without reservations."""
     return "GOOD, with reservations" if reservations else "GOOD"
+
+
+def verdict_word(result: Result) -> str:
+    """The word for a result that nothing speaks against; where single rows were not judged it is none of praise."""
+    return "NOT JUDGED ROW BY ROW" if result.in_parts else good(result.reservations)
 
 
 def judged(found: Iterable[Judgement | JudgementDocument]) -> list[str]:
@@ -42,7 +48,7 @@ def summary(result: Result) -> list[str]:
     head += ", measurement frame unknown" if result.frame_estimate is not None else ""
     chi2 = "" if result.reduced_chi2 is None else f", reduced chi-square {result.reduced_chi2:.3g}"
     verdicts = [f"DOUBTFUL: {finding}" for finding in result.findings]
-    verdicts = verdicts or [f"{good(result.reservations)}: {result.solver.message}", *result.reservations]
+    verdicts = verdicts or [f"{verdict_word(result)}: {result.solver.message}", *result.reservations]
     more = [f"... and {len(verdicts) - 3} more findings"] if len(verdicts) > 3 else []
     estimated = [p for p in result.parameters if p.identifiability != "fixed"]
     known = sum(p.sigma is not None for p in estimated)
@@ -106,9 +112,20 @@ def format_result(result: Result) -> str:
         xyz = "  ".join("unknown" if v is None else f"{v * 1e3:.4f}" for v in result.frame_estimate.xyz)
         quaternion = "  ".join("unknown" if v is None else f"{v:.8f}" for v in result.frame_estimate.quaternion_xyzw)
         parts += ["", "Measurement frame (world_T_base)", f"xyz {xyz} mm", f"quaternion xyzw {quaternion}"]
+    if lost := result.observability.lost:
+        parts += ["", "What the data do not determine", *_lost(lost)]
     if notes := [text for text in result.cautions if result.findings or text not in result.reservations]:
         parts += ["", "Notes", *map(escaped, notes)]
     return "\n".join(parts)
+
+
+def _lost(found: Iterable[Lost]) -> Iterator[str]:
+    """A line for each reason, with the directions that have it."""
+    by_reason: dict[str, list[str]] = {}
+    for one in found:
+        by_reason.setdefault(one.reason, []).append(format_relation(one.relation))
+    for reason, relations in by_reason.items():
+        yield escaped(f"{', '.join(relations)}: {reason}")
 
 
 def _scales(result: Result) -> Iterator[str]:

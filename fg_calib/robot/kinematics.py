@@ -18,6 +18,7 @@ References:
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -286,7 +287,7 @@ def turning_of_base(w: Floats, rotation: Floats) -> Floats:
     w_mean, R_mean = w.mean(axis=0), rotation.mean(axis=0)
     # Normal equations of b about the means; where the rotations hardly tell it is zero, and the turn the base's.
     values, V = np.linalg.eigh(np.eye(3) - R_mean.T @ R_mean)
-    right = np.einsum("nji,njp->ip", rotation, w) / len(w) - R_mean.T @ w_mean
+    right = rotation.reshape(-1, 3).T @ w.reshape(3 * len(w), w.shape[2]) / len(w) - R_mean.T @ w_mean
     inverse = np.divide(1.0, values, out=np.zeros(3), where=values > LEAST_TURNING)
     a: Floats = w_mean - R_mean @ ((V * inverse) @ (V.T @ right))
     return a
@@ -312,9 +313,10 @@ def turning_of_points(points: Floats, shifts: Floats) -> Floats:
         points: Shape (n, 3), [m].
         shifts: In each column, shape (n, 3, n_columns).
     """
-    p, s = points - points.mean(axis=0), shifts - shifts.mean(axis=0)
+    p = points - points.mean(axis=0)
     inertia = np.sum(p * p) * np.eye(3) - p.T @ p
-    moment = np.cross(p[:, :, None], s, axis=1).sum(axis=0)
+    products = np.tensordot(p, shifts, (0, 0))  # their mean has no moment about that of the points
+    moment = np.stack([products[i, k] - products[k, i] for i, k in ((1, 2), (2, 0), (0, 1))])
     turn: Floats = np.linalg.pinv(inertia, rcond=1e-8, hermitian=True) @ moment
     return turn
 
@@ -358,3 +360,7 @@ def over_processors(run: Callable[[int], T], n: int) -> Iterator[T]:
 @cache
 def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(processors(), thread_name_prefix="fg-calib")
+
+
+if hasattr(os, "register_at_fork"):  # whose child has none of the threads
+    os.register_at_fork(after_in_child=_pool.cache_clear)

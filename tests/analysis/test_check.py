@@ -1,5 +1,6 @@
 """New rows of a calibrated arm: what is drift of a joint, and what is not."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -140,6 +141,38 @@ def test_a_gross_row_does_not_count_against_a_limit(known):
     assert found.gross_rows == ("r6",)
     assert found.verdict == without.verdict == "pass"
     assert found.rms["position"] == pytest.approx(without.rms["position"], rel=1e-3)  # frames to convergence
+
+
+def test_many_rows_are_judged_in_the_memory_that_rows_take(known):
+    """Columns of gross errors at each configuration would be as many as the rows."""
+    calibration, true, _ = known
+    rows = measured(true, 450, np.random.default_rng(0))
+    tracemalloc.start()
+    found = calibration.check(rows)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert found.verdict == "pass"
+    assert peak < 0.5 * 8 * (6 * rows.n_configurations) ** 2
+
+
+def test_many_pairs_of_few_configurations_are_judged_without_a_suspect_each():
+    robot, rng = arm(), np.random.default_rng(0)
+    true = true_robot(robot, rng)
+
+    def pairs_of(n, n_pairs):
+        q = rng.uniform(-2.0, 2.0, (n, robot.n_joints))
+        p, every = pose(true, q).position, np.transpose(np.triu_indices(n, 1))
+        a, b = every[rng.permutation(len(every))[:n_pairs]].T
+        length = np.linalg.norm(p[b] - p[a], axis=1) + 1e-4 * rng.normal(size=n_pairs)
+        return Measurements.from_arrays(q, pairs={"a": a, "b": b, "distance": length, "sigma_distance": 1e-4})
+
+    calibration = calibrate(robot, pairs_of(30, 200), model="distance")
+    tracemalloc.start()
+    found = calibration.check(pairs_of(150, 8000))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert found.verdict == "pass"
+    assert peak < 0.5 * 8 * 8000**2
 
 
 @pytest.mark.parametrize("factor", [1.3, 3.0])

@@ -378,7 +378,7 @@ def test_leverage_in_chunks_is_leverage_at_once(monkeypatch):
     robot = small_arm(tolerance=TOLERANCE)
     solution = solve(case("star joint", robot, rng, 20))
     at_once = assess(solution).goodness
-    monkeypatch.setattr(goodness_module, "_CHUNK", 7)
+    monkeypatch.setattr(goodness_module, "_FEW", 7)
     in_chunks = assess(solution).goodness
     assert in_chunks.studentised == pytest.approx(at_once.studentised)
     p = [fit.p_value for fit in at_once.kinds]

@@ -1,12 +1,13 @@
 """A table in parts: their sum says what the whole table says, whoever reduces them."""
 
 import pickle
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from simulated import measure, small_arm, true_robot
+from simulated import TOOL, measure, paper_robot, small_arm, true_robot
 
 from fg_calib import (
     CalibrationError,
@@ -24,6 +25,7 @@ from fg_calib import (
 )
 from fg_calib.graph.information import row_triangles
 from fg_calib.graph.problem import assembled
+from fg_calib.graph.solver import SolverOptions
 from fg_calib.robot.kinematics import pose
 
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3}
@@ -146,11 +148,19 @@ def test_parts_are_tables_and_there_is_one():
     robot = small_arm(TOLERANCE)
     with pytest.raises(InputError, match=r"^parts: none, expected at least one"):
         solve_parts(robot, [], model="pose")
+    with pytest.raises(InputError, match=r"^parts: found Measurements.*, expected a list of a Measurements or a f"):
+        solve_parts(robot, table("pose", robot), model="pose")
+    with pytest.raises(InputError, match=r"^parts\[0\]: found 3, expected a Measurements or a function"):
+        solve_parts(robot, [3], model="pose")
     with pytest.raises(ProblemError, match=r"^parts: part 1: part: found 3, expected measurements, or a function that"):
         solve_parts(robot, [partial(int, 3)], model="pose")
     with pytest.raises(InputError, match=r"^n_rows: found 0"):
         cut(table("pose", robot), 0)
     labelled = Measurements.from_arrays(np.zeros((3, 4)), position=np.zeros((3, 3)), target=["a", "b", "a"])
+    other = Measurements.from_arrays(np.zeros((1, 5)), position=np.zeros((1, 3)), sigma_position=1e-3)
+    for frame in ("known", "unknown"):
+        with pytest.raises(ProblemError, match=r"^parts: part 2: readings: shape \(1, 5\), expected \(n, 4\) for the"):
+            solve_parts(robot, [*cut(table("pose", robot), 60), other], model="position", frame=frame)
     with pytest.raises(ProblemError, match="targets, stations, anchors or touched points, which rows of all parts"):
         solve_parts(robot, [labelled], model="position")
 
@@ -162,3 +172,65 @@ def test_independent_pairs_with_joint_noise_may_be_cut():
     found = solve_parts(robot, cut(m, 100), **choices)
     whole = solve(build_problem(robot, m, **choices))
     assert 0.5 * found.chi2 == pytest.approx(whole.cost, rel=1e-9)
+
+
+def test_pairs_beside_poses_that_are_solved_are_refused_as_cut_parts_hold_a_pose_many_times():
+    robot = small_arm(TOLERANCE)
+    m = table("pose", robot)
+    rows = np.arange(60)
+    both = replace(m, pairs=table("distance", robot).pairs.select(rows))
+    with pytest.raises(ProblemError, match=r"^parts: part 1: measurements: pairs beside the poses, which model pose"):
+        solve_parts(robot, cut(both, 7), model="pose")
+    assert solve_parts(robot, cut(replace(both, pairs=None), 7), model="pose").reduced.n_residuals == 360
+
+
+@pytest.mark.parametrize("n_rows", [2, 10])
+def test_a_frame_is_started_by_all_parts_as_one_may_not_tell_where_it_is(n_rows):
+    robot, rng = small_arm(TOLERANCE), np.random.default_rng(6)
+    frame = (Rotation.random(random_state=6), np.array([0.5, 1.0, -0.3]))
+    m = measure(true_robot(robot, rng), 20, rng, frame=frame)
+    choices = {"model": "position", "frame": "unknown"}
+    parts = cut(m, n_rows)
+    tested = replace(parts[0], test=np.ones(n_rows, dtype=np.bool_))
+    expected = solve(build_problem(robot, m, **choices)).cost
+    for given in (parts, (tested, *parts), (m.select(np.arange(0)), *parts)):
+        found = solve_parts(robot, given, **choices)
+        assert found.converged
+        assert 0.5 * found.chi2 == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_tool_far_from_nominal_is_started_from_distances():
+    robot = small_arm(TOLERANCE, estimate=TOOL)
+    off = -1.5 * np.isin([p.name for p in robot.parameters], TOOL[:2])
+    m = table("distance", robot.with_values(robot.nominal + off))
+    found = solve_parts(robot, cut(m, 50), model="distance")
+    assert found.converged
+    assert 0.5 * found.chi2 == pytest.approx(solve(build_problem(robot, m, model="distance")).cost, rel=1e-9)
+
+
+def test_the_same_parameters_have_a_sigma_as_in_a_calibration():
+    """Undetermined directions turn a little away from nominal: that makes nothing unknown that was known there."""
+    robot, rng = paper_robot(), np.random.default_rng(1)
+    m = measure(true_robot(robot, rng), 80, rng, sigma=(1e-4, 1e-4), frame=FRAME)
+    choices = {"model": "pose", "frame": "unknown", "gauge": "none"}
+    uncertainty = assess(solve(build_problem(robot, m, **choices)))
+    sigma = solve_parts(robot, cut(m, 30), **choices).sigma
+    expected = np.sqrt(np.diag(uncertainty.covariance))
+    assert np.isnan(expected).any()
+    assert [sigma[name] for name in uncertainty.names] == pytest.approx(expected.tolist(), rel=1e-4, nan_ok=True)
+
+
+def test_test_rows_alone_are_no_calibration():
+    robot = small_arm(TOLERANCE)
+    m = table("pose", robot)
+    with pytest.raises(ProblemError, match=r"^parts: no train row, expected at least one"):
+        solve_parts(robot, [replace(m, test=np.ones(len(m.readings), dtype=np.bool_))], model="pose")
+
+
+def test_the_options_say_after_how_many_steps_to_give_up():
+    robot = small_arm(TOLERANCE)
+    parts = cut(table("pose", robot), 20)
+    found = solve_parts(robot, parts, model="pose", max_iterations=1)
+    assert found.iterations == 1
+    same = solve_parts(robot, parts, solver=SolverOptions(max_iterations=1), model="pose")
+    assert found.parameters.tobytes() == same.parameters.tobytes()

@@ -264,6 +264,25 @@ def test_an_interrupt_is_silent_while_libraries_are_loaded_too(example, seconds)
     assert (process.returncode, shown, err) == (-signal.SIGINT, "", "")
 
 
+@pytest.mark.slow
+def test_an_interrupt_ends_a_command_that_has_read_its_tables():
+    """polars listens to interrupts from when it is loaded."""
+    script = """
+import os, signal, sys
+import fg_calib.cli as c
+import fg_calib.cli.entry as entry
+def run():
+    import polars
+    print(".", flush=True)
+    os.kill(os.getpid(), signal.SIGINT)
+    print("still here")
+entry.run = run
+c.main()
+"""
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (-signal.SIGINT, ".\n", "")
+
+
 def test_the_command_leaves_interrupts_as_they_were(fg_calib):
     before = signal.getsignal(signal.SIGINT)
     assert fg_calib("--version").code == 0

@@ -147,7 +147,7 @@ def everything_given_the_noise(solution):
         values = pair_values(arm, q, *series.ends.T)[:, quantities]
         slope = np.einsum("nii->ni", residuals.unpack(noise.rows.whitening, residual_dim))
         start = noise.predicted[:, quantities]
-        return (start - series.data + noise.excess + slope * (values - start))[train].ravel()[used]
+        return (start - series.data + noise.figures()[1] + slope * (values - start))[train].ravel()[used]
 
     model_of_poses = series.kind.ends == 1
     quantities = [("distance", "angle").index(name) for name in series.kind.names] if not model_of_poses else []

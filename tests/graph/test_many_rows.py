@@ -6,15 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from simulated import small_arm, true_robot
+from simulated import measure, small_arm, true_robot
 from tolerances import rounding
 
-from fg_calib import Calibration, InputError, Measurements, assess, solve
-from fg_calib.graph import solver
+from fg_calib import Calibration, InputError, Measurements, Pairing, Table, assess, solve
+from fg_calib.graph import noise, solver
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.information import row_triangles
 from fg_calib.graph.noise import whitening_of
-from fg_calib.graph.problem import reweighted_at, some_rows
+from fg_calib.graph.problem import noises_at, reweighted_at, some_rows
 from fg_calib.graph.solver import _Linearised as Linearised
 from fg_calib.measurements import fingerprints, residuals
 from fg_calib.measurements.residuals import pack, unpack
@@ -57,6 +57,23 @@ def test_a_start_from_some_rows_leads_to_the_optimum_of_all(problem, monkeypatch
     estimated = [p.estimated for p in problem.robot.parameters]
     # Both are nearer to the optimum than 3e-7 sigma.
     assert np.max(np.abs(change[estimated] / sigma)) < 1e-6
+
+
+@pytest.mark.parametrize("sigma_joint", [0.0, 1e-3])
+@pytest.mark.parametrize("tested", [False, True])
+def test_a_small_table_beside_a_large_one_of_which_no_row_is_drawn(sigma_joint, tested, monkeypatch):
+    robot, rng = small_arm(TOLERANCE), np.random.default_rng(0)
+    true = true_robot(robot, rng)
+    large, small = (measure(true, n, rng, sigma_joint=sigma_joint) for n in (50, 4))
+    small = replace(small, source="small", test=np.full(4, tested))
+    tables = [Table(large, "pose"), Table(small, "distance-rotation", Pairing("chain"))]
+    problem = build_problem(robot, tables)
+    expected = solve(problem)
+    monkeypatch.setattr(solver, "MANY_ROWS", 100)
+    assert any(s.n == 0 for s in some_rows(problem, solver.FEW).data.series)
+    found = solve(problem)
+    assert found.converged
+    assert found.cost == pytest.approx(expected.cost, rel=1e-9)
 
 
 def test_some_rows_are_train_rows_and_as_many_as_asked_for(problem):
@@ -162,6 +179,24 @@ def displaced(problem, solution, n_sigma):
     sigma = np.sqrt(np.diag(assess(solution).covariance))
     there[[i for i, p in enumerate(problem.robot.parameters) if p.estimated]] += n_sigma * sigma
     return there
+
+
+def test_noise_of_many_rows_is_worked_out_anew_where_it_is_asked_for_and_is_the_same(problem, monkeypatch):
+    spread = 30.0 * np.diag(problem.variables.prior_scales)  # so large that it bends rows
+    of_few = noises_at(replace(problem, state=replace(problem.state, spread=spread)), problem.start)[0]
+    monkeypatch.setattr(noise, "SPAN", 64)
+    (of_many,) = noises_at(replace(problem, state=replace(problem.state, spread=spread)), problem.start)
+    rows = np.random.default_rng(0).permutation(of_few.series.n)[:500]
+    kept, anew = of_few.moments_at(slice(None)), of_many.moments_at(slice(None))
+    assert np.sum(of_few.bent_by(spread, 0.05)) > 100  # most rows are long, and straight
+    assert np.sum(kept.slope < 0.999) > 10  # some are near a kink
+    for name in ("excess", "slope", "variance"):
+        # Bends are sums over the ends of the same rows, in products of other shapes.
+        assert getattr(anew, name) == pytest.approx(getattr(kept, name), rel=1e-9, abs=1e-15)
+        assert np.array_equal(getattr(of_many.moments_at(rows), name), getattr(anew, name)[rows])
+    figures = zip(of_many.figures(), (of_many.residual(), anew.excess, of_many.sigma), strict=True)
+    assert all(np.array_equal(found, expected) for found, expected in figures)
+    assert of_many.sigma == pytest.approx(of_few.sigma, rel=1e-9)
 
 
 def test_near_the_optimum_rows_are_linearised_once_for_every_time_that_they_are_whitened(problem, monkeypatch):

@@ -21,6 +21,7 @@ from fg_calib.analysis.variance_components import estimate_noise
 from fg_calib.errors import InputError, ProblemError
 from fg_calib.files.csv_writer import write_csv
 from fg_calib.graph.build import build_problem
+from fg_calib.graph.problem import assembled
 from fg_calib.graph.solver import solve
 from fg_calib.measurements.dataset import Groups, Pairs, no_pairs
 from fg_calib.measurements.series import Table
@@ -573,3 +574,26 @@ def test_an_anchor_plane_or_board_of_one_name_in_two_tables_is_one(instrument):
     named = [[p.name for p in u.points if not p.name.startswith("offset of")] for u in (mixed, whole)]
     assert named[0] == named[1]
     assert mixed.chi2 == pytest.approx(whole.chi2, rel=1e-6)
+
+
+@pytest.mark.parametrize("apart", [False, True])
+@pytest.mark.parametrize("model", ["distance-rotation", "distance", "pose"])
+def test_test_rows_have_no_say_in_the_fit(model, apart):
+    """Nor how they are whitened where what parameters may be off bends them; also where a table has no others."""
+    rng = np.random.default_rng(3)
+    robot = small_arm(tolerance=TOLERANCE)
+    m = measure(true_robot(robot, rng), 20, rng, sigma_joint=1e-4, n_test=12)
+    train, test = m.select(np.flatnonzero(~m.test)), m.select(np.flatnonzero(m.test))
+    together = [Table(part, model) for part in (train, replace(test, source="others"))] if apart else Table(m, model)
+    alone, beside = (build_problem(robot, tables) for tables in (Table(train, model), together))
+    spread = 3.0 * np.diag(alone.variables.prior_scales)
+    rows = []
+    for problem in (alone, beside):
+        bent = assembled(problem, problem.start, replace(problem.state, spread=spread))
+        rows.append([row_set.triangle(bent.variables.at(bent.start)) for row_set in bent.rows])
+    for R, S in zip(*rows, strict=True):
+        assert S.T @ S == pytest.approx(R.T @ R, rel=1e-9, abs=1e-9 * np.abs(R.T @ R).max())
+    fitted, beside = solve(alone), solve(beside)
+    sigma = np.sqrt(np.diag(assess(fitted).spread.tangent))
+    step = fitted.problem.variables.step(fitted.values, beside.values) / sigma
+    assert np.abs(step).max() < 1e-6

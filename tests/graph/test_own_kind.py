@@ -412,6 +412,15 @@ def test_figures_are_checked_before_anything_is_solved():
         of_kind(Mine())
 
 
+def test_want_of_memory_is_no_fault_of_a_kind():
+    class Mine(AnchorDistance):
+        def figures(self, data):
+            raise MemoryError
+
+    with pytest.raises(MemoryError):
+        of_kind(Mine())
+
+
 def test_a_kind_may_compute_in_single_precision():
     class Single(AnchorDistance):
         def rows(self, at, data, nuisances):

@@ -377,7 +377,7 @@ HOW = {
     "export": [are_typed, exports_an_arm],
     "next-month": [are_typed, slow(checks_and_updates)],
     "observability": [is_printed],
-    "many-jobs": [are_typed, slow(names_each_job), slow(calibrates_many)],
+    "many-jobs": [are_typed, slow(names_each_job), slow(calibrates_many), are_typed],
     "simulate": [slow(are_run), is_scenario, are_configurations, slow(draws_candidates),
                  slow(is_scenario, pytest.mark.long)],
     "compare": [slow(is_printed)],

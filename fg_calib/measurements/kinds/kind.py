@@ -147,6 +147,8 @@ def _called(kind: Kind, method: str, *arguments: Any, source: str = "") -> Any:
     """
     try:
         return getattr(kind, method)(*arguments)
+    except MemoryError:  # which says nothing of the kind
+        raise
     except Exception as error:
         message = f"{type(error).__name__}: {error}".rstrip(": ")
         raise InputError(_place(kind, method, source), f"raised {message}") from error
@@ -204,7 +206,7 @@ def checked_figures(kind: Kind, data: Floats, source: str) -> Floats:
     found = as_figures(place, _called(kind, "figures", data.copy(), source=source), f"numbers of shape {shape}")
     if found.shape != (len(data), kind.residual_dim):
         raise InputError(place, f"shape {found.shape}", shape)
-    return found
+    return data if np.array_equal(found, data) else found  # of a long table in memory once
 
 
 def check_start(kind: Kind, at: Frames, data: Floats, nuisances: Floats, source: str) -> None:

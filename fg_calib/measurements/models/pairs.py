@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.arrays import once
 from fg_calib.errors import ProblemError
-from fg_calib.measurements.dataset import Pairs, form_pairs, no_pairs
+from fg_calib.measurements.dataset import Pairs, are_same, form_pairs, no_pairs
 from fg_calib.measurements.kinds import Distance, Kind, RotationAngle, SamePoint, stack
 from fg_calib.measurements.models.poses import ANGLES
 from fg_calib.measurements.series import Series, Table, Unknowns
@@ -46,7 +47,7 @@ def usable_pairs(table: Table) -> Pairs:
             noise = source if m.pairs is None else kind
             raise ProblemError(pairs.source, f"no sigma for {kind}", f"noise.{noise} or a column sigma_{noise}")
         measured |= use & np.isfinite(values)
-    return pairs.select(measured)
+    return pairs if measured.all() else pairs.select(measured)
 
 
 def pair_series(robot: Robot, table: Table, number: int, unknowns: Unknowns) -> list[Series]:
@@ -61,23 +62,22 @@ def pair_series(robot: Robot, table: Table, number: int, unknowns: Unknowns) -> 
     m, pairs = table.measurements, usable_pairs(table)
     assert table.model is not None
     formed, wanted = m.pairs is None, PAIR_MODELS[table.model]
-    values, sigmas = np.stack([pairs.distance, pairs.angle]), np.stack([pairs.sigma_distance, pairs.sigma_angle])
-    there = np.isfinite(values) & np.array(wanted)[:, None]
-    point = there[0] & (values[0] == 0.0) & (not formed)
-    there[0] &= ~point
-    ends = np.stack([pairs.a, pairs.b], axis=1)
-    same = np.all(m.readings[pairs.a] == m.readings[pairs.b], axis=1)
+    values, sigmas = (pairs.distance, pairs.angle), (pairs.sigma_distance, pairs.sigma_angle)
+    there = np.stack([np.isfinite(of) & is_wanted for of, is_wanted in zip(values, wanted, strict=True)], axis=1)
+    point = there[:, 0] & (values[0] == 0.0) & (not formed)
+    there[:, 0] &= ~point
+    same = are_same(m.readings, pairs.a, pairs.b)
 
     def series(kind: Kind, rows: Integers, data: Floats, sigma: Floats, measured: Booleans) -> Series:
         return Series(
             kind=kind,
             table=number,
-            ends=np.ascontiguousarray(ends[rows]),
+            ends=np.stack([pairs.a[rows], pairs.b[rows]], axis=1),
             data=data,
             sigma=sigma,
             measured=measured,
             test=pairs.test[rows],
-            number=rows,
+            number=rows.astype(pairs.a.dtype),
             nuisances=np.zeros((len(rows), 0), dtype=np.int64),
             formed=formed,
             excluded={"same_configuration": same[rows]},
@@ -85,12 +85,11 @@ def pair_series(robot: Robot, table: Table, number: int, unknowns: Unknowns) -> 
         )
 
     found, use = [], [k for k in (0, 1) if wanted[k]]
-    rows = np.flatnonzero(there.any(axis=0))
+    rows = np.flatnonzero(there.any(axis=1))
     if len(rows):
         kind = stack(*((Distance(), RotationAngle())[k] for k in use))
-        data = np.ascontiguousarray(np.nan_to_num(values[use][:, rows].T))
-        sigma = np.zeros_like(data) if formed else np.nan_to_num(sigmas[use][:, rows].T)
-        found.append(series(kind, rows, data, sigma, there[use][:, rows].T))
+        data, sigma = (np.stack([np.nan_to_num(of[k][rows]) for k in use], axis=1) for of in (values, sigmas))
+        found.append(series(kind, rows, data, once(np.zeros_like(data) if formed else sigma), there[rows][:, use]))
     rows = np.flatnonzero(point)
     if len(rows):
         sigma = np.repeat(pairs.sigma_distance[rows, None], 3, axis=1)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from fg_calib.analysis.covariance import TangentCovariance
 from fg_calib.analysis.tool_error import ToolErrorModel
 from fg_calib.analysis.workspace import Workspace, survey
+from fg_calib.files.columns import PIECE
 from fg_calib.files.result import Result
 from fg_calib.files.saved import SavedConfigurations, SavedResiduals
 from fg_calib.report.shown import FAMILY_UNIT
@@ -62,7 +63,8 @@ class Run:
         if job is None:
             return None
         folds = [] if self.result.folds is None else ["--folds", f"{self.result.folds.n}"]
-        return shlex.join(["fg-calib", "calibrate", job, "--out", self.folder.name or "result", *folds])
+        parts = ["--parts", str(PIECE)] if self.result.in_parts else []
+        return shlex.join(["fg-calib", "calibrate", job, "--out", self.folder.name or "result", *folds, *parts])
 
     @property
     def free_of_frame(self) -> bool:

@@ -24,7 +24,7 @@ from fg_calib.report.page.figures import (
 from fg_calib.report.page.markup import tag
 from fg_calib.report.page.run import Run
 from fg_calib.report.shown import FAMILY_UNIT, SHOWN
-from fg_calib.report.summary import good, judged, parameter_rows
+from fg_calib.report.summary import judged, parameter_rows, verdict_word
 from fg_calib.report.tolerances import HEADINGS, TITLE, tolerance_rows
 
 if TYPE_CHECKING:
@@ -34,6 +34,9 @@ Floats = NDArray[np.float64]
 
 _FEW = 3
 """Residuals a parameter, below which strong correlations may come from that alone."""
+
+_WHOLE = "Not of a calibration in parts: fg-calib calibrate without --parts, of some of the rows, has it."
+"""In place of what takes single rows."""
 
 _MOST_ROWS = 40
 """Suspicious rows that the page lists; the table of residuals has all."""
@@ -54,10 +57,10 @@ def verdict(run: Run) -> list[Element]:
         lines = [tag("div", text) for text in result.findings]
         parts.append(tag("div", tag("strong", "DOUBTFUL: not to be trusted"), lines, class_="verdict fail"))
     else:
-        word = good(result.reservations)
+        word = verdict_word(result) + (": figures may be trusted" if not result.in_parts else "")
         lines = [tag("div", text) for text in (*result.reservations, result.solver.message)]
         kind = "open" if result.reservations else "pass"
-        parts.append(tag("div", tag("strong", f"{word}: figures may be trusted"), lines, class_=f"verdict {kind}"))
+        parts.append(tag("div", tag("strong", word), lines, class_=f"verdict {kind}"))
     if result.acceptance is None:
         text = "No limits were set: with accept: {position: 0.5 mm} in the job this page says pass or fail."
         parts.append(tag("p", text, class_="soft"))
@@ -115,7 +118,8 @@ def cross_validation(run: Run) -> list[Element]:
     """How well configurations are predicted without which it was calibrated."""
     found = run.result.folds
     if found is None:
-        return [tag("p", "Not done: fg-calib calibrate --folds 5 holds every configuration out once.", class_="soft")]
+        words = "Not done: fg-calib calibrate --folds 5 holds every configuration out once."
+        return [tag("p", _WHOLE if run.result.in_parts else words, class_="soft")]
     words = (
         f"{found.n_held_out} configurations in {found.n} folds, each predicted by a calibration without it. RMS; the"
         " noise stated is there to compare."
@@ -146,7 +150,7 @@ def joints(run: Run) -> list[Element]:
     """Residuals against each joint's reading, and where each joint was read."""
     charts = error_over_joints(run)
     if not charts:
-        return [_missing("configurations.csv")]
+        return [_missing(run, "configurations.csv")]
     words = "Each dot is a configuration. A bow or a slope means an effect that the model lacks at that joint."
     parts = [tag("p", words), figures(charts)]
     workspace = run.workspace
@@ -263,7 +267,7 @@ def residuals(run: Run) -> list[Element]:
     """What is left, and what is suspicious."""
     charts = residual_charts(run)
     if not charts:
-        return [_missing("residuals.csv")]
+        return [_missing(run, "residuals.csv and no residuals.parquet", "without --residuals none")]
     words = "Residuals in their own standard deviations: noise as stated follows the curve, and 1 in 370 is beyond 3."
     parts = [tag("p", words), figures(charts)]
     found = run.residuals
@@ -290,7 +294,7 @@ def workspace(run: Run) -> list[Element]:
     """Expected error all over the workspace."""
     found = run.workspace
     if found is None:
-        return [_missing("configurations.csv")]
+        return [_missing(run, "configurations.csv")]
     if not np.isfinite(found.error).any():
         return [tag("p", "The error of the tool depends on what the measurements do not determine: it is not known.")]
     where = "after the best rigid fit to the measured positions" if found.fitted else "in the base frame"
@@ -369,5 +373,6 @@ def table(heading: Sequence[str], rows: Sequence[Sequence[str]], *, words: bool 
     return tag("div", tag("table", head, body), class_="wide")
 
 
-def _missing(name: str) -> Element:
-    return tag("p", f"The folder holds no {name}: calibrate again with --out to have this part.", class_="soft")
+def _missing(run: Run, files: str, how: str = "with --out") -> Element:
+    words = f"The folder holds no {files}: calibrate again {how} to have this part."
+    return tag("p", _WHOLE if run.result.in_parts else words, class_="soft")
