@@ -346,8 +346,9 @@ class Table:
         for column in columns:
             good = cells(self.frame, column).is_finite().fill_null(optional)
             self.require(good.to_numpy(), column, "a finite number")
-        values = select(self.frame, columns).to_numpy(order="c").copy()
+        values = np.empty((self.n_rows, len(columns)))
         for i, name in enumerate(columns):
+            values[:, i] = self.frame[name].to_numpy()
             if (meant := self.header.meant.get(name)) is not None:
                 values[:, i] = (values[:, i] - meant.zero) * meant.scale
         size = np.abs(values)
