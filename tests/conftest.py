@@ -3,6 +3,7 @@
 import gc
 import os
 import shutil
+import signal
 import sys
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +12,8 @@ import pytest
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # one worker a processor: threads of BLAS would only wait for each other
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read once, when numpy is loaded
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in a shell's background, and so in what tests interrupt
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 os.environ["PYTHONSAFEPATH"] = "1"  # subprocesses have the package that is tested, compiled once, wherever they run
 
 from fg_calib import cli

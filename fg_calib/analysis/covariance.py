@@ -112,12 +112,15 @@ class Spread(TangentCovariance):
     """The covariance of a solution, under the noise as it is taken to be and otherwise.
 
     Attributes:
+        root: A square root R of `tangent`, R R^T, shape (n_columns, k); its first `rank`
+            columns are the directions that data and priors determine, orthogonal in `prior_scales`.
         actual: `tangent` by the errors that rows share, also where they are asked to count as independent.
         rank: Number of directions that data and priors determine.
         excess: By how much the mean of chi-square is below its degrees of freedom, because rows that share errors are
             weighted as independent.
     """
 
+    root: Floats
     actual: Floats
     rank: int
     excess: float
@@ -147,11 +150,13 @@ def spread_of(solution: Solution) -> Spread:
     held = held_frames(directions[rank:], directions_nominal[rank_nominal:], scales, variables.n_robot_columns)
     half = directions[:rank].T / s[:rank]
     added = correlation(problem, solution.parameters)
+    root = np.hstack([half, held])
     middle = np.zeros((rank, rank)) if added is None else half.T @ added @ half
     return Spread(
         variables=variables,
         parameters=solution.parameters,
-        tangent=half @ half.T + held @ held.T,
+        root=root,
+        tangent=root @ root.T,
         actual=half @ (np.eye(rank) + middle) @ half.T + held @ held.T,
         loose=_orthonormal(directions[rank:], variables.scales),
         loose_at_nominal=_orthonormal(directions_nominal[rank_nominal:], variables.scales),

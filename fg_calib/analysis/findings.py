@@ -13,6 +13,7 @@ from fg_calib.analysis.chi_square import ChiSquare
 from fg_calib.analysis.conventions import MissingMotion
 from fg_calib.analysis.corrections import PriorFit
 from fg_calib.analysis.covariance import Spread
+from fg_calib.analysis.curvature import beyond_linear
 from fg_calib.analysis.goodness import OUTLIER_WEIGHT, Goodness
 from fg_calib.analysis.mistakes import SetupCheck
 from fg_calib.analysis.noise_components import has_joint_noise
@@ -26,6 +27,7 @@ from fg_calib.analysis.verdict import (
     of_bent,
     of_change,
     of_chi2,
+    of_curvature,
     of_estimated_noise,
     of_evaluation,
     of_folds,
@@ -131,6 +133,7 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
         *of_priors(fit.priors),
         *_of_tolerances(solution, fit),
         *_of_bent_rows(solution, spread, fit.table, fit.goodness, too_large=fit.chi2.too_large),
+        *of_curvature(beyond_linear(solution, spread)),
         *_of_noise(solution, fit.table, fit.goodness),
     ]
     setup, structure = SetupCheck(), of_structure(noise_like)
@@ -178,15 +181,14 @@ def _of_bent_rows(
     in chi-square. In simulations there, of tolerances of 7 to 30 sigma, that of each wrong one was 12 to 80 times too
     large, and without a wrong one the sigmas were honest (experiment 08). Vectors about 0 point anywhere, which fits.
     """
-    values, V = np.linalg.eigh(spread.tangent)
-    half, scales = V * np.sqrt(np.maximum(values, 0.0)), np.diag(solution.problem.variables.prior_scales)
+    scales = np.diag(solution.problem.variables.prior_scales)
     leverage = np.nan_to_num(goodness.leverage)
     bent, folded, turned, lengths = (np.zeros(table.n, dtype=np.bool_) for _ in range(4))
     for number, noise in enumerate(solution.noises):
         if isinstance(noise, PairNoise):
             rows, measured = table.rows_of(number), noise.series.measured
             used = lengths[rows] = table.used[rows]
-            bent[rows] = noise.bent_by(half, BENT)[measured] & used
+            bent[rows] = noise.bent_by(spread.root, BENT)[measured] & used
             folded[rows] = noise.may_fold(scales)[measured] & used
             turned[rows] = noise.about_half_a_turn()[measured] & used
     if not lengths.any():

@@ -37,6 +37,9 @@ LEAST_REST, LEAST_SHARE = 0.3, 0.01
 LEAST_FOLDED, MOST_FOLDED = 0.05, 0.3
 """Part of what the rows say that may rest on vectors of unknown sign: with a caution, and no more at all."""
 
+LEAST_CURVED, MOST_CURVED = 0.2, 1.0
+"""Mean square of an estimate's error beyond its covariance, because rows bend: with a caution, and no more at all."""
+
 LARGE_NOISE = 0.2
 """Estimated noise over the motions measured, beyond which it is no noise."""
 
@@ -298,6 +301,23 @@ def of_bent(n: int, n_rows: int, directions: float) -> list[Statement]:
         " sigmas of these may be 10 % too small, or there is a second optimum"
     )
     return [Statement(text, finding=False)]
+
+
+def of_curvature(beyond: float) -> list[Statement]:
+    """What it means that rows are not linear within what the parameters may still be off, far from any fold.
+
+    Args:
+        beyond: By how much the mean square of an estimate's error, in sigma, is above one a direction.
+    """
+    if beyond < LEAST_CURVED:
+        return []
+    times = f"{np.sqrt(1.0 + beyond):.2g}" if np.isfinite(beyond) else "many"
+    text = (
+        "the measurements bend within what they leave unknown: sums of parameters that they determine well are off by"
+        f" some {times} times their sigmas, although those of single parameters hardly change: measure at more"
+        " configurations"
+    )
+    return [Statement(text, beyond > MOST_CURVED, reservation=True)]
 
 
 def of_folds(n: int, n_rows: int, share: float) -> list[Statement]:

@@ -18,10 +18,7 @@ References:
 
 from __future__ import annotations
 
-import re
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
@@ -32,11 +29,10 @@ from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
 from fg_calib.arrays import FrozenArrays
-from fg_calib.errors import CalibrationError, SolverError
+from fg_calib.errors import SolverError
 from fg_calib.graph.extension import with_added
-from fg_calib.graph.factors import Variables, dense, eliminate
+from fg_calib.graph.linearised import Linearised, in_one_line
 from fg_calib.graph.noise import NoiseState, RowNoise
-from fg_calib.graph.observability import determined
 from fg_calib.graph.problem import (
     Problem,
     depends,
@@ -85,9 +81,6 @@ BACK = 0.1
 
 SPREAD_ROUNDS = 2
 """Times that rows of pairs are bent by what the parameters may be off there; then that stays as it is."""
-
-WEAKEST = 0.1
-"""Signal-to-noise ratio below which a direction is not taken for weaker: rows are bent by no more than that."""
 
 NEAR_ENOUGH = 1e-3
 """What may be left to go when all iterations are spent, [sigma]."""
@@ -455,7 +448,7 @@ def _stride(run: _Run, bends: int) -> int:
         state = _learn(run.problem, parameters, Weighting(run.problem.options.loss))[0]
         try:
             anew = reweighted_at(run.problem, parameters, replace(state, spread=here.spread) if bends else state)
-            there = _Linearised(anew, values)
+            there = Linearised(anew, values)
         except SolverError:
             return bends
         if there.decrement > max(SHORTER * here.decrement, there.rounding):
@@ -501,14 +494,14 @@ class _Run:
         self.message = ""
         self._options = options
         self._damping = FIRST_DAMPING
-        self._last: tuple[_Linearised, Floats] | None = None  # where the last step began, and that step
-        with _in_one_line(problem.variables):
+        self._last: tuple[Linearised, Floats] | None = None  # where the last step began, and that step
+        with in_one_line(problem.variables):
             self.initial_cost = problem.graph.error(problem.initial)
         if not np.isfinite(self.initial_cost):
             raise SolverError(
                 f"the cost at the start is {self.initial_cost}: the measurements or the robot hold absurd numbers"
             )
-        self.here = _Linearised(problem, problem.initial)
+        self.here = Linearised(problem, problem.initial)
 
     @property
     def parameters(self) -> Floats:
@@ -530,7 +523,7 @@ class _Run:
         left = self.here.decrement
         return left if left <= self.here.rounding else left / (1.0 - min(left / was, SLOWEST))
 
-    def arrive(self, problem: Problem, there: _Linearised) -> None:
+    def arrive(self, problem: Problem, there: Linearised) -> None:
         """Take the Gauss-Newton step, to other rows."""
         length = float(np.linalg.norm(self.here.step / problem.variables.all_scales))
         self.history.append(Iteration(there.cost, 0.0, length, self.here.decrement))
@@ -539,7 +532,7 @@ class _Run:
     def go_on_with(self, problem: Problem) -> None:
         """The same place with other rows."""
         self.problem = problem
-        self.here = _Linearised(problem, self.here.values)
+        self.here = Linearised(problem, self.here.values)
 
     def descend(self, goal: float, most: int | None = None) -> bool:
         """Step until the optimum of these rows is nearer than `goal`, [sigma]; whether it is, after `most` steps."""
@@ -582,19 +575,19 @@ class _Run:
     def _left(self) -> str:
         return f"{self.here.decrement:.1e} sigma"
 
-    def _undamped(self, first: Floats) -> list[_Linearised]:
+    def _undamped(self, first: Floats) -> list[Linearised]:
         """Where Gauss-Newton steps lead after a first one; nothing if they do not keep what they promise.
 
         A valley that is weakly determined may be curved: a step along it leaves it, and the next ones come back. So the
         cost may rise as long as the steps that follow are ever shorter.
         """
-        path: list[_Linearised] = []
+        path: list[Linearised] = []
         here = there = self.here
         for _ in range(PATIENCE):
             last = there
             try:
                 step = last.step if path else first
-                there = _Linearised(self.problem, self.problem.variables.moved(last.values, step))
+                there = Linearised(self.problem, self.problem.variables.moved(last.values, step))
             except SolverError:
                 return []  # so far off that the rows have no derivative there
             path.append(there)
@@ -623,10 +616,10 @@ class _Run:
         far = here.product(extrapolated, extrapolated) >= (FARTHEST * here.decrement) ** 2
         return [here.step] if far else [extrapolated, here.step]
 
-    def _damped(self) -> list[_Linearised]:
+    def _damped(self) -> list[Linearised]:
         """Where GTSAM's next damped step leads, undetermined directions held; nothing if none lowers the cost."""
         here, graph, variables = self.here, self.problem.graph, self.problem.variables
-        with _in_one_line(variables):
+        with in_one_line(variables):
             optimizer = gtsam.LevenbergMarquardtOptimizer(graph, here.values, levenberg_marquardt_params(self._damping))
             optimizer.iterate()
         if not optimizer.error() < here.cost or optimizer.lambda_() >= MOST_DAMPING:
@@ -634,63 +627,9 @@ class _Run:
         self._damping = max(optimizer.lambda_(), LEAST_DAMPING)
         step = variables.step(here.values, optimizer.values())
         held = variables.moved(here.values, here.remove_gauge_drift(step))
-        with _in_one_line(variables):
+        with in_one_line(variables):
             lower = graph.error(held) < here.cost
-        return [_Linearised(self.problem, held if lower else gtsam.Values(optimizer.values()))]
-
-
-class _Linearised:
-    """A problem linearised at some values.
-
-    Attributes:
-        values: GTSAM's values.
-        cost: Half the sum of squared whitened residuals.
-        decrement: Length of the Gauss-Newton step along determined directions, [sigma].
-        step: The step itself, shape (n_columns + n_nuisance,), of minimum norm in units of the arm's geometry.
-        spread: A square root S of the core's covariance S S^T, weak directions cut short, shape (n_columns, rank).
-        rounding: What rounding of the residuals makes of the decrement, [sigma].
-        at_rounding: Whether rounding of the cost is above the decrease that the step promises.
-    """
-
-    def __init__(self, problem: Problem, values: gtsam.Values) -> None:
-        variables = problem.variables
-        with _in_one_line(variables):
-            A, b = dense(problem.graph.linearize(values), variables.keys)
-            left = eliminate(A, b, variables.n_columns)
-            self._sizes = variables.prior_scales
-            tall = np.vstack([left.A * self._sizes, np.zeros((len(self._sizes),) * 2)])  # so that Vt is square
-            U, s, Vt = np.linalg.svd(tall, full_matrices=False)
-        rank = determined(s)
-        along = U[: len(left.b), :rank].T @ left.b
-        core = self._sizes * (Vt[:rank].T @ (along / s[:rank]))
-        self.spread: Floats = self._sizes[:, None] * Vt[:rank].T / np.maximum(s[:rank], WEAKEST)
-        self.values = values
-        self.cost = 0.5 * float(b @ b)
-        self.decrement = float(np.hypot(np.linalg.norm(left.own), np.linalg.norm(along)))
-        self.step: Floats = np.concatenate([core, left.inverse @ left.own + left.follow @ core])
-        self.rounding = 10.0 * float(np.finfo(float).eps) / variables.robot.scale_of("rad") * float(s.max(initial=0.0))
-        self.at_rounding = 0.5 * self.decrement**2 <= 10.0 * self.rounding * np.sqrt(2.0 * self.cost)
-        self._loose, self._follow = Vt[rank:], left.follow
-        self._information = s[:rank, None] * Vt[:rank]
-        self._variables = variables
-
-    def product(self, a: Floats, b: Floats) -> float:
-        """Scalar product of two steps of the core, in sigma."""
-        n = len(self._sizes)
-        a, b = (self._information @ (step[:n] / self._sizes) for step in (a, b))
-        return float(a @ b)
-
-    def decrement_to(self, values: gtsam.Values) -> float:
-        """How far some other values are, in sigma as seen from here."""
-        step = self._variables.step(self.values, values)[: len(self._sizes)]
-        return float(np.linalg.norm(self._information @ (step / self._sizes)))
-
-    def remove_gauge_drift(self, step: Floats) -> Floats:
-        """A step with the same effect on every row, but none on the core's undetermined directions."""
-        n = len(self._sizes)
-        drift = self._sizes * (self._loose.T @ (self._loose @ (step[:n] / self._sizes)))
-        held: Floats = step - np.concatenate([drift, self._follow @ drift])
-        return held
+        return [Linearised(self.problem, held if lower else gtsam.Values(optimizer.values()))]
 
 
 def levenberg_marquardt_params(damping: float = FIRST_DAMPING) -> gtsam.LevenbergMarquardtParams:
@@ -710,23 +649,3 @@ def levenberg_marquardt_params(damping: float = FIRST_DAMPING) -> gtsam.Levenber
     parameters.setRelativeErrorTol(1e-13)  # no search for a lambda once the cost's own rounding decides
     parameters.setAbsoluteErrorTol(0.0)
     return parameters
-
-
-@contextmanager
-def _in_one_line(variables: Variables) -> Iterator[None]:
-    """What GTSAM, LAPACK or a factor that somebody added raises in the block becomes a `SolverError`."""
-    try:
-        yield
-    except CalibrationError:
-        raise
-    except Exception as error:
-        raise SolverError(_in_words(str(error) or type(error).__name__, variables)) from error
-
-
-def _in_words(message: str, variables: Variables) -> str:
-    """GTSAM's message in one line, with the key it names as our variable and its parameters."""
-    found = re.search(r"Symbol:\s*(\w)(\d+)", message)
-    if "ndetermin" in message and found:
-        key = gtsam.symbol(found.group(1), int(found.group(2)))
-        return f"the linear system has no unique solution near {variables.describe(key)}"
-    return " ".join(message.split())

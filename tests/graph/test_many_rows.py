@@ -13,9 +13,9 @@ from fg_calib import Calibration, InputError, Measurements, Pairing, Table, asse
 from fg_calib.graph import noise, solver
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.information import row_triangles
+from fg_calib.graph.linearised import Linearised
 from fg_calib.graph.noise import whitening_of
 from fg_calib.graph.problem import noises_at, reweighted_at, some_rows
-from fg_calib.graph.solver import _Linearised as Linearised
 from fg_calib.measurements import fingerprints, residuals
 from fg_calib.measurements.residuals import pack, unpack
 from fg_calib.robot import kinematics
@@ -202,7 +202,7 @@ def test_noise_of_many_rows_is_worked_out_anew_where_it_is_asked_for_and_is_the_
 def test_near_the_optimum_rows_are_linearised_once_for_every_time_that_they_are_whitened(problem, monkeypatch):
     expected, counted = solve(problem), []
     near = reweighted_at(problem, displaced(problem, expected, 3.0))
-    monkeypatch.setattr(solver, "_Linearised", lambda *given: counted.append(given[0]) or Linearised(*given))
+    monkeypatch.setattr(solver, "Linearised", lambda *given: counted.append(given[0]) or Linearised(*given))
     run = solver._fit(near, solver.SolverOptions(), near=True)
     assert run.converged
     assert run.here.decrement <= 3e-7

@@ -1,0 +1,133 @@
+"""Rows that bend within what they leave unknown: by second differences written out, and by true errors."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from simulated import small_arm, true_robot
+
+from fg_calib import Measurements, calibrate, pose
+from fg_calib.analysis import curvature
+from fg_calib.analysis.curvature import beyond_linear
+
+WIDE = {"a": 1e-2, "d": 1e-2, "alpha": 1e-2, "theta": 1e-2}
+SAID = "bend within what they leave unknown"
+
+
+def measured(true, n, sigma, rng, *, rotation=False):
+    q = rng.uniform(-2.0, 2.0, (n, 4))
+    at = pose(true, q)
+    turned = at.rotation @ Rotation.from_rotvec(sigma * rng.normal(size=(n, 3))).as_matrix()
+    more = {"rotation": turned, "sigma_orientation": sigma} if rotation else {}
+    return Measurements.from_arrays(
+        q, position=at.position + sigma * rng.normal(size=(n, 3)), sigma_position=sigma, **more
+    )
+
+
+def calibrated(n, sigma, seed, *, model="position", tolerance=WIDE):
+    rng, robot = np.random.default_rng(seed), small_arm(tolerance)
+    true = true_robot(robot, rng)
+    found = calibrate(robot, measured(true, n, sigma, rng, rotation=model == "pose"), model=model, frame="known")
+    return found, true
+
+
+def squared_error(found, true):
+    """Squared error of the estimate in sigma, by direction of its covariance."""
+    solution, assessed = found.assessed
+    spread = assessed.spread
+    inverse = np.linalg.pinv(spread.root[:, : spread.rank] / spread.variables.prior_scales[:, None], rcond=1e-14)
+    off = true.nominal - solution.parameters[solution.problem.variables.robot_span]
+    estimated = [i for i, p in enumerate(true.parameters) if p.estimated]
+    return float(np.mean((inverse @ (off[estimated] / spread.variables.prior_scales)) ** 2))
+
+
+def said(found):
+    return [text for text in (*found.result.findings, *found.result.cautions) if SAID in text]
+
+
+def by_second_differences(found, m, sigma, rng, n_draws):
+    """Mean of |R^T J^T q|^2, q what positions are beyond linear at draws R z, J by differences."""
+    robot, spread = found.robot, found.assessed[1].spread
+    names = [i for i, p in enumerate(robot.parameters) if p.estimated]
+    root = spread.root[:, : spread.rank]
+
+    def rows(change):
+        values = robot.nominal.copy()
+        values[names] += change
+        return pose(robot.with_values(values), m.readings).position.ravel() / sigma
+
+    steps = 1e-6 * np.eye(len(names))
+    J = np.array([(rows(h) - rows(-h)) / 2e-6 for h in steps]).T
+    bent = []
+    for change in rng.normal(size=(n_draws, spread.rank)) @ root.T:
+        q = 0.5 * (rows(change) + rows(-change)) - rows(np.zeros(len(names)))
+        bent.append(np.mean((root.T @ (J.T @ q)) ** 2))
+    return np.mean(bent)
+
+
+@pytest.mark.parametrize("sigma", [1e-5, 1e-4])
+def test_it_is_what_second_differences_say(monkeypatch, sigma):
+    """Both are means over 400 draws of a sum of squares of squares, whose own spread is some 2 of its mean."""
+    monkeypatch.setattr(curvature, "N_DRAWS", 400)
+    monkeypatch.setattr(curvature, "NONE", 0.0)
+    found, _ = calibrated(3, sigma, 1)
+    m = found.assessed[0].problem.data.tables[0].measurements
+    expected = by_second_differences(found, m, sigma, np.random.default_rng(5), 400)
+    assert beyond_linear(found.assessed[0], found.assessed[1].spread) == pytest.approx(expected, rel=0.4)
+
+
+def test_it_grows_as_the_square_of_the_tolerances_over_the_noise():
+    """Along what no row tells the spread is the tolerance whatever the noise: ten times less is a hundredfold."""
+    of = [beyond_linear(*_judged(calibrated(3, sigma, 1)[0])) for sigma in (1e-5, 1e-6)]
+    assert of[1] / of[0] == pytest.approx(100.0, rel=0.5)
+
+
+def _judged(found):
+    return found.assessed[0], found.assessed[1].spread
+
+
+def test_fewer_rows_say_the_same(monkeypatch):
+    """Two joints stand still, so that 400 rows leave much to tolerances; 150 of them see some 5 % else of it."""
+    rng, robot = np.random.default_rng(2), small_arm(WIDE)
+    true = true_robot(robot, rng)
+    q = rng.uniform(-2.0, 2.0, (400, 4))
+    q[:, 1:3] = 0.4
+    position = pose(true, q).position + 1e-5 * rng.normal(size=(400, 3))
+    m = Measurements.from_arrays(q, position=position, sigma_position=1e-5)
+    judged = _judged(calibrate(robot, m, model="position", frame="known"))
+    whole = beyond_linear(*judged)
+    monkeypatch.setattr(curvature, "ENOUGH_ROWS", 450)
+    assert whole > 1.0
+    assert beyond_linear(*judged) == pytest.approx(whole, rel=0.3)
+
+
+def test_a_result_says_so_and_more_configurations_end_it():
+    few, _ = calibrated(3, 1e-5, 1)
+    assert said(few)
+    assert not few.result.trustworthy
+    enough, _ = calibrated(12, 1e-5, 1)
+    assert not said(enough)
+
+
+def test_it_is_a_caution_that_the_verdict_mentions_where_it_is_small():
+    found, _ = calibrated(3, 1e-4, 1)
+    assert 0.2 < beyond_linear(*_judged(found)) < 1.0
+    assert said(found)
+    assert not found.result.findings
+    assert said(found)[0] in found.result.reservations
+
+
+@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.parametrize(("n", "sigma", "model"), [(3, 1e-5, "position"), (3, 1e-4, "position"), (2, 3e-5, "pose")])
+def test_true_errors_are_beyond_their_covariance_by_as_much(n, sigma, model):
+    """200 arms: means agree within four of their standard errors, or a quarter: its own are of but 8 draws each."""
+    seen, expected = [], []
+    for seed in range(200):
+        found, true = calibrated(n, sigma, 1000 + seed, model=model)
+        seen.append(squared_error(found, true))
+        expected.append(1.0 + beyond_linear(*_judged(found)))
+    error = float(np.hypot(np.std(seen), np.std(expected)) / np.sqrt(len(seen)))
+    assert abs(np.mean(seen) - np.mean(expected)) < max(4.0 * error, 0.25 * np.mean(expected)), (
+        np.mean(seen),
+        np.mean(expected),
+    )
