@@ -605,6 +605,8 @@ class _Rows:
         factor = self._factor(rows, (table, family))
         enough, degrees = expected >= 1.0, part.degrees(chosen)
         size = np.abs(self.studentised[rows])
+        n_beyond, largest = int(np.sum(size > suspect_level(len(rows)))), float(np.nanmax(size)) if enough else np.nan
+        typical = float(np.nanmedian(size, overwrite_input=True)) / _MEDIAN if enough else np.nan
         return KindFit(
             kind=family,
             table=table,
@@ -616,10 +618,10 @@ class _Rows:
             chi2=chi2,
             expected=max(expected, 0.0),
             p_value=part.p_value(chosen, chi2, degrees) if enough and known else None,
-            typical=float(np.nanmedian(size)) / _MEDIAN if enough else np.nan,
-            largest=float(np.nanmax(size)) if enough else np.nan,
+            typical=typical,
+            largest=largest,
             degrees=degrees,
-            n_beyond=int(np.sum(size > suspect_level(len(rows)))),
+            n_beyond=n_beyond,
             own_sigma_rms=float(np.sqrt(np.mean(self._stated[1][rows] ** 2))),
             own_factor=self._problem.state.factors.get((table, family), 1.0),
         )

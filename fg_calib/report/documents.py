@@ -99,8 +99,9 @@ OBSERVABILITY_SCHEMA = "fg-calib/observability/1"
 COMPARISON_SCHEMA = "fg-calib/comparison/1"
 KINDS = ("position", "orientation", "distance", "angle")
 
-_ROWS_AT_ONCE = 100_000
-"""Rows of residuals that are turned into text, or into a group of rows of a Parquet file, at once."""
+_ROWS_AT_ONCE = {".csv": 100_000, ".parquet": 20_000}
+"""Rows of residuals that are turned into text, or into a group of rows of a Parquet file (of which several wait to be
+written), at once."""
 
 ResidualFile = Literal["csv", "parquet", "none"]
 """How single residuals are written, if at all."""
@@ -847,9 +848,9 @@ def _write_residuals(path: Path, solution: Solution, uncertainty: Uncertainty) -
             **({"row": _numbers(table.table_row[rows])} if labelled else {}),
         }
 
-    starts = range(0, max(table.n, 1), _ROWS_AT_ONCE)
+    n = _ROWS_AT_ONCE[path.suffix]
     write = write_csv_parts if path.suffix == ".csv" else write_parquet_parts
-    write(path, (columns(slice(start, start + _ROWS_AT_ONCE)) for start in starts))
+    write(path, (columns(slice(start, start + n)) for start in range(0, max(table.n, 1), n)))
 
 
 def _write_configurations(path: Path, solution: Solution, uncertainty: Uncertainty) -> None:
