@@ -11,7 +11,7 @@ measured, with its slope and variance (see `moments`). At given parameters that 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -507,11 +507,15 @@ class PairNoise(RowNoise):
             trace = trace + self._traces[ends].sum(axis=1)
         across = np.maximum(trace - along, 0.0) / 2.0 + self._bending(rows)
         along, across, own = (np.where(self._wanted, v, 0.0) for v in (along, across, own))
-        found = [
+        lengths, angles = (
             of(self.predicted[rows, k], along[:, k], across[:, k], own[:, k])
             for k, of in enumerate((length_moments, angle_moments))
-        ]
-        return Moments(*(np.stack(pair, axis=1) for pair in zip(*map(astuple, found), strict=True)))
+        )
+        return Moments(
+            np.stack([lengths.excess, angles.excess], axis=1),
+            np.stack([lengths.slope, angles.slope], axis=1),
+            np.stack([lengths.variance, angles.variance], axis=1),
+        )
 
     def _formed_variance(self) -> Floats:
         """Variance of distances and angles between measured poses, shape (n, 2); nan where not measured."""
@@ -591,7 +595,7 @@ class PairNoise(RowNoise):
         if not len(train):
             return train, np.zeros((0, 2))
         some, spread_of = _evenly(train), self._spread_by(spread)
-        of_some = BEND_MARGIN * spread_of(some)[0]
+        of_some = BEND_MARGIN * spread_of(None)[0]
         most, found, variances = 4.0 * of_some.max(axis=0), [train[:0]], [np.zeros((0, 2))]
         for start in range(0, self.series.n, SPAN):
             least = sigmas * self._straight(slice(start, start + SPAN))
@@ -615,8 +619,10 @@ class PairNoise(RowNoise):
         sigma = np.sqrt(own)
         return np.where((own > 0.0) & self._wanted, sigma * np.maximum(predicted, sigma), np.inf)
 
-    def _spread_by(self, spread: Floats) -> Callable[[Integers], tuple[Floats, Floats]]:
+    def _spread_by(self, spread: Floats) -> Callable[[Integers | None], tuple[Floats, Floats]]:
         """Variance that the parameters' own gives vectors: in each direction across, and along, shapes (m, 2), of rows.
+
+        Of None it is that of some train rows, evenly chosen.
 
         With Q the rotation from a to b, R_b R_a^T, turns w_a and w_b of the tool turn Q by w_b - Q w_a: in b itself by
         R_b^T w_b - R_a^T w_a. Motions of the base, and of the tool in itself, carry vector and rotation with them and
@@ -626,18 +632,18 @@ class PairNoise(RowNoise):
         Args:
             spread: A square root of the parameters' covariance, shape (n_columns, k).
         """
-        at, which = self._moved(_evenly(np.flatnonzero(~self.series.test)), spread)
+        of_some = at, which = self._moved(_evenly(np.flatnonzero(~self.series.test)), spread)
         everywhere = which.ravel()
         R, p, (turn, shift) = at.rotation[everywhere], at.position[everywhere], np.split(at.jacobian[everywhere], 2, 1)
         base = turning_of_base(turn, R)  # (3, k)
         carried = base + common_axes(R) @ (turning_of_points(p, shift) - base)
 
-        def spread_of(rows: Integers) -> tuple[Floats, Floats]:
-            at, which = self._moved(rows, spread)
+        def spread_of(rows: Integers | None) -> tuple[Floats, Floats]:
+            at, which = of_some if rows is None else self._moved(rows, spread)
             (turn, shift), (a, b) = np.split(at.jacobian, 2, axis=1), which.T
             turn = np.swapaxes(at.rotation, 1, 2) @ (turn - base)
             shift = shift + _skew(at.position) @ carried
-            across, along = np.empty((len(rows), 2)), np.empty((len(rows), 2))
+            across, along = np.empty((len(which), 2)), np.empty((len(which), 2))
             Q = np.swapaxes(at.rotation[a], 1, 2) @ at.rotation[b]
             directions = at.position[b] - at.position[a], rotation_angle(Q)[1]
             for k, (u, moved) in enumerate(zip(directions, (shift, turn), strict=True)):
@@ -712,9 +718,13 @@ def _over_rows(run: Callable[[slice], None], n: int) -> None:
         pass
 
 
+_SOME = 500
+"""Rows that stand for many."""
+
+
 def _evenly(rows: Integers) -> Integers:
-    """Some of many rows, evenly chosen."""
-    return rows[np.unique(np.linspace(0, len(rows) - 1, 500).astype(np.int64))]
+    """Some of many rows, evenly chosen; all of few."""
+    return rows if len(rows) <= _SOME else rows[np.linspace(0, len(rows) - 1, _SOME).astype(np.int64)]
 
 
 def _trace(sigma: Floats | None, ends: Integers) -> Floats:

@@ -386,7 +386,7 @@ def _fit(problem: Problem, options: SolverOptions, *, near: bool = False) -> _Ru
     Args:
         problem: The problem.
         options: Settings of the solver.
-        near: Whether the start is so near that the rows are to be whitened anew after every step.
+        near: Whether the start is so near that the rows are to be whitened anew after every step from the first on.
     """
     robust = problem.options.loss != "none"
     weighting = Weighting(problem.options.loss)
@@ -411,6 +411,10 @@ def _fit(problem: Problem, options: SolverOptions, *, near: bool = False) -> _Ru
             run.problem = anew
         else:
             run.go_on_with(anew)
+            if not robust and run.here.decrement <= COARSE:
+                bends = _stride(run, bends)
+                if run.converged:
+                    break
         # Where no step could be taken and what is left falls no more, rows whitened anew differ by rounding alone.
         moved = len(run.history) > n_steps
         stands = not moved and goal <= run.least and was <= run.here.decrement
@@ -440,7 +444,7 @@ def _stride(run: _Run, bends: int) -> int:
     Returns:
         How often they still are.
     """
-    left = np.inf
+    left, run.converged = np.inf, False
     while (bends or left > run.least) and not run.exhausted:
         here, variables = run.here, run.problem.variables
         values = variables.moved(here.values, here.step)
