@@ -311,7 +311,7 @@ class PairNoise(RowNoise):
     def _prepare(self, state: NoiseState) -> None:
         s = self.series
         self._parts = [_QUANTITY[type(part)] for part in getattr(s.kind, "parts", (s.kind,))]
-        self._wanted = np.isin([0, 1], self._parts)
+        self._wanted = np.array([k in self._parts for k in (0, 1)])
         self._spread = state.spread
         wide = np.ones(2)
         wide[self._parts] = self.factors
@@ -718,7 +718,7 @@ def _over_rows(run: Callable[[slice], None], n: int) -> None:
         pass
 
 
-_SOME = 500
+_SOME = 100
 """Rows that stand for many."""
 
 
