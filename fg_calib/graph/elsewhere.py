@@ -64,10 +64,15 @@ def elsewhere(problem: Problem, parameters: Floats) -> Problem | None:
 
 def _before(problem: Problem) -> list[Table]:
     """Tables such as those of earlier rows, of which but the models are known: without targets, anchors or boards."""
-    views = () if problem.knowledge is None else problem.knowledge.views
+    if problem.knowledge is None:
+        return []
     q = np.zeros((1, problem.robot.n_joints))
     nothing = Measurements.from_arrays(q, position=np.zeros((1, 3)), rotation=np.eye(3)[None])
-    return [Table(nothing, model, frame=frame) for model, frame in views if model in (*POSE_MODELS, *PAIR_MODELS)]
+    return [
+        Table(nothing, model, frame=frame)
+        for model, frame in problem.knowledge.views
+        if model in (*POSE_MODELS, *PAIR_MODELS)
+    ]
 
 
 def _says(table: Table) -> tuple[object, ...]:
