@@ -31,7 +31,7 @@ def calibrate(
             "--out",
             metavar="DIR",
             readable=False,
-            help="Write result.json, the calibrated robot and residuals.csv there; of many jobs to a folder each.",
+            help="Write result.json, the calibrated robot and all residuals there; of many jobs to a folder each.",
         ),
     ] = None,
     folds: Annotated[

@@ -43,6 +43,7 @@ from fg_calib.cli.report import report
 from fg_calib.cli.simulate import simulate
 from fg_calib.cli.update import update
 from fg_calib.errors import CalibrationError, InputError, printable
+from fg_calib.threads import processors
 
 app = typer.Typer(
     name="fg-calib",
@@ -195,11 +196,12 @@ _LEAST_ADDRESS_SPACE = 2 * 1024**3
 
 
 def _require_resources() -> None:
-    """Check limits on the process's memory (`ulimit -v` or `-d`) and on its open files, if there are any.
+    """Check limits on the process's memory (`ulimit -v` or `-d`), its open files and its threads, if there are any.
 
     Raises:
-        InputError: It is so low that libraries could not even be loaded.
+        InputError: One is so low that libraries could not even be loaded, or no number.
     """
+    processors()
     for kind, option in ((resource.RLIMIT_AS, "-v"), (resource.RLIMIT_DATA, "-d")):
         limit, _ = resource.getrlimit(kind)
         if limit != resource.RLIM_INFINITY and limit < _LEAST_ADDRESS_SPACE:

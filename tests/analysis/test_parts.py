@@ -234,3 +234,9 @@ def test_the_options_say_after_how_many_steps_to_give_up():
     assert found.iterations == 1
     same = solve_parts(robot, parts, solver=SolverOptions(max_iterations=1), model="pose")
     assert found.parameters.tobytes() == same.parameters.tobytes()
+
+
+def test_a_parameter_vector_of_another_size_is_refused_in_one_line():
+    robot = small_arm()
+    with pytest.raises(InputError, match=r"parameters: found shape \(3,\), expected \(\d+,\): the robot's parameters"):
+        reduce_parts(robot, [table("pose", robot)], np.zeros(3), model="pose")
