@@ -258,9 +258,10 @@ def run(
     record = out / f"{NAME}.json"
     if (only or works_wanted) and record.is_file():
         before = json.loads(record.read_text())
-        for name, rows in before["works"].items():
-            table[name] = rows | table.get(name, {})
-        skipped = {name: reason for name, reason in before["skipped"].items() if name not in skipped} | skipped
+        if before["quick"] == quick:  # rows of other draws are not to stand beside these
+            for name, rows in before["works"].items():
+                table[name] = rows | table.get(name, {})
+            skipped = {name: reason for name, reason in before["skipped"].items() if name not in skipped} | skipped
     table = {
         work: {peer.name: rows[peer.name] for peer in PEERS if peer.name in rows}
         for work, rows in ((work, table[work]) for work in HOW if work in table)
