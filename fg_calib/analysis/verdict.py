@@ -17,6 +17,7 @@ from scipy import special
 from fg_calib.analysis.changes import Change
 from fg_calib.analysis.chi_square import CONFIDENCE, FACTOR, ChiSquare
 from fg_calib.analysis.corrections import PriorFit
+from fg_calib.analysis.curvature import Curvature
 from fg_calib.analysis.goodness import GrossErrors, PredictedFit
 from fg_calib.analysis.offsets import Offset
 from fg_calib.graph.tolerances import ToleranceScale
@@ -38,7 +39,7 @@ LEAST_FOLDED, MOST_FOLDED = 0.05, 0.3
 """Part of what the rows say that may rest on vectors of unknown sign: with a caution, and no more at all."""
 
 LEAST_CURVED, MOST_CURVED = 0.2, 1.0
-"""Mean square of an estimate's error beyond its covariance, because rows bend: with a caution, and no more at all."""
+"""Mean square of errors beyond what the covariance says, because rows bend: with a caution, and no more at all."""
 
 LARGE_NOISE = 0.2
 """Estimated noise over the motions measured, beyond which it is no noise."""
@@ -303,21 +304,27 @@ def of_bent(n: int, n_rows: int, directions: float) -> list[Statement]:
     return [Statement(text, finding=False)]
 
 
-def of_curvature(beyond: float) -> list[Statement]:
+def of_curvature(found: Curvature) -> list[Statement]:
     """What it means that rows are not linear within what the parameters may still be off, far from any fold.
 
     Args:
-        beyond: By how much the mean square of an estimate's error, in sigma, is above one a direction.
+        found: By how much mean squares of errors exceed what the covariance says.
     """
-    if beyond < LEAST_CURVED:
-        return []
-    times = f"{np.sqrt(1.0 + beyond):.2g}" if np.isfinite(beyond) else "many"
-    text = (
-        "the measurements bend within what they leave unknown: sums of parameters that they determine well are off by"
-        f" some {times} times their sigmas, although those of single parameters hardly change: measure at more"
-        " configurations"
-    )
-    return [Statement(text, beyond > MOST_CURVED, reservation=True)]
+    bend, worst = "the measurements bend within what they leave unknown", max(found.parameters, found.tool)
+    if worst >= LEAST_CURVED:
+        who = "the tool's" if found.tool >= found.parameters else "a parameter's"
+        text = f"{bend}: {who} errors are {_times(worst)} what sigmas say: measure at more configurations"
+        return [Statement(text, worst > MOST_CURVED, reservation=True)]
+    if found.sums > MOST_CURVED:
+        honest = "those of single parameters and of the tool are honest"
+        text = f"{bend}: errors of sums of parameters are up to {_times(found.sums)} what the covariance says;"
+        return [Statement(f"{text} {honest}", finding=False)]
+    return []
+
+
+def _times(beyond: float) -> str:
+    """Errors over their sigma, in words, by how much the mean of their ratio's square exceeds 1."""
+    return f"some {np.sqrt(1.0 + beyond):.2g} times" if np.isfinite(beyond) else "many times"
 
 
 def of_folds(n: int, n_rows: int, share: float) -> list[Statement]:
