@@ -420,6 +420,7 @@ def test_fleet_quick_has_a_result_of_every_job(tmp_path):
     small, large = found["fleet"]
     assert small["core_hours"] == large["core_hours"] > 0.0
     assert found["here"]["result_written"] > 1e5
+    assert found["parts"]["pairs"] == 2000
 
 
 def test_million_quick_times_every_command_and_fits_every_growth(tmp_path):

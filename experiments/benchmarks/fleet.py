@@ -187,7 +187,7 @@ def run(out: Path, quick: bool, n_jobs: int, n_pairs: int, seed: int) -> dict[st
         found["here"] = time_here(jobs[0], Path(folder) / "here", 2 if quick else 20)
         found["processes"] = [time_jobs(jobs, Path(folder) / f"out{n}", n) for n in ((2,) if quick else (1, 2))]
     found["dask_seconds_a_job"] = None if quick else time_dask(2000)
-    found["parts"] = None if quick else time_parts(n_pairs, seed)
+    found["parts"] = time_parts(2000 if quick else n_pairs, seed)
     start = max(row["start_seconds"] for row in found["processes"])
     found["fleet"] = fleet(found["here"], start, found["dask_seconds_a_job"])
     out.mkdir(parents=True, exist_ok=True)
@@ -227,7 +227,7 @@ def describe(found: dict[str, Any]) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="two jobs, two processes, no Dask and no table")
+    parser.add_argument("--quick", action="store_true", help="two jobs, two processes, no Dask, a small table")
     parser.add_argument("--jobs", type=int, help="instead of 60")
     parser.add_argument("--pairs", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=0)

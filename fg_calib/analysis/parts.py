@@ -179,7 +179,8 @@ def reduce_parts(
     Args:
         robot: The nominal robot.
         parts: The parts, from `cut` for example.
-        parameters: The parameter vector (see `Variables`).
+        parameters: The parameter vector, shape (n_parameters + 6,): the robot's, then those of the measurement frame,
+            also where that is known (see `Variables`).
         options: Which measurements take part.
         executor: Where the parts are reduced; in this process if None.
         choices: Instead of `options`, any of theirs as keywords.
@@ -190,9 +191,9 @@ def reduce_parts(
     """
     options = Options.given(options, choices)
     _check_options(options)
-    n = len(robot.parameters) + 6 * options.unknown_frame
+    n = len(robot.parameters) + 6
     if np.shape(parameters) != (n,):
-        what = f"({n},): the robot's parameters" + " and the frame's six" * options.unknown_frame
+        what = f"({n},): the robot's parameters and the frame's six"
         raise InputError("parameters", f"found shape {shape_of('parameters', parameters, what)}", what)
     return _reduce(_Task(robot, options, parameters), parts, executor)
 
@@ -488,9 +489,11 @@ def _check_options(options: Options) -> None:
     """Whether the sum over parts is that of the whole table."""
     if options.model not in POSE_MODELS and not options.uses_pairs:
         raise InputError("model", f"found {options.model}", "one of poses or pairs")
-    for name, only in (("loss", "none"), ("encoder", "propagated"), ("estimate_noise", False)):
+    for name, only in (("loss", "none"), ("encoder", "propagated")):
         if getattr(options, name) != only:
             raise InputError(name, f"found {shown(getattr(options, name))}", f"{only}: parts are reduced once each")
+    if options.estimate_noise:
+        raise InputError("noise", "to be estimated", "as stated: parts are reduced once each")
     if options.gauge == "keep" or options.estimate_tolerance is not None:
         raise InputError("gauge", "keep, or estimated tolerances", "prior or none: parts are reduced once each")
     for name, given in (("accept", options.accept != Limits()), ("folds", options.folds is not None)):
