@@ -14,6 +14,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -25,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import ValidationError
 
 from fg_calib.analysis.covariance import TangentCovariance
 from fg_calib.analysis.residual_table import ResidualTable
@@ -32,7 +34,7 @@ from fg_calib.analysis.uncertainty import FrameEstimate, Uncertainty, assess
 from fg_calib.analysis.variance_components import solve_job
 from fg_calib.arguments import checked
 from fg_calib.arrays import as_floats, shape_of
-from fg_calib.errors import InputError, escaped, shown
+from fg_calib.errors import InputError, SolverError, escaped, shown
 from fg_calib.files.disk import exists, is_folder, noting_reads
 from fg_calib.files.job import UNSTATED, read_job, read_table_like
 from fg_calib.files.parts import JobInParts, read_parts
@@ -121,14 +123,29 @@ def calibrate_job(job: Job | Path | str, executor: Executor | None = None) -> Ca
     """
     given = job if isinstance(job, Job) else read_job(job)
     tell("calibrating")
-    solution = solve_job(given)
-    tell("judging the result")
-    uncertainty = assess(solution)
-    if given.options.folds is not None:
-        from fg_calib.analysis.folds import cross_validate
+    with _estimable(given.options):
+        solution = solve_job(given)
+        tell("judging the result")
+        uncertainty = assess(solution)
+        if given.options.folds is not None:
+            from fg_calib.analysis.folds import cross_validate
 
-        uncertainty = uncertainty.with_folds(cross_validate(given, given.options.folds, executor=executor), solution)
-    return Calibration.of(solution, uncertainty, given.inputs, job=given.document)
+            folds = cross_validate(given, given.options.folds, executor=executor)
+            uncertainty = uncertainty.with_folds(folds, solution)
+        return Calibration.of(solution, uncertainty, given.inputs, job=given.document)
+
+
+@contextmanager
+def _estimable(options: Options) -> Iterator[None]:
+    """Within, noise or tolerances that rows do not tell at all may be estimated beyond what figures hold: one line."""
+    try:
+        yield
+    except (ArithmeticError, np.linalg.LinAlgError, ValidationError) as error:
+        given = {"noise": options.estimate_noise, "tolerance": options.estimate_tolerance is not None}
+        asked = " and ".join(name for name, is_estimated in given.items() if is_estimated)
+        if not asked:
+            raise
+        raise SolverError(f"{asked} cannot be estimated from these rows, which leave no error: state it") from error
 
 
 @checked

@@ -28,8 +28,8 @@ from concurrent.futures import (
 )
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from multiprocessing import get_context
-from threading import Lock, Thread
+from multiprocessing import get_context, parent_process
+from threading import Lock, Thread, current_thread, main_thread
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar
 
 from fg_calib.arguments import checked
@@ -59,6 +59,9 @@ PATIENCE = 30.0
 KILLED = f"the process that it ran on died, {1 + RESUBMISSIONS} times of {1 + RESUBMISSIONS}"
 HINT_KILLED = "is there enough memory for it?"
 CANCELLED = "the executor gave it up, as where a scheduler ends"
+_LOOK = 1.0
+"""Seconds after which one looks whether somebody else gave jobs up."""
+
 NO_WORKERS = "worker processes died, and no others can be started"
 HINT_NO_WORKERS = 'local_processes has fresh ones; a script needs `if __name__ == "__main__":`'
 
@@ -125,12 +128,16 @@ def map_jobs(
 
 
 def _attempt(function: Callable[[T], R], job: T, name: str) -> R | Failure:
-    """What runs on a worker: no exception leaves it, as many of them cannot be pickled."""
+    """What runs on a worker: no exception leaves it, as many cannot be pickled, but Ctrl-C where that may be."""
     try:
         return function(job)
     except (CalibrationError, MemoryError) as error:
         return Failure(name, _reason(error))
-    except Exception as error:
+    except (Exception, SystemExit) as error:
+        return Failure(name, _reason(error), traceback.format_exc())
+    except KeyboardInterrupt as error:
+        if current_thread() is main_thread() and parent_process() is None:
+            raise
         return Failure(name, _reason(error), traceback.format_exc())
 
 
@@ -170,6 +177,7 @@ class _Run(Generic[T, R]):
     def _side_by_side(self, waiting: deque[int]) -> list[int]:
         """Run jobs until none waits or workers have died; returns those that were under way then."""
         most = getattr(self._executor, "under_way", UNDER_WAY)
+        most = most if isinstance(most, int) and most > 0 else UNDER_WAY
         under_way: dict[Future[R | Failure], int] = {}
         lost: list[int] = []
         try:
@@ -180,7 +188,8 @@ class _Run(Generic[T, R]):
                         under_way[self._submit(k)] = k
                     except BrokenExecutor:
                         lost.append(k)
-                for future in wait(under_way, return_when=FIRST_COMPLETED).done:
+                done = wait(under_way, timeout=_LOOK, return_when=FIRST_COMPLETED).done
+                for future in done or [f for f in under_way if f.cancelled()]:  # which nobody may have told of
                     k = under_way.pop(future)
                     if not self._settled(k, future):
                         lost.append(k)

@@ -102,6 +102,8 @@ def measured_of(found: Calibration, folder: Path | None = None) -> Floats:
     folder = folder if is_folder(folder) else folder.parent
     require_unchanged(folder, found.result.files)
     saved = read_configurations(folder, found.robot.n_joints)
+    if saved is None and found.result.in_parts:
+        raise InputError(str(folder), "of poses in parts, which keep no configurations", "pairs, or a table whole")
     if saved is None or not len(saved.ids):
         raise InputError(str(folder / "configurations.csv"), "no such file", "what `fg-calib calibrate --out` wrote")
     return saved.readings

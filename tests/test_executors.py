@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
@@ -483,3 +484,38 @@ def test_workers_end_with_the_process_that_started_them_however_that_ends(exampl
     process.communicate(timeout=60)
     until(lambda: nobody_left(process.pid))
     assert len(list((tmp_path / "out").glob("*/result.json"))) < 9
+
+
+def leave(k):
+    if k == 1:
+        raise SystemExit(0)
+    if k == 2 and threading.current_thread() is not threading.main_thread():
+        raise KeyboardInterrupt
+    return k
+
+
+@pytest.mark.parametrize("executor", [None, "threads"])
+def test_a_job_that_ends_its_process_is_a_failure_of_its_own(executor):
+    with ThreadPoolExecutor(1) as threads:
+        found = map_jobs(leave, range(4), None if executor is None else threads)
+    assert found[1].reason == "SystemExit: 0"
+    assert found[2] == 2 if executor is None else found[2].reason == "KeyboardInterrupt"
+    assert [found[0], found[3]] == [0, 3]
+
+
+def test_jobs_that_somebody_else_gives_up_are_not_waited_for():
+    begun = threading.Event()
+
+    def work(k):
+        begun.set()
+        time.sleep(0.2)
+        return k
+
+    with ThreadPoolExecutor(1) as threads:
+        give_up = threading.Thread(
+            target=lambda: begun.wait() and threads.shutdown(wait=False, cancel_futures=True), daemon=True
+        )
+        give_up.start()
+        found = map_jobs(work, range(4), threads)
+    assert found[0] == 0
+    assert all(isinstance(one, Failure) for one in found[2:])

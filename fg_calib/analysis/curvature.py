@@ -34,7 +34,7 @@ ENOUGH_ROWS = 5_000
 """Residuals that suffice: of more, so many are drawn evenly where that is possible."""
 
 NONE = 0.01
-"""What a single draw finds, below which there is none."""
+"""Mean square that single draws find, below which there is none."""
 
 N_DRAWS = 16
 """Draws by which it is measured where there is some, each with its opposite."""
@@ -80,7 +80,8 @@ def beyond_linear(solution: Solution, spread: Spread) -> Curvature:
         return out
 
     try:
-        if np.sum((in_sigma @ moved(rng.choice([-1.0, 1.0], rank))) ** 2) < NONE * rank:
+        looked = [in_sigma @ moved(rng.choice([-1.0, 1.0], rank)) for _ in range(2)]  # one may cancel by chance
+        if np.max(np.sum(np.square(looked), axis=1)) < NONE * rank:
             return Curvature()
         draws = rng.normal(size=(N_DRAWS, rank))
         c = np.array([moved(draw) for draw in draws])

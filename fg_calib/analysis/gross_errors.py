@@ -174,7 +174,7 @@ class _Search:
             ]
         new = np.zeros_like(out)
         for chance, *unit in sorted(found)[: max(1, int(_AT_ONCE * count))]:
-            if chance < 0.0 and not new[unit].any():
+            if chance < 0.0 and not new[unit].any() and not out[unit].all():
                 new[unit], count = True, count + 1
         self._many = bool(np.sum(out | new) > MOST_FEW * len(out))
         if not new.any() or self._many:

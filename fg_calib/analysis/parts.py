@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from fg_calib.analysis.covariance import TangentCovariance, held_frames
 from fg_calib.arguments import checked
-from fg_calib.arrays import Brief, FrozenArrays, shape_of
+from fg_calib.arrays import Brief, FrozenArrays, as_floats
 from fg_calib.errors import InputError, ProblemError, shown
 from fg_calib.executors import Failure, map_jobs
 from fg_calib.graph.factors import Variables, build_variables, prior_rows
@@ -192,10 +192,8 @@ def reduce_parts(
     options = Options.given(options, choices)
     _check_options(options)
     n = len(robot.parameters) + 6
-    if np.shape(parameters) != (n,):
-        what = f"({n},): the robot's parameters and the frame's six"
-        raise InputError("parameters", f"found shape {shape_of('parameters', parameters, what)}", what)
-    return _reduce(_Task(robot, options, parameters), parts, executor)
+    at = as_floats("parameters", parameters, f"({n})")
+    return _reduce(_Task(robot, options, at), parts, executor)
 
 
 @checked

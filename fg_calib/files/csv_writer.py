@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
@@ -84,6 +86,7 @@ def write_parquet_parts(path: Path | str, parts: Iterable[Mapping[str, ArrayLike
         InputError: The folder does not exist or may not be written to.
     """
     require_polars(str(path))
+    import polars as pl
     from polars.io.plugins import register_io_source
 
     frames = _frames(parts)
@@ -95,7 +98,13 @@ def write_parquet_parts(path: Path | str, parts: Iterable[Mapping[str, ArrayLike
 
     with replacing(Path(path)) as temporary:
         rows = max(first.height, 1)
-        register_io_source(source, schema=first.schema).sink_parquet(temporary, row_group_size=rows)
+        try:
+            register_io_source(source, schema=first.schema).sink_parquet(temporary, row_group_size=rows)
+        except pl.exceptions.ComputeError as error:
+            number = re.search(r"os error (\d+)", str(error))
+            if number is None:
+                raise
+            raise OSError(int(number[1]), os.strerror(int(number[1]))) from error
 
 
 def _frames(parts: Iterable[Mapping[str, ArrayLike | Words | None]]) -> Iterator[pl.DataFrame]:

@@ -77,6 +77,10 @@ class JobInParts(Brief):
     document: dict[str, Any] = field(default_factory=dict)
 
 
+_MOST_AT_ONCE = 2**32 - 1
+"""Rows of a part at most: polars counts no further."""
+
+
 @checked
 def read_parts(path: Path | str, n_rows: int = PIECE) -> JobInParts:
     """A calibration job in a YAML file, its table cut into spans of rows: those of its pairs, else those of its poses.
@@ -92,6 +96,7 @@ def read_parts(path: Path | str, n_rows: int = PIECE) -> JobInParts:
     """
     path = Path(path).absolute()
     check_number("n_rows", n_rows, above=True, whole=True)
+    n_rows = min(int(n_rows), _MOST_AT_ONCE)
     tables: list[_Table] = []
 
     def first_rows(table: Path, robot: Robot, **how: Any) -> Measurements:

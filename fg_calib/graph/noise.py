@@ -589,13 +589,14 @@ class PairNoise(RowNoise):
     def _noticed(self, spread: Floats, sigmas: float) -> tuple[Integers, Floats]:
         """Rows that may be bent by so many sigma, in ascending order; variance across where it does so, else 0.
 
-        Where four times the largest of some pairs, evenly chosen, would not, it is not even worked out.
+        Where four times the largest of some pairs would not, it is not even worked out: some evenly chosen, and those
+        that little bends, which may be the only ones to see some parameters.
         """
         train = np.flatnonzero(~self.series.test)
         if not len(train):
             return train, np.zeros((0, 2))
-        some, spread_of = _evenly(train), self._spread_by(spread)
-        of_some = BEND_MARGIN * spread_of(None)[0]
+        some, spread_of = np.union1d(_evenly(train), self._easily_bent(train)), self._spread_by(spread)
+        of_some = BEND_MARGIN * spread_of(some)[0]
         most, found, variances = 4.0 * of_some.max(axis=0), [train[:0]], [np.zeros((0, 2))]
         for start in range(0, self.series.n, SPAN):
             least = sigmas * self._straight(slice(start, start + SPAN))
@@ -610,6 +611,16 @@ class PairNoise(RowNoise):
             variances.append(np.where(across >= least[near], across, 0.0))
         return np.concatenate(found), np.concatenate(variances)
 
+    def _easily_bent(self, train: Integers) -> Integers:
+        """Some of the train rows: those that the least variance across bends."""
+        if len(train) <= _SOME:
+            return train
+        least = np.empty(self.series.n)
+        for start in range(0, len(least), SPAN):
+            rows = slice(start, start + SPAN)
+            least[rows] = self._straight(rows).min(axis=1)
+        return train[np.argpartition(least[train], _SOME)[:_SOME]]
+
     def _straight(self, rows: Integers | slice) -> Floats:
         """Variance across that bends a row by one sigma, shape (n, 2); infinite where there is none to bend.
 
@@ -619,10 +630,8 @@ class PairNoise(RowNoise):
         sigma = np.sqrt(own)
         return np.where((own > 0.0) & self._wanted, sigma * np.maximum(predicted, sigma), np.inf)
 
-    def _spread_by(self, spread: Floats) -> Callable[[Integers | None], tuple[Floats, Floats]]:
+    def _spread_by(self, spread: Floats) -> Callable[[Integers], tuple[Floats, Floats]]:
         """Variance that the parameters' own gives vectors: in each direction across, and along, shapes (m, 2), of rows.
-
-        Of None it is that of some train rows, evenly chosen.
 
         With Q the rotation from a to b, R_b R_a^T, turns w_a and w_b of the tool turn Q by w_b - Q w_a: in b itself by
         R_b^T w_b - R_a^T w_a. Motions of the base, and of the tool in itself, carry vector and rotation with them and
@@ -632,14 +641,15 @@ class PairNoise(RowNoise):
         Args:
             spread: A square root of the parameters' covariance, shape (n_columns, k).
         """
-        of_some = at, which = self._moved(_evenly(np.flatnonzero(~self.series.test)), spread)
+        some = _evenly(np.flatnonzero(~self.series.test))
+        of_some = at, which = self._moved(some, spread)
         everywhere = which.ravel()
         R, p, (turn, shift) = at.rotation[everywhere], at.position[everywhere], np.split(at.jacobian[everywhere], 2, 1)
         base = turning_of_base(turn, R)  # (3, k)
         carried = base + common_axes(R) @ (turning_of_points(p, shift) - base)
 
-        def spread_of(rows: Integers | None) -> tuple[Floats, Floats]:
-            at, which = of_some if rows is None else self._moved(rows, spread)
+        def spread_of(rows: Integers) -> tuple[Floats, Floats]:
+            at, which = of_some if np.array_equal(rows, some) else self._moved(rows, spread)
             (turn, shift), (a, b) = np.split(at.jacobian, 2, axis=1), which.T
             turn = np.swapaxes(at.rotation, 1, 2) @ (turn - base)
             shift = shift + _skew(at.position) @ carried

@@ -102,7 +102,7 @@ def weak_directions(observability: Observability) -> RenderableType | None:
     table = plain_table(("sigma / tolerance", "right"), ("largest members", "left"), wrap=True)
     for weak in observability.weak[:5]:
         members = ", ".join(f"{name} {share:+.2f}" for name, share in list(weak.members.items())[:6])
-        table.add_row(f"{1.0 / weak.signal_to_noise:.3g}", members)
+        table.add_row(f"{1.0 / weak.signal_to_noise:.3g}" if weak.signal_to_noise > 0.0 else "unknown", members)
     if len(observability.weak) > 5:
         table.add_row("", f"and {len(observability.weak) - 5} more")
     return table
