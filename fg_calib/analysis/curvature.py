@@ -49,13 +49,15 @@ class Curvature:
 
     Attributes:
         sums: Of the estimate along all directions that are determined, in sigma, a direction.
-        parameters: Of that parameter, or coordinate of a frame, of which it is most.
+        parameter: Of the parameter of which it is most, of the robot or of a frame's pose.
         tool: Of the tool's position after the best rigid fit.
+        name: The parameter's; empty for one of a frame.
     """
 
     sums: float = 0.0
-    parameters: float = 0.0
+    parameter: float = 0.0
     tool: float = 0.0
+    name: str = ""
 
 
 def beyond_linear(solution: Solution, spread: Spread) -> Curvature:
@@ -88,11 +90,13 @@ def beyond_linear(solution: Solution, spread: Spread) -> Curvature:
     except SolverError:
         return Curvature(np.inf, np.inf, np.inf)
     variance = np.sum(root**2, axis=1)
-    known = variance > 0.0
+    of_each = np.divide(np.mean(c**2, axis=0), variance, out=np.zeros(n_columns), where=variance > 0.0)
+    worst, names = int(np.argmax(of_each)), spread.variables.names
     return Curvature(
         sums=float(np.mean((c @ in_sigma.T) ** 2)),
-        parameters=float(np.max(np.mean(c[:, known] ** 2, axis=0) / variance[known], initial=0.0)),
+        parameter=float(of_each[worst]),
         tool=_of_tool(solution, draws @ root.T, c),
+        name=names[worst] if worst < len(names) else "",
     )
 
 

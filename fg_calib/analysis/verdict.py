@@ -310,11 +310,14 @@ def of_curvature(found: Curvature) -> list[Statement]:
     Args:
         found: By how much mean squares of errors exceed what the covariance says.
     """
-    bend, worst = "the measurements bend within what they leave unknown", max(found.parameters, found.tool)
-    if worst >= LEAST_CURVED:
-        who = "the tool's" if found.tool >= found.parameters else "a parameter's"
-        text = f"{bend}: {who} errors are {_times(worst)} what sigmas say: measure at more configurations"
-        return [Statement(text, worst > MOST_CURVED, reservation=True)]
+    bend = "the measurements bend within what they leave unknown"
+    if found.tool >= LEAST_CURVED:
+        text = f"{bend}: the tool's errors are {_times(found.tool)} what sigmas say: measure at more configurations"
+        return [Statement(text, found.tool > MOST_CURVED, reservation=True)]
+    if found.parameter >= LEAST_CURVED:
+        who, honest = found.name or "a frame", "; those of the tool are honest"
+        text = f"{bend}: errors of {who} are {_times(found.parameter)} what its sigma says{honest}"
+        return [Statement(text, finding=False, reservation=True)]
     if found.sums > MOST_CURVED:
         honest = "those of single parameters and of the tool are honest"
         text = f"{bend}: errors of sums of parameters are up to {_times(found.sums)} what the covariance says;"

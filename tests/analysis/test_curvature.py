@@ -119,7 +119,7 @@ def test_what_rows_cannot_tell_spoils_no_result_of_many_precise_ones():
     beyond = beyond_linear(*_judged(found))
     assert beyond.sums > 100.0
     assert beyond.tool < 0.2
-    assert beyond.parameters < 0.2
+    assert beyond.parameter < 0.2
     assert not found.result.findings
 
 
@@ -128,7 +128,8 @@ def test_what_rows_cannot_tell_spoils_no_result_of_many_precise_ones():
     [
         (Curvature(0.9, 0.1, 0.1), None, None, ""),
         (Curvature(3.0, 0.1, 0.1), False, False, "errors of sums of parameters are up to some 2 times"),
-        (Curvature(3.0, 0.44, 0.1), False, True, "a parameter's errors are some 1.2 times what sigmas say"),
+        (Curvature(3.0, 0.44, 0.1, "a2"), False, True, "errors of a2 are some 1.2 times what its sigma says"),
+        (Curvature(3.0, 8.0, 0.1), False, True, "errors of a frame are some 3 times what its sigma says"),
         (Curvature(3.0, 0.1, 3.0), True, True, "the tool's errors are some 2 times what sigmas say"),
         (Curvature(np.inf, np.inf, np.inf), True, True, "the tool's errors are many times what sigmas say"),
     ],
