@@ -74,7 +74,7 @@ def beyond_linear(solution: Solution, spread: Spread) -> Curvature:
     here = Linearised(problem, problem.variables.values(solution.parameters))
 
     def moved(draw: Floats) -> Floats:
-        """C of a draw and its opposite, shape (n_columns,)."""
+        """The shift c by a draw and its opposite, shape (n_columns,)."""
         core = root @ draw
         step = np.concatenate([core, here.follow @ core])
         both = [Linearised(problem, problem.variables.moved(here.values, move)).step for move in (step, -step)]

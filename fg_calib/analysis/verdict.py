@@ -320,7 +320,7 @@ def of_curvature(found: Curvature) -> list[Statement]:
         return [Statement(text, finding=False, reservation=True)]
     if found.sums > MOST_CURVED:
         honest = "those of single parameters and of the tool are honest"
-        text = f"{bend}: errors of sums of parameters are up to {_times(found.sums)} what the covariance says;"
+        text = f"{bend}: errors of sums of parameters are {_times(found.sums)} what the covariance says;"
         return [Statement(f"{text} {honest}", finding=False)]
     return []
 

@@ -105,7 +105,7 @@ def test_fewer_rows_say_the_same(monkeypatch):
 
 def test_sums_alone_are_a_caution_that_more_configurations_end():
     few, _ = calibrated(3, 1e-5, 1)
-    assert re.search("errors of sums of parameters are up to some .* times what the covariance says", said(few)[0])
+    assert re.search("errors of sums of parameters are some .* times what the covariance says", said(few)[0])
     assert said(few)[0] in few.result.cautions
     assert few.result.reservations == ()
     assert few.result.trustworthy
@@ -127,7 +127,7 @@ def test_what_rows_cannot_tell_spoils_no_result_of_many_precise_ones():
     ("beyond", "finding", "reservation", "words"),
     [
         (Curvature(0.9, 0.1, 0.1), None, None, ""),
-        (Curvature(3.0, 0.1, 0.1), False, False, "errors of sums of parameters are up to some 2 times"),
+        (Curvature(3.0, 0.1, 0.1), False, False, "errors of sums of parameters are some 2 times"),
         (Curvature(3.0, 0.44, 0.1, "a2"), False, True, "errors of a2 are some 1.2 times what its sigma says"),
         (Curvature(3.0, 8.0, 0.1), False, True, "errors of a frame are some 3 times what its sigma says"),
         (Curvature(3.0, 0.1, 3.0), True, True, "the tool's errors are some 2 times what sigmas say"),

@@ -1,5 +1,6 @@
 """Tolerances estimated with the fit: of whole arms, beside noise, in the report and the files."""
 
+import contextlib
 import json
 from dataclasses import replace
 from functools import cache
@@ -14,13 +15,15 @@ from fg_calib.analysis.uncertainty import assess
 from fg_calib.analysis.variance_components import estimate_noise
 from fg_calib.analysis.verdict import of_tolerances
 from fg_calib.calibration import Calibration, calibrate, calibrate_job
-from fg_calib.errors import InputError
+from fg_calib.errors import InputError, SolverError
 from fg_calib.files.result import read_result
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.graph.tolerances import FIRST, ToleranceScale
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.options import Options, Pairing
+from fg_calib.robot.kinematics import pose
+from fg_calib.robot.model import Robot
 
 STATED = {"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3}
 TRUE = {"a": 3e-3, "d": 3e-4, "alpha": 8e-3, "theta": 1e-3}
@@ -200,3 +203,17 @@ def test_scales_far_from_1_and_those_that_data_do_not_tell_are_told_of():
         "the data tell next to nothing of the corrections of d: the scale of their tolerances goes with the others"
     )
     assert of_tolerances([replace(scales[0], scale=2.0)], too_large=True) == []
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_two_rows_that_tell_no_tolerance_at_all_are_one_line(seed):
+    """Wide tolerances beside two exact positions: the covariance ran over."""
+    rows = [[0.4, 0.3, 0.2, 0], [0.3, -1.2, 0.1, 0], [0.5, 0.7, 0.1, 0]]
+    robot = Robot.from_dh(rows, convention="dh", tolerance=dict.fromkeys(("a", "d", "alpha", "theta"), 0.1))
+    rng = np.random.default_rng(seed)
+    q = rng.uniform(-2, 2, (2, 3))
+    position = pose(robot, q).position + 1e-4 * rng.normal(size=(2, 3))
+    m = Measurements.from_arrays(q, position=position, sigma_position=1e-4)
+    with contextlib.suppress(SolverError):  # or it is calibrated, where rounding falls otherwise
+        found = calibrate(robot, m, model="position", frame="unknown", estimate_tolerance="kind")
+        assert np.isfinite(found.result.chi2)

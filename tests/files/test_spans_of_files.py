@@ -288,3 +288,16 @@ def test_options_without_meaning_for_parts_are_refused(tmp_path, fg_calib, more,
     ended = fg_calib("calibrate", tmp_path / "job.yaml", "--parts", 20, *more)
     assert ended.code == 2
     assert why in " ".join(ended.err.replace("│", " ").split())
+
+
+@pytest.mark.parametrize("n_rows", [10**12, np.int64(7)])
+def test_parts_may_have_any_number_of_rows_of_any_kind(tmp_path, n_rows):
+    parts = read_parts(poses_job(tmp_path), n_rows).parts
+    assert sum(len(part().readings) for part in parts) == 60
+
+
+def test_predictions_of_poses_in_parts_have_their_line(tmp_path, fg_calib):
+    fg_calib("calibrate", poses_job(tmp_path), "--out", tmp_path / "out", "--parts", "30")
+    done = fg_calib("predict", tmp_path / "out")
+    assert done.code == 1
+    assert "of poses in parts, which keep no configurations, expected pairs, or a table whole" in done.err
