@@ -138,6 +138,7 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
     ]
     setup, structure = SetupCheck(), of_structure(noise_like)
     doubts = any(s.finding for s in (*statements, *structure))
+    statements[:0] = [Statement(text, finding=True) for text in _other_optima(solution)]  # which fit as well
     if not problem.evaluated:
         doubtful = doubts or max((kind.factor for kind in kinds), default=1.0) > MOST_ESTIMATED
         setup = check_problem(problem, solution.before, doubtful=doubtful)
@@ -258,7 +259,6 @@ def _of_solver(solution: Solution) -> list[Statement]:
     statements = []
     if not solution.converged:
         statements.append(Statement(solution.message, finding=True))
-    statements += [Statement(text, finding=True) for text in _other_optima(solution)]
     weights, series = solution.problem.state.weights, solution.problem.data.series
     labels = solution.problem.data.labels
     for s, w in zip(series, weights or (), strict=False):

@@ -8,7 +8,8 @@ estimate, from two tolerances (two sigma if that is more) to either side. The be
 data cannot tell from it is told of.
 
 Distances and angles near 0, and angles near half a turn, fold: where nominal has a pair on the other side, the descent
-may end there, bending the whole arm. So it is repeated from the optimum of all rows but those that tolerances may fold.
+may end there, bending the whole arm. So it is repeated from the optimum of all rows but those that tolerances may fold,
+and from arms that have the vectors of these the other way (see `other_sides`).
 
 Planes and anchors are tried at their mirror images (see `mirrored`), one after the other from the best optimum so far.
 
@@ -18,6 +19,7 @@ for the optimum that nominal leads to, and would pay for looking elsewhere a tho
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -25,13 +27,13 @@ from numpy.typing import NDArray
 
 from fg_calib.analysis.covariance import spread_of
 from fg_calib.analysis.mirrored import mirror_images
+from fg_calib.analysis.other_sides import folds_of, other_sides, without
 from fg_calib.arguments import checked
-from fg_calib.graph.factors import prior_rows
-from fg_calib.graph.information import whitened_triangle
-from fg_calib.graph.noise import NoiseState, PairNoise
+from fg_calib.graph.information import directions
+from fg_calib.graph.noise import NoiseState
 from fg_calib.graph.observability import SIGNAL_FLOOR
-from fg_calib.graph.problem import Problem, assembled, noises_at, reweighted_at
-from fg_calib.graph.solver import Solution, SolverOptions, solve, solve_from, solve_image
+from fg_calib.graph.problem import Problem, noises_at, reweighted_at
+from fg_calib.graph.solver import Solution, SolverOptions, descend_from, solve, solve_from, solve_image
 from fg_calib.threads import one_blas_thread
 
 Floats = NDArray[np.float64]
@@ -73,23 +75,21 @@ def look_elsewhere(solution: Solution, options: SolverOptions | None = None) -> 
 
     Returns:
         The solution with the smallest cost; in its `others` those that data and priors cannot tell from it. The same
-        solution where nothing is weak, where it has not converged, and with a robust loss, whose weights differ from
-        optimum to optimum.
+        solution where nothing is weak, and where it has not converged; with a robust loss, whose weights differ from
+        optimum to optimum, there are only those others that have vectors the other way.
     """
-    settings = solution.problem.options
-    if not solution.converged or settings.loss != "none" or solution.problem.evaluated:
+    if not solution.converged or solution.problem.evaluated:
         return solution
-    variables, seconds = solution.problem.variables, solution.seconds
+    if solution.problem.options.loss != "none":
+        return replace(solution, others=_with_the_same_weights(solution, options))
+    seconds = solution.seconds
     with one_blas_thread:
         steps = _steps(solution)
         unfolded = _without_folds(solution, options)
     found, starts = [solution], [(unfolded, reweighted_at(solution.problem, unfolded))] if unfolded is not None else []
-    for step in steps:
-        whole = np.concatenate([step, np.zeros(variables.n_nuisance)])
-        starts.append((variables.parameters(variables.moved(solution.values, whole)), solution.problem))
+    starts += [(_moved(solution, step), solution.problem) for step in steps]
     for start, rows in starts:
         least = min(one.cost for one in found)
-        # Twice what is asked for below, for the rows are whitened where the first optimum is.
         other = solve_from(replace(solution, problem=rows), start, least + INDISTINCT, options)
         if other is None:
             continue
@@ -103,12 +103,15 @@ def look_elsewhere(solution: Solution, options: SolverOptions | None = None) -> 
 
 
 def _with_images(found: list[Solution], seconds: float, options: SolverOptions | None) -> tuple[list[Solution], float]:
-    """The optima found, and those of mirror images, one after the other from the best so far; time taken by all."""
+    """The optima found, and those of mirror images and other sides, one after the other from the best so far.
+
+    Returns:
+        All optima, and the time taken.
+    """
     best, better = min(found, key=lambda one: one.cost), True
     while better:
         better = False
-        for image in mirror_images(best):
-            other = solve_image(best, image.problem, image.before, best.cost + 0.5 * INDISTINCT, options)
+        for other in _descents(best, options):
             if other is None or not other.converged:
                 continue
             seconds += other.seconds
@@ -121,13 +124,45 @@ def _with_images(found: list[Solution], seconds: float, options: SolverOptions |
     return found, seconds
 
 
+def _descents(best: Solution, options: SolverOptions | None) -> Iterator[Solution | None]:
+    """Where descents from mirror images and from vectors' other sides lead."""
+    for image in mirror_images(best):
+        yield solve_image(best, image.problem, image.before, best.cost + 0.5 * INDISTINCT, options)
+    with one_blas_thread:
+        steps = other_sides(best)
+    for step in steps:
+        # Twice what is asked for, for the rows are whitened where the first optimum is.
+        yield solve_from(best, _moved(best, step), best.cost + INDISTINCT, options)
+
+
+def _with_the_same_weights(solution: Solution, options: SolverOptions | None) -> tuple[Floats, ...]:
+    """Parameter vectors of other sides that explain the measurements as well by the weights that they have."""
+    with one_blas_thread:
+        steps = other_sides(solution)
+    found = [solution]
+    for step in steps:
+        most = solution.weighted_cost + 0.5 * INDISTINCT
+        other = descend_from(solution, _moved(solution, step), most, options)
+        if other is not None:
+            there = replace(solution, parameters=other, values=solution.problem.variables.values(other))
+            found += [there] if all(_apart(there, one) for one in found) else []
+    return tuple(one.parameters for one in found[1:])
+
+
+def _moved(solution: Solution, step: Floats) -> Floats:
+    """The parameter vector a step of the core away from the estimate, nuisances as they are there."""
+    variables = solution.problem.variables
+    whole = np.concatenate([step, np.zeros(variables.n_nuisance)])
+    return variables.parameters(variables.moved(solution.values, whole))
+
+
 def _steps(solution: Solution) -> list[Floats]:
     """Steps from the estimate to other starts, shape (n_columns,) each."""
     problem, variables = solution.problem, solution.problem.variables
     scales, steps = variables.prior_scales, []
     nominal = _nominal(solution)
-    s, V = _directions(problem, solution.parameters)
-    s_nominal, V_nominal = _directions(problem, nominal)
+    s, V = directions(problem, solution.parameters)
+    s_nominal, V_nominal = directions(problem, nominal)
     # What is seen better here than at nominal, by ratio 1 / r: as of a square, with its vertex beyond nominal.
     spread = np.linalg.norm((V.T @ V_nominal) / np.maximum(s, SIGNAL_FLOOR)[:, None], axis=0)
     ratio = spread * np.maximum(s_nominal, SIGNAL_FLOOR)
@@ -163,20 +198,13 @@ def _without_folds(solution: Solution, options: SolverOptions | None) -> Floats 
     if not problem.pair_series or (many and 2.0 * solution.cost < MUCH * problem.n_residuals):
         return None
     state = NoiseState(factors=problem.state.factors)
-    spread = FAR * np.diag(problem.variables.prior_scales)
-    series, n_folded = [], 0
-    for noise in noises_at(replace(problem, state=state), nominal):
-        s = noise.series
-        folds = noise.may_fold(spread) & s.used if isinstance(noise, PairNoise) else np.zeros_like(s.measured)
-        folds[s.test] = False
-        n_folded += int(np.sum(folds))
-        series.append(replace(s, measured=s.measured & ~folds))
+    folds = folds_of(noises_at(replace(problem, state=state), nominal), problem.variables.prior_scales)
+    n_folded = sum(int(np.sum(mine)) for mine in folds)
     if not n_folded or 2 * n_folded > problem.n_residuals:
         return None
     if problem.state.joint_errors is not None:
         state = replace(state, joint_errors=np.zeros_like(problem.state.joint_errors))
-    without = assembled(problem, solution.before, state, data=replace(problem.data, series=tuple(series)))
-    return solve(without, options).parameters
+    return solve(without(problem, folds, solution.before, state), options).parameters
 
 
 def _nominal(solution: Solution) -> Floats:
@@ -186,14 +214,6 @@ def _nominal(solution: Solution) -> Floats:
         if parameter.tolerance is not None:
             nominal[i] = parameter.nominal
     return nominal
-
-
-def _directions(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
-    """Signal-to-noise ratios of data and priors at some parameters, and their unit-free directions as columns."""
-    n = problem.variables.n_columns
-    rows = np.vstack([whitened_triangle(problem, parameters), prior_rows(problem.variables, parameters)[1]])
-    _, s, Vt = np.linalg.svd(np.vstack([rows * problem.variables.prior_scales, np.zeros((n, n))]), full_matrices=False)
-    return s, Vt.T
 
 
 def _apart(a: Solution, b: Solution) -> bool:

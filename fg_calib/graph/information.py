@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.graph.factors import Eliminated, Variables, dense, eliminate, unknown_prior_rows
+from fg_calib.graph.factors import Eliminated, Variables, dense, eliminate, prior_rows, unknown_prior_rows
 from fg_calib.graph.observability import RANK_TOLERANCE, SIGNAL_FLOOR, Observability, observability_of_rows
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.robust import effect
@@ -84,6 +84,18 @@ def _with_loss(problem: Problem) -> tuple[tuple[RowSet, ...], float]:
 def whitened_triangle(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> Floats:
     """A square root of what the train rows and added factors say of the core, shape (m, n_columns)."""
     return eliminated(problem, parameters, with_loss=with_loss).A
+
+
+def directions(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
+    """Signal-to-noise ratios of data and priors at some parameters, and their unit-free directions as columns.
+
+    Returns:
+        Shapes (n_columns,) and (n_columns, n_columns); directions of which nothing is known have a ratio of 0.
+    """
+    n, sizes = problem.variables.n_columns, problem.variables.prior_scales
+    rows = np.vstack([whitened_triangle(problem, parameters), prior_rows(problem.variables, parameters)[1]])
+    _, s, Vt = np.linalg.svd(np.vstack([rows * sizes, np.zeros((n, n))]), full_matrices=False)
+    return s, Vt.T
 
 
 def known_rows(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:

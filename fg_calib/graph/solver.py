@@ -277,16 +277,38 @@ def solve_from(solution: Solution, start: Floats, most: float, options: SolverOp
         SolverError: GTSAM could not solve a step at all.
     """
     clock, options = time.perf_counter(), options or options_of(solution.problem.options)
+    near = descend_from(solution, start, most, options)
+    if near is None:
+        return None
+    with one_blas_thread:
+        run = _fit(reweighted_at(solution.problem, near), options)
+        found = _solution(run, solution.before, solution.initial_cost, clock)
+        return _estimated_as(solution, found)
+
+
+def descend_from(solution: Solution, start: Floats, most: float, options: SolverOptions | None = None) -> Floats | None:
+    """Where the descent on a solution's problem from another start leads, with rows whitened and weighted as there.
+
+    Args:
+        solution: What was found before.
+        start: The parameter vector to start from.
+        most: Weighted cost of an optimum that is of no interest.
+        options: Settings of the solver.
+
+    Returns:
+        The parameter vector near the optimum; None if the descent leads nowhere, above `most` or back to where the
+        solution is.
+
+    Raises:
+        SolverError: GTSAM could not solve a step at all.
+    """
+    options = options or options_of(solution.problem.options)
     with one_blas_thread:
         problem = started_at(solution.problem, start)
         rough = _Run(problem, replace(options, max_iterations=min(SHORT, options.max_iterations)))
         if not rough.descend(COARSE) or rough.here.cost >= most:
             return None
-        if rough.here.decrement_to(solution.values) < BACK:
-            return None
-        run = _fit(reweighted_at(problem, rough.parameters), options)
-        found = _solution(run, solution.before, solution.initial_cost, clock)
-        return _estimated_as(solution, found)
+        return None if rough.here.decrement_to(solution.values) < BACK else rough.parameters
 
 
 def solve_image(
