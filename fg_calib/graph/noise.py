@@ -80,7 +80,7 @@ class NoiseState:
         joint_errors: True joint values less their readings, where encoder noise is estimated, shape
             (n_configurations, n_joints), [rad] (prismatic: [m]); None for 0.
         spread: A square root S of the parameters' covariance S S^T in the chain's columns, shape (n_columns, k), where
-            what they may be off bends a row; None for 0.
+            what they may be off bends a row, or might bend a test row; None for 0.
     """
 
     weights: tuple[Floats, ...] | None = None
@@ -256,6 +256,11 @@ class RowNoise:
         r = np.where(used, self.residual(), 0.0)
         W = whitening_of(self.total, used)
         return np.linalg.norm(W @ r[:, :, None], axis=(1, 2)), used.sum(axis=1)
+
+    @property
+    def bends(self) -> bool:
+        """Whether what the parameters may be off bends any row, or nearly so."""
+        return False
 
     def more_if_redundant(self, shared: frozenset[str]) -> Floats | float:
         """What is added to the diagonal of `own` where there are more rows than errors that they share."""
@@ -607,6 +612,11 @@ class PairNoise(RowNoise):
         place = np.minimum(np.searchsorted(bent, index), len(bent) - 1)
         return np.where((bent[place] == index)[:, None], across[place], 0.0)
 
+    @property
+    def bends(self) -> bool:
+        """Whether what the parameters may be off bends any row, or nearly so."""
+        return len(self._bent[0]) > 0
+
     def _where_bent(self) -> tuple[Integers, Floats]:
         """The rows that what the parameters may be off bends, in ascending order, and `_bending` there."""
         if self._spread is None:
@@ -696,7 +706,9 @@ class PairNoise(RowNoise):
         """Where some rows have their ends: poses, with what they move along `spread`; which of them, shape (m, 2)."""
         where, which = np.unique(self.series.ends[rows], return_inverse=True)
         at = forward(self.place.chain, self.place.trig, where)
-        return replace(at, jacobian=at.jacobian @ spread), which.reshape(-1, 2)
+        n, n_twists = at.jacobian.shape[:2]
+        moved = at.jacobian.reshape(n * n_twists, -1) @ spread  # all at once
+        return replace(at, jacobian=moved.reshape(n, n_twists, -1)), which.reshape(-1, 2)
 
     def _joint_trace(self) -> Floats:
         """Variance that joint noise gives each vector at one end, all directions together, shape (n_configurations, 2).

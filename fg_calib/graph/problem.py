@@ -245,7 +245,11 @@ def assembled(problem: Problem, start: Floats, state: NoiseState | None = None, 
         changes: What else of the problem is to change.
     """
     p = replace(problem, start=start, state=state or problem.state, **changes)
-    bare = replace(p, rows=_row_sets(p, start), initial=p.variables.values(start))
+    noises = noises_at(p, start, fitted=True)
+    if p.state.spread is not None and not any(noise.bends for noise in noises):
+        # Test rows may be shorter than any train row.
+        p = p if any(s.test.any() for s in p.pair_series) else replace(p, state=replace(p.state, spread=None))
+    bare = replace(p, rows=_row_sets(p, noises), initial=p.variables.values(start))
     graph = _graph_of(bare)
     return replace(bare, graph=graph, factors=gtsam.NonlinearFactorGraph(graph))
 
@@ -272,13 +276,12 @@ def known_factors(problem: Problem) -> list[gtsam.CustomFactor]:
     return [] if known is None else [known.factor(problem.variables, problem.data.unknowns)]
 
 
-def _row_sets(problem: Problem, start: Floats) -> tuple[RowSet, ...]:
-    """The train rows whitened at a parameter vector."""
+def _row_sets(problem: Problem, noises: tuple[RowNoise, ...]) -> tuple[RowSet, ...]:
+    """The train rows whitened by their noise."""
     state, sharing = problem.state, problem.options.pair_errors == "shared"
     weights = None
     if state.weights is not None:
         weights = [w[s.train] for w, s in zip(state.weights, problem.data.series, strict=True)]
-    noises = noises_at(problem, start, fitted=True)
     return whitened_rows(noises, sharing=sharing, joint_errors=state.joint_errors, weights=weights)
 
 
@@ -448,10 +451,11 @@ def joint_errors(problem: Problem, parameters: Floats) -> Floats:
 def frames_only(problem: Problem) -> Problem | None:
     """The same problem with the arm at nominal: measurement frame, base and tool alone; None if none is estimated."""
     robot, n = problem.robot, problem.robot.n_joints
-    robot = robot.with_estimated([p.name for p in robot.parameters if p.estimated and not 1 <= p.owner <= n])
-    variables = variables_of(robot, problem.data, problem.options)
-    if not variables.items:
+    frames = [p.name for p in robot.parameters if p.estimated and not 1 <= p.owner <= n]
+    if not frames and not problem.variables.frames:
         return None
+    robot = robot.with_estimated(frames)
+    variables = variables_of(robot, problem.data, problem.options)
     options = replace(problem.options, encoder="propagated", pair_errors="independent")  # good enough for a start
     start = problem.start[: variables.nuisance_span.stop]
     state = replace(problem.state, joint_errors=None, spread=None)  # of other columns

@@ -428,6 +428,7 @@ def _fit(problem: Problem, options: SolverOptions, *, near: bool = False) -> _Ru
         if bends:
             state, bends = replace(state, spread=run.here.spread), bends - 1
         anew = reweighted_at(problem, run.parameters, state)
+        bends = bends if anew.state.spread is not None else 0  # where nothing bends nothing will
         unchanged = same_rows(anew, run.problem)
         if unchanged:
             run.problem = anew
@@ -480,7 +481,7 @@ def _stride(run: _Run, bends: int) -> int:
         if there.decrement > max(SHORTER * here.decrement, there.rounding):
             return bends
         run.arrive(anew, there)
-        left, bends = run.left_after(here.decrement), max(bends - 1, 0)
+        left, bends = run.left_after(here.decrement), max(bends - 1, 0) if anew.state.spread is not None else 0
     if left <= run.least:
         run.descend(run.least)
     return bends

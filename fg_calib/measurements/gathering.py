@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -186,14 +186,14 @@ def check_repeats(table: Table) -> None:
         if figures:
             labels = [of.index[:, None] for of in m.labels.values()]
             rows = np.hstack([m.readings, *figures, m.test[:, None], *labels])
-            _check_different(m.source, "poses", rows, m.ids.tolist())
+            _check_different(m.source, "poses", rows, lambda i: str(m.ids[i]))
     if m.pairs is not None and table.uses_pairs:
-        _check_pairs_different(m.pairs, m.readings, m.ids.tolist())
+        _check_pairs_different(m.pairs, m.readings, m.ids)
     if groups is not None and table.uses_pairs:
         _check_pairs_different(groups.pairs, np.arange(groups.n_groups)[:, None], groups.names)
 
 
-def _check_pairs_different(pairs: Pairs, places: Integers | Floats, names: Sequence[str]) -> None:
+def _check_pairs_different(pairs: Pairs, places: Integers | Floats, names: Sequence[str] | NDArray[np.str_]) -> None:
     """Check that pairs differ, whichever end is a; one of the same place tells nothing and takes no part."""
     if pairs.n_pairs - np.sum(are_same(places, pairs.a, pairs.b)) > MOST_LOOKED_AT:
         return
@@ -204,11 +204,11 @@ def _check_pairs_different(pairs: Pairs, places: Integers | Floats, names: Seque
     ends[sign < 0.0] = ends[sign < 0.0][:, ::-1]
     rows = np.hstack([ends[:, 0], ends[:, 1], np.stack([pairs.distance, pairs.angle, pairs.test], axis=1)])
     chosen = np.flatnonzero(sign != 0.0)
-    called = [f"{names[a]}-{names[b]}" for a, b in zip(pairs.a[chosen], pairs.b[chosen], strict=True)]
-    _check_different(pairs.source, "pairs", rows[chosen], called)
+    ends_of = np.stack([pairs.a, pairs.b], axis=1)[chosen]
+    _check_different(pairs.source, "pairs", rows[chosen], lambda i: "-".join(names[k] for k in ends_of[i]))
 
 
-def _check_different(source: str, what: str, rows: Floats, names: Sequence[str]) -> None:
+def _check_different(source: str, what: str, rows: Floats, called: Callable[[int], str]) -> None:
     """Warn where rows stand more than once; of very many that is not looked for."""
     if not 1 < len(rows) <= MOST_LOOKED_AT:
         return
@@ -219,7 +219,7 @@ def _check_different(source: str, what: str, rows: Floats, names: Sequence[str])
     if not repeated.any():
         return
     row = int(np.argmax(repeated))
-    first, second = (names[i] for i in np.flatnonzero(of == of[row])[:2])
+    first, second = (called(i) for i in np.flatnonzero(of == of[row])[:2].tolist())
     found = f"{int(np.sum(repeated))} of {len(rows)} {what} have the readings and figures of another"
     _log.warning(
         "%s: %s, as %s and %s; were they copied? They count as often", source, found, shown(first), shown(second)

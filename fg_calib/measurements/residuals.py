@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,11 +92,18 @@ def unpack(whitening: Floats, residual_dim: int) -> Floats:
 
 def unit_whitening(n: int, residual_dim: int) -> Floats:
     """For rows that are not whitened; all of them are the same in memory."""
-    return np.broadcast_to(pack(np.eye(residual_dim)[None]), (n, residual_dim * (residual_dim + 1) // 2))
+    return np.broadcast_to(_packed_unit(residual_dim), (n, residual_dim * (residual_dim + 1) // 2))
+
+
+@cache
+def _packed_unit(residual_dim: int) -> Floats:
+    return pack(np.eye(residual_dim)[None])
 
 
 def rows_of(block: Block, rows: slice | Integers) -> Block:
     """The measurements at `rows` of a block."""
+    if isinstance(rows, slice) and rows.indices(block.n) == (0, block.n, 1):
+        return block
     return replace(block, **{f.name: getattr(block, f.name)[rows] for f in fields(block)[2:-1]})
 
 

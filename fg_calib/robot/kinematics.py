@@ -22,7 +22,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -87,7 +87,7 @@ class Chain(Brief):
         """The same chain with the derivatives in the joints as well."""
         return replace(self, joint_columns=True)
 
-    @property
+    @cached_property
     def arrays(self) -> ChainArrays:
         """What the kernels take."""
         return ChainArrays(

@@ -9,6 +9,7 @@ from fg_calib.analysis.covariance import spread_of
 from fg_calib.graph import noise
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
+from fg_calib.robot.inverse import solve_inverse
 
 ROWS = [
     [0, 0, 0.34, 0],
@@ -48,3 +49,35 @@ def test_few_short_motions_among_long_ones_are_found(monkeypatch, first):
     bent = [at.noises[0].bent_by(spread.root, 0.1) for at in (found, expected)]
     assert bent[1].any()
     assert np.array_equal(*bent)
+
+
+def long_pairs(short):
+    """Pairs of wide motions, far from 0; the last one of another posture near the same place, for a test, or not."""
+    robot = Robot.from_dh(ROWS, convention="mdh", tool=[0.1, 0, 0.2], tolerance={"a": 1e-3, "d": 1e-3, "theta": 2e-3})
+    rng = np.random.default_rng(1)
+    true, q = true_robot(robot, rng), rng.uniform(-2.0, 2.0, (80, 7))
+    if short:
+        there = pose(true, q[-2:-1]).position + np.array([2e-4, 0.0, 0.0])
+        q[-1] = solve_inverse(true, there, generator=rng).readings[0]
+    p, a = pose(true, q).position, np.arange(0, 80, 2)
+    distance = np.linalg.norm(p[a + 1] - p[a], axis=1) + SIGMA * rng.normal(size=40)
+    assert np.sort(distance)[1] > 0.1
+    pairs = {"a": a, "b": a + 1, "distance": distance, "sigma_distance": SIGMA, "test": a == 78 if short else a < 0}
+    return build_problem(robot, Measurements.from_arrays(q, pairs=pairs), model="distance")
+
+
+def test_what_bends_no_row_is_not_worked_out_again():
+    """Nothing is near to being bent: the parameters' covariance is looked at once, and is not kept."""
+    solution = solve(long_pairs(short=False))
+    assert solution.converged
+    assert solution.problem.state.spread is None
+    assert not solution.noises[0].bent_by(spread_of(solution).root, noise.LEAST_BEND).any()
+
+
+def test_a_short_test_pair_is_bent_although_no_train_pair_is():
+    """Its sigma has what the parameters may be off: they are kept for it."""
+    solution = solve(long_pairs(short=True))
+    state = solution.problem.state
+    assert state.spread is not None
+    bent = solution.noises[0].bent_by(state.spread, noise.LEAST_BEND)[:, 0]
+    assert bent.tolist() == [False] * 39 + [True]
