@@ -57,11 +57,12 @@ PATIENCE = 30.0
 """Seconds in which a scheduler must answer."""
 
 KILLED = f"the process that it ran on died, {1 + RESUBMISSIONS} times of {1 + RESUBMISSIONS}"
-HINT_KILLED = "is there enough memory for it?"
+HINT_KILLED = "is there enough memory for it, and can other processes read the job?"
 CANCELLED = "the executor gave it up, as where a scheduler ends"
 _LOOK = 1.0
 """Seconds after which one looks whether somebody else gave jobs up."""
 
+NO_FUTURE = TypeError("submit of the executor returned no future of its own for each job")
 NO_WORKERS = "worker processes died, and no others can be started"
 HINT_NO_WORKERS = 'local_processes has fresh ones; a script needs `if __name__ == "__main__":`'
 
@@ -109,10 +110,14 @@ def map_jobs(
         what: What is being done, in a few words, for who listens to progress.
 
     Raises:
-        InputError: The executor is none, or there are more or fewer names than jobs.
+        InputError: The jobs are no list, the executor is none, or there are more or fewer names than jobs.
     """
+    if not isinstance(jobs, Iterable):
+        raise InputError("jobs", f"found {shown(jobs)}", "a list of them, or whatever hands out one after the other")
     given = list(jobs)
-    named = [f"job {k + 1}" for k in range(len(given))] if names is None else list(names)
+    if names is not None and (isinstance(names, str) or not isinstance(names, Iterable)):
+        raise InputError("names", f"found {shown(names)}", "a list of text")
+    named = [f"job {k + 1}" for k in range(len(given))] if names is None else list(map(str, names))
     if len(named) != len(given):
         raise InputError("names", f"found {len(named)}", f"{len(given)}, one for each job")
     if executor is None:
@@ -147,7 +152,11 @@ def _reason(error: BaseException) -> str:
         return str(error)
     if isinstance(error, MemoryError):
         return "there is not enough memory for it"
-    return printable(f"{type(error).__name__}: {error}".rstrip(": "))
+    try:
+        text = str(error)
+    except Exception:  # one of somebody's own
+        text = "it cannot say why"
+    return printable(f"{type(error).__name__}: {text}".rstrip(": "))
 
 
 class _Run(Generic[T, R]):
@@ -185,9 +194,11 @@ class _Run(Generic[T, R]):
                 while waiting and not lost and len(under_way) < most:
                     k = waiting.popleft()
                     try:
-                        under_way[self._submit(k)] = k
+                        future = self._submit(k)
                     except BrokenExecutor:
                         lost.append(k)
+                        continue
+                    under_way[future if future not in under_way else _refused(NO_FUTURE)] = k
                 done = wait(under_way, timeout=_LOOK, return_when=FIRST_COMPLETED).done
                 for future in done or [f for f in under_way if f.cancelled()]:  # which nobody may have told of
                     k = under_way.pop(future)
@@ -211,13 +222,12 @@ class _Run(Generic[T, R]):
 
     def _submit(self, k: int) -> Future[R | Failure]:
         try:
-            return self._executor.submit(_attempt, self._function, self._jobs[k], self._names[k])
+            future = self._executor.submit(_attempt, self._function, self._jobs[k], self._names[k])
         except BrokenExecutor:
             raise
         except Exception as error:  # it takes no more, after it was shut down say; what is done stays
-            refused: Future[R | Failure] = Future()
-            refused.set_exception(error)
-            return refused
+            return _refused(error)
+        return future if isinstance(future, Future) else _refused(NO_FUTURE)
 
     def _settled(self, k: int, future: Future[R | Failure]) -> bool:
         """Wait for a job's outcome; False if its worker has died."""
@@ -240,6 +250,13 @@ class _Run(Generic[T, R]):
             except BrokenExecutor:
                 pass
         return False
+
+
+def _refused(error: Exception) -> Future[Any]:
+    """A job that an executor did not take."""
+    refused: Future[Any] = Future()
+    refused.set_exception(error)
+    return refused
 
 
 class LocalProcesses(Executor):

@@ -38,7 +38,8 @@ from fg_calib.threads import THREADS, processors
 
 JOBS = [1, "refused", 2, "a bug", "too large", 3]
 REFUSED = Failure("job 2", "job.yaml: found nonsense, expected sense; look at it")
-KILLED = "the process that it ran on died, 3 times of 3; is there enough memory for it?"
+HINT = "is there enough memory for it, and can other processes read the job?"
+KILLED = f"the process that it ran on died, 3 times of 3; {HINT}"
 
 
 def check_outcomes(found):
@@ -118,6 +119,8 @@ def test_jobs_that_an_executor_does_not_take_or_gives_up_are_no_matter_to_the_ot
             "executor: found 'four', expected an executor of concurrent.futures, such as local_processes(4)",
         ),
         (([1, 2], None, ["one"]), "names: found 1, expected 2, one for each job"),
+        (([1, 2], None, 5), "names: found 5, expected a list of text"),
+        ((3, None), "jobs: found 3, expected a list of them, or whatever hands out one after the other"),
     ],
 )
 def test_what_is_no_executor_is_refused(arguments, expected):
@@ -125,6 +128,36 @@ def test_what_is_no_executor_is_refused(arguments, expected):
     with pytest.raises(InputError) as refused:
         map_jobs(work, jobs, executor, names=names[0] if names else None)
     assert str(refused.value) == expected
+
+
+class Silent(Exception):
+    def __str__(self):
+        raise ValueError
+
+
+def raise_silently(_):
+    raise Silent
+
+
+@pytest.mark.parametrize("submitted", [None, "the same"])
+def test_an_executor_that_returns_no_future_of_its_own_fails_its_jobs_alone(submitted):
+    class Wrong(ThreadPoolExecutor):
+        first = None
+
+        def submit(self, *args, **kwargs):
+            self.first = self.first or super().submit(*args, **kwargs)
+            return self.first if submitted else None
+
+    with Wrong(1) as executor:
+        found = map_jobs(work, [1, 2, 3], executor)
+    reason = "TypeError: submit of the executor returned no future of its own for each job"
+    assert found[1:] == [Failure(f"job {k}", reason) for k in (2, 3)]
+    assert found[0] == (2 if submitted else Failure("job 1", reason))
+
+
+def test_an_error_that_cannot_be_printed_is_a_failure_by_its_kind():
+    (found,) = map_jobs(raise_silently, [1])
+    assert found.reason == "Silent: it cannot say why"
 
 
 @pytest.mark.parametrize("n", [0, -1, 1.5, "2", 1001, 2**31])
@@ -347,7 +380,7 @@ def test_many_jobs_are_written_to_a_folder_each_and_the_worst_is_the_exit_code(f
     out = tmp_path / "out"
     ended = fg_calib("calibrate", *two_arms, "--out", out, "--json")
     assert ended.code == 1
-    assert ended.err.startswith("arm2: error: calibration.yaml: model: found 'nonsense', expected one of pose, ")
+    assert "arm2: error: calibration.yaml: model: found 'nonsense', expected one of pose, " in ended.err
     found = json.loads(ended.out)
     assert found == json.loads((out / "jobs.json").read_text())
     assert found["schema"] == "fg-calib/jobs/1"
@@ -361,8 +394,10 @@ def test_many_jobs_are_written_to_a_folder_each_and_the_worst_is_the_exit_code(f
     assert good["reduced_chi2"] == saved["reduced_chi2"]
     assert good["rms"] == {kind: rms["after"] for kind, rms in saved["residual_rms"]["test"].items() if rms}
     heads, first, second = (out / "jobs.csv").read_text().splitlines()
-    assert heads.startswith("name,job,verdict,robot,n_configurations,reduced_chi2,seconds,rms distance,rms angle,")
+    rms = "rms distance [m],rms angle [rad]"
+    assert heads == f"name,job,verdict,robot,n_configurations,reduced_chi2,seconds,{rms},rows,reason,warnings"
     assert first.startswith(f"arm1,{two_arms[0]},good,space-robot,52,")
+    assert first.endswith(",test,,")
     assert second.startswith(f"arm2,{two_arms[1]},failed,,,,,,,")
 
 

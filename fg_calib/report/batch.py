@@ -164,18 +164,23 @@ def write_jobs(folder: Path, jobs: Sequence[JobSummary], seconds: float) -> None
 
 
 def _csv(jobs: Sequence[JobSummary]) -> str:
-    """A row for each job; its RMS by kind in columns of their own."""
-    kinds = _kinds(jobs)
+    """A row for each job; its RMS by kind, and of which rows it is, in columns of their own."""
+    kinds, units = _kinds(jobs), _units(jobs)
     heads = ["name", "job", "verdict", "robot", "n_configurations", "reduced_chi2", "seconds"]
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow([*heads, *(f"rms {kind}" for kind in kinds), "reason"])
+    table.writerow([*heads, *(f"rms {kind} [{units[kind]}]" for kind in kinds), "rows", "reason", "warnings"])
     for job in jobs:
-        rms = job.rms or {}
-        table.writerow(
-            [*(getattr(job, head) for head in heads), *map(rms.get, kinds), "; ".join(why for _, why in job.reasons)]
-        )
+        figures = [getattr(job, head) for head in heads]
+        rows = None if job.of_test is None else "test" if job.of_test else "train"
+        said = ["; ".join(why for _, why in job.reasons), "; ".join(job.warnings)]
+        table.writerow([*figures, *map((job.rms or {}).get, kinds), rows, *said])
     return text.getvalue()
+
+
+def _units(jobs: Sequence[JobSummary]) -> dict[str, str]:
+    """Unit of each kind of residual."""
+    return {kind: unit for job in jobs for kind, unit in (job.units or {}).items()}
 
 
 def _kinds(jobs: Sequence[JobSummary]) -> list[str]:
@@ -189,8 +194,7 @@ def build_jobs_table(jobs: Sequence[JobSummary], seconds: float) -> RenderableTy
         jobs: What became of each.
         seconds: What all of them took together, by the clock.
     """
-    kinds = _kinds(jobs)
-    units = {kind: unit for job in jobs for kind, unit in (job.units or {}).items()}
+    kinds, units = _kinds(jobs), _units(jobs)
     heads = [f"{kind} {SHOWN[units[kind]][1]}" for kind in kinds]
     figures = [(head, "right") for head in (*heads, "chi2/dof", "s")]
     table = plain_table(("job", "left"), ("verdict", "left"), *figures, ("reason", "left"), wrap=True)
