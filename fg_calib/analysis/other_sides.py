@@ -10,6 +10,7 @@ Rows that see one vector take that step together; where several vectors are open
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -19,9 +20,11 @@ from fg_calib.graph.information import directions
 from fg_calib.graph.noise import NoiseState, PairNoise, RowNoise
 from fg_calib.graph.problem import Problem, assembled
 from fg_calib.graph.solver import Solution
+from fg_calib.robot.kinematics import SPAN
 
 Floats = NDArray[np.float64]
 Folds = tuple[NDArray[np.bool_], ...]
+Places = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 TOLERANCES = 2.0
 """Tolerances within which vectors may point the other way."""
@@ -29,8 +32,8 @@ TOLERANCES = 2.0
 FARTHEST = 6.0
 """An arm further away than that, [sigma] of what other rows leave open, is not the true one."""
 
-LEAST_LEVERAGE = 0.3
-"""Directions of the parameters that rows say, together, below which no parameter rests on them."""
+LEAST_SHARE = 0.3
+"""Part of what is known in some direction that must rest on the rows that may fold: else the others say where it is."""
 
 ALIKE = 0.9
 """Cosine of two steps from which they are one."""
@@ -71,39 +74,45 @@ def other_sides(solution: Solution) -> list[Floats]:
     if not problem.pair_series or problem.evaluated:
         return []
     folds = folds_of(solution.noises, scales)
-    if not any(mine.any() for mine in folds):
-        return []
-    if _leverage(solution, folds, _root(problem, at)) < LEAST_LEVERAGE:
+    n_folded = sum(int(np.sum(mine)) for mine in folds)
+    if not n_folded or 2 * n_folded > problem.n_residuals or _share(solution, folds) < LEAST_SHARE:
         return []
     S = _root(without(problem, folds, at, problem.state), at)
-    ways = [np.zeros((0, S.shape[1]))]
+    nearest = np.zeros((0, S.shape[1]))
+    for noise, some in _in_spans(solution, folds):
+        nearest = _different(np.concatenate([nearest, noise.ways_around(some, S)]))
+    return [S @ step for step in nearest]
+
+
+def _in_spans(solution: Solution, folds: Folds) -> Iterator[tuple[PairNoise, Places]]:
+    """The rows that may fold, some at a time: row and figure of each."""
     for noise, mine in zip(solution.noises, folds, strict=True):
         if isinstance(noise, PairNoise):
-            ways.append(noise.ways_around(mine, S))
-    steps = np.concatenate(ways)
-    length = np.linalg.norm(steps, axis=1)
-    kept: list[int] = []
-    for i in np.argsort(length).tolist():
+            rows, part = np.nonzero(mine)
+            for start in range(0, len(rows), SPAN):
+                yield noise, (rows[start : start + SPAN], part[start : start + SPAN])
+
+
+def _share(solution: Solution, folds: Folds) -> float:
+    """Largest part of what is known in any direction that rows say, as if all their noise were their own."""
+    S = _root(solution.problem, solution.parameters)
+    gram = np.zeros((S.shape[1],) * 2)
+    for noise, (rows, part) in _in_spans(solution, folds):
+        variance = np.einsum("nii->ni", noise.total_at(rows))[np.arange(len(rows)), part]
+        along = noise.derivatives_along((rows, part), S) / np.sqrt(variance)[:, None]
+        gram += along.T @ along
+    return float(np.linalg.eigvalsh(gram)[-1])
+
+
+def _different(steps: Floats) -> Floats:
+    """The shortest of some steps that are not alike, the nearest first, shape (m, k)."""
+    length, kept = np.linalg.norm(steps, axis=1), list[int]()
+    for i in np.argsort(length, kind="stable").tolist():
         if length[i] > FARTHEST or len(kept) == MOST:
             break
         if np.all(np.abs(steps[kept] @ steps[i]) < ALIKE * length[kept] * length[i]):
             kept.append(i)
-    return [S @ steps[i] for i in kept]
-
-
-def _leverage(solution: Solution, folds: Folds, root: Floats) -> float:
-    """How many directions of the parameters rows say, as if all their noise were their own."""
-    total = 0.0
-    for noise, mine in zip(solution.noises, folds, strict=True):
-        if isinstance(noise, PairNoise):
-            of_each = noise.derivatives_along(mine, root)
-            rows, part = np.nonzero(mine)
-            total += float(
-                np.sum(
-                    np.sum(of_each**2, axis=1) / np.einsum("nii->ni", noise.total_at(rows))[np.arange(len(rows)), part]
-                )
-            )
-    return total
+    return steps[kept]
 
 
 def _root(problem: Problem, parameters: Floats) -> Floats:

@@ -464,31 +464,29 @@ class PairNoise(RowNoise):
             folds[rows, 1] |= along[:, 1] > np.maximum((np.pi - f[rows, 1]) ** 2 / 4.0, noise[:, 1])
         return folds[:, self._parts]
 
-    def derivatives_along(self, chosen: Booleans, spread: Floats) -> Floats:
+    def derivatives_along(self, chosen: tuple[Integers, Integers], spread: Floats) -> Floats:
         """Derivatives of the predicted figures of some rows along the parameters' spread, shape (m, k).
 
         Args:
-            chosen: Which rows, shape (n, residual_dim).
+            chosen: Row, and place in it, of each figure, shape (m,).
             spread: A square root of the parameters' covariance, shape (n_columns, k).
         """
-        rows, part = np.nonzero(chosen)
+        rows, part = chosen
         J = residuals.linearise(residuals.rows_of(self.as_measured, rows), self.place.chain)[1]
         out: Floats = J[np.arange(len(rows)), part] @ spread
         return out
 
-    def ways_around(self, chosen: Booleans, spread: Floats) -> Floats:
+    def ways_around(self, chosen: tuple[Integers, Integers], spread: Floats) -> Floats:
         """The least steps along the spread that turn the vectors of some rows around, shape (m, k), [sigma].
 
         Of an angle beyond a quarter turn that is the vector's other way about half a turn, else about 0.
 
         Args:
-            chosen: Which rows, shape (n, residual_dim).
+            chosen: Row, and place in it, of each figure, shape (m,).
             spread: A square root of the parameters' covariance, shape (n_columns, k).
         """
-        rows, part = np.nonzero(chosen)
-        along, f = self.derivatives_along(chosen, spread), self._narrow(self.predicted)[rows, part]
-        beyond = self.about_half_a_turn()[rows, part]
-        way = 2.0 * np.where(beyond, np.pi - f, -f)
+        along, f = self.derivatives_along(chosen, spread), self._narrow(self.predicted)[chosen]
+        way = 2.0 * np.where(self.about_half_a_turn()[chosen], np.pi - f, -f)
         out: Floats = way[:, None] * along / np.maximum(np.sum(along**2, axis=1, keepdims=True), 1e-300)
         return out
 
