@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from fg_calib.analysis.goodness import OUTLIER_WEIGHT, Goodness
 from fg_calib.analysis.mistakes import SetupCheck
 from fg_calib.analysis.noise_components import has_joint_noise
 from fg_calib.analysis.offsets import forgotten_offsets
+from fg_calib.analysis.other_sides import wide_root
 from fg_calib.analysis.residual_table import ResidualTable
 from fg_calib.analysis.structure import excess_left, probability_of_noise
 from fg_calib.analysis.table_setups import check_problem
@@ -32,6 +33,7 @@ from fg_calib.analysis.verdict import (
     of_evaluation,
     of_folds,
     of_kept_noise,
+    of_lost,
     of_offset,
     of_priors,
     of_structure,
@@ -39,7 +41,7 @@ from fg_calib.analysis.verdict import (
     of_tolerances,
 )
 from fg_calib.graph.noise import JOINT_NOISE, PairNoise
-from fg_calib.graph.problem import at_parameters
+from fg_calib.graph.problem import at_parameters, reweighted_at
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements.kinds import AnchorContact
 from fg_calib.robot.kinematics import forward, precompute_trig
@@ -51,6 +53,9 @@ MOST_OUTLIERS = 0.5
 
 BENT = 1.0
 """Sigma by which what the parameters may still be off bends a row that is not linear enough."""
+
+LOST = 3.0
+"""Sigma of a parameter over what it is with all outliers, from which these are nearly all that sees it."""
 
 EXPLAINED = 0.8
 """Part of the excess of chi-square left with what a convention has no parameter for, up to which that is the cause.
@@ -268,7 +273,19 @@ def _of_solver(solution: Solution) -> list[Statement]:
             what = f"loss {solution.problem.options.loss} takes {lost} of {n} measurements"
             text = f"{what} of {s.kind.names[0].partition('.')[0]}{of} for outliers"
             statements.append(Statement(f"{text}: more than it can tell from noise", finding=True))
-    return statements
+    return statements + of_lost(_lost(solution), solution.problem.options.loss)
+
+
+def _lost(solution: Solution) -> list[str]:
+    """Parameters that nearly only outliers see: with these their sigma would be so much smaller."""
+    problem, at = solution.problem, solution.parameters
+    weights, series = problem.state.weights, problem.data.series
+    if not any(np.any(w[s.train] < OUTLIER_WEIGHT) for s, w in zip(series, weights or (), strict=False)):
+        return []
+    whole = reweighted_at(problem, at, replace(problem.state, weights=None))
+    weighted, all_of_them = (np.linalg.norm(wide_root(one, at), axis=1) for one in (problem, whole))
+    lost = weighted[: problem.variables.n_robot_columns] > LOST * all_of_them[: problem.variables.n_robot_columns]
+    return [problem.variables.names[i] for i in np.flatnonzero(lost)]
 
 
 def _of_model(
@@ -303,6 +320,7 @@ def _of_model(
 def _other_optima(solution: Solution, most: int = 4) -> list[str]:
     """A line for each other optimum: the parameters that differ most, in their tolerances, with both corrections."""
     robot, found = solution.problem.robot, []
+    advice = "; pairs between which more joints move tell them apart" if solution.problem.pair_series else ""
     for other in solution.others:
         apart = {p.name: abs(other[i] - solution.parameters[i]) / p.scale for i, p in enumerate(robot.parameters)}
         largest = max(apart.values())
@@ -313,5 +331,7 @@ def _other_optima(solution: Solution, most: int = 4) -> list[str]:
             factor, unit = (1e3, "mm") if p.unit == "m" else (180.0 / np.pi, "deg")
             here, there = (factor * (at[i] - p.nominal) for at in (solution.parameters, other))
             words.append(f"{p.name} {here:+.3g} or {there:+.3g} {unit}")
-        found.append(f"a second optimum that the data cannot tell from this one: {', '.join(words)} from nominal")
+        found.append(
+            f"a second optimum that the data cannot tell from this one: {', '.join(words)} from nominal{advice}"
+        )
     return found

@@ -305,7 +305,7 @@ def _of_table(t: TableSurvey) -> Iterator[str]:
     if t.n_pairs and t.n_folded > LEAST_FOLDED * t.n_pairs:
         yield (
             f"{t.name}: {t.n_folded} of {t.n_pairs} train pairs are so near 0 or half a turn that tolerances let their"
-            " vectors point either way: longer and wider motions tell more"
+            " vectors point either way: longer and wider motions, in which more joints move, tell more"
         )
 
 

@@ -30,7 +30,10 @@ TOLERANCES = 2.0
 """Tolerances within which vectors may point the other way."""
 
 FARTHEST = 6.0
-"""An arm further away than that, [sigma] of what other rows leave open, is not the true one."""
+"""An arm further away than that, [sigma] of what other rows leave open, is not the true one where this one fits."""
+
+MUCH = 1.2
+"""Chi-square over the number of residuals from which it does not."""
 
 LEAST_SHARE = 0.3
 """Part of what is known in some direction that must rest on the rows that may fold: else the others say where it is."""
@@ -74,13 +77,13 @@ def other_sides(solution: Solution) -> list[Floats]:
     if not problem.pair_series or problem.evaluated:
         return []
     folds = folds_of(solution.noises, scales)
-    n_folded = sum(int(np.sum(mine)) for mine in folds)
-    if not n_folded or 2 * n_folded > problem.n_residuals or _share(solution, folds) < LEAST_SHARE:
+    far = 2.0 * solution.objective > MUCH * problem.n_residuals
+    if not any(mine.any() for mine in folds) or not (far or _share(solution, folds) >= LEAST_SHARE):
         return []
-    S = _root(without(problem, folds, at, problem.state), at)
+    S = wide_root(without(problem, folds, at, problem.state), at)
     nearest = np.zeros((0, S.shape[1]))
     for noise, some in _in_spans(solution, folds):
-        nearest = _different(np.concatenate([nearest, noise.ways_around(some, S)]))
+        nearest = _different(np.concatenate([nearest, noise.ways_around(some, S)]), np.inf if far else FARTHEST)
     return [S @ step for step in nearest]
 
 
@@ -95,7 +98,7 @@ def _in_spans(solution: Solution, folds: Folds) -> Iterator[tuple[PairNoise, Pla
 
 def _share(solution: Solution, folds: Folds) -> float:
     """Largest part of what is known in any direction that rows say, as if all their noise were their own."""
-    S = _root(solution.problem, solution.parameters)
+    S = wide_root(solution.problem, solution.parameters)
     gram = np.zeros((S.shape[1],) * 2)
     for noise, (rows, part) in _in_spans(solution, folds):
         variance = np.einsum("nii->ni", noise.total_at(rows))[np.arange(len(rows)), part]
@@ -104,18 +107,18 @@ def _share(solution: Solution, folds: Folds) -> float:
     return float(np.linalg.eigvalsh(gram)[-1])
 
 
-def _different(steps: Floats) -> Floats:
+def _different(steps: Floats, farthest: float) -> Floats:
     """The shortest of some steps that are not alike, the nearest first, shape (m, k)."""
     length, kept = np.linalg.norm(steps, axis=1), list[int]()
     for i in np.argsort(length, kind="stable").tolist():
-        if length[i] > FARTHEST or len(kept) == MOST:
+        if length[i] > farthest or len(kept) == MOST:
             break
         if np.all(np.abs(steps[kept] @ steps[i]) < ALIKE * length[kept] * length[i]):
             kept.append(i)
     return steps[kept]
 
 
-def _root(problem: Problem, parameters: Floats) -> Floats:
+def wide_root(problem: Problem, parameters: Floats) -> Floats:
     """A square root of the parameters' covariance, of what nothing determines wide, shape (n_columns, n_columns)."""
     s, V = directions(problem, parameters)
     out: Floats = problem.variables.prior_scales[:, None] * V / np.maximum(s, OPEN)

@@ -27,13 +27,13 @@ from numpy.typing import NDArray
 
 from fg_calib.analysis.covariance import spread_of
 from fg_calib.analysis.mirrored import mirror_images
-from fg_calib.analysis.other_sides import folds_of, other_sides, without
+from fg_calib.analysis.other_sides import MUCH, folds_of, other_sides, without
 from fg_calib.arguments import checked
 from fg_calib.graph.information import directions
 from fg_calib.graph.noise import NoiseState
 from fg_calib.graph.observability import SIGNAL_FLOOR
 from fg_calib.graph.problem import Problem, noises_at, reweighted_at
-from fg_calib.graph.solver import Solution, SolverOptions, descend_from, solve, solve_from, solve_image
+from fg_calib.graph.solver import Solution, SolverOptions, solve, solve_from, solve_image
 from fg_calib.threads import one_blas_thread
 
 Floats = NDArray[np.float64]
@@ -61,8 +61,11 @@ MAX_ROWS = 20_000
 """Beyond this many residuals only the mirror image is tried: a descent takes seconds, and so many rows see much."""
 
 
-MANY_ROWS, MUCH = 2000, 1.2
+MANY_ROWS = 2000
 """Beyond so many residuals rows that may fold are left out only where chi-square is so much above their number."""
+
+FAR_OFF = 10.0
+"""Chi-square over the number of residuals that no arm near the optimum has."""
 
 
 @checked
@@ -74,79 +77,82 @@ def look_elsewhere(solution: Solution, options: SolverOptions | None = None) -> 
         options: Of the solver.
 
     Returns:
-        The solution with the smallest cost; in its `others` those that data and priors cannot tell from it. The same
-        solution where nothing is weak, and where it has not converged; with a robust loss, whose weights differ from
-        optimum to optimum, there are only those others that have vectors the other way.
+        The solution that costs least; in its `others` those that data and priors cannot tell from it. The same solution
+        where nothing is weak or folded. One that has not converged is left only for what folds: about a fold steps
+        arrive nowhere.
     """
-    if not solution.converged or solution.problem.evaluated:
+    if solution.problem.evaluated or not (solution.converged or solution.problem.pair_series):
         return solution
-    if solution.problem.options.loss != "none":
-        return replace(solution, others=_with_the_same_weights(solution, options))
-    seconds = solution.seconds
-    with one_blas_thread:
-        steps = _steps(solution)
-        unfolded = _without_folds(solution, options)
-    found, starts = [solution], [(unfolded, reweighted_at(solution.problem, unfolded))] if unfolded is not None else []
-    starts += [(_moved(solution, step), solution.problem) for step in steps]
-    for start, rows in starts:
-        least = min(one.cost for one in found)
-        other = solve_from(replace(solution, problem=rows), start, least + INDISTINCT, options)
-        if other is None:
-            continue
-        seconds += other.seconds
-        if other.converged and 2.0 * (other.cost - least) < INDISTINCT and all(_apart(other, one) for one in found):
-            found.append(other)
-    found, seconds = _with_images(found, seconds, options)
-    best, *rest = sorted(found, key=lambda one: one.cost)
-    others = tuple(one.parameters for one in rest if 2.0 * (one.cost - best.cost) < INDISTINCT)
-    return replace(best, others=others, seconds=seconds)
+    search = _Search(solution, options)
+    search.from_other_starts()
+    search.from_images()
+    return search.outcome()
 
 
-def _with_images(found: list[Solution], seconds: float, options: SolverOptions | None) -> tuple[list[Solution], float]:
-    """The optima found, and those of mirror images and other sides, one after the other from the best so far.
+class _Search:
+    """The optima of a problem that have been found.
 
-    Returns:
-        All optima, and the time taken.
+    Args:
+        solution: The first.
+        options: Of the solver.
     """
-    best, better = min(found, key=lambda one: one.cost), True
-    while better:
-        better = False
-        for other in _descents(best, options):
-            if other is None or not other.converged:
-                continue
-            seconds += other.seconds
-            better = other.cost < best.cost - LEAST_GAIN
-            if better or all(_apart(other, one) for one in found):
-                found = [*found, other]
-            if better:
-                best = other
-                break
-    return found, seconds
 
+    def __init__(self, solution: Solution, options: SolverOptions | None) -> None:
+        self._first, self._options = solution, options
+        self._found, self._seconds = [solution], solution.seconds
 
-def _descents(best: Solution, options: SolverOptions | None) -> Iterator[Solution | None]:
-    """Where descents from mirror images and from vectors' other sides lead."""
-    for image in mirror_images(best):
-        yield solve_image(best, image.problem, image.before, best.cost + 0.5 * INDISTINCT, options)
-    with one_blas_thread:
-        steps = other_sides(best)
-    for step in steps:
-        # Twice what is asked for, for the rows are whitened where the first optimum is.
-        yield solve_from(best, _moved(best, step), best.cost + INDISTINCT, options)
+    @property
+    def _best(self) -> Solution:
+        return min(self._found, key=lambda one: one.objective)
 
+    def outcome(self) -> Solution:
+        """The best, with those that are as good."""
+        best, *rest = sorted(self._found, key=lambda one: one.objective)
+        told = [best]
+        for one in rest:
+            if 2.0 * (one.objective - best.objective) < INDISTINCT and all(_apart(one, other) for other in told):
+                told.append(one)
+        return replace(best, others=tuple(one.parameters for one in told[1:]), seconds=self._seconds)
 
-def _with_the_same_weights(solution: Solution, options: SolverOptions | None) -> tuple[Floats, ...]:
-    """Parameter vectors of other sides that explain the measurements as well by the weights that they have."""
-    with one_blas_thread:
-        steps = other_sides(solution)
-    found = [solution]
-    for step in steps:
-        most = solution.weighted_cost + 0.5 * INDISTINCT
-        other = descend_from(solution, _moved(solution, step), most, options)
-        if other is not None:
-            there = replace(solution, parameters=other, values=solution.problem.variables.values(other))
-            found += [there] if all(_apart(there, one) for one in found) else []
-    return tuple(one.parameters for one in found[1:])
+    def from_other_starts(self) -> None:
+        """Descents from without what may fold, and from along directions that are weak or seen by a square."""
+        with one_blas_thread:
+            steps = _steps(self._first) if self._first.converged else []
+            unfolded = _without_folds(self._first, self._options)
+        aside = [] if unfolded is None else [unfolded]
+        for start in (*aside, *_beside_nominal(self._first)):
+            self._keep(self._from(replace(self._first, problem=reweighted_at(self._first.problem, start)), start))
+        for step in steps:
+            self._keep(self._from(self._first, _moved(self._first, step)))
+
+    def from_images(self) -> None:
+        """Descents from mirror images and from vectors' other sides, one after the other from the best so far."""
+        while any(self._keep(other) for other in self._images()):
+            pass
+
+    def _images(self) -> Iterator[Solution | None]:
+        best = self._best
+        if best.problem.options.loss == "none":
+            for image in mirror_images(best):
+                yield solve_image(best, image.problem, image.before, best.cost + 0.5 * INDISTINCT, self._options)
+        with one_blas_thread:
+            steps = other_sides(best)
+        for step in steps:
+            yield self._from(best, _moved(best, step))
+
+    def _from(self, solution: Solution, start: Floats) -> Solution | None:
+        # Twice what is asked for at last, for the rows are whitened where the first optimum is.
+        return solve_from(solution, start, self._best.cost + INDISTINCT, self._options)
+
+    def _keep(self, other: Solution | None) -> bool:
+        """Keep an optimum if it is nearly as good as the best; whether it is better than all before."""
+        if other is None or not other.converged:
+            return False
+        self._seconds += other.seconds
+        gain = self._best.objective - other.objective
+        if -2.0 * gain < INDISTINCT:
+            self._found.append(other)
+        return gain > LEAST_GAIN
 
 
 def _moved(solution: Solution, step: Floats) -> Floats:
@@ -194,17 +200,34 @@ def _without_folds(solution: Solution, options: SolverOptions | None) -> Floats 
     Of very many rows no single one bends an arm: then only where chi-square is too large.
     """
     problem, nominal = solution.problem, _nominal(solution)
-    many = problem.n_residuals > MANY_ROWS
-    if not problem.pair_series or (many and 2.0 * solution.cost < MUCH * problem.n_residuals):
+    if not problem.pair_series or (problem.n_residuals > MANY_ROWS and not _is_far(solution, MUCH)):
         return None
     state = NoiseState(factors=problem.state.factors)
     folds = folds_of(noises_at(replace(problem, state=state), nominal), problem.variables.prior_scales)
     n_folded = sum(int(np.sum(mine)) for mine in folds)
-    if not n_folded or 2 * n_folded > problem.n_residuals:
+    if not 0 < n_folded < problem.n_residuals:
         return None
     if problem.state.joint_errors is not None:
         state = replace(state, joint_errors=np.zeros_like(problem.state.joint_errors))
     return solve(without(problem, folds, solution.before, state), options).parameters
+
+
+def _beside_nominal(solution: Solution) -> list[Floats]:
+    """Parameter vectors a tolerance to either side of nominal, where the rows are explained far too badly.
+
+    Nominal may be where two sides of a fold meet: no derivative leads away from there.
+    """
+    problem, variables = solution.problem, solution.problem.variables
+    if not problem.pair_series or problem.n_residuals > MAX_ROWS or not _is_far(solution, FAR_OFF):
+        return []
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], variables.n_columns)
+    there = replace(solution, parameters=(nominal := _nominal(solution)), values=variables.values(nominal))
+    return [_moved(there, sign * signs * variables.prior_scales) for sign in (1.0, -1.0)]
+
+
+def _is_far(solution: Solution, factor: float) -> bool:
+    """Whether chi-square is so many times the number of rows."""
+    return 2.0 * solution.objective > factor * solution.problem.n_residuals
 
 
 def _nominal(solution: Solution) -> Floats:
@@ -217,8 +240,8 @@ def _nominal(solution: Solution) -> Floats:
 
 
 def _apart(a: Solution, b: Solution) -> bool:
-    """Whether the robot of the second differs by more than what is left open at the first, in some column."""
-    variables, spread = a.problem.variables, spread_of(a)
-    sigma = np.sqrt(np.diag(spread.covariance(np.eye(variables.n_columns))))  # nan where nothing determines it
-    apart = np.abs(variables.step(a.values, b.values)[: variables.n_columns]) > APART * sigma
-    return bool(np.any(apart[: variables.n_robot_columns]))
+    """Whether the robots of two differ by more than what is left open at either, in some column."""
+    variables, eye = a.problem.variables, np.eye(a.problem.variables.n_columns)
+    step = np.abs(variables.step(a.values, b.values)[: len(eye)])
+    variance = np.maximum(*(spread_of(one).variance(eye) for one in (a, b)))  # nan where nothing determines it
+    return bool(np.any((step > APART * np.sqrt(variance))[: variables.n_robot_columns]))

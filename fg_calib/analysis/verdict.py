@@ -304,6 +304,22 @@ def of_bent(n: int, n_rows: int, directions: float) -> list[Statement]:
     return [Statement(text, finding=False)]
 
 
+def of_lost(names: Sequence[str], loss: str) -> list[Statement]:
+    """What it means that nearly all measurements that see some parameters count as outliers.
+
+    Args:
+        names: The parameters.
+        loss: The robust loss.
+    """
+    if not names:
+        return []
+    text = (
+        f"nearly all measurements that see {_listed(names)} are taken for outliers by loss {loss}: look at them;"
+        " calibrate without a loss to see what they say"
+    )
+    return [Statement(text, finding=False, reservation=True)]
+
+
 def of_curvature(found: Curvature) -> list[Statement]:
     """What it means that rows are not linear within what the parameters may still be off, far from any fold.
 
@@ -343,7 +359,7 @@ def of_folds(n: int, n_rows: int, share: float) -> list[Statement]:
     text = (
         f"{n} of {n_rows} lengths and angles are so near 0 or half a turn that tolerances let their vectors point"
         f" either way, and {100.0 * share:.0f} % of what the rows say rests on them: there may be a better optimum far"
-        " away; start from a better nominal arm, or measure longer and wider motions"
+        " away; measure longer and wider motions, in which more joints move"
     )
     return [Statement(text, share > MOST_FOLDED)]
 

@@ -62,7 +62,7 @@ BEND_MARGIN = 2.0
 by a derivative that is there only at the estimate; with 1 the NEES of a SCARA's star is 1.05, with 2 about 1.02."""
 
 MOST_BEND = 1.0
-"""A row is bent by no more sigma: what is off by more than that is for the optimum to find, not to be called noise."""
+"""A fitted row is bent by no more sigma: what is off by more than that is for the optimum to find, and no noise."""
 
 REDUNDANT = 100.0
 """Factor on what is not linear in pairs that are more than the errors they share: they have nothing else to say there,
@@ -620,7 +620,9 @@ class PairNoise(RowNoise):
         if self._spread is None:
             return np.zeros(0, dtype=np.int64), np.zeros((0, 2))
         rows, across = self._noticed(self._spread, LEAST_BEND)
-        return rows, np.minimum(across, MOST_BEND * self._straight(rows))
+        fitted = ~self.series.test[rows]
+        across[fitted] = np.minimum(across[fitted], MOST_BEND * self._straight(rows[fitted]))
+        return rows, across
 
     def _noticed(self, spread: Floats, sigmas: float) -> tuple[Integers, Floats]:
         """Rows that may be bent by so many sigma, in ascending order; variance across where it does so, else 0.

@@ -77,6 +77,27 @@ def weight(loss: Loss, e: Floats, c: Floats | float) -> Floats:
             return (e <= c).astype(np.float64)
 
 
+def cost(loss: Loss, e: Floats, c: Floats | float) -> Floats:
+    """What a loss has measurements cost, of which `weight` times `e` is the derivative.
+
+    Args:
+        loss: The loss.
+        e: Length of the whitened residual, any shape.
+        c: The loss's constant, of a shape that goes with `e`.
+    """
+    match loss:
+        case "none":
+            return 0.5 * e**2
+        case "huber":
+            return np.where(e <= c, 0.5 * e**2, c * (e - 0.5 * c))
+        case "cauchy":
+            return 0.5 * c**2 * np.log1p((e / c) ** 2)
+        case "geman-mcclure":
+            return 0.5 * c**2 * e**2 / (c**2 + e**2)
+        case "gnc":
+            return 0.5 * np.minimum(e, c) ** 2
+
+
 @cache
 def tuning(loss: Loss, dim: int) -> float:
     """The constant c of a loss for measurements of `dim` rows; infinite for `none`."""
@@ -92,6 +113,13 @@ def tuning(loss: Loss, dim: int) -> float:
         return float(slope**2 / squared) - EFFICIENCY
 
     return float(optimize.brentq(excess, 0.2, 50.0))
+
+
+def constants(loss: Loss, residual_dim: NDArray[np.int64]) -> Floats:
+    """The constant of a loss for measurements of so many rows each, shape (n,)."""
+    of_dim = [tuning(loss, max(h, 1)) for h in range(residual_dim.max(initial=0) + 1)]
+    out: Floats = np.array(of_dim)[residual_dim]
+    return out
 
 
 @dataclass(frozen=True)
@@ -169,7 +197,7 @@ class Weighting:
             e: Length of each measurement's whitened residual, shape (n,).
             residual_dim: Its number of rows, shape (n,); 0 for one that takes no part.
         """
-        c = np.array([tuning(self._loss, max(h, 1)) for h in range(residual_dim.max(initial=0) + 1)])[residual_dim]
+        c = constants(self._loss, residual_dim)
         e = np.where(residual_dim > 0, e, 0.0)  # what takes no part keeps its weight
         if self._loss != "gnc":
             return weight(self._loss, e, c), True

@@ -45,7 +45,7 @@ from fg_calib.graph.problem import (
     some_rows,
     started_at,
 )
-from fg_calib.graph.robust import Weighting
+from fg_calib.graph.robust import Weighting, constants, cost
 from fg_calib.graph.tolerances import ToleranceScales
 from fg_calib.options import Options, check_number
 from fg_calib.threads import one_blas_thread
@@ -170,7 +170,7 @@ class Solution(FrozenArrays):
 
     def __getstate__(self) -> dict[str, Any]:
         """All but what follows from the rest."""
-        return {name: value for name, value in self.__dict__.items() if name != "noises"}
+        return {name: value for name, value in self.__dict__.items() if name not in ("noises", "objective")}
 
     def __repr__(self) -> str:
         costs = f"{self.iterations} iterations, cost {self.initial_cost:.6g} -> {self.cost:.6g}"
@@ -180,6 +180,19 @@ class Solution(FrozenArrays):
     def iterations(self) -> int:
         """Number of steps."""
         return len(self.history)
+
+    @cached_property
+    def objective(self) -> float:
+        """What it is an optimum of: the cost; with a robust loss by what that has each measurement cost."""
+        weights, loss = self.problem.state.weights, self.problem.options.loss
+        if weights is None:
+            return self.cost
+        total = self.weighted_cost
+        distances = mahalanobis_distances(self.problem, self.parameters)
+        for s, w, (e, residual_dim) in zip(self.problem.data.series, weights, distances, strict=True):
+            more = cost(loss, e, constants(loss, residual_dim)) - 0.5 * w * e**2
+            total += float(np.sum(more[s.train]))
+        return total
 
     @cached_property
     def noises(self) -> tuple[RowNoise, ...]:
@@ -267,7 +280,8 @@ def solve_from(solution: Solution, start: Floats, most: float, options: SolverOp
     Args:
         solution: What was found before; `before` and the initial cost stay as they are.
         start: The parameter vector to start from.
-        most: Cost of an optimum that is of no interest, with the rows whitened as they are in the solution.
+        most: Cost of an optimum that is of no interest, with the rows whitened as they are in the solution. With a
+            robust loss, whose weights follow from where one is, it says nothing.
         options: Settings of the solver.
 
     Returns:
@@ -277,38 +291,18 @@ def solve_from(solution: Solution, start: Floats, most: float, options: SolverOp
         SolverError: GTSAM could not solve a step at all.
     """
     clock, options = time.perf_counter(), options or options_of(solution.problem.options)
-    near = descend_from(solution, start, most, options)
-    if near is None:
-        return None
-    with one_blas_thread:
-        run = _fit(reweighted_at(solution.problem, near), options)
-        found = _solution(run, solution.before, solution.initial_cost, clock)
-        return _estimated_as(solution, found)
-
-
-def descend_from(solution: Solution, start: Floats, most: float, options: SolverOptions | None = None) -> Floats | None:
-    """Where the descent on a solution's problem from another start leads, with rows whitened and weighted as there.
-
-    Args:
-        solution: What was found before.
-        start: The parameter vector to start from.
-        most: Weighted cost of an optimum that is of no interest.
-        options: Settings of the solver.
-
-    Returns:
-        The parameter vector near the optimum; None if the descent leads nowhere, above `most` or back to where the
-        solution is.
-
-    Raises:
-        SolverError: GTSAM could not solve a step at all.
-    """
-    options = options or options_of(solution.problem.options)
     with one_blas_thread:
         problem = started_at(solution.problem, start)
-        rough = _Run(problem, replace(options, max_iterations=min(SHORT, options.max_iterations)))
-        if not rough.descend(COARSE) or rough.here.cost >= most:
-            return None
-        return None if rough.here.decrement_to(solution.values) < BACK else rough.parameters
+        if problem.options.loss == "none":
+            rough = _Run(problem, replace(options, max_iterations=min(SHORT, options.max_iterations)))
+            if not rough.descend(COARSE) or rough.here.cost >= most:
+                return None
+            if rough.here.decrement_to(solution.values) < BACK:
+                return None
+            problem = reweighted_at(problem, rough.parameters)
+        run = _fit(problem, options)
+        found = _solution(run, solution.before, solution.initial_cost, clock)
+        return _estimated_as(solution, found)
 
 
 def solve_image(
