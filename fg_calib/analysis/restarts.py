@@ -9,12 +9,15 @@ data cannot tell from it is told of.
 
 Distances and angles near 0, and angles near half a turn, fold: where nominal has a pair on the other side, the descent
 may end there, bending the whole arm. So it is repeated from the optimum of all rows but those that tolerances may fold,
-and from arms that have the vectors of these the other way (see `other_sides`).
+and from arms that have the vectors of these the other way (see `other_sides`). Where the rows are explained far too
+badly, nominal may be right between two sides: then it starts from both sides of that.
+
+With a robust loss optima are compared by what the loss has measurements cost: their weights differ.
 
 Planes and anchors are tried at their mirror images (see `mirrored`), one after the other from the best optimum so far.
 
-This stands behind the front door of jobs (`noise.solve_job`) and not in `solve`: a simulation of a thousand draws asks
-for the optimum that nominal leads to, and would pay for looking elsewhere a thousand times.
+This stands behind the front door of jobs (`solve_job`) and not in `solve`: a simulation of a thousand draws asks for
+the optimum that nominal leads to, and would pay for looking elsewhere a thousand times.
 """
 
 from __future__ import annotations
@@ -58,7 +61,8 @@ LEAST_GAIN = 0.01
 """Cost by which a mirror image must be better to be taken: as good ones stay on the side that the start chose."""
 
 MAX_ROWS = 20_000
-"""Beyond this many residuals only the mirror image is tried: a descent takes seconds, and so many rows see much."""
+"""Beyond this many residuals only the mirror image is tried: a descent takes seconds, and so many rows see much. With a
+robust loss, whose descents are many, beyond `MANY_ROWS`."""
 
 
 MANY_ROWS = 2000
@@ -177,7 +181,7 @@ def _steps(solution: Solution) -> list[Floats]:
     if curved.any():
         steps.append(-2.0 * scales * (V_nominal[:, curved] @ (moved[curved] / (1.0 - ratio[curved]))))
     weak = V[:, (s < WEAK) & (s > SIGNAL_FLOOR)]
-    if weak.size and problem.n_residuals <= MAX_ROWS:
+    if weak.size and problem.n_residuals <= (MAX_ROWS if problem.options.loss == "none" else MANY_ROWS):
         signs = np.random.default_rng(0).choice([-1.0, 1.0], len(scales))
         # Two tolerances or sigma, whichever is more: the same whatever basis the weak directions have.
         far = np.minimum(FAR / np.minimum(s[(s < WEAK) & (s > SIGNAL_FLOOR)], 1.0), _reaches(problem, weak))
