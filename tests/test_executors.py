@@ -204,6 +204,24 @@ def test_folders_are_called_by_what_tells_jobs_apart():
     assert names("x/jobs.json.yaml", "y/other.yaml") == ["x", "y"]  # where a file of all jobs would be
 
 
+def test_no_folder_of_a_job_is_outside_that_of_all_or_where_files_are_being_written(tmp_path, monkeypatch):
+    (tmp_path / "arm" / "sub").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "arm" / "sub")
+
+    def names(*jobs):
+        return job_names([Path(job) for job in jobs])
+
+    assert names("../job.yaml", "job.yaml") == ["arm", "sub"]
+    assert names("../../x/../job.yaml", "../job.yaml", "job.yaml") == [tmp_path.name, "arm", "sub"]
+    for hidden in ("...yaml", "..yaml", ".fg-calib-written.yaml", ".FG-calib-Writing-1.yaml"):
+        assert names(f"../{hidden}", "cold.yaml") == ["arm", "sub"]
+        assert names(hidden, "cold.yaml") == [f"sub-{Path(hidden).stem}", "sub-cold"]
+    with pytest.raises(InputError) as refused:
+        names(".fg-calib-x/job.yaml", "a/job.yaml")
+    found = "JOB: .fg-calib-x/job.yaml would be written to a folder .fg-calib-x-job"
+    assert str(refused.value) == f"{found}, expected no name that begins with .fg-calib-"
+
+
 @pytest.mark.parametrize(
     "jobs", [("a/job.yaml", "a/job.yaml"), ("x/a/job.yaml", "y/a/job.yaml"), ("A/job.yaml", "a/job.yaml")]
 )
