@@ -18,7 +18,7 @@ from fg_calib.arguments import checked
 from fg_calib.calibration import Calibration, calibrate_job
 from fg_calib.errors import InputError, escaped, shown
 from fg_calib.executors import Failure, map_jobs
-from fg_calib.files.disk import RESERVED, clear_dead, require_own, require_writable
+from fg_calib.files.disk import RESERVED, clear_dead, require_own, require_writable, stamp
 from fg_calib.files.job import read_job
 from fg_calib.files.parts import JobInParts, read_parts
 from fg_calib.job import Job
@@ -148,14 +148,35 @@ def calibrate_into(orders: Sequence[Order], executor: Executor | None = None) ->
         orders: The orders.
         executor: Where they run; one after the other in this process if None.
     """
+    before = [_saved(order) for order in orders]
     found = map_jobs(carry_out, orders, executor, names=[order.name for order in orders])
-    for order, one in zip(orders, found, strict=True):
-        if isinstance(one, Failure) and order.folder is not None:
-            clear_dead(order.folder)
     return [
-        JobSummary(order.name, str(order.job), "failed", one.reason) if isinstance(one, Failure) else one
-        for order, one in zip(orders, found, strict=True)
+        _failed(order, one, earlier) if isinstance(one, Failure) else one
+        for order, one, earlier in zip(orders, found, before, strict=True)
     ]
+
+
+def _failed(order: Order, failure: Failure, earlier: tuple[int, int] | None) -> JobSummary:
+    """The line of an order that has no result.
+
+    Args:
+        order: The order.
+        failure: Why.
+        earlier: What was saved in its folder before, see `_saved`.
+    """
+    if order.folder is not None:
+        clear_dead(order.folder)
+    is_earlier = earlier is not None and _saved(order) == earlier
+    reason = f"{failure.reason}; {EARLIER}" if is_earlier else failure.reason
+    return JobSummary(order.name, str(order.job), "failed", reason)
+
+
+EARLIER = "the result in its folder is of an earlier run"
+
+
+def _saved(order: Order) -> tuple[int, int] | None:
+    """Which result is in an order's folder; None if there is none."""
+    return None if order.folder is None else stamp(order.folder / "result.json")
 
 
 def job_names(jobs: Sequence[Path]) -> list[str]:

@@ -32,7 +32,7 @@ from fg_calib import (
     simulate,
 )
 from fg_calib.analysis.folds import cross_validate
-from fg_calib.batch import Order, calibrate_into, job_names
+from fg_calib.batch import EARLIER, Order, calibrate_into, job_names
 from fg_calib.progress import listening
 from fg_calib.threads import THREADS, processors
 
@@ -417,6 +417,31 @@ def test_many_jobs_are_written_to_a_folder_each_and_the_worst_is_the_exit_code(f
     assert first.startswith(f"arm1,{two_arms[0]},good,space-robot,52,")
     assert first.endswith(",test,,")
     assert second.startswith(f"arm2,{two_arms[1]},failed,,,,,,,")
+
+
+def test_a_result_of_an_earlier_run_stays_where_a_job_fails_and_is_called_so(fg_calib, two_arms, tmp_path):
+    """But not one that the job itself has written before it failed, nor where there is none."""
+    out = tmp_path / "out"
+    earlier = out / "arm2" / "result.json"
+    earlier.parent.mkdir(parents=True)
+    earlier.write_text("{}")
+    ended = fg_calib("calibrate", *two_arms, "--out", out)
+    assert ended.code == 1
+    assert earlier.read_text() == "{}"
+    reason = json.loads((out / "jobs.json").read_text())["jobs"][1]["error"]
+    assert reason.startswith("calibration.yaml: model: found 'nonsense'")
+    assert reason.endswith("; the result in its folder is of an earlier run")
+    assert (reason in ended.err, f'"{reason}"' in (out / "jobs.csv").read_text()) == (True, True)
+
+    class WritesAndFails(Executor):
+        def submit(self, *_):
+            earlier.unlink()
+            earlier.write_text("another")
+            raise RuntimeError("no space left")
+
+    orders = [Order("arm2", two_arms[1], earlier.parent), Order("arm3", two_arms[1], out / "arm3")]
+    assert [one.error for one in calibrate_into(orders[:1], WritesAndFails())] == ["RuntimeError: no space left"]
+    assert [EARLIER in (one.error or "") for one in calibrate_into(orders)] == [True, False]
 
 
 @pytest.mark.slow

@@ -438,6 +438,15 @@ def exists(path: Path) -> bool:
         return False
 
 
+def stamp(path: Path) -> tuple[int, int] | None:
+    """What is another when a file has been written anew, as `exists` sees it; None where none can be read."""
+    try:
+        found = _newest(path).stat()
+    except (OSError, ValueError, InputError):
+        return None
+    return found.st_ino, found.st_mtime_ns
+
+
 def is_folder(path: Path) -> bool:
     """Whether there is a folder; none has a name that no file can have."""
     try:
