@@ -64,7 +64,9 @@ _LOOK = 1.0
 
 NO_FUTURE = TypeError("submit of the executor returned no future of its own for each job")
 NO_WORKERS = "worker processes died, and no others can be started"
-HINT_NO_WORKERS = 'local_processes has fresh ones; a script needs `if __name__ == "__main__":`'
+HINT_NO_WORKERS = (
+    'local_processes has fresh ones; a script must be a file, as they import it, with `if __name__ == "__main__":`'
+)
 
 
 @dataclass(frozen=True)
@@ -326,7 +328,8 @@ def _interrupts_later() -> Iterator[None]:
 def local_processes(n_workers: int) -> LocalProcesses:
     """An executor of worker processes on this machine, for a `with` block.
 
-    A script that uses it needs the usual `if __name__ == "__main__":`, as its workers import it.
+    A script that uses it is a file, not read from stdin, and needs the usual `if __name__ == "__main__":`, as its
+    workers import it.
 
     Args:
         n_workers: Number of processes.

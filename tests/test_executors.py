@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 from deadly import deadly_calibration, die_once, every_bit, work
+from rich.console import Console
 
 from fg_calib import (
     CalibrationError,
@@ -34,6 +35,7 @@ from fg_calib import (
 from fg_calib.analysis.folds import cross_validate
 from fg_calib.batch import EARLIER, Order, calibrate_into, job_names
 from fg_calib.progress import listening
+from fg_calib.report.batch import JobSummary, build_jobs_table
 from fg_calib.threads import THREADS, processors
 
 JOBS = [1, "refused", 2, "a bug", "too large", 3]
@@ -266,8 +268,8 @@ def test_a_pool_that_cannot_be_mended_is_said_to_be_broken():
         *_, last = map_jobs(work, [1, "deadly", 3], executor)
     assert last == Failure(
         "job 3",
-        "worker processes died, and no others can be started;"
-        ' local_processes has fresh ones; a script needs `if __name__ == "__main__":`',
+        "worker processes died, and no others can be started; local_processes has fresh ones;"
+        ' a script must be a file, as they import it, with `if __name__ == "__main__":`',
     )
 
 
@@ -442,6 +444,27 @@ def test_a_result_of_an_earlier_run_stays_where_a_job_fails_and_is_called_so(fg_
     orders = [Order("arm2", two_arms[1], earlier.parent), Order("arm3", two_arms[1], out / "arm3")]
     assert [one.error for one in calibrate_into(orders[:1], WritesAndFails())] == ["RuntimeError: no space left"]
     assert [EARLIER in (one.error or "") for one in calibrate_into(orders)] == [True, False]
+
+
+def test_lines_say_of_which_rows_they_are_where_that_is_not_the_same_for_all():
+    def printed(*of_test):
+        jobs = [JobSummary(f"arm{k}", "a.yaml", "good", of_test=of) for k, of in enumerate(of_test)]
+        with console.capture() as text:
+            console.print(build_jobs_table([*jobs, JobSummary("none", "b.yaml", "failed", "no file")], 1.0))
+        return [" ".join(line.split()) for line in text.get().splitlines()]
+
+    console = Console(width=100)
+    assert printed(True, False)[:-1] == [
+        "job verdict rows chi2/dof s reason",
+        "arm0 good test",
+        "arm1 good train",
+        "none failed no file",
+        "RMS after the calibration, of test or train rows",
+    ]
+    heads, first, *_, note, _ = printed(False, False)
+    assert "rows" not in heads
+    assert (first, note) == ("arm0 good", "RMS after the calibration, of train rows")
+    assert len(printed(None)) == 4  # heads, lines, and how many failed: no note
 
 
 @pytest.mark.slow
