@@ -148,7 +148,7 @@ def calibrate_into(orders: Sequence[Order], executor: Executor | None = None) ->
         orders: The orders.
         executor: Where they run; one after the other in this process if None.
     """
-    before = [_saved(order) for order in orders]
+    before = saved_in(orders)
     found = map_jobs(carry_out, orders, executor, names=[order.name for order in orders])
     return [
         _failed(order, one, earlier) if isinstance(one, Failure) else one
@@ -162,11 +162,11 @@ def _failed(order: Order, failure: Failure, earlier: tuple[int, int] | None) -> 
     Args:
         order: The order.
         failure: Why.
-        earlier: What was saved in its folder before, see `_saved`.
+        earlier: What was saved in its folder before, see `saved_in`.
     """
     if order.folder is not None:
         clear_dead(order.folder)
-    is_earlier = earlier is not None and _saved(order) == earlier
+    is_earlier = earlier is not None and saved_in([order]) == [earlier]
     reason = f"{failure.reason}; {EARLIER}" if is_earlier else failure.reason
     return JobSummary(order.name, str(order.job), "failed", reason)
 
@@ -174,9 +174,9 @@ def _failed(order: Order, failure: Failure, earlier: tuple[int, int] | None) -> 
 EARLIER = "the result in its folder is of an earlier run"
 
 
-def _saved(order: Order) -> tuple[int, int] | None:
-    """Which result is in an order's folder; None if there is none."""
-    return None if order.folder is None else stamp(order.folder / "result.json")
+def saved_in(orders: Sequence[Order]) -> list[tuple[int, int] | None]:
+    """Which result is in each order's folder: another one has another `stamp`; None where there is none."""
+    return [None if order.folder is None else stamp(order.folder / "result.json") for order in orders]
 
 
 def job_names(jobs: Sequence[Path]) -> list[str]:

@@ -285,7 +285,8 @@ class LocalProcesses(Executor):
     def _start(self) -> None:
         self._theirs, self._lifeline = self._context.Pipe(duplex=False)
         share = max(1, processors() // self.n_workers)
-        self._pool = ProcessPoolExecutor(self.n_workers, self._context, _begin, (self._theirs, share))
+        with _interrupts_later():
+            self._pool = ProcessPoolExecutor(self.n_workers, self._context, _begin, (self._theirs, share))
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
         """See `concurrent.futures.Executor.submit`; where worker processes have died there are fresh ones."""
@@ -316,8 +317,8 @@ class LocalProcesses(Executor):
 
 @contextmanager
 def _interrupts_later() -> Iterator[None]:
-    """Within, processes start that Ctrl-C does not reach, which says it to all: they end with the one that it ends."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    """Within, processes start that Ctrl-C, or a terminal that goes, does not reach: they end with who started them."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
     try:
         yield
     finally:

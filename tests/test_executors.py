@@ -34,6 +34,8 @@ from fg_calib import (
 )
 from fg_calib.analysis.folds import cross_validate
 from fg_calib.batch import EARLIER, Order, calibrate_into, job_names
+from fg_calib.cli.calibrate import _written
+from fg_calib.files.disk import fill_folder, write_text
 from fg_calib.progress import listening
 from fg_calib.report.batch import JobSummary, build_jobs_table
 from fg_calib.threads import THREADS, processors
@@ -553,16 +555,27 @@ def nobody_left(group):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("all_of_them", [False, True])  # as kill does, and as the terminal does
-def test_an_interrupt_ends_the_workers_too_in_one_line(example, tmp_path, all_of_them):
+def test_what_ends_the_command_ends_the_workers_too_in_one_line(example, tmp_path, number, all_of_them):
     process = started(other_jobs(example, 9), tmp_path / "out")
-    (os.killpg if all_of_them else os.kill)(process.pid, signal.SIGINT)
+    (os.killpg if all_of_them else os.kill)(process.pid, number)
     shown, said = process.communicate(timeout=60)
-    line = "interrupted; the results of jobs that were done have been written\n"
-    assert (process.returncode, shown, said) == (130, "", line)
+    assert (process.returncode, shown) == (128 + number, "")
     until(lambda: nobody_left(process.pid))
-    assert len(list((tmp_path / "out").glob("*/result.json"))) < 9
+    n = len(list((tmp_path / "out").glob("*/result.json")))
+    assert 0 < n < 9
+    assert said == f"interrupted; results of {n} of 9 jobs have been written\n"
     assert not (tmp_path / "out" / "jobs.json").exists()
+
+
+def test_results_are_said_to_be_written_that_were_written_since(tmp_path):
+    orders = [Order(name, Path("job.yaml"), tmp_path / name) for name in ("earlier", "now", "later")]
+    fill_folder(tmp_path / "earlier", lambda into: write_text(into / "result.json", "{}"))
+    said = _written([*orders, Order("nowhere", Path("job.yaml"), None)])
+    assert said() == "nothing has been written"
+    fill_folder(tmp_path / "now", lambda into: write_text(into / "result.json", "{}"))
+    assert said() == "results of 1 of 4 jobs have been written"
 
 
 @pytest.mark.slow
