@@ -18,7 +18,7 @@ from fg_calib.arguments import checked
 from fg_calib.calibration import Calibration, calibrate_job
 from fg_calib.errors import InputError, escaped, shown
 from fg_calib.executors import Failure, map_jobs
-from fg_calib.files.disk import clear_dead, require_own, require_writable
+from fg_calib.files.disk import RESERVED, clear_dead, require_own, require_writable, stamp
 from fg_calib.files.job import read_job
 from fg_calib.files.parts import JobInParts, read_parts
 from fg_calib.job import Job
@@ -148,14 +148,35 @@ def calibrate_into(orders: Sequence[Order], executor: Executor | None = None) ->
         orders: The orders.
         executor: Where they run; one after the other in this process if None.
     """
+    before = saved_in(orders)
     found = map_jobs(carry_out, orders, executor, names=[order.name for order in orders])
-    for order, one in zip(orders, found, strict=True):
-        if isinstance(one, Failure) and order.folder is not None:
-            clear_dead(order.folder)
     return [
-        JobSummary(order.name, str(order.job), "failed", one.reason) if isinstance(one, Failure) else one
-        for order, one in zip(orders, found, strict=True)
+        _failed(order, one, earlier) if isinstance(one, Failure) else one
+        for order, one, earlier in zip(orders, found, before, strict=True)
     ]
+
+
+def _failed(order: Order, failure: Failure, earlier: tuple[int, int] | None) -> JobSummary:
+    """The line of an order that has no result.
+
+    Args:
+        order: The order.
+        failure: Why.
+        earlier: What was saved in its folder before, see `saved_in`.
+    """
+    if order.folder is not None:
+        clear_dead(order.folder)
+    is_earlier = earlier is not None and saved_in([order]) == [earlier]
+    reason = f"{failure.reason}; {EARLIER}" if is_earlier else failure.reason
+    return JobSummary(order.name, str(order.job), "failed", reason)
+
+
+EARLIER = "the result in its folder is of an earlier run"
+
+
+def saved_in(orders: Sequence[Order]) -> list[tuple[int, int] | None]:
+    """Which result is in each order's folder: another one has another `stamp`; None where there is none."""
+    return [None if order.folder is None else stamp(order.folder / "result.json") for order in orders]
 
 
 def job_names(jobs: Sequence[Path]) -> list[str]:
@@ -168,28 +189,36 @@ def job_names(jobs: Sequence[Path]) -> list[str]:
         jobs: The jobs' files.
 
     Raises:
-        InputError: Two have the same name nevertheless.
+        InputError: Two have the same name nevertheless, or one has a name that no folder of results can have.
     """
+    paths = [Path(os.path.abspath(path)) for path in jobs]  # without `..`, which would lead elsewhere
     rules: tuple[Callable[[Path], str], ...] = (
         lambda path: path.stem,
-        lambda path: path.absolute().parent.name,
-        lambda path: f"{path.absolute().parent.name}-{path.stem}",
+        lambda path: path.parent.name,
+        lambda path: f"{path.parent.name}-{path.stem}",
     )
-    names: list[str] = []
     for rule in rules:
-        names = [rule(path) for path in jobs]
-        if not _clash(names):
+        names = [rule(path) for path in paths]
+        if _usable(names):
             return names
-    name = _clash(names)
-    alike = [str(path) for path, other in zip(jobs, names, strict=True) if other.casefold() == name.casefold()]
-    found = f"{', '.join(map(escaped, alike[:3]))} would be written to the same folder {name}"
-    raise InputError("JOB", found, "files, or folders, of different names")
+    times = Counter(name.casefold() for name in names)
+    name = next(name for name in names if times[name.casefold()] > 1 or not _is_folder_name(name))
+    alike = [escaped(str(path)) for path, other in zip(jobs, names, strict=True) if other.casefold() == name.casefold()]
+    if len(alike) > 1:
+        found = f"{', '.join(alike[:3])} would be written to the same folder {name}"
+        raise InputError("JOB", found, "files, or folders, of different names")
+    raise InputError("JOB", f"{alike[0]} would be written to a folder {name}", f"no name that begins with {RESERVED}")
 
 
-def _clash(names: Sequence[str]) -> str:
-    """A name that two have, on file systems that tell no capitals apart too, or that no folder can have; else empty."""
-    times = Counter(name.casefold() for name in (*names, *JOBS_FILES))
-    return next((name or "without a name" for name in names if not name or times[name.casefold()] > 1), "")
+def _usable(names: Sequence[str]) -> bool:
+    """Whether folders beside the files of all jobs can have these names; some file systems tell no capitals apart."""
+    different = {name.casefold() for name in (*names, *JOBS_FILES)}
+    return len(different) == len(names) + len(JOBS_FILES) and all(map(_is_folder_name, names))
+
+
+def _is_folder_name(name: str) -> bool:
+    """Whether a folder of results can have a name: it leads nowhere else, and is none used while files are written."""
+    return name not in ("", ".", "..") and not name.casefold().startswith(RESERVED)
 
 
 def require_place(folder: Path) -> None:

@@ -38,7 +38,17 @@ from fg_calib.errors import InputError, SolverError, escaped, shown
 from fg_calib.files.disk import exists, is_folder, noting_reads
 from fg_calib.files.job import UNSTATED, read_job, read_table_like
 from fg_calib.files.parts import JobInParts, read_parts
-from fg_calib.files.result import Carried, KindGoodness, Parameter, Posterior, Previous, Result, read_result
+from fg_calib.files.result import (
+    ROUNDING,
+    Carried,
+    Covariance,
+    KindGoodness,
+    Parameter,
+    Posterior,
+    Previous,
+    Result,
+    read_result,
+)
 from fg_calib.files.result import Knowledge as SavedKnowledge
 from fg_calib.files.robot_yaml import read_robot
 from fg_calib.graph.factors import Variables, build_variables, frame_of
@@ -649,7 +659,7 @@ def _tables_with_frame(variables: Variables) -> list[int]:
 
 def _array(matrix: Sequence[Sequence[float | None]], width: int) -> Floats:
     """A matrix of a result, nan for None, shape (n, width)."""
-    return np.array(matrix, dtype=np.float64).reshape(-1, width)
+    return np.array(matrix, dtype=np.float64).reshape(len(matrix), width)
 
 
 def _saved_robot(folder: Path, result: Result) -> Robot:
@@ -691,7 +701,22 @@ def _saved_posterior(robot: Robot, result: Result, place: str) -> TangentCovaria
     arrays = [_array(matrix, n) for matrix in matrices]
     if not all(np.isfinite(array).all() for array in arrays):
         raise InputError(place, "figures that are not finite", "covariances, and directions that are not determined")
-    return TangentCovariance(variables, parameters, *arrays)
+    found = TangentCovariance(variables, parameters, *arrays)
+    _require_same(found, result.covariance, place)
+    return found
+
+
+def _require_same(found: TangentCovariance, stated: Covariance, place: str) -> None:
+    """Check that a saved posterior says of the robot's parameters what their covariance says, where both know it.
+
+    Raises:
+        InputError: It does not.
+    """
+    order = [stated.names.index(name) for name in found.variables.names[: len(stated.names)]]
+    matrix = _array(stated.matrix, len(order))[np.ix_(order, order)]
+    sigma = np.sqrt(matrix.diagonal())
+    if (np.abs(found.named() - matrix) > ROUNDING * np.outer(sigma, sigma)).any():
+        raise InputError(place, "contradicts the covariance of the parameters", "the same of both", "was it changed?")
 
 
 def _saved_options(result: Result) -> Options:

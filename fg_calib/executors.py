@@ -64,7 +64,9 @@ _LOOK = 1.0
 
 NO_FUTURE = TypeError("submit of the executor returned no future of its own for each job")
 NO_WORKERS = "worker processes died, and no others can be started"
-HINT_NO_WORKERS = 'local_processes has fresh ones; a script needs `if __name__ == "__main__":`'
+HINT_NO_WORKERS = (
+    'local_processes has fresh ones; a script must be a file, as they import it, with `if __name__ == "__main__":`'
+)
 
 
 @dataclass(frozen=True)
@@ -283,7 +285,8 @@ class LocalProcesses(Executor):
     def _start(self) -> None:
         self._theirs, self._lifeline = self._context.Pipe(duplex=False)
         share = max(1, processors() // self.n_workers)
-        self._pool = ProcessPoolExecutor(self.n_workers, self._context, _begin, (self._theirs, share))
+        with _interrupts_later():
+            self._pool = ProcessPoolExecutor(self.n_workers, self._context, _begin, (self._theirs, share))
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
         """See `concurrent.futures.Executor.submit`; where worker processes have died there are fresh ones."""
@@ -314,8 +317,8 @@ class LocalProcesses(Executor):
 
 @contextmanager
 def _interrupts_later() -> Iterator[None]:
-    """Within, processes start that Ctrl-C does not reach, which says it to all: they end with the one that it ends."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    """Within, processes start that Ctrl-C, or a terminal that goes, does not reach: they end with who started them."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
     try:
         yield
     finally:
@@ -326,7 +329,8 @@ def _interrupts_later() -> Iterator[None]:
 def local_processes(n_workers: int) -> LocalProcesses:
     """An executor of worker processes on this machine, for a `with` block.
 
-    A script that uses it needs the usual `if __name__ == "__main__":`, as its workers import it.
+    A script that uses it is a file, not read from stdin, and needs the usual `if __name__ == "__main__":`, as its
+    workers import it.
 
     Args:
         n_workers: Number of processes.

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 from deadly import deadly_calibration, die_once, every_bit, work
+from rich.console import Console
 
 from fg_calib import (
     CalibrationError,
@@ -32,8 +33,11 @@ from fg_calib import (
     simulate,
 )
 from fg_calib.analysis.folds import cross_validate
-from fg_calib.batch import Order, calibrate_into, job_names
+from fg_calib.batch import EARLIER, Order, calibrate_into, job_names
+from fg_calib.cli.calibrate import _written
+from fg_calib.files.disk import fill_folder, write_text
 from fg_calib.progress import listening
+from fg_calib.report.batch import JobSummary, build_jobs_table
 from fg_calib.threads import THREADS, processors
 
 JOBS = [1, "refused", 2, "a bug", "too large", 3]
@@ -204,6 +208,24 @@ def test_folders_are_called_by_what_tells_jobs_apart():
     assert names("x/jobs.json.yaml", "y/other.yaml") == ["x", "y"]  # where a file of all jobs would be
 
 
+def test_no_folder_of_a_job_is_outside_that_of_all_or_where_files_are_being_written(tmp_path, monkeypatch):
+    (tmp_path / "arm" / "sub").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "arm" / "sub")
+
+    def names(*jobs):
+        return job_names([Path(job) for job in jobs])
+
+    assert names("../job.yaml", "job.yaml") == ["arm", "sub"]
+    assert names("../../x/../job.yaml", "../job.yaml", "job.yaml") == [tmp_path.name, "arm", "sub"]
+    for hidden in ("...yaml", "..yaml", ".fg-calib-written.yaml", ".FG-calib-Writing-1.yaml"):
+        assert names(f"../{hidden}", "cold.yaml") == ["arm", "sub"]
+        assert names(hidden, "cold.yaml") == [f"sub-{Path(hidden).stem}", "sub-cold"]
+    with pytest.raises(InputError) as refused:
+        names(".fg-calib-x/job.yaml", "a/job.yaml")
+    found = "JOB: .fg-calib-x/job.yaml would be written to a folder .fg-calib-x-job"
+    assert str(refused.value) == f"{found}, expected no name that begins with .fg-calib-"
+
+
 @pytest.mark.parametrize(
     "jobs", [("a/job.yaml", "a/job.yaml"), ("x/a/job.yaml", "y/a/job.yaml"), ("A/job.yaml", "a/job.yaml")]
 )
@@ -248,8 +270,8 @@ def test_a_pool_that_cannot_be_mended_is_said_to_be_broken():
         *_, last = map_jobs(work, [1, "deadly", 3], executor)
     assert last == Failure(
         "job 3",
-        "worker processes died, and no others can be started;"
-        ' local_processes has fresh ones; a script needs `if __name__ == "__main__":`',
+        "worker processes died, and no others can be started; local_processes has fresh ones;"
+        ' a script must be a file, as they import it, with `if __name__ == "__main__":`',
     )
 
 
@@ -401,6 +423,52 @@ def test_many_jobs_are_written_to_a_folder_each_and_the_worst_is_the_exit_code(f
     assert second.startswith(f"arm2,{two_arms[1]},failed,,,,,,,")
 
 
+def test_a_result_of_an_earlier_run_stays_where_a_job_fails_and_is_called_so(fg_calib, two_arms, tmp_path):
+    """But not one that the job itself has written before it failed, nor where there is none."""
+    out = tmp_path / "out"
+    earlier = out / "arm2" / "result.json"
+    earlier.parent.mkdir(parents=True)
+    earlier.write_text("{}")
+    ended = fg_calib("calibrate", *two_arms, "--out", out)
+    assert ended.code == 1
+    assert earlier.read_text() == "{}"
+    reason = json.loads((out / "jobs.json").read_text())["jobs"][1]["error"]
+    assert reason.startswith("calibration.yaml: model: found 'nonsense'")
+    assert reason.endswith("; the result in its folder is of an earlier run")
+    assert (reason in ended.err, f'"{reason}"' in (out / "jobs.csv").read_text()) == (True, True)
+
+    class WritesAndFails(Executor):
+        def submit(self, *_):
+            earlier.unlink()
+            earlier.write_text("another")
+            raise RuntimeError("no space left")
+
+    orders = [Order("arm2", two_arms[1], earlier.parent), Order("arm3", two_arms[1], out / "arm3")]
+    assert [one.error for one in calibrate_into(orders[:1], WritesAndFails())] == ["RuntimeError: no space left"]
+    assert [EARLIER in (one.error or "") for one in calibrate_into(orders)] == [True, False]
+
+
+def test_lines_say_of_which_rows_they_are_where_that_is_not_the_same_for_all():
+    def printed(*of_test):
+        jobs = [JobSummary(f"arm{k}", "a.yaml", "good", of_test=of) for k, of in enumerate(of_test)]
+        with console.capture() as text:
+            console.print(build_jobs_table([*jobs, JobSummary("none", "b.yaml", "failed", "no file")], 1.0))
+        return [" ".join(line.split()) for line in text.get().splitlines()]
+
+    console = Console(width=100)
+    assert printed(True, False)[:-1] == [
+        "job verdict rows chi2/dof s reason",
+        "arm0 good test",
+        "arm1 good train",
+        "none failed no file",
+        "RMS after the calibration, of test or train rows",
+    ]
+    heads, first, *_, note, _ = printed(False, False)
+    assert "rows" not in heads
+    assert (first, note) == ("arm0 good", "RMS after the calibration, of train rows")
+    assert len(printed(None)) == 4  # heads, lines, and how many failed: no note
+
+
 @pytest.mark.slow
 def test_an_arm_that_is_not_to_be_trusted_is_the_worst_where_all_have_a_result(fg_calib, two_arms, tmp_path):
     other = two_arms[1]
@@ -487,16 +555,27 @@ def nobody_left(group):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("all_of_them", [False, True])  # as kill does, and as the terminal does
-def test_an_interrupt_ends_the_workers_too_in_one_line(example, tmp_path, all_of_them):
+def test_what_ends_the_command_ends_the_workers_too_in_one_line(example, tmp_path, number, all_of_them):
     process = started(other_jobs(example, 9), tmp_path / "out")
-    (os.killpg if all_of_them else os.kill)(process.pid, signal.SIGINT)
+    (os.killpg if all_of_them else os.kill)(process.pid, number)
     shown, said = process.communicate(timeout=60)
-    line = "interrupted; the results of jobs that were done have been written\n"
-    assert (process.returncode, shown, said) == (130, "", line)
+    assert (process.returncode, shown) == (128 + number, "")
     until(lambda: nobody_left(process.pid))
-    assert len(list((tmp_path / "out").glob("*/result.json"))) < 9
+    n = len(list((tmp_path / "out").glob("*/result.json")))
+    assert 0 < n < 9
+    assert said == f"interrupted; results of {n} of 9 jobs have been written\n"
     assert not (tmp_path / "out" / "jobs.json").exists()
+
+
+def test_results_are_said_to_be_written_that_were_written_since(tmp_path):
+    orders = [Order(name, Path("job.yaml"), tmp_path / name) for name in ("earlier", "now", "later")]
+    fill_folder(tmp_path / "earlier", lambda into: write_text(into / "result.json", "{}"))
+    said = _written([*orders, Order("nowhere", Path("job.yaml"), None)])
+    assert said() == "nothing has been written"
+    fill_folder(tmp_path / "now", lambda into: write_text(into / "result.json", "{}"))
+    assert said() == "results of 1 of 4 jobs have been written"
 
 
 @pytest.mark.slow

@@ -244,7 +244,7 @@ class PredictedFit(FrozenArrays):
         kinds: The fit by kind; here chi-square is the sum of the squares of residuals over their own sigma, what the
             estimate may be off included.
         n_rows: Number of scalar rows.
-        n: Number of them behind chi-square: evenly spaced ones if there are many (`MAX_WHITENED`).
+        n: Number of them behind chi-square: evenly spaced ones if there are many to be whitened (`MAX_WHITENED`).
         outliers: Measurements that count for nothing because a robust loss would call them outliers.
         n_unknown: Rows not judged because they depend on what neither data nor priors determine.
         chi2: Sum of the squares of the rows, whitened by their noise and by what the estimate may be off.
@@ -563,13 +563,14 @@ class _Rows:
         part = self.predicted
         if not (len(part.rows) or self._outliers.test):
             return None
-        chi2, expected, nu = self._whitened(part)
+        chosen = self._chosen(part)
+        chi2, expected, nu = self._whitened(part, chosen)
         behind = part.degrees_behind(np.arange(len(part.rows)))
         found = (self._kind(part, code, 0.0, True) for code in range(len(self._table.groups)))
         return PredictedFit(
             kinds=tuple(fit for fit in found if fit is not None),
             n_rows=len(part.rows),
-            n=min(len(part.rows), MAX_WHITENED),
+            n=len(chosen),
             outliers=self._outliers,
             n_unknown=self._n_unknown,
             chi2=chi2,
@@ -579,14 +580,20 @@ class _Rows:
             configurations=part.configurations(),
         )
 
-    def _whitened(self, part: _Part) -> tuple[float, float, float]:
-        """Sum of the squares of the predicted rows, whitened together; its mean, and its degrees of freedom.
+    def _chosen(self, part: _Part) -> Integers:
+        """Which of the predicted rows are looked at together: of many that are whitened some, evenly spaced."""
+        n = len(part.rows)
+        if part.covariance is None:
+            return np.arange(n)
+        return np.unique(np.linspace(0, n - 1, min(n, MAX_WHITENED)).round().astype(np.int64))
+
+    def _whitened(self, part: _Part, chosen: Integers) -> tuple[float, float, float]:
+        """Sum of the squares of the chosen predicted rows, whitened together; its mean, and its degrees of freedom.
 
         What pairs formed from poses do not share counts as `PRIVATE_SHARE` of their variance at least, as in the fit.
         """
-        chosen = np.unique(np.linspace(0, len(part.rows) - 1, MAX_WHITENED).round().astype(np.int64))
-        if not isinstance(part.covariance, LowRank) or not len(part.rows):
-            return float(np.sum(part.squares)), float(np.sum(part.means)), part.degrees(np.arange(len(part.rows)))
+        if not isinstance(part.covariance, LowRank) or not len(chosen):
+            return float(np.sum(part.squares)), float(np.sum(part.means)), part.degrees(chosen)
         z = np.sign(self._table.after[part.rows[chosen]]) * np.sqrt(part.squares[chosen])
         return part.covariance.at(chosen).whitened(z)
 

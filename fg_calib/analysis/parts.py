@@ -426,7 +426,7 @@ def _reduce(task: _Task, parts: Sequence[Part], executor: Executor | None) -> Re
     all_found = [_checked(one) for one in map_jobs(task, parts, executor, names=names, what="reducing parts")]
     found: list[Reduced] = [one for one in all_found if one is not None]
     if not sum(one.n_residuals for one in found):
-        raise ProblemError("parts", "no train row", "at least one: test rows are never fitted")
+        raise ProblemError("parts", "no train row", "at least one", "test rows and empty cells are never fitted")
     n_all = build_variables(task.robot, [task.options.unknown_frame], False).n_columns + 1
     squares: dict[str, tuple[int, float]] = {}
     excluded: Counter[str] = Counter()

@@ -234,7 +234,7 @@ def of_test(fit: PredictedFit | None, of_fitted: float, names: Sequence[str]) ->
     claim = "the arm does not predict them as well as it claims"
     return [
         Statement(
-            f"test rows: {chi2_in_words(fit.chi2, fit.expected, fit.p_value)}: {claim}{suspicious}",
+            f"{predicted_in_words(fit)}: {claim}{suspicious}",
             finding=ratio > FACTOR,
             reservation=ratio <= FACTOR,
         )
@@ -367,6 +367,12 @@ def of_folds(n: int, n_rows: int, share: float) -> list[Statement]:
 def chi2_in_words(chi2: float, expected: float, p_value: float) -> str:
     """`chi-square 169 where 30 is expected (p-value < 0.001)`."""
     return f"chi-square {chi2:.4g} where {expected:.4g} is expected (p-value {probability(p_value)})"
+
+
+def predicted_in_words(fit: PredictedFit) -> str:
+    """`test rows: chi-square 1012 where 1000 is expected (p-value 0.4), of 1000 of the 9990 rows, evenly spaced`."""
+    some = f", of {fit.n} of the {fit.n_rows} rows, evenly spaced" if fit.n < fit.n_rows else ""
+    return f"test rows: {chi2_in_words(fit.chi2, fit.expected, fit.p_value)}{some}"
 
 
 def probability(p: float) -> str:

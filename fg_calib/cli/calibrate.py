@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from fg_calib.batch import Order
-
-_WRITTEN = "the results of jobs that were done have been written"
 
 
 def calibrate(
@@ -65,8 +63,9 @@ def calibrate(
     if parts is not None:
         _require_parts_alone(len(jobs), folds, residuals)
     if len(jobs) == 1:
-        with executor_for(workers, scheduler, _WRITTEN) as executor:
-            _calibrate_one(Order("", jobs[0], out, folds, report, figures, residuals), parts, executor, as_json)
+        order = Order("", jobs[0], out, folds, report, figures, residuals)
+        with executor_for(workers, scheduler, _written([order])) as executor:
+            _calibrate_one(order, parts, executor, as_json)
         return
     names = job_names(jobs)
     if out is not None:
@@ -77,8 +76,21 @@ def calibrate(
         Order(name, job, None if out is None else out / name, folds, report, figures, residuals)
         for name, job in zip(names, jobs, strict=True)
     ]
-    with executor_for(workers, scheduler, _WRITTEN) as executor:
+    with executor_for(workers, scheduler, _written(orders)) as executor:
         _calibrate_many(orders, out, executor, as_json)
+
+
+def _written(orders: Sequence[Order]) -> Callable[[], str]:
+    """What says later of how many orders a result has been written since."""
+    from fg_calib.batch import saved_in
+
+    before = saved_in(orders)
+
+    def said() -> str:
+        n = sum(now != then for now, then in zip(saved_in(orders), before, strict=True))
+        return f"results of {n} of {len(orders)} jobs have been written" if n else "nothing has been written"
+
+    return said
 
 
 def _calibrate_one(order: Order, n_rows: int | None, executor: Executor | None, as_json: bool) -> None:

@@ -150,7 +150,7 @@ def _found(
 
     if not several:
         return {name: designed(one, **choices) for name, one in subjects.items()}, []
-    with executor_for(workers, scheduler, "nothing has been written") as executor:
+    with executor_for(workers, scheduler, lambda: "nothing has been written") as executor:
         outcomes = compare_designs(subjects, executor, **choices)
     found = {name: one for name, one in outcomes.items() if not isinstance(one, Failure)}
     return found, [one for one in outcomes.values() if isinstance(one, Failure)]

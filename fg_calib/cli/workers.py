@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -30,28 +30,38 @@ def require_one(workers: int | None, scheduler: str | None) -> None:
         raise typer.BadParameter("is of this machine: either this or --scheduler", param_hint="--workers")
 
 
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Ctrl-C, the end that a system or a scheduler of jobs asks for, and that of the terminal."""
+
+
 @contextmanager
-def executor_for(workers: int | None, scheduler: str | None, left: str) -> Iterator[Executor | None]:
-    """What was asked for; while it works, Ctrl-C is an exception, which ends the workers too.
+def executor_for(workers: int | None, scheduler: str | None, left: Callable[[], str]) -> Iterator[Executor | None]:
+    """What was asked for; while it works, what ends the command is an exception, which ends the workers too.
 
     Args:
         workers: Number of processes of this machine.
         scheduler: Address of a Dask cluster's.
-        left: What is said to be left after Ctrl-C.
+        left: What is said to be left then.
     """
     from fg_calib.executors import dask_executor, local_processes
 
     if workers is None and scheduler is None:
         yield None
         return
-    before = signal.getsignal(signal.SIGINT)
+    found = {number: signal.getsignal(number) for number in _ENDING}
+    before = {k: handler for k, handler in found.items() if handler in (end_at_once, signal.SIG_DFL)}  # not ignored
     try:
-        if before is end_at_once:  # what `main` has made of it
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+        for number in before:
+            signal.signal(number, _interrupt)
         with dask_executor(scheduler) if scheduler is not None else local_processes(workers or 1) as executor:
             yield executor
-    except KeyboardInterrupt:
-        say(f"interrupted; {left}")
-        raise typer.Exit(128 + signal.SIGINT) from None
+    except KeyboardInterrupt as interrupt:
+        say(f"interrupted; {left()}")
+        raise typer.Exit(128 + next(iter(interrupt.args), signal.SIGINT)) from None
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _interrupt(number: int, _: object) -> NoReturn:
+    raise KeyboardInterrupt(number)

@@ -215,10 +215,13 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_bytes(text.encode())
 
 
-_BESIDE = ".fg-calib-file-"
+RESERVED = ".fg-calib-"
+"""How all names begin that are used here while files are written."""
+
+_BESIDE = f"{RESERVED}file-"
 """Folder beside a file that is written."""
 
-_WRITING, _WRITTEN, _REMOVED = ".fg-calib-writing-", ".fg-calib-written", ".fg-calib-removed"
+_WRITING, _WRITTEN, _REMOVED = f"{RESERVED}writing-", f"{RESERVED}written", f"{RESERVED}removed"
 """Folders within a folder that is filled: while files are written, and when all are there but not yet moved; and in the
 latter the list of files that are to be removed."""
 
@@ -433,6 +436,15 @@ def exists(path: Path) -> bool:
         return _newest(path).exists()
     except (OSError, ValueError):  # a name that no file can have
         return False
+
+
+def stamp(path: Path) -> tuple[int, int] | None:
+    """What is another when a file has been written anew, as `exists` sees it; None where none can be read."""
+    try:
+        found = _newest(path).stat()
+    except (OSError, ValueError, InputError):
+        return None
+    return found.st_ino, found.st_mtime_ns
 
 
 def is_folder(path: Path) -> bool:

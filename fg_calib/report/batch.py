@@ -172,10 +172,14 @@ def _csv(jobs: Sequence[JobSummary]) -> str:
     table.writerow([*heads, *(f"rms {kind} [{units[kind]}]" for kind in kinds), "rows", "reason", "warnings"])
     for job in jobs:
         figures = [getattr(job, head) for head in heads]
-        rows = None if job.of_test is None else "test" if job.of_test else "train"
         said = ["; ".join(why for _, why in job.reasons), "; ".join(job.warnings)]
-        table.writerow([*figures, *map((job.rms or {}).get, kinds), rows, *said])
+        table.writerow([*figures, *map((job.rms or {}).get, kinds), _rows(job), *said])
     return text.getvalue()
+
+
+def _rows(job: JobSummary) -> str:
+    """Of which rows a job's RMS is; empty where there is none."""
+    return "" if job.of_test is None else "test" if job.of_test else "train"
 
 
 def _units(jobs: Sequence[JobSummary]) -> dict[str, str]:
@@ -197,23 +201,20 @@ def build_jobs_table(jobs: Sequence[JobSummary], seconds: float) -> RenderableTy
     kinds, units = _kinds(jobs), _units(jobs)
     heads = [f"{kind} {SHOWN[units[kind]][1]}" for kind in kinds]
     figures = [(head, "right") for head in (*heads, "chi2/dof", "s")]
-    table = plain_table(("job", "left"), ("verdict", "left"), *figures, ("reason", "left"), wrap=True)
+    of = sorted(set(filter(None, map(_rows, jobs))))
+    split = [("rows", "left")] if len(of) > 1 else []
+    table = plain_table(("job", "left"), ("verdict", "left"), *split, *figures, ("reason", "left"), wrap=True)
     for job in jobs:
         cells = [_rms(job, kind, units[kind]) for kind in kinds]
         chi2 = "" if job.reduced_chi2 is None else f"{job.reduced_chi2:.3g}"
         took = "" if job.seconds is None else f"{job.seconds:.1f}"
         more = f" (and {len(job.reasons) - 1} more)" if len(job.reasons) > 1 else ""
         reason = job.reasons[0][1] + more if job.reasons else ""
-        table.add_row(job.name, job.verdict, *cells, chi2, took, reason, style=_STYLES[job.verdict])
+        rows = [_rows(job)] if split else []
+        table.add_row(job.name, job.verdict, *rows, *cells, chi2, took, reason, style=_STYLES[job.verdict])
     n = jobs_document(jobs, seconds)["n"]
     counts = ", ".join(f"{count} {verdict}" for verdict, count in n.items() if count)
-    of_test = {job.of_test for job in jobs if job.of_test is not None}
-    rows = (
-        "test rows, of train rows where there are none"
-        if len(of_test) > 1
-        else f"{'test' if True in of_test else 'train'} rows"
-    )
-    notes = [f"RMS after the calibration, of {rows}"] if of_test else []
+    notes = [f"RMS after the calibration, of {' or '.join(of)} rows"] if of else []
     return Group(table, *indented(notes), line(f"{len(jobs)} jobs in {seconds:.1f} s: {counts}", "bold"))
 
 

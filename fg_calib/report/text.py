@@ -11,7 +11,7 @@ from fg_calib.analysis.accuracy import ExpectedError
 from fg_calib.analysis.joint_values import JointValues
 from fg_calib.analysis.uncertainty import FrameEstimate, Uncertainty
 from fg_calib.analysis.unknowns import PointEstimate
-from fg_calib.analysis.verdict import chi2_in_words, probability
+from fg_calib.analysis.verdict import chi2_in_words, predicted_in_words, probability
 from fg_calib.arguments import checked
 from fg_calib.graph.noise import JOINT_NOISE
 from fg_calib.graph.solver import Solution
@@ -98,7 +98,7 @@ def _verdict(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
             lines.append(line(f"test rows: {figures}"))
     test = uncertainty.goodness.test
     if test is not None and test.n:
-        lines.append(line(f"test rows: {chi2_in_words(test.chi2, test.expected, test.p_value)}"))
+        lines.append(line(predicted_in_words(test)))
     return Group(*lines)
 
 

@@ -1,7 +1,7 @@
 """Results read back: version 1 and 2, against their schema, and damaged ones refused in a line."""
 
 import json
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +60,11 @@ def changed(folder, change):
 def moved(parameter):
     """An estimate 1 mm farther from nominal."""
     return {key: parameter[key] + 1e-3 for key in ("estimate", "correction")}
+
+
+def scale_posterior(document, factor):
+    posterior = document["posterior"]
+    posterior["covariance"] = [[factor * value for value in row] for row in posterior["covariance"]]
 
 
 def enlarge_one_covariance(document):
@@ -278,6 +283,13 @@ def test_version_1_is_readable_with_no_more_than_it_promised(folder):
             lambda f: changed(f, lambda d: d["posterior"]["undetermined"].append([1.0])),
             "result.json: posterior: other variables than the robot",
         ),
+        *(
+            (
+                lambda f, factor=factor: changed(f, lambda d: scale_posterior(d, factor)),
+                "result.json: posterior: contradicts the covariance of the parameters, expected the same of both",
+            )
+            for factor in (0.0, 2.0)
+        ),
     ],
 )
 def test_a_damaged_folder_is_refused_in_a_line(folder, damage, message):
@@ -285,6 +297,17 @@ def test_a_damaged_folder_is_refused_in_a_line(folder, damage, message):
     with pytest.raises(InputError, match=message) as error:
         Calibration.load(folder)
     assert "\n" not in str(error.value)
+
+
+def test_an_arm_that_was_only_evaluated_reads_back(tmp_path):
+    """Nothing is estimated: the covariance has no row."""
+    rng = np.random.default_rng(6)
+    robot = small_arm(TOLERANCE)
+    m = measure(robot, 12, rng)
+    calibrate(robot, replace(m, test=np.ones(12, dtype=bool)), model="position").save(tmp_path)
+    found = Calibration.load(tmp_path)
+    assert found.result.evaluated_only
+    assert found.covariance().shape == (0, 0)
 
 
 def test_there_must_be_something_to_read(tmp_path):

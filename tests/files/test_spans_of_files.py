@@ -238,6 +238,10 @@ REFUSED = {
         r"part 4: pairs.parquet: row 150: distance: found -1.0, expected a number not below 0",
     ),
     "test": (lambda f: pairs_job(f, more={"split": ["test"] * N_PAIRS}), "no train row, expected at least one"),
+    "empty": (
+        lambda f: pairs_job(f, more=dict.fromkeys(("distance", "angle"), [None] * N_PAIRS)),
+        "no train row, expected at least one; test rows and empty cells are never fitted",
+    ),
 }
 
 

@@ -360,6 +360,13 @@ def calibrates_many(code, folder, fg_calib):
     assert reason == "other.yaml: missing key 'model'"
 
 
+def sums_parts(code, folder, fg_calib):
+    assert fg_calib("example", "space-robot", "--out", folder).code == 0
+    drawn, found = run_python(folder, code).splitlines()
+    assert drawn == "52 positions, RMS 15.74 mm"
+    assert found == "52 positions, RMS 1.72 mm"
+
+
 def slow(function, mark=pytest.mark.slow):
     return pytest.param(function, marks=mark)
 
@@ -377,7 +384,8 @@ HOW = {
     "export": [are_typed, exports_an_arm],
     "next-month": [are_typed, slow(checks_and_updates)],
     "observability": [is_printed],
-    "many-jobs": [are_typed, slow(names_each_job), slow(calibrates_many), are_typed],
+    "many-jobs": [are_typed, slow(names_each_job), slow(calibrates_many), are_typed,
+                  slow(sums_parts)],
     "simulate": [slow(are_run), is_scenario, are_configurations, slow(draws_candidates),
                  slow(is_scenario, pytest.mark.long)],
     "compare": [slow(is_printed)],

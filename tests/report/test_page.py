@@ -396,15 +396,18 @@ def test_several_tables_and_touched_points_have_a_page(tmp_path):
 
 
 @pytest.mark.slow
-def test_an_evaluation_says_that_it_is_one(tmp_path):
+@pytest.mark.parametrize("frame", ["unknown", "known"])  # which is fitted, or nothing at all
+def test_an_evaluation_says_that_it_is_one(tmp_path, frame):
     rng = np.random.default_rng(0)
     robot = small_arm(tolerance=LARGE, estimate=("tool.x", "tool.y", "tool.z"))
     m = measure(robot, 30, rng)
-    calibrate(robot, replace(m, test=np.ones(30, dtype=bool)), model="position", frame="unknown").save(tmp_path)
-    write_report(tmp_path)
+    calibrate(robot, replace(m, test=np.ones(30, dtype=bool)), model="position", frame=frame).save(tmp_path)
+    write_report(tmp_path, figures=True)
     words = text_of(html.parse(str(tmp_path / "report.html")))
     assert "Evaluated only: all rows are test rows" in words
     assert "the estimate never saw them" not in words
+    assert "nothing was estimated that could say how far off it is" in words
+    assert not list(tmp_path.glob("**/workspace*.svg"))
     assert {item["test"] for item in scene(load_run(tmp_path))["items"]} == {True}
 
 

@@ -22,6 +22,7 @@ from fg_calib import (
     observe_structure,
     solve,
 )
+from fg_calib.analysis import goodness
 from fg_calib.options import Options
 from fg_calib.report.tables import plain_table, plain_text
 from fg_calib.robot.model import Joint, Robot, RobotBuilder
@@ -169,6 +170,22 @@ def test_its_figures_are_those_of_linear_least_squares_by_hand():
     assert f"position    6 {np.sum(predicted**2 / (1 + np.diag(of_estimate))):10.4g} " in GOLDEN
     assert f"position    mm             {np.sqrt(np.trace(of_estimate) / 2 + 1 / 7):.4f} " in GOLDEN
     assert f"3.3943 {np.sqrt(left.item() / 6):.4f} " in GOLDEN
+
+
+def test_it_is_said_that_some_of_many_test_rows_are_whitened(monkeypatch):
+    def line(wrong=0.0):
+        m = planar_measurements()
+        position = m.position + wrong * m.test[:, None]
+        return report(planar_arm(), replace(m, position=position), model="position").splitlines()[1:]
+
+    assert "rows" not in line()[1].removeprefix("test rows: ")
+    monkeypatch.setattr(goodness, "MAX_WHITENED", 4)
+    some = r"test rows: chi-square \S+ where 4 is expected \(p-value \S+\), of 4 of the 6 rows, evenly spaced"
+    assert re.fullmatch(some, line()[1])
+    some = some.replace("p-value ", "p-value < ")
+    assert re.match(f"DOUBTFUL: {some}: the arm does not predict", " ".join(line(0.1)))
+    monkeypatch.setattr(goodness, "MAX_KEPT", 0)  # all of them, one by one
+    assert re.fullmatch(r"test rows: chi-square \S+ where 6 is expected \(p-value \S+\)", line()[1])
 
 
 def test_the_report_names_the_frame_and_what_stays_open():

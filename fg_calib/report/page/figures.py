@@ -276,7 +276,7 @@ def _place(k: int) -> str:
 def figures_of(run: Run) -> dict[str, Sequence[Figure]]:
     """All figures by name; what the folder lacks has none."""
     matrix_of, found = correlation_matrix(run), run.workspace
-    known = found is not None and bool(np.isfinite(found.error).any())
+    known = found is not None and not run.result.evaluated_only and bool(np.isfinite(found.error).any())
     every: dict[str, Sequence[Figure]] = {
         "accuracy": [accuracy_bars(run)],
         "joints": error_over_joints(run),

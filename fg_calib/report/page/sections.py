@@ -295,6 +295,8 @@ def workspace(run: Run) -> list[Element]:
     found = run.workspace
     if found is None:
         return [_missing(run, "configurations.csv")]
+    if run.result.evaluated_only:
+        return [tag("p", "The arm was only evaluated: nothing was estimated that could say how far off it is.")]
     if not np.isfinite(found.error).any():
         return [tag("p", "The error of the tool depends on what the measurements do not determine: it is not known.")]
     where = "after the best rigid fit to the measured positions" if found.fitted else "in the base frame"
