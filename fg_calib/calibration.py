@@ -649,7 +649,7 @@ def _tables_with_frame(variables: Variables) -> list[int]:
 
 def _array(matrix: Sequence[Sequence[float | None]], width: int) -> Floats:
     """A matrix of a result, nan for None, shape (n, width)."""
-    return np.array(matrix, dtype=np.float64).reshape(-1, width)
+    return np.array(matrix, dtype=np.float64).reshape(len(matrix), width)
 
 
 def _saved_robot(folder: Path, result: Result) -> Robot:

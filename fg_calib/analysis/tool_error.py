@@ -92,7 +92,7 @@ class ToolErrorModel(FrozenArrays):
         points, motion, _ = model._derivatives(measured[np.unique(evenly.astype(np.int64))])
         w, v = motion[:, :3], motion[:, 3:]
         left, turn = without_rigid_motion(points, v)
-        if not np.isfinite(spread.variance(left.reshape(-1, left.shape[2]))).all():
+        if not np.isfinite(spread.variance(np.concatenate(left))).all():
             turn = w.mean(axis=0)  # points that are not determined fit nothing: orientations by their own best rotation
         return cls(spread, model.chain, sigma_joint, points.mean(axis=0), (v - left).mean(axis=0), turn)
 
@@ -132,7 +132,7 @@ class ToolErrorModel(FrozenArrays):
         return left
 
     def _rms(self, motion: Floats) -> Floats:
-        return _lengths(self.spread.variance(motion.reshape(-1, motion.shape[2])).reshape(-1, 6))
+        return _lengths(self.spread.variance(motion.reshape(6 * len(motion), motion.shape[2])).reshape(-1, 6))
 
 
 def _lengths(variance: Floats) -> Floats:

@@ -316,6 +316,18 @@ class Variables(Brief):
             variables = replace(variables, nuisance=(*variables.nuisance, added))
         return replace(variables, own=start)
 
+    def columns_of(self, fewer: Variables, parameters: Floats) -> Floats:
+        """What each column of the variables of fewer of the parameters is in these, shape (n_columns, fewer.n_columns).
+
+        Args:
+            fewer: Those.
+            parameters: The parameter vector, of either.
+        """
+        by_name = dict(zip(self.names, self.tangent_derivative(parameters).T, strict=True))
+        poses = {v.key: np.eye(self.n_columns)[v.columns] for v in self.items if v.is_pose}
+        rows = [poses.get(v.key, np.array([by_name[name] for name in fewer.names[v.columns]])) for v in fewer.items]
+        return np.vstack([np.zeros((0, self.n_columns)), *rows]).T
+
     def named_derivative(self, parameters: Floats) -> Floats:
         """Derivative of the named scalars in the columns, shape (n_columns, n_columns).
 

@@ -394,6 +394,14 @@ def started_at(problem: Problem, start: Floats) -> Problem:
     return replace(problem, start=start, initial=problem.variables.values(start))
 
 
+def by_columns_of(problem: Problem, variables: Variables) -> Problem:
+    """The same problem and rows by the columns of the variables of more, or the same, parameters."""
+    state = problem.state
+    if state.spread is not None:
+        state = replace(state, spread=variables.columns_of(problem.variables, problem.start) @ state.spread)
+    return replace(problem, variables=variables, state=state)
+
+
 def same_rows(a: Problem, b: Problem) -> bool:
     """Whether two problems have the very same rows, to the last figure."""
     return _equal(a.rows, b.rows)

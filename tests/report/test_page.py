@@ -14,7 +14,7 @@ from instruments import measured_by
 from lxml import etree, html
 from simulated import measure, plus, small_arm, true_robot, write_job
 
-from fg_calib import KnownPoint, Measurements, Robot, Table, calibrate, write_report
+from fg_calib import Calibration, KnownPoint, Measurements, Robot, Table, calibrate, predict, write_report
 from fg_calib.analysis.seen import Seen
 from fg_calib.pages import load_run
 from fg_calib.report.page.arm import scene
@@ -22,6 +22,7 @@ from fg_calib.report.page.charts import Scale, limits_of, short
 from fg_calib.report.page.figures import _histogram
 from fg_calib.report.page.files import FIGURES
 from fg_calib.report.page.sections import correlations, tiles
+from fg_calib.report.slices import slices_of
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.shape import link_points
 
@@ -406,6 +407,27 @@ def test_an_evaluation_says_that_it_is_one(tmp_path):
     assert "Evaluated only: all rows are test rows" in words
     assert "the estimate never saw them" not in words
     assert {item["test"] for item in scene(load_run(tmp_path))["items"]} == {True}
+
+
+def test_an_evaluation_of_nothing_but_test_rows_is_read_back_and_expects_no_errors(tmp_path):
+    rng = np.random.default_rng(0)
+    robot = small_arm(tolerance=LARGE)
+    saved = calibrate(robot, measure(true_robot(robot, rng), 0, rng, n_test=8), model="position")
+    saved.save(tmp_path)
+    assert Calibration.load(tmp_path).posterior.tangent.shape == (0, 0)
+    write_report(tmp_path, figures=True)
+    assert "no covariance says how large its errors are" in text_of(html.parse(str(tmp_path / "report.html")))
+    assert not list(tmp_path.rglob("workspace*"))
+
+
+def test_a_tool_on_its_only_axis_has_a_page_and_pictures(tmp_path):
+    robot = Robot.from_dh([[0.0, 0.0, 0.2, 0.0]], tolerance=LARGE)
+    q, there = np.linspace(-3.0, 3.0, 15)[:, None], np.tile([0.0, 0.0, 0.2], (15, 1))
+    calibrate(robot, Measurements.from_arrays(q, position=there, sigma_position=1e-4), model="position").save(tmp_path)
+    write_report(tmp_path)
+    for one in slices_of(predict(tmp_path)):
+        assert one.x[-1] > one.x[0]
+        assert one.y[-1] > one.y[0]
 
 
 def test_long_names_keep_what_tells_them_apart():

@@ -293,6 +293,8 @@ def residuals(run: Run) -> list[Element]:
 def workspace(run: Run) -> list[Element]:
     """Expected error all over the workspace."""
     found = run.workspace
+    if run.result.evaluated_only:
+        return [tag("p", "Nothing of the arm was estimated: no covariance says how large its errors are.")]
     if found is None:
         return [_missing(run, "configurations.csv")]
     if not np.isfinite(found.error).any():
