@@ -718,7 +718,8 @@ def well_conditioned(R: Floats) -> bool:
     """Whether the singular values of R, columns scaled to length 1, are dead or above 1e-5 of the largest."""
     lengths = np.linalg.norm(R, axis=0)
     s = np.linalg.svd(R[:, lengths > 0.0] / lengths[lengths > 0.0], compute_uv=False)
-    return not bool(np.any((s > 1e-12 * s[0]) & (s < 1e-5 * s[0])))
+    largest = s.max(initial=0.0)  # 0 where rows depend on no column: angles of pairs on a tool point
+    return not bool(np.any((s > 1e-12 * largest) & (s < 1e-5 * largest)))
 
 
 def prior_rows(variables: Variables, parameters: Floats, only: Variable | None = None) -> tuple[Floats, Floats]:
