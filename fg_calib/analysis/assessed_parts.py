@@ -68,15 +68,15 @@ class AssessedParts(Brief):
 
 
 @single_threaded
-def assess_parts(solution: PartsSolution, n_configurations: int, part: Part) -> AssessedParts:
+def assess_parts(solution: PartsSolution, part: Part) -> AssessedParts:
     """What is known of a calibration in parts.
 
     Args:
         solution: The calibration.
-        n_configurations: Number of train configurations.
         part: One of the parts: of pairs all have the same configurations; for the reasons why directions are lost.
     """
-    posterior, options = solution.posterior, solution.options
+    posterior, options, n_configurations = solution.posterior, solution.options, solution.reduced.n_configurations
+    assert n_configurations is not None
     variables = posterior.variables
     robot, n_priors = variables.robot, len(prior_rows(variables, solution.parameters)[0])
     by_name = {p.name: p for p in robot.parameters}

@@ -162,10 +162,7 @@ class Problem(FrozenArrays):
     @property
     def n_configurations(self) -> int:
         """Configurations that the train rows come from."""
-        return _n_different([self._train_configurations(s) for s in self.data.series])
-
-    def _train_configurations(self, series: Series) -> Integers:
-        return self.data.places[series.table][series.ends[series.train]].ravel()
+        return int(np.sum(self.data.fitted))
 
     @property
     def n_residuals(self) -> int:

@@ -151,6 +151,35 @@ def test_a_result_in_parts_says_what_that_of_the_whole_job_says_of_all_rows(tmp_
     assert found.reservations == (UNJUDGED,)
 
 
+@pytest.mark.parametrize("n_rows", [7, 41, 1000])
+def test_configurations_that_no_fitted_pair_is_of_are_not_counted(tmp_path, n_rows):
+    rng = np.random.default_rng(5)
+    ends = {"a": rng.integers(0, 20, N_PAIRS), "b": rng.integers(20, 30, N_PAIRS)}
+    ends["a"][100:], ends["b"][0] = rng.integers(0, 12, 100), 39
+    job = pairs_job(tmp_path, more=ends | {"split": ["test"] + ["train"] * 99 + ["test"] * 100})
+    whole, found = read_job(job), calibrate_parts(read_parts(job, n_rows)).result
+    assert found.n_configurations == build_problem(whole.robot, whole.measurements, whole.options).n_configurations < 31
+
+
+@pytest.mark.parametrize("column", ["distance", "angle"])
+def test_a_table_with_either_figure_alone_may_be_cut(tmp_path, column):
+    job = pairs_job(tmp_path)
+    pairs = pl.read_parquet(tmp_path / "pairs.parquet")
+    pairs.drop(column).write_parquet(tmp_path / "pairs.parquet")
+    whole, found = Calibration.of(*_solved(job)).result, calibrate_parts(read_parts(job, 41)).result
+    assert found.residual_rms["train"][column] is whole.residual_rms["train"][column] is None
+    assert found.reduced_chi2 == pytest.approx(whole.reduced_chi2, rel=1e-9)
+
+
+@pytest.mark.parametrize("estimated", ["tool.x", "base.z"])
+def test_rms_before_is_unknown_where_more_than_the_joints_would_be_fitted_to_all_rows_first(tmp_path, estimated):
+    job = pairs_job(tmp_path, model="distance")
+    write_robot(tmp_path / "robot.yaml", small_arm(TOLERANCE, estimate=(estimated,)))
+    found = calibrate_parts(read_parts(job, 41)).result
+    assert found.residual_rms["train"]["distance"].before is None
+    assert found.solver.initial_cost is None
+
+
 def _solved(job):
     given = read_job(job)
     solution = solve(build_problem(given.robot, given.measurements, given.options))

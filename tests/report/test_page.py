@@ -16,6 +16,7 @@ from simulated import measure, plus, small_arm, true_robot, write_job
 
 from fg_calib import Calibration, KnownPoint, Measurements, Robot, Table, calibrate, predict, write_report
 from fg_calib.analysis.seen import Seen
+from fg_calib.files.saved import read_configurations
 from fg_calib.pages import load_run
 from fg_calib.report.page.arm import scene
 from fg_calib.report.page.charts import Scale, limits_of, short
@@ -418,6 +419,26 @@ def test_an_evaluation_of_nothing_but_test_rows_is_read_back_and_expects_no_erro
     write_report(tmp_path, figures=True)
     assert "no covariance says how large its errors are" in text_of(html.parse(str(tmp_path / "report.html")))
     assert not list(tmp_path.rglob("workspace*"))
+
+
+def test_a_configuration_is_held_out_only_if_no_fitted_pair_is_of_it(tmp_path):
+    rng = np.random.default_rng(0)
+    robot = small_arm(tolerance=LARGE)
+    q = rng.uniform(-2.0, 2.0, (30, robot.n_joints))
+    p = pose(true_robot(robot, rng), q).position
+    a, b = (ends.ravel() for ends in np.triu_indices(30, 1))
+    chosen = rng.permutation(len(a))[:150]
+    a, b = a[chosen], b[chosen]
+    test = (rng.uniform(size=len(a)) < 0.3) | (a == 3) | (b == 3)
+    pairs = {"a": a, "b": b, "distance": np.linalg.norm(p[a] - p[b], axis=1), "sigma_distance": 1e-4, "test": test}
+    saved = calibrate(robot, Measurements.from_arrays(q, pairs=pairs), model="distance")
+    saved.save(tmp_path)
+    found, rows = read_configurations(tmp_path, robot.n_joints), saved.uncertainty.residuals
+    assert np.flatnonzero(found.test).tolist() == [3]
+    for k in range(30):
+        mine = ((rows.a == k) | (rows.b == k)) & (rows.split == (k == 3))
+        assert found.rms["distance"][k] == pytest.approx(np.sqrt(np.mean(rows.after[mine] ** 2)), rel=1e-6)
+    assert saved.result.expected_error.of == 1
 
 
 def test_a_tool_on_its_only_axis_has_a_page_and_pictures(tmp_path):
