@@ -203,6 +203,8 @@ def test_the_command_writes_a_result_that_others_read(tmp_path, fg_calib):
     assert page.count("Not of a calibration in parts") == 3  # folds, errors over joints, residuals
     assert "calibrate again" not in page
     assert "--folds" not in page
+    assert "accept:" not in page
+    assert "none were held out" not in page
     loaded = Calibration.load(out)
     assert loaded.result.trustworthy is None
     assert loaded.result.goodness == {}
@@ -225,6 +227,15 @@ def test_a_fit_that_is_bad_as_a_whole_is_doubtful(tmp_path, fg_calib):
     assert json.loads(ended.out)["trustworthy"] is False
     assert calibrate_parts(job).trustworthy is False
     assert "not to be trusted: reduced chi-square" in ended.err
+
+
+def test_findings_are_told_to_their_end(tmp_path, fg_calib):
+    job = pairs_job(tmp_path, noise={"distance": SIGMA / 3.0, "angle": SIGMA / 3.0})
+    ended = fg_calib("calibrate", job, "--parts", 50)
+    lines = ended.out.splitlines()
+    findings = calibrate_parts(read_parts(job, 50)).result.findings
+    assert max(map(len, findings)) > 100 >= max(len(line) for line in lines[: lines.index("Parameters")])
+    assert all(f"DOUBTFUL: {finding}" in " ".join(ended.out.split()) for finding in findings)
 
 
 def test_what_was_calibrated_in_parts_has_no_residuals(tmp_path):

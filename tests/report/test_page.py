@@ -441,6 +441,18 @@ def test_a_configuration_is_held_out_only_if_no_fitted_pair_is_of_it(tmp_path):
     assert saved.result.expected_error.of == 1
 
 
+@pytest.mark.parametrize(
+    ("model", "offered"),
+    [("distance", "distance: 0.5 mm"), ("rotation", "angle: 0.1 deg"), ("pose", "position: 0.5 mm")],
+)
+def test_limits_that_the_page_offers_can_be_judged(tmp_path, model, offered):
+    rng = np.random.default_rng(0)
+    robot = small_arm(tolerance=LARGE)
+    calibrate(robot, measure(true_robot(robot, rng), 20, rng), model=model).save(tmp_path)
+    write_report(tmp_path)
+    assert f"with accept: {{{offered}}} in the job" in text_of(html.parse(str(tmp_path / "report.html")))
+
+
 def test_a_tool_on_its_only_axis_has_a_page_and_pictures(tmp_path):
     robot = Robot.from_dh([[0.0, 0.0, 0.2, 0.0]], tolerance=LARGE)
     q, there = np.linspace(-3.0, 3.0, 15)[:, None], np.tile([0.0, 0.0, 0.2], (15, 1))
