@@ -4,6 +4,7 @@ import json
 import os
 import pickle
 import re
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
@@ -162,13 +163,36 @@ def test_configurations_that_no_fitted_pair_is_of_are_not_counted(tmp_path, n_ro
 
 
 @pytest.mark.parametrize("column", ["distance", "angle"])
-def test_a_table_with_either_figure_alone_may_be_cut(tmp_path, column):
+def test_a_table_with_either_figure_alone_may_be_cut(tmp_path, caplog, column):
     job = pairs_job(tmp_path)
     pairs = pl.read_parquet(tmp_path / "pairs.parquet")
     pairs.drop(column).write_parquet(tmp_path / "pairs.parquet")
-    whole, found = Calibration.of(*_solved(job)).result, calibrate_parts(read_parts(job, 41)).result
+    whole = Calibration.of(*_solved(job)).result
+    (said,) = caplog.messages
+    found = calibrate_parts(read_parts(job, 41)).result
+    assert caplog.messages == [said, said]
+    assert said in found.cautions
+    assert said in whole.cautions
     assert found.residual_rms["train"][column] is whole.residual_rms["train"][column] is None
     assert found.reduced_chi2 == pytest.approx(whole.reduced_chi2, rel=1e-9)
+
+
+def test_a_figure_of_which_no_pair_has_any_is_told_of_with_the_columns_that_nothing_uses(tmp_path, caplog):
+    job = pairs_job(tmp_path, more={"day": ["2026-03-01"] * N_PAIRS})
+    pairs = pl.read_parquet(tmp_path / "pairs.parquet")
+    pairs.rename({"distance": "separation"}).write_parquet(tmp_path / "pairs.parquet")
+    whole = read_job(job)
+    build_problem(whole.robot, whole.measurements, whole.options)
+    assert caplog.messages == [
+        "pairs.parquet: no pair has a distance, of which model distance-rotation makes use; is a column misspelt"
+        " (columns separation, day are not used)? model: rotation says that there is none"
+    ]
+    caplog.clear()
+    build_problem(whole.robot, whole.measurements, replace(whole.options, model="rotation"))
+    pairs.write_parquet(tmp_path / "pairs.parquet")
+    whole = read_job(job)
+    build_problem(whole.robot, whole.measurements, whole.options)
+    assert not caplog.messages
 
 
 @pytest.mark.parametrize("estimated", ["tool.x", "base.z"])
