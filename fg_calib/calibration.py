@@ -180,7 +180,7 @@ def calibrate_parts(job: JobInParts | Path | str, executor: Executor | None = No
     given = job if isinstance(job, JobInParts) else read_parts(job)
     solution = solve_parts(given.robot, given.parts, given.options, executor)
     tell("judging the result")
-    assessed = assess_parts(solution, given.n_configurations, given.parts[0])
+    assessed = assess_parts(solution, given.parts[0])
     return Calibration(solution.robot, result_of_parts(given, assessed), solution.posterior, assessed)
 
 

@@ -84,7 +84,7 @@ def expected_error(problem: Problem, spread: TangentCovariance) -> ExpectedError
 
 def judged_configurations(data: Dataset) -> tuple[Integers, Literal["test", "train"]]:
     """The test configurations of all tables, or the train ones for want of these, and which they are."""
-    test = data.tested
+    test = data.held_out
     return np.flatnonzero(test if test.any() else ~test), "test" if test.any() else "train"
 
 

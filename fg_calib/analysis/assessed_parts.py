@@ -6,6 +6,7 @@ not asked: outliers, mistakes, other optima, whether residuals follow the arm. S
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +24,10 @@ from fg_calib.graph.factors import corrections_of, prior_rows
 from fg_calib.graph.information import named_rows
 from fg_calib.graph.observability import Observability, observability_of_rows
 from fg_calib.measurements.dataset import Measurements
+from fg_calib.measurements.models.pairs import no_figure
 from fg_calib.threads import single_threaded
+
+_log = logging.getLogger(__name__)
 
 UNJUDGED = "solved in parts: no single row was judged, and no outlier, mistake or other optimum looked for"
 """What its reader must know of every such calibration."""
@@ -68,15 +72,15 @@ class AssessedParts(Brief):
 
 
 @single_threaded
-def assess_parts(solution: PartsSolution, n_configurations: int, part: Part) -> AssessedParts:
+def assess_parts(solution: PartsSolution, part: Part) -> AssessedParts:
     """What is known of a calibration in parts.
 
     Args:
         solution: The calibration.
-        n_configurations: Number of train configurations.
         part: One of the parts: of pairs all have the same configurations; for the reasons why directions are lost.
     """
-    posterior, options = solution.posterior, solution.options
+    posterior, options, n_configurations = solution.posterior, solution.options, solution.reduced.n_configurations
+    assert n_configurations is not None
     variables = posterior.variables
     robot, n_priors = variables.robot, len(prior_rows(variables, solution.parameters)[0])
     by_name = {p.name: p for p in robot.parameters}
@@ -99,6 +103,7 @@ def assess_parts(solution: PartsSolution, n_configurations: int, part: Part) -> 
     priors = judge_tolerances(variables, solution.parameters, posterior.tangent)
     statements = [] if solution.converged else [Statement(solution.message, finding=True)]
     statements += [*of_chi2(chi2), *of_priors(priors)]
+    statements += [Statement(text, finding=False) for text in _missing_figures(solution, table.measurements)]
     statements += [Statement(UNJUDGED, finding=False), *([Statement(INDEPENDENT, finding=False)] if shared else [])]
     return AssessedParts(
         solution=solution,
@@ -113,6 +118,17 @@ def assess_parts(solution: PartsSolution, n_configurations: int, part: Part) -> 
         configurations=replace(table.measurements, pairs=None) if options.uses_pairs else None,
         expected_error=expected_error(problem, posterior) if options.uses_pairs else None,
     )
+
+
+def _missing_figures(solution: PartsSolution, m: Measurements) -> list[str]:
+    """A sentence, that is warned of too, on each figure that the model uses and no fitted pair has."""
+    if m.pairs is None:
+        return []
+    missing = [name for name, (n, _) in solution.reduced.squares.items() if not n]
+    texts = [no_figure(m.pairs, solution.options.model, name) for name in missing]
+    for text in texts:
+        _log.warning("%s", text)
+    return texts
 
 
 def _parameters(solution: PartsSolution, observability: Observability) -> tuple[ParameterEstimate, ...]:

@@ -27,7 +27,7 @@ from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.factors import Variables, prior_rows
 from fg_calib.graph.information import correlation, whitened_triangle
 from fg_calib.graph.observability import RANK_TOLERANCE, SIGNAL_FLOOR, SUPPORT_TOLERANCE, determined
-from fg_calib.graph.problem import Problem
+from fg_calib.graph.problem import Problem, by_columns_of
 from fg_calib.graph.solver import Solution
 from fg_calib.robot.model import Robot
 
@@ -262,13 +262,11 @@ def _errors(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
     """
     assert problem.whole is not None
     own, whole = problem.variables, problem.whole.variables
-    by_name = dict(zip(whole.names, whole.tangent_derivative(parameters).T, strict=True))
-    poses = {v.key: np.eye(whole.n_columns)[v.columns] for v in whole.items if v.is_pose}
-    rows = [poses.get(v.key, np.array([by_name[name] for name in own.names[v.columns]])) for v in own.items]
-    M = np.vstack([np.zeros((0, whole.n_columns)), *rows]).T
+    M, derivative = whole.columns_of(own, parameters), whole.tangent_derivative(parameters)
+    by_name = dict(zip(whole.names, derivative.T, strict=True))
     left_out = [by_name[p.name] for p in problem.whole.estimated if p.name not in own.names]
     N = np.array(left_out).reshape(-1, whole.n_columns).T
-    J = whitened_triangle(replace(problem, variables=whole), parameters)
+    J = whitened_triangle(by_columns_of(problem, whole), parameters)
     U, s, Vt = np.linalg.svd((J @ M) * own.scales, full_matrices=False)
     rank = determined(s)
     G = own.scales[:, None] * ((Vt[:rank].T / s[:rank]) @ (U[:, :rank].T @ (J @ N)))

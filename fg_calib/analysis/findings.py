@@ -44,6 +44,7 @@ from fg_calib.graph.noise import JOINT_NOISE, PairNoise
 from fg_calib.graph.problem import at_parameters, reweighted_at
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements.kinds import AnchorContact
+from fg_calib.measurements.models.pairs import missing_figures
 from fg_calib.robot.kinematics import forward, precompute_trig
 
 Floats = NDArray[np.float64]
@@ -140,6 +141,7 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
         *_of_bent_rows(solution, spread, fit.table, fit.goodness, too_large=fit.chi2.too_large),
         *of_curvature(beyond_linear(solution, spread)),
         *_of_noise(solution, fit.table, fit.goodness),
+        *(Statement(text, finding=False) for table in problem.data.tables for text in missing_figures(table)),
     ]
     setup, structure = SetupCheck(), of_structure(noise_like)
     doubts = any(s.finding for s in (*statements, *structure))

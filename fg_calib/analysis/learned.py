@@ -11,7 +11,7 @@ from fg_calib.analysis.seen import Seen
 from fg_calib.graph.factors import eliminate, prior_rows, unknown_prior_rows
 from fg_calib.graph.information import row_triangles
 from fg_calib.graph.knowledge import SIZE, STAYING, Knowledge, Name, coordinates_of
-from fg_calib.graph.problem import Problem
+from fg_calib.graph.problem import Problem, by_columns_of
 from fg_calib.graph.solver import Solution
 
 Floats = NDArray[np.float64]
@@ -31,7 +31,7 @@ def knowledge_of(solution: Solution) -> Knowledge | None:
     if problem.evaluated or problem.added or not problem.variables.n_robot_columns:
         return None
     if problem.whole is not None:  # all parameters, those left out among them
-        problem = replace(problem, variables=problem.whole.variables)
+        problem = by_columns_of(problem, problem.whole.variables)
     as_drawn, x = at_nominal(problem, solution.before)
     nominal = _known_at(as_drawn, x, with_loss=False)
     views = Seen.of(problem).views

@@ -20,6 +20,7 @@ References:
 from __future__ import annotations
 
 import time
+import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -75,6 +76,7 @@ class Reduced(FrozenArrays):
         n_measurements: Number of pairs or poses that give at least one.
         squares: By kind of noise the number of measurements, and the sum of their squared residuals, [m^2] or [rad^2].
         n_excluded: Number of measurements that take no part, by reason.
+        fitted: Of pairs, by the CRC-32 of the ids of a table of configurations, which of these they are of: one a bit.
     """
 
     triangle: Floats
@@ -82,11 +84,21 @@ class Reduced(FrozenArrays):
     n_measurements: int = 0
     squares: Mapping[str, tuple[int, float]] = field(default_factory=dict)
     n_excluded: Mapping[str, int] = field(default_factory=dict)
+    fitted: Mapping[int, NDArray[np.uint8]] = field(default_factory=dict)
+
+    @property
+    def n_configurations(self) -> int | None:
+        """Number of configurations that rows are of; None of pairs whose parts have tables of their own of these."""
+        if len(self.fitted) > 1:
+            return None
+        return (
+            sum(int(np.unpackbits(bits).sum()) for bits in self.fitted.values()) if self.fitted else self.n_measurements
+        )
 
     @property
     def rms(self) -> dict[str, float]:
         """By kind of noise the RMS of the length of a measurement's residuals, [m] or [rad]."""
-        return {kind: float(np.sqrt(total / n)) for kind, (n, total) in self.squares.items()}
+        return {kind: float(np.sqrt(total / n)) for kind, (n, total) in self.squares.items() if n}
 
 
 @dataclass(frozen=True)
@@ -341,8 +353,13 @@ class _Task:
             sharing, at = self.options.pair_errors == "shared", problem.variables.at(self.parameters)
             rows = whitened_rows(noises, sharing=sharing, joint_errors=None, weights=None)
             triangle = _upper([one.triangle(at) for one in rows], problem.variables.n_columns + 1)
-        n = problem.n_pairs if self.options.uses_pairs else problem.n_configurations
-        return Reduced(triangle, problem.n_residuals, n, _squares(noises), problem.n_excluded)
+        n, fitted = problem.n_configurations, dict[int, NDArray[np.uint8]]()
+        if self.options.uses_pairs:
+            n, fitted = (
+                problem.n_pairs,
+                {zlib.crc32(table.measurements.ids.tobytes()): np.packbits(problem.data.fitted)},
+            )
+        return Reduced(triangle, problem.n_residuals, n, _squares(noises), problem.n_excluded, fitted)
 
 
 def problem_of_table(robot: Robot, table: Table, options: Options, parameters: Floats) -> Problem:
@@ -429,9 +446,12 @@ def _reduce(task: _Task, parts: Sequence[Part], executor: Executor | None) -> Re
         raise ProblemError("parts", "no train row", "at least one", "test rows and empty cells are never fitted")
     n_all = build_variables(task.robot, [task.options.unknown_frame], False).n_columns + 1
     squares: dict[str, tuple[int, float]] = {}
+    fitted: dict[int, NDArray[np.uint8]] = {}
     excluded: Counter[str] = Counter()
     for one in found:
         excluded.update(one.n_excluded)
+        for table, bits in one.fitted.items():
+            fitted[table] = fitted.get(table, np.zeros_like(bits)) | bits
         for kind, (n, total) in one.squares.items():
             before = squares.get(kind, (0, 0.0))
             squares[kind] = (before[0] + n, before[1] + total)
@@ -441,6 +461,7 @@ def _reduce(task: _Task, parts: Sequence[Part], executor: Executor | None) -> Re
         n_measurements=sum(one.n_measurements for one in found),
         squares=squares,
         n_excluded=dict(excluded),
+        fitted=fitted,
     )
 
 

@@ -222,11 +222,13 @@ class ResidualTable(FrozenArrays):
                     }
         return found
 
-    def of_configurations(self, n: int) -> tuple[NDArray[np.int64], Floats, dict[str, Floats]]:
+    def of_configurations(self, held_out: Booleans) -> tuple[NDArray[np.int64], Floats, dict[str, Floats]]:
         """How many rows that count each configuration takes part in, the sum of their squares, and RMS by kind.
 
+        The rows are its train rows, or its test rows where it was held out.
+
         Args:
-            n: Number of configurations.
+            held_out: Which configurations were, shape (n,).
 
         Returns:
             Rows, shape (n,); sum of squares in sigma, shape (n,); by kind of noise the RMS of the length of a
@@ -238,7 +240,11 @@ class ResidualTable(FrozenArrays):
             def ends(some: slice) -> tuple[Indices, Indices]:
                 return self.a[some], self.b[some]
 
-            return sum_by_end(ends, self.n, n, lambda some: np.where(mine[some], values(some), 0.0))
+            def of(split: int) -> Floats:
+                chosen = mine & (self.split == split)
+                return sum_by_end(ends, self.n, len(held_out), lambda some: np.where(chosen[some], values(some), 0.0))
+
+            return np.where(held_out, of(1), of(0)) if held_out.any() else of(0)
 
         rms = {}
         for k, family in enumerate(self.families):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fg_calib.analysis.covariance import Spread
 from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.information import eliminated
-from fg_calib.graph.problem import at_parameters
+from fg_calib.graph.problem import at_parameters, by_columns_of
 from fg_calib.graph.solver import Solution
 
 Floats = NDArray[np.float64]
@@ -58,7 +58,7 @@ def point_estimates(solution: Solution, spread: Spread) -> tuple[PointEstimate, 
     if not unknowns.names:
         return ()
     at = at_parameters(problem, solution.parameters)
-    left = eliminated(replace(problem, variables=spread.variables), solution.parameters)
+    left = eliminated(by_columns_of(problem, spread.variables), solution.parameters)
     counts = np.zeros(len(unknowns.names), dtype=np.int64)
     for s in data.series:
         owners = unknowns.owners[s.nuisances[s.train]]

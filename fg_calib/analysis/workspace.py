@@ -26,6 +26,9 @@ N_DRAWN = 12_000
 FAR = 0.15
 """Distance from the nearest measured position, in the radius of the workspace, beyond which nothing was measured."""
 
+LEAST_WIDTH = 1e-3
+"""Width that pictures of a workspace have at least, [m]: a tool on its arm's only axis stays where it is."""
+
 
 @dataclass(frozen=True)
 class JointRange(FrozenArrays):

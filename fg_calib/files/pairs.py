@@ -117,6 +117,7 @@ def _read_piece(table: Table, configurations: Configurations, units: Units, nois
         sigma_angle=_sigma(table, "sigma_angle", noise.angle, turn),
         test=table.test_rows() | _has_test_end(ends, configurations),
         source=table.header.name,
+        unused=tuple(name for name in table.header.columns if name not in PAIR_COLUMNS),
     )
     return pairs.select(~ends.of_groups), pairs.select(ends.of_groups)
 

@@ -63,7 +63,6 @@ class JobInParts(Brief):
         robot: The robot as it is before the calibration.
         parts: Functions that read some train rows of the table each, for `solve_parts`; they can be pickled.
         options: Every choice.
-        n_configurations: Train rows of the table of configurations.
         inputs: SHA-256 of every file read, by its path relative to the job.
         document: The job as its file has it, without its robot.
     """
@@ -72,7 +71,6 @@ class JobInParts(Brief):
     robot: Robot
     parts: tuple[Span, ...]
     options: Options
-    n_configurations: int
     inputs: dict[str, str] = field(default_factory=dict)
     document: dict[str, Any] = field(default_factory=dict)
 
@@ -113,10 +111,10 @@ def read_parts(path: Path | str, n_rows: int = PIECE) -> JobInParts:
     if table.pairs is not None and not job.options.uses_pairs:
         raise InputError(f"{path.name}: pairs", f"given with model {job.options.model}", "none: it is one of poses")
     with keeping_warnings():  # they were said of the first rows
-        n, of_train = table.counts(repeated=bool(job.measurements.labels))
+        n = table.count(repeated=bool(job.measurements.labels))
     spans = [(k, n_rows) for k in range(0, n, n_rows)]
     parts = tuple(Span(table.read, rows, table.files) for rows in spans)
-    return JobInParts(path, job.robot, parts, job.options, of_train, job.inputs, job.document)
+    return JobInParts(path, job.robot, parts, job.options, job.inputs, job.document)
 
 
 class _Table:
@@ -140,8 +138,8 @@ class _Table:
         self.files = {file_at(path): _stamp(path) for path in there}
         return self.read(rows=(0, n_rows))
 
-    def counts(self, *, repeated: bool) -> tuple[int, int]:
-        """Rows that are cut, and train rows of configurations.
+    def count(self, *, repeated: bool) -> int:
+        """Number of rows that are cut.
 
         Args:
             repeated: Whether several rows may have the same id.
@@ -150,14 +148,9 @@ class _Table:
             InputError: Several have, and may not.
         """
         header = header_for(self._path, self._robot, self._how["columns"] or {}, by_rows=self.pairs is None)
-        columns = header.present("id", "split")
-        n_train = n = header.n_rows() if not header.is_csv else 0
-        if columns or header.is_csv:
-            table = Table.read(header, (), columns or header.columns[:1])
-            n = table.n_rows
-            read_ids(table, repeated=repeated)
-            n_train = n - int(np.sum(table.test_rows()))
-        return (n if self.pairs is None else Header.read(self.pairs, "", by_rows=True).n_rows()), n_train
+        if header.present("id"):
+            read_ids(Table.read(header, (), ("id",)), repeated=repeated)
+        return (header if self.pairs is None else Header.read(self.pairs, "", by_rows=True)).n_rows()
 
 
 def _stamp(path: Path) -> tuple[int, int]:

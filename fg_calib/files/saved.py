@@ -27,7 +27,7 @@ class SavedConfigurations(FrozenArrays):
 
     Attributes:
         ids: Name of each configuration.
-        test: Which have test rows, shape (n,).
+        test: Which were held out, shape (n,): they have test rows, and no fitted one.
         readings: Joint readings, shape (n, n_joints), [rad] (prismatic: [m]).
         tool: Where the calibrated tool is, from the base, shape (n, 3), [m].
         rms: By kind of residual the RMS at the estimate, shape (n,); nan where there is none.

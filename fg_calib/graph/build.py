@@ -24,6 +24,7 @@ from fg_calib.job import Job
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.gathering import Dataset, check_repeats, gather
 from fg_calib.measurements.kinds import Frames, check_derivatives, check_start, is_ours
+from fg_calib.measurements.models.pairs import missing_figures
 from fg_calib.measurements.models.predictions import predictions
 from fg_calib.measurements.series import Table
 from fg_calib.options import (
@@ -81,6 +82,8 @@ def build_problem(
         if not table.uses_pairs and table.measurements.pairs is not None:
             source = table.measurements.pairs.source
             _log.warning("%s: not used, model %s is of poses", source, table.model)
+        for text in missing_figures(table):
+            _log.warning("%s", text)
         check_repeats(table)
     return problem_of_tables(robot, tables, options)
 

@@ -316,6 +316,18 @@ class Variables(Brief):
             variables = replace(variables, nuisance=(*variables.nuisance, added))
         return replace(variables, own=start)
 
+    def columns_of(self, fewer: Variables, parameters: Floats) -> Floats:
+        """What each column of the variables of fewer of the parameters is in these, shape (n_columns, fewer.n_columns).
+
+        Args:
+            fewer: Those.
+            parameters: The parameter vector, of either.
+        """
+        by_name = dict(zip(self.names, self.tangent_derivative(parameters).T, strict=True))
+        poses = {v.key: np.eye(self.n_columns)[v.columns] for v in self.items if v.is_pose}
+        rows = [poses.get(v.key, np.array([by_name[name] for name in fewer.names[v.columns]])) for v in fewer.items]
+        return np.vstack([np.zeros((0, self.n_columns)), *rows]).T
+
     def named_derivative(self, parameters: Floats) -> Floats:
         """Derivative of the named scalars in the columns, shape (n_columns, n_columns).
 
@@ -706,7 +718,8 @@ def well_conditioned(R: Floats) -> bool:
     """Whether the singular values of R, columns scaled to length 1, are dead or above 1e-5 of the largest."""
     lengths = np.linalg.norm(R, axis=0)
     s = np.linalg.svd(R[:, lengths > 0.0] / lengths[lengths > 0.0], compute_uv=False)
-    return not bool(np.any((s > 1e-12 * s[0]) & (s < 1e-5 * s[0])))
+    largest = s.max(initial=0.0)  # 0 where rows depend on no column: angles of pairs on a tool point
+    return not bool(np.any((s > 1e-12 * largest) & (s < 1e-5 * largest)))
 
 
 def prior_rows(variables: Variables, parameters: Floats, only: Variable | None = None) -> tuple[Floats, Floats]:

@@ -162,10 +162,7 @@ class Problem(FrozenArrays):
     @property
     def n_configurations(self) -> int:
         """Configurations that the train rows come from."""
-        return _n_different([self._train_configurations(s) for s in self.data.series])
-
-    def _train_configurations(self, series: Series) -> Integers:
-        return self.data.places[series.table][series.ends[series.train]].ravel()
+        return int(np.sum(self.data.fitted))
 
     @property
     def n_residuals(self) -> int:
@@ -392,6 +389,14 @@ def some_rows(problem: Problem, share: float) -> Problem | None:
 def started_at(problem: Problem, start: Floats) -> Problem:
     """The same problem, its rows as they are whitened, with another start: a parameter vector."""
     return replace(problem, start=start, initial=problem.variables.values(start))
+
+
+def by_columns_of(problem: Problem, variables: Variables) -> Problem:
+    """The same problem and rows by the columns of the variables of more, or the same, parameters."""
+    state = problem.state
+    if state.spread is not None:
+        state = replace(state, spread=variables.columns_of(problem.variables, problem.start) @ state.spread)
+    return replace(problem, variables=variables, state=state)
 
 
 def same_rows(a: Problem, b: Problem) -> bool:

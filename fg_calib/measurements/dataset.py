@@ -80,6 +80,7 @@ class Pairs(FrozenArrays):
         sigma_angle: Shape (n_pairs,), [rad].
         test: True for pairs that are predicted but never fitted, shape (n_pairs,).
         source: File name, for messages.
+        unused: Columns of the file that mean nothing.
     """
 
     a: Integers
@@ -90,6 +91,7 @@ class Pairs(FrozenArrays):
     sigma_angle: Floats
     test: Booleans
     source: str = "pairs"
+    unused: tuple[str, ...] = ()
 
     _left_open = ("a", "b")
 
@@ -114,11 +116,11 @@ class Pairs(FrozenArrays):
 
 def joined(parts: Sequence[Pairs]) -> Pairs:
     """Pairs of one table, one part after the other."""
-    names = [f.name for f in fields(Pairs) if f.name != "source"]
+    names = [f.name for f in fields(Pairs) if f.name not in ("source", "unused")]
     columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
     for name in ("sigma_distance", "sigma_angle", "test"):
         columns[name] = once(columns[name])
-    return Pairs(source=parts[0].source, **columns)
+    return Pairs(source=parts[0].source, unused=parts[0].unused, **columns)
 
 
 def are_same(places: Integers | Floats, a: Integers, b: Integers) -> Booleans:

@@ -82,14 +82,22 @@ class Dataset(Brief):
         return out
 
     @property
-    def tested(self) -> Booleans:
-        """Which configurations have test rows, shape (n_configurations,)."""
+    def fitted(self) -> Booleans:
+        """Which configurations the train rows are of, shape (n_configurations,)."""
+        found = np.zeros(self.n_configurations, dtype=np.bool_)
+        for s in self.series:
+            found[self.places[s.table][s.ends[s.train]]] = True
+        return found
+
+    @property
+    def held_out(self) -> Booleans:
+        """Which configurations have test rows and no train row, shape (n_configurations,)."""
         found = np.zeros(self.n_configurations, dtype=np.bool_)
         for s in self.series:
             found[self.places[s.table][s.ends[s.test]]] = True
         for table, place in zip(self.tables, self.places, strict=True):
             found[place[table.measurements.test]] = True
-        return found
+        return found & ~self.fitted
 
     @property
     def sigma_joint(self) -> Floats:

@@ -857,11 +857,12 @@ def _write_configurations(path: Path, solution: Solution, uncertainty: Uncertain
     """One line a configuration: its readings, where the calibrated tool is (from the base), how large residuals are."""
     data, robot = solution.problem.data, uncertainty.robot
     readings, n = data.readings, data.n_configurations
-    rows, chi2, rms = uncertainty.residuals.of_configurations(n)
+    held_out = data.held_out | solution.problem.evaluated
+    rows, chi2, rms = uncertainty.residuals.of_configurations(held_out)
     tool = np.concatenate([pose(robot, readings[k : k + SPAN]).position for k in range(0, max(n, 1), SPAN)])
     columns: dict[str, Any] = {
         "id": Words(data.names[:n], np.arange(n)),
-        "split": Words(("train", "test"), (data.tested | solution.problem.evaluated).astype(np.int64)),
+        "split": Words(("train", "test"), held_out.astype(np.int64)),
         **{f"q{i + 1}": readings[:, i] for i in range(robot.n_joints)},
         **{f"tool_{axis}": tool[:, i] for i, axis in enumerate("xyz")},
         "rows": rows,

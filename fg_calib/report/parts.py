@@ -54,7 +54,7 @@ def result_of_parts(job: JobInParts, found: AssessedParts) -> Result:
         pair_errors=options.pair_errors if options.uses_pairs else None,
         encoder=options.encoder,
         loss=options.loss,
-        n_configurations=job.n_configurations,
+        n_configurations=s.reduced.n_configurations,
         n_pairs=s.reduced.n_measurements if options.uses_pairs else 0,
         n_residuals=s.reduced.n_residuals,
         n_priors=found.n_priors,
@@ -103,8 +103,12 @@ def _solver(s: PartsSolution) -> Solver:
 
 
 def _is_before(s: PartsSolution) -> bool:
-    """Whether the start is the arm as drawn with nothing left to fit: neither measurement frame nor base nor tool."""
-    return not any(v.is_pose for v in s.posterior.variables.items)
+    """Whether the start is the arm as drawn with nothing left to fit: neither measurement frame nor base nor tool.
+
+    These are fitted to some rows only before.
+    """
+    of_joints = range(1, s.robot.n_joints + 1)
+    return not s.options.unknown_frame and all(p.owner in of_joints for p in s.robot.parameters if p.estimated)
 
 
 def _residual_rms(s: PartsSolution) -> dict[str, dict[str, Rms | None]]:

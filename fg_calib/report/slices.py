@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.analysis.prediction import PredictedErrors
+from fg_calib.analysis.workspace import LEAST_WIDTH
 from fg_calib.report.figures import LOST, empty_figure
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def slices_of(found: PredictedErrors) -> tuple[Slice, ...]:
     """
     p, error = found.errors.position, found.expected[:, 0]
     low, high = p.min(axis=0), p.max(axis=0)
-    width = float((high - low).max())
+    width = max(float((high - low).max()), LEAST_WIDTH)
     thick, middle = SLAB * width, 0.5 * (low + high)
     edges = [np.linspace(m - 0.5 * width, m + 0.5 * width, CELLS + 1) for m in middle]
     worst = None if found.worst is None else found.worst.errors.position[0]
@@ -85,7 +86,7 @@ def slices_of(found: PredictedErrors) -> tuple[Slice, ...]:
         slices.append(Slice(title, names, edges[0], edges[1], cells, unknown, found.measured[near, :2], at))
     radial, z = _radial(p), edges[2]
     r = np.arange(CELLS + 1) * (z[1] - z[0])
-    r = r[: int(np.searchsorted(r, radial[:, 0].max())) + 1]
+    r = r[: max(int(np.searchsorted(r, radial[:, 0].max())), 1) + 1]
     cells, unknown = _cells(radial, error, r, z)
     at = None if worst is None else _radial(worst[None])[0]
     names = ("distance from the z axis [m]", "z [m]")

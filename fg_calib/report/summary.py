@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from html import escape
+from textwrap import wrap
 
 from fg_calib.analysis.acceptance import Judgement
 from fg_calib.errors import escaped
@@ -43,25 +44,31 @@ def judged(found: Iterable[Judgement | JudgementDocument]) -> list[str]:
 
 def summary(result: Result) -> list[str]:
     """What was calibrated from what, whether it is to be trusted, and how large residuals are: at most 10 lines."""
+    lines = _summary(result, 3)
+    return [escaped(line if len(line) <= WIDTH else f"{line[: WIDTH - 4]} ...") for line in lines]
+
+
+def _summary(result: Result, most: int | None = None) -> list[str]:
+    """The lines of a summary as long as they are, of findings or reservations so many at most."""
     head = f"{result.robot}: {result.model}"
     head += "" if result.pairing is None else f", pairs: {result.pairing}"
     head += ", measurement frame unknown" if result.frame_estimate is not None else ""
     chi2 = "" if result.reduced_chi2 is None else f", reduced chi-square {result.reduced_chi2:.3g}"
     verdicts = [f"DOUBTFUL: {finding}" for finding in result.findings]
     verdicts = verdicts or [f"{verdict_word(result)}: {result.solver.message}", *result.reservations]
-    more = [f"... and {len(verdicts) - 3} more findings"] if len(verdicts) > 3 else []
+    shown = verdicts[:most]
+    more = [f"... and {len(verdicts) - len(shown)} more findings"] if len(verdicts) > len(shown) else []
     estimated = [p for p in result.parameters if p.identifiability != "fixed"]
     known = sum(p.sigma is not None for p in estimated)
-    lines = [
+    return [
         head,
         *([] if result.acceptance is None else judged(result.acceptance.judgements)),
-        *verdicts[:3],
+        *shown,
         *more,
         f"{result.n_configurations} configurations, {result.n_residuals} residuals{chi2}",
         f"{len(estimated)} of {len(result.parameters)} parameters estimated, {known} of them with a known sigma",
         *(f"{split} residuals, RMS: {text}" for split, text in _rms(result)),
     ]
-    return [escaped(line if len(line) <= WIDTH else f"{line[: WIDTH - 4]} ...") for line in lines]
 
 
 def _rms(result: Result) -> Iterator[tuple[str, str]]:
@@ -105,7 +112,8 @@ def format_result(result: Result) -> str:
         (cell.ljust(w) if i in left else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True)))
         for row in rows
     )
-    parts = [*summary(result), "", "Parameters", *("  ".join(row).rstrip() for row in cells)]
+    head = [part for line in _summary(result) for part in wrap(escaped(line), WIDTH, subsequent_indent="  ")]
+    parts = [*head, "", "Parameters", *("  ".join(row).rstrip() for row in cells)]
     if result.tolerance_scales:
         parts += ["", TITLE, *_scales(result)]
     if result.frame_estimate is not None:

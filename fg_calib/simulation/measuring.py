@@ -324,7 +324,9 @@ class _Work:
         at, (distances, angles) = self.at(), PAIR_MODELS[self.model]
         true = form_pairs(self.rows(position=at.position, rotation=at.rotation), i.pairs)
         n = true.n_pairs
-        measured = {f"{v}{kind}": np.full(n, np.nan) for kind in ("distance", "angle") for v in ("", "sigma_")}
+        measured: dict[str, Any] = {
+            f"{v}{kind}": np.full(n, np.nan) for kind in ("distance", "angle") for v in ("", "sigma_")
+        }
         if distances:
             measured["distance"] = np.abs(true.distance + self.noise("distance", n))
             measured["sigma_distance"] = self.stated("distance", n)

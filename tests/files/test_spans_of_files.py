@@ -4,6 +4,7 @@ import json
 import os
 import pickle
 import re
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
@@ -151,6 +152,58 @@ def test_a_result_in_parts_says_what_that_of_the_whole_job_says_of_all_rows(tmp_
     assert found.reservations == (UNJUDGED,)
 
 
+@pytest.mark.parametrize("n_rows", [7, 41, 1000])
+def test_configurations_that_no_fitted_pair_is_of_are_not_counted(tmp_path, n_rows):
+    rng = np.random.default_rng(5)
+    ends = {"a": rng.integers(0, 20, N_PAIRS), "b": rng.integers(20, 30, N_PAIRS)}
+    ends["a"][100:], ends["b"][0] = rng.integers(0, 12, 100), 39
+    job = pairs_job(tmp_path, more=ends | {"split": ["test"] + ["train"] * 99 + ["test"] * 100})
+    whole, found = read_job(job), calibrate_parts(read_parts(job, n_rows)).result
+    assert found.n_configurations == build_problem(whole.robot, whole.measurements, whole.options).n_configurations < 31
+
+
+@pytest.mark.parametrize("column", ["distance", "angle"])
+def test_a_table_with_either_figure_alone_may_be_cut(tmp_path, caplog, column):
+    job = pairs_job(tmp_path)
+    pairs = pl.read_parquet(tmp_path / "pairs.parquet")
+    pairs.drop(column).write_parquet(tmp_path / "pairs.parquet")
+    whole = Calibration.of(*_solved(job)).result
+    (said,) = caplog.messages
+    found = calibrate_parts(read_parts(job, 41)).result
+    assert caplog.messages == [said, said]
+    assert said in found.cautions
+    assert said in whole.cautions
+    assert found.residual_rms["train"][column] is whole.residual_rms["train"][column] is None
+    assert found.reduced_chi2 == pytest.approx(whole.reduced_chi2, rel=1e-9)
+
+
+def test_a_figure_of_which_no_pair_has_any_is_told_of_with_the_columns_that_nothing_uses(tmp_path, caplog):
+    job = pairs_job(tmp_path, more={"day": ["2026-03-01"] * N_PAIRS})
+    pairs = pl.read_parquet(tmp_path / "pairs.parquet")
+    pairs.rename({"distance": "separation"}).write_parquet(tmp_path / "pairs.parquet")
+    whole = read_job(job)
+    build_problem(whole.robot, whole.measurements, whole.options)
+    assert caplog.messages == [
+        "pairs.parquet: no pair has a distance, of which model distance-rotation makes use; is a column misspelt"
+        " (columns separation, day are not used)? model: rotation says that there is none"
+    ]
+    caplog.clear()
+    build_problem(whole.robot, whole.measurements, replace(whole.options, model="rotation"))
+    pairs.write_parquet(tmp_path / "pairs.parquet")
+    whole = read_job(job)
+    build_problem(whole.robot, whole.measurements, whole.options)
+    assert not caplog.messages
+
+
+@pytest.mark.parametrize("estimated", ["tool.x", "base.z"])
+def test_rms_before_is_unknown_where_more_than_the_joints_would_be_fitted_to_all_rows_first(tmp_path, estimated):
+    job = pairs_job(tmp_path, model="distance")
+    write_robot(tmp_path / "robot.yaml", small_arm(TOLERANCE, estimate=(estimated,)))
+    found = calibrate_parts(read_parts(job, 41)).result
+    assert found.residual_rms["train"]["distance"].before is None
+    assert found.solver.initial_cost is None
+
+
 def _solved(job):
     given = read_job(job)
     solution = solve(build_problem(given.robot, given.measurements, given.options))
@@ -174,6 +227,8 @@ def test_the_command_writes_a_result_that_others_read(tmp_path, fg_calib):
     assert page.count("Not of a calibration in parts") == 3  # folds, errors over joints, residuals
     assert "calibrate again" not in page
     assert "--folds" not in page
+    assert "accept:" not in page
+    assert "none were held out" not in page
     loaded = Calibration.load(out)
     assert loaded.result.trustworthy is None
     assert loaded.result.goodness == {}
@@ -196,6 +251,15 @@ def test_a_fit_that_is_bad_as_a_whole_is_doubtful(tmp_path, fg_calib):
     assert json.loads(ended.out)["trustworthy"] is False
     assert calibrate_parts(job).trustworthy is False
     assert "not to be trusted: reduced chi-square" in ended.err
+
+
+def test_findings_are_told_to_their_end(tmp_path, fg_calib):
+    job = pairs_job(tmp_path, noise={"distance": SIGMA / 3.0, "angle": SIGMA / 3.0})
+    ended = fg_calib("calibrate", job, "--parts", 50)
+    lines = ended.out.splitlines()
+    findings = calibrate_parts(read_parts(job, 50)).result.findings
+    assert max(map(len, findings)) > 100 >= max(len(line) for line in lines[: lines.index("Parameters")])
+    assert all(f"DOUBTFUL: {finding}" in " ".join(ended.out.split()) for finding in findings)
 
 
 def test_what_was_calibrated_in_parts_has_no_residuals(tmp_path):

@@ -211,6 +211,7 @@ def test_large_blocks_change_to_the_gram_matrix_only_if_well_conditioned():
     J = rng.normal(size=(30, 4))
     assert well_conditioned(J)
     assert well_conditioned(np.hstack([J, J[:, :1], np.zeros((30, 1))]))  # dead directions do not matter
+    assert well_conditioned(np.zeros((30, 3)))  # nor do they where there is nothing else
     assert not well_conditioned(np.hstack([J, J[:, :1] + 1e-7 * rng.normal(size=(30, 1))]))
 
     problem = problem_of("distance-rotation", n=150, frame="known", estimate=())

@@ -12,11 +12,15 @@ from simulated import TOOL, measure, paper_robot, small_arm, true_robot
 
 from fg_calib.analysis.bounds import cramer_rao
 from fg_calib.analysis.covariance import Spread
+from fg_calib.analysis.learned import knowledge_of
 from fg_calib.analysis.uncertainty import assess
 from fg_calib.files.csv_writer import write_csv
 from fg_calib.files.robot_yaml import write_robot
 from fg_calib.graph.build import build_problem
+from fg_calib.graph.information import whitened_triangle
+from fg_calib.graph.problem import by_columns_of
 from fg_calib.graph.solver import solve
+from fg_calib.measurements.dataset import Measurements
 from fg_calib.robot.kinematics import pose
 
 TOLERANCE = {"a": 1e-3, "d": 2e-3, "alpha": 1e-3, "theta": 1.5e-3, "tool": 2e-3}
@@ -224,3 +228,25 @@ def test_where_nothing_was_left_out_parameters_stand_for_themselves(tmp_path, fg
     ended = fg_calib("calibrate", job_files(tmp_path, paper_robot(tolerance=HAYATI), gauge), "--json")
     assert not any("stands_for" in p for p in json.loads(ended.out)["parameters"])
     assert "kept parameters" not in fg_calib("calibrate", tmp_path / "job.yaml").out
+
+
+@pytest.mark.parametrize("loss", ["none", "huber"])
+def test_rows_say_the_same_by_the_columns_of_parameters_that_were_left_out(loss):
+    rng = np.random.default_rng(0)
+    robot = small_arm(dict.fromkeys(("a", "d", "alpha", "theta"), 2e-3))
+    q = rng.uniform(-2.0, 2.0, (80, robot.n_joints))
+    p = pose(robot, q).position
+    distance = np.linalg.norm(p[:40] - p[40:], axis=1) + 1e-4 * rng.normal(size=40)
+    distance[0] = 0.0  # one point, seen twice: three rows, beside which the loss takes less from others
+    pairs = {"a": np.arange(40), "b": np.arange(40, 80), "distance": distance, "sigma_distance": 1e-4}
+    solution = solve(
+        build_problem(robot, Measurements.from_arrays(q, pairs=pairs), model="distance", gauge="keep", loss=loss)
+    )
+    problem, x = solution.problem, solution.parameters
+    assert problem.state.spread is not None
+    wide = problem.whole.variables
+    of_all = whitened_triangle(by_columns_of(problem, wide), x, with_loss=True)
+    mine = whitened_triangle(problem, x, with_loss=True)
+    seen = of_all @ wide.columns_of(problem.variables, x)
+    np.testing.assert_allclose(seen.T @ seen, mine.T @ mine, rtol=1e-9, atol=1e-9 * np.abs(mine).max() ** 2)
+    assert knowledge_of(solution).n >= problem.variables.n_columns

@@ -14,14 +14,16 @@ from instruments import measured_by
 from lxml import etree, html
 from simulated import measure, plus, small_arm, true_robot, write_job
 
-from fg_calib import KnownPoint, Measurements, Robot, Table, calibrate, write_report
+from fg_calib import Calibration, KnownPoint, Measurements, Robot, Table, calibrate, predict, write_report
 from fg_calib.analysis.seen import Seen
+from fg_calib.files.saved import read_configurations
 from fg_calib.pages import load_run
 from fg_calib.report.page.arm import scene
 from fg_calib.report.page.charts import Scale, limits_of, short
 from fg_calib.report.page.figures import _histogram
 from fg_calib.report.page.files import FIGURES
 from fg_calib.report.page.sections import correlations, tiles
+from fg_calib.report.slices import slices_of
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.shape import link_points
 
@@ -409,6 +411,59 @@ def test_an_evaluation_says_that_it_is_one(tmp_path, frame):
     assert "nothing was estimated that could say how far off it is" in words
     assert not list(tmp_path.glob("**/workspace*.svg"))
     assert {item["test"] for item in scene(load_run(tmp_path))["items"]} == {True}
+
+
+def test_an_evaluation_of_nothing_but_test_rows_is_read_back_and_expects_no_errors(tmp_path):
+    rng = np.random.default_rng(0)
+    robot = small_arm(tolerance=LARGE)
+    saved = calibrate(robot, measure(true_robot(robot, rng), 0, rng, n_test=8), model="position")
+    saved.save(tmp_path)
+    assert Calibration.load(tmp_path).posterior.tangent.shape == (0, 0)
+    write_report(tmp_path, figures=True)
+    assert "no covariance says how large its errors are" in text_of(html.parse(str(tmp_path / "report.html")))
+    assert not list(tmp_path.rglob("workspace*"))
+
+
+def test_a_configuration_is_held_out_only_if_no_fitted_pair_is_of_it(tmp_path):
+    rng = np.random.default_rng(0)
+    robot = small_arm(tolerance=LARGE)
+    q = rng.uniform(-2.0, 2.0, (30, robot.n_joints))
+    p = pose(true_robot(robot, rng), q).position
+    a, b = (ends.ravel() for ends in np.triu_indices(30, 1))
+    chosen = rng.permutation(len(a))[:150]
+    a, b = a[chosen], b[chosen]
+    test = (rng.uniform(size=len(a)) < 0.3) | (a == 3) | (b == 3)
+    pairs = {"a": a, "b": b, "distance": np.linalg.norm(p[a] - p[b], axis=1), "sigma_distance": 1e-4, "test": test}
+    saved = calibrate(robot, Measurements.from_arrays(q, pairs=pairs), model="distance")
+    saved.save(tmp_path)
+    found, rows = read_configurations(tmp_path, robot.n_joints), saved.uncertainty.residuals
+    assert np.flatnonzero(found.test).tolist() == [3]
+    for k in range(30):
+        mine = ((rows.a == k) | (rows.b == k)) & (rows.split == (k == 3))
+        assert found.rms["distance"][k] == pytest.approx(np.sqrt(np.mean(rows.after[mine] ** 2)), rel=1e-6)
+    assert saved.result.expected_error.of == 1
+
+
+@pytest.mark.parametrize(
+    ("model", "offered"),
+    [("distance", "distance: 0.5 mm"), ("rotation", "angle: 0.1 deg"), ("pose", "position: 0.5 mm")],
+)
+def test_limits_that_the_page_offers_can_be_judged(tmp_path, model, offered):
+    rng = np.random.default_rng(0)
+    robot = small_arm(tolerance=LARGE)
+    calibrate(robot, measure(true_robot(robot, rng), 20, rng), model=model).save(tmp_path)
+    write_report(tmp_path)
+    assert f"with accept: {{{offered}}} in the job" in text_of(html.parse(str(tmp_path / "report.html")))
+
+
+def test_a_tool_on_its_only_axis_has_a_page_and_pictures(tmp_path):
+    robot = Robot.from_dh([[0.0, 0.0, 0.2, 0.0]], tolerance=LARGE)
+    q, there = np.linspace(-3.0, 3.0, 15)[:, None], np.tile([0.0, 0.0, 0.2], (15, 1))
+    calibrate(robot, Measurements.from_arrays(q, position=there, sigma_position=1e-4), model="position").save(tmp_path)
+    write_report(tmp_path)
+    for one in slices_of(predict(tmp_path)):
+        assert one.x[-1] > one.x[0]
+        assert one.y[-1] > one.y[0]
 
 
 def test_long_names_keep_what_tells_them_apart():

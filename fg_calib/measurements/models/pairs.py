@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arrays import once
-from fg_calib.errors import ProblemError
+from fg_calib.errors import ProblemError, escaped
 from fg_calib.measurements.dataset import Pairs, are_same, form_pairs, no_pairs
 from fg_calib.measurements.kinds import Distance, Kind, RotationAngle, SamePoint, stack
 from fg_calib.measurements.models.poses import ANGLES
@@ -17,6 +17,9 @@ from fg_calib.robot.model import Robot
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Booleans = NDArray[np.bool_]
+
+_NAMED = 5
+"""Columns without a meaning that a warning names."""
 
 
 def usable_pairs(table: Table) -> Pairs:
@@ -48,6 +51,25 @@ def usable_pairs(table: Table) -> Pairs:
             raise ProblemError(pairs.source, f"no sigma for {kind}", f"noise.{noise} or a column sigma_{noise}")
         measured |= use & np.isfinite(values)
     return pairs if measured.all() else pairs.select(measured)
+
+
+def missing_figures(table: Table) -> list[str]:
+    """A sentence on each figure that the model uses and no measured pair of a table has."""
+    pairs = table.measurements.pairs
+    if pairs is None or not pairs.n_pairs or table.model not in PAIR_MODELS:
+        return []
+    there = {"distance": pairs.distance, "angle": pairs.angle}
+    wanted = zip(there, PAIR_MODELS[table.model], strict=True)
+    return [no_figure(pairs, table.model, name) for name, use in wanted if use and np.isnan(there[name]).all()]
+
+
+def no_figure(pairs: Pairs, model: str, name: str) -> str:
+    """That no pair has a figure that the model uses: its column may be misspelt."""
+    article, other = {"distance": ("a", "rotation"), "angle": ("an", "distance")}[name]
+    unused = f"columns {', '.join(map(escaped, pairs.unused[:_NAMED]))} are not used" if pairs.unused else ""
+    asked = f"is a column misspelt ({unused})?" if unused else "is a column misspelt?"
+    found = f"{pairs.source}: no pair has {article} {name}, of which model {model} makes use"
+    return f"{found}; {asked} model: {other} says that there is none"
 
 
 def pair_series(robot: Robot, table: Table, number: int, unknowns: Unknowns) -> list[Series]:

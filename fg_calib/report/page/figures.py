@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.analysis.workspace import Workspace
+from fg_calib.analysis.workspace import LEAST_WIDTH, Workspace
 from fg_calib.report.page.charts import (
     BOTTOM,
     LEFT,
@@ -220,7 +220,7 @@ def workspace_slices(found: Workspace) -> list[Figure]:
     """Expected error of the tool in three slices through the middle of what was measured."""
     middle = np.median(found.measured, axis=0)
     low, high = found.position.min(axis=0), found.position.max(axis=0)
-    width = float((high - low).max())
+    width = max(float((high - low).max()), LEAST_WIDTH)
     thick = _SLAB * width
     low, high = (0.5 * (low + high) + sign * 0.52 * width for sign in (-1.0, 1.0))  # a cube: all axes on one scale
     ends = np.nanquantile(found.error, [0.05, 0.95]) * 1e3

@@ -38,6 +38,9 @@ _FEW = 3
 _WHOLE = "Not of a calibration in parts: fg-calib calibrate without --parts, of some of the rows, has it."
 """In place of what takes single rows."""
 
+_LIMITS = {"position": "0.5 mm", "distance": "0.5 mm", "orientation": "0.1 deg", "angle": "0.1 deg"}
+"""Limits that a job may state, as its file writes them: one of a kind that was measured is shown."""
+
 _MOST_ROWS = 40
 """Suspicious rows that the page lists; the table of residuals has all."""
 
@@ -62,18 +65,27 @@ def verdict(run: Run) -> list[Element]:
         kind = "open" if result.reservations else "pass"
         parts.append(tag("div", tag("strong", word), lines, class_=f"verdict {kind}"))
     if result.acceptance is None:
-        text = "No limits were set: with accept: {position: 0.5 mm} in the job this page says pass or fail."
-        parts.append(tag("p", text, class_="soft"))
+        parts.append(tag("p", f"No limits were set{_how_to_set_limits(run)}.", class_="soft"))
     cautions = [text for text in result.cautions if text not in result.reservations]
     if cautions:
         parts += [tag("h3", "Worth knowing"), tag("ul", [tag("li", text) for text in cautions])]
     return parts
 
 
+def _how_to_set_limits(run: Run) -> str:
+    """How the job would state a limit of something that its rows say; nothing where none can be judged."""
+    if run.result.in_parts:
+        return ": a calibration in parts judges none"
+    measured = run.result.residual_rms.get(run.judged_on, {})
+    kind = next((name for name in _LIMITS if measured.get(name) is not None), None)
+    return "" if kind is None else f": with accept: {{{kind}: {_LIMITS[kind]}}} in the job this page says pass or fail"
+
+
 def tiles(run: Run) -> Element:
     """The few figures that count."""
     result, split = run.result, run.judged_on
-    rows = "held out" if run.held_out else "fitted (none were held out)"
+    none = "test rows are left out" if result.in_parts else "none were held out"
+    rows = "held out" if run.held_out else f"fitted ({none})"
     rows = "of an evaluation" if result.evaluated_only else rows
     found = []
     for family, held in (result.folds.kinds if result.folds is not None and not run.held_out else {}).items():
@@ -107,6 +119,8 @@ def accuracy(run: Run) -> list[Element]:
         if run.result.evaluated_only
         else "rows that were held out: the estimate never saw them"
         if run.held_out
+        else "rows that were fitted; test rows are left out of a calibration in parts: elsewhere the arm will do worse"
+        if run.result.in_parts
         else "rows that were fitted, for none were held out (split: test): elsewhere the arm will do worse"
     )
     words = f"RMS residuals before and after the calibration, of {rows}."
@@ -293,10 +307,10 @@ def residuals(run: Run) -> list[Element]:
 def workspace(run: Run) -> list[Element]:
     """Expected error all over the workspace."""
     found = run.workspace
+    if run.result.evaluated_only:
+        return [tag("p", "Nothing of the arm was estimated: no covariance says how large its errors are.")]
     if found is None:
         return [_missing(run, "configurations.csv")]
-    if run.result.evaluated_only:
-        return [tag("p", "The arm was only evaluated: nothing was estimated that could say how far off it is.")]
     if not np.isfinite(found.error).any():
         return [tag("p", "The error of the tool depends on what the measurements do not determine: it is not known.")]
     where = "after the best rigid fit to the measured positions" if found.fitted else "in the base frame"
