@@ -408,7 +408,7 @@ def test_an_evaluation_says_that_it_is_one(tmp_path, frame):
     words = text_of(html.parse(str(tmp_path / "report.html")))
     assert "Evaluated only: all rows are test rows" in words
     assert "the estimate never saw them" not in words
-    assert "nothing was estimated that could say how far off it is" in words
+    assert "no covariance says how large its errors are" in words
     assert not list(tmp_path.glob("**/workspace*.svg"))
     assert {item["test"] for item in scene(load_run(tmp_path))["items"]} == {True}
 
