@@ -22,8 +22,10 @@ the optimum that nominal leads to, and would pay for looking elsewhere a thousan
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +34,7 @@ from fg_calib.analysis.covariance import spread_of
 from fg_calib.analysis.mirrored import mirror_images
 from fg_calib.analysis.other_sides import MUCH, folds_of, other_sides, without
 from fg_calib.arguments import checked
+from fg_calib.errors import CalibrationError
 from fg_calib.graph.information import directions
 from fg_calib.graph.noise import NoiseState
 from fg_calib.graph.observability import SIGNAL_FLOOR
@@ -40,6 +43,7 @@ from fg_calib.graph.solver import Solution, SolverOptions, solve, solve_from, so
 from fg_calib.threads import one_blas_thread
 
 Floats = NDArray[np.float64]
+T = TypeVar("T")
 
 WEAK = 2.0
 """A direction with a signal-to-noise ratio below this, priors included, is weak: sigma above half a tolerance."""
@@ -122,10 +126,12 @@ class _Search:
         """Descents from without what may fold, and from along directions that are weak or seen by a square."""
         with one_blas_thread:
             steps = _steps(self._first) if self._first.converged else []
-            unfolded = _without_folds(self._first, self._options)
+            unfolded = _attempted(lambda: _without_folds(self._first, self._options))
         aside = [] if unfolded is None else [unfolded]
         for start in (*aside, *_beside_nominal(self._first)):
-            self._keep(self._from(replace(self._first, problem=reweighted_at(self._first.problem, start)), start))
+            problem = _attempted(partial(reweighted_at, self._first.problem, start))
+            if problem is not None:
+                self._keep(self._from(replace(self._first, problem=problem), start))
         for step in steps:
             self._keep(self._from(self._first, _moved(self._first, step)))
 
@@ -137,8 +143,9 @@ class _Search:
     def _images(self) -> Iterator[Solution | None]:
         best = self._best
         if best.problem.options.loss == "none":
+            most = best.cost + 0.5 * INDISTINCT
             for image in mirror_images(best):
-                yield solve_image(best, image.problem, image.before, best.cost + 0.5 * INDISTINCT, self._options)
+                yield _attempted(partial(solve_image, best, image.problem, image.before, most, self._options))
         with one_blas_thread:
             steps = other_sides(best)
         for step in steps:
@@ -146,7 +153,7 @@ class _Search:
 
     def _from(self, solution: Solution, start: Floats) -> Solution | None:
         # Twice what is asked for at last, for the rows are whitened where the first optimum is.
-        return solve_from(solution, start, self._best.cost + INDISTINCT, self._options)
+        return _attempted(partial(solve_from, solution, start, self._best.cost + INDISTINCT, self._options))
 
     def _keep(self, other: Solution | None) -> bool:
         """Keep an optimum if it is nearly as good as the best; whether it is better than all before."""
@@ -157,6 +164,14 @@ class _Search:
         if -2.0 * gain < INDISTINCT:
             self._found.append(other)
         return gain > LEAST_GAIN
+
+
+def _attempted(descent: Callable[[], T]) -> T | None:
+    """What a descent from elsewhere leads to; None where it cannot be made, which is no fault of the first."""
+    try:
+        return descent()
+    except CalibrationError:
+        return None
 
 
 def _moved(solution: Solution, step: Floats) -> Floats:

@@ -9,6 +9,7 @@ from simulated import measure, paper_robot, small_arm, true_robot
 from fg_calib.analysis.restarts import _steps, look_elsewhere
 from fg_calib.analysis.uncertainty import assess
 from fg_calib.analysis.variance_components import solve_job
+from fg_calib.errors import SolverError
 from fg_calib.files.job import read_job
 from fg_calib.files.robot_yaml import read_robot
 from fg_calib.graph import solver
@@ -108,6 +109,20 @@ def test_what_data_see_has_one_optimum_and_costs_nothing_more(tmp_path, monkeypa
     solution = solve_job(read_job(path))
     assert solution.others == ()
     assert assess(solution).trustworthy
+
+
+def test_a_descent_from_elsewhere_that_cannot_be_made_is_no_fault_of_the_first(tmp_path, monkeypatch):
+    """Elsewhere a step may have no solution at all, or noise be lost in rounding."""
+
+    def fail(*_):
+        raise SolverError("the linear system has no unique solution near J1")
+
+    first = solver.solve(problem_of(read_job(pointer(tmp_path, nominal=1e-3, true=0.02))))
+    for name in ("solve_from", "_without_folds"):
+        monkeypatch.setattr(f"fg_calib.analysis.restarts.{name}", fail)
+    found = look_elsewhere(first)
+    assert found.parameters is first.parameters
+    assert found.others == ()
 
 
 @pytest.mark.slow
