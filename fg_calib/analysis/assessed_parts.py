@@ -125,7 +125,7 @@ def _missing_figures(solution: PartsSolution, m: Measurements) -> list[str]:
     if m.pairs is None:
         return []
     missing = [name for name, (n, _) in solution.reduced.squares.items() if not n]
-    texts = [no_figure(m.pairs, solution.options.model, name) for name in missing]
+    texts = [no_figure(m.pairs, solution.options.model, name, "no fitted pair") for name in missing]
     for text in texts:
         _log.warning("%s", text)
     return texts

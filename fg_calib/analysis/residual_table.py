@@ -253,7 +253,9 @@ class ResidualTable(FrozenArrays):
             with np.errstate(invalid="ignore"):
                 rms[family] = np.sqrt(squares / summed(lambda some: first[some].astype(np.float64), mine))
         rows = summed(lambda some: np.ones(len(counted[some]))).astype(np.int64)
-        return rows, summed(lambda some: (self.after[some] / self.sigma[some]) ** 2), rms
+        with np.errstate(divide="ignore", invalid="ignore"):  # of rows that have no sigma
+            chi2 = summed(lambda some: (self.after[some] / self.sigma[some]) ** 2)
+        return rows, chi2, rms
 
     def held_out(self, labels: Sequence[str]) -> dict[tuple[str, str], HeldOut]:
         """Test rows that count, by table and kind of noise; where there are none there is nothing.

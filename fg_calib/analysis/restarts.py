@@ -12,7 +12,8 @@ may end there, bending the whole arm. So it is repeated from the optimum of all 
 and from arms that have the vectors of these the other way (see `other_sides`). Where the rows are explained far too
 badly, nominal may be right between two sides: then it starts from both sides of that.
 
-With a robust loss optima are compared by what the loss has measurements cost: their weights differ.
+With a robust loss optima are compared by what the loss has measurements cost: their weights differ. Those that reject
+have many, and start from that of `gnc` too.
 
 Planes and anchors are tried at their mirror images (see `mirrored`), one after the other from the best optimum so far.
 
@@ -38,7 +39,7 @@ from fg_calib.errors import CalibrationError
 from fg_calib.graph.information import directions
 from fg_calib.graph.noise import NoiseState
 from fg_calib.graph.observability import SIGNAL_FLOOR
-from fg_calib.graph.problem import Problem, noises_at, reweighted_at
+from fg_calib.graph.problem import Problem, assembled, noises_at, reweighted_at
 from fg_calib.graph.solver import Solution, SolverOptions, solve, solve_from, solve_image
 from fg_calib.threads import one_blas_thread
 
@@ -118,7 +119,8 @@ class _Search:
         best, *rest = sorted(self._found, key=lambda one: one.objective)
         told = [best]
         for one in rest:
-            if 2.0 * (one.objective - best.objective) < INDISTINCT and all(_apart(one, other) for other in told):
+            as_good = 2.0 * (one.objective - best.objective) < INDISTINCT
+            if as_good and _is_an_arm(one, best) and all(_apart(one, other) for other in told):
                 told.append(one)
         return replace(best, others=tuple(one.parameters for one in told[1:]), seconds=self._seconds)
 
@@ -127,7 +129,8 @@ class _Search:
         with one_blas_thread:
             steps = _steps(self._first) if self._first.converged else []
             unfolded = _attempted(lambda: _without_folds(self._first, self._options))
-        aside = [] if unfolded is None else [unfolded]
+            rejecting = _attempted(lambda: _by_gnc(self._first, self._options))
+        aside = [start for start in (unfolded, rejecting) if start is not None]
         for start in (*aside, *_beside_nominal(self._first)):
             problem = _attempted(partial(reweighted_at, self._first.problem, start))
             if problem is not None:
@@ -231,6 +234,17 @@ def _without_folds(solution: Solution, options: SolverOptions | None) -> Floats 
     return solve(without(problem, folds, solution.before, state), options).parameters
 
 
+def _by_gnc(solution: Solution, options: SolverOptions | None) -> Floats | None:
+    """The optimum by `gnc`, of losses that have many: these may take good rows for outliers from the start on."""
+    problem = solution.problem
+    if problem.options.loss not in ("cauchy", "geman-mcclure") or problem.n_residuals > MANY_ROWS:
+        return None
+    state = replace(problem.state, weights=None, spread=None)
+    return solve(
+        assembled(problem, solution.before, state, options=replace(problem.options, loss="gnc")), options
+    ).parameters
+
+
 def _beside_nominal(solution: Solution) -> list[Floats]:
     """Parameter vectors a tolerance to either side of nominal, where the rows are explained far too badly.
 
@@ -256,6 +270,13 @@ def _nominal(solution: Solution) -> Floats:
         if parameter.tolerance is not None:
             nominal[i] = parameter.nominal
     return nominal
+
+
+def _is_an_arm(other: Solution, best: Solution) -> bool:
+    """Whether another optimum is another arm: angles a radian away are the same in other words, or of none at all."""
+    angles = [p.unit == "rad" for p in best.problem.robot.parameters]
+    off = (other.parameters - best.parameters)[best.problem.variables.robot_span]
+    return bool(np.all(np.abs(off[angles]) < 1.0))
 
 
 def _apart(a: Solution, b: Solution) -> bool:

@@ -63,12 +63,12 @@ def missing_figures(table: Table) -> list[str]:
     return [no_figure(pairs, table.model, name) for name, use in wanted if use and np.isnan(there[name]).all()]
 
 
-def no_figure(pairs: Pairs, model: str, name: str) -> str:
+def no_figure(pairs: Pairs, model: str, name: str, who: str = "no pair") -> str:
     """That no pair has a figure that the model uses: its column may be misspelt."""
     article, other = {"distance": ("a", "rotation"), "angle": ("an", "distance")}[name]
     unused = f"columns {', '.join(map(escaped, pairs.unused[:_NAMED]))} are not used" if pairs.unused else ""
     asked = f"is a column misspelt ({unused})?" if unused else "is a column misspelt?"
-    found = f"{pairs.source}: no pair has {article} {name}, of which model {model} makes use"
+    found = f"{pairs.source}: {who} has {article} {name}, of which model {model} makes use"
     return f"{found}; {asked} model: {other} says that there is none"
 
 
