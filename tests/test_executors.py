@@ -402,7 +402,8 @@ def test_many_jobs_are_written_to_a_folder_each_and_the_worst_is_the_exit_code(f
     out = tmp_path / "out"
     ended = fg_calib("calibrate", *two_arms, "--out", out, "--json")
     assert ended.code == 1
-    assert "arm2: error: calibration.yaml: model: found 'nonsense', expected one of pose, " in ended.err
+    *_, said = ended.err.splitlines()  # kernels may have been compiled before
+    assert said.startswith("arm2: error: calibration.yaml: model: found 'nonsense', expected one of pose, ")
     found = json.loads(ended.out)
     assert found == json.loads((out / "jobs.json").read_text())
     assert found["schema"] == "fg-calib/jobs/1"

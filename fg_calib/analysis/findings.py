@@ -322,7 +322,7 @@ def _of_model(
 def _other_optima(solution: Solution, most: int = 4) -> list[str]:
     """A line for each other optimum: the parameters that differ most, in their tolerances, with both corrections."""
     robot, found = solution.problem.robot, []
-    advice = "; pairs between which more joints move tell them apart" if solution.problem.pair_series else ""
+    advice = "; positions, or pairs between which more joints move, may tell" if solution.problem.pair_series else ""
     for other in solution.others:
         apart = {p.name: abs(other[i] - solution.parameters[i]) / p.scale for i, p in enumerate(robot.parameters)}
         largest = max(apart.values())

@@ -78,13 +78,7 @@ def weight(loss: Loss, e: Floats, c: Floats | float) -> Floats:
 
 
 def cost(loss: Loss, e: Floats, c: Floats | float) -> Floats:
-    """What a loss has measurements cost, of which `weight` times `e` is the derivative.
-
-    Args:
-        loss: The loss.
-        e: Length of the whitened residual, any shape.
-        c: The loss's constant, of a shape that goes with `e`.
-    """
+    """What a loss has measurements cost: its derivative in `e` is `e` times their `weight`, whose arguments it has."""
     match loss:
         case "none":
             return 0.5 * e**2

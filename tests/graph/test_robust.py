@@ -13,7 +13,7 @@ from tolerances import rounding
 from fg_calib.analysis.uncertainty import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.problem import mahalanobis_distances, reweighted_at
-from fg_calib.graph.robust import EFFICIENCY, HALF_WEIGHT, Weighting, effect, tuning, weight
+from fg_calib.graph.robust import EFFICIENCY, HALF_WEIGHT, Weighting, cost, effect, tuning, weight
 from fg_calib.graph.solver import solve
 from fg_calib.measurements import residuals
 from fg_calib.options import Pairing
@@ -82,6 +82,21 @@ def test_weights_fall_with_the_residual_and_are_half_where_said(loss):
     assert around.tolist() == [1.0, 0.0] if loss == "gnc" else around == pytest.approx([0.5, 0.5], abs=0.01)
 
 
+@pytest.mark.parametrize("loss", LOSSES)
+def test_costs_have_the_weights_as_their_slopes(loss):
+    """By central differences, and for GTSAM's losses by what these say themselves."""
+    c, h = tuning(loss, 2), 1e-6
+    e = np.linspace(0.05, 12.0, 200)
+    e = e[np.abs(e - c) > 2 * h]  # where gnc has its step
+    slope = (cost(loss, e + h, c) - cost(loss, e - h, c)) / (2 * h)
+    assert slope == pytest.approx(weight(loss, e, c) * e, abs=1e-7)  # rounding of the cost, some 70, over the step
+    if loss in GTSAM:
+        theirs = GTSAM[loss].Create(c)
+        assert cost(loss, e, c) == pytest.approx([theirs.loss(one) for one in e], rel=rounding(1, 10))
+    else:
+        assert cost(loss, e, c) == pytest.approx(0.5 * np.minimum(e**2, c**2), rel=rounding(1, 10))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("loss", "model"), diagonal(SMOOTH, ["pose", "distance", "distance-rotation"]))
 def test_the_optimum_is_that_of_gtsams_robust_noise_on_factors_of_one_measurement(loss, model):
@@ -113,6 +128,7 @@ def test_the_optimum_is_that_of_gtsams_robust_noise_on_factors_of_one_measuremen
     sigma = np.sqrt(np.diag(assess(solution).spread.tangent)) / variables.scales
     assert np.max(np.abs(away) / sigma) < 1e-4
     assert graph.error(found) == pytest.approx(graph.error(solution.values), rel=rounding(1, 100))
+    assert solution.objective == pytest.approx(graph.error(solution.values), rel=rounding(1, 1000))  # sums of 40 to 240
     gradient = graph.linearize(solution.values).gradientAtZero()
     assert all(np.all(np.isfinite(gradient.at(k))) for k in variables.keys)
 
