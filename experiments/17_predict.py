@@ -112,7 +112,7 @@ def one_draw(task: Task) -> dict[str, Any]:
     solution = fg_calib.solve(fg_calib.build_problem(scenario.robot, drawn.tables))
     problem = solution.problem
     estimate: Robot = scenario.robot.with_values(solution.parameters[problem.variables.robot_span])
-    measured = problem.data.readings[~problem.data.tested]
+    measured = problem.data.readings[~problem.data.held_out]
     sigma = problem.sigma_joint
     model = ToolErrorModel.of(spread_of(solution), measured, sigma if np.any(sigma > 0.0) else None)
     q, _ = places(task.case, task.n_at)
