@@ -1,5 +1,7 @@
 """A second optimum is looked for where measurements see a combination only curved, and told of."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from jobs import ur5e
@@ -123,6 +125,18 @@ def test_a_descent_from_elsewhere_that_cannot_be_made_is_no_fault_of_the_first(t
     found = look_elsewhere(first)
     assert found.parameters is first.parameters
     assert found.others == ()
+
+
+@pytest.mark.parametrize(("off", "told"), [(0.5, 1), (1.5, 0), (2.0 * np.pi, 0)])
+def test_an_optimum_a_radian_away_is_no_other_arm(tmp_path, monkeypatch, off, told):
+    """Angles half a turn or a whole one away are the same arm in other words, or one that nobody built."""
+    first = solver.solve(problem_of(read_job(pointer(tmp_path, nominal=1e-3, true=0.02))))
+    robot, there = first.problem.robot, first.parameters.copy()
+    there[robot.index("d2")] *= -1.0
+    there[robot.index("theta2")] += off
+    other = replace(first, parameters=there, values=first.problem.variables.values(there))
+    monkeypatch.setattr("fg_calib.analysis.restarts.solve_from", lambda *_: other)
+    assert len(look_elsewhere(first).others) == told
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """Rows that what the parameters may be off bends: the same ones from some pairs as from all of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from simulated import true_robot
@@ -8,6 +10,7 @@ from fg_calib import Measurements, Robot, pose
 from fg_calib.analysis.covariance import spread_of
 from fg_calib.graph import noise
 from fg_calib.graph.build import build_problem
+from fg_calib.graph.problem import noises_at
 from fg_calib.graph.solver import solve
 from fg_calib.robot.inverse import solve_inverse
 
@@ -81,3 +84,22 @@ def test_a_short_test_pair_is_bent_although_no_train_pair_is():
     assert state.spread is not None
     bent = solution.noises[0].bent_by(state.spread, noise.LEAST_BEND)[:, 0]
     assert bent.tolist() == [False] * 39 + [True]
+
+
+def test_a_test_row_is_bent_in_full_where_a_train_row_of_the_same_pair_is_not():
+    """A fit bends a row by its own sigma at most; what checks it has all that the parameters may be off."""
+    solution = solve(long_pairs(short=True))
+    problem = solution.problem
+    (series,), state = problem.data.series, problem.state
+
+    def sigma(test, times):
+        """Of the short pair, where the parameters may be off by so many times as much."""
+        data = replace(problem.data, series=(replace(series, test=test),))
+        wide = replace(problem, data=data, state=replace(state, spread=times * state.spread))
+        return np.sqrt(noises_at(wide, solution.parameters)[0].total_at(np.array([39]))[0, 0, 0])
+
+    # An error that is some times the vector is what is seen of it: the sigma of its length grows with it.
+    assert sigma(series.test, 100.0) == pytest.approx(10.0 * sigma(series.test, 10.0), rel=0.02)
+    none = np.zeros_like(series.test)
+    assert sigma(none, 100.0) == pytest.approx(sigma(none, 10.0), rel=1e-9)
+    assert SIGMA < sigma(none, 10.0) < 1.5 * SIGMA
