@@ -26,7 +26,7 @@ from fg_calib.measurements.kinds import Distance, RotationAngle
 from fg_calib.measurements.moments import Moments, angle_moments, length_moments
 from fg_calib.measurements.residuals import Block, unit_whitening
 from fg_calib.measurements.series import Series
-from fg_calib.robot.kernels import whiten_small
+from fg_calib.robot.kernels import vector_variances, whiten_small
 from fg_calib.robot.kinematics import (
     SPAN,
     Chain,
@@ -369,7 +369,7 @@ class PairNoise(RowNoise):
     def _work_out(self, rows: Integers | slice) -> tuple[Moments, Floats]:
         """`moments_at`, and of pairs formed from poses the variance that is not linear in their errors (else 0)."""
         moments = self._moments(rows)
-        excess, slope, left = (self._narrow(v) for v in (moments.excess, moments.slope, moments.variance))
+        excess, slope, left = moments.excess, moments.slope, moments.variance
         of_bending = np.zeros(left.shape if self.series.formed else (1, left.shape[1]))
         if not self.place.joints_estimated:
             left -= slope**2 * self._diagonals(self._joint_sources, rows)
@@ -526,7 +526,7 @@ class PairNoise(RowNoise):
         return own
 
     def _moments(self, rows: Integers | slice) -> Moments:
-        """Mean and variance of each distance and angle, shapes (n, 2); of no meaning where not wanted."""
+        """Mean and variance of the distances and angles that the kind has, shapes (n, residual_dim)."""
         s, m, factors = self.series, self.place.measurements, self._both**2
         ends, own = s.ends[rows], self._own(rows)
         along, trace = np.zeros_like(own), np.zeros_like(own)
@@ -537,16 +537,9 @@ class PairNoise(RowNoise):
             along = along + (0.0 if self._linear is None else self._linear[rows])
             trace = trace + self._traces[ends].sum(axis=1)
         across = np.maximum(trace - along, 0.0) / 2.0 + self._bending(rows)
-        along, across, own = (np.where(self._wanted, v, 0.0) for v in (along, across, own))
-        lengths, angles = (
-            of(self.predicted[rows, k], along[:, k], across[:, k], own[:, k])
-            for k, of in enumerate((length_moments, angle_moments))
-        )
-        return Moments(
-            np.stack([lengths.excess, angles.excess], axis=1),
-            np.stack([lengths.slope, angles.slope], axis=1),
-            np.stack([lengths.variance, angles.variance], axis=1),
-        )
+        given = (self.predicted[rows], along, across, own)
+        of = [_MOMENTS[k](*(v[:, k] for v in given)) for k in self._parts]
+        return Moments(*(np.stack([getattr(m, name) for m in of], axis=1) for name in ("excess", "slope", "variance")))
 
     def _formed_variance(self) -> Floats:
         """Variance of distances and angles between measured poses, shape (n, 2); nan where not measured."""
@@ -683,21 +676,15 @@ class PairNoise(RowNoise):
         of_some = at, which = self._moved(some, spread)
         everywhere = which.ravel()
         R, p, (turn, shift) = at.rotation[everywhere], at.position[everywhere], np.split(at.jacobian[everywhere], 2, 1)
-        base = turning_of_base(turn, R)  # (3, k)
-        carried = base + common_axes(R) @ (turning_of_points(p, shift) - base)
+        carried = base = turning_of_base(turn, R)  # (3, k)
+        axes = common_axes(R)
+        if axes.any():
+            carried = base + axes @ (turning_of_points(p, shift) - base)
 
         def spread_of(rows: Integers) -> tuple[Floats, Floats]:
             at, which = of_some if np.array_equal(rows, some) else self._moved(rows, spread)
-            (turn, shift), (a, b) = np.split(at.jacobian, 2, axis=1), which.T
-            turn = np.swapaxes(at.rotation, 1, 2) @ (turn - base)
-            shift = shift + _skew(at.position) @ carried
             across, along = np.empty((len(which), 2)), np.empty((len(which), 2))
-            Q = np.swapaxes(at.rotation[a], 1, 2) @ at.rotation[b]
-            directions = at.position[b] - at.position[a], rotation_angle(Q)[1]
-            for k, (u, moved) in enumerate(zip(directions, (shift, turn), strict=True)):
-                change = moved[b] - moved[a]
-                along[:, k] = np.sum((_unit(u)[:, None] @ change)[:, 0] ** 2, axis=1)
-                across[:, k] = np.maximum(np.sum(change**2, axis=(1, 2)) - along[:, k], 0.0) / 2.0
+            vector_variances((at.rotation, at.position, at.jacobian), which, base, carried, across, along)
             return across, along
 
         return spread_of
@@ -723,6 +710,7 @@ class PairNoise(RowNoise):
 
 
 _QUANTITY: dict[type, int] = {Distance: 0, RotationAngle: 1}
+_MOMENTS = (length_moments, angle_moments)
 
 
 def row_noise(series: Series, place: Place, state: NoiseState) -> RowNoise:
@@ -783,14 +771,6 @@ def _trace(sigma: Floats | None, ends: Integers) -> Floats:
         return np.zeros(len(ends))
     both: Floats = np.sum(sigma**2, axis=1)[ends].sum(axis=1)
     return both
-
-
-def _skew(vectors: Floats) -> Floats:
-    """Matrices K with `K w = v x w`, shape (n, 3, 3)."""
-    out = np.zeros((len(vectors), 3, 3))
-    x, y, z = vectors.T
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -z, y, -x
-    return out - np.swapaxes(out, 1, 2)
 
 
 def _unit(vectors: Floats) -> Floats:

@@ -378,9 +378,10 @@ def _part(
         pass
     block = replace(measured, data=data, whitening=whitening)
     offset = None if joint_errors is None else _offset(noise, train, W, joint_errors)
-    E = scipy.sparse.csr_array((n * residual_dim, 0))
     if any(name != "joints" for name in carried):
         E = block_diagonal(W * np.sqrt(np.maximum(diagonal - noise.bare(train), 0.0))[:, None])
+    else:
+        E = scipy.sparse.csr_array((n * residual_dim, 0))
     return Part(block, series.table, number, series.nuisances[train], offset), shares.loading(noise, train, W, masks), E
 
 
@@ -472,26 +473,28 @@ class ErrorColumns:
             sources: Those of the noise's sources that are wanted, of some of the rows perhaps; all if None.
         """
         n, residual_dim = len(rows), noise.series.kind.residual_dim
-        places, columns, figures = [], [], []
+        found, columns = list[Floats](), list[Integers]()  # of each source, as many in each row
         for source in noise.sources if sources is None else sources:
             if masks is not None and not masks[source.name].any():
                 continue
             ends, w = source.loading.shape[2:]
-            flat = source.loading[rows].reshape(n, residual_dim, ends * w)
-            G = (flat if W is None else W @ flat).reshape(n, residual_dim, ends, w)
-            chosen = G != 0.0
+            G = source.loading[rows]
             if masks is not None:
-                chosen &= masks[source.name][:, None, :, None]
+                G = G * masks[source.name][:, None, :, None]
+            flat = G.reshape(n, residual_dim, ends * w)
+            found.append((flat if W is None else W @ flat).reshape(-1, ends * w))
             first = source.ends[rows] * self.width + self._first[source.name]  # (n, ends)
-            row = np.arange(n * residual_dim).reshape(n, residual_dim)
-            places.append(np.broadcast_to(row[:, :, None, None], G.shape)[chosen])
-            columns.append(np.broadcast_to((first[:, :, None] + np.arange(w))[:, None], G.shape)[chosen])
-            figures.append(G[chosen])
+            mine = (first[:, :, None] + np.arange(w)).reshape(n, 1, ends * w)
+            columns.append(np.broadcast_to(mine, flat.shape).reshape(-1, ends * w))
         shape = (n * residual_dim, self.n_errors)
-        if not places:
+        if not found:
             return scipy.sparse.csr_array(shape)
-        triple = (np.concatenate(figures), (np.concatenate(places), np.concatenate(columns)))
-        return scipy.sparse.csr_array(scipy.sparse.coo_array(triple, shape=shape))
+        figures = np.hstack(found)
+        chosen = figures != 0.0
+        starts = np.concatenate([[0], np.cumsum(np.sum(chosen, axis=1))])
+        out = scipy.sparse.csr_array((figures[chosen], np.hstack(columns)[chosen], starts), shape=shape)
+        out.sum_duplicates()
+        return out
 
     def row_set(self, together: Sequence[tuple[Part, Sparse, Sparse]]) -> RowSet:
         """The rows of several series that share errors."""
@@ -510,6 +513,8 @@ class ErrorColumns:
 
 def _stacked(matrices: Sequence[Sparse], *, apart: bool = False) -> Sparse:
     """Sparse matrices one below the other, with the same columns or, `apart`, each with its own."""
+    if len(matrices) == 1:
+        return matrices[0]
     widths = [M.shape[1] * apart for M in matrices]
     rows, figures, first = (
         [0, *np.cumsum(n)] for n in ([M.shape[0] for M in matrices], [M.nnz for M in matrices], widths)

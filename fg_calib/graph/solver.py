@@ -438,7 +438,9 @@ def _fit(problem: Problem, options: SolverOptions, *, near: bool = False) -> _Ru
         # Where nothing moved what whitening anew leaves tells nothing: the next goal is to be nearer than here.
         left = run.left_after(was) if moved else run.here.decrement
         was, n_steps = run.here.decrement, len(run.history)
-        if final and (goal <= run.least if unchanged else not bends and (stands or left <= run.least)):
+        # Rows that are the same to the last figure will be so at the optimum, so near; but weights may change.
+        same = goal <= run.least or (run.converged and not robust)
+        if final and (same if unchanged else not bends and (stands or left <= run.least)):
             run.descend(run.least)
             break
         if run.exhausted:

@@ -155,32 +155,57 @@ def gather(robot: Robot, tables: Sequence[Table], *, predicted: bool = False) ->
         m = table.measurements
         for before in () if predicted else tables[:number]:
             _check_once(table, before)
-        place = np.empty(m.n_configurations, dtype=np.int64)
-        for k, name in enumerate(m.ids.tolist()):
-            other = found.get(name) if m.named else None
-            if other is None:
-                place[k] = len(names)
-                names.append(name if len(tables) == 1 or m.named else f"{name} of {m.source}")
-                if m.named:
-                    found[name] = (number, k)
-                continue
-            of_other = tables[other[0]].measurements
-            if not np.allclose(m.readings[k], of_other.readings[other[1]], rtol=0.0, atol=SAME_READING):
-                expected = f"those of {of_other.source}, or another id"
-                raise ProblemError(m.source, f"other joint readings at id {name}", expected)
-            place[k] = places[other[0]][other[1]] if other[0] < number else place[other[1]]
+        if m.named:
+            places.append(_places_of_named(number, tables, places, names, found))
+        else:
+            places.append(np.arange(len(names), len(names) + m.n_configurations))
+            names += m.ids.tolist() if len(tables) == 1 else [f"{name} of {m.source}" for name in m.ids.tolist()]
         if not np.array_equal(m.sigma_joint, tables[0].measurements.sigma_joint):
             source = tables[0].measurements.source
             raise ProblemError(
                 m.source, "another noise.joint", f"that of {source}: the readings are of the same encoders"
             )
-        places.append(place)
         series += series_of(robot, table, number, unknowns)
     _check_known(tables)
     check_fitted(series, unknowns)
     start_places(robot, tables, series, unknowns)
     series = _without_untouched(series, unknowns.n_coordinates)
     return Dataset(tuple(tables), tuple(series), unknowns, tuple(places), (*names, *unknowns.names))
+
+
+def _places_of_named(
+    number: int,
+    tables: Sequence[Table],
+    places: list[Integers],
+    names: list[str],
+    found: dict[str, tuple[int, int]],
+) -> Integers:
+    """Numbers of a table's configurations: by their names those of earlier ones, or new ones, which are added.
+
+    Args:
+        number: Which table.
+        tables: All of them.
+        places: What this returned for those before.
+        names: Of all configurations so far.
+        found: Table and row where each name stood first.
+
+    Raises:
+        ProblemError: A name stands for two configurations.
+    """
+    m = tables[number].measurements
+    place = np.empty(m.n_configurations, dtype=np.int64)
+    for k, name in enumerate(m.ids.tolist()):
+        other = found.get(name)
+        if other is None:
+            place[k], found[name] = len(names), (number, k)
+            names.append(name)
+            continue
+        of_other = tables[other[0]].measurements
+        if not np.allclose(m.readings[k], of_other.readings[other[1]], rtol=0.0, atol=SAME_READING):
+            expected = f"those of {of_other.source}, or another id"
+            raise ProblemError(m.source, f"other joint readings at id {name}", expected)
+        place[k] = places[other[0]][other[1]] if other[0] < number else place[other[1]]
+    return place
 
 
 def check_repeats(table: Table) -> None:

@@ -115,11 +115,10 @@ def _vector_length(f: Floats, along: Floats, across: Floats) -> Moments:
     relative = np.divide(across, f**2, out=np.zeros_like(f), where=(f > 0.0) & ~near)
     excess, slope, variance = relative * f, 1.0 - relative, along + (across - 2.0 * along) * relative
     folds = (across == 0.0) & (along > 0.0)
-    for rows, moments in (
-        (near, _near_length(f[near], along[near], across[near])),
-        (folds, _fold(f[folds], along[folds])),
-    ):
-        excess[rows], slope[rows], variance[rows] = moments.excess, moments.slope, moments.variance
+    for rows, of in ((near, _near_length), (folds, lambda f, along, _: _fold(f, along))):
+        if rows.any():
+            moments = of(f[rows], along[rows], across[rows])
+            excess[rows], slope[rows], variance[rows] = moments.excess, moments.slope, moments.variance
     return Moments(excess, slope, variance)
 
 
@@ -152,6 +151,8 @@ def _fold(x: Floats, variance: Floats) -> Moments:
     s = np.sqrt(variance)
     excess, slope, left = np.zeros_like(x), np.ones_like(x), variance.astype(np.float64).copy()
     near = (x <= FAR * s) & (s > 0.0)
+    if not near.any():
+        return Moments(excess, slope, left)
     a = x[near] / s[near]
     erf = special.erf(a / np.sqrt(2.0))
     mean = np.sqrt(2.0 / np.pi) * np.exp(-0.5 * a * a) + a * erf
