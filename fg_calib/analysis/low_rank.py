@@ -31,6 +31,9 @@ MOST_WIDE = 64
 WORTH = 3
 """How many times as many rows as columns of U there must be for blocks to take less time than the whole matrix."""
 
+SMALL = 256
+"""Rows of whose whole matrix moments take less time than of its parts."""
+
 
 class LowRank:
     """Covariance `D + L L^T + P S P^T` of standardised residuals.
@@ -64,6 +67,8 @@ class LowRank:
 
     def moments(self, rows: Integers) -> tuple[float, float]:
         """Trace, and trace of the square, of the part at `rows`."""
+        if len(self._d) <= SMALL:
+            return Dense(self._whole).moments(rows)
         wide, narrow = self._by_reach
         P, w, N, p, of_l, d = self._P[rows], wide[rows], narrow[rows], self._p[rows], self._l[rows], self._d[rows]
         both = np.hstack([w, P])
@@ -89,6 +94,12 @@ class LowRank:
         # less what was added: of tr B and tr B^2, B = 1 - (A + floor)^-1 floor
         expected = len(z) - added
         return chi2, expected, expected**2 / (expected - added + squared)
+
+    @cached_property
+    def _whole(self) -> Floats:
+        """The matrix as it stands, shape (n, n)."""
+        A: Floats = np.diag(self._d) + (self._P * self._sign) @ self._P.T + (self._L @ self._L.T).toarray()
+        return A
 
     @cached_property
     def _by_reach(self) -> tuple[Floats, Loadings]:
@@ -153,8 +164,7 @@ class LowRank:
 
     def _whitened_whole(self, z: Floats, floor: Floats) -> tuple[float, float, float]:
         """`z^T (A + F)^-1 z`, and trace and trace of the square of `(A + F)^-1 F`; F has the diagonal `floor`."""
-        A = np.diag(self._d + floor) + (self._P * self._sign) @ self._P.T + (self._L @ self._L.T).toarray()
-        factor = scipy.linalg.cholesky(A, lower=True)
+        factor = scipy.linalg.cholesky(self._whole + np.diag(floor), lower=True)
         white = scipy.linalg.solve_triangular(factor, z, lower=True)
         if not floor.any():
             return float(white @ white), 0.0, 0.0

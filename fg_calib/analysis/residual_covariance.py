@@ -166,11 +166,12 @@ class Nuisances:
     def errors(self, number: int, rows: Integers) -> Errors:
         """What rows of a series follow from."""
         known, N = self._nuisances_known(number, rows)
-        unsaid = np.repeat(self._unsaid[number][rows], len(known.J) // max(len(rows), 1))
-        anywhere = np.where(unsaid, np.nan, 0.0)[:, None]  # a point that no row says anything of
-        L = known.L + N @ self._averaged
-        of_fit = L[:, self._wanted] @ self._felt.T if len(self._wanted) else known.felt
-        return Errors(known.J + anywhere + N @ self._follow, N @ self._inverse, known.private, L, of_fit)
+        J, own, L = known.J, known.own, known.L
+        if N.shape[1]:
+            unsaid = np.repeat(self._unsaid[number][rows], len(J) // max(len(rows), 1))
+            anywhere = np.where(unsaid, np.nan, 0.0)[:, None]  # a point that no row says anything of
+            J, own, L = J + anywhere + N @ self._follow, N @ self._inverse, L + N @ self._averaged
+        return Errors(J, own, known.private, L, L[:, self._wanted] @ self._felt.T if len(self._wanted) else known.felt)
 
     def _nuisances_known(self, number: int, rows: Integers) -> tuple[Errors, Loadings]:
         """The same if nuisances were known; derivatives in these, sparse, shape (n residual_dim, n_coordinates).
@@ -186,11 +187,12 @@ class Nuisances:
         N = scipy.sparse.csr_array((in_nuisances.ravel(), (row, place)), shape=(n * residual_dim, len(self._follow)))
         private = np.maximum(noise.moments_at(rows).variance, 0.0).ravel()
         apart = np.flatnonzero(np.repeat(self._apart[number][rows], residual_dim))
-        column = self._first[number] + (rows[:, None] * residual_dim + np.arange(residual_dim)).ravel()[apart]
-        own = scipy.sparse.csr_array((np.sqrt(private[apart]), (apart, column)), shape=(n * residual_dim, width))
-        private[apart] = 0.0
         L = self._columns.loading(noise, rows)
-        L = scipy.sparse.csr_array((L.data, L.indices, L.indptr), shape=own.shape) + own
+        L = scipy.sparse.csr_array((L.data, L.indices, L.indptr), shape=(n * residual_dim, width))
+        if len(apart):
+            column = self._first[number] + (rows[:, None] * residual_dim + np.arange(residual_dim)).ravel()[apart]
+            L = L + scipy.sparse.csr_array((np.sqrt(private[apart]), (apart, column)), shape=L.shape)
+            private[apart] = 0.0
         none = np.zeros((n * residual_dim, 0))
         return Errors(of_core, none, private, L, none), N
 

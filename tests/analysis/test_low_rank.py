@@ -57,9 +57,10 @@ def test_rows_in_one_long_chain_are_whitened_as_a_whole(monkeypatch):
     np.testing.assert_allclose(covariance.whitened(z)[0], z @ np.linalg.solve(A, z), rtol=1e-12)
 
 
-@pytest.mark.parametrize("most", [0, low_rank.MOST_WIDE])
-def test_moments_are_the_traces_of_the_matrix_and_of_its_square(monkeypatch, most):
-    """Of some of the rows, with errors of many rows set apart or not."""
+@pytest.mark.parametrize(("small", "most"), [(0, 0), (0, low_rank.MOST_WIDE), (N, 0)])
+def test_moments_are_the_traces_of_the_matrix_and_of_its_square(monkeypatch, small, most):
+    """Of some of the rows: as it stands, or with errors of many rows set apart or not."""
+    monkeypatch.setattr(low_rank, "SMALL", small)
     monkeypatch.setattr(low_rank, "MOST_WIDE", most)
     rng = np.random.default_rng(3)
     covariance, rows = star(rng), np.sort(rng.choice(N, 50, replace=False))
