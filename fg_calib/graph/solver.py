@@ -55,6 +55,9 @@ Floats = NDArray[np.float64]
 FAIR_SHARE = 0.25
 """Share of the promised decrease of the cost that an undamped step must bring."""
 
+SURE = 4.0
+"""How many times the share that whitening anew left the last time the next one may leave."""
+
 SHORTER = 0.5
 """Share of a step that the next one may be, where the cost does not judge."""
 
@@ -477,7 +480,10 @@ def _stride(run: _Run, bends: int) -> int:
         if there.decrement > max(SHORTER * here.decrement, there.rounding):
             return bends
         run.arrive(anew, there)
-        left, bends = run.left_after(here.decrement), max(bends - 1, 0) if anew.state.spread is not None else 0
+        left = run.left_after(here.decrement)
+        if there.decrement > run.least:  # one more step, of which whitening anew would leave the same share as of this
+            left *= min(1.0, SURE * there.decrement / here.decrement)
+        bends = max(bends - 1, 0) if anew.state.spread is not None else 0
     if left <= run.least:
         run.descend(run.least)
     return bends
