@@ -434,8 +434,9 @@ class _Part:
         looked_at = np.flatnonzero(expected > 1e-3)
         limit = ALARM / max(1, len(looked_at))
         # No effective number of degrees of freedom is below 1, where the tail is heaviest.
+        least = 2.0 * special.erfcinv(limit) ** 2
         found = []
-        for k in looked_at[special.gammaincc(0.5, 0.5 * chi2[looked_at] / expected[looked_at]) < limit]:
+        for k in looked_at[chi2[looked_at] > least * expected[looked_at]]:
             nu = max(1.0, self.degrees(np.flatnonzero(((a == k) | (b == k))[self.rows])))
             ratio = chi2[k] / expected[k]
             if special.gammaincc(nu / 2.0, nu / 2.0 * ratio) < limit:

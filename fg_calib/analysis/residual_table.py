@@ -287,9 +287,9 @@ class ResidualTable(FrozenArrays):
         begins = np.flatnonzero(first[rows])
         squares, in_sigma = (np.add.reduceat(v[rows] ** 2, begins) for v in (self.after, self.after / self.sigma))
         d = np.diff(np.append(begins, len(rows)))
-        n = len(d)
-        typical = max(float(np.median(in_sigma / special.chdtri(d, 0.5))), 1.0)
-        far = in_sigma > typical * special.chdtri(d, CHANCE / n)
+        n, (degrees, of) = len(d), np.unique(d, return_inverse=True)  # of very many measurements few
+        typical = max(float(np.median(in_sigma / special.chdtri(degrees, 0.5)[of])), 1.0)
+        far = in_sigma > typical * special.chdtri(degrees, CHANCE / n)[of]
         if not far.any() or np.sum(far) > MOST_FEW * n:
             return (), float(np.sqrt(squares.sum() / n))
         worst = np.flatnonzero(far)[np.argsort(-in_sigma[far], kind="stable")]
