@@ -55,9 +55,6 @@ Floats = NDArray[np.float64]
 FAIR_SHARE = 0.25
 """Share of the promised decrease of the cost that an undamped step must bring."""
 
-SURE = 4.0
-"""How many times the share that whitening anew left the last time the next one may leave."""
-
 SHORTER = 0.5
 """Share of a step that the next one may be, where the cost does not judge."""
 
@@ -441,8 +438,8 @@ def _fit(problem: Problem, options: SolverOptions, *, near: bool = False) -> _Ru
         # Where nothing moved what whitening anew leaves tells nothing: the next goal is to be nearer than here.
         left = run.left_after(was) if moved else run.here.decrement
         was, n_steps = run.here.decrement, len(run.history)
-        # Rows that are the same to the last figure will be so at the optimum, so near; but weights may change.
-        same = goal <= run.least or (run.converged and not robust)
+        # Rows that steps longer than what is left have not changed will be the same there; but weights may change.
+        same = goal <= run.least or (moved and run.converged and not robust)
         if final and (same if unchanged else not bends and (stands or left <= run.least)):
             run.descend(run.least)
             break
@@ -480,10 +477,7 @@ def _stride(run: _Run, bends: int) -> int:
         if there.decrement > max(SHORTER * here.decrement, there.rounding):
             return bends
         run.arrive(anew, there)
-        left = run.left_after(here.decrement)
-        if there.decrement > run.least:  # one more step, of which whitening anew would leave the same share as of this
-            left *= min(1.0, SURE * there.decrement / here.decrement)
-        bends = max(bends - 1, 0) if anew.state.spread is not None else 0
+        left, bends = run.left_after(here.decrement), max(bends - 1, 0) if anew.state.spread is not None else 0
     if left <= run.least:
         run.descend(run.least)
     return bends
