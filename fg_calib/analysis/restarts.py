@@ -8,9 +8,9 @@ estimate, from two tolerances (two sigma if that is more) to either side. The be
 data cannot tell from it is told of.
 
 Distances and angles near 0, and angles near half a turn, fold: where nominal has a pair on the other side, the descent
-may end there, bending the whole arm. So it is repeated from arms that have the vectors of rows that tolerances may fold
-the other way (see `other_sides`). Where the rows are explained far too badly, nominal may be right between two sides:
-then it starts from both sides of that.
+may end there, bending the whole arm. So it is repeated from the optimum of all rows but those that tolerances may fold,
+and from arms that have the vectors of these the other way (see `other_sides`). Where the rows are explained far too
+badly, nominal may be right between two sides: then it starts from both sides of that.
 
 With a robust loss optima are compared by what the loss has measurements cost: their weights differ. Those that reject
 have many, and start from that of `gnc` too.
@@ -33,12 +33,13 @@ from numpy.typing import NDArray
 
 from fg_calib.analysis.covariance import spread_of
 from fg_calib.analysis.mirrored import mirror_images
-from fg_calib.analysis.other_sides import other_sides
+from fg_calib.analysis.other_sides import MUCH, folds_of, other_sides, without
 from fg_calib.arguments import checked
 from fg_calib.errors import CalibrationError
 from fg_calib.graph.information import directions
+from fg_calib.graph.noise import NoiseState
 from fg_calib.graph.observability import SIGNAL_FLOOR
-from fg_calib.graph.problem import Problem, assembled, reweighted_at
+from fg_calib.graph.problem import Problem, assembled, noises_at, reweighted_at
 from fg_calib.graph.solver import Solution, SolverOptions, solve, solve_from, solve_image
 from fg_calib.threads import one_blas_thread
 
@@ -65,10 +66,12 @@ LEAST_GAIN = 0.01
 """Cost by which a mirror image must be better to be taken: as good ones stay on the side that the start chose."""
 
 MAX_ROWS = 20_000
-"""Beyond this many residuals only the mirror image is tried: a descent takes seconds, and so many rows see much."""
+"""Beyond this many residuals only the mirror image is tried: a descent takes seconds, and so many rows see much. With a
+robust loss, whose descents are many, beyond `MANY_ROWS`."""
 
-MAX_ROBUST_ROWS = 2000
-"""The same with a robust loss, whose descents are many."""
+
+MANY_ROWS = 2000
+"""Beyond so many residuals rows that may fold are left out only where chi-square is so much above their number."""
 
 FAR_OFF = 10.0
 """Chi-square over the number of residuals that no arm near the optimum has."""
@@ -122,11 +125,12 @@ class _Search:
         return replace(best, others=tuple(one.parameters for one in told[1:]), seconds=self._seconds)
 
     def from_other_starts(self) -> None:
-        """Descents from beside nominal, and from along directions that are weak or seen by a square."""
+        """Descents from without what may fold, and from along directions that are weak or seen by a square."""
         with one_blas_thread:
             steps = _steps(self._first) if self._first.converged else []
+            unfolded = _attempted(lambda: _without_folds(self._first, self._options))
             rejecting = _attempted(lambda: _by_gnc(self._first, self._options))
-        aside = [] if rejecting is None else [rejecting]
+        aside = [start for start in (unfolded, rejecting) if start is not None]
         for start in (*aside, *_beside_nominal(self._first)):
             problem = _attempted(partial(reweighted_at, self._first.problem, start))
             if problem is not None:
@@ -195,7 +199,7 @@ def _steps(solution: Solution) -> list[Floats]:
     if curved.any():
         steps.append(-2.0 * scales * (V_nominal[:, curved] @ (moved[curved] / (1.0 - ratio[curved]))))
     weak = V[:, (s < WEAK) & (s > SIGNAL_FLOOR)]
-    if weak.size and problem.n_residuals <= (MAX_ROWS if problem.options.loss == "none" else MAX_ROBUST_ROWS):
+    if weak.size and problem.n_residuals <= (MAX_ROWS if problem.options.loss == "none" else MANY_ROWS):
         signs = np.random.default_rng(0).choice([-1.0, 1.0], len(scales))
         # Two tolerances or sigma, whichever is more: the same whatever basis the weak directions have.
         far = np.minimum(FAR / np.minimum(s[(s < WEAK) & (s > SIGNAL_FLOOR)], 1.0), _reaches(problem, weak))
@@ -212,10 +216,28 @@ def _reaches(problem: Problem, directions: Floats) -> Floats:
     return np.maximum(out, FAR)
 
 
+def _without_folds(solution: Solution, options: SolverOptions | None) -> Floats | None:
+    """The optimum of all rows but those that tolerances may fold at nominal; None if there are none, or no others.
+
+    Of very many rows no single one bends an arm: then only where chi-square is too large.
+    """
+    problem, nominal = solution.problem, _nominal(solution)
+    if not problem.pair_series or (problem.n_residuals > MANY_ROWS and not _is_far(solution, MUCH)):
+        return None
+    state = NoiseState(factors=problem.state.factors)
+    folds = folds_of(noises_at(replace(problem, state=state), nominal), problem.variables.prior_scales)
+    n_folded = sum(int(np.sum(mine)) for mine in folds)
+    if not 0 < n_folded < problem.n_residuals:
+        return None
+    if problem.state.joint_errors is not None:
+        state = replace(state, joint_errors=np.zeros_like(problem.state.joint_errors))
+    return solve(without(problem, folds, solution.before, state), options).parameters
+
+
 def _by_gnc(solution: Solution, options: SolverOptions | None) -> Floats | None:
     """The optimum by `gnc`, of losses that have many: these may take good rows for outliers from the start on."""
     problem = solution.problem
-    if problem.options.loss not in ("cauchy", "geman-mcclure") or problem.n_residuals > MAX_ROBUST_ROWS:
+    if problem.options.loss not in ("cauchy", "geman-mcclure") or problem.n_residuals > MANY_ROWS:
         return None
     state = replace(problem.state, weights=None, spread=None)
     return solve(
@@ -229,12 +251,16 @@ def _beside_nominal(solution: Solution) -> list[Floats]:
     Nominal may be where two sides of a fold meet: no derivative leads away from there.
     """
     problem, variables = solution.problem, solution.problem.variables
-    is_far = 2.0 * solution.objective > FAR_OFF * problem.n_residuals
-    if not problem.pair_series or problem.n_residuals > MAX_ROWS or not is_far:
+    if not problem.pair_series or problem.n_residuals > MAX_ROWS or not _is_far(solution, FAR_OFF):
         return []
     signs = np.random.default_rng(0).choice([-1.0, 1.0], variables.n_columns)
     there = replace(solution, parameters=(nominal := _nominal(solution)), values=variables.values(nominal))
     return [_moved(there, sign * signs * variables.prior_scales) for sign in (1.0, -1.0)]
+
+
+def _is_far(solution: Solution, factor: float) -> bool:
+    """Whether chi-square is so many times the number of rows."""
+    return 2.0 * solution.objective > factor * solution.problem.n_residuals
 
 
 def _nominal(solution: Solution) -> Floats:
