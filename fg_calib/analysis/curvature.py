@@ -89,8 +89,9 @@ def beyond_linear(solution: Solution, spread: Spread) -> Curvature:
         c = np.array([moved(draw) for draw in draws])
     except SolverError:
         return Curvature(np.inf, np.inf, np.inf)
-    variance = np.sum(root**2, axis=1)
-    of_each = np.divide(np.mean(c**2, axis=0), variance, out=np.zeros(n_columns), where=variance > 0.0)
+    named = np.nan_to_num(spread.variables.named_derivative(solution.parameters))
+    variance = np.sum((named @ root) ** 2, axis=1)
+    of_each = np.divide(np.mean((c @ named.T) ** 2, axis=0), variance, out=np.zeros(n_columns), where=variance > 0.0)
     worst, names = int(np.argmax(of_each)), spread.variables.names
     return Curvature(
         sums=float(np.mean((c @ in_sigma.T) ** 2)),

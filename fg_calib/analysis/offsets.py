@@ -35,10 +35,13 @@ class Offset:
 
 
 def forgotten_offsets(solution: Solution) -> tuple[Offset, ...]:
-    """Offsets that were not estimated and are no chance; none with robust losses, or of more rows than `MAX_ROWS`."""
+    """Offsets that were not estimated and are no chance; none of more rows than `MAX_ROWS`.
+
+    With a robust loss, which cuts residuals off, noise counts as stated at least.
+    """
     problem = solution.problem
     tables = [k for k, table in enumerate(problem.data.tables) if table.model == "anchor" and not table.offset]
-    if not tables or problem.n_residuals > MAX_ROWS or problem.state.weights is not None or problem.has_more:
+    if not tables or problem.n_residuals > MAX_ROWS or problem.has_more:
         return ()
     at, found = at_parameters(problem, solution.parameters), []
     column = at.n_columns + at.n_nuisance
@@ -53,7 +56,8 @@ def forgotten_offsets(solution: Solution) -> tuple[Offset, ...]:
         if not new.shape[1] or fit.dof < 2:
             continue
         along, left = float(new[:, 0] @ fit.r), float(fit.r @ fit.r)
-        variance = max(left - along**2, 1e-300) / (fit.dof - 1)
+        least = 1e-300 if problem.state.weights is None else 1.0
+        variance = max((left - along**2) / (fit.dof - 1), least)
         if special.fdtrc(1, fit.dof - 1, along**2 / variance) < CERTAIN:
             per_metre = float(new[: len(fit.J), 0] @ fit.J[:, column])
             found.append(Offset(number, -along / per_metre, float(np.sqrt(variance)) / abs(per_metre)))

@@ -745,7 +745,7 @@ def whitening_of(covariance: Floats, used: Booleans) -> Floats:
     C, mine = (np.require(given, requirements=["C", "W"]) for given in (covariance, used))  # as the kernel takes them
     if not all(over_spans(lambda start, stop: whiten_small(C, mine, start, stop, W), len(used))):
         found = "lost in rounding beside what errors of the joint readings do"
-        hint = "is a length of the arm or of a table far too large, or that noise far too small?"
+        hint = "is noise.joint or a length of the arm or of a table far too large, or other noise far too small?"
         raise InputError("noise", found, "figures nearer to each other", hint)
     return W
 

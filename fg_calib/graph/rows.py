@@ -272,9 +272,14 @@ def whitened_rows(
 
 
 def share_errors(noises: Sequence[RowNoise]) -> bool:
-    """Whether errors of configurations reach more than one train measurement."""
+    """Whether errors of configurations that are not estimated reach more than one train measurement."""
     shares = ErrorColumns(noises, sharing=True, estimated=False)
-    return any(shares.mask(source)[noise.series.train].any() for noise in noises for source in noise.sources)
+    return any(shares.mask(source)[noise.series.train].any() for noise in noises for source in _not_estimated(noise))
+
+
+def _not_estimated(noise: RowNoise) -> tuple[Source, ...]:
+    """The sources of a series' noise but for estimated joint errors, which count as shared whatever is asked."""
+    return tuple(s for s in noise.sources if not (noise.place.joints_estimated and s.name == "joints"))
 
 
 def correlation_of(noises: Sequence[RowNoise], rows: Sequence[RowSet], at: At, follow: Floats) -> Floats:
@@ -282,22 +287,22 @@ def correlation_of(noises: Sequence[RowNoise], rows: Sequence[RowSet], at: At, f
 
     Args:
         noises: The rows of all series and their noise.
-        rows: The whitened train rows, a set for each series that has any.
+        rows: The whitened train rows.
         at: Where the derivatives J are wanted; C is the covariance of the whitened rows.
         follow: How the nuisance variables follow the core, shape (n_nuisance, n_columns): in J they do.
     """
     shares = ErrorColumns(noises, sharing=True, estimated=False)
     n, own = at.n_columns, np.zeros((at.n_columns, at.n_columns))
     common = np.zeros((shares.n_errors, n))
-    with_train = [noise for noise in noises if len(noise.series.train)]
-    for noise, row_set in zip(with_train, rows, strict=True):
-        (part,), train, residual_dim = row_set.parts, noise.series.train, noise.series.kind.residual_dim
+    for part in (part for row_set in rows for part in row_set.parts):
+        noise = noises[part.series]
+        sources, train, residual_dim = _not_estimated(noise), noise.series.train, noise.series.kind.residual_dim
         wide = np.concatenate(list(part.linearise(at)))
         J = wide[:, :n] + wide[:, n:-1] @ follow
         W = whitener_of(noise, part)
-        masks = {source.name: shares.mask(source)[train] for source in noise.sources}
-        common += shares.loading(noise, train, W, masks).T @ J
-        for source in noise.sources:
+        masks = {source.name: shares.mask(source)[train] for source in sources}
+        common += shares.loading(noise, train, W, masks, sources).T @ J
+        for source in sources:
             G = np.einsum("nhk,nkew->nhew", W, source.loading[train] * masks[source.name][:, None, :, None])
             each = np.einsum("nhew,nhp->newp", G, J.reshape(len(train), residual_dim, n)).reshape(-1, n)
             own += each.T @ each

@@ -266,7 +266,7 @@ def _check_once(table: Table, other: Table) -> None:
     do so by chance, where instruments round.
     """
     mine, others = _measured_by(table), _measured_by(other)
-    for words in mine.keys() & others.keys():
+    for words in sorted(mine.keys() & others.keys()):
         a, b = ({row.tobytes() for row in np.round(rows, 9) + 0.0} for rows in (mine[words], others[words]))
         if 2 * len(a & b) > min(len(a), len(b)):
             a_source, b_source = table.measurements.source, other.measurements.source

@@ -431,7 +431,7 @@ def vector_variances(poses, ends, base, carried, across, along):  # type: ignore
             u[c], axis[c] = position[b, c] - position[a, c], 0.0
             for k in range(3):  # of A^T B in A
                 axis[c] += A[k, e] * B[k, d] - A[k, d] * B[k, e]
-        to_u, to_axis = _inverse_length(u), _inverse_length(axis)
+        to_u, to_axis = _inverse_length(u, 0.0), _inverse_length(axis, 1e-14)  # below is the rounding of rotations
         across[m] = 0.0
         along[m] = 0.0
         for j in range(moved.shape[2]):
@@ -447,8 +447,10 @@ def vector_variances(poses, ends, base, carried, across, along):  # type: ignore
 
 
 @inlined
-def _inverse_length(v):  # type: ignore[no-untyped-def]
-    return 1.0 / max(np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]), 1e-300)
+def _inverse_length(v, least):  # type: ignore[no-untyped-def]
+    """Zero for a vector that has no direction, being no longer than `least`."""
+    length = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    return 1.0 / length if length > least else 0.0
 
 
 @inlined

@@ -7,10 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from simulated import small_arm, true_robot
 
-from fg_calib import Measurements, calibrate, pose
+from fg_calib import Measurements, Robot, calibrate, pose
 from fg_calib.analysis import curvature
+from fg_calib.analysis.covariance import spread_of
 from fg_calib.analysis.curvature import Curvature, beyond_linear
 from fg_calib.analysis.verdict import of_curvature
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.solver import solve
 
 WIDE = {"a": 1e-2, "d": 1e-2, "alpha": 1e-2, "theta": 1e-2}
 SAID = "bend within what they leave unknown"
@@ -175,3 +178,22 @@ def test_true_errors_are_beyond_their_covariance_by_as_much(n, sigma, model):
         np.mean(seen),
         np.mean(expected),
     )
+
+
+def test_what_bends_of_a_frame_is_named_as_it_is_reported():
+    """A frame's columns are its turns, then its shifts; its names are x, y, z, yaw, pitch, roll. A shift bends here."""
+    rows = [
+        *([0.0, -np.pi / 2, 0.1, -np.pi / 2], [0.0, -np.pi / 2, 0.1, -np.pi / 2], [0.0, 0.0, 0.1, 0.0]),
+        *([0.0, np.pi / 2, 0.0, 0.0], [0.0, 0.0, 0.05, 0.0]),
+    ]
+    tolerance = {"a": 1e-3, "d": 1e-3, "alpha": 2e-3, "theta": 2e-3}
+    robot = Robot.from_dh(rows, types=["prismatic"] * 3 + ["revolute"] * 2, tolerance=tolerance)
+    rng, sigma, world = np.random.default_rng(0), 1e-6, Rotation.from_euler("xyz", [0.3, 0.2, 0.5])
+    true, q = true_robot(robot, rng), rng.uniform([0.0, 0.0, 0.0, -2.0, -2.0], [1.0, 1.0, 1.0, 2.0, 2.0], (400, 5))
+    at = pose(true, q)
+    noise = Rotation.from_rotvec(sigma * rng.normal(size=(400, 3))).as_matrix()
+    position = at.position @ world.as_matrix().T + sigma * rng.normal(size=(400, 3))
+    measured = {"position": position, "rotation": world.as_matrix() @ at.rotation @ noise}
+    m = Measurements.from_arrays(q, **measured, sigma_position=sigma, sigma_orientation=sigma)
+    solution = solve(build_problem(robot, m, model="pose", frame="unknown"))
+    assert beyond_linear(solution, spread_of(solution)).name in ("frame.x", "frame.y", "frame.z")

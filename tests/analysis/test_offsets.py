@@ -39,6 +39,21 @@ def test_a_forgotten_offset_is_a_reservation_with_its_size():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("offset", "least", "most"), [(0.0, 0, 0), (5e-3, 8, 12)])
+def test_a_robust_loss_hides_no_forgotten_offset(offset, least, most):
+    """Of 12 tables with gross errors; the loss takes a part of what the offset does to the lengths for outliers."""
+    n = 0
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        robot, table = lengths(rng, offset)
+        m = table.measurements
+        gross = 0.03 * rng.normal(size=len(m.length)) * (rng.random(len(m.length)) < 0.08)
+        table = replace(table, measurements=replace(m, length=m.length + gross))
+        n += len(forgotten_offsets(solve(build_problem(robot, [table], loss="gnc"))))
+    assert least <= n <= most
+
+
+@pytest.mark.slow
 def test_lengths_without_one_have_none():
     """40 tables, CERTAIN of which by chance each."""
     rng = np.random.default_rng(2)

@@ -11,6 +11,7 @@ from fg_calib.analysis.uncertainty import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.problem import reweighted_at
 from fg_calib.graph.solver import solve, solve_from
+from fg_calib.measurements.dataset import rotation_angle
 
 SIGMA, TOLERANCE = 1e-4, 5e-3
 
@@ -169,3 +170,53 @@ def test_the_side_that_wide_pairs_see_is_found_from_the_other(seed, n_wide, loss
     a3 = found.parameters["a3"]
     assert a3.estimate == pytest.approx(true[robot.index("a3")], abs=5 * a3.sigma)
     assert found.assessed[0].others == ()
+
+
+WRIST = [
+    *([0.0, np.pi / 2, 0.3, 0.0], [0.4, 0.0, 0.0, 0.0], [0.03, np.pi / 2, 0.0, 0.0]),
+    *([0.0, -np.pi / 2, 0.4, 0.0], [0.0, np.pi / 2, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]),
+]
+GANTRY = [
+    *([0.0, -np.pi / 2, 0.1, -np.pi / 2], [0.0, -np.pi / 2, 0.1, -np.pi / 2], [0.0, 0.0, 0.1, 0.0]),
+    *([0.0, np.pi / 2, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]),
+]
+
+
+def one_joint_a_pair(rows, n_prismatic, *, seed, n, length, angle, model):
+    """An arm of which each pair moves one joint: many a length that nominal has at 0 is the radius of a circle."""
+    rng, sigma, turning = np.random.default_rng(seed), 1e-5, len(rows) - n_prismatic
+    types = ["prismatic"] * n_prismatic + ["revolute"] * turning
+    tolerance = {"a": length, "d": length, "tool": length, "alpha": angle, "theta": angle}
+    robot = Robot.from_dh(rows, types=types, estimate=["tool.x", "tool.z"], tolerance=tolerance)
+    off = np.array([(p.tolerance or 0.0) * p.estimated for p in robot.parameters])
+    true = robot.nominal + off * rng.normal(size=len(off))
+    low, high = np.array([0.0] * n_prismatic + [-2.5] * turning), np.array([0.4] * n_prismatic + [2.5] * turning)
+    a, moved, each = rng.uniform(low, high, (n, len(rows))), rng.integers(0, len(rows), n), np.arange(n)
+    b = a.copy()
+    b[each, moved] = rng.uniform(low, high, (n, len(rows)))[each, moved]
+    at = [pose(robot.with_values(true), q) for q in (a, b)]
+    distance = np.abs(np.linalg.norm(at[1].position - at[0].position, axis=1) + sigma * rng.normal(size=n))
+    pairs = {"a": each, "b": n + each, "distance": distance, "sigma_distance": sigma}
+    if model == "distance-rotation":
+        turn = rotation_angle(np.swapaxes(at[0].rotation, 1, 2) @ at[1].rotation)[0]
+        pairs |= {"angle": np.abs(turn + sigma * rng.normal(size=n)), "sigma_angle": sigma}
+    return robot, Measurements.from_arrays(np.concatenate([a, b]), pairs=pairs)
+
+
+@pytest.mark.parametrize("seed", [7, 56, 67])
+def test_a_start_without_what_may_fold_is_needed(seed):
+    """Of 20 distances: without it chi-square is 750 to 27 000, and 7 of 200 such arms end at another optimum."""
+    robot, m = one_joint_a_pair(WRIST, 0, seed=seed, n=20, length=1e-3, angle=1e-3, model="distance")
+    solution = look_elsewhere(solve(build_problem(robot, m, model="distance")))
+    assert solution.converged
+    assert 2.0 * solution.objective < 60.0
+
+
+@pytest.mark.parametrize("seed", [100, 108, 110])
+def test_starts_beside_nominal_are_needed(seed):
+    """Of a gantry whose head has its lengths at 0: without them a third of 120 such arms has a chi-square above 1e5."""
+    given = {"seed": seed, "n": 40, "length": 1e-2, "angle": 1e-2, "model": "distance-rotation"}
+    robot, m = one_joint_a_pair(GANTRY, 3, **given)
+    solution = look_elsewhere(solve(build_problem(robot, m, model="distance-rotation")))
+    assert solution.converged
+    assert 2.0 * solution.objective < 160.0  # of 80 rows

@@ -214,7 +214,7 @@ def test_near_the_optimum_rows_are_linearised_once_for_every_time_that_they_are_
 
 @pytest.mark.parametrize("off", [0.0, 0.2, 3.0])
 def test_rows_that_are_whitened_at_the_optimum_leave_nothing_to_go(problem, off):
-    """Also where the start is so near that no step is taken before they are whitened anew, as they are there already."""
+    """Also where the start is so near that no step is taken before they are whitened anew as they were."""
     expected = solve(problem)
     there = displaced(problem, expected, off / np.sqrt(problem.variables.n_columns))
     found = solve(reweighted_at(problem, there))

@@ -15,7 +15,7 @@ from sparing import diagonal
 from test_own_kind import measured
 from touches import corners, touch
 
-from fg_calib import Measurements, read_job, write_robot
+from fg_calib import Measurements, Robot, read_job, write_robot
 from fg_calib.analysis.uncertainty import assess
 from fg_calib.analysis.variance_components import estimate_noise
 from fg_calib.errors import InputError, ProblemError
@@ -597,3 +597,23 @@ def test_test_rows_have_no_say_in_the_fit(model, apart):
     sigma = np.sqrt(np.diag(assess(fitted).spread.tangent))
     step = fitted.problem.variables.step(fitted.values, beside.values) / sigma
     assert np.abs(step).max() < 1e-6
+
+
+def test_estimated_joint_errors_of_two_tables_are_shared_whatever_is_asked():
+    """Of direct pairs they are all that is shared: counted as independent they end in the same covariance."""
+    rng, rows = np.random.default_rng(0), [[0.4, 0.3, 0.2, 0.0], [0.3, -1.2, 0.1, 0.0], [0.5, 0.7, 0.1, 0.0]]
+    robot = Robot.from_dh(rows, tolerance={"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3})
+
+    def chain(source):
+        q, a = rng.uniform(-2.0, 2.0, (30, 3)), np.arange(29)
+        p = pose(robot, q).position
+        distance = np.linalg.norm(p[1:] - p[:-1], axis=1) + 1e-4 * rng.normal(size=29)
+        pairs = {"a": a, "b": a + 1, "distance": distance, "sigma_distance": 1e-4}
+        return Table(Measurements.from_arrays(q, pairs=pairs, sigma_joint=1e-4, source=source), "distance")
+
+    tables = [chain("one"), chain("two")]
+    found = [
+        assess(solve(build_problem(robot, tables, encoder="estimated", pair_errors=asked))).covariance
+        for asked in ("shared", "independent")
+    ]
+    assert found[1] == pytest.approx(found[0], rel=1e-9, abs=1e-20)

@@ -58,7 +58,8 @@ def test_variances_are_those_of_moved_vectors():
 
 def test_vectors_of_no_length_have_no_direction():
     """All of their variance is across."""
-    R, p = np.eye(3)[None].repeat(2, axis=0), np.ones((2, 3))
+    turn = Rotation.from_rotvec([0.3, -0.5, 0.7]).as_matrix()  # whose products round
+    R, p = turn[None].repeat(2, axis=0), np.ones((2, 3))
     moved = np.zeros((2, 6, 1))
     moved[1] = np.array([[0.1], [0.2], [0.2], [1.0], [2.0], [2.0]])
     across, along = np.empty((1, 2)), np.empty((1, 2))
