@@ -449,17 +449,6 @@ def test_a_result_of_an_earlier_run_stays_where_a_job_fails_and_is_called_so(fg_
     assert [EARLIER in (one.error or "") for one in calibrate_into(orders)] == [True, False]
 
 
-def test_so_is_that_of_one_job(fg_calib, two_arms, tmp_path):
-    """The line says so where there is one, and only there."""
-    ended = fg_calib("calibrate", two_arms[1], "--out", tmp_path)
-    assert (ended.code, "earlier run" in ended.err) == (1, False)
-    (tmp_path / "result.json").write_text("{}")
-    ended = fg_calib("calibrate", two_arms[1], "--out", tmp_path)
-    assert ended.code == 1
-    assert ended.err.splitlines()[-1].endswith("; the result in its folder is of an earlier run")
-    assert (tmp_path / "result.json").read_text() == "{}"
-
-
 def test_lines_say_of_which_rows_they_are_where_that_is_not_the_same_for_all():
     def printed(*of_test):
         jobs = [JobSummary(f"arm{k}", "a.yaml", "good", of_test=of) for k, of in enumerate(of_test)]

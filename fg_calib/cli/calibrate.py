@@ -95,19 +95,13 @@ def _written(orders: Sequence[Order]) -> Callable[[], str]:
 
 def _calibrate_one(order: Order, n_rows: int | None, executor: Executor | None, as_json: bool) -> None:
     """Calibrate one job, its table in parts of so many rows unless that is None."""
-    from fg_calib.batch import EARLIER, ordered_job, ordered_parts, save_ordered, saved_in
+    from fg_calib.batch import ordered_job, ordered_parts, save_ordered
     from fg_calib.calibration import calibrate_job, calibrate_parts
-    from fg_calib.errors import CalibrationError
 
-    try:
-        if n_rows is None:
-            found = calibrate_job(ordered_job(order), executor)
-        else:
-            found = calibrate_parts(ordered_parts(order, n_rows), executor)
-    except CalibrationError as error:
-        if saved_in([order]) == [None]:
-            raise
-        raise CalibrationError(f"{error}; {EARLIER}") from error
+    if n_rows is None:
+        found = calibrate_job(ordered_job(order), executor)
+    else:
+        found = calibrate_parts(ordered_parts(order, n_rows), executor)
     try:
         show_calibration(found, as_json)
     finally:  # also where nobody takes the report
