@@ -77,9 +77,7 @@ class _Start:
         self._frames = {int(v.symbol[2:-1]): v for v in variables.frames}
 
     def all_tables(self) -> None:
-        """Fill in what each table says, if anything is to be found."""
-        if not (self._frames or self._turn or self._shift.any() or len(self.places)):
-            return
+        """Fill in what each table says."""
         bare = self._robot.nominal
         bare[self._tool] = 0.0
         chain = build_chain(self._robot.with_values(bare))
