@@ -69,7 +69,6 @@ MAX_ROWS = 20_000
 """Beyond this many residuals only the mirror image is tried: a descent takes seconds, and so many rows see much. With a
 robust loss, whose descents are many, beyond `MANY_ROWS`."""
 
-
 MANY_ROWS = 2000
 """Beyond so many residuals rows that may fold are left out only where chi-square is so much above their number."""
 

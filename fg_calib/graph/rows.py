@@ -485,7 +485,7 @@ class ErrorColumns:
             ends, w = source.loading.shape[2:]
             G = source.loading[rows]
             if masks is not None:
-                G = G * masks[source.name][:, None, :, None]
+                G = np.where(masks[source.name][:, None, :, None], G, 0.0)
             flat = G.reshape(n, residual_dim, ends * w)
             found.append((flat if W is None else W @ flat).reshape(-1, ends * w))
             first = source.ends[rows] * self.width + self._first[source.name]  # (n, ends)

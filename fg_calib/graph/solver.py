@@ -406,7 +406,7 @@ def _fit(problem: Problem, options: SolverOptions, *, near: bool = False) -> _Ru
     """
     robust = problem.options.loss != "none"
     weighting = Weighting(problem.options.loss)
-    run, goal, was, n_steps = _Run(problem, options), COARSE, np.inf, 0
+    run, goal, was = _Run(problem, options), COARSE, np.inf
     bends = SPREAD_ROUNDS if problem.pair_series and problem.state.spread is None else 0
     if near:
         bends = _stride(run, bends)
@@ -415,7 +415,7 @@ def _fit(problem: Problem, options: SolverOptions, *, near: bool = False) -> _Ru
             return run
     if robust:
         run.go_on_with(reweighted_at(problem, problem.start, _learn(problem, problem.start, weighting)[0]))
-    tries = FOLDED_TRIES if problem.pair_series else 0
+    tries, n_steps = FOLDED_TRIES if problem.pair_series else 0, len(run.history)
     while run.descend(goal, FOLDED_STEPS if tries else None) or robust or tries:
         tries -= not run.converged and tries > 0
         state, final = _learn(run.problem, run.parameters, weighting)
