@@ -182,7 +182,7 @@ def _seen_board(problem: Problem, number: int, q: Floats) -> tuple[Floats, Float
     if table.fixed_camera:
         poses = forward(build_chain(robot), precompute_trig(robot, q))
         frame = next((v for v in problem.variables.frames if v.symbol == f"X({number})"), None)
-        X = pose_of(np.zeros(6) if frame is None else problem.start[list(frame.parameters)])
+        X = pose_of(np.zeros(6) if frame is None else problem.start[frame.places])
         turn, shift = X.rotation().matrix(), X.translation()
         return turn @ poses.rotation, poses.position @ turn.T + shift
     seen = at_configurations(robot, table, q, places_of(problem, problem.start), "boards").measurements
@@ -214,7 +214,7 @@ def _alone(whole: Problem, number: int, table: Table) -> Problem:
     x = v.nominal()
     x[v.robot_span] = start[whole.variables.robot_span]
     for frame in v.frames:
-        x[list(frame.parameters)] = start[list(_frame(whole, number).parameters)]
+        x[frame.places] = start[_frame(whole, number).places]
     for name in zip(data.unknowns.letters, data.unknowns.names, strict=True):
         there, here = (coordinates_of(p, d.unknowns, name) for p, d in ((whole.variables, whole.data), (v, data)))
         if there is not None and here is not None:

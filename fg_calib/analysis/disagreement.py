@@ -132,9 +132,9 @@ class RoughFit:
         """The start of a problem of the same tables with base, tool and measurement frames where they were fitted."""
         start, fitted = problem.start.copy(), self.problem.variables
         start[problem.variables.robot_span] = self.parameters[fitted.robot_span]
-        frames = {v.symbol: self.parameters[list(v.parameters)] for v in fitted.frames}
+        frames = {v.symbol: self.parameters[v.places] for v in fitted.frames}
         for v in problem.variables.frames:
-            start[list(v.parameters)] = frames[v.symbol]
+            start[v.places] = frames[v.symbol]
         return start
 
 

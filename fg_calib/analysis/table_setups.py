@@ -58,7 +58,7 @@ def check_tables(
     """
     whole, variables = problem.whole or problem, problem.variables
     robot = whole.robot.with_values(before[variables.robot_span])
-    frame_of_table = {v.symbol: before[list(v.parameters)] for v in variables.frames}
+    frame_of_table = {v.symbol: before[v.places] for v in variables.frames}
     checks, setups, frames = [], [], []
     for number, (name, table) in enumerate(zip(problem.data.labels, problem.data.tables, strict=True)):
         if table.model is None:

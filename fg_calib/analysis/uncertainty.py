@@ -365,7 +365,7 @@ def frame_estimates(variables: Variables, parameters: Floats, whole: TangentCova
     """
     found = []
     for k, v in enumerate(variables.frames):
-        world_T_base = pose_of(parameters[list(v.parameters)])
+        world_T_base = pose_of(parameters[v.places])
         first = whole.variables.n_robot_columns + 6 * k
         found.append(
             FrameEstimate(

@@ -151,7 +151,7 @@ class _Table:
         """world_T_base of the table."""
         p = self._problem
         frame = next(v for v in p.variables.frames if v.symbol == f"X({self._number})")
-        found = pose_of(p.start[list(frame.parameters)])
+        found = pose_of(p.start[frame.places])
         return Placement(found.rotation().matrix(), found.translation())
 
     def _known(self, letter: str, name: str) -> Floats:

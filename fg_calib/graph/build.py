@@ -232,7 +232,7 @@ def true_problem(
             start[place] = places[name]
     for v, name in zip(variables.frames, frame_names(data, variables), strict=True):
         if name in places:
-            start[list(v.parameters)] = places[name]
+            start[v.places] = places[name]
     return problem_at(robot, data, options, variables, start)
 
 

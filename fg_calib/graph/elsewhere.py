@@ -105,7 +105,7 @@ def places_of(problem: Problem, parameters: Floats) -> dict[tuple[str, str], Flo
     unknowns, coordinates = problem.data.unknowns, problem.variables.at(parameters).coordinates
     parts = np.split(coordinates, np.cumsum(unknowns.sizes)[:-1]) if unknowns.sizes else []
     places = dict(zip(zip(unknowns.letters, unknowns.names, strict=True), parts, strict=True))
-    frames = [parameters[list(v.parameters)] for v in problem.variables.frames]
+    frames = [parameters[v.places] for v in problem.variables.frames]
     return places | dict(zip(frame_names(problem.data, problem.variables), frames, strict=True))
 
 

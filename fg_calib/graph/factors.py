@@ -78,6 +78,11 @@ class Variable:
     scales: tuple[float, ...] = ()
     prior: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
+    @cached_property
+    def places(self) -> NDArray[np.int64]:
+        """`parameters` to index with."""
+        return np.array(self.parameters, dtype=np.int64)
+
     @property
     def is_pose(self) -> bool:
         """Whether it is a Pose3; else it is a vector."""
@@ -209,7 +214,7 @@ class Variables(Brief):
         """GTSAM's values at a parameter vector."""
         values, off = gtsam.Values(), gtsam.VectorValues()
         for v in self.items + self.nuisance:
-            chosen = parameters[list(v.parameters)]
+            chosen = parameters[v.places]
             if v.kind == "own":
                 off.insert(v.key, chosen)
             else:
@@ -222,7 +227,7 @@ class Variables(Brief):
         """The parameter vector at GTSAM's values; what is not a variable (or not in `only`) keeps its nominal value."""
         parameters = self.nominal()
         for v in self.items + self.nuisance if only is None else only:
-            of_v = list(v.parameters)
+            of_v = v.places
             if v.kind == "own":
                 parameters[of_v] = local_coordinates(self.own, values, v.key)
             elif v.is_pose:
@@ -236,7 +241,7 @@ class Variables(Brief):
         """The parameter vector after a tangent step of the core, shape (n_columns,)."""
         after = parameters.copy()
         for v in self.items:
-            of_v, part = list(v.parameters), step[v.columns]
+            of_v, part = v.places, step[v.columns]
             if not v.is_pose:
                 after[of_v] += part
             elif part.any():
@@ -339,7 +344,7 @@ class Variables(Brief):
         D = np.eye(self.n_columns)
         for v in self.items:
             if v.is_pose:
-                D[v.columns, v.columns] = _frame_derivative(parameters[list(v.parameters)])
+                D[v.columns, v.columns] = _frame_derivative(parameters[v.places])
         return D
 
     def tangent_derivative(self, parameters: Floats) -> Floats:
@@ -350,7 +355,7 @@ class Variables(Brief):
         E = np.eye(self.n_columns)
         for v in self.items:
             if v.is_pose:
-                E[v.columns, v.columns] = _tangent_derivative(parameters[list(v.parameters)])
+                E[v.columns, v.columns] = _tangent_derivative(parameters[v.places])
         return E
 
     def describe(self, key: int) -> str:
@@ -604,14 +609,15 @@ def factor_columns(
     """
     there = set(variables.coordinates[coordinates.ravel()].tolist())
     nuisance = tuple(v for v in variables.nuisance if there.intersection(v.parameters))
-    items = (variables.items if with_core else ()) + nuisance
-    local, chosen, column = [], [np.zeros(0, dtype=np.int64)], 0
-    for v in items:
+    core = variables.items if with_core else ()
+    column = variables.n_columns if with_core else 0
+    local, chosen = list(core), [np.arange(column)]  # the core's columns come first
+    for v in nuisance:
         width = v.columns.stop - v.columns.start
         local.append(replace(v, columns=slice(column, column + width)))
         chosen.append(np.arange(v.columns.start, v.columns.stop))
         column += width
-    return local, np.concatenate(chosen), items
+    return local, np.concatenate(chosen), core + nuisance
 
 
 def dense(linear: gtsam.GaussianFactorGraph, keys: list[int]) -> tuple[Floats, Floats]:
@@ -738,7 +744,7 @@ def prior_rows(variables: Variables, parameters: Floats, only: Variable | None =
         stated, weight = variables.stated[v.symbol]
         if not stated:
             continue
-        of_v, rows = list(v.parameters), slice(first, first + len(stated))
+        of_v, rows = v.places, slice(first, first + len(stated))
         if v.is_pose:
             off, D = _off_nominal(parameters[of_v], nominal[of_v])
         else:
@@ -783,7 +789,7 @@ def unknown_prior_rows(variables: Variables, parameters: Floats) -> tuple[Floats
             mean, sigma = (np.array(figures) for figures in v.prior)
             rows = np.zeros((len(sigma), variables.n_columns + variables.n_nuisance))
             rows[:, v.columns] = np.diag(1.0 / sigma)
-            r.append((parameters[list(v.parameters)] - mean) / sigma)
+            r.append((parameters[v.places] - mean) / sigma)
             J.append(rows)
     return np.concatenate(r), np.vstack(J)
 
@@ -791,7 +797,7 @@ def unknown_prior_rows(variables: Variables, parameters: Floats) -> tuple[Floats
 def _prior_factor(variables: Variables, variable: Variable, n_rows: int) -> gtsam.NonlinearFactor:
     """GTSAM's own, which calls no Python, of a vector all of which has a prior; of poses, and of parts, ours."""
     if not variable.is_pose and n_rows == len(variable.parameters):
-        mean, sigma = variables.nominal()[list(variable.parameters)], 1.0 / variables.stated[variable.symbol][1]
+        mean, sigma = variables.nominal()[variable.places], 1.0 / variables.stated[variable.symbol][1]
         return gtsam.PriorFactorVector(variable.key, mean, gtsam.noiseModel.Diagonal.Sigmas(sigma))
     local = Variable(
         variable.key, variable.symbol, variable.kind, variable.parameters, slice(0, len(variable.parameters))

@@ -175,7 +175,7 @@ class Knowledge(FrozenArrays):
         values, before = parameters[own.robot_span], self.robot.nominal
         s, turned = np.zeros(n + len(self.at)), np.eye(n)
         for v in own.items:
-            of_v = list(v.parameters)
+            of_v = v.places
             if v.is_pose:
                 step = gtsam.Pose3.Logmap(pose_of(before[of_v]).between(pose_of(values[of_v])))
                 s[v.columns], turned[v.columns, v.columns] = step, gtsam.Pose3.LogmapDerivative(step)

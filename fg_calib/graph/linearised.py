@@ -41,7 +41,8 @@ class Linearised:
             A, b = dense(problem.graph.linearize(values), variables.keys)
             left = eliminate(A, b, variables.n_columns)
             self._sizes = variables.prior_scales
-            tall = np.vstack([left.A * self._sizes, np.zeros((len(self._sizes),) * 2)])  # so that Vt is square
+            scaled, n = left.A * self._sizes, len(self._sizes)
+            tall = np.vstack([scaled, np.zeros((max(n - len(scaled), 0), n))])  # so that Vt is square
             U, s, Vt = np.linalg.svd(tall, full_matrices=False)
         rank = determined(s)
         along = U[: len(left.b), :rank].T @ left.b

@@ -283,7 +283,7 @@ class RowNoise:
         """
         return residuals.rows_of(self.as_measured, rows)
 
-    @property
+    @cached_property
     def as_measured(self) -> Block:
         """All rows as they were measured."""
         s, p = self.series, self.place
@@ -520,9 +520,9 @@ class PairNoise(RowNoise):
         """Variance of some distances and angles as measured, 0 where not wanted, shape (m, 2)."""
         if self._formed is not None:
             return self._formed[rows]
-        sigma = np.nan_to_num(self.series.sigma[rows])
+        sigma = self.series.sigma[rows]
         own = np.zeros((len(sigma), 2))
-        own[:, self._parts] = sigma**2 * self.factors**2
+        own[:, self._parts] = np.where(np.isnan(sigma), 0.0, sigma**2 * self.factors**2)
         return own
 
     def _moments(self, rows: Integers | slice) -> Moments:
@@ -626,7 +626,9 @@ class PairNoise(RowNoise):
         train = np.flatnonzero(~self.series.test)
         if not len(train):
             return train, np.zeros((0, 2))
-        some, spread_of = np.union1d(_evenly(train), self._easily_bent(train)), self._spread_by(spread)
+        spread_of, some = self._spread_by(spread), train
+        if len(train) > _SOME:
+            some = np.union1d(_evenly(train), self._easily_bent(train))
         of_some = BEND_MARGIN * spread_of(some)[0]
         most, found, variances = 4.0 * of_some.max(axis=0), [train[:0]], [np.zeros((0, 2))]
         for start in range(0, self.series.n, SPAN):
@@ -644,8 +646,6 @@ class PairNoise(RowNoise):
 
     def _easily_bent(self, train: Integers) -> Integers:
         """Some of the train rows: those that the least variance across bends."""
-        if len(train) <= _SOME:
-            return train
         least = np.empty(self.series.n)
         for start in range(0, len(least), SPAN):
             rows = slice(start, start + SPAN)
@@ -756,7 +756,7 @@ def _over_rows(run: Callable[[slice], None], n: int) -> None:
         pass
 
 
-_SOME = 100
+_SOME = 500
 """Rows that stand for many."""
 
 

@@ -93,7 +93,7 @@ class Problem(FrozenArrays):
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take over a state, and make GTSAM's objects of it."""
         super().__setstate__(state)
-        graph = _graph_of(self)
+        graph = _graph_of(self, self.rows)
         initial = self.variables.values(self.start)
         self.__dict__.update(graph=graph, factors=gtsam.NonlinearFactorGraph(graph), initial=initial)
 
@@ -246,17 +246,18 @@ def assembled(problem: Problem, start: Floats, state: NoiseState | None = None, 
     if p.state.spread is not None and not any(noise.bends for noise in noises):
         # Test rows may be shorter than any train row.
         p = p if any(s.test.any() for s in p.pair_series) else replace(p, state=replace(p.state, spread=None))
-    bare = replace(p, rows=_row_sets(p, noises), initial=p.variables.values(start))
-    graph = _graph_of(bare)
-    return replace(bare, graph=graph, factors=gtsam.NonlinearFactorGraph(graph))
+    rows = _row_sets(p, noises)
+    graph = _graph_of(p, rows)
+    factors, initial = gtsam.NonlinearFactorGraph(graph), p.variables.values(start)
+    return replace(p, rows=rows, initial=initial, graph=graph, factors=factors)
 
 
-def _graph_of(problem: Problem) -> gtsam.NonlinearFactorGraph:
-    """The rows, the priors and what somebody added as factors; rows that depend on no variable are none."""
+def _graph_of(problem: Problem, rows: tuple[RowSet, ...]) -> gtsam.NonlinearFactorGraph:
+    """Rows, a problem's priors and what somebody added as factors; rows that depend on no variable are none."""
     graph = gtsam.NonlinearFactorGraph()
-    for rows in problem.rows:
-        if depends(rows, problem.variables):
-            graph.add(row_factor(rows, problem.variables))
+    for row_set in rows:
+        if depends(row_set, problem.variables):
+            graph.add(row_factor(row_set, problem.variables))
     for factor in (*prior_factors(problem.variables), *known_factors(problem), *problem.added):
         graph.add(factor)
     return graph

@@ -266,8 +266,8 @@ def whitened_rows(
         for i, noise in enumerate(noises)
         if len(noise.series.train)
     ]
-    together = [(part, L, E) for part, L, E in gathered if L.nnz]
-    alone = [RowSet((part,)) for part, L, _ in gathered if not L.nnz]
+    together = [(part, *shared) for part, shared in gathered if shared and shared[0].nnz]
+    alone = [RowSet((part,)) for part, shared in gathered if not (shared and shared[0].nnz)]
     return (*alone, shares.row_set(together)) if together else tuple(alone)
 
 
@@ -342,8 +342,8 @@ def whitener_of(noise: RowNoise, part: Part) -> Floats:
 
 def _part(
     number: int, noise: RowNoise, shares: ErrorColumns, joint_errors: Floats | None, weights: Floats | None
-) -> tuple[Part, Sparse, Sparse]:
-    """The train rows of a series; how they follow from shared errors; E of `RowSet.spare`."""
+) -> tuple[Part, tuple[Sparse, Sparse] | None]:
+    """The train rows of a series; how they follow from errors that they share, if any, and E of `RowSet.spare`."""
     series, train = noise.series, noise.series.train
     n, residual_dim = len(train), series.kind.residual_dim
     masks = {source.name: shares.mask(source)[train] for source in noise.sources}
@@ -383,11 +383,14 @@ def _part(
         pass
     block = replace(measured, data=data, whitening=whitening)
     offset = None if joint_errors is None else _offset(noise, train, W, joint_errors)
+    part = Part(block, series.table, number, series.nuisances[train], offset)
+    if not carried:
+        return part, None
     if any(name != "joints" for name in carried):
         E = block_diagonal(W * np.sqrt(np.maximum(diagonal - noise.bare(train), 0.0))[:, None])
     else:
         E = scipy.sparse.csr_array((n * residual_dim, 0))
-    return Part(block, series.table, number, series.nuisances[train], offset), shares.loading(noise, train, W, masks), E
+    return part, (shares.loading(noise, train, W, masks), E)
 
 
 def _at(values: Floats | float, rows: Integers) -> Floats | float:

@@ -518,13 +518,18 @@ class _Run:
         self._options = options
         self._damping = FIRST_DAMPING
         self._last: tuple[Linearised, Floats] | None = None  # where the last step began, and that step
-        with in_one_line(problem.variables):
-            self.initial_cost = problem.graph.error(problem.initial)
+        try:
+            self.here = Linearised(problem, problem.initial)
+            self.initial_cost = self.here.cost
+        except SolverError:
+            with in_one_line(problem.variables):
+                self.initial_cost = problem.graph.error(problem.initial)
+            if np.isfinite(self.initial_cost):
+                raise
         if not np.isfinite(self.initial_cost):
             raise SolverError(
                 f"the cost at the start is {self.initial_cost}: the measurements or the robot hold absurd numbers"
             )
-        self.here = Linearised(problem, problem.initial)
 
     @property
     def parameters(self) -> Floats:

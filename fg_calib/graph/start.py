@@ -233,7 +233,7 @@ class _Start:
 
     def _put(self, number: int, X: Frame) -> None:
         if number in self._frames:
-            self.parameters[list(self._frames[number].parameters)] = _coordinates(X)
+            self.parameters[self._frames[number].places] = _coordinates(X)
 
 
 def _spread_out(board: Integers, good: Booleans) -> Booleans:

@@ -78,16 +78,21 @@ class Block(Brief):
 
 def pack(whitening: Floats) -> Floats:
     """Lower triangles, shape (n, d, d) with d the residual_dim, row by row: shape (n, d * (d + 1) / 2)."""
-    rows, columns = np.tril_indices(whitening.shape[1])
+    rows, columns = _lower(whitening.shape[1])
     return np.ascontiguousarray(whitening[:, rows, columns])
 
 
 def unpack(whitening: Floats, residual_dim: int) -> Floats:
     """What `pack` packed, shape (n, residual_dim, residual_dim)."""
-    rows, columns = np.tril_indices(residual_dim)
+    rows, columns = _lower(residual_dim)
     out = np.zeros((len(whitening), residual_dim, residual_dim))
     out[:, rows, columns] = whitening
     return out
+
+
+@cache
+def _lower(residual_dim: int) -> tuple[Integers, Integers]:
+    return np.tril_indices(residual_dim)
 
 
 def unit_whitening(n: int, residual_dim: int) -> Floats:
@@ -213,7 +218,6 @@ def _n_columns(block: Block, chain: Chain) -> int:
 def _panels(block: Block, chain: Chain, start: int, stop: int) -> Iterator[tuple[int, int, Floats]]:
     """First and last measurement and the panel of each chunk; lanes without a measurement are zero."""
     arrays, twins = chain.arrays, block.kind.twins()
-    free = chain.without_columns()
     size = min(CHUNK, -(-(stop - start) // LANES) * LANES)
     whole = np.zeros((_n_columns(block, chain) + 1, block.residual_dim, size))
     for first in range(start, stop, size):
@@ -222,7 +226,7 @@ def _panels(block: Block, chain: Chain, start: int, stop: int) -> Iterator[tuple
         panel = whole if width == size else np.zeros((*whole.shape[:2], width))
         ends = np.ascontiguousarray(block.ends[first:last])
         data, whitening = (np.array(a[first:last], order="C") for a in (block.data, block.whitening))
-        given = _NOTHING if len(twins) else _given(block, free, slice(first, last))
+        given = _NOTHING if len(twins) else _given(block, chain, slice(first, last))
         fill(arrays, block.trig, ends, data, whitening, twins, given, _turning(block, chain, ends), panel)
         yield first, last, panel
 
@@ -230,7 +234,7 @@ def _panels(block: Block, chain: Chain, start: int, stop: int) -> Iterator[tuple
 def _given(block: Block, chain: Chain, rows: slice) -> tuple[Floats, Floats, Floats]:
     """Residuals and derivatives in frames and nuisances, by the kind's numpy."""
     ends = block.ends[rows]
-    at = forward(chain, block.trig, ends.ravel())
+    at = forward(chain.without_columns(), block.trig, ends.ravel())
     frames = Frames(at.rotation.reshape(*ends.shape, 3, 3), at.position.reshape(*ends.shape, 3))
     return checked_rows(block.kind, frames, block.data[rows], block.nuisances[rows], block.source)
 

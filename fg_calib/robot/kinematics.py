@@ -77,7 +77,9 @@ class Chain(Brief):
         The six further values are those of the measurement frame, in the order of `FRAME_KINDS`.
         """
         value = self.constant + self.sign * np.where(self.source >= 0, parameters[self.source], 0.0)
-        return replace(self, value=value)
+        there = replace(self, value=value)
+        there.__dict__["_turns"] = self._turns  # which values do not change
+        return there
 
     def without_columns(self) -> Chain:
         """The same chain with no derivatives."""
@@ -100,10 +102,11 @@ class Chain(Brief):
             column=self.column,
             n_columns=self.n_columns,
             n_own=self.n_joints if self.joint_columns else 0,
-            turns=self._turns(),
+            turns=self._turns,
             basis=self.basis,
         )
 
+    @cached_property
     def _turns(self) -> NDArray[np.bool_]:
         """For each column, joints included, whether it belongs to a rotation, shape (n_columns + n_joints,)."""
         turns = np.zeros(self.n_columns + self.n_joints, dtype=np.bool_)
