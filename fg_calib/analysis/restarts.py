@@ -72,6 +72,9 @@ robust loss, whose descents are many, beyond `MANY_ROWS`."""
 MANY_ROWS = 2000
 """Beyond so many residuals rows that may fold are left out only where chi-square is so much above their number."""
 
+MOST_SIDES = 8
+"""Optima, as good as each other, from which mirror images and other sides are looked for, at most."""
+
 FAR_OFF = 10.0
 """Chi-square over the number of residuals that no arm near the optimum has."""
 
@@ -115,13 +118,18 @@ class _Search:
 
     def outcome(self) -> Solution:
         """The best, with those that are as good."""
+        best, *rest = self._told()
+        return replace(best, others=tuple(one.parameters for one in rest), seconds=self._seconds)
+
+    def _told(self) -> list[Solution]:
+        """The best, and those that are as good, each once."""
         best, *rest = sorted(self._found, key=lambda one: one.objective)
         told = [best]
         for one in rest:
             as_good = 2.0 * (one.objective - best.objective) < INDISTINCT
             if as_good and _is_an_arm(one, best) and all(_apart(one, other) for other in told):
                 told.append(one)
-        return replace(best, others=tuple(one.parameters for one in told[1:]), seconds=self._seconds)
+        return told
 
     def from_other_starts(self) -> None:
         """Descents from without what may fold, and from along directions that are weak or seen by a square."""
@@ -138,20 +146,29 @@ class _Search:
             self._keep(self._from(self._first, _moved(self._first, step)))
 
     def from_images(self) -> None:
-        """Descents from mirror images and from vectors' other sides, one after the other from the best so far."""
-        while any(self._keep(other) for other in self._images()):
-            pass
+        """Descents from mirror images and from vectors' other sides: of the best so far, then of those as good.
 
-    def _images(self) -> Iterator[Solution | None]:
-        best = self._best
-        if best.problem.options.loss == "none":
-            most = best.cost + 0.5 * INDISTINCT
-            for image in mirror_images(best):
-                yield _attempted(partial(solve_image, best, image.problem, image.before, most, self._options))
+        What is mirrored in two ways has four sides, and from each only some of the others may be one step away.
+        """
+        looked_from, n_as_good = list[Solution](), 0
+
+        def new(one: Solution) -> bool:
+            return all(was.objective - one.objective > LEAST_GAIN or _apart(one, was) for was in looked_from)
+
+        while n_as_good < MOST_SIDES and (here := next(filter(new, self._told()), None)) is not None:
+            looked_from.append(here)
+            better = any(self._keep(other) for other in self._images(here))
+            n_as_good = 0 if better else n_as_good + 1
+
+    def _images(self, here: Solution) -> Iterator[Solution | None]:
+        if here.problem.options.loss == "none":
+            most = self._best.cost + 0.5 * INDISTINCT
+            for image in mirror_images(here):
+                yield _attempted(partial(solve_image, here, image.problem, image.before, most, self._options))
         with one_blas_thread:
-            steps = other_sides(best)
+            steps = other_sides(here)
         for step in steps:
-            yield self._from(best, _moved(best, step))
+            yield self._from(here, _moved(here, step))
 
     def _from(self, solution: Solution, start: Floats) -> Solution | None:
         # Twice what is asked for at last, for the rows are whitened where the first optimum is.

@@ -519,7 +519,8 @@ class _Run:
         self._damping = FIRST_DAMPING
         self._last: tuple[Linearised, Floats] | None = None  # where the last step began, and that step
         try:
-            self.here = Linearised(problem, problem.initial)
+            with np.errstate(over="ignore"):
+                self.here = Linearised(problem, problem.initial)
             self.initial_cost = self.here.cost
         except SolverError:
             with in_one_line(problem.variables):

@@ -74,6 +74,9 @@ def test_of_two_lengths_the_true_sides_are_among_those_told_of(seed, tilt):
     told = np.array([x[both] for x in (solution.parameters, *solution.others)])
     assert len(told) > 1
     assert np.min(np.max(np.abs(told - lengths), axis=1)) < 5 * SIGMA  # some two sigma of single lengths
+    if tilt == 0.0:  # then the mirror image of an arm explains all as well, whichever of them rounding calls the best
+        mirrored = np.max(np.abs(told[:, None] + told[None]), axis=2).min(axis=1)
+        assert np.all(mirrored < SIGMA)
     from_truth = solve_from(solution, true, np.inf)
     assert from_truth is None or from_truth.cost >= solution.cost - 0.01
 

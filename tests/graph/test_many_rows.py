@@ -52,7 +52,7 @@ def test_a_start_from_some_rows_leads_to_the_optimum_of_all(problem, monkeypatch
     found = solve(problem)
     assert found.converged
     assert found.history[0].decrement < 0.1 * expected.history[0].decrement  # it began nearer
-    assert found.initial_cost == expected.initial_cost
+    assert found.initial_cost == pytest.approx(expected.initial_cost, rel=1e-12)  # the same, summed in another order
     sigma = np.sqrt(np.diag(assess(expected).covariance))
     change = (found.parameters - expected.parameters)[problem.variables.robot_span]
     estimated = [p.estimated for p in problem.robot.parameters]
