@@ -9,7 +9,7 @@ results stay as they are, so that `--only fg_calib` (a minute) is all it takes a
 The works are those of `side_by_side/works.py`, how a peer is run and timed stands in `side_by_side/protocol.py`, and
 what is called of each in `side_by_side/in_*.py`. Packages are installed into virtual environments of their own in
 `--cache`, which need some minutes, 2 GB and a package index the first time. One that does not install, or cannot do a
-work, says why. Every process has one BLAS thread, and about `--cap` seconds of processors for a work. On a machine that
+work, says why. Every process has one BLAS thread, and about `--cap` seconds for a work. On a machine that
 others use read the processor time: the clock counts what they did.
 
 Expected: fg_calib within 1 % of the optimum on every work; figaroh within 10 % of it, 0.4 s for 60 poses; robotkinecal
@@ -426,7 +426,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", nargs="+", default=(), help="peers whose names have one of these, and the optimum")
     parser.add_argument("--works", dest="works_wanted", nargs="+", default=(), choices=tuple(HOW), help="these alone")
     parser.add_argument("--draws", type=int, default=20, help="of simulated arms")
-    parser.add_argument("--cap", type=float, default=120.0, help="processor seconds for a peer on a work")
+    parser.add_argument("--cap", type=float, default=120.0, help="seconds for a peer on a work")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args(arguments)
     print(describe(run(**vars(given))))

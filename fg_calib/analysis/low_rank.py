@@ -63,6 +63,8 @@ class LowRank:
 
     def at(self, rows: Integers) -> LowRank:
         """The part at some rows."""
+        if are_all(rows, len(self._d)):
+            return self
         return LowRank(self._P[rows], self._L[rows], self._d[rows], self._sign)
 
     def moments(self, rows: Integers) -> tuple[float, float]:
@@ -189,6 +191,11 @@ class Dense:
         """Trace, and trace of the square, of the part at `rows`."""
         A = self._A[np.ix_(rows, rows)]
         return float(np.trace(A)), float(np.sum(A * A))
+
+
+def are_all(rows: Integers, n: int) -> bool:
+    """Whether chosen rows are all of n, in their order."""
+    return len(rows) == n and np.array_equal(rows, np.arange(n))
 
 
 def times(L: Loadings, by: Floats) -> Loadings:

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from fg_calib.analysis.low_rank import Loadings, LowRank, squares_of_rows, times
+from fg_calib.analysis.low_rank import Loadings, LowRank, are_all, squares_of_rows, times
 from fg_calib.graph.information import eliminated, felt
 from fg_calib.graph.noise import RowNoise
 from fg_calib.graph.problem import Problem, at_parameters, says_where
@@ -87,6 +87,8 @@ class Errors:
 
     def at(self, rows: Integers) -> Errors:
         """Those of some rows."""
+        if are_all(rows, len(self.private)):
+            return self
         return Errors(self.J[rows], self.own[rows], self.private[rows], self.L[rows], self.felt[rows])
 
     def over(self, sigma: Floats) -> Errors:
@@ -98,6 +100,8 @@ class Errors:
     @classmethod
     def of_all(cls, parts: Sequence[Errors]) -> Errors:
         """Those of several rows, one after the other."""
+        if len(parts) == 1:
+            return parts[0]
         J, own, private, felt = (
             np.concatenate([getattr(part, name) for part in parts]) for name in ("J", "own", "private", "felt")
         )
