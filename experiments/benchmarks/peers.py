@@ -429,6 +429,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--cap", type=float, default=120.0, help="seconds for a peer on a work")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args(arguments)
+    if unknown := [word for word in given.only if not any(word in peer.name for peer in PEERS)]:
+        parser.error(f"--only: no peer is called {', '.join(unknown)}; there are {', '.join(p.name for p in PEERS)}")
     print(describe(run(**vars(given))))
     return 0
 

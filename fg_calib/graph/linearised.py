@@ -39,6 +39,8 @@ class Linearised:
         variables = problem.variables
         with in_one_line(variables):
             A, b = dense(problem.graph.linearize(values), variables.keys)
+            if not np.isfinite(A).all():
+                raise SolverError("a derivative of a factor that somebody added is not finite")
             left = eliminate(A, b, variables.n_columns)
             self._sizes = variables.prior_scales
             scaled, n = left.A * self._sizes, len(self._sizes)

@@ -519,7 +519,7 @@ class _Run:
         self._damping = FIRST_DAMPING
         self._last: tuple[Linearised, Floats] | None = None  # where the last step began, and that step
         try:
-            with np.errstate(over="ignore"):
+            with np.errstate(over="ignore", invalid="ignore"):
                 self.here = Linearised(problem, problem.initial)
             self.initial_cost = self.here.cost
         except SolverError:

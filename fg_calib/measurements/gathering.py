@@ -165,12 +165,21 @@ def gather(robot: Robot, tables: Sequence[Table], *, predicted: bool = False) ->
             raise ProblemError(
                 m.source, "another noise.joint", f"that of {source}: the readings are of the same encoders"
             )
+        _check_joint_noise(robot, m)
         series += series_of(robot, table, number, unknowns)
     _check_known(tables)
     check_fitted(series, unknowns)
     start_places(robot, tables, series, unknowns)
     series = _without_untouched(series, unknowns.n_coordinates)
     return Dataset(tuple(tables), tuple(series), unknowns, tuple(places), (*names, *unknowns.names))
+
+
+def _check_joint_noise(robot: Robot, m: Measurements) -> None:
+    """Raise where the noise of a revolute joint's readings is so large that they say nothing."""
+    for joint, sigma in zip(robot.joints, m.sigma_joint.tolist(), strict=False):  # their number is checked later
+        if not joint.prismatic and sigma >= np.pi:
+            found = f"noise.joint of {np.rad2deg(sigma):.4g} deg at {joint.name}"
+            raise ProblemError(m.source, found, "less than half a turn", "is it in degrees?")
 
 
 def _places_of_named(

@@ -76,10 +76,14 @@ class Chain(Brief):
 
         The six further values are those of the measurement frame, in the order of `FRAME_KINDS`.
         """
-        value = self.constant + self.sign * np.where(self.source >= 0, parameters[self.source], 0.0)
-        there = replace(self, value=value)
+        there = replace(self, value=self.values(parameters))
         there.__dict__["_turns"] = self._turns  # which values do not change
         return there
+
+    def values(self, parameters: Floats) -> Floats:
+        """Value of each element without its reading at parameter values as `at` takes them, shape (n_elements,)."""
+        out: Floats = self.constant + self.sign * np.where(self.source >= 0, parameters[self.source], 0.0)
+        return out
 
     def without_columns(self) -> Chain:
         """The same chain with no derivatives."""
@@ -170,7 +174,8 @@ def build_chain(
     )
     changing = set(columns) | set(range(n_parameters, n_parameters + 6))
     changing |= set(() if tool_tangent is None else tool) | set(() if base_tangent is None else base)
-    return _without_idle(chain.at(np.concatenate([robot.nominal, np.zeros(6)])), changing)
+    chain = replace(chain, value=chain.values(np.concatenate([robot.nominal, np.zeros(6)])))
+    return _without_idle(chain, changing)
 
 
 def _joint_of(element: Element) -> int:

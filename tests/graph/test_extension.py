@@ -453,6 +453,16 @@ def test_what_a_factor_raises_on_the_way_is_one_line():
     assert isinstance(found.value.__cause__, ValueError)
 
 
+def test_a_derivative_that_is_nan_is_named():
+    def error(_, values, H):
+        if H is not None:
+            H[0] = np.full((1, 4), np.nan, order="F")
+        return np.array([float(np.sum(values.atVector(K1)))])
+
+    with pytest.raises(SolverError, match="^a derivative of a factor that somebody added is not finite$"):
+        solve(damaged(custom(error)))
+
+
 def test_what_was_added_is_expanded_too():
     def anchored(problem):
         problem.graph.add(gtsam.PriorFactorVector(ANCHOR, np.ones(3), UNIT(3)))

@@ -220,6 +220,10 @@ def test_what_cannot_be_solved_is_refused_in_one_line():
     assert refused(robot, replace(poses, sigma_position=None), model="distance") == (
         "pairs from poses.csv: no sigma for distance, expected noise.position or a column sigma_position"
     )
+    lost = replace(poses, sigma_joint=np.array([1e-4, 1e8, 1e-4, 1e-4]))
+    assert refused(robot, lost, model="distance") == (
+        "poses.csv: noise.joint of 5.73e+09 deg at j2, expected less than half a turn; is it in degrees?"
+    )
     still = planar_pairs([0.0, 0.0])
     assert refused(planar_robot(), still, model="rotation") == (
         "pairs.csv: no pair left to fit: 2 excluded for same configuration, expected pairs that tell something"
