@@ -153,12 +153,15 @@ def of_offset(found: Offset, labels: Sequence[str], high: bool) -> list[Statemen
     Args:
         found: By how much.
         labels: Of the tables.
-        high: Whether residuals are too large for the noise: else it is a reservation.
+        high: Whether residuals are too large for the noise: else it is a reservation. The rest is then far from where it
+            will be, and of the figure the linearised fit knows less than its sigma says.
     """
     of = f" of {labels[found.table]}" if len(labels) > 1 else ""
+    adds = f"{1e3 * found.size:+.3g} mm"
+    adds = f"some {adds} to each" if high else f"{adds} to each (sigma {1e3 * found.sigma:.2g} mm)"
     text = (
-        f"the lengths{of} fit better if the instrument adds {1e3 * found.size:+.3g} mm to each (sigma"
-        f" {1e3 * found.sigma:.2g} mm), which was not estimated: offset: estimate, or calibrate the instrument"
+        f"the lengths{of} fit better if the instrument adds {adds}, which was not estimated: offset: estimate, or"
+        " calibrate the instrument"
     )
     return [Statement(text, finding=high, reservation=not high)]
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fg_calib.arrays import Brief
 from fg_calib.errors import ProblemError, shown
-from fg_calib.measurements.dataset import Pairs, are_same
+from fg_calib.measurements.dataset import Measurements, Pairs, are_same
 from fg_calib.measurements.kinds import Kind, PointDistance, TouchedPoint
 from fg_calib.measurements.models import SERIES_OF, own_series, touch_series
 from fg_calib.measurements.models.starts import check_fitted, start_places

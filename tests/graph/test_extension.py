@@ -459,7 +459,7 @@ def test_a_derivative_that_is_nan_is_named():
             H[0] = np.full((1, 4), np.nan, order="F")
         return np.array([float(np.sum(values.atVector(K1)))])
 
-    with pytest.raises(SolverError, match="^a derivative of a factor that somebody added is not finite$"):
+    with pytest.raises(SolverError, match=r"^a derivative of a factor that somebody added is not finite$"):
         solve(damaged(custom(error)))
 
 
