@@ -153,8 +153,8 @@ def of_offset(found: Offset, labels: Sequence[str], high: bool) -> list[Statemen
     Args:
         found: By how much.
         labels: Of the tables.
-        high: Whether residuals are too large for the noise: else it is a reservation. The rest is then far from where it
-            will be, and of the figure the linearised fit knows less than its sigma says.
+        high: Whether residuals are too large for the noise: else it is a reservation. The rest is then far from where
+            it will be, and of the figure the linearised fit knows less than its sigma says.
     """
     of = f" of {labels[found.table]}" if len(labels) > 1 else ""
     adds = f"{1e3 * found.size:+.3g} mm"
