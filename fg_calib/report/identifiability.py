@@ -86,7 +86,7 @@ def format_relation(relation: Mapping[str, float]) -> str:
     large = {n: v for n, v in relation.items() if abs(v) >= 0.01}  # the largest is 1
     text = " with ".join(f"{n} by {v:+.4g} {unit_of(n)}" for n, v in large.items())
     n_small = len(relation) - len(large)
-    return text + (f" and a little of {n_small} more" if n_small else "")
+    return text + (f" and a little of {n_small} other parameter{'s' * (n_small > 1)}" if n_small else "")
 
 
 def unit_of(name: str) -> str:
