@@ -81,8 +81,13 @@ def test_it_is_what_second_differences_say(monkeypatch, sigma):
     assert beyond_linear(found.assessed[0], found.assessed[1].spread).sums == pytest.approx(expected, rel=0.4)
 
 
-def test_it_grows_as_the_square_of_the_tolerances_over_the_noise():
-    """Along what no row tells the spread is the tolerance whatever the noise: ten times less is a hundredfold."""
+@pytest.mark.slow
+def test_it_grows_as_the_square_of_the_tolerances_over_the_noise(monkeypatch):
+    """Along what no row tells the spread is the tolerance whatever the noise: ten times less is a hundredfold.
+
+    Draws are along a basis that rounding turns, so each figure scatters by 2 / sqrt(400), and their ratio by 0.14.
+    """
+    monkeypatch.setattr(curvature, "N_DRAWS", 400)
     of = [beyond_linear(*_judged(calibrated(3, sigma, 1)[0])).sums for sigma in (1e-5, 1e-6)]
     assert of[1] / of[0] == pytest.approx(100.0, rel=0.5)
 
@@ -167,14 +172,17 @@ def test_errors_of_the_tool_are_honest_where_those_of_sums_are_not():
 @pytest.mark.long
 @pytest.mark.parametrize(("n", "sigma", "model"), [(3, 1e-5, "position"), (3, 1e-4, "position"), (2, 3e-5, "pose")])
 def test_true_errors_are_beyond_their_covariance_by_as_much(n, sigma, model):
-    """200 arms: means agree within four of their standard errors, or a quarter: its own are of but 8 draws each."""
+    """200 arms: means agree within four of their standard errors, or by half.
+
+    What is expected is of 16 draws, the same for all arms, in a basis that rounding turns: it scatters by 2 / sqrt(16).
+    """
     seen, expected = [], []
     for seed in range(200):
         found, true = calibrated(n, sigma, 1000 + seed, model=model)
         seen.append(squared_error(found, true))
         expected.append(1.0 + beyond_linear(*_judged(found)).sums)
     error = float(np.hypot(np.std(seen), np.std(expected)) / np.sqrt(len(seen)))
-    assert abs(np.mean(seen) - np.mean(expected)) < max(4.0 * error, 0.25 * np.mean(expected)), (
+    assert abs(np.mean(seen) - np.mean(expected)) < max(4.0 * error, 0.5 * np.mean(expected)), (
         np.mean(seen),
         np.mean(expected),
     )
