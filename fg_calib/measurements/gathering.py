@@ -145,7 +145,8 @@ def gather(robot: Robot, tables: Sequence[Table], *, predicted: bool = False) ->
         predicted: Whether nothing of them was measured: what predicts the same is no measurement counted twice.
 
     Raises:
-        ProblemError: A table lacks what its model needs, or two tables contradict each other.
+        ProblemError: A table lacks what its model needs, the noise of a joint is no figure of one, or two tables
+            contradict each other.
     """
     unknowns, series = Unknowns(), list[Series]()
     places: list[Integers] = []

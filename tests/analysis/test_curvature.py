@@ -171,18 +171,19 @@ def test_errors_of_the_tool_are_honest_where_those_of_sums_are_not():
 @pytest.mark.slow
 @pytest.mark.long
 @pytest.mark.parametrize(("n", "sigma", "model"), [(3, 1e-5, "position"), (3, 1e-4, "position"), (2, 3e-5, "pose")])
-def test_true_errors_are_beyond_their_covariance_by_as_much(n, sigma, model):
-    """200 arms: means agree within four of their standard errors, or by half.
+def test_true_errors_are_beyond_their_covariance_by_as_much(monkeypatch, n, sigma, model):
+    """200 arms: means agree within four of their standard errors, or a quarter.
 
-    What is expected is of 16 draws, the same for all arms, in a basis that rounding turns: it scatters by 2 / sqrt(16).
+    Of 100 draws: all arms have the same ones, so that their scatter of 2 / sqrt(n) does not go with the arms.
     """
+    monkeypatch.setattr(curvature, "N_DRAWS", 100)
     seen, expected = [], []
     for seed in range(200):
         found, true = calibrated(n, sigma, 1000 + seed, model=model)
         seen.append(squared_error(found, true))
         expected.append(1.0 + beyond_linear(*_judged(found)).sums)
     error = float(np.hypot(np.std(seen), np.std(expected)) / np.sqrt(len(seen)))
-    assert abs(np.mean(seen) - np.mean(expected)) < max(4.0 * error, 0.5 * np.mean(expected)), (
+    assert abs(np.mean(seen) - np.mean(expected)) < max(4.0 * error, 0.25 * np.mean(expected)), (
         np.mean(seen),
         np.mean(expected),
     )
