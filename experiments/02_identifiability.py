@@ -29,12 +29,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import fg_calib
-from fg_calib.analysis.identifiability import observe_structure
-from fg_calib.analysis.uncertainty import marginals
 from fg_calib.graph.build import random_problem
 from fg_calib.measurements.dataset import Measurements
+from fg_calib.observability.identifiability import observe_structure
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, Model
 from fg_calib.robot.model import CONVENTIONS, Joint, RobotBuilder
+from fg_calib.statistics.assessment import marginals
 
 Floats = NDArray[np.float64]
 

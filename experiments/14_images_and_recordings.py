@@ -23,10 +23,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from space_robot import arguments_of, write_json
 
-from fg_calib.camera.board import CalibrationBoard
-from fg_calib.camera.opencv import find_corners
-from fg_calib.camera.views import Corners, fit_board
-from fg_calib.measurements.standstill import average_stops
+from fg_calib.importers.board import CalibrationBoard
+from fg_calib.importers.opencv import find_corners
+from fg_calib.importers.standstill import average_stops
+from fg_calib.importers.views import Corners, fit_board
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import boards

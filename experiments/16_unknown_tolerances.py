@@ -31,7 +31,6 @@ from space_robot import arguments_of, clean, write_json
 
 import fg_calib
 from fg_calib import Noise, ProblemError, Robot, Scenario
-from fg_calib.analysis.covariance import spread_of, with_unsure_tolerances
 from fg_calib.baseline.comparison import real_errors
 from fg_calib.graph.solver import Solution
 from fg_calib.robot.inverse import random_readings
@@ -39,6 +38,7 @@ from fg_calib.robot.model import Joint, RobotBuilder, tolerance_kind
 from fg_calib.simulation.configurations import RandomReadings
 from fg_calib.simulation.instruments import LengthGauge, Tracker
 from fg_calib.simulation.scenario import Errors
+from fg_calib.statistics.covariance import spread_of, with_unsure_tolerances
 
 Floats = NDArray[np.float64]
 

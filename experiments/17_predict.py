@@ -29,14 +29,14 @@ from space_robot import arguments_of, clean, paper_scenario, write_json
 
 import fg_calib
 from fg_calib import Noise, Robot, Scenario, pose
-from fg_calib.analysis.covariance import spread_of
-from fg_calib.analysis.prediction import predict_errors
-from fg_calib.analysis.tool_error import ToolErrorModel
+from fg_calib.prediction.prediction import predict_errors
+from fg_calib.prediction.tool_pose import ToolErrorModel
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.kinematics import Poses
 from fg_calib.simulation.configurations import RandomReadings
 from fg_calib.simulation.instruments import Tracker
 from fg_calib.simulation.scenario import Errors
+from fg_calib.statistics.covariance import spread_of
 
 Floats = NDArray[np.float64]
 

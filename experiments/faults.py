@@ -25,7 +25,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fg_calib import Calibration, InputError, calibrate, read_scenario, simulate
-from fg_calib.files.disk import read_bytes
+from fg_calib.io.disk import read_bytes
 
 NAMES = ("result.json", "residuals.csv", "configurations.csv", "robot_calibrated.yaml")
 STEPS = ("rename", "replace", "rmdir", "mkdir", "unlink", "open", "listdir")

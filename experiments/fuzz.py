@@ -7,7 +7,7 @@ kept under `--out` with the file that caused it, and the exit code is 1.
 
     python experiments/fuzz.py --cases 1000000     # 20 000 take 18 s of processor time; --quick runs 300
 
-The tests draw from the same mutations by hypothesis, which shrinks what it finds (tests/files/test_fuzz.py).
+The tests draw from the same mutations by hypothesis, which shrinks what it finds (tests/io/test_fuzz.py).
 """
 
 from __future__ import annotations

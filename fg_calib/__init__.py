@@ -15,50 +15,45 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fg_calib.analysis.bounds import Bound, cramer_rao
-    from fg_calib.analysis.check import Check, Explanation
-    from fg_calib.analysis.estimated_tolerances import estimate_tolerances
-    from fg_calib.analysis.identifiability import Identifiability, observe_configurations, observe_structure
-    from fg_calib.analysis.inspection import Inspection, inspect_job
-    from fg_calib.analysis.mistakes import SetupCheck, check_setup
-    from fg_calib.analysis.parts import PartsSolution, cut, reduce_parts, solve_parts
-    from fg_calib.analysis.prediction import PredictedErrors
-    from fg_calib.analysis.restarts import look_elsewhere
-    from fg_calib.analysis.uncertainty import Uncertainty, assess
-    from fg_calib.analysis.variance_components import estimate_noise, solve_job
     from fg_calib.baseline.comparison import Comparison, compare
     from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
     from fg_calib.batch import calibrate_jobs
     from fg_calib.calibration import Calibration, calibrate, calibrate_job, calibrate_parts
-    from fg_calib.correction import correct
     from fg_calib.designs.comparison import compare_designs
     from fg_calib.designs.design import Design, design
+    from fg_calib.diagnostics.inspection import Inspection, inspect_job
+    from fg_calib.diagnostics.multistart import look_elsewhere
+    from fg_calib.diagnostics.setup_check import SetupCheck, check_setup
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
     from fg_calib.executors import Failure, dask_executor, local_processes, map_jobs
     from fg_calib.exports.export import Export, export
-    from fg_calib.files.columns import Column
-    from fg_calib.files.history import History, history_of
-    from fg_calib.files.job import read_job
-    from fg_calib.files.parts import JobInParts, read_parts
-    from fg_calib.files.result import Result, read_result, result_schema
-    from fg_calib.files.robot_yaml import read_robot, write_robot
-    from fg_calib.files.scenario import read_scenario
-    from fg_calib.files.simulation import write_simulation
-    from fg_calib.files.tables import read_measurements
-    from fg_calib.files.targets import Targets, read_targets
-    from fg_calib.files.units import Units
-    from fg_calib.files.urdf import read_urdf
     from fg_calib.graph.build import build_problem, problem_of
     from fg_calib.graph.extension import DistanceFactor, RotationAngleFactor, expand
     from fg_calib.graph.problem import Problem
     from fg_calib.graph.solver import Solution, SolverOptions, levenberg_marquardt_params, solve
+    from fg_calib.io.columns import Column
+    from fg_calib.io.history import History, history_of
+    from fg_calib.io.job import read_job
+    from fg_calib.io.parts import JobInParts, read_parts
+    from fg_calib.io.parts_solver import PartsSolution, cut, reduce_parts, solve_parts
+    from fg_calib.io.result import Result, read_result, result_schema
+    from fg_calib.io.robot_file import read_robot, write_robot
+    from fg_calib.io.tables import read_measurements
+    from fg_calib.io.targets import Targets, read_targets
+    from fg_calib.io.units import Units
+    from fg_calib.io.urdf import read_urdf
     from fg_calib.job import Job
     from fg_calib.measurements.dataset import Measurements, Noise
     from fg_calib.measurements.kinds.pixel import Camera
     from fg_calib.measurements.series import KnownPoint, Own, Table
+    from fg_calib.monitoring.check import Check, Explanation
+    from fg_calib.observability.cramer_rao import Bound, cramer_rao
+    from fg_calib.observability.identifiability import Identifiability, observe_configurations, observe_structure
     from fg_calib.options import Limits, Options, Pairing
     from fg_calib.pages import write_report
-    from fg_calib.prediction import predict, write_prediction
+    from fg_calib.prediction.correction import correct
+    from fg_calib.prediction.predict import predict, write_prediction
+    from fg_calib.prediction.prediction import PredictedErrors
     from fg_calib.report.comparison import format_comparison
     from fg_calib.report.documents import (
         comparison_document,
@@ -77,53 +72,58 @@ if TYPE_CHECKING:
     from fg_calib.robot.reaching import Correction
     from fg_calib.simulation.configurations import BoardViews, GivenReadings, RandomReadings, TargetViews
     from fg_calib.simulation.scenario import Scenario, Simulation
+    from fg_calib.simulation.scenario_file import read_scenario
     from fg_calib.simulation.simulator import simulate
+    from fg_calib.simulation.write import write_simulation
+    from fg_calib.statistics.assessment import Uncertainty, assess
+    from fg_calib.statistics.prior_scales import estimate_tolerances
+    from fg_calib.statistics.variance_components import estimate_noise, solve_job
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "fg_calib.analysis.bounds": ("Bound", "cramer_rao"),
+    "fg_calib.observability.cramer_rao": ("Bound", "cramer_rao"),
     "fg_calib.baseline.comparison": ("Comparison", "compare"),
     "fg_calib.batch": ("calibrate_jobs",),
     "fg_calib.calibration": ("Calibration", "calibrate", "calibrate_job", "calibrate_parts"),
-    "fg_calib.correction": ("correct",),
+    "fg_calib.prediction.correction": ("correct",),
     "fg_calib.designs.comparison": ("compare_designs",),
     "fg_calib.designs.design": ("Design", "design"),
     "fg_calib.simulation.configurations": ("BoardViews", "GivenReadings", "RandomReadings", "TargetViews"),
     "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
     "fg_calib.executors": ("Failure", "dask_executor", "local_processes", "map_jobs"),
     "fg_calib.exports.export": ("Export", "export"),
-    "fg_calib.files.columns": ("Column",),
-    "fg_calib.analysis.check": ("Check", "Explanation"),
-    "fg_calib.files.history": ("History", "history_of"),
-    "fg_calib.files.job": ("read_job",),
-    "fg_calib.files.parts": ("JobInParts", "read_parts"),
+    "fg_calib.io.columns": ("Column",),
+    "fg_calib.monitoring.check": ("Check", "Explanation"),
+    "fg_calib.io.history": ("History", "history_of"),
+    "fg_calib.io.job": ("read_job",),
+    "fg_calib.io.parts": ("JobInParts", "read_parts"),
     "fg_calib.job": ("Job",),
-    "fg_calib.files.result": ("Result", "read_result", "result_schema"),
-    "fg_calib.files.urdf": ("read_urdf",),
+    "fg_calib.io.result": ("Result", "read_result", "result_schema"),
+    "fg_calib.io.urdf": ("read_urdf",),
     "fg_calib.robot.inverse": ("Inverse", "solve_inverse"),
     "fg_calib.robot.reaching": ("Correction",),
-    "fg_calib.files.robot_yaml": ("read_robot", "write_robot"),
-    "fg_calib.files.scenario": ("read_scenario",),
-    "fg_calib.files.simulation": ("write_simulation",),
-    "fg_calib.files.tables": ("read_measurements",),
-    "fg_calib.files.targets": ("Targets", "read_targets"),
-    "fg_calib.files.units": ("Units",),
-    "fg_calib.analysis.identifiability": ("Identifiability", "observe_configurations", "observe_structure"),
+    "fg_calib.io.robot_file": ("read_robot", "write_robot"),
+    "fg_calib.simulation.scenario_file": ("read_scenario",),
+    "fg_calib.simulation.write": ("write_simulation",),
+    "fg_calib.io.tables": ("read_measurements",),
+    "fg_calib.io.targets": ("Targets", "read_targets"),
+    "fg_calib.io.units": ("Units",),
+    "fg_calib.observability.identifiability": ("Identifiability", "observe_configurations", "observe_structure"),
     "fg_calib.robot.kinematics": ("pose",),
     "fg_calib.baseline.least_squares": ("LeastSquares", "fit_least_squares"),
     "fg_calib.measurements.dataset": ("Measurements", "Noise"),
-    "fg_calib.analysis.inspection": ("Inspection", "inspect_job"),
-    "fg_calib.analysis.mistakes": ("SetupCheck", "check_setup"),
-    "fg_calib.analysis.estimated_tolerances": ("estimate_tolerances",),
-    "fg_calib.analysis.variance_components": ("estimate_noise", "solve_job"),
+    "fg_calib.diagnostics.inspection": ("Inspection", "inspect_job"),
+    "fg_calib.diagnostics.setup_check": ("SetupCheck", "check_setup"),
+    "fg_calib.statistics.prior_scales": ("estimate_tolerances",),
+    "fg_calib.statistics.variance_components": ("estimate_noise", "solve_job"),
     "fg_calib.graph.build": ("build_problem", "problem_of"),
     "fg_calib.graph.problem": ("Problem",),
     "fg_calib.measurements.kinds.pixel": ("Camera",),
     "fg_calib.measurements.series": ("KnownPoint", "Own", "Table"),
     "fg_calib.pages": ("write_report",),
-    "fg_calib.prediction": ("predict", "write_prediction"),
-    "fg_calib.analysis.prediction": ("PredictedErrors",),
+    "fg_calib.prediction.predict": ("predict", "write_prediction"),
+    "fg_calib.prediction.prediction": ("PredictedErrors",),
     "fg_calib.options": ("Limits", "Options", "Pairing"),
     "fg_calib.report.comparison": ("format_comparison",),
     "fg_calib.report.identifiability": ("format_identifiability",),
@@ -136,11 +136,11 @@ _HOMES = {
     "fg_calib.robot.model": ("Robot",),
     "fg_calib.simulation.scenario": ("Scenario", "Simulation"),
     "fg_calib.simulation.simulator": ("simulate",),
-    "fg_calib.analysis.parts": ("PartsSolution", "cut", "reduce_parts", "solve_parts"),
-    "fg_calib.analysis.restarts": ("look_elsewhere",),
+    "fg_calib.io.parts_solver": ("PartsSolution", "cut", "reduce_parts", "solve_parts"),
+    "fg_calib.diagnostics.multistart": ("look_elsewhere",),
     "fg_calib.graph.extension": ("DistanceFactor", "RotationAngleFactor", "expand"),
     "fg_calib.graph.solver": ("Solution", "SolverOptions", "levenberg_marquardt_params", "solve"),
-    "fg_calib.analysis.uncertainty": ("Uncertainty", "assess"),
+    "fg_calib.statistics.assessment": ("Uncertainty", "assess"),
 }
 _FROM_FILES = {"Robot": ("from_urdf", "read_urdf"), "Measurements": ("from_frame", "read_measurements")}
 """Constructors that read files, which the folders of these classes know nothing of: they are attached here."""

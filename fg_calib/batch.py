@@ -18,9 +18,9 @@ from fg_calib.arguments import checked
 from fg_calib.calibration import Calibration, calibrate_job
 from fg_calib.errors import InputError, escaped, shown
 from fg_calib.executors import Failure, map_jobs
-from fg_calib.files.disk import RESERVED, clear_dead, require_own, require_writable, stamp
-from fg_calib.files.job import read_job
-from fg_calib.files.parts import JobInParts, read_parts
+from fg_calib.io.disk import RESERVED, clear_dead, require_own, require_writable, stamp
+from fg_calib.io.job import read_job
+from fg_calib.io.parts import JobInParts, read_parts
 from fg_calib.job import Job
 from fg_calib.progress import keeping_warnings
 from fg_calib.report.batch import JOBS_FILES, JobSummary, summary_of

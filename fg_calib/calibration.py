@@ -28,17 +28,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
-from fg_calib.analysis.covariance import TangentCovariance
-from fg_calib.analysis.residual_table import ResidualTable
-from fg_calib.analysis.uncertainty import FrameEstimate, Uncertainty, assess
-from fg_calib.analysis.variance_components import solve_job
 from fg_calib.arguments import checked
 from fg_calib.arrays import as_floats, shape_of
 from fg_calib.errors import InputError, SolverError, escaped, shown
-from fg_calib.files.disk import exists, is_folder, noting_reads
-from fg_calib.files.job import UNSTATED, read_job, read_table_like
-from fg_calib.files.parts import JobInParts, read_parts
-from fg_calib.files.result import (
+from fg_calib.graph.factors import Variables, build_variables, frame_of
+from fg_calib.graph.knowledge import SIZE, Knowledge
+from fg_calib.graph.problem import tables_of
+from fg_calib.graph.solver import Solution
+from fg_calib.io.disk import exists, is_folder, noting_reads
+from fg_calib.io.job import UNSTATED, read_job, read_table_like
+from fg_calib.io.parts import JobInParts, read_parts
+from fg_calib.io.result import (
     ROUNDING,
     Carried,
     Covariance,
@@ -49,17 +49,13 @@ from fg_calib.files.result import (
     Result,
     read_result,
 )
-from fg_calib.files.result import Knowledge as SavedKnowledge
-from fg_calib.files.robot_yaml import read_robot
-from fg_calib.graph.factors import Variables, build_variables, frame_of
-from fg_calib.graph.knowledge import SIZE, Knowledge
-from fg_calib.graph.problem import tables_of
-from fg_calib.graph.solver import Solution
+from fg_calib.io.result import Knowledge as SavedKnowledge
+from fg_calib.io.robot_file import read_robot
 from fg_calib.job import Job
 from fg_calib.measurements.checks import check_readings
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.fingerprints import counted_before
 from fg_calib.measurements.series import Table
+from fg_calib.monitoring.fingerprints import counted_before
 from fg_calib.options import NEAR, Options, Pairing, check_flag, check_names, did_you_mean, listed
 from fg_calib.progress import tell
 from fg_calib.report.documents import ResidualFile, result_of, write_result
@@ -67,13 +63,17 @@ from fg_calib.report.summary import format_result, html, judged, summary
 from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import forward, precompute_trig
 from fg_calib.robot.model import Robot, names_of
+from fg_calib.statistics.assessment import FrameEstimate, Uncertainty, assess
+from fg_calib.statistics.covariance import TangentCovariance
+from fg_calib.statistics.residual_table import ResidualTable
+from fg_calib.statistics.variance_components import solve_job
 from fg_calib.threads import single_threaded
 
 if TYPE_CHECKING:
-    from fg_calib.analysis.assessed_parts import AssessedParts
-    from fg_calib.analysis.check import Check
-    from fg_calib.analysis.new_rows import Calibrated, Rows
-    from fg_calib.files.history import Run
+    from fg_calib.io.assessed_parts import AssessedParts
+    from fg_calib.io.history import Run
+    from fg_calib.monitoring.check import Check
+    from fg_calib.monitoring.new_data import Calibrated, Rows
 
 Floats = NDArray[np.float64]
 
@@ -138,7 +138,7 @@ def calibrate_job(job: Job | Path | str, executor: Executor | None = None) -> Ca
         tell("judging the result")
         uncertainty = assess(solution)
         if given.options.folds is not None:
-            from fg_calib.analysis.folds import cross_validate
+            from fg_calib.statistics.cross_validation import cross_validate
 
             folds = cross_validate(given, given.options.folds, executor=executor)
             uncertainty = uncertainty.with_folds(folds, solution)
@@ -173,8 +173,8 @@ def calibrate_parts(job: JobInParts | Path | str, executor: Executor | None = No
         InputError: The job, or a file that it names, cannot be used, or its table not be cut.
         ProblemError: Rows of a part share errors with those of others, or cannot be used.
     """
-    from fg_calib.analysis.assessed_parts import assess_parts
-    from fg_calib.analysis.parts import solve_parts
+    from fg_calib.io.assessed_parts import assess_parts
+    from fg_calib.io.parts_solver import solve_parts
     from fg_calib.report.parts import result_of_parts
 
     given = job if isinstance(job, JobInParts) else read_parts(job)
@@ -311,7 +311,7 @@ class Calibration:
         Raises:
             InputError: There is none, or it is damaged.
         """
-        from fg_calib.files.history import history_of
+        from fg_calib.io.history import history_of
 
         result, folder = read_result(path), Path(path) if is_folder(Path(path)) else Path(path).parent
         robot = _saved_robot(folder, result)
@@ -340,7 +340,7 @@ class Calibration:
 
     def _history(self, digest: str) -> dict[str, str]:
         """What is written of the runs that it came from, with itself."""
-        from fg_calib.files.history import HISTORY, History, run_of
+        from fg_calib.io.history import HISTORY, History, run_of
 
         runs = (*self.history, run_of(self.result, digest, self.history[-1]))
         return {HISTORY: History(robot=self.result.robot, runs=runs).text()}
@@ -348,7 +348,7 @@ class Calibration:
     @property
     def runs(self) -> tuple[Run, ...]:
         """The runs that it came from, and itself."""
-        from fg_calib.files.history import run_of
+        from fg_calib.io.history import run_of
 
         if self.assessed is None:
             return self.history
@@ -358,7 +358,7 @@ class Calibration:
     @property
     def calibrated(self) -> Calibrated:
         """What is known of the arm, for new rows."""
-        from fg_calib.analysis.new_rows import Calibrated
+        from fg_calib.monitoring.new_data import Calibrated
 
         of_result = {p.name: p.prior_sigma for p in self.result.parameters}  # as they were estimated, perhaps
         nominal = self.posterior.variables.robot
@@ -408,7 +408,7 @@ class Calibration:
             InputError: The rows cannot be read, or are of another robot; or the calibration is not to be trusted.
             ProblemError: The rows lack what their model needs.
         """
-        from fg_calib.analysis.check import check_rows
+        from fg_calib.monitoring.check import check_rows
 
         self._require_trust()
         new, _ = self._rows(rows, pairs, like)
@@ -449,7 +449,7 @@ class Calibration:
             ProblemError: The rows lack what their model needs, or do not suffice.
             SolverError: GTSAM could not solve a step at all.
         """
-        from fg_calib.analysis.update import predicted_before, updated
+        from fg_calib.monitoring.update import predicted_before, updated
 
         self._require_trust()
         if self.result.in_parts:
@@ -492,7 +492,7 @@ class Calibration:
         Raises:
             InputError: They are of another robot, or cannot be read.
         """
-        from fg_calib.analysis.new_rows import Rows
+        from fg_calib.monitoring.new_data import Rows
 
         options, robot = _saved_options(self.result), self.posterior.variables.robot
         if isinstance(given, Path | str) and Path(given).suffix.lower() not in (".yaml", ".yml"):

@@ -17,7 +17,8 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in a shell's background
 os.environ["PYTHONSAFEPATH"] = "1"  # subprocesses have the package that is tested, compiled once, wherever they run
 
 from fg_calib import cli
-from fg_calib.analysis import identifiability, mistakes
+from fg_calib.diagnostics import setup_check as mistakes
+from fg_calib.observability import identifiability
 
 
 @pytest.hookimpl(tryfirst=True)  # before tests are chosen by their marks

@@ -4,8 +4,8 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from fg_calib.files.csv_writer import write_csv
-from fg_calib.files.robot_yaml import read_robot
+from fg_calib.io.csv_writer import write_csv
+from fg_calib.io.robot_file import read_robot
 
 SIGMA = (5e-5, 1e-4)
 """1 sigma of a position, [m], and of an orientation, [rad]."""

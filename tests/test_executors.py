@@ -32,12 +32,12 @@ from fg_calib import (
     read_scenario,
     simulate,
 )
-from fg_calib.analysis.folds import cross_validate
 from fg_calib.batch import EARLIER, Order, calibrate_into, job_names
 from fg_calib.cli.calibrate import _written
-from fg_calib.files.disk import fill_folder, write_text
+from fg_calib.io.disk import fill_folder, write_text
 from fg_calib.progress import listening
 from fg_calib.report.batch import JobSummary, build_jobs_table
+from fg_calib.statistics.cross_validation import cross_validate
 from fg_calib.threads import THREADS, processors
 
 JOBS = [1, "refused", 2, "a bug", "too large", 3]
@@ -509,7 +509,7 @@ def test_a_folder_with_jobs_of_somebody_else_is_left_alone(fg_calib, two_arms, t
 WRITE_AND_DIE = """
 import os, signal, sys
 from pathlib import Path
-from fg_calib.files.disk import fill_folder
+from fg_calib.io.disk import fill_folder
 def write(into):
     (into / "result.json").write_text("half")
     os.kill(os.getpid(), signal.SIGKILL)

@@ -77,9 +77,9 @@ def test_who_has_no_home_has_no_cache_in_the_current_folder(monkeypatch):
 FORK = """
 import os, sys
 from fg_calib import InputError
-from fg_calib.files.csv_writer import write_csv
-from fg_calib.files.frames import as_polars
-from fg_calib.files.parquet import parquet_columns
+from fg_calib.io.csv_writer import write_csv
+from fg_calib.io.frames import as_polars
+from fg_calib.io.parquet import parquet_columns
 as_polars({"a": [1.0]}, "t")
 if os.fork() == 0:
     for use in (lambda: as_polars({"a": [1.0]}, "t"), lambda: parquet_columns(b"", "t"), lambda: write_csv("t", {})):

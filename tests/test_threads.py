@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from fg_calib.files.job import read_job
+from fg_calib.io.job import read_job
 from fg_calib.robot.kinematics import SPAN
 from fg_calib.threads import THREADS, one_blas_thread, single_threaded
 

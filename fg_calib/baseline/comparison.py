@@ -32,10 +32,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.analysis.accuracy import errors_at, judged_configurations, pose_rms
-from fg_calib.analysis.residual_table import residual_table
-from fg_calib.analysis.uncertainty import Uncertainty, assess
-from fg_calib.analysis.variance_components import solve_job
 from fg_calib.arguments import checked
 from fg_calib.arrays import Brief
 from fg_calib.baseline.least_squares import LeastSquares, fit_dataset
@@ -45,8 +41,12 @@ from fg_calib.graph.factors import corrections_of
 from fg_calib.graph.solver import Solution
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import rotation_angle
+from fg_calib.prediction.expected_error import errors_at, judged_configurations, pose_rms
 from fg_calib.robot.kinematics import Poses, build_chain, forward, precompute_trig
 from fg_calib.robot.model import Robot
+from fg_calib.statistics.assessment import Uncertainty, assess
+from fg_calib.statistics.residual_table import residual_table
+from fg_calib.statistics.variance_components import solve_job
 from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]

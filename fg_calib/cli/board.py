@@ -40,19 +40,19 @@ def board(
     if (camera is None) != estimate_camera:
         say("error: one of --camera and --estimate-camera is needed, and only one")
         raise typer.Exit(2)
-    from fg_calib.camera.opencv import opencv
-    from fg_calib.camera.views import fit_board
-    from fg_calib.files.board_tables import (
+    from fg_calib.importers.board_tables import (
         BoardTables,
         read_readings,
         require_no_input_of_board,
         write_board_tables,
     )
-    from fg_calib.files.calibration_board import read_calibration_board
-    from fg_calib.files.disk import read_bytes, require_writable
-    from fg_calib.files.images import image_files, read_corners
-    from fg_calib.files.instruments import read_camera, read_camera_of_images
-    from fg_calib.files.units import Units
+    from fg_calib.importers.calibration_board import read_calibration_board
+    from fg_calib.importers.images import image_files, read_corners
+    from fg_calib.importers.opencv import opencv
+    from fg_calib.importers.views import fit_board
+    from fg_calib.io.disk import read_bytes, require_writable
+    from fg_calib.io.instruments import read_camera, read_camera_of_images
+    from fg_calib.io.units import Units
     from fg_calib.report.board import build_board_report
 
     opencv()

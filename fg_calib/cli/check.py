@@ -38,7 +38,7 @@ def check(
 ) -> None:
     """Say whether a calibration is still good by new rows, and what changed if it is not."""
     from fg_calib.calibration import Calibration
-    from fg_calib.files.units import Units, quantity
+    from fg_calib.io.units import Units, quantity
     from fg_calib.report.check import build_check_report, check_document
 
     limits = [

@@ -28,7 +28,7 @@ def compare(
     as_json: Json = False,
 ) -> None:
     """Run the factor graph beside plain least squares on the same job; or show two results side by side."""
-    from fg_calib.files.disk import require_writable
+    from fg_calib.io.disk import require_writable
 
     if out is None and figures:
         raise typer.BadParameter("needs --out, the folder to write to", param_hint="--figures")
@@ -42,7 +42,7 @@ def compare(
 
 def _compare_estimators(job: Path, out: Path | None, figures: bool, as_json: bool) -> None:
     from fg_calib.baseline import comparison
-    from fg_calib.files.job import read_job
+    from fg_calib.io.job import read_job
     from fg_calib.report.comparison import build_comparison_report
     from fg_calib.report.documents import comparison_document, write_comparison
 

@@ -36,9 +36,9 @@ def correct(
 ) -> None:
     """Find what to command so that the calibrated arm reaches targets: joint values, and poses for a nominal model."""
     from fg_calib.calibration import Calibration
-    from fg_calib.correction import correct as correct_targets
-    from fg_calib.files.targets import read_targets, require_commands, write_commands
-    from fg_calib.files.units import Units
+    from fg_calib.io.targets import read_targets, require_commands, write_commands
+    from fg_calib.io.units import Units
+    from fg_calib.prediction.correction import correct as correct_targets
     from fg_calib.report.correction import build_correction_report, correction_document
 
     if out is not None:

@@ -14,7 +14,7 @@ from fg_calib.cli.workers import Scheduler, Workers, executor_for, require_one
 if TYPE_CHECKING:
     from fg_calib.designs.design import Design
     from fg_calib.executors import Failure
-    from fg_calib.files.units import Units
+    from fg_calib.io.units import Units
     from fg_calib.job import Job
     from fg_calib.robot.model import Robot
     from fg_calib.simulation.scenario import Scenario
@@ -93,8 +93,8 @@ def design(
     as_json: Json = False,
 ) -> None:
     """Choose which configurations to measure, and say what accuracy to expect of how many."""
-    from fg_calib.files.disk import require_writable
-    from fg_calib.files.units import quantity
+    from fg_calib.io.disk import require_writable
+    from fg_calib.io.units import quantity
 
     if n is not None and target is not None:
         say("error: --n and --target: one of the two")
@@ -197,10 +197,10 @@ def _of_instruments(of: Sequence[str], instruments: Sequence[Path] | None) -> li
 def _read(of: str, instruments: Sequence[Path]) -> tuple[dict[str, Scenario | Job], Units, Robot]:
     """What is to be designed, by the instruments' names, the units of its tables, and the arm."""
     from fg_calib.errors import InputError
-    from fg_calib.files.job import is_job, read_job, units_of
-    from fg_calib.files.scenario import read_scenario
-    from fg_calib.files.units import Units
+    from fg_calib.io.job import is_job, read_job, units_of
+    from fg_calib.io.units import Units
     from fg_calib.report.plan_files import names_of_files
+    from fg_calib.simulation.scenario_file import read_scenario
 
     if is_job(of):
         if instruments:
@@ -218,15 +218,15 @@ def _read(of: str, instruments: Sequence[Path]) -> tuple[dict[str, Scenario | Jo
 
 
 def _readings(path: Path, robot: Robot, units: Units) -> Any:
-    from fg_calib.files.tables import read_measurements
+    from fg_calib.io.tables import read_measurements
 
     return read_measurements(path, robot, units=units).readings
 
 
 def _candidates(given: str | None, robot: Robot, units: Units) -> dict[str, Any]:
     """Where the candidates come from."""
-    from fg_calib.files.scenario import read_scenario
     from fg_calib.simulation.configurations import GivenReadings
+    from fg_calib.simulation.scenario_file import read_scenario
 
     if given is None:
         return {}

@@ -64,7 +64,7 @@ def export(
     as_json: Json = False,
 ) -> None:
     """Write the calibrated arm as others read it: URDF, ROS, Tesseract, tables, joint zeros."""
-    from fg_calib.files.disk import is_folder, require_absent
+    from fg_calib.io.disk import is_folder, require_absent
 
     is_result = is_folder(arm) or arm.suffix.lower() == ".json"
     if is_result and (base_link or tip_link):
@@ -76,7 +76,7 @@ def export(
     from fg_calib.calibration import Calibration
     from fg_calib.exports.export import export as export_arm
     from fg_calib.exports.export import measured_configurations
-    from fg_calib.files.robot_yaml import read_robot
+    from fg_calib.io.robot_file import read_robot
 
     if out is not None:
         require_absent(out.parent, [out.name])

@@ -28,7 +28,7 @@ def help_(topic: _Topic = None, markdown: _Markdown = False) -> None:
 
 def _show(topic: str, markdown: bool) -> None:
     """Show a page: those of files come from what the readers know, the others are files themselves."""
-    from fg_calib.files.reference import Topic
+    from fg_calib.io.reference import Topic
     from fg_calib.report.guide import build_page, read_page
     from fg_calib.report.reference import build_reference, reference_markdown
 

@@ -15,8 +15,8 @@ def inspect(
     as_json: Json = False,
 ) -> None:
     """Say what a job holds, what looks wrong with it, and what it can determine, without solving it."""
-    from fg_calib.analysis.inspection import inspect_job
-    from fg_calib.files.job import read_job
+    from fg_calib.diagnostics.inspection import inspect_job
+    from fg_calib.io.job import read_job
     from fg_calib.report.inspection import build_inspection_report, inspection_document
 
     given = read_job(job)

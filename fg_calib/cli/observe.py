@@ -12,7 +12,7 @@ from fg_calib.cli.output import BaseLink, Json, TipLink, say, show_json, show_re
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, AngleUnit, FrameKnowledge, LengthUnit, Model, check_number
 
 if TYPE_CHECKING:  # imported where it is used: `--help` need not wait for it
-    from fg_calib.files.units import Units
+    from fg_calib.io.units import Units
     from fg_calib.measurements.dataset import Noise
     from fg_calib.robot.model import Robot
 
@@ -73,10 +73,10 @@ def observe(
     as_json: Json = False,
 ) -> None:
     """Say which parameters measurements can determine, which only together, and why not the others."""
-    from fg_calib.analysis.identifiability import observe_configurations, observe_structure
-    from fg_calib.files.robot_yaml import read_robot
-    from fg_calib.files.tables import read_measurements
-    from fg_calib.files.units import Units
+    from fg_calib.io.robot_file import read_robot
+    from fg_calib.io.tables import read_measurements
+    from fg_calib.io.units import Units
+    from fg_calib.observability.identifiability import observe_configurations, observe_structure
     from fg_calib.options import Pairing
     from fg_calib.report.documents import observability_document, write_observability
     from fg_calib.report.identifiability import build_identifiability_report

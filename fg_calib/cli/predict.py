@@ -41,10 +41,10 @@ def predict(
 ) -> None:
     """Say how far off the calibrated tool is expected to be: over the workspace, or at configurations."""
     from fg_calib.calibration import Calibration
-    from fg_calib.files.prediction import read_joint_table
-    from fg_calib.files.units import Units, quantity
-    from fg_calib.prediction import measured_of, require_prediction, write_prediction
-    from fg_calib.prediction import predict as predict_tool
+    from fg_calib.io.prediction import read_joint_table
+    from fg_calib.io.units import Units, quantity
+    from fg_calib.prediction.predict import measured_of, require_prediction, write_prediction
+    from fg_calib.prediction.predict import predict as predict_tool
     from fg_calib.report.prediction import build_prediction_report, prediction_document
 
     most = None if limit is None else quantity(limit, "m", Units(), "--limit")

@@ -21,9 +21,9 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """Simulate a calibration job: the true robot, and what is measured of it, with noise."""
-    from fg_calib.files.scenario import read_scenario
-    from fg_calib.files.simulation import write_simulation
     from fg_calib.simulation import simulator
+    from fg_calib.simulation.scenario_file import read_scenario
+    from fg_calib.simulation.write import write_simulation
 
     simulation = simulator.simulate(read_scenario(scenario), seed)
     names = write_simulation(out, simulation)

@@ -45,7 +45,7 @@ def update(
 ) -> None:
     """Add new rows to a calibration, from what it has learned: its own rows are not read again."""
     from fg_calib.calibration import Calibration
-    from fg_calib.files.disk import is_folder, require_writable
+    from fg_calib.io.disk import is_folder, require_writable
     from fg_calib.report.documents import require_apart
 
     require_writable(out)
@@ -74,7 +74,7 @@ def _growth(given: Sequence[str], robot: Robot) -> dict[str, float]:
         InputError: One is not `NAME=FIGURE` with a unit.
     """
     from fg_calib.errors import InputError
-    from fg_calib.files.units import Units, quantity
+    from fg_calib.io.units import Units, quantity
     from fg_calib.robot.model import tolerance_kind
 
     units = {name: p.unit for p in robot.parameters for name in (tolerance_kind(p), p.name) if name}

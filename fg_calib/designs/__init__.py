@@ -1,1 +1,1 @@
-"""Where to measure: candidates, and which of them tell most."""
+"""Which configurations to measure."""

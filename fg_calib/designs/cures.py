@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.analysis.reasons import NOT_EXCITED, explain_relations
 from fg_calib.designs.task import Posterior
 from fg_calib.graph.build import random_problem
 from fg_calib.graph.information import named_triangle, observability_of
-from fg_calib.graph.observability import Observability
 from fg_calib.graph.problem import Problem
+from fg_calib.observability.indices import Observability
+from fg_calib.observability.reasons import NOT_EXCITED, explain_relations
 from fg_calib.options import FrameKnowledge, Model
 
 Floats = NDArray[np.float64]

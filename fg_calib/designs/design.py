@@ -17,7 +17,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.analysis.accuracy import PoseRms
 from fg_calib.arguments import checked
 from fg_calib.arrays import FrozenArrays, as_floats
 from fg_calib.designs.candidates import Candidates
@@ -32,11 +31,12 @@ from fg_calib.designs.search import Chosen
 from fg_calib.designs.system import system_of
 from fg_calib.designs.task import N_TASK, Task, is_fitted
 from fg_calib.errors import InputError, ProblemError
-from fg_calib.graph.observability import Observability
 from fg_calib.graph.problem import Problem
 from fg_calib.job import Job
 from fg_calib.measurements.series import Table
+from fg_calib.observability.indices import Observability
 from fg_calib.options import check, check_flag, check_number
+from fg_calib.prediction.expected_error import PoseRms
 from fg_calib.progress import tell
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.model import Robot

@@ -24,7 +24,6 @@ from fg_calib.designs.scene import along_axes
 from fg_calib.designs.task import Posterior, n_measured
 from fg_calib.errors import InputError
 from fg_calib.graph.build import true_problem
-from fg_calib.graph.elsewhere import Places, places_of
 from fg_calib.graph.factors import Variables, unknown_prior_rows
 from fg_calib.graph.information import whitened_jacobian
 from fg_calib.graph.knowledge import coordinates_of
@@ -32,6 +31,7 @@ from fg_calib.graph.problem import Problem
 from fg_calib.measurements.dataset import Noise
 from fg_calib.measurements.kinds.board_pose import left_jacobian
 from fg_calib.measurements.series import KnownPoint, Table, Unknowns
+from fg_calib.observability.random_configurations import Places, places_of
 from fg_calib.options import PAIR_MODELS, Gauge, Model, Options, Pairing
 from fg_calib.robot.model import Robot
 from fg_calib.simulation.configurations import BoardViews, Configurations, GivenReadings, Placement

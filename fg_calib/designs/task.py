@@ -13,14 +13,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.analysis.accuracy import PoseRms, errors_at, without_rigid_motion
-from fg_calib.analysis.covariance import TangentCovariance, covariance_of_rows
-from fg_calib.analysis.seen import Seen
 from fg_calib.arrays import Brief, FrozenArrays
 from fg_calib.graph.factors import eliminate
-from fg_calib.graph.observability import Observability, observability_of_rows
 from fg_calib.graph.problem import Problem
+from fg_calib.observability.indices import Observability, observability_of_rows
+from fg_calib.observability.observed_quantities import Seen
+from fg_calib.prediction.expected_error import PoseRms, errors_at, without_rigid_motion
 from fg_calib.robot.kinematics import forward, precompute_trig
+from fg_calib.statistics.covariance import TangentCovariance, covariance_of_rows
 
 Floats = NDArray[np.float64]
 

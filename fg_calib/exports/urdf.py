@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fg_calib.errors import InputError
 from fg_calib.exports.links import Links, inverse, links_of, rigid, transform
-from fg_calib.files.urdf import ROUNDING, urdf_text
+from fg_calib.io.urdf import ROUNDING, urdf_text
 from fg_calib.robot.model import FRAME_KINDS, Joint, Robot, frame_values, roll_pitch_yaw
 
 Floats = NDArray[np.float64]

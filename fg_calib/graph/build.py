@@ -12,14 +12,12 @@ from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
 from fg_calib.errors import ProblemError
-from fg_calib.graph.elsewhere import Places, frame_names
 from fg_calib.graph.factors import Variables, prior_rows
 from fg_calib.graph.information import observability_of, whitened_triangle
 from fg_calib.graph.knowledge import coordinates_of
-from fg_calib.graph.observability import determined, singular_values
 from fg_calib.graph.problem import Problem, problem_at, tables_of, variables_of
-from fg_calib.graph.start import start_of
 from fg_calib.graph.tolerances import with_first_tolerances
+from fg_calib.initialization.start import start_of
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.gathering import Dataset, check_repeats, gather
@@ -27,6 +25,8 @@ from fg_calib.measurements.kinds import Frames, check_derivatives, check_start, 
 from fg_calib.measurements.models.pairs import missing_figures
 from fg_calib.measurements.models.predictions import predictions
 from fg_calib.measurements.series import Table
+from fg_calib.observability.indices import determined, singular_values
+from fg_calib.observability.random_configurations import Places, frame_names
 from fg_calib.options import (
     FrameKnowledge,
     Gauge,

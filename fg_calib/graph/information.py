@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.graph.factors import Eliminated, Variables, dense, eliminate, prior_rows, unknown_prior_rows
-from fg_calib.graph.observability import RANK_TOLERANCE, SIGNAL_FLOOR, Observability, observability_of_rows
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.robust import effect
 from fg_calib.graph.rows import ErrorColumns, RowSet, correlation_of, felt_errors, whitened_rows
+from fg_calib.observability.indices import RANK_TOLERANCE, SIGNAL_FLOOR, Observability, observability_of_rows
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

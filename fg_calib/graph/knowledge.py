@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.factors import Variables, build_variables, custom_factor, eliminate, pose_of
-from fg_calib.graph.observability import determined
 from fg_calib.measurements.series import Unknowns
+from fg_calib.observability.indices import determined
 from fg_calib.options import FrameKnowledge, Model
 from fg_calib.robot.model import Robot
 

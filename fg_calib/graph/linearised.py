@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from fg_calib.errors import CalibrationError, SolverError
 from fg_calib.graph.factors import Variables, dense, eliminate
-from fg_calib.graph.observability import determined
 from fg_calib.graph.problem import Problem
+from fg_calib.observability.indices import determined
 
 Floats = NDArray[np.float64]
 

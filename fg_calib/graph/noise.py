@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.errors import InputError
+from fg_calib.initialization.hand_eye import nearest_rotation
 from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Measurements, rotation_angle
-from fg_calib.measurements.frames import nearest_rotation
 from fg_calib.measurements.kinds import Distance, RotationAngle
 from fg_calib.measurements.moments import Moments, angle_moments, length_moments
 from fg_calib.measurements.residuals import Block, unit_whitening

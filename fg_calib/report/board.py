@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from rich.console import Group, RenderableType
 
-from fg_calib.camera.views import FIGURES, View
-from fg_calib.files.board_tables import BoardTables
+from fg_calib.importers.board_tables import BoardTables
+from fg_calib.importers.views import FIGURES, View
 from fg_calib.report.shown import SHOWN
 from fg_calib.report.tables import WIDTH, indented, line, plain_table, plain_text, section
 

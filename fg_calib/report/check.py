@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from rich.console import Group, RenderableType
 
-from fg_calib.analysis.check import Check, Explanation
-from fg_calib.analysis.verdict import probability
+from fg_calib.diagnostics.verdict import probability
+from fg_calib.monitoring.check import Check, Explanation
 from fg_calib.options import LIMITED
 from fg_calib.report.shown import SHOWN
 from fg_calib.report.tables import indented, line, plain_table, section

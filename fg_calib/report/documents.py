@@ -19,30 +19,16 @@ import scipy
 from numpy.typing import NDArray
 
 from fg_calib import __version__
-from fg_calib.analysis.accuracy import ExpectedError
-from fg_calib.analysis.conventions import WORDS, MissingMotion
-from fg_calib.analysis.corrections import PriorFit
-from fg_calib.analysis.covariance import TangentCovariance
-from fg_calib.analysis.goodness import (
-    FLAGS,
-    PREDICTION_VERDICTS,
-    VERDICTS,
-    KindFit,
-    OutlierCounts,
-    PredictedFit,
-    SuspectConfiguration,
-)
-from fg_calib.analysis.identifiability import Identifiability
-from fg_calib.analysis.joint_values import JointValues
-from fg_calib.analysis.learned import knowledge_of
-from fg_calib.analysis.mistakes import SetupCheck
-from fg_calib.analysis.typical_residuals import TypicalResidual
-from fg_calib.analysis.uncertainty import ParameterEstimate, Uncertainty
 from fg_calib.arguments import checked
+from fg_calib.diagnostics.setup_check import SetupCheck
+from fg_calib.diagnostics.typical_residuals import TypicalResidual
 from fg_calib.errors import InputError
-from fg_calib.files.csv_writer import Words, write_csv_parts, write_parquet_parts
-from fg_calib.files.disk import digest_of, fill_folder, require_own, write_text
-from fg_calib.files.result import (
+from fg_calib.graph.noise import JOINT_NOISE
+from fg_calib.graph.problem import Problem
+from fg_calib.graph.solver import Solution
+from fg_calib.io.csv_writer import Words, write_csv_parts, write_parquet_parts
+from fg_calib.io.disk import digest_of, fill_folder, require_own, write_text
+from fg_calib.io.result import (
     SCHEMA,
     Acceptance,
     AtNominal,
@@ -76,20 +62,34 @@ from fg_calib.files.result import (
     Typical,
     Weak,
 )
-from fg_calib.files.result import ExpectedError as ExpectedErrorDocument
-from fg_calib.files.result import Folds as FoldsDocument
-from fg_calib.files.result import JointValues as JointValuesDocument
-from fg_calib.files.result import SuspectConfiguration as Suspect
-from fg_calib.files.robot_yaml import write_robot
-from fg_calib.graph.noise import JOINT_NOISE
-from fg_calib.graph.problem import Problem
-from fg_calib.graph.solver import Solution
-from fg_calib.measurements.fingerprints import fingerprints
+from fg_calib.io.result import ExpectedError as ExpectedErrorDocument
+from fg_calib.io.result import Folds as FoldsDocument
+from fg_calib.io.result import JointValues as JointValuesDocument
+from fg_calib.io.result import SuspectConfiguration as Suspect
+from fg_calib.io.robot_file import write_robot
+from fg_calib.monitoring.fingerprints import fingerprints
+from fg_calib.monitoring.prior_information import knowledge_of
+from fg_calib.observability.identifiability import Identifiability
+from fg_calib.observability.parallel_axes import WORDS, MissingMotion
 from fg_calib.options import Options, check
+from fg_calib.prediction.expected_error import ExpectedError
 from fg_calib.report.page.files import FIGURE_FILES, PAGE
 from fg_calib.report.shown import FAMILY_UNIT
 from fg_calib.robot.kinematics import SPAN, pose
 from fg_calib.robot.model import Robot
+from fg_calib.statistics.assessment import ParameterEstimate, Uncertainty
+from fg_calib.statistics.covariance import TangentCovariance
+from fg_calib.statistics.goodness_of_fit import (
+    FLAGS,
+    PREDICTION_VERDICTS,
+    VERDICTS,
+    KindFit,
+    OutlierCounts,
+    PredictedFit,
+    SuspectConfiguration,
+)
+from fg_calib.statistics.joint_values import JointValues
+from fg_calib.statistics.prior_consistency import PriorFit
 from fg_calib.threads import single_threaded
 
 if TYPE_CHECKING:  # a calibration is written without the baseline
@@ -800,7 +800,7 @@ def write_calibrated_robot(folder: Path, robot: Robot) -> None:
     if robot.urdf is None:
         write_robot(folder / "robot_calibrated.yaml", robot)
         return
-    from fg_calib.files.urdf import write_urdf
+    from fg_calib.io.urdf import write_urdf
 
     write_urdf(folder / "robot_calibrated.urdf", robot)
     if any(p.nominal != 0.0 or p.estimated for p in robot.parameters if p.owner in (0, robot.n_joints + 1)):

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.analysis.identifiability import Identifiability
-from fg_calib.graph.observability import CORRELATED, WEAK
 from fg_calib.libraries import without_settings
+from fg_calib.observability.identifiability import Identifiability
+from fg_calib.observability.indices import CORRELATED, WEAK
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.console import Group, RenderableType
 
-from fg_calib.analysis.verdict import probability
-from fg_calib.files.disk import fill_folder
-from fg_calib.files.history import SCHEMA, History, Run
+from fg_calib.diagnostics.verdict import probability
+from fg_calib.io.disk import fill_folder
+from fg_calib.io.history import SCHEMA, History, Run
 from fg_calib.report.figures import empty_figure
 from fg_calib.report.shown import SHOWN
 from fg_calib.report.tables import line, plain_table, section

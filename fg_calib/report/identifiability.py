@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 
 from rich.console import Group, RenderableType
 
-from fg_calib.analysis.identifiability import Identifiability
-from fg_calib.analysis.reasons import LostDirection
 from fg_calib.arguments import checked
-from fg_calib.graph.observability import CORRELATED, Observability
+from fg_calib.observability.identifiability import Identifiability
+from fg_calib.observability.indices import CORRELATED, Observability
+from fg_calib.observability.reasons import LostDirection
 from fg_calib.report.shown import SHOWN
 from fg_calib.report.tables import WIDTH, line, plain_table, plain_text, section
 from fg_calib.robot.model import AXIS_OF_KIND, Axis

@@ -10,18 +10,18 @@ from typing import Any
 from rich.console import Group, RenderableType
 
 from fg_calib import __version__
-from fg_calib.analysis.disagreement import Disagreements
-from fg_calib.analysis.inspection import Inspection, JointRange
-from fg_calib.analysis.mistakes import SetupCheck
-from fg_calib.analysis.setup import ROWS
-from fg_calib.analysis.table_survey import NEAR_KINK
 from fg_calib.arguments import checked
+from fg_calib.diagnostics.inspection import Inspection, JointRange
+from fg_calib.diagnostics.setup import ROWS
+from fg_calib.diagnostics.setup_check import SetupCheck
+from fg_calib.diagnostics.table_survey import NEAR_KINK
 from fg_calib.job import Job
 from fg_calib.report.documents import observability_document
 from fg_calib.report.identifiability import WEAK, lost_directions, weak_directions
 from fg_calib.report.shown import SHOWN
 from fg_calib.report.tables import WIDTH, indented, line, plain_table, plain_text, section
 from fg_calib.report.text import expected_tool_error, in_words
+from fg_calib.statistics.robust_screening import Disagreements
 
 SCHEMA = "fg-calib/inspection/1"
 

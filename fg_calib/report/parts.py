@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from fg_calib import __version__
-from fg_calib.analysis.assessed_parts import AssessedParts
-from fg_calib.analysis.parts import PartsSolution
-from fg_calib.files.csv_writer import Words, write_csv_parts
-from fg_calib.files.disk import digest_of, fill_folder, write_text
-from fg_calib.files.parts import JobInParts
-from fg_calib.files.result import IN_PARTS, SCHEMA, Carried, Covariance, Frame, Result, Rms, Solver, Step
+from fg_calib.io.assessed_parts import AssessedParts
+from fg_calib.io.csv_writer import Words, write_csv_parts
+from fg_calib.io.disk import digest_of, fill_folder, write_text
+from fg_calib.io.parts import JobInParts
+from fg_calib.io.parts_solver import PartsSolution
+from fg_calib.io.result import IN_PARTS, SCHEMA, Carried, Covariance, Frame, Result, Rms, Solver, Step
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.report.documents import (
     KINDS,

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from rich.console import Group, RenderableType
 
-from fg_calib.analysis.accuracy import PoseRms
-from fg_calib.analysis.conventions import missing_motions
 from fg_calib.designs.design import Design
 from fg_calib.executors import Failure
+from fg_calib.observability.parallel_axes import missing_motions
+from fg_calib.prediction.expected_error import PoseRms
 from fg_calib.report.shown import SHOWN
 from fg_calib.report.tables import indented, line, plain_table, rounded, section
 from fg_calib.simulation.configurations import RandomReadings

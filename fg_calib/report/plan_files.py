@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 
 from fg_calib.designs.design import Design
 from fg_calib.errors import InputError
-from fg_calib.files.csv_writer import write_csv
-from fg_calib.files.disk import Filling, exists, fill_folders, read_bytes, read_text, write_text
-from fg_calib.files.robot_yaml import write_robot
-from fg_calib.files.simulated_tables import instrument_keys, is_filled_in, table_columns, to_fill_in
-from fg_calib.files.units import Units
-from fg_calib.files.urdf import write_urdf
+from fg_calib.io.csv_writer import write_csv
+from fg_calib.io.disk import Filling, exists, fill_folders, read_bytes, read_text, write_text
+from fg_calib.io.robot_file import write_robot
+from fg_calib.io.units import Units
+from fg_calib.io.urdf import write_urdf
 from fg_calib.measurements.series import Table
 from fg_calib.report.figures import empty_figure
 from fg_calib.report.plan import SCHEMA, UNKNOWN_ABOVE, design_document, error_counts
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
+from fg_calib.simulation.simulated_tables import instrument_keys, is_filled_in, table_columns, to_fill_in
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

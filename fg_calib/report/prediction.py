@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from rich.console import Group, RenderableType
 
 from fg_calib import __version__
-from fg_calib.analysis.prediction import PredictedErrors, Responsible, WorstConfiguration, summed_up
-from fg_calib.analysis.tool_error import ToolErrors
-from fg_calib.files import prediction as document
-from fg_calib.files.csv_writer import write_csv
-from fg_calib.files.result import Result
-from fg_calib.files.tables import joint_columns
-from fg_calib.files.units import Units
+from fg_calib.io import prediction as document
+from fg_calib.io.csv_writer import write_csv
+from fg_calib.io.result import Result
+from fg_calib.io.tables import joint_columns
+from fg_calib.io.units import Units
 from fg_calib.options import LengthUnit
+from fg_calib.prediction.prediction import PredictedErrors, Responsible, WorstConfiguration, summed_up
+from fg_calib.prediction.tool_pose import ToolErrors
 from fg_calib.report.shown import SHOWN
 from fg_calib.report.summary import verdict_word
 from fg_calib.report.tables import indented, line, plain_table, rounded, section

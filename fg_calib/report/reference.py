@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from rich.console import Group, RenderableType
 
-from fg_calib.files.reference import SECTIONS, TABLE_COLUMNS, WORDS, Key, Topic, keys_of
+from fg_calib.io.reference import SECTIONS, TABLE_COLUMNS, WORDS, Key, Topic, keys_of
 from fg_calib.report.tables import indented, line, plain_table, section
 
 _KEYS = ("key", "what it may be", "default", "meaning")

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.analysis.prediction import PredictedErrors
-from fg_calib.analysis.workspace import LEAST_WIDTH
+from fg_calib.prediction.prediction import PredictedErrors
+from fg_calib.prediction.workspace import LEAST_WIDTH
 from fg_calib.report.figures import LOST, empty_figure
 
 if TYPE_CHECKING:

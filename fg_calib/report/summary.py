@@ -6,14 +6,14 @@ from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 from textwrap import wrap
 
-from fg_calib.analysis.acceptance import Judgement
 from fg_calib.errors import escaped
-from fg_calib.files.result import Judgement as JudgementDocument
-from fg_calib.files.result import Lost, Parameter, Result, Rms
+from fg_calib.io.result import Judgement as JudgementDocument
+from fg_calib.io.result import Lost, Parameter, Result, Rms
 from fg_calib.options import LIMITED
 from fg_calib.report.identifiability import format_relation
 from fg_calib.report.shown import FAMILY_UNIT, SHOWN
 from fg_calib.report.tolerances import TITLE, tolerance_rows
+from fg_calib.statistics.acceptance import Judgement
 
 WIDTH = 100
 

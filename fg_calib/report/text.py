@@ -7,16 +7,13 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from rich.console import Group, RenderableType
 
-from fg_calib.analysis.accuracy import ExpectedError
-from fg_calib.analysis.joint_values import JointValues
-from fg_calib.analysis.uncertainty import FrameEstimate, Uncertainty
-from fg_calib.analysis.unknowns import PointEstimate
-from fg_calib.analysis.verdict import chi2_in_words, predicted_in_words, probability
 from fg_calib.arguments import checked
+from fg_calib.diagnostics.verdict import chi2_in_words, predicted_in_words, probability
 from fg_calib.graph.noise import JOINT_NOISE
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements.kinds import PointDistance, TouchedPoint
 from fg_calib.measurements.series import Table
+from fg_calib.prediction.expected_error import ExpectedError
 from fg_calib.report.fit import goodness_of_fit, prediction, suspicious, with_joint_noise
 from fg_calib.report.folds import folds
 from fg_calib.report.identifiability import WEAK, lost_directions, weak_directions
@@ -26,6 +23,9 @@ from fg_calib.report.shown import SHOWN
 from fg_calib.report.summary import good, judged
 from fg_calib.report.tables import WIDTH, in_order, indented, line, plain_table, plain_text, rounded, section
 from fg_calib.report.tolerances import TITLE
+from fg_calib.statistics.assessment import FrameEstimate, Uncertainty
+from fg_calib.statistics.joint_values import JointValues
+from fg_calib.statistics.landmark_estimates import PointEstimate
 
 
 @checked

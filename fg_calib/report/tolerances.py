@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from fg_calib.analysis.uncertainty import ParameterEstimate
-from fg_calib.files.result import Parameter
-from fg_calib.files.result import ToleranceScale as ScaleDocument
 from fg_calib.graph.tolerances import ToleranceScale
+from fg_calib.io.result import Parameter
+from fg_calib.io.result import ToleranceScale as ScaleDocument
 from fg_calib.report.shown import SHOWN
+from fg_calib.statistics.assessment import ParameterEstimate
 
 HEADINGS = ("", "stated", "estimated", "", "ratio", "from", "to", "corrections seen")
 """What the cells of a row are; the interval is one of 95 %."""

@@ -1,1 +1,1 @@
-"""Scenarios, and the measurements that they make."""
+"""Robots and measurements to try things on."""

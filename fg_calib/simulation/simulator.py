@@ -36,7 +36,7 @@ from fg_calib.simulation.configurations import (
     TargetViews,
 )
 from fg_calib.simulation.instruments import frame_knowledge, with_figures
-from fg_calib.simulation.measuring import Scene, Stops, drawn_frame, measure, share_knowledge, together
+from fg_calib.simulation.measure import Scene, Stops, drawn_frame, measure, share_knowledge, together
 from fg_calib.simulation.scenario import Errors, Scenario, Simulation, figures_by_name
 from fg_calib.simulation.views import reach_all, view_board
 from fg_calib.threads import single_threaded

@@ -13,22 +13,22 @@ from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
 from tolerances import rounding
 
-from fg_calib.analysis.uncertainty import assess
 from fg_calib.baseline import comparison as comparison_module
 from fg_calib.baseline.comparison import ESTIMATORS, best_rigid_fit, compare, real_errors
 from fg_calib.baseline.least_squares import fit_least_squares
 from fg_calib.errors import InputError
-from fg_calib.files.csv_writer import write_csv
-from fg_calib.files.job import read_job
-from fg_calib.files.robot_yaml import write_robot
 from fg_calib.graph.build import build_problem, problem_of
 from fg_calib.graph.solver import solve
+from fg_calib.io.csv_writer import write_csv
+from fg_calib.io.job import read_job
+from fg_calib.io.robot_file import write_robot
 from fg_calib.job import Job
 from fg_calib.measurements.series import Table
 from fg_calib.options import Options, Pairing
 from fg_calib.report.comparison import format_comparison
 from fg_calib.report.documents import comparison_document
 from fg_calib.robot.kinematics import pose
+from fg_calib.statistics.assessment import assess
 
 TOLERANCE = {"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3}
 FRAME = (Rotation.from_rotvec(np.pi * np.array([0.0, 0.6, 0.8])), np.array([7.0, -30.0, 2.0]))

@@ -11,11 +11,11 @@ import yaml
 from boards import CAMERA, SIZE, render, views
 from scipy.spatial.transform import Rotation
 
-from fg_calib.camera.board import CalibrationBoard
-from fg_calib.camera.opencv import opencv
-from fg_calib.files import images
-from fg_calib.files.calibration_board import read_calibration_board
-from fg_calib.files.instruments import read_camera
+from fg_calib.importers import images
+from fg_calib.importers.board import CalibrationBoard
+from fg_calib.importers.calibration_board import read_calibration_board
+from fg_calib.importers.opencv import opencv
+from fg_calib.io.instruments import read_camera
 
 cv2 = pytest.importorskip("cv2", reason="no OpenCV: pip install 'fg_calib[camera]'")
 

@@ -23,7 +23,7 @@ from typer.testing import CliRunner
 
 from fg_calib import __version__, cli, read_measurements, read_robot, write_robot
 from fg_calib.cli import entry
-from fg_calib.files.units import Units
+from fg_calib.io.units import Units
 from fg_calib.robot.model import Joint, RobotBuilder
 
 JOB, POSES, ROBOT, TRUTH = "calibration.yaml", "poses.csv", "robot_nominal.yaml", "robot_true.yaml"

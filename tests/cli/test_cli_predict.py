@@ -11,8 +11,8 @@ from simulated import measure, small_arm, true_robot
 
 import fg_calib as package
 from fg_calib import Calibration, calibrate
-from fg_calib.analysis import prediction
-from fg_calib.files.prediction import Prediction, prediction_schema
+from fg_calib.io.prediction import Prediction, prediction_schema
+from fg_calib.prediction import prediction
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 JOINTS = ["q1", "q2", "q3", "q4"]

@@ -8,8 +8,6 @@ from scenarios import INSTRUMENTS, SIGMA, WALL, scenario
 from simulated import small_arm
 
 from fg_calib import Pairing
-from fg_calib.analysis.accuracy import errors_at
-from fg_calib.analysis.covariance import spread_of
 from fg_calib.designs.design import design
 from fg_calib.errors import InputError
 from fg_calib.graph.build import build_problem
@@ -17,10 +15,12 @@ from fg_calib.graph.solver import solve
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import Noise
 from fg_calib.options import Options
+from fg_calib.prediction.expected_error import errors_at
 from fg_calib.simulation.configurations import GivenReadings, RandomReadings
 from fg_calib.simulation.instruments import BoardCamera, LengthGauge, PairGauge, Spot, Tracker
 from fg_calib.simulation.scenario import Errors
 from fg_calib.simulation.simulator import simulate
+from fg_calib.statistics.covariance import spread_of
 
 NOISE = replace(SIGMA, joint=2e-4)
 STAR = Tracker(model="distance-rotation", name="it")

@@ -4,10 +4,10 @@ from itertools import pairwise, permutations
 
 import numpy as np
 import pytest
+from fg_calib.design import order
 from simulated import paper_robot, planar_robot, small_arm
 from tolerances import rounding
 
-from fg_calib.designs import order
 from fg_calib.designs.order import shortest_way, travel
 from fg_calib.robot.inverse import random_readings
 

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from simulated import small_arm
 
 from fg_calib import InputError, Job, Measurements, Options, calibrate_job
-from fg_calib.analysis.accuracy import errors_at
 from fg_calib.designs.design import design
 from fg_calib.designs.of_job import solved
 from fg_calib.designs.plans import with_names
@@ -17,6 +16,7 @@ from fg_calib.designs.task import Posterior
 from fg_calib.graph.information import whitened_jacobian
 from fg_calib.measurements.dataset import Noise
 from fg_calib.options import Pairing
+from fg_calib.prediction.expected_error import errors_at
 from fg_calib.robot.kinematics import pose
 from fg_calib.simulation.configurations import GivenReadings, RandomReadings
 from fg_calib.simulation.instruments import Indicator, LengthGauge, PairGauge, Sockets, Tracker

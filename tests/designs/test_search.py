@@ -5,10 +5,10 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from fg_calib.design import search
 from systems import random_system, system_with_less
 from tolerances import rounding
 
-from fg_calib.designs import search
 from fg_calib.designs.chooser import N_EXACT, Chooser
 from fg_calib.designs.criteria import Measure
 from fg_calib.designs.search import choose, exchanged, greedy, not_worse_than_random, random_values

@@ -8,8 +8,6 @@ import pytest
 from scenarios import SIGMA, scenario
 
 from fg_calib import calibrate_job
-from fg_calib.analysis.accuracy import errors_at
-from fg_calib.analysis.covariance import spread_of
 from fg_calib.designs.design import design
 from fg_calib.designs.pairs import PairWork
 from fg_calib.designs.plans import with_names
@@ -20,10 +18,12 @@ from fg_calib.graph.solver import solve
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import Noise
 from fg_calib.options import Options, Pairing
+from fg_calib.prediction.expected_error import errors_at
 from fg_calib.simulation.configurations import GivenReadings, RandomReadings
 from fg_calib.simulation.instruments import Indicator, LengthGauge, PairGauge, Plane, Spot, Tracker
 from fg_calib.simulation.scenario import Errors
 from fg_calib.simulation.simulator import simulate
+from fg_calib.statistics.covariance import spread_of
 
 NOISE = replace(SIGMA, joint=2e-4)
 SILENT = Noise(0.0, 0.0, 0.0, distance=0.0, angle=0.0, point=0.0, pixel=0.0)

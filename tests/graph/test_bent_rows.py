@@ -7,12 +7,12 @@ import pytest
 from simulated import true_robot
 
 from fg_calib import Measurements, Robot, pose
-from fg_calib.analysis.covariance import spread_of
 from fg_calib.graph import noise
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.problem import noises_at
 from fg_calib.graph.solver import solve
 from fg_calib.robot.inverse import solve_inverse
+from fg_calib.statistics.covariance import spread_of
 
 ROWS = [
     [0, 0, 0.34, 0],

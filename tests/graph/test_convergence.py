@@ -13,18 +13,18 @@ from touches import TOLERANCE as TOUCH_TOLERANCE
 from touches import TOOL_POINT, corners, touch
 
 from fg_calib import assess
-from fg_calib.analysis.covariance import spread_of
 from fg_calib.baseline.least_squares import fit_least_squares
-from fg_calib.files.robot_yaml import read_robot
-from fg_calib.files.tables import read_measurements
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.problem import reweighted_at
 from fg_calib.graph.solver import SolverOptions, solve
+from fg_calib.io.robot_file import read_robot
+from fg_calib.io.tables import read_measurements
 from fg_calib.measurements.dataset import Noise, rotation_angle
 from fg_calib.measurements.series import Table
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Axis, Element, Joint, RobotBuilder
+from fg_calib.statistics.covariance import spread_of
 
 MOST = 15
 """Steps within which everything here arrives; scipy takes as many."""

@@ -10,18 +10,18 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 from simulated import TOOL, measure, paper_robot, small_arm, true_robot
 
-from fg_calib.analysis.bounds import cramer_rao
-from fg_calib.analysis.covariance import Spread
-from fg_calib.analysis.learned import knowledge_of
-from fg_calib.analysis.uncertainty import assess
-from fg_calib.files.csv_writer import write_csv
-from fg_calib.files.robot_yaml import write_robot
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.information import whitened_triangle
 from fg_calib.graph.problem import by_columns_of
 from fg_calib.graph.solver import solve
+from fg_calib.io.csv_writer import write_csv
+from fg_calib.io.robot_file import write_robot
 from fg_calib.measurements.dataset import Measurements
+from fg_calib.monitoring.prior_information import knowledge_of
+from fg_calib.observability.cramer_rao import cramer_rao
 from fg_calib.robot.kinematics import pose
+from fg_calib.statistics.assessment import assess
+from fg_calib.statistics.covariance import Spread
 
 TOLERANCE = {"a": 1e-3, "d": 2e-3, "alpha": 1e-3, "theta": 1.5e-3, "tool": 2e-3}
 TOLERANCE |= {f"tool.{k}": 2e-3 for k in ("roll", "pitch", "yaw")}

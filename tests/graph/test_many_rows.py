@@ -17,8 +17,9 @@ from fg_calib.graph.information import row_triangles
 from fg_calib.graph.linearised import Linearised
 from fg_calib.graph.noise import whitening_of
 from fg_calib.graph.problem import noises_at, reweighted_at, some_rows
-from fg_calib.measurements import fingerprints, residuals
+from fg_calib.measurements import residuals
 from fg_calib.measurements.residuals import pack, unpack
+from fg_calib.monitoring import fingerprints
 from fg_calib.robot import kinematics
 from fg_calib.robot.kinematics import SPAN, pose
 from fg_calib.threads import processors

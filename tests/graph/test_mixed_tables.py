@@ -16,17 +16,17 @@ from test_own_kind import measured
 from touches import corners, touch
 
 from fg_calib import Measurements, Robot, read_job, write_robot
-from fg_calib.analysis.uncertainty import assess
-from fg_calib.analysis.variance_components import estimate_noise
 from fg_calib.errors import InputError, ProblemError
-from fg_calib.files.csv_writer import write_csv
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.problem import assembled
 from fg_calib.graph.solver import solve
+from fg_calib.io.csv_writer import write_csv
 from fg_calib.measurements.dataset import Groups, Pairs, no_pairs
 from fg_calib.measurements.series import Table
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
+from fg_calib.statistics.assessment import assess
+from fg_calib.statistics.variance_components import estimate_noise
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 PLACED = (Rotation.from_rotvec([0.4, -1.1, 2.0]), np.array([3.0, -1.0, 0.5]))

@@ -10,8 +10,6 @@ from scipy.stats import chi2
 from simulated import measure, small_arm, true_robot
 
 from fg_calib import Calibration, calibrate
-from fg_calib.analysis.reasons import NOT_EXCITED
-from fg_calib.analysis.uncertainty import assess
 from fg_calib.baseline.comparison import compare
 from fg_calib.errors import InputError
 from fg_calib.graph.build import build_problem
@@ -20,11 +18,13 @@ from fg_calib.job import Job
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.kinds import Distance, Kind, Rows
 from fg_calib.measurements.series import Own, Table
+from fg_calib.observability.reasons import NOT_EXCITED
 from fg_calib.options import Options
 from fg_calib.report.comparison import format_comparison
 from fg_calib.report.documents import result_document
 from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import pose
+from fg_calib.statistics.assessment import assess
 
 
 class AnchorDistance(Kind):

@@ -15,16 +15,16 @@ from scipy.spatial.transform import Rotation
 from simulated import TOOL, small_arm
 from sparing import diagonal
 
-from fg_calib.analysis.identifiability import observe_structure
-from fg_calib.analysis.uncertainty import assess
-from fg_calib.files.csv_writer import write_csv
-from fg_calib.files.robot_yaml import write_robot
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.factors import build_variables, corrections_of, frame_of, pose_of, prior_rows
 from fg_calib.graph.solver import solve
+from fg_calib.io.csv_writer import write_csv
+from fg_calib.io.robot_file import write_robot
 from fg_calib.measurements.dataset import Measurements
+from fg_calib.observability.identifiability import observe_structure
 from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import pose
+from fg_calib.statistics.assessment import assess
 
 BASE = [name.replace("tool", "base") for name in TOOL]
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3, "tool": 5e-3, "base": 5e-3}

@@ -16,21 +16,21 @@ from tolerances import NEGLIGIBLE, rounding, sigmas_apart
 from touches import SIGMA, TOLERANCE, TOOL_POINT, corners, touch
 
 from fg_calib import write_robot
-from fg_calib.analysis.uncertainty import assess
-from fg_calib.analysis.variance_components import estimate_noise
 from fg_calib.errors import InputError, ProblemError
-from fg_calib.files.tables import read_measurements
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.factors import eliminate, prior_rows
 from fg_calib.graph.information import named_triangle, observability_of, whitened_triangle
 from fg_calib.graph.problem import started_at
 from fg_calib.graph.robust import tuning, weight
 from fg_calib.graph.solver import solve
+from fg_calib.io.tables import read_measurements
 from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Groups, Noise, Pairs, no_pairs
 from fg_calib.report.documents import result_document
 from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import pose
+from fg_calib.statistics.assessment import assess
+from fg_calib.statistics.variance_components import estimate_noise
 
 RIGID = ("a1", "alpha1", "d1", "theta1")
 """Parameters of the small arm that move it as one body; two more motions of the base are none of its parameters."""

@@ -37,8 +37,8 @@ from fg_calib import (
 )
 from fg_calib.cli import EXAMPLES
 from fg_calib.cli.entry import app
-from fg_calib.files.calibration_board import read_calibration_board
-from fg_calib.files.result import Result
+from fg_calib.importers.calibration_board import read_calibration_board
+from fg_calib.io.result import Result
 from fg_calib.report.guide import TOPICS, read_page
 from fg_calib.robot.kinematics import pose
 

@@ -5,7 +5,7 @@ import pytest
 from matplotlib.text import Text
 from simulated import measure, paper_robot, planar_robot, small_arm
 
-from fg_calib.analysis.identifiability import observe_configurations, observe_structure
+from fg_calib.observability.identifiability import observe_configurations, observe_structure
 from fg_calib.report.figures import draw_correlations, draw_groups, draw_spectrum, write_figures
 
 

@@ -15,8 +15,8 @@ from lxml import etree, html
 from simulated import measure, plus, small_arm, true_robot, write_job
 
 from fg_calib import Calibration, KnownPoint, Measurements, Robot, Table, calibrate, predict, write_report
-from fg_calib.analysis.seen import Seen
-from fg_calib.files.saved import read_configurations
+from fg_calib.io.saved import read_configurations
+from fg_calib.observability.observed_quantities import Seen
 from fg_calib.pages import load_run
 from fg_calib.report.page.arm import scene
 from fg_calib.report.page.charts import Scale, limits_of, short

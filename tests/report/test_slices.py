@@ -5,7 +5,7 @@ import pytest
 from simulated import measure, small_arm, true_robot
 
 from fg_calib import calibrate, predict
-from fg_calib.analysis import prediction
+from fg_calib.prediction import prediction
 from fg_calib.report.slices import CELLS, SLAB, draw_slices, slices_of
 
 

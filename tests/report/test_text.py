@@ -22,10 +22,10 @@ from fg_calib import (
     observe_structure,
     solve,
 )
-from fg_calib.analysis import goodness
 from fg_calib.options import Options
 from fg_calib.report.tables import plain_table, plain_text
 from fg_calib.robot.model import Joint, Robot, RobotBuilder
+from fg_calib.statistics import goodness_of_fit as goodness
 
 
 def planar_arm(tolerance=None) -> Robot:

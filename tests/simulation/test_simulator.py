@@ -21,17 +21,17 @@ from tolerances import rounding
 import fg_calib
 from fg_calib.cli import EXAMPLES
 from fg_calib.errors import InputError
-from fg_calib.files.job import read_job
-from fg_calib.files.robot_yaml import read_robot
-from fg_calib.files.scenario import SCENARIOS, read_scenario
-from fg_calib.files.simulation import write_simulation
+from fg_calib.io.job import read_job
+from fg_calib.io.robot_file import read_robot
 from fg_calib.measurements.dataset import Noise
 from fg_calib.robot.shape import Box, enters
 from fg_calib.simulation.configurations import BoardViews, GivenReadings, Placement, RandomReadings, TargetViews
-from fg_calib.simulation.measuring import FARTHEST_BASE
+from fg_calib.simulation.measure import FARTHEST_BASE
 from fg_calib.simulation.scenario import Errors, Scenario
+from fg_calib.simulation.scenario_file import SCENARIOS, read_scenario
 from fg_calib.simulation.simulator import simulate
 from fg_calib.simulation.views import view_board
+from fg_calib.simulation.write import write_simulation
 
 FILES = ("calibration.yaml", "poses.csv", "robot_nominal.yaml", "robot_true.yaml")
 BOARD = np.array([0.0, 6.5, 2.55])

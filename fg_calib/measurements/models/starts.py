@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.errors import ProblemError
+from fg_calib.initialization.landmarks import anchors_from_lengths, offset_from_lengths, plane_from_distances
 from fg_calib.measurements.kinds import AnchorContact, AnchorDistance, PlaneDistance
-from fg_calib.measurements.places import anchors_from_lengths, offset_from_lengths, plane_from_distances
 from fg_calib.measurements.series import Series, Table, Unknowns
 from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
 from fg_calib.robot.model import Robot

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.analysis.workspace import LEAST_WIDTH, Workspace
+from fg_calib.prediction.workspace import LEAST_WIDTH, Workspace
 from fg_calib.report.page.charts import (
     BOTTOM,
     LEFT,

@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.analysis.covariance import TangentCovariance
-from fg_calib.analysis.tool_error import ToolErrorModel
-from fg_calib.analysis.workspace import Workspace, survey
-from fg_calib.files.columns import PIECE
-from fg_calib.files.result import Result
-from fg_calib.files.saved import SavedConfigurations, SavedResiduals
+from fg_calib.io.columns import PIECE
+from fg_calib.io.result import Result
+from fg_calib.io.saved import SavedConfigurations, SavedResiduals
+from fg_calib.prediction.tool_pose import ToolErrorModel
+from fg_calib.prediction.workspace import Workspace, survey
 from fg_calib.report.shown import FAMILY_UNIT
 from fg_calib.robot.model import Robot
+from fg_calib.statistics.covariance import TangentCovariance
 
 Floats = NDArray[np.float64]
 

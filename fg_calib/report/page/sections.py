@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.analysis.folds import wide
-from fg_calib.analysis.workspace import Workspace
-from fg_calib.files.result import Parameter, Rms
+from fg_calib.io.result import Parameter, Rms
+from fg_calib.prediction.workspace import Workspace
 from fg_calib.report.identifiability import format_relation
 from fg_calib.report.page.figures import (
     accuracy_bars,
@@ -26,6 +25,7 @@ from fg_calib.report.page.run import Run
 from fg_calib.report.shown import FAMILY_UNIT, SHOWN
 from fg_calib.report.summary import judged, parameter_rows, verdict_word
 from fg_calib.report.tolerances import HEADINGS, TITLE, tolerance_rows
+from fg_calib.statistics.cross_validation import wide
 
 if TYPE_CHECKING:
     from lxml.etree import _Element as Element

@@ -11,8 +11,8 @@ import numpy as np
 from rich.console import Group, RenderableType
 
 from fg_calib.errors import InputError
-from fg_calib.files.disk import fill_folder, write_text
-from fg_calib.files.result import Parameter
+from fg_calib.io.disk import fill_folder, write_text
+from fg_calib.io.result import Parameter
 from fg_calib.report.page import sections
 from fg_calib.report.page.charts import bars, whiskers
 from fg_calib.report.page.figures import Figure

@@ -1,0 +1,1 @@
+"""Measurements from recordings, images and other people's tables."""

@@ -1,0 +1,242 @@
+"""Tables of what a camera saw of a calibration board: `pixels.csv`, `board.csv`, and the camera beside them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from fg_calib import __version__
+from fg_calib.errors import InputError
+from fg_calib.importers.views import FIGURES, BoardFit, View
+from fg_calib.io.columns import Header, Table
+from fg_calib.io.csv_writer import write_csv
+from fg_calib.io.disk import fill_folder, require_own, write_text
+from fg_calib.io.table_columns import COVARIANCE
+from fg_calib.io.tables import KNOWN
+from fg_calib.io.units import Units
+
+BOARD_FILES = {
+    "board.json": b'{\n "schema": "fg-calib/board/',
+    "board.csv": b"id,",
+    "pixels.csv": b"id,",
+    "camera.yaml": b"",
+}
+"""What is written and how it begins."""
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Joint readings of images, as a table has them.
+
+    Attributes:
+        ids: Names of images, in the order of the table.
+        columns: The columns of readings, and `split`, as they are written.
+    """
+
+    ids: tuple[str, ...]
+    columns: Mapping[str, tuple[str, ...]]
+
+
+def read_readings(path: Path) -> Readings:
+    """Joint readings from a table of configurations whose `id` is the name of an image without its ending.
+
+    Columns that are measurements, such as `x`, are left out; all others are taken as they are.
+
+    Raises:
+        InputError: The table cannot be used.
+    """
+    header = Header.read(path, "configurations").understood(KNOWN)
+    if "id" not in header.columns:
+        raise InputError(header.name, "no column id", "the name of each row's image without its ending")
+    kept = [column for column in header.columns if column not in KNOWN]
+    if not kept:
+        raise InputError(header.name, "no columns of joint readings", "q1, q2 and so on, or the joints' names")
+    kept += header.present("split")
+    table = Table.read(header, (), ["id", *kept])
+    ids = table.texts("id", "the name of an image without its ending")
+    table.require(ids.is_first_distinct().to_numpy(), "id", "one row an image")
+    comma = r"^([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)$" if header.separator != "," else r"$^"  # of decimals: we write points
+    return Readings(
+        tuple(ids), {name: tuple(table.frame[name].fill_null("").str.replace(comma, "$1.$2")) for name in kept}
+    )
+
+
+@dataclass(frozen=True)
+class BoardTables:
+    """What is written of images of a board.
+
+    Attributes:
+        fit: Poses and camera.
+        without: Names of images without a board, and why.
+        readings: Joint readings of the images, where there are some.
+        units: Of the tables that are written, and of the readings.
+        camera_file: The bytes of the camera's file; None if it was estimated.
+    """
+
+    fit: BoardFit
+    without: Mapping[str, str]
+    readings: Readings | None
+    units: Units
+    camera_file: bytes | None
+
+    def __post_init__(self) -> None:
+        if self.readings is not None and not self.used:
+            rows, images = (", ".join(names[:3]) for names in (self.without_image, self.without_row))
+            raise InputError("configurations", f"no id is the name of an image: {rows}", f"ids such as {images}")
+
+    @property
+    def used(self) -> tuple[View, ...]:
+        """Images that stand in the tables: those with a row of readings, where there are readings."""
+        ids = None if self.readings is None else set(self.readings.ids)
+        return tuple(view for view in self.fit.views if ids is None or view.name in ids)
+
+    @property
+    def posed(self) -> tuple[View, ...]:
+        """Those of them whose pose stands in the table of poses: it is not one of two."""
+        return tuple(view for view in self.used if not view.ambiguous)
+
+    @property
+    def without_row(self) -> tuple[str, ...]:
+        """Images with a board that have no row of readings."""
+        used = {view.name for view in self.used}
+        return tuple(view.name for view in self.fit.views if view.name not in used)
+
+    @property
+    def without_image(self) -> tuple[str, ...]:
+        """Rows of readings that have no image with a board."""
+        seen = {view.name for view in self.fit.views}
+        return () if self.readings is None else tuple(name for name in self.readings.ids if name not in seen)
+
+    def document(self) -> dict[str, Any]:
+        """What `board.json` holds: SI, full precision.
+
+        { "schema": "fg-calib/board/1", "version", "board": {keys of its file, in m}, "image_size": [width, height],
+          "rms_pixel", "sigma_pixel", "images": [{"id", "n_corners", "rms_pixel", "sigma_pixel", "position",
+          "rotation_vector", "covariance", "covariance_by_camera" | null, "ambiguous", "poor"}], "camera": {figures},
+          "camera_sigma": {figures} | null, "without_board": {file: reason}, "without_pose": [ids],
+          "without_readings": [ids], "without_image": [ids], "findings": [text] }
+
+        """
+        fit = self.fit
+        return {
+            "schema": "fg-calib/board/1",
+            "version": __version__,
+            "board": asdict(fit.board),
+            "image_size": list(fit.size),
+            "rms_pixel": fit.rms,
+            "sigma_pixel": fit.sigma,
+            "images": [_image_document(view, fit.camera_covariance is not None) for view in fit.views],
+            "camera": asdict(fit.camera),
+            "camera_sigma": fit.camera_sigma,
+            "without_board": dict(self.without),
+            "without_pose": list(fit.without_pose),
+            "without_readings": list(self.without_row),
+            "without_image": list(self.without_image),
+            "findings": list(fit.findings),
+        }
+
+
+def _image_document(view: View, estimated: bool) -> dict[str, Any]:
+    return {
+        "id": view.name,
+        "n_corners": len(view.corners),
+        "rms_pixel": view.rms,
+        "sigma_pixel": view.sigma,
+        "position": view.position.tolist(),
+        "rotation_vector": view.rotation_vector.tolist(),
+        "covariance": view.covariance.tolist(),
+        "covariance_by_camera": view.by_camera.tolist() if estimated else None,
+        "ambiguous": bool(view.ambiguous),
+        "poor": bool(view.poor),
+    }
+
+
+def require_no_input_of_board(folder: Path, inputs: Sequence[Path]) -> None:
+    """Check that tables written to a folder would not replace what they are made of, nor a file that no board wrote.
+
+    Raises:
+        InputError: They would.
+    """
+    given = {path.resolve() for path in inputs}
+    for name in BOARD_FILES:
+        if (folder / name).resolve() in given:
+            raise InputError(str(folder / name), "would be replaced by what is made of it", "another folder")
+    require_own(folder, BOARD_FILES)
+
+
+def write_board_tables(folder: Path, tables: BoardTables) -> tuple[str, ...]:
+    """Write `pixels.csv`, `board.csv`, `camera.yaml` and `board.json`, all of them or none.
+
+    Without an image that has one pose alone there is no `board.csv`.
+
+    Returns:
+        The names of the files.
+
+    Raises:
+        InputError: The folder cannot be written, or holds files of these names that are not of a board.
+    """
+    names: list[str] = []
+
+    def write(into: Path) -> None:
+        write_text(into / "board.json", json.dumps(tables.document(), indent=1, allow_nan=False) + "\n")
+        write_csv(into / "pixels.csv", _pixel_columns(tables))
+        if tables.posed:
+            write_csv(into / "board.csv", _pose_columns(tables))
+        if tables.camera_file is not None:
+            (into / "camera.yaml").write_bytes(tables.camera_file)
+        else:
+            write_text(into / "camera.yaml", _camera_text(tables.fit))
+        names.extend(sorted(file.name for file in into.iterdir()))
+
+    fill_folder(folder, write, BOARD_FILES)
+    return tuple(names)
+
+
+def _row_columns(tables: BoardTables, views: Sequence[View], each: Sequence[int]) -> dict[str, Any]:
+    """What rows begin with: id, readings, the board's name; those of an image stand as often as `each` says."""
+    rows = np.repeat(np.arange(len(views)), each)
+    columns: dict[str, Any] = {"id": np.array([view.name for view in views])[rows]}
+    if tables.readings is not None:
+        place = {name: i for i, name in enumerate(tables.readings.ids)}
+        of_view = [place[view.name] for view in views]
+        for name, cells in tables.readings.columns.items():
+            columns[name] = np.array([cells[i] for i in of_view])[rows]
+    if name := tables.fit.board.name:
+        columns["board"] = np.full(len(rows), name)
+    return columns
+
+
+def _pixel_columns(tables: BoardTables) -> dict[str, Any]:
+    views, length = tables.used, tables.units.factor("m")
+    each = [len(view.corners) for view in views]
+    uv = np.concatenate([view.uv for view in views])
+    corner = np.concatenate([tables.fit.board.corners[view.corners] for view in views]) / length
+    columns = _row_columns(tables, views, each)
+    columns |= {"u": uv[:, 0], "v": uv[:, 1], "corner_x": corner[:, 0], "corner_y": corner[:, 1]}
+    return columns | {"sigma_pixel": np.repeat([view.sigma for view in views], each)}
+
+
+def _pose_columns(tables: BoardTables) -> dict[str, Any]:
+    views, length, angle = tables.posed, tables.units.factor("m"), tables.units.factor("rad")
+    columns = _row_columns(tables, views, [1] * len(views))
+    columns |= dict(zip("xyz", np.array([view.position for view in views]).T / length, strict=True))
+    turns = np.array([view.rotation_vector for view in views]) / angle
+    columns |= dict(zip(("rx", "ry", "rz"), turns.T, strict=True))
+    size = np.repeat([angle, length], 3)
+    upper = (np.array([view.covariance for view in views]) / np.outer(size, size))[:, *np.triu_indices(6)]
+    return columns | dict(zip(COVARIANCE, upper.T, strict=True))
+
+
+def _camera_text(fit: BoardFit) -> str:
+    """The file of a camera that was estimated."""
+    width, height = fit.size
+    figures: dict[str, Any] = {name: getattr(fit.camera, name) for name in FIGURES}
+    figures |= {"width": width, "height": height, "sigma": fit.camera_sigma}
+    words = f"# fg-calib board: estimated from {len(fit.views)} images, in px; sigma: 1 sigma of each figure\n"
+    return words + yaml.safe_dump(figures, sort_keys=False)

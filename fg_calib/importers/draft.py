@@ -1,0 +1,350 @@
+"""A job for files that are there: `fg-calib init` writes it, and says what only its user can decide."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from fg_calib.errors import InputError, printable
+from fg_calib.importers.recognise import Recognised, recognise
+from fg_calib.io.robot_file import read_robot
+from fg_calib.io.units import ANGLES, LENGTHS
+from fg_calib.io.yaml import read_yaml
+from fg_calib.options import PAIR_MODELS, POSE_MODELS, Model
+from fg_calib.robot.model import Robot
+
+_TABLES = (".csv", ".parquet", ".pq")
+
+GUESSES = {
+    "position": (1e-4, "m"),
+    "orientation": (2e-4, "rad"),
+    "distance": (1e-4, "m"),
+    "angle": (2e-4, "rad"),
+    "point": (1e-4, "m"),
+    "pixel": (0.2, "px"),
+}
+"""1 sigma that stands in a job until somebody says better, and its unit: 0.1 mm, 0.2 mrad, 0.2 px."""
+
+_NOISE_OF: dict[str, tuple[str, ...]] = {
+    "pose": ("position", "orientation"),
+    "position": ("position",),
+    "orientation": ("orientation",),
+    "anchor": ("distance",),
+    "plane": ("distance",),
+    "board": ("position", "orientation"),
+    "pixels": ("pixel",),
+}
+"""What noise a model has; pairs have that of what they were measured by."""
+
+
+@dataclass(frozen=True)
+class _Inputs:
+    """The files of a job, sorted.
+
+    Attributes:
+        robot_file: The robot's file.
+        robot: The robot.
+        tables: Tables of configurations.
+        pairs: The table of pairs, if there is one.
+        camera: The camera's file, if there is one.
+    """
+
+    robot_file: Path
+    robot: Robot
+    tables: tuple[Recognised, ...]
+    pairs: Recognised | None
+    camera: Path | None
+
+    @property
+    def every(self) -> tuple[Recognised, ...]:
+        """All tables."""
+        return (*self.tables, *(() if self.pairs is None else (self.pairs,)))
+
+
+def draft_job(files: Sequence[Path], out: Path) -> str:
+    """The text of a job for some files.
+
+    Args:
+        files: A robot file, tables, perhaps a camera's file.
+        out: Where the job will be; the paths in it are relative to its folder.
+
+    Raises:
+        InputError: There is no robot or no table among them, several of what there may be one, or one cannot be used.
+    """
+    inputs = _sorted(files)
+    folder = out.parent
+    several = len(inputs.tables) > 1
+    lines = list(_head(inputs, folder))
+    if several:
+        lines += ["measurements:"]
+        for table in inputs.tables:
+            lines += _entry(table, inputs, folder)
+    else:
+        lines += _single(inputs.tables[0], inputs, folder)
+    lines += _units(inputs)
+    lines += _noise(inputs)
+    lines += _choices(inputs)
+    return "\n".join(lines) + "\n"
+
+
+def _sorted(files: Sequence[Path]) -> _Inputs:
+    """The files, each by what it is.
+
+    Raises:
+        InputError: See `draft_job`.
+    """
+    robots, tables, cameras = list[Path](), list[Path](), list[Path]()
+    for file in files:
+        ending = file.suffix.lower()
+        if ending in (".urdf", ".xacro"):
+            robots.append(file)
+        elif ending in _TABLES:
+            tables.append(file)
+        elif ending in (".yaml", ".yml"):
+            (robots if _is_robot(file) else cameras).append(file)
+        else:
+            expected = f"robot.yaml, a .urdf, camera.yaml, or a table: {', '.join(_TABLES)}"
+            raise InputError(str(file), f"ending {ending!r}", expected)
+    for found, what in ((robots, "robot file"), (cameras, "camera")):
+        if len(found) > 1:
+            raise InputError("init", f"several {what}s: {', '.join(f.name for f in found)}", "one")
+    if not robots or not tables:
+        missing, expected = ("table", "poses.csv") if robots else ("robot", "robot.yaml or a URDF")
+        raise InputError("init", f"no {missing} among the files", f"one, such as {expected}")
+    twice = [table.name for k, table in enumerate(tables) if any(_same_file(table, other) for other in tables[:k])]
+    if twice:
+        raise InputError("init", f"the same table twice: {twice[0]}", "every table once")
+    robot = read_robot(robots[0])
+    recognised = [recognise(table, robot) for table in tables]
+    pairs = _pairs_among(recognised)
+    measured = _with_pairs([table for table in recognised if table.kind == "joints"], pairs)
+    for table in measured:
+        if table.model is None:
+            hint = f"its other columns are {', '.join(table.unused)}" if table.unused else ""
+            raise InputError(table.path.name, "joint readings alone", "what was measured at them, or pairs", hint)
+        if table.model == "pixels" and not cameras:
+            raise InputError(table.path.name, "images of a camera that is not among the files", "camera.yaml too")
+    return _Inputs(robots[0], robot, tuple(measured), pairs, cameras[0] if cameras else None)
+
+
+def _same_file(one: Path, other: Path) -> bool:
+    """Whether two paths lead to one file; one that is not there is told of when it is read."""
+    return one.exists() and other.exists() and one.samefile(other)
+
+
+def _pairs_among(tables: Sequence[Recognised]) -> Recognised | None:
+    """The table of pairs among some.
+
+    Raises:
+        InputError: There are several, it stands alone, or it has columns of other names: a job cannot explain these.
+    """
+    pairs = [table for table in tables if table.kind == "pairs"]
+    if len(pairs) > 1:
+        raise InputError("init", f"several tables of pairs: {', '.join(t.path.name for t in pairs)}", "one")
+    if not pairs:
+        return None
+    (one,) = pairs
+    if len(tables) == 1:
+        raise InputError(one.path.name, "pairs alone", "the table of the configurations that they are of too")
+    for name, column in one.columns.items():
+        if column.lower() != name:
+            hint = "a job's key columns is of configurations: rename it in the table"
+            raise InputError(one.path.name, f"column {column!r}", name, hint)
+    return one
+
+
+def _is_robot(file: Path) -> bool:
+    """Whether a YAML file is a robot's, and not a camera's.
+
+    Raises:
+        InputError: It is neither.
+    """
+    mapping = read_yaml(file)
+    if {"joints", "urdf"} & mapping.keys():
+        return True
+    if "fx" in mapping:
+        return False
+    found = "a job" if "measurements" in mapping else f"keys {', '.join(map(str, mapping))}"
+    raise InputError(file.name, found, "a robot (joints, or urdf) or a camera (fx, fy, cx, cy)")
+
+
+def _with_pairs(tables: Sequence[Recognised], pairs: Recognised | None) -> list[Recognised]:
+    """The tables, that first which the pairs are of: at which nothing else was measured, or points were touched."""
+    if pairs is None:
+        return list(tables)
+    distance, angle = "distance" in pairs.present, "angle" in pairs.present
+    model: Model = "distance-rotation" if distance and angle else "rotation" if angle else "distance"
+    ranked = sorted(tables, key=lambda t: 0 if t.model is None else 1 if "group" in t.present else 2)
+    return [replace(ranked[0], model=model), *ranked[1:]]
+
+
+def _path(file: Path, folder: Path) -> str:
+    """A file's path as a job in the folder names it, in quotes where YAML needs them."""
+    return _scalar(os.path.relpath(file.absolute(), folder.absolute()))
+
+
+def _scalar(text: str) -> str:
+    """Text as a scalar of YAML, also within brackets."""
+    return yaml.safe_dump([text], default_flow_style=True, width=10_000).strip()[1:-1]
+
+
+def _head(inputs: _Inputs, folder: Path) -> Iterator[str]:
+    yield "# A calibration job, written by fg-calib init. Lines with DECIDE are yours to look at;"
+    yield "# `fg-calib help job` has every key, `fg-calib inspect` says what this job looks like."
+    robot = inputs.robot
+    yield f"robot: {_path(inputs.robot_file, folder)}"
+    arm = [p for p in robot.parameters if p.estimated and 1 <= p.owner <= robot.n_joints]
+    if any(p.tolerance is None for p in arm):
+        yield "# DECIDE how far off the drawing may be: the robot file does not say it of all that is estimated;"
+        yield "# such as tolerance: {a: 0.001, d: 0.001, alpha: 0.1, theta: 0.1}, in its units. Without, nothing holds"
+        yield "# what the measurements do not determine (gauge: keep, below, leaves it at nominal)."
+        if inputs.robot_file.suffix.lower() == ".urdf":
+            urdf = _path(inputs.robot_file, folder)
+            yield f"# robot: {{urdf: {urdf}, estimate: [tool.x, tool.y, tool.z], tolerance: {{...}}}}"
+    tool = [robot.parameters[i] for i in robot.owned_by(robot.n_joints + 1)]
+    if not any(p.estimated for p in tool):
+        yield "# DECIDE whether exactly the robot file's tool was measured; if not: estimate: [tool.x, tool.y, tool.z]"
+        yield "# in it (and tool.roll, tool.pitch, tool.yaw where orientations were measured)."
+
+
+def _single(table: Recognised, inputs: _Inputs, folder: Path) -> Iterator[str]:
+    """The keys of one table alone."""
+    yield f"measurements: {_path(table.path, folder)}"
+    for key, value, comment in _keys(table, inputs, folder):
+        yield f"{key}: {value}{comment}"
+
+
+def _entry(table: Recognised, inputs: _Inputs, folder: Path) -> Iterator[str]:
+    """The entry of one of several tables."""
+    yield f"  - table: {_path(table.path, folder)}"
+    for key, value, comment in _keys(table, inputs, folder):
+        yield f"    {key}: {value}{comment}"
+    own = _units_of(table)
+    if own and own != _common_units(inputs):
+        yield f"    units: {_flow(own)}"
+
+
+def _keys(table: Recognised, inputs: _Inputs, folder: Path) -> Iterator[tuple[str, str, str]]:
+    """Keys of a table with their values and comments."""
+    if inputs.pairs is not None and table is inputs.tables[0]:
+        which = "  # DECIDE whether they are of this table" if len(inputs.tables) > 1 else ""
+        yield "pairs", _path(inputs.pairs.path, folder), which
+    yield "model", str(table.model), _of_model(table)
+    if table.model in POSE_MODELS:
+        yield "frame", "unknown", "  # DECIDE: known only if the measurement frame is the robot's base frame"
+    if table.model == "pixels":
+        assert inputs.camera is not None
+        room = "  # DECIDE: if it stands in the room, {file: ..., fixed: true}, and frame: unknown"
+        yield "camera", _path(inputs.camera, folder), room
+    alone = len(inputs.tables) == 1  # names of several tables would have to agree
+    named = {"id": table.maybe_id} if table.maybe_id and alone else {}
+    columns: dict[str, Any] = {name: _column(table, name) for name in table.columns} | named
+    if columns:
+        yield "columns", _flow(columns), "  # DECIDE whether these are what the names mean"
+    if table.counts:
+        yield "# DECIDE scale and zero of each", "reading = (count - zero) * scale, in the units below", ""
+    if table.maybe_id and not alone:
+        same = "  # if the same name in two tables is the same configuration"
+        yield "# DECIDE, among columns", _flow({"id": table.maybe_id}), same
+    unused = [name for name in table.unused if name not in named.values()]
+    if unused:
+        names = printable(", ".join(unused))
+        yield "# not used", names if len(names) <= 90 else f"{names[:86]} ...", ""
+
+
+def _column(table: Recognised, name: str) -> Any:
+    """What the job says of a column that the table calls otherwise, or has in counts or another unit."""
+    column = table.columns[name]
+    if name in table.counts:
+        return {"name": column, "scale": 1.0, "zero": 0.0}
+    return {"name": column, "scale": table.scales[name]} if name in table.scales else column
+
+
+def _of_model(table: Recognised) -> str:
+    other: dict[str | None, str] = {
+        "pose": "or distance-rotation, which needs no frame; position without the orientations; board if a camera on"
+        " the tool measured where a board is",
+        "position": "or distance, which needs no frame",
+        "orientation": "or rotation, which needs no frame",
+        "anchor": "offset: estimate if the instrument adds a length of its own",
+    }
+    return f"  # {other[table.model]}" if table.model in other else ""
+
+
+def _flow(mapping: dict[str, Any]) -> str:
+    """A mapping on one line."""
+    return yaml.safe_dump(mapping, default_flow_style=True, width=10_000, sort_keys=False, allow_unicode=False).strip()
+
+
+def _units_of(table: Recognised) -> dict[str, str]:
+    return {key: unit for key in ("length", "angle") if (unit := getattr(table, key)) is not None}
+
+
+def _common_units(inputs: _Inputs) -> dict[str, str]:
+    """The units at the top: those that the first table that says so has."""
+    found: dict[str, str] = {"length": "m", "angle": "rad"}
+    for table in reversed(inputs.every):
+        found |= _units_of(table)
+    return found
+
+
+def _units(inputs: _Inputs) -> Iterator[str]:
+    guessed = sorted({key for table in inputs.every for key in table.guessed})
+    why = (
+        f"  # DECIDE: {' and '.join(guessed)} guessed from the figures' sizes" if guessed else "  # as the headers say"
+    )
+    yield f"units: {_flow(_common_units(inputs))}{why}"
+
+
+def _noise(inputs: _Inputs) -> Iterator[str]:
+    """Noise as guesses that are estimated until somebody says better."""
+    wanted = dict.fromkeys(kind for table in inputs.tables for kind in _noise_of(table, inputs))
+    units = _common_units(inputs)
+    sizes = {"m": LENGTHS[units["length"]], "rad": ANGLES[units["angle"]], "px": 1.0}
+    figures = {kind: float(f"{GUESSES[kind][0] / sizes[GUESSES[kind][1]]:.2g}") for kind in wanted}
+    yield "# DECIDE the noise, 1 sigma in the units above: the figures are guesses, so it is estimated from residuals;"
+    yield "# put your instrument's in their place and leave estimate out. joint: repeatability of the joint readings."
+    yield f"noise: {_flow({**figures, 'joint': 0.0, 'estimate': True})}"
+
+
+def _lengths(inputs: _Inputs, **metres: float) -> str:
+    """An example of lengths in the job's unit."""
+    factor = LENGTHS[_common_units(inputs)["length"]]
+    return _flow({name: float(f"{value / factor:.3g}") for name, value in metres.items()})
+
+
+def _noise_of(table: Recognised, inputs: _Inputs) -> list[str]:
+    """Kinds of noise that a job has to state for a table, because the table does not."""
+    if table.model not in PAIR_MODELS:
+        return [kind for kind in _NOISE_OF[str(table.model)] if kind not in table.has_sigma]
+    pairs = inputs.pairs if table is inputs.tables[0] else None
+    kinds = ["point"] if "group" in table.present and "point" not in table.has_sigma else []
+    if pairs is None:
+        return kinds
+    return kinds + [kind for kind in ("distance", "angle") if kind in pairs.present and kind not in pairs.has_sigma]
+
+
+def _choices(inputs: _Inputs) -> Iterator[str]:
+    """The other keys with their defaults, as comments."""
+    columns = {name for table in inputs.tables for name in table.present}
+    yield ""
+    yield "# The rest as it is without a word:"
+    if any(table.model in POSE_MODELS for table in inputs.tables):
+        yield "# pairing: star        # of models of pairs: star | chain | all | {random: 3000, seed: 0}"
+    if "target" in columns:
+        near = _lengths(inputs, x=0.0, y=0.0, z=0.1, tolerance=0.001)
+        yield f"# targets: {{smr1: {near}}}   # where targets are on the tool, if known"
+    if "anchor" in columns:
+        near = _lengths(inputs, x=1.0, y=0.0, z=0.0, tolerance=0.002)
+        yield f"# anchors: {{bolt: {near}}}     # where anchors are from the base, if known"
+    yield "# loss: none           # huber | cauchy | geman-mcclure | gnc where there are gross errors"
+    yield "# gauge: prior         # what data do not determine: tolerances hold it; keep: it stays at nominal; none"
+    yield "# encoder: propagated  # estimated: the true joint values too"
+    yield "# pair_errors: shared  # independent: pairs of one configuration share no errors"
+    if "split" not in columns:
+        yield "# A column split with `test` in some rows keeps them out of the fit, to check the prediction."

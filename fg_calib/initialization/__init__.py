@@ -1,0 +1,1 @@
+"""Closed-form and linear starts of frames, landmarks and boards."""

@@ -1,0 +1,1 @@
+"""Readers and writers, one a format; the only place of units."""

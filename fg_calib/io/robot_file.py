@@ -1,0 +1,370 @@
+"""Robots in YAML: a DH convention with a row a joint, or a URDF with what it cannot hold itself.
+
+```yaml
+name: arm                              urdf: arm.urdf        # relative to this file
+convention: mdh                        base_link: base_link  # default: the root link
+units: {length: mm, angle: deg}        tip_link: flange      # default: the only leaf link
+joints:                                units: {length: mm, angle: deg}
+  - {a: 0, alpha: 0, d: 340, theta: 0, limits: [-170, 170]}
+  - {a: 0, alpha: -90, d: 0, theta: 0, type: prismatic, name: slide}
+```
+Both take `name`, `base`, `tool`, `fixed`, `estimate` and `tolerance` too. Rows without `name` are called q1 to qn.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import Field
+
+from fg_calib.arguments import checked
+from fg_calib.errors import InputError
+from fg_calib.io.disk import write_text
+from fg_calib.io.units import UNITS, Units, UnitsOfFile
+from fg_calib.io.yaml import (
+    Bound,
+    FilePath,
+    Number,
+    Positive,
+    Schema,
+    Section,
+    meaning,
+    read_yaml,
+    shown,
+    validate,
+)
+from fg_calib.robot.model import (
+    AXIS_OF_KIND,
+    CONVENTIONS,
+    FRAME_KINDS,
+    IN_RAD,
+    MOST_ANGLE,
+    Axis,
+    Joint,
+    Parameter,
+    Robot,
+    RobotBuilder,
+    tolerance_kind,
+)
+
+
+class FrameValues(Schema):
+    """A frame as six values, those missing 0."""
+
+    x: Number = meaning("Place along x", 0.0)
+    y: Number = meaning("Place along y", 0.0)
+    z: Number = meaning("Place along z", 0.0)
+    roll: Number = meaning("Turn about x, the first of Rz(yaw) Ry(pitch) Rx(roll) to act", 0.0)
+    pitch: Number = meaning("Turn about y", 0.0)
+    yaw: Number = meaning("Turn about z", 0.0)
+
+    def si(self, units: Units, place: str) -> dict[str, float]:
+        """The six values by kind, [m] and [rad].
+
+        Raises:
+            InputError: An angle in rad is one in deg.
+        """
+        for kind in ("roll", "pitch", "yaw"):
+            if units.angle == "rad" and abs(value := getattr(self, kind)) > MOST_ANGLE:
+                raise InputError(f"{place}: {kind}", f"found {value:g}", IN_RAD, "units: {angle: deg} are deg")
+        return {kind: getattr(self, kind) * units.factor(_unit_of_kind(kind)) for kind in FRAME_KINDS}
+
+
+class _Robot(Schema):
+    """The keys that both forms of a robot file have."""
+
+    name: str | None = meaning("The robot's name", None)
+    units: UnitsOfFile = meaning("Of the figures in this file", Units(), kind="mapping")
+    base: FrameValues = meaning("Base frame to frame 0, or to the first link of a URDF", FrameValues(), kind="frame")
+    tool: FrameValues = meaning("Last frame to tool frame", FrameValues(), kind="frame")
+    fixed: tuple[str, ...] = meaning("Parameters of the joints that are known exactly, never estimated", ())
+    estimate: tuple[str, ...] = meaning(
+        "Parameters of base and tool that are estimated, which others are not: tool.x", ()
+    )
+    tolerance: dict[str, Positive] = meaning(
+        "1 sigma of true minus nominal, by kind (a, theta, tool, ...) or by name: used as priors",
+        {},
+        kind="mapping of numbers above 0",
+    )
+
+    def choices(self, place: str) -> dict[str, Any]:
+        """What `RobotBuilder.build` wants to know, [m] and [rad].
+
+        Raises:
+            InputError: A tolerance is too small.
+        """
+        tolerance = {
+            key: self.units.sigma(value, unit_of_key(key), f"{place}: tolerance: {key}")
+            for key, value in self.tolerance.items()
+        }
+        return {"fixed": self.fixed, "estimate": self.estimate, "tolerance": tolerance}
+
+
+_Limits = Annotated[list[Bound], Field(min_length=2, max_length=2)]
+
+
+class _Row(Schema):
+    type: Literal["revolute", "prismatic"] = meaning("Whether it turns or slides", "revolute")
+    name: str | None = meaning("The joint's name, which its column may have; q1 to qn if left out", None)
+    a: Number | None = meaning("Shift along x", None)
+    alpha: Number | None = meaning("Turn about x", None)
+    d: Number | None = meaning("Shift along z; the reading of a slide is added", None)
+    theta: Number | None = meaning("Turn about z; the reading of a turning joint is added", None)
+    beta: Number = meaning("Turn about y, of the conventions with -hayati", 0.0)
+    limits: _Limits | None = meaning("Lower and upper of its readings; none if left out", None)
+
+
+class _DhRobot(_Robot):
+    convention: Literal["dh", "mdh", "mdh-hayati", "dh-hayati"] = meaning("Order of one joint's transforms")
+    joints: Annotated[list[_Row], Field(min_length=1)] = meaning("A row a joint, in chain order", kind="list of rows")
+
+
+class _UrdfRobot(_Robot):
+    urdf: FilePath = meaning("A URDF, in place of convention and joints; the path is relative to this file")
+    base_link: str | None = meaning("Link where the chain starts; the root if left out", None)
+    tip_link: str | None = meaning("Link where the chain ends; the only leaf if left out", None)
+
+
+SECTIONS = (
+    Section("", _DhRobot, "By rows of a Denavit-Hartenberg convention:"),
+    Section("", _UrdfRobot, "Or a URDF with what it cannot hold itself (a path to the .urdf alone will do too):"),
+    UNITS,
+    Section("joints: each row", _Row, required=("a", "alpha", "d", "theta")),
+    Section("base, tool", FrameValues),
+)
+"""The mappings of a robot file, for the reference."""
+
+
+@checked
+def read_robot(path: Path | str, *, base_link: str | None = None, tip_link: str | None = None) -> Robot:
+    """The robot in a YAML file or a URDF, told apart by the ending `.urdf`.
+
+    Args:
+        path: The file.
+        base_link: Link of the URDF where the chain starts, instead of the one the file names.
+        tip_link: Link of the URDF where the chain ends, instead of the one the file names.
+
+    Raises:
+        InputError: There is no such file, or it does not describe a robot.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".urdf":
+        from fg_calib.io.urdf import read_urdf
+
+        return read_urdf(path, base_link=base_link, tip_link=tip_link)
+    if path.suffix.lower() == ".xacro":
+        hint = f"`xacro {path.name} > {path.name.removesuffix(path.suffix).removesuffix('.urdf')}.urdf` writes one"
+        raise InputError(path.name, "a file of xacro", "a URDF", hint)
+    mapping = read_yaml(path)
+    if "urdf" in mapping:
+        links = {"base_link": base_link, "tip_link": tip_link}
+        return robot_from_mapping(mapping | {k: v for k, v in links.items() if v is not None}, path.name, path.parent)
+    if base_link is not None or tip_link is not None:
+        raise InputError(path.name, "a robot without links", "a URDF", "base_link and tip_link name links of one")
+    return robot_from_mapping({"name": path.stem} | mapping, path.name, path.parent)
+
+
+def robot_from_mapping(mapping: Mapping[str, Any], place: str, folder: Path) -> Robot:
+    """The robot that a mapping of a YAML file describes.
+
+    Args:
+        mapping: The mapping: with `urdf`, or with `convention` and `joints`.
+        place: Its file, and its key there if it is not the whole file.
+        folder: What the path of a URDF is relative to.
+
+    Raises:
+        InputError: It does not describe a robot.
+    """
+    if "urdf" in mapping:
+        return _build_urdf(validate(_UrdfRobot, dict(mapping), place), place, folder)
+    return _build_dh(validate(_DhRobot, dict(mapping), place), place)
+
+
+def _build_urdf(file: _UrdfRobot, place: str, folder: Path) -> Robot:
+    from fg_calib.io.urdf import read_urdf
+
+    return read_urdf(
+        folder / file.urdf,
+        base_link=file.base_link,
+        tip_link=file.tip_link,
+        name=file.name,
+        base=file.base.si(file.units, f"{place}: base"),
+        tool=file.tool.si(file.units, f"{place}: tool"),
+        place=place,
+        **file.choices(place),
+    )
+
+
+def _build_dh(file: _DhRobot, place: str) -> Robot:
+    builder = RobotBuilder(file.name or "robot", file.convention)
+    builder.add_frame("base", file.base.si(file.units, f"{place}: base"), 0, False)
+    names = [row.name or f"q{i}" for i, row in enumerate(file.joints, start=1)]
+    for i, (row, name) in enumerate(zip(file.joints, names, strict=True), start=1):
+        here = f"{place}: joint {i}"
+        if name in names[: i - 1]:
+            raise InputError(f"{here}: name", f"found {name!r}, the name of joint {names.index(name) + 1}", "another")
+        values = {}
+        for kind in CONVENTIONS[file.convention]:
+            value = getattr(row, kind)
+            if value is None:
+                raise InputError(here, f"missing key {kind!r}")
+            unit = _unit_of_kind(kind)
+            if file.units.name(unit) == "rad" and abs(value) > MOST_ANGLE:
+                raise InputError(f"{here}: {kind}", f"found {value:g}", IN_RAD, "units: {angle: deg} are deg")
+            values[kind] = value * file.units.factor(unit)
+        if row.beta != 0.0 and "beta" not in values:
+            raise InputError(
+                f"{here}: beta",
+                f"found {row.beta!r}",
+                f"none: the convention {file.convention} has no beta",
+                f"{file.convention}-hayati has",
+            )
+        lower, upper = row.limits or (-math.inf, math.inf)
+        if not lower < upper:
+            raise InputError(f"{here}: limits", f"found {shown([lower, upper])}", "lower below upper")
+        joint = Joint(name, prismatic=row.type == "prismatic")
+        factor = file.units.factor(joint.unit)
+        builder.add_convention_joint(Joint(name, joint.prismatic, lower * factor, upper * factor), values)
+    builder.add_frame("tool", file.tool.si(file.units, f"{place}: tool"), len(file.joints) + 1, False)
+    return builder.build(place=place, **file.choices(place))
+
+
+@checked
+def write_robot(path: Path | str, robot: Robot, *, units: Units | None = None, urdf_name: str | None = None) -> None:
+    """Write a robot YAML that `read_robot` reads back to the same robot.
+
+    Args:
+        path: The file to write.
+        robot: The robot; its nominal values are written.
+        units: The file's units; default m and rad, in which every value reads back exactly.
+        urdf_name: For a URDF robot the path of its URDF, relative to `path`: the file refers to it and holds
+            what it cannot. The joints' own values are those of the URDF: see `write_urdf`.
+
+    Raises:
+        InputError: The folder does not exist or may not be written to, or the robot has what no such file can say.
+        ValueError: A URDF robot without `urdf_name`, or the other way round.
+    """
+    write_text(Path(path), robot_text(robot, units=units, urdf_name=urdf_name, place=str(path)))
+
+
+def robot_text(
+    robot: Robot, *, units: Units | None = None, urdf_name: str | None = None, place: str | None = None
+) -> str:
+    """The text that `write_robot` writes.
+
+    Args:
+        robot: The robot.
+        units: Of the text; default m and rad.
+        urdf_name: See `write_robot`.
+        place: The file, for messages; the robot's name if None.
+
+    Raises:
+        InputError: The robot has what no such file can say.
+        ValueError: A URDF robot without `urdf_name`, or the other way round.
+    """
+    if (robot.urdf is None) != (urdf_name is None):
+        raise ValueError("a URDF robot, and no other, is written with urdf_name")
+    units = units or Units()
+    mapping: dict[str, Any] = {"name": robot.name}
+    if robot.urdf is None:
+        mapping |= {"convention": robot.convention}
+    else:
+        mapping |= {"urdf": urdf_name, "base_link": robot.urdf.base_link, "tip_link": robot.urdf.tip_link}
+    mapping |= {"units": _Flow(asdict(units))}
+    if robot.urdf is None:
+        mapping |= {"joints": [_row(robot, i, units) for i in range(robot.n_joints)]}
+    base, tool = robot.owned_by(0), robot.owned_by(robot.n_joints + 1)
+    for key, owned in (("base", base), ("tool", tool)):
+        frame = [robot.parameters[i] for i in owned]
+        mapping |= {key: _Flow((p.kind, units.from_si(p.nominal, p.unit)) for p in frame if p.nominal != 0.0)}
+    frames = {*base, *tool}
+    mapping |= {
+        "fixed": _Line(p.name for i, p in enumerate(robot.parameters) if i not in frames and not p.estimated),
+        "estimate": _Line(p.name for i, p in enumerate(robot.parameters) if i in frames and p.estimated),
+        "tolerance": _Flow(_tolerances(robot, units)),
+    }
+    kept = {key: value for key, value in mapping.items() if value or key == "joints"}
+    if robot.urdf is None:
+        _check_written(robot, kept, place or robot.name)
+    return str(yaml.dump(kept, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=math.inf))
+
+
+def _check_written(robot: Robot, mapping: Mapping[str, Any], place: str) -> None:
+    """Check that what is to be written describes the robot, element by element.
+
+    Raises:
+        InputError: It does not, as the robot has other elements than its convention, a base and a tool.
+    """
+    expected = "base, joints of one convention, tool: all that a robot file can say"
+    if robot.convention not in CONVENTIONS:
+        raise InputError(place, f"the robot is of the convention {shown(robot.convention)}", expected)
+    try:
+        again = robot_from_mapping(mapping, place, Path())
+    except InputError:
+        return  # figures of a fit that went astray: a result is written whole, and readers refuse such a robot
+    names = [p.name for p in robot.parameters]
+    if [p.name for p in again.parameters] != names or again.elements != robot.elements:
+        raise InputError(place, "the robot has elements or parameters of its own", expected)
+
+
+def _unit_of_kind(kind: str) -> str:
+    """`m` or `rad`: the unit of a kind of parameter."""
+    return "m" if AXIS_OF_KIND[kind] < Axis.RX else "rad"
+
+
+def unit_of_key(key: str) -> str:
+    """The unit of a tolerance by kind (`a`, `tool`) or by name (`alpha3`, `elbow.yaw`)."""
+    kind = re.sub(r".*\.|\d+$", "", key)
+    return _unit_of_kind(kind) if kind in AXIS_OF_KIND else "m"
+
+
+def _row(robot: Robot, index: int, units: Units) -> dict[str, Any]:
+    joint = robot.joints[index]
+    row: dict[str, Any] = {} if joint.name == f"q{index + 1}" else {"name": joint.name}
+    owned: list[Parameter] = [robot.parameters[i] for i in robot.owned_by(index + 1)]
+    row |= {p.kind: units.from_si(p.nominal, p.unit) for p in owned}
+    if joint.prismatic:
+        row["type"] = "prismatic"
+    if (joint.lower, joint.upper) != (-math.inf, math.inf):
+        row["limits"] = [units.from_si(limit, joint.unit) for limit in (joint.lower, joint.upper)]
+    return _Flow(row)
+
+
+def _tolerances(robot: Robot, units: Units) -> dict[str, float]:
+    """Tolerances by kind where all parameters of the kind share one, by name elsewhere."""
+    by_kind: dict[str | None, set[float | None]] = {}
+    for p in robot.parameters:
+        by_kind.setdefault(tolerance_kind(p), set()).add(p.tolerance)
+    tolerances = {}
+    for p in robot.parameters:
+        if p.tolerance is not None:
+            kind = tolerance_kind(p)
+            shared = kind is not None and len(by_kind[kind]) == 1
+            tolerances[kind if kind and shared else p.name] = units.from_si(p.tolerance, p.unit)
+    return tolerances
+
+
+class _Flow(dict[str, Any]):
+    """A mapping to be written on one line."""
+
+
+class _Line(list[str]):
+    """Names to be written on one line."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """The safe dumper, with rows, frames and names on one line."""
+
+
+_Dumper.add_representer(
+    _Flow, lambda dumper, row: dumper.represent_mapping("tag:yaml.org,2002:map", row, flow_style=True)
+)
+_Dumper.add_representer(
+    _Line, lambda dumper, names: dumper.represent_sequence("tag:yaml.org,2002:seq", names, flow_style=True)
+)

@@ -1,0 +1,506 @@
+"""URDF: the chain between any two links of the file, and its calibrated origins written back.
+
+Of each joint its type, parent, child, origin, axis, limit and mimic are read; meshes, inertias and whatever else a URDF
+may hold are not. Calibrated origins are written into the same XML, so that everything else stays as it was.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fg_calib.arguments import checked
+from fg_calib.errors import InputError
+from fg_calib.io.disk import decoded, read_bytes, replacing
+from fg_calib.io.yaml import shown, shown_word
+from fg_calib.options import NEAR, did_you_mean, known_names
+from fg_calib.robot.model import FRAME_KINDS, IN_RAD, MOST_ANGLE, Joint, Robot, RobotBuilder, UrdfSource, frame_values
+from fg_calib.sizes import LEAST_SIZE, MOST_SIZE, ORDINARY
+
+if TYPE_CHECKING:  # lxml is imported where it is used: `fg-calib --help` need not wait for it
+    from lxml.etree import _Element as Element
+
+_log = logging.getLogger(__name__)
+
+_ORIGIN = {"xyz": ("x", "y", "z"), "rpy": ("roll", "pitch", "yaw")}
+"""The attributes of `<origin>` and the kinds of parameters that they hold."""
+
+ROUNDING = 1e-13
+"""Change of an origin's figure, [m] and [rad], that is rounding of the solution: parameters that nothing moves."""
+
+_ATTRIBUTES = {"origin": ("xyz", "rpy"), "axis": ("xyz",), "limit": ("lower", "upper", "effort", "velocity")}
+"""What is read of a joint on the chain, and the attributes that it may have."""
+
+_OTHERS = ("parent", "child", "mimic", "calibration", "dynamics", "safety_controller", "comment")
+"""Other elements of a joint."""
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?inf(inity)?", re.ASCII | re.IGNORECASE)
+
+_NO_ENTITIES = "a URDF without entities: they are not expanded"
+
+
+@dataclass(frozen=True)
+class _UrdfJoint:
+    """A joint as the file has it; its axis, limit and mimic matter only on the chain and are read there."""
+
+    element: Element
+    name: str
+    parent: str
+    child: str
+    origin: Mapping[str, float]
+    """By kind, [m] and [rad]."""
+
+
+@checked
+def read_urdf(
+    path: Path | str,
+    *,
+    base_link: str | None = None,
+    tip_link: str | None = None,
+    name: str | None = None,
+    base: Mapping[str, float] | ArrayLike | None = None,
+    tool: Mapping[str, float] | ArrayLike | None = None,
+    fixed: Sequence[str] = (),
+    estimate: Sequence[str] = (),
+    tolerance: Mapping[str, float] | None = None,
+    place: str | None = None,
+) -> Robot:
+    """The chain from one link of a URDF to another, up and down the tree.
+
+    Fixed joints become constants. A joint that the chain passes from child to parent is inverted; its parameters and
+    its reading stay those of the joint itself.
+
+    Args:
+        path: The URDF.
+        base_link: Where the chain starts; default: the root link.
+        tip_link: Where it ends; default: the only leaf link below the start.
+        name: The robot's name; default: the URDF's.
+        base: The frame before `base_link`: values by kind, or as in `Robot.from_dh`, [m] and [rad].
+        tool: The frame behind `tip_link`, likewise.
+        fixed: See `RobotBuilder.build`.
+        estimate: See `RobotBuilder.build`.
+        tolerance: See `RobotBuilder.build`, [m] or [rad].
+        place: The file that `fixed`, `estimate` and `tolerance` come from, for messages.
+
+    Raises:
+        InputError: There is no such file, it is not a URDF, or the chain is not one of revolute, continuous,
+            prismatic and fixed joints.
+    """
+    if str(path).lstrip().startswith("<"):
+        raise InputError("path", "found XML text", "the path of a URDF", "write the text to a file")
+    path = Path(path)
+    data = read_bytes(path)
+    text, root = _parse(data, path.name)
+    builder = RobotBuilder(name or root.get("name") or path.stem, "urdf")
+    builder.add_frame("base", frame_values("base", base), 0, False)
+    with _hinting_at_xacro(root):
+        tree = _Tree(_read_joints(root, path.name), _read_links(root, path.name), path.name)
+        base_link = tree.root() if base_link is None else tree.known(base_link)
+        tip_link = tree.leaf(base_link) if tip_link is None else tree.known(tip_link)
+        n_joints = _add_chain(builder, tree.chain(base_link, tip_link), path.name)
+        if n_joints == 0:
+            raise InputError(path.name, f"no moving joint between links {base_link!r} and {tip_link!r}", "at least one")
+    builder.add_frame("tool", frame_values("tool", tool), n_joints + 1, False)
+    return builder.build(
+        fixed=fixed,
+        estimate=estimate,
+        tolerance=tolerance,
+        urdf=UrdfSource(text, base_link, tip_link),
+        place=place or path.name,
+    )
+
+
+@contextmanager
+def _hinting_at_xacro(root: Element) -> Iterator[None]:
+    """Say of a mistake in a file with elements of xacro that it was not expanded: they may hold what is missing."""
+    try:
+        yield
+    except InputError as error:
+        if not any("xacro" in str(element.tag) for element in root.iter()):
+            raise
+        raise InputError(error.place, error.found, error.expected, _XACRO) from None
+
+
+_XACRO = "it holds elements of xacro: expand them by `xacro arm.urdf.xacro > arm.urdf`"
+
+
+def _add_chain(builder: RobotBuilder, chain: Iterable[tuple[_UrdfJoint, bool]], place: str) -> int:
+    """Add the joints of a chain, each with whether it is passed backwards; the number of those that move."""
+    n_joints = 0
+    for joint, backwards in chain:
+        _check_spelling(joint, f"{place}:{joint.element.sourceline}: joint {joint.name!r}")
+        if joint.element.get("type") == "fixed":
+            builder.add_constant_frame(joint.origin, backwards=backwards)
+            continue
+        here = f"{place}: joint {joint.name!r}"
+        builder.add_urdf_joint(_moving_joint(joint, here), joint.origin, _axis(joint, here), backwards=backwards)
+        n_joints += 1
+    return n_joints
+
+
+def _check_spelling(joint: _UrdfJoint, place: str) -> None:
+    """Check what on the chain would silently be replaced by a default.
+
+    Raises:
+        InputError: An element is there twice; a name is of another case; angles are of many turns.
+    """
+    read: dict[str, Element] = {}
+    for child in joint.element:
+        tag = child.tag if isinstance(child.tag, str) else "comment"
+        if tag in _ATTRIBUTES and tag in read:
+            raise InputError(place, f"two elements <{tag}>", "one")
+        if tag in _ATTRIBUTES:
+            read[tag] = child
+        elif tag.lower() in _ATTRIBUTES:
+            raise InputError(place, f"element <{tag}>", f"<{tag.lower()}>")
+        elif tag not in _OTHERS and (hint := did_you_mean(tag, _ATTRIBUTES)):
+            _log.warning("%s: element <%s> is not used; %s", place, tag, hint)
+    for tag, element in read.items():
+        for name in map(str, element.attrib):
+            if name not in _ATTRIBUTES[tag] and name.lower() in _ATTRIBUTES[tag]:
+                raise InputError(f"{place}: {tag}", f"attribute {shown_word(name)}", name.lower())
+            if name not in _ATTRIBUTES[tag]:
+                known = ", ".join(_ATTRIBUTES[tag])
+                _log.warning("%s: attribute %s of <%s> is not used; known are %s", place, name, tag, known)
+    angles = [joint.origin[kind] for kind in _ORIGIN["rpy"]]
+    if max(map(abs, angles)) > MOST_ANGLE:
+        found = f"found {' '.join(f'{angle:g}' for angle in angles)}"
+        raise InputError(f"{place}: origin rpy", found, IN_RAD, "are they in deg?")
+
+
+def write_urdf(path: Path | str, robot: Robot) -> None:
+    """Write the URDF the robot was read from with the origins of its moving joints at the nominal values.
+
+    Everything else is kept byte for byte: see `urdf_text`. A URDF has no place for base and tool: `write_robot` writes
+    them beside it.
+
+    Raises:
+        InputError: The folder does not exist or may not be written to.
+        ValueError: The robot was not read from a URDF.
+    """
+    if robot.urdf is None:
+        raise ValueError("the robot was not read from a URDF")
+    values = {p.name: p.nominal for p in robot.parameters}
+    origins = {j.name: {kind: values[f"{j.name}.{kind}"] for kind in FRAME_KINDS} for j in robot.joints}
+    text = urdf_text(robot.urdf.text, origins)
+    with replacing(Path(path)) as temporary:
+        temporary.write_bytes(text.encode(encoding_of(text)))
+
+
+def encoding_of(text: str) -> str:
+    """The encoding that an XML text declares; UTF-8 if it declares none."""
+    declared = _DECLARED.match(text)
+    return declared[1] if declared else "utf-8"
+
+
+_DECLARED = re.compile(r"""\ufeff?<\?xml[^>]*?\sencoding\s*=\s*["']([\w.-]+)["']""")
+
+
+def urdf_text(text: str, origins: Mapping[str, Mapping[str, float]], zeros: Mapping[str, float] | None = None) -> str:
+    """A URDF with other origins of some joints and nothing else changed: comments, blanks and quotes stay.
+
+    A figure of `<origin>` that is the one wanted but for `ROUNDING` stays, an attribute of such figures as written.
+
+    Args:
+        text: The URDF, as it was read.
+        origins: By joint x, y, z, roll, pitch and yaw, [m] and [rad].
+        zeros: By joint what is to be added to its reading, [rad] or [m]: it is added to `rising` of the joint's
+            `<calibration>`, which it gets if it has none.
+    """
+    data = text.encode()
+    edits: list[tuple[int, int, str]] = []  # from, to, instead
+    for name, place in _places(data).items():
+        if name in origins:
+            wanted = {attribute: [origins[name][kind] for kind in kinds] for attribute, kinds in _ORIGIN.items()}
+            edits += _edits(data, place, "origin", wanted)
+        if zeros is not None and abs(zeros.get(name, 0.0)) > ROUNDING:
+            before = _figures(_attributes(data, place.get("calibration")).get("rising", (0, 0, "0"))[2])
+            edits += _edits(data, place, "calibration", {"rising": [sum(before) + zeros[name]]})
+    for start, end, instead in sorted(edits, reverse=True):
+        data = data[:start] + instead.encode() + data[end:]
+    return data.decode()
+
+
+def _places(data: bytes) -> dict[str, dict[str, int]]:
+    """Where the tags of each joint of a URDF in UTF-8 begin, and those of the first of its elements of each name.
+
+    The document was read before, and holds no entities.
+    """
+    from xml.parsers.expat import ParserCreate
+
+    parser = ParserCreate("utf-8")
+    found: dict[str, dict[str, int]] = {}
+    within: list[dict[str, int] | None] = []  # of each open element, the joint that it is
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        joint = found.setdefault(attributes.get("name", ""), {}) if len(within) == 1 and tag == "joint" else None
+        parent = within[-1] if within else None
+        for place in (joint, parent):
+            if place is not None:
+                place.setdefault(tag, parser.CurrentByteIndex)
+        within.append(joint)
+
+    def end(_: str) -> None:
+        within.pop()
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.Parse(data, True)
+    return found
+
+
+_TAG = re.compile(rb"""<[^\s/>]+((?:\s+[^\s=/>]+\s*=\s*(?:"[^"]*"|'[^']*'))*)\s*/?>""")
+_NAMED = re.compile(rb"""([^\s=]+)\s*=\s*("[^"]*"|'[^']*')""")
+
+
+def _attributes(data: bytes, tag: int | None) -> dict[str, tuple[int, int, str]]:
+    """By name where the values of the attributes of the tag at a place are, without quotes, and what they are."""
+    if tag is None or (read := _TAG.match(data, tag)) is None:
+        return {}
+    named = (found for found in _NAMED.finditer(data, read.start(1), read.end(1)))
+    return {n[1].decode(): (n.start(2) + 1, n.end(2) - 1, n[2][1:-1].decode()) for n in named}
+
+
+def _edits(
+    data: bytes, place: Mapping[str, int], tag: str, wanted: Mapping[str, Sequence[float]]
+) -> list[tuple[int, int, str]]:
+    """What to write where so that a joint's element has attributes with these figures; 0 is what is left out."""
+    present = _attributes(data, place.get(tag))
+    words, changed = {}, {}
+    for name, figures in wanted.items():
+        read = _figures(present[name][2]) if name in present else [0.0] * len(figures)
+        pairs = zip(read or [math.nan] * len(figures), figures, strict=True)
+        kept = [was if abs(was - figure) <= ROUNDING else float(figure) for was, figure in pairs]
+        words[name] = " ".join(map(repr, kept))
+        if kept != read:
+            changed[name] = words[name]
+    if not changed:
+        return []
+    if tag not in place:
+        opened = _TAG.match(data, place["joint"])
+        behind = place["joint"] if opened is None else opened.end()
+        blanks = re.match(rb"\s*", data[behind:])
+        indent = "" if blanks is None else blanks[0].decode()
+        new = "".join(f' {name}="{figures}"' for name, figures in words.items())
+        return [(behind, behind, f"{indent}<{tag}{new}/>")]
+    edits = [(*present[name][:2], figures) for name, figures in changed.items() if name in present]
+    read_tag = _TAG.match(data, place[tag])
+    end = place[tag] if read_tag is None else read_tag.end(1)
+    new = "".join(f' {name}="{figures}"' for name, figures in changed.items() if name not in present)
+    return [*edits, (end, end, new)] if new else edits
+
+
+def _parse(data: bytes, place: str, encoding: str | None = None) -> tuple[str, Element]:
+    """The text and the root element of an XML file, which may neither refer to other files nor hold entities."""
+    from lxml import etree
+
+    safe = etree.XMLParser(encoding=encoding, resolve_entities=False, load_dtd=False, no_network=True, huge_tree=False)
+    try:
+        root = etree.fromstring(data, safe)
+    except etree.XMLSyntaxError as error:
+        expected = _NO_ENTITIES if "entity" in error.msg.lower() else ""
+        hint = _XACRO if "xacro" in error.msg else ""
+        if b"encoding" not in data[:100]:
+            decoded(data, place)  # says of other encodings what they are
+        found = f"not XML: {error.msg.replace(', use XML_PARSE_HUGE option', '')}"
+        raise InputError(f"{place}:{error.lineno}", found, expected, hint) from None
+    document = root.getroottree().docinfo
+    types: Any = document.internalDTD
+    if types is not None and (types.system_url or types.entities()):
+        raise InputError(place, "a <!DOCTYPE> with entities or of another file", _NO_ENTITIES)
+    if root.tag != "robot":
+        raise InputError(place, f"root element <{root.tag}>", "<robot>")
+    try:
+        return data.decode(document.encoding or "utf-8"), root
+    except UnicodeDecodeError as error:
+        raise InputError(place, f"not {document.encoding or 'utf-8'}: {error.reason}", "text in UTF-8") from None
+    except LookupError:  # libxml2 knows more encodings than Python
+        raise InputError(place, f"text in {document.encoding}", "text in UTF-8", "save it as UTF-8") from None
+
+
+def _read_links(root: Element, place: str) -> list[str]:
+    links = []
+    for link in root.findall("link"):
+        if not link.get("name"):
+            raise InputError(f"{place}:{link.sourceline}", "a link without a name")
+        links.append(link.get("name", ""))
+    return links
+
+
+def _read_joints(root: Element, place: str) -> list[_UrdfJoint]:
+    """All joints, each with a name of its own, an origin, a parent and a child."""
+    joints: dict[str, _UrdfJoint] = {}
+    for joint in root.findall("joint"):
+        name = joint.get("name")
+        here = f"{place}:{joint.sourceline}: joint {name!r}"
+        if not name:
+            raise InputError(f"{place}:{joint.sourceline}", "a joint without a name")
+        if name in joints:
+            raise InputError(here, "a second joint of this name", "different names")
+        parent, child = (_link_at(joint, end, here) for end in ("parent", "child"))
+        joints[name] = _UrdfJoint(joint, name, parent, child, _origin(joint, here))
+    return list(joints.values())
+
+
+def _link_at(joint: Element, end: str, place: str) -> str:
+    """The link that a joint has as `end`: parent or child."""
+    element = joint.find(end)
+    link = None if element is None else element.get("link")
+    if not link:
+        raise InputError(place, f"no <{end}>", f'<{end} link="..."/>')
+    return link
+
+
+def _origin(joint: Element, place: str) -> dict[str, float]:
+    values: dict[str, float] = {}
+    for attribute, kinds in _ORIGIN.items():
+        text = _attribute(joint, "origin", attribute, "0 0 0")
+        figures = _figures(text)
+        if len(figures) != len(kinds) or not np.isfinite(figures).all():
+            raise InputError(f"{place}: origin {attribute}", f"found {shown(text)}", "three finite numbers")
+        if max(map(abs, figures)) > MOST_SIZE:
+            raise InputError(f"{place}: origin {attribute}", f"found {shown(text)}", ORDINARY)
+        values |= zip(kinds, figures, strict=True)
+    return values
+
+
+def _attribute(joint: Element, child: str, attribute: str, default: str) -> str:
+    """An attribute of a joint's first child of some name; `default` where either is missing."""
+    element = joint.find(child)
+    return default if element is None else element.get(attribute, default)
+
+
+def _figures(text: str) -> list[float]:
+    """The numbers in a text; none if a word of it is none as other readers have them (`1_000` is Python's alone)."""
+    words = text.split()
+    return [float(word) for word in words] if all(_NUMBER.fullmatch(word) for word in words) else []
+
+
+def _moving_joint(joint: _UrdfJoint, place: str) -> Joint:
+    """The joint with its limits; URDF's missing limit is 0, and two zeros are none at all."""
+    kind, mimic = joint.element.get("type"), joint.element.find("mimic")
+    if kind not in {"revolute", "continuous", "prismatic"}:
+        found = f"type {shown_word(kind)}" if kind else "no type"
+        raise InputError(place, found, "revolute, continuous, prismatic or fixed on the chain")
+    if mimic is not None:
+        found = f"mimics joint {shown(mimic.get('joint', ''))}"
+        raise InputError(place, found, "joints on the chain that move by themselves")
+    lower, upper = (0.0, 0.0) if kind == "continuous" else (_limit(joint, end, place) for end in ("lower", "upper"))
+    if lower == upper == 0.0:
+        return Joint(joint.name, kind == "prismatic")
+    if not lower < upper:
+        raise InputError(f"{place}: limit", f"lower {lower:g}, upper {upper:g}", "lower below upper")
+    return Joint(joint.name, kind == "prismatic", lower, upper)
+
+
+def _limit(joint: _UrdfJoint, end: str, place: str) -> float:
+    text = _attribute(joint.element, "limit", end, "0")
+    figures = _figures(text)
+    if len(figures) != 1:
+        raise InputError(f"{place}: limit {end}", f"found {shown(text)}", "a number")
+    if MOST_SIZE < abs(figures[0]) < np.inf:
+        raise InputError(f"{place}: limit {end}", f"found {shown(text)}", ORDINARY)
+    return figures[0]
+
+
+def _axis(joint: _UrdfJoint, place: str) -> NDArray[np.float64]:
+    """The joint's unit axis, shape (3,); x where the file says none."""
+    text = _attribute(joint.element, "axis", "xyz", "1 0 0")
+    axis = np.array(_figures(text))
+    length = math.hypot(*axis)
+    if axis.shape != (3,) or not LEAST_SIZE <= length <= MOST_SIZE:
+        raise InputError(f"{place}: axis", f"found {shown(text)}", "a direction of three numbers")
+    return axis / length
+
+
+class _Tree:
+    """The links of a URDF and the joints between them."""
+
+    def __init__(self, joints: Sequence[_UrdfJoint], links: Sequence[str], place: str) -> None:
+        self._place = place
+        self._links = dict.fromkeys([*links, *(link for j in joints for link in (j.parent, j.child))])
+        self._joint_above: dict[str, _UrdfJoint] = {}  # by child link
+        for joint in joints:
+            if joint.child in self._joint_above:
+                first = self._joint_above[joint.child].name
+                raise InputError(
+                    place, f"link {joint.child!r} is the child of joints {first!r} and {joint.name!r}", "one"
+                )
+            self._joint_above[joint.child] = joint
+        self._check_circles()
+
+    def _check_circles(self) -> None:
+        """Raise where links are below themselves."""
+        seen: set[str] = set()
+        for link in self._links:
+            up: dict[str, None] = {}  # a set would forget their order
+            at: str | None = link
+            while at is not None and at not in seen:
+                seen.add(at)
+                up[at] = None
+                at = self._joint_above[at].parent if at in self._joint_above else None
+            if at in up:
+                circle = [*up][[*up].index(at) :]
+                found = f"links in a circle: {' below '.join(shown_word(one) for one in (*circle, circle[0]))}"
+                raise InputError(self._place, found, "a tree of links")
+
+    def known(self, link: str) -> str:
+        """`link`, if there is such a link."""
+        if link not in self._links:
+            hint = did_you_mean(link, self._links, NEAR)
+            raise InputError(self._place, f"no link {link!r}", known_names(self._links, 40), hint)
+        return link
+
+    def root(self) -> str:
+        """The only link without a parent."""
+        roots = [link for link in self._links if link not in self._joint_above]
+        if not self._links:
+            raise InputError(self._place, "no links and joints", "<link> and <joint> within <robot>")
+        return self._only(roots, "root", "base_link")
+
+    def leaf(self, base: str) -> str:
+        """The only link without a child at or below `base`."""
+        below: dict[str, list[str]] = {}
+        for joint in self._joint_above.values():
+            below.setdefault(joint.parent, []).append(joint.child)
+        reached = [base]
+        for link in reached:
+            reached += below.get(link, ())
+        return self._only([link for link in reached if link not in below], "leaf", "tip_link")
+
+    def chain(self, base: str, tip: str) -> list[tuple[_UrdfJoint, bool]]:
+        """The joints from `base` to `tip`, with whether each is passed from child to parent."""
+        up, down = self._links_up(base), self._links_up(tip)
+        all_down = set(down)
+        common = next((link for link in up if link in all_down), None)
+        if common is None:
+            raise InputError(self._place, f"links {base!r} and {tip!r} are not connected", "two links of one tree")
+        above = self._joint_above
+        return [
+            *((above[link], True) for link in up[: up.index(common)]),
+            *((above[link], False) for link in reversed(down[: down.index(common)])),
+        ]
+
+    def _links_up(self, link: str) -> list[str]:
+        """`link` and the links above it, up to the root."""
+        links = [link]
+        while links[-1] in self._joint_above:
+            links.append(self._joint_above[links[-1]].parent)
+        return links
+
+    def _only(self, found: list[str], what: str, argument: str) -> str:
+        if len(found) != 1:
+            listed = ", ".join(shown_word(link) for link in found[:12]) + ", ..." * (len(found) > 12)
+            where = f"{{urdf: {self._place}, {argument}: ...}} in a file, --{argument.replace('_', '-')} of observe"
+            raise InputError(
+                self._place, f"{len(found)} {what} links ({listed})", "one", f"name one as {argument}: {where}"
+            )
+        return found[0]

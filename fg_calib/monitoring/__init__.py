@@ -1,0 +1,1 @@
+"""Whether a calibration still holds by new data, what has changed, and its update."""

@@ -1,0 +1,352 @@
+"""New rows of an arm that was calibrated before, beside what that calibration says of it.
+
+The rows are whitened by their noise and linearised at the calibrated arm, measurement frames and whatever else does not
+stay with the arm fitted to them. What the arm and its targets may be off is then counted by columns `J B` with rows
+`u ~ N(0, 1)` of their own, B B^T the covariance of the calibration; what nothing determined, frames, anchors, planes,
+boards, touched points and offsets have columns without. So the smallest sum of squares is chi-square by the covariance
+`N + J B B^T J^T` after what is free has been fitted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.diagnostics.unmodelled_effects import basis_of
+from fg_calib.errors import ProblemError
+from fg_calib.graph.factors import build_variables, unknown_prior_rows
+from fg_calib.graph.knowledge import Knowledge, columns_in, coordinates_of
+from fg_calib.graph.noise import JOINT_NOISE, NoiseName, NoiseState
+from fg_calib.graph.problem import Problem, assembled, at_parameters, problem_at, tables_of, variables_of
+from fg_calib.graph.rows import At, RowSet
+from fg_calib.graph.solver import Solution, solve
+from fg_calib.initialization.start import start_of
+from fg_calib.measurements import residuals
+from fg_calib.measurements.gathering import gather
+from fg_calib.measurements.series import KnownPoint, Table
+from fg_calib.options import POSE_MODELS, Options
+from fg_calib.robot.model import Robot, names_of
+from fg_calib.statistics.covariance import TangentCovariance
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+_NOTHING = 1e-9
+"""Part of a column's length that counts as nothing."""
+
+TABLES_OF = {"P": tuple(POSE_MODELS), "A": ("anchor",)}
+"""Models whose tables have unknowns of a letter."""
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """An arm that was calibrated before.
+
+    Attributes:
+        robot: The nominal robot, with its tolerances; what the calibration is of is estimated.
+        values: Its parameters as calibrated, shape (n_parameters,).
+        posterior: Their covariance.
+        knowledge: What the calibration's rows say; None where that was not saved.
+        options: Its options.
+        noise: What stated sigmas are multiplied by, by table and kind, where noise was estimated.
+        noise_degrees: Degrees of freedom that it was estimated by; None where it was stated, or is not known.
+    """
+
+    robot: Robot
+    values: Floats
+    posterior: TangentCovariance
+    knowledge: Knowledge | None
+    options: Options
+    noise: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    noise_degrees: float | None = None
+
+    def state_for(self, tables: Sequence[Table], like: Sequence[str]) -> NoiseState:
+        """The noise of new tables: as it was found, of the only table if there was one.
+
+        Args:
+            tables: The tables, those of one station each.
+            like: By the number of each which of the calibration's it is like.
+        """
+        factors: dict[NoiseName, float] = {}
+        of_tables = {name: kinds for name, kinds in self.noise.items() if name}
+        if "joint" in self.noise.get("", {}):
+            factors[JOINT_NOISE] = self.noise[""]["joint"]
+        for number, name in enumerate(like):
+            kinds = of_tables.get(name) or (next(iter(of_tables.values())) if len(of_tables) == 1 else {})
+            factors |= {(number, kind): factor for kind, factor in kinds.items()}
+        return NoiseState(factors=factors)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """New tables, as they are to be compared with a calibrated arm.
+
+    Attributes:
+        tables: They, those of one station each.
+        like: Of each the name of the calibration's table that it is like.
+    """
+
+    tables: tuple[Table, ...]
+    like: tuple[str, ...]
+
+    @classmethod
+    def of(cls, tables: Sequence[Table], like: Sequence[str], options: Options) -> Rows:
+        """Tables apart by their stations.
+
+        Args:
+            tables: They.
+            like: Of each the name of the calibration's table that it is like.
+            options: Of the calibration.
+        """
+        parts = [(part, name) for t, name in zip(tables, like, strict=True) for part in tables_of([t], options)]
+        return cls(tuple(part for part, _ in parts), tuple(name for _, name in parts))
+
+    def turned(self, offsets: Floats) -> Rows:
+        """The same with the joints turned by so much more than was read, shape (n_joints,)."""
+        moved = [
+            replace(t, measurements=replace(t.measurements, readings=t.measurements.readings + offsets))
+            for t in self.tables
+        ]
+        return replace(self, tables=tuple(moved))
+
+    def at_known_places(self, known: Knowledge | None, tolerance: float | None) -> tuple[Table, ...]:
+        """The tables with targets and anchors where they were found to be.
+
+        Args:
+            known: What says where they are.
+            tolerance: Figure that lets them be estimated from there on; None to hold them.
+        """
+        if known is None:
+            return self.tables
+        places = {letter: {n: KnownPoint(known.place((letter, n)), tolerance) for k, n in known.unknowns if k == letter}
+                  for letter in TABLES_OF}  # fmt: skip
+        found = []
+        for table in self.tables:
+            more = {n: k for letter, of in places.items() if table.model in TABLES_OF[letter] for n, k in of.items()}
+            found.append(replace(table, known={**table.known, **more}).by_itself())
+        return tuple(found)
+
+
+@dataclass(frozen=True)
+class Placed:
+    """New rows with the arm held, frames and all that does not stay with it fitted.
+
+    Attributes:
+        solution: The fit.
+        problem: The same rows with every parameter of the robot, and targets, estimated; started there.
+        pinned: Unknowns that the calibration says where they are.
+    """
+
+    solution: Solution
+    problem: Problem
+    pinned: tuple[tuple[str, str], ...]
+
+
+def placed(calibrated: Calibrated, rows: Rows, values: Floats) -> Placed:
+    """New rows at an arm that is held.
+
+    Args:
+        calibrated: The arm.
+        rows: The rows.
+        values: Its parameters.
+
+    Raises:
+        ProblemError: The rows lack what their model needs, or do not suffice for a frame.
+    """
+    robot, known = calibrated.robot.with_values(values), calibrated.knowledge
+    options = replace(
+        calibrated.options,
+        gauge="none",
+        encoder="propagated",
+        loss="none",
+        estimate_noise=False,
+        estimate_tolerance=None,
+        prefer=(),
+    )
+    state = calibrated.state_for(rows.tables, rows.like)
+
+    def problem(arm: Robot, tables: Sequence[Table], start: Solution | None) -> Problem:
+        data = gather(arm, tables)
+        variables = variables_of(arm, data, options)
+        x = start_of(arm, data, variables) if start is None else variables.nominal()
+        if start is not None:
+            x[variables.frame_span] = start.parameters[variables.frame_span]
+            there = variables.coordinates >= 0
+            x[variables.coordinates[there]] = at_parameters(start.problem, start.parameters).coordinates[there]
+        return assembled(problem_at(arm, data, options, variables, x), x, state)
+
+    held = problem(robot.with_estimated([]), rows.at_known_places(known, None), None)
+    if not held.n_residuals:
+        raise ProblemError(held.data.source, "no row takes part", "rows that model and options use")
+    solution = solve(held)
+    wide = problem(robot.with_estimated(names_of(robot.parameters)), rows.at_known_places(known, 1.0), solution)
+    seen = () if known is None else known.unknowns
+    pinned = tuple(n for n in seen if coordinates_of(wide.variables, wide.data.unknowns, n) is not None)
+    return Placed(solution, wide, pinned)
+
+
+@dataclass(frozen=True)
+class Linear:
+    """New rows and what is known of the arm as one linear system, what the arm may be off fitted.
+
+    Attributes:
+        placed: The rows.
+        r: Residuals, zeros for what is known below them, shape (m + k,).
+        system: The rows by what is fitted, then what is known of that, shape (m + k, n).
+        directions: What is fitted, in the columns of `placed.problem`, shape (n_columns + n_nuisance, n).
+        fitted: Basis of `system`, shape (m + k, rank).
+        columns: Derivatives in the columns of `placed.problem`, shape (m, n_columns + n_nuisance).
+        joints: Derivatives in the joints' zeros, shape (m, n_joints).
+        dof: Degrees of freedom of chi-square.
+        n_free: Directions that were fitted to the new rows alone.
+    """
+
+    placed: Placed
+    r: Floats
+    system: Floats
+    directions: Floats
+    fitted: Floats
+    columns: Floats
+    joints: Floats
+    dof: int
+    n_free: int
+
+    @property
+    def left(self) -> Floats:
+        """What the fit leaves of the residuals."""
+        out: Floats = self.r - self.fitted @ (self.fitted.T @ self.r)
+        return out
+
+    @property
+    def chi2(self) -> float:
+        """Chi-square, by noise and by what the arm may be off."""
+        return float(np.sum(self.left**2))
+
+    def stacked(self, columns: Floats) -> Floats:
+        """Columns of the rows with zeros for what is known, shape (m + k, n)."""
+        return np.vstack([columns, np.zeros((len(self.r) - len(columns), columns.shape[1]))])
+
+    def without(self, columns: Floats) -> Linear:
+        """The same with more columns fitted, such as those of gross errors, shape (m, n)."""
+        U, s, _ = np.linalg.svd(self.new(columns), full_matrices=False)
+        more = U[:, s > _NOTHING * s.max(initial=0.0)]
+        return replace(
+            self,
+            system=np.hstack([self.system, self.stacked(columns)]),
+            directions=np.hstack([self.directions, np.zeros((len(self.directions), columns.shape[1]))]),
+            fitted=np.hstack([self.fitted, more]),
+            dof=self.dof - more.shape[1],
+        )
+
+    def new(self, columns: Floats) -> Floats:
+        """What columns of the rows have that is not fitted, shape (m + k, n)."""
+        wide = self.stacked(columns)
+        for _ in range(2):  # once more: rounding of the first time
+            wide = wide - self.fitted @ (self.fitted.T @ wide)
+        return wide
+
+
+def linear(calibrated: Calibrated, at: Placed) -> Linear:
+    """The rows and what is known as a linear system."""
+    problem = at.problem
+    J, joints, r = linearised(problem)
+    known, free = _fitted(calibrated, at)
+    stated, prior_of_free = _stated(at, free)
+    m, k = len(r), known.shape[1]
+    system = np.zeros((m + k + len(stated), k + free.shape[1]))
+    directions = np.hstack([known, free])
+    system[:m] = J @ directions
+    system[m : m + k, :k] = np.eye(k)
+    system[m + k :, k:] = prior_of_free
+    fitted = basis_of(system)
+    rank = fitted.shape[1]
+    return Linear(
+        placed=at,
+        r=np.concatenate([r, np.zeros(k), stated]),
+        system=system,
+        directions=directions,
+        fitted=fitted,
+        columns=J,
+        joints=joints,
+        dof=problem.n_independent + k + len(stated) - rank,
+        n_free=rank - k - len(stated),
+    )
+
+
+def linearised(problem: Problem) -> tuple[Floats, Floats, Floats]:
+    """Whitened rows: derivatives in all columns, in the joints' zeros, and residuals."""
+    at = problem.variables.at(problem.start)
+    n = at.n_columns + at.n_nuisance
+    blocks = []
+    for rows in problem.rows:
+        wide = np.hstack([rows.private(at), _of_joints(rows, at)])
+        blocks.append(wide if rows.shared is None else rows.shared.whiten(wide))
+    every = np.vstack(blocks)
+    return every[:, :n], every[:, n + 1 :], every[:, n]
+
+
+def _of_joints(rows: RowSet, at: At) -> Floats:
+    """Derivatives of rows in the joints' zeros, the same for all configurations, shape (n_rows, n_joints)."""
+    found = []
+    for part in rows.parts:
+        chain, block = at.chains[part.table], part.at(at)
+        ends = block.kind.ends
+        J = residuals.linearise(block, chain.without_columns().with_joint_columns())[1]
+        J = J[:, :, : ends * chain.n_joints].reshape(*J.shape[:2], ends, chain.n_joints).sum(axis=2)
+        found.append(J.reshape(-1, chain.n_joints))
+    return np.vstack(found)
+
+
+def _fitted(calibrated: Calibrated, at: Placed) -> tuple[Floats, Floats]:
+    """What is known up to its covariance, in its own sigma, and what is free, in the problem's columns.
+
+    Returns:
+        Shapes (n_columns + n_nuisance, k) and (n_columns + n_nuisance, n).
+    """
+    v, posterior = at.problem.variables, calibrated.posterior
+    n_all, n_arm = v.n_columns + v.n_nuisance, posterior.variables.n_robot_columns
+    arm = build_variables(posterior.variables.robot, [False], False)
+    M = np.zeros((n_all, n_arm))
+    M[: v.n_columns] = columns_in(v, arm, at.problem.start)
+    scales = posterior.variables.scales[:n_arm]
+    w, V = np.linalg.eigh(posterior.tangent[:n_arm, :n_arm] / np.outer(scales, scales))
+    B = scales[:, None] * V * np.sqrt(np.maximum(w, 0.0))
+    loose = posterior.loose[:, :n_arm].T
+    free_places = [np.arange(v.n_columns + v.n_nuisance)[f.columns] for f in v.frames]
+    pinned: list[Integers] = []
+    own = np.zeros((n_all, 0))
+    if at.pinned:
+        assert calibrated.knowledge is not None
+        known = calibrated.knowledge.about(at.pinned)
+        follow, root, unknown = known.follow()
+        pinned = [_columns_of(at.problem, name) for name in at.pinned]
+        of_pinned = np.concatenate(pinned)
+        M[of_pinned] += follow
+        own = np.zeros((n_all, root.shape[1]))
+        own[of_pinned] = root
+        free_places += [of_pinned[unknown]]
+    others = np.arange(v.n_columns, n_all)
+    free_places.append(np.setdiff1d(others, np.concatenate([np.zeros(0, dtype=np.int64), *pinned])))
+    free = np.hstack([M @ loose, np.eye(n_all)[:, np.concatenate(free_places)]])
+    return np.hstack([M @ B, own]), free
+
+
+def _columns_of(problem: Problem, name: tuple[str, str]) -> Integers:
+    v = problem.variables
+    place = coordinates_of(v, problem.data.unknowns, name)
+    assert place is not None
+    out: Integers = place - v.nuisance_span.start + v.n_columns
+    return out
+
+
+def _stated(at: Placed, free: Floats) -> tuple[Floats, Floats]:
+    """What the job says of unknowns that are not the calibration's, as rows by what is free."""
+    v = at.problem.variables
+    r, J = unknown_prior_rows(v, at.problem.start)
+    pinned = [_columns_of(at.problem, name) for name in at.pinned]
+    of_pinned = np.concatenate([np.zeros(0, dtype=np.int64), *pinned])
+    mine = ~np.any(J[:, of_pinned] != 0.0, axis=1)
+    return r[mine], J[mine] @ free

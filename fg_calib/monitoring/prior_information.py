@@ -1,0 +1,115 @@
+"""What a calibration has learned, for the next one: what its rows say, without the rows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.graph.factors import eliminate, prior_rows, unknown_prior_rows
+from fg_calib.graph.information import row_triangles
+from fg_calib.graph.knowledge import SIZE, STAYING, Knowledge, Name, coordinates_of
+from fg_calib.graph.problem import Problem, by_columns_of
+from fg_calib.graph.solver import Solution
+from fg_calib.observability.observed_quantities import Seen
+
+Floats = NDArray[np.float64]
+
+
+def knowledge_of(solution: Solution) -> Knowledge | None:
+    """What the rows of a solution say of the arm, targets and anchors, with what was known before.
+
+    Tolerances of the arm are not counted among it, said places of targets and anchors are. Parameters that were left
+    out to fix the gauge have their columns. Rows that share errors but were to count as independent do so here, as in
+    the posterior that is saved.
+
+    Returns:
+        None where the arm was evaluated only, or somebody's own factors take part.
+    """
+    problem = solution.problem
+    if problem.evaluated or problem.added or not problem.variables.n_robot_columns:
+        return None
+    if problem.whole is not None:  # all parameters, those left out among them
+        problem = by_columns_of(problem, problem.whole.variables)
+    as_drawn, x = at_nominal(problem, solution.before)
+    nominal = _known_at(as_drawn, x, with_loss=False)
+    views = Seen.of(problem).views
+    nominal = replace(nominal, right=np.zeros(nominal.n), views=views)
+    return replace(_known_at(problem, solution.parameters, with_loss=True), views=views, nominal=nominal)
+
+
+def at_nominal(problem: Problem, before: Floats) -> tuple[Problem, Floats]:
+    """A problem and the parameter vector at which one asks what its rows, and those before, determine.
+
+    Args:
+        problem: It.
+        before: The parameter vector with frame, base and tool fitted, the arm at nominal; of an update where that
+            started, which is as calibrated.
+    """
+    if problem.knowledge is None or problem.knowledge.nominal is None:
+        return problem, before
+    known, v, x = problem.knowledge.nominal, problem.variables, before.copy()
+    x[v.robot_span] = known.robot.nominal
+    for name in known.unknowns:
+        place = _place(problem, name)
+        if place is not None:
+            x[place] = known.place(name)
+    return replace(problem, knowledge=known), x
+
+
+def _known_at(problem: Problem, x: Floats, *, with_loss: bool) -> Knowledge:
+    """What the rows of a problem, and those before, say, linearised at a parameter vector."""
+    v = problem.variables
+    robot = v.robot.with_values(x[v.robot_span])
+    places = {name: place for name in _staying(problem) if (place := _place(problem, name)) is not None}
+    before = problem.knowledge
+    unseen = [] if before is None else [name for name in before.unknowns if name not in places]
+    A, b = _rows(problem, x, unseen, with_loss=with_loss)
+    columns = [place - v.nuisance_span.start + v.n_columns for place in places.values()]
+    wide = np.arange(A.shape[1])
+    kept = np.concatenate([wide[: v.n_robot_columns], *columns, wide[v.n_columns + v.n_nuisance :]])
+    left = eliminate(A[:, np.concatenate([kept, np.setdiff1d(wide, kept)])], b, len(kept))
+    at = [x[place] for place in places.values()]
+    if before is not None:
+        at += [before.place(name) for name in unseen]
+    return Knowledge.of_rows(robot, [*places, *unseen], np.concatenate([np.zeros(0), *at]), left.A, left.b)
+
+
+def _staying(problem: Problem) -> list[Name]:
+    unknowns = problem.data.unknowns
+    return [name for name in zip(unknowns.letters, unknowns.names, strict=True) if name[0] in STAYING]
+
+
+def _place(problem: Problem, name: Name) -> NDArray[np.int64] | None:
+    return coordinates_of(problem.variables, problem.data.unknowns, name)
+
+
+def _rows(problem: Problem, parameters: Floats, unseen: list[Name], *, with_loss: bool) -> tuple[Floats, Floats]:
+    """All rows but the arm's tolerances, by the problem's columns, then by those of what was known and is not seen."""
+    v, extra = problem.variables, SIZE * len(unseen)
+    r, J = unknown_prior_rows(v, parameters)
+    blocks = [np.column_stack([J, r]), *row_triangles(problem, parameters, with_loss=with_loss)]
+    wide = [np.column_stack([B[:, :-1], np.zeros((len(B), extra)), B[:, -1]]) for B in blocks]
+    known = problem.knowledge
+    if known is not None:
+        s, D = known.step_to(v, problem.data.unknowns, parameters)
+        own = [known.rows[:, known.span(name)] for name in unseen]
+        wide.append(np.column_stack([known.rows @ D, *own, known.right + known.rows @ s]))
+    every = np.vstack(wide)
+    return every[:, :-1], every[:, -1]
+
+
+def with_tolerances(known: Knowledge, nominal: Floats, tolerances: dict[str, float]) -> Knowledge:
+    """Knowledge with the arm's tolerances about its nominal values as rows of their own.
+
+    Args:
+        known: What rows say.
+        nominal: Nominal values of all parameters of the robot.
+        tolerances: 1 sigma by parameter.
+    """
+    parameters = tuple(replace(p, tolerance=tolerances.get(p.name)) for p in known.robot.parameters)
+    robot = replace(known.robot, parameters=parameters).with_values(nominal)
+    variables = replace(known.variables, robot=robot, priors=True)
+    r, J = prior_rows(variables, np.append(known.robot.nominal, np.zeros(6)))
+    return known.with_rows(np.hstack([J, np.zeros((len(J), len(known.at)))]), r)

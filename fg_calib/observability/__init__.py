@@ -1,0 +1,1 @@
+"""Which parameters measurements determine, and why not the others."""

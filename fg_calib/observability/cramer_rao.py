@@ -1,0 +1,228 @@
+"""What a calibration can reach: the Cramér-Rao bound at true parameters, and what an estimator of a kind makes of it.
+
+With J the whitened derivatives of the rows in the parameters that may be wrong, x the parameters' errors (true minus
+nominal), n the whitened noise and P the rows 1/sigma of the priors, the estimate of the kept parameters K is, to first
+order,
+
+    x_K = S+ [J x + n; 0],   S = [J_K; P_K],
+
+and what is held stays at its nominal value: its estimated error is 0. So the error of the estimate is
+
+    e = [S+_J J - 1] x + S+_J n,   S+_J the columns of S+ that belong to J,
+
+whose covariance follows from that of n, which is 1, and that of x, the squared tolerances. With everything kept and
+with priors this is the Bayesian Cramér-Rao bound (J^T J + P^T P)^-1 (Van Trees 1968, section 2.4.3). Without priors and
+with what the rows determine kept it is the Cramér-Rao bound (J_K^T J_K)^-1, and beside it what the held parameters'
+own errors do to the tool that the kept ones do not make up for; for the paper's gauges this is nothing in the tool's
+position. Where rows share errors but are weighted as independent, n has the covariance C of the rows so weighted: the
+estimator is then another, its error larger, and what it claims, (S^T S)^-1, is neither.
+
+A covariance depends on second moments alone, so tolerances serve for uniform errors as well (bound / sqrt 3).
+
+References:
+    Van Trees (1968), Detection, Estimation, and Modulation Theory, Part I. Wiley.
+    Sobol (1967), The distribution of points in a cube and the approximate evaluation of integrals. USSR Comp. Math. 7.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import qmc
+
+from fg_calib.arguments import checked
+from fg_calib.arrays import Brief
+from fg_calib.errors import InputError, shown
+from fg_calib.graph.build import predicted_problem, true_problem
+from fg_calib.graph.information import correlation, named_triangle
+from fg_calib.graph.problem import Problem
+from fg_calib.measurements.dataset import Measurements
+from fg_calib.measurements.series import Table
+from fg_calib.options import FrameKnowledge, Model, Options, PairErrors, Pairing, check, check_flag, check_names
+from fg_calib.prediction.expected_error import without_rigid_motion
+from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.robot.model import Robot
+from fg_calib.threads import single_threaded
+
+Floats = NDArray[np.float64]
+Booleans = NDArray[np.bool_]
+
+RCOND = 1e-10
+"""Singular values below this share of the largest belong to directions that nothing determines."""
+
+_ENTERS = 1e-6
+"""Share of an error above which it counts as entering the estimate's error."""
+
+_SAMPLES = 512
+"""Draws from the bound for the expected mean and maximum, evenly spread: their error is below a percent."""
+
+
+@dataclass(frozen=True)
+class PositionBound(Brief):
+    """Errors of the tool point over some configurations, as a bound expects them.
+
+    Attributes:
+        rms: Root of the mean square of the distances between estimated and true tool point, over configurations and
+            over errors and noise, [m].
+        mean: Mean of the distances, if the errors are normal, [m].
+        max: Mean of the largest distance, if the errors are normal, [m].
+    """
+
+    rms: float
+    mean: float
+    max: float
+
+
+@dataclass(frozen=True)
+class Bound(Brief):
+    """The least error that some measurements allow, to first order.
+
+    Attributes:
+        robot: The true robot.
+        names: The parameters that may be wrong.
+        covariance: Of estimated minus true parameters, held ones included, shape (n_names, n_names), [m] and [rad].
+        claimed: What the estimator itself takes for its covariance: held parameters count as known, and rows that are
+            weighted as independent as independent; shape (n_names, n_names), [m] and [rad].
+        rank: Number of directions that data and priors determine.
+    """
+
+    robot: Robot
+    names: tuple[str, ...]
+    covariance: Floats
+    claimed: Floats
+    rank: int
+
+    @checked
+    @single_threaded
+    def position(self, readings: Floats, *, fitted: bool = False, claimed: bool = False) -> PositionBound:
+        """The bound on the tool point at joint readings.
+
+        Args:
+            readings: Shape (n, n_joints), [rad] (prismatic: [m]).
+            fitted: Whether the rotation and shift are taken away that bring the estimated points nearest to the true
+                ones (to first order: the six rigid motions of the set of points); else in the base frame.
+            claimed: Whether to propagate what the estimator claims.
+        """
+        columns = {self.robot.index(name): k for k, name in enumerate(self.names)}
+        at = forward(build_chain(self.robot, columns), precompute_trig(self.robot, readings))
+        G = at.jacobian[:, 3:]
+        if fitted:
+            G, _ = without_rigid_motion(at.position, G)
+        G = G.reshape(-1, len(self.names))  # (3 n, n_names)
+        variance, V = np.linalg.eigh(self.claimed if claimed else self.covariance)
+        V = V * np.sign(V[np.argmax(np.abs(V), axis=0), np.arange(len(variance))])  # its signs are anyone's choice
+        half = (G @ (V * np.sqrt(np.maximum(variance, 0.0))))[:, ::-1]  # (3 n, n_names), the largest first
+        z = _normal(half.shape[1]).T
+        distance = np.linalg.norm((half @ z).reshape(len(readings), 3, -1), axis=1)  # (n, samples)
+        return PositionBound(
+            rms=float(np.sqrt(np.sum(half**2) / len(readings))),
+            mean=float(distance.mean()),
+            max=float(distance.max(axis=0).mean()),
+        )
+
+
+def _normal(n: int) -> Floats:
+    """Normal figures, evenly spread (Sobol 1967), most evenly the first of them: shape (_SAMPLES, n)."""
+    figures: Floats = qmc.MultivariateNormalQMC(np.zeros(n), engine=qmc.Sobol(n, seed=0)).random(_SAMPLES)
+    return figures
+
+
+@checked
+@single_threaded
+def cramer_rao(
+    robot: Robot,
+    measurements: Measurements | Table | Sequence[Table],
+    *,
+    model: Model | None = None,
+    pairing: Pairing | None = None,
+    frame: FrameKnowledge = "known",
+    prior: bool = True,
+    kept: Sequence[str] | None = None,
+    pair_errors: PairErrors = "shared",
+) -> Bound:
+    """The Cramér-Rao bound of a robot's parameters from what could be measured at some configurations.
+
+    Of measurements only the readings of train rows, their sigmas and names are used: what a model would measure there
+    is predicted without noise, at the true parameters. Tables are used as they were measured or simulated: the arm is
+    where the true parameters have it, and what else is unknown (frames, targets, anchors, planes, boards) is where
+    their rows then put it.
+
+    Args:
+        robot: The true robot. The parameters that may be wrong are those it lets be estimated; their tolerances are
+            the sigmas of true minus nominal values, and of the priors.
+        measurements: Readings and sigmas; or tables, such as those of a simulation.
+        model: Which measurements take part; each table has its own.
+        pairing: How pairs are formed, a star if None; each table has its own.
+        frame: `unknown` estimates world_T_base with the parameters; each table has its own. Of no meaning for models of
+            pairs.
+        prior: Whether the tolerances are priors.
+        kept: The parameters that are estimated, all if None; the others stay at nominal and keep their errors.
+            Directions that nothing determines are left where they are, by minimum norm, metres beside radians.
+        pair_errors: `shared`: the exact noise of pairs; `independent`: pairs are weighted as if independent.
+
+    Raises:
+        InputError: An unknown parameter, or one without tolerance whose error enters the estimate's; a choice that
+            tables make themselves.
+        ProblemError: A table lacks what its model needs.
+    """
+    names = tuple(p.name for p in robot.parameters if p.estimated)
+    check_names("kept", () if kept is None else kept, names, "or fixed parameter")
+    check_flag("prior", prior)
+    k = np.array([kept is None or name in kept for name in names])
+    problem = _problem_of(robot, measurements, model, pairing, frame, pair_errors)
+    J = named_triangle(problem, problem.start)  # (m, n_names)
+    sigma = np.array([np.inf if p.tolerance is None else p.tolerance for p in robot.parameters if p.estimated])
+    gain, claimed, rank = _linear_estimate(J, np.diag(1.0 / sigma) if prior else np.zeros((0, len(names))), k)
+    left = gain @ J - np.eye(len(names))
+    enters = np.abs(left).max(axis=0, initial=0.0) > _ENTERS
+    # With priors every parameter that has one enters by it; the others are determined or not.
+    for i in np.flatnonzero(np.isinf(sigma) & enters):
+        raise InputError(f"robot {robot.name}", f"no tolerance for {names[i]}", "one: its own error stays in part")
+    of_errors = left * np.where(np.isfinite(sigma), sigma, 0.0)
+    covariance = gain @ gain.T + of_errors @ of_errors.T
+    added = correlation(problem, problem.start) if pair_errors == "independent" else None
+    if added is not None:
+        back = problem.variables.tangent_derivative(problem.start)
+        covariance = covariance + claimed @ (back.T @ added @ back) @ claimed
+    return Bound(robot, names, covariance, claimed, rank)
+
+
+def _problem_of(
+    robot: Robot,
+    measurements: Measurements | Table | Sequence[Table],
+    model: Model | None,
+    pairing: Pairing | None,
+    frame: FrameKnowledge,
+    pair_errors: PairErrors,
+) -> Problem:
+    """The problem of what would be measured at a table's configurations, or of tables as they are."""
+    if isinstance(measurements, Measurements):
+        chosen = check("model", model, Model)
+        return predicted_problem(robot, measurements, chosen, frame=frame, pairing=pairing, pair_errors=pair_errors)
+    for key, given, default in (("model", model, None), ("pairing", pairing, None), ("frame", frame, "known")):
+        if given is not default and given != default:
+            raise InputError(key, f"found {shown(given)} with tables", "none: each table has its own")
+    return true_problem(robot, measurements, Options("pose", gauge="none", pair_errors=pair_errors))
+
+
+def _linear_estimate(J: Floats, P: Floats, k: Booleans) -> tuple[Floats, Floats, int]:
+    """Least squares with rows of data and of priors for some of the parameters, the others at nominal.
+
+    Args:
+        J: Whitened rows of the data, shape (m, n).
+        P: Whitened rows of the priors, shape (n_priors, n).
+        k: Which parameters are estimated, shape (n,).
+
+    Returns:
+        Estimate per residual of the data, shape (n, m); the covariance that it takes for its own, shape (n, n); rank.
+    """
+    U, s, Vt = np.linalg.svd(np.vstack([J[:, k], P[:, k]]), full_matrices=False)
+    rank = int(np.sum(s > RCOND * s.max(initial=0.0)))
+    half = Vt[:rank].T / s[:rank]  # (n_kept, rank)
+    gain, claimed = np.zeros((len(k), len(J))), np.zeros((len(k), len(k)))
+    gain[k] = half @ U[: len(J), :rank].T
+    claimed[np.ix_(k, k)] = half @ half.T
+    return gain, claimed, rank

@@ -1,0 +1,174 @@
+"""Which parameters measurements can determine: of a robot in principle, or at given configurations.
+
+*Structural*: at the nominal parameters and many random configurations within the joint limits; what is lost there is
+lost whatever one measures. *Practical*: at the user's configurations and noise; more may be lost, and some of the rest
+may be weak.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.arguments import checked
+from fg_calib.arrays import Brief
+from fg_calib.errors import ProblemError
+from fg_calib.graph.build import STRUCTURAL_FLOOR, predicted_problem, random_problem
+from fg_calib.graph.information import observability_of
+from fg_calib.graph.problem import Problem
+from fg_calib.measurements.dataset import Measurements
+from fg_calib.observability.indices import SIGNAL_FLOOR, Observability
+from fg_calib.observability.parallel_axes import MissingMotion, missing_motions
+from fg_calib.observability.reasons import LostDirection, explain
+from fg_calib.options import FrameKnowledge, Model, Pairing, check_names, check_number
+from fg_calib.robot.model import Robot, names_of
+from fg_calib.threads import single_threaded
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Identifiability(Brief):
+    """What measurements determine of a robot's parameters, and why not the rest.
+
+    Attributes:
+        robot: The robot's name.
+        model: What is measured; of `pixels` it is looked at what the boards' poses would say.
+        kind: On random configurations, or on the user's.
+        n_configurations: How many.
+        observability: Rank, classes, groups, indices.
+        looked_at: The problem and the parameter vector that it is of, for the reasons; None of what was pickled, which
+            has them.
+        with_fixed_known: The same where the parameters that the robot's file calls fixed are known; None if it calls
+            none fixed, or if only the others were looked at anyway.
+        fixed: Those parameters.
+        missing: Small motions between neighbouring axes that the robot's convention has no parameter for.
+    """
+
+    robot: str
+    model: Model
+    kind: Literal["structural", "practical"]
+    n_configurations: int
+    observability: Observability
+    looked_at: tuple[Problem, Floats] | None = field(repr=False, compare=False)
+    with_fixed_known: Identifiability | None = None
+    fixed: tuple[str, ...] = ()
+    missing: tuple[MissingMotion, ...] = ()
+
+    @cached_property
+    def lost(self) -> tuple[LostDirection, ...]:
+        """Every lost direction with its reason, looked for when they are first asked for."""
+        assert self.looked_at is not None
+        return explain(*self.looked_at, self.observability)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the problem, the reasons among it."""
+        return {**self.__dict__, "lost": self.lost, "looked_at": None}
+
+
+@checked
+@single_threaded
+def observe_structure(
+    robot: Robot,
+    model: Model,
+    *,
+    frame: FrameKnowledge = "known",
+    prefer: Sequence[str] = (),
+    n_configurations: int = 0,
+    seed: int = 0,
+) -> Identifiability:
+    """What a model can determine of a robot's parameters at all.
+
+    All parameters of the joints are looked at, and those of base and tool that the robot's file has estimated; what
+    it calls fixed is looked at both as unknown and as known.
+
+    Args:
+        robot: The robot.
+        model: What is measured.
+        frame: Whether the measurement frame is unknown too.
+        prefer: Parameters to keep, first choice first, where only combinations are determined.
+        n_configurations: Random configurations; 0 for ten for every parameter, 300 at least.
+        seed: Of the random configurations.
+
+    Raises:
+        InputError: An option is not one of those possible.
+    """
+    check_names("prefer", prefer, names_of(robot.parameters))
+    check_number("n_configurations", n_configurations, whole=True)
+    check_number("seed", seed, whole=True)
+    estimated = [p for p in robot.parameters if p.estimated]
+    everything = [p for p in robot.parameters if p.estimated or 1 <= p.owner <= robot.n_joints]
+
+    def look(names: Sequence[str]) -> Identifiability:
+        problem = random_problem(
+            robot.with_estimated(names), model, frame, n_configurations=n_configurations, seed=seed
+        )
+        return replace(identifiability_of(problem, problem.start, "structural", prefer), model=model)
+
+    whole = look(names_of(everything))
+    fixed = tuple(p.name for p in everything if not p.estimated)
+    if not fixed or not estimated:
+        return whole
+    known = look(names_of(estimated))
+    return replace(whole, with_fixed_known=known, fixed=fixed)
+
+
+@checked
+@single_threaded
+def observe_configurations(
+    robot: Robot,
+    measurements: Measurements,
+    model: Model,
+    *,
+    frame: FrameKnowledge = "known",
+    pairing: Pairing | None = None,
+    prefer: Sequence[str] = (),
+) -> Identifiability:
+    """What a model determines at given configurations, with their noise; measured values are not looked at.
+
+    Args:
+        robot: The robot; what is fixed counts as known.
+        measurements: The configurations (train rows) and their noise; 1 mm and 1 mrad where it is not stated.
+        model: What would be measured.
+        frame: Whether the measurement frame is unknown too.
+        pairing: How pairs are formed; a star if None.
+        prefer: Parameters to keep, first choice first, where only combinations are determined.
+
+    Raises:
+        InputError: An option is not one of those possible.
+        ProblemError: Nothing is estimated, or no row takes part.
+    """
+    check_names("prefer", prefer, names_of(robot.parameters))
+    if not any(p.estimated for p in robot.parameters):
+        raise ProblemError(f"robot {robot.name}", "nothing to estimate", "at least one parameter that is not fixed")
+    problem = predicted_problem(robot, measurements, model, frame=frame, pairing=pairing)
+    if not problem.rows:
+        if measurements.test.all():
+            raise ProblemError(measurements.source, "test rows alone", "train rows: test rows are never fitted")
+        raise ProblemError(measurements.source, "no row takes part", "configurations that differ")
+    return replace(identifiability_of(problem, problem.start, "practical", prefer), model=model)
+
+
+def identifiability_of(
+    problem: Problem,
+    parameters: Floats,
+    kind: Literal["structural", "practical"],
+    prefer: Sequence[str] = (),
+) -> Identifiability:
+    """What the train rows of a problem, without priors, determine around a parameter vector."""
+    floor = STRUCTURAL_FLOOR if kind == "structural" else SIGNAL_FLOOR
+    observability = observability_of(problem, parameters, prefer, floor)
+    return Identifiability(
+        robot=problem.robot.name,
+        model=problem.options.model,
+        kind=kind,
+        n_configurations=problem.n_configurations,
+        observability=observability,
+        looked_at=(problem, parameters),
+        missing=missing_motions(problem.robot),
+    )

@@ -1,0 +1,189 @@
+"""Why directions are lost: each is moved at random configurations, and what it does to the tool tells the cause.
+
+A cause is stated only if it is checked: that the tool does not move, that everything moves as one body, that the tool
+only turns about its own point, that unknowns of the measurements take the direction up (see `absorbed`), and so on.
+Where no check succeeds the reason is `NO_CAUSE`, never a guess.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.graph.information import named_triangle
+from fg_calib.graph.problem import Problem
+from fg_calib.observability.confounding import Absorbed
+from fg_calib.observability.indices import SUPPORT_TOLERANCE, Observability
+from fg_calib.observability.observed_quantities import SEES_ORIENTATION, SEES_POSITION, Seen
+from fg_calib.observability.random_configurations import elsewhere
+from fg_calib.robot.inverse import random_readings
+from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.robot.model import Parameter
+from fg_calib.threads import single_threaded
+
+Floats = NDArray[np.float64]
+
+NO_CAUSE = "no simple cause found"
+NOT_EXCITED = "not excited by these configurations"
+BASE = "the measurement is blind to the base: the whole arm moves as one body"
+
+_NOTHING = 1e-7
+"""A motion below this part of what its members do one by one is none: relations are rounded to nine digits, and what
+`SUPPORT_TOLERANCE` left out of them may move as much as it could."""
+
+
+@dataclass(frozen=True)
+class LostDirection:
+    """A direction that the measurements do not determine.
+
+    Attributes:
+        relation: The change of each parameter, [m] and [rad], the largest being 1 or -1.
+        reason: Why, in words.
+    """
+
+    relation: dict[str, float]
+    reason: str
+
+
+@single_threaded
+def explain(problem: Problem, parameters: Floats, observability: Observability) -> tuple[LostDirection, ...]:
+    """The reason for every lost direction of an observability found for a problem at a parameter vector."""
+    return explain_relations(problem, observability.names, observability.lost, parameters)
+
+
+def explain_relations(
+    problem: Problem, names: Sequence[str], lost: Sequence[dict[str, float]], parameters: Floats
+) -> tuple[LostDirection, ...]:
+    """The reason for every one of some relations of a problem's parameters, by these names, at a parameter vector."""
+    if not lost:
+        return ()
+    tables = problem.data.tables
+    motion = _Motion(problem, parameters, Seen.of(problem))
+    directions = np.array([[relation.get(name, 0.0) for name in names] for relation in lost]).T
+    absorbed, anywhere = Absorbed(problem, parameters, directions), elsewhere(problem, parameters)
+    # What kinds of one's own would show elsewhere is not known.
+    effect = np.zeros((1, len(directions))) if anywhere is None else named_triangle(anywhere, anywhere.start)
+    largest = float(np.linalg.norm(effect, axis=0).max())
+    seen = np.linalg.norm(effect @ directions, axis=0) > 1e-6 * largest * np.abs(directions).max(axis=0)
+    touched = any(table.measurements.groups is not None for table in tables)
+
+    def reason(k: int, direction: Floats) -> str:
+        by = absorbed.by(k)
+        if seen[k] and not (by and touched):  # nor what touches of the same points would
+            return NOT_EXCITED
+        if by == ():
+            return motion.reason(direction)
+        return NO_CAUSE if by is None else BASE if motion.of_base(direction) else absorbed.words(k)
+
+    return tuple(LostDirection(relation, reason(k, directions[:, k])) for k, relation in enumerate(lost))
+
+
+class _Motion:
+    """What a problem's parameters do to the tool at random configurations."""
+
+    def __init__(self, problem: Problem, parameters: Floats, seen: Seen) -> None:
+        robot = problem.robot.with_values(parameters[problem.variables.robot_span])
+        self._parameters = problem.estimated
+        self._seen = seen
+        columns = {robot.index(p.name): k for k, p in enumerate(self._parameters)}
+        chain = build_chain(robot, columns).with_joint_columns()
+        poses = forward(chain, precompute_trig(robot, random_readings(robot, 60, np.random.default_rng(0))))
+        n = len(self._parameters)
+        self._R, self._p = poses.rotation, poses.position
+        self._J = poses.jacobian[:, :, :n]
+        self._scales = np.array([robot.scale_of(p.unit) for p in self._parameters])
+        axes = np.moveaxis(poses.jacobian[:, :3, n:], 2, 1)[:, [not j.prismatic for j in robot.joints]]
+        axes = axes * np.where(np.sum(axes * axes[:1, :1], axis=2, keepdims=True) < 0.0, -1.0, 1.0)
+        self._common_axis = axes[:, 0] if axes.size and self._constant(axes.reshape(-1, 3)) else None
+        last = poses.jacobian[:, 3:, -1]
+        self._on_last_axis = not robot.joints[-1].prismatic and float(np.abs(last).max()) < _NOTHING
+
+    def reason(self, direction: Floats) -> str:  # noqa: PLR0911 - one return a cause
+        """Why a direction, shape (n,), [m] and [rad], has no effect on the measurements."""
+        w, dp, turns, moves = self._of_tool(direction)
+        sees_orientation, sees_position = map(self._seen.any_of, (SEES_ORIENTATION, SEES_POSITION))
+        if not turns and not moves:
+            return self._same_motion(direction)
+        if not sees_orientation and not moves:
+            if self._on_last_axis:
+                return f"the tool point lies on the last axis: the tool only turns about it, unseen by {self._seen}"
+            return f"the tool only turns about its own point, unseen by {self._seen}"
+        if not sees_position and not turns:
+            if self._all_turn(direction):
+                return f"{self._parallel(direction)}: only the sum of their turns is seen, and no lengths are"
+            return f"the tool only moves without turning, unseen by {self._seen}"
+        if self.of_base(direction):
+            return BASE
+        if self._seen.pairs and not moves and self._constant(np.einsum("nji,nj->ni", self._R, w)):
+            return self._tool_turned(direction)
+        if self._seen.pairs and not sees_position and self._constant(np.einsum("nji,nj->ni", self._R, w)):
+            return self._tool_turned(direction)
+        if self._seen.pairs and self._common_axis is not None and self._tilts(w, dp, self._common_axis):
+            return "parallel axes, all of them: it only tilts the arm out of its plane, unseen to first order"
+        return NO_CAUSE
+
+    def of_base(self, direction: Floats) -> bool:
+        """Whether a direction moves the arm as if the base alone had moved, and nothing seen says where the base is."""
+        w, dp, turns, _ = self._of_tool(direction)
+        if not self._seen.relative(SEES_POSITION) or (turns and not self._seen.relative(SEES_ORIENTATION)):
+            return False
+        return self._rigid(w, dp, self._seen.any_of(SEES_POSITION))
+
+    def _of_tool(self, direction: Floats) -> tuple[Floats, Floats, bool, bool]:
+        """Turns and shifts of the tool, shape (n_configurations, 3), and whether these are any."""
+        w = self._J[:, :3] @ direction
+        dp = self._J[:, 3:] @ direction
+        size_w = float(np.abs(self._J[:, :3] * direction).sum(axis=2).max())
+        size_p = float(np.abs(self._J[:, 3:] * direction).sum(axis=2).max())
+        turns = float(np.abs(w).max()) > _NOTHING * max(size_w, 1e-3 * size_p)
+        moves = float(np.abs(dp).max()) > _NOTHING * max(size_p, 1e-3 * size_w)
+        share = SUPPORT_TOLERANCE * float(np.abs(direction / self._scales).max())
+        left_w, left_p = (share * float(np.abs(J * self._scales).max()) for J in (self._J[:, :3], self._J[:, 3:]))
+        return w, dp, turns and float(np.abs(w).max()) > left_w, moves and float(np.abs(dp).max()) > left_p
+
+    def _tilts(self, w: Floats, dp: Floats, axis: Floats) -> bool:
+        """Whether the tool moves along the common axis of the joints only, and turns across it only."""
+        along = np.sum(w * axis, axis=1)
+        in_plane = dp - np.sum(dp * axis, axis=1, keepdims=True) * axis
+        return bool(np.abs(along).max() < 1e-8 and np.abs(in_plane).max() < 1e-8)
+
+    def _tool_turned(self, direction: Floats) -> str:
+        what = "the tool frame turns by the same in itself everywhere, which no angle between two poses shows"
+        of_the_tool = all(p.name.startswith("tool.") for p in self._members(direction))
+        return f"the tool point lies on the last axis: {what}" if self._on_last_axis and not of_the_tool else what
+
+    def _same_motion(self, direction: Floats) -> str:
+        """The cause where several parameters cancel each other completely."""
+        members = self._members(direction)
+        if all(p.unit == "m" for p in members):
+            return f"{self._parallel(direction)}: only the sum of the shifts along them acts"
+        if all(p.unit == "rad" for p in members):
+            return "only their sum turns about the same axis"
+        return "together they do not move the tool"
+
+    def _members(self, direction: Floats) -> list[Parameter]:
+        return [p for p, v in zip(self._parameters, direction, strict=True) if v != 0.0]
+
+    def _all_turn(self, direction: Floats) -> bool:
+        return all(p.unit == "rad" for p in self._members(direction))
+
+    def _parallel(self, direction: Floats) -> str:
+        """`parallel axes 3, 4`: the joints whose axes the members turn about or shift along; else in general words."""
+        members = self._members(direction)
+        if all(p.kind in ("d", "theta") for p in members):
+            return f"parallel axes {', '.join(str(p.owner) for p in members)}"
+        return "parallel directions"
+
+    def _rigid(self, w: Floats, dp: Floats, sees_position: bool) -> bool:
+        """Whether the tool moves everywhere as if the base alone had moved."""
+        if not sees_position:
+            return self._constant(w)
+        return self._constant(w) and self._constant(dp - np.cross(w, self._p))
+
+    @staticmethod
+    def _constant(values: Floats) -> bool:
+        """Whether rows are all the same."""
+        return float(np.abs(values - values[0]).max()) <= 1e-8 * max(1.0, float(np.abs(values).max()))

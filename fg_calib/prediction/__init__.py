@@ -1,0 +1,1 @@
+"""What the tool will miss by, and what to command."""

@@ -1,0 +1,282 @@
+"""The covariance of the estimate, and what nothing determines.
+
+Where parameters were left out to fix the gauge (`keep`) they stay at nominal, but are not known. With K what was
+estimated and L what was left out, J_K and J_L the whitened derivatives of the rows in them, x true minus nominal values
+and n the noise, the estimate of K is, to first order, `J_K^+ (J_K x_K + J_L x_L + n)`. So the errors, estimated minus
+true, are
+
+    e_K = G x_L + J_K^+ n,   e_L = -x_L,   G = J_K^+ J_L,
+
+and with the left-out tolerances T and the covariance C_K of the noise's part
+
+    cov(e_K, e_K) = C_K + G T^2 G^T,   cov(e_K, e_L) = -G T^2,   cov(e_L, e_L) = T^2.
+
+Where one of L has no tolerance its error may be anything: the direction (G, -1) of it is not determined. What an
+estimate is known to be, whatever x_L, is that of the combination `x_K + G x_L`, with the covariance C_K.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fg_calib.arrays import FrozenArrays
+from fg_calib.graph.factors import Variables, prior_rows
+from fg_calib.graph.information import correlation, whitened_triangle
+from fg_calib.graph.problem import Problem, by_columns_of
+from fg_calib.graph.solver import Solution
+from fg_calib.observability.indices import RANK_TOLERANCE, SIGNAL_FLOOR, SUPPORT_TOLERANCE, determined
+from fg_calib.robot.model import Robot
+
+Floats = NDArray[np.float64]
+
+NO_ANGLE = 1.0
+"""An angle of a pose with a larger sigma is not known, [rad]: near a pitch of a quarter turn yaw and roll are none."""
+
+
+@dataclass(frozen=True)
+class TangentCovariance(FrozenArrays):
+    """The covariance in the tangent space of the variables, and the directions that nothing determines.
+
+    Attributes:
+        variables: The variables; the columns are theirs.
+        parameters: The estimate (see `Variables`).
+        tangent: Covariance of the determined part, by the noise that rows are weighted by, shape (n_columns,) * 2.
+        loose: Undetermined directions at the estimate, orthonormal in changes of ordinary size, shape
+            (n_loose, n_columns).
+        loose_at_nominal: The same at the nominal parameters.
+    """
+
+    variables: Variables
+    parameters: Floats
+    tangent: Floats
+    loose: Floats
+    loose_at_nominal: Floats
+
+    def covariance(self, rows: Floats) -> Floats:
+        """Covariance of linear functions of the columns, shape (m, n_columns); nan where undetermined."""
+        with np.errstate(invalid="ignore"):  # yaw and roll at a pitch of a quarter turn have no derivative
+            out: Floats = rows @ self.tangent @ rows.T
+        unknown = self._unknown(rows) | ~np.isfinite(np.diag(out))
+        out[unknown, :] = np.nan
+        out[:, unknown] = np.nan
+        return out
+
+    def variance(self, rows: Floats) -> Floats:
+        """The diagonal of `covariance`, shape (m,)."""
+        with np.errstate(invalid="ignore"):
+            out: Floats = np.einsum("ij,ij->i", rows @ self.tangent, rows)
+        out[self._unknown(rows) | ~np.isfinite(out)] = np.nan
+        return out
+
+    def _unknown(self, rows: Floats) -> NDArray[np.bool_]:
+        """Which linear functions have a share in what nothing determines, at nominal and at the estimate."""
+        scaled = rows * self.variables.scales
+        with np.errstate(invalid="ignore"):
+            size = np.linalg.norm(scaled, axis=1)
+            shares = [np.linalg.norm(scaled @ loose.T, axis=1) for loose in (self.loose, self.loose_at_nominal)]
+            found: NDArray[np.bool_] = (shares[0] > SUPPORT_TOLERANCE * size) & (shares[1] > SUPPORT_TOLERANCE * size)
+        return found
+
+    def named(self) -> Floats:
+        """Covariance of the robot's parameters among the columns, shape (n_robot_columns, n_robot_columns)."""
+        n = self.variables.n_robot_columns
+        out = self.covariance(self.variables.named_derivative(self.parameters)[:n])
+        for v in self.variables.items:
+            if v.is_pose and v.kind != "frame":
+                angles = np.arange(v.columns.start + 3, v.columns.stop)
+                unknown = angles[np.diag(out)[angles] > NO_ANGLE**2]
+                out[unknown, :] = np.nan
+                out[:, unknown] = np.nan
+        return out
+
+    def derivative(self, function: Callable[[Robot], ArrayLike]) -> Floats:
+        """Derivative of a function of the robot in the columns, by central differences, shape (m, n_columns)."""
+        v, steps = self.variables, 1e-2 * np.diag(self.variables.scales)
+        robot = v.robot.with_values(self.parameters[v.robot_span])
+
+        def at(step: Floats) -> Floats:
+            moved = robot.with_values(v.stepped(self.parameters, step)[v.robot_span])
+            return np.ravel(np.asarray(function(moved), dtype=np.float64))
+
+        columns = [(at(h) - at(-h)) / (2.0 * h.sum()) for h in steps[: v.n_robot_columns]]
+        of_frame = [np.zeros_like(at(np.zeros(v.n_columns)))] * (v.n_columns - v.n_robot_columns)
+        return np.array(columns + of_frame).T
+
+
+@dataclass(frozen=True)
+class Spread(TangentCovariance):
+    """The covariance of a solution, under the noise as it is taken to be and otherwise.
+
+    Attributes:
+        root: A square root R of `tangent`, R R^T, shape (n_columns, k); its first `rank`
+            columns are the directions that data and priors determine, orthogonal in `prior_scales`.
+        actual: `tangent` by the errors that rows share, also where they are asked to count as independent.
+        rank: Number of directions that data and priors determine.
+        excess: By how much the mean of chi-square is below its degrees of freedom, because rows that share errors are
+            weighted as independent.
+    """
+
+    root: Floats
+    actual: Floats
+    rank: int
+    excess: float
+
+
+def spread_of(solution: Solution) -> Spread:
+    """The covariance: that of the weighted least-squares estimate under the noise as it is taken to be.
+
+    Parameters that were left out to fix the gauge count as known; see `with_left_out`. Where nothing determines frames,
+    what follows them as they are held is in it: see `held_frames`.
+
+    Where rows share errors but are asked to count as independent, with H = J^T J and C their covariance, the `actual`
+    one is H^-1 (J^T C J) H^-1 (priors are rows of their own). The mean of chi-square, tr C - tr(H^-1 J^T C J), is then
+    below the degrees of freedom by tr(H^-1 J^T (C - 1) J). A robust loss loses some of what clean data hold: see
+    `robust.Effect`.
+    """
+    problem, variables = solution.problem, solution.problem.variables
+    scales = variables.prior_scales
+
+    def decomposed(parameters: Floats) -> tuple[Floats, Floats, int]:
+        return _decomposed(variables, parameters, whitened_triangle(problem, parameters, with_loss=True))
+
+    found = s, directions, rank = decomposed(solution.parameters)
+    _, directions_nominal, rank_nominal = (
+        found if solution.before is solution.parameters else decomposed(solution.before)
+    )
+    held = held_frames(directions[rank:], directions_nominal[rank_nominal:], scales, variables.n_robot_columns)
+    half = directions[:rank].T / s[:rank]
+    added = correlation(problem, solution.parameters)
+    root = np.hstack([half, held])
+    middle = np.zeros((rank, rank)) if added is None else half.T @ added @ half
+    return Spread(
+        variables=variables,
+        parameters=solution.parameters,
+        root=root,
+        tangent=root @ root.T,
+        actual=half @ (np.eye(rank) + middle) @ half.T + held @ held.T,
+        loose=_orthonormal(directions[rank:], variables.scales),
+        loose_at_nominal=_orthonormal(directions_nominal[rank_nominal:], variables.scales),
+        rank=rank,
+        excess=float(np.trace(middle)),
+    )
+
+
+def covariance_of_rows(variables: Variables, parameters: Floats, rows: Floats) -> TangentCovariance:
+    """The covariance that whitened rows and the robot's tolerances make, both at one parameter vector.
+
+    Args:
+        variables: The variables.
+        parameters: The parameter vector.
+        rows: Derivatives in the core, nuisances eliminated, shape (m, n_columns).
+    """
+    s, directions, rank = _decomposed(variables, parameters, rows)
+    half, loose = directions[:rank].T / s[:rank], _orthonormal(directions[rank:], variables.scales)
+    return TangentCovariance(variables, parameters, half @ half.T, loose, loose)
+
+
+def _decomposed(variables: Variables, parameters: Floats, rows: Floats) -> tuple[Floats, Floats, int]:
+    """Singular values of rows and priors by how far columns may be off, their directions, how many are determined."""
+    n, scales = variables.n_columns, variables.prior_scales
+    stacked = np.vstack([rows, prior_rows(variables, parameters)[1], np.zeros((n, n))]) * scales
+    _, s, Vt = np.linalg.svd(stacked, full_matrices=False)
+    return s, Vt * scales, determined(s)
+
+
+def held_frames(loose: Floats, loose_at_nominal: Floats, scales: Floats, n_robot: int) -> Floats:
+    """Errors of frames that nothing determines, with what follows them; shape (n_columns, k).
+
+    No nominal value says where frames are: they stay where they were started. Where nothing at nominal determines one
+    in some direction (the height of a SCARA's frame and targets, its axes being parallel), the angles that were
+    corrected make other parameters depend on it. It may be off by what is the least that counts as undetermined.
+
+    Args:
+        loose: Undetermined directions at the estimate, shape (n, n_columns), orthonormal in units of `scales`.
+        loose_at_nominal: The same at the nominal parameters.
+        scales: Of the columns, shape (n_columns,).
+        n_robot: How many columns, the first ones, are the robot's.
+    """
+    at_nominal, here = loose_at_nominal / scales, loose / scales
+    U, s, _ = np.linalg.svd(at_nominal[:, :n_robot])
+    of_frames = U[:, np.append(s, np.zeros(len(U) - len(s))) <= SUPPORT_TOLERANCE].T @ at_nominal
+    turned: Floats = of_frames @ here.T @ here
+    return (turned * scales).T / SIGNAL_FLOOR
+
+
+def with_left_out(solution: Solution, spread: Spread) -> Spread:
+    """The covariance of all parameters, those among them that were left out to fix the gauge: see the module's head.
+
+    Args:
+        solution: The solution.
+        spread: That of what was estimated.
+    """
+    problem = solution.problem
+    if problem.whole is None:
+        return spread
+    variables, own_scales = problem.whole.variables, spread.variables.scales
+    tolerances = [p.tolerance for p in problem.whole.estimated if p.name not in spread.variables.names]
+    known = np.array([t is not None for t in tolerances], dtype=np.bool_)
+    M, errors = _errors(problem, solution.parameters)
+    M_nominal, errors_nominal = _errors(problem, solution.before)
+    of_left_out = errors[:, known] * np.array([t for t in tolerances if t is not None])
+
+    def loose(own: Floats, M: Floats, errors: Floats) -> Floats:
+        return _orthonormal(np.vstack([(own * own_scales) @ M.T, errors[:, ~known].T]), variables.scales)
+
+    return replace(
+        spread,
+        variables=variables,
+        tangent=M @ spread.tangent @ M.T + of_left_out @ of_left_out.T,
+        actual=M @ spread.actual @ M.T + of_left_out @ of_left_out.T,
+        loose=loose(spread.loose, M, errors),
+        loose_at_nominal=loose(spread.loose_at_nominal, M_nominal, errors_nominal),
+    )
+
+
+def with_unsure_tolerances(solution: Solution, spread: Spread) -> Spread:
+    """The covariance with what it adds that tolerances were estimated, and are not known; the same where they are.
+
+    Args:
+        solution: The solution.
+        spread: That with the tolerances taken as known.
+    """
+    scales = solution.estimated_tolerances
+    if scales is None:
+        return spread
+    return replace(spread, tangent=spread.tangent + scales.unsure, actual=spread.actual + scales.unsure)
+
+
+def _errors(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
+    """How the error of the estimate comes about, in the columns of all parameters, left-out ones among them.
+
+    Args:
+        problem: The problem without the left-out parameters; `problem.whole` has them.
+        parameters: The parameter vector.
+
+    Returns:
+        What each column of the problem is in them, and the error that each left-out parameter's own makes: (G, -1).
+        Shapes (n_all, n_columns) and (n_all, n_left_out).
+    """
+    assert problem.whole is not None
+    own, whole = problem.variables, problem.whole.variables
+    M, derivative = whole.columns_of(own, parameters), whole.tangent_derivative(parameters)
+    by_name = dict(zip(whole.names, derivative.T, strict=True))
+    left_out = [by_name[p.name] for p in problem.whole.estimated if p.name not in own.names]
+    N = np.array(left_out).reshape(-1, whole.n_columns).T
+    J = whitened_triangle(by_columns_of(problem, whole), parameters)
+    U, s, Vt = np.linalg.svd((J @ M) * own.scales, full_matrices=False)
+    rank = determined(s)
+    G = own.scales[:, None] * ((Vt[:rank].T / s[:rank]) @ (U[:, :rank].T @ (J @ N)))
+    return M, M @ G - N
+
+
+def _orthonormal(directions: Floats, scales: Floats) -> Floats:
+    """The same span of directions, shape (n, n_columns), orthonormal in changes of ordinary size."""
+    scaled = directions / scales
+    scaled = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1e-300)
+    _, s, Vt = np.linalg.svd(scaled, full_matrices=False)
+    basis: Floats = Vt[s > RANK_TOLERANCE * s.max(initial=0.0)]
+    return basis

@@ -1,0 +1,455 @@
+"""What is said of a job before it is solved: each fault is named where it is, and healthy jobs are not alarmed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from jobs import SIGMA, UR5E, ur5e
+from scenarios import INSTRUMENTS, scenario
+from scipy.spatial.transform import Rotation
+from simulated import measure, plus, small_arm, true_robot
+from touches import reach
+
+from fg_calib import InputError, Job, Measurements, Options, Robot, Table, inspect_job, simulate
+from fg_calib.io.job import read_job
+from fg_calib.robot.kinematics import pose
+from fg_calib.statistics import robust_screening as disagreement
+
+PLACED = (Rotation.from_euler("xyz", [0.3, -0.7, 1.9]), np.array([1.0, -2.0, 0.5]))
+"""World_T_base of a tracker beside the robot."""
+
+SLOW = ("pixels", "camera in the room", "contact", "faces", "sockets")
+"""Instruments whose simulation, or placing, takes longest."""
+
+MODELS = [("pose", "unknown"), ("position", "known"), ("distance-rotation", "known"), ("distance", "known")]
+
+
+@pytest.fixture
+def arm(tmp_path):
+    """A UR5e with a tolerance for everything."""
+    return ur5e(tmp_path)
+
+
+def measured(robot, seed=0, *, placed=PLACED, n=40, n_test=10, readings=None):
+    """What is measured of a robot whose errors are those its tolerances say."""
+    rng = np.random.default_rng(seed)
+    return measure(true_robot(robot, rng), n, rng, sigma=SIGMA, frame=placed, n_test=n_test, readings=readings)
+
+
+def inspected(robot, m, model="pose", frame="unknown", **choices):
+    return inspect_job(Job(None, robot, m, Options(model, frame=frame, **choices)))
+
+
+def said(found):
+    """All that is said of a job."""
+    return (*found.findings, *found.cautions)
+
+
+# --- healthy jobs ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_bundled_example_is_ready_and_nothing_is_to_be_said_of_it(whole_example):
+    found = inspect_job(read_job(whole_example / "calibration.yaml"))
+    assert found.ready
+    assert said(found) == ()
+    (table,) = found.tables
+    assert (table.n_rows, table.n_test, table.n_pairs, table.n_test_pairs) == (552, 500, 51, 499)
+    assert table.n_residuals == {"distance": 51, "angle": 51}
+    assert found.identifiability.observability.rank == 23
+    assert found.dof == 102
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("model", [model for model, _ in MODELS])
+def test_a_healthy_table_of_poses_is_ready(arm, model):
+    found = inspected(arm, measured(arm), model)
+    assert said(found) == ()
+    assert all(one.excess < 2.0 for check in found.setups for one in check.residuals)
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW)) for n in INSTRUMENTS])
+def test_a_healthy_table_of_every_instrument_is_ready(name, seed):
+    simulation = simulate(scenario(INSTRUMENTS[name], n=40 + 20 * (name == "faces")), seed=seed)
+    found = inspect_job(Job(None, simulation.robot, tuple(simulation.tables), Options()))
+    assert found.findings == ()
+    assert [check.table for check in found.setups] == [t.name if len(found.tables) > 1 else "" for t in found.tables]
+    assert found.disagreements.n >= 15
+
+
+@pytest.mark.slow
+def test_the_expected_accuracy_is_that_of_the_calibration(example):
+    """To first order, at nominal instead of at the estimate."""
+    from fg_calib import calibrate_job
+
+    job = read_job(example / "calibration.yaml")
+    before, after = inspect_job(job).expected_error, calibrate_job(job).uncertainty.expected_error
+    assert before.base.position == pytest.approx(after.base.position, rel=0.01)
+    assert before.fitted.orientation == pytest.approx(after.fitted.orientation, rel=0.01)
+
+
+def test_rows_to_test_alone_are_inspected_as_an_evaluation(arm):
+    m = measured(arm)
+    found = inspected(arm, replace(m, test=np.ones(50, dtype=bool)))
+    assert found.evaluated
+    assert found.findings == ()
+    assert found.expected_error is None
+
+
+@pytest.mark.slow
+def test_what_an_arm_without_tolerances_is_off_by_is_a_caution(tmp_path):
+    """Nobody said that it is not: by 50 mm here, which is 25 times the usual."""
+    arm = ur5e(tmp_path, tolerance={})
+    rough = arm.with_values([p.nominal + 0.05 * (p.kind == "a") for p in arm.parameters])
+    m = measured(rough)
+    found = inspected(arm, m)
+    assert found.ready
+    assert "times what noise and tolerances predict: none of the usual mistakes" in found.cautions[0]
+    found = inspected(ur5e(tmp_path), m)
+    assert "none of the usual mistakes in a set-up explains it" in found.findings[0]
+
+
+# --- mistakes in the set-up ------------------------------------------------------------------------------------------
+
+MISTAKES = {
+    "x, y, z are in mm, not m": lambda m: replace(m, position=m.position * 1e3),
+    "joint readings are in deg, not rad": lambda m: replace(m, readings=np.rad2deg(m.readings)),
+    "the poses are inverted": lambda m: replace(
+        m, rotation=np.swapaxes(m.rotation, 1, 2), position=-np.einsum("nji,nj->ni", m.rotation, m.position)
+    ),
+    "columns x, y, z hold y, z, x": lambda m: replace(m, position=m.position[:, [1, 2, 0]]),
+    "joint 2 turns the other way": lambda m: replace(m, readings=m.readings * [1, -1, 1, 1, 1, 1]),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_in_the_set_up_is_a_finding(arm, mistake):
+    found = inspected(arm, MISTAKES[mistake](measured(arm)))
+    assert len(found.findings) == 1
+    assert f"if {mistake}" in found.findings[0]
+    assert found.disagreements.found == ()  # not looked for: all rows would
+
+
+@pytest.mark.slow
+def test_a_mistake_in_one_of_two_tables_is_said_of_that_table(arm):
+    good = Table(replace(measured(arm), source="monday.csv"), "position", frame="unknown")
+    spoilt = replace(measured(arm, 1), source="tuesday.csv")
+    spoilt = Table(replace(spoilt, position=spoilt.position * 1e3), "position", frame="unknown")
+    found = inspect_job(Job(None, arm, (good, spoilt), Options()))
+    (finding,) = found.findings
+    assert finding.startswith("tuesday.csv: position residuals fall from")
+    assert [bool(check.explanations) for check in found.setups] == [False, True]
+
+
+@pytest.mark.slow
+def test_a_mistake_with_targets_is_found_although_they_have_to_be_placed():
+    simulation = simulate(scenario(INSTRUMENTS["targets"]), seed=0)
+    (table,) = simulation.tables
+    m = table.measurements
+    spoilt = replace(table, measurements=replace(m, position=m.position * 1e3))
+    found = inspect_job(Job(None, simulation.robot, (spoilt,), Options()))
+    assert "if x, y, z are in mm, not m" in found.findings[0]
+
+
+# --- single rows -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("model", "frame"), MODELS)
+@pytest.mark.parametrize("size", [0.03, pytest.param(1.0, marks=pytest.mark.slow)])
+def test_rows_that_disagree_with_the_arm_are_named(arm, model, frame, size):
+    """The rest of the table is not spoilt by them: one off by a metre shifts a frame by least squares."""
+    m = measured(arm, placed=PLACED if frame == "unknown" else None)
+    found = inspected(arm, replace(m, position=plus(m.position, [7, 43], [0.0, size, 0.0])), model, frame)
+    (finding,) = found.findings
+    assert finding.startswith("2 measurements disagree with the arm as drawn far more than the others do")
+    rows = {one.row: one for one in found.disagreements.found}
+    assert set(rows) == {7, 43}
+    assert (rows[7].ends, rows[7].kind, rows[7].test, rows[43].test) == (("7",), "position", False, True)
+    assert rows[7].size == pytest.approx(size, rel=0.3)
+
+
+@pytest.mark.parametrize(
+    ("rows", "advice"),
+    [
+        ([7], "look at it, or let a robust loss do so (loss: gnc)"),
+        ([43], "look at it; a test row: no loss acts on what is held out"),
+        ([43, 45], "look at them; test rows: no loss acts on what is held out"),
+        ([7, 43], "(loss: gnc); 1 are test rows: no loss acts on what is held out"),
+    ],
+)
+def test_a_robust_loss_is_not_offered_for_test_rows(arm, rows, advice):
+    m = measured(arm)
+    (finding,) = inspected(arm, replace(m, position=plus(m.position, rows, [0.0, 0.3, 0.0]))).findings
+    assert finding.endswith(advice)
+
+
+@pytest.mark.parametrize("n_test", [0, 10])
+def test_limits_that_cannot_be_evaluated_are_told_of(arm, n_test):
+    m = measured(arm)
+    m = replace(m, test=np.arange(m.n_configurations) < n_test)
+    limits = {"position": 1e-3, "distance": 1e-3}
+    found = inspect_job(Job(None, arm, m, Options(model="pose", frame="unknown", accept=limits)))
+    lacking, *others = found.findings
+    assert lacking == "accept: nothing in this job measures any distance: its limit cannot be evaluated"
+    assert [text.startswith("accept: limits are judged by what is held out, and nothing is") for text in others] == [
+        True
+    ] * (n_test == 0)
+    folds = Options(model="pose", frame="unknown", accept={"position": 1e-3}, folds=5)
+    assert inspect_job(Job(None, arm, m, folds)).ready
+
+
+def test_a_wrong_orientation_is_named_as_that(arm):
+    m = measured(arm)
+    R = m.rotation.copy()
+    R[3] = R[3] @ Rotation.from_rotvec([0.2, 0.0, 0.0]).as_matrix()
+    (one,) = inspected(arm, replace(m, rotation=R)).disagreements.found
+    assert (one.row, one.kind, one.unit) == (3, "orientation", "rad")
+    assert one.size == pytest.approx(0.2, rel=0.1)
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param("targets", marks=pytest.mark.slow), "anchors", "planes", "board", "pairs", "sockets", "stations"],
+)
+def test_a_wrong_row_of_every_instrument_is_named(name):
+    """Targets are placed by least squares before residuals are compared: all of them look far off there."""
+    simulation = simulate(scenario(INSTRUMENTS[name], n=40), seed=1)
+    tables = list(simulation.tables)
+    m = tables[0].measurements
+    if m.pairs is not None:
+        m = replace(m, pairs=replace(m.pairs, distance=plus(m.pairs.distance, [5], 0.5)))
+    elif m.length is not None:
+        m = replace(m, length=plus(m.length, [5], 0.5))
+    elif m.groups is not None:
+        m = replace(m, readings=plus(m.readings, [5], [0.3, 0.0, 0.0, 0.0]))
+    else:
+        m = replace(m, position=plus(m.position, [5], [0.0, 5.0 if name == "targets" else 0.5, 0.0]))
+    tables[0] = replace(tables[0], measurements=m)
+    found = inspect_job(Job(None, simulation.robot, tuple(tables), Options()))
+    (one,) = found.disagreements.found
+    assert one.row == (-1 if name == "pairs" else 5)
+    assert len(found.findings) == 1
+    assert "one measurement disagrees with the arm as drawn" in found.findings[0]
+    assert (one.of != "") == (name in ("targets", "anchors", "planes", "sockets", "stations", "board"))
+
+
+def test_a_row_out_of_line_is_named_although_tolerances_would_allow_it(tmp_path):
+    """They are ten times what the arm is off by."""
+    careful = ur5e(tmp_path)
+    m = measured(careful)
+    loose = {kind: 10.0 * sigma for kind, sigma in UR5E["tolerance"].items()}
+    found = inspected(ur5e(tmp_path, tolerance=loose), replace(m, position=plus(m.position, [7], 0.03)))
+    (one,) = found.disagreements.found
+    assert one.row == 7
+    assert one.size < 3.0 * one.expected
+    assert said(inspected(ur5e(tmp_path, tolerance=loose), m)) == ()
+
+
+@pytest.mark.slow
+def test_a_wrong_distance_of_touched_points_is_named_by_these():
+    simulation = simulate(scenario(INSTRUMENTS["sockets"], n=30), seed=1)
+    (table,) = simulation.tables
+    groups = table.measurements.groups
+    off = replace(groups, pairs=replace(groups.pairs, distance=plus(groups.pairs.distance, [0], 1.0)))
+    wrong = replace(table, measurements=replace(table.measurements, groups=off))
+    (one,) = inspect_job(Job(None, simulation.robot, (wrong,), Options())).disagreements.found
+    assert (one.kind, one.row, one.ends) == ("distance", -1, ("it socket 1", "it socket 2"))
+
+
+def test_a_robust_loss_makes_wrong_rows_a_caution(arm):
+    m = measured(arm)
+    found = inspected(arm, replace(m, position=plus(m.position, [7], 0.1)), loss="gnc")
+    assert found.ready
+    assert found.cautions[0].endswith("(7)")
+
+
+def test_of_a_long_table_some_rows_are_looked_at_and_it_is_said(arm, monkeypatch):
+    monkeypatch.setattr(disagreement, "MOST_ROWS", 25)
+    m = measured(arm)
+    found = inspected(arm, replace(m, position=plus(m.position, [49], 0.05)))
+    assert [one.row for one in found.disagreements.found] == [49]
+    assert (found.disagreements.n, found.disagreements.of) == (25, 50)
+
+
+# --- what rows hold --------------------------------------------------------------------------------------------------
+
+
+def test_copies_of_rows_are_told_from_repeats(arm):
+    """A repeat has the same readings and another measurement."""
+    m = measured(arm)
+    again = m.select(np.array([*range(50), 3]))
+    again = replace(again, ids=np.arange(51).astype(str), test=np.append(m.test, False))
+    found = inspected(arm, again)
+    (caution,) = found.cautions
+    assert caution.startswith("measurements: one row is an exact copy of another (3 and 50): what was copied counts")
+    assert (found.tables[0].n_copies, found.tables[0].n_repeats) == (1, 0)
+    repeated = inspected(arm, replace(again, position=plus(again.position, [50], 1e-5)))
+    assert said(repeated) == ()
+    assert (repeated.tables[0].n_copies, repeated.tables[0].n_repeats) == (0, 1)
+
+
+def test_copies_of_measured_pairs_are_told_of():
+    simulation = simulate(scenario(INSTRUMENTS["pairs"], n=40), seed=0)
+    (table,) = simulation.tables
+    m = table.measurements
+    again = m.pairs.select(np.array([*range(m.pairs.n_pairs), 3]))
+    again = replace(again, a=np.append(again.a[:-1], again.b[3]), b=np.append(again.b[:-1], again.a[3]))
+    twice = replace(table, measurements=replace(m, pairs=again))
+    (survey,) = inspect_job(Job(None, simulation.robot, (twice,), Options())).tables
+    assert (survey.n_copies, survey.n_repeats) == (1, 0)
+    assert survey.copy == f"{m.ids[m.pairs.a[3]]}-{m.ids[m.pairs.b[3]]}"
+
+
+def test_several_targets_at_one_configuration_are_no_repeats():
+    simulation = simulate(scenario(INSTRUMENTS["targets"]), seed=0)
+    (table,) = inspect_job(Job(None, simulation.robot, tuple(simulation.tables), Options())).tables
+    assert (table.n_rows, table.n_configurations, table.n_repeats, table.labels) == (180, 60, 0, {"target": 3})
+
+
+def test_test_rows_at_train_configurations_are_told_of(arm):
+    q = np.random.default_rng(5).uniform(-2, 2, (50, 6))
+    q[[41, 42]] = q[[1, 2]] + 5e-4
+    found = inspected(arm, measured(arm, readings=q))
+    assert found.cautions == (
+        "measurements: 2 test rows are at configurations of train rows: no check of a prediction",
+    )
+    assert found.tables[0].n_near == 4
+
+
+def test_a_table_without_test_rows_is_told_of(arm):
+    (caution,) = said(inspected(arm, measured(arm, n_test=0, n=50)))
+    assert caution.startswith("no test rows")
+
+
+def test_joint_ranges_stand_beside_limits():
+    robot = Robot.from_dh([[0.5, 0.2, 0.1, 0]] * 3, "dh", limits=[[-2, 2], None, [-1, 1]])
+    q = np.random.default_rng(0).uniform(-0.9, 0.9, (20, 3))
+    q[:2, :2] = [[-1.0, -1.0], [1.0, 3.0]]
+    joints = inspected(robot, measure(robot, 20, np.random.default_rng(0), readings=q), "position", "known").joints
+    assert [(j.least, j.most, j.share) for j in joints[:2]] == [(-1.0, 1.0, 0.5), (-1.0, 3.0, None)]
+
+
+def test_a_joint_that_hardly_moves_is_told_of(arm):
+    q = np.random.default_rng(5).uniform(-2, 2, (50, 6))
+    q[:, 3] = 0.3
+    found = inspected(arm, measured(arm, readings=q))
+    assert [joint.name for joint in found.joints if joint.still] == ["q4"]
+    assert found.ready
+    assert found.cautions[0] == "q4 hardly moves: its zero is not told from what stands before it"
+    assert any("not excited by these configurations" in caution for caution in found.cautions)
+
+
+def test_readings_far_outside_limits_are_a_finding():
+    """Of a job that was not read from files: the reader refuses them."""
+    robot = Robot.from_dh([[0.5, 0.2, 0.1, 0]] * 3, "dh", limits=[[-2, 2]] * 3, tolerance={"a": 1e-3})
+    rng = np.random.default_rng(0)
+    m = measure(robot, 30, rng, readings=rng.uniform(-1.9, 1.9, (30, 3)))
+    found = inspected(robot, replace(m, readings=plus(m.readings, [4], [60.0, 0, 0])), "position", "known")
+    assert "q1 is outside its limits in 1 configurations: is it in another unit?" in found.findings
+    assert found.joints[0].n_outside == 1
+
+
+def test_pairs_near_nothing_are_counted():
+    robot = small_arm(tolerance={"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3})
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-2, 2, (30, 4))
+    q[1:8] = q[0] + 1e-4 * rng.normal(size=(7, 4))  # the star's first
+    m = measure(robot, 30, rng, sigma=(1e-4, 1e-4), readings=q)
+    found = inspected(robot, m, "distance-rotation", "known")
+    assert (found.tables[0].n_pairs, found.tables[0].n_near_kink) == (29, 7)
+
+
+def test_pairs_whose_vectors_may_point_either_way_are_told_of():
+    """Eight configurations that bring the tool to one place: what lies between them is what the arm is off by."""
+    robot = small_arm(tolerance={"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3})
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-2, 2, (30, 4))
+    q[:8] = reach(robot, np.tile(pose(robot, q[:1]).position, (8, 1)), rng)
+    found = inspected(robot, measure(robot, 30, rng, sigma=(1e-4, 1e-4), readings=q), "distance", "known")
+    assert found.tables[0].n_folded == 7
+    assert "measurements: 7 of 29 train pairs are so near 0 or half a turn" in found.cautions[-1]
+
+
+# --- what can be determined ------------------------------------------------------------------------------------------
+
+
+def test_parallel_axes_without_a_parameter_are_told_of():
+    robot = Robot.from_dh(
+        [[0, np.pi / 2, 0.16, 0], [-0.4, 0, 0, 0], [-0.4, 0, 0, 0], [0, np.pi / 2, 0.1, 0]],
+        "dh",
+        tolerance={"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3},
+    )
+    found = inspected(robot, measured(robot))
+    assert found.ready
+    assert any("parallel and convention dh has no parameter for a tilt about y" in c for c in found.cautions)
+
+
+def test_configurations_that_are_all_the_same_determine_nothing(arm):
+    q = np.tile([0.1, -1.0, 1.2, 0.3, 0.4, 0.5], (50, 1))
+    found = inspected(arm, measured(arm, readings=q))
+    assert found.identifiability.observability.rank < 6
+
+
+def test_a_job_whose_rows_determine_nothing_is_not_ready():
+    """Lengths alone are to be estimated, and turns alone were measured."""
+    robot = Robot.from_dh([[0.5, 0.2, 0.1, 0]] * 3, "dh", tolerance={"a": 1e-3}).with_estimated(["a1", "a2"])
+    found = inspected(robot, measured(robot, placed=None), "orientation", "known")
+    assert found.identifiability.observability.rank == 0
+    assert found.findings == ("these rows determine none of the parameters that are estimated",)
+
+
+def test_as_many_unknowns_as_rows_leave_nothing_to_judge_by():
+    robot = Robot.from_dh([[0.5, 0, 0, 0], [0.4, 0, 0, 0]], "dh").with_estimated(["a1", "a2", "theta1"])
+    at = pose(robot, [[0.3, 1.0]])
+    m = Measurements.from_arrays([[0.3, 1.0]], position=at.position, sigma_position=1e-3)
+    found = inspected(robot.with_estimated(["a1", "a2"]), m, "position", "known", gauge="none")
+    assert found.dof == 1
+    found = inspected(robot.with_estimated(["a1", "a2", "d1"]), m, "position", "known", gauge="none")
+    assert found.findings[-1].startswith("no degree of freedom is left")
+
+
+def test_noise_to_be_estimated_is_told_of(arm):
+    found = inspected(arm, measured(arm), estimate_noise=True)
+    assert found.cautions == (
+        "noise is to be estimated: sigmas and accuracy here are for noise as stated, or 1 mm and 1 mrad",
+    )
+
+
+def test_nothing_to_estimate_is_refused_as_by_calibrate(arm):
+    with pytest.raises(InputError, match="nothing to estimate"):
+        inspected(arm.with_estimated([]), measured(arm))
+
+
+@pytest.mark.slow
+def test_the_repr_fits_a_screen(arm):
+    found = inspected(arm, measured(arm))
+    assert repr(found) == "Inspection of 'ur5e': 50 rows in 1 table, rank 23 of 30\n  ready"
+    lines = repr(inspected(arm, MISTAKES["x, y, z are in mm, not m"](measured(arm)))).splitlines()
+    assert lines[1].startswith("  LOOK AT THIS FIRST: position residuals fall")
+    assert max(map(len, lines)) <= 100
+
+
+@pytest.mark.parametrize("frames", [("known", "known"), ("unknown", "known")])
+def test_a_base_and_a_tool_that_are_far_from_nominal_are_no_mistake_where_they_are_estimated(frames):
+    """Also with several tables, which are compared at the base and the tool that they say together."""
+    estimate = ["base.x", "base.y", "base.z", "base.roll", "base.pitch", "base.yaw", "tool.x", "tool.y", "tool.z"]
+    true = small_arm({"a": 2e-3, "d": 2e-3, "alpha": 4e-3, "theta": 4e-3}, estimate=estimate)
+    rng = np.random.default_rng(3)
+    off = [0.05 * rng.normal() * (p.name in estimate) for p in true.parameters]
+    nominal, true = true.with_values(true.nominal + off), true_robot(true, rng)
+    tables = [
+        Table(
+            replace(
+                measure(true, 30, rng, sigma=SIGMA, frame=PLACED if frame == "unknown" else None), source=f"{k}.csv"
+            ),
+            "position",
+            frame=frame,
+        )
+        for k, frame in enumerate(frames)
+    ]
+    found = inspect_job(Job(None, nominal, tuple(tables), Options()))
+    assert found.findings == ()

@@ -1,0 +1,526 @@
+"""Tables spoilt by one usual mistake, or two, are named by it; healthy ones by none."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from jobs import SIGMA, UR5E, only, ur5e, write_job
+from oracle import random_robot
+from scipy.spatial.transform import Rotation
+from simulated import TOOL, measure, paper_robot, small_arm, true_robot
+from sparing import as_case, diagonal
+
+from fg_calib import Robot
+from fg_calib.diagnostics import setup_check as mistakes
+from fg_calib.diagnostics.setup_check import EXPLAINED, FAR, REDUCTION, check_setup
+from fg_calib.errors import SolverError
+from fg_calib.graph import solver
+from fg_calib.io.csv_writer import write_csv
+from fg_calib.io.job import read_job
+from fg_calib.options import MODELS, PAIR_MODELS, POSE_MODELS
+from fg_calib.robot.inverse import solve_inverse
+
+PLACED = (Rotation.from_euler("xyz", [0.3, -0.7, 1.9]), np.array([1.0, -2.0, 0.5]))
+"""World_T_base of a tracker beside the robot."""
+
+FRAME_KINDS = ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+def measured(robot, seed=0, *, placed=None, n=50):
+    """What is measured of a robot whose errors are those its tolerances say."""
+    rng = np.random.default_rng(seed)
+    return measure(true_robot(robot, rng), n, rng, sigma=SIGMA, frame=placed)
+
+
+def exchanged(m, i, j):
+    order = np.arange(6)
+    order[[i - 1, j - 1]] = j - 1, i - 1
+    return replace(m, readings=m.readings[:, order])
+
+
+def inverted(m):
+    R = np.swapaxes(m.rotation, 1, 2)
+    return replace(m, rotation=R, position=-np.einsum("nij,nj->ni", R, m.position))
+
+
+def wxyz(m):
+    """The scalar first, in the columns of the vector."""
+    quaternion = np.roll(Rotation.from_matrix(m.rotation.copy()).as_quat(), 1, axis=1)
+    return replace(m, rotation=Rotation.from_quat(quaternion).as_matrix())
+
+
+SPOILT = {
+    "x, y, z are in mm, not m": lambda m: replace(m, position=m.position * 1e3),
+    "x, y, z are in m, not mm": lambda m: replace(m, position=m.position * 1e-3),
+    "x, y, z are in cm, not m": lambda m: replace(m, position=m.position * 1e2),
+    "joint readings are in deg, not rad": lambda m: replace(m, readings=np.rad2deg(m.readings)),
+    "joint readings are in rad, not deg": lambda m: replace(m, readings=np.deg2rad(m.readings)),
+    "the poses are inverted": inverted,
+    "the orientations are inverted": lambda m: replace(m, rotation=np.swapaxes(m.rotation, 1, 2)),
+    "columns qx, qy, qz, qw hold w, x, y, z": wxyz,
+    "columns x, y, z hold y, z, x": lambda m: replace(m, position=m.position[:, [1, 2, 0]]),
+    "columns x, y, z hold y, x, z": lambda m: replace(m, position=m.position[:, [1, 0, 2]]),
+    "z has the wrong sign": lambda m: replace(m, position=m.position * [1, 1, -1]),
+    "joint 2 turns the other way": lambda m: replace(m, readings=m.readings * only(2, -1, 1)),
+    "joint 6 turns the other way": lambda m: replace(m, readings=m.readings * only(6, -1, 1)),
+    "the readings of joints 2 and 3 are exchanged": lambda m: exchanged(m, 2, 3),
+    "the joints are in the opposite order": lambda m: replace(m, readings=m.readings[:, ::-1]),
+    "the zero of joint 2 is off by 90 deg": lambda m: replace(m, readings=m.readings - only(2, np.pi / 2)),
+    "the zero of joint 3 is off by 180 deg": lambda m: replace(m, readings=m.readings + only(3, np.pi)),
+}
+"""Mistakes in a table: how they are named, and how they are made."""
+
+ONE = {
+    "x, y, z are in inches, not mm": lambda m: replace(m, position=m.position / 25.4),
+    "x, y, z are in inches, not m": lambda m: replace(m, position=m.position / 0.0254),
+    "x, y, z are in mm, not inches": lambda m: replace(m, position=m.position * 25.4),
+    "x, y, z are in cm, not mm": lambda m: replace(m, position=m.position * 0.1),
+    "readings of joint 3 are in deg, not rad": lambda m: replace(m, readings=m.readings * only(3, 180 / np.pi, 1)),
+    "readings of joint 2 are in rad, not deg": lambda m: replace(m, readings=m.readings * only(2, np.pi / 180, 1)),
+}
+"""Further ones, of one quantity or one joint."""
+
+LENGTHS = [key for key in SPOILT if key.startswith(("x,", "columns x", "z has"))]
+TURNS = ["the orientations are inverted", "columns qx, qy, qz, qw hold w, x, y, z"]
+JOINTS = [key for key in SPOILT if "joint" in key]
+
+CASES = [
+    *[("pose", "known", key) for key in SPOILT],
+    *[("pose", "unknown", key) for key in SPOILT],
+    *[("position", "known", key) for key in SPOILT if key not in TURNS],
+    *[("position", "unknown", key) for key in SPOILT if key in JOINTS],
+    *[("orientation", "known", key) for key in TURNS],
+    *[("orientation", "unknown", key) for key in TURNS],
+    *[("distance-rotation", "known", key) for key in SPOILT if key not in LENGTHS + TURNS or "in mm" in key],
+    *[("distance", "known", key) for key in SPOILT if key not in LENGTHS + TURNS or "in m, not" in key],
+    *[("rotation", "known", key) for key in SPOILT if key in JOINTS and "deg, not" in key],
+]
+
+
+def named(check):
+    """What the first explanation says."""
+    return str(check.explanations[0]) if check.explanations else ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("model", "frame", "mistake"), CASES)
+def test_a_mistake_in_the_table_is_named(tmp_path, model, frame, mistake):
+    robot = ur5e(tmp_path)
+    m = measured(robot, placed=PLACED if frame == "unknown" else None)
+    healthy = check_setup(robot, m, model, frame, doubtful=True)
+    assert healthy.excess < 2.0
+    assert healthy.explanations == ()
+    check = check_setup(robot, SPOILT[mistake](m), model, frame)
+    assert mistake in named(check)
+    assert check.explanations[0].excess <= min(EXPLAINED, check.excess / REDUCTION)
+
+
+def stuck(robot, joint, place, seed=0, *, placed=PLACED):
+    """What is measured where one joint stands still while its readings change."""
+    rng = np.random.default_rng(seed)
+    true = true_robot(robot, rng)
+    most = np.array([0.3 if joint.prismatic else 3.1 for joint in robot.joints])
+    q = rng.uniform(-most, most, (50, robot.n_joints))
+    still = np.where(np.arange(robot.n_joints) == joint, place, q)
+    m = measure(true, 50, rng, sigma=SIGMA, frame=placed, readings=still)
+    return replace(m, readings=q)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("stands", "model"), diagonal([(0, 0.4), (3, -2.2), (5, 0.3), (5, 3.0)], ["pose", "position"]))
+def test_a_joint_that_is_stuck_is_not_called_one_in_another_unit(tmp_path, stands, model):
+    joint, place = stands
+    robot = ur5e(tmp_path)
+    check = check_setup(robot, stuck(robot, joint, place), model, "unknown")
+    assert named(check).startswith(f"joint {joint + 1} does not move: its readings change, but the arm does not follow")
+    assert not any("in deg" in str(e) for e in check.explanations)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("joint", "place"), [(0, 0.4), (2, 0.08), (3, 0.3)])
+def test_a_joint_of_a_scara_that_is_stuck_is_named_too(joint, place):
+    """The last one moves the tool point by 40 mm only, and a slide in mm instead of cm would move by a tenth."""
+    rows = [[0, 0, 0.35, 0], [0.3, 0, 0, 0], [0.25, np.pi, 0, 0], [0, 0, 0.05, 0]]
+    types = ["revolute", "revolute", "prismatic", "revolute"]
+    tolerance = {"a": 5e-4, "d": 5e-4, "alpha": 1e-3, "theta": 2e-3, "tool": 1e-3}
+    place_of_tool = {"tool": [0.04, 0, 0.06], "estimate": ["tool.x", "tool.y", "tool.z"]}
+    robot = Robot.from_dh(rows, convention="mdh", types=types, tolerance=tolerance, **place_of_tool)
+    check = check_setup(robot, stuck(robot, joint, place), "position", "unknown")
+    assert f"joint {joint + 1} does not move" in named(check)
+    assert not any("in deg" in str(e) or "in mm" in str(e) for e in check.explanations)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [np.pi / 180, 180 / np.pi])
+def test_readings_of_a_joint_in_another_unit_are_not_called_stuck(tmp_path, factor):
+    robot = ur5e(tmp_path)
+    m = measured(robot, placed=PLACED)
+    check = check_setup(robot, replace(m, readings=m.readings * only(4, factor, 1)), "pose", "unknown")
+    assert "readings of joint 4 are in" in named(check)
+    assert not any("does not move" in str(e) for e in check.explanations)
+
+
+EVERY_SECOND = CASES[1::2]
+"""Every mistake, model and frame; that all their combinations are named is for the test above."""
+
+
+def test_every_second_case_has_every_mistake_model_and_frame():
+    assert {case[2] for case in EVERY_SECOND} == set(SPOILT)
+    assert {case[:2] for case in EVERY_SECOND} == {case[:2] for case in CASES}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("model", "frame", "mistake"), EVERY_SECOND)
+def test_a_mistake_is_the_first_finding_of_a_calibration(tmp_path, fg_calib, model, frame, mistake):
+    m = SPOILT[mistake](measured(ur5e(tmp_path), placed=PLACED if frame == "unknown" else None))
+    ended = fg_calib("calibrate", write_job(tmp_path, m, model=model, frame=frame))
+    assert ended.code == 3
+    first = " ".join(ended.out.split()).partition("DOUBTFUL: ")[2].partition(" DOUBTFUL: ")[0]
+    assert "residuals fall from" in first
+    assert mistake in first
+    assert "the noise there is" not in " ".join(ended.out.split())
+
+
+TWO = [
+    ("x, y, z are in mm, not m", "joint readings are in deg, not rad"),
+    ("x, y, z are in mm, not m", "joint 2 turns the other way"),
+    ("joint readings are in deg, not rad", "the poses are inverted"),
+    ("x, y, z are in mm, not m", "columns qx, qy, qz, qw hold w, x, y, z"),
+]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("two", [as_case((two,), is_slow=i in (0, 2)) for i, two in enumerate(TWO)], ids=" and ".join)
+def test_two_mistakes_at_once_are_named(tmp_path, two):
+    robot = ur5e(tmp_path)
+    m = measured(robot, placed=PLACED)
+    check = check_setup(robot, SPOILT[two[1]](SPOILT[two[0]](m)), "pose", "unknown")
+    assert all(mistake in named(check) for mistake in two)
+
+
+ANGLES = {
+    "roll, pitch, yaw are in deg, not rad": lambda R: R.as_euler("xyz", degrees=True),
+    "roll, pitch, yaw turn about the moving axes x, y, z": lambda R: R.as_euler("XYZ"),
+    "columns roll, pitch, yaw hold yaw, pitch, roll": lambda R: R.as_euler("ZYX"),
+    "roll, pitch, yaw are angles about the moving axes z, y, z": lambda R: R.as_euler("ZYZ"),
+    "roll, pitch, yaw are a rotation vector": lambda R: R.as_rotvec(),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mistake", ANGLES)
+def test_other_angles_than_roll_pitch_yaw_are_named(tmp_path, mistake):
+    m = measured(ur5e(tmp_path))
+    angles = ANGLES[mistake](Rotation.from_matrix(m.rotation.copy()))
+    job = read_job(write_job(tmp_path, m, angles=angles, model="pose"))
+    assert f"if {mistake}" in str(check_setup(job.robot, job.measurements, "pose"))
+
+
+CHANGED = {
+    "the tool point is another one (estimate: [tool.x, tool.y, tool.z])": {"tool": {"roll": 20}},
+    "the tool frame is another one (estimate: all of tool.x ... tool.yaw)": {"tool": {}},
+    "the robot's convention is mdh-hayati, not dh-hayati": None,
+    "the robot's angles are in deg, not rad": None,
+    "the robot's lengths are in mm, not m": None,
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("mistake", "model"), diagonal(CHANGED, ["pose", "distance-rotation"]))
+def test_a_mistake_in_the_robot_is_named(tmp_path, model, mistake):
+    robot = ur5e(tmp_path)
+    changes = CHANGED[mistake]
+    if "convention" in mistake:
+        robot = ur5e(tmp_path, convention="mdh-hayati")
+        changes = {}
+    elif "lengths" in mistake:
+        joints = [{k: v * 1e3 if k in "ad" else v for k, v in joint.items()} for joint in UR5E["joints"]]
+        changes = {"joints": joints, "tool": {"x": 50, "y": -30, "z": 120, "roll": 20}}
+    m = measured(robot)
+    nominal = ur5e(tmp_path, **(changes or {}))
+    if "angles" in mistake:  # a file of such angles is refused
+        degrees = [np.rad2deg(p.nominal) if p.unit == "rad" else p.nominal for p in nominal.parameters]
+        nominal = nominal.with_values(np.array(degrees))
+    check = check_setup(nominal, m, model)
+    if "frame" in mistake and model != "pose":
+        mistake = "the tool point is another one"  # how it is turned does not show in pairs
+    assert mistake in named(check)
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("model", ["pose", "position"])
+def test_a_wrong_tool_is_named_though_it_is_estimated(tmp_path, fg_calib, model):
+    """Its corrections alone were told of, d6 +22 of its tolerances first, where the file had the flange as the tool."""
+    point = {"estimate": ["tool.x", "tool.y", "tool.z"], "tolerance": UR5E["tolerance"] | {"tool": 0.002}}
+    m = measured(ur5e(tmp_path, **point))
+    assert not check_setup(ur5e(tmp_path, **point), m, model, doubtful=True).explanations
+    ur5e(tmp_path, **point, tool=UR5E["tool"] | {"x": 0, "y": 0, "z": 0})
+    ended = fg_calib("calibrate", write_job(tmp_path, m, model=model))
+    first = " ".join(ended.out.split("DOUBTFUL: ")[1].split())
+    assert ended.code == 3
+    assert first.startswith("position residuals fall from 1")
+    assert first.endswith("if the tool is another one, farther off than its tolerance lets it be")
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize(("model", "kinds"), [("pose", FRAME_KINDS), ("position", FRAME_KINDS[:3])])
+def test_a_forgotten_unknown_frame_is_named_though_the_base_is_estimated(tmp_path, fg_calib, model, kinds):
+    """Fitted freely when the set-up was checked, its residuals were small: only corrections were told of."""
+    names = [f"base.{kind}" for kind in kinds]
+    estimated = {"estimate": names, "tolerance": UR5E["tolerance"] | dict.fromkeys(names, 0.002)}
+    robot = ur5e(tmp_path, **estimated)
+    m = measured(robot)
+    assert not check_setup(robot, m, model, doubtful=True).explanations
+    placed = PLACED if len(kinds) > 3 else (Rotation.identity(), PLACED[1])
+    ended = fg_calib(
+        "calibrate", write_job(tmp_path, measured(ur5e(tmp_path, **estimated), placed=placed), model=model)
+    )
+    first = " ".join(ended.out.split("DOUBTFUL: ")[1].split())
+    assert ended.code == 3
+    assert first.startswith("position residuals fall from")
+    assert "if the measurement frame is not the base (frame: unknown), which is farther off than" in first
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["position", "pose", "orientation"])
+def test_a_forgotten_unknown_frame_is_named(tmp_path, fg_calib, model):
+    job = write_job(tmp_path, measured(ur5e(tmp_path), placed=PLACED), model=model)
+    ended = fg_calib("calibrate", job)
+    assert ended.code == 3
+    assert "if the measurement frame is not the base (frame: unknown)" in " ".join(ended.out.split())
+
+
+@pytest.mark.slow
+def test_a_slide_that_goes_the_other_way_or_in_another_unit_is_named():
+    rng = np.random.default_rng(0)
+    arm = small_arm()
+    m = measure(true_robot(arm, rng), 50, rng)
+    for factor, mistake in (
+        ([1, 1, -1, 1], "joint 3 slides the other way"),
+        ([1, 1, 1e3, 1], "readings of slides are in mm"),
+    ):
+        assert mistake in named(check_setup(arm, replace(m, readings=m.readings * factor), "pose"))
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize(("mistake", "frame"), diagonal(ONE, ["known", "unknown"]))
+def test_a_unit_of_one_quantity_or_one_joint_is_named(tmp_path, mistake, frame):
+    robot = ur5e(tmp_path)
+    m = measured(robot, placed=PLACED if frame == "unknown" else None)
+    assert named(check_setup(robot, ONE[mistake](m), "pose", frame)) == mistake
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("factor", "unit"), [(1e-3, "m, not mm"), (0.1, "cm, not mm"), (1e3, "mm, not m")])
+def test_one_slide_of_two_in_another_unit_is_named(factor, unit):
+    rng = np.random.default_rng(0)
+    rows = [(0.0, 1.6, 0.5, 0.0), (0.1, 1.6, 0.4, 1.6), (0.2, 0.7, 0.3, 0.0), (0.3, -1.5, 0.1, 0.0)]
+    arm = Robot.from_dh(rows, types=["prismatic", "prismatic", "revolute", "revolute"], tool=[0.1, 0.0, 0.2])
+    m = measure(true_robot(arm, rng), 50, rng)
+    check = check_setup(arm, replace(m, readings=m.readings * [1.0, factor, 1.0, 1.0]), "pose")
+    assert named(check) == f"readings of joint 2 are in {unit}"
+
+
+@pytest.mark.slow
+def test_one_thing_is_not_said_to_be_in_two_units(tmp_path):
+    """Two changes of the same unit explain what one does: 10 is 1000 / 100."""
+    robot = ur5e(tmp_path)
+    m = measured(robot)
+    for factor in (0.1, 0.3):
+        check = check_setup(robot, replace(m, position=m.position * factor), "pose")
+        for explanation in check.explanations:
+            subjects = [words.partition(" are in ")[0] for words in explanation.mistakes]
+            assert len(set(subjects)) == len(subjects)
+
+
+def pairs_of(m, length=1.0):
+    """A table of pairs, each with the next."""
+    turned = np.swapaxes(m.rotation[:-1], 1, 2) @ m.rotation[1:]
+    n = len(turned)
+    return {
+        "a": np.arange(n),
+        "b": np.arange(n) + 1,
+        "distance": length * np.linalg.norm(np.diff(m.position, axis=0), axis=1),
+        "angle": np.minimum(Rotation.from_matrix(turned).magnitude(), np.pi),
+    }
+
+
+@pytest.mark.slow
+def test_measured_pairs_in_another_unit_are_named(tmp_path, fg_calib):
+    m = measured(ur5e(tmp_path), n=120)
+    job = write_job(tmp_path, m, pairs=pairs_of(m), model="distance-rotation")
+    assert fg_calib("calibrate", job).code == 0
+    job = write_job(tmp_path, m, pairs=pairs_of(m, 1e3), model="distance-rotation")
+    ended = fg_calib("calibrate", job)
+    assert ended.code == 3
+    assert "distances are in mm, not m" in " ".join(ended.out.split())
+
+
+def touches(folder, seed=0, distance=0.05):
+    """A job of a ball put into two sockets: readings that bring the true tool point to each in many ways."""
+    robot = ur5e(folder, estimate=["tool.x", "tool.y", "tool.z"])
+    rng = np.random.default_rng(seed)
+    true = true_robot(robot, rng)
+    points = np.repeat([[0.4, 0.2, 0.3], [0.45, 0.2, 0.3]], 25, axis=0)
+    down = Rotation.from_euler("x", np.pi)
+    turned = (Rotation.from_rotvec(rng.normal(scale=0.6, size=(50, 3))) * down).as_matrix()
+    found = solve_inverse(true, points, turned, generator=rng)
+    q = found.readings[found.reached]
+    columns = {f"q{i + 1}": v for i, v in enumerate(q.T)}
+    write_csv(folder / "touches.csv", columns | {"group": np.repeat(["one", "two"], 25)[found.reached]})
+    write_csv(folder / "sockets.csv", {"a": ["one"], "b": ["two"], "distance": [distance]})
+    job = {"robot": "robot.yaml", "measurements": "touches.csv", "pairs": "sockets.csv", "model": "distance"}
+    path = folder / "job.yaml"
+    path.write_text(yaml.safe_dump(job | {"noise": {"point": 1e-4, "distance": 5e-5}}))
+    return read_job(path)
+
+
+@pytest.mark.slow
+def test_touched_points_name_a_joint_that_turns_the_other_way(tmp_path):
+    job = touches(tmp_path)
+    assert not check_setup(job.robot, job.measurements, "distance").far
+    spoilt = replace(job.measurements, readings=job.measurements.readings * only(2, -1, 1))
+    assert "joint 2 turns the other way" in named(check_setup(job.robot, spoilt, "distance"))
+
+
+@pytest.mark.slow
+def test_sockets_whose_distance_is_in_another_unit_are_named(tmp_path):
+    job = touches(tmp_path, distance=50.0)
+    assert named(check_setup(job.robot, job.measurements, "distance")) == "distances are in mm, not m"
+
+
+@pytest.mark.slow
+def test_the_mistake_stands_first_in_report_and_result(tmp_path, fg_calib):
+    m = measured(ur5e(tmp_path), placed=PLACED)
+    job = write_job(tmp_path, replace(m, position=m.position * 1e3), model="pose", frame="unknown")
+    ended = fg_calib("calibrate", job, "--out", tmp_path / "result")
+    assert ended.code == 3
+    said = " ".join(ended.out.split("\n\n")[0].split())
+    assert said.startswith("ur5e: pose, measurement frame unknown DOUBTFUL: position residuals fall from")
+    assert (
+        said.partition(" DOUBTFUL: ")[2]
+        .partition(" DOUBTFUL: ")[0]
+        .endswith("mm in the median if x, y, z are in mm, not m")
+    )
+    assert "the noise there is" not in " ".join(ended.out.split())
+    result = json.loads((tmp_path / "result" / "result.json").read_text())
+    assert result["findings"][0].endswith("if x, y, z are in mm, not m")
+    (explanation,) = result["setup"]["explanations"]
+    assert explanation["mistakes"] == ["x, y, z are in mm, not m"]
+    before, after = (one["residuals"]["position"]["typical"] for one in (result["setup"], explanation))
+    assert before > 100.0
+    assert after < 0.01
+
+
+@pytest.mark.slow
+def test_what_no_usual_mistake_explains_is_said_plainly(tmp_path, fg_calib):
+    m = measured(ur5e(tmp_path))
+    shuffled = replace(m, position=m.position[::-1], rotation=m.rotation[::-1])
+    ended = fg_calib("calibrate", write_job(tmp_path, shuffled, model="pose"))
+    assert ended.code == 3
+    said = " ".join(ended.out.split())
+    assert " in the median, " in said
+    assert "times what noise and tolerances predict: none of the usual mistakes in a set-up explains it" in said
+    assert "the noise there is" not in said
+
+
+@pytest.mark.slow
+def test_a_solver_that_gives_up_names_the_mistake_too(tmp_path, fg_calib, monkeypatch):
+    def gives_up(*_, **__):
+        raise SolverError("no step can be solved")
+
+    m = measured(ur5e(tmp_path))
+    job = write_job(tmp_path, replace(m, position=m.position * 1e3), model="pose")
+    monkeypatch.setattr(solver, "_fit", gives_up)
+    ended = fg_calib("calibrate", job)
+    assert ended.code == 1
+    assert "no step can be solved" in ended.err
+    assert "if x, y, z are in mm, not m" in ended.err
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("seed", range(24))
+def test_a_healthy_job_raises_no_alarm(seed):
+    """With large but stated tolerances; also where it is looked at although its residuals are as predicted."""
+    rng = np.random.default_rng(seed)
+    large = {"a": 0.02, "d": 0.02, "alpha": 0.03, "theta": 0.05}
+    robot = (
+        paper_robot(tolerance={"a": 0.01, "alpha": 1e-3, "d": 0.01, "theta": 1e-3, "beta": 1e-3}),
+        small_arm(tolerance=large, estimate=TOOL),
+        small_arm(),
+        random_robot("urdf", 6, rng),
+        random_robot("dh", 5, rng),
+    )[seed % 5]
+    models = (*POSE_MODELS, *PAIR_MODELS)
+    model = models[seed % len(models)]
+    unknown = bool(rng.random() < 0.5) and model in ("pose", "position", "orientation")
+    m = measure(true_robot(robot, rng), 40 + 10 * seed, rng, sigma=(1e-3, 1e-3), frame=PLACED if unknown else None)
+    check = check_setup(robot, m, model, "unknown" if unknown else "known", doubtful=True)
+    assert check.excess < FAR / 2
+    assert check.explanations == ()
+
+
+def test_a_healthy_job_is_looked_at_once(monkeypatch, tmp_path):
+    """What it costs: the hypotheses are not even made."""
+    robot = ur5e(tmp_path)
+    monkeypatch.setattr(mistakes, "_explanations", lambda *_: pytest.fail("looked for mistakes"))
+    assert check_setup(robot, measured(robot), "pose").excess < 2.0
+
+
+def test_gross_errors_are_no_mistake_in_the_set_up(tmp_path):
+    robot = ur5e(tmp_path)
+    m = measured(robot)
+    position = m.position.copy()
+    position[::5] += 0.5
+    check = check_setup(robot, replace(m, position=position), "pose", doubtful=True)
+    assert not check.far
+    assert check.explanations == ()
+
+
+@pytest.mark.sampled(13)
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_few_rows_say_nothing(tmp_path, model, n):
+    robot = ur5e(tmp_path)
+    check = check_setup(robot, measured(robot, n=n, placed=PLACED), model, "unknown", doubtful=True)
+    assert check.explanations == ()
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_rows_that_are_not_there_say_nothing(tmp_path, model):
+    """Test rows alone, and a table without what the model uses."""
+    robot = ur5e(tmp_path)
+    m = measured(robot)
+    assert check_setup(robot, replace(m, test=np.ones(50, dtype=bool)), model).residuals == ()
+    bare = replace(m, position=None, rotation=None, sigma_position=None, sigma_orientation=None)
+    assert check_setup(robot, bare, model, doubtful=True).residuals == ()
+
+
+def test_touches_of_test_rows_alone_say_nothing(tmp_path):
+    job = touches(tmp_path)
+    groups = replace(job.measurements.groups, index=np.where(np.arange(job.measurements.n_configurations) > 2, 0, -1))
+    test = np.arange(job.measurements.n_configurations) > 2
+    assert check_setup(job.robot, replace(job.measurements, groups=groups, test=test), "distance").residuals == ()
+
+
+def test_real_poses_raise_no_alarm(data_folder, tmp_path):
+    robot = data_folder / "ur10_tmac" / "robot.yaml"
+    job = {"robot": str(robot), "measurements": str(robot.parent / "series_b.csv"), "frame": "unknown"}
+    path = tmp_path / "job.yaml"
+    for model in ("pose", "distance-rotation"):
+        path.write_text(yaml.safe_dump(job | {"model": model, "noise": {"position": 1e-4, "orientation": 1e-4}}))
+        read = read_job(path)
+        check = check_setup(read.robot, read.measurements, read.options.model, read.options.frame, doubtful=True)
+        assert not check.far
+        assert check.explanations == ()
+
+
+@pytest.mark.slow
+def test_more_explanations_than_are_told_are_counted(tmp_path, fg_calib):
+    """In an unknown frame one wrong sign is as good as any exchange of two columns: six explain it, three are told."""
+    m = measured(ur5e(tmp_path))
+    mirrored = replace(m, position=m.position * [-1.0, 1.0, 1.0])
+    said = " ".join(fg_calib("calibrate", write_job(tmp_path, mirrored, model="position", frame="unknown")).out.split())
+    assert ", or 3 more (--json has all)" in said

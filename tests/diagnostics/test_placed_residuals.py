@@ -1,0 +1,151 @@
+"""Mistakes in the set-up of instruments' tables: targets, anchors, planes, boards, pixels; healthy ones have none."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from instruments import CAMERA, measured_by
+from scipy.spatial.transform import Rotation
+
+from fg_calib import Robot, calibrate
+from fg_calib.diagnostics import nominal_residuals as placed_residuals
+from fg_calib.diagnostics.setup import has_places, setup_of_table
+from fg_calib.diagnostics.setup_check import FAR, check_setup
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.solver import SolverOptions, solve
+from fg_calib.measurements.dataset import Measurements
+from fg_calib.measurements.series import KnownPoint, Table
+from fg_calib.robot.kinematics import pose
+from fg_calib.statistics.assessment import assess
+
+
+def check(robot, table, **changes):
+    table = replace(table, measurements=replace(table.measurements, **changes))
+    return check_setup(robot, table.measurements, table.model, table.frame, doubtful=True, table=table)
+
+
+def turned(rotation, factor):
+    vector = Rotation.from_matrix(rotation.copy()).as_rotvec()
+    return Rotation.from_rotvec(vector * factor).as_matrix()
+
+
+def sign(m, joint):
+    return m.readings * np.where(np.arange(m.readings.shape[1]) == joint, -1.0, 1.0)
+
+
+def in_rad(m):
+    return {"readings": m.readings * np.where(np.arange(4) == 2, 1.0, np.pi / 180)}
+
+
+def inverted(m):
+    R = np.swapaxes(m.rotation, 1, 2)
+    return {"rotation": R, "position": -np.einsum("nij,nj->ni", R, m.position)}
+
+
+CASES = [
+    ("targets", "x, y, z are in m, not mm", lambda m: {"position": m.position / 1e3}),
+    ("targets stations", "joint 2 turns the other way", lambda m: {"readings": sign(m, 1)}),
+    ("targets known", "readings of joints 1 and 2 are exchanged", lambda m: {"readings": m.readings[:, [1, 0, 2, 3]]}),
+    ("anchors", "distances are in mm, not m", lambda m: {"length": m.length * 1e3}),
+    ("anchors offset", "joint 2 turns the other way", lambda m: {"readings": sign(m, 1)}),
+    ("anchors known", "joint readings are in rad, not deg", in_rad),
+    ("planes", "distances are in m, not mm", lambda m: {"length": m.length / 1e3}),
+    ("board", "the poses are inverted (board_T_camera instead of camera_T_board)", inverted),
+    ("board", "rx, ry, rz are in rad, not deg", lambda m: {"rotation": turned(m.rotation, np.pi / 180)}),
+    ("pixels", "columns u, v hold v, u", lambda m: {"image": m.image[:, [1, 0, 2, 3]]}),
+    ("pixels", "corner_x, corner_y are in mm, not m", lambda m: {"image": m.image * [1, 1, 1e3, 1e3]}),
+    ("pixels", "joint 2 turns the other way", lambda m: {"readings": sign(m, 1)}),
+]  # fmt: skip
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("instrument", "mistake", "spoil"), CASES, ids=[f"{case[0]}: {case[1][:20]}" for case in CASES]
+)
+def test_a_mistake_in_an_instruments_table_is_named(instrument, mistake, spoil):
+    robot, _, table = measured_by(instrument, np.random.default_rng(1))
+    assert mistake in str(check(robot, table, **spoil(table.measurements)))
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("instrument", ["targets stations", "anchors offset", "planes", "board", "pixels"])
+def test_healthy_tables_have_no_mistake(instrument):
+    for seed in range(3):
+        robot, _, table = measured_by(instrument, np.random.default_rng(seed), sigma_joint=1e-4)
+        found = check(robot, table)
+        assert 0.05 < found.excess < 3.0
+        assert found.explanations == ()
+
+
+@pytest.mark.slow
+def test_what_is_expected_is_what_arms_drawn_from_their_tolerances_show():
+    """The median over arms of size over expected; what is placed takes up a part of the errors, up to four fifths."""
+    for instrument in ("targets known", "planes"):
+        ratios = [check(*measured_by(instrument, np.random.default_rng(k))[::2]).excess for k in range(20)]
+        assert 0.2 < np.median(ratios) < 1.3
+
+
+def test_rows_are_drawn_so_that_every_target_and_anchor_is_there():
+    for instrument, label in (("targets", "target"), ("anchors", "anchor")):
+        robot, _, table = measured_by(instrument, np.random.default_rng(2), n=150)
+        setup = setup_of_table(robot, table)
+        assert len(setup.measurements.readings) <= 80
+        assert set(setup.measurements.labels[label].index) == {0, 1, 2}
+        assert has_places(table.measurements, table.model)
+
+
+@pytest.mark.slow
+def test_targets_in_the_frame_of_the_flange_are_named():
+    rng = np.random.default_rng(3)
+    rows = [[0, np.pi / 2, 0.4, 0], [0.5, 0, 0, 0], [0.1, np.pi / 2, 0, 0], [0, -np.pi / 2, 0.5, 0],
+            [0, np.pi / 2, 0, 0], [0, 0, 0.1, 0]]  # fmt: skip
+    tolerance = {"a": 1e-4, "d": 1e-4, "alpha": 2e-4, "theta": 2e-4}
+    robot = Robot.from_dh(rows, convention="dh", tool=[0.1, 0, 0.2, 0.3, 0, 0.5], tolerance=tolerance)
+    q, places = rng.uniform(-2, 2, (40, 6)), np.array([[0.05, 0.02, 0.1], [-0.1, 0.1, 0.2], [0.1, -0.15, 0.25]])
+    at = pose(robot, q)
+    flange = at.rotation @ Rotation.from_euler("xyz", [0.3, 0, 0.5]).inv().as_matrix()
+    origin = at.position - flange @ [0.1, 0, 0.2]
+    seen = np.concatenate([origin + flange @ place for place in places])
+    target = np.repeat(["t0", "t1", "t2"], 40)
+    m = Measurements.from_arrays(np.tile(q, (3, 1)), position=seen, sigma_position=1e-5, target=target)
+    known = {f"t{k}": KnownPoint(place) for k, place in enumerate(places)}
+    said = str(check(robot, Table(m, "position", frame="unknown", known=known)))
+    assert "the targets' coordinates are in the frame of the flange, not of the tool" in said
+
+
+@pytest.mark.slow
+def test_the_calibration_says_it_first():
+    robot, _, table = measured_by("planes", np.random.default_rng(4))
+    m = table.measurements
+    metres = assess(solve(build_problem(robot, [replace(table, measurements=replace(m, length=m.length / 1e3))])))
+    assert metres.findings[0].startswith("distance residuals fall from")
+    assert "if distances are in m, not mm" in metres.findings[0]
+
+
+@pytest.mark.slow
+def test_what_no_usual_mistake_explains_is_said_of_instruments_too():
+    robot, _, table = measured_by("targets", np.random.default_rng(4))
+    mixed = np.random.default_rng(5).permutation(table.measurements.position)
+    assert str(check(robot, table, position=mixed)).endswith("none of the usual mistakes in a set-up explains it")
+
+
+@pytest.mark.slow
+def test_what_could_not_be_checked_is_said(monkeypatch):
+    monkeypatch.setattr(placed_residuals, "_placed_residuals", lambda setup: ())
+    robot, _, table = measured_by("planes", np.random.default_rng(6))
+    m = table.measurements
+    wrong = build_problem(robot, [replace(table, measurements=replace(m, length=m.length / 1e3))])
+    found = assess(solve(wrong, SolverOptions(max_iterations=5)))
+    assert any("was not checked for the usual mistakes (units, signs, columns)" in said for said in found.cautions)
+    good = assess(solve(build_problem(robot, [table])))
+    assert not any("was not checked" in said for said in good.cautions)
+
+
+@pytest.mark.long
+def test_a_calibration_in_one_call_checks_too():
+    robot, _, table = measured_by("pixels", np.random.default_rng(7), n=20)
+    m = replace(table.measurements, image=table.measurements.image[:, [1, 0, 2, 3]])
+    assert check_setup(robot, m, "pixels", doubtful=True).residuals == ()  # without a camera
+    found = calibrate(robot, [Table(m, "pixels", camera=CAMERA)])
+    assert "columns u, v hold v, u" in found.findings[0]
+    assert found.uncertainty.setup.excess > FAR

@@ -1,0 +1,120 @@
+"""Several tables, one of them with a mistake in its set-up: it is named, whatever the order of the tables."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from jobs import ur5e
+from scipy.spatial.transform import Rotation
+from simulated import TOOL, measure, true_robot
+from sparing import diagonal
+
+from fg_calib.diagnostics.table_setups import OTHER_TOOL, check_problem
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.solver import solve
+from fg_calib.measurements.dataset import Pairs
+from fg_calib.measurements.series import Table
+
+TOLERANCE = {"a": 0.0005, "d": 0.0005, "alpha": 0.05, "theta": 0.05, "beta": 0.05, "tool": 0.001}
+PLACED = (Rotation.from_euler("xyz", [0.3, -0.7, 1.9]), np.array([1.0, -2.0, 0.5]))
+
+
+def tracker(true, rng, **keys):
+    return replace(measure(true, 30, rng, sigma=(5e-5, 1e-4), **keys), source="tracker.csv")
+
+
+def lengths(true, rng, shifted=0):
+    """Lengths between configurations measured directly; of the pair before that, where they are shifted."""
+    m = measure(true, 40, rng, sigma=(5e-5, 1e-4))
+    a, b = np.arange(0, 40, 2), np.arange(1, 40, 2)
+    distance = np.linalg.norm(m.position[b] - m.position[a], axis=1)
+    nothing, sigma = np.full(20, np.nan), np.full(20, 5e-5)
+    pairs = Pairs(a, b, np.roll(distance, shifted), nothing, sigma, nothing, np.zeros(20, dtype=bool))
+    return replace(m, position=None, rotation=None, sigma_position=None, sigma_orientation=None, pairs=pairs,
+                   source="bar.csv")  # fmt: skip
+
+
+def said(robot, tables, order):
+    problem = build_problem(robot, [tables[i] for i in order], max_iterations=1)  # only what comes before counts
+    found = check_problem(problem, solve(problem).before, doubtful=True)
+    return [str(check) for check in (found, *found.others)]
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_a_forgotten_unknown_frame_of_one_of_two_tables_is_said_of_that_table(tmp_path, order):
+    rng = np.random.default_rng(3)
+    robot = ur5e(tmp_path, estimate=["tool.x", "tool.y", "tool.z"], tolerance=TOLERANCE)
+    true = true_robot(robot, rng)
+    turned = (Rotation.from_rotvec([0.0, 0.0, 1.0]), np.array([2.0, 1.0, 0.0]))
+    wrong = replace(tracker(true, rng, frame=turned), source="other.csv")
+    found = said(robot, [Table(tracker(true, rng), "position"), Table(wrong, "position")], order)
+    assert len(found) == 1
+    assert found[0].startswith("other.csv: position residuals fall from ")
+    assert found[0].endswith(" if the measurement frame is not the base (frame: unknown)")
+
+
+MISTAKES = {
+    "bar.csv: distance residuals fall from": "if distances are in m, not mm",
+    "bar.csv: distance residuals before calibration are": "none of the usual mistakes in a set-up explains it",
+    "cam.csv: position residuals fall from": "if x, y, z are in mm, not m",
+}
+
+
+def three_tables(true, rng, mistake):
+    bar = lengths(true, rng, shifted=int("before" in mistake))
+    if "distance residuals fall" in mistake:
+        bar = replace(bar, pairs=replace(bar.pairs, distance=bar.pairs.distance * 1e-3))
+    cam = replace(tracker(true, rng), source="cam.csv")
+    if "cam" in mistake:
+        cam = replace(cam, position=cam.position * 1e3)
+    first = Table(tracker(true, rng, frame=PLACED), "position", frame="unknown")
+    return [first, Table(bar, "distance"), Table(cam, "pose", frame="unknown")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("mistake", "order"), diagonal(MISTAKES, [(0, 1, 2), (2, 1, 0)]))
+def test_a_mistake_in_one_of_three_tables_is_said_of_that_table(tmp_path, mistake, order):
+    rng = np.random.default_rng(3)
+    robot = ur5e(tmp_path, estimate=["tool.x", "tool.y", "tool.z"], tolerance=TOLERANCE)
+    found = said(robot, three_tables(true_robot(robot, rng), rng, mistake), order)
+    assert len(found) == 1
+    assert found[0].startswith(mistake)
+    assert MISTAKES[mistake] in found[0]
+
+
+@pytest.mark.slow
+def test_all_tables_that_have_an_explanation_of_their_own_are_named(tmp_path):
+    rng = np.random.default_rng(3)
+    robot = ur5e(tmp_path, estimate=["tool.x", "tool.y", "tool.z"], tolerance=TOLERANCE)
+    first, bar, cam = three_tables(true_robot(robot, rng), rng, "cam")
+    pairs = bar.measurements.pairs
+    bar = replace(bar, measurements=replace(bar.measurements, pairs=replace(pairs, distance=pairs.distance * 1e-3)))
+    found = said(robot, [first, bar, cam], (0, 1, 2))
+    assert len(found) == 2
+    assert any(text.startswith("cam.csv: position residuals fall from ") for text in found)
+    assert any(text.startswith("bar.csv: distance residuals fall from ") for text in found)
+
+
+@pytest.mark.parametrize(("n_right", "named"), [(1, {"one.csv", "other.csv"}), (2, {"other.csv"})])
+def test_another_tool_is_said_of_the_table_that_disagrees_with_most_others(tmp_path, n_right, named):
+    rng = np.random.default_rng(5)
+    robot = ur5e(tmp_path, estimate=TOOL, tolerance=TOLERANCE)
+    true = true_robot(robot, rng)
+    values = true.nominal
+    values[[true.index(f"tool.{k}") for k in "xyz"]] += [0.06, -0.02, 0.03]
+    names = ["one.csv", "two.csv"][:n_right]
+    tables = [replace(tracker(true, rng), source=name) for name in names]
+    tables.append(replace(tracker(true.with_values(values), rng), source="other.csv"))
+    found = said(robot, [Table(m, "position") for m in tables], range(len(tables)))
+    assert {text.partition(":")[0] for text in found} == named
+    assert all(text.endswith(f" if {OTHER_TOOL}") for text in found)
+
+
+def test_tables_without_a_mistake_have_nothing_to_say(tmp_path):
+    rng = np.random.default_rng(3)
+    robot = ur5e(tmp_path, estimate=["tool.x", "tool.y", "tool.z"], tolerance=TOLERANCE)
+    problem = build_problem(robot, three_tables(true_robot(robot, rng), rng, "none"))
+    found = check_problem(problem, solve(problem).before, doubtful=True)
+    assert not found.far
+    assert (found.explanations, found.others) == ((), ())

@@ -1,0 +1,401 @@
+"""ROS bags of every format, written by the tests: what is read of them, and a line for each that cannot be used."""
+
+import gc
+import json
+import re
+import shutil
+import sys
+
+import numpy as np
+import pytest
+import yaml
+from recordings import FORMATS, NAMES, POSE_TYPES, START, BagWriter, arm, record, write_bag
+from sparing import diagonal
+
+from fg_calib import InputError, Robot, read_measurements, read_robot, write_robot
+from fg_calib.importers.bag import read_bag
+from fg_calib.importers.standstill import average_stops
+from fg_calib.importers.stops import write_stops
+from fg_calib.io.tables import joint_columns
+
+pytest.importorskip("rosbags", reason="the extra ros is not installed")
+
+# rosbags leaves files open that it cannot read, which is told of wherever garbage is collected.
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+
+@pytest.fixture(autouse=True)
+def collect_what_was_left_open():
+    """Where nobody minds, and not in another test."""
+    yield
+    gc.collect()
+
+
+QUICK = {"n_stops": 3, "rest": 1.1, "move": 0.8, "joint_rate": 30.0, "pose_rate": 25.0}
+
+
+@pytest.fixture(scope="module")
+def short():
+    return record(0, **QUICK)
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory, short):
+    """The same motion in each format."""
+    return {form: write_bag(tmp_path_factory.mktemp(form), short, form) for form in FORMATS}
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_what_was_recorded_is_read(bags, short, form):
+    joints, poses = read_bag(bags[form], arm())
+    assert joints.readings == pytest.approx(short.readings, abs=0)
+    assert joints.time == pytest.approx(short.joint_time, abs=2e-9)
+    assert poses.time == pytest.approx(short.pose_time, abs=2e-9)
+    assert poses.position == pytest.approx(short.position, abs=0)
+    assert poses.rotation == pytest.approx(short.rotation, abs=1e-12)
+    assert joints.source.lag - poses.source.lag == pytest.approx(short.offset, abs=1e-6)
+    assert (joints.source.topic, poses.source.topic) == ("/joint_states", "/pose")
+    assert joints.source.notes == poses.source.notes == ()
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize(("pose_type", "form"), diagonal(POSE_TYPES[1:], ["ros1", "mcap"]))
+def test_poses_of_every_type_are_read(tmp_path, short, form, pose_type):
+    _, poses = read_bag(write_bag(tmp_path, short, form, pose_type), arm())
+    assert poses.position == pytest.approx(short.position, abs=0)
+    assert poses.rotation == pytest.approx(short.rotation, abs=1e-12)
+
+
+@pytest.mark.parametrize("form", ["sqlite3", "mcap"])
+def test_a_file_of_a_folder_is_a_bag_too(bags, short, form):
+    file = next(file for file in bags[form].iterdir() if file.suffix in (".db3", ".mcap"))
+    assert read_bag(file, arm())[1].position == pytest.approx(short.position, abs=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", FORMATS)
+def test_a_bag_calibrates_the_arm(tmp_path, fg_calib, form):
+    """The whole way: bag, table, job; clocks 137 ms apart. The calibrated arm is right at the stops."""
+    motion = record(5, robot=arm(1e-3), n_stops=40, rest=1.3, move=1.0, joint_rate=40.0, pose_rate=30.0)
+    nominal = arm(tolerance={"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}, estimate=["tool.x", "tool.y"])
+    write_robot(tmp_path / "robot.yaml", nominal)
+    bag = write_bag(tmp_path, motion, form)
+    table = tmp_path / "poses.csv"
+    ended = fg_calib("bag", bag, "--robot", tmp_path / "robot.yaml", "--out", table)
+    assert ended.code == 0
+    assert "40 stops found, 40 used, 0 skipped" in ended.out
+    assert ended.err.endswith(f"wrote 40 poses to {table}\n")
+    assert table.read_text().startswith(
+        "id,begin,seconds,samples,pan,lift,elbow,wrist1,wrist2,wrist3,x,y,z,qx,qy,qz,qw,"
+    )
+    job = {"robot": "robot.yaml", "measurements": "poses.csv", "model": "pose", "frame": "unknown"}
+    (tmp_path / "job.yaml").write_text(yaml.safe_dump(job))
+    ended = fg_calib("calibrate", tmp_path / "job.yaml", "--out", tmp_path / "result")
+    assert (ended.code, ended.err) == (0, "")
+    calibrated = read_robot(tmp_path / "result" / "robot_calibrated.yaml")
+    assert np.abs(predicted(calibrated, motion) - motion.true_position).max() < 1e-4
+    assert np.abs(predicted(nominal, motion) - motion.true_position).max() > 1e-3
+
+
+@pytest.mark.slow
+def test_the_command_reports_topics_clocks_and_stops(tmp_path, fg_calib, bags):
+    write_robot(tmp_path / "robot.yaml", arm())
+    ended = fg_calib("bag", bags["ros1"], "--robot", tmp_path / "robot.yaml")
+    assert (ended.code, ended.err) == (0, "nothing is written: --out poses.csv writes the table\n")
+    lines = [line.rstrip() for line in ended.out.splitlines()]
+    assert lines[0] == "run.bag: 3 stops found, 3 used, 0 skipped"
+    assert lines[3].split() == ["joints", "/joint_states", "sensor_msgs/msg/JointState", "144", "30"]
+    assert re.fullmatch(r"  poses are stamped \+0\.13[67]\d+ \+- 0\.000\d+ s against the joints", lines[7])
+    assert lines[8].startswith("  from 2 moves; speeds by joints and by poses correlate by 1.000")
+    assert lines[9] == "  this offset is taken out"
+    ended = fg_calib("bag", bags["ros1"], "--robot", tmp_path / "robot.yaml", "--offset", 0.1, "--json")
+    document = json.loads(ended.out)
+    assert document["schema"] == "fg-calib/bag/1"
+    assert (document["n_found"], document["n_written"], document["applied_offset"]) == (3, 3, 0.1)
+    assert document["offset"]["seconds"] == pytest.approx(0.137, abs=1e-3)
+    assert set(document["scatter"]) == {"position", "orientation", "joint"}
+
+
+def test_a_table_that_is_somebody_elses_is_kept(tmp_path, fg_calib, bags):
+    write_robot(tmp_path / "robot.yaml", arm())
+    (tmp_path / "poses.csv").write_text("id,q1\n")
+    ended = fg_calib("bag", bags["ros1"], "--robot", tmp_path / "robot.yaml", "--out", tmp_path / "poses.csv")
+    assert ended.code == 1
+    assert "poses.csv: is there already, not written by this command" in ended.err
+    ended = fg_calib("bag", bags["ros1"], "--robot", tmp_path / "robot.yaml", "--out", tmp_path / "poses.parquet")
+    assert ended.err == f"error: {tmp_path / 'poses.parquet'}: ending '.parquet', expected .csv\n"
+
+
+def predicted(robot, motion):
+    """Positions of the tool at the stops, after the best rigid fit, shape (n, 3), [m]."""
+    from scipy.spatial.transform import Rotation
+
+    from fg_calib import pose
+
+    p = pose(robot, motion.true_readings).position
+    centre = p.mean(axis=0), motion.true_position.mean(axis=0)
+    turn, _ = Rotation.align_vectors(motion.true_position - centre[1], p - centre[0])
+    return turn.apply(p - centre[0]) + centre[1]
+
+
+@pytest.mark.slow
+def test_the_table_is_read_as_it_was_averaged(tmp_path):
+    motion = record(2, n_stops=6)
+    stops = average_stops(*motion.streams(), arm())
+    write_stops(tmp_path / "poses.csv", stops, arm())
+    m = read_measurements(tmp_path / "poses.csv", arm())
+    assert tuple(m.ids) == stops.ids
+    assert m.readings == pytest.approx(stops.readings, abs=0)
+    assert m.position == pytest.approx(stops.position, abs=0)
+    assert m.rotation == pytest.approx(stops.rotation, abs=1e-12)
+    assert m.sigma_position == pytest.approx(stops.sigma_position, abs=0)
+    assert m.sigma_orientation == pytest.approx(stops.sigma_orientation, abs=0)
+    write_stops(tmp_path / "poses.csv", stops, arm())  # its own table is replaced
+    (tmp_path / "mine.csv").write_text("id,q1\n")
+    with pytest.raises(InputError, match="is there already, not written by this command"):
+        write_stops(tmp_path / "mine.csv", stops, arm())
+
+
+@pytest.mark.parametrize("name", ["x", "id", "target", "begin", "a,b", "1st"])
+def test_joints_whose_names_mean_something_else_are_numbered(name):
+    robot = Robot.from_dh([[0, 0, 0, 0]] * 2, names=[name, "other"])
+    assert joint_columns(robot) == ("q1", "q2")
+    assert joint_columns(Robot.from_dh([[0, 0, 0, 0]], names=["arm_0-joint"])) == ("arm_0-joint",)
+
+
+# What is chosen, and what is mended
+
+
+@pytest.fixture
+def bag(tmp_path):
+    """An open bag with two joint messages."""
+    bag = BagWriter(tmp_path, "sqlite3")
+    for k in range(2):
+        bag.joints(START + k, NAMES, np.zeros(6))
+    return bag
+
+
+def poses(bag, n=2, **more):
+    for k in range(n):
+        bag.pose(START + k, [k, 0, 0], [0, 0, np.sin(0.1 * k), np.cos(0.1 * k)], **more)
+
+
+@pytest.mark.slow
+def test_transforms_of_one_frame_are_chosen(bag):
+    poses(bag, form="TFMessage", topic="/tf", frames=("/map", "base"))
+    poses(bag, n=3, form="TFMessage", topic="/tf", frames=("camera", "marker"))
+    path = bag.close()
+    assert len(read_bag(path, arm(), child="marker")[1].time) == 3
+    assert len(read_bag(path, arm(), parent="map")[1].time) == 2
+    assert error(path) == (
+        f"{path.name}: topic /tf: poses of 2 frames, expected one: --parent FRAME --child FRAME; "
+        "it has map -> base, camera -> marker"
+    )
+    assert error(path, child="hand").startswith(f"{path.name}: topic /tf: no poses of these frames, expected one:")
+
+
+def test_transforms_are_taken_where_there_is_nothing_else(bag):
+    poses(bag, form="TFMessage", topic="/tf_static")
+    poses(bag, form="TFMessage", topic="/tf")
+    poses(bag, n=3, topic="/tracker")
+    assert read_bag(bag.close(), arm())[1].source.topic == "/tracker"
+
+
+def test_without_stamps_times_of_receipt_are_used(tmp_path):
+    bag = BagWriter(tmp_path, "mcap")
+    for k in range(3):
+        bag.joints(0, NAMES, np.zeros(6), received=START + k * 10**7)
+    poses(bag)
+    joints, _ = read_bag(bag.close(), arm())
+    assert joints.time == pytest.approx([0, 0.01, 0.02], abs=1e-12)
+    assert joints.source.notes == ("no stamps in the headers: times of receipt are used",)
+
+
+def test_what_is_mended_is_told(bag):
+    for k, (late, x) in enumerate(((5, 5.0), (3, 3.0), (3, 4.0), (7, np.nan))):
+        bag.pose(START + late * 10**6, [x, 0, 0], [0, 0, 0, 1], received=START + 10**9 + k)
+    bag.joints(START + 10**7, ["gripper"], [0.1])
+    joints, found = read_bag(bag.close(), arm())
+    assert found.position[:, 0].tolist() == [3.0, 5.0]
+    assert joints.source.notes == ("1 message without the robot's joints left out",)
+    assert found.source.notes == (
+        "1 message with nan left out",
+        "2 messages out of order put in order",
+        "1 message with the stamp of another left out",
+        "all orientations are the same: taken as not measured",
+    )
+    assert found.rotation is None
+
+
+def test_joints_are_found_by_other_names(bag):
+    poses(bag)
+    robot = Robot.from_dh(np.zeros((6, 4)))
+    path = bag.close()
+    assert read_bag(path, robot, names=NAMES)[0].readings.shape == (2, 6)
+    with pytest.raises(InputError, match="joint names: found pan, expected 6 different ones"):
+        read_bag(path, robot, names=["pan"])
+
+
+# A line each for what cannot be used
+
+
+def error(path, robot=None, **more):
+    with pytest.raises(InputError) as caught:
+        read_bag(path, robot or arm(), **more)
+    return str(caught.value)
+
+
+def test_topics_that_are_not_there(bag):
+    poses(bag)
+    path = bag.close()
+    has = "the bag has /joint_states (sensor_msgs/msg/JointState), /pose (geometry_msgs/msg/PoseStamped)"
+    assert error(path, pose="/tool") == f"{path.name}: no topic /tool; {has}"
+    assert error(path, joints="/pose") == (
+        f"{path.name}: topic /pose is of geometry_msgs/msg/PoseStamped, expected sensor_msgs/msg/JointState; {has}"
+    )
+
+
+def test_topics_of_which_several_fit(bag):
+    poses(bag)
+    poses(bag, topic="/camera", form="Odometry")
+    path = bag.close()
+    assert error(path) == (
+        f"{path.name}: 2 topics fit: /camera (nav_msgs/msg/Odometry), /pose (geometry_msgs/msg/PoseStamped), "
+        "expected one of them: --pose TOPIC"
+    )
+    assert read_bag(path, arm(), pose="/camera")[1].source.topic == "/camera"
+
+
+def test_a_bag_without_poses(bag):
+    path = bag.close()
+    found = error(path)
+    assert found.startswith(f"{path.name}: no topic of type geometry_msgs/msg/PoseStamped or ")
+    assert found.endswith("; the bag has /joint_states (sensor_msgs/msg/JointState)")
+
+
+def test_a_joint_that_is_not_there(bag):
+    poses(bag)
+    path = bag.close()
+    robot = Robot.from_dh([[0, 0, 0, 0]] * 2, names=["pan", "tilt"])
+    assert error(path, robot) == (
+        f"{path.name}: topic /joint_states: no joint tilt, expected the robot's joints among {', '.join(NAMES)}; "
+        "name the bag's joints in chain order: --names, or `name` in the robot file"
+    )
+
+
+def test_joints_that_are_never_in_one_message(tmp_path):
+    bag = BagWriter(tmp_path, "sqlite3")
+    for k in range(4):
+        half = NAMES[:3] if k % 2 else NAMES[3:]
+        bag.joints(START + k, half, np.zeros(3))
+    poses(bag)
+    path = bag.close()
+    found = f"{path.name}: topic /joint_states: no message has positions of all joints"
+    assert error(path) == f"{found}, expected one with {', '.join(NAMES)}"
+
+
+def test_a_clock_that_was_set_back(bag):
+    for k in (2, 60, 3):
+        bag.pose(START + k * 10**9, [k, 0, 0], [0, 0, 0, 1], received=START + 100)
+    path = bag.close()
+    assert (
+        error(path) == f"{path.name}: topic /pose: stamps go back by 57 s at message 3, expected a clock that runs on"
+    )
+
+
+def test_quaternions_that_are_none(bag):
+    for k in range(3):
+        bag.pose(START + k, [0, 0, 0], [0, 0, 0.5 * k, 1])
+    path = bag.close()
+    assert error(path) == (
+        f"{path.name}: topic /pose: quaternion of norm 1.11803, expected 1 within 0.001; 2 of 3 poses"
+    )
+
+
+def test_a_topic_with_one_message(bag):
+    poses(bag, n=1)
+    path = bag.close()
+    assert error(path) == f"{path.name}: topic /pose: 1 message, expected a recording"
+
+
+def test_a_definition_that_is_not_the_standard_one(tmp_path):
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    bag = BagWriter(tmp_path, "ros1")
+    standard, bag.store = bag.store, get_typestore(Stores.EMPTY)
+    text = "builtin_interfaces/Time stamp\nfloat64 x"
+    bag.store.register(get_types_from_msg(text, "sensor_msgs/msg/JointState"))
+    stamp = bag.store.types["builtin_interfaces/msg/Time"](sec=1, nanosec=0)
+    kind = "sensor_msgs/msg/JointState"
+    for k in range(2):
+        bag.write("/joint_states", kind, bag.store.types[kind](stamp=stamp, x=0.0), START + k)
+    bag.store = standard
+    poses(bag)
+    path = bag.close()
+    assert error(path) == (
+        f"{path.name}: topic /joint_states has a definition of sensor_msgs/msg/JointState that is not the standard one"
+    )
+
+
+def test_what_is_no_bag(tmp_path):
+    (tmp_path / "empty.bag").touch()
+    (tmp_path / "run.txt").write_text("x")
+    (tmp_path / "folder").mkdir()
+    assert error(tmp_path / "none.bag") == f"{tmp_path / 'none.bag'}: no such bag"
+    assert error(tmp_path / "empty.bag") == "empty.bag: an empty file, expected a bag"
+    assert error(tmp_path / "run.txt") == "run.txt: ending '.txt', expected a folder, or one of .bag, .db3, .mcap"
+    assert error(tmp_path / "folder") == (
+        f"{tmp_path / 'folder'}: a folder without metadata.yaml, expected a ROS 2 bag, or a file in it"
+    )
+
+
+LEFT_OPEN = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+"""Older readers leave damaged files open."""
+
+
+@LEFT_OPEN
+@pytest.mark.parametrize(("form", "kept"), diagonal(FORMATS, [0.02, 0.4, 0.97]))
+def test_a_bag_that_was_cut_off(tmp_path, bags, form, kept):
+    path = cut(bags[form], tmp_path, kept)
+    found = error(path)
+    assert found.startswith(f"{path.name}: ")
+    assert "\n" not in found
+
+
+def cut(bag, folder, kept):
+    """A copy of a bag whose data end early."""
+    path = folder / bag.name
+    (shutil.copytree if bag.is_dir() else shutil.copy)(bag, path)
+    file = path if path.is_file() else next(f for f in path.iterdir() if f.suffix != ".yaml")
+    content = file.read_bytes()
+    file.write_bytes(content[: int(kept * len(content))])
+    return path
+
+
+@pytest.mark.sampled(1)
+@LEFT_OPEN
+@pytest.mark.parametrize("form", FORMATS)
+def test_damage_is_one_line_or_nothing(tmp_path, bags, form):
+    """Bytes that are changed anywhere: what is read, or an `InputError`; nothing else."""
+    generator = np.random.default_rng(0)
+    path = cut(bags[form], tmp_path, 1.0)
+    file = path if path.is_file() else next(f for f in path.iterdir() if f.suffix != ".yaml")
+    content = np.frombuffer(file.read_bytes(), dtype=np.uint8)
+    refused = 0
+    for _ in range(8):
+        damaged = content.copy()
+        where = generator.integers(0, len(content), 40)
+        damaged[where] = generator.integers(0, 256, 40)
+        file.write_bytes(damaged.tobytes())
+        try:
+            read_bag(path, arm())
+        except InputError as found:
+            refused += "\n" not in str(found)
+    assert refused > 0
+
+
+def test_without_rosbags_a_line_says_what_to_install(tmp_path, fg_calib, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    write_robot(tmp_path / "robot.yaml", arm())
+    ended = fg_calib("bag", tmp_path / "run.bag", "--robot", tmp_path / "robot.yaml")
+    assert ended == (1, "", "error: fg-calib bag needs rosbags: pip install 'fg_calib[ros]'\n")

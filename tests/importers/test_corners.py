@@ -1,0 +1,128 @@
+"""Corners that are found are where they are, in the board's own order, however the camera is turned."""
+
+import numpy as np
+import pytest
+from boards import CAMERA, render
+from scipy.spatial.transform import Rotation
+
+from fg_calib.errors import InputError
+from fg_calib.importers.board import CalibrationBoard
+from fg_calib.importers.opencv import charuco_board, find_corners, in_order
+
+pytest.importorskip("cv2", reason="no OpenCV: pip install 'fg_calib[camera]'")
+
+CHECKERBOARD = CalibrationBoard("checkerboard", 9, 6, 0.02)
+CHARUCO = CalibrationBoard("charuco", 9, 7, 0.02, 0.014, "DICT_5X5_100")
+BOARDS = [CHECKERBOARD, CalibrationBoard("checkerboard", 6, 9, 0.02), CHARUCO]
+EVERY = pytest.mark.parametrize("board", BOARDS, ids=["9 x 6", "6 x 9", "charuco"])
+
+
+def seen_from(board, roll, tilt=20.0, distance=0.45):
+    """The board's axes and origin in a camera that looks at its centre."""
+    R = Rotation.from_euler("ZX", [roll, tilt], degrees=True).as_matrix()
+    return R, np.array([0.01, -0.01, distance]) - R[:, :2] @ board.corners.mean(axis=0)
+
+
+def images_of(board, R, t, camera=CAMERA):
+    return camera.image(t + board.corners @ R[:, :2].T)[0]
+
+
+@pytest.mark.sampled(4)
+@EVERY
+@pytest.mark.parametrize("roll", [0, 100, 180, 260])
+def test_corners_are_where_they_are_seen(board, roll):
+    """Within 0.3 px each, and 0.06 px on average: a neighbour is 20 px away."""
+    R, t = seen_from(board, roll)
+    corners, uv = find_corners(render(board, R, t, np.random.default_rng(roll)), board)
+    assert len(corners) >= (40 if board.type == "charuco" else 54)  # a marker may be missed
+    error = uv - images_of(board, R, t)[corners]
+    assert np.abs(error).max() < 0.3
+    assert np.sqrt(np.mean(error**2)) < 0.06
+
+
+def test_a_charuco_board_is_known_by_what_is_seen_of_it():
+    R, t = seen_from(CHARUCO, 30)
+    t = t + np.array([0.2, 0.0, 0.0])
+    corners, uv = find_corners(render(CHARUCO, R, t, np.random.default_rng(1)), CHARUCO)
+    assert 6 <= len(corners) < 36
+    assert np.abs(uv - images_of(CHARUCO, R, t)[corners]).max() < 0.3
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_a_charuco_board_of_an_older_opencv_is_another_one(legacy):
+    """Even numbers of rows began with a white square; the other reading finds markers without corners."""
+    drawn = CalibrationBoard("charuco", 7, 6, 0.02, 0.014, "DICT_5X5_100", legacy=legacy)
+    other = CalibrationBoard("charuco", 7, 6, 0.02, 0.014, "DICT_5X5_100", legacy=not legacy)
+    R, t = seen_from(drawn, 10)
+    image = render(drawn, R, t, np.random.default_rng(2))
+    assert len(find_corners(image, drawn)[0]) == len(drawn.corners)
+    assert find_corners(image, other) == "21 markers, but no corners"
+
+
+@pytest.mark.parametrize("turn", ["as it is", "half a turn", "mirrored", "both"])
+def test_a_checkerboard_begins_with_a_black_square_and_is_seen_from_the_front(turn):
+    R, t = seen_from(CHECKERBOARD, 40)
+    image = render(CHECKERBOARD, R, t, np.random.default_rng(3))
+    grid = images_of(CHECKERBOARD, R, t).reshape(6, 9, 2)
+    given = {
+        "as it is": grid,
+        "half a turn": grid[::-1, ::-1],
+        "mirrored": grid[:, ::-1],
+        "both": grid[::-1],
+    }[turn]
+    assert in_order(image, given) == pytest.approx(grid, abs=0.0)
+
+
+def test_an_even_checkerboard_stays_in_the_order_in_which_it_was_found():
+    board = CalibrationBoard("checkerboard", 8, 6, 0.02)
+    assert board.ambiguous
+    assert not CHECKERBOARD.ambiguous
+    R, t = seen_from(board, 40)
+    image = render(board, R, t, np.random.default_rng(4))
+    grid = images_of(board, R, t).reshape(6, 8, 2)
+    assert in_order(image, grid[::-1, ::-1]) == pytest.approx(grid[::-1, ::-1], abs=0.0)
+
+
+def test_corners_of_a_charuco_board_are_opencvs():
+    theirs = np.asarray(charuco_board(CHARUCO, "board").getChessboardCorners())
+    assert np.column_stack([CHARUCO.corners, np.zeros(48)]) == pytest.approx(theirs, abs=1e-8)
+
+
+@EVERY
+def test_an_image_without_the_board_has_none(board):
+    grey = np.random.default_rng(5).normal(128, 20, (240, 320)).clip(0, 255).astype(np.uint8)
+    assert find_corners(grey, board) == "no board"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("shape", "reason"),
+    [
+        ((8, 5), "a larger board: 9 x 6 inner corners"),
+        ((10, 7), "another board or part of one: 9 x 6 inner corners"),
+    ],
+)
+def test_a_checkerboard_of_other_dimensions_is_named(shape, reason):
+    R, t = seen_from(CHECKERBOARD, 20)
+    image = render(CHECKERBOARD, R, t, np.random.default_rng(7))
+    assert find_corners(image, CalibrationBoard("checkerboard", *shape, 0.02)) == reason
+
+
+def test_a_large_image_is_searched_reduced_and_its_corners_are_found_in_full():
+    import cv2
+
+    R, t = seen_from(CHECKERBOARD, 15)
+    image = cv2.resize(render(CHECKERBOARD, R, t, np.random.default_rng(6)), (3200, 2400))
+    corners, uv = find_corners(image, CHECKERBOARD)
+    assert np.abs((uv + 0.5) / 5.0 - 0.5 - images_of(CHECKERBOARD, R, t)[corners]).max() < 0.2
+
+
+def test_corners_along_a_line_say_too_little():
+    assert CHECKERBOARD.span(np.arange(9)) == pytest.approx(0.0, abs=1e-12)
+    assert CHECKERBOARD.span(np.arange(18)) == pytest.approx(0.5)
+
+
+def test_a_dictionary_with_too_few_markers_is_refused():
+    with pytest.raises(InputError) as error:
+        charuco_board(CalibrationBoard("charuco", 15, 11, 0.02, 0.014, "DICT_4X4_50"), "board.yaml")
+    assert str(error.value) == "board.yaml: dictionary: DICT_4X4_50 has 50 markers, expected 82 or more"

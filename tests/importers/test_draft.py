@@ -1,0 +1,314 @@
+"""`fg-calib init`: the job that it writes is read as the files are meant, and asks for what only its user knows."""
+
+from dataclasses import astuple
+
+import numpy as np
+import polars as pl
+import pytest
+import yaml
+from jobs import UR5E
+from scenarios import CAMERA, INSTRUMENTS, scenario
+from simulated import true_robot
+
+from fg_calib import read_job, read_robot, simulate, write_simulation
+from fg_calib.io.csv_writer import write_csv
+from fg_calib.robot.kinematics import pose
+
+JOB = "calibration.yaml"
+SLOW = ("pixels", "camera in the room")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder with a robot, and positions of 40 configurations: `write(**changes)` of their columns by name."""
+    (tmp_path / "robot.yaml").write_text(yaml.safe_dump(UR5E))
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-2.0, 2.0, (40, 6))
+    p = pose(true_robot(read_robot(tmp_path / "robot.yaml"), rng), q).position
+    columns = {f"q{i + 1}": q[:, i] for i in range(6)} | dict(zip("xyz", p.T, strict=True))
+
+    def write(names=None, factors=None, name="poses.csv"):
+        names, factors = names or {}, factors or {}
+        write_csv(tmp_path / name, {names.get(c, c): v * factors.get(c, 1.0) for c, v in columns.items()})
+        return tmp_path / name
+
+    return tmp_path, write
+
+
+def drafted(fg_calib, folder, *files):
+    """The job that is written for files, as YAML holds it."""
+    ended = fg_calib("init", *files, "--out", folder / JOB)
+    assert (ended.code, ended.out) == (0, "")
+    return yaml.safe_load((folder / JOB).read_text())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.slow] * (n in (*SLOW, "contact", "faces", "sockets"))) for n in INSTRUMENTS],
+)
+def test_a_job_for_the_tables_of_every_instrument_is_ready(fg_calib, tmp_path, name):
+    simulation = simulate(scenario(INSTRUMENTS[name], n=40 + 20 * (name == "faces")), seed=0)
+    write_simulation(tmp_path / "simulated", simulation)
+    files = [file for file in (tmp_path / "simulated").iterdir() if file.suffix == ".csv"]
+    if name in SLOW:
+        figures = dict(zip(("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"), astuple(CAMERA), strict=True))
+        (tmp_path / "camera.yaml").write_text(yaml.safe_dump(figures))
+        files.append(tmp_path / "camera.yaml")
+    given = drafted(fg_calib, tmp_path, tmp_path / "simulated" / "robot_nominal.yaml", *files)
+    model = {"formed pairs": "pose"}.get(name, simulation.tables[0].model)
+    assert given["model"] == model
+    assert given["units"] == {"length": "m", "angle": "rad"}
+    assert given["noise"]["estimate"] is True
+    if name != "camera in the room":
+        ended = fg_calib("inspect", tmp_path / JOB)
+        assert ended.code == 0
+        assert "noise is to be estimated" in ended.out
+    read = read_job(tmp_path / JOB).tables[0].measurements
+    assert np.allclose(read.readings, simulation.tables[0].measurements.readings, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_columns_of_other_names_and_units_are_explained(fg_calib, folder):
+    folder, write = folder
+    names = {f"q{i}": f"J{i} [deg]" for i in range(1, 7)} | {"x": "X (mm)", "y": "Y_mm", "z": "pos_z [cm]"}
+    factors = {f"q{i}": 180 / np.pi for i in range(1, 7)} | {"x": 1e3, "y": 1e3, "z": 1e2}
+    given = drafted(fg_calib, folder, folder / "robot.yaml", write(names, factors))
+    assert given["units"] == {"length": "mm", "angle": "deg"}
+    assert given["columns"] == {f"q{i}": f"J{i} [deg]" for i in range(1, 7)} | {
+        "x": "X (mm)",
+        "y": "Y_mm",
+        "z": {"name": "pos_z [cm]", "scale": 10.0},
+    }
+    assert "DECIDE whether these are what the names mean" in (folder / JOB).read_text()
+    assert "guessed" not in (folder / JOB).read_text()
+    assert fg_calib("inspect", folder / JOB).code == 0
+    write(name="plain.csv")
+    (folder / "plain.yaml").write_text("{robot: robot.yaml, measurements: plain.csv, model: position}")
+    mine, plain = (read_job(folder / f).tables[0].measurements for f in (JOB, "plain.yaml"))
+    assert np.allclose(mine.position, plain.position, atol=1e-12)
+    assert np.allclose(mine.readings, plain.readings, atol=1e-12)
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("names", ["joint_{}", "Axis {}", "actual_q_{}", "q{}"])
+def test_joints_are_recognised_whether_counted_from_0_or_1(fg_calib, folder, names):
+    folder, write = folder
+    first = int(names in ("joint_{}", "actual_q_{}"))
+    given = drafted(
+        fg_calib, folder, folder / "robot.yaml", write({f"q{i}": names.format(i - first) for i in range(1, 7)})
+    )
+    called = {f"q{i}": names.format(i - first) for i in range(1, 7)}
+    assert given.get("columns", {}) == {known: name for known, name in called.items() if known != name}
+    assert fg_calib("inspect", folder / JOB).code == 0
+
+
+def test_units_that_no_header_says_are_guessed_from_the_figures_and_said_to_be(fg_calib, folder):
+    folder, write = folder
+    factors = {f"q{i}": 180 / np.pi for i in range(1, 7)} | dict.fromkeys("xyz", 1e3)
+    given = drafted(fg_calib, folder, folder / "robot.yaml", write(factors=factors))
+    assert given["units"] == {"length": "mm", "angle": "deg"}
+    assert "# DECIDE: angle and length guessed from the figures' sizes" in (folder / JOB).read_text()
+    assert given["noise"]["position"] == 0.1
+
+
+@pytest.mark.slow
+def test_several_tables_have_entries_and_units_of_their_own(fg_calib, folder):
+    folder, write = folder
+    mm = write({"x": "x [mm]", "y": "y [mm]", "z": "z [mm]"}, dict.fromkeys("xyz", 1e3), "monday.csv")
+    rng = np.random.default_rng(1)
+    q = rng.uniform(-2, 2, (30, 6))
+    p = pose(read_robot(folder / "robot.yaml"), q).position
+    far = {"anchor": np.array(["bolt"] * 30), "distance [m]": np.linalg.norm(p - [1.0, 0.5, 0.0], axis=1)}
+    write_csv(folder / "tuesday.csv", {f"q{i + 1}": q[:, i] for i in range(6)} | far)
+    given = drafted(fg_calib, folder, mm, folder / "tuesday.csv", folder / "robot.yaml")
+    first, second = given["measurements"]
+    assert (first["table"], first["model"], first["frame"]) == ("monday.csv", "position", "unknown")
+    assert (second["table"], second["model"], second["units"]) == (
+        "tuesday.csv",
+        "anchor",
+        {"length": "m", "angle": "rad"},
+    )
+    assert given["units"] == {"length": "mm", "angle": "rad"}
+    assert set(given["noise"]) == {"position", "distance", "joint", "estimate"}
+    assert fg_calib("inspect", folder / JOB).code == 0
+
+
+def test_sigmas_in_a_table_need_no_figure_of_noise(fg_calib, folder):
+    folder, write = folder
+    table = pl.read_csv(write()).with_columns(pl.lit(5e-5).alias("sigma_position"))
+    table.write_parquet(folder / "poses.parquet")
+    given = drafted(fg_calib, folder, folder / "robot.yaml", folder / "poses.parquet")
+    assert given["measurements"] == "poses.parquet"
+    assert given["noise"] == {"joint": 0.0, "estimate": True}
+
+
+def test_columns_that_mean_nothing_are_told_of(fg_calib, folder):
+    folder, write = folder
+    table = pl.read_csv(write()).with_columns(pl.lit(21.5).alias("temperature"))
+    table.write_csv(folder / "poses.csv")
+    drafted(fg_calib, folder, folder / "robot.yaml", folder / "poses.csv")
+    assert "# not used: temperature\n" in (folder / JOB).read_text()
+
+
+def test_a_path_is_relative_to_the_job_and_quoted_where_it_needs_to_be(fg_calib, folder):
+    folder, write = folder
+    write().rename(folder / "poses, [old] #1.csv")
+    (folder / "jobs").mkdir()
+    ended = fg_calib("init", folder / "robot.yaml", folder / "poses, [old] #1.csv", "--out", folder / "jobs" / JOB)
+    assert ended.code == 0
+    assert yaml.safe_load((folder / "jobs" / JOB).read_text())["measurements"] == "../poses, [old] #1.csv"
+    assert fg_calib("inspect", folder / "jobs" / JOB).code == 0
+
+
+def test_what_only_the_user_knows_is_asked_for(fg_calib, folder):
+    folder, write = folder
+    robot = {key: value for key, value in UR5E.items() if key != "tolerance"}
+    (folder / "robot.yaml").write_text(yaml.safe_dump(robot))
+    drafted(fg_calib, folder, folder / "robot.yaml", write())
+    text = (folder / JOB).read_text()
+    for question in ("how far off the drawing may be", "whether exactly the robot file's tool", "DECIDE the noise"):
+        assert text.count(question) == 1
+
+
+def test_the_commented_keys_are_keys_of_a_job(fg_calib, folder):
+    """Each taken from its comment is read."""
+    folder, write = folder
+    drafted(fg_calib, folder, folder / "robot.yaml", write())
+    text = (folder / JOB).read_text()
+    commented = [
+        line[2:] for line in text.splitlines() if line.startswith(("# loss:", "# gauge:", "# encoder:", "# pair"))
+    ]
+    assert len(commented) == 5
+    (folder / JOB).write_text(text + "\n".join(commented))
+    assert read_job(folder / JOB).options.loss == "none"
+
+
+@pytest.mark.slow
+def test_columns_of_counts_are_recognised_and_their_scale_is_asked_for(fg_calib, folder):
+    folder, write = folder
+    counts = {f"q{i}": 1000.0 for i in range(1, 7)}
+    given = drafted(fg_calib, folder, folder / "robot.yaml", write({f"q{i}": f"Enc{i}" for i in range(1, 7)}, counts))
+    assert given["columns"] == {f"q{i}": {"name": f"Enc{i}", "scale": 1.0, "zero": 0.0} for i in range(1, 7)}
+    text = (folder / JOB).read_text()
+    assert "# DECIDE scale and zero of each: reading = (count - zero) * scale" in text
+    assert "guessed" in text  # the unit of x, y, z
+    (folder / JOB).write_text(text.replace("scale: 1.0", "scale: 0.001"))
+    assert fg_calib("inspect", folder / JOB).code == 0
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize(
+    ("name", "cells", "found"),
+    [
+        ("Messpunkt", [f"P{i}" for i in range(40)], "Messpunkt"),
+        ("No.", [str(i) for i in range(40)], "No."),
+        ("Bediener", ["Eva"] * 40, None),
+        ("Temperatur", [f"{20 + 0.01 * i:.2f}" for i in range(40)], None),
+        ("Zeit", [f"{i}e-3" for i in range(40)], None),
+    ],
+)
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_a_column_that_names_the_rows_is_suggested_as_id(fg_calib, folder, name, cells, found, ending):
+    folder, write = folder
+    table = pl.read_csv(write()).with_columns(pl.Series(name, cells))
+    file = folder / f"named.{ending}"
+    table.write_csv(file) if ending == "csv" else table.write_parquet(file)
+    given = drafted(fg_calib, folder, folder / "robot.yaml", file)
+    assert given.get("columns", {}).get("id") == found
+    assert (f"# not used: {name}" in (folder / JOB).read_text()) == (found is None)
+    assert fg_calib("inspect", folder / JOB).code == 0
+
+
+def test_examples_in_comments_are_in_the_jobs_units(fg_calib, folder):
+    folder, _ = folder
+    q = np.random.default_rng(1).uniform(-100, 100, (30, 6))
+    far = {"anchor": np.array(["bolt"] * 30), "distance [mm]": np.linspace(700.0, 900.0, 30)}
+    write_csv(folder / "bar.csv", {f"q{i + 1}": q[:, i] for i in range(6)} | far)
+    drafted(fg_calib, folder, folder / "robot.yaml", folder / "bar.csv")
+    text = (folder / JOB).read_text()
+    assert "# anchors: {bolt: {x: 1000.0, y: 0.0, z: 0.0, tolerance: 2.0}}" in text
+    (folder / JOB).write_text(text.replace("# anchors", "anchors"))
+    assert read_job(folder / JOB).tables[0].known["bolt"].xyz[0] == 1.0
+
+
+def test_a_table_of_poses_may_be_a_boards(fg_calib, folder):
+    """A hand-eye table has the columns of one of poses: only its user knows."""
+    folder, _ = folder
+    q = np.random.default_rng(1).uniform(-2, 2, (30, 6))
+    columns = {name: np.full(30, 0.1) for name in ("x", "y", "z", "rx", "ry", "rz")}
+    write_csv(folder / "seen.csv", {f"q{i + 1}": q[:, i] for i in range(6)} | columns)
+    drafted(fg_calib, folder, folder / "robot.yaml", folder / "seen.csv")
+    assert "board if a camera on the tool measured where a board is" in (folder / JOB).read_text()
+
+
+def test_an_existing_file_is_never_overwritten(fg_calib, folder):
+    folder, write = folder
+    (folder / JOB).write_text("mine")
+    ended = fg_calib("init", folder / "robot.yaml", write(), "--out", folder / JOB)
+    assert ended.code == 1
+    assert ended.err == f"error: {folder / JOB}: is there already, expected a folder without it\n"
+    assert (folder / JOB).read_text() == "mine"
+
+
+REFUSED = {
+    "no robot": (["poses.csv"], "error: init: no robot among the files, expected one, such as robot.yaml or a URDF\n"),
+    "no table": (["robot.yaml"], "error: init: no table among the files, expected one, such as poses.csv\n"),
+    "two robots": (
+        ["robot.yaml", "other.yaml", "poses.csv"],
+        "error: init: several robot files: robot.yaml, other.yaml",
+    ),
+    "one table twice": (
+        ["robot.yaml", "poses.csv", "../{}/poses.csv"],
+        "error: init: the same table twice: poses.csv, ",
+    ),
+    "a picture": (["robot.yaml", "poses.png"], "error: {}/poses.png: ending '.png', expected robot.yaml, a .urdf"),
+    "a job": (["robot.yaml", "job.yaml"], "error: job.yaml: a job, expected a robot"),
+    "joints alone": (["robot.yaml", "alone.csv"], "error: alone.csv: joint readings alone, expected what was measured"),
+    "other joints": (
+        ["robot.yaml", "other.csv"],
+        "error: other.csv: neither joint readings nor pairs, expected columns q1 to",
+    ),
+    "pairs alone": (
+        ["robot.yaml", "pairs.csv"],
+        "error: pairs.csv: pairs alone, expected the table of the configurations",
+    ),
+    "odd pairs": (
+        ["robot.yaml", "alone.csv", "odd.csv"],
+        "error: odd.csv: column 'distance [mm]', expected distance; ",
+    ),
+    "no camera": (
+        ["robot.yaml", "seen.csv"],
+        "error: seen.csv: images of a camera that is not among the files, expected",
+    ),
+    "not a number": (["robot.yaml", "bad.csv"], "error: bad.csv:2: x: found 'far', expected a finite number"),
+    "no file": (["robot.yaml", "none.csv"], "error: "),
+}
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_cannot_be_used_is_refused_in_one_line(fg_calib, folder, case):
+    folder, write = folder
+    write()
+    q = ",".join(f"q{i}" for i in range(1, 7))
+    zeros = ",".join("0" * 6)
+    (folder / "other.yaml").write_text((folder / "robot.yaml").read_text())
+    (folder / "job.yaml").write_text("{robot: robot.yaml, measurements: poses.csv, model: pose}")
+    (folder / "poses.png").write_bytes(b"\x89PNG")
+    (folder / "alone.csv").write_text(f"{q}\n{zeros}\n")
+    (folder / "other.csv").write_text("q1,q2,x,y,z\n0,0,0,0,0\n")
+    (folder / "pairs.csv").write_text("a,b,distance\n0,1,0.5\n")
+    (folder / "odd.csv").write_text("a,b,distance [mm]\n0,1,500\n")
+    (folder / "seen.csv").write_text(f"{q},u,v,corner_x,corner_y\n{zeros},1,2,0,0\n")
+    (folder / "bad.csv").write_text(f"{q},x,y,z\n{zeros},far,0,0\n")
+    files, says = REFUSED[case]
+    ended = fg_calib("init", *(folder / file.format(folder.name) for file in files), "--out", folder / JOB)
+    assert (ended.code, ended.out) == (1, "")
+    assert ended.err.startswith(says.format(folder))
+    assert ended.err.count("\n") == 1
+    assert not (folder / JOB).exists()
+
+
+def test_no_files_are_wrong_usage(fg_calib):
+    assert fg_calib("init").code == 2

@@ -1,0 +1,247 @@
+"""Stops, the sigma of their means, and the offset of clocks, on recordings whose truth is known."""
+
+import re
+
+import numpy as np
+import pytest
+from recordings import arm, correlated, record
+from scipy.spatial.transform import Rotation
+
+from fg_calib import InputError, Robot
+from fg_calib.importers.autocorrelation import correlation_time, is_slow, sigmas_of_means
+from fg_calib.importers.standstill import average_stops, find_standstills
+from fg_calib.importers.streams import JointStream, PoseStream, Source
+
+
+def averaged(motion, **more):
+    return average_stops(*motion.streams(), arm(1e-3), **more)
+
+
+def nees(stops, motion):
+    """Mean squared error over its variance, of positions and orientations."""
+    k = [int(name[4:]) - 1 for name in stops.ids]
+    off = (stops.position - motion.true_position[k]) / stops.sigma_position
+    turned = Rotation.from_matrix(stops.rotation.copy()).inv() * Rotation.from_matrix(motion.true_rotation[k])
+    return np.mean(off**2), np.mean((turned.as_rotvec() / stops.sigma_orientation) ** 2)
+
+
+@pytest.fixture(scope="module")
+def motion():
+    return record(1)
+
+
+@pytest.mark.slow
+def test_every_stop_gives_a_row_of_its_configuration(motion):
+    stops = averaged(motion)
+    assert stops.ids == tuple(f"stop{k + 1}" for k in range(12))
+    assert stops.skipped == ()
+    scatter = 2e-5 / np.sqrt(100.0)  # some 110 readings a stop
+    assert np.abs(stops.readings - motion.true_readings).max() < 5.0 * scatter
+    assert stops.scatter["position"].single == pytest.approx(1e-4, rel=0.2)
+    assert nees(stops, motion) == pytest.approx([1.0, 1.0], abs=5.0 * np.sqrt(2.0 / 36.0))
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("offset", [0.137, -2.5, 1.6e9])
+def test_the_offset_of_the_clocks_is_found_within_its_sigma(offset):
+    """Also of a clock that counts from another day: 1e9 s are known to 2e-7 s."""
+    motion = record(2, offset=offset)
+    found = averaged(motion).offset
+    assert abs(found.seconds - offset) < 5.0 * np.hypot(found.sigma, 3e-7)
+    assert found.sigma < 2e-4
+    assert found.n_moves >= 10  # of 11; one may be left out
+    assert found.others == ()
+    assert found.correlation > 0.98
+
+
+@pytest.mark.slow
+def test_the_offset_needs_no_place_of_the_target_on_the_tool():
+    motion = record(3, tool=(0.15, -0.1, 0.05))
+    found = averaged(motion).offset
+    assert abs(found.seconds - 0.137) < 5.0 * found.sigma < 5e-3
+
+
+@pytest.mark.slow
+def test_the_offset_of_positions_alone():
+    joints, poses = record(4, sigma_position=5e-4).streams()
+    stops = average_stops(joints, PoseStream(poses.time, poses.position, None, poses.source), arm(1e-3))
+    assert stops.rotation is stops.sigma_orientation is None
+    assert abs(stops.offset.seconds - 0.137) < 5.0 * stops.offset.sigma
+
+
+@pytest.mark.slow
+def test_a_stated_offset_is_used_and_compared(motion):
+    stops = averaged(motion, offset=0.13)
+    assert stops.applied == 0.13
+    assert abs(stops.offset.seconds - 0.137) < 5.0 * stops.offset.sigma
+
+
+@pytest.mark.slow
+def test_a_large_offset_is_refused_where_that_is_asked(motion):
+    with pytest.raises(InputError, match=r"topic /pose: an offset of 0\.137 \+- .* s .*, expected at most 0\.1 s"):
+        averaged(motion, most_offset=0.1)
+    assert averaged(motion, most_offset=0.2).ids
+
+
+@pytest.mark.slow
+def test_of_motions_that_repeat_themselves_the_offset_nearest_to_receipt_is_taken():
+    once = record(5, n_stops=4, sigma_position=1e-5, sigma_orientation=1e-5)
+    period = once.joint_time[-1] + 1.0
+    joints, poses = once.streams()
+    many = 6
+    readings = np.concatenate([joints.readings] * many)
+    time = np.concatenate([joints.time + k * period for k in range(many)])
+    pose_time = np.concatenate([poses.time + k * period for k in range(many)])
+    position, rotation = (np.concatenate([x] * many) for x in (poses.position, poses.rotation))
+    for turns in (0, 1, -1):
+        source = Source("/pose", "", lag=-(0.137 + turns * period))
+        shifted = PoseStream(pose_time + turns * period, position, rotation, source)
+        found = average_stops(JointStream(time, readings, joints.source), shifted, arm()).offset
+        assert found.seconds == pytest.approx(0.137 + turns * period, abs=1e-3)
+        assert any(abs(abs(other - found.seconds) - period) < 0.1 for other in found.others)
+
+
+def test_poses_of_something_else_are_refused():
+    joints, _ = record(6).streams()
+    _, poses = record(7, move=2.0).streams()
+    with pytest.raises(
+        InputError, match=r"the poses do not move as the joints do \(correlation .*\), expected poses of"
+    ):
+        average_stops(joints, poses, arm())
+
+
+@pytest.mark.slow
+def test_short_pauses_are_skipped_and_told():
+    rest = np.full(12, 1.5)
+    rest[4] = 0.7
+    motion = record(8, rest=rest)
+    stops = averaged(motion)
+    assert "stop5" not in stops.ids
+    assert [s.id for s in stops.skipped] == ["stop5"]
+    assert stops.skipped[0].reason.endswith("shorter than 1 s")
+    assert len(averaged(motion, still=0.6).ids) == 12
+
+
+@pytest.mark.slow
+def test_stops_without_poses_are_skipped():
+    motion = record(9)
+    joints, poses = motion.streams()
+    begin = averaged(motion).interval[3, 0] + motion.offset
+    seen = (poses.time < begin) | (poses.time > begin + 2.0)
+    poses = PoseStream(poses.time[seen], poses.position[seen], poses.rotation[seen], poses.source)
+    stops = average_stops(joints, poses, arm(1e-3))
+    assert [(s.id, s.reason) for s in stops.skipped] == [("stop4", "0 poses, fewer than 8")]
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda u: 0.01 * u, "the position drifts by"),
+        (lambda u: 5e-3 * np.sin(40 * u), "the position scatters .* times as much as usual"),
+    ],
+)
+def test_stops_with_odd_poses_are_skipped(change, reason):
+    motion = record(10)
+    joints, poses = motion.streams()
+    first, last = averaged(motion).interval[5] + motion.offset
+    inside = (poses.time >= first) & (poses.time <= last)
+    position = poses.position.copy()
+    position[inside, 1] += change((poses.time[inside] - first) / (last - first))
+    stops = average_stops(joints, PoseStream(poses.time, position, poses.rotation, poses.source), arm(1e-3))
+    assert [s.id for s in stops.skipped] == ["stop6"]
+    assert re.match(reason, stops.skipped[0].reason)
+
+
+def test_an_arm_that_never_rests_is_refused():
+    motion = record(11, rest=0.6)
+    with pytest.raises(InputError, match=r"no standstill of 2 s, expected the arm at rest.*; the longest pause is"):
+        averaged(motion, still=2.0)
+
+
+def test_slides_and_encoders_without_noise_stand_still():
+    robot = Robot.from_dh([[0, 0, 0, 0]], types="prismatic")
+    time = np.arange(0.0, 6.0, 0.01)
+    reading = np.clip(time - 2.0, 0.0, 1.0) * 0.3
+    found = find_standstills(JointStream(time, np.round(reading, 4)[:, None], Source("/j", "")), robot, 1.0)
+    assert np.allclose(found, [(0.0, 2.0), (3.0, 6.0)], atol=0.05)
+
+
+def test_sigma_of_white_noise_is_that_of_students_t():
+    """In closed form: s^2 / n (n - 1) / (n - 3), s^2 the unbiased estimate."""
+    x = np.random.default_rng(0).standard_normal((20, 3))
+    x -= x.mean(axis=0)
+    s2 = x.var(axis=0, ddof=1)
+    assert sigmas_of_means([x], 1.0)[0] == pytest.approx(np.sqrt(s2 / 20 * 19 / 17), rel=1e-12)
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("phi", [0.0, 0.5, 0.8])
+def test_correlation_time_is_that_of_the_noise(phi):
+    """Of AR(1) it is (1 + phi) / (1 - phi)."""
+    generator = np.random.default_rng(3)
+    stops = [x - x.mean(axis=0) for x in (s * correlated(generator, (100, 3), phi) for s in (1.0, 10.0) * 50)]
+    expected = (1 + phi) / (1 - phi)
+    assert correlation_time(stops) == pytest.approx(expected, rel=0.1)
+    assert not is_slow(expected, 100)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("settings", "least"),
+    [({}, 0.85), ({"pose_rate": 20.0}, 0.8), ({"phi": 0.8}, 0.7), ({"phi": 0.9}, 0.5), ({"phi": 0.97}, 0.45)],
+    ids=str,
+)
+def test_sigmas_are_those_of_the_errors(settings, least):
+    """Monte Carlo: 20 recordings of 12 stops; of noise as slow as a stop sigmas may be larger, not smaller."""
+    found = [nees(averaged(motion), motion) for motion in (record(100 + s, **settings) for s in range(20))]
+    mean = np.mean(found, axis=0)
+    error = np.std(found, axis=0) / np.sqrt(20)
+    assert np.all(mean < 1.05 + 3.0 * error)
+    assert np.all(mean > least - 3.0 * error)
+
+
+@pytest.mark.slow
+def test_the_sigma_of_the_offset_is_that_of_its_errors():
+    """Monte Carlo with a wrong nominal arm, which counts as noise from move to move; 11 moves: Student's t."""
+    found = [averaged(record(200 + s)).offset for s in range(40)]
+    z = np.array([(o.seconds - 0.137) / o.sigma for o in found])
+    assert abs(z.mean()) < 4.0 / np.sqrt(40)
+    expected = 10 / 8 / 1.05**2  # variance of Student's t over the square of its 68 % point
+    assert np.mean(z**2) == pytest.approx(expected, abs=4.0 * np.sqrt(2.0 / 40) * expected)
+
+
+@pytest.mark.slow
+def test_sigmas_of_orientations_are_about_the_tools_axes_and_of_positions_along_the_worlds():
+    joints, poses = record(12, sigma_position=1e-9, sigma_orientation=1e-9).streams()
+    generator = np.random.default_rng(0)
+    off, turn = generator.standard_normal((2, len(poses.time), 3)) * [[[1e-4, 1e-3, 1e-4]], [[1e-3, 1e-4, 1e-4]]]
+    rotation = Rotation.from_matrix(poses.rotation.copy()) * Rotation.from_rotvec(turn)
+    stops = average_stops(
+        joints, PoseStream(poses.time, poses.position + off, rotation.as_matrix(), poses.source), arm()
+    )
+    assert np.median(stops.sigma_position / stops.sigma_position[:, :1], axis=0) == pytest.approx([1, 10, 1], rel=0.2)
+    ratio = stops.sigma_orientation / stops.sigma_orientation[:, 1:2]
+    assert np.median(ratio, axis=0) == pytest.approx([10, 1, 1], rel=0.2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seconds", "most"), [(0.3, 1.2), (1.0, 1.7)])
+def test_slow_noise_is_seen_beneath_white_noise(seconds, most):
+    """Monte Carlo: 12 recordings of noise of 0.2 mm as slow as a stop under 0.05 mm that is white; was 4.5 for 1 s."""
+    found = []
+    for seed in range(12):
+        motion = record(300 + seed, sigma_position=5e-5)
+        slow = correlated(np.random.default_rng(seed), motion.position.shape, np.exp(-1.0 / (60.0 * seconds)))
+        motion.position += 2e-4 * slow
+        found.append(nees(averaged(motion), motion)[0])
+    assert np.mean(found) < most + 3.0 * np.std(found) / np.sqrt(12)
+    assert np.mean(found) > 0.2
+
+
+@pytest.mark.slow
+def test_white_noise_alone_is_not_called_slow():
+    generator = np.random.default_rng(4)
+    for n in (12, 70, 500):
+        stops = [x - x.mean(axis=0) for x in generator.standard_normal((12, n, 3))]
+        assert correlation_time(stops) < 1.3

@@ -1,0 +1,231 @@
+"""Poses of a board and cameras are known as well as is said, in the axes of `BoardPose`."""
+
+from dataclasses import astuple, replace
+
+import numpy as np
+import pytest
+from boards import CAMERA, SIZE, render, views
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2, kstest
+from tolerances import sigmas_apart
+
+from fg_calib.errors import InputError
+from fg_calib.importers.board import CalibrationBoard
+from fg_calib.importers.opencv import find_corners
+from fg_calib.importers.views import FIGURES, Corners, camera_derivatives, fit_board
+from fg_calib.measurements.kinds import BoardPose, Camera
+from fg_calib.measurements.kinds.kind import Frames
+
+cv2 = pytest.importorskip("cv2", reason="no OpenCV: pip install 'fg_calib[camera]'")
+
+BOARD = CalibrationBoard("checkerboard", 9, 6, 0.02)
+SIGMA = 0.05
+"""Of a corner, [px]."""
+
+
+def drawn(n, rng, sigma=SIGMA, board=BOARD, **of_views):
+    """Corners in n images with noise, and the true poses by name."""
+    R, t = views(board, n, rng, **of_views)
+    seen = [CAMERA.image(p + board.corners @ A[:, :2].T)[0] for A, p in zip(R, t, strict=True)]
+    every = np.arange(len(board.corners))
+    found = [Corners(f"i{k}", every, uv + sigma * rng.normal(size=uv.shape)) for k, uv in enumerate(seen)]
+    return found, {f"i{k}": (A, p) for k, (A, p) in enumerate(zip(R, t, strict=True))}
+
+
+def residual_of(view, R, t):
+    """What `BoardPose` says of a measured pose where the true one is R, t."""
+    at = Frames(np.eye(3)[None, None], np.zeros((1, 1, 3)))
+    board = np.append(Rotation.from_matrix(R).as_rotvec(), t)[None]
+    return BoardPose().rows(at, np.append(view.rotation.ravel(), view.position)[None], board).residual[0]
+
+
+def nees(fit, truth):
+    """Squared errors of the poses over their covariances, shape (n,)."""
+    errors = [residual_of(view, *truth[view.name]) for view in fit.views]
+    return np.array([e @ np.linalg.solve(v.covariance, e) for e, v in zip(errors, fit.views, strict=True)])
+
+
+def test_derivatives_by_the_camera_are_those_of_differences():
+    """Of a camera with all of its distortion; 1e-6 is what differences of 1e-6 leave."""
+    points = np.random.default_rng(0).normal([0, 0, 1.5], 0.2, (20, 3))
+    values = np.array(astuple(CAMERA))
+    K = camera_derivatives(CAMERA, points)
+    for i in range(9):
+        step = 1e-6 * np.eye(9)[i] * max(1.0, abs(values[i]))
+        ahead, behind = (Camera(*(values + s)).image(points)[0] for s in (step, -step))
+        assert K[:, :, i] == pytest.approx((ahead - behind) / (2.0 * step[i]), rel=1e-6, abs=1e-6)
+
+
+def test_the_covariance_is_that_of_opencvs_projection_in_the_cameras_axes():
+    """Differences of `projectPoints`, in a turn and a shift along the camera's axes."""
+    found, _ = drawn(3, np.random.default_rng(1))
+    K = np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1]])
+    lens = np.array(astuple(CAMERA)[4:])
+    places = np.column_stack([BOARD.corners, np.zeros(len(BOARD.corners))])
+
+    def seen(view, step):
+        turned = Rotation.from_rotvec(step[:3]) * Rotation.from_matrix(view.rotation)
+        return cv2.projectPoints(places, turned.as_rotvec(), view.position + step[3:], K, lens)[0].ravel()
+
+    for view in fit_board(BOARD, found, SIZE, CAMERA).views:
+        steps = 1e-6 * np.eye(6)
+        J = np.stack([(seen(view, s) - seen(view, -s)) / 2e-6 for s in steps], axis=1)
+        expected = view.sigma**2 * np.linalg.inv(J.T @ J)
+        size = np.sqrt(np.diag(expected))
+        assert view.covariance / np.outer(size, size) == pytest.approx(expected / np.outer(size, size), abs=1e-6)
+
+
+def test_a_pose_is_the_optimum_of_its_corners():
+    """Another step of least squares, with differences of our own projection, moves it by a thousandth of a sigma."""
+    found, _ = drawn(5, np.random.default_rng(2))
+    for view in fit_board(BOARD, found, SIZE, CAMERA).views:
+
+        def residual(step, view=view):
+            R = (Rotation.from_rotvec(step[:3]) * Rotation.from_matrix(view.rotation)).as_matrix()
+            return (CAMERA.image(view.position + step[3:] + BOARD.corners @ R[:, :2].T)[0] - view.uv).ravel()
+
+        J = np.stack([(residual(s) - residual(-s)) / 2e-6 for s in 1e-6 * np.eye(6)], axis=1)
+        step = np.linalg.lstsq(J, -residual(np.zeros(6)), rcond=None)[0]
+        assert sigmas_apart(step, np.zeros(6), np.sqrt(np.diag(view.covariance))) < 1e-3
+
+
+def test_errors_of_poses_are_what_their_covariances_say():
+    """NEES of 50 poses within 4 of its own sigma; the sigma of corners within 4 of its own."""
+    found, truth = drawn(50, np.random.default_rng(3))
+    fit = fit_board(BOARD, found, SIZE, CAMERA)
+    e = nees(fit, truth)
+    assert abs(e.mean() / 6.0 - 1.0) < 4.0 * np.sqrt(2.0 / 6.0 / len(e))
+    assert kstest(chi2.cdf(e, 6), "uniform").pvalue > 1e-3
+    assert abs(fit.sigma / SIGMA - 1.0) < 4.0 / np.sqrt(2.0 * len(e) * 102)
+
+
+def test_the_sigma_of_corners_allows_for_what_the_poses_take_up():
+    """Of 24 residuals an image a pose takes up 6: without them sigma would be 13 % too small."""
+    board = CalibrationBoard("checkerboard", 4, 3, 0.04)
+    found, _ = drawn(40, np.random.default_rng(12), board=board)
+    fit = fit_board(board, found, SIZE, CAMERA)
+    assert abs(fit.sigma / SIGMA - 1.0) < 3.0 / np.sqrt(2.0 * 40 * 18)
+    assert fit.rms == pytest.approx(fit.sigma * np.sqrt(18 / 24))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("board", [BOARD, CalibrationBoard("charuco", 9, 7, 0.02, 0.014, "DICT_5X5_100")], ids=str)
+def test_errors_of_poses_of_images_are_what_their_covariances_say(board):
+    """The same of 40 images, corners found in them; 4 sigma, and 10 % for corners that are not quite unbiased."""
+    rng = np.random.default_rng(4)
+    truth, found = {}, []
+    for k, (R, t) in enumerate(zip(*views(board, 40, rng, off=0.1), strict=True)):
+        seen = find_corners(render(board, R, t, rng), board)
+        if not isinstance(seen, str):
+            found.append(Corners(f"i{k}", *seen))
+            truth[f"i{k}"] = (R, t)
+    fit = fit_board(board, found, SIZE, CAMERA)
+    e = nees(fit, truth)
+    assert len(e) >= 36
+    assert fit.rms < 0.06
+    assert abs(e.mean() / 6.0 - 1.0) < 0.1 + 4.0 * np.sqrt(2.0 / 6.0 / len(e))
+
+
+def test_an_image_with_more_noise_has_a_larger_sigma():
+    """Its own residuals say so: within 4 of the sigma of a standard deviation, a tenth of others' for the prior."""
+    rng = np.random.default_rng(5)
+    found, _ = drawn(20, rng)
+    noisy = found[3]._replace(uv=found[3].uv + 0.3 * rng.normal(size=(54, 2)))
+    fit = fit_board(BOARD, [*found[:3], noisy, *found[4:]], SIZE, CAMERA)
+    sigma = np.array([view.sigma for view in fit.views])
+    assert abs(sigma[3] / 0.3 - 1.0) < 0.1 + 4.0 / np.sqrt(2.0 * 102)
+    assert np.abs(np.delete(sigma, 3) / SIGMA - 1.0).max() < 0.2 + 4.0 / np.sqrt(2.0 * 102)
+    assert [view.poor for view in fit.views] == [k == 3 for k in range(20)]
+
+
+def test_a_camera_is_known_as_well_as_is_said():
+    found, truth = drawn(12, np.random.default_rng(6))
+    fit = fit_board(BOARD, found, SIZE)
+    error = np.array(astuple(fit.camera)) - astuple(CAMERA)
+    assert np.all(np.abs(error) < 3.0 * np.array([fit.camera_sigma[name] for name in FIGURES]))
+    assert chi2.cdf(error @ np.linalg.solve(fit.camera_covariance, error), 9) < 0.999
+    assert fit.findings == ()
+    e = [residual_of(v, *truth[v.name]) for v in fit.views]
+    total = [x @ np.linalg.solve(v.covariance + v.by_camera, x) for x, v in zip(e, fit.views, strict=True)]
+    assert np.mean(total) < 3.0 * 6.0  # correlated by the camera: no more than a check of size
+
+
+@pytest.mark.slow
+def test_errors_of_cameras_are_what_their_covariance_says():
+    """NEES of 60 cameras within 4 of its own sigma; half of the images have three times the noise."""
+    e = []
+    for seed in range(60):
+        rng = np.random.default_rng(1000 + seed)
+        found, _ = drawn(8, rng)
+        found = [c._replace(uv=c.uv + 0.15 * (k % 2) * rng.normal(size=c.uv.shape)) for k, c in enumerate(found)]
+        fit = fit_board(BOARD, found, SIZE)
+        error = np.array(astuple(fit.camera)) - astuple(CAMERA)
+        e.append(error @ np.linalg.solve(fit.camera_covariance, error))
+    assert abs(np.mean(e) / 9.0 - 1.0) < 4.0 * np.sqrt(2.0 / 9.0 / len(e))
+
+
+def test_what_the_camera_adds_is_how_poses_move_with_it():
+    """Against poses fitted with a camera that is off by a part of each of its sigmas."""
+    found, _ = drawn(4, np.random.default_rng(7))
+    fit = fit_board(BOARD, found, SIZE)
+    G = np.empty((len(found), 6, 9))
+    for i, name in enumerate(FIGURES):
+        off = 0.1 * fit.camera_sigma[name]
+        moved = [
+            fit_board(BOARD, found, SIZE, replace(fit.camera, **{name: getattr(fit.camera, name) + s}))
+            for s in (off, -off)
+        ]
+        for k, (a, b) in enumerate(zip(moved[0].views, moved[1].views, strict=True)):
+            G[k, :, i] = -residual_of(b, a.rotation, a.position) / (-2.0 * off)
+    for k, view in enumerate(fit.views):
+        expected = G[k] @ fit.camera_covariance @ G[k].T
+        size = np.sqrt(np.diag(expected))
+        assert view.by_camera / np.outer(size, size) == pytest.approx(expected / np.outer(size, size), abs=0.02)
+
+
+def test_images_that_are_all_alike_do_not_determine_a_camera():
+    rng = np.random.default_rng(8)
+    found, _ = drawn(6, rng, tilt=0.0, off=0.01)
+    try:
+        finding = fit_board(BOARD, found, SIZE).findings[0]
+    except InputError as error:
+        finding = str(error)
+    assert finding.startswith(("the images do not determine the camera: f", "images: no camera that they determine"))
+
+
+def test_two_images_are_too_few_for_a_camera():
+    with pytest.raises(InputError) as error:
+        fit_board(BOARD, drawn(2, np.random.default_rng(9))[0], SIZE)
+    assert str(error.value) == "images: 2 with a board, expected at least 3 to estimate a camera from"
+
+
+@pytest.mark.parametrize(("distance", "tilt", "ambiguous"), [(3.0, 10.0, True), (0.4, 40.0, False)])
+def test_a_board_that_is_seen_small_and_hardly_tilted_has_two_poses(distance, tilt, ambiguous):
+    R = Rotation.from_euler("x", tilt, degrees=True).as_matrix()
+    uv = CAMERA.image(np.array([-0.08, -0.05, distance]) + BOARD.corners @ R[:, :2].T)[0]
+    noise = np.random.default_rng(10).normal(scale=0.3, size=uv.shape)
+    (view,) = fit_board(BOARD, [Corners("i", np.arange(54), uv + noise)], SIZE, CAMERA).views
+    assert view.ambiguous == ambiguous
+
+
+def test_corners_that_no_pose_explains_are_named(monkeypatch):
+    found, _ = drawn(3, np.random.default_rng(11))
+    import fg_calib.importers.views as module
+
+    true = module.both_poses
+    monkeypatch.setattr(module, "both_poses", lambda p, uv, c: [] if uv is found[1].uv else true(p, uv, c))
+    fit = fit_board(BOARD, found, SIZE, CAMERA)
+    assert ([v.name for v in fit.views], fit.without_pose) == (["i0", "i2"], ("i1",))
+    monkeypatch.setattr(module, "both_poses", lambda p, uv, c: [])
+    with pytest.raises(InputError, match="images: corners that no pose of the board explains, expected images of this"):
+        fit_board(BOARD, found, SIZE, CAMERA)
+
+
+def test_a_camera_of_images_of_another_size_is_found_out():
+    """Images four times as large as those that the camera was calibrated with."""
+    found, _ = drawn(4, np.random.default_rng(13))
+    larger = [one._replace(uv=4.0 * one.uv + 1.5) for one in found]
+    (finding,) = fit_board(BOARD, larger, (4 * SIZE[0], 4 * SIZE[1]), CAMERA).findings
+    assert finding.startswith("no poses explain the corners: residuals of ")
+    assert finding.endswith("is the camera that of these images of 2560 x 1920 px, is the board as its file says?")
+    assert fit_board(BOARD, found, SIZE, CAMERA).findings == ()

@@ -1,0 +1,154 @@
+"""A board from one image: exact, either way it may be tilted, with corners that are far off."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fg_calib.initialization.boards import board_from_image, boards_from_image, undistorted
+from fg_calib.measurements.kinds import Camera
+
+CAMERA = Camera(fx=900, fy=880, cx=640, cy=480)
+CORNERS = np.array([[0.08 * i, 0.08 * j] for i in range(4) for j in range(3)])
+
+
+def image_of(rotation, place, noise=0.0, camera=CAMERA, corners=CORNERS):
+    """u, v and the corners, of a board that is somewhere ahead of the camera."""
+    seen = camera.image(corners @ rotation[:, :2].T + place)[0]
+    return np.hstack([seen + noise, corners])
+
+
+def angle_between(a, b):
+    return Rotation.from_matrix(a.T @ b).magnitude()
+
+
+def tilted(cosine, rng):
+    """A board about 2 m ahead whose normal is at an angle of that cosine to the line of sight."""
+    place = np.array([*rng.uniform(-0.5, 0.5, 2), rng.uniform(1.5, 2.5)])
+    sight = place / np.linalg.norm(place)
+    across = np.linalg.svd(sight[None])[2][1:].T @ [np.cos(turn := rng.uniform(0, 6)), np.sin(turn)]
+    normal = cosine * sight + np.sqrt(1.0 - cosine**2) * across
+    x = np.linalg.svd(normal[None])[2][1]
+    R = np.column_stack([x, np.cross(normal, x), normal]) @ Rotation.from_rotvec([0, 0, rng.uniform(0, 6)]).as_matrix()
+    return R, place
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("distortion", [{}, {"k1": -0.25, "k2": 0.08, "p1": 1e-3, "p2": -5e-4}])
+def test_a_board_from_its_image(distortion):
+    """Nearer than 2 mm and 5 mrad at a metre with 0.1 pixel, and exact without noise."""
+    camera = Camera(fx=900, fy=905, cx=640, cy=360, **distortion)
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(7) * 0.03, np.arange(5) * 0.03))
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        R = Rotation.from_euler("xyz", [*rng.uniform(-0.7, 0.7, 2), rng.uniform(-3, 3)]).as_matrix()
+        t = np.append(rng.uniform(-0.15, 0.0, 2), rng.uniform(0.5, 1.2))
+        seen = camera.image(np.column_stack([x, y, 0 * x]) @ R.T + t)[0]
+        for sigma, abs_t, abs_R in ((0.0, 1e-9, 1e-9), (0.1, 2e-3, 2e-2)):
+            found = board_from_image(camera, np.column_stack([seen + sigma * rng.normal(size=seen.shape), x, y]))
+            assert found.translation == pytest.approx(t, abs=abs_t)
+            assert found.rotation == pytest.approx(R, abs=abs_R)
+
+
+@pytest.mark.sampled(3)
+@pytest.mark.parametrize("cosine", [-0.9, 0.05, 0.12, 0.3, 0.9])
+def test_an_image_leaves_two_poses_and_the_true_one_is_among_them(cosine):
+    """At 0.3 pixel, of a board seen nearly from its edge too."""
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        R, place = tilted(cosine, rng)
+        found = boards_from_image(CAMERA, image_of(R, place, 0.3 * rng.normal(size=(12, 2))), np.full((12, 2), 0.3))
+        assert len(found) <= 2
+        assert [cost for cost, _ in found] == sorted(cost for cost, _ in found)
+        assert all(np.linalg.norm(frame.translation - place) < 0.3 for _, frame in found)  # none diverged
+        assert min(angle_between(R, frame.rotation) for _, frame in found) < 0.15
+
+
+def test_a_small_board_is_seen_tilted_either_way():
+    """50 mm at 2 m, tilted by 20 degrees: the other pose is tilted by as much the other way."""
+    R, place = Rotation.from_rotvec([np.deg2rad(20), 0, 0]).as_matrix(), np.array([0.0, 0.0, 2.0])
+    corners = 0.2 * (CORNERS - CORNERS.mean(axis=0))
+    (first, one), (second, other) = boards_from_image(CAMERA, image_of(R, place, corners=corners))
+    assert one.rotation == pytest.approx(R, abs=1e-7)
+    assert other.rotation == pytest.approx(R.T, abs=0.02)
+    assert first < 1e-12 < second < 12 * 0.1**2  # told apart by less than a tenth of a pixel a corner
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("n_off", [1, 3])
+def test_corners_that_are_far_off_do_not_move_a_board(n_off):
+    """30 pixels, of 12 corners at 0.1 pixel: where the others alone have it."""
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        R, place = tilted(0.8, rng)
+        image = image_of(R, place, 0.1 * rng.normal(size=(12, 2)))
+        off = rng.permutation(12)[:n_off]
+        image[off, :2] += 30.0 * Rotation.random(n_off, random_state=seed).as_matrix()[:, 0, :2]
+        clean = board_from_image(CAMERA, np.delete(image, off, axis=0), np.full((12 - n_off, 2), 0.1))
+        found = board_from_image(CAMERA, image, np.full((12, 2), 0.1))
+        assert found.translation == pytest.approx(clean.translation, abs=0.02)
+        assert angle_between(found.rotation, clean.rotation) < 0.05
+
+
+def test_noise_that_differs_from_corner_to_corner_is_weighed():
+    """Half of the corners at 0.01 pixel, half at 3: the former say where the board is."""
+    rng = np.random.default_rng(0)
+    R, place = tilted(0.7, rng)
+    sigma = np.where(np.arange(12)[:, None] % 2, 3.0, 0.01) * np.ones((12, 2))
+    found = board_from_image(CAMERA, image_of(R, place, sigma * rng.normal(size=(12, 2))), sigma)
+    assert found.translation == pytest.approx(place, abs=2e-3)
+
+
+def test_what_a_distortion_shows_of_no_point_is_left_out():
+    """Beyond where the image of this lens turns back, at 1.15 focal lengths from the axis."""
+    camera = Camera(fx=900, fy=880, cx=640, cy=480, k1=-0.25)
+    x = np.array([[0.0, 0.0], [0.3, -0.2], [-0.9, 0.5], [0.1, 1.0]])
+    pixels = np.vstack([camera.image(np.column_stack([x, np.ones(4)]))[0], [[640 + 900 * 0.8, 480]]])
+    found, there = undistorted(camera, pixels)
+    assert there.tolist() == [True] * 4 + [False]
+    assert found[:4] == pytest.approx(x, abs=1e-9)
+    rng = np.random.default_rng(1)
+    R, place = tilted(0.8, rng)
+    image = np.vstack([image_of(R, place, camera=camera), [640 + 900 * 0.8, 480, 0.3, 0.3]])
+    assert board_from_image(camera, image).translation == pytest.approx(place, abs=1e-6)
+
+
+def test_points_on_one_line_say_nothing_of_a_board():
+    x = np.arange(5.0)
+    image = np.column_stack([100 * x, 50 * x, x, 2 * x])
+    assert board_from_image(Camera(900, 900, 640, 480), image) is None
+    assert board_from_image(Camera(900, 900, 640, 480), image[:3]) is None
+
+
+def test_images_of_no_board_have_no_pose_that_breaks_anything():
+    """All corners at one pixel, on one line, at random, doubled: no error, and every pose is ahead of the camera."""
+    rng = np.random.default_rng(0)
+    line = np.outer(np.linspace(0.0, 1.0, 12), [400.0, 300.0]) + 100.0
+    for seen in (np.full((12, 2), 300.0), line, rng.uniform(0, 900, (12, 2)), np.tile(line[::6], (6, 1)), 1e9 * line):
+        for camera in (CAMERA, Camera(fx=900, fy=880, cx=640, cy=480, k1=-0.25, k2=0.1)):
+            for _, frame in boards_from_image(camera, np.hstack([seen, CORNERS])):
+                assert np.isfinite(frame.translation).all()
+                assert frame.rotation @ frame.rotation.T == pytest.approx(np.eye(3), abs=1e-9)
+    assert boards_from_image(CAMERA, np.hstack([np.full((12, 2), 300.0), CORNERS])) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("corners", [[[0, 0], [1, 0], [0, 1], [1, 1]], [[0, 0], [1, 0], [2, 0], [3, 0], [0, 1]]])
+def test_a_board_from_a_few_corners_is_before_the_camera_or_nowhere(corners):
+    """Few corners fit many poses: steps that leave for infinity once started whole calibrations there."""
+    rng, camera = np.random.default_rng(0), Camera(900, 905, 640, 480, k1=-0.1, k2=0.05)
+    corners = 0.1 * np.array(corners)
+    n, found, near = len(corners), 0, 0
+    for _ in range(150):
+        turn = Rotation.from_rotvec(rng.normal(size=3) * 0.6) * Rotation.from_rotvec([np.pi, 0.0, 0.0])
+        place = np.array([*rng.uniform(-0.5, 0.5, 2), 2.5])
+        points = turn.apply(np.column_stack([corners, np.zeros(n)])) + place
+        seen = camera.image(points)[0] + 0.3 * rng.normal(size=(n, 2))
+        frame = board_from_image(camera, np.hstack([seen, corners]))
+        if frame is not None:
+            found += 1
+            there = np.column_stack([corners, np.zeros(n)]) @ frame.rotation.T + frame.translation
+            assert there[:, 2].min() > 0.0
+            assert np.abs(frame.translation).max() < 2e3
+            near += np.linalg.norm(frame.translation - place) < 0.5
+    if n == 4:  # of five with four on a line there is mostly nothing to start from
+        assert near > 0.9 * found > 100

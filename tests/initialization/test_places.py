@@ -1,0 +1,120 @@
+"""Closed-form starts of targets, frames, anchors, offsets and planes: metres away and half a turn away."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fg_calib.initialization.hand_eye import Frame
+from fg_calib.initialization.landmarks import (
+    anchors_from_lengths,
+    offset_from_lengths,
+    plane_from_distances,
+    targets_from_positions,
+)
+
+SIGMA = 1e-3
+ORIGIN = Frame(np.eye(3), np.zeros(3))
+
+
+def arm(n, rng):
+    return Rotation.random(n, random_state=rng.integers(1000)).as_matrix(), rng.normal(size=(n, 3))
+
+
+@pytest.mark.sampled(9)
+@pytest.mark.parametrize("away", [0.1, 3.0])
+@pytest.mark.parametrize("n_targets", [1, 2, 3])
+@pytest.mark.parametrize("n_known", [0, 1])
+@pytest.mark.parametrize("unknown_frame", [False, True])
+def test_targets_and_frame_from_positions(away, n_targets, n_known, unknown_frame):
+    """Nearer than 30 mm and 30 mrad with 1 mm of noise: a start, from which a descent goes on."""
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        (R, p), targets = arm(20, rng), away * rng.normal(size=(n_targets, 3))
+        X = Frame(Rotation.random(random_state=seed).as_matrix(), 5.0 * rng.normal(size=3)) if unknown_frame else ORIGIN
+        which = np.arange(20) % n_targets
+        points = p + np.einsum("nij,nj->ni", R, targets[which])
+        measured = points @ X.rotation.T + X.translation + SIGMA * rng.normal(size=(20, 3))
+        known = np.full((n_targets, 3), np.nan)
+        known[:n_known] = targets[:n_known]
+        found, places = targets_from_positions((R, p), measured, which, known, ORIGIN, unknown_frame)
+        assert places == pytest.approx(targets, abs=0.03)
+        assert found.rotation == pytest.approx(X.rotation, abs=0.03)
+        assert found.translation == pytest.approx(X.translation, abs=0.1)  # 30 mrad at some metres
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("offset", [0.0, 0.3])
+@pytest.mark.parametrize("flat", [1.0, 0.2])
+def test_anchors_and_what_an_instrument_adds_from_lengths(offset, flat):
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        points, anchors = rng.normal(size=(45, 3)) * [1.0, 1.0, flat], 2.0 * rng.normal(size=(3, 3))
+        which = np.arange(45) % 3
+        length = np.linalg.norm(points - anchors[which], axis=1) + offset + SIGMA * rng.normal(size=45)
+        unknown = np.full((3, 3), np.nan)
+        added = offset_from_lengths(points, length, which, unknown) if offset > 0.0 else 0.0
+        found = anchors_from_lengths(points, length - added, which, unknown)
+        assert found == pytest.approx(anchors, abs=0.1)
+        assert added == pytest.approx(offset, abs=0.1)
+
+
+def test_a_known_anchor_stays_where_it_is():
+    rng = np.random.default_rng(1)
+    points, anchors = rng.normal(size=(20, 3)), rng.normal(size=(2, 3))
+    which = np.arange(20) % 2
+    length = np.linalg.norm(points - anchors[which], axis=1) + 0.2
+    known = np.stack([anchors[0], np.full(3, np.nan)])
+    added = offset_from_lengths(points, length, which, known)
+    found = anchors_from_lengths(points, length - added, which, known)
+    assert found == pytest.approx(anchors, abs=1e-6)
+    assert added == pytest.approx(0.2, abs=1e-6)
+
+
+@pytest.mark.parametrize("height", [0.0, 0.3, 2.0])
+def test_a_plane_from_distances(height):
+    """Away from the base where all distances are zero, as the true one here; else the side is said by them."""
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        n = rng.normal(size=3)
+        n /= np.linalg.norm(n)
+        points, distance = rng.normal(size=(15, 3)), height * rng.random(15)
+        points += (0.7 + distance - points @ n + SIGMA * rng.normal(size=15))[:, None] * n
+        c, f = plane_from_distances(points, distance)
+        found = (f - c) / np.linalg.norm(f - c)
+        assert found == pytest.approx(n, abs=0.01)
+        assert found @ f == pytest.approx(0.7, abs=0.01)
+
+
+@pytest.mark.parametrize("height", [0.0, 0.02])
+def test_a_plane_whose_side_no_distance_tells_faces_away_from_the_base(height):
+    """Touched with a tip, or with a ball of one radius everywhere: the points lie on either side of it alike."""
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        n = rng.normal(size=3)
+        n /= np.linalg.norm(n)
+        points = rng.normal(size=(15, 3))
+        points += (0.7 - points @ n + SIGMA * rng.normal(size=15))[:, None] * n
+        c, f = plane_from_distances(points, np.full(15, height))
+        found = (f - c) / np.linalg.norm(f - c)
+        assert found == pytest.approx(n, abs=0.01)
+        assert found @ f == pytest.approx(0.7 - height, abs=0.01)
+
+
+@pytest.mark.parametrize("n", [1, 3])
+@pytest.mark.parametrize("distance", [0.0, 0.1])
+def test_a_plane_that_one_point_alone_is_at_goes_through_it(n, distance):
+    """Any direction will do; what rounding leaves of three readings of one point is none."""
+    points = np.tile([1.1, 2.1, 0.4], (n, 1)) / 3.0
+    c, f = plane_from_distances(points, np.full(n, distance))
+    normal = (f - c) / np.linalg.norm(f - c)
+    assert (points - f) @ normal == pytest.approx(distance, abs=1e-12)
+
+
+def test_a_plane_near_the_base_is_where_the_distances_say():
+    """They fix the side, although the normal then points to the base."""
+    rng = np.random.default_rng(0)
+    distance = 0.1 * rng.random(15)
+    points = np.column_stack([rng.normal(size=(15, 2)), -0.7 + distance])  # above a plane below the base
+    c, f = plane_from_distances(points, distance)
+    assert (f - c) / np.linalg.norm(f - c) == pytest.approx([0, 0, 1], abs=1e-6)
+    assert f[2] == pytest.approx(-0.7, abs=1e-6)

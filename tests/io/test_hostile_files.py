@@ -1,0 +1,234 @@
+"""Files as an enemy would write them: one line for each, and what was asked for is read, not what a name looks like."""
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import polars as pl
+import pytest
+
+from fg_calib import InputError, Robot, read_job, read_measurements
+from fg_calib.io import yaml as schema
+from fg_calib.io.disk import read_bytes
+from fg_calib.io.yaml import read_yaml
+from fg_calib.sizes import ORDINARY
+
+ROWS_OF_DH = [[0.5, 0.1, 0.2, 0.0], [0.4, 0.2, 0.1, 0.0], [0.3, 0.0, 0.1, 0.0]]
+ARM = Robot.from_dh(ROWS_OF_DH, convention="dh")
+ROWS = "q1,q2,q3,x,y,z\n0.1,0.2,0.3,1,2,3\n0.4,0.5,0.6,4,5,6\n"
+LAUGHS = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"a{i + 1}: &a{i + 1} [{', '.join([f'*a{i}'] * 9)}]\n" for i in range(24)
+)
+MERGES = "a0: &a0 {k: 1}\n" + "".join(f"a{i + 1}: &a{i + 1}\n  <<: [{', '.join([f'*a{i}'] * 9)}]\n" for i in range(12))
+UTF_16 = "UTF-16 text, expected UTF-8 text; save it as UTF-8"
+
+YAML = {
+    LAUGHS: "robot.yaml:5: aliases that stand for more than 50000 values",
+    MERGES: "robot.yaml:11: aliases that stand for more than 50000 values",
+    "a: &a [*a]\n": "robot.yaml:1: an alias of what it stands in",
+    "a: " + "[" * 3000: "robot.yaml: nested too deeply, expected a mapping, key: value",
+    "a: !!int ''\n": "robot.yaml:1: '' is no YAML of type int",
+    "a: !!bool abc\n": "robot.yaml:1: 'abc' is no YAML of type bool",
+    "a: !!timestamp x\n": "robot.yaml:1: 'x' is no YAML of type timestamp",
+    "a: !!float x\n": "robot.yaml:1: 'x' is no YAML of type float",
+    "a: {b: 0,0005}\n": "robot.yaml:1: key 0005, expected a word; is it a decimal comma? numbers have a decimal point",
+    "a: 1".encode("utf-16"): f"robot.yaml: {UTF_16}",
+}
+
+
+@pytest.mark.parametrize("text", YAML, ids=lambda text: repr(text[:20]))
+def test_no_yaml_hangs_or_ends_in_a_traceback(tmp_path, text):
+    file = tmp_path / "robot.yaml"
+    file.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(InputError) as error:
+        read_yaml(file)
+    assert str(error.value) == YAML[text]
+
+
+def test_a_long_yaml_is_given_up_where_it_becomes_too_long(tmp_path, monkeypatch):
+    """Not when all of it has been read: 900 000 names took 17 s. The mapping, its key and the list are values too."""
+    monkeypatch.setattr(schema, "MOST_VALUES", 1000)
+    file = tmp_path / "robot.yaml"
+    for text, line in (("fixed: [" + 9000 * "a1, " + "]", 1), ("fixed:\n" + 9000 * "- a1\n", 999)):
+        file.write_text(text)
+        with pytest.raises(InputError) as error:
+            read_yaml(file)
+        assert str(error.value) == f"robot.yaml:{line}: more than 1000 values in one file"
+    file.write_text("fixed:\n" + 997 * "- a1\n")
+    assert len(read_yaml(file)["fixed"]) == 997
+
+
+TABLES = {
+    ROWS.encode("utf-16"): f"poses.csv: {UTF_16}",
+    ROWS.replace("0.2", "9" * 200_000): f"poses.csv:2: q2: found '{'9' * 56}..., expected a finite number",
+    ROWS.replace("0.2", '"0.2'): "poses.csv:2: 2 cells, expected 6 as in the header; "
+    "a quote joins it with lines below: is one missing?",
+    "\n\n" + ROWS.replace("0.2", ""): "poses.csv:4: q2: found an empty cell, expected a finite number",
+    ROWS.replace("0.2", "1e200"): f"poses.csv:2: q2: found '1e200', expected {ORDINARY}",
+    ROWS + ",,,,,7\n": "poses.csv:4: q1: found an empty cell, expected a finite number",
+    ROWS.replace("\n", "\r").replace("0.2", "?"): "poses.csv:2: q2: found '?', expected a finite number",
+}
+
+
+@pytest.mark.parametrize("text", TABLES, ids=lambda text: repr(text[:20]))
+def test_no_table_hangs_or_ends_in_a_traceback(tmp_path, text):
+    file = tmp_path / "poses.csv"
+    file.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(InputError) as error:
+        read_measurements(file, ARM)
+    assert str(error.value) == TABLES[text]
+
+
+@pytest.mark.parametrize(
+    "text", [ROWS, ROWS.replace("\n", "\r"), ROWS.replace("\n", "\r\n"), "\n\n" + ROWS, ROWS + "\n,,,,,\n"]
+)
+def test_lines_end_as_on_any_system_and_may_be_blank(tmp_path, text):
+    (tmp_path / "poses.csv").write_bytes(text.encode())
+    assert read_measurements(tmp_path / "poses.csv", ARM).readings.tolist() == [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda b: b[: len(b) // 2], lambda b: b[:4] + b"\xff" * 40 + b[44:], lambda b: b"PAR1"]
+)
+def test_a_damaged_parquet_file_is_one_line_and_silent(tmp_path, capfd, damage):
+    file = tmp_path / "poses.parquet"
+    pl.read_csv(ROWS.encode()).write_parquet(file)
+    file.write_bytes(damage(file.read_bytes()))
+    with pytest.raises(InputError, match=r"^poses\.parquet: not a Parquet file: [^\n]*$"):
+        read_measurements(file, ARM)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_parquet_file_may_have_blanks_about_its_names(tmp_path):
+    frame = pl.read_csv(ROWS.encode()).rename({"q1": " q1", "x": "x "})
+    frame.select(reversed(frame.columns)).write_parquet(tmp_path / "poses.parquet")
+    found = read_measurements(tmp_path / "poses.parquet", ARM)
+    assert found.readings[1].tolist() == [0.4, 0.5, 0.6]
+    assert found.position[1].tolist() == [4.0, 5.0, 6.0]
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet", "frame"])
+def test_a_column_is_no_pattern(tmp_path, ending):
+    """Polars takes * for all columns, and ^...$ for those that it matches."""
+    arm = Robot.from_dh(ROWS_OF_DH[:2], convention="dh", names=["*", "^.*$"])
+    frame = pl.DataFrame({"*": [0.1], "^.*$": [0.2], "^a$": [9.0], "row of the file": [3]})
+    file = tmp_path / f"poses.{ending}"
+    if ending != "frame":
+        frame.write_csv(file) if ending == "csv" else frame.write_parquet(file)
+    assert read_measurements(frame if ending == "frame" else file, arm).readings.tolist() == [[0.1, 0.2]]
+
+
+def test_joints_may_be_called_in_capitals(tmp_path):
+    (tmp_path / "poses.csv").write_text(ROWS.replace("q1,q2", "Q1,Q2"))
+    assert read_measurements(tmp_path / "poses.csv", ARM).readings.shape == (2, 3)
+
+
+def test_cells_of_several_types_are_all_read(tmp_path):
+    """None becomes an empty cell in silence."""
+    columns = {"q1": [1, 0.5], "q2": ["0.25", 1], "q3": [np.float32(0.5), 10**400], "id": [1, "b"]}
+    with pytest.raises(InputError) as error:
+        read_measurements(columns, ARM)
+    assert str(error.value) == f"frame: row 1: q3: found '1{'0' * 55}..., expected a finite number"
+    found = read_measurements(columns | {"q3": [0.5, 0.75]}, ARM)
+    assert found.readings.tolist() == [[1.0, 0.25, 0.5], [0.5, 1.0, 0.75]]
+    assert found.ids.tolist() == ["1", "b"]
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_columns_of_no_use_cost_next_to_nothing(tmp_path, ending):
+    wide = pl.read_csv(ROWS.encode()).with_columns(**{f"c{i}": pl.lit("?") for i in range(1200)})
+    file = tmp_path / f"poses.{ending}"
+    wide.write_csv(file) if ending == "csv" else wide.write_parquet(file)
+    assert read_measurements(file, ARM).readings.shape == (2, 3)
+
+
+def test_a_name_is_no_pattern(example):
+    """A folder `run[1]` is not `run1`, and what is hashed is what was read."""
+    odd, plain = example.with_name("run[1]"), example.with_name("run1")
+    shutil.copytree(example, plain)
+    example.rename(odd)
+    text = (plain / "poses.csv").read_text()
+    (plain / "poses.csv").write_text(text.replace("p0,", "q0,", 1))
+    job = read_job(odd / "calibration.yaml")
+    assert job.measurements.ids[0] == "p0"
+    assert job.inputs["poses.csv"] == hashlib.sha256((odd / "poses.csv").read_bytes()).hexdigest()
+    assert sorted(job.inputs) == ["calibration.yaml", "poses.csv", "robot_nominal.yaml", "robot_true.yaml"]
+
+
+def test_a_header_of_another_case_is_understood_and_one_nearly_right_is_told_of(tmp_path, caplog):
+    text = "Q1,q2,q3,X,y,z,Split,sigma_positon,anything\n" + "0,0,0,1,2,3,test,1,1\n"
+    (tmp_path / "poses.csv").write_text(text.replace("Q1", "q1"))
+    found = read_measurements(tmp_path / "poses.csv", ARM)
+    assert found.test.tolist() == [True]
+    assert found.position.tolist() == [[1.0, 2.0, 3.0]]
+    assert caplog.messages == ["poses.csv: column 'sigma_positon' is not used; did you mean sigma_position?"]
+
+
+def test_columns_that_look_as_if_they_were_used_are_told_of(tmp_path, caplog):
+    names = ["sigma_joint", "sigma_yaw", "sigma_pos", "sigma_position [mm]", "X", "note"]
+    (tmp_path / "poses.csv").write_text(",".join(["q1,q2,q3,x,y,z", *names]) + "\n0,0,0,1,2,3" + ",1" * 6 + "\n")
+    read_measurements(tmp_path / "poses.csv", ARM)
+    sigmas = ["distance", "orientation", "pixel", "point", "position", "rx", "ry", "rz", "u", "v", "x", "y", "z"]
+    said = f"sigmas are {', '.join(f'sigma_{name}' for name in sigmas)}"
+    expected = [f"poses.csv: column {name!r} is not used; {said}" for name in names[:4]]
+    assert caplog.messages == [*expected, "poses.csv: column 'X' is not used; x is"]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda folder: folder / "nothing", "nothing: no such file"),
+        (lambda folder: folder, ": is a folder, expected a file"),
+        (lambda folder: folder / ("x" * 5000), "cannot be read: File name too long, expected a file"),
+        (lambda folder: folder / "a\0b", "cannot be read: "),
+        (lambda folder: os.mkfifo(folder / "pipe") or folder / "pipe", "pipe: is a pipe or a device, expected a file"),
+    ],
+)
+def test_what_is_no_file_is_one_line(tmp_path, make, message):
+    with pytest.raises(InputError) as error:
+        read_bytes(make(tmp_path))
+    assert message in str(error.value)
+    assert len(str(error.value)) < 300
+
+
+@pytest.mark.slow
+def test_a_path_need_not_be_utf_8(example):
+    odd = os.fsencode(example.parent) + b"/r\xff"
+    os.rename(os.fsencode(example), odd)
+    command = [sys.executable, "-m", "fg_calib.cli", "calibrate", odd + b"/calibration.yaml", "--json"]
+    ended = subprocess.run(command, capture_output=True, check=False)
+    assert (ended.returncode, ended.stderr) == (0, b"")
+    assert np.isfinite(json.loads(ended.stdout)["chi2"])
+
+
+@pytest.mark.parametrize("figure", ["1.0e-200", "1.0e+300"])
+@pytest.mark.parametrize("place", ["noise", "robot"])
+def test_figures_that_no_arithmetic_holds_are_named(example, fg_calib, place, figure):
+    file = example / {"noise": "calibration.yaml", "robot": "robot_nominal.yaml"}[place]
+    text = file.read_text()
+    key = {"noise": r"position: [0-9.e-]+", "robot": r"tolerance: \{a: [0-9.e-]+"}[place]
+    assert re.search(key, text)
+    file.write_text(re.sub(key, lambda found: found[0].rpartition(" ")[0] + f" {figure}", text, count=1))
+    ended = fg_calib("calibrate", example / "calibration.yaml")
+    assert (ended.code, ended.out) == (1, "")
+    assert ended.err.endswith(f": found {float(figure)!r}, expected {ORDINARY}\n")
+
+
+def test_nothing_left_to_check_the_fit_by_is_not_good(example, fg_calib):
+    """Every point touched once: as many unknowns as residuals."""
+    table = pl.read_csv(example / "poses.csv").head(40).select("id", *(f"q{i}" for i in range(1, 8)))
+    table.with_columns(group="g" + pl.col("id")).write_csv(example / "poses.csv")
+    job = example / "calibration.yaml"
+    job.write_text(
+        re.sub("model: .*", "model: distance", job.read_text()).replace("noise: {", "noise: {point: 0.001, ")
+    )
+    ended = fg_calib("calibrate", job, "--json")
+    result = json.loads(ended.out)
+    assert (ended.code, result["dof"]) == (3, 0)
+    expected = "no degree of freedom is left: nothing says whether the fit is right, or the noise; measure more"
+    assert result["findings"] == [expected]

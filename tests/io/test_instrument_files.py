@@ -1,0 +1,298 @@
+"""Tables and jobs of instruments: what is read is what stands there, and what cannot be used is named."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from instruments import CAMERA, measured_by
+from scipy.spatial.transform import Rotation
+
+from fg_calib.calibration import calibrate, calibrate_job
+from fg_calib.errors import InputError
+from fg_calib.io.csv_writer import write_csv
+from fg_calib.io.instruments import COVARIANCE, read_camera
+from fg_calib.io.job import read_job
+from fg_calib.io.robot_file import write_robot
+from fg_calib.io.tables import read_measurements
+from fg_calib.measurements.dataset import Noise
+from fg_calib.measurements.kinds import Camera
+
+INTRINSICS = {name: getattr(CAMERA, name) for name in ("fx", "fy", "cx", "cy", "k1", "k2")}
+KEYS = {
+    "targets known": {"frame": "unknown", "targets": {"t0": {"x": 300, "y": 100, "z": -200}}},
+    "targets stations": {"frame": "unknown"},
+    "anchors offset": {"offset": "estimate"},
+    "anchors known": {},
+    "planes": {},
+    "board": {},
+    "pixels": {"camera": "camera.yaml"},
+}
+
+
+def write_files(folder, robot, table, job):
+    """Robot, table in mm and degrees, and a job."""
+    m = table.measurements
+    columns = {f"q{i + 1}": np.rad2deg(q) if i != 2 else 1e3 * q for i, q in enumerate(m.readings.T)}
+    columns |= {"id": m.ids} if m.named else {}
+    for name, labels in m.labels.items():
+        columns[name] = np.array(["", *labels.names])[labels.index + 1]
+    if m.length is not None:
+        columns["distance"] = 1e3 * m.length
+    if m.image is not None:
+        columns |= dict(zip(("u", "v", "corner_x", "corner_y"), (m.image * [1, 1, 1e3, 1e3]).T, strict=True))
+    if m.position is not None:
+        columns |= dict(zip("xyz", 1e3 * m.position.T, strict=True))
+    if m.rotation is not None:
+        turn = np.rad2deg(Rotation.from_matrix(m.rotation.copy()).as_rotvec())
+        columns |= dict(zip(("rx", "ry", "rz"), turn.T, strict=True))
+    if m.covariance is not None:
+        size = np.repeat([180.0 / np.pi, 1e3], 3)
+        upper = (m.covariance * np.outer(size, size))[:, *np.triu_indices(6)]
+        columns |= dict(zip(COVARIANCE, upper.T, strict=True))
+    write_csv(folder / "table.csv", columns)
+    write_robot(folder / "robot.yaml", robot)
+    (folder / "camera.yaml").write_text(yaml.safe_dump(INTRINSICS))
+    given = {
+        "robot": "robot.yaml",
+        "measurements": "table.csv",
+        "model": table.model,
+        "units": {"length": "mm", "angle": "deg"},
+    }
+    given["noise"] = {"position": 0.1, "distance": 0.1, "pixel": 0.1}
+    (folder / "job.yaml").write_text(yaml.safe_dump(given | job))
+    return folder / "job.yaml"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("instrument", KEYS)
+def test_a_job_is_what_python_makes_of_the_same_arrays(instrument, tmp_path):
+    """Parameters within a hundredth of their sigma: what twelve digits in mm and degrees leave is far less."""
+    robot, _, table = measured_by(instrument, np.random.default_rng(20))
+    if instrument == "targets known":
+        keep = {"t0": table.known["t0"]}
+        table = type(table)(table.measurements, "position", frame="unknown", known=keep)
+    if instrument == "anchors known":
+        x, y, z = (1e3 * table.known["a0"].xyz).tolist()
+        KEYS[instrument] = {"anchors": {"a0": {"x": x, "y": y, "z": z}}}
+    path = write_files(tmp_path, robot, table, KEYS[instrument])
+    found, expected = calibrate_job(path), calibrate(robot, [table])
+    for name, parameter in expected.parameters.items():
+        if parameter.sigma:
+            assert abs(found.parameters[name].estimate - parameter.estimate) < 0.01 * parameter.sigma
+            assert found.parameters[name].sigma == pytest.approx(parameter.sigma, rel=1e-3)
+    assert [g.kind for g in found.result.groups] == [g.kind for g in expected.result.groups]
+
+
+def test_every_form_of_a_known_point(tmp_path):
+    robot, _, table = measured_by("anchors", np.random.default_rng(21))
+    anchors = {"a0": {"x": 1, "y": 2, "z": 3}, "a1": {"x": 0, "y": 0, "z": 4, "tolerance": 50}}
+    path = write_files(tmp_path, robot, table, {"anchors": anchors, "tolerance": {"anchors": 7}})
+    known = read_job(path).tables[0].known
+    assert known["a0"].xyz.tolist() == pytest.approx([1e-3, 2e-3, 3e-3])
+    assert (known["a0"].tolerance, known["a1"].tolerance) == pytest.approx((7e-3, 50e-3))
+
+
+@pytest.mark.sampled(3)
+@pytest.mark.parametrize(
+    ("top", "entry", "fixed"),
+    [
+        ("camera.yaml", None, False),
+        ("camera.yaml", "fixed", True),
+        (None, "camera.yaml", False),
+        (None, {"file": "camera.yaml", "fixed": True}, True),
+        (None, INTRINSICS, False),
+        (INTRINSICS, "fixed", True),
+    ],
+)
+def test_every_form_of_a_camera(top, entry, fixed, tmp_path):
+    robot, _, table = measured_by("pixels", np.random.default_rng(22))
+    one = {"table": "table.csv"} | ({} if entry is None else {"camera": entry})
+    path = write_files(tmp_path, robot, table, {"measurements": [one]} | ({} if top is None else {"camera": top}))
+    found = read_job(path).tables[0]
+    assert (found.camera, found.fixed_camera) == (CAMERA, fixed)
+
+
+def test_a_table_of_poses_takes_rotation_vectors(tmp_path):
+    robot, _, _ = measured_by("anchors", np.random.default_rng(23))
+    (tmp_path / "poses.csv").write_text("q1,q2,q3,q4,x,y,z,rx,ry,rz\n0,0,0,0,1,2,3,0.1,-0.2,0.3\n")
+    found = read_measurements(tmp_path / "poses.csv", robot).rotation
+    assert found[0] == pytest.approx(Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix())
+
+
+def test_a_column_that_another_model_uses_means_nothing(tmp_path):
+    robot, _, _ = measured_by("anchors", np.random.default_rng(24))
+    (tmp_path / "poses.csv").write_text("q1,q2,q3,q4,x,y,z,anchor,distance,u\n0,0,0,0,1,2,3,,far,left\n")
+    found = read_measurements(tmp_path / "poses.csv", robot, model="position")
+    assert found.labels == {}
+    assert found.length is None
+
+
+HEAD = "q1,q2,q3,q4"
+CASES = [
+    ("anchor", f"{HEAD},anchor,distance\n0,0,0,0,a,-1\n",
+     "t.csv:2: distance: found '-1', expected a number not below 0"),
+    ("anchor", f"{HEAD},anchor,distance\n0,0,0,0,a,far\n", "t.csv:2: distance: found 'far', expected a finite number"),
+    ("anchor", f"{HEAD},anchor,distance,sigma_distance\n0,0,0,0,a,1,0\n",
+     "t.csv:2: sigma_distance: found '0', expected a number above 0"),
+    ("board", f"{HEAD},x,y,z,qx,qy,qz,qw,board\n0,0,0,0,1,2,3,0,0,0,1,\n",
+     "t.csv:2: board: found an empty cell, expected the name of a board"),
+    ("position", f"{HEAD},x,y,z,station\n0,0,0,0,1,2,3,\n",
+     "t.csv:2: station: found an empty cell, expected the name of a station"),
+    ("pixels", f"{HEAD},u,v\n0,0,0,0,1,2\n", "t.csv: no column corner_x, expected u v corner_x corner_y together"),
+    ("pixels", f"{HEAD},u,v,corner_x,corner_y,sigma_pixel,sigma_u\n0,0,0,0,1,2,3,4,1,1\n",
+     "t.csv: both sigma_pixel and sigma_u, expected one of the two"),
+    ("board", f"{HEAD},cov_11\n0,0,0,0,1\n", f"t.csv: no column cov_12, expected {' '.join(COVARIANCE)} together"),
+    ("board", f"{HEAD},{','.join(COVARIANCE)}\n0,0,0,0,{','.join(['1'] * 21)}\n",
+     "t.csv:2: cov_11: found '1', expected a covariance: eigenvalues above 0"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("model", "text", "message"), CASES)
+def test_a_cell_that_cannot_be_used_is_named(model, text, message, tmp_path):
+    robot, _, _ = measured_by("anchors", np.random.default_rng(25))
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises(InputError) as error:
+        read_measurements(tmp_path / "t.csv", robot, model=model, noise=Noise(distance=1e-3))
+    assert str(error.value) == message
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"fx": 1}, "camera.yaml: missing keys 'fy', 'cx', 'cy'"),
+        (INTRINSICS | {"fx": -1}, "camera.yaml: fx: found -1, expected 1 to 1e+06 px"),
+        (INTRINSICS | {"fx": 1e300}, "camera.yaml: fx: found 1e+300, expected a number no larger than 1e+15"),
+        (INTRINSICS | {"fy": True}, "camera.yaml: fy: found True, expected a finite number"),
+        (INTRINSICS | {"k1": -1e7}, "camera.yaml: k1: found -1e+07, expected -1e+06 to 1e+06"),
+        (INTRINSICS | {"cy": 1e7}, "camera.yaml: cy: found 1e+07, expected -1e+06 to 1e+06 px"),
+        (INTRINSICS | {"k4": 0}, "camera.yaml: unknown key 'k4', expected one of fx, fy, cx, cy, k1, k2, p1, p2, k3"),
+        (INTRINSICS | {"cx": float("nan")}, "camera.yaml: cx: found nan, expected a finite number"),
+        (INTRINSICS | {"width": 0}, "camera.yaml: width: found 0, expected a number above 0"),
+        (
+            INTRINSICS | {"sigma": {"k4": 1}},
+            "camera.yaml: sigma: unknown key 'k4', expected one of fx, fy, cx, cy, k1, k2",
+        ),
+        (INTRINSICS | {"sigma": {"fx": -1}}, "camera.yaml: sigma: fx: found -1, expected a number not below 0"),
+    ],
+)
+def test_a_camera_that_is_none_is_named(given, message, tmp_path):
+    (tmp_path / "camera.yaml").write_text(yaml.safe_dump(given))
+    with pytest.raises(InputError) as error:
+        read_camera(tmp_path / "camera.yaml")
+    assert str(error.value).startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("anchors", {"a0": {"x": 1, "y": 2}}, "job.yaml: anchors: a0: missing key 'z'"),
+        ("anchors", {"a0": {"x": 1, "y": 2, "z": 3, "tolerance": 0}}, "job.yaml: anchors: a0: tolerance"),
+        ("anchors", {"a0": {"x": 1, "y": True, "z": 3}}, "job.yaml: anchors: a0: y: found True, expected a finite n"),
+        (
+            "tolerance",
+            {"anchor": 1},
+            "job.yaml: tolerance: unknown key 'anchor', expected one of estimate, targets, anchors",
+        ),
+        ("offset", "yes", "job.yaml: offset"),
+    ],
+)
+def test_a_key_that_cannot_be_used_is_named(key, value, message, tmp_path):
+    robot, _, table = measured_by("anchors", np.random.default_rng(26))
+    path = write_files(tmp_path, robot, table, {key: value})
+    with pytest.raises(InputError) as error:
+        read_job(path)
+    assert str(error.value).startswith(message)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("instrument", ["anchors offset", "targets stations"])
+def test_the_command_compares_instruments(instrument, fg_calib, tmp_path):
+    robot, _, table = measured_by(instrument, np.random.default_rng(27))
+    ended = fg_calib("compare", write_files(tmp_path, robot, table, KEYS[instrument]), "--json")
+    assert (ended.code, ended.err) == (0, "")
+    document = json.loads(ended.out)
+    assert (document["model"], document["frame"]) == (table.model, table.frame)
+    assert all(e["converged"] for e in document["estimates"])
+
+
+@pytest.mark.parametrize(("column", "word"), [("anchor", "NA"), ("plane", "nan"), ("station", "-"), ("target", "None")])
+def test_a_word_for_nothing_is_no_name(column, word, tmp_path):
+    """R writes NA where there is none, Python nan or None: an unknown of that name would take the row's error up."""
+    robot, _, _ = measured_by("anchors", np.random.default_rng(29))
+    (tmp_path / "t.csv").write_text(f"{HEAD},x,y,z,{column},distance\n0,0,0,0,1,2,3,{word},1\n")
+    model = column if column in ("anchor", "plane") else "position"
+    empty = ", or an empty cell" * (column != "station")
+    with pytest.raises(InputError) as error:
+        read_measurements(tmp_path / "t.csv", robot, model=model)
+    assert str(error.value) == f"t.csv:2: {column}: found {word!r}, expected the name of a {column}{empty}"
+
+
+def test_a_place_of_a_misspelt_name_is_not_left_out(tmp_path):
+    robot, _, table = measured_by("anchors", np.random.default_rng(30))
+    place = {"x": 0, "y": 0, "z": 0}
+    with pytest.raises(InputError) as error:
+        calibrate_job(write_files(tmp_path, robot, table, {"anchors": {"A0": place}}))
+    assert str(error.value) == "anchors: no row is of 'A0', expected one of a0, a1, a2; did you mean a0?"
+
+
+@pytest.mark.slow
+def test_a_place_of_what_no_row_is_of_is_told_of(tmp_path, caplog):
+    """One list of anchors may serve many jobs."""
+    robot, _, table = measured_by("anchors", np.random.default_rng(31))
+    place = {"x": 0, "y": 0, "z": 0}
+    calibrate_job(write_files(tmp_path, robot, table, {"anchors": {"ceiling": place}}))
+    assert "anchors: no row is of 'ceiling'; it is not used" in caplog.messages
+
+
+def test_a_key_of_another_instrument_is_told_of(tmp_path, caplog):
+    robot, _, table = measured_by("planes", np.random.default_rng(33))
+    read_job(write_files(tmp_path, robot, table, {"offset": "estimate", "camera": "camera.yaml"}))
+    assert caplog.messages == [
+        "job.yaml: offset is not used: no table is of model anchor",
+        "job.yaml: camera is not used: no table is of model pixels",
+    ]
+    for given in ({"offset": True}, {"camera": CAMERA}):
+        with pytest.raises(InputError, match=rf"^table: {next(iter(given))}: given with model plane, expected model "):
+            replace(table, **given)
+
+
+def test_contacts_alone_say_nothing_of_an_offset(tmp_path):
+    robot, _, table = measured_by("anchors", np.random.default_rng(32))
+    path = write_files(tmp_path, robot, table, {"offset": "estimate"})
+    write_csv(
+        tmp_path / "table.csv", dict.fromkeys(("q1", "q2", "q3", "q4", "distance"), np.zeros(9)) | {"anchor": ["a"] * 9}
+    )
+    with pytest.raises(InputError) as error:
+        calibrate_job(path)
+    expected = "table.csv: contacts alone: all distances are 0, expected lengths, or no offset to be estimated"
+    assert str(error.value) == expected
+
+
+@pytest.mark.parametrize(
+    ("figures", "message"),
+    [
+        ({"fx": float("nan")}, "camera: fx: found nan, expected a finite number"),
+        ({"fx": None}, "camera: fx: found nan, expected a finite number"),
+        ({"fy": "800"}, "camera: fy: found '800', expected numbers of shape ()"),
+        ({"fy": 0}, "camera: fy: found 0, expected 1 to 1e+06 px"),
+        ({"k1": 1e10}, "camera: k1: found 1e+10, expected -1e+06 to 1e+06"),
+        ({"fx": True}, "camera: fx: found True, expected numbers of shape ()"),
+    ],
+)
+def test_a_camera_of_arrays_is_checked_too(figures, message):
+    with pytest.raises(InputError) as error:
+        Camera(**({"fx": 900, "fy": 900, "cx": 640, "cy": 480} | figures))
+    assert str(error.value) == message
+
+
+@pytest.mark.slow
+def test_observe_knows_them_before_and_after_they_are_measured(fg_calib, tmp_path):
+    robot, _, table = measured_by("anchors", np.random.default_rng(28))
+    write_files(tmp_path, robot, table, {})
+    for more in ((), ("--configurations", tmp_path / "table.csv", "--length", "mm", "--angle", "deg")):
+        ended = fg_calib("observe", tmp_path / "robot.yaml", "--model", "anchor", *more)
+        assert ended.code == 0
+        assert "rank 10 of 16" in ended.out
+        assert "the measurement is blind to the base" in " ".join(ended.out.split())

@@ -1,0 +1,242 @@
+"""Calibration jobs: defaults, units, what they refer to, and one message a mistake."""
+
+import hashlib
+import math
+
+import numpy as np
+import pytest
+
+from fg_calib.errors import InputError
+from fg_calib.io.job import read_job
+from fg_calib.options import MODELS, Options, Pairing
+
+ROBOT = """\
+convention: mdh
+joints:
+  - {a: 0, alpha: 0, d: 0, theta: 0}
+  - {a: 0, alpha: 0, d: 0, theta: 0, type: prismatic}
+"""
+URDF = (
+    '<robot name="one"><link name="a"/><link name="b"/><joint name="j" type="continuous">'
+    '<parent link="a"/><child link="b"/></joint></robot>'
+)
+JOB = """\
+robot: robots/robot.yaml
+measurements: poses.csv
+model: pose
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "robots").mkdir()
+    (tmp_path / "robots" / "robot.yaml").write_text(ROBOT)
+    (tmp_path / "robots" / "arm.urdf").write_text(URDF)
+    (tmp_path / "robots" / "wrapped.yaml").write_text("urdf: arm.urdf\ntool: {z: 1}\n")
+    (tmp_path / "poses.csv").write_text("q1,q2,x,y,z\n0,0,0,0,0\n10,20,1000,0,0\n")
+    (tmp_path / "one.csv").write_text("j\n0\n1\n")
+    (tmp_path / "q.csv").write_text("q1\n0\n1\n")
+    (tmp_path / "pairs.csv").write_text("a,b,distance,angle\n0,1,2000,90\n")
+    return tmp_path
+
+
+def read(folder, text):
+    (folder / "calibration.yaml").write_text(text)
+    return read_job(folder / "calibration.yaml")
+
+
+def sha256(path):
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@pytest.mark.parametrize("units", ["{length: mm, angle: deg}", "{length: um}", "{angle: mrad}", "{}"])
+def test_a_urdf_in_a_job_has_the_jobs_units(folder, units, caplog):
+    """Its tolerances, base and tool, unless it states units of its own; as a file with a line `units` reads."""
+    rest = "tool: {x: 3}, estimate: [tool.yaw], tolerance: {x: 0.5, yaw: 0.01, tool: 2}"
+    (folder / "arm.yaml").write_text(f"urdf: robots/arm.urdf\nunits: {units}\n" + rest.replace(", est", "\nest")
+                                     .replace(", tol", "\ntol"))  # fmt: skip
+    job = "measurements: one.csv\nmodel: pose\n"
+    in_the_job = read(folder, job + f"units: {units}\nrobot: {{urdf: robots/arm.urdf, {rest}}}\n").robot
+    assert ("robot: base and tool are in " in caplog.text) == (units != "{}")
+    assert in_the_job.parameters == read(folder, job + "robot: arm.yaml\n").robot.parameters
+    own = f"{{urdf: robots/arm.urdf, units: {{length: cm}}, {rest}}}"
+    stated = read(folder, job + f"units: {units}\nrobot: {own}\n").robot
+    tolerance = {p.name: p.tolerance for p in stated.parameters}
+    assert (tolerance["j.x"], tolerance["j.yaw"], tolerance["tool.x"]) == (0.005, 0.01, 0.02)
+
+
+def test_dh_rows_in_a_job_are_a_robot_file_of_their_own(folder):
+    """They have always been in m and rad unless they say otherwise."""
+    robot = "{convention: dh, joints: [{a: 1, alpha: 0, d: 0, theta: 0.5}], tolerance: {theta: 0.01}}"
+    job = read(folder, f"robot: {robot}\nmeasurements: q.csv\nmodel: pose\nunits: {{length: mm, angle: deg}}\n")
+    theta = job.robot.parameters[job.robot.index("theta1")]
+    assert (theta.nominal, theta.tolerance) == (0.5, 0.01)
+
+
+def test_a_short_job_has_the_defaults(folder):
+    job = read(folder, JOB)
+    assert job.path == folder / "calibration.yaml"
+    assert (job.robot.name, job.robot.n_joints) == ("robot", 2)
+    assert job.measurements.position[1].tolist() == [1000, 0, 0]
+    assert job.options == Options("pose")
+    assert job.measurements.sigma_position is None
+    assert job.inputs == {
+        name: sha256(folder / name) for name in ("calibration.yaml", "robots/robot.yaml", "poses.csv")
+    }
+
+
+def test_a_full_job_is_converted_to_si(folder):
+    job = read(
+        folder,
+        JOB + "pairs: pairs.csv\npairing: {random: 30, seed: 4}\nframe: unknown\nunits: {length: mm, angle: deg}\n"
+        "noise: {position: 1, orientation: 2, joint: 3, distance: 4, angle: 5}\nprior: false\nloss: none\n",
+    )
+    m = job.measurements
+    assert m.readings[1] == pytest.approx([math.radians(10), 0.02])
+    assert m.sigma_position == pytest.approx(np.full((2, 3), 1e-3))
+    assert m.sigma_joint == pytest.approx([math.radians(3), 3e-3])  # the second joint slides
+    assert (m.pairs.distance[0], m.pairs.angle[0]) == pytest.approx((2.0, math.pi / 2))
+    assert (m.pairs.sigma_distance[0], m.pairs.sigma_angle[0]) == pytest.approx((4e-3, math.radians(5)))
+    assert job.options.pairing == Pairing("random", 30, 4)
+    assert (job.options.frame, job.options.gauge) == ("unknown", "none")
+    assert job.inputs["pairs.csv"] == sha256(folder / "pairs.csv")
+
+
+def test_tables_have_columns_of_their_own_names(folder):
+    """For all tables at the top, or in a table's own entry; figures are in the table's units after their scale."""
+    (folder / "robots" / "robot.yaml").write_text(ROBOT.replace("joints", "units: {angle: deg}\njoints"))
+    (folder / "counts.csv").write_text("C1;C2;X;Y;Z\n180;20;1000,5;0;0\n0;10;0;0;0\n")
+    own = "{q1: {name: C1, scale: 0.5, zero: 160}, q2: C2, x: X, y: Y, z: Z}"
+    units = "units: {length: mm, angle: deg}\n"
+    job = JOB.replace("model: pose", "model: position").replace("poses.csv", "counts.csv") + units
+    data = read(folder, f"{job}columns: {own}\n").measurements
+    assert data.readings[0].tolist() == pytest.approx([np.deg2rad(10.0), 0.02], rel=1e-15)
+    assert data.position[0].tolist() == [1.0005, 0.0, 0.0]
+    entry = f"\n  - {{table: counts.csv, columns: {own}}}"
+    (table,) = read(folder, job.replace(" counts.csv", entry)).measurements
+    assert table.measurements.readings.tolist() == data.readings.tolist()
+
+
+def test_noise_of_orientations_is_converted_too(folder):
+    (folder / "poses.csv").write_text("q1,q2,qx,qy,qz,qw\n0,0,0,0,0,1\n")
+    job = read(folder, JOB + "units: {angle: mrad}\nnoise: {orientation: 2, joint: [1, 0.5]}\n")
+    assert job.measurements.sigma_orientation == pytest.approx(np.full((1, 3), 2e-3))
+    assert job.measurements.sigma_joint == pytest.approx([1e-3, 0.5])
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_every_model_is_accepted(folder, model):
+    assert read(folder, JOB.replace("model: pose", f"model: {model}")).options.model == model
+
+
+@pytest.mark.parametrize("strategy", ["star", "chain", "all"])
+def test_every_strategy_is_accepted(folder, strategy):
+    assert read(folder, JOB + f"pairing: {strategy}\n").options.pairing == Pairing(strategy)
+
+
+@pytest.mark.parametrize(
+    ("robot", "files"),
+    [
+        ("robots/arm.urdf", ["robots/arm.urdf"]),
+        ("robots/wrapped.yaml", ["robots/wrapped.yaml", "robots/arm.urdf"]),
+        ("{urdf: robots/arm.urdf, base_link: a, tip_link: b}", ["robots/arm.urdf"]),
+        ("{convention: dh, joints: [{a: 0, alpha: 0, d: 0, theta: 0, name: j}]}", []),
+    ],
+)
+def test_a_robot_may_be_a_file_or_stand_in_the_job(folder, robot, files):
+    job = read(folder, f"robot: {robot}\nmeasurements: one.csv\nmodel: pose\n")
+    assert [joint.name for joint in job.robot.joints] == ["j"]
+    assert list(job.inputs) == ["calibration.yaml", *files, "one.csv"]
+
+
+KEYS = (
+    "one of robot, measurements, pairs, model, pairing, frame, units, noise, prior, gauge, prefer, pair_errors, "
+    "encoder, loss, max_iterations, accept, folds, truth, targets, anchors, tolerance, offset, camera, columns"
+)
+MISTAKES = [
+    ("", "calibration.yaml: an empty file, expected a mapping, key: value"),
+    ("robot: a\n", "calibration.yaml: missing keys 'measurements', 'model'"),
+    (JOB.replace("model: pose\n", ""), "calibration.yaml: missing key 'model'"),
+    (JOB + "measurments: a\n",
+     f"calibration.yaml: unknown key 'measurments', expected {KEYS}; did you mean measurements?"),
+    (JOB.replace("pose\n", "poses\n"), "calibration.yaml: model: found 'poses', expected one of pose, position, "
+     "orientation, distance, rotation, distance-rotation, anchor, plane, board, pixels; did you mean pose?"),
+    (JOB + "frame: free\n", "calibration.yaml: frame: found 'free', expected one of known, unknown"),
+    (JOB + "prior: 1\n", "calibration.yaml: prior: found 1, expected true or false"),
+    (JOB + "loss: tukey\n",
+     "calibration.yaml: loss: found 'tukey', expected one of none, huber, cauchy, geman-mcclure, gnc"),
+    (JOB + "noise: guess\n", "calibration.yaml: noise: found 'guess', expected a mapping of figures, or estimate"),
+    (JOB + "pair_errors: both\n",
+     "calibration.yaml: pair_errors: found 'both', expected one of shared, independent"),
+    (JOB + "pairing: stars\n",
+     "calibration.yaml: pairing: found 'stars', expected one of star, chain, all, {random: N, seed: S}; "
+     "did you mean star?"),
+    (JOB + "pairing: {random: 0}\n", "calibration.yaml: pairing: random: found 0, expected a number above 0"),
+    (JOB + "pairing: {random: yes}\n", "calibration.yaml: pairing: random: found True, expected a whole number"),
+    (JOB + "pairing: {random: 1.5}\n", "calibration.yaml: pairing: random: found 1.5, expected a whole number"),
+    (JOB + "pairing: {random: 5, sed: 1}\n",
+     "calibration.yaml: pairing: unknown key 'sed', expected one of random, seed; did you mean seed?"),
+    (JOB + "units: {angle: grad}\n", "calibration.yaml: units: angle: found 'grad', expected one of rad, deg, mrad"),
+    (JOB + "noise: {postion: 1}\n", "calibration.yaml: noise: unknown key 'postion', expected one of position, "
+     "orientation, joint, distance, angle, point, pixel, estimate; did you mean position?"),
+    (JOB + "noise: {position: 0}\n", "calibration.yaml: noise: position: found 0, expected a number above 0"),
+    (JOB + "noise: {angle: low}\n", "calibration.yaml: noise: angle: found 'low', expected a finite number"),
+    (JOB + "noise: {joint: -1}\n", "calibration.yaml: noise: joint: found -1, expected a number not below 0"),
+    (JOB + "noise: {joint: [0, x]}\n", "calibration.yaml: noise: joint 2: found 'x', expected a finite number"),
+    (JOB + "noise: {joint: [0, 0, 0]}\n",
+     "calibration.yaml: noise: joint: 3 figures, expected one for all or 2, one a joint"),
+    (JOB + "noise: 1\n", "calibration.yaml: noise: found 1, expected a mapping of figures, or estimate"),
+    (JOB.replace("robots/robot.yaml", "[]"),
+     "calibration.yaml: robot: found [], expected a path, or the mapping of a robot file"),
+    (JOB.replace("robots/robot.yaml", "{convention: dh, joints: [{a: 0}]}"),
+     "calibration.yaml: robot: joint 1: missing key 'theta'"),
+    (JOB.replace("poses.csv", "1"), "calibration.yaml: measurements: found 1, expected a path, or a list of tables"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "message"), MISTAKES, ids=range(len(MISTAKES)))
+def test_a_mistake_is_named_in_one_line(folder, text, message):
+    with pytest.raises(InputError) as caught:
+        read(folder, text)
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(("old", "new"), [("poses.csv", "nowhere.csv"), ("robots/robot.yaml", "robots/nowhere.yaml")])
+def test_a_missing_file_of_a_job_is_named(folder, old, new):
+    with pytest.raises(InputError) as caught:
+        read(folder, JOB.replace(old, new))
+    assert str(caught.value) == f"{folder / new}: no such file"
+
+
+def test_a_missing_job_is_named(tmp_path):
+    with pytest.raises(InputError) as caught:
+        read_job(tmp_path / "calibration.yaml")
+    assert str(caught.value) == f"{tmp_path / 'calibration.yaml'}: no such file"
+
+
+def test_a_simulated_job_knows_the_truth(folder):
+    assert read(folder, JOB).truth is None
+    (folder / "true.yaml").write_text(ROBOT.replace("a: 0, alpha", "a: 0.25, alpha"))
+    job = read(folder, JOB + "truth: true.yaml\n")
+    assert job.truth.nominal[job.truth.index("a1")] == 0.25
+    assert job.robot.nominal[job.robot.index("a1")] == 0.0
+    assert "true.yaml" in job.inputs
+
+
+def test_the_truth_is_a_robot_with_the_same_parameters(folder):
+    (folder / "true.yaml").write_text(ROBOT.replace("mdh", "mdh-hayati"))
+    with pytest.raises(InputError) as error:
+        read(folder, JOB + "truth: true.yaml\n")
+    assert str(error.value) == "true.yaml: another robot, expected the parameters of robot, with their true values"
+
+
+def test_noise_may_be_left_to_the_data(folder):
+    poses = "q1,q2,x,y,z,roll,pitch,yaw\n0,0,0,0,0,0,0,0\n10,20,1000,0,0,0,0,0\n"
+    (folder / "poses.csv").write_text(poses)
+    given = read(folder, JOB + "noise: {position: 0.5, estimate: true}\n")
+    assert given.options.estimate_noise
+    assert (given.measurements.sigma_position[0, 0], given.measurements.sigma_orientation[0, 0]) == (0.5, 1e-3)
+    start = read(folder, JOB + "noise: estimate\n")
+    assert start.options.estimate_noise
+    assert (start.measurements.sigma_position[0, 0], start.measurements.sigma_orientation[0, 0]) == (1e-3, 1e-3)
+    assert not read(folder, JOB + "noise: {position: 0.5}\n").options.estimate_noise

@@ -1,0 +1,334 @@
+"""Robot YAML: what is read, what is written back, and one message a mistake."""
+
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from oracle import dh_joint, frame, tool_pose
+from tolerances import rounding
+
+from fg_calib.errors import InputError
+from fg_calib.io.robot_file import read_robot, write_robot
+from fg_calib.io.units import Units
+from fg_calib.robot.model import CONVENTIONS, Axis, Element, Joint, Robot, RobotBuilder
+
+GOOD = """\
+name: two
+convention: mdh-hayati
+units: {length: mm, angle: deg}
+joints:
+  - {a: 0, alpha: 0, d: 100, theta: 0, beta: 0, limits: [-90, 90]}
+  - {a: 1e1, alpha: -90, d: 0.5, theta: 30, beta: 1, type: prismatic, name: slide, limits: [0, 200]}
+base: {x: 1, yaw: 90}
+tool: {z: 50}
+fixed: [a1, beta2]
+estimate: [tool.z]
+tolerance: {a: 1, alpha: 0.5, d2: 2, tool: 5, base.yaw: 3}
+"""
+
+
+def read(tmp_path, text, name="robot.yaml"):
+    path = tmp_path / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return read_robot(path)
+
+
+def test_a_robot_file_is_converted_to_si(tmp_path):
+    robot = read(tmp_path, GOOD)
+    assert (robot.name, robot.convention, robot.n_joints) == ("two", "mdh-hayati", 2)
+    assert robot.joints[0] == Joint("q1", lower=-math.radians(90), upper=math.radians(90))
+    assert robot.joints[1] == Joint("slide", prismatic=True, lower=0.0, upper=0.2)
+    by_name = {p.name: p for p in robot.parameters}
+    assert by_name["a2"].nominal == pytest.approx(0.01)  # 1e1 is text to PyYAML
+    assert by_name["alpha2"].nominal == pytest.approx(-math.pi / 2)
+    assert by_name["base.yaw"].nominal == pytest.approx(math.pi / 2)
+    assert by_name["a1"].tolerance == pytest.approx(1e-3)
+    assert by_name["alpha1"].tolerance == pytest.approx(math.radians(0.5))
+    assert by_name["d1"].tolerance is None
+    assert by_name["d2"].tolerance == pytest.approx(2e-3)
+    assert by_name["tool.x"].tolerance == pytest.approx(5e-3)
+    assert by_name["tool.roll"].tolerance is None
+    assert by_name["base.yaw"].tolerance == pytest.approx(math.radians(3))
+    estimated = {name for name, p in by_name.items() if p.estimated}
+    assert estimated == {"alpha1", "d1", "theta1", "beta1", "a2", "alpha2", "d2", "theta2", "tool.z"}
+
+
+def test_the_chain_is_base_then_joints_then_tool(tmp_path):
+    robot = read(tmp_path, GOOD)
+    q = np.array([0.3, 0.04])
+    first = {"a": 0.0, "alpha": 0.0, "d": 0.1, "theta": 0.0, "beta": 0.0}
+    second = {"a": 0.01, "alpha": -math.pi / 2, "d": 5e-4, "theta": math.pi / 6, "beta": math.radians(1)}
+    expected = (
+        frame(1e-3, 0, 0, 0, 0, math.pi / 2)
+        @ dh_joint("mdh-hayati", first, q[0], False)
+        @ dh_joint("mdh-hayati", second, q[1], True)
+        @ frame(0, 0, 0.05, 0, 0, 0)
+    )
+    assert tool_pose(robot, q) == pytest.approx(expected, abs=rounding(1.0))  # rounding of a few products
+
+
+def test_beta_may_be_left_out_and_units_default_to_si(tmp_path):
+    robot = read(tmp_path, "convention: dh-hayati\njoints: [{a: 1, alpha: 2, d: 3, theta: 4}]\n", "arm.yaml")
+    assert robot.name == "arm"
+    assert robot.joints == (Joint("q1"),)
+    values = {p.name: p.nominal for p in robot.parameters if p.owner == 1}
+    assert values == {"theta1": 4.0, "d1": 3.0, "a1": 1.0, "alpha1": 2.0, "beta1": 0.0}
+
+
+numbers = st.floats(-12.0, 12.0)  # angles of more than two turns are taken for degrees
+positive = st.floats(1e-9, 1e3)
+words = st.from_regex(r"[a-z][a-z0-9_.\- ]{0,8}", fullmatch=True) | st.sampled_from(["on", "1e-3", "null", "ünï", "7"])
+
+
+@st.composite
+def robots(draw):
+    """Robots of every DH convention with all that a file can hold."""
+    convention = draw(st.sampled_from(list(CONVENTIONS)))
+    builder = RobotBuilder(draw(words), convention)
+    frames = st.dictionaries(st.sampled_from(["x", "y", "z", "roll", "pitch", "yaw"]), numbers)
+    builder.add_frame("base", draw(frames), 0, False)
+    names = draw(st.lists(words, min_size=1, max_size=4, unique=True))
+    for name in names:
+        lower = draw(numbers | st.just(-math.inf))
+        limits = (lower, draw(numbers.map(lambda v, low=lower: max(low, -1e3) + abs(v) + 1e-3) | st.just(math.inf)))
+        joint = Joint(name, draw(st.booleans()), *(limits if draw(st.booleans()) else (-math.inf, math.inf)))
+        builder.add_convention_joint(joint, {kind: draw(numbers) for kind in CONVENTIONS[convention]})
+    builder.add_frame("tool", draw(frames), len(names) + 1, False)
+    bare = builder.build()
+    own = [p.name for p in bare.parameters if 1 <= p.owner <= len(names)]
+    frame_names = [p.name for p in bare.parameters if p.name not in own]
+    some_names = st.sampled_from([*own, *frame_names, *CONVENTIONS[convention], "base", "tool"])
+    return builder.build(
+        fixed=draw(st.lists(st.sampled_from(own), unique=True)),
+        estimate=draw(st.lists(st.sampled_from(frame_names), unique=True)),
+        tolerance=draw(st.dictionaries(some_names, positive)),
+    )
+
+
+@pytest.mark.slow
+@given(robot=robots())
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+def test_a_robot_written_in_si_reads_back_the_same(tmp_path, robot):
+    write_robot(tmp_path / "robot.yaml", robot)
+    assert read_robot(tmp_path / "robot.yaml") == robot
+
+
+@pytest.mark.slow
+@given(
+    robot=robots(), length=st.sampled_from(["m", "cm", "mm", "um", "in"]), angle=st.sampled_from(["rad", "deg", "mrad"])
+)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+def test_a_robot_written_in_other_units_reads_back_to_rounding(tmp_path, robot, length, angle):
+    write_robot(tmp_path / "robot.yaml", robot, units=Units(length=length, angle=angle))
+    back = read_robot(tmp_path / "robot.yaml")
+    # one division and one multiplication: an ulp of each
+    assert back.nominal == pytest.approx(robot.nominal, rel=4.5e-16, abs=1e-300)
+    assert back.limits == pytest.approx(robot.limits, rel=4.5e-16, abs=1e-300)
+    for p, p_back in zip(robot.parameters, back.parameters, strict=True):
+        assert (p.name, p.estimated, p.tolerance is None) == (p_back.name, p_back.estimated, p_back.tolerance is None)
+        assert p_back.tolerance == (p.tolerance and pytest.approx(p.tolerance, rel=4.5e-16))
+
+
+@pytest.mark.parametrize("base", [True, False])
+@pytest.mark.parametrize("tool", [True, False])
+def test_a_robot_built_without_base_or_tool_reads_back_the_same(tmp_path, base, tool):
+    """It has those of its file, all zero: what is saved with one could not be loaded else."""
+    built = []
+    for with_base, with_tool in ((base, tool), (True, True)):
+        builder = RobotBuilder("arm", "mdh")
+        if with_base:
+            builder.add_frame("base", {}, 0, False)
+        for i in range(3):
+            builder.add_convention_joint(Joint(f"q{i + 1}"), {"a": 0.1 * i, "alpha": 0.2, "d": 0.3, "theta": 0.4})
+        if with_tool:
+            builder.add_frame("tool", {}, 4, False)
+        built.append(builder.build(tolerance={"a": 1e-3}))
+    write_robot(tmp_path / "robot.yaml", built[0])
+    assert built[0] == built[1] == replace(read_robot(tmp_path / "robot.yaml"), name="arm")
+
+
+def test_a_robot_that_no_file_can_hold_is_refused(tmp_path):
+    """Elements of one's own would be lost without a word, and a result saved with them could not be loaded."""
+    robot = Robot.from_dh([[0.1, 0.2, 0.3, 0.4]] * 2)
+    more = replace(robot, elements=(*robot.elements, Element(Axis.TX, 0.1)))
+    another = RobotBuilder("arm", "dh")
+    another.add_frame("base", {}, 0, False)
+    another.add_convention_joint(Joint("q1"), {"a": 0.1, "alpha": 0.2, "d": 0.3, "theta": 0.4})
+    another.add_frame("flange", {"x": 0.1}, 2, False)
+    for one in (more, another.build()):
+        with pytest.raises(InputError, match="the robot has elements or parameters of its own, expected base, joints"):
+            write_robot(tmp_path / "robot.yaml", one)
+    with pytest.raises(InputError, match="the robot is of the convention 'urdf', expected base, joints"):
+        write_robot(tmp_path / "robot.yaml", replace(robot, convention="urdf"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_written_robot_is_readable_for_people(tmp_path):
+    robot = read(tmp_path, GOOD)
+    write_robot(tmp_path / "out.yaml", robot, units=Units(length="mm", angle="deg"))
+    assert (
+        (tmp_path / "out.yaml").read_text()
+        == """\
+name: two
+convention: mdh-hayati
+units: {length: mm, angle: deg}
+joints:
+- {a: 0.0, alpha: 0.0, d: 100.0, theta: 0.0, beta: 0.0, limits: [-90.0, 90.0]}
+- {name: slide, a: 10.0, alpha: -90.0, d: 0.5, theta: 30.0, beta: 1.0, type: prismatic, limits: [0.0, 200.0]}
+base: {x: 1.0, yaw: 90.0}
+tool: {z: 50.0}
+fixed: [a1, beta2]
+estimate: [tool.z]
+tolerance: {base.yaw: 3.0, a: 1.0, alpha: 0.5, d2: 2.0, tool: 5.0}
+"""
+    )
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    robot = read(tmp_path, GOOD)
+    target = tmp_path / "out" / "robot.yaml"
+    with pytest.raises(InputError, match=re.escape(f"{target}: there is no folder {target.parent}")):
+        write_robot(target, robot)
+    target.parent.mkdir()
+    target.write_text("old")
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.replace", fail)
+    with pytest.raises(InputError, match="cannot be written: No space left on device"):
+        write_robot(target, robot)
+    assert [p.name for p in target.parent.iterdir()] == ["robot.yaml"]
+    assert target.read_text() == "old"
+
+
+def test_a_dh_robot_has_no_urdf_name(tmp_path):
+    with pytest.raises(ValueError, match="a URDF robot, and no other, is written with urdf_name"):
+        write_robot(tmp_path / "out.yaml", read(tmp_path, GOOD), urdf_name="arm.urdf")
+
+
+ROW = "  - {a: 0, alpha: 0, d: 0, theta: 0}\n"
+HEAD = "convention: dh\njoints:\n"
+KEYS = "one of name, units, base, tool, fixed, estimate, tolerance, convention, joints"
+ROW_KEYS = "one of type, name, a, alpha, d, theta, beta, limits"
+PARAMETERS = (
+    "one of base.x, base.y, base.z, base.yaw, base.pitch, base.roll, theta1, d1, a1, alpha1, tool.x, tool.y, ..."
+)
+
+MISTAKES = {
+    "": "robot.yaml: an empty file, expected a mapping, key: value",
+    "# nothing\n": "robot.yaml: an empty file, expected a mapping, key: value",
+    "- 1\n": "robot.yaml: found [1], expected a mapping, key: value",
+    "a: [1\n": (
+        "robot.yaml:2: expected ',' or ']', but got '<stream end>'; while parsing a flow sequence from line 1 on"
+    ),
+    "a: 1\n\tb: 2\n": "robot.yaml:2: found character '\\t' that cannot start any token",
+    "a: 1\nb: \x01\n": "robot.yaml:2: character 0x01, expected printable text",
+    "a: 2024-13-45\n": "robot.yaml:1: '2024-13-45' is no YAML of type timestamp",
+    b"a: 1\nb: \xe9\n": "robot.yaml:2: byte 0xe9, expected UTF-8 text; is it Latin-1 or Windows text? save it as UTF-8",
+    "name: a\nname: b\n": "robot.yaml:2: key 'name' stands here twice",
+    "base:\n  x: 1\n  x: 2\n": "robot.yaml:3: key 'x' stands here twice",
+    "1: 2\n": "robot.yaml:1: key 1, expected a word",
+    "[1]: 2\n": "robot.yaml:1: key that is no word, expected a word",
+    "name: a\n": "robot.yaml: missing keys 'convention', 'joints'",
+    "convention: dh\n": "robot.yaml: missing key 'joints'",
+    f"convension: dh\njoints:\n{ROW}": (
+        f"robot.yaml: unknown key 'convension', expected {KEYS}; did you mean convention?"
+    ),
+    HEAD + ROW + "zzz: 1\n": f"robot.yaml: unknown key 'zzz', expected {KEYS}",
+    f"convention: dhh\njoints:\n{ROW}": (
+        "robot.yaml: convention: found 'dhh', expected one of dh, mdh, mdh-hayati, dh-hayati; did you mean dh?"
+    ),
+    "convention: dh\njoints: []\n": "robot.yaml: joints: found [], expected at least 1 in the list",
+    "convention: dh\njoints: 3\n": "robot.yaml: joints: found 3, expected a list",
+    HEAD + "  - 3\n": "robot.yaml: joint 1: found 3, expected a mapping",
+    HEAD + ROW + "  - {a: 0, d: 0, theta: 0}\n": "robot.yaml: joint 2: missing key 'alpha'",
+    HEAD + ROW + "  - {a: 0, alfa: 0, d: 0, theta: 0}\n": (
+        f"robot.yaml: joint 2: unknown key 'alfa', expected {ROW_KEYS}; did you mean alpha?"
+    ),
+    HEAD + "  - {a: 0, alpha: abc, d: 0, theta: 0}\n": (
+        "robot.yaml: joint 1: alpha: found 'abc', expected a finite number"
+    ),
+    HEAD + "  - {a: .nan, alpha: .inf, d: yes, theta: 0}\n": (
+        "robot.yaml: joint 1: a: found nan, expected a finite number (and 2 more)"
+    ),
+    HEAD + "  - {a: 0, alpha: 0, d: yes, theta: 0}\n": ("robot.yaml: joint 1: d: found True, expected a finite number"),
+    HEAD + "  - {a: 0, alpha: 0, d: 1e999, theta: 0}\n": (
+        "robot.yaml: joint 1: d: found '1e999', expected a finite number"
+    ),
+    HEAD + "  - {a: 0, alpha: 0, d: 0, theta: 0, beta: 0.1}\n": (
+        "robot.yaml: joint 1: beta: found 0.1, expected none: the convention dh has no beta; dh-hayati has"
+    ),
+    HEAD + "  - {a: 0, alpha: 0, d: 0, theta: 0, type: continuous}\n": (
+        "robot.yaml: joint 1: type: found 'continuous', expected one of revolute, prismatic"
+    ),
+    HEAD + "  - {a: 0, alpha: 0, d: 0, theta: 0, limits: [1, -1]}\n": (
+        "robot.yaml: joint 1: limits: found [1.0, -1.0], expected lower below upper"
+    ),
+    HEAD + "  - {a: 0, alpha: 0, d: 0, theta: 0, limits: [1, .nan]}\n": (
+        "robot.yaml: joint 1: limits: found [1.0, nan], expected lower below upper"
+    ),
+    HEAD + "  - {a: 0, alpha: 0, d: 0, theta: 0, limits: [1]}\n": (
+        "robot.yaml: joint 1: limits: found [1], expected at least 2 in the list"
+    ),
+    HEAD + "  - {a: 0, alpha: 0, d: 0, theta: 0, limits: [0, x]}\n": (
+        "robot.yaml: joint 1: limit 2: found 'x', expected a finite number"
+    ),
+    HEAD + ROW + "  - {a: 0, alpha: 0, d: 0, theta: 0, name: q1}\n": (
+        "robot.yaml: joint 2: name: found 'q1', the name of joint 1, expected another"
+    ),
+    HEAD + ROW + "units: {length: inch}\n": (
+        "robot.yaml: units: length: found 'inch', expected one of m, cm, mm, um, in; did you mean in?"
+    ),
+    HEAD + ROW + "units: {lenght: m}\n": (
+        "robot.yaml: units: unknown key 'lenght', expected one of length, angle; did you mean length?"
+    ),
+    HEAD + ROW + "name: 7\n": "robot.yaml: name: found 7, expected text",
+    HEAD + ROW + "base:\n": "robot.yaml: base: found nothing, expected a mapping",
+    HEAD + ROW + "tool: {w: 1}\n": ("robot.yaml: tool: unknown key 'w', expected one of x, y, z, roll, pitch, yaw"),
+    HEAD + ROW + "fixed: a1\n": "robot.yaml: fixed: found 'a1', expected a list",
+    HEAD + ROW + "fixed: [beta1]\n": f"robot.yaml: fixed: unknown parameter 'beta1', expected {PARAMETERS}",
+    HEAD + ROW + "estimate: [tool.w]\n": f"robot.yaml: estimate: unknown parameter 'tool.w', expected {PARAMETERS}",
+    HEAD + ROW + "tolerance: {b: 1}\n": (
+        "robot.yaml: tolerance: unknown parameter or kind 'b', expected one of a, alpha, base, d, theta, tool"
+    ),
+    HEAD + ROW + "tolerance: {a: -1}\n": "robot.yaml: tolerance: a: found -1, expected a number above 0",
+    HEAD + ROW + "tolerance: {a: 0}\n": "robot.yaml: tolerance: a: found 0, expected a number above 0",
+}
+
+
+@pytest.mark.parametrize("text", MISTAKES)
+def test_a_mistake_is_named_in_one_line(tmp_path, text):
+    with pytest.raises(InputError) as caught:
+        read(tmp_path, text)
+    assert str(caught.value) == MISTAKES[text]
+
+
+def test_a_missing_file_is_named(tmp_path):
+    path = tmp_path / "robot.yaml"
+    with pytest.raises(InputError) as caught:
+        read_robot(path)
+    assert str(caught.value) == f"{path}: no such file"
+
+
+def test_a_folder_is_no_file(tmp_path):
+    with pytest.raises(InputError) as caught:
+        read_robot(tmp_path)
+    assert str(caught.value) == f"{tmp_path}: is a folder, expected a file"
+
+
+def test_links_are_for_urdfs(tmp_path):
+    (tmp_path / "robot.yaml").write_text(GOOD)
+    with pytest.raises(InputError) as caught:
+        read_robot(tmp_path / "robot.yaml", tip_link="flange")
+    assert str(caught.value) == (
+        "robot.yaml: a robot without links, expected a URDF; base_link and tip_link name links of one"
+    )
+
+
+def test_a_byte_order_mark_is_tolerated(tmp_path):
+    assert read(tmp_path, b"\xef\xbb\xbf" + GOOD.encode()) == read(tmp_path, GOOD)

@@ -1,0 +1,458 @@
+"""Tables of configurations and pairs: what is read from CSV and Parquet, and one message a mistake."""
+
+import logging
+import math
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from oracle import frame
+from tolerances import rounding
+
+from fg_calib.errors import InputError
+from fg_calib.io.columns import Column
+from fg_calib.io.csv_writer import write_csv
+from fg_calib.io.tables import read_measurements
+from fg_calib.io.units import Units
+from fg_calib.measurements.dataset import Noise
+from fg_calib.robot.model import Joint, RobotBuilder
+
+LIMIT = 2.09
+
+
+def arm(*joints):
+    builder = RobotBuilder("arm", "dh")
+    for joint in joints:
+        builder.add_convention_joint(joint, dict.fromkeys(("theta", "d", "a", "alpha"), 0.0))
+    return builder.build()
+
+
+ARM = arm(Joint("q1", lower=-LIMIT, upper=LIMIT), Joint("q2"), Joint("lift", prismatic=True, lower=0.0, upper=0.5))
+
+POSES = """\
+q1,q2,q3,id,x,y,z,qx,qy,qz,qw,split,note
+0.1,0.2,0.3,p1,1,2,3,0,0,0,1,train,first
+1e-3,-0.2,0.1,p2,1.5,2,3,1,0,0,0,,
+ 0.5 ,0,0,p3,-1,2,3,0,0.6,0,0.8,test,
+"""
+PAIRS = """\
+a,b,distance,angle,sigma_distance,split
+p1,p2,0.5,,0.01,
+p2,p1,,3.1,,
+p1,p3,0.1,0.2,,train
+p2,p1,0.1,,,test
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Write a table: text as CSV, or columns as Parquet."""
+
+    def write(content, name="poses.csv"):
+        path = tmp_path / name
+        if isinstance(content, dict):
+            pl.DataFrame(content).write_parquet(path)
+        else:
+            path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    return write
+
+
+def test_poses_and_configurations_are_read_in_order(write):
+    m = read_measurements(write(POSES), ARM)
+    assert m.readings.tolist() == [[0.1, 0.2, 0.3], [1e-3, -0.2, 0.1], [0.5, 0.0, 0.0]]
+    assert m.ids.tolist() == ["p1", "p2", "p3"]
+    assert m.test.tolist() == [False, False, True]
+    assert m.position.tolist() == [[1, 2, 3], [1.5, 2, 3], [-1, 2, 3]]
+    assert m.rotation[0] == pytest.approx(np.eye(3))
+    assert m.rotation[1] == pytest.approx(np.diag([1, -1, -1]))
+    assert m.rotation[2] == pytest.approx(frame(0, 0, 0, 0, 2 * math.atan2(0.6, 0.8), 0)[:3, :3])
+    assert (m.sigma_position, m.sigma_orientation, m.pairs) == (None, None, None)
+    assert m.sigma_joint.tolist() == [0.0, 0.0, 0.0]
+    assert m.source == "poses.csv"
+
+
+def test_units_are_converted_to_si(write):
+    path = write(
+        "q1,q2,q3,x,y,z,roll,pitch,yaw,sigma_position,sigma_rx,sigma_ry,sigma_rz\n90,-90,250,1,2,3,10,20,30,5,1,2,3\n"
+    )
+    m = read_measurements(path, ARM, units=Units(length="mm", angle="deg"))
+    assert m.readings[0] == pytest.approx([math.pi / 2, -math.pi / 2, 0.25])
+    assert m.position[0] == pytest.approx([1e-3, 2e-3, 3e-3])
+    assert m.rotation[0] == pytest.approx(frame(0, 0, 0, *np.radians([10, 20, 30]))[:3, :3])
+    assert m.sigma_position[0] == pytest.approx([5e-3, 5e-3, 5e-3])
+    assert m.sigma_orientation[0] == pytest.approx(np.radians([1, 2, 3]))
+
+
+def test_noise_fills_what_the_table_does_not_state(write):
+    noise = Noise(position=0.1, orientation=0.2, joint=(1e-3, 2e-3, 3e-3))
+    m = read_measurements(write(POSES), ARM, noise=noise)
+    assert m.sigma_position == pytest.approx(np.full((3, 3), 0.1))
+    assert m.sigma_orientation == pytest.approx(np.full((3, 3), 0.2))
+    assert m.sigma_joint.tolist() == [1e-3, 2e-3, 3e-3]
+    table = "q1,q2,q3,x,y,z,sigma_x,sigma_y,sigma_z\n0,0,0,0,0,0,1,,3\n"
+    m = read_measurements(write(table), ARM, noise=Noise(position=0.1, joint=0.5), units=Units(length="mm"))
+    assert m.sigma_position.tolist() == [[0.001, 0.1, 0.003]]
+    assert m.sigma_joint.tolist() == [0.5, 0.5, 0.5]
+    assert (m.rotation, m.sigma_orientation) == (None, None)
+
+
+def test_a_quaternion_is_normalised(write):
+    path = write("q1,q2,q3,qx,qy,qz,qw\n0,0,0,0,0,0.6005,0.8005\n")
+    assert np.linalg.det(read_measurements(path, ARM).rotation[0]) == pytest.approx(1, abs=rounding(1.0))
+
+
+def test_columns_may_bear_the_joints_names_in_any_order(write):
+    robot = arm(Joint("base_yaw"), Joint("q1"))
+    m = read_measurements(write("q1,base_yaw\n1,2\n"), robot)
+    assert m.readings.tolist() == [[2, 1]]
+    m = read_measurements(write("q2,q1\n1,2\n"), robot)
+    assert m.readings.tolist() == [[2, 1]]
+    with pytest.raises(InputError) as caught:
+        read_measurements(write("x,y\n1,2\n"), arm(Joint("x"), Joint("y")))  # x and y are the tool's position
+    assert str(caught.value) == (
+        "poses.csv: no joint columns, expected q1 to q2 for the robot's 2 joints; the columns are x, y"
+    )
+
+
+def test_blank_lines_and_quotes_and_a_byte_order_mark_are_tolerated(write):
+    path = write(b'\xef\xbb\xbf"q1" , q2,q3,note\r\n\r\n0,0,0,"two\r\nlines"\r\n\r\n0,0,abc,\r\n\r\n')
+    with pytest.raises(InputError) as caught:
+        read_measurements(path, ARM)
+    assert str(caught.value) == "poses.csv:6: q3: found 'abc', expected a finite number"
+    path = write(b"\n\xef\xbb\xbfq1,q2,q3\n0,0,0\n\n,,\n1,1,0.1\n\n".replace(b"\n\xef\xbb\xbf", b"\xef\xbb\xbf"))
+    assert read_measurements(path, ARM).readings.tolist() == [[0, 0, 0], [1, 1, 0.1]]
+
+
+@pytest.mark.parametrize("ends", ["\n\n\n", "\r\n\n", "\n\r\n", "\n\n\r", "\r\r\n", "\r\r\r"], ids=repr)
+def test_no_row_is_lost_to_a_mixture_of_line_ends(write, ends):
+    text = "".join(line + end for line, end in zip(("q1,q2,q3,note", "0.1,0,0,", "0.2,0,0,"), ends, strict=True))
+    assert read_measurements(write(text), ARM).readings[:, 0].tolist() == [0.1, 0.2]
+    assert read_measurements(write(text.replace("\r", "\r\r\n")), ARM).readings[:, 0].tolist() == [0.1, 0.2]
+
+
+SPREADSHEET = """\
+id;q1;q2;q3;x;y;z;roll;pitch;yaw
+p1;0,1;-0,25;1e-1;1,5;2;3;0;0;0
+"a;b";,5;1;0;1.5;2,;3;0;0;0
+"""
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_cells_may_have_semicolons_or_tabs_between_and_numbers_decimal_commas(write, separator):
+    """As spreadsheets write them where the comma is the decimal point."""
+    text = SPREADSHEET.replace('"a;b"', "a,b").replace(";", separator)
+    found = read_measurements(write(text), ARM)
+    assert found.readings.tolist() == [[0.1, -0.25, 0.1], [0.5, 1.0, 0.0]]
+    assert found.position.tolist() == [[1.5, 2.0, 3.0], [1.5, 2.0, 3.0]]
+    assert found.ids.tolist() == ["p1", "a,b"]
+    assert read_measurements(write(SPREADSHEET), ARM).ids.tolist() == ["p1", "a;b"]
+
+
+def test_pairs_may_have_semicolons_too(write):
+    found = read_measurements(write(POSES), ARM, pairs=write("a;b;distance\np1;p2;0,5\n", "pairs.csv"))
+    assert found.pairs.distance.tolist() == [0.5]
+
+
+OWN = {"q1": Column("J1 [counts]", scale=0.001, zero=32768), "q2": Column(" A2 "), "q3": Column("lift axis")}
+
+
+def test_columns_have_names_of_their_own_and_figures_their_scale(write):
+    """Counts of an encoder, whose zero and size the user knows; a column that a name would have meant is not used."""
+    text = "J1 [counts],A2,lift axis,x,y,z,X\n33268,0.2,0.1,1,2,3,9\n32768,0.3,0.2,4,5,6,8\n"
+    found = read_measurements(write(text), ARM, columns=OWN | {"x": Column("X", scale=-2.0)})
+    exact = rounding(np.array([[0.5, 0.2, 0.1], [0.0, 0.3, 0.2]]))
+    np.testing.assert_allclose(found.readings, [[0.5, 0.2, 0.1], [0.0, 0.3, 0.2]], rtol=0, atol=exact)
+    assert found.position.tolist() == [[-18.0, 2.0, 3.0], [-16.0, 5.0, 6.0]]
+    table = {"J1 [counts]": [33268, 32768], "A2": [0.2, 0.3], "lift axis": [0.1, 0.2]}
+    assert (
+        read_measurements(write(table, "poses.parquet"), ARM, columns=OWN).readings.tolist() == found.readings.tolist()
+    )
+    assert read_measurements(table, ARM, columns=OWN).readings.tolist() == found.readings.tolist()
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"q1": "J1"}, "columns: q1: found 'J1', expected a Column, such as Column('J1')"),
+        ({"q1": Column("J2")}, "poses.csv: columns: q1: unknown column 'J2', expected one of J1, x"),
+        ({"Q1": Column("J1")}, "poses.csv: columns: unknown column 'Q1', expected one of {known}; did you mean q1?"),
+        (
+            {"q1": Column("J1"), "q2": Column("J1")},
+            "poses.csv: columns: the table's: two columns called 'J1', expected different names",
+        ),
+    ],
+)
+def test_a_mistake_in_names_of_columns_is_named(write, columns, message):
+    with pytest.raises(InputError) as caught:
+        read_measurements(write("J1,x\n0,0\n"), ARM, columns=columns)
+    start, known, end = message.partition("{known}")
+    assert str(caught.value).startswith(start)
+    assert str(caught.value).endswith(end)
+    assert known or str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (("",), "columns: name: found '', expected the name of a column"),
+        ((3,), "columns: name: found 3, expected the name of a column"),
+        (("a", 0), "columns: a: scale: found 0, expected a finite number other than 0"),
+        (("a", math.inf), "columns: a: scale: found inf, expected a finite number other than 0"),
+        (("a", 1.0, math.nan), "columns: a: zero: found nan, expected a finite number"),
+        (("a", 1.0, "x"), "columns: a: zero: found 'x', expected a number"),
+    ],
+)
+def test_a_column_without_a_meaning_is_refused(given, message):
+    with pytest.raises(InputError) as caught:
+        Column(*given)
+    assert str(caught.value) == message
+
+
+def test_parquet_and_csv_read_the_same(write):
+    csv = read_measurements(write(POSES), ARM, pairs=write(PAIRS, "pairs.csv"))
+    columns = pl.read_csv(write(POSES).read_bytes().replace(b" 0.5 ", b"0.5")).to_dict()
+    pairs = pl.read_csv(write(PAIRS, "pairs.csv")).to_dict()
+    parquet = read_measurements(write(columns, "poses.parquet"), ARM, pairs=write(pairs, "pairs.pq"))
+    for name in ("readings", "ids", "test", "position", "rotation"):
+        assert np.array_equal(getattr(csv, name), getattr(parquet, name)), name
+    for name in ("a", "b", "distance", "angle", "sigma_distance", "sigma_angle", "test"):
+        assert np.array_equal(getattr(csv.pairs, name), getattr(parquet.pairs, name), equal_nan=name[:4] != "test"), (
+            name
+        )
+
+
+@pytest.mark.slow
+@given(
+    rows=st.lists(st.tuples(*[st.floats(-1e15, 1e15)] * 3), min_size=1, max_size=5),
+    units=st.sampled_from([Units(), Units(length="mm", angle="deg")]),
+)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+def test_a_written_table_reads_back_exactly(tmp_path, rows, units):
+    values = np.array(rows)
+    robot = arm(Joint("q1"), Joint("q2"), Joint("lift", prismatic=True))
+    write_csv(tmp_path / "out.csv", {"q1": values[:, 0], "q2": values[:, 1], "q3": values[:, 2]})
+    m = read_measurements(tmp_path / "out.csv", robot, units=units)
+    assert np.array_equal(m.readings, values * [units.factor(j.unit) for j in robot.joints])
+
+
+def test_columns_of_all_types_are_written(tmp_path):
+    write_csv(tmp_path / "out.csv", {"id": np.array(["a", "b"]), "n": [1, 2], "v": [0.1, np.nan], "t": [True, False]})
+    assert (tmp_path / "out.csv").read_text() == "id,n,v,t\na,1,0.1,true\nb,2,NaN,false\n"
+    with pytest.raises(InputError) as caught:
+        write_csv(tmp_path / "nowhere" / "out.csv", {"n": [1]})
+    assert str(caught.value) == f"{tmp_path / 'nowhere' / 'out.csv'}: there is no folder {tmp_path / 'nowhere'}"
+
+
+def test_pairs_name_configurations_by_id(write):
+    noise = Noise(distance=0.02, angle=0.03)
+    pairs = read_measurements(write(POSES), ARM, pairs=write(PAIRS, "pairs.csv"), noise=noise).pairs
+    nan = np.nan
+    assert pairs.a.tolist() == [0, 1, 0, 1]
+    assert pairs.b.tolist() == [1, 0, 2, 0]
+    assert np.array_equal(pairs.distance, [0.5, nan, 0.1, 0.1], equal_nan=True)
+    assert np.array_equal(pairs.angle, [nan, 3.1, 0.2, nan], equal_nan=True)
+    assert pairs.sigma_distance.tolist() == [0.01, 0.02, 0.02, 0.02]
+    assert pairs.sigma_angle.tolist() == [0.03] * 4
+    assert pairs.test.tolist() == [False, False, True, True]  # p3 is a test row, the last says so itself
+    assert pairs.source == "pairs.csv"
+
+
+def test_pairs_name_configurations_by_row_where_there_are_no_ids(write):
+    path = write("q1,q2,q3,split\n0,0,0,\n0.1,0,0,test\n0.2,0,0,\n")
+    pairs = write("a,b,angle,sigma_angle\n2,0,180,1\n1,2,90,\n", "pairs.csv")
+    m = read_measurements(path, ARM, pairs=pairs, units=Units(angle="deg", length="mm"))
+    assert m.ids.tolist() == ["0", "1", "2"]
+    assert (m.pairs.a.tolist(), m.pairs.b.tolist()) == ([2, 1], [0, 2])
+    assert m.pairs.angle == pytest.approx([math.pi, math.pi / 2])
+    assert m.pairs.sigma_angle == pytest.approx([math.radians(1), np.nan], nan_ok=True)
+    assert np.isnan(m.pairs.distance).all()
+    assert m.pairs.test.tolist() == [False, True]
+    rounded = write("a,b,angle\n0,2,3.14160\n", "pairs.csv")
+    assert read_measurements(path, ARM, pairs=rounded).pairs.angle.tolist() == [math.pi]
+
+
+def test_row_numbers_may_be_whole_floats_and_ids_with_a_hash_are_names(write):
+    pairs = write("a,b,distance\n0.0,1.0,0.5\n", "pairs.csv")
+    found = read_measurements(write("id,q1,q2,q3\n#1,0,0,0\n#2,1,0,0\n"), ARM)
+    assert found.ids.tolist() == ["#1", "#2"]
+    found = read_measurements(write("q1,q2,q3\n0,0,0\n1,0,0\n"), ARM, pairs=pairs)
+    assert (found.pairs.a.tolist(), found.pairs.b.tolist()) == ([0], [1])
+
+
+def test_integer_ids_match_between_csv_and_parquet(write):
+    poses = write({"id": [10, 20], "q1": [0, 1], "q2": [0, 0], "q3": [0.0, 0.1]}, "poses.parquet")
+    m = read_measurements(poses, ARM, pairs=write("a,b,distance\n20,10,0.5\n", "pairs.csv"))
+    assert m.readings.tolist() == [[0, 0, 0], [1, 0, 0.1]]
+    assert (m.pairs.a.tolist(), m.pairs.b.tolist()) == ([1], [0])
+
+
+def changed(old, new, table=POSES):
+    assert table.count(old) == 1
+    return table.replace(old, new)
+
+
+COLUMNS = "id, x, y, z, qx, qy, qz, qw, split, note"
+JOINTS = "expected q1 to q3 for the robot's 3 joints, or their names q1, q2, lift; the columns are"
+WIDEN = "; widen the joint's limits if the reading is right"
+
+MISTAKES = [
+    ("", "poses.csv:1: an empty file, expected a header and rows"),
+    ("q1,q2,q3\n", "poses.csv: no rows, expected at least one"),
+    ("q1,q2,q3\n\n\n", "poses.csv: no rows, expected at least one"),
+    ("q1,q2,q2\n0,0,0\n", "poses.csv:1: two columns called 'q2', expected different names"),
+    (changed("q3,id", "id"), f"poses.csv: 2 joint columns (q1, q2), {JOINTS} q1, q2, {COLUMNS}"),
+    (changed("q3,id", "q3,q4"),
+     f"poses.csv: 4 joint columns (q1, q2, q3, q4), {JOINTS} q1, q2, q3, q4, {COLUMNS[4:]}"),
+    ("q1,lift\n0,0\n", f"poses.csv: 2 joint columns (q1, lift), {JOINTS} q1, lift"),
+    (changed(",z,", ",w,"), "poses.csv: no column z, expected x y z together"),
+    (changed(",qw,", ",w,"), "poses.csv: no column qw, expected qx qy qz qw together"),
+    ("q1,q2,q3,roll,yaw\n0,0,0,0,0\n", "poses.csv: no column pitch, expected roll pitch yaw together"),
+    ("q1,q2,q3,roll,pitch,yaw,qx,qy,qz,qw\n0,0,0,0,0,0,0,0,0,1\n",
+     "poses.csv: both qx qy qz qw and roll pitch yaw, expected one of the two"),
+    ("q1,q2,q3,x,y,z,sigma_position,sigma_y\n0,0,0,0,0,0,1,1\n",
+     "poses.csv: both sigma_position and sigma_y, expected one of the two"),
+    ("q1,q2,q3,x,y,z,sigma_x,sigma_y\n0,0,0,0,0,0,1,1\n",
+     "poses.csv: no column sigma_z, expected sigma_x sigma_y sigma_z together"),
+    (changed("0.2,0.3", "abc,0.3"), "poses.csv:2: q2: found 'abc', expected a finite number"),
+    (changed("-0.2,0.1", ",0.1"), "poses.csv:3: q2: found an empty cell, expected a finite number"),
+    (changed("-0.2,0.1", "  ,0.1"), "poses.csv:3: q2: found an empty cell, expected a finite number"),
+    (changed("1.5,2,3", "NaN,2,3"), "poses.csv:3: x: found 'NaN', expected a finite number"),
+    (changed("-1,2,3", "-1,-inf,3"), "poses.csv:4: y: found '-inf', expected a finite number"),
+    (changed("0,0.6,0,0.8", "0,0.6,0,0.802"), "poses.csv:4: quaternion of norm 1.0016, expected 1 within 0.001"),
+    (changed("1,0,0,0", "0,0,0,0"), "poses.csv:3: quaternion of norm 0, expected 1 within 0.001"),
+    (changed(",test", ",Test"), "poses.csv:4: split: found 'Test', expected train or test"),
+    (changed("p3", "p1"), "poses.csv:4: id: found 'p1', expected different ids; the same as poses.csv:2"),
+    (changed("p2", ""), "poses.csv:3: id: found an empty cell, expected an id"),
+    (changed("p2,", ""), "poses.csv:3: 12 cells, expected 13 as in the header"),
+    (changed("first", "first,2"), "poses.csv:2: 14 cells, expected 13 as in the header"),
+    ('q1,q2,q3\n"0,0,0\n', "poses.csv:2: 1 cell, expected 3 as in the header; "
+     "a quote joins it with lines below: is one missing?"),
+    (
+        b"q1,q2,q3\n0,0,\xe9\n",
+        "poses.csv:2: byte 0xe9, expected UTF-8 text; is it Latin-1 or Windows text? save it as UTF-8",
+    ),
+    (changed("1e-3", "2.092"), f"poses.csv:3: q1 = 2.092 rad is outside [-2.09, 2.09]{WIDEN}"),
+    (changed("1e-3", "4.71"), "poses.csv:3: q1 = 4.71 rad is outside [-2.09, 2.09]; is q1 in deg?"),
+    (changed("1e-3", "200"), f"poses.csv:3: q1 = 200 rad is outside [-2.09, 2.09]{WIDEN}"),
+    (changed("0.2,0.3", "0.2,300"), "poses.csv:2: q3 = 300 m is outside [0, 0.5]; is the table in mm?"),
+    (changed("0.2,0.3", "0.2,-0.01"), f"poses.csv:2: q3 = -0.01 m is outside [0, 0.5]{WIDEN}"),
+    ("q1,q2,q3,x,y,z,sigma_position\n0,0,0,0,0,0,1\n0,0,0,0,0,0,-1\n",
+     "poses.csv:3: sigma_position: found '-1', expected a number above 0"),
+    ("q1,q2,q3,x,y,z,sigma_x,sigma_y,sigma_z\n0,0,0,0,0,0,1,0,1\n",
+     "poses.csv:2: sigma_y: found '0', expected a number above 0"),
+    ("q1,q2,q3,x,y,z,sigma_position\n0,0,0,0,0,0,inf\n",
+     "poses.csv:2: sigma_position: found 'inf', expected a finite number"),
+    ("q1,q2,q3,x,y,z,sigma_position\n0,0,0,0,0,0,\n",
+     "poses.csv:2: sigma_position: found an empty cell, expected a finite number"),
+]  # fmt: skip
+
+
+@pytest.mark.sampled(22)
+@pytest.mark.parametrize(("table", "message"), MISTAKES, ids=range(len(MISTAKES)))
+def test_a_mistake_is_named_in_one_line(write, table, message):
+    with pytest.raises(InputError) as caught:
+        read_measurements(write(table), ARM)
+    assert str(caught.value) == message
+
+
+PARQUET_MISTAKES = [
+    (b"nothing", "poses.parquet: not a Parquet file: "),
+    ({"q1": [0.0, 3.0], "q2": [0.0, 0.0], "q3": [0.0, 0.0]},
+     f"poses.parquet: row 1: q1 = 3 rad is outside [-2.09, 2.09]{WIDEN}"),
+    ({"q1": [0.0, None], "q2": [0.0, 0.0], "q3": [0.0, 0.0]},
+     "poses.parquet: row 1: q1: found an empty cell, expected a finite number"),
+    ({"q1": [0.0, 0.0], "q2": [math.nan, 0.0], "q3": [0.0, 0.0]},
+     "poses.parquet: row 0: q2: found nan, expected a finite number"),
+    ({"q1": [0.0, 0.0], "q2": ["1", "x"], "q3": [0.0, 0.0]},
+     "poses.parquet: row 1: q2: found 'x', expected a finite number"),
+    ({"q1": [0.0], "q2": [True], "q3": [0.0]}, "poses.parquet: q2: type Boolean, expected numbers"),
+    ({"q1": [], "q2": [], "q3": []}, "poses.parquet: no rows, expected at least one"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("table", "message"), PARQUET_MISTAKES, ids=range(len(PARQUET_MISTAKES)))
+def test_a_mistake_in_parquet_is_named_by_its_row(write, table, message):
+    with pytest.raises(InputError) as caught:
+        read_measurements(write(table, "poses.parquet"), ARM)
+    assert str(caught.value) == message or (table == b"nothing" and str(caught.value).startswith(message))
+
+
+def test_the_hint_asks_about_degrees_only_where_the_table_is_in_radians(write):
+    with pytest.raises(InputError) as caught:
+        read_measurements(write("q1,q2,q3\n150,0,0\n"), ARM, units=Units(angle="deg"))
+    assert str(caught.value) == f"poses.csv:2: q1 = 150 deg is outside [-119.748, 119.748]{WIDEN}"
+
+
+def test_a_joint_without_limits_that_seems_to_be_in_degrees_is_warned_of(write, caplog):
+    with caplog.at_level(logging.WARNING):
+        read_measurements(write("q1,q2,q3\n0,13,0\n0,12,0\n"), ARM)  # half of the rows are not more than half
+        assert caplog.messages == []
+        read_measurements(write("q1,q2,q3\n0,-13,0\n0,90,0\n0,12,0\n"), ARM)
+    assert caplog.messages == ["poses.csv: most of q2 are more than two turns; is the table in deg?"]
+
+
+PAIR_MISTAKES = [
+    (changed("a,b", "a,c", PAIRS), "pairs.csv: no column b, expected a and b, the two configurations of a pair"),
+    ("a,b\np1,p2\n", "pairs.csv: neither distance nor angle, expected at least one of the columns"),
+    ("a,b,distance\n", "pairs.csv: no rows, expected at least one"),
+    (changed("p1,p3", "p1,p99", PAIRS), "pairs.csv:4: b = 'p99' is not an id of poses.csv"),
+    (changed("p1,p3", ",p3", PAIRS), "pairs.csv:4: a: found an empty cell, expected a configuration"),
+    (changed("p1,p3", "p3,p3", PAIRS), "pairs.csv:4: a and b are both 'p3', expected two different configurations"),
+    (changed("0.5,,", "-0.5,,", PAIRS), "pairs.csv:2: distance: found '-0.5', expected a number not below 0"),
+    (changed("0.5,,", "long,,", PAIRS), "pairs.csv:2: distance: found 'long', expected a finite number"),
+    (changed("3.1", "3.2", PAIRS),
+     "pairs.csv:3: angle: found '3.2', expected 0 to 3.14159 rad; is the table in deg?"),
+    (changed("3.1", "-0.1", PAIRS), "pairs.csv:3: angle: found '-0.1', expected 0 to 3.14159 rad"),
+    (changed("0.01", "-0.01", PAIRS), "pairs.csv:2: sigma_distance: found '-0.01', expected a number above 0"),
+    (changed("train", "fit", PAIRS), "pairs.csv:4: split: found 'fit', expected train or test"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("table", "message"), PAIR_MISTAKES, ids=range(len(PAIR_MISTAKES)))
+def test_a_mistake_in_the_pairs_is_named_in_one_line(write, table, message):
+    with pytest.raises(InputError) as caught:
+        read_measurements(write(POSES), ARM, pairs=write(table, "pairs.csv"))
+    assert str(caught.value) == message
+
+
+def test_a_row_number_beyond_the_table_is_named(write):
+    poses = write("q1,q2,q3\n0,0,0\n0,0,0\n")
+    with pytest.raises(InputError) as caught:
+        read_measurements(poses, ARM, pairs=write("a,b,distance\n0,2,1\n", "pairs.csv"))
+    assert str(caught.value) == "pairs.csv:2: b = '2' is not a row of poses.csv, expected a number from 0 to 1"
+
+
+def test_a_missing_or_unknown_file_is_named(write, tmp_path):
+    with pytest.raises(InputError) as caught:
+        read_measurements(tmp_path / "poses.csv", ARM)
+    assert str(caught.value) == f"{tmp_path / 'poses.csv'}: no such file"
+    with pytest.raises(InputError) as caught:
+        read_measurements(write("", "poses.xlsx"), ARM)
+    assert str(caught.value) == "poses.xlsx: ending '.xlsx', expected one of .csv, .parquet, .pq"
+
+
+@pytest.mark.parametrize(
+    ("joint", "message"),
+    [
+        ((0.1, 0.2), "noise: joint: 2 figures, expected one for all or 3, one a joint"),
+        (-0.1, "noise: joint: found -0.1, expected a finite number not below 0"),
+        (math.inf, "noise: joint: found inf, expected a finite number not below 0"),
+    ],
+)
+def test_noise_of_the_joints_must_fit(write, joint, message):
+    with pytest.raises(InputError) as caught:
+        read_measurements(write(POSES), ARM, noise=Noise(joint=joint))
+    assert str(caught.value) == message
+
+
+def test_pairs_cannot_name_configurations_that_have_one_id():
+    readings = pl.DataFrame({"id": ["a", "b", "a"], "target": ["t", "t", "u"], "x": 1.0, "y": 1.0, "z": 1.0})
+    readings = readings.with_columns(q1=pl.lit(0.1), q2=pl.lit(0.2), q3=pl.lit(0.3))
+    pairs = pl.DataFrame({"a": ["a"], "b": ["b"], "distance": [0.1]})
+    with pytest.raises(InputError) as caught:
+        read_measurements(readings, ARM, pairs=pairs, noise=Noise(distance=1e-3, position=1e-3))
+    assert str(caught.value) == "frame: row 2: id = 'a' of a second row, expected different ids where pairs name them"

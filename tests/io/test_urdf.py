@@ -1,0 +1,556 @@
+"""URDF: chains against yourdfpy's own forward kinematics, origins written back, and one message a mistake."""
+
+import math
+import socket
+
+import numpy as np
+import pytest
+import yourdfpy
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from oracle import tool_pose
+from tolerances import rounding
+
+from fg_calib.errors import InputError
+from fg_calib.io.robot_file import read_robot, write_robot
+from fg_calib.io.urdf import read_urdf, urdf_text, write_urdf
+from fg_calib.robot.model import Joint
+
+TREE = """\
+<?xml version="1.0"?>
+<!-- a torso with two arms -->
+<robot name="torso">
+  <link name="world"/>
+  <link name="left_1"/>
+  <link name="left_2"><visual><geometry><mesh filename="package://nowhere/a.stl"/></geometry></visual></link>
+  <link name="left_tip"/>
+  <link name="right_1"/>
+  <link name="right_2"/>
+  <link name="right_tip"/>
+  <joint name="l1" type="revolute"><origin xyz="0.1 -0.2 0.3" rpy="0.4 -0.5 0.6"/>
+    <parent link="world"/><child link="left_1"/><axis xyz="1 2 -3"/>
+    <limit lower="-1.5" upper="2" effort="1" velocity="1"/></joint>
+  <joint name="l2" type="fixed"><origin xyz="0.3 0 0.1" rpy="-1 0.3 2"/>
+    <parent link="left_1"/><child link="left_2"/></joint>
+  <joint name="l3" type="prismatic"><!-- no axis: x --><origin xyz="0 0.5 0" rpy="0 1.5708 0"/>
+    <parent link="left_2"/><child link="left_tip"/>
+    <limit lower="0" upper="0.7" effort="1" velocity="1"/></joint>
+  <joint name="r1" type="continuous">
+    <parent link="world"/><child link="right_1"/><axis xyz="0 0 -1"/></joint>
+  <joint name="r2" type="revolute"><origin xyz="0 0.05 0.7"/>
+    <parent link="right_1"/><child link="right_2"/><axis xyz="-2 0.5 0.1"/>
+    <limit effort="1" velocity="1"/></joint>
+  <joint name="r3" type="fixed"><origin rpy="0.1 0.2 0.3" xyz="1 2 3"/>
+    <parent link="right_2"/><child link="right_tip"/></joint>
+</robot>
+"""
+LINKS = ["world", "left_1", "left_2", "left_tip", "right_1", "right_2", "right_tip"]
+
+
+@pytest.fixture
+def tree(tmp_path):
+    path = tmp_path / "torso.urdf"
+    path.write_text(TREE)
+    return path
+
+
+def yourdfpy_pose(path, base, tip, q):
+    """base_T_tip by yourdfpy, which turns about axes as they stand in the file: they are normalised here."""
+    model = yourdfpy.URDF.load(str(path), load_meshes=False)
+    for joint in model.robot.joints:
+        joint.axis = joint.axis / np.linalg.norm(joint.axis)
+    model.update_cfg(q)
+    return model.get_transform(tip, base)
+
+
+@pytest.mark.parametrize(
+    ("base", "tip"),
+    [
+        ("world", "left_tip"),
+        ("world", "right_tip"),
+        ("left_1", "left_tip"),
+        ("left_tip", "world"),
+        ("right_tip", "right_1"),
+        ("left_tip", "right_tip"),
+        ("right_2", "left_1"),
+    ],
+)
+def test_any_two_links_span_the_chain_that_yourdfpy_computes(tree, base, tip):
+    robot = read_urdf(tree, base_link=base, tip_link=tip)
+    rng = np.random.default_rng(1)
+    for _ in range(3):
+        q = {name: rng.uniform(-1.4, 1.4) for name in ("l1", "l3", "r1", "r2")}
+        expected = yourdfpy_pose(tree, base, tip, q)
+        assert tool_pose(robot, [q[j.name] for j in robot.joints]) == pytest.approx(expected, abs=rounding(1.0))
+
+
+def test_the_tip_defaults_to_the_only_leaf_below_the_base(tree):
+    robot = read_urdf(tree, base_link="right_1")
+    assert (robot.urdf.base_link, robot.urdf.tip_link) == ("right_1", "right_tip")
+
+
+def test_joints_stand_in_chain_order_with_their_own_parameters_and_limits(tree):
+    robot = read_urdf(tree, base_link="left_tip", tip_link="right_tip")
+    assert robot.joints == (
+        Joint("l3", prismatic=True, lower=0.0, upper=0.7),
+        Joint("l1", lower=-1.5, upper=2.0),
+        Joint("r1"),
+        Joint("r2"),
+    )
+    assert [p.name for p in robot.parameters if p.owner == 1] == [
+        f"l3.{k}" for k in ("x", "y", "z", "yaw", "pitch", "roll")
+    ]
+    assert robot.parameters[robot.index("l3.pitch")].nominal == 1.5708  # as written, beyond a quarter turn
+    assert robot.parameters[robot.index("l1.yaw")].nominal == 0.6
+    assert {p.owner for p in robot.parameters if p.estimated} == {1, 2, 3, 4}
+
+
+@pytest.mark.slow
+@given(
+    rpy=st.tuples(*[st.floats(-3.2, 3.2)] * 3),
+    xyz=st.tuples(*[st.floats(-2, 2)] * 3),
+    axis=st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda a: np.linalg.norm(a) > 1e-3),
+    kind=st.sampled_from(["continuous", "prismatic"]),
+    q=st.floats(-3, 3).filter(lambda q: q == 0.0 or abs(q) > 1e-6),  # yourdfpy rounds smaller ones to 0
+)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+def test_every_joint_and_its_reverse_equal_yourdfpys(tmp_path, rpy, xyz, axis, kind, q):
+    path = tmp_path / "one.urdf"
+    xyz_text, rpy_text, axis_text = (" ".join(map(repr, v)) for v in (xyz, rpy, axis))
+    path.write_text(
+        f'<robot name="one"><link name="a"/><link name="b"/><joint name="j" type="{kind}">'
+        f'<origin xyz="{xyz_text}" rpy="{rpy_text}"/><parent link="a"/><child link="b"/><axis xyz="{axis_text}"/>'
+        '<limit lower="-9" upper="9" effort="1" velocity="1"/></joint></robot>'
+    )
+    expected = yourdfpy_pose(path, "a", "b", {"j": q})
+    assert tool_pose(read_urdf(path), [q]) == pytest.approx(expected, abs=rounding(1.0))
+    reverse = read_urdf(path, base_link="b", tip_link="a")
+    assert tool_pose(reverse, [q]) @ expected == pytest.approx(np.eye(4), abs=rounding(1.0))
+
+
+def test_changed_parameters_of_a_reversed_chain_are_those_of_the_file(tree, tmp_path):
+    robot = read_urdf(tree, base_link="left_tip", tip_link="right_tip")
+    rng = np.random.default_rng(2)
+    own = np.array([1 <= p.owner <= 4 for p in robot.parameters])
+    changed = robot.with_values(robot.nominal + own * rng.uniform(-0.1, 0.1, len(own)))
+    out = tmp_path / "calibrated.urdf"
+    write_urdf(out, changed)
+    q = {"l3": 0.3, "l1": -0.7, "r1": 2.0, "r2": 0.4}
+    expected = yourdfpy_pose(out, "left_tip", "right_tip", q)
+    assert tool_pose(changed, list(q.values())) == pytest.approx(expected, abs=rounding(1.0))
+    back = read_urdf(out, base_link="left_tip", tip_link="right_tip")
+    assert back.parameters == changed.parameters  # exactly
+    assert np.abs(tool_pose(robot, list(q.values())) - expected).max() > 1e-3
+
+
+def test_only_origins_of_moving_joints_are_rewritten(tree, tmp_path):
+    robot = read_urdf(tree, tip_link="right_tip")
+    values = robot.nominal
+    values[robot.index("r1.z")] = 0.1
+    values[robot.index("r2.yaw")] = 1 / 3
+    write_urdf(tmp_path / "out.urdf", robot.with_values(values))
+    expected = (
+        TREE.replace('<joint name="r1" type="continuous">\n    ', '<joint name="r1" type="continuous">\n    '
+                 '<origin xyz="0.0 0.0 0.1" rpy="0.0 0.0 0.0"/>\n    ')
+        .replace('<origin xyz="0 0.05 0.7"/>', '<origin xyz="0 0.05 0.7" rpy="0.0 0.0 0.3333333333333333"/>')
+    )  # fmt: skip
+    assert (tmp_path / "out.urdf").read_text() == expected
+
+
+ODD = """\
+<?xml version='1.0' encoding="utf-8" ?>
+<!DOCTYPE robot [ <!-- nothing --> ]>
+<?editor <joint name="l1"><origin xyz="9 9 9"/></joint> ?>
+<robot   name = 'odd' >\t<!-- <joint name="l1"><origin xyz="8 8 8"/></joint> -->
+<link name="a"/><link name='b&amp;c'
+/><link name="d"/><gazebo><joint name="l1"><origin xyz="7 7 7"/></joint></gazebo>
+<joint
+    note='xyz="1 2 3" > origin' type='revolute'
+    name="l1" ><![CDATA[<origin xyz="6 6 6"/>]]>
+  <dynamics damping="0"><origin xyz="5 5 5"/></dynamics>
+  <origin  rpy='0.1  0.20
+     3e-1'
+     xyz = "1.0 +2.0 3.00"  ></origin  >
+  <parent link="a"/><child link="b&amp;c"/><axis xyz="0 0 1"/><calibration falling="0.5"/>
+</joint  >
+<joint name="&lt;l2&gt;" type="continuous"><parent link="b&amp;c"/><child link="d"/><origin /></joint>
+</robot >
+<!-- after -->
+"""
+
+
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "iso-8859-1", "utf-16"])
+def test_a_urdf_is_written_byte_for_byte_but_for_the_figures_of_origins(tmp_path, encoding, newline):
+    text = ODD.replace("utf-8", encoding.removesuffix("-sig")).replace("nothing", "kein Körper")
+    (tmp_path / "in.urdf").write_bytes(text.replace("\n", newline).encode(encoding))
+    robot = read_urdf(tmp_path / "in.urdf")
+    write_urdf(tmp_path / "out.urdf", robot)
+    assert (tmp_path / "out.urdf").read_bytes() == (tmp_path / "in.urdf").read_bytes()
+    values = robot.nominal
+    values[robot.index("l1.y")] = -0.25
+    values[robot.index("<l2>.roll")] = 1e-7
+    write_urdf(tmp_path / "out.urdf", robot.with_values(values))
+    expected = text.replace('"1.0 +2.0 3.00"', '"1.0 -0.25 3.0"').replace(
+        "<origin />", '<origin rpy="1e-07 0.0 0.0" />'
+    )
+    assert (tmp_path / "out.urdf").read_bytes() == expected.replace("\n", newline).encode(encoding)
+    assert read_urdf(tmp_path / "out.urdf").parameters == robot.with_values(values).parameters
+
+
+def test_zeros_are_added_to_what_a_joint_is_calibrated_by():
+    text = ODD.replace('falling="0.5"', 'rising="0.5" falling="0"')
+    assert urdf_text(ODD, {}, {"l1": 0.25, "<l2>": -0.5}) == ODD.replace(
+        '<calibration falling="0.5"/>', '<calibration falling="0.5" rising="0.25"/>'
+    ).replace('type="continuous">', 'type="continuous"><calibration rising="-0.5"/>')
+    assert urdf_text(text, {}, {"l1": 0.25}) == text.replace('rising="0.5"', 'rising="0.75"')
+
+
+def test_an_encoding_that_python_does_not_know_is_a_line(tmp_path):
+    (tmp_path / "arm.urdf").write_text(TREE.replace('"1.0"?>', '"1.0" encoding="ARMSCII-8"?>'))
+    with pytest.raises(InputError, match=r"^arm\.urdf: text in ARMSCII-8, expected text in UTF-8; save it"):
+        read_urdf(tmp_path / "arm.urdf", tip_link="tool")
+
+
+def test_other_encodings_survive(tmp_path):
+    text = TREE.replace('"1.0"?>', '"1.0" encoding="ISO-8859-1"?>').replace("a torso", "ein Körper")
+    (tmp_path / "in.urdf").write_bytes(text.encode("latin-1"))
+    robot = read_urdf(tmp_path / "in.urdf", tip_link="left_tip")
+    write_urdf(tmp_path / "out.urdf", robot)
+    assert (tmp_path / "out.urdf").read_bytes() == text.encode("latin-1")
+    assert read_urdf(tmp_path / "out.urdf", tip_link="left_tip").parameters == robot.parameters
+
+
+def test_a_yaml_gives_a_urdf_links_a_tool_and_tolerances(tree, tmp_path):
+    folder = tmp_path / "robots"
+    folder.mkdir()
+    path = folder / "robot.yaml"
+    path.write_text(
+        "urdf: ../torso.urdf\nbase_link: world\ntip_link: right_tip\nunits: {length: mm, angle: deg}\n"
+        "tool: {z: 100, yaw: 90}\nfixed: [r1.x]\nestimate: [tool.z]\ntolerance: {x: 2, roll: 1, tool: 5, r2.yaw: 3}\n"
+    )
+    robot = read_robot(path)
+    assert (robot.name, robot.urdf.tip_link) == ("torso", "right_tip")
+    by_name = {p.name: p for p in robot.parameters}
+    assert by_name["tool.z"].nominal == pytest.approx(0.1)
+    assert by_name["tool.yaw"].nominal == pytest.approx(math.pi / 2)
+    assert not by_name["r1.x"].estimated
+    assert by_name["tool.z"].estimated
+    assert by_name["r2.x"].tolerance == pytest.approx(2e-3)
+    assert by_name["r2.roll"].tolerance == pytest.approx(math.radians(1))
+    assert by_name["r2.yaw"].tolerance == pytest.approx(math.radians(3))
+    assert read_robot(path, tip_link="right_2").urdf.tip_link == "right_2"
+
+    write_urdf(tmp_path / "calibrated.urdf", robot)
+    write_robot(tmp_path / "calibrated.yaml", robot, urdf_name="calibrated.urdf")
+    back = read_robot(tmp_path / "calibrated.yaml")
+    assert (back.name, back.joints, back.parameters, back.elements) == (
+        robot.name,
+        robot.joints,
+        robot.parameters,
+        robot.elements,
+    )
+
+
+def test_a_urdf_robot_is_written_with_its_urdf(tree, tmp_path):
+    with pytest.raises(ValueError, match="a URDF robot, and no other, is written with urdf_name"):
+        write_robot(tmp_path / "out.yaml", read_urdf(tree, tip_link="left_tip"))
+
+
+def test_mistakes_in_the_yaml_of_a_urdf_are_named_there(tree, tmp_path):
+    path = tmp_path / "robot.yaml"
+    path.write_text("urdf: torso.urdf\ntip_link: right_tip\nfixed: [r9.x]\n")
+    with pytest.raises(InputError) as caught:
+        read_robot(path)
+    assert str(caught.value).startswith("robot.yaml: fixed: unknown parameter 'r9.x', expected one of base.x, base.y")
+    path.write_text("urdf: torso.urdf\nconvention: dh\n")
+    with pytest.raises(InputError) as caught:
+        read_robot(path)
+    assert str(caught.value) == (
+        "robot.yaml: unknown key 'convention', expected one of name, units, base, tool, fixed, estimate, tolerance, "
+        "urdf, base_link, tip_link"
+    )
+
+
+@pytest.mark.parametrize(
+    "junk",
+    [
+        '<axis xyz="1 2 -3"/><mimic joint="r1"/>',
+        '<mimic joint="nowhere" multiplier="two"/>',
+        "<axis/><mimic/><dynamics/><safety_controller/>",
+        '<axis xyz="${axis}"/><limit lower="low"/>',
+    ],
+)
+def test_what_is_off_the_chain_does_not_matter(tmp_path, junk):
+    path = tmp_path / "arm.urdf"
+    text = TREE.replace('name="l1" type="revolute"', 'name="l1" type="floating"')
+    path.write_text(text.replace('<axis xyz="1 2 -3"/>', junk))
+    assert read_urdf(path, tip_link="right_tip").n_joints == 2
+
+
+JUNK = [
+    '<link name="r0"><inertial><mass value="heavy"/></inertial><visual><geometry><mesh/></geometry></visual></link>',
+    '<transmission name="t"><joint name="r1"><mechanicalReduction>100</mechanicalReduction></joint></transmission>',
+    '<gazebo reference="r1"><link name="inside"/><joint name="r1" type="screw"/></gazebo>',
+    '<x:macro xmlns:x="http://www.ros.org/wiki/xacro"><link name="r1"/><joint name="r1"/></x:macro>',
+    '<x:joint xmlns:x="http://www.ros.org/wiki/xacro" name="r1"/>',
+    '<link name="right_1"/><!-- again --><?editor <joint name="r1"/>?><![CDATA[<joint name="r1"/>]]>',
+]
+"""What yourdfpy reads, refuses or skips, and what says nothing of the chain."""
+
+
+@pytest.mark.parametrize("junk", JUNK, ids=range(len(JUNK)))
+def test_only_links_and_joints_of_the_robot_itself_are_read(tree, tmp_path, junk):
+    path = tmp_path / "junk.urdf"
+    path.write_text(TREE.replace('  <joint name="r1"', f'{junk}\n  <joint name="r1"'))
+    robot, plain = (read_urdf(p, base_link="left_1", tip_link="right_tip") for p in (path, tree))
+    assert (robot.joints, robot.parameters, robot.elements) == (plain.joints, plain.parameters, plain.elements)
+
+
+def test_a_robot_without_a_name_is_called_as_its_file(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(TREE.replace('<robot name="torso">', "<robot>"))
+    assert read_urdf(path, tip_link="left_tip").name == "arm"
+
+
+def random_urdf(rng):
+    """A tree of 3 to 12 links in any order, with all that a joint may leave out or state in an odd way."""
+
+    def numbers(scale):
+        return rng.choice(["  ", " \n\t", " "]).join(map(repr, rng.uniform(-scale, scale, 3).tolist()))
+
+    def element(tag, **attributes):
+        given = [f"{name}='{value}'" for name, value in attributes.items() if rng.random() < 0.7]
+        return f"<{tag} {' '.join(given)}/>" if rng.random() < 0.8 else ""
+
+    def joint(child):
+        low, high = np.sort(rng.uniform(-3, 3, 2))
+        mimic = f"<mimic joint='j1' multiplier='{low}'/>" if rng.random() < 0.1 and child > 1 else "<!-- itself -->"
+        parts = [
+            element("origin", xyz=numbers(1), rpy=numbers(4)),
+            element("axis", xyz=numbers(2)),
+            element("limit", lower=min(low, 0.0), upper=max(high, 0.0), effort=1),
+            f"<parent link='L{rng.integers(child)}'/>",
+            f"<child link='L{child}'/>",
+            mimic,
+        ]
+        kind = rng.choice(["revolute", "continuous", "prismatic", "fixed"])
+        return f"<joint name='j{child}' type='{kind}'>{''.join(rng.permutation(parts))}</joint>"
+
+    n = int(rng.integers(3, 13))
+    parts = [*(f"<link name='L{i}'/>" for i in range(n)), *(joint(i) for i in range(1, n))]
+    return n, f"<robot name='r'>{''.join(rng.permutation(parts))}</robot>"
+
+
+def yourdfpy_chain(model, base, tip):
+    """Names of the joints from `base` to `tip` by what yourdfpy says are their parents and children."""
+    above = {joint.child: joint for joint in model.robot.joints}
+
+    def up(link):
+        return [above[link].name, *up(above[link].parent)] if link in above else []
+
+    there, back = up(base), up(tip)
+    return [*(j for j in there if j not in back), *reversed([j for j in back if j not in there])]
+
+
+@pytest.mark.sampled(30)
+@pytest.mark.parametrize("seed", range(60))
+def test_random_trees_are_the_chains_limits_and_poses_of_yourdfpy(tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    path = tmp_path / "random.urdf"
+    n, text = random_urdf(rng)
+    path.write_text(text)
+    base, tip = (f"L{i}" for i in rng.choice(n, 2, replace=False))
+    model = yourdfpy.URDF.load(str(path), load_meshes=False)
+    chain = [model.joint_map[name] for name in yourdfpy_chain(model, base, tip)]
+    moving = [joint for joint in chain if joint.type != "fixed"]
+    if not moving or any(joint.mimic for joint in moving):
+        with pytest.raises(InputError, match="mimics joint 'j1'" if moving else "no moving joint"):
+            read_urdf(path, base_link=base, tip_link=tip)
+        return
+    robot = read_urdf(path, base_link=base, tip_link=tip)
+    limits = [
+        (j.limit.lower or 0.0, j.limit.upper or 0.0) if j.limit and j.type != "continuous" else (0.0, 0.0)
+        for j in moving
+    ]
+    assert robot.joints == tuple(
+        Joint(joint.name, joint.type == "prismatic", *(limit if any(limit) else ()))
+        for joint, limit in zip(moving, limits, strict=True)
+    )
+    q = rng.uniform(-2, 2, len(moving))
+    expected = yourdfpy_pose(path, base, tip, dict(zip([j.name for j in moving], q, strict=True)))
+    assert tool_pose(robot, q) == pytest.approx(expected, abs=rounding(float(n)))
+
+
+def changed(old, new):
+    assert old in TREE
+    return TREE.replace(old, new)
+
+
+ALL = "one of " + ", ".join(LINKS)
+MISTAKES = [
+    ("<robot name='a'>\n<link>\n</robot>", {},
+     "torso.urdf:3: not XML: Opening and ending tag mismatch: link line 2 and robot, line 3, column 9"),
+    ("", {}, "torso.urdf:1: not XML: Document is empty, line 1, column 1"),
+    ("<html/>", {}, "torso.urdf: root element <html>, expected <robot>"),
+    (TREE, {}, "torso.urdf: 2 leaf links (left_tip, right_tip), expected one; name one as tip_link: {urdf: torso.urdf, "
+     "tip_link: ...} in a file, --tip-link of observe"),
+    (TREE, {"base_link": "nowhere"}, f"torso.urdf: no link 'nowhere', expected {ALL}"),
+    (TREE, {"tip_link": "nowhere"}, f"torso.urdf: no link 'nowhere', expected {ALL}"),
+    (TREE, {"tip_link": "world"},
+     "torso.urdf: no moving joint between links 'world' and 'world', expected at least one"),
+    (TREE, {"base_link": "right_2", "tip_link": "right_tip"},
+     "torso.urdf: no moving joint between links 'right_2' and 'right_tip', expected at least one"),
+    (changed("</robot>", '<link name="island"/></robot>'), {"tip_link": "left_tip"},
+     "torso.urdf: 2 root links (world, island), expected one; name one as base_link: {urdf: torso.urdf, "
+     "base_link: ...} in a file, --base-link of observe"),
+    (changed("</robot>", '<link name="island"/></robot>'), {"base_link": "island", "tip_link": "left_tip"},
+     "torso.urdf: links 'island' and 'left_tip' are not connected, expected two links of one tree"),
+    (changed('<child link="right_1"/>', '<child link="left_1"/>'), {},
+     "torso.urdf: link 'left_1' is the child of joints 'l1' and 'r1', expected one"),
+    (changed('<parent link="world"/><child link="left_1"/>', '<parent link="left_tip"/><child link="left_1"/>'),
+     {"base_link": "left_1", "tip_link": "left_tip"},
+     "torso.urdf: links in a circle: left_1 below left_tip below left_2 below left_1, expected a tree of links"),
+    (changed('name="l1" type="revolute"', 'name="l1" type="floating"'), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': type floating, expected revolute, continuous, prismatic or fixed on the chain"),
+    (changed('name="l1" type="revolute"', 'name="l1" type="planar"'), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': type planar, expected revolute, continuous, prismatic or fixed on the chain"),
+    (changed('<axis xyz="1 2 -3"/>', '<mimic joint="r1"/>'), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': mimics joint 'r1', expected joints on the chain that move by themselves"),
+    (changed("1 2 -3", "0 0 0"), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': axis: found '0 0 0', expected a direction of three numbers"),
+    (changed("1 2 -3", "1 2"), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': axis: found '1 2', expected a direction of three numbers"),
+    (changed('upper="2"', 'upper="-2"'), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': limit: lower -1.5, upper -2, expected lower below upper"),
+    (changed("0.1 -0.2 0.3", "0.1 -0.2"), {},
+     "torso.urdf:11: joint 'l1': origin xyz: found '0.1 -0.2', expected three finite numbers"),
+    (changed("0.4 -0.5 0.6", "0.4 nan 0.6"), {},
+     "torso.urdf:11: joint 'l1': origin rpy: found '0.4 nan 0.6', expected three finite numbers"),
+    (changed("0.4 -0.5 0.6", "0.4 zero 0.6"), {},
+     "torso.urdf:11: joint 'l1': origin rpy: found '0.4 zero 0.6', expected three finite numbers"),
+    (changed('<joint name="l1"', "<joint"), {}, "torso.urdf:11: a joint without a name"),
+    (changed('name="l2"', 'name="l1"'), {},
+     "torso.urdf:14: joint 'l1': a second joint of this name, expected different names"),
+    (changed('<parent link="left_2"/>', ""), {},
+     "torso.urdf:16: joint 'l3': no <parent>, expected <parent link=\"...\"/>"),
+    (changed("1 2 -3", "a b c"), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': axis: found 'a b c', expected a direction of three numbers"),
+    (changed("1 2 -3", "${pi} 0 0"), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': axis: found '${pi} 0 0', expected a direction of three numbers"),
+    (changed("1 2 -3", "0 nan 1"), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': axis: found '0 nan 1', expected a direction of three numbers"),
+    (changed('upper="2"', 'upper="2 rad"'), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': limit upper: found '2 rad', expected a number"),
+    (changed('upper="2"', 'upper="nan"'), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': limit upper: found 'nan', expected a number"),
+    (changed('name="l1" type="revolute"', 'name="l1"'), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l1': no type, expected revolute, continuous, prismatic or fixed on the chain"),
+    (changed('<child link="left_1"/>', "<child/>"), {},
+     "torso.urdf:11: joint 'l1': no <child>, expected <child link=\"...\"/>"),
+    (changed('<link name="left_1"/>', "<link/>"), {}, "torso.urdf:5: a link without a name"),
+    (changed('<robot name="torso">', '<robot name="torso" xmlns="http://www.ros.org">'), {},
+     "torso.urdf: root element <{http://www.ros.org}robot>, expected <robot>"),
+    (changed("</robot>", "<xacro:arm/></robot>"), {},
+     "torso.urdf:26: not XML: Namespace prefix xacro on arm is not defined, line 26, column 11; "
+     "it holds elements of xacro: expand them by `xacro arm.urdf.xacro > arm.urdf`"),
+    (changed("l1", "tool"), {"tip_link": "left_tip"},
+     "torso.urdf: two frames called 'tool', expected different names; "
+     "base and tool are the frames before and behind the joints"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "links", "message"), MISTAKES, ids=range(len(MISTAKES)))
+def test_a_mistake_is_named_in_one_line(tmp_path, text, links, message):
+    path = tmp_path / "torso.urdf"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_urdf(path, **links)
+    assert str(caught.value) == message
+
+
+LAUGHS = '<!ENTITY a0 "ha">' + "".join(f'<!ENTITY a{i + 1} "{f"&a{i};" * 10}">' for i in range(9))
+NONE = "expected a URDF without entities: they are not expanded"
+ENTITIES = {
+    "laughs in text": (LAUGHS, "&a9;", NONE),
+    "laughs in an attribute": (LAUGHS, '<link name="&a9;"/>', NONE),
+    "one long text a thousand times": (f'<!ENTITY a "{"x" * 10**5}">', f'<link name="{"&a;" * 1000}"/>', NONE),
+    "a circle": ('<!ENTITY a "&b;"><!ENTITY b "&a;">', '<link name="&a;"/>', NONE),
+    "a file in text": ('<!ENTITY a SYSTEM "{secret}">', "&a;", NONE),
+    "a file in an attribute": ('<!ENTITY a SYSTEM "{secret}">', '<link name="&a;"/>', NONE),
+    "a file of entities": ('<!ENTITY % a SYSTEM "{secret}"> %a;', "", NONE),
+    "the net in text": ('<!ENTITY a SYSTEM "{url}">', "&a;", NONE),
+    "the net, for entities": ('<!ENTITY % a SYSTEM "{url}"> %a;', "", NONE),
+    "an entity that would do": ('<!ENTITY a "0.1">', '<link name="&a;"/>', NONE),
+    "none such": ("", "&a;", NONE),
+}
+
+
+@pytest.fixture(scope="module")
+def listening():
+    """A server that waits for somebody to ask it."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(0.0)
+        yield server
+
+
+@pytest.mark.parametrize(("declared", "used", "message"), ENTITIES.values(), ids=ENTITIES)
+def test_entities_are_refused_in_one_line_and_nothing_is_fetched(tmp_path, listening, declared, used, message):
+    (tmp_path / "secret").write_text("<!ENTITY b 'secret'>")
+    declared = declared.format(secret=tmp_path / "secret", url=f"http://127.0.0.1:{listening.getsockname()[1]}/a.dtd")
+    path = tmp_path / "torso.urdf"
+    path.write_text(f"<!DOCTYPE robot [{declared}]>" + TREE.partition("\n")[2].replace("</robot>", f"{used}</robot>"))
+    with pytest.raises(InputError) as caught:
+        read_urdf(path, tip_link="left_tip")
+    assert str(caught.value).startswith("torso.urdf:")
+    assert str(caught.value).endswith(message)
+    assert len(str(caught.value)) < 200
+    with pytest.raises(BlockingIOError):
+        listening.accept()
+
+
+def test_a_document_type_elsewhere_is_refused_and_a_bare_one_says_nothing(tmp_path, listening):
+    path = tmp_path / "torso.urdf"
+    path.write_text(TREE.replace("<robot", "<!DOCTYPE robot>\n<robot", 1))
+    assert read_urdf(path, tip_link="left_tip").n_joints == 2
+    url = f"http://127.0.0.1:{listening.getsockname()[1]}/a.dtd"
+    path.write_text(TREE.replace("<robot", f'<!DOCTYPE robot SYSTEM "{url}">\n<robot', 1))
+    with pytest.raises(InputError, match=r"torso\.urdf: a <!DOCTYPE> with entities or of another file"):
+        read_urdf(path, tip_link="left_tip")
+    with pytest.raises(BlockingIOError):
+        listening.accept()
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(InputError) as caught:
+        read_robot(tmp_path / "arm.urdf")
+    assert str(caught.value) == f"{tmp_path / 'arm.urdf'}: no such file"
+
+
+def test_reading_says_nothing_about_meshes(tree, caplog, capsys):
+    read_urdf(tree, tip_link="left_tip")
+    assert caplog.records == []
+    assert capsys.readouterr() == ("", "")
+
+
+def test_tool_and_base_may_be_given_as_for_a_table_of_dh(tmp_path):
+    file = tmp_path / "arm.urdf"
+    joint = '<joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint>'
+    file.write_text(f'<robot name="arm"><link name="a"/><link name="b"/>{joint}</robot>')
+    listed, named = read_urdf(file, tool=[0.02, 0, 0.15]), read_urdf(file, tool={"x": 0.02, "z": 0.15})
+    assert listed.nominal.tolist() == named.nominal.tolist()
+    with pytest.raises(InputError, match=r"tool: shape \(2,\)"):
+        read_urdf(file, tool=[0.02, 0])
+
+
+def test_what_is_nearly_an_element_of_a_joint_is_told_of(tmp_path, caplog):
+    inner = '<orign xyz="1 0 0"/><axes xyz="0 0 1"/><limit min="-1" effort="1"/><origin pos="1"/><dynamics/>'
+    joint = f'<joint name="j" type="revolute"><parent link="a"/><child link="b"/>{inner}</joint>'
+    (tmp_path / "arm.urdf").write_text(f'<robot name="r"><link name="a"/><link name="b"/>{joint}</robot>')
+    read_urdf(tmp_path / "arm.urdf")
+    assert caplog.messages == [
+        "arm.urdf:1: joint 'j': element <orign> is not used; did you mean origin?",
+        "arm.urdf:1: joint 'j': element <axes> is not used; did you mean axis?",
+        "arm.urdf:1: joint 'j': attribute min of <limit> is not used; known are lower, upper, effort, velocity",
+        "arm.urdf:1: joint 'j': attribute pos of <origin> is not used; known are xyz, rpy",
+    ]

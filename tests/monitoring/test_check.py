@@ -1,0 +1,333 @@
+"""New rows of a calibrated arm: what is drift of a joint, and what is not."""
+
+import tracemalloc
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from month import SIGMA, arm, calibrated, measured, placed, slipped
+from scipy import stats
+from simulated import true_robot
+
+from fg_calib import Measurements, Robot, Table, calibrate, pose
+from fg_calib.errors import InputError
+from fg_calib.measurements.dataset import Labels
+from fg_calib.monitoring.hypotheses import zero_names
+
+SMALL = 2.5e-4
+"""A slip of some sigma in an unknown frame, [rad]."""
+
+
+@pytest.fixture(scope="module")
+def known():
+    """Calibrated in a known frame; nobody changes it."""
+    return calibrated(1)
+
+
+@pytest.fixture(scope="module")
+def unknown():
+    """Calibrated in an unknown frame."""
+    return calibrated(2, unknown=True)
+
+
+def likely(check):
+    return [e.parameters for e in check.explanations if e.likely]
+
+
+def test_a_healthy_arm_passes(known):
+    calibration, true, _ = known
+    found = calibration.check(measured(true, 8, np.random.default_rng(0)))
+    assert found.verdict == "pass"
+    assert found.deploy
+    assert found.explanations == ()
+    assert found.dof == 48
+
+
+def test_chi_square_is_that_of_the_covariance_written_out(known):
+    """r^T (N + J Sigma J^T)^-1 r, with J by differences of the predicted poses."""
+    calibration, true, _ = known
+    rows = measured(true, 3, np.random.default_rng(3))
+    alone = Measurements.from_arrays(rows.readings, position=rows.position, sigma_position=SIGMA[0])
+    found = calibration.check(Table(alone, "position"))
+    predicted = calibration.predict(rows.readings)
+    r = (predicted.position - rows.position).ravel()
+    names, values = list(calibration.result.covariance.names), calibration.robot.nominal
+    J = []
+    for name in names:
+        at = [calibration.robot.with_values(values + h * np.eye(len(values))[calibration.robot.index(name)])
+              for h in (1e-5, -1e-5)]  # fmt: skip
+        J.append((pose(at[0], rows.readings).position - pose(at[1], rows.readings).position).ravel() / 2e-5)
+    C = SIGMA[0] ** 2 * np.eye(9) + np.array(J).T @ calibration.covariance(names) @ np.array(J)
+    assert found.chi2 == pytest.approx(r @ np.linalg.solve(C, r), rel=1e-5)  # differences
+    assert found.p_value == pytest.approx(stats.chi2.sf(found.chi2, 9))
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("joint", [2, 3, 4, 5])
+def test_the_joint_that_slipped_is_named(known, joint):
+    calibration, true, _ = known
+    new = slipped(true, **{f"theta{joint}": 2e-3})
+    found = calibration.check(measured(new, 10, np.random.default_rng(joint)))
+    assert found.verdict == "fail"
+    assert likely(found) == [(f"theta{joint}",)]
+    best = found.explanations[0]
+    assert abs(best.change[0] - 2e-3) < 4 * best.sigma[0]
+    assert found.deploy
+
+
+def test_a_slip_too_large_to_be_linear_is_found_in_full(known):
+    calibration, true, _ = known
+    found = calibration.check(measured(slipped(true, theta3=0.05), 10, np.random.default_rng(0)))
+    best = found.explanations[0]
+    assert best.parameters == ("theta3",)
+    assert abs(best.change[0] - 0.05) < 4 * best.sigma[0]
+
+
+def few_rows_of_a_slip(seed=0, slip=4e-3):
+    """Configurations in which joints 2 and 3 do nearly the same: the elbow stretched, and turned a little."""
+    calibration, true, rng = calibrated(5, unknown=True)
+    q = np.array([0.3, -1.0, 0.02, 0.5, 0.8, 0.2]) + 0.04 * rng.normal(size=(5, 6))
+    frame = placed(rng)
+    return calibration, slipped(true, theta3=slip), frame, q, np.random.default_rng(seed)
+
+
+@pytest.mark.slow
+def test_what_merely_correlates_is_said_not_to_be_told_apart():
+    calibration, new, frame, q, rng = few_rows_of_a_slip()
+    found = calibration.check(measured(new, len(q), rng, frame=frame, q=q))
+    assert found.verdict == "fail"
+    assert ("theta3",) in likely(found)
+    assert len(likely(found)) > 1
+    assert not found.deploy
+    assert all(e.not_told_apart_from for e in found.explanations if e.likely)
+
+
+@pytest.mark.slow
+def test_the_configurations_advised_tell_the_changes_apart():
+    """Followed to the letter: the same rows, and the advised ones in the same frame."""
+    calibration, new, frame, q, rng = few_rows_of_a_slip()
+    rows = measured(new, len(q), rng, frame=frame, q=q)
+    advice = calibration.check(rows).advice
+    assert advice is not None
+    assert advice.enough
+    q = np.vstack([q, advice.readings])
+    found = calibration.check(measured(new, len(q), np.random.default_rng(0), frame=frame, q=q))
+    assert likely(found) == [("theta3",)]
+    assert found.deploy
+
+
+def test_a_gross_row_is_named_and_is_no_drift(known):
+    calibration, true, _ = known
+    rows = measured(true, 10, np.random.default_rng(4), ids="r")
+    spoilt = rows.position.copy()
+    spoilt[6, 1] += 3e-3
+    found = calibration.check(replace(rows, position=spoilt))
+    assert found.gross_rows == ("r6",)
+    assert found.verdict == "pass"
+    assert found.explanations == ()
+
+
+def test_a_gross_row_does_not_count_against_a_limit(known):
+    """The frame is fitted without it: the errors are those that the other rows have by themselves."""
+    calibration, true, rng = known
+    rows = measured(true, 12, np.random.default_rng(4), ids="r", frame=placed(rng))
+    spoilt = rows.position.copy()
+    spoilt[6] += [8e-3, -5e-3, 3e-3]
+    limit = 5 * SIGMA[0]
+    table = Table(replace(rows, position=spoilt), "pose", frame="unknown")
+    found = calibration.check(table, limit=limit)
+    keep = np.flatnonzero(np.arange(12) != 6)
+    without = calibration.check(Table(rows.select(keep), "pose", frame="unknown"), limit=limit)
+    assert found.gross_rows == ("r6",)
+    assert found.verdict == without.verdict == "pass"
+    assert found.rms["position"] == pytest.approx(without.rms["position"], rel=1e-3)  # frames to convergence
+
+
+def test_many_rows_are_judged_in_the_memory_that_rows_take(known):
+    """Columns of gross errors at each configuration would be as many as the rows."""
+    calibration, true, _ = known
+    rows = measured(true, 450, np.random.default_rng(0))
+    tracemalloc.start()
+    found = calibration.check(rows)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert found.verdict == "pass"
+    assert peak < 0.5 * 8 * (6 * rows.n_configurations) ** 2
+
+
+def test_many_pairs_of_few_configurations_are_judged_without_a_suspect_each():
+    robot, rng = arm(), np.random.default_rng(0)
+    true = true_robot(robot, rng)
+
+    def pairs_of(n, n_pairs):
+        q = rng.uniform(-2.0, 2.0, (n, robot.n_joints))
+        p, every = pose(true, q).position, np.transpose(np.triu_indices(n, 1))
+        a, b = every[rng.permutation(len(every))[:n_pairs]].T
+        length = np.linalg.norm(p[b] - p[a], axis=1) + 1e-4 * rng.normal(size=n_pairs)
+        return Measurements.from_arrays(q, pairs={"a": a, "b": b, "distance": length, "sigma_distance": 1e-4})
+
+    calibration = calibrate(robot, pairs_of(30, 200), model="distance")
+    tracemalloc.start()
+    found = calibration.check(pairs_of(150, 8000))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert found.verdict == "pass"
+    assert peak < 0.5 * 8 * 8000**2
+
+
+@pytest.mark.parametrize("factor", [1.3, 3.0])
+def test_noise_that_is_larger_than_stated_is_no_drift(known, factor):
+    calibration, true, _ = known
+    rows = measured(true, 30, np.random.default_rng(6), sigma=(factor * SIGMA[0], factor * SIGMA[1]))
+    stated = replace(
+        rows, sigma_position=rows.sigma_position / factor, sigma_orientation=rows.sigma_orientation / factor
+    )
+    found = calibration.check(stated)
+    assert found.explanations == ()
+    assert found.verdict == ("fail" if factor > 2 else "pass")
+    assert any("noise" in line or "times as large" in line for line in (*found.reasons, *found.cautions))
+
+
+def test_a_tracker_that_was_moved_is_fitted_anew(unknown):
+    calibration, true, _ = unknown
+    rng = np.random.default_rng(7)
+    assert calibration.check(measured(true, 8, rng, frame=placed(rng))).verdict == "pass"
+
+
+def test_a_frame_that_was_moved_although_known_is_called_that(known):
+    calibration, true, _ = known
+    rng = np.random.default_rng(8)
+    turn, shift = placed(rng)
+    found = calibration.check(measured(true, 8, rng, frame=(type(turn).from_rotvec(1e-3 * shift), 1e-3 * shift)))
+    assert likely(found) == [("frame",)]
+
+
+def test_a_tool_that_was_changed_is_found(known):
+    calibration, true, _ = known
+    found = calibration.check(measured(slipped(true, tool_y=1e-3), 8, np.random.default_rng(9)))
+    assert likely(found) == [("tool.y",)]
+    assert abs(found.explanations[0].change[0] - 1e-3) < 4 * found.explanations[0].sigma[0]
+
+
+def test_two_joints_that_slipped_together_are_found(known):
+    calibration, true, _ = known
+    found = calibration.check(measured(slipped(true, theta3=3e-3, theta5=-4e-3), 12, np.random.default_rng(10)))
+    assert ("theta3", "theta5") in likely(found)
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("seed", [0, 2, 3])
+def test_two_small_slips_are_not_taken_for_noise_that_is_a_little_too_small(unknown, seed):
+    """The better of the two alone leaves a reduced chi-square below 2, which is more than chance."""
+    calibration, true, _ = unknown
+    rng = np.random.default_rng(seed)
+    found = calibration.check(measured(slipped(true, theta2=SMALL, theta5=-SMALL), 8, rng, frame=placed(rng)))
+    assert ("theta2", "theta5") in likely(found)
+
+
+def test_few_rows_that_a_slip_explains_are_not_said_to_be_explained_by_none(known):
+    """Too few to tell it from noise stated too small."""
+    calibration, true, _ = known
+    found = calibration.check(measured(slipped(true, theta4=2.5e-4), 2, np.random.default_rng(1)))
+    assert found.explanations == ()
+    assert "too small, or a change such as of theta4" in found.reasons[0]
+
+
+def test_a_p_value_counts_that_noise_was_estimated_by_few_rows():
+    """Chi-square over its degrees of freedom is then F; by chi-square 6 of 50 healthy arms had a p-value below 0.01."""
+    calibration, true, rng = calibrated(4, n=10, estimate_noise=True)
+    found = calibration.check(measured(true, 8, rng))
+    degrees = sum(kind.expected for kind in calibration.goodness.values())
+    assert degrees < 60 - 20  # of 60 figures all but those that the arm takes
+    assert found.p_value == pytest.approx(stats.f.sf(found.chi2 / found.dof, found.dof, degrees))
+
+
+def test_what_moves_the_tool_alike_everywhere_is_one():
+    """Shifts along the parallel axes 2, 3 and 4 of a UR."""
+    calibration, true, _ = calibrated(11)
+    found = calibration.check(measured(slipped(true, d3=2e-3), 10, np.random.default_rng(0)))
+    best = found.explanations[0]
+    assert {"d3", "d4"} <= {*best.parameters, *best.same}
+
+
+@pytest.mark.slow
+def test_limits_decide_where_they_are_set(known):
+    calibration, true, _ = known
+    rows = measured(slipped(true, theta4=4e-4), 10, np.random.default_rng(12))
+    assert calibration.check(rows).verdict == "fail"
+    assert calibration.check(rows, limit=1e-2).verdict == "pass"
+    assert calibration.check(rows, limit=1e-5).verdict == "fail"
+    assert "limit" in calibration.check(rows, limit=1e-5).reasons[0]
+
+
+def test_too_few_rows_are_not_judged(unknown):
+    calibration, true, _ = unknown
+    rng = np.random.default_rng(13)
+    found = calibration.check(measured(true, 1, rng, frame=placed(rng)))
+    assert found.verdict == "not_evaluated"
+    assert "at least 3 needed" in found.reasons[0]
+
+
+@pytest.mark.slow
+def test_a_target_keeps_its_place_and_what_is_known_of_it():
+    rng = np.random.default_rng(14)
+    robot = arm()
+    true, spot = true_robot(robot, rng), np.array([0.03, 0.08, 0.02])
+
+    def seen(n, at):
+        q = rng.uniform(-2.5, 2.5, (n, 6))
+        poses = pose(true, q)
+        p = poses.position + poses.rotation @ at + SIGMA[0] * rng.normal(size=(n, 3))
+        rows = Measurements.from_arrays(q, position=p, sigma_position=SIGMA[0])
+        return Table(replace(rows, labels={"target": Labels(("a",), np.zeros(n, int))}), "position")
+
+    calibration = calibrate(robot, seen(40, spot))
+    healthy = calibration.check(seen(6, spot))
+    assert healthy.verdict == "pass"
+    assert healthy.dof == 18  # nothing is fitted: the target is known
+    assert calibration.check(seen(6, spot + np.array([1e-3, 0, 0]))).verdict == "fail"
+
+
+def test_rows_of_another_robot_are_refused(known):
+    calibration = known[0]
+    other = Measurements.from_arrays(np.zeros((4, 5)), position=np.zeros((4, 3)), sigma_position=1e-4)
+    with pytest.raises(InputError, match="joints"):
+        calibration.check(other)
+
+
+def test_zeros_of_a_urdf_are_called_by_their_joints():
+    assert zero_names(arm())[:2] == ("theta1", "theta2")
+    sliding = Robot.from_dh([[0, 0, 0.1, 0], [0, 0, 0.2, 0]], "dh", types=["revolute", "prismatic"])
+    assert zero_names(sliding) == ("theta1", "d2")
+
+
+MISREAD = {
+    "x, y, z are in mm, not m": {"position": 1e3},
+    "x, y, z are in m, not mm": {"position": 1e-3},
+    "joint readings are in rad, not deg": {"readings": np.pi / 180},
+    "joint 4 turns the other way": {"readings": np.array([1, 1, 1, -1, 1, 1])},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("frame", ["known", "unknown"])
+@pytest.mark.parametrize("words", MISREAD)
+def test_a_table_that_is_misread_is_told_of_before_anything_else(known, unknown, words, frame):
+    """In wrong units no change of the arm is named, and the calibration is not blamed."""
+    calibration, true, rng = known if frame == "known" else unknown
+    rows = measured(true, 12, np.random.default_rng(1), frame=placed(rng) if frame == "unknown" else None)
+    wrong = replace(rows, **{name: getattr(rows, name) * by for name, by in MISREAD[words].items()})
+    found = calibration.check(Table(wrong, "pose", frame=frame))
+    assert found.verdict == "not_evaluated"
+    assert words in found.reasons[0]
+    assert found.explanations == ()
+    assert not found.deploy
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("slip", [{"theta3": 0.5}, {"theta4": np.pi / 2}])
+def test_a_large_slip_is_no_table_that_is_misread(known, slip):
+    calibration, true, _ = known
+    found = calibration.check(measured(slipped(true, **slip), 12, np.random.default_rng(2)))
+    assert found.verdict == "fail"
+    assert likely(found) == [tuple(slip)]

@@ -1,0 +1,142 @@
+"""Directions that unknowns of the measurements take up: said only where giving these would show them."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from instruments import TARGETS, measured_by
+from touches import corners, touch
+
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.information import named_triangle
+from fg_calib.measurements.dataset import Measurements
+from fg_calib.measurements.series import KnownPoint, Table
+from fg_calib.observability.identifiability import identifiability_of
+from fg_calib.observability.reasons import BASE, NO_CAUSE, NOT_EXCITED
+from fg_calib.robot.kinematics import pose
+from fg_calib.robot.model import Robot
+
+TARGETS_DO = "the unknown places of the targets on the tool take it up"
+
+
+def looked_at(robot, tables):
+    """The problem of some tables, and what it determines."""
+    problem = build_problem(robot, tables)
+    return problem, identifiability_of(problem, problem.start, "practical")
+
+
+def by_reason(found):
+    """Lost directions by their reason."""
+    reasons = {}
+    for lost in found.lost:
+        reasons.setdefault(lost.reason, []).append(lost.relation)
+    return reasons
+
+
+def seen(problem, relation):
+    """Signal-to-noise ratio of a direction: how many sigma it moves the measurements."""
+    direction = np.array([relation.get(p.name, 0.0) for p in problem.estimated])
+    return float(np.linalg.norm(named_triangle(problem, problem.start) @ direction))
+
+
+def given(table, names):
+    """The same with the places of some targets known."""
+    return replace(table, known={name: KnownPoint(TARGETS[int(name[1:])]) for name in names})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("instrument", ["targets", "targets stations"])
+def test_unknown_targets_take_up_what_a_known_one_shows(instrument):
+    robot, _, table = measured_by(instrument, np.random.default_rng(0))
+    _, found = looked_at(robot, table)
+    reasons = by_reason(found)
+    help_ = ": to see it, give the place of one target (key targets)"
+    assert set(reasons) == {BASE, TARGETS_DO + help_}
+    with_one, _ = looked_at(robot, given(table, ["t0"]))
+    without, _ = looked_at(robot, table)
+    for relation in reasons[TARGETS_DO + help_]:
+        assert seen(without, relation) < 1e-6 * seen(with_one, relation)
+
+
+@pytest.mark.slow
+def test_how_many_places_must_be_given_is_counted():
+    """The tool may turn about two of three known targets."""
+    robot, _, table = measured_by("targets", np.random.default_rng(0))
+    robot = replace(robot, parameters=tuple(
+        replace(p, estimated=p.name.startswith("tool.")) for p in robot.parameters))  # fmt: skip
+    _, found = looked_at(robot, table)
+    ((reason, relations),) = by_reason(found).items()
+    assert reason == f"{TARGETS_DO}: to see it, give the places of 3 targets (key targets)"
+    assert len(relations) == 6
+    for names, rank in ((["t0"], 3), (["t0", "t1"], 5), (["t0", "t1", "t2"], 6)):
+        assert looked_at(robot, given(table, names))[1].observability.rank == rank
+
+
+@pytest.mark.slow
+def test_a_joint_that_hardly_moves_is_still_the_reason_with_targets():
+    """Targets or not: a joint that was not moved says nothing of its own axis."""
+    robot, true, table = measured_by("targets", np.random.default_rng(0))
+    m = table.measurements
+    q = m.readings.copy()
+    q[:, 1] = 0.3
+    at = pose(true, q)
+    where = at.position + np.einsum("nij,nj->ni", at.rotation, TARGETS[m.labels["target"].index])
+    still = replace(table, measurements=replace(m, readings=q, position=where))
+    _, found = looked_at(robot, given(still, ["t0", "t1", "t2"]))
+    assert NOT_EXCITED in by_reason(found)
+    _, found = looked_at(robot, still)
+    assert NOT_EXCITED in by_reason(found)
+    assert any(reason.startswith(TARGETS_DO) for reason in by_reason(found))
+
+
+def test_unknown_anchors_beside_a_known_one_take_up_the_turn_about_it():
+    robot, _, table = measured_by("anchors known", np.random.default_rng(0))
+    problem, found = looked_at(robot, table)
+    reasons = by_reason(found)
+    said = "the unknown anchors take it up: to see it, give the place of one anchor (key anchors)"
+    (relation,) = reasons[said]
+    assert set(relation) == {"a1", "alpha1", "d1", "theta1"}
+    second = dict(table.known) | {"a1": KnownPoint(problem.data.unknowns.starts[1])}
+    assert seen(looked_at(robot, replace(table, known=second))[0], relation) > 1.0
+
+
+def test_what_an_instrument_adds_takes_up_a_length():
+    """A slide that only moves towards its anchor."""
+    robot = Robot.from_dh([[0.0, 0.0, 0.3, 0.0]], convention="dh", types="prismatic", tolerance={"d": 1e-3})
+    robot = replace(robot, parameters=tuple(replace(p, estimated=p.name == "d1") for p in robot.parameters))
+    q = np.linspace(0.0, 0.5, 9)[:, None]
+    data = Measurements.from_arrays(q, anchor=["end"] * 9, distance=1.7 - q[:, 0], sigma_distance=1e-5)
+    table = Table(data, "anchor", known={"end": KnownPoint([0, 0, 2.0])})
+    assert not looked_at(robot, table)[1].lost
+    _, found = looked_at(robot, replace(table, offset=True))
+    assert by_reason(found) == {"what the instrument adds to every length takes it up": [{"d1": 1.0}]}
+
+
+def test_touched_points_take_up_the_size_of_the_arm():
+    """Without a distance between two points nothing is said of what other configurations would show."""
+    rows = [[0.1, 1.5, 0.4, 0.1], [0.5, 0.2, 0.1, 0.0], [0.4, -1.4, 0.05, 0.3], [0.3, 0.9, 0.2, -0.2]]
+    robot, rng = Robot.from_dh(rows, tolerance={"a": 1e-3}), np.random.default_rng(1)
+    points = corners(robot, 4, rng)
+    m = replace(touch(robot, points, 20, rng, sigma=1e-12), sigma_point=np.full(80, 1e-4))
+    _, found = looked_at(robot, Table(m, "distance"))
+    reasons = by_reason(found)
+    assert "the unknown touched points take it up" in reasons
+    assert NOT_EXCITED not in reasons
+    assert NO_CAUSE not in reasons
+    m = touch(robot, points, 20, rng, sigma=1e-12, distances=[(0, 1, 1e-5), (1, 2, 1e-5)])
+    problem, _ = looked_at(robot, Table(replace(m, sigma_point=np.full(80, 1e-4)), "distance"))
+    assert max(seen(problem, relation) for relation in reasons["the unknown touched points take it up"]) > 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("instrument", ["targets", "targets known", "targets stations", "anchors", "anchors known",
+                                        "anchors offset", "planes", "board", "pixels"])  # fmt: skip
+def test_every_reason_holds_of_random_configurations_too(instrument):
+    """What is lost at many configurations is not called not excited; base and arm alone are judged as before."""
+    robot, _, table = measured_by(instrument, np.random.default_rng(3))
+    _, found = looked_at(robot, table)
+    assert found.lost
+    assert NOT_EXCITED not in by_reason(found)
+    assert NO_CAUSE not in by_reason(found)
+    assert not any(re.search("last axis", reason) for reason in by_reason(found))

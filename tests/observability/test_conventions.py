@@ -1,0 +1,309 @@
+"""What a convention has no parameter for, found by moving links, beside what geometry says."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from jobs import UR5E, only, ur5e, write_job
+from oracle import random_robot, rotation, tool_pose, translation
+from simulated import measure, paper_robot, true_robot
+
+from fg_calib import Measurements, Robot, calibrate
+from fg_calib.io.robot_file import read_robot
+from fg_calib.observability.parallel_axes import missing_motions
+from fg_calib.robot.kinematics import pose
+from fg_calib.robot.model import Axis, Joint, RobotBuilder
+
+QUARTER, SIGMA = np.pi / 2, (5e-5, 1e-4)
+TILT, SHIFT = (Axis.RY,), (Axis.TY,)
+BOTH = (Axis.TY, Axis.RY)
+
+
+def arm(convention, *joints, tool=(0.1, 0.2)):
+    """An arm of (a, alpha in degrees, d) a joint, a fourth figure makes it slide; x and z of its tool."""
+    builder = RobotBuilder("arm", convention)
+    builder.add_frame("base", {}, 0, False)
+    for i, (a, alpha, d, *slides) in enumerate(joints):
+        values = {"a": a, "alpha": np.deg2rad(alpha), "d": d, "theta": 0.0, "beta": 0.0}
+        builder.add_convention_joint(Joint(f"q{i + 1}", prismatic=bool(slides)), values)
+    builder.add_frame("tool", {"x": tool[0], "z": tool[1]}, len(joints) + 1, False)
+    return builder.build()
+
+
+UR = ((0, 90, 0.16), (-0.43, 0, 0), (-0.39, 0, 0), (0, 90, 0.13), (0, -90, 0.1), (0, 0, 0.1))
+UR_CRAIG = ((0, 0, 0.16), (0, 90, 0), (-0.43, 0, 0), (-0.39, 0, 0.13), (0, 90, 0.1), (0, -90, 0.1))
+SCARA = ((0.3, 0, 0.4), (0.25, 0, 0), (0, 0, 0, "slide"), (0, 0, 0.1))
+COAXIAL = ((0, 90, 0.1), (0, 0, 0.3), (0, 90, 0), (0, 90, 0), (0, 90, 0.1))
+GANTRY = ((0, 90, 0, "slide"), (0, 90, 0, "slide"), (0, 0, 0, "slide"), (0, 90, 0), (0, 90, 0.1))
+BENT = ((0, 90, 0.1), (0.3, 80, 0), (0.2, -70, 0.1), (0, 90, 0.2))
+
+
+@pytest.mark.sampled(3)
+@pytest.mark.parametrize(
+    ("convention", "joints", "expected"),
+    [
+        ("dh", UR, [((2, 3, 4), TILT, "dh-hayati")]),
+        ("mdh", UR_CRAIG, [((2, 3, 4), TILT, "mdh-hayati")]),
+        ("dh-hayati", UR, []),
+        ("mdh-hayati", UR_CRAIG, []),
+        ("dh", SCARA, [((1, 2, 3, 4), TILT, "dh-hayati")]),
+        ("dh-hayati", SCARA, []),
+        # On one line there is no common normal that a could be measured along.
+        ("dh", COAXIAL, [((2, 3), BOTH, "a URDF")]),
+        ("dh-hayati", COAXIAL, [((2, 3), SHIFT, "a URDF")]),
+        # Where a slide is does not matter, only its direction.
+        ("dh", GANTRY, [((3, 4), TILT, "dh-hayati")]),
+        ("dh", BENT, []),
+        ("mdh", BENT, []),
+    ],
+)
+def test_parallel_neighbours_lack_a_tilt(convention, joints, expected):
+    found = missing_motions(arm(convention, *joints))
+    assert [(m.axes, m.motions, m.use) for m in found] == expected
+    assert all(m.convention == convention for m in found)
+
+
+@pytest.mark.parametrize(("degrees", "missing"), [(0.0, True), (1e-4, True), (0.5, True), (10.0, False), (45.0, False)])
+def test_nearly_parallel_is_parallel(degrees, missing):
+    """At half a degree a tilt of 1 mrad asks for 0.1 rad of theta, and metres of d."""
+    found = missing_motions(arm("dh", (0, 90, 0.1), (0.4, degrees, 0), (0, 90, 0.1), (0, 0, 0.1)))
+    assert bool(found) == missing
+    if found:
+        assert found[0].axes == (2, 3)
+        assert found[0].angle == pytest.approx(np.deg2rad(degrees), abs=1e-7)  # arcsin of a cross product near 0
+
+
+def test_the_words_name_axes_convention_and_cure():
+    (parallel,) = missing_motions(arm("dh", *UR))
+    assert str(parallel) == (
+        "axes 2, 3 and 4 are parallel and convention dh has no parameter for a tilt about y between them: use dh-hayati"
+    )
+    (nearly,) = missing_motions(arm("dh", (0, 90, 0.1), (0.4, 0.5, 0), (0, 90, 0.1), (0, 0, 0.1)))
+    assert str(nearly).startswith("axes 2 and 3 are parallel within 0.5 deg and convention dh has no")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_six_parameters_a_joint_leave_nothing_out(seed):
+    found = missing_motions(random_robot("urdf", 6, np.random.default_rng(seed)))
+    assert all(motion.frame for motion in found)  # but for origins that happen to be pitched by a quarter turn
+
+
+def test_the_papers_robot_lacks_nothing():
+    """Two pairs of its axes are parallel; its convention has Hayati's angle."""
+    assert missing_motions(paper_robot()) == ()
+
+
+def test_a_robot_needs_no_frames_of_base_and_tool():
+    builder = RobotBuilder("bare", "dh")
+    for i, (a, alpha, d) in enumerate(UR):
+        values = {"a": a, "alpha": np.deg2rad(alpha), "d": d, "theta": 0.0}
+        builder.add_convention_joint(Joint(f"q{i + 1}"), values)
+    assert [m.axes for m in missing_motions(builder.build())] == [(2, 3, 4)]
+
+
+@pytest.mark.slow
+def test_units_do_not_matter():
+    """A crane of 100 m, an arm of 1 mm."""
+    for factor in (1e-3, 1.0, 1e2):
+        scaled = [(a * factor, alpha, d * factor) for a, alpha, d in UR]
+        found = missing_motions(arm("dh", *scaled, tool=(0.1 * factor, 0.2 * factor)))
+        assert [(m.axes, m.motions) for m in found] == [((2, 3, 4), TILT)]
+
+
+@pytest.mark.slow
+def test_a_tilt_that_is_missing_is_followed_by_no_parameters():
+    """Against products of matrices: the best change of all parameters leaves most of a tilt between axes 2 and 3."""
+    robot = arm("dh", *UR)
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-np.pi, np.pi, (40, 6))
+
+    def moved(step):
+        """Tool poses after a change of parameters, then of a tilt at the end of link 2."""
+        changed = robot.with_values(robot.nominal + step[:-1])
+        out = []
+        for row in q:
+            T = np.eye(4)
+            for i in range(6):
+                theta, d, a, alpha = (p.nominal for p in changed.parameters[6 + 4 * i : 10 + 4 * i])
+                T = T @ rotation(2, theta + row[i]) @ translation(2, d) @ translation(0, a) @ rotation(0, alpha)
+                if i == 1:
+                    T = T @ rotation(1, step[-1])
+            out.append((T @ translation(0, 0.1) @ translation(2, 0.2))[:3].ravel())
+        return np.concatenate(out)
+
+    n = len(robot.parameters)
+    assert moved(np.zeros(n + 1)) == pytest.approx(np.concatenate([tool_pose(robot, row)[:3].ravel() for row in q]))
+    J = np.stack([(moved(h) - moved(-h)) / 2e-6 for h in 1e-6 * np.eye(n + 1)], axis=1)
+    left = J[:, -1] - J[:, :-1] @ np.linalg.lstsq(J[:, :-1], J[:, -1], rcond=1e-6)[0]
+    assert np.linalg.norm(left) > 0.3 * np.linalg.norm(J[:, -1])
+
+
+# --- through the command line
+
+
+DH = {
+    **{"convention": "dh", "tolerance": {k: v for k, v in UR5E["tolerance"].items() if k != "beta"}},
+    "joints": [{k: v for k, v in joint.items() if k != "beta"} for joint in UR5E["joints"]],
+}
+SAID = "axes 2, 3 and 4 are parallel and convention dh has no parameter for a tilt about y between them: use dh-hayati"
+
+
+def textbook_job(folder, seed=0, tilts=True, noise=None, **keys):
+    """A job of the UR5e in convention dh, whose true arm has small tilts that it has no parameter for."""
+    robot = ur5e(folder)
+    rng = np.random.default_rng(seed)
+    true = true_robot(robot, rng)
+    if not tilts:
+        true = true.with_values([0.0 if p.kind == "beta" else p.nominal for p in true.parameters])
+    m = measure(true, 60, rng, sigma=(5e-5, 1e-4))
+    ur5e(folder, **DH)
+    return write_job(folder, m, **{"model": "pose", **keys}, **({} if noise is None else {"noise": noise}))
+
+
+def words(text):
+    return " ".join(text.split())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["pose", "position", "distance-rotation"])
+def test_a_bad_fit_says_first_what_the_convention_lacks(tmp_path, fg_calib, model):
+    ended = fg_calib("calibrate", textbook_job(tmp_path, model=model), "--out", tmp_path / "out")
+    assert ended.code == 3
+    assert words(ended.out).partition("DOUBTFUL: ")[2].startswith(SAID)
+    assert "the noise there is" not in words(ended.out)
+    assert "the residuals follow the arm, as noise does not" in words(ended.out)
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert result["findings"][0] == SAID
+    assert result["observability"]["missing"][0]["axes"] == [2, 3, 4]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("error", [only(2, 1e-3), only(5, 2e-3)])
+def test_what_the_convention_lacks_is_no_finding_where_something_else_is_wrong(tmp_path, fg_calib, error):
+    """A gear ratio that is off: the convention that has the parameter would not fit any better."""
+    m = measure(true_robot(ur5e(tmp_path, **DH), np.random.default_rng(0)), 60, np.random.default_rng(1), sigma=SIGMA)
+    ended = fg_calib("calibrate", write_job(tmp_path, replace(m, readings=m.readings * (1.0 + error)), model="pose"))
+    assert ended.code == 3
+    assert SAID not in words(ended.out.partition("Fit statistics")[0])
+    assert SAID in words(ended.out.partition("Notes")[2])
+
+
+def anchored(error, rng):
+    """Lengths from three anchors to a gantry's tool, its readings off, of a convention that lacks a tilt."""
+    rows = [[0, QUARTER, 0, QUARTER], [0, QUARTER, 0, QUARTER], [0, QUARTER, 0, QUARTER], [0, 0, 0.3, 0],
+            [0, QUARTER, 0, 0], [0, -QUARTER, 0.1, 0]]  # fmt: skip
+    tolerance = {"a": 5e-4, "d": 5e-4, "alpha": 1e-3, "theta": 1e-3}
+    robot = Robot.from_dh(rows, convention="mdh", types=["prismatic"] * 3 + ["revolute"] * 3, tolerance=tolerance)
+    q = rng.uniform([0, 0, 0, -3, -1.7, -3], [3, 2, 1, 3, 1.7, 3], (70, 6))
+    anchors = np.array([[0.8, -1.0, 0.2], [1.6, -0.3, 1.6], [0.5, -2.8, 0.2]])
+    which = np.arange(70) % 3
+    reached = pose(true_robot(robot, rng), q + error * q).position
+    length = np.linalg.norm(reached - anchors[which], axis=1) + 1e-5 * rng.normal(size=70)
+    names = [f"a{k}" for k in which]
+    return robot, Measurements.from_arrays(q, anchor=names, distance=length, sigma_distance=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("without_mistakes")
+@pytest.mark.parametrize("error", [only(5, -2.0), only(1, 1e-3), only(4, 2e-3)])
+def test_neither_is_it_of_instruments(error):
+    robot, m = anchored(error, np.random.default_rng(2))
+    assert missing_motions(robot)
+    found = calibrate(robot, m, model="anchor")
+    assert not found.trustworthy
+    assert not any("use mdh-hayati" in finding for finding in found.findings)
+    assert any("use mdh-hayati" in caution for caution in found.uncertainty.cautions)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", ["estimate", {"position": 5e-5, "orientation": 1e-4, "estimate": True}])
+def test_estimated_noise_does_not_make_it_good(tmp_path, fg_calib, noise):
+    ended = fg_calib("calibrate", textbook_job(tmp_path, noise=noise))
+    assert ended.code == 3
+    assert words(ended.out).partition("DOUBTFUL: ")[2].startswith(SAID)
+
+
+@pytest.mark.slow
+def test_a_good_fit_has_it_as_a_caution(tmp_path, fg_calib):
+    ended = fg_calib("calibrate", textbook_job(tmp_path, tilts=False))
+    assert ended.code == 0
+    assert SAID in words(ended.out.partition("Notes")[2])
+
+
+@pytest.mark.slow
+def test_the_convention_that_is_named_fits(tmp_path, fg_calib):
+    job = textbook_job(tmp_path)
+    ur5e(tmp_path)
+    assert fg_calib("calibrate", job).code == 0
+
+
+@pytest.mark.slow
+def test_observe_says_it_first(tmp_path, fg_calib):
+    path = tmp_path / "dh.yaml"
+    path.write_text(yaml.safe_dump(UR5E | DH))
+    assert read_robot(path).convention == "dh"
+    said = fg_calib("observe", path).out
+    assert words(said.partition("rank ")[0]).endswith(SAID)
+    document = json.loads(fg_calib("observe", path, "--json").out)
+    assert document["missing"] == [
+        {"axes": [2, 3, 4], "motions": ["a tilt about y"], "convention": "dh", "use": "dh-hayati", "message": SAID}
+    ]
+    path.write_text(yaml.safe_dump(UR5E))
+    assert json.loads(fg_calib("observe", path, "--json").out)["missing"] == []
+
+
+# --- noise: estimate
+
+
+def stated(factor):
+    """The noise of `textbook_job`, stated too small by a factor."""
+    return {"position": 5e-5 / factor, "orientation": 1e-4 / factor}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("factor", "offered"), [(1.6, True), (5.0, False)])
+def test_noise_is_offered_to_be_estimated_only_near_what_was_stated(tmp_path, fg_calib, factor, offered):
+    m = measure(true_robot(ur5e(tmp_path), np.random.default_rng(0)), 80, np.random.default_rng(1), sigma=(5e-5, 1e-4))
+    said = words(fg_calib("calibrate", write_job(tmp_path, m, model="pose", noise=stated(factor))).out)
+    assert ("estimate: true beside the figures of noise in the job" in said) == offered
+    assert "follow the arm" not in said
+
+
+@pytest.mark.slow
+def test_noise_is_not_offered_to_be_estimated_where_residuals_follow_the_arm(tmp_path, fg_calib):
+    """An eccentric encoder: joint 2 is off by 0.2 mrad times the sine of itself."""
+    m = measure(true_robot(ur5e(tmp_path), np.random.default_rng(0)), 80, np.random.default_rng(1), sigma=(5e-5, 1e-4))
+    readings = m.readings + only(2, 3e-4) * np.sin(m.readings)
+    ended = fg_calib("calibrate", write_job(tmp_path, replace(m, readings=readings), model="pose"))
+    assert "the residuals follow the arm, as noise does not: effects that are not modelled" in words(ended.out)
+    assert "the noise there is" not in words(ended.out)
+
+
+@pytest.mark.slow
+def test_a_wrong_encoder_reading_is_not_offered_as_noise(tmp_path, fg_calib):
+    """Noise that is estimated hides it; the loss that is offered beside the suspicious rows does not."""
+    m = measure(true_robot(ur5e(tmp_path), np.random.default_rng(0)), 60, np.random.default_rng(1), sigma=(5e-5, 1e-4))
+    readings = m.readings.copy()
+    readings[7, 3] += 0.02
+    wrong = replace(m, readings=readings)
+    said = words(fg_calib("calibrate", write_job(tmp_path, wrong, model="pose")).out)
+    assert "or let a robust loss weigh them: loss in the job" in said
+    assert "the noise there is" not in said
+    said = words(fg_calib("calibrate", write_job(tmp_path, wrong, model="pose", loss="huber")).out)
+    assert "look at the suspicious rows below" in said
+    assert "let a robust loss weigh them" not in said
+
+
+@pytest.mark.parametrize(("pitch", "told"), [(90.0, True), (-84.0, True), (60.0, False)])
+def test_a_joint_origin_pitched_by_a_quarter_turn_hardly_holds_a_tilt(pitch, told, fg_calib, tmp_path):
+    """Roll and yaw of a URDF origin turn about one axis there: a truly tilted joint made `noise stated too small`."""
+    joint = '<joint name="{0}" type="revolute"><parent link="l{1}"/><child link="l{2}"/><axis xyz="0 1 0"/>{3}</joint>'
+    origins = ['<origin xyz="0 0 0.2"/>', f'<origin xyz="0 0.1 0.3" rpy="0 {float(np.deg2rad(pitch))!r} 0"/>']
+    joints = "".join(joint.format(f"j{i}", i, i + 1, origin) for i, origin in enumerate(origins))
+    links = "".join(f'<link name="l{i}"/>' for i in range(3))
+    (tmp_path / "arm.urdf").write_text(f'<robot name="arm">{links}{joints}</robot>')
+    ended = fg_calib("observe", tmp_path / "arm.urdf", "--model", "pose")
+    assert ended.code == 0
+    assert ("the origin of joint j1 is pitched by about 90 deg" in " ".join(ended.out.split())) == told

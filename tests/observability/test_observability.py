@@ -1,0 +1,192 @@
+"""Rank, classes and groups: the paper's tables, invariance, and hand-made matrices."""
+
+import numpy as np
+import pytest
+from simulated import measure, paper_robot, small_arm
+from tolerances import rounding
+
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.information import observability_of
+from fg_calib.graph.solver import solve
+from fg_calib.observability.indices import RelativeGroup, observability_indices, observability_of_rows
+from fg_calib.options import Pairing
+from fg_calib.robot.model import Parameter
+from fg_calib.statistics.assessment import assess
+
+# Ranks and groups recomputed independently for Jia et al. (2019), Tables 3 and 4 and the other four measurements.
+BASE_FREE = ["a1", "alpha1", "d1", "theta1", "beta6", "theta7", "beta7"]
+TABLE = {
+    "pose": (
+        29,
+        [],
+        [["beta1", "theta2"], ["beta2", "theta3"], ["d3", "d4", "d5"], ["beta5", "theta6"], ["beta6", "theta7"]],
+    ),
+    "distance-rotation": (
+        23,
+        BASE_FREE,
+        [["beta1", "theta2"], ["beta2", "theta3"], ["d3", "d4", "d5"], ["beta5", "theta6"]],
+    ),
+    "distance": (
+        21,
+        BASE_FREE,
+        [["beta1", "theta2"], ["beta2", "theta3"], ["d3", "d4", "d5"], ["beta5", "theta6", "a7"], ["d6", "alpha7"]],
+    ),
+    "rotation": (
+        11,
+        None,
+        [["beta1", "theta2"], ["beta2", "theta3", "theta4", "theta5"], ["beta5", "theta6"]],
+    ),
+    "position": (
+        25,
+        ["beta6", "theta7", "beta7"],
+        [["beta1", "theta2"], ["beta2", "theta3"], ["d3", "d4", "d5"], ["beta5", "theta6", "a7"], ["d6", "alpha7"]],
+    ),
+    "orientation": (
+        15,
+        None,
+        [["beta1", "theta2"], ["beta2", "theta3", "theta4", "theta5"], ["beta5", "theta6"], ["beta6", "theta7"]],
+    ),
+}
+
+
+def observed(robot, model, frame="known", n=300, seed=0):
+    measurements = measure(robot, n, np.random.default_rng(seed))
+    problem = build_problem(robot, measurements, model=model, pairing=Pairing("random", n), frame=frame, prior=False)
+    return observability_of(problem, problem.variables.nominal())
+
+
+@pytest.mark.sampled(3)
+@pytest.mark.parametrize("model", TABLE)
+def test_the_papers_robot_has_the_ranks_and_groups_of_its_tables(model):
+    rank, ineffective, groups = TABLE[model]
+    found = observed(paper_robot(), model)
+    assert found.rank == rank
+    assert found.gap > 1e6  # exact, not a matter of a threshold
+    assert [sorted(g.parameters) for g in found.relative] == [sorted(g) for g in groups]
+    if ineffective is not None:
+        assert found.named("ineffective") == ineffective
+    lost = sum(g.lost for g in found.relative) + len(found.named("ineffective"))
+    assert lost == 35 - rank
+
+
+def test_the_package_keeps_what_the_paper_keeps():
+    found = observed(paper_robot(), "pose")
+    assert [g.keep for g in found.relative] == [("theta2",), ("theta3",), ("d5",), ("theta6",), ("theta7",)]
+
+
+@pytest.mark.slow
+def test_relations_say_what_moves_together():
+    found = observed(paper_robot(), "distance")
+    relations = {g.parameters: g.relations for g in found.relative}
+    assert relations[("beta1", "theta2")] == ({"beta1": 1.0, "theta2": -1.0},)
+    assert relations[("d3", "d4", "d5")] == ({"d3": 1.0, "d4": -1.0}, {"d4": 1.0, "d5": -1.0})
+    # d6 by 0.5 m acts like alpha7 by 1 rad
+    assert relations[("d6", "alpha7")] == ({"d6": 0.5, "alpha7": 1.0},)
+
+
+def test_every_relation_moves_no_measurement():
+    robot = paper_robot()
+    measurements = measure(robot, 60, np.random.default_rng(1))
+    problem = build_problem(robot, measurements, model="distance", prior=False)
+    found = observability_of(problem, problem.variables.nominal())
+    (rows,) = problem.rows
+    J = rows.linearise(problem.variables.at(problem.variables.nominal()))[1]
+    for group in found.relative:
+        for relation in group.relations:
+            direction = np.array([relation.get(name, 0.0) for name in problem.variables.names])
+            assert np.abs(J @ direction).max() < rounding(J * direction, 1e4)
+
+
+def test_an_unknown_frame_makes_the_base_ineffective():
+    found = observed(paper_robot(), "pose", frame="unknown")
+    assert found.rank == 25
+    assert found.named("ineffective") == ["a1", "alpha1", "d1", "theta1"]
+
+
+def test_a_generic_arm_with_known_frame_determines_everything():
+    found = observed(small_arm(), "pose")
+    # 4 a revolute joint, 2 for the prismatic one, which only has a direction; 6 for the ends, less what mdh lacks
+    assert found.rank == found.singular_values.size - len(found.null_space)
+    assert set(found.classes) <= {"independent", "relative"}
+
+
+def test_the_answer_does_not_depend_on_units():
+    rng = np.random.default_rng(2)
+    J = rng.normal(size=(20, 5))
+    J[:, 4] = 2 * J[:, 3]
+    kinds = ["a", "a", "d", "d", "theta"]
+    parameters = [Parameter(f"{k}{i}", k, i, 0.0) for i, k in enumerate(kinds)]
+    metres = observability_of_rows(J, parameters, scales=np.full(5, 1e-3), n_measurements=10)
+    unit = np.array([1e-3, 1e-3, 1e-3, 1e-3, 1.0])  # columns per millimetre
+    millimetres = observability_of_rows(J * unit, parameters, scales=1e-3 / unit, n_measurements=10)
+    assert millimetres.singular_values == pytest.approx(metres.singular_values, rel=rounding(1, 10), abs=rounding(1.0))
+    assert millimetres.classes == metres.classes == ("independent",) * 3 + ("relative",) * 2
+    assert millimetres.indices == pytest.approx(metres.indices)
+    assert metres.relative[0].keep == millimetres.relative[0].keep == ("theta4",)
+    assert metres.relative[0].relations == ({"d3": 1.0, "theta4": -0.5},)
+    assert millimetres.relative[0].relations == ({"d3": 1.0, "theta4": -0.0005},)
+
+
+def test_indices_follow_their_formulas():
+    s = np.array([8.0, 4.0, 2.0])
+    assert observability_indices(s, 4) == pytest.approx(
+        {"O1": 4.0 / 2, "O2": 0.25, "O3": 2.0, "O4": 0.5, "O5": 1 / 0.875}
+    )
+    assert observability_indices(np.array([]), 4)["O3"] == 0.0
+
+
+def test_what_kept_members_stand_for_undoes_every_relation():
+    """d3, d4 and d5 act by their sum; of p + q and q - 2 r two are kept."""
+    sum_of_three = RelativeGroup(("d3", "d4", "d5"), ({"d3": 1.0, "d4": -1.0}, {"d4": 1.0, "d5": -1.0}), ("d5",))
+    assert sum_of_three.combinations(["d5"]) == {"d5": {"d5": 1.0, "d3": 1.0, "d4": 1.0}}
+    assert sum_of_three.combinations(["d3"]) == {"d3": {"d3": 1.0, "d4": 1.0, "d5": 1.0}}
+    chain = RelativeGroup(("a1", "theta1", "alpha1"), ({"a1": 0.5, "theta1": -1.0, "alpha1": 0.25},), ())
+    assert chain.combinations(["a1", "alpha1"]) == {
+        "a1": {"a1": 1.0, "theta1": 0.5},
+        "alpha1": {"alpha1": 1.0, "theta1": 0.25},
+    }
+    assert chain.combinations(["theta1", "alpha1"]) == {
+        "theta1": {"theta1": 1.0, "a1": 2.0},
+        "alpha1": {"alpha1": 1.0, "a1": -0.5},
+    }
+
+
+@pytest.mark.parametrize("model", ["pose", "distance-rotation"])
+def test_classes_do_not_depend_on_tolerances(model):
+    """What is determined is a matter of the data: a tight tolerance loses none, a ratio of 1e6 groups none."""
+    rng = np.random.default_rng(3)
+    measurements = measure(paper_robot(), 80, rng)
+    wild = {
+        f"{kind}{i}": 1e-3 * 10.0 ** rng.uniform(-4, 4) for kind in ("a", "d", "theta", "beta") for i in range(1, 8)
+    }
+    found = []
+    for tolerance in (None, {"a3": 1e-7}, {"a": 1.0, "d": 1e-6, "alpha": 1e-6}, wild):
+        problem = build_problem(paper_robot(tolerance=tolerance), measurements, model=model)
+        found.append(observability_of(problem, problem.start))
+    for other in found[1:]:
+        assert (other.rank, other.classes, other.relative) == (found[0].rank, found[0].classes, found[0].relative)
+        assert np.array_equal(other.singular_values, found[0].singular_values)
+        assert np.array_equal(other.null_space, found[0].null_space)
+    assert found[0].rank == TABLE[model][0]
+
+
+def test_a_tolerance_says_what_is_weak():
+    """A sigma of 1 um is weak against a tolerance of 2 um, and not against one of 2 mm."""
+    parameters = [Parameter("a1", "a", 1, 0.0), Parameter("a2", "a", 2, 0.0, 2e-6), Parameter("a3", "a", 3, 0.0, 2e-3)]
+    found = observability_of_rows(np.eye(3) / 1e-6, parameters, scales=np.full(3, 1e-3), n_measurements=3)
+    assert [weak.members for weak in found.weak] == [{"a2": 1.0}]
+    assert found.weak[0].signal_to_noise == pytest.approx(2.0)
+    assert found.sigma == pytest.approx(dict.fromkeys(("a1", "a2", "a3"), 1e-6))
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("tolerance", [1e-7, 1e-3, 5.0])
+def test_a_prior_holds_what_the_data_leave_open_whatever_its_size(tolerance):
+    """Its sigma is the tolerance: nothing else is known of the base of an arm that is seen in pairs alone."""
+    rng = np.random.default_rng(4)
+    robot = paper_robot(tolerance={"a": tolerance, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3})
+    uncertainty = assess(solve(build_problem(robot, measure(robot, 80, rng), model="distance-rotation")))
+    sigma = {p.name: p.sigma for p in uncertainty.parameters}
+    assert sigma["a1"] == pytest.approx(tolerance, rel=1e-6)
+    assert sigma["a4"] <= tolerance
+    assert uncertainty.dof == uncertainty.residuals.used.sum()

@@ -1,0 +1,255 @@
+"""What is expected of a calibrated arm: errors, where they are largest, and what they come from."""
+
+import numpy as np
+import pytest
+from simulated import measure, small_arm, true_robot
+from tolerances import rounding
+
+from fg_calib import Calibration, InputError, Measurements, assess, build_problem, calibrate, pose, predict, solve
+from fg_calib.io.job import joint_noise_in
+from fg_calib.prediction import prediction
+from fg_calib.prediction.predict import joint_noise_of
+from fg_calib.prediction.prediction import predict_errors, summed_up
+from fg_calib.prediction.tool_pose import ToolErrorModel
+from fg_calib.statistics.covariance import spread_of
+
+LARGE = {"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}
+JOINTS = np.array([1e-4, 2e-4, 5e-5, 3e-4])
+
+
+@pytest.fixture(scope="module")
+def calibrated():
+    rng = np.random.default_rng(1)
+    robot = small_arm(tolerance=LARGE)
+    m = measure(true_robot(robot, rng), 40, rng, sigma=(1e-4, 1e-4))
+    return calibrate(robot, m, model="pose"), m
+
+
+@pytest.fixture(scope="module")
+def in_unknown_frame():
+    """Without priors: nothing says where the base is."""
+    rng = np.random.default_rng(2)
+    robot = small_arm()
+    return calibrate(robot, measure(robot, 40, rng), model="pose", frame="unknown", gauge="none")
+
+
+def small(monkeypatch):
+    """Few configurations instead of thousands."""
+    monkeypatch.setattr(prediction, "N_DRAWN", 300)
+
+
+def test_given_configurations_have_the_errors_of_predicted_poses(calibrated):
+    """In the base frame, position and orientation, against `Calibration.predict`."""
+    q = np.random.default_rng(3).uniform(-2.0, 2.0, (20, 4))
+    found, poses = predict(calibrated[0], q), calibrated[0].predict(q)
+    expected = np.column_stack([np.linalg.norm(s, axis=1) for s in (poses.sigma_position, poses.sigma_rotation)])
+    assert not found.fitted
+    assert found.expected == pytest.approx(expected, rel=1e-9)  # the same sums in another order
+    assert found.errors.position == pytest.approx(poses.position, abs=rounding(poses.position))
+    row = int(np.argmax(expected[:, 0]))
+    assert found.worst.row == row
+    assert found.worst.sigma**2 @ np.ones(3) == pytest.approx(expected[row, 0] ** 2, rel=1e-9)
+    C = poses.covariance[row, :3, :3]
+    for axis, sigma in zip(found.worst.axes, found.worst.sigma, strict=True):
+        assert C @ axis == pytest.approx(sigma**2 * axis, abs=1e-9 * np.trace(C))
+
+
+def test_orientations_after_the_best_fit_lack_its_rotation(in_unknown_frame):
+    """A turn of the whole arm about its base is no error then: with every point and every orientation it goes."""
+    q = np.random.default_rng(4).uniform(-2.0, 2.0, (10, 4))
+    found = predict(in_unknown_frame, q)
+    assert found.fitted
+    assert np.isnan(found.errors.base).all()  # the base may be anywhere: unknown, not 0
+    assert np.isfinite(found.errors.fitted).all()
+    assert (found.errors.fitted > 0.0).all()
+    assert (found.unknown, found.undetermined) == (0.0, ())
+
+
+def test_joint_noise_moves_the_tool_as_differences_say(calibrated):
+    result, m = calibrated
+    q = np.random.default_rng(5).uniform(-2.0, 2.0, (6, 4))
+    model = ToolErrorModel.of(result.posterior, m.readings, JOINTS)
+    step, squares = 1e-6, np.zeros(6)
+    for j, sigma in enumerate(JOINTS):
+        ahead, behind = (pose(result.robot, q + s * step * np.eye(4)[j]).position for s in (1, -1))
+        squares += np.sum(((ahead - behind) / (2 * step) * sigma) ** 2, axis=1)
+    found = model.at(q).joint_noise
+    assert found[:, 0] == pytest.approx(np.sqrt(squares), rel=1e-7)  # differences of 1e-6: 1e-16 / 1e-6 of a metre
+    turning = np.array([not joint.prismatic for joint in result.robot.joints])
+    assert found[:, 1] == pytest.approx(np.sqrt(np.sum(JOINTS[turning] ** 2)), rel=1e-12)
+
+
+def test_joint_noise_is_that_of_the_measurements(calibrated):
+    assert joint_noise_of(calibrated[0]) is None
+    rng = np.random.default_rng(10)
+    robot = small_arm(tolerance=LARGE)
+    q = rng.uniform(-2.0, 2.0, (20, 4))
+    m = Measurements.from_arrays(q, position=pose(robot, q).position, sigma_position=1e-4, sigma_joint=JOINTS)
+    problem = build_problem(robot, m, model="position")
+    found = Calibration.of(solution := solve(problem), assess(solution))
+    assert joint_noise_of(found) == pytest.approx(JOINTS, rel=1e-15)
+
+
+@pytest.mark.slow
+def test_joint_noise_is_that_of_the_saved_job(fg_calib, example, tmp_path):
+    fg_calib("calibrate", example / "calibration.yaml", "--out", tmp_path / "result")
+    found = joint_noise_of(Calibration.load(tmp_path / "result"))
+    assert found == pytest.approx(np.full(7, np.deg2rad(0.005)), rel=1e-12)
+
+
+def test_the_worst_configuration_is_worse_than_all_that_were_drawn(calibrated, monkeypatch):
+    small(monkeypatch)
+    found = predict(calibrated[0], limit=1.0)
+    worst = found.worst.errors.base[0, 0]
+    assert worst >= np.nanmax(found.expected[:, 0])
+    low, high = found.errors.readings.min(axis=0), found.errors.readings.max(axis=0)
+    assert (found.worst.errors.readings >= low).all()
+    assert (found.worst.errors.readings <= high).all()
+    assert found.within == 1.0
+    assert found.far.shape == (300,)
+
+
+def test_what_a_parameter_is_responsible_for_goes_when_it_is_known(calibrated):
+    """The covariance conditioned on one parameter, by its own formula."""
+    result, _ = calibrated
+    q = np.random.default_rng(6).uniform(-2.0, 2.0, (1, 4))
+    worst = predict(result, q).worst
+    names = [p.name for p in result.robot.parameters if p.estimated]
+    C, v = result.covariance(names), derivatives(result.robot, names, q[0])
+    before = np.trace(v @ C @ v.T)
+    assert worst.responsible
+    for one in worst.responsible:
+        i = names.index(one.name)
+        known = C - np.outer(C[i], C[i]) / C[i, i]
+        assert one.share == pytest.approx(1.0 - np.trace(v @ known @ v.T) / before, abs=1e-6)
+        along = worst.axes[0] @ v
+        assert one.change == pytest.approx(C[i] @ along / np.sqrt(along @ C @ along), rel=1e-5)
+    shares = [1.0 - np.trace(v @ (C - np.outer(c, c) / c[i]) @ v.T) / before for i, c in enumerate(C)]
+    assert worst.responsible[0].name == names[int(np.argmax(shares))]
+
+
+def derivatives(robot, names, q, step=1e-6):
+    columns = []
+    for name in names:
+        at = []
+        for sign in (1, -1):
+            values = robot.nominal
+            values[robot.index(name)] += sign * step
+            at.append(pose(robot.with_values(values), [q]).position[0])
+        columns.append((at[0] - at[1]) / (2 * step))
+    return np.array(columns).T
+
+
+def test_what_nothing_determines_is_unknown_and_named(monkeypatch):
+    """Orientations say nothing of lengths, and no tolerance does."""
+    small(monkeypatch)
+    rng = np.random.default_rng(7)
+    robot = small_arm()
+    result = calibrate(robot, measure(robot, 40, rng), model="orientation", gauge="none")
+    found = predict(result, limit=1.0)
+    assert (found.unknown, found.within, found.worst, found.responsible) == (1.0, 0.0, None, ())
+    assert "a2" in found.undetermined
+    assert np.isnan(found.expected[:, 0]).all()
+    assert np.isfinite(found.expected[:, 1]).all()
+
+
+def test_unknown_errors_count_as_larger_than_all_known_ones():
+    errors = np.array([1.0, 2.0, np.nan, 1.5, 1.2])
+    assert summed_up(errors) == {"rms": None, "median": 1.5, "p95": None, "largest": None}
+    assert summed_up(errors[[0, 1]]) == {"rms": np.sqrt(2.5), "median": 2.0, "p95": 2.0, "largest": 2.0}
+
+
+@pytest.mark.slow
+def test_a_loaded_calibration_is_told_what_was_measured(calibrated, tmp_path):
+    result, m = calibrated
+    result.save(tmp_path / "result")
+    q = m.readings[:3]
+    loaded = Calibration.load(tmp_path / "result")
+    with pytest.raises(InputError, match="does not say what was measured"):
+        predict(loaded, q)
+    expected = predict(result, q).errors
+    for found in (predict(loaded, q, measured=m.readings), predict(tmp_path / "result", q)):
+        assert found.errors.fitted == pytest.approx(expected.fitted, rel=1e-9)
+    (tmp_path / "result" / "configurations.csv").unlink()
+    with pytest.raises(InputError, match=r"configurations\.csv: no such file"):
+        predict(tmp_path / "result", q)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"readings": np.zeros((2, 3))}, "readings: shape"),
+        ({"readings": np.zeros((0, 4))}, "readings"),
+        ({"readings": [[np.nan] * 4]}, "readings"),
+        ({"limit": 0.0}, "limit"),
+        ({"measured": np.zeros((0, 4))}, "measured"),
+    ],
+)
+def test_what_cannot_be_used_is_one_line(calibrated, given, message):
+    with pytest.raises(InputError, match=message) as caught:
+        predict(calibrated[0], **given)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_arm_that_was_only_evaluated_has_no_expected_error():
+    rng = np.random.default_rng(8)
+    robot = small_arm(tolerance=LARGE)
+    m = measure(robot, 20, rng)
+    all_test = Measurements.from_arrays(
+        m.readings, position=m.position, sigma_position=1e-4, test=np.ones(20, dtype=bool)
+    )
+    with pytest.raises(InputError, match="only evaluated"):
+        predict(calibrate(robot, all_test, model="position"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("frame", ["known", "unknown"])
+def test_arms_that_were_calibrated_are_as_far_off_as_expected(frame):
+    """RMS over drawn arms at fixed configurations and at the worst one; scatter of about two effective degrees each."""
+    rng, n = np.random.default_rng(9), 60
+    robot = small_arm(tolerance={"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3})
+    q = rng.uniform(-2.0, 2.0, (200, 4))
+    real, expected = np.zeros((n, 2)), np.zeros((n, 2))
+    for k in range(n):
+        true = true_robot(robot, rng)
+        m = measure(true, 25, rng, sigma=(2e-4, 2e-4))
+        solution = solve(build_problem(robot, m, model="pose", frame=frame))
+        estimate = robot.with_values(solution.parameters[solution.problem.variables.robot_span])
+        model = ToolErrorModel.of(spread_of(solution), m.readings)
+        worst = predict_errors(estimate, model, m.readings, q, fitted=frame == "unknown").worst
+        errors = model.at(q).of(frame == "unknown")[:, 0]
+        off = pose(estimate, q).position - pose(true, q).position
+        if frame == "unknown":
+            a, b = pose(estimate, m.readings).position, pose(true, m.readings).position
+            U, _, Vt = np.linalg.svd((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))
+            R = (U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt).T
+            off = (pose(estimate, q).position - a.mean(axis=0)) @ R.T + b.mean(axis=0) - pose(true, q).position
+        size = np.sum(off**2, axis=1)
+        real[k], expected[k] = (size.mean(), size[worst.row]), (np.mean(errors**2), errors[worst.row] ** 2)
+    ratio = np.sqrt(real.mean(axis=0) / expected.mean(axis=0))
+    # The square of an error with two degrees of freedom scatters by its mean: half of that over sqrt(n), 4 sigma.
+    assert ratio == pytest.approx(np.ones(2), abs=4 * 0.5 / np.sqrt(n))
+
+
+@pytest.mark.parametrize(
+    ("job", "sigma"),
+    [
+        ({"measurements": "poses.csv", "noise": {"position": 1e-4, "joint": 0.01}}, np.full(4, 0.01)),
+        ({"measurements": "poses.csv", "noise": "estimate"}, np.zeros(4)),
+        ({"measurements": "poses.csv"}, np.zeros(4)),
+        ({"measurements": [{"table": "a.csv"}], "noise": {"joint": [1, 2, 3, 4]}}, np.arange(1.0, 5.0)),
+        ({"measurements": [{"table": "a.csv", "noise": {"joint": 5}}], "noise": {"joint": 1}}, np.full(4, 5.0)),
+        ({"measurements": [{"table": "a.csv", "noise": {"position": 5}}], "noise": {"joint": 1}}, np.full(4, 1.0)),
+    ],
+)
+def test_joint_noise_is_read_from_a_job_in_its_units(job, sigma):
+    """In mm and degrees; of a list of tables the first entry's, or what holds for all."""
+    robot = small_arm()
+    units = [1e-3 if joint.prismatic else np.pi / 180.0 for joint in robot.joints]
+    found = joint_noise_in({"model": "pose", "units": {"length": "mm", "angle": "deg"}} | job, robot, "job")
+    assert found == pytest.approx(sigma * units, rel=1e-12)
+
+
+def test_joint_noise_of_a_damaged_job_is_one_line():
+    with pytest.raises(InputError, match="job: unit"):
+        joint_noise_in({"model": "pose", "measurements": "a.csv", "units": {"length": "ell"}}, small_arm(), "job")

@@ -1,0 +1,257 @@
+"""Cross-validation by configuration."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from instruments import measured_by
+from simulated import measure, small_arm, true_robot, write_job
+
+from fg_calib import InputError, Job, Measurements, Options, Own, ProblemError, calibrate
+from fg_calib.measurements.kinds import Position
+from fg_calib.measurements.series import Table
+from fg_calib.statistics.cross_validation import _train, cross_validate, wide
+
+LARGE = {"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}
+TOOL = ("tool.x", "tool.y", "tool.z")
+
+
+def poses(seed=0, n=40, n_test=0, tolerance=LARGE, **more):
+    rng = np.random.default_rng(seed)
+    robot = small_arm(tolerance=tolerance, estimate=TOOL)
+    return robot, measure(true_robot(robot, rng), n, rng, sigma=(1e-4, 1e-4), n_test=n_test, **more)
+
+
+def job_of(robot, *tables, **options):
+    options = Options.of(**{"model": "pose"} | options)
+    given = tuple(
+        t if isinstance(t, Table) else Table(t, options.model, options.pairing, options.frame) for t in tables
+    )
+    return Job(None, robot, given, options)
+
+
+@pytest.mark.slow
+def test_every_configuration_is_predicted_once_by_the_others():
+    """Against calibrations of one's own, fold by fold."""
+    robot, m = poses(n_test=7)
+    found = cross_validate(job_of(robot, m), 4)
+    assert found.fold.shape == (40,)  # test rows take no part
+    assert np.bincount(found.fold).tolist() == [10, 10, 10, 10]
+    squares, arms = 0.0, []
+    for k in range(4):
+        held = m.select(np.arange(40))
+        alone = calibrate(robot, replace(held, test=found.fold == k), model="pose")
+        squares += 10 * alone.residuals.rms()["test"]["position"]["after"] ** 2
+        arms.append([p.estimate for p in alone.parameters.values()])
+    assert found.kinds["position"].n == 40
+    assert found.kinds["position"].after == pytest.approx(np.sqrt(squares / 40), rel=1e-6)  # both converged: 1e-6 sigma
+    jackknife = np.sqrt(3 / 4 * np.sum((np.array(arms) - np.mean(arms, axis=0)) ** 2, axis=0))
+    assert found.spread == pytest.approx(jackknife, rel=1e-4, abs=1e-12)
+
+
+@pytest.mark.slow
+def test_rows_of_one_configuration_stay_together():
+    robot, _, table = measured_by("targets", np.random.default_rng(0), n=30)
+    found = cross_validate(job_of(robot, table), 5)
+    assert found.fold.shape == (30,)
+    assert np.bincount(found.fold).tolist() == [6] * 5
+    assert found.kinds["position"].n == 90
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("instrument", ["anchors", "planes", "board"])
+def test_what_few_configurations_know_of_is_spread_over_the_folds(instrument):
+    robot, _, table = measured_by(instrument, np.random.default_rng(0), n=40)
+    found = cross_validate(job_of(robot, table), 5)
+    m = table.measurements
+    for labels in m.labels.values():
+        for i in range(len(labels.names)):
+            mine = found.fold[labels.index == i]
+            assert np.ptp(np.bincount(mine, minlength=5)) <= 2
+    assert sum(held.n for held in found.kinds.values()) == 40 * len(found.kinds)
+    assert all(held.after < 3.0 * held.noise for held in found.kinds.values())
+
+
+@pytest.mark.long
+def test_who_alone_knows_of_a_station_is_never_held_out():
+    robot, _, table = measured_by("targets stations", np.random.default_rng(0), n=20)
+    m = table.measurements
+    station = m.labels["station"]
+    one = np.where(m.ids == m.ids[0], 1, 0)
+    m = replace(m, labels=m.labels | {"station": replace(station, index=one)})
+    found = cross_validate(job_of(robot, replace(table, measurements=m)), 4)
+    assert np.sum(found.fold == -1) == 1
+
+
+def with_measured_pairs(ends, seed=0):
+    robot, m = poses(seed)
+    a, b = np.array(ends).T
+    length = np.linalg.norm(m.position[b] - m.position[a], axis=1)
+    pairs = {"a": m.ids[a], "b": m.ids[b], "distance": length, "sigma_distance": np.full(len(a), 2e-4)}
+    return robot, Measurements.from_arrays(m.readings, ids=m.ids, pairs=pairs)
+
+
+@pytest.mark.slow
+def test_a_measured_pair_is_held_out_once():
+    chain = [(k, k + 1) for k in range(39)] + [(k, (k + 7) % 40) for k in range(33)] + [(k, k + 3) for k in range(37)]
+    robot, m = with_measured_pairs(chain)
+    found = cross_validate(job_of(robot, m, model="distance"), 5)
+    fold = found.fold
+    assert (fold >= 0).all()
+    assert found.kinds["distance"].n == len(chain)  # each once, although it is fitted without neither of its ends
+
+
+@pytest.mark.slow
+def test_the_hub_of_measured_pairs_is_never_held_out():
+    robot, m = with_measured_pairs([(0, k) for k in range(1, 40)])
+    found = cross_validate(job_of(robot, m, model="distance"), 5)
+    assert found.fold[0] == -1
+    assert found.kinds["distance"].n == 39
+    assert found.of_pairs
+
+
+@pytest.mark.long
+def test_the_spread_is_sigma_where_measurements_determine_a_parameter():
+    """The mean square of spread / sigma: each is chi-square of 4 degrees of freedom over 4, parameters are correlated.
+
+    60 draws of 14 parameters; with as few as 60 independent figures the mean scatters by sqrt(2 / 4 / 60) = 9 %.
+    """
+    wide_open = dict.fromkeys(LARGE, 1.0)
+    squares = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        robot = small_arm(tolerance=wide_open, estimate=TOOL)
+        true = true_robot(small_arm(tolerance=LARGE, estimate=TOOL), rng)
+        m = measure(true, 100, rng, sigma=(1e-4, 1e-4))
+        result = calibrate(robot, m, model="pose", folds=5)
+        spread = result.result.folds.spread
+        known = (p for p in result.parameters.values() if p.identifiability == "independent")
+        squares += [(spread[p.name] / p.sigma) ** 2 for p in known]
+    assert np.mean(squares) == pytest.approx(1.0, abs=4 * 0.09)
+    assert np.mean(squares) > 0.85
+
+
+@pytest.mark.slow
+def test_what_the_model_lacks_makes_folds_worse_than_the_noise():
+    """Joint 2 turns by 1 % more than its reading."""
+    robot, m = poses()
+    q = m.readings.copy()
+    q[:, 1] *= 0.99
+    found = cross_validate(job_of(robot, replace(m, readings=q)), 5)
+    healthy = cross_validate(job_of(robot, m), 5)
+    assert found.kinds["position"].after > 10.0 * found.kinds["position"].noise
+    assert healthy.kinds["position"].after < 1.5 * healthy.kinds["position"].noise
+
+
+@pytest.mark.slow
+def test_limits_without_test_rows_are_judged_by_the_folds():
+    robot, m = poses()
+    result = calibrate(robot, m, model="pose", folds=5, accept={"position": 5e-4})
+    one = result.result.acceptance.judgements[0]
+    assert (one.verdict, one.n) == ("pass", 40)
+    assert one.error == result.result.folds.kinds["position"].after
+
+
+@pytest.mark.slow
+def test_test_rows_come_before_folds():
+    robot, m = poses(n_test=6)
+    result = calibrate(robot, m, model="pose", folds=5, accept={"position": 5e-4})
+    assert result.result.acceptance.judgements[0].n == 6
+
+
+@pytest.mark.parametrize("n", [1, 0, -3, 2.5, True])
+def test_a_number_of_folds_that_cannot_be_is_one_line(n):
+    with pytest.raises(InputError, match="folds: found"):
+        Options.of(folds=n)
+
+
+def test_more_folds_than_configurations_are_refused():
+    robot, m = poses(n=12)
+    with pytest.raises(InputError, match="folds: found 13, expected at most 12"):
+        cross_validate(job_of(robot, m), 13)
+
+
+def test_a_fold_that_leaves_too_little_is_named():
+    """14 unknowns and 15 figures: without a fifth of them they do not suffice."""
+    robot, m = poses(n=5)
+    with pytest.raises(ProblemError, match="folds: without fold 1 of 5: "):
+        cross_validate(job_of(robot, m, gauge="keep", model="position"), 5)
+
+
+@pytest.mark.slow
+def test_the_command_says_it_in_report_and_result(tmp_path, fg_calib):
+    robot, m = poses()
+    job = write_job(tmp_path, robot, m, model="pose")
+    shown = fg_calib("calibrate", job, "--folds", "4")
+    assert (shown.code, shown.err) == (0, "")
+    assert "Cross-validation (4 folds of configurations, each predicted without it; RMS)" in shown.out
+    found = json.loads(fg_calib("calibrate", job, "--folds", "4", "--json").out)["folds"]
+    assert (found["n"], found["n_held_out"], found["n_not_converged"]) == (4, 40, 0)
+    assert found["kinds"]["position"]["n"] == 40
+    assert set(found["spread"]) == {p.name for p in robot.parameters if p.estimated}
+    assert fg_calib("calibrate", job, "--folds", "1").code == 2
+
+
+@pytest.mark.slow
+def test_a_job_may_ask_for_it(tmp_path, fg_calib):
+    robot, m = poses()
+    job = write_job(tmp_path, robot, m, model="pose", folds=3)
+    assert json.loads(fg_calib("calibrate", job, "--json").out)["folds"]["n"] == 3
+
+
+def test_only_what_chance_does_not_explain_is_wide():
+    """With 4 degrees of freedom noise alone is 2.4 times its sigma once in 10 000."""
+    assert wide({"a": 2.0, "b": 1.0}, 5) == []
+    assert wide({"a": 3.0, "b": 4.0, "c": 1.0}, 5) == ["b", "a"]
+    assert wide({"a": 2.0}, 30) == ["a"]
+
+
+@pytest.mark.slow
+def test_repeats_of_one_place_are_held_out_together():
+    robot, m = poses(n=20)
+    rows = np.repeat(np.arange(20), 3)
+    noise = 1e-4 * np.random.default_rng(5).normal(size=(60, 3))
+    repeated = replace(m.select(rows), ids=np.arange(60).astype(str), position=m.position[rows] + noise)
+    fold = cross_validate(job_of(robot, repeated), 5).fold
+    assert all(len(set(fold[rows == k])) == 1 for k in range(20))
+
+
+@pytest.mark.slow
+def test_an_anchor_that_few_lengths_go_to_is_never_held_out():
+    robot, _, table = measured_by("anchors", np.random.default_rng(0), n=40)
+    m = table.measurements
+    labels = m.labels["anchor"]
+    index = labels.index.copy()
+    first = np.flatnonzero(index == 0)
+    keep = np.sort(np.concatenate([first[:4], np.flatnonzero(index != 0)]))
+    few = replace(table, measurements=m.select(keep))
+    found = cross_validate(job_of(robot, few), 5)
+    of_few = few.measurements.labels["anchor"].index == 0
+    assert (found.fold[of_few] == -1).all()
+    assert (found.fold[~of_few] >= 0).all()
+    assert found.kinds["distance"].after < 3.0 * found.kinds["distance"].noise
+
+
+def test_measurements_of_ones_own_are_refused():
+    robot, m = poses()
+    own = Own(Position(), data=m.position, sigma=1e-3)
+    with pytest.raises(InputError, match="folds: measurements of one's own"):
+        cross_validate(job_of(robot, Table(m, "pose", own=(own,))), 5)
+
+
+def test_test_rows_alone_have_nothing_to_hold_out():
+    robot, m = poses(n=20)
+    with pytest.raises(InputError, match="folds: test rows alone"):
+        cross_validate(job_of(robot, replace(m, test=np.ones(20, dtype=bool))), 5)
+
+
+def test_distances_of_points_touched_in_another_table_stay():
+    _, m = poses(n=40)
+    touches = Measurements.from_arrays(m.readings, group=np.repeat(["a", "b"], 20), sigma_point=1e-3)
+    pairs = {"a": ["a"], "b": ["b"], "distance": [0.4], "sigma_distance": [1e-4]}
+    given = {"position": m.position[:1], "sigma_position": 1e-3, "pairs": pairs, "points": ["a", "b"]}
+    between = Measurements.from_arrays(m.readings[:1], **given)
+    first, second = _train((Table(touches, "distance"), Table(between, "distance")))
+    assert second.measurements.groups.pairs.n_pairs == 1
+    assert first.measurements.groups.n_groups == 2

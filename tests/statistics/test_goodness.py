@@ -1,0 +1,673 @@
+"""Goodness of fit: by kind, by row, by configuration, under repetition; and noise estimated from the residuals."""
+
+import re
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+from scipy.stats import kstest
+from simulated import measure, plus, small_arm, true_robot
+from sparing import diagonal
+from touches import SIGMA, TOOL_POINT, corners, touch
+
+from fg_calib.diagnostics.verdict import Statement, of_kept_noise
+from fg_calib.graph import problem as problem_module
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.factors import prior_rows
+from fg_calib.graph.noise import NoiseState
+from fg_calib.graph.rows import ErrorColumns
+from fg_calib.graph.solver import SolverOptions, solve
+from fg_calib.measurements import residuals
+from fg_calib.measurements.dataset import Pairs, rotation_angle
+from fg_calib.measurements.series import Table
+from fg_calib.options import Pairing
+from fg_calib.report.documents import result_document
+from fg_calib.report.text import format_report
+from fg_calib.robot.kinematics import pose
+from fg_calib.statistics import goodness_of_fit as goodness_module
+from fg_calib.statistics import variance_components as noise
+from fg_calib.statistics.assessment import assess
+from fg_calib.statistics.covariance import spread_of
+from fg_calib.statistics.goodness_of_fit import FLAGS, KindFit, kind_fits
+from fg_calib.statistics.residual_table import residual_table
+from fg_calib.statistics.variance_components import estimate_noise
+
+TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
+
+
+def measured_directly(m, robot, rng, a, b, sigma=(1e-3, 5e-4), sigma_joint=0.0):
+    """Pairs of the true robot measured directly, with noise; the joint errors are those of each configuration."""
+    q = m.readings + sigma_joint * rng.normal(size=m.readings.shape)
+    at, n = pose(robot, q), len(a)
+    distance = np.linalg.norm(at.position[b] - at.position[a], axis=1) + sigma[0] * rng.normal(size=n)
+    angle = rotation_angle(np.swapaxes(at.rotation[a], 1, 2) @ at.rotation[b])[0] + sigma[1] * rng.normal(size=n)
+    pairs = Pairs(a, b, distance, angle, np.full(n, sigma[0]), np.full(n, sigma[1]), np.zeros(n, dtype=bool))
+    return replace(m, position=None, rotation=None, pairs=pairs, sigma_joint=np.full(robot.n_joints, sigma_joint))
+
+
+def case(name, robot, rng, n=16, stated=1.0):
+    """A problem of a drawn true robot; noise stated is `stated` times the noise there is."""
+    true = true_robot(robot, rng)
+    if name.startswith("direct"):
+        sigma_joint = 3e-4 if "joint" in name else 0.0
+        a = np.concatenate([np.arange(n), np.arange(n)])
+        b = np.concatenate([np.roll(np.arange(n), 1), np.roll(np.arange(n), 3)])
+        m = measured_directly(measure(true, n, rng), true, rng, a, b, sigma_joint=sigma_joint)
+        m = replace(
+            m,
+            pairs=replace(
+                m.pairs, sigma_distance=m.pairs.sigma_distance * stated, sigma_angle=m.pairs.sigma_angle * stated
+            ),
+        )
+        return build_problem(robot, m, model="distance-rotation")
+    sigma_joint = 3e-4 if "joint" in name else 0.0
+    m = measure(true, n, rng, sigma=(1e-3, 5e-4), sigma_joint=sigma_joint)
+    m = replace(m, sigma_position=m.sigma_position * stated, sigma_orientation=m.sigma_orientation * stated)
+    if name.startswith("pose"):
+        return build_problem(robot, m, model="pose")
+    pairing, *rest = name.split()
+    errors = "independent" if "independent" in rest else "shared"
+    return build_problem(robot, m, model="distance-rotation", pairing=Pairing(pairing), pair_errors=errors)
+
+
+RUNS = {"pose": 100, "star": 70, "all": 40, "direct": 100, "direct joint": 60}
+RUNS |= {"pose joint": 60, "star joint": 60, "star independent": 60}
+
+
+@pytest.mark.parametrize(("name", "n_runs"), RUNS.items())
+@pytest.mark.long
+@pytest.mark.usefixtures("without_reasons")
+def test_p_values_are_uniform_and_the_noise_seen_is_the_noise_there_is(name, n_runs):
+    """Over calibrations of an arm drawn from its tolerances, at a fixed seed.
+
+    Kolmogorov-Smirnov at 0.1 %: by Satterthwaite's approximation a kind's p-value is uniform only nearly. The sum of
+    at least 6 n_runs squares has a relative sigma of sqrt(2 / 6 / n_runs); the root half of it.
+    """
+    rng = np.random.default_rng(7)
+    robot = small_arm(tolerance=TOLERANCE)
+    by_kind, squares, overall = {}, {}, []
+    for _ in range(n_runs):
+        uncertainty = assess(solve(case(name, robot, rng)))
+        overall.append(uncertainty.p_value)
+        for fit in uncertainty.goodness.kinds:
+            by_kind.setdefault(fit.kind, []).append(fit.p_value)
+            squares.setdefault(fit.kind, []).append((fit.chi2, fit.expected))
+    if "independent" not in name:
+        assert kstest(overall, "uniform").pvalue > 1e-3
+    for kind, p in by_kind.items():
+        assert kstest(p, "uniform").pvalue > 1e-3
+        chi2, expected = np.sum(squares[kind], axis=0)
+        assert np.sqrt(chi2 / expected) == pytest.approx(1.0, abs=4 * np.sqrt(1 / 12 / n_runs))
+
+
+@pytest.mark.parametrize("errors", ["", " independent"])
+@pytest.mark.slow
+def test_the_noise_seen_is_unbiased_whether_rows_count_as_independent_or_not(errors):
+    """All pairs of 12 poses share so much that the sum of squares is far below rows less parameters.
+
+    About 10 degrees of freedom a run and kind: 4 sigma are 4 * sqrt(2 / 10 / 60) / 2 = 0.11.
+    """
+    rng = np.random.default_rng(1)
+    robot = small_arm(tolerance=TOLERANCE)
+    sums = np.zeros((2, 2))
+    for _ in range(60):
+        fits = kinds_of(solve(case(f"all{errors}", robot, rng, n=12)))
+        sums += [(fit.chi2, fit.expected) for fit in fits]
+    assert fits[0].n > 50
+    ratio = np.sqrt(sums[:, 0] / sums[:, 1])
+    assert ratio == pytest.approx(
+        1.0, abs=0.06
+    )  # about 10 degrees of freedom a run and kind: 4 * sqrt(1 / 20 / 60) / 2
+
+
+def factors_of(solution):
+    """The factors that noise was estimated with, by kind, of the only table."""
+    assert all(table == 0 or name == "joint" for table, name in solution.problem.state.factors)
+    return {kind: factor for (_, kind), factor in solution.problem.state.factors.items()}
+
+
+def kinds_of(solution):
+    return kind_fits(solution, spread_of(solution), residual_table(solution))
+
+
+def test_leverages_are_those_of_the_hat_matrix():
+    """Independent rows without priors: H = J (J^T W J)^+ J^T W, whose trace is the rank."""
+    rng = np.random.default_rng(2)
+    robot = small_arm()
+    solution = solve(build_problem(robot, measure(true_robot(robot, rng), 20, rng, n_test=4), model="pose"))
+    uncertainty = assess(solution)
+    table, goodness = uncertainty.residuals, uncertainty.goodness
+    (rows,) = solution.problem.rows
+    J = rows.linearise(solution.problem.variables.at(solution.parameters))[1]
+    H = J @ np.linalg.pinv(J, rcond=1e-9)
+    assert goodness.leverage[table.used] == pytest.approx(np.diag(H), rel=1e-6)
+    assert goodness.leverage[table.used].sum() == pytest.approx(uncertainty.spread.rank)
+    expected = table.after / table.sigma / np.sqrt(1.0 + np.where(table.test, 1.0, -1.0) * goodness.leverage)
+    assert goodness.studentised == pytest.approx(expected)
+    assert {FLAGS[f] for f in goodness.flag[table.test]} == {"test"}
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("without_reasons")
+def test_studentised_residuals_of_fitted_and_predicted_rows_have_a_variance_of_one():
+    rng = np.random.default_rng(3)
+    robot = small_arm(tolerance=TOLERANCE)
+    fitted, predicted = [], []
+    for _ in range(40):
+        m = measure(true_robot(robot, rng), 10, rng, sigma=(1e-3, 5e-4), n_test=10)
+        uncertainty = assess(solve(build_problem(robot, m, model="pose")))
+        table, z = uncertainty.residuals, uncertainty.goodness.studentised
+        fitted.append(np.mean(z[table.used] ** 2))
+        predicted.append(np.mean(z[table.test] ** 2))
+    for values in (fitted, predicted):
+        assert np.mean(values) == pytest.approx(1.0, abs=4 * np.std(values) / np.sqrt(40))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "wrong"), diagonal(["star", "all", "pose"], [0, 7]))
+def test_a_configuration_wrong_by_50_sigma_is_the_first_suspect(name, wrong):
+    rng = np.random.default_rng(4)
+    robot = small_arm(tolerance=TOLERANCE)
+    m = measure(true_robot(robot, rng), 25, rng, sigma=(1e-3, 5e-4))
+    m = replace(m, position=plus(m.position, wrong, 50e-3 * np.array([0.6, 0.0, 0.8])))
+    settings = {"model": "pose"} if name == "pose" else {"model": "distance-rotation", "pairing": Pairing(name)}
+    solution = solve(build_problem(robot, m, **settings))
+    uncertainty = assess(solution)
+    table, goodness = uncertainty.residuals, uncertainty.goodness
+    assert goodness.configurations[0].configuration == wrong
+    worst = goodness.suspects[0]
+    assert wrong in (table.a[worst], table.b[worst])
+    text = format_report(solution, uncertainty)
+    assert re.search(rf"Suspicious configurations\n +rows +chi-square +expected\n{wrong} ", text)
+    assert re.search(rf"Suspicious rows\n(  pose {wrong} is in .*\n)?.*\n(\d+ +)?{wrong} ", text)
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("without_reasons")
+def test_clean_tables_seldom_have_a_suspect():
+    """1 % of tables have a suspect row, as many a suspect configuration: more than 4 of 60 are unlikely (0.1 %)."""
+    rng = np.random.default_rng(5)
+    robot = small_arm(tolerance=TOLERANCE)
+    suspicious = np.zeros(2)
+    for k in range(60):
+        goodness = assess(solve(case(["pose joint", "star", "all"][k % 3], robot, rng))).goodness
+        suspicious += [len(goodness.suspects) > 0, len(goodness.configurations) > 0]
+    assert np.all(suspicious <= 4)
+
+
+@pytest.mark.slow
+def test_verdicts_tell_outliers_from_noise_stated_wrong():
+    rng = np.random.default_rng(6)
+    robot = small_arm(tolerance=TOLERANCE)
+    found = {}
+    for what, stated in (("as stated", 1.0), ("too small", 0.5), ("too large", 2.0)):
+        found[what] = {fit.verdict for fit in assess(solve(case("pose", robot, rng, 50, stated))).goodness.kinds}
+    assert found == {what: {what} for what in found}
+    m = measure(true_robot(robot, rng), 50, rng)
+    m = replace(m, position=plus(m.position, ([3, 30], 0), 0.02))
+    fits = assess(solve(build_problem(robot, m, model="pose"))).goodness.kinds
+    assert {fit.kind: fit.verdict for fit in fits} == {"orientation": "as stated", "position": "outliers"}
+
+
+@pytest.mark.parametrize("name", ["pose", "star", "all", "direct joint"])
+@pytest.mark.long
+@pytest.mark.usefixtures("without_reasons")
+def test_noise_stated_wrong_by_two_is_found(name):
+    """The mean of its logarithm over some fits, 4 of its own sigmas about the truth."""
+    rng = np.random.default_rng(8)
+    robot = small_arm(tolerance=TOLERANCE)
+    factors, n_fits = [], 25 if name == "pose" else 9
+    for _ in range(n_fits):
+        if name == "direct joint":  # a factor is on all the noise of a row, joint noise with it
+            problem = case(name, robot, rng, n=24)
+            truth = 1.0
+        else:
+            problem, truth = case(name, robot, rng, n=24, stated=2.0), 0.5
+        solution = estimate_noise(problem)
+        assert solution.converged
+        factors.append(list(factors_of(solution).values()))
+    logs = np.log(np.array(factors) / truth)
+    assert np.all(np.abs(logs.mean(axis=0)) < 4 * logs.std(axis=0) / np.sqrt(n_fits))
+    assert np.all(logs.std(axis=0) < 0.35)
+
+
+@pytest.mark.slow
+def test_estimated_noise_gives_each_kind_the_sum_of_squares_it_expects():
+    rng = np.random.default_rng(9)
+    robot = small_arm(tolerance=TOLERANCE)
+    solution = estimate_noise(case("all", robot, rng, 20, 2.0))
+    uncertainty = assess(solution)
+    assert uncertainty.p_value is None
+    factors = factors_of(solution)
+    assert tuple(factors) == ("distance", "angle") == tuple(fit.kind for fit in uncertainty.goodness.kinds)
+    for fit in uncertainty.goodness.kinds:
+        assert fit.factor == factors[fit.kind]
+        assert fit.chi2 == pytest.approx(fit.expected, rel=3e-3)  # twice SETTLED
+        assert fit.p_value is None
+    document = result_document(solution, uncertainty)
+    assert tuple(document["noise_factors"].items()) == (
+        ("distance", factors["distance"]),
+        ("angle", factors["angle"]),
+    )
+    text = " ".join(format_report(solution, uncertainty).split())
+    assert "distance and angle noise was estimated from these residuals: chi-square says nothing about it" in text
+
+
+@cache
+def noise_estimated_from(name, stated):
+    """What all noise is found to be, over what it is, where `stated` times as much was stated."""
+    robot = small_arm(tolerance=TOLERANCE)
+    problem = case(name, robot, np.random.default_rng(14), 24, stated)
+    m = problem.measurements
+    joint = replace(m, sigma_joint=stated * m.sigma_joint)
+    solution = estimate_noise(build_problem(robot, joint, problem.options))
+    assert solution.converged, solution.message
+    return stated * np.array(list(factors_of(solution).values()))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [("pose", 25.0), ("all", 25.0), ("all", 1 / 25), ("star", 1 / 25), ("star", 25.0), ("pose", 1 / 25)],
+)
+def test_estimated_noise_is_the_same_wherever_it_starts(name, wrong):
+    """To a hundredth of the factor, whose own sigma is some ten times that: rows near kinks are judged as stated."""
+    found = [noise_estimated_from(name, stated) for stated in (1.0, wrong)]
+    assert found[1] == pytest.approx(found[0], rel=0.01)
+
+
+def test_a_solution_that_has_not_arrived_does_not_end_the_estimate_of_the_noise(monkeypatch):
+    problem = case("pose", small_arm(tolerance=TOLERANCE), np.random.default_rng(15), 24, 1 / 25)
+    rounds = []
+
+    def gives_up_at_first(problem, options):
+        rounds.append(solve(problem, options if rounds else SolverOptions(max_iterations=1)))
+        return rounds[-1]
+
+    expected = factors_of(estimate_noise(problem))
+    monkeypatch.setattr(noise, "solve", gives_up_at_first)
+    solution = estimate_noise(problem)
+    assert not rounds[0].converged
+    assert solution.converged, solution.message
+    assert factors_of(solution) == pytest.approx(expected, rel=1e-4)  # 10 times SETTLED
+
+
+def test_noise_that_could_not_be_estimated_is_not_called_estimated():
+    problem = case("pose", small_arm(tolerance=TOLERANCE), np.random.default_rng(16), 24, 2.0)
+    solution = estimate_noise(problem, SolverOptions(max_iterations=1))
+    assert not solution.converged
+    uncertainty = assess(solution)
+    assert uncertainty.findings[0].startswith("not converged: 1 iterations, ")
+    text = " ".join(format_report(solution, uncertainty).split())
+    assert "not settled: the estimate has not converged" in text
+    assert "was estimated from these residuals" not in text
+
+
+@pytest.mark.slow
+def test_a_kind_with_too_little_left_keeps_its_stated_noise(monkeypatch):
+    monkeypatch.setattr(noise, "LEAST_REDUNDANCY", 11.0)
+    rng = np.random.default_rng(10)
+    solution = estimate_noise(case("star", small_arm(tolerance=TOLERANCE), rng, 16, 2.0))
+    assert "distance" not in factors_of(solution)
+    assert factors_of(solution)["angle"] != 1.0
+    distance, angle = assess(solution).goodness.kinds
+    assert (distance.factor, angle.factor) == (1.0, factors_of(solution)["angle"])
+    assert solution.estimated_noise == ((0, "angle"),)
+    assert "too few rows to estimate it: as stated" in " ".join(format_report(solution, assess(solution)).split())
+
+
+@pytest.mark.slow
+def test_factors_that_do_not_settle_are_a_finding(monkeypatch):
+    monkeypatch.setattr(noise, "MAX_ROUNDS", 1)
+    rng = np.random.default_rng(11)
+    solution = estimate_noise(case("pose", small_arm(tolerance=TOLERANCE), rng, 16, 2.0))
+    assert not solution.converged
+    assert assess(solution).findings[0].startswith("not converged: the estimated noise still moved by 0.")
+
+
+def test_kept_parameters_are_estimated_with_estimated_noise_too():
+    rng = np.random.default_rng(12)
+    robot = small_arm()
+    m = measure(true_robot(robot, rng), 40, rng)
+    m = replace(m, sigma_position=2 * m.sigma_position, sigma_orientation=2 * m.sigma_orientation)
+    solution = estimate_noise(build_problem(robot, m, model="pose", gauge="keep"))
+    assert factors_of(solution) == pytest.approx({"orientation": 0.5, "position": 0.5}, rel=0.2)
+    assert solution.problem.whole.state.factors == solution.problem.state.factors
+
+
+def test_a_same_point_that_is_not_is_suspect():
+    """Each of its three coordinates is a row of 1 sigma; two readings that are nearly the same tell it nothing."""
+    rng = np.random.default_rng(13)
+    robot = small_arm(tolerance=TOLERANCE)
+    a = np.arange(20)
+    m = measured_directly(measure(robot, 40, rng), robot, rng, a, a + 20)
+    distance, readings = m.pairs.distance.copy(), m.readings.copy()
+    distance[:2], readings[20:22] = 0.0, readings[:2]
+    readings[20, 3] += 1e-9  # the same configuration twice tells nothing
+    apart = pose(robot, readings[1:2]).jacobian[0, 3:, -1]  # [m] per rad of the last joint
+    readings[21, 3] += 10e-3 / np.linalg.norm(apart)  # 10 sigma
+    m = replace(m, readings=readings, pairs=replace(m.pairs, distance=distance))
+    judged = assess(solve(build_problem(robot, m, model="distance")))
+    table, goodness = judged.residuals, judged.goodness
+    (kind,) = goodness.kinds
+    assert (kind.kind, kind.n) == ("distance", 18 + 2 * 3)
+    same, other = (np.flatnonzero(table.a == k) for k in (0, 1))
+    assert list(table.kind[same]) == ["distance.x", "distance.y", "distance.z"]
+    assert goodness.leverage[same] == pytest.approx(0.0, abs=1e-6)
+    assert np.all(np.abs(goodness.studentised[same]) < 1.0)
+    assert np.linalg.norm(table.after[other] / table.sigma[other]) == pytest.approx(10.0, abs=1.0)
+    assert goodness.suspects[0] in other
+    assert {one.configuration for one in goodness.configurations} == {1, 21}
+
+
+def test_pairs_that_a_model_of_poses_does_not_use_are_named(caplog):
+    rng = np.random.default_rng(14)
+    robot = small_arm(tolerance=TOLERANCE)
+    m = measure(robot, 20, rng)
+    direct = measured_directly(m, robot, rng, np.arange(10), np.arange(10, 20))
+    solution = solve(build_problem(robot, replace(m, pairs=direct.pairs), model="pose"))
+    assert caplog.messages == ["pairs: not used, model pose is of poses"]
+    assert "pairs is not used: model pose is of poses, not of pairs" in format_report(solution, assess(solution))
+
+
+@pytest.mark.slow
+def test_leverage_in_chunks_is_leverage_at_once(monkeypatch):
+    rng = np.random.default_rng(15)
+    robot = small_arm(tolerance=TOLERANCE)
+    solution = solve(case("star joint", robot, rng, 20))
+    at_once = assess(solution).goodness
+    monkeypatch.setattr(goodness_module, "_FEW", 7)
+    in_chunks = assess(solution).goodness
+    assert in_chunks.studentised == pytest.approx(at_once.studentised)
+    p = [fit.p_value for fit in at_once.kinds]
+    assert [fit.p_value for fit in in_chunks.kinds] == pytest.approx(p)
+
+
+@pytest.mark.slow
+def test_a_table_too_long_to_keep_is_judged_nearly_the_same(monkeypatch):
+    """Without derivatives kept, independent rows are judged by their variances alone."""
+    rng = np.random.default_rng(16)
+    robot = small_arm(tolerance=TOLERANCE)
+    solution = solve(case("direct", robot, rng, 100))
+    kept = assess(solution).goodness.kinds
+    monkeypatch.setattr(goodness_module, "MAX_DENSE", 0)
+    for fit, exact in zip(assess(solution).goodness.kinds, kept, strict=True):
+        assert fit.expected == pytest.approx(exact.expected)
+        assert fit.p_value == pytest.approx(exact.p_value, abs=0.02)
+
+
+def test_robust_weights_count_rows_and_flag_outliers():
+    rng = np.random.default_rng(17)
+    robot = small_arm(tolerance=TOLERANCE)
+    m = measure(true_robot(robot, rng), 30, rng)
+    m = replace(m, position=plus(m.position, 5, 0.05))
+    problem = build_problem(robot, m, model="pose")
+    state = NoiseState(weights=(np.where(np.arange(30) == 5, 0.0, 1.0),))
+    solution = solve(problem_module.reweighted_at(problem, problem.start, state))
+    assert solution.problem.state.weights is not None
+    uncertainty = assess(solution)
+    table, goodness = uncertainty.residuals, uncertainty.goodness
+    assert {FLAGS[f] for f in goodness.flag[table.a == 5]} == {"outlier"}
+    assert all(fit.p_value is None for fit in goodness.kinds)
+    assert [fit.seen_over_stated for fit in goodness.kinds] == pytest.approx([1.0, 1.0], abs=0.3)
+
+
+def test_noise_too_small_is_not_called_outliers():
+    """The median of few rows varies: only where some row is far from the others may it speak of outliers."""
+    clean = {"seen_over_stated": 1.8, "factor": 1.0, "p_value": 1e-4, "n": 45, "kind": "position", "unit": "m"}
+    fit = {**clean, "stated_sigma_rms": 1e-4, "chi2": 146.0, "expected": 45.0, "degrees": 45.0}
+    assert KindFit(**fit, typical=1.3, largest=4.9).verdict == "too small"
+    assert KindFit(**fit, typical=1.1, largest=20.0).verdict == "outliers"
+
+
+def test_without_a_p_value_noise_is_judged_by_what_its_rows_vary():
+    """Some 12 degrees of freedom see noise within a fifth: 0.75 times the noise stated is no news, 0.3 times is."""
+    fit = {
+        "kind": "angle",
+        "unit": "rad",
+        "n": 59,
+        "stated_sigma_rms": 1e-4,
+        "factor": 1.0,
+        "chi2": 20.0,
+        "largest": 2.0,
+    }
+    known = {**fit, "expected": 40.0, "p_value": None, "typical": 0.7, "degrees": 12.0}
+    assert KindFit(**known, seen_over_stated=0.75).verdict == "as stated"
+    assert KindFit(**known, seen_over_stated=0.3).verdict == "too large"
+
+
+def touched(robot, rng, n_each=8, sigma_joint=0.0):
+    """Five points touched: of 0, 1 and 2 some touches are test rows, of 3 and 4 all are."""
+    true = true_robot(robot, rng)
+    distances = ((0, 1, 1e-4), (0, 3, 1e-4), (3, 4, 1e-4))
+    m = touch(true, corners(true, 5, rng), n_each, rng, distances=distances, test=(3, 4))
+    noise = sigma_joint * rng.normal(size=m.readings.shape)
+    test = m.test | np.isin(np.arange(len(m.test)), [n_each - 2, n_each - 1, 2 * n_each - 2])
+    return replace(m, readings=m.readings + noise, sigma_joint=np.full(robot.n_joints, sigma_joint), test=test)
+
+
+def predicted(name, rng):
+    """A problem with test rows of a drawn true robot."""
+    sigma_joint = 2e-4 if "joint" in name else 0.0
+    if name.startswith("touches"):
+        robot = small_arm(tolerance=TOLERANCE | {"tool": 5e-3}, estimate=TOOL_POINT)
+        return build_problem(robot, touched(robot, rng, sigma_joint=sigma_joint), model="distance")
+    robot = small_arm(tolerance=TOLERANCE)
+    true = true_robot(robot, rng)
+    m = measure(true, 16, rng, sigma=(1e-3, 5e-4), sigma_joint=sigma_joint, n_test=10)
+    if name.startswith("pose"):
+        return build_problem(robot, m, model="pose")
+    if name.startswith("star"):
+        return build_problem(robot, m, model="distance-rotation", pairing=Pairing("star"))
+    k = np.arange(14)
+    a, b = np.concatenate([k, k]), np.concatenate([np.roll(k, 1), np.roll(k, 3)])
+    direct = measured_directly(measure(true, 14, rng), true, rng, a, b, sigma_joint=sigma_joint)
+    direct = replace(direct, pairs=replace(direct.pairs, test=np.arange(28) >= 20))
+    return build_problem(robot, [Table(m, model="pose"), Table(direct, model="distance")])
+
+
+@pytest.mark.parametrize("name", ["touches", "touches joint", "pose joint", "star joint", "tables", "tables joint"])
+@pytest.mark.long
+@pytest.mark.usefixtures("without_reasons")
+def test_fitted_and_predicted_rows_have_the_sums_of_squares_and_p_values_that_they_are_said_to(name):
+    """Of each table and kind, and all predicted rows together: means within 4 of their own sigma, p-values uniform.
+
+    Kolmogorov-Smirnov at 0.1 %, of kinds whose every run leaves a degree of freedom.
+    """
+    n_runs, rng = 50, np.random.default_rng(21)
+    off, p_values = {}, {}
+    for _ in range(n_runs):
+        goodness = assess(solve(predicted(name, rng))).goodness
+        fits = {("fitted", fit.table, fit.kind): fit for fit in goodness.kinds}
+        fits |= {("predicted", fit.table, fit.kind): fit for fit in goodness.test.kinds}
+        for key, fit in (fits | {"together": goodness.test}).items():
+            off.setdefault(key, []).append(fit.chi2 - fit.expected)
+            p_values.setdefault(key, []).append(fit.p_value)
+    assert len(off) == {"touches": 5, "pose": 5, "star": 5, "tables": 7}[name.split()[0]]
+    for key, found in off.items():
+        assert abs(np.mean(found)) < 4 * np.std(found) / np.sqrt(n_runs), key
+    for key, p in p_values.items():
+        if None not in p:
+            assert kstest(p, "uniform").pvalue > 1e-3, key
+    assert sum(None in p for p in p_values.values()) == name.startswith("touches")  # the one fitted distance
+
+
+@pytest.mark.slow
+def test_touches_of_a_point_that_is_their_mean_share_its_noise():
+    """Leverages by the arm's own derivatives: those of the row less the mean's; of n touches -1 / n for the noise.
+
+    To 1e-3 of it or of the noise: derivatives of rows are less `a x (p - point)`, the noise times an angle's error.
+    """
+    rng = np.random.default_rng(22)
+    robot = small_arm(tolerance=TOLERANCE | {"tool": 5e-3}, estimate=TOOL_POINT)
+    m = touched(robot, rng)
+    solution = solve(build_problem(robot, m, model="distance"))
+    judged = assess(solution)
+    table, goodness, arm = judged.residuals, judged.goodness, judged.robot
+    columns = [arm.index(name) for name in judged.names]
+    at, h = pose(arm, m.readings), 1e-6
+    moved = np.empty((len(m.readings), 3, len(columns)))
+    for k, column in enumerate(columns):
+        step = h * np.eye(len(arm.nominal))[column]
+        up, down = (pose(arm.with_values(arm.nominal + s * step), m.readings).position for s in (1, -1))
+        moved[:, :, k] = (up - down) / (2 * h)
+    means = {
+        g: (moved[m.groups.index == g].mean(axis=0), at.position[m.groups.index == g].mean(axis=0)) for g in (3, 4)
+    }
+    C, n = judged.covariance, 8
+    for g in (3, 4):
+        mine = np.flatnonzero(m.groups.index == g)
+        J = moved[mine] - means[g][0]
+        expected = np.einsum("nij,jk,nik->ni", J, C, J) / SIGMA**2 - 1 / n
+        rows = np.isin(table.a, mine) & (table.family == table.families.index("point"))
+        # The rows are turned; the sum over the three axes is not.
+        assert goodness.leverage[rows].reshape(-1, 3).sum(axis=1) == pytest.approx(
+            expected.sum(axis=1), rel=1e-3, abs=1e-3
+        )
+    (row,) = np.flatnonzero((table.b == len(table.names) - 1) & (table.family == table.families.index("distance")))
+    u = means[4][1] - means[3][1]
+    J = (u / np.linalg.norm(u)) @ (means[4][0] - means[3][0])
+    sigma = table.sigma[row]
+    assert goodness.leverage[row] == pytest.approx((J @ C @ J + 2 * SIGMA**2 / n) / sigma**2, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_the_only_touch_of_a_point_is_met_whatever_was_measured():
+    rng = np.random.default_rng(23)
+    robot = small_arm(tolerance=TOLERANCE | {"tool": 5e-3}, estimate=TOOL_POINT)
+    m = touched(robot, rng)
+    alone = np.flatnonzero(m.groups.index == 4)[1:]
+    index = plus(m.groups.index, alone, -5)  # of no point
+    m = replace(m, groups=replace(m.groups, index=index), sigma_point=plus(m.sigma_point, alone, np.nan))
+    for loss in ("none", "gnc"):
+        judged = assess(solve(build_problem(robot, m, model="distance", loss=loss)))
+        table, goodness = judged.residuals, judged.goodness
+        (first, *_) = met = np.flatnonzero(table.a == alone[0] - 1)
+        assert (len(met), table.kind[first]) == (3, "point.x")
+        assert np.all(np.isnan(goodness.studentised[met]))
+        assert goodness.test.n_unknown == 0
+        assert 1e-4 < goodness.test.p_value < 1.0
+        points = goodness.test.kinds[0]
+        assert (points.kind, points.n) == ("point", 3 * (3 + 8))
+        assert np.isfinite([points.chi2, points.expected, points.p_value, points.largest]).all()
+
+
+@pytest.mark.slow
+def test_rows_that_count_as_independent_but_are_not_have_their_covariance_with_touched_points_too():
+    """Touches, and pairs formed from poses of the same configurations, which share the errors of the readings.
+
+    By dense matrices: with J of core and points, W the weights and C the covariance that there is, residuals of the
+    estimate are (1 - H) e with H = J (J^T W J + priors)^-1 J^T W.
+    """
+    rng = np.random.default_rng(24)
+    robot = small_arm(tolerance=TOLERANCE | {"tool": 5e-3}, estimate=TOOL_POINT)
+    true = true_robot(robot, rng)
+    m = touched(robot, rng, sigma_joint=2e-4)
+    at = pose(true, m.readings)
+    n = len(m.readings)
+    m = replace(
+        m,
+        test=np.zeros(n, dtype=bool),
+        position=at.position + 1e-3 * rng.normal(size=(n, 3)),
+        rotation=at.rotation,
+        sigma_position=np.full((n, 3), 1e-3),
+        sigma_orientation=np.full((n, 3), 5e-4),
+        groups=replace(m.groups, pairs=replace(m.groups.pairs, test=np.zeros(3, dtype=bool))),
+    )
+    solution = solve(build_problem(robot, m, model="distance", pairing=Pairing("chain"), pair_errors="independent"))
+    problem, spread, table = solution.problem, spread_of(solution), residual_table(solution)
+    at, n_core = problem.variables.at(solution.parameters), problem.variables.n_columns
+    J = np.concatenate([rows.linearise(at)[1] for rows in problem.rows])
+    errors, W, C = ErrorColumns(problem.noises), [], []
+    for rows, given in zip(problem.rows, problem.noises, strict=True):
+        (part,), residual_dim = rows.parts, rows.parts[0].block.residual_dim
+        shaped = [residuals.unpack(block.whitening, residual_dim) for block in (part.block, given.rows)]
+        W.append(block_diag(*(shaped[0] @ np.linalg.inv(shaped[1]))))
+        every = np.arange(given.series.n)
+        C.append((errors.loading(given, every).toarray(), block_diag(*given.own_at(every))))
+    L, W = np.vstack([L for L, _ in C]), block_diag(*W)
+    C = W @ (L @ L.T + block_diag(*(own for _, own in C))) @ W.T
+    assert np.abs(C - np.diag(np.diag(C))).max() > 0.1  # much is shared
+    prior = np.zeros((J.shape[1],) * 2)
+    P = prior_rows(problem.variables, solution.parameters)[1]
+    prior[:n_core, :n_core] = P.T @ P
+    K = np.linalg.inv(J.T @ J + prior)
+    actual = K @ (J.T @ C @ J + prior) @ K
+    size = np.sqrt(np.diag(actual)[:n_core])
+    assert spread.actual / np.outer(size, size) == pytest.approx(
+        (actual[:n_core, :n_core]) / np.outer(size, size), abs=1e-4
+    )
+    left = np.eye(len(J)) - J @ K @ J.T
+    A = np.linalg.inv(W) @ (left @ C @ left.T + J @ K @ prior @ K @ J.T) @ np.linalg.inv(W).T
+    variance = np.diag(A) / table.sigma**2
+    for fit in kind_fits(solution, spread, table):
+        family = table.family == table.families.index(fit.kind)
+        assert fit.expected == pytest.approx(variance[family].sum(), rel=1e-4), fit.kind
+    assert [fit.kind for fit in kind_fits(solution, spread, table)] == ["distance", "point"]
+
+
+def differences(function, x, step=1e-5):
+    """Derivative of a function by central differences."""
+    return np.stack([(function(x + h) - function(x - h)) / (2 * step) for h in step * np.eye(len(x))], axis=-1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["one table", "two tables", "independent"])
+def test_predicted_pairs_that_share_joint_noise_with_fitted_ones_have_their_covariance_with_the_estimate(what):
+    """Against the whole covariance of all rows; to 2 % of a sigma, by which noise lengthens the shortest.
+
+    Without the errors in common the sigmas of the predicted rows would be up to a quarter larger.
+    """
+    robot, rng, n, sigma_joint = small_arm(tolerance=TOLERANCE), np.random.default_rng(5), 12, 1e-3
+    i, j = np.array(np.triu_indices(n, 1))[:, rng.permutation(66)]
+    true = true_robot(robot, rng)
+    m = measured_directly(measure(true, n, rng), true, rng, i, j, sigma=(3e-4, 1e-4), sigma_joint=sigma_joint)
+    test = np.arange(66) >= 50
+    whole = replace(m, named=True, pairs=replace(m.pairs, test=test))
+    parts = [replace(whole, pairs=whole.pairs.select(rows)) for rows in (~test, test)]
+    tables = [Table(part, model="distance") for part in parts] if what == "two tables" else whole
+    errors = "independent" if what == "independent" else "shared"
+    solution = solve(build_problem(robot, tables, model="distance", pair_errors=errors))
+    uncertainty = assess(solution)
+
+    def lengths(values, q):
+        p = pose(robot.with_values(values), q.reshape(m.readings.shape)).position
+        return np.linalg.norm(p[j] - p[i], axis=1)
+
+    x, columns = solution.parameters[: len(robot.parameters)], [p.estimated for p in robot.parameters]
+    J = differences(lambda values: lengths(values, m.readings), x)[:, columns]
+    L = sigma_joint * differences(lambda q: lengths(x, q), m.readings.ravel())
+    C = 9e-8 * np.eye(66) + L @ L.T
+    weighted_as = np.diag(np.diag(C)) if what == "independent" else C
+    J_fit, weights = J[~test], np.linalg.inv(weighted_as[np.ix_(~test, ~test)])
+    prior = np.diag([p.tolerance**-2 for p in robot.parameters if p.estimated])
+    K = np.linalg.inv(J_fit.T @ weights @ J_fit + prior)
+    made_of_noise = np.eye(66)[test]
+    made_of_noise[:, ~test] = -J[test] @ K @ J_fit.T @ weights
+    of_priors = J[test] @ K @ prior @ K @ J[test].T
+    A = made_of_noise @ C @ made_of_noise.T + of_priors
+    r = (lengths(x, m.readings) - m.pairs.distance)[test]
+    predicted = uncertainty.goodness.studentised[uncertainty.residuals.test]
+    apart = np.diag(J[test] @ K @ J[test].T + C[np.ix_(test, test)])
+    assert np.max(apart / np.diag(A)) > 1.3
+    assert predicted == pytest.approx(r / np.sqrt(np.diag(A)), abs=0.02)
+    assert uncertainty.goodness.test.chi2 == pytest.approx(r @ np.linalg.solve(A, r), rel=0.02)
+
+
+@pytest.mark.slow
+def test_noise_that_could_not_be_estimated_is_said_and_is_no_good_result():
+    rng = np.random.default_rng(3)
+    robot = small_arm(tolerance=TOLERANCE)
+    found = assess(estimate_noise(build_problem(robot, measure(true_robot(robot, rng), 2, rng), model="pose")))
+    assert found.findings == (
+        "the noise of orientation, position could not be estimated, for fewer than 3 degrees of freedom are left to it:"
+        " it is as stated, or 1 mm and 1 mrad where nothing was; nothing says whether it is right: measure more",
+    )
+    (caution,) = of_kept_noise(["angle"], every=False)
+    assert caution == Statement(
+        "the noise of angle could not be estimated, for fewer than 3 degrees of freedom are left to it: it is as"
+        " stated, or 1 mm and 1 mrad where nothing was",
+        finding=False,
+    )

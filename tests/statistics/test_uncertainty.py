@@ -1,0 +1,378 @@
+"""Covariance, chi-square and findings: closed forms, GTSAM's marginals, Monte Carlo."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2, kstest
+from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
+from tolerances import rounding
+
+from fg_calib.errors import InputError
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.solver import SolverOptions, solve
+from fg_calib.measurements.dataset import Measurements
+from fg_calib.options import Pairing
+from fg_calib.prediction.expected_error import pose_rms
+from fg_calib.robot.kinematics import pose
+from fg_calib.robot.model import Joint, Robot, RobotBuilder
+from fg_calib.statistics.assessment import assess, marginals
+from fg_calib.statistics.chi_square import chi2_bounds
+
+TOLERANCE = {"a": 5e-3, "d": 5e-3, "alpha": 2e-3, "theta": 2e-3, "beta": 2e-3, "tool": 5e-3}
+TOLERANCE |= {f"tool.{k}": 2e-3 for k in ("roll", "pitch", "yaw")}
+
+
+def sigma_of(uncertainty):
+    return {p.name: p.sigma for p in uncertainty.parameters}
+
+
+def test_covariance_of_a_planar_arm_is_the_one_computed_by_hand():
+    """At q2 = 0 the planar arm's tool is at a1 + a2 along x, (a2 theta2) along y: sums and products one can do."""
+    robot = planar_robot()
+    n, sigma = 50, 2e-3
+    q = np.array([[0.0, 0.0]] * (n // 2) + [[0.0, np.pi]] * (n // 2))
+    x = np.where(q[:, 1] == 0.0, 3.0, 1.0)
+    position = np.stack([x, np.zeros(n), np.zeros(n)], axis=1)
+    measurements = Measurements(
+        q, np.arange(n).astype(str), np.zeros(n, bool), position, None, np.full((n, 3), sigma), None, np.zeros(2)
+    )
+    found = sigma_of(assess(solve(build_problem(robot, measurements, model="position"))))
+    # a1 + a2 and a1 - a2 are each the mean of n / 2 values, a2 theta2 that of n values (with both signs)
+    assert found["a1"] == pytest.approx(sigma / np.sqrt(n), rel=1e-6)
+    assert found["a2"] == pytest.approx(sigma / np.sqrt(n), rel=1e-6)
+    assert found["theta2"] == pytest.approx(sigma / np.sqrt(n), rel=1e-6)
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize(
+    ("model", "frame", "estimate"),
+    [
+        ("distance-rotation", "known", []),
+        ("pose", "unknown", []),
+        ("pose", "known", TOOL),
+        ("pose", "known", ["tool.x"]),
+        ("position", "known", []),
+    ],
+)
+def test_covariance_equals_gtsams_marginals_where_these_exist(model, frame, estimate):
+    rng = np.random.default_rng(0)
+    robot = paper_robot(tolerance=TOLERANCE, estimate=estimate)
+    measurements = measure(true_robot(robot, rng), 60, rng)
+    solution = solve(build_problem(robot, measurements, model=model, frame=frame))
+    uncertainty = assess(solution)
+    joint = marginals(solution)
+    variables = solution.problem.variables
+    D = variables.named_derivative(solution.parameters)
+    for v in variables.items:
+        if v.kind == "frame":
+            sigma = np.sqrt(np.diag(joint.marginalCovariance(v.key)))
+            assert uncertainty.frame.sigma == pytest.approx(sigma, rel=1e-6)
+        else:
+            block = D[v.columns, v.columns]
+            expected = block @ joint.marginalCovariance(v.key) @ block.T
+            ours = uncertainty.covariance[v.columns, v.columns]
+            assert ours == pytest.approx(expected, rel=1e-6, abs=1e-6 * np.abs(expected).max())
+
+
+def test_without_priors_only_determined_parameters_have_a_sigma():
+    rng = np.random.default_rng(1)
+    robot = paper_robot()
+    uncertainty = assess(
+        solve(build_problem(robot, measure(true_robot(robot, rng), 100, rng), model="distance-rotation"))
+    )
+    # Table 4 of Jia et al. (2019)
+    ineffective = ["a1", "alpha1", "d1", "theta1", "beta6", "theta7", "beta7"]
+    relative = ["beta1", "theta2", "beta2", "d3", "theta3", "d4", "d5", "beta5", "theta6"]
+    sigma = sigma_of(uncertainty)
+    for p in uncertainty.parameters:
+        if "." in p.name:
+            assert (p.identifiability, p.sigma) == ("fixed", 0.0)
+            continue
+        expected = "ineffective" if p.name in ineffective else "relative" if p.name in relative else "independent"
+        assert p.identifiability == expected, p.name
+        assert (sigma[p.name] is None) == (expected != "independent"), p.name
+    known = np.isfinite(np.diag(uncertainty.covariance))
+    assert known.sum() == 19
+    assert np.all(np.isnan(uncertainty.covariance[~known]))
+    assert uncertainty.dof == 2 * 99 - 23
+    assert uncertainty.trustworthy
+
+
+def test_a_direction_held_by_its_prior_has_the_priors_sigma():
+    rng = np.random.default_rng(2)
+    robot = paper_robot(tolerance={"theta": 0.002, "beta": 0.002, "a": 1e-3, "d": 1e-3, "alpha": 0.002})
+    measurements = measure(true_robot(robot, rng), 100, rng, sigma=(1e-5, 1e-6))
+    uncertainty = assess(solve(build_problem(robot, measurements, model="distance-rotation")))
+    sigma = sigma_of(uncertainty)
+    for name in ("theta1", "beta6", "theta7", "beta7"):
+        assert sigma[name] == pytest.approx(0.002, rel=1e-4)
+    assert sigma["a1"] == pytest.approx(1e-3, rel=1e-4)
+    # beta2 - theta3 is open, their sum is not: half the prior's variance each
+    assert sigma["theta3"] == pytest.approx(0.002 / np.sqrt(2), rel=1e-2)
+
+
+def test_a_tool_turned_by_a_quarter_has_no_sigma_for_roll_and_yaw():
+    rng = np.random.default_rng(3)
+    robot = small_arm(estimate=TOOL)
+    values = robot.nominal
+    values[-6:] = [0.1, 0.0, 0.2, 0.0, np.pi / 2, 0.0]
+    robot = robot.with_values(values)
+    uncertainty = assess(solve(build_problem(robot, measure(robot, 40, rng, sigma=(1e-12, 1e-12)), model="pose")))
+    sigma = sigma_of(uncertainty)
+    assert sigma["tool.pitch"] is not None
+    assert all(sigma[f"tool.{k}"] is None or sigma[f"tool.{k}"] > 1e-9 for k in ("roll", "yaw"))
+
+
+@pytest.mark.long
+def test_monte_carlo_agrees_with_the_stated_covariance():
+    """NEES and chi-square over repeated calibrations of one arm, joint noise included."""
+    rng = np.random.default_rng(4)
+    robot = small_arm(tolerance={"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3})
+    nees, reduced, dof, n_runs = [], [], 0, 120
+    for _ in range(n_runs):
+        true = true_robot(robot, rng)
+        measurements = measure(true, 25, rng, sigma=(5e-4, 3e-4), sigma_joint=2e-4, frame=None)
+        solution = solve(build_problem(robot, measurements, model="pose"))
+        uncertainty = assess(solution)
+        index = [robot.index(name) for name in uncertainty.names]
+        error = solution.parameters[index] - true.nominal[index]
+        nees.append(error @ np.linalg.solve(uncertainty.covariance, error))
+        reduced.append(uncertainty.chi2)
+        dof = uncertainty.dof
+    n = len(index)
+    low, high = chi2.ppf([0.0005, 0.9995], n_runs * n) / n_runs
+    assert low < np.mean(nees) < high
+    assert kstest(nees, chi2(n).cdf).pvalue > 1e-3
+    assert kstest(reduced, chi2(dof).cdf).pvalue > 1e-3
+
+
+@pytest.mark.slow
+def test_chi_square_above_its_bounds_is_a_finding_and_below_them_a_caution():
+    rng = np.random.default_rng(5)
+    robot = small_arm()
+    measurements = measure(true_robot(robot, rng), 60, rng)
+    n = measurements.n_configurations
+    for factor, word in ((5.0, "noise stated too large"), (0.2, "noise stated too small"), (1.0, None)):
+        stated = replace(
+            measurements,
+            sigma_position=np.full((n, 3), 1e-3 * factor),
+            sigma_orientation=np.full((n, 3), 2e-4 * factor),
+        )
+        uncertainty = assess(solve(build_problem(robot, stated, model="pose")))
+        assert uncertainty.trustworthy == (factor >= 1.0)
+        said = uncertainty.findings if factor < 1.0 else uncertainty.cautions
+        assert any("noise stated" in text for text in said) == (word is not None)
+        assert word is None or word in said[0]
+
+
+def test_an_unfinished_solution_is_a_finding():
+    rng = np.random.default_rng(6)
+    robot = small_arm()
+    problem = build_problem(robot, measure(true_robot(robot, rng), 40, rng), model="pose")
+    uncertainty = assess(solve(problem, SolverOptions(max_iterations=1)))
+    assert uncertainty.findings[0].startswith("not converged")
+
+
+def test_bounds_of_chi_square_hold_its_distribution_and_a_factor_of_two():
+    low, high = chi2_bounds(10)
+    assert (low * 10, high * 10) == pytest.approx(chi2.ppf([0.0005, 0.9995], 10))
+    assert chi2_bounds(10_000) == (0.5, 2.0)
+    assert chi2_bounds(0) == (0.0, np.inf)
+
+
+@pytest.mark.parametrize("model", ["pose", "distance-rotation"])
+def test_residual_table_holds_every_row_before_and_after(model):
+    rng = np.random.default_rng(7)
+    robot = small_arm()
+    solution = solve(
+        build_problem(robot, measure(true_robot(robot, rng), 20, rng, n_test=10), model=model, pairing=Pairing("chain"))
+    )
+    table = assess(solution).residuals
+    assert len(table.kind) == (30 * 6 if model == "pose" else 2 * (19 + 9))
+    assert table.test.sum() == (10 * 6 if model == "pose" else 2 * 9)
+    rms = table.rms()
+    for split in ("train", "test"):
+        for kind in ("position", "orientation") if model == "pose" else ("distance", "angle"):
+            assert rms[split][kind]["after"] < rms[split][kind]["before"]
+    whitened = (table.after / table.sigma)[~table.test]
+    if model == "pose":  # pairs of a chain share the errors of their poses
+        assert whitened @ whitened == pytest.approx(2 * solution.cost, rel=rounding(1, 10))
+
+
+def test_position_rms_is_that_of_the_vectors_length():
+    rng = np.random.default_rng(8)
+    robot = small_arm()
+    solution = solve(build_problem(robot, measure(robot, 30, rng), model="position"))
+    table = assess(solution).residuals
+    lengths = np.linalg.norm(table.after.reshape(-1, 3), axis=1)
+    assert table.rms()["train"]["position"]["after"] == pytest.approx(np.sqrt(np.mean(lengths**2)))
+    assert table.rms()["test"] == {}
+
+
+def test_frame_estimate_is_world_T_base():
+    rng = np.random.default_rng(9)
+    robot = small_arm()
+    frame = (Rotation.from_rotvec([0.3, -2.0, 1.0]), np.array([5.0, 1.0, -2.0]))
+    uncertainty = assess(
+        solve(build_problem(robot, measure(robot, 60, rng, frame=frame), model="pose", frame="unknown"))
+    )
+    found = uncertainty.frame
+    turned = Rotation.from_quat(found.quaternion_xyzw).inv() * frame[0]
+    # the base itself is not determined beside the frame: where its columns are open, the frame moves with them
+    assert turned.magnitude() < 0.01
+    assert found.xyz == pytest.approx(frame[1], abs=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["distance-rotation", "pose", "position"])
+def test_every_gauge_predicts_the_same_where_prediction_is_possible(model):
+    rng = np.random.default_rng(10)
+    robot = paper_robot(tolerance={"a": 1.0, "d": 1.0, "alpha": 1.0, "theta": 1.0, "beta": 1.0})  # hardly a prior
+    measurements = measure(true_robot(paper_robot(), rng), 80, rng)
+    q = rng.uniform(-2, 2, (2, 7))
+
+    def distance(r):
+        p = pose(r, q).position
+        return [np.linalg.norm(p[1] - p[0])]
+
+    found = {}
+    for gauge in ("prior", "keep", "none"):
+        solution = solve(build_problem(robot, measurements, model=model, gauge=gauge))
+        assert solution.converged
+        found[gauge] = assess(solution)
+    values = {gauge: u.predict(distance) for gauge, u in found.items()}
+    sigma = values["none"].sigma[0]
+    assert np.isfinite(sigma)
+    for gauge in ("prior", "keep"):
+        # priors of 1 m and 1 rad pull by some millionths of a sigma; null directions turn with the estimate
+        assert values[gauge].value[0] == pytest.approx(values["none"].value[0], abs=1e-2 * sigma)
+        assert values[gauge].sigma[0] == pytest.approx(sigma, rel=1e-2)
+    assert found["keep"].names == found["none"].names
+    assert np.isfinite(found["keep"].covariance).all()  # what was left out is known to its tolerance
+    assert found["keep"].dof == found["none"].dof
+    classes = [[p.identifiability for p in found[g].parameters] for g in ("keep", "none")]
+    assert classes[0] == classes[1]
+    left_out = {p.name for p in found["keep"].parameters if p.sigma == 1.0 and p.correction == 0.0}
+    assert left_out == set(found["none"].names) - set(found["none"].observability.kept)
+
+
+def test_a_sum_is_known_although_its_terms_are_not():
+    rng = np.random.default_rng(11)
+    robot = paper_robot()
+    uncertainty = assess(
+        solve(build_problem(robot, measure(true_robot(robot, rng), 100, rng), model="distance-rotation"))
+    )
+    index = robot.index
+
+    def parameter_sum(r):
+        v = r.nominal
+        return [
+            v[index("beta2")] + v[index("theta3")],
+            v[index("d3")] + v[index("d4")] + v[index("d5")],
+            v[index("d3")],
+        ]
+
+    found = uncertainty.predict(parameter_sum)
+    assert np.isfinite(found.sigma[:2]).all()
+    assert np.isnan(found.sigma[2])
+    assert found.sigma[0] < 1e-3
+    assert np.isnan(
+        uncertainty.predict(lambda r: pose(r, np.zeros((1, 7))).position[0]).sigma
+    ).all()  # the base is not known
+
+
+@pytest.mark.long
+def test_predicted_sigmas_cover_the_truth():
+    rng = np.random.default_rng(12)
+    robot = small_arm(tolerance={"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3})
+    q = rng.uniform(-2, 2, (1, 4))
+    z = []
+    for _ in range(60):
+        true = true_robot(robot, rng)
+        uncertainty = assess(solve(build_problem(robot, measure(true, 20, rng), model="distance-rotation")))
+        found = uncertainty.predict(lambda r: pose(r, q).position[0])
+        z.append((found.value - pose(true, q).position[0]) / found.sigma)
+    assert 0.7 < np.std(z) < 1.4  # pairs of a star share a configuration: sigmas are somewhat off, not by factors
+
+
+def test_rows_that_are_not_linear_in_what_is_unknown_are_cautioned_about():
+    """Planar arm, tilts known from priors alone: angles of 20 mrad are bent by them; a generic arm's are not."""
+    rng, calm = np.random.default_rng(1), small_arm(tolerance={"alpha": 3e-3, "theta": 3e-3, "a": 1e-3, "d": 1e-3})
+    wide = measure(true_robot(calm, rng), 30, rng, sigma=(1e-4, 2e-4))
+    assert assess(solve(build_problem(calm, wide, model="distance-rotation"))).cautions == ()
+    robot = scara({"alpha": 3e-3, "beta": 3e-3, "theta": 1e-3, "a": 1e-3, "d": 1e-3})
+    q = rng.uniform(-1.0, 1.0, (30, 3))
+    q[-3:, 2] = q[0].sum() - q[-3:, 0] - q[-3:, 1] + 0.02  # turned by 20 mrad against the first
+    small = measure(true_robot(robot, rng), 30, rng, sigma=(1e-4, 1e-4), readings=q)
+    uncertainty = assess(solve(build_problem(robot, small, model="distance-rotation")))
+    assert any("bent by what the parameters may still be off" in text for text in uncertainty.cautions)
+
+
+@pytest.mark.slow
+def test_the_height_of_a_scaras_targets_is_in_the_sigmas_of_what_follows_it():
+    """Monte Carlo: 12 draws, targets 0.8 m below the flange where the fit starts at it; theta2 was 4.8 sigma off."""
+    rows = [[0.35, 0.0, 0.4, 0.0], [0.3, np.pi, 0.02, 0.1], [0.0, 0.0, 0.1, 0.0], [0.0, 0.0, 0.05, 0.3]]
+    types = ["revolute", "revolute", "prismatic", "revolute"]
+    arm = Robot.from_dh(rows, types=types, tolerance={"a": 1e-3, "d": 1e-3, "alpha": 2e-3, "theta": 2e-3})
+    errors = {"alpha1": 1.6e-3, "alpha2": 9e-4, "alpha3": 6e-4, "theta2": 1e-3, "a1": 4e-4}
+    at = [[p.name for p in arm.parameters].index(name) for name in errors]
+    values = arm.nominal.copy()
+    values[at] += list(errors.values())
+    z = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        q = rng.uniform(-1.8, 1.8, (40, 4)) * [1.0, 1.0, 0.17, 1.0]
+        there = pose(arm.with_values(values), q)
+        targets = np.add(rng.uniform(-0.3, 0.3, (3, 3)), [0.0, 0.0, 0.8])
+        seen = (there.position[:, None] + np.einsum("nij,kj->nki", there.rotation, targets)).reshape(-1, 3)
+        measured = Measurements.from_arrays(
+            np.repeat(q, 3, axis=0), position=seen + 5e-5 * rng.standard_normal(seen.shape), sigma_position=5e-5,
+            target=["a", "b", "c"] * 40, ids=np.repeat([f"k{i}" for i in range(40)], 3),
+        )  # fmt: skip
+        solution = solve(build_problem(arm, measured, model="position", frame="unknown"))
+        sigma = sigma_of(assess(solution))
+        z.append((solution.parameters[at] - values[at]) / [sigma[name] for name in errors])
+    rms = np.sqrt(np.mean(np.square(z), axis=0))
+    assert np.all(rms < 1.0 + 3.0 / np.sqrt(24.0))  # three standard errors of 12 draws
+    assert np.all(rms > 0.4)
+
+
+def scara(tolerance):
+    """Three parallel axes."""
+    builder = RobotBuilder("scara", "mdh-hayati")
+    builder.add_frame("base", {}, 0, False)
+    for i, a in enumerate((0.0, 0.4, 0.3)):
+        builder.add_convention_joint(Joint(f"q{i + 1}"), {"alpha": 0.0, "a": a, "d": 0.0, "theta": 0.0, "beta": 0.0})
+    builder.add_frame("tool", {"x": 0.1}, 4, False)
+    return builder.build(tolerance=tolerance)
+
+
+@pytest.mark.filterwarnings("error")
+def test_an_error_of_which_rounding_leaves_less_than_nothing_is_unknown():
+    """Tolerances of a million metres that cancel after the best rigid fit left variances below 0."""
+    rng = np.random.default_rng(0)
+    points, jacobian = rng.normal(size=(4, 3)), rng.normal(size=(4, 6, 2))
+    base, fitted = pose_rms(points, jacobian, lambda rows: np.full(len(rows), -1e-3))
+    assert (base.position, base.orientation, fitted.position, fitted.orientation) == (None,) * 4
+
+
+@pytest.mark.parametrize(
+    ("function", "said"),
+    [
+        (lambda robot: 1 / 0, "raised ZeroDivisionError: division by zero, expected figures of any robot"),
+        (lambda robot: "far", "found 'far', expected a number or an array of them"),
+        (lambda robot: [[1.0], [1.0, 2.0]], "found [[1.0], [1.0, 2.0]], expected a number or an array of them"),
+        (lambda robot: 1j, "found 1j, expected a number or an array of them"),
+    ],
+)
+def test_what_a_function_of_ones_own_raises_or_returns_is_one_line(function, said):
+    robot = small_arm(tolerance={"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3})
+    rng = np.random.default_rng(0)
+    found = assess(solve(build_problem(robot, measure(true_robot(robot, rng), 12, rng), model="position")))
+    with pytest.raises(InputError) as error:
+        found.predict(function)
+    assert str(error.value) == f"function: {said}"
+    with pytest.raises(InputError, match=r"^function: 2 figures, expected points, shape \(n, 3\), where errors are f"):
+        found.predict(lambda robot: [1.0, 2.0], fitted=True)

@@ -1,0 +1,381 @@
+"""Noise estimated where joint noise is stated too: a factor on each kind's own noise, and one on that of the joints."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from dense import dense
+from scipy.optimize import minimize
+from scipy.stats import chi2, kstest
+from simulated import measure, small_arm, true_robot
+from sparing import diagonal
+from tolerances import rounding
+from touches import TOOL_POINT, corners, touch
+
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.factors import prior_rows
+from fg_calib.graph.noise import JOINT_NOISE
+from fg_calib.graph.problem import reweighted_at
+from fg_calib.graph.rows import whitener_of
+from fg_calib.graph.solver import solve
+from fg_calib.measurements import sharing
+from fg_calib.measurements.dataset import Measurements, Pairs
+from fg_calib.measurements.series import Table
+from fg_calib.options import Pairing
+from fg_calib.report.documents import result_document
+from fg_calib.report.text import format_report
+from fg_calib.robot.kinematics import pose
+from fg_calib.statistics import variance_components as estimation
+from fg_calib.statistics.assessment import assess
+from fg_calib.statistics.covariance import spread_of
+from fg_calib.statistics.goodness_of_fit import kind_fits
+from fg_calib.statistics.noise_components import noise_components
+from fg_calib.statistics.residual_table import residual_table
+from fg_calib.statistics.variance_components import estimate_noise
+
+TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3, "tool": 5e-3}
+SIGMA, SIGMA_JOINT = (1e-3, 5e-4), 1e-3
+
+
+def stated(m, own, joint):
+    """Measurements whose noise is stated so many times as large as it is."""
+    changes = {name: getattr(m, name) for name in ("sigma_position", "sigma_orientation", "sigma_point")}
+    changes = {name: own * sigma for name, sigma in changes.items() if sigma is not None}
+    if m.pairs is not None:
+        changes["pairs"] = replace(m.pairs, sigma_distance=own * m.pairs.sigma_distance)
+    if m.groups is not None:
+        pairs = m.groups.pairs
+        changes["groups"] = replace(m.groups, pairs=replace(pairs, sigma_distance=own * pairs.sigma_distance))
+    return replace(m, sigma_joint=joint * m.sigma_joint, **changes)
+
+
+def tracker_and_bar(true, rng, n=30):
+    """Positions, and lengths between the same configurations measured directly: their joint noise is the same."""
+    q = rng.uniform(-np.pi, np.pi, (n, true.n_joints))
+    p = pose(true, q + SIGMA_JOINT * rng.normal(size=q.shape)).position
+    a = np.tile(np.arange(n), 2)
+    b = np.concatenate([np.roll(np.arange(n), 1), np.roll(np.arange(n), 3)])
+    length = np.linalg.norm(p[b] - p[a], axis=1) + 5e-4 * rng.normal(size=len(a))
+    sigma, none = np.full(len(a), 5e-4), np.full(len(a), np.nan)
+    same = {
+        "readings": q,
+        "ids": np.arange(n).astype(str),
+        "test": np.zeros(n, dtype=bool),
+        "rotation": None,
+        "sigma_orientation": None,
+        "sigma_joint": np.full(true.n_joints, SIGMA_JOINT),
+        "named": True,
+    }
+    p = p + SIGMA[0] * rng.normal(size=p.shape)
+    pairs = Pairs(a, b, length, none, sigma, none, np.zeros(len(a), dtype=bool))
+    return (
+        Measurements(position=p, sigma_position=np.full((n, 3), SIGMA[0]), source="tracker.csv", **same),
+        Measurements(position=None, sigma_position=None, pairs=pairs, source="bar.csv", **same),
+    )
+
+
+def touched(true, rng):
+    """Touches of five points and the lengths between these, with joint noise."""
+    points = corners(true, 5, rng)
+    between = tuple((a, b, 1e-4) for a in range(5) for b in range(a))
+    m = touch(true, points, 12, rng, sigma=1e-3, distances=between)
+    readings = m.readings + SIGMA_JOINT * rng.normal(size=m.readings.shape)
+    return replace(m, readings=readings, sigma_joint=np.full(true.n_joints, SIGMA_JOINT))
+
+
+CHOICES = {
+    "pose": {"model": "pose"},
+    "frame unknown": {"model": "pose", "frame": "unknown"},
+    "encoder estimated": {"model": "pose", "encoder": "estimated"},
+    "no joint noise": {"model": "pose"},
+    "joints drowned": {"model": "pose"},
+    "star": {"model": "distance-rotation"},
+    "star of distances": {"model": "distance"},
+    "all distances": {"model": "distance", "pairing": Pairing("all")},
+    "random": {"model": "distance-rotation", "pairing": Pairing("random", 100, 0)},
+    "touches": {"model": "distance"},
+    "tables": {},
+}
+
+
+def draw(name, rng, own=1 / 3, joint=2.0, n=30):
+    """A problem and its true robot; noise is stated `own` and `joint` times as large as it is."""
+    robot = small_arm(tolerance=TOLERANCE, estimate=TOOL_POINT if name == "touches" else ())
+    true = true_robot(robot, rng)
+    if name == "tables":
+        tracker, bar = (stated(m, own, joint) for m in tracker_and_bar(true, rng, n))
+        return build_problem(robot, [Table(tracker, "position"), Table(bar, "distance")]), true
+    if name == "touches":
+        return build_problem(robot, stated(touched(true, rng), own, joint), **CHOICES[name]), true
+    there = 0.0 if name in ("no joint noise", "joints drowned") else SIGMA_JOINT
+    m = measure(true, n, rng, sigma=SIGMA, sigma_joint=there, n_test=n // 3)
+    if name == "joints drowned":
+        m = replace(m, sigma_joint=np.full(4, SIGMA_JOINT))
+    return build_problem(robot, stated(m, own, joint), **CHOICES[name]), true
+
+
+def factors_of(solution):
+    return dict(solution.problem.state.factors)
+
+
+def dense_model(solution):
+    """[J r] with the priors' rows, the covariance of each noise's part, and of the priors, at a solution.
+
+    Priors are rows of variance 1; parts are by kind, then the joints'. No pairs here: own noise is diagonal.
+    """
+    problem, x = solution.problem, solution.parameters
+    A, of_joints, C = dense(problem, x)
+    J, r = A[:, :-1], A[:, -1]
+    L = of_joints.reshape(len(r), -1)
+    own = C - L @ L.T
+    kinds = np.concatenate([
+        np.tile([name.partition(".")[0] for name in s.kind.names], len(s.train)) for s in problem.data.series
+    ])  # fmt: skip
+    parts = [own * np.equal.outer(kinds, [k])[:, 0, None] for k in dict.fromkeys(kinds)]
+    residual, rows = prior_rows(problem.variables, x)
+    wide = np.zeros((len(rows), J.shape[1]))
+    wide[:, : rows.shape[1]] = rows
+    return J, r, [*parts, L @ L.T], wide, residual
+
+
+def spare_of(problem):
+    """Covariance that rows are weighted by on top of their noise: of distances alone."""
+    rows = problem.rows[0]
+    W = whitener_of(problem.noises[0], rows.parts[0])[:, 0, 0]
+    return np.diag(np.asarray(rows.spare.power(2).sum(axis=1)).ravel() / W**2)
+
+
+DENSE = ["pose", "frame unknown", "encoder estimated", "touches", "tables", "star of distances", "all distances"]
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize(("name", "exact"), diagonal(DENSE, [True, False]))
+def test_components_are_those_of_the_dense_covariance(name, exact, monkeypatch):
+    """To rounding of the dense inverse; estimated products to four of their sigmas, some sqrt(2 / 64) of themselves."""
+    problem, _ = draw(name, np.random.default_rng(1), own=0.8, joint=1.3, n=14)
+    state = replace(problem.state, factors={(0, "position"): 1.7, (0, "distance"): 0.6, JOINT_NOISE: 1.4})
+    solution = solve(reweighted_at(problem, problem.start, state))
+    there, state = solution.parameters, replace(solution.problem.state, spread=None)
+    problem = reweighted_at(solution.problem, there, state)
+    solution = replace(solution, problem=problem)
+    J, r, parts, rows, _ = dense_model(solution)
+    F = spare_of(problem) if "distances" in name else np.zeros((len(r), len(r)))
+    parts[0] = parts[0] - F
+    inverse = np.linalg.inv(sum(parts) + F)
+    P = inverse - inverse @ J @ np.linalg.solve(J.T @ inverse @ J + rows.T @ rows, J.T @ inverse)
+    if not exact:
+        monkeypatch.setattr(sharing, "MAX_EXACT", 0)
+    found = noise_components(solution, spread_of(solution))
+    e = inverse @ r  # at the optimum it is P times rows and priors
+    assert found.names[-1] == JOINT_NOISE
+    assert found.seen == pytest.approx([e @ V @ e for V in parts], rel=1e-5)
+    seen = np.array([[e @ V @ P @ U @ e for U in parts] for V in parts])
+    assert found.products_seen == pytest.approx(seen, rel=1e-5)
+    expected = [np.trace(P @ V) - np.trace(P @ V @ P @ F) for V in parts]
+    products = np.array([[np.trace(P @ V @ P @ U) for U in parts] for V in parts])
+    shares = problem.rows[0].shared is not None
+    rel = 1e-5 if exact or not shares else 4 * np.sqrt(2 / 64)
+    assert found.expected == pytest.approx(expected, rel=rel)
+    assert found.products == pytest.approx(products, rel=rel)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pose", "frame unknown"])
+def test_factors_are_the_most_likely_ones(name):
+    """Restricted maximum likelihood by Nelder-Mead on the dense linear model: the least of it is at the factors."""
+    problem, _ = draw(name, np.random.default_rng(17), n=20)
+    solution = estimate_noise(problem)
+    assert solution.converged
+    assert len(solution.estimated_noise) == 3
+    J, r, parts, rows, residual = dense_model(solution)
+
+    def unlikely(logarithms):
+        W = np.linalg.inv(np.linalg.cholesky(sum(np.exp(2.0 * x) * V for x, V in zip(logarithms, parts, strict=True))))
+        A, b = np.vstack([W @ J, rows]), np.concatenate([W @ r, residual])
+        left = b - A @ np.linalg.lstsq(A, b, rcond=1e-12)[0]
+        return -2.0 * np.log(np.diag(W)).sum() + np.linalg.slogdet(A.T @ A)[1] + left @ left
+
+    likely = minimize(unlikely, np.full(3, 0.1), method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-11}).x
+    assert likely == pytest.approx(0.0, abs=1e-4)
+
+
+def test_without_joint_noise_the_equations_are_those_of_the_kinds():
+    problem, _ = draw("no joint noise", np.random.default_rng(2), joint=0.0)
+    solution = solve(problem)
+    found = noise_components(solution, spread_of(solution))
+    kinds = kind_fits(solution, spread_of(solution), residual_table(solution))
+    assert found.names[:-1] == tuple((fit.table, fit.kind) for fit in kinds)
+    assert found.seen == pytest.approx([*(fit.chi2 for fit in kinds), 0.0], rel=1e-9)
+    assert found.expected == pytest.approx([*(fit.expected for fit in kinds), 0.0], rel=1e-9)
+    assert JOINT_NOISE not in factors_of(estimate_noise(problem))
+
+
+@cache
+def estimated(name, own=1 / 3, joint=2.0):
+    problem, true = draw(name, np.random.default_rng(4), own, joint)
+    return estimate_noise(problem), true
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("name", ["pose", "tables"])
+def test_own_noise_and_that_of_the_joints_are_told_apart(name):
+    """Each within four of its own sigmas; its degrees of freedom are 15 at least, or 5 of lengths."""
+    solution, _ = estimated(name)
+    found = factors_of(solution)
+    assert set(solution.estimated_noise) == set(found)
+    assert found.pop(JOINT_NOISE) == pytest.approx(0.5, rel=4 / np.sqrt(2 * 15))
+    for (_, kind), factor in found.items():
+        sigma = 1 / np.sqrt(2 * (5 if kind == "distance" else 15))
+        assert np.log(factor) == pytest.approx(np.log(3.0), abs=4 * sigma)
+
+
+@pytest.mark.slow
+def test_estimated_joint_values_tell_of_the_same_noise():
+    """To first order only: 1 mrad turns residuals by 1e-3 of themselves."""
+    found, other = (factors_of(estimated(name)[0]) for name in ("pose", "encoder estimated"))
+    assert other == pytest.approx(found, rel=0.02)
+    values = assess(estimated("encoder estimated")[0]).joint_values
+    assert values.sigma == pytest.approx(np.full(4, 2.0 * SIGMA_JOINT * other[JOINT_NOISE]))
+    assert values.scatter == pytest.approx(np.ones(4), abs=4 / np.sqrt(2 * 30))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("times", [1 / 25, 25.0])
+def test_factors_are_the_same_wherever_they_start(times):
+    """To ten times what settles them: they are the optimum's."""
+    expected, found = (factors_of(estimated("pose", *of)[0]) for of in ((1 / 3, 2.0), (times / 3, times * 2.0)))
+    assert {name: times * factor for name, factor in found.items()} == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_joint_noise_that_is_not_there_goes_to_nothing():
+    solution, _ = estimated("joints drowned", joint=1.0)
+    found = factors_of(solution)
+    assert JOINT_NOISE in solution.estimated_noise
+    assert found.pop(JOINT_NOISE) < 0.3
+    assert list(found.values()) == pytest.approx([3.0, 3.0], rel=4 / np.sqrt(2 * 60))
+
+
+@pytest.mark.slow
+def test_noise_that_is_drowned_keeps_what_was_stated_and_is_said_to(monkeypatch):
+    """Own noise of a hundredth of what the joints add."""
+    rng = np.random.default_rng(5)
+    robot = small_arm(tolerance=TOLERANCE)
+    m = measure(true_robot(robot, rng), 20, rng, sigma=(1e-6, 1e-6), sigma_joint=SIGMA_JOINT)
+    solution = estimate_noise(build_problem(robot, stated(m, 2.0, 2.0), model="position"))
+    assert solution.converged
+    assert solution.estimated_noise == (JOINT_NOISE,)
+    assert factors_of(solution)[0, "position"] == 1.0
+    assert factors_of(solution)[JOINT_NOISE] == pytest.approx(0.5, rel=4 / np.sqrt(2 * 44))
+    found = assess(solution)
+    assert "the noise of position could not be estimated" in found.cautions[0]
+    document = result_document(solution, found)
+    assert document["noise_kept"] == ["position"]
+    assert document["noise_factors"] == {"position": 1.0, "joint": factors_of(solution)[JOINT_NOISE]}
+    text = " ".join(format_report(solution, found).split())
+    assert "not to be told from other noise: as stated" in text
+    assert "joint noise was estimated from these residuals" in text
+
+
+def test_a_report_tells_own_noise_and_that_of_the_joints():
+    """Stated and estimated: position 1/3 mm by its factor; joints 2 mrad and, of the slide, 2 mm by theirs."""
+    solution, _ = estimated("pose")
+    found, factors = assess(solution), factors_of(solution)
+    assert found.trustworthy
+    assert not any("noise" in text for text in found.reservations)
+    lines = [" ".join(line.split()) for line in format_report(solution, found).splitlines()]
+    by = factors[0, "position"]
+    assert f"position mm 0.3333 {by / 3:.4f} {by:.3f} - estimated" in lines
+    by = factors[JOINT_NOISE]
+    assert f"joint readings mm 2.0000 {2 * by:.4f} {by:.3f} - estimated" in lines
+    assert f"joint readings deg 0.11459 {0.11459 * by:.5f} {by:.3f} - estimated" in lines
+    document = result_document(solution, found)
+    assert document["noise_kept"] == []
+    assert document["noise_factors"] == {"orientation": factors[0, "orientation"], "position": factors[0, "position"],
+                                         "joint": by}  # fmt: skip
+    for fit in found.goodness.kinds:  # all noise together is what is seen
+        assert fit.seen_over_stated / fit.factor == pytest.approx(1.0, abs=0.2)
+        rows = found.residuals.used & (found.residuals.kind_code == [k.name for k in found.residuals.kinds].index(
+            f"{fit.kind}.x"))  # fmt: skip
+        assert rows.any()
+    rms = {f.kind: f.stated_sigma_rms * f.factor for f in found.goodness.kinds}
+    sigma = found.residuals.sigma[found.residuals.used & np.char.startswith(found.residuals.kind, "position")]
+    assert rms["position"] == pytest.approx(np.sqrt(np.mean(sigma**2)))
+
+
+@pytest.mark.slow
+def test_factors_of_own_and_joint_noise_that_do_not_settle_are_a_finding(monkeypatch):
+    monkeypatch.setattr(estimation, "MAX_ROUNDS", 1)
+    solution = estimate_noise(draw("pose", np.random.default_rng(11))[0])
+    assert not solution.converged
+    assert assess(solution).findings[0].startswith("not converged: the estimated noise still moved by ")
+
+
+@pytest.mark.slow
+def test_kept_parameters_have_the_same_noise():
+    rng = np.random.default_rng(12)
+    robot = small_arm()
+    m = stated(measure(true_robot(robot, rng), 40, rng, sigma=SIGMA, sigma_joint=SIGMA_JOINT), 1 / 3, 2.0)
+    solution = estimate_noise(build_problem(robot, m, model="pose", gauge="keep"))
+    assert solution.problem.whole.state.factors == solution.problem.state.factors
+    assert JOINT_NOISE in solution.problem.state.factors
+
+
+N_DRAWS = 24
+
+CELLS = {  # how much own and joint noise is stated, as a multiple of what there is
+    "pose": (1 / 3, 2.0),
+    "encoder estimated": (1 / 3, 2.0),
+    "joints drowned": (1 / 3, 1.0),
+    "tables": (1 / 3, 2.0),
+    "star": (1.0, 2.0),
+    "random": (1 / 3, 2.0),
+    "touches": (1 / 3, 2.0),
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", CELLS)
+def test_sigmas_are_honest_with_estimated_noise(name):
+    """NEES within 99.9 % of its draws, and 6 % for what is not known of the noise; factors within 4 of their sigmas."""
+    rng, (own, joint) = np.random.default_rng(21), CELLS[name]
+    nees, factors, p, n = [], {}, [], 0
+    for _ in range(N_DRAWS):
+        problem, true = draw(name, rng, own, joint)
+        solution = estimate_noise(problem)
+        assert solution.converged, solution.message
+        spread = spread_of(solution)
+        n = spread.variables.n_robot_columns
+        columns = [true.index(name) for name in spread.variables.names[:n]]
+        off = solution.parameters[columns] - true.nominal[columns]
+        nees.append(float(off @ np.linalg.solve(spread.tangent[:n, :n], off)))
+        for key in solution.estimated_noise:
+            factors.setdefault(key, []).append(np.log(solution.problem.state.factors[key]))
+        test = assess(solution).goodness.test if name in ("pose", "random") else None
+        p += [test.p_value] if test is not None else []
+    low, high = chi2.ppf([5e-4, 1 - 5e-4], N_DRAWS * n) / (N_DRAWS * n)
+    assert low < np.mean(nees) / n < high + 0.06, np.mean(nees) / n
+    assert not p or kstest(p, "uniform").pvalue > 1e-3
+    for key, found in factors.items():
+        if len(found) == N_DRAWS and not (name == "joints drowned" and key == JOINT_NOISE):
+            true_factor = 1.0 / (joint if key == JOINT_NOISE else own)
+            # The logarithm of a root of a mean of squares is less than that of its mean by half its variance.
+            bias = np.median(found) - np.log(true_factor)
+            assert abs(bias) < 4 * 1.25 * np.std(found) / np.sqrt(N_DRAWS) + np.var(found) / 2, (key, bias)
+
+
+def test_curvature_is_there_where_a_noise_has_next_to_no_degrees_of_freedom():
+    """T is singular then, or by rounding less than that; else it is `2 seen - T`, lifted where it is too little."""
+    rng = np.random.default_rng(3)
+    A, B = rng.normal(size=(2, 4, 4))
+    T, seen = A @ A.T, B @ B.T
+    plain = estimation._curvature(T, T + 0.1 * seen)
+    assert plain == pytest.approx(T + 0.2 * seen, rel=rounding(1.0, 1e4))
+    lifted = np.linalg.eigvals(np.linalg.solve(T, estimation._curvature(T, 0.1 * seen)))
+    assert lifted.real.min() == pytest.approx(estimation.LEAST_CURVED, rel=rounding(1.0, 1e4))
+    for gone in (np.diag([1.0, 1.0, 1.0, 0.0]), np.diag([1.0, 1.0, 1.0, 1e-9])):
+        singular = gone @ T @ gone - np.diag([0.0, 0.0, 0.0, 1e-15])
+        found = estimation._curvature(singular, gone @ (T + 0.1 * seen) @ gone)
+        assert found[:3, :3] == pytest.approx(T[:3, :3] + 0.2 * seen[:3, :3], rel=1e-6)
+        assert np.linalg.eigvalsh(found).min() >= 0.0
