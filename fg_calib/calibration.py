@@ -61,7 +61,7 @@ from fg_calib.progress import tell
 from fg_calib.report.documents import ResidualFile, result_of, write_result
 from fg_calib.report.summary import format_result, html, judged, summary
 from fg_calib.report.text import format_report
-from fg_calib.robot.kinematics import forward, precompute_trig
+from fg_calib.robot.kinematics import forward
 from fg_calib.robot.model import Robot, names_of
 from fg_calib.statistics.assessment import FrameEstimate, Uncertainty, assess
 from fg_calib.statistics.covariance import TangentCovariance
@@ -626,7 +626,7 @@ class Calibration:
             raise InputError("world", "the measurement frame was not estimated, or not saved", "the base frame")
         known = build_variables(v.robot, [False]).chains[0]
         chain = v.chains[self._table_of(table)] if world else known
-        at = forward(chain.at(self.posterior.parameters), precompute_trig(v.robot, q))
+        at = forward(chain.at(self.posterior.parameters), v.robot.trig(q))
         jacobian = np.zeros((len(q), 6, v.n_columns))
         jacobian[:, :, : at.jacobian.shape[2]] = at.jacobian[:, [3, 4, 5, 0, 1, 2]]
         covariance = [self.posterior.covariance(rows) for rows in jacobian]

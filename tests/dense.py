@@ -16,7 +16,7 @@ from fg_calib.measurements.kinds import (
 )
 from fg_calib.measurements.moments import angle_moments, length_moments
 from fg_calib.measurements.residuals import Block, unit_whitening
-from fg_calib.robot.kinematics import forward, precompute_trig
+from fg_calib.robot.kinematics import forward
 
 STEP, WEIGHTS = 5e-3, np.array([45.0, -9.0, 1.0]) / 60.0
 """Central differences of sixth order: off by some 1e-13 of frames' own size."""
@@ -84,7 +84,7 @@ class SeriesRows:
         names = [name.split(".")[0] for name in s.kind.names]
         self.factors = np.array([state.factors.get((s.table, name), 1.0) for name in names])
         self.r = self._rows(self._ends(self._arm(self.q)))
-        trig, unit = precompute_trig(problem.robot, self.q), unit_whitening(s.n, s.kind.residual_dim)
+        trig, unit = problem.robot.trig(self.q), unit_whitening(s.n, s.kind.residual_dim)
         J = residuals.linearise(Block(s.kind, trig, s.ends, s.data, unit, self.points), self.chain)[1]
         self.J = np.zeros((*self.r.shape, at.n_columns + at.n_nuisance))
         self.J[:, :, : at.n_columns] = J[:, :, : at.n_columns]
@@ -148,7 +148,7 @@ class SeriesRows:
         self.own = self._diagonal(left)
 
     def _arm(self, q):
-        at = forward(self.chain.without_columns(), precompute_trig(self.problem.robot, q))
+        at = forward(self.chain.without_columns(), self.problem.robot.trig(q))
         return at.rotation, at.position
 
     def _moved(self, k, h):

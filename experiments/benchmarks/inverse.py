@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 
 import fg_calib
 from fg_calib.robot.inverse import N_STARTS, REACHED, random_readings, solve_inverse
-from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Joint, RobotBuilder
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -75,12 +75,12 @@ def trf(robot: fg_calib.Robot, rotation: np.ndarray, position: np.ndarray, n_sta
     for i in range(n):
 
         def residual(q: np.ndarray, i: int = i) -> np.ndarray:
-            at = forward(chain, precompute_trig(robot, q[None]))
+            at = forward(chain, robot.trig(q[None]))
             turn = Rotation.from_matrix(at.rotation[0] @ rotation[i].T).as_rotvec()
             return np.concatenate([turn, (at.position[0] - position[i]) / length])
 
         def jacobian(q: np.ndarray, i: int = i) -> np.ndarray:
-            J = forward(chain, precompute_trig(robot, q[None])).jacobian[0]
+            J = forward(chain, robot.trig(q[None])).jacobian[0]
             J[:3] = inverse_left_jacobian(residual(q, i)[:3]) @ J[:3]
             J[3:] /= length
             return J

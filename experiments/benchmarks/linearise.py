@@ -54,7 +54,7 @@ from fg_calib.graph.rows import Part, RowSet
 from fg_calib.measurements import residuals
 from fg_calib.measurements.kinds import Distance, RotationAngle, stack
 from fg_calib.measurements.residuals import Block
-from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.threads import one_blas_thread, processors
 
 Floats = NDArray[np.float64]
@@ -125,7 +125,7 @@ def build_case(n: int, seed: int) -> Case:
         pairs = slice(first, min(first + 10_000, n))
         rows = slice(2 * pairs.start, 2 * pairs.stop)
         q = rng.uniform(-np.pi, np.pi, (rows.stop - rows.start, robot.n_joints))
-        trig[rows] = precompute_trig(robot, q)
+        trig[rows] = robot.trig(q)
         poses = forward(true_chain, trig[rows])
         a_R_b = np.swapaxes(poses.rotation[::2], 1, 2) @ poses.rotation[1::2]
         distance = np.linalg.norm(poses.position[1::2] - poses.position[::2], axis=1)

@@ -41,7 +41,6 @@ from fg_calib.graph.factors import build_variables
 from fg_calib.measurements import residuals
 from fg_calib.measurements.kinds import Distance, RotationAngle, stack
 from fg_calib.measurements.residuals import Block
-from fg_calib.robot.kinematics import precompute_trig
 from fg_calib.threads import one_blas_thread
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -239,7 +238,7 @@ def _arm(n_joints: int, n: int, seed: int, kinds: int = 5) -> linearise.Case:
     ends = np.arange(2 * n).reshape(n, 2)
     whitening = np.tile([1e3, 0.0, 1e3], (n, 1))
     kind = stack(Distance(), RotationAngle())
-    block = Block(kind, precompute_trig(robot, q), ends, rng.uniform(0.1, 1.0, (n, 2)), whitening)
+    block = Block(kind, robot.trig(q), ends, rng.uniform(0.1, 1.0, (n, 2)), whitening)
     shifts = 1e-3 * rng.normal(size=(2, len(robot.nominal)))
     variables = build_variables(robot, [False])
     here, there = (np.append(robot.nominal + shift, np.zeros(6)) for shift in shifts)

@@ -42,7 +42,7 @@ from fg_calib.graph.solver import Solution
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import rotation_angle
 from fg_calib.prediction.expected_error import errors_at, judged_configurations, pose_rms
-from fg_calib.robot.kinematics import Poses, build_chain, forward, precompute_trig
+from fg_calib.robot.kinematics import Poses, build_chain, forward
 from fg_calib.robot.model import Robot
 from fg_calib.statistics.assessment import Uncertainty, assess
 from fg_calib.statistics.residual_table import residual_table
@@ -234,7 +234,7 @@ def _without_priors(job: Job, judge: _Judge) -> list[Estimate]:
 @single_threaded
 def real_errors(estimated: Robot, true: Robot, readings: Floats) -> RealErrors:
     """Errors of an estimated arm at joint readings, shape (n, n_joints), [rad] (prismatic: [m])."""
-    here, there = (forward(build_chain(r), precompute_trig(r, readings)) for r in (estimated, true))
+    here, there = (forward(build_chain(r), r.trig(readings)) for r in (estimated, true))
     fitted = None
     if len(readings) >= 3:
         R, t = best_rigid_fit(here.position, there.position)
@@ -299,7 +299,7 @@ class _Judge:
     def of_baseline(self, name: str, fit: LeastSquares) -> Estimate:
         """The estimate of plain least squares."""
         chain = build_chain(fit.robot, {fit.robot.index(p): k for k, p in enumerate(fit.names)})
-        at = forward(chain, precompute_trig(fit.robot, self._readings))
+        at = forward(chain, fit.robot.trig(self._readings))
         base, fitted = pose_rms(at.position, at.jacobian, lambda rows: np.sum((rows @ fit.covariance) * rows, axis=1))
         return Estimate(
             name=name,

@@ -15,7 +15,7 @@ from fg_calib.measurements.kinds import Distance, RotationAngle, parts_of
 from fg_calib.measurements.models.pairs import usable_pairs
 from fg_calib.measurements.residuals import Block, unit_whitening
 from fg_calib.measurements.series import Series
-from fg_calib.robot.kinematics import Chain, precompute_trig
+from fg_calib.robot.kinematics import Chain
 from fg_calib.robot.model import Robot
 
 Floats = NDArray[np.float64]
@@ -52,7 +52,7 @@ class Rows:
 
 def train_rows(robot: Robot, data: Dataset) -> tuple[Rows, ...]:
     """Every measured train row of all tables."""
-    trigs = [precompute_trig(robot, table.measurements.readings) for table in data.tables]
+    trigs = [robot.trig(table.measurements.readings) for table in data.tables]
     return tuple(_rows_of(data, s, trigs[s.table]) for s in data.series if len(s.train))
 
 

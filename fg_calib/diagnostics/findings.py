@@ -39,7 +39,7 @@ from fg_calib.graph.solver import Solution
 from fg_calib.measurements.kinds import AnchorContact
 from fg_calib.measurements.models.pairs import missing_figures
 from fg_calib.observability.parallel_axes import MissingMotion
-from fg_calib.robot.kinematics import forward, precompute_trig
+from fg_calib.robot.kinematics import forward
 from fg_calib.statistics.chi_square import ChiSquare
 from fg_calib.statistics.covariance import Spread
 from fg_calib.statistics.goodness_of_fit import OUTLIER_WEIGHT, Goodness
@@ -235,7 +235,7 @@ def _motion(solution: Solution, table: ResidualTable, number: int, kind: str) ->
         if s.table != number or all(name.partition(".")[0] != kind for name in s.kind.names):
             continue
         if s.kind.ends == 1:
-            trig = precompute_trig(problem.robot, problem.data.tables[number].measurements.readings)
+            trig = problem.data.trigs(problem.robot)[number]
             there = forward(at.chains[number].without_columns(), trig, s.ends[s.train, 0]).position
             if isinstance(s.kind, AnchorContact):
                 there = at.coordinates[s.nuisances[s.train]]

@@ -25,7 +25,7 @@ from fg_calib.graph.solver import Solution
 from fg_calib.initialization.hand_eye import nearest_rotation
 from fg_calib.prediction.expected_error import without_rigid_motion
 from fg_calib.robot.inverse import random_readings
-from fg_calib.robot.kinematics import forward, precompute_trig
+from fg_calib.robot.kinematics import forward
 from fg_calib.statistics.covariance import Spread
 
 Floats = NDArray[np.float64]
@@ -104,7 +104,7 @@ def beyond_linear(solution: Solution, spread: Spread) -> Curvature:
 def _of_tool(solution: Solution, d: Floats, c: Floats) -> float:
     """`Curvature.tool`: the tool at arms `x + d - c` and `x - d - c`, over what it does where all is linear."""
     robot, variables = solution.problem.robot, solution.problem.variables
-    trig = precompute_trig(robot, random_readings(robot, N_CONFIGURATIONS, np.random.default_rng(1)))
+    trig = robot.trig(random_readings(robot, N_CONFIGURATIONS, np.random.default_rng(1)))
 
     def tool(step: Floats) -> Floats:
         at = variables.chains[0].at(variables.stepped(solution.parameters, step)).without_columns()

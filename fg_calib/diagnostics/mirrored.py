@@ -18,7 +18,7 @@ from fg_calib.graph.rows import At
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements.kinds import AnchorContact, AnchorDistance, PlaneDistance
 from fg_calib.measurements.series import Unknowns
-from fg_calib.robot.kinematics import forward, precompute_trig
+from fg_calib.robot.kinematics import forward
 
 Floats = NDArray[np.float64]
 
@@ -81,7 +81,7 @@ def _anchor(solution: Solution, at: At, first: int) -> MirrorImage | None:
             rows = s.train[s.nuisances[s.train, 0] == first]
             if isinstance(s.kind, AnchorContact) and len(rows):
                 return None
-            trig = precompute_trig(problem.robot, problem.data.tables[s.table].measurements.readings)
+            trig = problem.data.trigs(problem.robot)[s.table]
             points.append(forward(at.chains[s.table].without_columns(), trig, s.ends[rows, 0]).position)
     there = np.concatenate(points)
     if len(there) < LEAST_POINTS:

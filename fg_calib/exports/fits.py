@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.robot.inverse import random_readings
-from fg_calib.robot.kinematics import Poses, build_chain, forward, pose, precompute_trig
+from fg_calib.robot.kinematics import Poses, build_chain, forward, pose
 from fg_calib.robot.model import Robot
 
 Floats = NDArray[np.float64]
@@ -72,7 +72,7 @@ def errors(found: Robot, wanted: Robot, readings: Floats, zeros: Floats | None =
 
 def poses(robot: Robot, readings: Floats) -> Poses:
     """Tool poses without derivatives."""
-    return forward(build_chain(robot), precompute_trig(robot, readings))
+    return forward(build_chain(robot), robot.trig(readings))
 
 
 def fit_zeros(nominal: Robot, calibrated: Robot, readings: Floats) -> Floats:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.errors import InputError, shown
-from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import AXIS_OF_KIND, CONVENTIONS, Axis, Element, Robot
 
 Floats = NDArray[np.float64]
@@ -68,7 +68,7 @@ def links_of(robot: Robot) -> Links:
 def _product(robot: Robot, elements: Sequence[Element]) -> Floats:
     """What elements of a robot without readings do together, shape (4, 4)."""
     part = replace(robot, elements=(Element(Axis.TX), *elements))  # a chain has at least one
-    at = forward(build_chain(part), precompute_trig(part, np.zeros((1, robot.n_joints))))
+    at = forward(build_chain(part), part.trig(np.zeros((1, robot.n_joints))))
     return rigid(at.rotation[0], at.position[0])
 
 

@@ -38,7 +38,7 @@ from fg_calib.options import (
     check_names,
 )
 from fg_calib.robot.inverse import random_readings
-from fg_calib.robot.kinematics import forward, precompute_trig
+from fg_calib.robot.kinematics import forward
 from fg_calib.robot.model import Robot, names_of
 from fg_calib.threads import single_threaded
 
@@ -273,7 +273,7 @@ def _check_own_kinds(robot: Robot, data: Dataset, variables: Variables, start: F
         if is_ours(s.kind):
             continue
         table = data.tables[s.table].measurements
-        poses = forward(at.chains[s.table].without_columns(), precompute_trig(robot, table.readings), s.ends.ravel())
+        poses = forward(at.chains[s.table].without_columns(), robot.trig(table.readings), s.ends.ravel())
         rotation, position = poses.rotation.reshape(*s.ends.shape, 3, 3), poses.position.reshape(*s.ends.shape, 3)
         nuisances = at.coordinates[s.nuisances]
         check_start(s.kind, Frames(rotation, position), s.data, nuisances, s.source)

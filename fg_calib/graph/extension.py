@@ -24,7 +24,6 @@ from fg_calib.graph.rows import Part, RowSet
 from fg_calib.measurements.kinds import Distance, Kind, RotationAngle
 from fg_calib.measurements.residuals import Block
 from fg_calib.options import check_number
-from fg_calib.robot.kinematics import precompute_trig
 
 Floats = NDArray[np.float64]
 Sparse = scipy.sparse.csr_array
@@ -165,7 +164,7 @@ def _pair_factor(
     check_number("sigma", sigma, above=True)
     n = variables.robot.n_joints
     readings = [as_floats(name, q, f"({n})") for name, q in (("start", start), ("end", end))]
-    trig = precompute_trig(variables.robot, np.array(readings))
+    trig = variables.robot.trig(np.array(readings))
     data, whitening = np.array([[float(measured[1])]]), np.array([[1.0 / float(sigma)]])
     block = Block(kind, trig, np.array([[0, 1]]), data, whitening, np.zeros((1, 0)))
     return row_factor(RowSet((Part(block, 0, 0, np.zeros((1, 0), dtype=np.int64)),)), variables)

@@ -34,7 +34,7 @@ from fg_calib.measurements.gathering import Dataset
 from fg_calib.measurements.kinds import TouchedPoint
 from fg_calib.measurements.series import Series, Table, by_station
 from fg_calib.options import Options
-from fg_calib.robot.kinematics import Chain, forward, precompute_trig
+from fg_calib.robot.kinematics import Chain, forward
 from fg_calib.robot.model import Parameter, Robot
 
 Floats = NDArray[np.float64]
@@ -304,7 +304,7 @@ def _places(problem: Problem, parameters: Floats, at_readings: bool) -> list[Pla
     trigs = data.trigs(problem.robot)
     if errors is not None and not at_readings:
         moved = [t.measurements.readings + errors[place] for t, place in zip(data.tables, data.places, strict=True)]
-        trigs = tuple(precompute_trig(problem.robot, readings) for readings in moved)
+        trigs = tuple(problem.robot.trig(readings) for readings in moved)
     at = at_parameters(problem, parameters, trigs)
     estimated = problem.options.encoder == "estimated"
     return [

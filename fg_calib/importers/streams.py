@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fg_calib.arrays import Floats, FrozenArrays
-from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot
 
 
@@ -44,7 +44,7 @@ class JointStream(FrozenArrays):
 
     def tool_path(self, robot: Robot) -> PoseStream:
         """The tool's poses at the readings, of the nominal robot in its base frame."""
-        trig = precompute_trig(robot, self.readings)
+        trig = robot.trig(self.readings)
         poses = forward(build_chain(robot, {}), trig)
         return PoseStream(self.time, poses.position, poses.rotation, self.source)
 

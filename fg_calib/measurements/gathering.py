@@ -19,7 +19,6 @@ from fg_calib.measurements.models import SERIES_OF, own_series, touch_series
 from fg_calib.measurements.models.starts import check_fitted, start_places
 from fg_calib.measurements.series import Series, Table, Unknowns
 from fg_calib.options import NEAR, PAIR_MODELS, POSE_MODELS, Model, did_you_mean
-from fg_calib.robot.kinematics import precompute_trig
 from fg_calib.robot.model import Robot
 
 _log = logging.getLogger(__name__)
@@ -65,7 +64,7 @@ class Dataset(Brief):
         """Readings of each table for the kernels, remembered, as parameters change nothing of them."""
         key = (tuple(joint.prismatic for joint in robot.joints), robot.bases)
         if key not in self._trigs:
-            self._trigs[key] = tuple(precompute_trig(robot, table.measurements.readings) for table in self.tables)
+            self._trigs[key] = tuple(robot.trig(table.measurements.readings) for table in self.tables)
         return self._trigs[key]
 
     @property

@@ -48,7 +48,7 @@ class Block(Brief):
 
     Attributes:
         kind: What they are.
-        trig: Readings, from `kinematics.precompute_trig`, shape (n_configurations, n_joints, 2).
+        trig: Readings, from `Robot.trig`, shape (n_configurations, n_joints, 2).
         ends: Row in `trig` of each end, shape (n, kind.ends).
         data: What was measured, as the kind has it, shape (n, kind.width); any number in a row without weight.
         whitening: Lower triangle, row by row, of a matrix that whitens a measurement's rows, shape (n, residual_dim *

@@ -24,7 +24,7 @@ from fg_calib.monitoring.new_data import Linear, linearised
 from fg_calib.observability.random_configurations import at_configurations, places_of
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, Pairing
 from fg_calib.robot.inverse import random_readings
-from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.robot.kinematics import build_chain, forward
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -180,7 +180,7 @@ def _seen_board(problem: Problem, number: int, q: Floats) -> tuple[Floats, Float
     """Where a camera sees its first board from configurations, shapes (n, 3, 3) and (n, 3)."""
     table, robot = problem.data.tables[number], problem.robot
     if table.fixed_camera:
-        poses = forward(build_chain(robot), precompute_trig(robot, q))
+        poses = forward(build_chain(robot), robot.trig(q))
         frame = next((v for v in problem.variables.frames if v.symbol == f"X({number})"), None)
         X = pose_of(np.zeros(6) if frame is None else problem.start[frame.places])
         turn, shift = X.rotation().matrix(), X.translation()

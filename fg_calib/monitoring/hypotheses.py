@@ -33,7 +33,7 @@ from fg_calib.graph.factors import build_variables
 from fg_calib.graph.rows import RowSet
 from fg_calib.monitoring.new_data import Calibrated, Linear, Placed, Rows, linear, placed
 from fg_calib.robot.inverse import random_readings
-from fg_calib.robot.kinematics import forward, precompute_trig
+from fg_calib.robot.kinematics import forward
 from fg_calib.robot.model import Robot
 
 Floats = NDArray[np.float64]
@@ -215,7 +215,7 @@ def motions(robot: Robot, readings: Floats) -> tuple[dict[str, Floats], Floats, 
     everything = robot.with_estimated([p.name for p in robot.parameters])
     v = build_variables(everything, [False], False)
     x = np.append(robot.nominal, np.zeros(6))
-    at = forward(v.chains[0].at(x).with_joint_columns(), precompute_trig(robot, readings))
+    at = forward(v.chains[0].at(x).with_joint_columns(), robot.trig(readings))
     n = v.n_columns
     named = at.jacobian[:, :, :n] @ v.tangent_derivative(x)
     found = dict(zip(v.names, named.transpose(2, 0, 1), strict=True))

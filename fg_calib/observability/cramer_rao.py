@@ -43,7 +43,7 @@ from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.series import Table
 from fg_calib.options import FrameKnowledge, Model, Options, PairErrors, Pairing, check, check_flag, check_names
 from fg_calib.prediction.expected_error import without_rigid_motion
-from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot
 from fg_calib.threads import single_threaded
 
@@ -107,7 +107,7 @@ class Bound(Brief):
             claimed: Whether to propagate what the estimator claims.
         """
         columns = {self.robot.index(name): k for k, name in enumerate(self.names)}
-        at = forward(build_chain(self.robot, columns), precompute_trig(self.robot, readings))
+        at = forward(build_chain(self.robot, columns), self.robot.trig(readings))
         G = at.jacobian[:, 3:]
         if fitted:
             G, _ = without_rigid_motion(at.position, G)

@@ -24,7 +24,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.robot.kinematics import Poses, build_chain, forward, pose, precompute_trig
+from fg_calib.robot.kinematics import Poses, build_chain, forward, pose
 from fg_calib.robot.model import CONVENTIONS, Axis, Element, Robot
 
 Floats = NDArray[np.float64]
@@ -161,7 +161,7 @@ def _motions(robot: Robot, readings: Floats, at: Poses, owner: int, length: floa
     """Effects of the six small motions of the link behind joint `owner` in its own frame, shape (n_rows, 6)."""
     nothing = Element(Axis.TX)  # of a robot without a base frame
     link = replace(robot, elements=(nothing, *robot.elements[: end_of_link(robot, owner)]))
-    return _motions_at(forward(build_chain(link), precompute_trig(robot, readings)), at, length)
+    return _motions_at(forward(build_chain(link), robot.trig(readings)), at, length)
 
 
 def _motions_at(link: Poses, at: Poses, length: float) -> Floats:

@@ -21,7 +21,7 @@ from fg_calib.measurements.gathering import Dataset, gather
 from fg_calib.measurements.series import Table
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, Model, Options, Pairing
 from fg_calib.robot.inverse import random_readings
-from fg_calib.robot.kinematics import Poses, build_chain, forward, precompute_trig
+from fg_calib.robot.kinematics import Poses, build_chain, forward
 from fg_calib.robot.model import Robot
 
 Floats = NDArray[np.float64]
@@ -124,7 +124,7 @@ def at_configurations(robot: Robot, table: Table, q: Floats, places: Places, sou
         places: Of what the table names.
         source: What the table is called.
     """
-    poses, model = forward(build_chain(robot), precompute_trig(robot, q)), _model(table)
+    poses, model = forward(build_chain(robot), robot.trig(q)), _model(table)
     column, names = _named(table)
     real = [name for name in names if name is not None]
     index = np.array([real.index(name) if name is not None else -1 for name in names])[np.arange(len(q)) % len(names)]

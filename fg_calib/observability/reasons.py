@@ -20,7 +20,7 @@ from fg_calib.observability.indices import SUPPORT_TOLERANCE, Observability
 from fg_calib.observability.observed_quantities import SEES_ORIENTATION, SEES_POSITION, Seen
 from fg_calib.observability.random_configurations import elsewhere
 from fg_calib.robot.inverse import random_readings
-from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Parameter
 from fg_calib.threads import single_threaded
 
@@ -90,7 +90,7 @@ class _Motion:
         self._seen = seen
         columns = {robot.index(p.name): k for k, p in enumerate(self._parameters)}
         chain = build_chain(robot, columns).with_joint_columns()
-        poses = forward(chain, precompute_trig(robot, random_readings(robot, 60, np.random.default_rng(0))))
+        poses = forward(chain, robot.trig(random_readings(robot, 60, np.random.default_rng(0))))
         n = len(self._parameters)
         self._R, self._p = poses.rotation, poses.position
         self._J = poses.jacobian[:, :, :n]

@@ -18,7 +18,7 @@ from fg_calib.errors import InputError
 from fg_calib.measurements.checks import check_readings
 from fg_calib.prediction.expected_error import errors_at
 from fg_calib.robot.inverse import REACHED
-from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot
 from fg_calib.robot.reaching import Correction, misses, reach
 
@@ -68,7 +68,7 @@ def correct(
         off[first.miss_position >= REACHED] = np.nan
         off[first.miss_rotation >= REACHED, 1] = np.nan
     found = reach(robot, target, turned, uncorrected)
-    commanded = forward(build_chain(nominal), precompute_trig(nominal, found.readings))
+    commanded = forward(build_chain(nominal), nominal.trig(found.readings))
     expected = calibration.predict(found.readings, world=world, table=table)
     _, fitted = errors_at(calibration.posterior, found.readings)
     sigmas = (expected.sigma_position, expected.sigma_rotation)
@@ -101,7 +101,7 @@ def _targets(
     if position is None:
         if near is None or rotation is not None:
             raise InputError("position", "none are given", "where the targets are, or joint values alone")
-        at = forward(build_chain(nominal), precompute_trig(nominal, near))
+        at = forward(build_chain(nominal), nominal.trig(near))
         return at.position, at.rotation, near
     target = as_floats("position", np.atleast_2d(position), "(n, 3)")
     if rotation is not None:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from fg_calib.graph.problem import Problem
 from fg_calib.measurements.gathering import Dataset
 from fg_calib.observability.observed_quantities import Seen
-from fg_calib.robot.kinematics import forward, precompute_trig
+from fg_calib.robot.kinematics import forward
 from fg_calib.statistics.covariance import TangentCovariance
 
 Floats = NDArray[np.float64]
@@ -96,7 +96,7 @@ def errors_at(spread: TangentCovariance, readings: Floats) -> tuple[PoseRms, Pos
         readings: Shape (n, n_joints), [rad] (prismatic: [m]).
     """
     variables = spread.variables
-    at = forward(variables.chains[0].at(spread.parameters), precompute_trig(variables.robot, readings))
+    at = forward(variables.chains[0].at(spread.parameters), variables.robot.trig(readings))
     jacobian = at.jacobian.copy()
     jacobian[:, :, variables.n_robot_columns :] = 0.0  # of where the base stands in the world, not of the arm
     return pose_rms(at.position, jacobian, spread.variance)

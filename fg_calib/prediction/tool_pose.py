@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.factors import build_variables
 from fg_calib.prediction.expected_error import without_rigid_motion
-from fg_calib.robot.kinematics import Chain, forward, precompute_trig
+from fg_calib.robot.kinematics import Chain, forward
 from fg_calib.statistics.covariance import TangentCovariance
 
 Floats = NDArray[np.float64]
@@ -120,7 +120,7 @@ class ToolErrorModel(FrozenArrays):
 
     def _derivatives(self, readings: Floats) -> tuple[Floats, Floats, Floats]:
         """Tool points, and (w, v) in the columns and in the joints."""
-        at = forward(self.chain, precompute_trig(self.spread.variables.robot, readings))
+        at = forward(self.chain, self.spread.variables.robot.trig(readings))
         n = self.chain.n_columns
         motion = np.zeros((len(readings), 6, self.spread.variables.n_columns))
         motion[:, :, :n] = at.jacobian[:, :, :n]

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from fg_calib.arguments import checked
 from fg_calib.arrays import Brief, as_floats, as_rotations
 from fg_calib.options import check_number
-from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot
 
 Floats = NDArray[np.float64]
@@ -174,7 +174,7 @@ class _Search:
             Pose minus tool, shape (n, 6), rotation vector first, about and along the base's axes; and the
             derivative, each joint in its own unit of step, shape (n, 6, n_joints).
         """
-        at = forward(self._chain, precompute_trig(self._robot, q))
+        at = forward(self._chain, self._robot.trig(q))
         shift = (self._position[rows] - at.position) / self.length
         jacobian = at.jacobian * self._unit
         jacobian[:, 3:] /= self.length

@@ -3,7 +3,7 @@
 All of this is compiled by numba and runs on blocks of `LANES` configurations at once: arrays are shaped
 (..., LANES) and the innermost loop runs over configurations, which the compiler turns into vector instructions.
 (Inside the walk rotation and point are flat, so that it sees at which constant distance columns lie and that they do
-not overlap.) Sine and cosine of the readings are taken once a data set (`precompute_trig`) and combined with those of
+not overlap.) Sine and cosine of the readings are taken once a data set (`Robot.trig`) and combined with those of
 the parameters by the addition theorem, so no trigonometry happens inside.
 
 A kind of measurement gives its residual and its wrench rows D: derivatives in a turn w about the base's axes through
@@ -116,7 +116,7 @@ def walk(chain, trig, row, rotation, point, twist):  # type: ignore[no-untyped-d
 
     Args:
         chain: `ChainArrays`.
-        trig: From `precompute_trig`, shape (n, n_joints, 2).
+        trig: From `Robot.trig`, shape (n, n_joints, 2).
         row: Row of `trig` of each lane, shape (LANES,).
         rotation: Filled: rotation matrix, [column, component, lane], shape (3, 3, LANES).
         point: Filled: tool point, shape (3, LANES), [m].
@@ -317,7 +317,7 @@ def fill(chain, trig, ends, data, whitening, twins, given, turning, panel):  # t
 
     Args:
         chain: `ChainArrays`.
-        trig: From `precompute_trig`, shape (n_configurations, n_joints, 2).
+        trig: From `Robot.trig`, shape (n_configurations, n_joints, 2).
         ends: Row of `trig` of each end, shape (n, n_ends).
         data: What was measured, shape (n, width).
         whitening: Lower triangles, row by row, shape (n, d * (d + 1) / 2), d the `residual_dim`.

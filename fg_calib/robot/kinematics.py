@@ -29,8 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import Brief, as_figures, check_sizes, shape_of
-from fg_calib.errors import InputError
+from fg_calib.arrays import Brief, as_figures, check_sizes
 from fg_calib.robot.kernels import ChainArrays, walk_all
 from fg_calib.robot.model import AXIS_OF_KIND, FRAME_KINDS, Axis, Element, Robot
 from fg_calib.threads import processors
@@ -52,7 +51,7 @@ class Chain(Brief):
         source: Index into the parameter vector of `at`, -1 where the value is constant.
         value: Value of each element without its reading, [m] or [rad].
         joint: Index of the joint whose reading is added, or is what the basis is a function of; -1 for none.
-        basis: Column of the `trig` of `precompute_trig` by which the value is multiplied, -1 for none.
+        basis: Column of the `trig` of `Robot.trig` by which the value is multiplied, -1 for none.
         column: Jacobian column of each element's parameter, -1 for none.
         n_columns: Number of parameter columns.
         n_joints: Number of moving joints.
@@ -207,31 +206,8 @@ def _without_idle(chain: Chain, changing: set[int]) -> Chain:
 
 
 def precompute_trig(robot: Robot, readings: Floats, given: Floats | None = None) -> Floats:
-    """Cosine and sine of revolute readings (value and 0 for prismatic), shape (n, n_joints, 2).
-
-    Where elements have bases, value and slope of each of `robot.bases` follow: shape (n, n_joints + n_bases, 2).
-
-    Args:
-        robot: The robot.
-        readings: Joint readings, shape (n, n_joints), [rad] (prismatic: [m]).
-        given: Values that bases of no joint take, one column each, shape (n, n_given).
-
-    Raises:
-        InputError: The readings are of more or fewer joints.
-    """
-    expected = f"(n, {robot.n_joints}) for the robot's joints"
-    shape = shape_of("readings", readings, expected)
-    if len(shape) != 2 or shape[1] != robot.n_joints:
-        raise InputError("readings", f"shape {shape}", expected)
-    prismatic = np.array([j.prismatic for j in robot.joints])
-    trig = np.empty((*shape, 2))
-    np.cos(readings, out=trig[:, :, 0])
-    np.sin(readings, out=trig[:, :, 1])
-    if prismatic.any():
-        trig[:, prismatic, 0], trig[:, prismatic, 1] = np.asarray(readings)[:, prismatic], 0.0
-    if not robot.bases:
-        return trig
-    return np.concatenate([trig, np.stack([b.values(readings, given) for b in robot.bases], axis=1)], axis=1)
+    """`Robot.trig`, under its former name."""
+    return robot.trig(readings, given)
 
 
 @dataclass(frozen=True)
@@ -256,7 +232,7 @@ def forward(chain: Chain, trig: Floats, rows: Integers | None = None) -> Poses:
 
     Args:
         chain: The chain; `without_columns` spares the derivatives.
-        trig: From `precompute_trig`, shape (n, n_joints, 2).
+        trig: From `Robot.trig`, shape (n, n_joints, 2).
         rows: Rows of `trig`, shape (m,); all if None.
 
     Note:
@@ -343,7 +319,7 @@ def pose(robot: Robot, readings: Floats | Sequence[Sequence[float]]) -> Poses:
     figures = as_figures("readings", readings, f"numbers of shape (n, {robot.n_joints})")
     check_sizes("readings", figures)
     chain = build_chain(robot, {i: i for i in range(len(robot.parameters))}).with_joint_columns()
-    return forward(chain, precompute_trig(robot, np.atleast_2d(figures)))
+    return forward(chain, robot.trig(np.atleast_2d(figures)))
 
 
 SPAN = 8192

@@ -299,6 +299,33 @@ class Robot:
         """What the elements' coefficients are multiplied by, each once."""
         return tuple(dict.fromkeys(e.basis for e in self.elements if e.basis is not None))
 
+    def trig(self, readings: Floats, given: Floats | None = None) -> Floats:
+        """Joint readings as the kernels take them, shape (n, n_joints + n_bases, 2).
+
+        Cosine and sine of each revolute reading (value and 0 of a prismatic one), then value and slope of each of the
+        robot's `bases`. Nothing else computes what an element's value takes from a configuration.
+
+        Args:
+            readings: Joint readings, shape (n, n_joints), [rad] (prismatic: [m]).
+            given: Values that bases of no joint take, one column each, shape (n, n_given).
+
+        Raises:
+            InputError: The readings are of more or fewer joints.
+        """
+        expected = f"(n, {self.n_joints}) for the robot's joints"
+        shape = shape_of("readings", readings, expected)
+        if len(shape) != 2 or shape[1] != self.n_joints:
+            raise InputError("readings", f"shape {shape}", expected)
+        prismatic = np.array([j.prismatic for j in self.joints])
+        trig = np.empty((*shape, 2))
+        np.cos(readings, out=trig[:, :, 0])
+        np.sin(readings, out=trig[:, :, 1])
+        if prismatic.any():
+            trig[:, prismatic, 0], trig[:, prismatic, 1] = np.asarray(readings)[:, prismatic], 0.0
+        if not self.bases:
+            return trig
+        return np.concatenate([trig, np.stack([b.values(readings, given) for b in self.bases], axis=1)], axis=1)
+
     @property
     def nominal(self) -> Floats:
         """Nominal values, shape (n_parameters,), [m] or [rad]; a new array each time."""

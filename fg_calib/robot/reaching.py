@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fg_calib.arrays import FrozenArrays
 from fg_calib.progress import tell
 from fg_calib.robot.inverse import N_STARTS, REACHED, Inverse, rotation_vector, solve_inverse
-from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot
 
 Floats = NDArray[np.float64]
@@ -189,7 +189,7 @@ def misses(robot: Robot, readings: Floats, position: Floats, rotation: Floats | 
         position: Shape (n, 3), [m].
         rotation: Shape (n, 3, 3); if None any will do, and the angle is 0.
     """
-    at = forward(build_chain(robot), precompute_trig(robot, readings))
+    at = forward(build_chain(robot), robot.trig(readings))
     far = np.linalg.norm(position - at.position, axis=1)
     if rotation is None:
         return far, np.zeros(len(far))
@@ -202,7 +202,7 @@ def _turn(robot: Robot, q: Floats, position: Floats, rotation: Floats) -> Floats
     lower, upper = robot.limits.T
 
     def step(q: Floats) -> tuple[Floats, float, float]:
-        at = forward(chain, precompute_trig(robot, q[None]))
+        at = forward(chain, robot.trig(q[None]))
         p, w = position - at.position[0], rotation_vector(rotation[None] @ np.swapaxes(at.rotation, 1, 2))[0]
         Jw, Jv = at.jacobian[0, :3], at.jacobian[0, 3:]
         _, size, Vt = np.linalg.svd(Jv)

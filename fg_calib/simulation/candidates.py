@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fg_calib.arrays import FrozenArrays, as_floats
 from fg_calib.measurements.limits import outside_limits
 from fg_calib.robot.inverse import Inverse, random_readings, solve_inverse
-from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot
 from fg_calib.robot.shape import enters
 from fg_calib.simulation.configurations import BoardViews, Configurations, GivenReadings, RandomReadings, TargetViews
@@ -191,7 +191,7 @@ def _target(robot: Robot, views: TargetViews, generator: np.random.Generator, k:
     """Configurations in which a tracker sees a reflector."""
     starts, places, turns, further = generator.spawn(4)
     readings, near = random_readings(robot, k, starts), True
-    at = forward(build_chain(robot).without_columns(), precompute_trig(robot, readings))
+    at = forward(build_chain(robot).without_columns(), robot.trig(readings))
     target, region = at.position + at.rotation @ views.target, views.region
     faced = faces(views, at.rotation, target)
     reason = np.full(k, "", dtype=WORD)

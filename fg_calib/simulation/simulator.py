@@ -23,7 +23,7 @@ from fg_calib.measurements.dataset import Measurements, Noise
 from fg_calib.measurements.series import Table
 from fg_calib.options import Pairing, check_number
 from fg_calib.robot.inverse import random_readings
-from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot
 from fg_calib.robot.shape import foot_in
 from fg_calib.simulation.candidates import draw_candidates, number_of, sifted
@@ -230,7 +230,7 @@ def _measure(
     # Standard normal numbers first: another sigma scales the same noise.
     joint, position, orientation = (generators[1].normal(size=(n, m)) for m in (robot.n_joints, 3, 3))
     true_readings = readings + _joint_sigma(scenario.noise, robot) * joint
-    at = forward(build_chain(true_robot).without_columns(), precompute_trig(true_robot, true_readings))
+    at = forward(build_chain(true_robot).without_columns(), true_robot.trig(true_readings))
     turned = Rotation.from_rotvec(sigma_orientation * orientation).as_matrix()
     world_R_tool = frame.rotation @ at.rotation @ turned
     world_p_tool = at.position @ frame.rotation.T + frame.position + sigma_position * position

@@ -10,7 +10,7 @@ from fg_calib.graph.information import whitened_jacobian
 from fg_calib.graph.noise import PRIVATE_SHARE
 from fg_calib.measurements.series import Table
 from fg_calib.options import Options
-from fg_calib.robot.kinematics import forward, pose, precompute_trig
+from fg_calib.robot.kinematics import forward, pose
 
 ARM = small_arm()
 SP, SO = 1e-4, 2e-4
@@ -43,7 +43,7 @@ def test_all_pairs_hold_what_poses_do_but_for_six_unknowns(model):
     )
     problem = true_problem(ARM, [Table(data, model, pairing=Pairing("all"))], Options(model, gauge="none"))
     pairs = whitened_jacobian(problem, problem.start)
-    moved = forward(problem.variables.chains[0].at(problem.start), precompute_trig(ARM, q)).jacobian
+    moved = forward(problem.variables.chains[0].at(problem.start), ARM.trig(q)).jacobian
     one, expected = np.tile(np.eye(3), (n, 1, 1)), np.zeros((pairs.shape[1],) * 2)
     if model != "rotation":
         turned = np.array([-skew(p) for p in at.position])

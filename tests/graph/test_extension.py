@@ -15,7 +15,7 @@ from fg_calib.graph.factors import prior_factors
 from fg_calib.graph.solver import levenberg_marquardt_params, solve
 from fg_calib.measurements.dataset import Pairs, rotation_angle
 from fg_calib.options import Pairing
-from fg_calib.robot.kinematics import forward, pose, precompute_trig
+from fg_calib.robot.kinematics import forward, pose
 from fg_calib.statistics.assessment import assess
 from fg_calib.statistics.variance_components import estimate_noise
 
@@ -41,7 +41,7 @@ def prior_on_k3(problem, sigma=1e-6):
 
 def known_distance(problem, extra=2e-3, sigma=1e-5):
     """The tool moves by 2 mm more than nominal between two configurations."""
-    variables, trig = problem.variables, precompute_trig(problem.robot, READINGS)
+    variables, trig = problem.variables, problem.robot.trig(READINGS)
     at = forward(variables.chains[0].at(problem.start), trig).position
     length = np.linalg.norm(at[1] - at[0]) + extra
 
@@ -62,7 +62,7 @@ def anchor_distances(problem, point, n=8, sigma=1e-4):
     """Distances from the tool to a fixed point that nobody knows, as seen at nominal."""
     variables = problem.variables
     q = np.random.default_rng(3).uniform(-1.5, 1.5, (n, problem.robot.n_joints))
-    trig = precompute_trig(problem.robot, q)
+    trig = problem.robot.trig(q)
     measured = np.linalg.norm(forward(variables.chains[0].at(problem.start), trig).position - point, axis=1)
 
     def factor(k):

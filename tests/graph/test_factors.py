@@ -25,7 +25,7 @@ from fg_calib.graph.factors import (
 from fg_calib.graph.rows import RowSet
 from fg_calib.measurements import residuals
 from fg_calib.options import Pairing
-from fg_calib.robot.kinematics import forward, precompute_trig
+from fg_calib.robot.kinematics import forward
 
 FRAME = (Rotation.from_rotvec([0.5, -1.0, 2.0]), np.array([3.0, -20.0, 1.0]))
 
@@ -34,7 +34,7 @@ def test_of_many_unknown_frames_each_chain_has_its_own_columns():
     robot = small_arm()
     variables = build_variables(robot, [True] * 4)
     here = np.concatenate([robot.nominal, np.zeros(24)])
-    trig = precompute_trig(robot, np.full((1, robot.n_joints), 0.3))
+    trig = robot.trig(np.full((1, robot.n_joints), 0.3))
     for table, chain in enumerate(variables.chains):
         moved = np.any(forward(chain.at(here), trig).jacobian[0] != 0.0, axis=0)
         of_frames = moved[variables.n_robot_columns :].reshape(4, 6)

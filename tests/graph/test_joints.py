@@ -16,7 +16,7 @@ from fg_calib.graph.solver import solve
 from fg_calib.measurements import residuals, sharing
 from fg_calib.measurements.dataset import Pairs, rotation_angle
 from fg_calib.options import Pairing
-from fg_calib.robot.kinematics import pose, precompute_trig
+from fg_calib.robot.kinematics import pose
 from fg_calib.statistics.assessment import assess
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
@@ -242,7 +242,7 @@ def test_derivatives_in_the_true_joint_values_are_those_of_the_rows():
                 found[k, :, place] += J[k, :, end]
 
         def at(q, noise=noise, chain=chain):
-            return residuals.residual(replace(noise.rows, trig=precompute_trig(robot, q)), chain)
+            return residuals.residual(replace(noise.rows, trig=robot.trig(q)), chain)
 
         for place in np.ndindex(m.readings.shape):
             h = np.zeros(m.readings.shape)

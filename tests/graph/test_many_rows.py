@@ -254,7 +254,7 @@ def test_where_such_steps_end_on_the_way_rows_are_whitened_anew_all_the_same(pro
 def test_readings_are_prepared_for_the_kernels_once_and_left_out_of_pickles(problem):
     data, robot = problem.data, problem.robot
     (trig,) = data.trigs(robot)
-    assert np.array_equal(trig, kinematics.precompute_trig(robot, data.tables[0].measurements.readings))
+    assert np.array_equal(trig, robot.trig(data.tables[0].measurements.readings))
     assert problem.rows[0].parts[0].block.trig is trig
     assert data.trigs(robot.with_values(robot.nominal + 0.1))[0] is trig  # parameters change nothing of it
     again = pickle.loads(pickle.dumps(data))

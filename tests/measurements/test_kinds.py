@@ -34,7 +34,7 @@ from fg_calib.measurements.kinds import (
 )
 from fg_calib.measurements.residuals import Block, pack, unit_whitening, unpack
 from fg_calib.robot.kernels import LANES
-from fg_calib.robot.kinematics import build_chain, precompute_trig
+from fg_calib.robot.kinematics import build_chain
 
 CONVENTIONS = ["dh", "mdh", "mdh-hayati", "dh-hayati", "urdf"]
 COMPILED = [
@@ -73,7 +73,7 @@ def data_of(kind, n, rng):
 
 def random_block(kind, robot, n, rng):
     h = kind.residual_dim
-    trig = precompute_trig(robot, rng.uniform(-3, 3, (2 * n + 1, robot.n_joints)))
+    trig = robot.trig(rng.uniform(-3, 3, (2 * n + 1, robot.n_joints)))
     ends = rng.permutation(2 * n + 1)[: n * kind.ends].reshape(n, kind.ends)
     whitening = pack(np.tril(rng.normal(size=(n, h, h))) + 3 * np.eye(h))
     return Block(kind, trig, ends, data_of(kind, n, rng), whitening, rng.normal(size=(n, kind.n_nuisances)))
@@ -103,7 +103,7 @@ def test_derivatives_are_those_of_central_differences(kind, convention):
         return x[n_parameters : n_parameters + q.size].reshape(kind.ends, 5)
 
     x = np.concatenate([robot.nominal, q.ravel(), nuisances.ravel()])
-    trig, ends = precompute_trig(robot, q.reshape(-1, 5)), np.arange(kind.ends)[None]
+    trig, ends = robot.trig(q.reshape(-1, 5)), np.arange(kind.ends)[None]
     block = Block(kind, trig, ends, data, pack(W[None]), nuisances)
     r, J = residuals.linearise(block, chain_of(robot))
     size = np.abs(J).max()
@@ -218,7 +218,7 @@ def test_orientations_in_numpy_are_right_at_no_turn_and_half_a_turn(angle):
     k = rng.normal(size=3)
     at = tool_pose(robot, q := rng.uniform(-1, 1, 4))[:3, :3]
     measured = at @ Rotation.from_rotvec(angle * k / np.linalg.norm(k)).as_matrix()
-    block = replace(block, trig=precompute_trig(robot, q[None]), ends=np.array([[0]]), data=measured.reshape(1, 9))
+    block = replace(block, trig=robot.trig(q[None]), ends=np.array([[0]]), data=measured.reshape(1, 9))
     J = residuals.linearise(block, chain_of(robot))[1]
     in_plain_numpy = residuals.linearise(replace(block, kind=in_numpy(block.kind)), chain_of(robot))[1]
     # At half a turn the axis has either sign, and its own derivative with it; rounding of the angle is over its sine.

@@ -16,7 +16,7 @@ from fg_calib.measurements.kinds import Distance, Orientation, Position, Rotatio
 from fg_calib.measurements.residuals import Block, pack
 from fg_calib.measurements.sharing import SharedErrors
 from fg_calib.robot.kernels import LANES
-from fg_calib.robot.kinematics import SPAN, build_chain, precompute_trig
+from fg_calib.robot.kinematics import SPAN, build_chain
 
 CONVENTIONS = ["dh", "mdh", "mdh-hayati", "dh-hayati", "urdf"]
 
@@ -78,7 +78,7 @@ def test_distance_and_angle_and_their_derivatives(convention):
             differences = central_differences(formula, x)
         for kinds in ((True, True), (True, False), (False, True)):
             W = np.array([[2.0, 0.0], [0.7 if all(kinds) else 0.0, 3.0]])
-            block = pair_block(precompute_trig(robot, q), np.array([0]), np.array([1]), measured[None], W[None], kinds)
+            block = pair_block(robot.trig(q), np.array([0]), np.array([1]), measured[None], W[None], kinds)
             r, J = residuals.linearise(block, chain_of(robot))
             rows = np.flatnonzero(kinds)
             assert r[0] == pytest.approx((W @ formula(x))[rows], abs=rounding(10, 1 / min(1.0, np.sin(angle) + 1e-4)))
@@ -99,7 +99,7 @@ def test_same_point_residual_and_its_derivatives(convention):
         A, B = (tool_pose(robot, q, x[:m]) for q in (x[m : m + n], x[m + n :]))
         return W @ (B[:3, 3] - A[:3, 3])
 
-    block = same_point_block(precompute_trig(robot, q), np.array([0]), np.array([1]), W[None])
+    block = same_point_block(robot.trig(q), np.array([0]), np.array([1]), W[None])
     r, J = residuals.linearise(block, chain_of(robot))
     x = np.concatenate([robot.nominal, *q])
     assert r[0] == pytest.approx(formula(x), abs=100 * ROUNDING)
@@ -137,7 +137,7 @@ def test_orientation_and_position_and_their_derivatives(convention, kinds, size)
         log = Rotation.from_matrix(measured_R.T @ P[:3, :3]).as_rotvec()
         return W @ np.concatenate([log, P[:3, 3] - measured_p])[rows]
 
-    block = pose_block(precompute_trig(robot, q[None]), measured_R[None], measured_p[None], W[None], kinds)
+    block = pose_block(robot.trig(q[None]), measured_R[None], measured_p[None], W[None], kinds)
     r, J = residuals.linearise(block, chain_of(robot))
     x = np.concatenate([robot.nominal, q])
     assert r[0] == pytest.approx(formula(x), abs=rounding(10.0))
@@ -153,7 +153,7 @@ def test_orientation_residual_is_exact_up_to_half_a_turn(angle):
     axis = rng.normal(size=3)
     axis /= np.linalg.norm(axis)
     measured = tool_pose(robot, q)[:3, :3] @ Rotation.from_rotvec(-angle * axis).as_matrix()
-    trig = precompute_trig(robot, q[None])
+    trig = robot.trig(q[None])
     block = pose_block(trig, measured[None], np.zeros((1, 3)), np.eye(3)[None], (True, False))
     r = residuals.residual(block, chain_of(robot))[0, :]
     sign = np.sign(r @ axis) if angle == np.pi else 1.0
@@ -163,14 +163,14 @@ def test_orientation_residual_is_exact_up_to_half_a_turn(angle):
 def test_residuals_are_predicted_minus_measured():
     robot = random_robot("dh", 3, np.random.default_rng(15))
     q = np.random.default_rng(16).uniform(-1, 1, (2, 3))
-    trig = precompute_trig(robot, q)
+    trig = robot.trig(q)
     pair = pair_block(trig, np.array([0]), np.array([1]), np.zeros((1, 2)), np.eye(2)[None])
     assert np.all(residuals.residual(pair, build_chain(robot)) > 0)
 
 
 def random_block(kind, n, rng):
     robot = random_robot("mdh-hayati", 6, rng)
-    trig = precompute_trig(robot, rng.uniform(-3, 3, (n + 1, 6)))
+    trig = robot.trig(rng.uniform(-3, 3, (n + 1, 6)))
     a, b = np.arange(n), rng.permutation(n) + 1
     if kind == "pairs":
         block = pair_block(trig, a, b, rng.uniform(0, 2, (n, 2)), np.tril(rng.uniform(0.5, 1, (n, 2, 2))))

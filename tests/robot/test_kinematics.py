@@ -11,7 +11,7 @@ from tolerances import rounding
 
 from fg_calib.errors import InputError
 from fg_calib.robot.kernels import LANES
-from fg_calib.robot.kinematics import SPAN, build_chain, forward, pose, precompute_trig
+from fg_calib.robot.kinematics import SPAN, build_chain, forward, pose
 from fg_calib.robot.model import BASES, CONVENTIONS, Axis, Basis, Element, Joint, Parameter, RobotBuilder
 
 CASES = [(c, n) for c in [*CONVENTIONS, "urdf"] for n in (1, 2, 3, 6, 7, 12)]
@@ -101,7 +101,7 @@ def test_tangent_columns_are_small_motions_of_tool_base_and_measurement_frame_in
     )
     values = dict(zip([p.name for p in robot.parameters], robot.nominal, strict=True))
     base = frame(*(values[f"base.{k}"] for k in ("x", "y", "z", "roll", "pitch", "yaw")))
-    poses = forward(chain, precompute_trig(robot, q))
+    poses = forward(chain, robot.trig(q))
     X = frame(*world_T_base[:3], *world_T_base[:2:-1])
 
     def small(xi):
@@ -124,7 +124,7 @@ def test_every_row_is_walked_whatever_the_number_of_rows(n):
     rng = np.random.default_rng(n)
     robot = random_robot("dh", 3, rng)
     q = rng.uniform(-3, 3, (n, 3))
-    position = forward(build_chain(robot), precompute_trig(robot, q)).position
+    position = forward(build_chain(robot), robot.trig(q)).position
     for i in {0, n // 2, n - 1}:
         assert position[i] == pytest.approx(tool_pose(robot, q[i])[:3, 3], abs=rounding(1.0))
 
@@ -211,7 +211,7 @@ def test_coefficients_times_functions_of_readings(convention):
     robot = with_coefficients(random_robot(convention, 4, rng), rng)
     n, (q, given) = len(robot.parameters), (rng.uniform(-3, 3, (40, 4)), rng.normal(size=(40, 3)))
     chain = build_chain(robot, {i: i for i in range(n)}).with_joint_columns()
-    poses = forward(chain, precompute_trig(robot, q, given))
+    poses = forward(chain, robot.trig(q, given))
     for i in (0, LANES - 1, 39):
         T = pose_with_coefficients(robot, robot.nominal, q[i], given[i])
         assert poses.rotation[i] == pytest.approx(T[:3, :3], abs=rounding(1.0))
@@ -234,9 +234,7 @@ def test_coefficients_that_are_fixed_at_zero_do_nothing():
     off = more.with_values([*robot.nominal, *np.zeros(len(more.parameters) - len(robot.parameters))])
     q = rng.uniform(-3, 3, (3, 4))
     assert len(build_chain(off).axis) == len(build_chain(robot).axis)
-    assert np.array_equal(
-        forward(build_chain(off), precompute_trig(off, q, np.zeros((3, 3)))).position, pose(robot, q).position
-    )
+    assert np.array_equal(forward(build_chain(off), off.trig(q, np.zeros((3, 3)))).position, pose(robot, q).position)
 
 
 def test_bases_that_make_no_sense_are_refused():
@@ -246,4 +244,4 @@ def test_bases_that_make_no_sense_are_refused():
     robot = with_coefficients(random_robot("dh", 2, rng), rng)
     for given in (None, np.zeros((1, 3)), np.zeros((2, 1))):
         with pytest.raises(InputError, match="given: "):
-            precompute_trig(robot, np.zeros((2, 2)), given)
+            robot.trig(np.zeros((2, 2)), given)

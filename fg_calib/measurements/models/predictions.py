@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.measurements.dataset import Labels, Measurements
 from fg_calib.options import Model
-from fg_calib.robot.kinematics import Poses, build_chain, forward, precompute_trig
+from fg_calib.robot.kinematics import Poses, build_chain, forward
 from fg_calib.robot.model import Robot
 
 Floats = NDArray[np.float64]
@@ -33,7 +33,7 @@ def predictions(robot: Robot, m: Measurements, model: Model) -> Measurements:
         model: Which measurements take part.
     """
     train = np.flatnonzero(~m.test)
-    poses = forward(build_chain(robot), precompute_trig(robot, m.readings[train]))
+    poses = forward(build_chain(robot), robot.trig(m.readings[train]))
     n = len(train)
 
     def stated(sigma: Floats | None, shape: tuple[int, ...]) -> Floats:

@@ -11,7 +11,7 @@ from fg_calib.errors import ProblemError
 from fg_calib.initialization.landmarks import anchors_from_lengths, offset_from_lengths, plane_from_distances
 from fg_calib.measurements.kinds import AnchorContact, AnchorDistance, PlaneDistance
 from fg_calib.measurements.series import Series, Table, Unknowns
-from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot
 
 Floats = NDArray[np.float64]
@@ -88,7 +88,7 @@ def _start_anchors(robot: Robot, tables: Sequence[Table], series: Sequence[Serie
 def _fitted(robot: Robot, tables: Sequence[Table], s: Series) -> tuple[Floats, Floats, Integers]:
     """Tool points at the nominal parameters, lengths, 0 of contacts, and nuisances of the train rows of a series."""
     train = np.flatnonzero(~s.test)
-    trig = precompute_trig(robot, tables[s.table].measurements.readings)
+    trig = robot.trig(tables[s.table].measurements.readings)
     points = forward(build_chain(robot), trig, s.ends[train, 0]).position
     length = s.data[train, 0] if s.kind.width else np.zeros(len(train))
     return points, length, s.nuisances[train]
