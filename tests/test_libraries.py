@@ -12,12 +12,10 @@ try:
     from fg_calib import Measurements, Robot
     from fg_calib.report.figures import _figure
     from fg_calib.robot import kernels
-    from numba.core import config
     figure, _ = _figure(1.0, 1.0)
     import matplotlib
-    config.reload_config()
     Measurements.from_frame({"q1": [0.0]}, Robot.from_dh([[1, 0, 0, 0]], convention="dh"))
-    print(config.CACHE_DIR, matplotlib.rcParams["text.usetex"])
+    print(matplotlib.rcParams["text.usetex"])
 except InputError as error:
     print(error)
 """
@@ -30,27 +28,20 @@ def ended(folder, **variables):
     return ran.stdout.strip(), ran.stderr
 
 
-FILES = [("cache_dir: of-a-stranger", "text.usetex: True"), ("a: [", b"\xff".decode("latin-1"))]
+FILES = ["text.usetex: True", b"\xff".decode("latin-1")]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("numba", "matplotlib"), FILES)
-def test_files_of_the_current_folder_set_nothing(tmp_path, numba, matplotlib):
-    (tmp_path / ".numba_config.yaml").write_text(numba)
+@pytest.mark.parametrize("matplotlib", FILES)
+def test_files_of_the_current_folder_set_nothing(tmp_path, matplotlib):
     (tmp_path / "matplotlibrc").write_bytes(matplotlib.encode("latin-1"))
     assert ended(tmp_path) == ("False", "")
-    assert sorted(f.name for f in tmp_path.iterdir()) == [".numba_config.yaml", "matplotlibrc"]
+    assert [f.name for f in tmp_path.iterdir()] == ["matplotlibrc"]
 
 
 WRONG = [
     ("POLARS_MAX_THREADS", "0", "POLARS_MAX_THREADS in the environment: found '0', expected a number above 0"),
     ("NUMBA_DISABLE_JIT", "1", "NUMBA_DISABLE_JIT in the environment: found '1', expected none"),
-    (
-        "NUMBA_NUM_THREADS",
-        "abc",
-        "NUMBA_* in the environment: Environment variable 'NUMBA_NUM_THREADS' is defined but its associated value"
-        " 'abc' could not be parsed, expected values that it takes",
-    ),
 ]
 
 
@@ -58,20 +49,6 @@ WRONG = [
 @pytest.mark.parametrize(("name", "value", "expected"), WRONG)
 def test_a_wrong_environment_is_one_line(tmp_path, name, value, expected):
     assert ended(tmp_path, **{name: value}) == (expected, "")
-
-
-def test_who_has_no_home_has_no_cache_in_the_current_folder(monkeypatch):
-    from fg_calib.robot.compiler import has_cache_folder
-
-    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
-    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    assert has_cache_folder()
-    monkeypatch.setattr(os.path, "expanduser", lambda path: path)
-    assert not has_cache_folder()
-    monkeypatch.setenv("XDG_CACHE_HOME", "")
-    assert not has_cache_folder()
-    monkeypatch.setenv("NUMBA_CACHE_DIR", os.path.abspath("cache"))
-    assert has_cache_folder()
 
 
 FORK = """

@@ -7,7 +7,6 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from fg_calib.baseline.methods import Fit, Solver
 from fg_calib.baseline.rows import Rows, evaluate, said_places, train_rows, whitening_of, without_kinks
@@ -15,6 +14,7 @@ from fg_calib.errors import InputError
 from fg_calib.measurements.gathering import Dataset
 from fg_calib.robot.kinematics import Chain, build_chain
 from fg_calib.robot.model import AXIS_OF_KIND, FRAME_KINDS, Element, Parameter, Robot
+from fg_calib.robot.rotations import rotation_of, yaw_pitch_roll
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -212,12 +212,5 @@ def _with_frame(robot: Robot, world_T_base: Floats) -> Robot:
 
 def _composed(start: Floats, correction: Floats) -> Floats:
     """x, y, z, yaw, pitch, roll of a frame and its correction, one after the other."""
-    turn, more = (Rotation.from_euler("ZYX", frame[3:]) for frame in (start, correction))
-    R = (turn * more).as_matrix()
-    level = np.hypot(R[0, 0], R[1, 0])
-    pitch = np.arctan2(-R[2, 0], level)
-    if level < 1e-9:  # straight up or down: yaw and roll are one, take it all as roll
-        yaw, roll = 0.0, np.arctan2(-R[1, 2], R[1, 1])
-    else:
-        yaw, roll = np.arctan2(R[1, 0], R[0, 0]), np.arctan2(R[2, 1], R[2, 2])
-    return np.array([*(start[:3] + turn.apply(correction[:3])), yaw, pitch, roll])
+    R = rotation_of(*start[3:])
+    return np.concatenate([start[:3] + R @ correction[:3], yaw_pitch_roll(R @ rotation_of(*correction[3:]))])

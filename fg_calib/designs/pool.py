@@ -29,11 +29,11 @@ from fg_calib.graph.information import whitened_jacobian
 from fg_calib.graph.knowledge import coordinates_of
 from fg_calib.graph.problem import Problem
 from fg_calib.measurements.dataset import Noise
-from fg_calib.measurements.kinds.board_pose import left_jacobian
 from fg_calib.measurements.series import KnownPoint, Table, Unknowns
 from fg_calib.observability.random_configurations import Places, places_of
 from fg_calib.options import PAIR_MODELS, Gauge, Model, Options, Pairing
 from fg_calib.robot.model import Robot
+from fg_calib.robot.rotations import left_jacobian
 from fg_calib.simulation.configurations import BoardViews, Configurations, GivenReadings, Placement
 from fg_calib.simulation.instruments import BoardCamera, Instrument, PairGauge, Tracker, with_figures
 from fg_calib.simulation.scenario import Errors, Scenario, Simulation

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fg_calib.errors import InputError
 from fg_calib.exports.links import Links, inverse, links_of, rigid, transform
 from fg_calib.io.urdf import ROUNDING, urdf_text
-from fg_calib.robot.model import FRAME_KINDS, Joint, Robot, frame_values, roll_pitch_yaw
+from fg_calib.robot.model import FRAME_KINDS, Joint, Robot, frame_of_matrix, frame_values
 
 Floats = NDArray[np.float64]
 
@@ -152,7 +152,7 @@ def zeros_of_origins(nominal: Robot, calibrated: Robot) -> tuple[dict[str, float
             motion = rigid(Rotation.from_rotvec(zero * axis).as_matrix(), np.zeros(3))
         rest = after @ inverse(motion)
         zeros[joint.name] = zero
-        origins[joint.name] = dict(zip("xyz", rest[:3, 3].tolist(), strict=True)) | roll_pitch_yaw(rest[:3, :3])
+        origins[joint.name] = frame_of_matrix(rest)
     return zeros, origins
 
 

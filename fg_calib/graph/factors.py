@@ -40,6 +40,7 @@ from fg_calib.graph.rows import At, RowSet
 from fg_calib.measurements.series import Unknowns
 from fg_calib.robot.kinematics import Chain, build_chain
 from fg_calib.robot.model import FRAME_KINDS, Robot, names_of
+from fg_calib.robot.rotations import QUARTER_TURN, yaw_pitch_roll
 
 Floats = NDArray[np.float64]
 
@@ -452,19 +453,8 @@ def frame_of(pose: gtsam.Pose3, near: Floats | None = None) -> Floats:
         near: Of the angles that make the same rotation those nearest to the angles of this frame, in the same order,
             are taken; those within half a turn and a quarter turn of pitch if None.
     """
-    R = pose.rotation()
-    yaw, pitch, roll = R.ypr()
-    if near is None:
-        return np.concatenate([pose.translation(), [yaw, pitch, roll]])
-    wanted = np.asarray(near)[3:]
-    if np.cos(pitch) < _QUARTER_TURN:  # only the sum or difference of yaw and roll acts: both go half the way
-        M, sign = R.matrix(), -np.sign(np.sin(pitch))
-        off = np.arctan2(-sign * M[0, 1], M[1, 1]) - (wanted[2] + sign * wanted[0])
-        half = 0.5 * np.remainder(off + np.pi, 2.0 * np.pi) - 0.5 * np.pi
-        return np.concatenate([pose.translation(), [wanted[0] + sign * half, pitch, wanted[2] + half]])
-    same = np.array([[yaw, pitch, roll], [yaw + np.pi, np.pi - pitch, roll + np.pi]])
-    same += 2.0 * np.pi * np.round((wanted - same) / (2.0 * np.pi))
-    return np.concatenate([pose.translation(), same[np.argmin(np.sum((same - wanted) ** 2, axis=1))]])
+    angles = yaw_pitch_roll(pose.rotation().matrix(), None if near is None else np.asarray(near)[3:])
+    return np.concatenate([pose.translation(), angles])
 
 
 def corrections_of(robot: Robot, values: Floats) -> Floats:
@@ -490,14 +480,11 @@ def corrections_of(robot: Robot, values: Floats) -> Floats:
 _ALONG_TANGENT = (5, 4, 3, 0, 1, 2)
 """Which of `FRAME_KINDS` goes with each direction of a pose's tangent: roll, pitch, yaw with turns about x, y, z."""
 
-_QUARTER_TURN = 1e-9
-"""Cosine of a pitch that counts as a quarter turn: what is missed by that is rounding."""
-
 
 def _frame_derivative(frame: Floats) -> Floats:
     """Derivative of x, y, z, yaw, pitch, roll in Pose3's tangent (rotation first, in itself), shape (6, 6)."""
     pitch, roll = frame[4], frame[5]
-    secant = 1.0 / np.cos(pitch) if abs(np.cos(pitch)) > _QUARTER_TURN else np.nan
+    secant = 1.0 / np.cos(pitch) if abs(np.cos(pitch)) > QUARTER_TURN else np.nan
     D = np.zeros((6, 6))
     D[:3, 3:] = pose_of(frame).rotation().matrix()
     # Body rates of Rz(yaw) Ry(pitch) Rx(roll), solved for the angles' rates.

@@ -42,7 +42,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csgraph
 
 from fg_calib.errors import SolverError
-from fg_calib.robot.kernels import compiled, inlined
+from fg_calib.robot._numba import compiled, inlined
 from fg_calib.robot.kinematics import over_processors
 
 Floats = NDArray[np.float64]

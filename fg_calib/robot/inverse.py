@@ -25,6 +25,7 @@ from fg_calib.arrays import Brief, as_floats, as_rotations
 from fg_calib.options import check_number
 from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot
+from fg_calib.robot.rotations import rotation_vector
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -222,10 +223,3 @@ def _range_of_starts(robot: Robot) -> tuple[Floats, Floats]:
     low = np.where(np.isfinite(lower), lower, np.where(np.isfinite(upper), upper - 2.0 * span, -span))
     high = np.where(np.isfinite(upper), upper, np.where(np.isfinite(lower), lower + 2.0 * span, span))
     return low, high
-
-
-def rotation_vector(rotation: Floats) -> Floats:
-    """Rotation vectors of rotation matrices, shape (n, 3), exact near 0, [rad]."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(rotation).as_rotvec()

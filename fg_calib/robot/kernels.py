@@ -17,67 +17,15 @@ any of them then has all of them compiled anew.
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable
-from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.robot.cache import check_cache
-from fg_calib.robot.compiler import event, has_cache_folder, numba
-
-logger = logging.getLogger(__name__)
+from fg_calib.robot._numba import compiled, inlined, part
 
 LANES = 32
 """Configurations walked at once: the width of the innermost loops. Shorter loops would be unrolled, not vectorised."""
-
-
-class _CompileNotice(event.Listener):  # type: ignore[misc]
-    """Says once, when numba starts to compile, why the program is silent for some seconds, and how often it will be."""
-
-    said, kept = False, True
-
-    def on_start(self, event: object) -> None:
-        """Numba begins to compile (a kernel found in its cache does not come here)."""
-        if not _CompileNotice.said:
-            _CompileNotice.said = True
-            each = "each time, unless NUMBA_CACHE_DIR is a folder that can be written"
-            often = "once an installation" if _CompileNotice.kept else each
-            logger.warning("compiling the kernels: some seconds, %s", often)
-
-    def on_end(self, event: object) -> None:
-        """Numba is done with one function."""
-
-
-_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
-"""Of all kernels: without the GIL, with fused multiply-adds."""
-
-
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a kernel with numba, cached where a folder can be written."""
-    _CompileNotice.kept &= has_cache_folder()
-    try:
-        kernel: Callable[..., Any] = numba.njit(cache=has_cache_folder(), **_OPTIONS)(function)
-    except RuntimeError:  # neither the package's folder nor the user's cache can be written
-        _CompileNotice.kept = False
-        return numba.njit(**_OPTIONS)(function)  # type: ignore[no-any-return]
-    check_cache(kernel)
-    return kernel
-
-
-def part(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
-    """Compile a part that kernels call, and Python does not: it is kept in their caches, without ways in of its own."""
-    options = _OPTIONS | {"no_cpython_wrapper": True, "no_cfunc_wrapper": True} | options
-    return numba.njit(**options)(function)  # type: ignore[no-any-return]
-
-
-inlined = partial(part, forceinline=True)
-"""As `part`, where it must see its caller's constants, or is faster in its place."""
-
-
-event.register("numba:compile", _CompileNotice())
 
 
 class ChainArrays(NamedTuple):

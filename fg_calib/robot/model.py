@@ -23,6 +23,7 @@ from fg_calib.arguments import checked
 from fg_calib.arrays import as_figures, as_floats, check_sizes, require, shape_of
 from fg_calib.errors import InputError, escaped, shown
 from fg_calib.options import NEAR, check, check_names, check_number, did_you_mean, known_names, listed
+from fg_calib.robot.rotations import yaw_pitch_roll
 from fg_calib.sizes import MOST_JOINTS
 
 _log = logging.getLogger(__name__)
@@ -571,33 +572,13 @@ def frame_values(name: str, given: Mapping[str, float] | ArrayLike | None) -> di
     R = matrix[:3, :3]
     if not np.allclose(matrix[3], [0, 0, 0, 1]) or np.abs(R.T @ R - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0:
         raise InputError(name, "a matrix that is no pose", "a rotation, a shift, and 0 0 0 1 as the last row")
-    return dict(zip("xyz", matrix[:3, 3].tolist(), strict=True)) | roll_pitch_yaw(R)
+    return frame_of_matrix(matrix)
 
 
-def roll_pitch_yaw(rotation: Floats) -> dict[str, float]:
-    """The angles of Rz(yaw) Ry(pitch) Rx(roll), exact for every pitch, [rad].
-
-    Near a pitch of a quarter turn roll and yaw turn about nearly one axis: each of them is determined badly, and their
-    sum well. Whatever the yaw is, the roll is therefore taken from what is left, Rz(-yaw) R = Ry(pitch) Rx(roll).
-
-    Args:
-        rotation: A rotation matrix, shape (3, 3).
-    """
-    R = rotation
-    level = np.hypot(R[0, 0], R[1, 0])  # cosine of the pitch
-    yaw = np.arctan2(-R[0, 1], R[1, 1]) if level < UPRIGHT else np.arctan2(R[1, 0], R[0, 0])
-    left = np.cos(yaw) * R[1] - np.sin(yaw) * R[0]  # the second row of what is left: 0, cos(roll), -sin(roll)
-    roll = 0.0 if level < UPRIGHT else np.arctan2(-left[2], left[1])
-    pitch = np.arctan2(-R[2, 0], level)
-    return {
-        "roll": float(roll) + 0.0,
-        "pitch": float(pitch) + 0.0,
-        "yaw": float(yaw) + 0.0,
-    }  # of two zeros the plain one
-
-
-UPRIGHT = 1e-14
-"""Cosine of a pitch below which the roll counts as a part of the yaw."""
+def frame_of_matrix(matrix: Floats) -> dict[str, float]:
+    """x, y, z, roll, pitch, yaw of a pose, shape (4, 4), by kind, [m] and [rad]."""
+    values = np.concatenate([matrix[:3, 3], yaw_pitch_roll(matrix[:3, :3])[::-1]])
+    return dict(zip(("x", "y", "z", "roll", "pitch", "yaw"), values.tolist(), strict=True))
 
 
 def _frame_in_rad(name: str, values: dict[str, float]) -> dict[str, float]:

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from fg_calib.arrays import FrozenArrays
 from fg_calib.progress import tell
-from fg_calib.robot.inverse import N_STARTS, REACHED, Inverse, rotation_vector, solve_inverse
+from fg_calib.robot.inverse import N_STARTS, REACHED, Inverse, solve_inverse
 from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot
+from fg_calib.robot.rotations import rotation_vector
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]

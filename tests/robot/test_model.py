@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 import yaml
-from oracle import frame
 from scipy.spatial.transform import Rotation
-from tolerances import rounding
 
 from fg_calib import InputError, Robot, pose, read_robot, read_urdf, write_robot
-from fg_calib.robot.model import CONVENTIONS, RobotBuilder, roll_pitch_yaw
+from fg_calib.robot.model import CONVENTIONS, RobotBuilder
 
 ROWS = [[0.0, -1.5, 0.34, 0.1, 0.01], [0.6, 0.0, 0.02, -0.2, 0.02], [0.1, 1.2, 0.0, 0.3, -0.03]]  # a alpha d theta beta
 
@@ -171,12 +169,3 @@ def test_limits_of_many_turns_are_told_of(caplog, limit, told):
 def test_a_builder_given_something_else_says_so(call, message):
     with pytest.raises(InputError, match=message):
         call(RobotBuilder("arm", "dh"))
-
-
-@pytest.mark.parametrize("tilt", [0.0, 1e-15, 1e-12, 1e-10, 1e-8, 1e-4, 0.1])
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_angles_of_a_rotation_are_exact_however_near_the_pitch_is_to_a_quarter_turn(tilt, sign):
-    rng = np.random.default_rng(0)
-    for roll, yaw in rng.uniform(-3.1, 3.1, (50, 2)):
-        R = frame(0, 0, 0, roll, sign * (np.pi / 2 - tilt), yaw)[:3, :3]
-        assert frame(0, 0, 0, **roll_pitch_yaw(R))[:3, :3] == pytest.approx(R, abs=rounding())

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.measurements.kinds.kind import Floats, Frames, Kind, Rows, cross_matrix
-from fg_calib.measurements.kinds.orientation import inverse_right_jacobian
+from fg_calib.measurements.kinds.kind import Floats, Frames, Kind, Rows
+from fg_calib.robot.rotations import cross_matrix, inverse_right_jacobian, left_jacobian
 
 
 class BoardPose(Kind):
@@ -37,11 +37,3 @@ class BoardPose(Kind):
         N = np.zeros((len(r), 6, 6))
         N[:, :3, :3], N[:, 3:, 3:] = turned @ left_jacobian(v), R_T
         return Rows(np.concatenate([r, shift], axis=1), D, N)
-
-
-def left_jacobian(v: Floats) -> Floats:
-    """The turn that a change of a rotation vector makes, per unit of it, shape (n, 3, 3): Sola et al. 2018, Eq. 145."""
-    angle = np.maximum(np.linalg.norm(v, axis=1), 1e-8)[:, None, None]
-    K = cross_matrix(v) / angle
-    out: Floats = np.eye(3) + np.sin(0.5 * angle) ** 2 / (0.5 * angle) * K + (1.0 - np.sinc(angle / np.pi)) * (K @ K)
-    return out

@@ -282,11 +282,3 @@ def between(start: Floats, end: Floats) -> tuple[Floats, Floats]:
     vector = end - start
     length: Floats = np.linalg.norm(vector, axis=1)
     return length, vector / np.maximum(length, 1e-300)[:, None]
-
-
-def cross_matrix(v: Floats) -> Floats:
-    """[v]x with `[v]x w = v x w`, shape (n, 3, 3)."""
-    out = np.zeros((len(v), 3, 3))
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
-    out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = v[:, 2], -v[:, 1], v[:, 0]
-    return out

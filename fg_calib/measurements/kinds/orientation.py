@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.measurements.kinds.kind import Floats, Frames, Kind, Rows, cross_matrix
+from fg_calib.measurements.kinds.kind import Floats, Frames, Kind, Rows
 from fg_calib.robot import kernels
+from fg_calib.robot.rotations import inverse_right_jacobian
 
 
 class Orientation(Kind):
@@ -28,13 +29,3 @@ class Orientation(Kind):
         D = np.zeros((len(r), 1, 3, 6))
         D[:, 0, :, :3] = inverse_right_jacobian(r) @ R_T
         return Rows(r, D)
-
-
-def inverse_right_jacobian(r: Floats) -> Floats:
-    """`1 + [r]x / 2 + g [r]x^2` at rotation vectors, shape (n, 3): shape (n, 3, 3)."""
-    angle = np.linalg.norm(r, axis=1)
-    half = 0.5 * np.maximum(angle, 1e-4)
-    g = np.where(angle < 1e-4, 1.0 / 12.0 + angle**2 / 720.0, (1.0 - half / np.tan(half)) / (4.0 * half**2))
-    cross = cross_matrix(r)
-    out: Floats = np.eye(3) + 0.5 * cross + g[:, None, None] * (cross @ cross)
-    return out

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.arrays import as_floats
 from fg_calib.errors import InputError
-from fg_calib.measurements.kinds.board_pose import left_jacobian
-from fg_calib.measurements.kinds.kind import Floats, Frames, Kind, Rows, cross_matrix
+from fg_calib.measurements.kinds.kind import Floats, Frames, Kind, Rows
+from fg_calib.robot.rotations import cross_matrix, left_jacobian
 
 MOST_PIXELS = 1e6
 """No camera has more, nor a focal length of more, nor a larger coefficient of distortion."""

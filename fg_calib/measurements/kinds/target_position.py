@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fg_calib.measurements.kinds.kind import Floats, Frames, Kind, Rows, cross_matrix
+from fg_calib.measurements.kinds.kind import Floats, Frames, Kind, Rows
+from fg_calib.robot.rotations import cross_matrix
 
 
 class TargetPosition(Kind):
