@@ -104,13 +104,13 @@ def write_jobs(data: Path, folder: Path, seed: int, quick: bool) -> dict[str, Pa
     return paths
 
 
-def calibrate(job: fg_calib.Job) -> tuple[fg_calib.Solution, fg_calib.Uncertainty]:
+def calibrate(job: fg_calib.Job) -> tuple[fg_calib.Solution, fg_calib.Assessment]:
     """What `fg-calib calibrate` does."""
     solution = fg_calib.solve(fg_calib.problem_of(job))
     return solution, fg_calib.assess(solution)
 
 
-def summarise(solution: fg_calib.Solution, uncertainty: fg_calib.Uncertainty) -> dict[str, Any]:
+def summarise(solution: fg_calib.Solution, uncertainty: fg_calib.Assessment) -> dict[str, Any]:
     """The numbers worth keeping, [m] and [rad]."""
     document = fg_calib.result_document(solution, uncertainty)
     keep = ("model", "frame", "pairing", "n_configurations", "n_pairs", "n_residuals", "n_excluded", "reduced_chi2")
@@ -166,7 +166,7 @@ def rms(errors: Floats) -> float:
     return float(np.sqrt(np.mean(errors**2)))
 
 
-def pose_magnitudes(uncertainty: fg_calib.Uncertainty, kind: str, when: str) -> Floats:
+def pose_magnitudes(uncertainty: fg_calib.Assessment, kind: str, when: str) -> Floats:
     """Norm of each test row's three residual components, shape (n_test,), [m] or [rad]."""
     table = uncertainty.residuals
     rows = table.test & np.char.startswith(table.kind, kind)
@@ -174,7 +174,7 @@ def pose_magnitudes(uncertainty: fg_calib.Uncertainty, kind: str, when: str) -> 
 
 
 def figures_of_test(
-    job: fg_calib.Job, solution: fg_calib.Solution, uncertainty: fg_calib.Uncertainty
+    job: fg_calib.Job, solution: fg_calib.Solution, uncertainty: fg_calib.Assessment
 ) -> dict[str, tuple[float, float]]:
     """RMS of the distances and of the angles of test pairs, [m] and [rad].
 

@@ -34,7 +34,6 @@ from fg_calib.measurements.dataset import Measurements
 from fg_calib.observability.identifiability import observe_structure
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, Model
 from fg_calib.robot.model import CONVENTIONS, Joint, RobotBuilder
-from fg_calib.statistics.assessment import marginals
 
 Floats = NDArray[np.float64]
 
@@ -146,7 +145,7 @@ def through_the_graph(
 
     kept = fg_calib.solve(fg_calib.build_problem(robot, measurements, gauge="keep", **options))
     ours = fg_calib.assess(kept).spread.tangent
-    joint = marginals(kept)
+    joint = gtsam.Marginals(kept.problem.graph, kept.values)
     worst = max(
         float(np.abs(joint.marginalCovariance(v.key) / ours[v.columns, v.columns] - 1.0).max())
         for v in kept.problem.variables.items

@@ -15,6 +15,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from fg_calib.assessment import Assessment, assess, solve_job
     from fg_calib.baseline.comparison import Comparison, compare
     from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
     from fg_calib.batch import calibrate_jobs
@@ -75,9 +76,8 @@ if TYPE_CHECKING:
     from fg_calib.simulation.scenario_file import read_scenario
     from fg_calib.simulation.simulator import simulate
     from fg_calib.simulation.write import write_simulation
-    from fg_calib.statistics.assessment import Uncertainty, assess
     from fg_calib.statistics.prior_scales import estimate_tolerances
-    from fg_calib.statistics.variance_components import estimate_noise, solve_job
+    from fg_calib.statistics.variance_components import estimate_noise
 
 __version__ = "0.1.0"
 
@@ -116,7 +116,7 @@ _HOMES = {
     "fg_calib.diagnostics.inspection": ("Inspection", "inspect_job"),
     "fg_calib.diagnostics.setup_check": ("SetupCheck", "check_setup"),
     "fg_calib.statistics.prior_scales": ("estimate_tolerances",),
-    "fg_calib.statistics.variance_components": ("estimate_noise", "solve_job"),
+    "fg_calib.statistics.variance_components": ("estimate_noise",),
     "fg_calib.graph.build": ("build_problem", "problem_of"),
     "fg_calib.graph.problem": ("Problem",),
     "fg_calib.measurements.kinds.pixel": ("Camera",),
@@ -140,7 +140,7 @@ _HOMES = {
     "fg_calib.diagnostics.multistart": ("look_elsewhere",),
     "fg_calib.graph.extension": ("DistanceFactor", "RotationAngleFactor", "expand"),
     "fg_calib.graph.solver": ("Solution", "SolverOptions", "levenberg_marquardt_params", "solve"),
-    "fg_calib.statistics.assessment": ("Uncertainty", "assess"),
+    "fg_calib.assessment": ("Assessment", "assess", "solve_job"),
 }
 _FROM_FILES = {"Robot": ("from_urdf", "read_urdf"), "Measurements": ("from_frame", "read_measurements")}
 """Constructors that read files, which the folders of these classes know nothing of: they are attached here."""
@@ -148,6 +148,7 @@ _FROM_FILES = {"Robot": ("from_urdf", "read_urdf"), "Measurements": ("from_frame
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
+    "Assessment",
     "BoardViews",
     "Bound",
     "Calibration",
@@ -195,7 +196,6 @@ __all__ = [
     "Table",
     "TargetViews",
     "Targets",
-    "Uncertainty",
     "Units",
     "assess",
     "build_problem",

@@ -39,7 +39,7 @@ EXAMPLES = {
     "Solution": "solve(problem)",
     "SolverOptions": "SolverOptions(max_iterations=200)",
     "Table": "Table(measurements, 'pose')",
-    "Uncertainty": "assess(solution)",
+    "Assessment": "assess(solution)",
     "Units": "Units(length='mm')",
     "Variables": "problem.variables",
 }

@@ -30,6 +30,8 @@ from pydantic import ValidationError
 
 from fg_calib.arguments import checked
 from fg_calib.arrays import as_floats, shape_of
+from fg_calib.assessment import Assessment as Uncertainty
+from fg_calib.assessment import assess, solve_job
 from fg_calib.errors import InputError, SolverError, escaped, shown
 from fg_calib.graph.factors import Variables, build_variables, frame_of
 from fg_calib.graph.knowledge import SIZE, Knowledge
@@ -63,10 +65,9 @@ from fg_calib.report.summary import format_result, html, judged, summary
 from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import forward
 from fg_calib.robot.model import Robot, names_of
-from fg_calib.statistics.assessment import FrameEstimate, Uncertainty, assess
 from fg_calib.statistics.covariance import TangentCovariance
+from fg_calib.statistics.estimates import FrameEstimate
 from fg_calib.statistics.residual_table import ResidualTable
-from fg_calib.statistics.variance_components import solve_job
 from fg_calib.threads import single_threaded
 
 if TYPE_CHECKING:
@@ -140,7 +141,7 @@ def calibrate_job(job: Job | Path | str, executor: Executor | None = None) -> Ca
         if given.options.folds is not None:
             from fg_calib.statistics.cross_validation import cross_validate
 
-            folds = cross_validate(given, given.options.folds, executor=executor)
+            folds = cross_validate(given, solve_job, given.options.folds, executor=executor)
             uncertainty = uncertainty.with_folds(folds, solution)
         return Calibration.of(solution, uncertainty, given.inputs, job=given.document)
 
@@ -545,7 +546,7 @@ class Calibration:
         Raises:
             InputError: The calibration was loaded (its residuals are in `residuals.csv`), or is one in parts.
         """
-        return self.uncertainty.residuals
+        return self.uncertainty.fit.residuals
 
     @property
     def _assessed(self) -> tuple[Solution, Uncertainty]:

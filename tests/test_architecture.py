@@ -36,6 +36,7 @@ FOLDERS = (
     "diagnostics",
     "prediction",
     "monitoring",
+    "assessment",
     "baseline",
     "io",
     "simulation",
@@ -70,14 +71,7 @@ UPWARD = {
         "report/prediction",
         "report/slices",
     },
-    "statistics/assessment": {
-        *("diagnostics/changes", "diagnostics/findings", "diagnostics/setup_check", "diagnostics/verdict"),
-        *("monitoring/prior_information", "prediction/expected_error"),
-    },
     "statistics/robust_screening": {"diagnostics/nominal_residuals"},
-    "statistics/variance_components": {
-        *("diagnostics/multistart", "diagnostics/setup_check", "diagnostics/verdict"),
-    },
 }
 """Imports that still run upwards: none is added."""
 
@@ -284,7 +278,7 @@ with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
 print(sorted(sys.modules))
 """
     loaded = set(ast.literal_eval(run_python(code)))
-    assert {"fg_calib.statistics.assessment", "fg_calib.report.text", "gtsam", "numba", "polars"} <= loaded
+    assert {"fg_calib.assessment", "fg_calib.report.text", "gtsam", "numba", "polars"} <= loaded
     idle = {"matplotlib", "lxml", "yourdfpy", "scipy.optimize", "scipy.stats", "fg_calib.io.urdf"}
     idle |= {"fg_calib.baseline", "fg_calib.report.figures", "fg_calib.report.page.page", "jinja2", "cv2", "rosbags"}
     idle |= {

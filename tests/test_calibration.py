@@ -294,7 +294,7 @@ def test_what_a_calibration_is_made_of_is_read_only(found):
     """But for arrays that kernels were compiled for."""
     uncertainty = found["priors"].uncertainty
     every = {type(part).__name__: part for part in frozen(uncertainty, {})}
-    assert {"Uncertainty", "Goodness", "PredictedFit", "PriorFit", "Spread"} <= set(every)
+    assert {"Assessment", "Goodness", "PredictedFit", "PriorFit", "Spread"} <= set(every)
     for name, part in every.items():
         for key, array in vars(part).items():
             if isinstance(array, np.ndarray) and key not in part._left_open:

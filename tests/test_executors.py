@@ -32,6 +32,7 @@ from fg_calib import (
     read_scenario,
     simulate,
 )
+from fg_calib.assessment import solve_job
 from fg_calib.batch import EARLIER, Order, calibrate_into, job_names
 from fg_calib.cli.calibrate import _written
 from fg_calib.io.disk import fill_folder, write_text
@@ -324,9 +325,9 @@ if __name__ == "__main__":
 @pytest.mark.slow
 def test_folds_are_the_same_to_the_last_bit_on_other_processes(example):
     job = read_job(example / "calibration.yaml")
-    here = cross_validate(job, 3)
+    here = cross_validate(job, solve_job, 3)
     with local_processes(2) as executor:
-        there = cross_validate(job, 3, executor=executor)
+        there = cross_validate(job, solve_job, 3, executor=executor)
     assert there.spread.tobytes() == here.spread.tobytes()
     assert {k: (v.n, v.before, v.after) for k, v in there.kinds.items()} == {
         k: (v.n, v.before, v.after) for k, v in here.kinds.items()

@@ -34,6 +34,8 @@ from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
 from fg_calib.arrays import Brief
+from fg_calib.assessment import Assessment as Uncertainty
+from fg_calib.assessment import assess, solve_job
 from fg_calib.baseline.least_squares import LeastSquares, fit_dataset
 from fg_calib.errors import CalibrationError, ProblemError
 from fg_calib.graph.build import problem_of
@@ -44,9 +46,7 @@ from fg_calib.measurements.dataset import rotation_angle
 from fg_calib.prediction.expected_error import errors_at, judged_configurations, pose_rms
 from fg_calib.robot.kinematics import Poses, build_chain, forward
 from fg_calib.robot.model import Robot
-from fg_calib.statistics.assessment import Uncertainty, assess
 from fg_calib.statistics.residual_table import residual_table
-from fg_calib.statistics.variance_components import solve_job
 from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]

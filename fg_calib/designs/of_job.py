@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib.assessment import solve_job
 from fg_calib.designs.candidates import Candidates
 from fg_calib.designs.pool import HUB, NONE, Pool, drawn, pool_of
 from fg_calib.designs.rows import stop_rows
@@ -15,7 +16,6 @@ from fg_calib.errors import InputError
 from fg_calib.graph.problem import Problem, reweighted_at
 from fg_calib.job import Job
 from fg_calib.simulation.configurations import Configurations
-from fg_calib.statistics.variance_components import solve_job
 
 Integers = NDArray[np.int64]
 

@@ -40,11 +40,9 @@ from fg_calib.measurements.kinds import AnchorContact
 from fg_calib.measurements.models.pairs import missing_figures
 from fg_calib.observability.parallel_axes import MissingMotion
 from fg_calib.robot.kinematics import forward
-from fg_calib.statistics.chi_square import ChiSquare
 from fg_calib.statistics.covariance import Spread
-from fg_calib.statistics.goodness_of_fit import OUTLIER_WEIGHT, Goodness
+from fg_calib.statistics.goodness_of_fit import OUTLIER_WEIGHT, Fit, Goodness
 from fg_calib.statistics.noise_components import has_joint_noise
-from fg_calib.statistics.prior_consistency import PriorFit
 from fg_calib.statistics.residual_table import ResidualTable
 
 Floats = NDArray[np.float64]
@@ -68,23 +66,6 @@ MOST_ESTIMATED = 2.0
 
 _WITH_MOTION = ("distance", "angle", "orientation", "position")
 """Kinds of noise whose motions are told from what the arm predicts."""
-
-
-@dataclass(frozen=True)
-class Fit:
-    """How well a solution fits, figure by figure.
-
-    Attributes:
-        chi2: Chi-square of the fitted rows and the priors.
-        table: Every residual.
-        goodness: Goodness of fit by kind, by row and by configuration.
-        priors: Corrections against tolerances; None without priors.
-    """
-
-    chi2: ChiSquare
-    table: ResidualTable
-    goodness: Goodness
-    priors: PriorFit | None
 
 
 @dataclass(frozen=True)
@@ -121,7 +102,7 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
     problem, kinds = solution.problem, fit.goodness.kinds
     estimated_noise = solution.estimated_noise is not None
     updated = problem.knowledge is not None
-    of_priors_alone = fit.priors is not None and fit.chi2.too_large and not _too_large(fit)
+    of_priors_alone = fit.priors is not None and fit.chi_square.too_large and not _too_large(fit)
     too_large = {kind.verdict for kind in kinds} & {"too small", "both", "many"}
     asked = not problem.evaluated and (too_large or estimated_noise)
     may_change = asked or (any(kind.verdict == "outliers" for kind in kinds) and not problem.evaluated)
@@ -132,15 +113,19 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
     statements = [
         *_of_solver(solution),
         *of_change(change, problem.end_names),
-        *(() if of_priors_alone else of_chi2(fit.chi2, problem.evaluated, follow=follow, gross=gross, updated=updated)),
+        *(
+            ()
+            if of_priors_alone
+            else of_chi2(fit.chi_square, problem.evaluated, follow=follow, gross=gross, updated=updated)
+        ),
         *of_evaluation(problem.evaluated, estimated_noise),
         *_of_kept_noise(solution, fit.goodness),
-        *of_test(fit.goodness.test, fit.chi2.ratio, problem.end_names),
+        *of_test(fit.goodness.test, fit.chi_square.ratio, problem.end_names),
         *of_priors(fit.priors),
         *_of_tolerances(solution, fit),
-        *_of_bent_rows(solution, spread, fit.table, fit.goodness, too_large=fit.chi2.too_large),
+        *_of_bent_rows(solution, spread, fit.residuals, fit.goodness, too_large=fit.chi_square.too_large),
         *of_curvature(beyond_linear(solution, spread)),
-        *_of_noise(solution, fit.table, fit.goodness),
+        *_of_noise(solution, fit.residuals, fit.goodness),
         *(Statement(text, finding=False) for table in problem.data.tables for text in missing_figures(table)),
     ]
     setup, structure = SetupCheck(), of_structure(noise_like)
@@ -151,9 +136,11 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
         setup = check_problem(problem, solution.before, doubtful=doubtful)
     if not (setup.explanations or gross is not None):
         labels = problem.data.labels
-        statements += [s for found in forgotten_offsets(solution) for s in of_offset(found, labels, fit.chi2.too_large)]
+        statements += [
+            s for found in forgotten_offsets(solution) for s in of_offset(found, labels, fit.chi_square.too_large)
+        ]
     fits = not (doubts or estimated_noise)
-    high = gross is None and (fit.chi2.too_large or follow)
+    high = gross is None and (fit.chi_square.too_large or follow)
     asked = high and bool(missing) and not setup.explanations and not updated  # the convention did before
     certain = asked and excess_left(solution, missing) <= EXPLAINED
     findings, cautions = _of_model(setup, missing, fits=fits, high=high, certain=certain)
@@ -167,9 +154,9 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
 def _too_large(fit: Fit) -> bool:
     """Whether chi-square is too large without the corrections, which are judged by themselves."""
     if fit.priors is None:
-        return fit.chi2.too_large
-    rest, dof = fit.chi2.value - fit.priors.chi2, fit.chi2.dof - len(fit.priors.names)
-    return rest > max(fit.chi2.bounds[1] * dof, 0.0) or any(
+        return fit.chi_square.too_large
+    rest, dof = fit.chi_square.value - fit.priors.chi2, fit.chi_square.dof - len(fit.priors.names)
+    return rest > max(fit.chi_square.bounds[1] * dof, 0.0) or any(
         kind.verdict in ("too small", "both", "many") for kind in fit.goodness.kinds
     )
 

@@ -18,9 +18,9 @@ from fg_calib.diagnostics.changes import Change
 from fg_calib.diagnostics.linearity import Curvature
 from fg_calib.diagnostics.offsets import Offset
 from fg_calib.graph.tolerances import ToleranceScale
-from fg_calib.statistics.chi_square import CONFIDENCE, FACTOR, ChiSquare
-from fg_calib.statistics.goodness_of_fit import GrossErrors, PredictedFit
+from fg_calib.statistics.goodness_of_fit import CONFIDENCE, FACTOR, ChiSquare, GrossErrors, PredictedFit
 from fg_calib.statistics.prior_consistency import PriorFit
+from fg_calib.statistics.variance_components import LEAST_REDUNDANCY
 
 LIKE_NOISE, NOT_NOISE = 1e-3, 1e-6
 """Probability below which residuals follow the arm more than noise does, and below which true errors are several times
@@ -46,9 +46,6 @@ LARGE_NOISE = 0.2
 
 MOST_KEPT = 3.0
 """Factor on estimated noise beyond which what was stated is no reason to trust the noise that measurements keep."""
-
-LEAST_REDUNDANCY = 3.0
-"""Degrees of freedom that a kind must have left for its noise to be estimated."""
 
 _NAMED = 3
 """Configurations or parameters that a statement names."""

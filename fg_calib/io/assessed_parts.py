@@ -22,8 +22,10 @@ from fg_calib.observability.identifiability import Identifiability
 from fg_calib.observability.indices import Observability, observability_of_rows
 from fg_calib.observability.parallel_axes import missing_motions
 from fg_calib.prediction.expected_error import ExpectedError, expected_error
-from fg_calib.statistics.assessment import FrameEstimate, ParameterEstimate, frame_estimates, known
-from fg_calib.statistics.chi_square import ChiSquare, chi_square_of
+from fg_calib.statistics.estimates import FrameEstimate, ParameterEstimate
+from fg_calib.statistics.estimates import estimate_frames as frame_estimates
+from fg_calib.statistics.estimates import finite as known
+from fg_calib.statistics.goodness_of_fit import ChiSquare, chi_square_of
 from fg_calib.statistics.prior_consistency import PriorFit, judge_tolerances
 from fg_calib.threads import single_threaded
 

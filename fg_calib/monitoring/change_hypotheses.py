@@ -26,7 +26,7 @@ from fg_calib.monitoring.hypotheses import (
 )
 from fg_calib.monitoring.new_data import Calibrated, Linear, Rows
 from fg_calib.robot.inverse import random_readings
-from fg_calib.statistics.chi_square import FACTOR
+from fg_calib.statistics.goodness_of_fit import FACTOR
 
 Floats = NDArray[np.float64]
 

@@ -34,7 +34,7 @@ from fg_calib.monitoring.hypotheses import CERTAIN, WRONG, Found, quantile, zero
 from fg_calib.monitoring.new_data import Calibrated, Linear, Rows, linear, placed
 from fg_calib.options import LIMITED, Limits
 from fg_calib.statistics.acceptance import LEAST
-from fg_calib.statistics.chi_square import FACTOR
+from fg_calib.statistics.goodness_of_fit import FACTOR
 from fg_calib.statistics.residual_table import residual_table
 
 Verdict = Literal["pass", "fail", "not_evaluated"]

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from fg_calib import __version__
 from fg_calib.arguments import checked
+from fg_calib.assessment import Assessment as Uncertainty
 from fg_calib.diagnostics.setup_check import SetupCheck
 from fg_calib.diagnostics.typical_residuals import TypicalResidual
 from fg_calib.errors import InputError
@@ -77,8 +78,9 @@ from fg_calib.report.page.files import FIGURE_FILES, PAGE
 from fg_calib.report.shown import FAMILY_UNIT
 from fg_calib.robot.kinematics import SPAN, pose
 from fg_calib.robot.model import Robot
-from fg_calib.statistics.assessment import ParameterEstimate, Uncertainty
 from fg_calib.statistics.covariance import TangentCovariance
+from fg_calib.statistics.estimates import JointErrors as JointValues
+from fg_calib.statistics.estimates import ParameterEstimate
 from fg_calib.statistics.goodness_of_fit import (
     FLAGS,
     PREDICTION_VERDICTS,
@@ -88,7 +90,6 @@ from fg_calib.statistics.goodness_of_fit import (
     PredictedFit,
     SuspectConfiguration,
 )
-from fg_calib.statistics.joint_values import JointValues
 from fg_calib.statistics.prior_consistency import PriorFit
 from fg_calib.threads import single_threaded
 

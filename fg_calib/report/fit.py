@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import RenderableType
 
+from fg_calib.assessment import Assessment as Uncertainty
 from fg_calib.diagnostics.verdict import probability
 from fg_calib.graph.noise import JOINT_NOISE, NoiseName
 from fg_calib.graph.solver import Solution
 from fg_calib.report.shown import SHOWN
 from fg_calib.report.tables import indented, plain_table, rounded, section
-from fg_calib.statistics.assessment import Uncertainty
 from fg_calib.statistics.goodness_of_fit import FLAGS, PREDICTION_VERDICTS, VERDICTS, KindFit, SuspectConfiguration
 
 Integers = NDArray[np.int64]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from rich.console import RenderableType
 
+from fg_calib.assessment import Assessment as Uncertainty
 from fg_calib.report.shown import SHOWN
 from fg_calib.report.tables import in_order, indented, plain_table, section
-from fg_calib.statistics.assessment import Uncertainty
 
 
 def folds(uncertainty: Uncertainty) -> list[RenderableType]:

@@ -6,13 +6,14 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from fg_calib.assessment import Assessment as Uncertainty
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements.kinds import SamePoint
 from fg_calib.report.shown import SHOWN
 from fg_calib.report.tables import rounded
 from fg_calib.robot.model import names_of
-from fg_calib.statistics.assessment import ParameterEstimate, Uncertainty
+from fg_calib.statistics.estimates import ParameterEstimate
 from fg_calib.statistics.goodness_of_fit import OUTLIER_WEIGHT
 
 _UNMOVED = 1e-9

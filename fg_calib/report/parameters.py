@@ -6,11 +6,11 @@ from collections.abc import Mapping
 
 from rich.console import RenderableType
 
+from fg_calib.assessment import Assessment as Uncertainty
 from fg_calib.graph.tolerances import ToleranceScales
 from fg_calib.report.shown import SHOWN
 from fg_calib.report.tables import plain_table, rounded
 from fg_calib.report.tolerances import HEADINGS, tolerance_rows
-from fg_calib.statistics.assessment import Uncertainty
 
 
 def parameters(uncertainty: Uncertainty) -> RenderableType:

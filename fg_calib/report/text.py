@@ -8,6 +8,7 @@ import numpy as np
 from rich.console import Group, RenderableType
 
 from fg_calib.arguments import checked
+from fg_calib.assessment import Assessment as Uncertainty
 from fg_calib.diagnostics.verdict import chi2_in_words, predicted_in_words, probability
 from fg_calib.graph.noise import JOINT_NOISE
 from fg_calib.graph.solver import Solution
@@ -23,9 +24,9 @@ from fg_calib.report.shown import SHOWN
 from fg_calib.report.summary import good, judged
 from fg_calib.report.tables import WIDTH, in_order, indented, line, plain_table, plain_text, rounded, section
 from fg_calib.report.tolerances import TITLE
-from fg_calib.statistics.assessment import FrameEstimate, Uncertainty
-from fg_calib.statistics.joint_values import JointValues
-from fg_calib.statistics.landmark_estimates import PointEstimate
+from fg_calib.statistics.estimates import FrameEstimate
+from fg_calib.statistics.estimates import JointErrors as JointValues
+from fg_calib.statistics.estimates import LandmarkEstimate as PointEstimate
 
 
 @checked

@@ -8,7 +8,7 @@ from fg_calib.graph.tolerances import ToleranceScale
 from fg_calib.io.result import Parameter
 from fg_calib.io.result import ToleranceScale as ScaleDocument
 from fg_calib.report.shown import SHOWN
-from fg_calib.statistics.assessment import ParameterEstimate
+from fg_calib.statistics.estimates import ParameterEstimate
 
 HEADINGS = ("", "stated", "estimated", "", "ratio", "from", "to", "corrections seen")
 """What the cells of a row are; the interval is one of 95 %."""

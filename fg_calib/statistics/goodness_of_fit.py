@@ -44,17 +44,19 @@ from scipy import special
 
 from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.factors import prior_rows
+from fg_calib.graph.information import eliminated
 from fg_calib.graph.noise import JOINT_NOISE, NoiseName
-from fg_calib.graph.problem import noises_at
-from fg_calib.graph.robust import tuning, weight
+from fg_calib.graph.problem import Problem, mahalanobis_distances, noises_at
+from fg_calib.graph.robust import effect, tuning, weight
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements.residuals import squares_along
 from fg_calib.robot.kinematics import SPAN
 from fg_calib.statistics.covariance import Spread
 from fg_calib.statistics.gross_errors import MOST_FEW, find_gross_errors
 from fg_calib.statistics.low_rank import Dense, LowRank
+from fg_calib.statistics.prior_consistency import PriorFit
 from fg_calib.statistics.residual_covariance import Errors, Nuisances, half_of
-from fg_calib.statistics.residual_table import ResidualTable, sum_by_end
+from fg_calib.statistics.residual_table import ALARM, ResidualTable, sum_by_end, suspect_level
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -71,9 +73,6 @@ MAX_KEPT = 300_000
 
 MAX_WHITENED = 1000
 """Predicted rows up to which all are whitened together; of more, so many that are evenly spaced."""
-
-ALARM = 0.01
-"""Probability of calling any row of a clean table suspect; and any configuration."""
 
 OUTLIER_WEIGHT = 0.5
 """A row with a robust weight below this is an outlier."""
@@ -306,9 +305,21 @@ class Goodness(FrozenArrays):
         return self.gross is not None and all(kind.verdict in fine for kind in self.kinds)
 
 
-def suspect_level(n: int) -> float:
-    """|studentised residual| that the largest of n clean rows exceeds with a probability of `ALARM` (Sidak 1967)."""
-    return float(special.ndtri(0.5 + 0.5 * (1.0 - ALARM) ** (1.0 / max(1, n))))
+@dataclass(frozen=True)
+class Fit:
+    """How well a solution fits.
+
+    Attributes:
+        chi_square: Chi-square of the fitted rows and the priors.
+        residuals: Every residual, before and after.
+        goodness: Goodness of fit by kind, by row and by configuration.
+        priors: Corrections against prior sigmas; None without priors.
+    """
+
+    chi_square: ChiSquare
+    residuals: ResidualTable
+    goodness: Goodness
+    priors: PriorFit | None
 
 
 def judge_fit(solution: Solution, spread: Spread, table: ResidualTable) -> Goodness:
@@ -779,3 +790,132 @@ def upper_probability(ratio: float, nu: float, behind: float = np.inf) -> float:
     if np.isfinite(behind):
         return float(special.fdtrc(nu, behind, ratio))
     return float(special.gammaincc(nu / 2.0, nu / 2.0 * ratio))
+
+
+CONFIDENCE = 0.999
+"""A sum of squares outside this central interval of its distribution is not by chance."""
+
+FACTOR = 2.0
+"""A reduced chi-square between 1 / FACTOR and FACTOR is good whatever its distribution: noise is never known better."""
+
+
+@dataclass(frozen=True)
+class ChiSquare:
+    """Chi-square of the fitted rows and the priors.
+
+    Attributes:
+        value: Sum of squared whitened residuals; with a robust loss of what keeps at least half its weight.
+        dof: Residuals and priors, less the determined directions.
+        expected: Its mean; not `dof` where rows that share errors count as independent.
+        bounds: Interval of the reduced chi-square that is taken as good.
+        p_value: Probability of one as large, were the noise as stated; None where that is not known.
+    """
+
+    value: float
+    dof: int
+    expected: float
+    bounds: tuple[float, float]
+    p_value: float | None
+
+    @property
+    def too_large(self) -> bool:
+        """Whether it is above what is taken as good."""
+        return self.value > self.bounds[1] * self.dof
+
+    @property
+    def reduced(self) -> float | None:
+        """Chi-square over its degrees of freedom; None without any."""
+        return self.value / self.dof if self.dof > 0 else None
+
+    @property
+    def ratio(self) -> float:
+        """It over its mean; 1 where nothing is expected."""
+        return self.value / self.expected if self.expected > 0.0 else 1.0
+
+
+def chi_square(solution: Solution, spread: Spread) -> ChiSquare:
+    """Chi-square of a solution.
+
+    Args:
+        solution: The solution.
+        spread: The covariance of what was estimated.
+    """
+    problem = solution.problem
+    chi2, n_rows, of_loss = _weighted_chi2(solution)
+    dof = (
+        n_rows
+        + problem.n_priors
+        + problem.n_added
+        + problem.n_known
+        - spread.rank
+        - eliminated(problem, solution.parameters).rank
+    )
+    expected = max(0.0, dof - spread.excess - (1.0 - of_loss) * n_rows)
+    independent = _independent_dof(problem, dof, spread.rank)
+    p_value = _p_value(solution, chi2, expected, independent)
+    return ChiSquare(chi2, dof, expected, chi2_bounds(dof, expected, independent), p_value)
+
+
+def chi2_bounds(dof: int, expected: float | None = None, independent: int | None = None) -> tuple[float, float]:
+    """Interval of the reduced chi-square taken as good: its central `CONFIDENCE`, widened to `FACTOR` either way.
+
+    Args:
+        dof: Degrees of freedom that chi-square is divided by.
+        expected: Mean of chi-square; `dof` if None.
+        independent: Degrees of freedom of the noise behind it; `dof` if None.
+    """
+    if dof <= 0:
+        return 0.0, np.inf
+    k = max(1, min(dof, independent or dof))
+    ratio = 1.0 if expected is None else expected / dof
+    low, high = (2.0 * special.gammaincinv(k / 2.0, p) / k for p in ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))
+    return ratio * min(float(low), 1.0 / FACTOR), max(1.0, ratio) * max(float(high), FACTOR)
+
+
+def chi_square_of(value: float, dof: int, *, independent: bool) -> ChiSquare:
+    """Chi-square of rows whose noise is as they are weighted by.
+
+    Args:
+        value: Sum of squared whitened residuals and priors.
+        dof: Residuals and priors, less the determined directions.
+        independent: Whether no rows share errors: where some may, nothing says how probable it is.
+    """
+    p_value = float(special.gammaincc(dof / 2.0, value / 2.0)) if independent and dof > 0 else None
+    return ChiSquare(value, dof, float(max(dof, 0)), chi2_bounds(dof), p_value)
+
+
+def _weighted_chi2(solution: Solution) -> tuple[float, int, float]:
+    """Chi-square, the independent residuals in it, and what a robust loss makes of the mean of one of them.
+
+    With a robust loss only measurements count that keep at least half their weight.
+    """
+    problem = solution.problem
+    weights, chi2 = problem.state.weights, 2.0 * solution.weighted_cost
+    if weights is None:
+        return chi2, problem.n_independent, 1.0
+    n_rows = n_kept = expected = 0.0
+    distances = mahalanobis_distances(problem, solution.parameters)
+    for series, w, (e, residual_dim) in zip(problem.data.series, weights, distances, strict=True):
+        train, outlier = (residual_dim > 0) & ~series.test, w < OUTLIER_WEIGHT
+        chi2 -= float(np.sum(w[train & outlier] * e[train & outlier] ** 2))
+        kept = float(residual_dim[train & ~outlier].sum())
+        n_rows, n_kept = n_rows + float(residual_dim[train].sum()), n_kept + kept
+        expected += kept * effect(problem.options.loss, int(residual_dim.max(initial=1))).chi2
+    of_loss = expected / n_kept if n_kept else 1.0
+    return max(0.0, chi2), round(problem.n_independent * n_kept / max(n_rows, 1.0)), of_loss
+
+
+def _p_value(solution: Solution, chi2: float, expected: float, independent: int) -> float | None:
+    """Upper p-value of chi-square, scaled to its mean; None where weights or noise came from the residuals."""
+    problem = solution.problem
+    if problem.state.weights is not None or solution.estimated_noise is not None or expected <= 0.0 or independent <= 0:
+        return None
+    return float(special.gammaincc(independent / 2.0, chi2 / expected * independent / 2.0))
+
+
+def _independent_dof(problem: Problem, dof: int, rank: int) -> int:
+    """Degrees of freedom of the noise behind the residuals: pairs hold no more than the poses they come from."""
+    if not (problem.formed and problem.missing_correlation) or len(problem.data.series) > 1:
+        return dof
+    each = 3 * problem.data.series[0].kind.residual_dim
+    return min(dof, each * (problem.n_configurations - 1) + problem.n_priors - rank)

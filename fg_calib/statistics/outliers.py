@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from fg_calib.errors import SolverError
 from fg_calib.graph.problem import Problem, assembled
 from fg_calib.graph.solver import Solution, solve
-from fg_calib.statistics.chi_square import chi_square
 from fg_calib.statistics.covariance import Spread, spread_of
-from fg_calib.statistics.goodness_of_fit import Goodness, GrossErrors, gross_errors, judge_fit
+from fg_calib.statistics.goodness_of_fit import Goodness, GrossErrors, chi_square, gross_errors, judge_fit
 from fg_calib.statistics.gross_errors import MOST_FEW
 from fg_calib.statistics.residual_table import ResidualTable, residual_table
 

@@ -35,7 +35,7 @@ from fg_calib.graph.factors import Variables, prior_rows, unknown_prior_rows
 from fg_calib.graph.information import eliminated
 from fg_calib.graph.solver import Solution
 from fg_calib.statistics.covariance import Spread
-from fg_calib.statistics.landmark_estimates import KINDS
+from fg_calib.statistics.estimates import KINDS
 
 Floats = NDArray[np.float64]
 

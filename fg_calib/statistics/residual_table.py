@@ -319,6 +319,15 @@ class ResidualTable(FrozenArrays):
         return first
 
 
+ALARM = 0.01
+"""Probability of calling any row of a clean table suspect; any configuration; any joint reading."""
+
+
+def suspect_level(n: int) -> float:
+    """|studentised residual| that the largest of n clean rows exceeds with a probability of `ALARM` (Sidak 1967)."""
+    return float(special.ndtri(0.5 + 0.5 * (1.0 - ALARM) ** (1.0 / max(1, n))))
+
+
 def sum_by_end(
     ends: Callable[[slice], tuple[Indices, Indices]], n_rows: int, n: int, values: Callable[[slice], Floats | None]
 ) -> Floats:
@@ -430,11 +439,10 @@ def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
 
 def _seen(readings: Floats, rows: dict[str, NDArray[Any]]) -> Booleans:
     """Which rows are of readings, at both ends, at which rows are fitted, shape (n,)."""
-    n = len(readings)
-    _, place = np.unique(np.round(readings, DIGITS), axis=0, return_inverse=True)
+    n, place = len(readings), same_readings(readings)
     counts = (rows["reason_code"] == 0) & ~rows["test"]
     ends = [np.where((end >= 0) & (end < n), end, n) for end in (rows["a"], rows["b"])]
-    place = np.append(place.ravel(), n)
+    place = np.append(place, n)
     at = np.zeros(n + 1, dtype=np.bool_)
     for end in ends:
         at[place[end[counts]]] = True
@@ -447,6 +455,12 @@ def _seen(readings: Floats, rows: dict[str, NDArray[Any]]) -> Booleans:
 
 DIGITS = 9
 """Decimals of readings, [rad] or [m], that tell configurations apart."""
+
+
+def same_readings(readings: Floats) -> NDArray[np.int64]:
+    """A number for each configuration, the same for equal readings, shape (n,)."""
+    place: NDArray[np.int64] = np.unique(np.round(readings, DIGITS), axis=0, return_inverse=True)[1]
+    return place.ravel()
 
 
 def _codes(of: Labels | None, codes: dict[str, int], n: int) -> Indices:

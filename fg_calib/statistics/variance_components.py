@@ -32,19 +32,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
-from fg_calib.diagnostics.multistart import look_elsewhere
-from fg_calib.diagnostics.setup_check import check_setup
-from fg_calib.diagnostics.verdict import LEAST_REDUNDANCY
-from fg_calib.errors import SolverError
-from fg_calib.graph.build import problem_of
 from fg_calib.graph.noise import NoiseName
 from fg_calib.graph.problem import Problem, reweighted_at
 from fg_calib.graph.solver import Solution, SolverOptions, solve
-from fg_calib.job import Job
 from fg_calib.statistics.covariance import spread_of
 from fg_calib.statistics.goodness_of_fit import KindFit, kind_fits
 from fg_calib.statistics.noise_components import has_joint_noise, noise_components
-from fg_calib.statistics.prior_scales import estimate_tolerances
 from fg_calib.statistics.residual_table import residual_table
 from fg_calib.threads import single_threaded
 
@@ -76,33 +69,10 @@ NOTHING = 0.01
 FLAT = 1e-9
 """Information on a combination of factors, as a share of that on each alone, below which there is none."""
 
+LEAST_REDUNDANCY = 3.0
+"""Degrees of freedom that a kind must have left for its noise to be estimated."""
+
 TINY = 1e-100
-
-
-@checked
-def solve_job(job: Job, problem: Problem | None = None) -> Solution:
-    """The solution of a job: the best optimum that is found, with noise and tolerances estimated if it asks for that.
-
-    Args:
-        job: The job.
-        problem: Another problem with the job's measurements; the job's own if None.
-
-    Raises:
-        ProblemError: The measurements lack what the model needs, or do not suffice.
-        SolverError: GTSAM could not solve a step at all.
-    """
-    problem = problem or problem_of(job)
-    try:
-        solution = estimate_tolerances(problem, estimate_noise if job.options.estimate_noise else solve)
-    except SolverError as error:
-        for table in job.tables:
-            if table.model is not None:
-                given = (job.robot, table.measurements, table.model, table.frame)
-                check = check_setup(*given, doubtful=True, table=table)
-                if check.explanations:
-                    raise SolverError(f"{error}; {check}") from error
-        raise
-    return look_elsewhere(solution)
 
 
 @checked

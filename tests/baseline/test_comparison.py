@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
 from tolerances import rounding
 
+from fg_calib.assessment import assess
 from fg_calib.baseline import comparison as comparison_module
 from fg_calib.baseline.comparison import ESTIMATORS, best_rigid_fit, compare, real_errors
 from fg_calib.baseline.least_squares import fit_least_squares
@@ -28,7 +29,6 @@ from fg_calib.options import Options, Pairing
 from fg_calib.report.comparison import format_comparison
 from fg_calib.report.documents import comparison_document
 from fg_calib.robot.kinematics import pose
-from fg_calib.statistics.assessment import assess
 
 TOLERANCE = {"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3}
 FRAME = (Rotation.from_rotvec(np.pi * np.array([0.0, 0.6, 0.8])), np.array([7.0, -30.0, 2.0]))

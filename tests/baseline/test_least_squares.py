@@ -10,6 +10,7 @@ from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_
 from sparing import diagonal
 from tolerances import NEGLIGIBLE, rounding, sigmas_apart
 
+from fg_calib.assessment import assess
 from fg_calib.baseline import system
 from fg_calib.baseline.least_squares import fit_least_squares
 from fg_calib.errors import InputError
@@ -18,7 +19,6 @@ from fg_calib.graph.solver import SolverOptions, solve
 from fg_calib.measurements.dataset import Measurements, Pairs, form_pairs, rotation_angle
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
-from fg_calib.statistics.assessment import assess
 
 PAPERS = ["distance", "distance-rotation", "pose"]
 OTHERS = ["rotation", "position", "orientation"]

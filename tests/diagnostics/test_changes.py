@@ -9,11 +9,11 @@ from simulated import measure, plus, true_robot
 from sparing import diagonal
 from test_structure import EFFECTS, PLACED, SIGMA, SIGMA_JOINT, arm, measured, problem_of
 
+from fg_calib.assessment import assess
 from fg_calib.diagnostics.changes import find_change
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.report.text import format_report
-from fg_calib.statistics.assessment import assess
 from fg_calib.statistics.goodness_of_fit import KindFit
 
 

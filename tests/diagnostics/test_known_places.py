@@ -9,9 +9,9 @@ from instruments import measured_by
 from scipy.stats import kstest
 
 from fg_calib import calibrate
+from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
-from fg_calib.statistics.assessment import assess
 
 
 @pytest.mark.slow

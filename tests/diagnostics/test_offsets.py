@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from instruments import measured_by
 
+from fg_calib.assessment import assess
 from fg_calib.diagnostics.offsets import CERTAIN, forgotten_offsets
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
-from fg_calib.statistics.assessment import assess
 
 
 def lengths(rng, offset, n=60):

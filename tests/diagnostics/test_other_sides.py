@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from fg_calib import Measurements, Robot, calibrate, pose
+from fg_calib.assessment import assess
 from fg_calib.diagnostics.multistart import look_elsewhere
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.problem import reweighted_at
 from fg_calib.graph.solver import solve, solve_from
 from fg_calib.measurements.dataset import rotation_angle
-from fg_calib.statistics.assessment import assess
 
 SIGMA, TOLERANCE = 1e-4, 5e-3
 

@@ -8,6 +8,7 @@ from instruments import CAMERA, measured_by
 from scipy.spatial.transform import Rotation
 
 from fg_calib import Robot, calibrate
+from fg_calib.assessment import assess
 from fg_calib.diagnostics import nominal_residuals as placed_residuals
 from fg_calib.diagnostics.setup import has_places, setup_of_table
 from fg_calib.diagnostics.setup_check import FAR, check_setup
@@ -16,7 +17,6 @@ from fg_calib.graph.solver import SolverOptions, solve
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.series import KnownPoint, Table
 from fg_calib.robot.kinematics import pose
-from fg_calib.statistics.assessment import assess
 
 
 def check(robot, table, **changes):

@@ -8,6 +8,7 @@ from jobs import ur5e
 from scipy.stats import chi2
 from simulated import measure, paper_robot, small_arm, true_robot
 
+from fg_calib.assessment import assess, solve_job
 from fg_calib.diagnostics.multistart import _steps, look_elsewhere
 from fg_calib.errors import SolverError
 from fg_calib.graph import solver
@@ -19,8 +20,6 @@ from fg_calib.measurements.dataset import Measurements, rotation_angle
 from fg_calib.options import Pairing
 from fg_calib.robot.inverse import solve_inverse
 from fg_calib.robot.kinematics import pose
-from fg_calib.statistics.assessment import assess
-from fg_calib.statistics.variance_components import solve_job
 
 ROBOT = """\
 name: pointer

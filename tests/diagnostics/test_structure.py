@@ -10,6 +10,7 @@ from scipy.stats import binom, kstest
 from simulated import measure, true_robot, write_job
 
 from fg_calib import Robot
+from fg_calib.assessment import assess
 from fg_calib.diagnostics.unmodelled_effects import probability_of_noise
 from fg_calib.diagnostics.verdict import LIKE_NOISE, NOT_NOISE, of_structure
 from fg_calib.graph.build import build_problem
@@ -18,7 +19,6 @@ from fg_calib.observability.parallel_axes import end_of_link
 from fg_calib.options import Pairing
 from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import pose
-from fg_calib.statistics.assessment import assess
 from fg_calib.statistics.variance_components import estimate_noise
 
 QUARTER = np.pi / 2

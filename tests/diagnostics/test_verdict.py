@@ -15,6 +15,7 @@ from sparing import as_case, diagonal
 from touches import TOLERANCE as TOUCH_TOLERANCE
 from touches import TOOL_POINT, corners, touch
 
+from fg_calib.assessment import assess
 from fg_calib.baseline.comparison import real_errors
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
@@ -22,7 +23,6 @@ from fg_calib.measurements.series import Table
 from fg_calib.options import Pairing
 from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import pose
-from fg_calib.statistics.assessment import assess
 from fg_calib.statistics.variance_components import estimate_noise
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}

@@ -8,6 +8,7 @@ import pytest
 from simulated import measure, paper_robot, small_arm, true_robot
 from tolerances import rounding
 
+from fg_calib.assessment import assess
 from fg_calib.errors import InputError, ProblemError, SolverError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.extension import DistanceFactor, RotationAngleFactor, expand
@@ -16,7 +17,6 @@ from fg_calib.graph.solver import levenberg_marquardt_params, solve
 from fg_calib.measurements.dataset import Pairs, rotation_angle
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import forward, pose
-from fg_calib.statistics.assessment import assess
 from fg_calib.statistics.variance_components import estimate_noise
 
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3, "beta": 1e-3}

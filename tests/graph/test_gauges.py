@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 from simulated import TOOL, measure, paper_robot, small_arm, true_robot
 
+from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.information import whitened_triangle
 from fg_calib.graph.problem import by_columns_of
@@ -20,7 +21,6 @@ from fg_calib.measurements.dataset import Measurements
 from fg_calib.monitoring.prior_information import knowledge_of
 from fg_calib.observability.cramer_rao import cramer_rao
 from fg_calib.robot.kinematics import pose
-from fg_calib.statistics.assessment import assess
 from fg_calib.statistics.covariance import Spread
 
 TOLERANCE = {"a": 1e-3, "d": 2e-3, "alpha": 1e-3, "theta": 1.5e-3, "tool": 2e-3}

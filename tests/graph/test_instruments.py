@@ -11,6 +11,7 @@ from instruments import CAMERA, TARGETS, measured_by
 from scipy.stats import chi2, kstest
 from sparing import diagonal
 
+from fg_calib.assessment import assess
 from fg_calib.calibration import calibrate
 from fg_calib.errors import ProblemError
 from fg_calib.graph.build import build_problem
@@ -18,7 +19,6 @@ from fg_calib.graph.solver import SolverOptions, solve
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.series import KnownPoint, Table
 from fg_calib.robot.model import FRAME_KINDS
-from fg_calib.statistics.assessment import assess
 from fg_calib.statistics.residual_table import residual_table
 
 INSTRUMENTS = [

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from simulated import measure, plus, small_arm, true_robot
 from tolerances import sigmas_apart
 
+from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.factors import pose_of
 from fg_calib.graph.problem import mahalanobis_distances, noises_at, reweighted_at
@@ -17,7 +18,6 @@ from fg_calib.measurements import residuals, sharing
 from fg_calib.measurements.dataset import Pairs, rotation_angle
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
-from fg_calib.statistics.assessment import assess
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 SIGMA, SIGMA_JOINT = (1e-3, 5e-4), 2e-3

@@ -16,6 +16,7 @@ from test_own_kind import measured
 from touches import corners, touch
 
 from fg_calib import Measurements, Robot, read_job, write_robot
+from fg_calib.assessment import assess
 from fg_calib.errors import InputError, ProblemError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.problem import assembled
@@ -25,7 +26,6 @@ from fg_calib.measurements.dataset import Groups, Pairs, no_pairs
 from fg_calib.measurements.series import Table
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
-from fg_calib.statistics.assessment import assess
 from fg_calib.statistics.variance_components import estimate_noise
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}

@@ -10,6 +10,7 @@ from scipy.stats import chi2
 from simulated import measure, small_arm, true_robot
 
 from fg_calib import Calibration, calibrate
+from fg_calib.assessment import assess
 from fg_calib.baseline.comparison import compare
 from fg_calib.errors import InputError
 from fg_calib.graph.build import build_problem
@@ -24,7 +25,6 @@ from fg_calib.report.comparison import format_comparison
 from fg_calib.report.documents import result_document
 from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import pose
-from fg_calib.statistics.assessment import assess
 
 
 class AnchorDistance(Kind):

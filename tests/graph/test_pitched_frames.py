@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from simulated import TOOL, small_arm
 from sparing import diagonal
 
+from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.factors import build_variables, corrections_of, frame_of, pose_of, prior_rows
 from fg_calib.graph.solver import solve
@@ -24,7 +25,6 @@ from fg_calib.measurements.dataset import Measurements
 from fg_calib.observability.identifiability import observe_structure
 from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import pose
-from fg_calib.statistics.assessment import assess
 
 BASE = [name.replace("tool", "base") for name in TOOL]
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3, "tool": 5e-3, "base": 5e-3}

@@ -16,6 +16,7 @@ from tolerances import NEGLIGIBLE, rounding, sigmas_apart
 from touches import SIGMA, TOLERANCE, TOOL_POINT, corners, touch
 
 from fg_calib import write_robot
+from fg_calib.assessment import assess
 from fg_calib.errors import InputError, ProblemError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.factors import eliminate, prior_rows
@@ -29,7 +30,6 @@ from fg_calib.measurements.dataset import Groups, Noise, Pairs, no_pairs
 from fg_calib.report.documents import result_document
 from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import pose
-from fg_calib.statistics.assessment import assess
 from fg_calib.statistics.variance_components import estimate_noise
 
 RIGID = ("a1", "alpha1", "d1", "theta1")

@@ -10,6 +10,7 @@ from simulated import measure, small_arm, true_robot
 from sparing import diagonal
 from tolerances import rounding
 
+from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.problem import mahalanobis_distances, reweighted_at
 from fg_calib.graph.robust import EFFICIENCY, HALF_WEIGHT, Weighting, cost, effect, tuning, weight
@@ -17,7 +18,6 @@ from fg_calib.graph.solver import solve
 from fg_calib.measurements import residuals
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
-from fg_calib.statistics.assessment import assess
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 SMOOTH = ("huber", "cauchy", "geman-mcclure")

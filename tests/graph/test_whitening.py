@@ -10,6 +10,7 @@ from simulated import measure, small_arm, true_robot
 from sparing import diagonal
 from tolerances import rounding
 
+from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.information import correlation, whitened_triangle
 from fg_calib.graph.noise import JOINT_NOISE
@@ -21,7 +22,6 @@ from fg_calib.measurements.dataset import Groups, Measurements, Pairs, rotation_
 from fg_calib.measurements.series import Table
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
-from fg_calib.statistics.assessment import assess
 
 KINDS = {"distance": (True, False), "rotation": (False, True), "distance-rotation": (True, True)}
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}

@@ -7,6 +7,7 @@ import pytest
 from simulated import measure, paper_robot, planar_robot, small_arm
 from sparing import diagonal
 
+from fg_calib.assessment import assess
 from fg_calib.errors import ProblemError
 from fg_calib.graph.build import STRUCTURAL_FLOOR, build_problem, random_problem
 from fg_calib.graph.information import named_triangle, observability_of
@@ -17,7 +18,6 @@ from fg_calib.observability.identifiability import identifiability_of, observe_c
 from fg_calib.observability.reasons import NO_CAUSE, NOT_EXCITED
 from fg_calib.options import Pairing
 from fg_calib.robot.model import Joint, RobotBuilder
-from fg_calib.statistics.assessment import assess
 
 MODELS = ("distance", "rotation", "distance-rotation", "position", "pose")
 OFF_AXIS = {"x": 0.1, "y": 0.05, "z": 0.2, "roll": 0.3}

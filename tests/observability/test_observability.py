@@ -5,13 +5,13 @@ import pytest
 from simulated import measure, paper_robot, small_arm
 from tolerances import rounding
 
+from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.information import observability_of
 from fg_calib.graph.solver import solve
 from fg_calib.observability.indices import RelativeGroup, observability_indices, observability_of_rows
 from fg_calib.options import Pairing
 from fg_calib.robot.model import Parameter
-from fg_calib.statistics.assessment import assess
 
 # Ranks and groups recomputed independently for Jia et al. (2019), Tables 3 and 4 and the other four measurements.
 BASE_FREE = ["a1", "alpha1", "d1", "theta1", "beta6", "theta7", "beta7"]

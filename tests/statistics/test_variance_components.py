@@ -13,6 +13,7 @@ from sparing import diagonal
 from tolerances import rounding
 from touches import TOOL_POINT, corners, touch
 
+from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.factors import prior_rows
 from fg_calib.graph.noise import JOINT_NOISE
@@ -27,7 +28,6 @@ from fg_calib.report.documents import result_document
 from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import pose
 from fg_calib.statistics import variance_components as estimation
-from fg_calib.statistics.assessment import assess
 from fg_calib.statistics.covariance import spread_of
 from fg_calib.statistics.goodness_of_fit import kind_fits
 from fg_calib.statistics.noise_components import noise_components

@@ -8,13 +8,18 @@ import pytest
 from instruments import measured_by
 from simulated import measure, small_arm, true_robot, write_job
 
-from fg_calib import InputError, Job, Measurements, Options, Own, ProblemError, calibrate
+from fg_calib import InputError, Job, Measurements, Options, Own, ProblemError, calibrate, solve_job
 from fg_calib.measurements.kinds import Position
 from fg_calib.measurements.series import Table
-from fg_calib.statistics.cross_validation import _train, cross_validate, wide
+from fg_calib.statistics.cross_validation import _train_tables, wide
+from fg_calib.statistics.cross_validation import cross_validate as cross_validate_with
 
 LARGE = {"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}
 TOOL = ("tool.x", "tool.y", "tool.z")
+
+
+def cross_validate(job, *given, **more):
+    return cross_validate_with(job, solve_job, *given, **more)
 
 
 def poses(seed=0, n=40, n_test=0, tolerance=LARGE, **more):
@@ -252,6 +257,6 @@ def test_distances_of_points_touched_in_another_table_stay():
     pairs = {"a": ["a"], "b": ["b"], "distance": [0.4], "sigma_distance": [1e-4]}
     given = {"position": m.position[:1], "sigma_position": 1e-3, "pairs": pairs, "points": ["a", "b"]}
     between = Measurements.from_arrays(m.readings[:1], **given)
-    first, second = _train((Table(touches, "distance"), Table(between, "distance")))
+    first, second = _train_tables((Table(touches, "distance"), Table(between, "distance")))
     assert second.measurements.groups.pairs.n_pairs == 1
     assert first.measurements.groups.n_groups == 2

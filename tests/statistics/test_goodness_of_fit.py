@@ -12,6 +12,7 @@ from simulated import measure, plus, small_arm, true_robot
 from sparing import diagonal
 from touches import SIGMA, TOOL_POINT, corners, touch
 
+from fg_calib.assessment import assess
 from fg_calib.diagnostics.verdict import Statement, of_kept_noise
 from fg_calib.graph import problem as problem_module
 from fg_calib.graph.build import build_problem
@@ -28,7 +29,6 @@ from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import pose
 from fg_calib.statistics import goodness_of_fit as goodness_module
 from fg_calib.statistics import variance_components as noise
-from fg_calib.statistics.assessment import assess
 from fg_calib.statistics.covariance import spread_of
 from fg_calib.statistics.goodness_of_fit import FLAGS, KindFit, kind_fits
 from fg_calib.statistics.residual_table import residual_table

@@ -10,6 +10,7 @@ import pytest
 from simulated import TOOL, measure, small_arm, true_robot, write_job
 from tolerances import NEGLIGIBLE, sigmas_apart
 
+from fg_calib.assessment import assess
 from fg_calib.calibration import Calibration, calibrate, calibrate_job
 from fg_calib.diagnostics.verdict import of_tolerances
 from fg_calib.errors import InputError, SolverError
@@ -21,7 +22,6 @@ from fg_calib.measurements.dataset import Measurements
 from fg_calib.options import Options, Pairing
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
-from fg_calib.statistics.assessment import assess
 from fg_calib.statistics.prior_scales import estimate_tolerances
 from fg_calib.statistics.variance_components import estimate_noise
 

@@ -11,13 +11,13 @@ from instruments import measured_by
 from scipy.stats import beta
 from simulated import measure, plus, small_arm, true_robot, write_job
 from sparing import diagonal
-from test_structure import measured, of_joint, problem_of
+from systematic import measured, of_joint, problem_of
 
+from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.options import Pairing
 from fg_calib.report.text import format_report
-from fg_calib.statistics.assessment import assess
 from fg_calib.statistics.gross_errors import find_gross_errors, log_chance
 from fg_calib.statistics.residual_covariance import Errors
 

@@ -1,0 +1,308 @@
+"""From a job to its solution, and from a solution to its assessment: the steps of `calibrate`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fg_calib.arguments import checked
+from fg_calib.arrays import Floats, FrozenArrays, as_figures
+from fg_calib.diagnostics.findings import MOST_ESTIMATED, Verdict, judge
+from fg_calib.diagnostics.multistart import look_elsewhere
+from fg_calib.diagnostics.setup_check import check_setup
+from fg_calib.diagnostics.verdict import LIKE_NOISE
+from fg_calib.errors import InputError, SolverError, escaped
+from fg_calib.graph.build import problem_of
+from fg_calib.graph.extension import check_graph
+from fg_calib.graph.problem import Problem
+from fg_calib.graph.solver import Solution, solve
+from fg_calib.job import Job
+from fg_calib.monitoring.prior_information import at_nominal
+from fg_calib.observability.identifiability import Identifiability, identifiability_of
+from fg_calib.observability.indices import Observability
+from fg_calib.prediction.expected_error import ExpectedError, expected_error, without_rigid_motion
+from fg_calib.robot.model import Robot
+from fg_calib.statistics.acceptance import Acceptance, Kinds, accept
+from fg_calib.statistics.covariance import Spread, spread_of, with_left_out, with_unsure_tolerances
+from fg_calib.statistics.cross_validation import Folds
+from fg_calib.statistics.estimates import Estimates, estimates_at
+from fg_calib.statistics.goodness_of_fit import Fit, chi_square, judge_fit
+from fg_calib.statistics.outliers import judged_without_gross_errors
+from fg_calib.statistics.prior_consistency import judge_priors
+from fg_calib.statistics.prior_scales import estimate_tolerances
+from fg_calib.statistics.residual_table import residual_table
+from fg_calib.statistics.variance_components import estimate_noise
+from fg_calib.threads import one_blas_thread, single_threaded
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A function of the parameters at the estimate.
+
+    Attributes:
+        value: Its value, shape (m,).
+        sigma: 1 sigma, shape (m,); nan where the measurements do not determine it.
+        covariance: Shape (m, m), nan in rows and columns of what is not determined.
+    """
+
+    value: Floats
+    sigma: Floats
+    covariance: Floats
+
+
+@dataclass(frozen=True)
+class Assessment(FrozenArrays):
+    """What `assess` finds out about a solution.
+
+    Attributes:
+        robot: The calibrated robot.
+        estimates: Every estimate with its sigma.
+        names: The parameters to be estimated, in the order of `covariance`, those left out to fix the gauge included.
+        covariance: Covariance of their errors, [m] and [rad]; nan in rows and columns of what nothing determines. A
+            parameter that was left out counts with its prior sigma.
+        spread: The covariance in the tangent space of the variables that were estimated, the others taken as known.
+        whole: The covariance in the tangent space of all parameters, those left out included.
+        fit: Chi-square, residuals, goodness of fit and corrections against prior sigmas.
+        identifiability: What the data alone determine, at the nominal parameters.
+        verdict: Whether the result is to be trusted, and what its reader should know.
+        expected_error: Of the tool, by the covariance; None where the arm was evaluated as it is.
+        acceptance: What became of the limits that its user set; None without any.
+        cross_validation: Held-out residuals and spread of the estimates; None where it was not asked for.
+    """
+
+    robot: Robot
+    estimates: Estimates
+    names: tuple[str, ...]
+    covariance: Floats
+    spread: Spread
+    whole: Spread
+    fit: Fit
+    identifiability: Identifiability
+    verdict: Verdict
+    expected_error: ExpectedError | None
+    acceptance: Acceptance | None = None
+    cross_validation: Folds | None = None
+
+    def with_folds(self, folds: Folds, solution: Solution) -> Assessment:
+        """The assessment with cross-validation, which judges limits on kinds without test rows.
+
+        Args:
+            folds: Result of the cross-validation.
+            solution: What was assessed.
+        """
+        return replace(self.with_held_out(folds.by_table, solution), cross_validation=folds)
+
+    def with_held_out(self, others: Kinds, solution: Solution) -> Assessment:
+        """The assessment with limits on kinds without test rows judged by other measurements that were predicted.
+
+        Args:
+            others: Those measurements, by table and kind of noise.
+            solution: What was assessed.
+        """
+        tested = self.fit.residuals.held_out(solution.problem.data.labels)
+        kinds = {kind for _, kind in tested}
+        held_out = tested | {key: held for key, held in others.items() if key[1] not in kinds}
+        return replace(self, acceptance=accept(solution.problem.options.accept, held_out, self.verdict.findings))
+
+    def __repr__(self) -> str:
+        known = sum(p.sigma is not None for p in self.estimates.parameters if p.identifiability != "fixed")
+        chi2 = self.fit.chi_square
+        lines = [
+            f"Assessment of {self.robot.name!r}: {known} of {len(self.names)} parameters have a known sigma",
+            f"  chi-square {chi2.value:.6g}, {chi2.dof} degrees of freedom",
+            *(f"  DOUBTFUL: {finding}" for finding in self.verdict.findings[:6]),
+        ]
+        return "\n".join(escaped(line if len(line) <= 100 else f"{line[:96]} ...") for line in lines)
+
+    @checked
+    @single_threaded
+    def predict(self, function: Callable[[Robot], ArrayLike], *, fitted: bool = False) -> Prediction:
+        """Value and sigma of any function of the robot: a tool position, a distance, a sum of parameters.
+
+        It may be determined although the parameters it depends on are not; where it is not, its sigma is nan.
+
+        Args:
+            function: From a robot to a number or an array; smooth, for it is differentiated by central differences.
+            fitted: Whether sigmas are those of points after the rotation and shift that bring them nearest to the true
+                ones, which the base has no part in; the function's values are points, shape (n, 3).
+
+        Note:
+            Parameters that were left out to fix the gauge (`keep`) count with their prior sigma: what depends on one
+            without is unknown.
+
+        Raises:
+            InputError: The function raised something, or returned no figures, or not as many of every robot.
+        """
+        figures = _CheckedFunction(function)
+        value, whole = figures(self.robot), self.whole
+        G = whole.derivative(figures)
+        if fitted:
+            if len(value) % 3:
+                raise InputError("function", f"{len(value)} figures", "points, shape (n, 3), where errors are fitted")
+            points = value.reshape(-1, 3)
+            G = without_rigid_motion(points, G.reshape(*points.shape, -1))[0].reshape(G.shape)
+        covariance = whole.covariance(G)
+        return Prediction(value, np.sqrt(np.diag(covariance)), covariance)
+
+    @property
+    def observability(self) -> Observability:
+        """Rank, classes and groups of `identifiability`."""
+        return self.identifiability.observability
+
+    @property
+    def noise_may_be_estimated(self) -> bool:
+        """Whether the residuals look like noise that is a little larger than specified."""
+        fit, verdict = self.fit, self.verdict
+        too_large = [kind for kind in fit.goodness.kinds if kind.verdict in ("too small", "both", "many")]
+        return (
+            not fit.residuals.evaluated
+            and not verdict.setup.explanations
+            and verdict.change is None
+            and not any(kind.verdict in ("outliers", "others", "both", "many") for kind in fit.goodness.kinds)
+            and not (too_large and self.identifiability.missing)
+            and all(kind.typical <= MOST_ESTIMATED for kind in too_large)
+            and (verdict.noise_like is None or verdict.noise_like > LIKE_NOISE)
+            and (fit.goodness.test is None or fit.goodness.test.p_value > LIKE_NOISE)
+        )
+
+    @property
+    def trustworthy(self) -> bool:
+        """Whether nothing speaks against the result."""
+        return not self.verdict.findings
+
+    def __getattr__(self, name: str) -> Any:
+        path = _FORMER.get(name)
+        if path is None:
+            raise AttributeError(name)
+        found: Any = self
+        for part in path.split("."):
+            found = getattr(found, part)
+        return found
+
+
+_FORMER = {
+    "parameters": "estimates.parameters",
+    "frame": "estimates.frame",
+    "frames": "estimates.frames",
+    "points": "estimates.landmarks",
+    "joint_values": "estimates.joint_errors",
+    "chi2": "fit.chi_square.value",
+    "dof": "fit.chi_square.dof",
+    "expected_chi2": "fit.chi_square.expected",
+    "chi2_bounds": "fit.chi_square.bounds",
+    "p_value": "fit.chi_square.p_value",
+    "reduced_chi2": "fit.chi_square.reduced",
+    "residuals": "fit.residuals",
+    "goodness": "fit.goodness",
+    "priors": "fit.priors",
+    "findings": "verdict.findings",
+    "cautions": "verdict.cautions",
+    "reservations": "verdict.reservations",
+    "setup": "verdict.setup",
+    "noise_like": "verdict.noise_like",
+    "change": "verdict.change",
+    "folds": "cross_validation",
+}
+"""Attributes of the assessment before it had parts."""
+
+
+class _CheckedFunction:
+    """A function of a robot that a user gave: an exception, or a value without figures, becomes one line."""
+
+    def __init__(self, function: Callable[[Robot], ArrayLike]) -> None:
+        self._function = function
+        self._n: int | None = None
+
+    def __call__(self, robot: Robot) -> Floats:
+        """Its value, shape (n,).
+
+        Raises:
+            InputError: It raised something, or its value is no figures, or more or fewer than before.
+        """
+        try:
+            value = self._function(robot)
+        except Exception as error:
+            message = f"{type(error).__name__}: {error}".rstrip(": ")
+            raise InputError("function", f"raised {message}", "figures of any robot") from error
+        figures = as_figures("function", value, "a number or an array of them").ravel()
+        self._n = figures.size if self._n is None else self._n
+        if figures.size != self._n:
+            raise InputError("function", f"{figures.size} figures, {self._n} before", "as many of every robot")
+        return figures
+
+
+@checked
+def solve_job(job: Job, problem: Problem | None = None) -> Solution:
+    """The solution of a job: the best optimum that is found, with noise and prior scales estimated if it asks for that.
+
+    Args:
+        job: The job.
+        problem: Another problem with the job's measurements; the job's own if None.
+
+    Raises:
+        ProblemError: The measurements lack what the model needs, or do not suffice.
+        SolverError: GTSAM could not solve a step at all.
+    """
+    problem = problem or problem_of(job)
+    try:
+        solution = estimate_tolerances(problem, estimate_noise if job.options.estimate_noise else solve)
+    except SolverError as error:
+        for table in job.tables:
+            if table.model is not None:
+                given = (job.robot, table.measurements, table.model, table.frame)
+                check = check_setup(*given, doubtful=True, table=table)
+                if check.explanations:
+                    raise SolverError(f"{error}; {check}") from error
+        raise
+    return look_elsewhere(solution)
+
+
+@checked
+def assess(solution: Solution) -> Assessment:
+    """Covariance, goodness of fit, residuals, identifiability and verdict of a solution.
+
+    The covariance comes from a singular value decomposition of the whitened Jacobian of data and priors, its
+    columns scaled, at the estimate. Directions that `determined` does not count are undetermined: a parameter with a
+    share in one has unknown sigma (None, nan in the covariance). It is not rescaled by chi-square.
+
+    Note:
+        Away from the nominal parameters undetermined directions turn, by about as many radians as the angles were
+        corrected, and get a small share of parameters that they did not have at nominal. Unknown is what has a share
+        in one both at the nominal parameters and at the estimate; the others are known given that the undetermined
+        directions are near nominal. Frames have no nominal value: what follows them may be off by as much as they are.
+
+    Raises:
+        ProblemError: The graph of the solution's problem has factors that are not its own.
+    """
+    check_graph(solution.problem)
+    with one_blas_thread:
+        return _assess(solution)
+
+
+def _assess(solution: Solution) -> Assessment:
+    problem = solution.problem
+    spread = spread_of(solution)
+    whole = with_unsure_tolerances(solution, with_left_out(solution, spread))
+    identifiability = identifiability_of(*at_nominal(problem.whole or problem, solution.before), "practical")
+    table = residual_table(solution)
+    goodness = judged_without_gross_errors(solution, spread, table, judge_fit(solution, spread, table))
+    table = table.without(goodness.unknown(table))
+    fit = Fit(chi_square(solution, spread), table, goodness, judge_priors(solution, spread))
+    verdict = judge(solution, spread, fit, identifiability.missing)
+    return Assessment(
+        robot=problem.robot.with_values(solution.parameters[problem.variables.robot_span]),
+        estimates=estimates_at(solution, spread, whole, identifiability.observability),
+        names=whole.variables.names[: whole.variables.n_robot_columns],
+        covariance=whole.named(),
+        spread=spread,
+        whole=whole,
+        fit=fit,
+        identifiability=identifiability,
+        verdict=verdict,
+        expected_error=None if problem.evaluated else expected_error(problem, whole),
+        acceptance=accept(problem.options.accept, fit.residuals.held_out(problem.data.labels), verdict.findings),
+    )
