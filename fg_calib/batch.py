@@ -18,7 +18,7 @@ from fg_calib.arguments import checked
 from fg_calib.calibration import Calibration, calibrate_job
 from fg_calib.errors import InputError, escaped, shown
 from fg_calib.executors import Failure, map_jobs
-from fg_calib.io.disk import RESERVED, clear_dead, require_own, require_writable, stamp
+from fg_calib.io.atomic import require_own, require_writable
 from fg_calib.io.job import read_job
 from fg_calib.io.parts import JobInParts, read_parts
 from fg_calib.job import Job
@@ -164,8 +164,6 @@ def _failed(order: Order, failure: Failure, earlier: tuple[int, int] | None) -> 
         failure: Why.
         earlier: What was saved in its folder before, see `saved_in`.
     """
-    if order.folder is not None:
-        clear_dead(order.folder)
     is_earlier = earlier is not None and saved_in([order]) == [earlier]
     reason = f"{failure.reason}; {EARLIER}" if is_earlier else failure.reason
     return JobSummary(order.name, str(order.job), "failed", reason)
@@ -175,8 +173,10 @@ EARLIER = "the result in its folder is of an earlier run"
 
 
 def saved_in(orders: Sequence[Order]) -> list[tuple[int, int] | None]:
-    """Which result is in each order's folder: another one has another `stamp`; None where there is none."""
-    return [None if order.folder is None else stamp(order.folder / "result.json") for order in orders]
+    """Which result is in each order's folder: its inode and time of modification; None where there is none."""
+    files = [None if order.folder is None else order.folder / "result.json" for order in orders]
+    found = [file.stat() if file is not None and file.exists() else None for file in files]
+    return [None if one is None else (one.st_ino, one.st_mtime_ns) for one in found]
 
 
 def job_names(jobs: Sequence[Path]) -> list[str]:
@@ -207,7 +207,7 @@ def job_names(jobs: Sequence[Path]) -> list[str]:
     if len(alike) > 1:
         found = f"{', '.join(alike[:3])} would be written to the same folder {name}"
         raise InputError("JOB", found, "files, or folders, of different names")
-    raise InputError("JOB", f"{alike[0]} would be written to a folder {name}", f"no name that begins with {RESERVED}")
+    raise InputError("JOB", f"{alike[0]} would be written to a folder {name}", "a name that a folder can have")
 
 
 def _usable(names: Sequence[str]) -> bool:
@@ -217,8 +217,8 @@ def _usable(names: Sequence[str]) -> bool:
 
 
 def _is_folder_name(name: str) -> bool:
-    """Whether a folder of results can have a name: it leads nowhere else, and is none used while files are written."""
-    return name not in ("", ".", "..") and not name.casefold().startswith(RESERVED)
+    """Whether a folder of results can have a name: it leads nowhere else."""
+    return name not in ("", ".", "..")
 
 
 def require_place(folder: Path) -> None:

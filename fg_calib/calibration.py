@@ -37,7 +37,7 @@ from fg_calib.graph.factors import Variables, build_variables, frame_of
 from fg_calib.graph.knowledge import SIZE, Knowledge
 from fg_calib.graph.problem import tables_of
 from fg_calib.graph.solver import Solution
-from fg_calib.io.disk import exists, is_folder, noting_reads
+from fg_calib.io.atomic import exists, is_folder, noting_reads
 from fg_calib.io.job import UNSTATED, read_job, read_table_like
 from fg_calib.io.parts import JobInParts, read_parts
 from fg_calib.io.result import (

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fg_calib.arguments import checked
 from fg_calib.calibration import Calibration
-from fg_calib.io.disk import is_folder
+from fg_calib.io.atomic import is_folder
 from fg_calib.io.saved import read_configurations, read_residuals, require_unchanged
 from fg_calib.report.page.figures import figures_of
 from fg_calib.report.page.page import write_figures, write_page

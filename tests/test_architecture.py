@@ -64,7 +64,7 @@ UPWARD = {
     "prediction/correction": {"calibration"},
     "prediction/predict": {
         "calibration",
-        "io/disk",
+        "io/atomic",
         "io/job",
         "io/saved",
         "io/units",

@@ -3,11 +3,9 @@
 import importlib.util
 import itertools
 import json
-import multiprocessing
 import shutil
 import subprocess
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -49,7 +47,6 @@ sharing = load("benchmarks/sharing.py")
 peers = load("benchmarks/peers.py")
 million = load("benchmarks/million.py")
 panda = load("10_panda_sockets.py")
-fuzz = load("fuzz.py")
 
 real_data = pytest.mark.skipif(
     not ur10.data_folder().is_dir(), reason="no folder ur10_tmac in FG_CALIB_DATA, which names where the real data are"
@@ -759,38 +756,6 @@ def test_gross_errors_leave_gnc_where_the_wrong_rows_alone_would(outliers_run, w
     assert gnc["clean_rejected"] <= 0.05
     assert none["over_clean"] > 5.0
     assert none["warned"] == 1.0
-
-
-def test_fuzz_quick_finds_nothing_but_errors_of_the_package(tmp_path, capsys):
-    assert fuzz.main(["--quick", "--out", str(tmp_path)]) == 0
-    found = json.loads((tmp_path / "fuzz.json").read_text())
-    rows = found["readers"].values()
-    assert sum(row["cases"] for row in rows) >= 300
-    assert all(row["accepted"] + row["refused"] == row["cases"] for row in rows)
-    assert capsys.readouterr().out.splitlines()[0].split()[:3] == ["reader", "cases", "accepted"]
-
-
-def test_fuzz_keeps_the_file_of_what_it_finds(tmp_path, capsys, monkeypatch):
-    def broken(path):
-        raise KeyError("name")
-
-    monkeypatch.setattr(fuzz, "read_result", broken)
-    assert fuzz.main(["--cases", "8", "--reader", "result", "--out", str(tmp_path)]) == 1
-    assert json.loads((tmp_path / "fuzz.json").read_text())["readers"]["result"]["others"] == 2
-    assert len(list((tmp_path / "fuzz" / "result").glob("*.json"))) == 2
-    assert "KeyError: \"'name'\" at test_experiments.py:" in capsys.readouterr().out
-
-
-def test_no_kill_full_disk_or_second_writer_mixes_or_loses_a_result(tmp_path):
-    import faults
-
-    # in a process of its own: it forks, and what has loaded polars is not to be forked
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        found = pool.submit(faults.run, tmp_path / "result", 10, 1).result()
-    allowed = {"0", "1", "not killed, new", "saved", "one line, no files", "no tmpfs", "whole"}
-    hidden = found.pop("hidden folders")
-    assert {which for counts in found.values() for which in counts} <= allowed
-    assert hidden["after it"] == 0
 
 
 def test_next_month_quick_says_nothing_of_what_did_not_change_and_finds_what_did(tmp_path):

@@ -50,7 +50,7 @@ def board(
     from fg_calib.importers.images import image_files, read_corners
     from fg_calib.importers.opencv import opencv
     from fg_calib.importers.views import fit_board
-    from fg_calib.io.disk import read_bytes, require_writable
+    from fg_calib.io.atomic import read_bytes, require_writable
     from fg_calib.io.instruments import read_camera, read_camera_of_images
     from fg_calib.io.units import Units
     from fg_calib.report.board import build_board_report

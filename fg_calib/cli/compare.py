@@ -28,7 +28,7 @@ def compare(
     as_json: Json = False,
 ) -> None:
     """Run the factor graph beside plain least squares on the same job; or show two results side by side."""
-    from fg_calib.io.disk import require_writable
+    from fg_calib.io.atomic import require_writable
 
     if out is None and figures:
         raise typer.BadParameter("needs --out, the folder to write to", param_hint="--figures")

@@ -93,7 +93,7 @@ def design(
     as_json: Json = False,
 ) -> None:
     """Choose which configurations to measure, and say what accuracy to expect of how many."""
-    from fg_calib.io.disk import require_writable
+    from fg_calib.io.atomic import require_writable
     from fg_calib.io.units import quantity
 
     if n is not None and target is not None:

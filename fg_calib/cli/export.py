@@ -64,7 +64,7 @@ def export(
     as_json: Json = False,
 ) -> None:
     """Write the calibrated arm as others read it: URDF, ROS, Tesseract, tables, joint zeros."""
-    from fg_calib.io.disk import is_folder, require_absent
+    from fg_calib.io.atomic import is_folder, require_absent
 
     is_result = is_folder(arm) or arm.suffix.lower() == ".json"
     if is_result and (base_link or tip_link):

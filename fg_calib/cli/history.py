@@ -23,7 +23,7 @@ def history(
     as_json: Json = False,
 ) -> None:
     """Show the runs that a calibration came from."""
-    from fg_calib.io.disk import is_folder
+    from fg_calib.io.atomic import is_folder
     from fg_calib.io.history import history_of
     from fg_calib.report.history import build_history, history_document, write_history
 

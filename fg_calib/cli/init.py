@@ -22,7 +22,7 @@ def init(
 ) -> None:
     """Write a commented job for a robot and its tables, recognised by their headers; nothing is overwritten."""
     from fg_calib.importers.draft import draft_job
-    from fg_calib.io.disk import require_absent, write_text
+    from fg_calib.io.atomic import require_absent, write_text
 
     require_absent(out.parent, [out.name])
     text = draft_job(files, out)

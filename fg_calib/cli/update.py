@@ -45,7 +45,7 @@ def update(
 ) -> None:
     """Add new rows to a calibration, from what it has learned: its own rows are not read again."""
     from fg_calib.calibration import Calibration
-    from fg_calib.io.disk import is_folder, require_writable
+    from fg_calib.io.atomic import is_folder, require_writable
     from fg_calib.report.documents import require_apart
 
     require_writable(out)

@@ -28,7 +28,7 @@ from fg_calib.exports.fits import (
 from fg_calib.exports.ros import UrBase, dumped, hash_of, tesseract_text, ur_base_of, ur_kinematics, ur_text
 from fg_calib.exports.tables import TableConvention, in_table
 from fg_calib.exports.urdf import BASE_LINK, TOOL_LINK, calibrated_urdf, new_urdf
-from fg_calib.io.disk import is_folder, replacing, require_absent
+from fg_calib.io.atomic import is_folder, replacing, require_absent
 from fg_calib.io.robot_file import robot_text
 from fg_calib.io.saved import read_configurations, require_unchanged
 from fg_calib.io.units import Units

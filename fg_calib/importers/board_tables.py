@@ -14,9 +14,9 @@ import yaml
 from fg_calib import __version__
 from fg_calib.errors import InputError
 from fg_calib.importers.views import FIGURES, BoardFit, View
+from fg_calib.io.atomic import fill_folder, require_own, write_text
 from fg_calib.io.columns import Header, Table
 from fg_calib.io.csv_writer import write_csv
-from fg_calib.io.disk import fill_folder, require_own, write_text
 from fg_calib.io.table_columns import COVARIANCE
 from fg_calib.io.tables import KNOWN
 from fg_calib.io.units import Units

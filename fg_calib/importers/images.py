@@ -11,7 +11,7 @@ from fg_calib.errors import InputError
 from fg_calib.importers.board import CalibrationBoard
 from fg_calib.importers.opencv import LARGER, decode, find_corners
 from fg_calib.importers.views import Corners
-from fg_calib.io.disk import read_bytes
+from fg_calib.io.atomic import read_bytes
 from fg_calib.measurements.dataset import Floats
 from fg_calib.progress import tell
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from fg_calib.arrays import NOTHING, as_figures, check_different
 from fg_calib.errors import InputError
-from fg_calib.io.disk import decoded, file_at, read_bytes, require_memory
+from fg_calib.io.atomic import decoded, digest_of, read_bytes
 from fg_calib.io.frames import as_polars, cells, of_polars, select
 from fg_calib.io.parquet import parquet_columns, parquet_rows, read_parquet
 from fg_calib.io.units import ANGLES, LENGTHS, Units
@@ -30,9 +30,6 @@ if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need
     import polars as pl
 
 _log = logging.getLogger(__name__)
-
-_BYTES_A_CELL = 48
-"""What polars needs of memory for a short text, the same without blanks, the number that it makes of it, and more."""
 
 PIECE = 200_000
 """Rows of a Parquet file that are read together where it is read by pieces."""
@@ -151,7 +148,8 @@ class Header:
     @classmethod
     def _of_rows(cls, path: Path) -> Header:
         """The header of a Parquet file that is read some rows at a time."""
-        found = file_at(path)
+        digest_of(path)
+        found = path
         if path.suffix.lower() not in _ENDINGS[1:]:
             expected = "a Parquet file, where some rows are read at a time"
             raise InputError(path.name, f"ending {path.suffix!r}", expected, "polars: scan_csv(...).sink_parquet(...)")
@@ -429,7 +427,6 @@ def _read_csv(header: Header, numbers: Sequence[str], texts: Sequence[str]) -> t
     wanted = list(dict.fromkeys((*numbers, *texts, last)))
     chosen = sorted(header.columns.index(c) for c in wanted)
     start = _start_of_header(header.text)
-    require_memory(header.name, _BYTES_A_CELL * len(chosen) * header.text.count(b"\n"))
     try:
         frame = of_polars(
             header.name,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fg_calib.errors import InputError
-from fg_calib.io.disk import replacing, require_own
+from fg_calib.io.atomic import replacing, require_own
 from fg_calib.libraries import require_polars
 
 if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it

@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError
 
 from fg_calib.arguments import checked
 from fg_calib.errors import InputError
-from fg_calib.io.disk import exists, is_folder, read_bytes, read_text
+from fg_calib.io.atomic import exists, is_folder, read_bytes, read_text
 from fg_calib.io.result import Date, Figure, Result, Section, Sigma, Whole, read_result
 from fg_calib.io.yaml import first_misfit
 

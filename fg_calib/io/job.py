@@ -13,8 +13,8 @@ from pydantic import Field, StrictBool
 
 from fg_calib.arguments import checked
 from fg_calib.errors import InputError
+from fg_calib.io.atomic import exists, is_folder, noting_reads
 from fg_calib.io.columns import Column
-from fg_calib.io.disk import exists, is_folder, noting_reads
 from fg_calib.io.instruments import camera_of, read_camera
 from fg_calib.io.robot_file import read_robot, robot_from_mapping
 from fg_calib.io.tables import read_measurements, read_points

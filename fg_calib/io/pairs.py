@@ -10,7 +10,6 @@ import numpy as np
 
 from fg_calib.errors import InputError
 from fg_calib.io.columns import Header, Table, unit_hint
-from fg_calib.io.disk import within_memory
 from fg_calib.io.units import Units
 from fg_calib.io.yaml import shown
 from fg_calib.measurements.checks import ANGLE_SLACK
@@ -52,7 +51,6 @@ class _Ends:
     of_groups: Booleans
 
 
-@within_memory
 def read_pairs(
     path: Path | str | Any,
     configurations: Configurations,

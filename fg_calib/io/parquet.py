@@ -23,7 +23,7 @@ from threading import Event, Lock, Timer
 from typing import IO, TYPE_CHECKING
 
 from fg_calib.errors import InputError
-from fg_calib.io.disk import NO_MEMORY, require_memory
+from fg_calib.io.atomic import NO_MEMORY
 from fg_calib.libraries import require_polars
 
 if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it
@@ -121,7 +121,6 @@ def read_parquet(
     import polars as pl
 
     answer = _READER.ask(list(columns), content, name, span)
-    require_memory(name, 2 * len(answer))
     frame = pl.read_ipc(BytesIO(answer))
     if span is not None and frame.height < span[1]:
         _READER.forget()

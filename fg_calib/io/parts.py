@@ -15,7 +15,6 @@ from fg_calib.arguments import checked
 from fg_calib.arrays import Brief
 from fg_calib.errors import InputError
 from fg_calib.io.columns import PIECE, Header, Table
-from fg_calib.io.disk import file_at
 from fg_calib.io.job import read_job_by
 from fg_calib.io.tables import header_for, read_ids, read_measurements
 from fg_calib.measurements.dataset import Measurements
@@ -135,7 +134,7 @@ class _Table:
     def first(self, n_rows: int) -> Measurements:
         """Its first rows."""
         there = [self._path] if self.pairs is None else [self._path, self.pairs]
-        self.files = {file_at(path): _stamp(path) for path in there}
+        self.files = {path: _stamp(path) for path in there}
         return self.read(rows=(0, n_rows))
 
     def count(self, *, repeated: bool) -> int:

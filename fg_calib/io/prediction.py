@@ -12,7 +12,6 @@ from pydantic import Field
 
 from fg_calib.arguments import checked
 from fg_calib.io.columns import Table
-from fg_calib.io.disk import within_memory
 from fg_calib.io.result import Figure, Position, Row, Section, Sigma, Sigmas, Whole
 from fg_calib.io.tables import find_joint_columns, header_for, read_ids, read_readings
 from fg_calib.io.units import Units
@@ -124,7 +123,6 @@ def prediction_schema() -> dict[str, Any]:
 
 
 @checked
-@within_memory
 def read_joint_table(
     path: Path | str | Any, robot: Robot, units: Units | None = None
 ) -> tuple[tuple[str, ...], Floats]:

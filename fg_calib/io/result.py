@@ -21,7 +21,7 @@ from pydantic_core import PydanticCustomError
 from fg_calib.arguments import checked
 from fg_calib.arrays import NORM_TOLERANCE, brief
 from fg_calib.errors import InputError
-from fg_calib.io.disk import exists, is_folder, read_text
+from fg_calib.io.atomic import exists, is_folder, read_text
 from fg_calib.io.yaml import first_misfit
 from fg_calib.options import FrameKnowledge, Model
 

@@ -25,7 +25,7 @@ from pydantic import Field
 
 from fg_calib.arguments import checked
 from fg_calib.errors import InputError
-from fg_calib.io.disk import write_text
+from fg_calib.io.atomic import write_text
 from fg_calib.io.units import UNITS, Units, UnitsOfFile
 from fg_calib.io.yaml import (
     Bound,

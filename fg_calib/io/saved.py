@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from fg_calib.arrays import FrozenArrays
 from fg_calib.errors import InputError
+from fg_calib.io.atomic import digest_of, exists
 from fg_calib.io.columns import Header, Table
-from fg_calib.io.disk import digest_of, exists
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -26,7 +26,6 @@ import numpy as np
 from fg_calib.arguments import checked
 from fg_calib.errors import InputError
 from fg_calib.io.columns import Column, Header, Table
-from fg_calib.io.disk import within_memory
 from fg_calib.io.instruments import COLUMNS, InstrumentColumns
 from fg_calib.io.pairs import Configurations, read_pairs
 from fg_calib.io.poses import OF_POSES, PoseColumns
@@ -50,7 +49,6 @@ KNOWN = {*_RESERVED, *COLUMNS, "sigma_position", "sigma_orientation", "sigma_poi
 
 
 @checked
-@within_memory
 def read_measurements(
     path: Path | str | Any,
     robot: Robot,

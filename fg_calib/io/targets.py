@@ -23,7 +23,6 @@ from fg_calib.arrays import FrozenArrays
 from fg_calib.errors import InputError
 from fg_calib.io.columns import Table
 from fg_calib.io.csv_writer import require_own_csv, write_csv
-from fg_calib.io.disk import within_memory
 from fg_calib.io.poses import PoseColumns
 from fg_calib.io.tables import find_joint_columns, header_for, joint_columns, read_ids, read_readings
 from fg_calib.io.units import Units
@@ -53,7 +52,6 @@ class Targets(FrozenArrays):
 
 
 @checked
-@within_memory
 def read_targets(path: Path | str | Any, robot: Robot, units: Units | None = None) -> Targets:
     """Read a table of targets.
 

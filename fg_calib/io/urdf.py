@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fg_calib.arguments import checked
 from fg_calib.errors import InputError
-from fg_calib.io.disk import decoded, read_bytes, replacing
+from fg_calib.io.atomic import decoded, read_bytes, replacing
 from fg_calib.io.yaml import shown, shown_word
 from fg_calib.options import NEAR, did_you_mean, known_names
 from fg_calib.robot.model import FRAME_KINDS, IN_RAD, MOST_ANGLE, Joint, Robot, RobotBuilder, UrdfSource, frame_values

@@ -17,7 +17,7 @@ from fg_calib.arguments import checked
 from fg_calib.arrays import as_floats
 from fg_calib.calibration import Calibration
 from fg_calib.errors import InputError
-from fg_calib.io.disk import fill_folder, is_folder, require_own, require_writable, write_text
+from fg_calib.io.atomic import fill_folder, is_folder, require_own, require_writable, write_text
 from fg_calib.io.job import joint_noise_in
 from fg_calib.io.saved import read_configurations, require_unchanged
 from fg_calib.io.units import Units

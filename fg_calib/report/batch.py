@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from rich.console import Group, RenderableType
 
-from fg_calib.io.disk import fill_folder, write_text
+from fg_calib.io.atomic import fill_folder, write_text
 from fg_calib.io.result import Result, Rms
 from fg_calib.report.shown import FAMILY_UNIT, SHOWN
 from fg_calib.report.tables import in_order, indented, line, plain_table

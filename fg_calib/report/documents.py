@@ -27,8 +27,8 @@ from fg_calib.errors import InputError
 from fg_calib.graph.noise import JOINT_NOISE
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
+from fg_calib.io.atomic import digest_of, fill_folder, require_own, write_text
 from fg_calib.io.csv_writer import Words, write_csv_parts, write_parquet_parts
-from fg_calib.io.disk import digest_of, fill_folder, require_own, write_text
 from fg_calib.io.result import (
     SCHEMA,
     Acceptance,

@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Group, RenderableType
 
 from fg_calib.diagnostics.verdict import probability
-from fg_calib.io.disk import fill_folder
+from fg_calib.io.atomic import fill_folder
 from fg_calib.io.history import SCHEMA, History, Run
 from fg_calib.report.figures import empty_figure
 from fg_calib.report.shown import SHOWN

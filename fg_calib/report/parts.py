@@ -11,8 +11,8 @@ import numpy as np
 
 from fg_calib import __version__
 from fg_calib.io.assessed_parts import AssessedParts
+from fg_calib.io.atomic import digest_of, fill_folder, write_text
 from fg_calib.io.csv_writer import Words, write_csv_parts
-from fg_calib.io.disk import digest_of, fill_folder, write_text
 from fg_calib.io.parts import JobInParts
 from fg_calib.io.parts_solver import PartsSolution
 from fg_calib.io.result import IN_PARTS, SCHEMA, Carried, Covariance, Frame, Result, Rms, Solver, Step

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from fg_calib.designs.design import Design
 from fg_calib.errors import InputError
+from fg_calib.io.atomic import exists, fill_folder, read_bytes, read_text, write_text
 from fg_calib.io.csv_writer import write_csv
-from fg_calib.io.disk import Filling, exists, fill_folders, read_bytes, read_text, write_text
 from fg_calib.io.robot_file import write_robot
 from fg_calib.io.units import Units
 from fg_calib.io.urdf import write_urdf
@@ -122,8 +122,8 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
         InputError: The folder cannot be written, or holds files of these names that are no design's, or tables that
             have been filled in.
     """
-    names, filling = _filling(folder, design, units)
-    fill_folders([filling])
+    names, write, own = _filling(folder, design, units)
+    fill_folder(folder, write, own)
     return names
 
 
@@ -143,12 +143,15 @@ def write_designs(folder: Path, designs: Mapping[str, Design], units: Units) -> 
     """
     each = {name: _filling(folder / name, one, units) for name, one in designs.items()}
     figure = draw_designs(designs)
-    picture = Filling(folder, lambda into: figure.savefig(into / _PICTURE, dpi=160), {_PICTURE: b"\x89PNG"})
-    fill_folders([picture, *(filling for _, filling in each.values())])
-    return (*(f"{name}/{file}" for name, (files, _) in each.items() for file in files), _PICTURE)
+    for name, (_, write, own) in each.items():
+        fill_folder(folder / name, write, own)
+    fill_folder(folder, lambda into: figure.savefig(into / _PICTURE, dpi=160), {_PICTURE: b"\x89PNG"})
+    return (*(f"{name}/{file}" for name, (files, *_) in each.items() for file in files), _PICTURE)
 
 
-def _filling(folder: Path, design: Design, units: Units) -> tuple[tuple[str, ...], Filling]:
+def _filling(
+    folder: Path, design: Design, units: Units
+) -> tuple[tuple[str, ...], Callable[[Path], None], Mapping[str, bytes]]:
     """The names of a plan's files, and what writes them.
 
     Raises:
@@ -192,7 +195,7 @@ def _filling(folder: Path, design: Design, units: Units) -> tuple[tuple[str, ...
             raise InputError(str(folder / name), "a table that has been filled in", "another folder")
     whose = {_DOCUMENT: _BEGINS}  # first: it says of the others whose they are
     own = whose | dict.fromkeys([*before, *names], b"") | {"calibration.yaml": _JOB_BEGINS.encode()} | whose
-    return tuple(names), Filling(folder, write, own)
+    return tuple(names), write, own
 
 
 def _files_before(folder: Path) -> list[str]:

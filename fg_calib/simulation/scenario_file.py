@@ -54,7 +54,7 @@ from typing import Any, Literal
 
 from fg_calib.arguments import checked
 from fg_calib.errors import InputError
-from fg_calib.io.disk import exists, is_folder
+from fg_calib.io.atomic import exists, is_folder
 from fg_calib.io.job import check_choices, joint_noise, robot_of
 from fg_calib.io.robot_file import FrameValues, unit_of_key
 from fg_calib.io.units import Units, UnitsOfFile

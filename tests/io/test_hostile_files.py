@@ -14,7 +14,7 @@ import pytest
 
 from fg_calib import InputError, Robot, read_job, read_measurements
 from fg_calib.io import yaml as schema
-from fg_calib.io.disk import read_bytes
+from fg_calib.io.atomic import read_bytes
 from fg_calib.io.yaml import read_yaml
 from fg_calib.sizes import ORDINARY
 
@@ -25,7 +25,7 @@ LAUGHS = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"a{i + 1}: &a{i + 1} [{', '.join([f'*a{i}'] * 9)}]\n" for i in range(24)
 )
 MERGES = "a0: &a0 {k: 1}\n" + "".join(f"a{i + 1}: &a{i + 1}\n  <<: [{', '.join([f'*a{i}'] * 9)}]\n" for i in range(12))
-UTF_16 = "UTF-16 text, expected UTF-8 text; save it as UTF-8"
+UTF_16 = "UTF-16 or UTF-32 text, expected UTF-8 text; save it as UTF-8"
 
 YAML = {
     LAUGHS: "robot.yaml:5: aliases that stand for more than 50000 values",

@@ -12,9 +12,29 @@ import math
 import numpy as np
 import polars as pl
 import pytest
-from fuzz import result_document
 
-from fg_calib import InputError, Robot, read_job, read_measurements, read_result, read_robot, read_scenario
+from fg_calib import (
+    InputError,
+    Measurements,
+    Robot,
+    calibrate,
+    pose,
+    read_job,
+    read_measurements,
+    read_result,
+    read_robot,
+    read_scenario,
+)
+
+
+def result_document():
+    """A small calibration's `result.json`."""
+    rng = np.random.default_rng(0)
+    arm = Robot.from_dh([[0.4, 0.1, 0.2, 0.3]], convention="dh", tolerance={"a": 0.01, "theta": 0.01})
+    q = rng.uniform(-1.0, 1.0, (6, 1))
+    data = Measurements.from_arrays(q, position=pose(arm, q).position, sigma_position=1e-3)
+    return calibrate(arm, data, model="position", frame="unknown").result.document()
+
 
 # fmt: off
 HEAD = "convention: dh\njoints:\n"
@@ -123,8 +143,8 @@ ROBOTS = [
     ("a: &a [*a, *b]", "robot.yaml:1: found undefined alias 'b'"),
     ("a: *a", "robot.yaml:1: found undefined alias 'a'"),
     ("\x00", 'robot.yaml:1: a null character, expected UTF-8 text; is it UTF-16, or no text at all? save it as UTF-8'),
-    (b"\xff\xfe\x00\x00a\x00\x00\x00", 'robot.yaml: UTF-32 text, expected UTF-8 text; save it as UTF-8'),
-    (b"\xfe\xffa", 'robot.yaml: UTF-16 text, expected UTF-8 text; save it as UTF-8'),
+    (b"\xff\xfe\x00\x00a\x00\x00\x00", 'robot.yaml: UTF-16 or UTF-32 text, expected UTF-8 text; save it as UTF-8'),
+    (b"\xfe\xffa", 'robot.yaml: UTF-16 or UTF-32 text, expected UTF-8 text; save it as UTF-8'),
     (b"a: \xff\n", 'robot.yaml:1: byte 0xff, expected UTF-8 text; is it Latin-1 or Windows text? save it as UTF-8'),
     (b"\x80", 'robot.yaml:1: byte 0x80, expected UTF-8 text; is it Latin-1 or Windows text? save it as UTF-8'),
     (b"a\xcc\x80\xed\xa0\x80: 1", 'robot.yaml:1: byte 0xed, expected UTF-8 text; is it Latin-1 or Windows text? save it as UTF-8'),
@@ -221,7 +241,7 @@ URDFS = [
     ('<?xml version="1.0" encoding="utf-16"?>'+r(L+j()), 'arm.urdf:1: not XML: Blank needed here, line 1, column 38'),
     ('<?xml version="1.0" encoding="nonsense"?>'+r(L+j()), 'arm.urdf:1: not XML: Unsupported encoding: nonsense, line 1, column 40'),
     ('<?xml version="9.0"?>'+r(L), "arm.urdf:1: not XML: Unsupported version '9.0', line 1, column 20"),
-    (r(L+j()).encode('utf-16')[:50], 'arm.urdf: UTF-16 text, expected UTF-8 text; save it as UTF-8'),
+    (r(L+j()).encode('utf-16')[:50], 'arm.urdf: UTF-16 or UTF-32 text, expected UTF-8 text; save it as UTF-8'),
     (r(L+'\x00'), 'arm.urdf:1: a null character, expected UTF-8 text; is it UTF-16, or no text at all? save it as UTF-8'),
     (r(L+'\x1b'), 'arm.urdf:1: not XML: PCDATA invalid Char value 27, line 1, column 49'),
     (r(L+'&#0;'), 'arm.urdf:1: not XML: xmlParseCharRef: invalid xmlChar value 0, line 1, column 53'),
@@ -507,9 +527,9 @@ POSES = [
     ("q1,q2,group,sigma_point\n0,0,g,-1\n", "poses.csv:2: sigma_point: found '-1', expected a number above 0"),
     ("q1,q2,group,sigma_point\n0,0,g,\n", 'poses.csv:2: sigma_point: found an empty cell, expected a number above 0'),
     (b"q1,q2\n0,\xff\n", 'poses.csv:2: byte 0xff, expected UTF-8 text; is it Latin-1 or Windows text? save it as UTF-8'),
-    (b"\xff\xfeq\x001\x00", 'poses.csv: UTF-16 text, expected UTF-8 text; save it as UTF-8'),
+    (b"\xff\xfeq\x001\x00", 'poses.csv: UTF-16 or UTF-32 text, expected UTF-8 text; save it as UTF-8'),
     ("q1,q2\n0,1\n".encode("utf-16-le"), 'poses.csv:1: a null character, expected UTF-8 text; is it UTF-16, or no text at all? save it as UTF-8'),
-    ("q1,q2\n0,1\n".encode("utf-32"), 'poses.csv: UTF-32 text, expected UTF-8 text; save it as UTF-8'),
+    ("q1,q2\n0,1\n".encode("utf-32"), 'poses.csv: UTF-16 or UTF-32 text, expected UTF-8 text; save it as UTF-8'),
     (b"q1,q2\n0,\x000\n", 'poses.csv:2: a null character, expected UTF-8 text; is it UTF-16, or no text at all? save it as UTF-8'),
     (b"PAR1", "poses.csv: no joint columns, expected q1 to q2 for the robot's 2 joints; the columns are PAR1"),
     (" \n", 'poses.csv:1: no names of columns, expected a header and rows'),
@@ -616,7 +636,7 @@ RESULTS = [
     ("["*100000, '{folder}/result.json: nested too deeply, expected a result.json'),
     ('{"a": 1e999}', '{folder}/result.json: no result of a calibration, expected a result.json of schema fg-calib/result/2'),
     ("\x00", 'result.json:1: a null character, expected UTF-8 text; is it UTF-16, or no text at all? save it as UTF-8'),
-    (b"\xff\xfe{", 'result.json: UTF-16 text, expected UTF-8 text; save it as UTF-8'),
+    (b"\xff\xfe{", 'result.json: UTF-16 or UTF-32 text, expected UTF-8 text; save it as UTF-8'),
     (b'{"a": "\xff"}', 'result.json:1: byte 0xff, expected UTF-8 text; is it Latin-1 or Windows text? save it as UTF-8'),
     ("NaN", '{folder}/result.json: no result of a calibration, expected a result.json of schema fg-calib/result/2'),
     ("{'a': 1}", '{folder}/result.json: not JSON: Expecting property name enclosed in double quotes: line 1 column 2 (char 1); was it cut off?'),

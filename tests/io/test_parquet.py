@@ -9,7 +9,7 @@ import pytest
 from simulated import planar_robot
 
 from fg_calib import InputError
-from fg_calib.io import columns, pairs, parquet, tables
+from fg_calib.io import columns, parquet
 from fg_calib.io.tables import read_measurements
 from fg_calib.measurements.dataset import Noise
 
@@ -108,23 +108,6 @@ except InputError as error:
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stdout.count("\n")) == (0, 1), ended.stderr
     assert ended.stdout.startswith(f"poses.{ending}: there is not enough memory for it")
-
-
-@pytest.mark.parametrize("module", [tables, pairs])
-def test_a_table_that_memory_does_not_suffice_for_is_named(module, tmp_path, monkeypatch):
-    """Where it is read whole already, and arrays are made of it."""
-    robot = planar_robot()
-    (tmp_path / "poses.csv").write_text("q1,q2,x,y,z\n0,0,3,0,0\n0,1,2,1,0\n")
-    (tmp_path / "pairs.csv").write_text("a,b,distance\n0,1,1\n")
-    name = {tables: "poses.csv", pairs: "pairs.csv"}[module]
-
-    def full(*_):
-        raise MemoryError
-
-    monkeypatch.setattr(module, "read_readings" if module is tables else "_ends", full)
-    with pytest.raises(InputError) as caught:
-        read_measurements(tmp_path / "poses.csv", robot, pairs=tmp_path / "pairs.csv", noise=Noise(position=1e-3))
-    assert str(caught.value) == f"{name}: there is not enough memory for it"
 
 
 def test_a_process_that_never_ends_is_a_line(content, reader, monkeypatch):

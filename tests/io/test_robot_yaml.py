@@ -199,7 +199,7 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypat
     def fail(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("pathlib.Path.replace", fail)
+    monkeypatch.setattr("os.replace", fail)
     with pytest.raises(InputError, match="cannot be written: No space left on device"):
         write_robot(target, robot)
     assert [p.name for p in target.parent.iterdir()] == ["robot.yaml"]

@@ -14,7 +14,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fg_calib.io.disk import fill_folder, write_text
+from fg_calib.io.atomic import fill_folder, write_text
 from fg_calib.report.page import sections
 from fg_calib.report.page.arm import scene
 from fg_calib.report.page.charts import RAMP

@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Group, RenderableType
 
 from fg_calib.errors import InputError
-from fg_calib.io.disk import fill_folder, write_text
+from fg_calib.io.atomic import fill_folder, write_text
 from fg_calib.io.result import Parameter
 from fg_calib.report.page import sections
 from fg_calib.report.page.charts import bars, whiskers

@@ -1,0 +1,247 @@
+"""Files: read or refused in one line, and written whole or not at all."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import stat
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from fg_calib.errors import InputError
+
+NO_MEMORY = "there is not enough memory for it"
+
+_noted: ContextVar[dict[Path, str] | None] = ContextVar("_noted", default=None)
+
+
+@contextmanager
+def noting_reads() -> Iterator[dict[Path, str]]:
+    """The SHA-256 of the bytes of every file that is read in the block, by its path."""
+    digests: dict[Path, str] = {}
+    token = _noted.set(digests)
+    try:
+        yield digests
+    finally:
+        _noted.reset(token)
+
+
+def read_bytes(path: Path) -> bytes:
+    """The content of a file.
+
+    Raises:
+        InputError: There is no such file, it may not be read, or it is a folder, a pipe or a device.
+    """
+    name = _short(str(path))
+    try:
+        mode = path.stat().st_mode
+        if not stat.S_ISREG(mode):
+            raise InputError(name, "is a folder" if stat.S_ISDIR(mode) else "is a pipe or a device", "a file")
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(name, "no such file") from None
+    except PermissionError:
+        raise InputError(name, "may not be read", hint="check the permissions of file and folder") from None
+    except MemoryError:
+        raise InputError(name, NO_MEMORY) from None
+    except (OSError, ValueError) as error:  # ValueError: a path with a null character
+        raise InputError(name, f"cannot be read: {getattr(error, 'strerror', None) or error}", "a file") from None
+    noted = _noted.get()
+    if noted is not None:
+        noted[path] = hashlib.sha256(content).hexdigest()
+    return content
+
+
+def read_text(path: Path) -> str:
+    """The text of a UTF-8 file, without a byte order mark.
+
+    Raises:
+        InputError: There is no such file, or it is not UTF-8.
+    """
+    return decoded(read_bytes(path), path.name)
+
+
+def decoded(content: bytes, name: str) -> str:
+    """UTF-8 text, without a byte order mark.
+
+    Raises:
+        InputError: It is something else; the message names the line and the byte.
+    """
+    if content.startswith((b"\xff\xfe", b"\xfe\xff", b"\0\0\xfe\xff")):
+        raise InputError(name, "UTF-16 or UTF-32 text", "UTF-8 text", "save it as UTF-8")
+    if b"\0" in content:
+        line = content.partition(b"\0")[0].count(b"\n") + 1
+        hint = "is it UTF-16, or no text at all? save it as UTF-8"
+        raise InputError(f"{name}:{line}", "a null character", "UTF-8 text", hint)
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        hint = "is it Latin-1 or Windows text? save it as UTF-8"
+        raise InputError(f"{name}:{line}", f"byte {content[error.start]:#04x}", "UTF-8 text", hint) from None
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of a file.
+
+    Raises:
+        InputError: There is no such file, or it may not be read.
+    """
+    return hashlib.sha256(read_bytes(path)).hexdigest()
+
+
+def exists(path: Path) -> bool:
+    """Whether there is a file or folder; False for a name that no file can have."""
+    return _answered(path.exists)
+
+
+def is_folder(path: Path) -> bool:
+    """Whether there is a folder; False for a name that no folder can have."""
+    return _answered(path.is_dir)
+
+
+def _answered(ask: Callable[[], bool]) -> bool:
+    try:
+        return ask()
+    except (OSError, ValueError):
+        return False
+
+
+def _short(path: str) -> str:
+    return path if len(path) <= 120 else f"{path[:117]}..."
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary file, which replaces `path` when the block ends well and vanishes when it does not.
+
+    Raises:
+        InputError: The folder does not exist or may not be written to.
+    """
+    if not is_folder(path.parent):
+        raise InputError(_short(str(path)), f"there is no folder {path.parent}")
+    try:
+        with _temporary_in(path.parent) as temporary:
+            yield Path(temporary, path.name)
+            os.replace(Path(temporary, path.name), path)
+    except OSError as error:
+        raise InputError(str(path), f"cannot be written: {error.strerror or error}") from None
+
+
+def _temporary_in(folder: Path) -> TemporaryDirectory[str]:
+    """A temporary folder beside the files that will be moved out of it: on the same disk, a move is atomic."""
+    return TemporaryDirectory(prefix=".fg-calib-", dir=folder, ignore_cleanup_errors=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write UTF-8 text, whole or not at all.
+
+    Raises:
+        InputError: The folder does not exist or may not be written to.
+    """
+    with replacing(path) as temporary:
+        temporary.write_bytes(text.encode())
+
+
+def fill_folder(folder: Path, write: Callable[[Path], None], own: Mapping[str, bytes] | None = None) -> None:
+    """Write several files to a folder, after all of them were written elsewhere.
+
+    An interruption while they are moved may leave old files with new ones. The first of `own` is moved last: where it
+    holds digests of the others, a reader detects that.
+
+    Args:
+        folder: Where the files appear; it is made if it does not exist.
+        write: Writes them to the folder that it is given.
+        own: Files that may be written, replaced, and removed if they are not written now: see `require_own`.
+
+    Raises:
+        InputError: The folder cannot be written, or holds other files of these names.
+    """
+    own = own or {}
+    last = next(iter(own), "")
+    missing = [f for f in (folder, *folder.parents) if not exists(f)]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with _temporary_in(folder) as made:
+            temporary = Path(made)
+            _write_to(temporary, write, folder)
+            names = sorted((file.name for file in temporary.iterdir()), key=lambda name: name == last)
+            require_own(folder, own)
+            for name in names:
+                if (folder / name).is_dir():
+                    raise InputError(str(folder / name), "is a folder", "a place for a file")
+            for name in set(own).difference(names):
+                (folder / name).unlink(missing_ok=True)
+            for name in names:
+                os.replace(temporary / name, folder / name)
+    except (OSError, ValueError) as error:  # ValueError: a path with a null character
+        found = f"cannot be written: {getattr(error, 'strerror', None) or error}"
+        raise InputError(_short(str(folder)), found, "a folder that can be") from error
+    finally:
+        for parent in missing:  # where nothing was written, they are empty
+            with suppress(OSError, ValueError):
+                parent.rmdir()
+
+
+def _write_to(temporary: Path, write: Callable[[Path], None], folder: Path) -> None:
+    """Write files to a temporary folder; errors name the folder where they were to appear."""
+    try:
+        write(temporary)
+    except InputError as error:
+        place = error.place.replace(str(temporary), str(folder))
+        raise InputError(place, error.found, error.expected, error.hint) from error
+
+
+def require_writable(folder: Path) -> None:
+    """Check that files can be written to a folder, which need not exist.
+
+    Raises:
+        InputError: They cannot.
+    """
+    fill_folder(folder, lambda _: None)
+
+
+def require_absent(folder: Path, names: Iterable[str]) -> None:
+    """Check that files that would be replaced do not exist.
+
+    Raises:
+        InputError: One does.
+    """
+    for name in names:
+        if os.path.lexists(folder / name):  # also a link to nothing
+            raise InputError(str(folder / name), "is there already", "a folder without it")
+
+
+def require_own(folder: Path, own: Mapping[str, bytes]) -> None:
+    """Check that files that would be replaced or removed were written by the same command.
+
+    Args:
+        folder: Where they are.
+        own: Names of what the command writes, and how each begins. The first identifies the others, as some begin with
+            nothing that is typical.
+
+    Raises:
+        InputError: One was not.
+    """
+    first = next(iter(own), "")
+    for name, beginning in own.items():
+        path = folder / name
+        if path.is_symlink() and not exists(path):
+            raise InputError(str(path), "is a link to nothing", "a place for a file")
+        if not exists(path):
+            continue
+        if not path.is_file():
+            raise InputError(str(path), "is no file", "a place for a file")
+        if not (_begins(path, beginning) and _begins(folder / first, own[first])):
+            raise InputError(str(path), "is there already, not written by this command", "another folder")
+
+
+def _begins(path: Path, beginning: bytes) -> bool:
+    try:
+        with path.open("rb") as file:
+            return file.read(len(beginning)) == beginning
+    except OSError:
+        return False

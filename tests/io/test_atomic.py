@@ -1,0 +1,166 @@
+"""Files are read or refused in one line; they appear whole or not at all, and nothing of others is replaced."""
+
+import os
+
+import pytest
+
+from fg_calib import InputError
+from fg_calib.io.atomic import fill_folder, read_bytes, require_absent, require_own, require_writable, write_text
+
+OWN = {"result": b"of ours", "table": b"", "page": b""}
+
+
+def write(text, names=("table", "result")):
+    def fill(into):
+        for name in names:
+            (into / name).write_text(f"of ours: {text}")
+
+    return fill
+
+
+def content(folder):
+    return {file.name: file.read_text().removeprefix("of ours: ") for file in folder.iterdir()}
+
+
+def test_files_appear_together_and_those_of_an_earlier_time_are_removed(tmp_path):
+    folder = tmp_path / "a" / "b"
+    fill_folder(folder, write("old", OWN), OWN)
+    assert content(folder) == dict.fromkeys(OWN, "old")
+    fill_folder(folder, write("new"), OWN)
+    assert content(folder) == {"table": "new", "result": "new"}
+
+
+def test_the_file_that_holds_digests_of_the_others_is_moved_last(tmp_path, monkeypatch):
+    fill_folder(tmp_path, write("old"), OWN)
+    replace = os.replace
+
+    def interrupted(source, target):
+        if os.path.basename(target) == "result":
+            raise KeyboardInterrupt
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fill_folder(tmp_path, write("new"), OWN)
+    assert content(tmp_path) == {"table": "new", "result": "old"}
+
+
+@pytest.mark.parametrize("own", [None, OWN])
+def test_a_failure_leaves_nothing_and_no_folder(tmp_path, own):
+    def fail(into):
+        (into / "table").write_text("new")
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(InputError, match=r"b: cannot be written: No space left on device, expected a folder that can"):
+        fill_folder(tmp_path / "a" / "b", fail, own)
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_errors_name_the_folder_where_files_were_to_appear(tmp_path):
+    def fail(into):
+        raise InputError(str(into / "table"), "wrong")
+
+    with pytest.raises(InputError) as error:
+        fill_folder(tmp_path, fail)
+    assert str(error.value) == f"{tmp_path / 'table'}: wrong"
+
+
+def test_asking_whether_a_folder_can_be_written_leaves_no_trace(tmp_path):
+    require_writable(tmp_path / "a" / "b")
+    assert [*tmp_path.iterdir()] == []
+    (tmp_path / "file").write_text("")
+    for folder, reason in (("file", "File exists"), ("file/b", "Not a directory"), ("a\0b", "embedded null byte")):
+        with pytest.raises(InputError, match=f"cannot be written: {reason}, expected a folder that can be"):
+            require_writable(tmp_path / folder)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda path: path.write_text("mine"),
+            "is there already, not written by this command, expected another folder",
+        ),
+        (lambda path: path.mkdir(), "is no file, expected a place for a file"),
+        (lambda path: path.symlink_to("nowhere"), "is a link to nothing, expected a place for a file"),
+    ],
+)
+def test_what_others_wrote_is_not_replaced(tmp_path, make, message):
+    path = tmp_path / "table"
+    make(path)
+    for attempt in (lambda: require_own(tmp_path, OWN), lambda: fill_folder(tmp_path, write("new"), OWN)):
+        with pytest.raises(InputError) as error:
+            attempt()
+        assert str(error.value) == f"{path}: {message}"
+    with pytest.raises(InputError, match="table: is there already, expected a folder without it"):
+        require_absent(tmp_path, ["table"])
+    assert [file.name for file in tmp_path.iterdir()] == ["table"]
+
+
+def test_a_folder_in_the_way_is_named_before_anything_is_replaced(tmp_path):
+    fill_folder(tmp_path, write("old"))
+    (tmp_path / "result").unlink()
+    (tmp_path / "result").mkdir()
+    with pytest.raises(InputError, match="result: is a folder, expected a place for a file"):
+        fill_folder(tmp_path, write("new"))
+    assert (tmp_path / "table").read_text() == "of ours: old"
+
+
+def test_a_text_is_written_whole_or_not_at_all(tmp_path):
+    write_text(tmp_path / "a", "old")
+    with pytest.raises(UnicodeEncodeError):
+        write_text(tmp_path / "a", "\udc00")
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("a", "old")]
+    with pytest.raises(InputError, match=r"b: there is no folder .*none$"):
+        write_text(tmp_path / "none" / "b", "")
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda folder: folder / "nothing", "nothing: no such file"),
+        (lambda folder: folder, ": is a folder, expected a file"),
+        (lambda folder: folder / ("x" * 5000), "cannot be read: File name too long, expected a file"),
+        (lambda folder: folder / "a\0b", "cannot be read: "),
+        (lambda folder: os.mkfifo(folder / "pipe") or folder / "pipe", "pipe: is a pipe or a device, expected a file"),
+    ],
+)
+def test_what_is_no_file_is_one_line(tmp_path, make, message):
+    with pytest.raises(InputError) as error:
+        read_bytes(make(tmp_path))
+    assert message in str(error.value)
+    assert len(str(error.value)) < 300
+
+
+@pytest.mark.parametrize("name", ["residuals.csv", "result.json"])
+def test_results_replace_results_and_nothing_else(example, fg_calib, name):
+    (example / name).write_text("q1,mine\n")
+    before = {file.name: file.read_bytes() for file in example.iterdir()}
+    ended = fg_calib("calibrate", example / "calibration.yaml", "--out", example)
+    expected = f"error: {example / name}: is there already, not written by this command, expected another folder\n"
+    assert ended == (1, "", expected)
+    assert {file.name: file.read_bytes() for file in example.iterdir()} == before
+
+
+def test_results_do_not_replace_what_they_are_of(example, fg_calib):
+    job = example / "calibration.yaml"
+    (example / "robot_nominal.yaml").rename(example / "robot_calibrated.yaml")
+    job.write_text(job.read_text().replace("robot_nominal.yaml", "robot_calibrated.yaml"))
+    before = {file.name: file.read_bytes() for file in example.iterdir()}
+    ended = fg_calib("calibrate", job, "--out", example)
+    name = example / "robot_calibrated.yaml"
+    expected = f"error: {name}: the job was read from it, expected another folder for the results\n"
+    assert ended == (1, "", expected)
+    assert {file.name: file.read_bytes() for file in example.iterdir()} == before
+
+
+@pytest.mark.slow
+def test_a_simulation_replaces_a_simulation_and_nothing_else(fg_calib, tmp_path):
+    assert fg_calib("simulate", "space-robot", "--out", tmp_path).code == 0
+    assert fg_calib("simulate", "space-robot", "--out", tmp_path, "--seed", 3).code == 0
+    (tmp_path / "calibration.yaml").write_text("model: pose\n")
+    ended = fg_calib("simulate", "space-robot", "--out", tmp_path, "--seed", 4)
+    found = "is there already, not written by this command, expected another folder"
+    expected = f"error: {tmp_path / 'calibration.yaml'}: {found}\n"
+    assert ended == (1, "", expected)
+    assert (tmp_path / "calibration.yaml").read_text() == "model: pose\n"
