@@ -1,4 +1,4 @@
-"""The factor graph beside plain least squares on one job: what each finds, claims and costs.
+"""Comparison of the factor graph with plain least squares on one job: what each finds, claims and costs.
 
 | estimator | estimates | weights |
 |---|---|---|
@@ -8,13 +8,12 @@
 | `weighted-gauss-newton` | the same parameters, by the same steps | noise |
 | `scipy` | the same parameters, by `scipy.optimize.least_squares` | noise |
 
-All of them estimate the places, unknown frames and offsets that the measurements depend on as well, from where the
-graph starts. Plain least squares takes every measurement for independent, whatever errors they share.
-
-Where a job has its noise estimated, both graphs do so; plain least squares weighs by the noise stated.
+All of them also estimate landmarks, unknown frames and offsets, from the graph's start. Plain least squares takes
+every measurement for independent, whatever errors they share. Where a job has its noise estimated, both graphs do so;
+plain least squares weights by the specified noise.
 
 All are judged on the same rows, by the same formulas, at the test configurations; at the train configurations where
-there are none. Where the truth is known (a simulation) the real errors stand beside the predicted ones.
+there are none. Where the truth is known (a simulation) real errors are compared with the predicted ones.
 
 References:
     Jia, Wang, Chen, Sun (2019), Error Modeling in Distance and Rotation for Self-Calibration of Space Robots on
@@ -24,9 +23,8 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -34,18 +32,18 @@ from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
 from fg_calib.arrays import Brief
-from fg_calib.assessment import Assessment as Uncertainty
-from fg_calib.assessment import assess, solve_job
-from fg_calib.baseline.least_squares import LeastSquares, fit_dataset
+from fg_calib.assessment import Assessment, assess, solve_job
+from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
 from fg_calib.errors import CalibrationError, ProblemError
 from fg_calib.graph.build import problem_of
 from fg_calib.graph.factors import corrections_of
+from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
 from fg_calib.job import Job
-from fg_calib.measurements.dataset import rotation_angle
-from fg_calib.prediction.expected_error import errors_at, judged_configurations, pose_rms
-from fg_calib.robot.kinematics import Poses, build_chain, forward
+from fg_calib.prediction.expected_error import PoseRms, errors_at, judged_configurations, pose_rms
+from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot
+from fg_calib.robot.rotations import rotation_vector
 from fg_calib.statistics.residual_table import residual_table
 from fg_calib.threads import single_threaded
 
@@ -171,7 +169,7 @@ class Comparison(Brief):
 def compare(job: Job) -> Comparison:
     """Run the factor graph and the plain estimators on one job.
 
-    A plain estimator that cannot run, or does not arrive, says so in its place.
+    A plain estimator that cannot run, or does not converge, says so in its place.
 
     Raises:
         CalibrationError: The job's own problem cannot be built or solved.
@@ -180,70 +178,113 @@ def compare(job: Job) -> Comparison:
     data = solution.problem.data
     if solution.problem.evaluated:
         raise ProblemError(data.source, "test rows alone", "train rows, for there is nothing to compare")
-    there, judged_on = judged_configurations(data)
-    readings = data.readings[there]
-    uncertainty = assess(solution)
-    judge = _Judge(job, readings, solution)
-    estimates = [judge.of_graph("graph", solution, uncertainty)]
+    configurations, judged_on = judged_configurations(data)
+    readings = data.readings[configurations]
+    assessed = assess(solution)
 
+    judge = _Judge(job, solution, readings)
     before = job.robot.with_values(solution.before[solution.problem.variables.robot_span])
-    try:
-        estimates += _without_priors(job, judge)
-    except CalibrationError as error:
-        estimates += [_failed(name, error) for name in list(ESTIMATORS)[1:]]
     return Comparison(
         job=job,
-        estimates=tuple(estimates),
+        estimates=(judge.of_graph("graph", solution, assessed), *map(judge.of_kept, list(ESTIMATORS)[1:])),
         before=before,
         errors_before=judge.errors(before),
         judged_on=judged_on,
         n_judged=len(readings),
-        findings=uncertainty.findings,
-        units={family: uncertainty.residuals.unit(family) for family in uncertainty.residuals.families},
+        findings=assessed.findings,
+        units={family: assessed.residuals.unit(family) for family in assessed.residuals.families},
     )
 
 
-def _without_priors(job: Job, judge: _Judge) -> list[Estimate]:
-    """The estimates of the kept parameters: by the graph, and by plain least squares from the same start."""
-    problem = problem_of(job, gauge="keep")
+@dataclass(frozen=True)
+class _Judge:
+    """Judgement of every estimate on the same rows and configurations, by the same formulas."""
+
+    job: Job
+    solution: Solution
+    readings: Floats
+
+    def errors(self, robot: Robot) -> RealErrors | None:
+        return None if self.job.truth is None else real_errors(robot, self.job.truth, self.readings)
+
+    def estimate(
+        self,
+        name: str,
+        fit: Solution | LeastSquares,
+        robot: Robot,
+        sigma: Mapping[str, float],
+        predicted: Sequence[PoseRms],
+    ) -> Estimate:
+        return Estimate(
+            name=name,
+            robot=robot,
+            sigma=sigma,
+            converged=fit.converged,
+            message=fit.message,
+            iterations=fit.iterations,
+            seconds=fit.seconds,
+            residual_rms=residual_table(replace(self.solution, parameters=fit.parameters)).rms(),
+            predicted_rms=predicted[0].position,
+            predicted_fitted_rms=predicted[1].position,
+            errors=self.errors(robot),
+        )
+
+    def of_graph(self, name: str, solution: Solution, assessed: Assessment) -> Estimate:
+        spread = assessed.spread
+        sigma = dict(zip(spread.variables.names, np.sqrt(np.diag(spread.named())).tolist(), strict=False))
+        return self.estimate(name, solution, assessed.robot, sigma, errors_at(spread, self.readings))
+
+    def of_baseline(self, name: str, fit: LeastSquares) -> Estimate:
+        chain = build_chain(fit.robot, {fit.robot.index(p): k for k, p in enumerate(fit.names)})
+        at = forward(chain, fit.robot.trig(self.readings))
+        predicted = pose_rms(at.position, at.jacobian, lambda rows: np.sum((rows @ fit.covariance) * rows, axis=1))
+        return self.estimate(name, fit, fit.robot, fit.sigma, predicted)
+
+    def of_kept(self, name: str) -> Estimate:
+        try:
+            problem = problem_of(self.job, gauge="keep")
+            if name != "graph-keep":
+                return self.of_baseline(name, _fit_kept(self.job, problem, name))
+            found = solve_job(self.job, problem)
+            return self.of_graph(name, found, assess(found))
+        except CalibrationError as error:
+            return Estimate(name, None, {}, False, f"could not run: {error}")
+
+
+def _fit_kept(job: Job, problem: Problem, name: str) -> LeastSquares:
+    """Plain least squares of the kept parameters, from the graph's start."""
     kept = [p.name for p in problem.estimated]
     held = [i for i, p in enumerate(job.robot.parameters) if p.name not in kept]
     start = problem.start.copy()
     start[held] = job.robot.nominal[held]  # of an unknown tool too, as in the graph
-    plain = partial(fit_dataset, job.robot, problem.data, names=kept, start=start)
-
-    def graph() -> Estimate:
-        solution = solve_job(job, problem)
-        return judge.of_graph("graph-keep", solution, assess(solution))
-
-    runs: dict[str, Callable[[], Estimate]] = {
-        "graph-keep": graph,
-        "gauss-newton": lambda: judge.of_baseline("gauss-newton", plain()),
-        "weighted-gauss-newton": lambda: judge.of_baseline("weighted-gauss-newton", plain(weighted=True)),
-        "scipy": lambda: judge.of_baseline("scipy", plain(weighted=True, method="scipy")),
-    }
-    estimates = []
-    for name, run in runs.items():
-        try:
-            estimates.append(run())
-        except CalibrationError as error:
-            estimates.append(_failed(name, error))
-    return estimates
+    return fit_least_squares(
+        job.robot,
+        problem.data,
+        names=kept,
+        start=start,
+        weighted=name != "gauss-newton",
+        method="scipy" if name == "scipy" else "gauss-newton",
+    )
 
 
 @single_threaded
 def real_errors(estimated: Robot, true: Robot, readings: Floats) -> RealErrors:
     """Errors of an estimated arm at joint readings, shape (n, n_joints), [rad] (prismatic: [m])."""
-    here, there = (forward(build_chain(r), r.trig(readings)) for r in (estimated, true))
-    fitted = None
-    if len(readings) >= 3:
-        R, t = best_rigid_fit(here.position, there.position)
-        fitted = _pose_error(here.rotation, here.position, there, R, t)
-    return RealErrors(_pose_error(here.rotation, here.position, there, np.eye(3), np.zeros(3)), fitted)
+    at, truth = (forward(build_chain(r), r.trig(readings)) for r in (estimated, true))
+
+    def error(R: Floats, t: Floats) -> PoseError:
+        distance = np.linalg.norm(at.position @ R.T + t - truth.position, axis=1)
+        turn = rotation_vector(np.swapaxes(R @ at.rotation, 1, 2) @ truth.rotation)
+        rms = float(np.sqrt(np.mean(distance**2)))
+        orientation_rms = float(np.sqrt(np.mean(np.sum(turn**2, axis=1))))
+        return PoseError(float(distance.max()), float(distance.mean()), rms, orientation_rms)
+
+    fitted = error(*best_rigid_fit(at.position, truth.position)) if len(readings) >= 3 else None
+    return RealErrors(error(np.eye(3), np.zeros(3)), fitted)
 
 
 def best_rigid_fit(points: Floats, onto: Floats) -> tuple[Floats, Floats]:
-    """Rotation R and shift t that minimise the sum of |R p + t - q|^2 (Umeyama 1991, without scale).
+    """Rotation R and translation t that minimise the sum of |R p + t - q|^2 (Umeyama 1991, without scale).
 
     Args:
         points: The points p, shape (n, 3), [m].
@@ -253,72 +294,3 @@ def best_rigid_fit(points: Floats, onto: Floats) -> tuple[Floats, Floats]:
     U, _, Vt = np.linalg.svd((onto - q).T @ (points - p))
     R: Floats = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
     return R, q - R @ p
-
-
-def _pose_error(rotation: Floats, position: Floats, true: Poses, R: Floats, t: Floats) -> PoseError:
-    distance = np.linalg.norm(position @ R.T + t - true.position, axis=1)
-    angle, _ = rotation_angle(np.swapaxes(R @ rotation, 1, 2) @ true.rotation)
-    return PoseError(
-        max=float(distance.max()),
-        mean=float(distance.mean()),
-        rms=float(np.sqrt(np.mean(distance**2))),
-        orientation_rms=float(np.sqrt(np.mean(angle**2))),
-    )
-
-
-def _failed(name: str, error: CalibrationError) -> Estimate:
-    return Estimate(name, None, {}, False, f"could not run: {error}")
-
-
-class _Judge:
-    """Judges every estimate on the same rows and configurations, by the same formulas."""
-
-    def __init__(self, job: Job, readings: Floats, solution: Solution) -> None:
-        self._truth = job.truth
-        self._readings = readings
-        self._solution = solution  # its rows are those that residuals are shown of
-
-    def of_graph(self, name: str, solution: Solution, uncertainty: Uncertainty) -> Estimate:
-        """The graph's estimate; like plain least squares it takes here what was held at nominal for known."""
-        spread = uncertainty.spread
-        base, fitted = errors_at(spread, self._readings)
-        return Estimate(
-            name=name,
-            robot=uncertainty.robot,
-            sigma=dict(zip(spread.variables.names, np.sqrt(np.diag(spread.named())).tolist(), strict=False)),
-            converged=solution.converged,
-            message=solution.message,
-            iterations=solution.iterations,
-            seconds=solution.seconds,
-            residual_rms=self.residual_rms(solution.parameters),
-            predicted_rms=base.position,
-            predicted_fitted_rms=fitted.position,
-            errors=self.errors(uncertainty.robot),
-        )
-
-    def of_baseline(self, name: str, fit: LeastSquares) -> Estimate:
-        """The estimate of plain least squares."""
-        chain = build_chain(fit.robot, {fit.robot.index(p): k for k, p in enumerate(fit.names)})
-        at = forward(chain, fit.robot.trig(self._readings))
-        base, fitted = pose_rms(at.position, at.jacobian, lambda rows: np.sum((rows @ fit.covariance) * rows, axis=1))
-        return Estimate(
-            name=name,
-            robot=fit.robot,
-            sigma=fit.sigma,
-            converged=fit.converged,
-            message=fit.message,
-            iterations=fit.iterations,
-            seconds=fit.seconds,
-            residual_rms=self.residual_rms(fit.parameters),
-            predicted_rms=base.position,
-            predicted_fitted_rms=fitted.position,
-            errors=self.errors(fit.robot),
-        )
-
-    def residual_rms(self, parameters: Floats) -> ResidualRms:
-        """RMS by split and kind at a parameter vector, on the rows of the job's graph."""
-        return residual_table(replace(self._solution, parameters=parameters)).rms()
-
-    def errors(self, robot: Robot) -> RealErrors | None:
-        """Real errors of an arm, where the truth is known."""
-        return None if self._truth is None else real_errors(robot, self._truth, self._readings)

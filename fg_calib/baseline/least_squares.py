@@ -6,19 +6,17 @@ Jia et al. (2019), Eq. (54) and (55), as printed:
     dOmega_{i+1} = J(Omega_i, Theta)^+ dPsi_i       the Moore-Penrose inverse: a minimum-norm step
     Omega_{i+1} = Omega_i + dOmega_{i+1}            until dOmega is small
 
-Beside it the same with rows whitened by their noise, and `scipy.optimize.least_squares` on the same rows. Nothing here
-knows of GTSAM, priors, damping or observability: of the graph's mathematics only `residuals` is shared.
+The same with rows whitened by their noise, and `scipy.optimize.least_squares` on the same rows, are further methods.
+Nothing here knows GTSAM, priors, damping or observability: of the graph's mathematics only `residuals` is shared.
 
-A measurement frame that is unknown takes six more unknowns: world_T_base = start * Txyz Rz(yaw) Ry(pitch) Rx(roll), a
-correction of the frame that the fit starts from. It starts at zero, so that its angles stay away from where they are
-singular. Targets, anchors, planes, boards and touched points whose places are not known are unknowns as well; one that
-is nearly known is a measurement of its place.
+An unknown measurement frame takes six more unknowns: world_T_base = start * Txyz Rz(yaw) Ry(pitch) Rx(roll), a
+correction of the frame that the fit starts from. It starts at zero, where its angles are far from singular. Landmarks
+that are not known are unknowns as well; a landmark with a prior is a measurement of its place.
 
 Note:
-    Every measured train row takes part. Only a row that has no derivative at the start (a distance of exactly 0, an
-    angle of exactly 0 or pi) is left out: the paper mentions these kinks and judges no further, and near one a row
-    misleads. Every measurement counts as independent, pairs formed from poses and the rows of one configuration, which
-    share its joint noise, among them. All rows and derivatives are held at once.
+    Every measured train row takes part, but for distances of exactly 0 and angles of exactly 0 or pi at the start,
+    where they are not differentiable. Every measurement counts as independent, also pairs formed from poses and the
+    rows of one configuration, which share its joint noise. All rows and derivatives are in memory at once.
 
 References:
     Jia, Wang, Chen, Sun (2019), Error Modeling in Distance and Rotation for Self-Calibration of Space Robots on
@@ -28,21 +26,23 @@ References:
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
 from fg_calib.arrays import Brief
-from fg_calib.baseline.methods import claimed_covariance, gauss_newton, scipy_fit
-from fg_calib.baseline.system import build_system, start_at
 from fg_calib.errors import InputError
-from fg_calib.measurements.dataset import Measurements, Pairs
+from fg_calib.measurements import residuals
+from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.gathering import Dataset, gather
+from fg_calib.measurements.kinds import Distance, RotationAngle, parts_of
+from fg_calib.measurements.models.pairs import usable_pairs
+from fg_calib.measurements.residuals import Block, unit_whitening
 from fg_calib.measurements.series import Table
 from fg_calib.options import (
     PAIR_MODELS,
@@ -52,38 +52,74 @@ from fg_calib.options import (
     Pairing,
     as_pairing,
     check,
-    check_flag,
     check_names,
     check_number,
 )
-from fg_calib.robot.model import Robot, names_of
+from fg_calib.robot.kinematics import Chain, build_chain
+from fg_calib.robot.model import AXIS_OF_KIND, FRAME_KINDS, Element, Parameter, Robot, names_of
+from fg_calib.robot.rotations import rotation_of, yaw_pitch_roll
 from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
+Booleans = NDArray[np.bool_]
+Integers = NDArray[np.int64]
 
 Method = Literal["gauss-newton", "scipy"]
 
+RCOND = 1e-10
+"""Singular values of J below this part of the largest count as zero in J^+."""
+
+MAX_SHARE = 1e-6
+"""A parameter with more than this share in a null-space direction of J has no sigma."""
+
+ROUNDING = 1e-8
+"""A step below this that no longer shrinks is rounding, which weak directions magnify, [m] and [rad]."""
+
+REWEIGHTED = 1e-10
+"""Weights are final once a fit with them moves the unknowns by less than this, [m] and [rad]."""
+
+NOT_DIFFERENTIABLE = 1e-12
+"""A predicted distance below this, or an angle this near to 0 or pi, has no derivative, [m], [rad]."""
+
+_ROUNDS = 20
+"""Fits with new weights at most."""
+
 
 @dataclass(frozen=True)
-class LeastSquares(Brief):
-    """What plain least squares found.
+class Fit(Brief):
+    """Unknowns where a method stopped, and why.
+
+    Attributes:
+        x: The unknowns, shape (n,).
+        converged: Whether the last step was small enough.
+        message: Why it stopped.
+        iterations: Steps taken (scipy: derivatives asked for).
+        steps: Length of each Gauss-Newton step, metres and radians side by side; empty for scipy.
+    """
+
+    x: Floats
+    converged: bool
+    message: str
+    iterations: int
+    steps: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeastSquares(Fit):
+    """The result of plain least squares.
 
     Attributes:
         robot: The robot with the estimated values.
         names: The parameters that were estimated, in the order of the covariance.
         frames: x, y, z, yaw, pitch, roll of each unknown measurement frame world_T_base, shape (n_frames, 6), [m] and
             [rad].
-        places: Coordinates of the estimated targets, anchors, planes, boards and points, shape (n_coordinates,).
+        places: Coordinates of the estimated landmarks, shape (n_coordinates,).
         covariance: Of the estimated parameters as least squares claims it, shape (n_names, n_names), [m] and [rad]:
             (J^T W J)^-1 if weighted by noise, else s^2 (J^T J)^-1 with s^2 = |r|^2 / (n_rows - rank). nan in rows and
-            columns of parameters that J leaves open, and everywhere where s^2 has no degree of freedom.
+            columns of parameters that J does not determine, and everywhere where s^2 has no degree of freedom.
         residuals: Predicted minus measured of the rows that took part, not weighted, shape (n_rows,), [m], [rad] and
             pixels.
         rank: Of J at the estimate, the columns of frames and places included.
-        converged: Whether the last step was small enough.
-        message: Why it stopped.
-        iterations: Steps taken (scipy: derivatives asked for).
-        steps: Length of each Gauss-Newton step, metres and radians side by side; empty for scipy.
         seconds: Time taken.
     """
 
@@ -94,11 +130,7 @@ class LeastSquares(Brief):
     covariance: Floats
     residuals: Floats
     rank: int
-    converged: bool
-    message: str
-    iterations: int
-    steps: tuple[float, ...]
-    seconds: float
+    seconds: float = 0.0
 
     @property
     def n_rows(self) -> int:
@@ -107,7 +139,7 @@ class LeastSquares(Brief):
 
     @property
     def sigma(self) -> dict[str, float]:
-        """1 sigma of each estimated parameter, [m] or [rad]; nan where J leaves it open."""
+        """1 sigma of each estimated parameter, [m] or [rad]; nan where J does not determine it."""
         return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
     @property
@@ -126,9 +158,9 @@ class LeastSquares(Brief):
 @single_threaded
 def fit_least_squares(
     robot: Robot,
-    measurements: Measurements,
+    measurements: Measurements | Dataset,
     *,
-    model: Model,
+    model: Model | None = None,
     pairing: Pairing | None = None,
     names: Sequence[str] | None = None,
     start: Floats | None = None,
@@ -142,13 +174,15 @@ def fit_least_squares(
 
     Args:
         robot: The nominal robot; its tolerances are not used.
-        measurements: What was measured. Rows that are nan in its pairs take no part.
-        model: Which measurements take part.
+        measurements: What was measured; or all tables of a calibration with their landmarks, which need no `model`,
+            `pairing` and `frame`.
+        model: Which measurements take part: a model of poses or pairs.
         pairing: How pairs are formed from poses where none were measured directly; a star if None.
         names: The parameters to estimate; all that the robot's file lets be estimated if None. With more than the
             measurements determine every step is a minimum-norm step.
         start: Values to start from, shape (n_parameters,), [m] or [rad], or with x, y, z, yaw, pitch, roll of the
-            measurement frame, shape (n_parameters + 6,). Nominal values and the identity if None.
+            measurement frames (six values at least) and coordinates of estimated landmarks. Nominal values and the
+            identity if None.
         frame: `unknown` estimates world_T_base with the parameters; of no meaning for models of pairs.
         weighted: Whether rows are whitened by the noise of measurements and, to first order, of joint readings. The
             weights are those at the start, then those at the estimate, until they change nothing more.
@@ -156,103 +190,352 @@ def fit_least_squares(
         max_iterations: Steps (scipy: evaluations) after which it gives up.
         tolerance: Length of a Gauss-Newton step that is small enough, metres and radians side by side.
 
-    Returns:
-        The estimate; where it did not converge its message says so.
-
     Raises:
-        InputError: An argument is not one of those possible, or the measurements lack what the model needs.
-    """
-    check("model", model, Model)
-    if model not in (*POSE_MODELS, *PAIR_MODELS):
-        raise InputError("model", f"found {model!r}", f"one of {', '.join((*POSE_MODELS, *PAIR_MODELS))} here")
-    check("method", method, Method)
-    check("frame", frame, FrameKnowledge)
-    check_flag("weighted", weighted)
-    check_number("max_iterations", max_iterations, least=1, whole=True)
-    check_number("tolerance", tolerance, finite=False)
-    known: FrameKnowledge = "known" if model in PAIR_MODELS else frame
-    table = Table(measurements if weighted else _with_any_noise(measurements), model, as_pairing(pairing), known)
-    return fit_dataset(
-        robot,
-        gather(robot, [table]),
-        names=names,
-        start=start,
-        weighted=weighted,
-        method=method,
-        max_iterations=max_iterations,
-        tolerance=tolerance,
-    )
-
-
-def fit_dataset(
-    robot: Robot,
-    data: Dataset,
-    *,
-    names: Sequence[str] | None,
-    start: Floats | None,
-    weighted: bool = False,
-    method: Method = "gauss-newton",
-    max_iterations: int = 50,
-    tolerance: float = 1e-12,
-) -> LeastSquares:
-    """`fit_least_squares` of all tables of a calibration, with the places that they depend on; arguments as there.
-
-    Raises:
-        InputError: There is no row to fit, nothing to estimate or no start of that length.
+        InputError: An argument is not one of those possible, the measurements lack what the model needs, there is no
+            row to fit, or nothing to estimate.
     """
     clock = time.perf_counter()
-    system = build_system(robot, data, _chosen(robot, names), start_at(robot, data, start))
-    solver = partial(gauss_newton if method == "gauss-newton" else scipy_fit, limit=max_iterations, tolerance=tolerance)
+    check("method", method, Method)
+    check_number("max_iterations", max_iterations, least=1, whole=True)
+    check_number("tolerance", tolerance, finite=False)
+    if isinstance(measurements, Measurements):
+        measurements = _dataset(robot, measurements, model, pairing, frame, weighted)
+    system = _System(robot, measurements, _chosen(robot, names), start)
+    solver = partial(_METHODS[method], limit=max_iterations, tolerance=tolerance)
     fit, weights = system.solve(solver, weighted)
-    covariance, rank = claimed_covariance(*system.evaluate(fit.x, weights), weighted)
-    m, n_core = len(system.chosen), system.n_core
-    values = system.start.values.copy()
-    values[system.chosen] = fit.x[:m]
-    return LeastSquares(
-        robot=robot.with_values(values),
-        names=tuple(robot.parameters[i].name for i in system.chosen),
-        frames=system.frames(fit.x),
-        places=fit.x[n_core:],
-        covariance=covariance[:m, :m],
-        residuals=system.evaluate(fit.x, None)[0],
-        rank=rank,
-        converged=fit.converged,
-        message=fit.message,
-        iterations=fit.iterations,
-        steps=fit.steps,
-        seconds=time.perf_counter() - clock,
-    )
+    return replace(system.result(fit, weights), seconds=time.perf_counter() - clock)
 
 
-def _with_any_noise(m: Measurements) -> Measurements:
-    """Measurements with a sigma of 1 m or 1 rad where none is stated, for fits that weigh nothing."""
+def _dataset(
+    robot: Robot, m: Measurements, model: Model | None, pairing: Pairing | None, frame: FrameKnowledge, weighted: bool
+) -> Dataset:
+    """Measurements of one table, checked; unweighted fits need no noise."""
+    check("model", model, Model)
+    check("frame", frame, FrameKnowledge)
+    if model not in (*POSE_MODELS, *PAIR_MODELS):
+        raise InputError("model", f"found {model!r}", f"one of {', '.join((*POSE_MODELS, *PAIR_MODELS))} here")
+    known: FrameKnowledge = "known" if model in PAIR_MODELS else frame
+    return gather(robot, [Table(m if weighted else _with_unit_noise(m), model, as_pairing(pairing), known)])
 
-    def of_poses(sigma: Floats | None, values: Floats | None) -> Floats | None:
-        return np.ones((len(values), 3)) if sigma is None and values is not None else sigma
 
-    def of_pairs(pairs: Pairs) -> Pairs:
-        figures = {name: np.nan_to_num(getattr(pairs, name), nan=1.0) for name in ("sigma_distance", "sigma_angle")}
-        return replace(pairs, **figures)
-
-    return replace(
-        m,
-        sigma_position=of_poses(m.sigma_position, m.position),
-        sigma_orientation=of_poses(m.sigma_orientation, m.rotation),
-        pairs=None if m.pairs is None else of_pairs(m.pairs),
-    )
+def _with_unit_noise(m: Measurements) -> Measurements:
+    """Measurements with a sigma of 1 m or 1 rad where none is stated, for unweighted fits."""
+    ones = {f"sigma_{name}": np.ones((len(m.readings), 3)) for name in ("position", "orientation")}
+    missing: dict[str, Any] = {name: sigma for name, sigma in ones.items() if getattr(m, name) is None}
+    pairs = m.pairs
+    if pairs is not None:
+        sigmas = {name: np.nan_to_num(getattr(pairs, name), nan=1.0) for name in ("sigma_distance", "sigma_angle")}
+        pairs = replace(pairs, **sigmas)
+    return replace(m, pairs=pairs, **missing)
 
 
 def _chosen(robot: Robot, names: Sequence[str] | None) -> list[int]:
     """Indices of the parameters to estimate, in the robot's order."""
-    if names is None:
-        chosen = [i for i, p in enumerate(robot.parameters) if p.estimated]
-    else:
-        known = names_of(robot.parameters)
-        check_names("names", names, known)
-        chosen = [i for i, name in enumerate(known) if name in set(names)]
-        if len(chosen) < len(names):
-            twice = next(name for name in names if list(names).count(name) > 1)
-            raise InputError("names", f"{twice!r} twice", "each parameter once")
-    if not chosen:
+    wanted = [p.name for p in robot.parameters if p.estimated] if names is None else list(names)
+    check_names("names", wanted, names_of(robot.parameters))
+    if not wanted:
         raise InputError("names", "nothing to estimate", "at least one parameter")
-    return chosen
+    return [i for i, p in enumerate(robot.parameters) if p.name in wanted]
+
+
+Evaluate = Callable[[Floats], tuple[Floats, Floats]]
+"""From the unknowns to residuals, shape (m,), and their derivatives, shape (m, n)."""
+
+Weights = tuple[Floats, ...]
+"""Whitening of each block of rows, shape (n, residual_dim, residual_dim)."""
+
+
+def gauss_newton(evaluate: Evaluate, x: Floats, *, limit: int, tolerance: float) -> Fit:
+    """Minimum by Eq. (54) and (55) of the paper."""
+    steps: list[float] = []
+
+    def end(converged: bool, message: str) -> Fit:
+        return Fit(x, converged, message, len(steps), tuple(steps))
+
+    for _ in range(limit):
+        with np.errstate(all="ignore"):
+            r, J = evaluate(x)
+            if not (np.isfinite(r).all() and np.isfinite(J).all()):
+                return end(False, f"diverged: residuals are not finite after {len(steps)} steps")
+            try:
+                step = np.linalg.pinv(J, rcond=RCOND) @ -r
+            except np.linalg.LinAlgError as error:
+                return end(False, f"no step possible: {error}")
+        if not np.isfinite(step).all():
+            return end(False, f"diverged: step {len(steps) + 1} is not finite")
+        x = x + step
+        steps.append(float(np.linalg.norm(step)))
+        if steps[-1] <= tolerance:
+            return end(True, f"converged: the last step was {steps[-1]:.1e}")
+        if steps[-1] <= ROUNDING and len(steps) > 1 and steps[-1] >= steps[-2]:
+            return end(True, f"converged to rounding: steps of {steps[-1]:.1e} no longer shrink")
+    return end(False, f"not converged: {limit} iterations, the last step was {steps[-1]:.1e}")
+
+
+def scipy_fit(evaluate: Evaluate, x: Floats, *, limit: int, tolerance: float) -> Fit:
+    """Minimum by MINPACK's Levenberg-Marquardt, or scipy's trust region with fewer rows than unknowns."""
+    from scipy import optimize  # here: it takes as long to import as a small calibration
+
+    exact = 1e-15  # near the least that MINPACK takes
+
+    def residual(x: Floats) -> Floats:
+        return evaluate(x)[0]
+
+    def jacobian(x: Floats) -> Floats:
+        return evaluate(x)[1]
+
+    try:
+        found = optimize.least_squares(
+            residual,
+            x,
+            jac=jacobian,
+            method="lm" if len(residual(x)) >= len(x) else "trf",
+            x_scale="jac",
+            ftol=exact,
+            xtol=max(exact, tolerance),
+            gtol=exact,
+            max_nfev=limit,
+        )
+    except (ValueError, np.linalg.LinAlgError) as error:
+        return Fit(x, False, f"no step possible: {error}", 0)
+    message = " ".join(str(found.message).split()).rstrip(".")
+    message = f"{'converged' if found.status > 0 else 'not converged'}: {message}"
+    return Fit(np.asarray(found.x, float), bool(found.status > 0), message, int(found.njev or found.nfev))
+
+
+_METHODS = {"gauss-newton": gauss_newton, "scipy": scipy_fit}
+
+
+def claimed_covariance(r: Floats, J: Floats, weighted: bool) -> tuple[Floats, int]:
+    """(J^T J)^-1, times s^2 of unweighted rows, nan where J does not determine a parameter; and the rank of J."""
+    n = J.shape[1]
+    if not np.isfinite(J).all():
+        return np.full((n, n), np.nan), 0
+    _, s, Vt = np.linalg.svd(np.vstack([J, np.zeros((n, n))]), full_matrices=False)
+    rank = int(np.sum(s > RCOND * s.max(initial=0.0)))
+    sqrt_cov = Vt[:rank].T / s[:rank]
+    covariance: Floats = sqrt_cov @ sqrt_cov.T
+    if not weighted:
+        covariance = covariance * (float(r @ r) / (len(r) - rank) if len(r) > rank else np.nan)
+    undetermined = np.linalg.norm(Vt[rank:], axis=0) > MAX_SHARE
+    covariance[undetermined, :] = np.nan
+    covariance[:, undetermined] = np.nan
+    return covariance, rank
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Train measurements of one kind from one table.
+
+    Attributes:
+        table: Number of their table.
+        block: The measurements with unit weights.
+        landmarks: Coordinates that each depends on, among those of the dataset, shape (n, kind.n_nuisances).
+        use: Which of their scalars take part, shape (n, residual_dim).
+        covariance: Private noise of each, shape (n, residual_dim, residual_dim); any number where not used.
+    """
+
+    table: int
+    block: Block
+    landmarks: Integers
+    use: Booleans
+    covariance: Floats
+
+    def at(self, coordinates: Floats) -> Block:
+        """The measurements with values of their landmarks."""
+        return replace(self.block, nuisances=coordinates[self.landmarks])
+
+    def differentiable(self, chain: Chain) -> _Rows:
+        """The rows without distances and angles of pairs that have no derivative at the start."""
+        parts = parts_of(self.block.kind)
+        if not all(isinstance(part, Distance | RotationAngle) for part in parts):
+            return self
+        predicted = residuals.residual(self.block, chain) + self.block.data
+        is_angle = np.array([isinstance(part, RotationAngle) for part in parts])
+        excluded = (predicted < NOT_DIFFERENTIABLE) | (is_angle & (predicted > np.pi - NOT_DIFFERENTIABLE))
+        return replace(self, use=self.use & ~excluded)
+
+    def whitening(self, chain: Chain, coordinates: Floats, sigma_joint: Floats) -> Floats:
+        """W with W S W^T = 1 of each measurement, lower triangular, shape (n, residual_dim, residual_dim).
+
+        S is the private noise plus joint noise to first order; an unused scalar has unit variance by itself.
+        """
+        S, ends = self.covariance, self.block.kind.ends
+        if ends and np.any(sigma_joint > 0.0):
+            J = residuals.linearise(self.at(coordinates), chain.without_columns().with_joint_columns())[1]
+            J = J[:, :, : ends * len(sigma_joint)] * np.tile(sigma_joint, ends)
+            S = S + J @ np.swapaxes(J, 1, 2)
+        S = np.where(self.use[:, :, None] & self.use[:, None, :], S, np.eye(self.block.residual_dim))
+        try:
+            W: Floats = np.tril(np.linalg.inv(np.linalg.cholesky(S)))
+        except np.linalg.LinAlgError:
+            raise InputError("noise", "a row without any", "noise in every row, to weight by") from None
+        return W
+
+
+def _train_rows(robot: Robot, data: Dataset) -> list[_Rows]:
+    """Every measured train row of all tables."""
+    found = []
+    for s in data.series:
+        train, h = s.train, s.kind.residual_dim
+        if not len(train):
+            continue
+        trig, unit = data.trigs(robot)[s.table], unit_whitening(len(train), h)
+        unset = np.zeros(s.nuisances[train].shape)
+        block = Block(s.kind, trig, s.ends[train], s.data[train], unit, unset, s.source)
+        sigma: Floats = s.sigma
+        if s.formed:  # each pair as if it were alone
+            pairs = usable_pairs(data.tables[s.table])
+            by_kind = {Distance: pairs.sigma_distance, RotationAngle: pairs.sigma_angle}
+            columns = [np.nan_to_num(by_kind[type(part)][s.number], nan=1.0) for part in parts_of(s.kind)]
+            sigma = np.stack(columns, axis=1)
+        covariance = sigma[train][:, :, None] ** 2 * np.eye(h)
+        if s.covariance is not None and not s.formed:
+            covariance = s.covariance[train]
+        found.append(_Rows(s.table, block, s.nuisances[train], s.used[train], covariance))
+    return found
+
+
+class _System:
+    """Rows as a function of the unknowns: parameters, a correction of each unknown frame, landmarks' coordinates."""
+
+    def __init__(self, robot: Robot, data: Dataset, chosen: list[int], start: Floats | None) -> None:
+        self._robot, self.chosen = robot, chosen
+        self._sigma_joint = data.sigma_joint
+        unknown = np.array([table.unknown_frame for table in data.tables])
+        self._frame_of = np.where(unknown, np.cumsum(unknown) - 1, -1).tolist()
+        edges = np.cumsum([0, *data.unknowns.sizes])
+        places = [np.arange(edges[i], edges[i + 1]) for i in np.flatnonzero(data.estimated()).tolist()]
+        self._estimated = np.concatenate([np.zeros(0, dtype=np.int64), *places])
+        tolerances = [t for t, of in zip(data.unknowns.tolerances, data.estimated(), strict=True) if of]
+        self._coordinates: Floats = np.concatenate([np.zeros(0), *data.unknowns.starts])
+        self._priors = [(p, self._coordinates[p], t) for p, t in zip(places, tolerances, strict=True) if t is not None]
+        n, n_frames, m = len(robot.parameters), int(unknown.sum()), len(chosen)
+        given = _checked_start(robot, start, n + 6 * max(1, n_frames), len(self._estimated))
+        self._values, self._frames = given[:n], given[n : n + 6 * n_frames].reshape(-1, 6)
+        landmarks = given[n + 6 * max(1, n_frames) :]
+        self._coordinates[self._estimated] = landmarks
+        self.n_core = m + self._frames.size
+        self._first = np.concatenate([self._values[chosen], np.zeros(self._frames.size), landmarks])
+        self._column = np.full(len(self._coordinates), -1, dtype=np.int64)  # -1: a known coordinate
+        self._column[self._estimated] = self.n_core + np.arange(len(landmarks))
+        self._chains = []
+        for frame in self._frame_of:
+            extended = _with_frame(robot.with_values(self._values), np.zeros(6) if frame < 0 else self._frames[frame])
+            columns = {c: k for k, c in enumerate(chosen)}
+            columns |= {n + k: m + 6 * frame + k for k in range(6) if frame >= 0}
+            self._chains.append(replace(build_chain(extended, columns), n_columns=self.n_core))
+        rows = (r.differentiable(self._chain(r.table, self._first)) for r in _train_rows(robot, data))
+        self._rows = [r for r in rows if r.use.any()]
+        if not self._rows:
+            models = ", ".join(dict.fromkeys(str(table.model) for table in data.tables))
+            raise InputError(data.source, "no row left to fit", f"train rows for model {models}")
+
+    def values(self, x: Floats) -> Floats:
+        """The robot's parameters at the unknowns x."""
+        values = self._values.copy()
+        values[self.chosen] = x[: len(self.chosen)]
+        return values
+
+    def frames(self, x: Floats) -> Floats:
+        """x, y, z, yaw, pitch, roll of each unknown frame at the unknowns x, shape (n_frames, 6)."""
+        corrections = x[len(self.chosen) : self.n_core].reshape(-1, 6)
+        found = np.empty((len(corrections), 6))
+        for out, start, correction in zip(found, self._frames, corrections, strict=True):
+            R = rotation_of(*start[3:])
+            out[:3], out[3:] = start[:3] + R @ correction[:3], yaw_pitch_roll(R @ rotation_of(*correction[3:]))
+        return found
+
+    def result(self, fit: Fit, weights: Weights | None) -> LeastSquares:
+        """The estimate at the end of a fit, with the covariance that it claims."""
+        x, m = fit.x, len(self.chosen)
+        covariance, rank = claimed_covariance(*self.evaluate(x, weights), weights is not None)
+        return LeastSquares(
+            **vars(fit),
+            robot=self._robot.with_values(self.values(x)),
+            names=tuple(self._robot.parameters[i].name for i in self.chosen),
+            frames=self.frames(x),
+            places=x[self.n_core :],
+            covariance=covariance[:m, :m],
+            residuals=self.evaluate(x, None)[0],
+            rank=rank,
+        )
+
+    def _chain(self, table: int, x: Floats) -> Chain:
+        """The arm in a table's measurement frame at the unknowns x."""
+        frame = len(self.chosen) + 6 * self._frame_of[table]
+        correction = np.zeros(6) if self._frame_of[table] < 0 else x[frame : frame + 6]
+        return self._chains[table].at(np.concatenate([self.values(x), correction]))
+
+    def _landmarks(self, x: Floats) -> Floats:
+        """Coordinates of all landmarks at the unknowns x."""
+        out = self._coordinates.copy()
+        out[self._estimated] = x[self.n_core :]
+        return out
+
+    def evaluate(self, x: Floats, weights: Weights | None) -> tuple[Floats, Floats]:
+        """Residuals, shape (m,), and derivatives, shape (m, n_unknowns); not weighted if `weights` is None."""
+        coordinates, found_r, found_J = self._landmarks(x), [], []
+        for i, rows in enumerate(self._rows):
+            r, J = residuals.linearise(rows.at(coordinates), self._chain(rows.table, x))
+            if weights is not None:
+                r = (weights[i] @ np.where(rows.use, r, 0.0)[:, :, None])[:, :, 0]
+                J = weights[i] @ (J * rows.use[:, :, None])
+            r, J, of = r[rows.use], J[rows.use], np.nonzero(rows.use)[0]
+            wide = np.zeros((len(r), len(x) + 1))  # the last column for known coordinates
+            wide[:, : self.n_core] = J[:, : self.n_core]
+            for k, columns in enumerate(self._column[rows.landmarks[of]].T):
+                wide[np.arange(len(r)), columns] = J[:, self.n_core + k]
+            found_r.append(r)
+            found_J.append(wide[:, :-1])
+        for place, mean, sigma in self._priors:
+            weight = 1.0 if weights is None else sigma
+            found_r.append((coordinates[place] - mean) / weight)
+            found_J.append(np.eye(len(x) + 1)[self._column[place], :-1] / weight)
+        return np.concatenate(found_r), np.concatenate(found_J)
+
+    def _weights(self, x: Floats) -> Weights:
+        coordinates = self._landmarks(x)
+        return tuple(r.whitening(self._chain(r.table, x), coordinates, self._sigma_joint) for r in self._rows)
+
+    def solve(self, solver: Callable[[Evaluate, Floats], Fit], weighted: bool) -> tuple[Fit, Weights | None]:
+        """The fit and its weights: those at the estimate, where joint noise makes them depend on it."""
+        if not weighted:
+            return solver(lambda x: self.evaluate(x, None), self._first), None
+        fit = Fit(self._first, converged=False, message="", iterations=0)
+        for _ in range(_ROUNDS):
+            weights = self._weights(fit.x)
+            again = solver(partial(self.evaluate, weights=weights), fit.x)
+            moved = float(np.linalg.norm(again.x - fit.x))
+            fit = replace(again, iterations=fit.iterations + again.iterations, steps=fit.steps + again.steps)
+            if not fit.converged or moved <= REWEIGHTED or not np.any(self._sigma_joint > 0.0):
+                return fit, weights
+        return replace(
+            fit, converged=False, message=f"not converged: new weights still move it by {moved:.1e}"
+        ), weights
+
+
+def _checked_start(robot: Robot, start: Floats | None, with_frames: int, n_landmarks: int) -> Floats:
+    """Values of the robot, of measurement frames (zeros where they are left out), and of landmarks.
+
+    Raises:
+        InputError: There are more or fewer, or one is not finite.
+    """
+    given, n = np.asarray(robot.nominal if start is None else start, dtype=np.float64), len(robot.parameters)
+    if given.shape == (n,):
+        given = np.append(given, np.zeros(with_frames - n))
+    if given.shape != (with_frames + n_landmarks,) or not np.isfinite(given).all():
+        found = f"shape {given.shape}" if np.isfinite(given).all() else "a value that is not finite"
+        landmarks = f", then {n_landmarks} of landmarks" if n_landmarks else ""
+        expected = f"{n} values of the robot, or {with_frames} with the measurement frame's{landmarks}"
+        raise InputError("start", found, expected)
+    return given
+
+
+def _with_frame(robot: Robot, world_T_base: Floats) -> Robot:
+    """The robot after a frame and a correction of it, whose six parameters come last."""
+    n = len(robot.parameters)
+    fixed = [Element(AXIS_OF_KIND[kind], float(v)) for kind, v in zip(FRAME_KINDS, world_T_base, strict=True)]
+    free = [Element(AXIS_OF_KIND[kind], parameter=n + i) for i, kind in enumerate(FRAME_KINDS)]
+    correction = (Parameter(f"frame.{kind}", kind, 0, 0.0) for kind in FRAME_KINDS)
+    return replace(robot, parameters=(*robot.parameters, *correction), elements=(*fixed, *free, *robot.elements))

@@ -192,14 +192,14 @@ def test_a_job_without_test_rows_is_reweighted_at_its_train_rows(simulated_job):
 
 @pytest.mark.slow
 def test_a_baseline_that_cannot_run_or_goes_astray_says_so(simulated_job, monkeypatch):
-    original = comparison_module.fit_dataset
+    original = comparison_module.fit_least_squares
 
     def broken(*arguments, method="gauss-newton", weighted=False, **settings):
         if method == "scipy":
             raise InputError("poses.csv", "no sigma for distance")
         return original(*arguments, weighted=weighted, max_iterations=50 if weighted else 1, **settings)
 
-    monkeypatch.setattr(comparison_module, "fit_dataset", broken)
+    monkeypatch.setattr(comparison_module, "fit_least_squares", broken)
     found = compare(simulated_job)
     *_, plain, _, scipys = found.estimates
     assert (scipys.robot, scipys.converged, scipys.predicted_rms) == (None, False, None)
