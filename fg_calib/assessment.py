@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,15 +26,15 @@ from fg_calib.observability.identifiability import Identifiability, identifiabil
 from fg_calib.observability.indices import Observability
 from fg_calib.prediction.expected_error import ExpectedError, expected_error, without_rigid_motion
 from fg_calib.robot.model import Robot
-from fg_calib.statistics.acceptance import Acceptance, Kinds, accept
+from fg_calib.statistics.acceptance import Acceptance, accept
 from fg_calib.statistics.covariance import Spread, spread_of, with_left_out, with_unsure_tolerances
-from fg_calib.statistics.cross_validation import Folds
+from fg_calib.statistics.cross_validation import CrossValidation
 from fg_calib.statistics.estimates import Estimates, estimates_at
 from fg_calib.statistics.goodness_of_fit import Fit, chi_square, judge_fit
 from fg_calib.statistics.outliers import judged_without_gross_errors
 from fg_calib.statistics.prior_consistency import judge_priors
 from fg_calib.statistics.prior_scales import estimate_tolerances
-from fg_calib.statistics.residual_table import residual_table
+from fg_calib.statistics.residual_table import HeldOut, residual_table
 from fg_calib.statistics.variance_components import estimate_noise
 from fg_calib.threads import one_blas_thread, single_threaded
 
@@ -85,9 +85,9 @@ class Assessment(FrozenArrays):
     verdict: Verdict
     expected_error: ExpectedError | None
     acceptance: Acceptance | None = None
-    cross_validation: Folds | None = None
+    cross_validation: CrossValidation | None = None
 
-    def with_folds(self, folds: Folds, solution: Solution) -> Assessment:
+    def with_folds(self, folds: CrossValidation, solution: Solution) -> Assessment:
         """The assessment with cross-validation, which judges limits on kinds without test rows.
 
         Args:
@@ -96,7 +96,7 @@ class Assessment(FrozenArrays):
         """
         return replace(self.with_held_out(folds.by_table, solution), cross_validation=folds)
 
-    def with_held_out(self, others: Kinds, solution: Solution) -> Assessment:
+    def with_held_out(self, others: Sequence[HeldOut], solution: Solution) -> Assessment:
         """The assessment with limits on kinds without test rows judged by other measurements that were predicted.
 
         Args:
@@ -104,8 +104,8 @@ class Assessment(FrozenArrays):
             solution: What was assessed.
         """
         tested = self.fit.residuals.held_out(solution.problem.data.labels)
-        kinds = {kind for _, kind in tested}
-        held_out = tested | {key: held for key, held in others.items() if key[1] not in kinds}
+        kinds = {held.kind for held in tested}
+        held_out = (*tested, *(held for held in others if held.kind not in kinds))
         return replace(self, acceptance=accept(solution.problem.options.accept, held_out, self.verdict.findings))
 
     def __repr__(self) -> str:

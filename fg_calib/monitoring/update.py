@@ -28,8 +28,7 @@ from fg_calib.monitoring.prior_information import with_tolerances
 from fg_calib.options import NEAR, did_you_mean, known_names
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.model import Robot, names_of, tolerance_kind
-from fg_calib.statistics.acceptance import Kinds
-from fg_calib.statistics.residual_table import residual_table
+from fg_calib.statistics.residual_table import HeldOut, residual_table
 
 Floats = NDArray[np.float64]
 
@@ -65,7 +64,7 @@ def updated(
     return solve(_problem(calibrated, robot, known, rows, at))
 
 
-def predicted_before(calibrated: Calibrated, rows: Rows) -> Kinds:
+def predicted_before(calibrated: Calibrated, rows: Rows) -> tuple[HeldOut, ...]:
     """How well the arm as it was calibrated before predicts new rows, by table and kind: it has not seen them.
 
     Args:
@@ -77,7 +76,7 @@ def predicted_before(calibrated: Calibrated, rows: Rows) -> Kinds:
     table = residual_table(solution)
     tested = replace(table, test=np.ones_like(table.test), n_fitted=0, seen=np.zeros_like(table.seen))
     found = tested.held_out(solution.problem.data.labels)
-    return {key: replace(held, by="the arm before this update") for key, held in found.items()}
+    return tuple(replace(held, by="the arm before this update") for held in found)
 
 
 def _problem(calibrated: Calibrated, robot: Robot, known: Knowledge, rows: Rows, at: Placed) -> Problem:

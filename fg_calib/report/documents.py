@@ -400,7 +400,7 @@ def _folds(uncertainty: Uncertainty) -> FoldsDocument | None:
     if found is None:
         return None
     estimated = {p.name for p in uncertainty.parameters if p.identifiability != "fixed"}
-    spread = {name: s for name, s in zip(found.names, found.spread, strict=True) if name in estimated}
+    spread = {name: s for name, s in found.spread.items() if name in estimated}
     return FoldsDocument.make(
         n=found.n,
         n_held_out=int(np.sum(found.fold >= 0)),

@@ -55,7 +55,7 @@ NEEDED = {"anchor": 4, "plane": 4, "station": 3, "target": 2, "board": 2}
 
 
 @dataclass(frozen=True)
-class Folds(FrozenArrays):
+class CrossValidation(FrozenArrays):
     """Result of a cross-validation.
 
     Attributes:
@@ -64,18 +64,16 @@ class Folds(FrozenArrays):
         by_table: Held-out residuals by table and kind.
         kinds: Held-out residuals by kind.
         of_pairs: Whether pairs take part, whose spread is larger than their sigma.
-        names: Every parameter of the robot.
-        spread: Jackknife of each, shape (n_parameters,), [m] and [rad].
+        spread: Jackknife of every parameter of the robot, by name, [m] and [rad].
         not_converged: Number of folds without which the solver did not converge.
     """
 
     n: int
     fold: Integers
-    by_table: dict[tuple[str, str], HeldOut]
+    by_table: tuple[HeldOut, ...]
     kinds: dict[str, HeldOut]
     of_pairs: bool
-    names: tuple[str, ...]
-    spread: Floats
+    spread: dict[str, float]
     not_converged: int
 
     def beyond(self, sigma: Mapping[str, float | None]) -> tuple[dict[str, float], list[str]]:
@@ -84,8 +82,7 @@ class Folds(FrozenArrays):
         Args:
             sigma: 1 sigma of parameters by name; None where it is not known.
         """
-        spread = dict(zip(self.names, self.spread.tolist(), strict=True))
-        ratio = {name: spread[name] / s for name, s in sigma.items() if s}
+        ratio = {name: self.spread[name] / s for name, s in sigma.items() if s}
         return ratio, [] if self.of_pairs else wide(ratio, self.n)
 
 
@@ -103,7 +100,7 @@ def wide(ratio: Mapping[str, float], n: int) -> list[str]:
 @checked
 def cross_validate(
     job: Job, solve: Callable[[Job], Solution], n: int = 5, seed: int = 0, *, executor: Executor | None = None
-) -> Folds:
+) -> CrossValidation:
     """Hold every configuration out once, and calibrate without it.
 
     Args:
@@ -140,22 +137,23 @@ def cross_validate(
             raise one.error() if one.trace else ProblemError("folds", f"{one.job}: {one.reason}")
         found.append(one)
     estimates, held, converged = zip(*found, strict=True)
-    keys = dict.fromkeys(key for of_fold in held for key in of_fold)
-    by_table = {key: pooled([of_fold[key] for of_fold in held if key in of_fold]) for key in keys}
-    kinds = dict.fromkeys(kind for _, kind in by_table)
-    return Folds(
+    parts: dict[tuple[str, str], list[HeldOut]] = {}
+    for one in (one for of_fold in held for one in of_fold):
+        parts.setdefault((one.table, one.kind), []).append(one)
+    by_table = tuple(pooled(some, table) for (table, _), some in parts.items())
+    jackknife = np.sqrt((n - 1) * np.var(estimates, axis=0)).tolist()
+    return CrossValidation(
         n=n,
         fold=fold,
         by_table=by_table,
-        kinds={kind: pooled([one for (_, of), one in by_table.items() if of == kind]) for kind in kinds},
+        kinds={kind: pooled([one for one in by_table if one.kind == kind]) for _, kind in parts},
         of_pairs=any(table.uses_pairs for table in data.tables),
-        names=tuple(p.name for p in job.robot.parameters),
-        spread=np.sqrt((n - 1) * np.var(estimates, axis=0)),
+        spread={p.name: s for p, s in zip(job.robot.parameters, jackknife, strict=True)},
         not_converged=n - sum(converged),
     )
 
 
-def _calibrated(job: Job, solve: Callable[[Job], Solution]) -> tuple[Floats, dict[tuple[str, str], HeldOut], bool]:
+def _calibrated(job: Job, solve: Callable[[Job], Solution]) -> tuple[Floats, tuple[HeldOut, ...], bool]:
     """The robot's parameters without a fold, the held-out residuals, and whether the solver converged."""
     solution = solve(job)
     problem = solution.problem

@@ -56,13 +56,12 @@ from fg_calib.statistics.gross_errors import MOST_FEW, find_gross_errors
 from fg_calib.statistics.low_rank import Dense, LowRank
 from fg_calib.statistics.prior_consistency import PriorFit
 from fg_calib.statistics.residual_covariance import Errors, Nuisances, half_of
-from fg_calib.statistics.residual_table import ALARM, ResidualTable, sum_by_end, suspect_level
+from fg_calib.statistics.residual_table import ALARM, ResidualTable, suspect_level
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
 Integers = NDArray[np.int64]
 Codes = NDArray[np.int8]
-Indices = NDArray[np.int32]
 Loadings = scipy.sparse.csr_array
 
 MAX_DENSE = 3000
@@ -433,22 +432,16 @@ class _Part:
         """Configurations whose rows are too large together, the least likely first."""
         if not self.judged:
             return ()  # outliers have been found already
-        a, b, n = self.table.a, self.table.b, len(self.rows)
-
-        def ends(some: slice) -> tuple[Indices, Indices]:
-            return a[self.rows[some]], b[self.rows[some]]
-
-        chi2, expected, count = (
-            sum_by_end(ends, n, self.n_ends, values)
-            for values in (lambda some: self.squares[some], lambda some: self.means[some], lambda _: None)
-        )
+        place, end = self.table.row_ends(self.rows)
+        chi2, expected = (np.bincount(end, v[place], self.n_ends) for v in (self.squares, self.means))
+        count = np.bincount(end, minlength=self.n_ends)
         looked_at = np.flatnonzero(expected > 1e-3)
         limit = ALARM / max(1, len(looked_at))
         # No effective number of degrees of freedom is below 1, where the tail is heaviest.
         least = 2.0 * special.erfcinv(limit) ** 2
         found = []
         for k in looked_at[chi2[looked_at] > least * expected[looked_at]]:
-            nu = max(1.0, self.degrees(np.flatnonzero(((a == k) | (b == k))[self.rows])))
+            nu = max(1.0, self.degrees(np.unique(place[end == k])))
             ratio = chi2[k] / expected[k]
             if special.gammaincc(nu / 2.0, nu / 2.0 * ratio) < limit:
                 strength = 0.5 * nu * (ratio - 1.0 - np.log(ratio))  # -log p, nearly; never underflows

@@ -1,16 +1,41 @@
-"""Tolerances estimated from the corrections: a scale on those stated, iterated with the fit.
+r"""Scales of the prior sigmas, estimated from the corrections: empirical Bayes, iterated with the fit.
 
-Nobody knows how far an arm is from its drawing; the corrections of all its parameters together tell. At each solution
-the scales are what the data say of them, the parameters integrated out to first order (see `tolerance_likelihood`);
-then everything is solved again with the tolerances that they say, until no scale moves. An arm is nearly linear within
-its tolerances, so that takes two or three rounds; where it is not, scales may jump to and fro, and each way back is
-made shorter. Where the noise is estimated too, that happens in each round.
+Nobody knows how far an arm is from its nominal model; the corrections of all its parameters together tell. With u the
+corrections in units of the specified prior sigmas, the data say of them to first order an information matrix G and a
+vector g: `-(u^T G u) / 2 + g^T u` is their log-likelihood. What has no prior, such as a measurement frame, is
+eliminated. Where u has the variance s^2, s the scale of its group, W = diag(s), `M = 1 + W G W` and `a = M^-1 W g`,
+
+    L(s) = (g^T W a - log det M) / 2
+
+is the likelihood with u integrated out. The estimate is `u = W a`, its covariance W C W with C = M^-1. In theta = log s
+
+    dL / dtheta_k           = sum over k of (a_i^2 + C_ii - 1)
+    d2L / dtheta_k dtheta_l = 4 a_k^T C_kl a_l + 2 |C_kl|^2 - delta_kl 2 sum over k of (a_i^2 + C_ii)
+
+of which the mean is `-2 |(1 - C)_kl|^2`: a correction that data determine counts 2, one that they do not, nothing.
+`sum over k of (1 - C_ii)` is how many corrections of a group the data determine.
+
+The scales have priors themselves: all may be off by a common factor, 1 sigma of which is 5 (`COMMON_SIGMA`), and each
+group by another of 3 (`GROUP_SIGMA`). So a group that the data do not determine follows the others, and one of a single
+correction that happens to be nil does not collapse. The posterior of theta is taken as normal: its axes are those of
+the curvature at the mode (Laplace), its mean and variance along each are integrated, for it is skew where few
+corrections are determined. The scale taken is the mean. The mean over the posterior, by cubature at points on its axes,
+of `W C W + (W a - u) (W a - u)^T` minus W C W is what unknown scales add to the covariance.
+
+At each solution the scales are estimated, then everything is solved again with their prior sigmas, until no scale
+moves: two or three rounds where the arm is nearly linear. Elsewhere scales may oscillate, so steps back are shortened.
+
+References:
+    MacKay (1992), Bayesian interpolation. Neural Computation 4(3): evidence, and number of well-determined parameters.
+    Kass & Steffey (1989), Approximate Bayesian inference in conditionally independent hierarchical models. JASA 84.
+    Gelman (2006), Prior distributions for variance parameters in hierarchical models. Bayesian Analysis 1(3).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,35 +47,53 @@ from fg_calib.graph.problem import Problem, reweighted_at
 from fg_calib.graph.solver import Solution, solve
 from fg_calib.graph.tolerances import ToleranceScale, ToleranceScales, groups_of, prior_parameters, with_scales
 from fg_calib.observability.indices import RANK_TOLERANCE
-from fg_calib.statistics.tolerance_likelihood import Corrections, posterior_of
 from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
 SETTLED = 1e-3
 """Relative change of a scale below which it has settled: a hundredth of what it is known to at best."""
 
 MAX_ROUNDS = 30
 
+COMMON_SIGMA, GROUP_SIGMA = float(np.log(5.0)), float(np.log(3.0))
+"""Prior sigma of the logarithm of a scale: of all together, and of each group."""
+
+MAX_STEP, MAX_STEPS = 2.0, 100
+"""Longest step of the logarithm of a scale, and number of steps to the mode."""
+
+LEAST_GAIN = 1e-9
+"""Gain of the logarithm of the posterior that a step must promise."""
+
+STARTS = (0.0, float(np.log(0.1)), float(np.log(10.0)))
+"""Logarithms of all scales that ascents start from: where few corrections are determined there may be two modes."""
+
+GRID = np.linspace(-6.0, 6.0, 25)
+"""Points on an axis over which the posterior is integrated, in sigma."""
+
+QUANTILE = 1.959963984540054
+"""Half width of the 95 % interval, in sigma."""
+
 
 @checked
 @single_threaded
 def estimate_tolerances(problem: Problem, solve_with: Callable[[Problem], Solution] = solve) -> Solution:
-    """Estimate the parameters and, with them, a scale on the tolerances of each group.
+    """Estimate the parameters and, with them, a scale on the prior sigmas of each group.
 
     Args:
-        problem: The problem; its options say what shares a scale, its tolerances are where the scales start from.
-        solve_with: What solves it at given tolerances: `solve`, or `estimate_noise`.
+        problem: The problem; its options say what shares a scale, its prior sigmas are where the scales start from.
+        solve_with: What solves it at given prior sigmas: `solve`, or `estimate_noise`.
 
     Returns:
-        The solution with the tolerances it ends with, and their scales in its `estimated_tolerances`. It has not
+        The solution with the prior sigmas it ends with, and their scales in its `estimated_tolerances`. It has not
         converged if the scales have not settled.
 
     Raises:
         SolverError: GTSAM could not solve a step at all.
     """
-    by, stated = problem.options.estimate_tolerance, problem.variables
-    parameters = prior_parameters(stated)
+    by, specified = problem.options.estimate_tolerance, problem.variables
+    parameters = prior_parameters(specified)
     if by is None or problem.evaluated or not parameters:
         return solve_with(problem)
     groups, group = groups_of(problem.robot, parameters, by)
@@ -59,9 +102,10 @@ def estimate_tolerances(problem: Problem, solve_with: Callable[[Problem], Soluti
     for _ in range(MAX_ROUNDS):
         solution = solve_with(now)
         seconds += solution.seconds
-        corrections, follow = _corrections(solution, stated, scale[group], group)
-        found = posterior_of(corrections)
-        step = _held(found.theta - np.log(scale), step)
+        corrections, follow = _corrections(solution, specified, scale[group], group)
+        found = fit_scales(corrections)
+        wanted, half = found.mean.theta - np.log(scale), 0.5 * np.abs(step)
+        step = np.where(wanted * step < 0.0, np.clip(wanted, -half, half), wanted)
         moves = float(np.abs(step).max())
         if moves < SETTLED:
             break
@@ -71,9 +115,9 @@ def estimate_tolerances(problem: Problem, solve_with: Callable[[Problem], Soluti
             reweighted_at(problem, problem.start, noise), by, dict(zip(groups, scale.tolist(), strict=True))
         )
     low, high = np.exp(found.interval)
-    figures = (v.tolist() for v in (scale, low, high, found.seen))
+    figures = (v.tolist() for v in (scale, low, high, found.mean.determined))
     scales = tuple(ToleranceScale(*of) for of in zip(groups, members, *figures, strict=True))
-    estimated = ToleranceScales(scales, follow @ found.unsure @ follow.T)
+    estimated = ToleranceScales(scales, follow @ found.added_covariance @ follow.T)
     solution = replace(solution, estimated_tolerances=estimated, seconds=seconds)
     if moves < SETTLED or not solution.converged:
         return solution
@@ -81,16 +125,140 @@ def estimate_tolerances(problem: Problem, solve_with: Callable[[Problem], Soluti
     return replace(solution, converged=False, message=message)
 
 
-def _held(wanted: Floats, last: Floats) -> Floats:
-    """Steps as wanted, but back no more than half of the last one: so they end where an arm is far from linear."""
-    half = 0.5 * np.abs(last)
-    return np.where(wanted * last < 0.0, np.clip(wanted, -half, half), wanted)
+@dataclass(frozen=True)
+class Corrections:
+    """What the data say of the corrections in prior sigmas.
+
+    Attributes:
+        information: G, shape (n, n).
+        preferred: g, shape (n,).
+        group: Number of the group of each, shape (n,).
+    """
+
+    information: Floats
+    preferred: Floats
+    group: Integers
+
+    @cached_property
+    def member(self) -> Floats:
+        """1 where a correction is of a group, shape (n_groups, n)."""
+        return np.equal.outer(np.arange(self.group.max(initial=-1) + 1), self.group).astype(np.float64)
+
+    @cached_property
+    def prior_information(self) -> Floats:
+        """Information on the logarithms of the scales before any data, shape (n_groups, n_groups)."""
+        n = len(self.member)
+        return np.linalg.inv(COMMON_SIGMA**2 * np.ones((n, n)) + GROUP_SIGMA**2 * np.eye(n)).astype(np.float64)
+
+
+class ScalePosterior:
+    """The corrections at given scales, and the posterior of these.
+
+    Args:
+        corrections: What the data say of the corrections.
+        theta: Logarithms of the scales, shape (n_groups,).
+
+    Attributes:
+        value: Logarithm of the posterior density.
+        estimate: Of the corrections, shape (n,).
+        covariance: Of the corrections, shape (n, n).
+        determined: How many corrections of each group the data determine, shape (n_groups,).
+        gradient: Of the logarithm of the posterior, shape (n_groups,).
+        hessian: The same, shape (n_groups, n_groups).
+        mean_hessian: Its mean over the data.
+    """
+
+    def __init__(self, corrections: Corrections, theta: Floats) -> None:
+        self.corrections, self.theta = corrections, theta
+        member, prior = corrections.member, corrections.prior_information
+        s = np.exp(theta) @ member
+        M = np.eye(len(s)) + s[:, None] * corrections.information * s
+        C = np.linalg.inv(M)
+        right = s * corrections.preferred
+        a = C @ right
+        self.value = float(0.5 * (right @ a - np.linalg.slogdet(M)[1] - theta @ prior @ theta))
+        self.estimate: Floats = s * a
+        self.covariance: Floats = s[:, None] * C * s
+        self.determined: Floats = member @ (1.0 - np.diag(C))
+        square = member @ (a**2 + np.diag(C))
+        self.gradient: Floats = square - member.sum(axis=1) - prior @ theta
+        self.hessian: Floats = (
+            member @ (4.0 * a[:, None] * C * a + 2.0 * C**2) @ member.T - np.diag(2.0 * square) - prior
+        )
+        self.mean_hessian: Floats = -2.0 * member @ (np.eye(len(a)) - C) ** 2 @ member.T - prior
+
+    @property
+    def curvature_covariance(self) -> Floats:
+        """Covariance of the logarithms by the curvature here, or by its mean where that is not concave."""
+        concave = np.linalg.eigvalsh(self.hessian)[-1] < 0.0
+        return np.linalg.inv(-(self.hessian if concave else self.mean_hessian)).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class EstimatedScales:
+    """The posterior of the scales.
+
+    Attributes:
+        mean: The corrections at the mean of the logarithms.
+        axes: A square root of the covariance of the logarithms, transposed, shape (n_groups, n_groups).
+    """
+
+    mean: ScalePosterior
+    axes: Floats
+
+    @property
+    def interval(self) -> tuple[Floats, Floats]:
+        """Lower and upper ends of the 95 % intervals of the logarithms, shape (n_groups,) each."""
+        half = QUANTILE * np.linalg.norm(self.axes, axis=0)
+        return self.mean.theta - half, self.mean.theta + half
+
+    @property
+    def added_covariance(self) -> Floats:
+        """What unknown scales add to the covariance of the corrections, shape (n, n)."""
+        added = -self.mean.covariance
+        for step in np.sqrt(len(self.axes)) * np.vstack([self.axes, -self.axes]):
+            other = ScalePosterior(self.mean.corrections, self.mean.theta + step)
+            away = other.estimate - self.mean.estimate
+            added = added + (other.covariance + np.outer(away, away)) / (2 * len(self.axes))
+        return added
+
+
+def fit_scales(corrections: Corrections) -> EstimatedScales:
+    """The posterior of the scales, about its highest mode.
+
+    Args:
+        corrections: What the data say of the corrections.
+    """
+    modes = (_climb(ScalePosterior(corrections, np.full(len(corrections.member), start))) for start in STARTS)
+    mode = max(modes, key=lambda mode: mode.value)
+    theta, axes = mode.theta, np.linalg.cholesky(mode.curvature_covariance).T.copy()
+    for k, axis in enumerate(axes.copy()):
+        density: Floats = np.exp([ScalePosterior(corrections, mode.theta + t * axis).value - mode.value for t in GRID])
+        mean = GRID @ density / density.sum()
+        theta = theta + mean * axis
+        axes[k] *= np.sqrt((GRID - mean) ** 2 @ density / density.sum())
+    return EstimatedScales(ScalePosterior(corrections, theta), axes)
+
+
+def _climb(point: ScalePosterior) -> ScalePosterior:
+    """The mode above a point, by Newton's steps, or Fisher's where the posterior is not concave."""
+    for _ in range(MAX_STEPS):
+        step = point.curvature_covariance @ point.gradient
+        step *= min(1.0, MAX_STEP / max(float(np.abs(step).max(initial=0.0)), LEAST_GAIN))
+        if float(point.gradient @ step) < LEAST_GAIN:
+            break
+        following = ScalePosterior(point.corrections, point.theta + step)
+        while following.value < point.value and float(np.abs(step).max()) > LEAST_GAIN:
+            step *= 0.5
+            following = ScalePosterior(point.corrections, point.theta + step)
+        point = following
+    return point
 
 
 def _corrections(
-    solution: Solution, stated: Variables, scale: Floats, group: NDArray[np.int64]
+    solution: Solution, specified: Variables, scale: Floats, group: Integers
 ) -> tuple[Corrections, Floats]:
-    """What the data say of the corrections in tolerances stated, to first order at a solution.
+    """What the data say of the corrections in specified prior sigmas, to first order at a solution.
 
     At the optimum the data pull as hard one way as the priors do the other, so that `g = (G + 1 / scale^2) u`. Where
     rows share errors but count as independent, g varies by H = G + (what they share) instead of by G: then the data
@@ -98,16 +266,16 @@ def _corrections(
 
     Args:
         solution: The solution.
-        stated: The variables with the tolerances stated.
-        scale: Scale of each correction's tolerance in the solution, shape (n,).
+        specified: The variables with the specified prior sigmas.
+        scale: Scale of each correction's prior sigma in the solution, shape (n,).
         group: Number of each one's group, shape (n,).
 
     Returns:
         The corrections, and how the columns follow them, shape (n_columns, n).
     """
     problem, at = solution.problem, solution.parameters
-    by = stated.prior_scales
-    u, P = prior_rows(stated, at)
+    by = specified.prior_scales
+    u, P = prior_rows(specified, at)
     U, s, Vt = np.linalg.svd(P * by)
     back, rest = by[:, None] * (Vt[: len(s)].T / s) @ U.T, by[:, None] * Vt[len(s) :].T
     J = whitened_triangle(problem, at)

@@ -173,7 +173,7 @@ def test_few_rows_that_alone_are_why_a_limit_is_not_kept_are_named(loss):
     m = replace(m, position=plus(m.position, wrong, 0.02))
     (one,) = calibrate(robot, m, model="pose", loss=loss, accept={"position": 5e-4}).result.acceptance.judgements
     assert one.verdict == "fail"
-    assert one.reason == f"within the limit without {m.ids[wrong]}, which is far off beside the others: look at it"
+    assert one.reason == f"within the limit without {m.ids[wrong]}, which is an outlier: look at it"
 
 
 def test_an_arm_that_is_wrong_everywhere_blames_no_row():

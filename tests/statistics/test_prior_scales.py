@@ -1,4 +1,4 @@
-"""Tolerances estimated with the fit: of whole arms, beside noise, in the report and the files."""
+"""Scales of prior sigmas: their posterior against dense formulas, and estimated with the fit of whole arms."""
 
 import contextlib
 import json
@@ -7,8 +7,9 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal, norm
 from simulated import TOOL, measure, small_arm, true_robot, write_job
-from tolerances import NEGLIGIBLE, sigmas_apart
+from tolerances import NEGLIGIBLE, rounding, sigmas_apart
 
 from fg_calib.assessment import assess
 from fg_calib.calibration import Calibration, calibrate, calibrate_job
@@ -22,14 +23,130 @@ from fg_calib.measurements.dataset import Measurements
 from fg_calib.options import Options, Pairing
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
-from fg_calib.statistics.prior_scales import estimate_tolerances
+from fg_calib.statistics.prior_scales import (
+    COMMON_SIGMA,
+    GROUP_SIGMA,
+    Corrections,
+    ScalePosterior,
+    estimate_tolerances,
+    fit_scales,
+)
 from fg_calib.statistics.variance_components import estimate_noise
+
+GROUP = np.array([0, 0, 0, 1, 1, 2])
+
+
+def drawn(rng, scale, rows=9, noise=0.3, group=GROUP, unseen=()):
+    """Rows of unit noise of corrections that are so many tolerances large, and what they say of these."""
+    R = rng.normal(size=(rows, len(group))) / noise
+    R[:, list(unseen)] = 0.0
+    z = R @ (np.asarray(scale)[group] * rng.normal(size=len(group))) + rng.normal(size=rows)
+    return R, z, Corrections(R.T @ R, R.T @ z, group)
+
+
+def guess(n):
+    """The covariance of the logarithms of scales before any data."""
+    return COMMON_SIGMA**2 * np.ones((n, n)) + GROUP_SIGMA**2 * np.eye(n)
+
+
+def test_the_scale_posterior_is_the_density_of_the_rows_with_the_corrections_integrated_out():
+    rng = np.random.default_rng(0)
+    R, z, corrections = drawn(rng, [1.0, 3.0, 0.2])
+
+    def dense(theta):
+        covariance = np.eye(len(z)) + R @ np.diag(np.exp(2.0 * theta[GROUP])) @ R.T
+        return multivariate_normal(cov=covariance).logpdf(z) + multivariate_normal(cov=guess(3)).logpdf(theta)
+
+    a, b = rng.normal(size=(2, 3))
+    found = ScalePosterior(corrections, a).value - ScalePosterior(corrections, b).value
+    assert found == pytest.approx(dense(a) - dense(b), abs=rounding(z @ z))
+
+
+def test_gradient_and_curvature_of_the_posterior_are_its_differences():
+    rng = np.random.default_rng(1)
+    _, _, corrections = drawn(rng, [1.0, 3.0, 0.2])
+    theta, h = 0.5 * rng.normal(size=3), 1e-4
+    at = ScalePosterior(corrections, theta)
+    steps = h * np.eye(3)
+    values = [
+        ScalePosterior(corrections, theta + s).value - ScalePosterior(corrections, theta - s).value for s in steps
+    ]
+    np.testing.assert_allclose(np.array(values) / (2.0 * h), at.gradient, rtol=1e-6)  # h^2 of the third derivative
+    ends = [[ScalePosterior(corrections, theta + way * s).gradient for way in (1.0, -1.0)] for s in steps]
+    slopes = [up - down for up, down in ends]
+    np.testing.assert_allclose(np.array(slopes) / (2.0 * h), at.hessian, rtol=1e-6)
+
+
+def test_the_normal_approximation_is_near_a_skew_posterior_on_a_fine_grid():
+    """Three corrections, two of them determined badly: mean, interval, and what an unknown scale adds."""
+    *_, corrections = drawn(np.random.default_rng(3), [2.0], rows=3, noise=1.5, group=np.zeros(3, dtype=np.int64))
+    found = fit_scales(corrections)
+    grid = np.linspace(-12.0, 8.0, 1001)
+    points = [ScalePosterior(corrections, np.array([t])) for t in grid]
+    density = np.exp([p.value - max(q.value for q in points[::50]) for p in points])
+    density /= density.sum()
+    mean = density @ grid
+    sd = np.sqrt(density @ (grid - mean) ** 2)
+    assert abs(found.mean.theta[0] - mean) < 0.1 * sd
+    np.testing.assert_allclose(np.ptp(found.interval), 2.0 * 1.96 * sd, rtol=0.05)
+    away = [p.estimate - found.mean.estimate for p in points]
+    whole = sum(d * (p.covariance + np.outer(o, o)) for d, p, o in zip(density, points, away, strict=True))
+    np.testing.assert_allclose(np.diag(found.added_covariance + found.mean.covariance), np.diag(whole), rtol=0.3)
+
+
+def test_a_group_that_rows_do_not_determine_goes_with_the_others():
+    """As far as a common factor explains these, and it is known no better than a group is beside the others."""
+    *_, corrections = drawn(np.random.default_rng(4), [10.0, 10.0, 1.0], rows=200, noise=1e-3, unseen=[5])
+    found = fit_scales(corrections)
+    assert found.mean.determined[2] == pytest.approx(0.0, abs=rounding())
+    share = guess(3)[2, :2] @ np.linalg.inv(guess(3)[:2, :2])
+    assert found.mean.theta[2] == pytest.approx(share @ found.mean.theta[:2], abs=0.1)
+    low, high = found.interval
+    assert high[2] - low[2] > 3.0 * GROUP_SIGMA
+
+
+def test_tolerances_that_rows_do_not_determine_stay_as_specified():
+    corrections = Corrections(np.zeros((6, 6)), np.zeros(6), GROUP)
+    found = fit_scales(corrections)
+    half = norm.ppf(0.975) * np.sqrt(guess(1)[0, 0])
+    np.testing.assert_allclose(found.mean.theta, 0.0, atol=0.1 * half)
+    low, high = found.interval
+    np.testing.assert_allclose(high, half, rtol=0.15)
+    np.testing.assert_allclose(low, -half, rtol=0.15)
+
+
+def test_one_correction_that_is_nil_does_not_make_its_tolerance_nothing():
+    found = fit_scales(Corrections(np.array([[1e8]]), np.zeros(1), np.zeros(1, dtype=np.int64)))
+    assert 1e-3 < np.exp(found.mean.theta[0]) < 1.0
+
+
+def test_many_good_rows_leave_what_the_corrections_themselves_say():
+    """Six corrections known exactly: the scale is their RMS but for its guess, known to 1 / sqrt(12)."""
+    rng, group = np.random.default_rng(5), np.zeros(6, dtype=np.int64)
+    u = 7.0 * rng.normal(size=6)
+    found = fit_scales(Corrections(1e10 * np.eye(6), 1e10 * u, group))
+    assert found.mean.theta[0] == pytest.approx(np.log(np.sqrt(np.mean(u**2))), abs=0.15)
+    assert np.ptp(found.interval) == pytest.approx(2.0 * 1.96 / np.sqrt(12.0), rel=0.15)
+    assert found.mean.determined[0] == pytest.approx(6.0, abs=1e-6)
+
+
+@pytest.mark.slow
+def test_intervals_of_scales_hold_the_true_ones_as_often_as_they_say():
+    """True scales drawn as the guess has them; 95 % of 240 within four sigma."""
+    rng = np.random.default_rng(6)
+    held = []
+    for _ in range(80):
+        theta = rng.multivariate_normal(np.zeros(3), guess(3))
+        low, high = fit_scales(drawn(rng, np.exp(theta))[2]).interval
+        held += ((low <= theta) & (theta <= high)).tolist()
+    assert abs(np.mean(held) - 0.95) < 4.0 * np.sqrt(0.95 * 0.05 / 80)
+
 
 STATED = {"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3}
 TRUE = {"a": 3e-3, "d": 3e-4, "alpha": 8e-3, "theta": 1e-3}
 
 
-def drawn(model="pose", n=12, seed=0, n_test=0, **choices):
+def drawn_problem(model="pose", n=12, seed=0, n_test=0, **choices):
     """A problem of an arm whose errors are other than stated, and its true robot."""
     rng = np.random.default_rng(seed)
     true = true_robot(small_arm(tolerance=TRUE), rng)
@@ -39,7 +156,7 @@ def drawn(model="pose", n=12, seed=0, n_test=0, **choices):
 
 @cache
 def solved():
-    return estimate_tolerances(drawn(estimate_tolerance="kind")[0])
+    return estimate_tolerances(drawn_problem(estimate_tolerance="kind")[0])
 
 
 def tolerances_of(solution):
@@ -64,7 +181,7 @@ def test_the_estimate_is_that_with_the_tolerances_found_stated():
 
 @pytest.mark.slow
 def test_not_knowing_the_scales_makes_sigmas_larger():
-    problem, _ = drawn("distance", n=14, estimate_tolerance="kind")
+    problem, _ = drawn_problem("distance", n=14, estimate_tolerance="kind")
     solution = estimate_tolerances(problem)
     found, known = assess(solution), assess(replace(solution, estimated_tolerances=None))
     wider = [a.sigma / b.sigma for a, b in zip(found.parameters, known.parameters, strict=True) if b.sigma]
@@ -74,13 +191,13 @@ def test_not_knowing_the_scales_makes_sigmas_larger():
 
 @pytest.mark.usefixtures("without_reasons", "without_mistakes")
 def test_corrections_beyond_their_tolerances_are_no_finding_once_these_are_estimated():
-    problem, _ = drawn()
+    problem, _ = drawn_problem()
     assert any("tolerances" in finding for finding in assess(solve(problem)).findings)
     assert not assess(solved()).findings
 
 
 def test_a_joint_may_have_one_scale():
-    problem, _ = drawn(estimate_tolerance="joint")
+    problem, _ = drawn_problem(estimate_tolerance="joint")
     scales = estimate_tolerances(problem).estimated_tolerances.scales
     assert [one.group for one in scales] == [joint.name for joint in problem.robot.joints]
     assert scales[1].parameters == ("a2", "alpha2", "d2", "theta2")
@@ -109,7 +226,7 @@ def test_joints_without_tolerances_start_from_a_millimetre_and_a_milliradian():
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("model", ["position", "distance", "distance-rotation"])
 def test_rows_of_every_model_tell_the_scales(model):
-    found = estimate_tolerances(drawn(model, n=30, estimate_tolerance="kind")[0]).estimated_tolerances
+    found = estimate_tolerances(drawn_problem(model, n=30, estimate_tolerance="kind")[0]).estimated_tolerances
     for one in found.scales:
         assert one.low / 2.0 < TRUE[one.group] / STATED[one.group] < 2.0 * one.high
 
@@ -119,7 +236,8 @@ def test_pairs_taken_for_independent_do_not_tell_of_more_corrections():
     """All pairs of ten poses: what they share is counted in what they say of corrections, and the estimate is that."""
     choices = {"n": 10, "pairing": Pairing("all"), "estimate_tolerance": "kind"}
     shared, independent = (
-        estimate_tolerances(drawn("distance", pair_errors=errors, **choices)[0]) for errors in ("shared", "independent")
+        estimate_tolerances(drawn_problem("distance", pair_errors=errors, **choices)[0])
+        for errors in ("shared", "independent")
     )
     for a, b in zip(shared.estimated_tolerances.scales, independent.estimated_tolerances.scales, strict=True):
         assert b.seen < a.seen + 0.05
@@ -128,7 +246,7 @@ def test_pairs_taken_for_independent_do_not_tell_of_more_corrections():
 
 @pytest.mark.slow
 def test_noise_and_tolerances_are_estimated_together():
-    problem, _ = drawn(n=30, estimate_tolerance="kind", estimate_noise=True)
+    problem, _ = drawn_problem(n=30, estimate_tolerance="kind", estimate_noise=True)
     tripled = replace(problem.measurements, sigma_position=3.0 * problem.measurements.sigma_position)
     problem = build_problem(problem.robot, tripled, problem.options)
     solution = estimate_tolerances(problem, estimate_noise)
@@ -140,7 +258,7 @@ def test_noise_and_tolerances_are_estimated_together():
 
 @pytest.mark.slow
 def test_with_a_robust_loss_gross_errors_do_not_reach_the_scales():
-    problem, _ = drawn(n=30, estimate_tolerance="kind", loss="cauchy")
+    problem, _ = drawn_problem(n=30, estimate_tolerance="kind", loss="cauchy")
     position = problem.measurements.position.copy()
     position[:2] += 0.05
     problem = build_problem(problem.robot, replace(problem.measurements, position=position), problem.options)
@@ -149,7 +267,7 @@ def test_with_a_robust_loss_gross_errors_do_not_reach_the_scales():
 
 
 def test_an_arm_that_is_only_evaluated_keeps_its_tolerances():
-    problem, _ = drawn(n=0, n_test=12, frame="unknown", estimate_tolerance="kind")
+    problem, _ = drawn_problem(n=0, n_test=12, frame="unknown", estimate_tolerance="kind")
     assert estimate_tolerances(problem).estimated_tolerances is None
 
 
