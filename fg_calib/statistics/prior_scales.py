@@ -231,12 +231,13 @@ def fit_scales(corrections: Corrections) -> EstimatedScales:
     """
     modes = (_climb(ScalePosterior(corrections, np.full(len(corrections.member), start))) for start in STARTS)
     mode = max(modes, key=lambda mode: mode.value)
-    theta, axes = mode.theta, np.linalg.cholesky(mode.curvature_covariance).T.copy()
+    theta = mode.theta
+    axes: Floats = np.linalg.cholesky(mode.curvature_covariance).T.astype(np.float64)
     for k, axis in enumerate(axes.copy()):
         density: Floats = np.exp([ScalePosterior(corrections, mode.theta + t * axis).value - mode.value for t in GRID])
         mean = GRID @ density / density.sum()
         theta = theta + mean * axis
-        axes[k] *= np.sqrt((GRID - mean) ** 2 @ density / density.sum())
+        axes[k] = axis * np.sqrt((GRID - mean) ** 2 @ density / density.sum())
     return EstimatedScales(ScalePosterior(corrections, theta), axes)
 
 
