@@ -51,9 +51,10 @@ from fg_calib.graph.factors import prior_rows
 from fg_calib.graph.information import whitened_triangle
 from fg_calib.graph.problem import Problem, reweighted_at
 from fg_calib.measurements import residuals
-from fg_calib.measurements.dataset import Measurements, Noise, Pairs, rotation_angle
+from fg_calib.measurements.dataset import Measurements, Noise, Pairs
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
+from fg_calib.robot.rotations import rotation_angle
 from fg_calib.simulation.configurations import BoardViews, GivenReadings, Placement
 from fg_calib.simulation.instruments import (
     BoardCamera,

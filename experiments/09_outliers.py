@@ -34,9 +34,10 @@ from scipy.spatial.transform import Rotation
 
 import fg_calib
 from fg_calib.errors import CalibrationError
-from fg_calib.measurements.dataset import Measurements, Pairs, rotation_angle
+from fg_calib.measurements.dataset import Measurements, Pairs
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
+from fg_calib.robot.rotations import rotation_angle
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]

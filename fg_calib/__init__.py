@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from fg_calib.graph.extension import DistanceFactor, RotationAngleFactor, expand
     from fg_calib.graph.problem import Problem
     from fg_calib.graph.solver import Solution, SolverOptions, levenberg_marquardt_params, solve
+    from fg_calib.initialization.camera import Camera
     from fg_calib.io.columns import Column
     from fg_calib.io.history import History, history_of
     from fg_calib.io.job import read_job
@@ -45,8 +46,7 @@ if TYPE_CHECKING:
     from fg_calib.io.urdf import read_urdf
     from fg_calib.job import Job
     from fg_calib.measurements.dataset import Measurements, Noise
-    from fg_calib.measurements.kinds.pixel import Camera
-    from fg_calib.measurements.series import KnownPoint, Own, Table
+    from fg_calib.measurements.table import CustomMeasurements, KnownPoint, Table
     from fg_calib.monitoring.check import Check, Explanation
     from fg_calib.observability.cramer_rao import Bound, cramer_rao
     from fg_calib.observability.identifiability import Identifiability, observe_configurations, observe_structure
@@ -119,8 +119,8 @@ _HOMES = {
     "fg_calib.statistics.variance_components": ("estimate_noise",),
     "fg_calib.graph.build": ("build_problem", "problem_of"),
     "fg_calib.graph.problem": ("Problem",),
-    "fg_calib.measurements.kinds.pixel": ("Camera",),
-    "fg_calib.measurements.series": ("KnownPoint", "Own", "Table"),
+    "fg_calib.initialization.camera": ("Camera",),
+    "fg_calib.measurements.table": ("KnownPoint", "CustomMeasurements", "Table"),
     "fg_calib.pages": ("write_report",),
     "fg_calib.prediction.predict": ("predict", "write_prediction"),
     "fg_calib.prediction.prediction": ("PredictedErrors",),
@@ -158,6 +158,7 @@ __all__ = [
     "Column",
     "Comparison",
     "Correction",
+    "CustomMeasurements",
     "Design",
     "DistanceFactor",
     "Explanation",
@@ -177,7 +178,6 @@ __all__ = [
     "Measurements",
     "Noise",
     "Options",
-    "Own",
     "Pairing",
     "PartsSolution",
     "PredictedErrors",

@@ -56,7 +56,7 @@ from fg_calib.io.robot_file import read_robot
 from fg_calib.job import Job
 from fg_calib.measurements.checks import check_readings
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.monitoring.fingerprints import counted_before
 from fg_calib.options import NEAR, Options, Pairing, check_flag, check_names, did_you_mean, listed
 from fg_calib.progress import tell

@@ -7,26 +7,30 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from numbers import Integral, Real
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from fg_calib.arguments import as_hinted
 from fg_calib.errors import InputError, shown
 from fg_calib.sizes import LEAST_SIZE, MOST_SIZE, ORDINARY
 
-Model = Literal[
-    "pose",
-    "position",
-    "orientation",
-    "distance",
-    "rotation",
-    "distance-rotation",
-    "anchor",
-    "plane",
-    "board",
-    "pixels",
-]
-"""What a calibration compares with the measurements: each pose, or part of it; what lies between two poses; lengths to
-anchors, distances from planes; boards as a camera sees them, as poses or corner by corner."""
+MODELS: dict[str, str] = {
+    "pose": "pose",
+    "position": "pose",
+    "orientation": "pose",
+    "distance": "pair",
+    "rotation": "pair",
+    "distance-rotation": "pair",
+    "anchor": "anchor",
+    "plane": "plane",
+    "board": "board",
+    "pixels": "pixel",
+}
+"""What a calibration compares with the measurements, each with the file of `measurements.kinds` that describes it."""
+
+if TYPE_CHECKING:
+    Model = str
+else:
+    Model = Literal[tuple(MODELS)]
 
 FrameKnowledge = Literal["known", "unknown"]
 """Whether the measurement frame is the base, or world_T_base is estimated too."""
@@ -51,8 +55,6 @@ SharedScale = Literal["kind", "joint"]
 
 LengthUnit = Literal["m", "cm", "mm", "um", "in"]
 AngleUnit = Literal["rad", "deg", "mrad"]
-
-MODELS: tuple[Model, ...] = get_args(Model)
 
 
 def check(key: str, value: object, possible: Any) -> Any:

@@ -5,15 +5,9 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.graph.noise import JOINT_NOISE
 from fg_calib.measurements import residuals
-from fg_calib.measurements.kinds import (
-    Distance,
-    Orientation,
-    PointDistance,
-    Position,
-    RotationAngle,
-    SamePoint,
-    TouchedPoint,
-)
+from fg_calib.measurements.kinds.contact import PointDistance, TouchedPoint
+from fg_calib.measurements.kinds.pair import Distance, RotationAngle, SamePoint
+from fg_calib.measurements.kinds.pose import Orientation, Position
 from fg_calib.measurements.moments import angle_moments, length_moments
 from fg_calib.measurements.residuals import Block, unit_whitening
 from fg_calib.robot.kinematics import forward
@@ -93,7 +87,7 @@ class SeriesRows:
         self.joint_factor = state.factors.get(JOINT_NOISE, 1.0)
         self.joints = self._sensitivity(lambda k, h: self._arm(self.q + h * np.eye(len(self.q[0]))[k]), len(self.q[0]))
         self.sources = {"joints": self.joints * self.m.sigma_joint * self.joint_factor}
-        if all(isinstance(part, Distance | RotationAngle) for part in parts_of(s.kind)):
+        if all(isinstance(part, Distance | RotationAngle) for part in s.kind.parts):
             self._pairs()
         else:
             self.own = self._diagonal((s.sigma * self.factors) ** 2)
@@ -111,14 +105,14 @@ class SeriesRows:
         trace, of_poses, poses = zero.copy(), zero, None
         if s.formed:
             poses = np.zeros((s.n, s.kind.residual_dim, 2, 3 * s.kind.residual_dim))
-            for i, part in enumerate(parts_of(s.kind)):
+            for i, part in enumerate(s.kind.parts):
                 move = self._moved if isinstance(part, Distance) else self._turned
                 sigma = m.sigma_position if isinstance(part, Distance) else m.sigma_orientation
                 G = self._sensitivity(move, 3)[:, i] * self.factors[i] * sigma[s.ends]
                 poses[:, i, :, 3 * i : 3 * i + 3] = -G
                 trace[:, i] += self.factors[i] ** 2 * np.sum(sigma[s.ends] ** 2, axis=(1, 2))
             of_poses = np.sum(poses**2, axis=(2, 3))
-        for i, part in enumerate(parts_of(s.kind)):
+        for i, part in enumerate(s.kind.parts):
             trace[:, i] += 0.0 if estimated else self.joint_factor**2 * self._trace_of_joints(part)
         value, along = self.r + s.data, of_poses + of_joints
         across = np.maximum(trace - along, 0.0) / 2.0
@@ -127,7 +121,7 @@ class SeriesRows:
             (length_moments if isinstance(part, Distance) else angle_moments)(
                 value[:, i], along[:, i], across[:, i], own[:, i]
             )
-            for i, part in enumerate(parts_of(s.kind))
+            for i, part in enumerate(s.kind.parts)
         ]
         excess, slope, variance = (
             np.stack([getattr(one, name) for one in moments], axis=1) for name in ("excess", "slope", "variance")
@@ -168,7 +162,7 @@ class SeriesRows:
 
     def _rows(self, ends, still=None):
         rows, column = [], 0
-        for part in parts_of(self.series.kind):
+        for part in self.series.kind.parts:
             measured = self.series.data[:, column : column + part.width]
             own = (measured, self.points)
             rows.append(predicted(part, *ends, *own) if still is None else change(part, *ends, still, *own))
@@ -237,7 +231,7 @@ def dense(problem, parameters):
         if "joints" in rows.sources and problem.state.joint_errors is not None and "joints" not in shared:
             shared.append("joints")
         own = rows.own.copy()
-        if shared and all(isinstance(part, Distance | RotationAngle) for part in parts_of(rows.series.kind)):
+        if shared and all(isinstance(part, Distance | RotationAngle) for part in rows.series.kind.parts):
             of_each = sum(rows.sources[name].shape[3] for name in shared)
             many = len(train) * residual_dim > len(np.unique(rows.series.ends[train])) * of_each
             if rows.series.formed and many and any(name != "joints" for name in shared):

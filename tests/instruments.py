@@ -6,7 +6,7 @@ from simulated import small_arm, true_robot
 
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.kinds import Camera
-from fg_calib.measurements.series import KnownPoint, Table
+from fg_calib.measurements.table import KnownPoint, Table
 from fg_calib.robot.kinematics import pose
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3, "tool": 5e-3}

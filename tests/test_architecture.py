@@ -27,8 +27,8 @@ FOLDERS = (
     "progress",
     "executors",
     "robot",
-    "measurements",
     "initialization",
+    "measurements",
     "job",
     "graph",
     "observability",
@@ -58,8 +58,6 @@ UPWARD = {
     "graph/information": {"observability/indices"},
     "graph/knowledge": {"observability/indices"},
     "graph/linearised": {"observability/indices"},
-    "initialization/start": {"graph/factors", "graph/problem"},
-    "measurements/models/starts": {"initialization/landmarks"},
     "observability/cramer_rao": {"prediction/expected_error"},
     "prediction/correction": {"calibration"},
     "prediction/predict": {

@@ -30,7 +30,9 @@ sys.path.insert(0, str(Path(__file__).parent))
 import special_kernels
 from linearise import ROOT, build_case
 
-from fg_calib.measurements.kinds import Distance, Orientation, Position, RotationAngle, stack
+from fg_calib.measurements.kinds import stack
+from fg_calib.measurements.kinds.pair import Distance, RotationAngle
+from fg_calib.measurements.kinds.pose import Orientation, Position
 from fg_calib.measurements.residuals import _NOTHING, CHUNK, pack
 from fg_calib.robot.kernels import fill
 from fg_calib.robot.kinematics import Chain

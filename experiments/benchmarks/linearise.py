@@ -52,7 +52,8 @@ import fg_calib
 from fg_calib.graph.factors import Variables, build_variables, row_factor
 from fg_calib.graph.rows import Part, RowSet
 from fg_calib.measurements import residuals
-from fg_calib.measurements.kinds import Distance, RotationAngle, stack
+from fg_calib.measurements.kinds import stack
+from fg_calib.measurements.kinds.pair import Distance, RotationAngle
 from fg_calib.measurements.residuals import Block
 from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.threads import one_blas_thread, processors

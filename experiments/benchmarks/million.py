@@ -39,7 +39,8 @@ from scipy.spatial.transform import Rotation
 import fg_calib
 from fg_calib.graph.factors import build_variables
 from fg_calib.measurements import residuals
-from fg_calib.measurements.kinds import Distance, RotationAngle, stack
+from fg_calib.measurements.kinds import stack
+from fg_calib.measurements.kinds.pair import Distance, RotationAngle
 from fg_calib.measurements.residuals import Block
 from fg_calib.threads import one_blas_thread
 

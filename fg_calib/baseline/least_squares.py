@@ -38,12 +38,11 @@ from fg_calib.arguments import checked
 from fg_calib.arrays import Brief
 from fg_calib.errors import InputError
 from fg_calib.measurements import residuals
+from fg_calib.measurements.build import Dataset, build_dataset
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.gathering import Dataset, gather
-from fg_calib.measurements.kinds import Distance, RotationAngle, parts_of
-from fg_calib.measurements.models.pairs import usable_pairs
+from fg_calib.measurements.kinds.pair import usable_pairs
 from fg_calib.measurements.residuals import Block, unit_whitening
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.options import (
     PAIR_MODELS,
     POSE_MODELS,
@@ -215,7 +214,7 @@ def _dataset(
     if model not in (*POSE_MODELS, *PAIR_MODELS):
         raise InputError("model", f"found {model!r}", f"one of {', '.join((*POSE_MODELS, *PAIR_MODELS))} here")
     known: FrameKnowledge = "known" if model in PAIR_MODELS else frame
-    return gather(robot, [Table(m if weighted else _with_unit_noise(m), model, as_pairing(pairing), known)])
+    return build_dataset(robot, [Table(m if weighted else _with_unit_noise(m), model, as_pairing(pairing), known)])
 
 
 def _with_unit_noise(m: Measurements) -> Measurements:
@@ -347,11 +346,11 @@ class _Rows:
 
     def differentiable(self, chain: Chain) -> _Rows:
         """The rows without distances and angles of pairs that have no derivative at the start."""
-        parts = parts_of(self.block.kind)
-        if not all(isinstance(part, Distance | RotationAngle) for part in parts):
+        parts = self.block.kind.parts
+        if not all(part.ends == 2 and part.quantity in ("distance", "angle") and not part.is_contact for part in parts):
             return self
         predicted = residuals.residual(self.block, chain) + self.block.data
-        is_angle = np.array([isinstance(part, RotationAngle) for part in parts])
+        is_angle = np.array([part.quantity == "angle" for part in parts])
         excluded = (predicted < NOT_DIFFERENTIABLE) | (is_angle & (predicted > np.pi - NOT_DIFFERENTIABLE))
         return replace(self, use=self.use & ~excluded)
 
@@ -385,9 +384,9 @@ def _train_rows(robot: Robot, data: Dataset) -> list[_Rows]:
         block = Block(s.kind, trig, s.ends[train], s.data[train], unit, unset, s.source)
         sigma: Floats = s.sigma
         if s.formed:  # each pair as if it were alone
-            pairs = usable_pairs(data.tables[s.table])
-            by_kind = {Distance: pairs.sigma_distance, RotationAngle: pairs.sigma_angle}
-            columns = [np.nan_to_num(by_kind[type(part)][s.number], nan=1.0) for part in parts_of(s.kind)]
+            pairs = usable_pairs(data.tables[s.table], ("distance" in s.kind.names, "angle" in s.kind.names))
+            sigma = {"distance": pairs.sigma_distance, "angle": pairs.sigma_angle}
+            columns = [np.nan_to_num(sigma[part.quantity][s.number], nan=1.0) for part in s.kind.parts]
             sigma = np.stack(columns, axis=1)
         covariance = sigma[train][:, :, None] ** 2 * np.eye(h)
         if s.covariance is not None and not s.formed:

@@ -33,7 +33,7 @@ from fg_calib.designs.task import N_TASK, Task, is_fitted
 from fg_calib.errors import InputError, ProblemError
 from fg_calib.graph.problem import Problem
 from fg_calib.job import Job
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.observability.indices import Observability
 from fg_calib.options import check, check_flag, check_number
 from fg_calib.prediction.expected_error import PoseRms

@@ -28,11 +28,12 @@ from fg_calib.graph.build import true_problem
 from fg_calib.graph.factors import prior_rows
 from fg_calib.graph.information import whitened_jacobian
 from fg_calib.graph.problem import Problem
-from fg_calib.measurements.dataset import Measurements, Pairs, rotation_angle
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.dataset import Measurements, Pairs
+from fg_calib.measurements.table import Table
 from fg_calib.options import PAIR_MODELS, Options
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
+from fg_calib.robot.rotations import rotation_angle
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

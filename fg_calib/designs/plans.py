@@ -16,7 +16,7 @@ from fg_calib.designs.pool import Pool, pool_of
 from fg_calib.designs.search import greedy
 from fg_calib.designs.system import system_of
 from fg_calib.designs.task import Posterior, Task
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.options import Pairing
 
 Floats = NDArray[np.float64]

@@ -29,7 +29,8 @@ from fg_calib.graph.information import whitened_jacobian
 from fg_calib.graph.knowledge import coordinates_of
 from fg_calib.graph.problem import Problem
 from fg_calib.measurements.dataset import Noise
-from fg_calib.measurements.series import KnownPoint, Table, Unknowns
+from fg_calib.measurements.landmarks import Landmarks
+from fg_calib.measurements.table import KnownPoint, Table
 from fg_calib.observability.random_configurations import Places, places_of
 from fg_calib.options import PAIR_MODELS, Gauge, Model, Options, Pairing
 from fg_calib.robot.model import Robot
@@ -192,7 +193,7 @@ def _says_something(table: Table) -> bool:
 def known_rows_of(before: Problem | None, problem: Problem) -> Floats:
     """What a problem's rows say, whitened, by the columns of another problem of the same arm and tables.
 
-    Unknowns that the other has not are eliminated.
+    Landmarks that the other has not are eliminated.
 
     Returns:
         Shape (m, n_columns + n_nuisance) of the other's.
@@ -227,7 +228,7 @@ def _place_of(problem: Problem, columns: Integers) -> Integers:
     return place
 
 
-def _columns_by_name(variables: Variables, unknowns: Unknowns) -> dict[tuple[str, str], Integers]:
+def _columns_by_name(variables: Variables, unknowns: Landmarks) -> dict[tuple[str, str], Integers]:
     """Columns of each variable: of the core's by its symbol, of the unknowns' by letter and name."""
     found = {("", v.symbol): np.arange(v.columns.start, v.columns.stop) for v in variables.items}
     for letter, name in zip(unknowns.letters, unknowns.names, strict=True):
@@ -400,7 +401,7 @@ def _silent(scenario: Scenario, readings: Mapping[str, Floats]) -> Scenario:
 
 def _without(noise: Noise) -> Noise:
     """No noise of the kinds that are stated; of others there is still none stated."""
-    nothing: dict[str, Any] = {f.name: None if getattr(noise, f.name) is None else 0.0 for f in fields(Noise)}
+    nothing: dict[str, Any] = {f.name: None if getattr(noise, f.name) is None else 0.0 for f in fields(Noise)[:-1]}
     return Noise(**nothing)
 
 

@@ -20,7 +20,7 @@ from fg_calib.graph.factors import pose_of
 from fg_calib.graph.knowledge import coordinates_of
 from fg_calib.graph.problem import Problem
 from fg_calib.measurements.dataset import Measurements, Noise
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.options import PAIR_MODELS, POSE_MODELS
 from fg_calib.robot.kinematics import pose
 from fg_calib.simulation.configurations import BoardViews, Configurations, Placement, RandomReadings

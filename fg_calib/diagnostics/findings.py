@@ -36,8 +36,7 @@ from fg_calib.diagnostics.verdict import (
 from fg_calib.graph.noise import JOINT_NOISE, PairNoise
 from fg_calib.graph.problem import at_parameters, reweighted_at
 from fg_calib.graph.solver import Solution
-from fg_calib.measurements.kinds import AnchorContact
-from fg_calib.measurements.models.pairs import missing_figures
+from fg_calib.measurements.kinds.pair import missing_values
 from fg_calib.observability.parallel_axes import MissingMotion
 from fg_calib.robot.kinematics import forward
 from fg_calib.statistics.covariance import Spread
@@ -126,7 +125,7 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
         *_of_bent_rows(solution, spread, fit.residuals, fit.goodness, too_large=fit.chi_square.too_large),
         *of_curvature(beyond_linear(solution, spread)),
         *_of_noise(solution, fit.residuals, fit.goodness),
-        *(Statement(text, finding=False) for table in problem.data.tables for text in missing_figures(table)),
+        *(Statement(text, finding=False) for table in problem.data.tables for text in missing_values(table)),
     ]
     setup, structure = SetupCheck(), of_structure(noise_like)
     doubts = any(s.finding for s in (*statements, *structure))
@@ -224,7 +223,7 @@ def _motion(solution: Solution, table: ResidualTable, number: int, kind: str) ->
         if s.kind.ends == 1:
             trig = problem.data.trigs(problem.robot)[number]
             there = forward(at.chains[number].without_columns(), trig, s.ends[s.train, 0]).position
-            if isinstance(s.kind, AnchorContact):
+            if s.kind.is_contact and s.kind.n_nuisances and not s.kind.turned_back:
                 there = at.coordinates[s.nuisances[s.train]]
             stays = not np.ptp(there, axis=0).any()
             motions.append(problem.robot.reach if stays else float(np.sqrt(np.mean(np.var(there, axis=0)))))

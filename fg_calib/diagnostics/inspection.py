@@ -24,7 +24,7 @@ from fg_calib.graph.problem import Problem, tables_of
 from fg_calib.graph.solver import unsolved
 from fg_calib.job import Job
 from fg_calib.measurements.limits import outside_limits
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.observability.identifiability import Identifiability, identifiability_of
 from fg_calib.observability.reasons import NOT_EXCITED
 from fg_calib.prediction.expected_error import ExpectedError, expected_error

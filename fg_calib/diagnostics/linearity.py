@@ -22,10 +22,10 @@ from fg_calib.errors import SolverError
 from fg_calib.graph.linearised import Linearised
 from fg_calib.graph.problem import some_rows, started_at
 from fg_calib.graph.solver import Solution
-from fg_calib.initialization.hand_eye import nearest_rotation
 from fg_calib.prediction.expected_error import without_rigid_motion
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.kinematics import forward
+from fg_calib.robot.rotations import nearest_rotation
 from fg_calib.statistics.covariance import Spread
 
 Floats = NDArray[np.float64]

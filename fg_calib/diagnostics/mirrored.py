@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from fg_calib.graph.problem import Problem, assembled, at_parameters
 from fg_calib.graph.rows import At
 from fg_calib.graph.solver import Solution
-from fg_calib.measurements.kinds import AnchorContact, AnchorDistance, PlaneDistance
-from fg_calib.measurements.series import Unknowns
+from fg_calib.measurements.kinds.anchor import AnchorContact, AnchorDistance
+from fg_calib.measurements.kinds.plane import PlaneDistance
+from fg_calib.measurements.landmarks import Landmarks
 from fg_calib.robot.kinematics import forward
 
 Floats = NDArray[np.float64]
@@ -95,7 +96,7 @@ def _anchor(solution: Solution, at: At, first: int) -> MirrorImage | None:
     return MirrorImage(assembled(problem, start), before)
 
 
-def _with_constants(problem: Problem, unknowns: Unknowns, start: Floats) -> Problem:
+def _with_constants(problem: Problem, unknowns: Landmarks, start: Floats) -> Problem:
     """A problem whose unknowns are started elsewhere, those too that are not estimated."""
     data = replace(problem.data, unknowns=unknowns)
     others = np.nan_to_num(np.concatenate(unknowns.starts))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, FrameKnowledge, Model
 from fg_calib.robot.model import Robot
 

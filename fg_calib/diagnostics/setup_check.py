@@ -23,7 +23,7 @@ from fg_calib.diagnostics.setup_hypotheses import About, Mistake, still_joints, 
 from fg_calib.diagnostics.typical_residuals import TypicalResidual, fitted_residuals, residuals_at
 from fg_calib.initialization.hand_eye import Frame
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.options import FrameKnowledge, Model, check, check_flag
 from fg_calib.robot.model import Robot
 from fg_calib.threads import one_blas_thread

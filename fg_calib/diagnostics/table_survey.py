@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from fg_calib.graph.noise import PairNoise
 from fg_calib.graph.problem import Problem
 from fg_calib.measurements.dataset import Measurements, Pairs
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -25,10 +25,11 @@ from scipy.spatial.transform import Rotation
 from fg_calib.diagnostics.setup import Setup
 from fg_calib.initialization import hand_eye as frames
 from fg_calib.initialization.hand_eye import Frame, Unknown
-from fg_calib.measurements.dataset import Measurements, Pairs, rotation_angle
+from fg_calib.measurements.dataset import Measurements, Pairs
 from fg_calib.options import PAIR_MODELS, POSE_MODELS
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
+from fg_calib.robot.rotations import rotation_angle
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]

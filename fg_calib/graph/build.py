@@ -15,16 +15,15 @@ from fg_calib.errors import ProblemError
 from fg_calib.graph.factors import Variables, prior_rows
 from fg_calib.graph.information import observability_of, whitened_triangle
 from fg_calib.graph.knowledge import coordinates_of
-from fg_calib.graph.problem import Problem, problem_at, tables_of, variables_of
+from fg_calib.graph.problem import Problem, problem_at, start_of, tables_of, variables_of
 from fg_calib.graph.tolerances import with_first_tolerances
-from fg_calib.initialization.start import start_of
 from fg_calib.job import Job
+from fg_calib.measurements.build import Dataset, build_dataset, check_repeats
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.gathering import Dataset, check_repeats, gather
-from fg_calib.measurements.kinds import Frames, check_derivatives, check_start, is_ours
-from fg_calib.measurements.models.pairs import missing_figures
-from fg_calib.measurements.models.predictions import predictions
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.kinds import INSTRUMENTS, Frames, check_derivatives, check_start, is_ours
+from fg_calib.measurements.kinds.pair import missing_values
+from fg_calib.measurements.predictions import predict_measurements
+from fg_calib.measurements.table import Table
 from fg_calib.observability.indices import determined, singular_values
 from fg_calib.observability.random_configurations import Places, frame_names
 from fg_calib.options import (
@@ -82,7 +81,7 @@ def build_problem(
         if not table.uses_pairs and table.measurements.pairs is not None:
             source = table.measurements.pairs.source
             _log.warning("%s: not used, model %s is of poses", source, table.model)
-        for text in missing_figures(table):
+        for text in missing_values(table):
             _log.warning("%s", text)
         check_repeats(table)
     return problem_of_tables(robot, tables, options)
@@ -108,7 +107,7 @@ def problem_of_tables(robot: Robot, tables: Sequence[Table], options: Options) -
         robot, options, tables = _for_evaluation(robot, options, tables)
     elif options.estimate_tolerance is not None:
         robot = with_first_tolerances(robot)
-    data = gather(robot, tables)
+    data = build_dataset(robot, tables)
     _check_frames(data)
     variables = variables_of(robot, data, options)
     start = start_of(robot, data, variables)
@@ -201,9 +200,10 @@ def predicted_problem(
         pair_errors: Whether pairs of one configuration share its errors or count as independent.
     """
     options = Options(model, as_pairing(pairing), frame, gauge="none", pair_errors=pair_errors)
-    if options.model == "pixels":
-        options = replace(options, model="board")
-    table = Table(predictions(robot, measurements, options.model), options.model, options.pairing, options.frame)
+    options = replace(options, model=INSTRUMENTS[options.model].random_model(Table(measurements)))
+    table = Table(
+        predict_measurements(robot, measurements, options.model), options.model, options.pairing, options.frame
+    )
     return true_problem(robot, table, options)
 
 
@@ -219,11 +219,9 @@ def true_problem(
         options: Whether pairs share errors; the tables' own choices count for the rest.
         places: Where frames and unknowns are, of which a few rows may not tell (see `places_of`).
     """
-    data, places = gather(robot, tables_of(tables, options), predicted=True), places or {}
+    data, places = build_dataset(robot, tables_of(tables, options), predicted=True), places or {}
     unknowns = data.unknowns
-    for i, name in enumerate(zip(unknowns.letters, unknowns.names, strict=True)):
-        if name in places:
-            unknowns.starts[i] = places[name].copy()
+    unknowns.place(places)
     variables = variables_of(robot, data, options)
     start = start_of(robot.with_estimated([]), data, variables)  # the arm as it is, what it measures where it is
     for name in places:

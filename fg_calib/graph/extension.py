@@ -21,7 +21,8 @@ from fg_calib.errors import CalibrationError, InputError, ProblemError, shown
 from fg_calib.graph.factors import Variable, Variables, custom_factor, factor_columns, prior_factors, row_factor
 from fg_calib.graph.problem import Problem, assembled, known_factors
 from fg_calib.graph.rows import Part, RowSet
-from fg_calib.measurements.kinds import Distance, Kind, RotationAngle
+from fg_calib.measurements.kinds import Kind
+from fg_calib.measurements.kinds.pair import Distance, RotationAngle
 from fg_calib.measurements.residuals import Block
 from fg_calib.options import check_number
 

@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from fg_calib.arrays import Brief
 from fg_calib.errors import SolverError
 from fg_calib.graph.rows import At, RowSet
-from fg_calib.measurements.series import Unknowns
+from fg_calib.measurements.landmarks import Landmarks
 from fg_calib.robot.kinematics import Chain, build_chain
 from fg_calib.robot.model import FRAME_KINDS, Robot, names_of
 from fg_calib.robot.rotations import QUARTER_TURN, yaw_pitch_roll
@@ -83,6 +83,16 @@ class Variable:
     def places(self) -> NDArray[np.int64]:
         """`parameters` to index with."""
         return np.array(self.parameters, dtype=np.int64)
+
+    @property
+    def number(self) -> int:
+        """Number in its symbol: of a measurement frame that of its table."""
+        return int(gtsam.symbolIndex(self.key))
+
+    @property
+    def letter(self) -> str:
+        """Letter of its symbol."""
+        return chr(gtsam.symbolChr(self.key))
 
     @property
     def is_pose(self) -> bool:
@@ -269,7 +279,7 @@ class Variables(Brief):
             delta.insert(v.key, step[v.columns])
         return values.retract(delta)
 
-    def with_unknowns(self, unknowns: Unknowns, estimated: NDArray[np.bool_]) -> Variables:
+    def with_unknowns(self, unknowns: Landmarks, estimated: NDArray[np.bool_]) -> Variables:
         """The same with the measurements' unknowns as nuisance variables, those that are estimated."""
         column, place = self.n_columns + self.n_nuisance, self.nuisance_span.stop
         coordinates: list[int] = []

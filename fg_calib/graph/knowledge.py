@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.factors import Variables, build_variables, custom_factor, eliminate, pose_of
-from fg_calib.measurements.series import Unknowns
+from fg_calib.measurements.landmarks import Landmarks
 from fg_calib.observability.indices import determined
 from fg_calib.options import FrameKnowledge, Model
 from fg_calib.robot.model import Robot
@@ -160,7 +160,7 @@ class Knowledge(FrozenArrays):
         left = eliminate(self.rows, self.right, self.variables.n_columns)
         return left.follow, left.inverse, left.unknown
 
-    def step_to(self, variables: Variables, unknowns: Unknowns, parameters: Floats) -> tuple[Floats, Floats]:
+    def step_to(self, variables: Variables, unknowns: Landmarks, parameters: Floats) -> tuple[Floats, Floats]:
         """The step from where the rows were linearised to a parameter vector, and its derivative.
 
         Args:
@@ -191,16 +191,16 @@ class Knowledge(FrozenArrays):
                 D[rows, place - variables.nuisance_span.start + variables.n_columns] = 1.0
         return s, D
 
-    def seen_by(self, variables: Variables, unknowns: Unknowns) -> Knowledge:
+    def seen_by(self, variables: Variables, unknowns: Landmarks) -> Knowledge:
         """The same of what a problem estimates, the other unknowns eliminated."""
         return self.about([n for n in self.unknowns if coordinates_of(variables, unknowns, n) is not None])
 
-    def at_parameters(self, variables: Variables, unknowns: Unknowns, parameters: Floats) -> tuple[Floats, Floats]:
+    def at_parameters(self, variables: Variables, unknowns: Landmarks, parameters: Floats) -> tuple[Floats, Floats]:
         """The rows at a parameter vector and their derivatives, shapes (k,), (k, n of all the problem's columns)."""
         s, D = self.step_to(variables, unknowns, parameters)
         return self.right + self.rows @ s, self.rows @ D
 
-    def factor(self, variables: Variables, unknowns: Unknowns) -> gtsam.CustomFactor:
+    def factor(self, variables: Variables, unknowns: Landmarks) -> gtsam.CustomFactor:
         """The rows as a factor on all variables of a problem."""
 
         def rows(values: gtsam.Values) -> tuple[Floats, Floats]:
@@ -209,7 +209,7 @@ class Knowledge(FrozenArrays):
         return custom_factor([*variables.items, *variables.nuisance], self.n, lambda values: rows(values)[0], rows)
 
 
-def coordinates_of(variables: Variables, unknowns: Unknowns, name: Name) -> Integers | None:
+def coordinates_of(variables: Variables, unknowns: Landmarks, name: Name) -> Integers | None:
     """Where an unknown's coordinates stand in a parameter vector; None for one that is not there, or not estimated."""
     names = list(zip(unknowns.letters, unknowns.names, strict=True))
     if name not in names:

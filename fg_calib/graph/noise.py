@@ -19,13 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.errors import InputError
-from fg_calib.initialization.hand_eye import nearest_rotation
 from fg_calib.measurements import residuals
-from fg_calib.measurements.dataset import Measurements, rotation_angle
-from fg_calib.measurements.kinds import Distance, RotationAngle
+from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.moments import Moments, angle_moments, length_moments
 from fg_calib.measurements.residuals import Block, unit_whitening
-from fg_calib.measurements.series import Series
+from fg_calib.measurements.table import MeasurementBlock
+from fg_calib.robot import kernels
 from fg_calib.robot.kernels import vector_variances, whiten_small
 from fg_calib.robot.kinematics import (
     SPAN,
@@ -37,6 +36,7 @@ from fg_calib.robot.kinematics import (
     turning_of_base,
     turning_of_points,
 )
+from fg_calib.robot.rotations import nearest_rotation, rotation_angle
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -155,7 +155,7 @@ class RowNoise:
         joint_factor: What that of the joint readings is multiplied by.
     """
 
-    def __init__(self, series: Series, place: Place, state: NoiseState) -> None:
+    def __init__(self, series: MeasurementBlock, place: Place, state: NoiseState) -> None:
         self.series = series
         self.place = place
         families = [name.partition(".")[0] for name in series.kind.names]
@@ -315,7 +315,7 @@ class PairNoise(RowNoise):
 
     def _prepare(self, state: NoiseState) -> None:
         s = self.series
-        self._parts = [_QUANTITY[type(part)] for part in getattr(s.kind, "parts", (s.kind,))]
+        self._parts = [_COMPONENT[part.code] for part in s.kind.parts if part.code is not None]
         self._wanted = np.array([k in self._parts for k in (0, 1)])
         self._spread = state.spread
         wide = np.ones(2)
@@ -709,23 +709,25 @@ class PairNoise(RowNoise):
         return np.stack([np.sum(J[:, 3:] ** 2, axis=(1, 2)), np.sum(J[:, :3] ** 2, axis=(1, 2))], axis=1)
 
 
-_QUANTITY: dict[type, int] = {Distance: 0, RotationAngle: 1}
+_COMPONENT = {kernels.DISTANCE: 0, kernels.ROTATION_ANGLE: 1}
+"""Where the moments of a pair's distance and angle stand, by the code of its kind."""
+
 _MOMENTS = (length_moments, angle_moments)
 
 
-def row_noise(series: Series, place: Place, state: NoiseState) -> RowNoise:
+def row_noise(series: MeasurementBlock, place: Place, state: NoiseState) -> RowNoise:
     """The rows of a series and their noise."""
     return (PairNoise if _is_lengthened(series) else RowNoise)(series, place, state)
 
 
-def same_everywhere(series: Series, sigma_joint: Floats) -> bool:
+def same_everywhere(series: MeasurementBlock, sigma_joint: Floats) -> bool:
     """Whether the noise is the same at all parameters: what lengthens vectors, or comes from joint readings, is not."""
     return not _is_lengthened(series) and not (series.kind.ends and np.any(sigma_joint > 0.0))
 
 
-def _is_lengthened(series: Series) -> bool:
+def _is_lengthened(series: MeasurementBlock) -> bool:
     """Whether all its rows are distances and angles of pairs."""
-    return all(type(part) in _QUANTITY for part in getattr(series.kind, "parts", (series.kind,)))
+    return all(part.code in _COMPONENT for part in series.kind.parts)
 
 
 def whitening_of(covariance: Floats, used: Booleans) -> Floats:

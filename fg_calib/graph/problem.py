@@ -21,6 +21,8 @@ from fg_calib.errors import ProblemError, shown
 from fg_calib.graph.factors import (
     Variables,
     build_variables,
+    frame_of,
+    pose_of,
     prior_factors,
     prior_rows,
     row_factor,
@@ -29,10 +31,10 @@ from fg_calib.graph.factors import (
 from fg_calib.graph.knowledge import Knowledge
 from fg_calib.graph.noise import JOINT_NOISE, NoiseState, Place, RowNoise, row_noise, same_everywhere
 from fg_calib.graph.rows import At, RowSet, share_errors, whitened_rows
+from fg_calib.initialization.hand_eye import Frame
+from fg_calib.measurements.build import Dataset, start_frames
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.gathering import Dataset
-from fg_calib.measurements.kinds import TouchedPoint
-from fg_calib.measurements.series import Series, Table, by_station
+from fg_calib.measurements.table import MeasurementBlock, Table, by_station
 from fg_calib.options import Options
 from fg_calib.robot.kinematics import Chain, forward
 from fg_calib.robot.model import Parameter, Robot
@@ -144,8 +146,8 @@ class Problem(FrozenArrays):
         return [parameters[name] for name in self.variables.names[: self.variables.n_robot_columns]]
 
     @property
-    def pair_series(self) -> tuple[Series, ...]:
-        """Series of pairs of configurations."""
+    def pair_series(self) -> tuple[MeasurementBlock, ...]:
+        """MeasurementBlock of pairs of configurations."""
         return tuple(s for s in self.data.series if s.kind.ends == 2)
 
     @property
@@ -328,6 +330,41 @@ def at_parameters(problem: Problem, parameters: Floats, trigs: Sequence[Floats] 
     return problem.variables.at(parameters, contact_points(problem.data, at.chains, trigs))
 
 
+def start_of(robot: Robot, data: Dataset, variables: Variables) -> Floats:
+    """The nominal parameters with frames, tool and landmarks from closed forms, as a parameter vector.
+
+    Args:
+        robot: The nominal robot.
+        data: The tables.
+        variables: What is estimated.
+
+    Raises:
+        ProblemError: No image shows enough of a board.
+    """
+    start, tool = variables.nominal(), np.array(robot.owned_by(robot.n_joints + 1), dtype=np.int64)
+    nominal, free, bare = np.zeros(6), np.zeros(6, dtype=np.bool_), robot.nominal
+    if len(tool):
+        nominal, free, bare[tool] = start[tool], np.array([robot.parameters[i].estimated for i in tool]), 0.0
+    before = Frame(pose_of(nominal).rotation().matrix(), nominal[:3])
+    begun = start_frames(robot.with_values(bare), data, before, free)
+    if begun.found.any():
+        start[tool[begun.found]] = _coordinates(begun.tool, nominal)[begun.found]
+    for v in variables.frames:
+        if v.number in begun.frames:
+            start[v.places] = _coordinates(begun.frames[v.number])
+    if variables.nuisance:
+        at = variables.at(start)
+        places = np.where(np.isnan(begun.places), contact_points(data, at.chains, data.trigs(robot)), begun.places)
+        there = variables.coordinates >= 0
+        start[variables.coordinates[there]] = places[there]
+    return start
+
+
+def _coordinates(frame: Frame, near: Floats | None = None) -> Floats:
+    """x, y, z, yaw, pitch, roll of a frame (see `frame_of`)."""
+    return frame_of(gtsam.Pose3(gtsam.Rot3(frame.rotation), frame.translation), near)
+
+
 def contact_points(data: Dataset, chains: Sequence[Chain], trigs: Sequence[Floats]) -> Floats:
     """Of each unknown coordinate of a touched point the mean of what touched it, of others the start as given."""
     found: Floats = np.concatenate([np.zeros(0), *data.unknowns.starts])
@@ -341,13 +378,13 @@ def contact_points(data: Dataset, chains: Sequence[Chain], trigs: Sequence[Float
     return found
 
 
-def says_where(data: Dataset, series: Series) -> Booleans:
+def says_where(data: Dataset, series: MeasurementBlock) -> Booleans:
     """Which measurements say where points are that start there: touches, test ones where no train row touched.
 
     Returns:
         Shape (n,).
     """
-    if not isinstance(series.kind, TouchedPoint):
+    if not (series.kind.is_contact and series.kind.n_nuisances):
         return np.zeros(series.n, dtype=np.bool_)
     first, start = series.nuisances[:, 0], np.concatenate([np.zeros(0), *data.unknowns.starts])
     says: Booleans = np.isnan(start[first]) & ~(series.test & np.isin(first, first[~series.test]))

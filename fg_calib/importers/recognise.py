@@ -261,7 +261,7 @@ def _model(present: Sequence[str]) -> Model | None:
     placed = {"x", "y", "z"} <= there
     for column, model in (("u", "pixels"), ("board", "board"), (COVARIANCE[0], "board"), ("anchor", "anchor")):
         if column in there:
-            return model  # type: ignore[return-value]
+            return model
     if "plane" in there or "group" in there:
         return "plane" if "plane" in there else "distance"
     return "pose" if placed and turned else "position" if placed else "orientation" if turned else None

@@ -18,8 +18,9 @@ from fg_calib.errors import InputError
 from fg_calib.importers.board import CalibrationBoard
 from fg_calib.importers.opencv import both_poses, first_camera
 from fg_calib.measurements.dataset import Floats, Integers
-from fg_calib.measurements.kinds import Camera, RoomPixel
-from fg_calib.measurements.kinds.kind import Frames
+from fg_calib.measurements.kind import Frames
+from fg_calib.measurements.kinds import Camera
+from fg_calib.measurements.kinds.pixel import RoomPixel
 
 FIGURES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 """A camera's figures, in the order of its covariance."""

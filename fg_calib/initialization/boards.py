@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from fg_calib.initialization.camera import Camera
 from fg_calib.initialization.hand_eye import Frame
-from fg_calib.measurements.kinds import Camera
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]

@@ -15,12 +15,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import permutations, product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from fg_calib.measurements.dataset import rotation_angle
+from fg_calib.robot.rotations import nearest_rotation, rotation_angle
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -62,6 +62,11 @@ class Unknown:
     frame: bool
     tool_rotation: bool
     tool_translation: Booleans
+
+    @property
+    def anything(self) -> bool:
+        """Whether there is something to find."""
+        return self.frame or self.tool_rotation or bool(self.tool_translation.any())
 
 
 def start_from_poses(
@@ -212,14 +217,6 @@ def _tool_point_by_distances(
     return best, least
 
 
-def nearest_rotation(M: Floats) -> Floats:
-    """The rotations nearest to matrices, shape (..., 3, 3) (maximise trace(R^T M))."""
-    U, _, Vt = np.linalg.svd(M)
-    U[..., 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
-    rotation: Floats = U @ Vt
-    return rotation
-
-
 def _rotations(R_F: Floats, R_M: Floats, R_X: Floats, R_T: Floats, unknown: Unknown) -> list[tuple[Floats, Floats]]:
     """Rotations X and T with X F T = M in the least-squares sense; several where the rotations alone leave a choice."""
     if not unknown.frame:
@@ -235,12 +232,12 @@ def _rotations(R_F: Floats, R_M: Floats, R_X: Floats, R_T: Floats, unknown: Unkn
         return [(R_X, _tool_rotation(R_F, R_M, R_X))]
     # Every rotation is about one axis: X and T may turn about it against each other. Find one solution, from the
     # nominal tool or any quarter turn of it, and leave the choice of the turn to the positions.
-    starts = np.array([R_T, *(R_T @ Q for Q in _quarter_turns())])
+    starts = np.concatenate([R_T[None], R_T @ Rotation.create_group("O").as_matrix().round()])
     all_X, all_T, reached = _alternate(R_F, R_M, starts, steps=20)
     best = int(np.argmax(np.round(reached, 9)))
     R_X, R_T = all_X[best], all_T[best]
     axis = _common_axis(R_F)
-    turns = _about(axis, np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False))
+    turns = Rotation.from_rotvec(np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)[:, None] * axis).as_matrix()
     return [(R_X @ turn, turn.T @ R_T) for turn in turns]
 
 
@@ -275,22 +272,6 @@ def _common_axis(R_F: Floats) -> Floats:
     _, axes = rotation_angle(R_F @ R_F[0].T)
     axis: Floats = np.linalg.svd(axes, full_matrices=False)[2][0]
     return axis
-
-
-def _about(axis: Floats, angles: Floats) -> Floats:
-    """The rotations about a unit axis (Rodrigues), shape (n, 3, 3)."""
-    K = np.cross(np.eye(3), axis)
-    sine, cosine = np.sin(angles)[:, None, None], np.cos(angles)[:, None, None]
-    turns: Floats = np.eye(3) + sine * K + (1.0 - cosine) * (K @ K)
-    return turns
-
-
-def _quarter_turns() -> list[Floats]:
-    """The 24 rotations of a cube."""
-    signed = (
-        np.eye(3)[list(p)] * np.array(s)[:, None] for p in permutations(range(3)) for s in product((1, -1), repeat=3)
-    )
-    return [M for M in signed if np.linalg.det(M) > 0]
 
 
 def _frame_rotations(R_F: Floats, p_F: Floats, p_M: Floats, t: Floats, unknown: Unknown) -> list[Floats]:

@@ -12,7 +12,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.initialization.hand_eye import Frame, nearest_rotation
+from fg_calib.initialization.hand_eye import Frame
+from fg_calib.robot.rotations import nearest_rotation
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

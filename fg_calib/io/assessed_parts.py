@@ -17,7 +17,6 @@ from fg_calib.graph.factors import corrections_of, prior_rows
 from fg_calib.graph.information import named_rows
 from fg_calib.io.parts_solver import Part, PartsSolution, problem_of_table, table_of_part
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.models.pairs import no_figure
 from fg_calib.observability.identifiability import Identifiability
 from fg_calib.observability.indices import Observability, observability_of_rows
 from fg_calib.observability.parallel_axes import missing_motions
@@ -127,7 +126,7 @@ def _missing_figures(solution: PartsSolution, m: Measurements) -> list[str]:
     if m.pairs is None:
         return []
     missing = [name for name, (n, _) in solution.reduced.squares.items() if not n]
-    texts = [no_figure(m.pairs, solution.options.model, name, "no fitted pair") for name in missing]
+    texts = [f"{m.pairs.source}: no fitted pair has values of {name}; is a column misspelt?" for name in missing]
     for text in texts:
         _log.warning("%s", text)
     return texts

@@ -36,7 +36,7 @@ from fg_calib.io.yaml import (
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import Measurements, Noise
 from fg_calib.measurements.kinds import Camera
-from fg_calib.measurements.series import KnownPoint, Table
+from fg_calib.measurements.table import KnownPoint, Table
 from fg_calib.options import (
     LIMITED,
     POSE_MODELS,
@@ -608,7 +608,7 @@ def _noise(given: object, units: Units, robot: Robot, place: str) -> tuple[Noise
     )
     if not file.estimate:
         return noise, False
-    missing = {f.name: getattr(UNSTATED, f.name) for f in fields(Noise) if getattr(noise, f.name) is None}
+    missing = {f.name: getattr(UNSTATED, f.name) for f in fields(Noise)[:-1] if getattr(noise, f.name) is None}
     return replace(noise, **missing), True
 
 

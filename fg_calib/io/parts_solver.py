@@ -37,13 +37,12 @@ from fg_calib.errors import InputError, ProblemError, shown
 from fg_calib.executors import Failure, map_jobs
 from fg_calib.graph.factors import Variables, build_variables, prior_rows
 from fg_calib.graph.noise import RowNoise
-from fg_calib.graph.problem import Problem, noises_at, unassembled, variables_of
+from fg_calib.graph.problem import Problem, noises_at, start_of, unassembled, variables_of
 from fg_calib.graph.rows import whitened_rows
 from fg_calib.graph.solver import NEAR_ENOUGH, Iteration, SolverOptions, options_of
-from fg_calib.initialization.start import start_of
+from fg_calib.measurements.build import build_dataset
 from fg_calib.measurements.dataset import Measurements, joined
-from fg_calib.measurements.gathering import gather
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.observability.indices import determined
 from fg_calib.options import POSE_MODELS, Limits, Options, check_number
 from fg_calib.robot.model import Robot
@@ -364,7 +363,7 @@ class _Task:
 
 def problem_of_table(robot: Robot, table: Table, options: Options, parameters: Floats) -> Problem:
     """The problem that a table is at a parameter vector, without its rows."""
-    data = gather(robot, (table,))
+    data = build_dataset(robot, (table,))
     return unassembled(robot, data, options, variables_of(robot, data, options), parameters)
 
 
@@ -400,7 +399,7 @@ def _start(robot: Robot, parts: Sequence[Part], options: Options, executor: Exec
     table = _joined([_checked(one) for one in found])
     if not table.n_configurations:
         return variables.nominal()
-    data = gather(robot, (table_of_part(table, options),))
+    data = build_dataset(robot, (table_of_part(table, options),))
     return start_of(robot, data, variables)
 
 
@@ -411,7 +410,7 @@ def _some(part: Part, robot: Robot, options: Options) -> Measurements:
     rows = train[:: max(1, -(-len(train) // STARTED_FROM))]
     some = _with_pairs(m, rows) if options.uses_pairs else m.select(rows)
     if len(rows):
-        gather(robot, (table_of_part(some, options),)).trigs(robot)
+        build_dataset(robot, (table_of_part(some, options),)).trigs(robot)
     return some
 
 

@@ -27,6 +27,7 @@ from fg_calib.measurements.checks import (
 )
 from fg_calib.options import Pairing, check_number, listed
 from fg_calib.robot.kinematics import over_spans
+from fg_calib.robot.rotations import rotation_angle
 from fg_calib.sizes import MOST_PAIRS
 
 Floats = NDArray[np.float64]
@@ -46,6 +47,7 @@ class Noise:
         angle: Of a directly measured rotation angle, [rad].
         point: Of a touched point, per axis, [m].
         pixel: Of a point's image, per axis, [px].
+        more: Of columns that one instrument alone has, by name.
     """
 
     position: float | None = None
@@ -55,9 +57,12 @@ class Noise:
     angle: float | None = None
     point: float | None = None
     pixel: float | None = None
+    more: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for f in fields(self):
+        for name, figure in self.more.items():
+            check_number(f"noise: {name}", figure)
+        for f in fields(self)[:-1]:
             given = getattr(self, f.name)
             if f.name == "joint" and isinstance(given, list | np.ndarray):
                 given = tuple(np.atleast_1d(np.array(given, dtype=object)).tolist())
@@ -202,6 +207,8 @@ class Measurements(FrozenArrays):
         covariance: Of a board's measured pose, about and along the camera's axes, shape (n_configurations, 6, 6), [rad]
             and [m]; None where sigmas say it.
         part: Which rows of a table these are, shape (n_configurations,); None where they are all.
+        columns: What instruments with columns of their own measured, by column, shape (n_configurations,) each.
+        sigmas: 1 sigma of these, by the same names.
     """
 
     readings: Floats
@@ -225,6 +232,8 @@ class Measurements(FrozenArrays):
     sigma_pixel: Floats | None = None
     covariance: Floats | None = None
     part: Integers | None = None
+    columns: Mapping[str, Floats] = field(default_factory=dict)
+    sigmas: Mapping[str, Floats] = field(default_factory=dict)
 
     from_frame: ClassVar[Callable[..., Measurements]]
     """`files.tables.read_measurements`, attached by the package: this folder knows nothing of tables."""
@@ -352,8 +361,9 @@ class Measurements(FrozenArrays):
             value = getattr(self, f.name)
             if isinstance(value, np.ndarray) and f.name != "sigma_joint" and len(value) == n:
                 changes[f.name] = value[rows]
-        labels = {name: of.of(rows) for name, of in self.labels.items()}
-        return replace(self, **changes, labels=labels, pairs=None, groups=None)
+        for name in ("labels", "columns", "sigmas"):
+            changes[name] = {key: v.of(rows) if name == "labels" else v[rows] for key, v in getattr(self, name).items()}
+        return replace(self, **changes, pairs=None, groups=None)
 
     @property
     def end_names(self) -> tuple[str, ...]:
@@ -416,20 +426,6 @@ def form_pairs(measurements: Measurements, pairing: Pairing) -> Pairs:
     return Pairs(
         a, b, distance, angle, sigma_distance, sigma_angle, measurements.test[a], f"pairs from {measurements.source}"
     )
-
-
-def rotation_angle(rotation: Floats) -> tuple[Floats, Floats]:
-    """Angle in [0, pi] and (unnormalised) axis of rotation matrices, shapes (n,) and (n, 3)."""
-    axis = 0.5 * np.stack(
-        [
-            rotation[:, 2, 1] - rotation[:, 1, 2],
-            rotation[:, 0, 2] - rotation[:, 2, 0],
-            rotation[:, 1, 0] - rotation[:, 0, 1],
-        ],
-        axis=1,
-    )  # sin(angle) times the unit axis
-    cosine = 0.5 * (np.trace(rotation, axis1=1, axis2=2) - 1.0)
-    return np.arctan2(np.linalg.norm(axis, axis=1), cosine), axis
 
 
 def _choose(rows: Integers, pairing: Pairing, generator: np.random.Generator) -> Integers:

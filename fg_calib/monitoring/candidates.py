@@ -17,9 +17,9 @@ from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.factors import Variable, pose_of
 from fg_calib.graph.knowledge import coordinates_of
 from fg_calib.graph.problem import Problem, problem_at, variables_of
+from fg_calib.measurements.build import build_dataset
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.gathering import gather
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.monitoring.new_data import Linear, linearised
 from fg_calib.observability.random_configurations import at_configurations, places_of
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, Pairing
@@ -209,7 +209,7 @@ def _alone(whole: Problem, number: int, table: Table) -> Problem:
     """The problem of a table of candidates, everything where the rows there are have it; each error is a row's own."""
     robot, start = whole.robot, whole.start
     options = replace(whole.options, encoder="propagated", pair_errors="independent", loss="none")
-    data = gather(robot, [table])
+    data = build_dataset(robot, [table])
     v = variables_of(robot, data, options)
     x = v.nominal()
     x[v.robot_span] = start[whole.variables.robot_span]

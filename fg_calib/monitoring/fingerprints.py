@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.measurements.dataset import Labels, Measurements, Pairs
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.robot.kinematics import over_spans
 
 Floats = NDArray[np.float64]

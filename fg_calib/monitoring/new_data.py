@@ -20,13 +20,12 @@ from fg_calib.errors import ProblemError
 from fg_calib.graph.factors import build_variables, unknown_prior_rows
 from fg_calib.graph.knowledge import Knowledge, columns_in, coordinates_of
 from fg_calib.graph.noise import JOINT_NOISE, NoiseName, NoiseState
-from fg_calib.graph.problem import Problem, assembled, at_parameters, problem_at, tables_of, variables_of
+from fg_calib.graph.problem import Problem, assembled, at_parameters, problem_at, start_of, tables_of, variables_of
 from fg_calib.graph.rows import At, RowSet
 from fg_calib.graph.solver import Solution, solve
-from fg_calib.initialization.start import start_of
 from fg_calib.measurements import residuals
-from fg_calib.measurements.gathering import gather
-from fg_calib.measurements.series import KnownPoint, Table
+from fg_calib.measurements.build import build_dataset
+from fg_calib.measurements.table import KnownPoint, Table
 from fg_calib.options import POSE_MODELS, Options
 from fg_calib.robot.model import Robot, names_of
 from fg_calib.statistics.covariance import TangentCovariance
@@ -169,7 +168,7 @@ def placed(calibrated: Calibrated, rows: Rows, values: Floats) -> Placed:
     state = calibrated.state_for(rows.tables, rows.like)
 
     def problem(arm: Robot, tables: Sequence[Table], start: Solution | None) -> Problem:
-        data = gather(arm, tables)
+        data = build_dataset(arm, tables)
         variables = variables_of(arm, data, options)
         x = start_of(arm, data, variables) if start is None else variables.nominal()
         if start is not None:

@@ -21,7 +21,7 @@ from fg_calib.graph.build import kept_of
 from fg_calib.graph.knowledge import Knowledge, coordinates_of
 from fg_calib.graph.problem import Problem, assembled, at_parameters, problem_at, variables_of
 from fg_calib.graph.solver import Solution, solve
-from fg_calib.measurements.gathering import gather
+from fg_calib.measurements.build import build_dataset
 from fg_calib.monitoring.hypotheses import motions, zero_names
 from fg_calib.monitoring.new_data import Calibrated, Placed, Rows, placed
 from fg_calib.monitoring.prior_information import with_tolerances
@@ -86,7 +86,7 @@ def _problem(calibrated: Calibrated, robot: Robot, known: Knowledge, rows: Rows,
     tables = tuple(
         replace(t, known={name: place for name, place in t.known.items() if name not in stays}) for t in rows.tables
     )
-    data = gather(robot, tables)
+    data = build_dataset(robot, tables)
     state = calibrated.state_for(rows.tables, rows.like)
     places = at_parameters(at.solution.problem, at.solution.parameters).coordinates
 

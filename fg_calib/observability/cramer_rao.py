@@ -40,7 +40,7 @@ from fg_calib.graph.build import predicted_problem, true_problem
 from fg_calib.graph.information import correlation, named_triangle
 from fg_calib.graph.problem import Problem
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.options import FrameKnowledge, Model, Options, PairErrors, Pairing, check, check_flag, check_names
 from fg_calib.prediction.expected_error import without_rigid_motion
 from fg_calib.robot.kinematics import build_chain, forward

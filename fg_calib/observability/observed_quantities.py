@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from fg_calib.graph.problem import Problem
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.options import PAIR_MODELS, FrameKnowledge, Model
 
 PLACES: tuple[Model, ...] = ("anchor", "plane", "board", "pixels")

@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fg_calib.graph.factors import Variables
-from fg_calib.graph.problem import Problem, problem_at, variables_of
-from fg_calib.initialization.start import start_of
+from fg_calib.graph.problem import Problem, problem_at, start_of, variables_of
+from fg_calib.measurements.build import Dataset, build_dataset
 from fg_calib.measurements.dataset import Labels, Measurements
-from fg_calib.measurements.gathering import Dataset, gather
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, Model, Options, Pairing
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.kinematics import Poses, build_chain, forward
@@ -57,7 +56,7 @@ def elsewhere(problem: Problem, parameters: Floats) -> Problem | None:
         for i, table in enumerate(different.values())
     ]
     options = Options(gauge="none", pair_errors="independent")
-    data = gather(robot, tables)
+    data = build_dataset(robot, tables)
     variables = variables_of(robot, data, options)
     return problem_at(robot, data, options, variables, start_of(robot.with_estimated([]), data, variables))
 

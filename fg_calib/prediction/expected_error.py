@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.graph.problem import Problem
-from fg_calib.measurements.gathering import Dataset
+from fg_calib.measurements.build import Dataset
 from fg_calib.observability.observed_quantities import Seen
 from fg_calib.robot.kinematics import forward
 from fg_calib.statistics.covariance import TangentCovariance

@@ -9,7 +9,6 @@ import numpy as np
 from fg_calib.assessment import Assessment as Uncertainty
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
-from fg_calib.measurements.kinds import SamePoint
 from fg_calib.report.shown import SHOWN
 from fg_calib.report.tables import rounded
 from fg_calib.robot.model import names_of
@@ -25,7 +24,7 @@ def notes(solution: Solution, uncertainty: Uncertainty) -> Iterable[str]:
     for reason, count in solution.problem.n_excluded.items():
         if count:
             yield f"{count} train rows take no part: {reason.replace('_', ' ')}"
-    if same := solution.problem.data.n_train(SamePoint):
+    if same := solution.problem.data.n_train(lambda kind: kind.is_contact and kind.ends == 2):
         yield f"{same} train pairs are one point twice: three coordinates each instead of a distance"
     for table in solution.problem.data.tables:
         if not table.uses_pairs and table.measurements.pairs is not None:

@@ -20,7 +20,7 @@ from fg_calib.io.csv_writer import write_csv
 from fg_calib.io.robot_file import write_robot
 from fg_calib.io.units import Units
 from fg_calib.io.urdf import write_urdf
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.report.figures import empty_figure
 from fg_calib.report.plan import SCHEMA, UNKNOWN_ABOVE, design_document, error_counts
 from fg_calib.robot.kinematics import pose

@@ -12,8 +12,7 @@ from fg_calib.assessment import Assessment as Uncertainty
 from fg_calib.diagnostics.verdict import chi2_in_words, predicted_in_words, probability
 from fg_calib.graph.noise import JOINT_NOISE
 from fg_calib.graph.solver import Solution
-from fg_calib.measurements.kinds import PointDistance, TouchedPoint
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.prediction.expected_error import ExpectedError
 from fg_calib.report.fit import goodness_of_fit, prediction, suspicious, with_joint_noise
 from fg_calib.report.folds import folds
@@ -58,7 +57,7 @@ def build_report(solution: Solution, uncertainty: Uncertainty) -> RenderableType
     parts += _joint_values(solution, uncertainty.joint_values)
     for frame, variable in zip(uncertainty.frames, solution.problem.variables.frames, strict=True):
         labels = solution.problem.data.labels
-        which = "" if len(labels) == 1 else f" of {labels[int(variable.symbol[2:-1])]}"
+        which = "" if len(labels) == 1 else f" of {labels[variable.number]}"
         parts += section(f"Measurement frame (world_T_base{which})", _frame(frame))
     parts += _points(solution, uncertainty.points)
     if uncertainty.identifiability.lost:
@@ -79,8 +78,9 @@ def _verdict(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
     if len(labels) > 1:
         tables = [f"{label} ({words})" for label, words in zip(labels, tables, strict=True)]
     what = f"{problem.robot.name}: {'; '.join(tables)}"
-    touched = sum(v.symbol.startswith("L") for v in problem.variables.nuisance)
-    what += f", {touched} touched points" if problem.data.touched else ""
+    touched = problem.data.n_train(lambda kind: kind.is_contact and kind.turned_back and kind.ends == 1)
+    n_points = sum(v.letter == "L" for v in problem.variables.nuisance)
+    what += f", {n_points} touched points" if touched else ""
     if problem.state.joint_errors is not None:
         what += ", joint values estimated"
     what += "" if settings.loss == "none" else f", loss {settings.loss}"
@@ -123,9 +123,10 @@ def _statistics(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
     rows = [("configurations", f"{problem.n_configurations}")]
     if problem.pair_series:
         rows.append(("pairs", f"{problem.n_pairs}"))
-    if problem.data.touched:
-        n_points = sum(v.symbol.startswith("L") for v in problem.variables.nuisance)
-        touches, between = (problem.data.n_train(kind) for kind in (TouchedPoint, PointDistance))
+    touches = problem.data.n_train(lambda kind: kind.is_contact and kind.turned_back and kind.ends == 1)
+    if touches:
+        n_points = sum(v.letter == "L" for v in problem.variables.nuisance)
+        between = problem.data.n_train(lambda kind: kind.ends == 0)
         rows += [("touches", f"{touches} of {n_points} points"), ("distances of points", f"{between}")]
     if problem.added:
         chi2 = 2.0 * sum(factor.error(solution.values) for factor in problem.added)

@@ -68,6 +68,23 @@ def rotation_of(yaw: float, pitch: float, roll: float) -> Floats:
     )
 
 
+def nearest_rotation(M: Floats) -> Floats:
+    """The rotations R nearest to matrices M, shape (..., 3, 3): they maximise trace(R^T M)."""
+    U, _, Vt = np.linalg.svd(M)
+    U[..., 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
+    rotation: Floats = U @ Vt
+    return rotation
+
+
+def rotation_angle(rotation: Floats) -> tuple[Floats, Floats]:
+    """Angle in [0, pi] and axis times its sine of rotation matrices, shapes (n,) and (n, 3)."""
+    R = rotation
+    pairs = (R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1])
+    axis = 0.5 * np.stack(pairs, axis=1)
+    cosine = 0.5 * (np.trace(R, axis1=1, axis2=2) - 1.0)
+    return np.arctan2(np.linalg.norm(axis, axis=1), cosine), axis
+
+
 def cross_matrix(v: Floats) -> Floats:
     """[v]x with `[v]x w = v x w`, shape (n, 3, 3)."""
     out = np.zeros((len(v), 3, 3))

@@ -286,7 +286,7 @@ def check_count(place: str, given: object, least: int = 1) -> None:
 
 def with_figures(noise: Noise, more: Noise) -> Noise:
     """A noise with the figures of another where it has some; the joints' stay."""
-    figures = {f.name: getattr(more, f.name) for f in fields(Noise) if f.name != "joint"}
+    figures = {f.name: getattr(more, f.name) for f in fields(Noise)[:-1] if f.name != "joint"}
     own = {f.name: getattr(noise, f.name) for f in fields(Noise)}
     return Noise(**own | {name: figure for name, figure in figures.items() if figure is not None})
 

@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from fg_calib.errors import InputError
 from fg_calib.measurements.dataset import Groups, Labels, Measurements, Noise, Pairs, form_pairs, no_pairs
 from fg_calib.measurements.kinds import Camera
-from fg_calib.measurements.series import KnownPoint, Table
+from fg_calib.measurements.table import KnownPoint, Table
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, FrameKnowledge
 from fg_calib.robot.inverse import N_STARTS, solve_inverse
 from fg_calib.robot.kinematics import Poses, pose

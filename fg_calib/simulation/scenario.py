@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fg_calib.arrays import Brief
 from fg_calib.errors import InputError
 from fg_calib.measurements.dataset import Measurements, Noise
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.options import NEAR, AngleUnit, LengthUnit, check, did_you_mean, known_names
 from fg_calib.robot.model import Robot, names_of, tolerance_kind
 from fg_calib.simulation.configurations import Configurations, Placement

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fg_calib.io.units import Units
 from fg_calib.measurements.dataset import Measurements, Pairs
-from fg_calib.measurements.series import KnownPoint, Table
+from fg_calib.measurements.table import KnownPoint, Table
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, Pairing
 from fg_calib.robot.model import Robot
 from fg_calib.simulation.configurations import Placement

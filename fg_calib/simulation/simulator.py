@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from fg_calib.arguments import checked
 from fg_calib.errors import InputError
 from fg_calib.measurements.dataset import Measurements, Noise
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.options import Pairing, check_number
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.kinematics import build_chain, forward

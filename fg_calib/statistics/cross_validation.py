@@ -35,8 +35,8 @@ from fg_calib.executors import Failure, map_jobs
 from fg_calib.graph.build import problem_of
 from fg_calib.graph.solver import Solution
 from fg_calib.job import Job
-from fg_calib.measurements.gathering import Dataset
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.build import Dataset
+from fg_calib.measurements.table import Table
 from fg_calib.options import check_number
 from fg_calib.statistics.residual_table import HeldOut, pooled, residual_table, same_readings
 

@@ -16,7 +16,7 @@ from fg_calib.graph.problem import noises_at
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements.dataset import Labels
 from fg_calib.measurements.kinds import checked_figures
-from fg_calib.measurements.series import Series
+from fg_calib.measurements.table import MeasurementBlock
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -415,7 +415,7 @@ def _codes(of: Labels | None, codes: dict[str, int], n: int) -> Indices:
     return np.array([*known, 0], dtype=np.int32)[of.index]  # -1, no name, is the last
 
 
-def _table_rows(series: Series, part: Integers | None) -> Indices:
+def _table_rows(series: MeasurementBlock, part: Integers | None) -> Indices:
     """Row of its table that each measurement is from, -1 where it is from none or two.
 
     Args:

@@ -29,7 +29,7 @@ from fg_calib.graph.noise import RowNoise, whitening_of
 from fg_calib.graph.problem import Problem, noises_at, reweighted_at
 from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Booleans, Measurements
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.options import PAIR_MODELS, Model, Options
 from fg_calib.robot.kinematics import Chain
 from fg_calib.robot.model import Robot

@@ -24,7 +24,7 @@ from fg_calib.io.csv_writer import write_csv
 from fg_calib.io.job import read_job
 from fg_calib.io.robot_file import write_robot
 from fg_calib.job import Job
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.options import Options, Pairing
 from fg_calib.report.comparison import format_comparison
 from fg_calib.report.documents import comparison_document

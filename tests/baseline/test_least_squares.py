@@ -16,9 +16,10 @@ from fg_calib.baseline.least_squares import fit_least_squares
 from fg_calib.errors import InputError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import SolverOptions, solve
-from fg_calib.measurements.dataset import Measurements, Pairs, form_pairs, rotation_angle
+from fg_calib.measurements.dataset import Measurements, Pairs, form_pairs
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
+from fg_calib.robot.rotations import rotation_angle
 
 PAPERS = ["distance", "distance-rotation", "pose"]
 OTHERS = ["rotation", "position", "orientation"]

@@ -13,7 +13,7 @@ from fg_calib.diagnostics.multistart import look_elsewhere
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.robot.kinematics import pose
 from fg_calib.statistics.residual_table import residual_table
 

@@ -11,7 +11,7 @@ from fg_calib.diagnostics.multistart import look_elsewhere
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.problem import reweighted_at
 from fg_calib.graph.solver import solve, solve_from
-from fg_calib.measurements.dataset import rotation_angle
+from fg_calib.robot.rotations import rotation_angle
 
 SIGMA, TOLERANCE = 1e-4, 5e-3
 

@@ -15,7 +15,7 @@ from fg_calib.diagnostics.setup_check import FAR, check_setup
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import SolverOptions, solve
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.series import KnownPoint, Table
+from fg_calib.measurements.table import KnownPoint, Table
 from fg_calib.robot.kinematics import pose
 
 

@@ -16,10 +16,11 @@ from fg_calib.graph.build import build_problem, problem_of
 from fg_calib.graph.solver import solve
 from fg_calib.io.job import read_job
 from fg_calib.io.robot_file import read_robot
-from fg_calib.measurements.dataset import Measurements, rotation_angle
+from fg_calib.measurements.dataset import Measurements
 from fg_calib.options import Pairing
 from fg_calib.robot.inverse import solve_inverse
 from fg_calib.robot.kinematics import pose
+from fg_calib.robot.rotations import rotation_angle
 
 ROBOT = """\
 name: pointer

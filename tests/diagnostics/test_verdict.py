@@ -19,7 +19,7 @@ from fg_calib.assessment import assess
 from fg_calib.baseline.comparison import real_errors
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.options import Pairing
 from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import pose

@@ -19,11 +19,12 @@ from fg_calib.graph.problem import reweighted_at
 from fg_calib.graph.solver import SolverOptions, solve
 from fg_calib.io.robot_file import read_robot
 from fg_calib.io.tables import read_measurements
-from fg_calib.measurements.dataset import Noise, rotation_angle
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.dataset import Noise
+from fg_calib.measurements.table import Table
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Axis, Element, Joint, RobotBuilder
+from fg_calib.robot.rotations import rotation_angle
 from fg_calib.statistics.covariance import spread_of
 
 MOST = 15

@@ -14,9 +14,10 @@ from fg_calib.graph.build import build_problem
 from fg_calib.graph.extension import DistanceFactor, RotationAngleFactor, expand
 from fg_calib.graph.factors import prior_factors
 from fg_calib.graph.solver import levenberg_marquardt_params, solve
-from fg_calib.measurements.dataset import Pairs, rotation_angle
+from fg_calib.measurements.dataset import Pairs
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import forward, pose
+from fg_calib.robot.rotations import rotation_angle
 from fg_calib.statistics.variance_components import estimate_noise
 
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3, "beta": 1e-3}

@@ -17,7 +17,7 @@ from fg_calib.errors import ProblemError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import SolverOptions, solve
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.series import KnownPoint, Table
+from fg_calib.measurements.table import KnownPoint, Table
 from fg_calib.robot.model import FRAME_KINDS
 from fg_calib.statistics.residual_table import residual_table
 
@@ -197,10 +197,10 @@ def test_what_a_model_lacks_is_named():
     m = table.measurements
     cases = [
         (Table(m, "plane"), "no column plane, expected the name of a plane for model plane"),
-        (Table(m, "board"), "no column qx, qy, qz, qw, or roll, pitch, yaw, or rx, ry, rz, expected measured"),
+        (Table(m, "board"), "no columns qx, qy, qz, qw, or roll, pitch, yaw, or rx, ry, rz, expected measured"),
         (
             Table(m, "pixels"),
-            "no column u, v, corner_x, corner_y, expected images of a board's points for model pixels",
+            "no columns u, v, corner_x, corner_y, expected images of a board's points for model pixels",
         ),
         (Table(m, "position"), "no columns x, y, z, expected measured positions for model position"),
     ]

@@ -15,9 +15,10 @@ from fg_calib.graph.factors import pose_of
 from fg_calib.graph.problem import mahalanobis_distances, noises_at, reweighted_at
 from fg_calib.graph.solver import solve
 from fg_calib.measurements import residuals, sharing
-from fg_calib.measurements.dataset import Pairs, rotation_angle
+from fg_calib.measurements.dataset import Pairs
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
+from fg_calib.robot.rotations import rotation_angle
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 SIGMA, SIGMA_JOINT = (1e-3, 5e-4), 2e-3

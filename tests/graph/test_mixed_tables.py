@@ -23,7 +23,7 @@ from fg_calib.graph.problem import assembled
 from fg_calib.graph.solver import solve
 from fg_calib.io.csv_writer import write_csv
 from fg_calib.measurements.dataset import Groups, Pairs, no_pairs
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 from fg_calib.statistics.variance_components import estimate_noise
@@ -225,7 +225,7 @@ def test_an_unknown_of_one_name_started_at_two_places_is_refused():
              for rows in (slice(0, 12), slice(12, 20))]  # fmt: skip
     both = build_problem(robot, replace(table, own=tuple(parts)))
     assert both.data.unknowns.names == ["A", "B", "C"]
-    with pytest.raises(ProblemError, match="lengths: the same Own twice, expected every measurement once"):
+    with pytest.raises(ProblemError, match="lengths: the same CustomMeasurements twice, expected every"):
         build_problem(robot, replace(table, own=(own, own)))
 
 

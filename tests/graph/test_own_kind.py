@@ -17,8 +17,9 @@ from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.kinds import Distance, Kind, Rows
-from fg_calib.measurements.series import Own, Table
+from fg_calib.measurements.kinds import Kind, Rows
+from fg_calib.measurements.kinds.pair import Distance
+from fg_calib.measurements.table import CustomMeasurements, Table
 from fg_calib.observability.reasons import NOT_EXCITED
 from fg_calib.options import Options
 from fg_calib.report.comparison import format_comparison
@@ -61,7 +62,9 @@ def measured(seed, *, n=60, sigma_joint=0.0, gross=0, n_test=0):
     )  # fmt: skip
     starts = ANCHORS + 0.05 * rng.normal(size=ANCHORS.shape)
     test = np.arange(len(q)) >= n
-    own = Own(AnchorDistance(), lengths, SIGMA, unknowns=starts, which=which[:, None], names=("A", "B", "C"), test=test)
+    own = CustomMeasurements(
+        AnchorDistance(), lengths, SIGMA, unknowns=starts, which=which[:, None], names=("A", "B", "C"), test=test
+    )
     return robot, true, Table(m, model=None, own=(own,))
 
 
@@ -123,7 +126,7 @@ def test_an_unknown_may_have_any_number_of_coordinates(tmp_path):
     robot, _, table = measured(1, n=40)
     q = table.measurements.readings
     heights = pose(robot, q).position[:, 2] + 0.01 + SIGMA * np.random.default_rng(0).normal(size=len(q))
-    own = Own(Offset(), heights, SIGMA, unknowns=[[0.0]], names=("offset",))
+    own = CustomMeasurements(Offset(), heights, SIGMA, unknowns=[[0.0]], names=("offset",))
     found = calibrate(robot, replace(table, own=(own,)))
     found.save(tmp_path)
     (offset,) = Calibration.load(tmp_path).result.groups
@@ -145,14 +148,14 @@ def test_a_sigma_that_may_mean_two_things_is_refused():
         residual_dim, names, units = 3, ("x", "y", "z"), ("m", "m", "m")
 
     with pytest.raises(InputError, match=r"own: sigma: shape \(3,\) of 3 measurements of 3 rows, expected \(3, 1\)"):
-        Own(Three(), [[1.0], [2.0], [3.0]], sigma=[1e-3, 2e-3, 3e-3], unknowns=[[0.0]])
+        CustomMeasurements(Three(), [[1.0], [2.0], [3.0]], sigma=[1e-3, 2e-3, 3e-3], unknowns=[[0.0]])
     with pytest.raises(InputError, match=r"own: sigma: shape \(7,\), expected one that broadcasts to \(3, 3\)"):
-        Own(Three(), [[1.0], [2.0], [3.0]], sigma=np.full(7, 1e-3), unknowns=[[0.0]])
+        CustomMeasurements(Three(), [[1.0], [2.0], [3.0]], sigma=np.full(7, 1e-3), unknowns=[[0.0]])
 
 
 def test_what_was_given_stays_as_it_was_when_the_giver_changes_it():
     ends, test = np.arange(4)[:, None], np.zeros(4, bool)
-    own = Own(Offset(), np.ones(4), SIGMA, unknowns=[[0.0]], ends=ends, test=test)
+    own = CustomMeasurements(Offset(), np.ones(4), SIGMA, unknowns=[[0.0]], ends=ends, test=test)
     ends[:], test[:] = 0, True
     assert own.ends.ravel().tolist() == [0, 1, 2, 3]
     assert not own.test.any()
@@ -390,7 +393,7 @@ def test_what_rows_raise_or_return_is_one_line_that_names_kind_and_table(change,
 )  # fmt: skip
 def test_what_a_kind_does_not_say_of_itself_is_named(attributes, said):
     with pytest.raises(InputError) as found:
-        Own(described(**attributes), np.ones(3), SIGMA, unknowns=ANCHORS)
+        CustomMeasurements(described(**attributes), np.ones(3), SIGMA, unknowns=ANCHORS)
     assert str(found.value) == f"kind Mine: {said}"
 
 
@@ -400,7 +403,7 @@ def test_a_kind_of_ours_cannot_be_changed_under_its_compiled_twin():
             return super().rows(at, 1.1 * data, nuisances)
 
     with pytest.raises(InputError, match="kind Longer: code: found 0, expected None: compiled code would take"):
-        Own(Longer(), np.ones(3), SIGMA, ends=np.zeros((3, 2), int))
+        CustomMeasurements(Longer(), np.ones(3), SIGMA, ends=np.zeros((3, 2), int))
 
 
 def test_figures_are_checked_before_anything_is_solved():

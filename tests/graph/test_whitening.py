@@ -18,10 +18,11 @@ from fg_calib.graph.problem import joint_errors, noises_at, reweighted_at
 from fg_calib.graph.solver import solve
 from fg_calib.measurements import residuals
 from fg_calib.measurements import sharing as sharing_module
-from fg_calib.measurements.dataset import Groups, Measurements, Pairs, rotation_angle
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.dataset import Groups, Measurements, Pairs
+from fg_calib.measurements.table import Table
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
+from fg_calib.robot.rotations import rotation_angle
 
 KINDS = {"distance": (True, False), "rotation": (False, True), "distance-rotation": (True, True)}
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}

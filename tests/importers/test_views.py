@@ -13,8 +13,9 @@ from fg_calib.errors import InputError
 from fg_calib.importers.board import CalibrationBoard
 from fg_calib.importers.opencv import find_corners
 from fg_calib.importers.views import FIGURES, Corners, camera_derivatives, fit_board
-from fg_calib.measurements.kinds import BoardPose, Camera
-from fg_calib.measurements.kinds.kind import Frames
+from fg_calib.measurements.kind import Frames
+from fg_calib.measurements.kinds import Camera
+from fg_calib.measurements.kinds.board import BoardPose
 
 cv2 = pytest.importorskip("cv2", reason="no OpenCV: pip install 'fg_calib[camera]'")
 

@@ -12,7 +12,9 @@ from tolerances import rounding
 
 from fg_calib.graph.rows import At, Part, RowSet
 from fg_calib.measurements import residuals
-from fg_calib.measurements.kinds import Distance, Orientation, Position, RotationAngle, SamePoint, stack
+from fg_calib.measurements.kinds import stack
+from fg_calib.measurements.kinds.pair import Distance, RotationAngle, SamePoint
+from fg_calib.measurements.kinds.pose import Orientation, Position
 from fg_calib.measurements.residuals import Block, pack
 from fg_calib.measurements.sharing import SharedErrors
 from fg_calib.robot.kernels import LANES

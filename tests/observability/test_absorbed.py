@@ -11,7 +11,7 @@ from touches import corners, touch
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.information import named_triangle
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.series import KnownPoint, Table
+from fg_calib.measurements.table import KnownPoint, Table
 from fg_calib.observability.identifiability import identifiability_of
 from fg_calib.observability.reasons import BASE, NO_CAUSE, NOT_EXCITED
 from fg_calib.robot.kinematics import pose

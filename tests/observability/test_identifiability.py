@@ -12,8 +12,8 @@ from fg_calib.errors import ProblemError
 from fg_calib.graph.build import STRUCTURAL_FLOOR, build_problem, random_problem
 from fg_calib.graph.information import named_triangle, observability_of
 from fg_calib.graph.solver import solve
-from fg_calib.measurements.kinds import SamePoint
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.kinds.pair import SamePoint
+from fg_calib.measurements.table import Table
 from fg_calib.observability.identifiability import identifiability_of, observe_configurations, observe_structure
 from fg_calib.observability.reasons import NO_CAUSE, NOT_EXCITED
 from fg_calib.options import Pairing

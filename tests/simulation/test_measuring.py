@@ -13,7 +13,8 @@ from simulated import paper_robot, small_arm
 from tolerances import rounding
 
 from fg_calib import InputError, Pairing, calibrate, read_job, simulate, write_simulation
-from fg_calib.measurements.dataset import Noise, rotation_angle
+from fg_calib.measurements.dataset import Noise
+from fg_calib.robot.rotations import rotation_angle
 from fg_calib.simulation.configurations import BoardViews, GivenReadings, Placement, RandomReadings
 from fg_calib.simulation.instruments import (
     BoardCamera,

@@ -8,9 +8,9 @@ import pytest
 from instruments import measured_by
 from simulated import measure, small_arm, true_robot, write_job
 
-from fg_calib import InputError, Job, Measurements, Options, Own, ProblemError, calibrate, solve_job
-from fg_calib.measurements.kinds import Position
-from fg_calib.measurements.series import Table
+from fg_calib import CustomMeasurements, InputError, Job, Measurements, Options, ProblemError, calibrate, solve_job
+from fg_calib.measurements.kinds.pose import Position
+from fg_calib.measurements.table import Table
 from fg_calib.statistics.cross_validation import _train_tables, wide
 from fg_calib.statistics.cross_validation import cross_validate as cross_validate_with
 
@@ -240,7 +240,7 @@ def test_an_anchor_that_few_lengths_go_to_is_never_held_out():
 
 def test_measurements_of_ones_own_are_refused():
     robot, m = poses()
-    own = Own(Position(), data=m.position, sigma=1e-3)
+    own = CustomMeasurements(Position(), data=m.position, sigma=1e-3)
     with pytest.raises(InputError, match="folds: measurements of one's own"):
         cross_validate(job_of(robot, Table(m, "pose", own=(own,))), 5)
 

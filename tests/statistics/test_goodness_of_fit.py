@@ -21,12 +21,13 @@ from fg_calib.graph.noise import NoiseState
 from fg_calib.graph.rows import ErrorColumns
 from fg_calib.graph.solver import SolverOptions, solve
 from fg_calib.measurements import residuals
-from fg_calib.measurements.dataset import Pairs, rotation_angle
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.dataset import Pairs
+from fg_calib.measurements.table import Table
 from fg_calib.options import Pairing
 from fg_calib.report.documents import result_document
 from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import pose
+from fg_calib.robot.rotations import rotation_angle
 from fg_calib.statistics import goodness_of_fit as goodness_module
 from fg_calib.statistics import variance_components as noise
 from fg_calib.statistics.covariance import spread_of

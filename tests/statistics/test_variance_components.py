@@ -22,7 +22,7 @@ from fg_calib.graph.rows import whitener_of
 from fg_calib.graph.solver import solve
 from fg_calib.measurements import sharing
 from fg_calib.measurements.dataset import Measurements, Pairs
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.options import Pairing
 from fg_calib.report.documents import result_document
 from fg_calib.report.text import format_report

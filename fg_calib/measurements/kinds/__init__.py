@@ -1,10 +1,12 @@
-"""Kinds of measurement, one small class a file: its few lines of numpy are the documentation of its mathematics."""
+"""Instruments, one a file: columns, landmarks with their start, residual, simulation, and words.
 
-from fg_calib.measurements.kinds.anchor_contact import AnchorContact
-from fg_calib.measurements.kinds.anchor_distance import AnchorDistance
-from fg_calib.measurements.kinds.board_pose import BoardPose
-from fg_calib.measurements.kinds.distance import Distance
-from fg_calib.measurements.kinds.kind import (
+`options.MODELS` registers each model with its file; here they come together.
+"""
+
+from importlib import import_module
+
+from fg_calib.initialization.camera import Camera
+from fg_calib.measurements.kind import (
     Frames,
     Kind,
     Rows,
@@ -15,43 +17,40 @@ from fg_calib.measurements.kinds.kind import (
     checked_rows,
     is_ours,
 )
-from fg_calib.measurements.kinds.orientation import Orientation
-from fg_calib.measurements.kinds.pixel import Camera, Pixel, RoomPixel
-from fg_calib.measurements.kinds.plane_distance import PlaneDistance
-from fg_calib.measurements.kinds.point_distance import PointDistance
-from fg_calib.measurements.kinds.position import Position
-from fg_calib.measurements.kinds.rotation_angle import RotationAngle
-from fg_calib.measurements.kinds.same_point import SamePoint
-from fg_calib.measurements.kinds.stacked import Stacked, parts_of, stack
-from fg_calib.measurements.kinds.target_position import TargetPosition
-from fg_calib.measurements.kinds.touched_point import TouchedPoint
+from fg_calib.measurements.kinds.contact import POINT
+from fg_calib.measurements.kinds.custom import UNKNOWN
+from fg_calib.measurements.kinds.instrument import Column, Instrument
+from fg_calib.measurements.kinds.stacked import stack
+from fg_calib.measurements.landmarks import LandmarkKind
+from fg_calib.options import MODELS
+
+INSTRUMENTS: dict[str, Instrument] = {
+    instrument.model: instrument
+    for module in dict.fromkeys(MODELS.values())
+    for instrument in import_module(f"fg_calib.measurements.kinds.{module}").INSTRUMENTS
+}
+"""The instrument of each model."""
+
+LANDMARKS: dict[str, LandmarkKind] = {
+    kind.letter: kind for kinds in ((POINT, UNKNOWN), *(i.landmarks for i in INSTRUMENTS.values())) for kind in kinds
+}
+"""Kinds of landmarks, by the letter of their symbols."""
 
 __all__ = [
-    "AnchorContact",
-    "AnchorDistance",
-    "BoardPose",
+    "INSTRUMENTS",
+    "LANDMARKS",
     "Camera",
-    "Distance",
+    "Column",
     "Frames",
+    "Instrument",
     "Kind",
-    "Orientation",
-    "Pixel",
-    "PlaneDistance",
-    "PointDistance",
-    "Position",
-    "RoomPixel",
-    "RotationAngle",
+    "LandmarkKind",
     "Rows",
-    "SamePoint",
-    "Stacked",
-    "TargetPosition",
-    "TouchedPoint",
     "check_derivatives",
     "check_kind",
     "check_start",
     "checked_figures",
     "checked_rows",
     "is_ours",
-    "parts_of",
     "stack",
 ]

@@ -1,92 +1,43 @@
-"""Image of a point on a board."""
+"""Corners of boards as a camera sees them: a board in the room from the tool, or one on the tool from the room."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arrays import as_floats
-from fg_calib.errors import InputError
-from fg_calib.measurements.kinds.kind import Floats, Frames, Kind, Rows
+from fg_calib.errors import ProblemError
+from fg_calib.initialization.boards import boards_from_image
+from fg_calib.initialization.camera import Camera
+from fg_calib.initialization.start import FrameStart
+from fg_calib.measurements.dataset import Labels, Measurements
+from fg_calib.measurements.kind import Floats, Frames, Integers, Kind, Rows
+from fg_calib.measurements.kinds.board import BOARD_COLUMN, BoardCamera, board_coordinates, start_boards
+from fg_calib.measurements.kinds.instrument import Column, require_sigma, require_values, simple_block
+from fg_calib.measurements.landmarks import Landmarks
+from fg_calib.measurements.table import MeasurementBlock, Table
 from fg_calib.robot.rotations import cross_matrix, left_jacobian
 
-MOST_PIXELS = 1e6
-"""No camera has more, nor a focal length of more, nor a larger coefficient of distortion."""
+Booleans = NDArray[np.bool_]
 
-NEAREST = 1e-6
-"""Depth that a point has at least, [m]: behind the camera there is no image."""
+MAX_CHOICES = 2
+"""Poses of a board that one image may leave, at most."""
 
+MAX_IMAGES = 60
+"""Images of a board that it is started from: more would not make the start better."""
 
-@dataclass(frozen=True)
-class Camera:
-    """A pinhole camera with OpenCV's distortion.
-
-    Attributes:
-        fx: Focal length over the width of a pixel.
-        fy: The same over its height.
-        cx: Column of the principal point, [px].
-        cy: Row of the principal point, [px].
-        k1: Radial distortion, of the square of the distance from the axis.
-        k2: Of its fourth power.
-        p1: Tangential distortion.
-        p2: The same across.
-        k3: Radial distortion, of the sixth power.
-
-    Raises:
-        InputError: A figure is none that a camera can have.
-    """
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    k1: float = 0.0
-    k2: float = 0.0
-    p1: float = 0.0
-    p2: float = 0.0
-    k3: float = 0.0
-
-    def __post_init__(self) -> None:
-        for f in fields(self):
-            figure = as_floats(f"camera: {f.name}", getattr(self, f.name), "()")
-            focal = f.name in ("fx", "fy")
-            if not (1.0 <= figure <= MOST_PIXELS if focal else abs(figure) <= MOST_PIXELS):
-                expected = f"{'1' if focal else f'{-MOST_PIXELS:g}'} to {MOST_PIXELS:g}{' px' * (f.name[0] in 'fc')}"
-                raise InputError(f"camera: {f.name}", f"found {getattr(self, f.name):g}", expected)
-            object.__setattr__(self, f.name, float(figure))
-
-    def image(self, points: Floats) -> tuple[Floats, Floats]:
-        """Where points in the camera's frame are seen, shape (n, 2), [px], and its derivative, shape (n, 2, 3).
-
-        x to the right, y down, z ahead. With x, y over z and r their distance from the axis: x (1 + k1 r^2 + k2 r^4 +
-        k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), and likewise in y with p1 and p2 exchanged.
-        """
-        z = np.maximum(points[:, 2], NEAREST)
-        x, y = points[:, 0] / z, points[:, 1] / z
-        s = x * x + y * y
-        radial = 1.0 + s * (self.k1 + s * (self.k2 + s * self.k3))
-        slope = self.k1 + s * (2.0 * self.k2 + 3.0 * s * self.k3)  # of `radial` in s
-        u = self.fx * (x * radial + 2.0 * self.p1 * x * y + self.p2 * (s + 2.0 * x * x)) + self.cx
-        v = self.fy * (y * radial + 2.0 * self.p2 * x * y + self.p1 * (s + 2.0 * y * y)) + self.cy
-        mixed = 2.0 * x * y * slope + 2.0 * self.p1 * x + 2.0 * self.p2 * y
-        J = np.empty((len(points), 2, 3))
-        J[:, 0, 0] = self.fx * (radial + 2.0 * x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x)
-        J[:, 0, 1], J[:, 1, 0] = self.fx * mixed, self.fy * mixed
-        J[:, 1, 1] = self.fy * (radial + 2.0 * y * y * slope + 2.0 * self.p2 * x + 6.0 * self.p1 * y)
-        J[:, :, :2] /= z[:, None, None]  # of (x, y) in the point's own coordinates across the axis
-        J[:, :, 2] = -(J[:, :, 0] * x[:, None] + J[:, :, 1] * y[:, None])
-        J[points[:, 2] < NEAREST] = 0.0
-        return np.stack([u, v], axis=1), J
+GOOD_SHARE = 0.5
+"""Share of the points of a board's fullest image from which another is good for a start: a few corners say little."""
 
 
 class Pixel(Kind):
-    """Where a camera on the tool sees a point of a board in the room, less where it did, [px].
+    """Where a camera on the tool sees a point of a board in the room, minus where it did, [px].
 
     With R, p the camera, B = Exp(v), b the board and c the point on it, `R^T (B c + b - p)` is where it is in the
-    camera's frame. A turn w and a shift dp of the camera move it by `R^T ((B c + b - p) x w - dp)`, the board's
-    coordinates by `R^T (Jl(v) dv x B c + db)`.
+    camera's frame. A rotation w and a translation dp of the camera move it by `R^T ((B c + b - p) x w - dp)`, the
+    board's coordinates by `R^T (Jl(v) dv x B c + db)`.
 
     Data: u, v, [px], and the point on the board, x and y, [m]. Nuisances: v, [rad], and b, [m], as of `BoardPose`.
 
@@ -115,9 +66,18 @@ class Pixel(Kind):
         """See `Kind.figures`."""
         return data[:, :2]
 
+    def simulate(self, at: Frames, data: Floats, nuisances: Floats, noise: Floats) -> Floats:
+        """See `Kind.simulate`; the point on the board is given."""
+        seen = np.hstack([np.zeros((len(data), 2)), data[:, 2:]])
+        return np.hstack([self.rows(at, seen, nuisances).residual + noise, data[:, 2:]])
 
-class RoomPixel(Kind):
-    """Where a camera fixed in the room sees a point of a board on the tool, less where it did, [px].
+    def fields(self, data: Floats) -> dict[str, Floats]:
+        """See `Kind.fields`."""
+        return {"image": data}
+
+
+class RoomPixel(Pixel):
+    """Where a camera fixed in the room sees a point of a board on the tool, minus where it did, [px].
 
     The chain starts in the camera's frame: with R, p the board and c the point on it, `p + R c` is where it is.
 
@@ -127,11 +87,7 @@ class RoomPixel(Kind):
         camera: What the camera does to what it sees.
     """
 
-    names, units = ("pixel.u", "pixel.v"), ("px", "px")
-    ends, residual_dim, width = 1, 2, 4
-
-    def __init__(self, camera: Camera) -> None:
-        self.camera = camera
+    n_nuisances = 0
 
     def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
         """See `Kind.rows`."""
@@ -140,6 +96,108 @@ class RoomPixel(Kind):
         D = np.concatenate([-J @ cross_matrix(corner), J], axis=2)[:, None]
         return Rows(seen - data[:, :2], D)
 
-    def figures(self, data: Floats) -> Floats:
-        """See `Kind.figures`."""
-        return data[:, :2]
+
+class PixelCamera(BoardCamera):
+    """Images of the boards' points."""
+
+    model, words = "pixels", "images of boards' points"
+    columns = (
+        BOARD_COLUMN,
+        Column(("u", "v"), "pixel", "Where a corner was seen"),
+        Column(("corner_x", "corner_y"), "length", "Where that corner is on the board"),
+        Column(("sigma_pixel",), "pixel", "1 sigma of u and v, or"),
+        Column(("sigma_u", "sigma_v"), "pixel", "1 sigma of each by itself"),
+    )
+    noise, options = ("pixel",), ("camera", "fixed_camera")
+
+    def blocks(self, table: Table, number: int, landmarks: Landmarks) -> list[MeasurementBlock]:
+        """See `Instrument.blocks`."""
+        m = table.measurements
+        image = require_values(table, m.image, "u, v, corner_x, corner_y", "images of a board's points")
+        if table.camera is None:
+            raise ProblemError(m.source, "no camera", f"the key camera for model {table.model}")
+        rows = np.arange(m.n_configurations)
+        kind = RoomPixel(table.camera) if table.fixed_camera else Pixel(table.camera)
+        nuisances = np.zeros((len(rows), 0), dtype=np.int64)
+        if kind.n_nuisances:
+            index, place = board_coordinates(table, landmarks)
+            nuisances = place[index]
+        sigma = require_sigma(table, m.sigma_pixel, "pixel", rows)
+        return [simple_block(kind, table, number, rows, image, sigma, nuisances=nuisances, of=_corners(m, image))]
+
+    def start_frames(
+        self,
+        start: FrameStart,
+        table: Table,
+        blocks: Sequence[MeasurementBlock],
+        flange: tuple[Floats, Floats],
+        landmarks: Landmarks,
+    ) -> None:
+        """Boards, or the frame, and the tool: first what the board's pose in each image may be."""
+        for block in blocks:
+            if not isinstance(block.kind, Pixel):
+                continue
+            rows, boards, choices = _poses_of_images(table, block, block.kind.camera)
+            if block.kind.n_nuisances:
+                start_boards(start, flange, rows, boards, choices)
+            else:
+                start.align_choices((flange[0][rows], flange[1][rows]), choices, unknown_frame=start.unknown_frame)
+
+    def random_model(self, table: Table) -> str:
+        """Poses stand for points, which must be in sight. See `Instrument.random_model`."""
+        return "pose" if table.fixed_camera else "board"
+
+
+def _poses_of_images(
+    table: Table, block: MeasurementBlock, camera: Camera
+) -> tuple[Integers, Integers, tuple[Floats, Floats]]:
+    """Configuration and first coordinate of the board of each good image, and the poses that it leaves.
+
+    Raises:
+        ProblemError: No image shows enough of a board.
+    """
+    _, first, of = np.unique(table.measurements.ids, return_index=True, return_inverse=True)
+    place = first[of.ravel()]  # the first row of each one's configuration
+    board = block.nuisances[:, 0] if block.kind.n_nuisances else np.zeros(block.n, dtype=np.int64)
+    which = np.stack([place[block.ends[:, 0]], board], axis=1)[~block.test]
+    image, of = np.unique(which, axis=0, return_inverse=True)
+    train = np.flatnonzero(~block.test)[np.argsort(of.ravel(), kind="stable")]
+    shown = np.bincount(of.ravel(), minlength=len(image))
+    most = {name: shown[image[:, 1] == name].max() for name in np.unique(image[:, 1]).tolist()}
+    share = shown / np.array([most[name] for name in image[:, 1].tolist()])
+    used = _spread_out(image[:, 1], share >= GOOD_SHARE)
+    rows, boards, poses = [], [], []
+    for k, corners in enumerate(np.split(train, np.cumsum(shown)[:-1])):
+        found = boards_from_image(camera, block.data[corners], block.sigma[corners]) if used[k] else []
+        if found:
+            rows.append(block.ends[corners[0], 0])
+            boards.append(image[k, 1])
+            poses.append([frame for _, frame in (found + found)[:MAX_CHOICES]])
+    if not poses:
+        expected = "four points or more that are not on a line"
+        raise ProblemError(block.source, "no image of a board to start from", expected)
+    rotations = np.array([[pose.rotation for pose in each] for each in poses])
+    return np.array(rows), np.array(boards), (rotations, np.array([[p.translation for p in each] for each in poses]))
+
+
+def _spread_out(board: Integers, good: Booleans) -> Booleans:
+    """Of each board's good images `MAX_IMAGES` at most, evenly spread, shape (n,)."""
+    found = np.zeros(len(good), dtype=np.bool_)
+    for name in np.unique(board):
+        rows = np.flatnonzero(good & (board == name))
+        found[rows[np.unique(np.linspace(0, len(rows) - 1, min(MAX_IMAGES, len(rows))).round().astype(int))]] = True
+    return found
+
+
+def _corners(m: Measurements, image: Floats) -> Labels:
+    """The point of a board that each row is of, with the board's name where a column says it."""
+    board = m.labels.get("board")
+    which = np.zeros(len(image)) if board is None else board.index
+    places = np.column_stack([which, image[:, 2:] * 1e3]) + 0.0  # no -0
+    different, index = np.unique(places, axis=0, return_inverse=True)
+    of_board = [""] if board is None else [*(f"{name} " for name in board.names), ""]
+    names = tuple(f"{of_board[int(k)]}corner {x:.6g} {y:.6g} mm" for k, x, y in different.tolist())
+    return Labels(names, index.ravel())
+
+
+INSTRUMENTS = (PixelCamera(),)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fg_calib.measurements.kinds.kind import Floats, Frames, Integers, Kind, Rows
+from fg_calib.measurements.kind import Floats, Frames, Integers, Kind, Rows
 
 
 class Stacked(Kind):
@@ -14,7 +14,7 @@ class Stacked(Kind):
     """
 
     def __init__(self, *parts: Kind) -> None:
-        self.parts = parts
+        self._parts = parts
         self.names = tuple(name for part in parts for name in part.names)
         self.units = tuple(unit for part in parts for unit in part.units)
         self.ends = parts[0].ends
@@ -22,13 +22,21 @@ class Stacked(Kind):
         self.width = sum(part.width for part in parts)
         self.n_nuisances = sum(part.n_nuisances for part in parts)
 
+    @property
+    def parts(self) -> tuple[Kind, ...]:
+        """See `Kind.parts`."""
+        return self._parts
+
+    def _split(self, data: Floats) -> list[Floats]:
+        """Data of each part, a view of its columns."""
+        return np.split(data, np.cumsum([part.width for part in self.parts])[:-1], axis=1)
+
     def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
         """See `Kind.rows`."""
-        of_data = np.split(data, np.cumsum([part.width for part in self.parts])[:-1], axis=1)
         ends = np.cumsum([part.n_nuisances for part in self.parts])
         rows = [
             part.rows(at, columns, nuisances[:, end - part.n_nuisances : end])
-            for part, columns, end in zip(self.parts, of_data, ends, strict=True)
+            for part, columns, end in zip(self.parts, self._split(data), ends, strict=True)
         ]
         N, first = np.zeros((len(data), self.residual_dim, self.n_nuisances)), 0
         for part, found, end in zip(self.parts, rows, ends, strict=True):
@@ -40,9 +48,19 @@ class Stacked(Kind):
 
     def figures(self, data: Floats) -> Floats:
         """See `Kind.figures`."""
-        ends = np.cumsum([part.width for part in self.parts])[:-1]
-        columns = np.split(data, ends, axis=1)
-        return np.hstack([part.figures(own) for part, own in zip(self.parts, columns, strict=True)])
+        return np.hstack([part.figures(own) for part, own in zip(self.parts, self._split(data), strict=True)])
+
+    def simulate(self, at: Frames, data: Floats, nuisances: Floats, noise: Floats) -> Floats:
+        """See `Kind.simulate`."""
+        errors = np.split(noise, np.cumsum([part.residual_dim for part in self.parts])[:-1], axis=1)
+        values = np.split(nuisances, np.cumsum([part.n_nuisances for part in self.parts])[:-1], axis=1)
+        each = zip(self.parts, self._split(data), values, errors, strict=True)
+        return np.hstack([part.simulate(at, *arguments) for part, *arguments in each])
+
+    def fields(self, data: Floats) -> dict[str, Floats]:
+        """See `Kind.fields`."""
+        each = zip(self.parts, self._split(data), strict=True)
+        return {name: values for part, own in each for name, values in part.fields(own).items()}
 
     def twins(self) -> Integers:
         """See `Kind.twins`; none at all if a part has none."""
@@ -56,8 +74,3 @@ class Stacked(Kind):
 def stack(*parts: Kind) -> Kind:
     """The kinds measured together; one alone is itself."""
     return parts[0] if len(parts) == 1 else Stacked(*parts)
-
-
-def parts_of(kind: Kind) -> tuple[Kind, ...]:
-    """The kinds that are measured together, or the one alone."""
-    return kind.parts if isinstance(kind, Stacked) else (kind,)

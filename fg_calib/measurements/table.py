@@ -1,9 +1,8 @@
-"""Series: measurements of one kind, as estimation takes them; and the tables that they are made of (see `models`)."""
+"""Tables of measurements as a job has them, and blocks of one kind as estimation takes them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from copy import copy
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -13,8 +12,9 @@ from numpy.typing import NDArray
 from fg_calib.arguments import check_fields
 from fg_calib.arrays import Brief, FrozenArrays, as_figures, as_floats, check_sizes, require
 from fg_calib.errors import InputError, ProblemError, shown
+from fg_calib.initialization.camera import Camera
 from fg_calib.measurements.dataset import Groups, Labels, Measurements, Pairs
-from fg_calib.measurements.kinds import Camera, Kind, check_kind
+from fg_calib.measurements.kind import Kind, check_kind
 from fg_calib.options import (
     PAIR_MODELS,
     POSE_MODELS,
@@ -34,7 +34,7 @@ Booleans = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Series(Brief):
+class MeasurementBlock(Brief):
     """Measurements of one kind from one table.
 
     Attributes:
@@ -89,12 +89,12 @@ class Series(Brief):
         return np.flatnonzero(self.used.any(axis=1) & ~self.test)
 
     @property
-    def fitted(self) -> Series:
+    def fitted(self) -> MeasurementBlock:
         """The train measurements alone."""
         train = self.train
         return self if len(train) == self.n else self.select(train)
 
-    def select(self, rows: Integers) -> Series:
+    def select(self, rows: Integers) -> MeasurementBlock:
         """Some of the measurements."""
         each = ("ends", "data", "sigma", "measured", "test", "number", "nuisances")
         return replace(
@@ -116,8 +116,8 @@ class Series(Brief):
 
 
 @dataclass(frozen=True)
-class Own(Brief):
-    """Measurements of a kind of one's own, at the configurations of a table.
+class CustomMeasurements(Brief):
+    """Measurements of a custom kind, at the configurations of a table.
 
     Attributes:
         kind: What they are.
@@ -148,7 +148,7 @@ class Own(Brief):
         data = data.reshape(n, -1) if n else data
         if not n or data.shape[1] != kind.width:
             raise InputError("own: data", f"shape {np.shape(self.data)}", f"({n or 'n'}, {kind.width})")
-        sigma = _own_sigma(self.sigma, n, kind.residual_dim)
+        sigma = _custom_sigma(self.sigma, n, kind.residual_dim)
         names = listed("own: names", self.names)
         if not all(isinstance(name, str) and name for name in names):
             raise InputError("own: names", f"found {shown(self.names)}", "a word for each unknown")
@@ -175,7 +175,7 @@ class Own(Brief):
         object.__setattr__(self, "names", names)
 
 
-def _own_sigma(given: Any, n: int, residual_dim: int) -> Floats:
+def _custom_sigma(given: Any, n: int, residual_dim: int) -> Floats:
     """Sigmas that broadcast to (n, residual_dim), all above 0."""
     sigma = as_figures("own: sigma", given, "finite numbers")
     check_sizes("own: sigma", sigma)
@@ -258,7 +258,7 @@ class Table(Brief):
     model: Model | None = "distance-rotation"
     pairing: Pairing = field(default_factory=Pairing)
     frame: FrameKnowledge = "known"
-    own: tuple[Own, ...] = ()
+    own: tuple[CustomMeasurements, ...] = ()
     known: Mapping[str, KnownPoint] = field(default_factory=dict)
     offset: bool = False
     camera: Camera | None = None
@@ -277,9 +277,6 @@ class Table(Brief):
         if self.model is not None:
             set_checked(self, "table: ", model=Model)
         set_checked(self, "table: ", frame=FrameKnowledge)
-        for name, model in (("offset", "anchor"), ("camera", "pixels"), ("fixed_camera", "pixels")):
-            if getattr(self, name) and self.model != model:
-                raise InputError(f"table: {name}", f"given with model {self.model}", f"model {model}")
         if self.model is None and self.frame == "unknown":
             raise InputError(
                 "table: frame", "unknown, without a model", "a kind with unknowns of its own for the frame"
@@ -320,7 +317,7 @@ class Table(Brief):
             only = np.array([len(here) > 0 and bool(here.all()) for here in touches], dtype=np.bool_)
             return replace(groups, pairs=split(groups.pairs, only))
 
-        def of_own(own: Own) -> Own:
+        def of_own(own: CustomMeasurements) -> CustomMeasurements:
             if not configurations.any():
                 return replace(own, test=None)
             ends = np.arange(len(configurations)) if own.ends is None else own.ends
@@ -338,124 +335,7 @@ class Table(Brief):
     @property
     def unknown_frame(self) -> bool:
         """Whether its world_T_base is estimated."""
-        return self.frame == "unknown" and (self.model in POSE_MODELS or (self.model == "pixels" and self.fixed_camera))
-
-
-class Unknowns:
-    """The unknowns besides the arm that series depend on: touched points, and those of one's own.
-
-    Attributes:
-        letters: Letter of each one's key, shape (n,).
-        names: What each is called.
-        sizes: Number of coordinates of each.
-        starts: Where each is started, or is said to be; nan where the measurements say.
-        units: `m` or `rad` of each coordinate of each.
-        tolerances: 1 sigma of where each is said to be; None where its start says nothing.
-        known: Whether each is where it is said to be, and not estimated.
-    """
-
-    def __init__(self) -> None:
-        self.letters: list[str] = []
-        self.names: list[str] = []
-        self.sizes: list[int] = []
-        self.starts: list[Floats] = []
-        self.units: list[tuple[str, ...]] = []
-        self.tolerances: list[float | None] = []
-        self.known: list[bool] = []
-        self._named: dict[tuple[str, str, int], int] = {}
-        self._first: list[int] = []
-
-    @property
-    def n_coordinates(self) -> int:
-        """Number of coordinates of all."""
-        return sum(self.sizes)
-
-    @property
-    def owners(self) -> Integers:
-        """Which unknown each coordinate is of, shape (n_coordinates,)."""
-        return np.repeat(np.arange(len(self.sizes)), self.sizes)
-
-    def add(
-        self,
-        letter: str,
-        names: Sequence[str],
-        starts: Floats,
-        place: str,
-        frame: int = -1,
-        *,
-        units: Sequence[str] = (),
-        tolerances: Sequence[float | None] = (),
-        known: Sequence[bool] = (),
-    ) -> Integers:
-        """Add unknowns of one dimension; those of a name that is there are the same, whatever table they are from.
-
-        What one table says of where such a one is holds for all: the others may say the same, or nothing.
-
-        Args:
-            letter: Letter of their keys.
-            names: What they are called; none have names of their own if empty.
-            starts: Where they are started, shape (n, dimension); nan where the measurements are to say it.
-            place: The table, for messages.
-            frame: The table in whose own measurement frame they are, -1 for the base: elsewhere a name is another.
-            units: Of each one's coordinates; [m] if empty.
-            tolerances: 1 sigma of each one's start; None, as of all if empty, where it says nothing.
-            known: Whether each start is exact; none is if empty.
-
-        Returns:
-            Their coordinates' places, shape (n, dimension).
-
-        Raises:
-            ProblemError: Two of one name are said to be at different places.
-        """
-        found = np.empty(starts.shape, dtype=np.int64)
-        for k, start in enumerate(starts):
-            name = names[k] if names else str(k)
-            said = start, tolerances[k] if tolerances else None, known[k] if known else False
-            i = self._named.get((letter, name, frame), len(self.names)) if names else len(self.names)
-            if i == len(self.names):
-                self._first.append(self._first[-1] + self.sizes[-1] if self.sizes else 0)
-                self.letters.append(letter)
-                self.names.append(name)
-                self.sizes.append(len(start))
-                self.units.append(tuple(units) or ("m",) * len(start))
-                self.starts.append(said[0])
-                self.tolerances.append(said[1])
-                self.known.append(said[2])
-            elif not self.is_stated(i):
-                self.starts[i], self.tolerances[i], self.known[i] = said
-            elif not np.isnan(start).any() and not self._says(i, *said):
-                there = f"{self.starts[i].tolist()}{_within(self.tolerances[i])}"
-                here = f"start {start.tolist()}{_within(said[1])} of unknown {name}"
-                raise ProblemError(place, here, f"that of the other {name}: {there}")
-            if names:
-                self._named[letter, name, frame] = i
-            found[k] = self._first[i] + np.arange(len(start))
-        return found
-
-    def _says(self, index: int, start: Floats, tolerance: float | None, known: bool) -> bool:
-        """Whether that is what is said of an unknown."""
-        same = (self.tolerances[index], self.known[index]) == (tolerance, known)
-        return same and np.array_equal(self.starts[index], start)
-
-    def is_stated(self, index: int) -> bool:
-        """Whether a table says where an unknown is, or is started."""
-        return not bool(np.isnan(self.starts[index]).any())
-
-    def start(self, coordinate: int, place: Floats) -> None:
-        """Start the unknown with that first coordinate somewhere, unless it is stated where it is."""
-        index = self._first.index(coordinate)
-        if not self.is_stated(index):
-            self.starts[index] = place
-
-    def with_start(self, coordinate: int, place: Floats) -> Unknowns:
-        """The same, but that the one with that first coordinate is started elsewhere."""
-        other, index = copy(self), self._first.index(coordinate)
-        other.starts = [*self.starts[:index], place, *self.starts[index + 1 :]]
-        return other
-
-
-def _within(tolerance: float | None) -> str:
-    return "" if tolerance is None else f" within {tolerance:g}"
+        return self.frame == "unknown" and (self.model in POSE_MODELS or self.fixed_camera)
 
 
 def by_station(table: Table) -> tuple[Table, ...]:

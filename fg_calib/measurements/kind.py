@@ -61,6 +61,7 @@ class Kind(ABC):
         n_nuisances: Coordinates of nuisances.
         turned_back: Whether only the length of its residual, a vector in the base frame, counts: derivatives in the
             parameters then leave out that all vectors turn with the base (see `kinematics.turning_of_base`).
+        is_contact: Whether it says that points coincide, where a distance would be 0 and have no direction.
         code: Of its twin in `kernels`, which computes residual and D by compiled code; None if it has none.
     """
 
@@ -72,6 +73,7 @@ class Kind(ABC):
     n_nuisances: int = 0
     turned_back: bool = False
     code: int | None = None
+    is_contact: bool = False
 
     @abstractmethod
     def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
@@ -90,6 +92,43 @@ class Kind(ABC):
             if self.width == self.residual_dim
             else np.full((len(data), self.residual_dim), np.nan)
         )
+
+    @property
+    def quantity(self) -> str:
+        """Kind of noise of its first row: `distance`, `angle`, `position`, `orientation`, `point`, `pixel`."""
+        return self.names[0].partition(".")[0]
+
+    @property
+    def parts(self) -> tuple[Kind, ...]:
+        """The kinds that are measured together, or the one alone."""
+        return (self,)
+
+    def simulate(self, at: Frames, data: Floats, nuisances: Floats, noise: Floats) -> Floats:
+        """Data that would be measured, shape (n, width).
+
+        Args:
+            at: True tool frames of the ends.
+            data: What is given and not measured, such as a pixel's corner, shape (n, width).
+            nuisances: True values, shape (n, n_nuisances).
+            noise: Error of each row, shape (n, residual_dim).
+        """
+        if self.width == 0:  # a contact: its noise is where the arm stood
+            return np.zeros((len(noise), 0))
+        return self.rows(at, np.zeros((len(noise), self.width)), nuisances).residual + noise
+
+    def fields(self, data: Floats) -> dict[str, Floats]:
+        """Data by the names of the fields of `Measurements`; of kinds that no table has, nothing."""
+        return {}
+
+    def mirrored(self, points: Floats, data: Floats, nuisances: Floats) -> Floats | None:
+        """Nuisances of one landmark at its mirror image, which the same data may fit nearly as well; None of none.
+
+        Args:
+            points: Tool points of all its measurements, shape (n, 3), [m].
+            data: Their data, shape (n, width).
+            nuisances: Values that its measurements share, shape (n_nuisances,).
+        """
+        return None
 
     def twins(self) -> Integers:
         """Twins that compute it, part by part: code, first row, first column of data; shape (n_parts, 3)."""

@@ -12,13 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arrays import Brief
-from fg_calib.errors import ProblemError, shown
+from fg_calib.errors import InputError, ProblemError, shown
+from fg_calib.initialization.hand_eye import Frame
+from fg_calib.initialization.start import FrameStart
 from fg_calib.measurements.dataset import Measurements, Pairs, are_same
-from fg_calib.measurements.kinds import Kind, PointDistance, TouchedPoint
-from fg_calib.measurements.models import SERIES_OF, own_series, touch_series
-from fg_calib.measurements.models.starts import check_fitted, start_places
-from fg_calib.measurements.series import Series, Table, Unknowns
-from fg_calib.options import NEAR, PAIR_MODELS, POSE_MODELS, Model, did_you_mean
+from fg_calib.measurements.kind import Kind, is_ours
+from fg_calib.measurements.kinds import INSTRUMENTS, LANDMARKS
+from fg_calib.measurements.kinds.contact import POINT
+from fg_calib.measurements.kinds.custom import custom_block
+from fg_calib.measurements.landmarks import Landmarks
+from fg_calib.measurements.table import MeasurementBlock, Table
+from fg_calib.options import NEAR, did_you_mean
+from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
 from fg_calib.robot.model import Robot
 
 _log = logging.getLogger(__name__)
@@ -32,9 +37,6 @@ SAME_READING = 1e-8
 
 MOST_LOOKED_AT = 100_000
 """Rows up to which copies are looked for."""
-
-POINT_MODELS: tuple[Model, ...] = ("distance", "distance-rotation")
-"""Models that use touched points."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +52,8 @@ class Dataset(Brief):
     """
 
     tables: tuple[Table, ...]
-    series: tuple[Series, ...]
-    unknowns: Unknowns
+    series: tuple[MeasurementBlock, ...]
+    unknowns: Landmarks
     places: tuple[Integers, ...]
     names: tuple[str, ...]
     _trigs: dict[Any, tuple[Floats, ...]] = field(default_factory=dict, init=False, repr=False, compare=False)
@@ -64,7 +66,7 @@ class Dataset(Brief):
         """Readings of each table for the kernels, remembered, as parameters change nothing of them."""
         key = (tuple(joint.prismatic for joint in robot.joints), robot.bases)
         if key not in self._trigs:
-            self._trigs[key] = tuple(robot.trig(table.measurements.readings) for table in self.tables)
+            self._trigs[key] = tuple(precompute_trig(robot, table.measurements.readings) for table in self.tables)
         return self._trigs[key]
 
     @property
@@ -109,14 +111,9 @@ class Dataset(Brief):
         sources = [table.measurements.source for table in self.tables]
         return tuple(s if sources.count(s) == 1 else f"{s} ({i})" for i, s in enumerate(sources, start=1))
 
-    @property
-    def touched(self) -> bool:
-        """Whether points were touched."""
-        return any(isinstance(s.kind, TouchedPoint) for s in self.series)
-
-    def n_train(self, kind: type[Kind]) -> int:
-        """Number of train measurements of a kind."""
-        return sum(len(s.train) for s in self.series if isinstance(s.kind, kind))
+    def n_train(self, chosen: Callable[[Kind], bool]) -> int:
+        """Number of train measurements of the kinds chosen."""
+        return sum(len(s.train) for s in self.series if chosen(s.kind))
 
     @property
     def source(self) -> str:
@@ -133,7 +130,7 @@ class Dataset(Brief):
         return seen[first] & ~np.array(self.unknowns.known) if len(first) else np.zeros(0, dtype=np.bool_)
 
 
-def gather(robot: Robot, tables: Sequence[Table], *, predicted: bool = False) -> Dataset:
+def build_dataset(robot: Robot, tables: Sequence[Table], *, predicted: bool = False) -> Dataset:
     """All tables together.
 
     Where tables state ids, the same id is the same configuration.
@@ -147,7 +144,7 @@ def gather(robot: Robot, tables: Sequence[Table], *, predicted: bool = False) ->
         ProblemError: A table lacks what its model needs, the noise of a joint is no figure of one, or two tables
             contradict each other.
     """
-    unknowns, series = Unknowns(), list[Series]()
+    unknowns, series = Landmarks(), list[MeasurementBlock]()
     places: list[Integers] = []
     names: list[str] = []
     found: dict[str, tuple[int, int]] = {}
@@ -166,11 +163,11 @@ def gather(robot: Robot, tables: Sequence[Table], *, predicted: bool = False) ->
                 m.source, "another noise.joint", f"that of {source}: the readings are of the same encoders"
             )
         _check_joint_noise(robot, m)
-        series += series_of(robot, table, number, unknowns)
+        series += blocks_of(table, number, unknowns)
     _check_known(tables)
-    check_fitted(series, unknowns)
-    start_places(robot, tables, series, unknowns)
-    series = _without_untouched(series, unknowns.n_coordinates)
+    _check_fitted(series, unknowns)
+    _start_landmarks(robot, tables, series, unknowns)
+    series = _predicted_alone(series, unknowns.n_coordinates)
     return Dataset(tuple(tables), tuple(series), unknowns, tuple(places), (*names, *unknowns.names))
 
 
@@ -285,8 +282,11 @@ def _check_once(table: Table, other: Table) -> None:
 def _measured_by(table: Table) -> dict[str, Floats]:
     """What takes part of a table, with the readings that it is of, a row each, by what it is called."""
     m, pairs, groups = table.measurements, table.measurements.pairs, table.measurements.groups
-    distance, angle = PAIR_MODELS.get(table.model, (False, False))  # type: ignore[arg-type]
-    turned, placed = POSE_MODELS.get(table.model, (angle, distance))  # type: ignore[arg-type] # of which pairs are formed
+    instrument = INSTRUMENTS.get(table.model or "")
+    if instrument is None or instrument.sees_landmarks:
+        placed = turned = False
+    else:
+        placed, turned = instrument.sees_position, instrument.sees_orientation
     found: dict[str, tuple[Floats, ...]] = {}
     if groups is not None:
         touches = groups.index >= 0
@@ -298,7 +298,7 @@ def _measured_by(table: Table) -> dict[str, Floats]:
                 found[name] = (m.readings, v.reshape(len(v), math.prod(v.shape[1:])))
     else:
         ends = (m.readings[pairs.a], m.readings[pairs.b])
-        for name, wanted, v in (("distances", distance, pairs.distance), ("angles", angle, pairs.angle)):
+        for name, wanted, v in (("distances", placed, pairs.distance), ("angles", turned, pairs.angle)):
             if wanted and np.isfinite(v).any():
                 there = np.isfinite(v)
                 found[name] = (ends[0][there], ends[1][there], v[there, None])
@@ -316,8 +316,8 @@ def _check_known(tables: Sequence[Table]) -> None:
     Raises:
         ProblemError: A name is much like one that a table has and nothing is known of.
     """
-    for column, models in (("target", tuple(POSE_MODELS)), ("anchor", ("anchor",))):
-        of_kind = [table for table in tables if table.model in models]
+    for column in (kind.name for kind in LANDMARKS.values() if kind.key):
+        of_kind = [t for t in tables if t.model is not None and column in INSTRUMENTS[t.model].labels]
         seen = {name for t in of_kind if (labels := t.measurements.labels.get(column)) for name in labels.names}
         said = dict.fromkeys(name for table in of_kind for name in table.known)
         for name in said:
@@ -330,37 +330,100 @@ def _check_known(tables: Sequence[Table]) -> None:
             _log.warning("%ss: %s; it is not used", column, found)
 
 
-def _without_untouched(series: Sequence[Series], n_coordinates: int) -> list[Series]:
-    """The series; distances of a point that no train row touched are there to be predicted alone."""
+def _predicted_alone(blocks: Sequence[MeasurementBlock], n_coordinates: int) -> list[MeasurementBlock]:
+    """The blocks; what is measured between landmarks of which no train row at a configuration is, is test rows."""
     touched = np.zeros(n_coordinates, dtype=np.bool_)
-    for s in series:
-        if isinstance(s.kind, TouchedPoint):
-            touched[s.nuisances[~s.test]] = True
+    for block in blocks:
+        if block.kind.ends:
+            touched[block.nuisances[~block.test]] = True
     return [
-        replace(s, test=s.test | ~touched[s.nuisances].all(axis=1)) if isinstance(s.kind, PointDistance) else s
-        for s in series
+        block
+        if block.kind.ends or not is_ours(block.kind)
+        else replace(block, test=block.test | ~touched[block.nuisances].all(axis=1))
+        for block in blocks
     ]
 
 
-def series_of(robot: Robot, table: Table, number: int, unknowns: Unknowns) -> list[Series]:
-    """The series of a table.
+def blocks_of(table: Table, number: int, landmarks: Landmarks) -> list[MeasurementBlock]:
+    """The blocks of a table.
 
     Args:
-        robot: The nominal robot.
         table: The table.
         number: Its number.
-        unknowns: What the series depend on is added here.
+        landmarks: What they depend on is added here.
 
     Raises:
         ProblemError: The table lacks what its model needs, or a sigma.
     """
-    m = table.measurements
-    if m.groups is not None and table.model not in POINT_MODELS:
-        raise ProblemError(m.source, f"a column group with model {table.model}", f"model {' or '.join(POINT_MODELS)}")
+    m, instrument = table.measurements, None if table.model is None else INSTRUMENTS[table.model]
+    for name in ("offset", "camera", "fixed_camera"):
+        if getattr(table, name) and (instrument is None or name not in instrument.options):
+            models = " or ".join(model for model, other in INSTRUMENTS.items() if name in other.options)
+            raise InputError(f"table: {name}", f"given with model {table.model}", f"model {models}")
+    if m.groups is not None and (instrument is None or POINT not in instrument.landmarks):
+        models = " or ".join(model for model, other in INSTRUMENTS.items() if POINT in other.landmarks)
+        raise ProblemError(m.source, f"a column group with model {table.model}", f"model {models}")
     for k, own in enumerate(table.own):
         if any(own is before for before in table.own[:k]):
-            raise ProblemError(m.source, "the same Own twice", "every measurement once")
-    found = [own_series(own, table, number, unknowns) for own in table.own]
-    if table.model is not None:
-        found += SERIES_OF[table.model](robot, table, number, unknowns)
-    return found + touch_series(table, number, unknowns)
+            raise ProblemError(m.source, "the same CustomMeasurements twice", "every measurement once")
+    found = [custom_block(own, table, number, landmarks) for own in table.own]
+    return found + ([] if instrument is None else instrument.blocks(table, number, landmarks))
+
+
+def _check_fitted(blocks: Sequence[MeasurementBlock], landmarks: Landmarks) -> None:
+    """Raise where nothing but test rows says where something is.
+
+    Args:
+        blocks: All blocks.
+        landmarks: What these depend on, as the tables say it.
+    """
+    fitted = np.zeros(landmarks.n_coordinates, dtype=np.bool_)
+    for block in blocks:
+        fitted[block.nuisances[~block.test]] = True
+    for block in blocks:
+        for i in np.unique(landmarks.owners[block.nuisances[~fitted[block.nuisances]]]).tolist():
+            item = landmarks.items[i]
+            if item.kind.must_be_fitted and not item.is_stated:
+                found = f"{item.kind.called(item.name)} has test rows alone"
+                raise ProblemError(block.source, found, "train rows too, or its place as known")
+
+
+def _start_landmarks(
+    robot: Robot, tables: Sequence[Table], blocks: Sequence[MeasurementBlock], landmarks: Landmarks
+) -> None:
+    """Start landmarks that tool points of the nominal arm say, by the instrument that measured them."""
+    for instrument in INSTRUMENTS.values():
+        train = [b.select(np.flatnonzero(~b.test)) for b in blocks if tables[b.table].model == instrument.model
+                 and b.kind.n_nuisances and is_ours(b.kind) and not b.test.all()]  # fmt: skip
+        if train and instrument.sees_landmarks:
+            chain = build_chain(robot)
+            trigs = [precompute_trig(robot, tables[block.table].measurements.readings) for block in train]
+            ends = [block.ends[:, 0] for block in train]
+            points = [forward(chain, trig, rows).position for trig, rows in zip(trigs, ends, strict=True)]
+            instrument.start_landmarks(train, points, landmarks)
+
+
+def start_frames(robot: Robot, data: Dataset, tool: Frame, free: Booleans) -> FrameStart:
+    """Start frames, tool and landmarks by closed forms, table by table, poses first.
+
+    Args:
+        robot: The robot, without its tool.
+        data: The tables.
+        tool: flange_T_tool at the nominal parameters.
+        free: Which of its parameters are estimated, translation first, shape (6,).
+
+    Raises:
+        ProblemError: No image shows enough of a board.
+    """
+    start = FrameStart(tool, free, np.concatenate([np.zeros(0), *data.unknowns.starts]))
+    chain, trigs = build_chain(robot), data.trigs(robot)
+    instruments = [None if table.model is None else INSTRUMENTS[table.model] for table in data.tables]
+    says = [0 if i is None or not i.is_pose else i.sees_position + i.sees_orientation for i in instruments]
+    for number in sorted(range(len(says)), key=lambda k: -says[k]):
+        instrument, table = instruments[number], data.tables[number]
+        if instrument is not None:
+            flange = forward(chain, trigs[number])
+            start.begin(number, table.unknown_frame)
+            blocks = [block for block in data.series if block.table == number]
+            instrument.start_frames(start, table, blocks, (flange.rotation, flange.position), data.unknowns)
+    return start

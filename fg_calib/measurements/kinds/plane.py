@@ -1,0 +1,145 @@
+"""Dial indicators, tool tip on a flat face: distances of the tool point from planes in the room."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from fg_calib.initialization.landmarks import plane_from_distances
+from fg_calib.measurements.dataset import Measurements
+from fg_calib.measurements.kind import Floats, Frames, Kind, Rows, between
+from fg_calib.measurements.kinds.instrument import (
+    Column,
+    Instrument,
+    Places,
+    places_of_rows,
+    require_labels,
+    require_sigma,
+    simple_block,
+)
+from fg_calib.measurements.landmarks import Estimate, LandmarkKind, Landmarks
+from fg_calib.measurements.table import MeasurementBlock, Table
+from fg_calib.robot.kinematics import Poses
+
+
+def normal_and_distance(behind: Floats, through: Floats, covariance: Floats) -> Estimate:
+    """Unit normal and distance from the base of a plane (see `PlaneDistance`), and their covariance."""
+    step = through - behind
+    length = np.linalg.norm(step)
+    n = step / length
+    tilt = (np.eye(3) - np.outer(n, n)) / length
+    J = np.vstack([tilt, n + through @ tilt])
+    return np.append(n, n @ through), J @ covariance @ J.T, ("", "", "", "m")
+
+
+BEHIND = LandmarkKind("C", "point behind a plane", "", "")
+PLANE = LandmarkKind(
+    "F",
+    "plane",
+    "the unknown planes",
+    "Planes (unit normal in the base frame, distance from the base in mm)",
+    n_configurations=4,
+    reference=BEHIND,
+    estimate=normal_and_distance,
+)
+
+
+class PlaneDistance(Kind):
+    """`n . (p - f) - measured`, [m]; its derivative is `n . dp` and, in f, `(p - f) . (1 - n n^T) / |f - c| - n`.
+
+    The plane goes through its point f across the unit normal n, which points there from a point c away from the plane:
+    three coordinates that may be any, where a normal and a distance would be four that may not.
+
+    Data: the distance on the side that n points to, [m]. Nuisances: c and f in the frame that the chain starts in, 6
+    coordinates, [m].
+    """
+
+    names, units = ("distance",), ("m",)
+    ends, residual_dim, width, n_nuisances = 1, 1, 1, 6
+
+    def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
+        """See `Kind.rows`."""
+        length, n = between(nuisances[:, :3], nuisances[:, 3:])
+        step = at.position[:, 0] - nuisances[:, 3:]
+        height = np.einsum("ni,ni->n", n, step)
+        D = np.zeros((len(n), 1, 1, 6))
+        D[:, 0, 0, 3:] = n
+        tilt = (step - height[:, None] * n) / length[:, None]
+        N = np.concatenate([-tilt, tilt - n], axis=1)[:, None]
+        return Rows(height[:, None] - data[:, :1], D, N)
+
+    def fields(self, data: Floats) -> dict[str, Floats]:
+        """See `Kind.fields`."""
+        return {"length": data[:, 0]}
+
+    def mirrored(self, points: Floats, data: Floats, nuisances: Floats) -> Floats | None:
+        """The plane with its normal the other way, shifted to where the readings are those from there, in the mean.
+
+        None where all readings are the same, and tell no side. See `Kind.mirrored`.
+        """
+        if np.ptp(data) == 0.0:
+            return None
+        c, f = nuisances[:3], nuisances[3:]
+        through = f + 2.0 * float(np.mean(data)) * (f - c) / np.linalg.norm(f - c)
+        return np.concatenate([through + (f - c), through])
+
+
+class PlaneGauge(Instrument):
+    """Distances from planes."""
+
+    model, words = "plane", "distances from planes"
+    columns = (
+        Column(("plane",), "", "Which plane the tool point is on, or at a distance from"),
+        Column(("distance",), "length", "To the anchor (0: contact), or from the plane (0 without)"),
+        Column(("sigma_distance",), "length", "1 sigma of that"),
+    )
+    labels = optional_labels = ("plane",)
+    noise, landmarks = ("distance",), (BEHIND, PLANE)
+    sees_landmarks = True
+
+    def blocks(self, table: Table, number: int, landmarks: Landmarks) -> list[MeasurementBlock]:
+        """Distances from planes; 0, on the plane, where no column says them. See `Instrument.blocks`."""
+        m = table.measurements
+        labels = require_labels(table, "plane")
+        distance = np.zeros(m.n_configurations) if m.length is None else m.length
+        rows = np.flatnonzero((labels.index >= 0) & np.isfinite(distance))
+        sigma = require_sigma(table, m.sigma_length, "distance", rows)
+        nowhere = np.full((len(labels.names), 3), np.nan)
+        places = [
+            landmarks.add(kind, labels.names, nowhere, m.source, known=[kind is BEHIND] * len(labels.names))
+            for kind in (BEHIND, PLANE)
+        ]
+        nuisances = np.hstack([place[labels.index[rows]] for place in places])
+        of, data = labels.of(rows), distance[rows, None]
+        return [simple_block(PlaneDistance(), table, number, rows, data, sigma[:, None], nuisances=nuisances, of=of)]
+
+    def start_landmarks(
+        self, blocks: Sequence[MeasurementBlock], points: Sequence[Floats], landmarks: Landmarks
+    ) -> None:
+        """See `Instrument.start_landmarks`."""
+        there, nuisances = np.concatenate(points), np.concatenate([block.nuisances for block in blocks])
+        distance = np.concatenate([block.data[:, 0] for block in blocks])
+        for behind, through in np.unique(nuisances[:, [0, 3]], axis=0).tolist():
+            chosen = nuisances[:, 0] == behind
+            c, f = plane_from_distances(there[chosen], distance[chosen])
+            landmarks.start(behind, c)
+            landmarks.start(through, f)
+
+    def predict(self, m: Measurements, poses: Poses, places: Places) -> Measurements:
+        """See `Instrument.predict`."""
+        behind, there = (places_of_rows(places, kind, m.labels["plane"]) for kind in (BEHIND, PLANE))
+        normal = between(behind, there)[1]
+        return replace(m, length=np.einsum("ni,ni->n", normal, poses.position - there))
+
+    def default_places(self, names: Sequence[str], middle: Floats, reach: float) -> dict[tuple[str, str], Floats]:
+        """See `Instrument.default_places`."""
+        normals = Rotation.random(len(names), random_state=0).as_matrix()[:, :, 2]
+        through = {(PLANE.letter, name): middle - 2.0 * reach * n for name, n in zip(names, normals, strict=True)}
+        behind = {(BEHIND.letter, name): middle - 3.0 * reach * n for name, n in zip(names, normals, strict=True)}
+        return through | behind
+
+
+INSTRUMENTS = (PlaneGauge(),)

@@ -1,0 +1,230 @@
+"""Laser trackers, motion capture: poses, positions or orientations of the tool, or positions of targets on it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from fg_calib.initialization.hand_eye import Frame
+from fg_calib.initialization.landmarks import targets_from_positions
+from fg_calib.initialization.start import FrameStart
+from fg_calib.measurements.dataset import Measurements
+from fg_calib.measurements.kind import Floats, Frames, Integers, Kind, Rows
+from fg_calib.measurements.kinds.instrument import (
+    Column,
+    Instrument,
+    Places,
+    add_points,
+    places_of_rows,
+    require_sigma,
+    require_values,
+    simple_block,
+)
+from fg_calib.measurements.kinds.stacked import stack
+from fg_calib.measurements.landmarks import LandmarkKind, Landmarks
+from fg_calib.measurements.table import MeasurementBlock, Table
+from fg_calib.robot import kernels
+from fg_calib.robot.kinematics import Poses
+from fg_calib.robot.rotations import cross_matrix, inverse_right_jacobian
+
+TARGET = LandmarkKind(
+    "P",
+    "target",
+    "the unknown places of the targets on the tool",
+    "Targets (in the tool frame), mm",
+    key="targets",
+    n_configurations=2,
+    stays=True,
+)
+
+POSE_COLUMNS = (
+    Column(("x", "y", "z"), "length", "Measured position; of model board that of the board before the camera"),
+    Column(("qx", "qy", "qz", "qw"), "", "Measured orientation as unit quaternion, or"),
+    Column(("roll", "pitch", "yaw"), "angle", "the same as Rz(yaw) Ry(pitch) Rx(roll), or"),
+    Column(("rx", "ry", "rz"), "angle", "the same as rotation vector"),
+    Column(("sigma_position",), "length", "1 sigma of the row's position on each axis, or"),
+    Column(("sigma_x", "sigma_y", "sigma_z"), "length", "1 sigma on each axis by itself"),
+    Column(("sigma_orientation",), "angle", "1 sigma of the row's orientation about each axis, or"),
+    Column(("sigma_rx", "sigma_ry", "sigma_rz"), "angle", "1 sigma about each axis by itself"),
+)
+
+ANGLES = "qx, qy, qz, qw or roll, pitch, yaw"
+
+
+class Position(Kind):
+    """`p - measured` in the frame that the chain starts in, [m]; its derivative is `dp`.
+
+    Data: the position, 3 columns, [m].
+    """
+
+    names, units = ("position.x", "position.y", "position.z"), ("m", "m", "m")
+    ends, residual_dim, width = 1, 3, 3
+    code = kernels.POSITION
+
+    def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
+        """See `Kind.rows`."""
+        D = np.zeros((len(data), 1, 3, 6))
+        D[:, 0, :, 3:] = np.eye(3)
+        return Rows(at.position[:, 0] - data[:, :3], D)
+
+    def fields(self, data: Floats) -> dict[str, Floats]:
+        """See `Kind.fields`."""
+        return {"position": data}
+
+
+class TargetPosition(Kind):
+    """`p + R t - measured` in the frame that the chain starts in, [m]; its derivative is `dp + w x R t + R dt`.
+
+    Data: the position, 3 columns, [m]. Nuisances: the target t in the tool frame, 3 coordinates, [m].
+    """
+
+    names, units = ("position.x", "position.y", "position.z"), ("m", "m", "m")
+    ends, residual_dim, width, n_nuisances = 1, 3, 3, 3
+
+    def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
+        """See `Kind.rows`."""
+        R = at.rotation[:, 0]
+        arm = np.einsum("nij,nj->ni", R, nuisances)
+        D = np.zeros((len(data), 1, 3, 6))
+        D[:, 0, :, :3], D[:, 0, :, 3:] = -cross_matrix(arm), np.eye(3)
+        return Rows(at.position[:, 0] + arm - data[:, :3], D, R)
+
+    def fields(self, data: Floats) -> dict[str, Floats]:
+        """See `Kind.fields`."""
+        return {"position": data}
+
+
+class Orientation(Kind):
+    """`r = Log(R_measured^T R)`, the rotation vector in the tool frame, [rad]; its derivative is `Jr^-1(r) R^T w`.
+
+    Jr is the right Jacobian of SO(3) (Sola et al. 2018, Eq. 144).
+
+    Data: the rotation matrix in the frame that the chain starts in, row by row, 9 columns.
+    """
+
+    names, units = ("orientation.x", "orientation.y", "orientation.z"), ("rad", "rad", "rad")
+    ends, residual_dim, width = 1, 3, 9
+    code = kernels.ORIENTATION
+
+    def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
+        """See `Kind.rows`."""
+        R_T = np.swapaxes(at.rotation[:, 0], 1, 2)
+        r = -Rotation.from_matrix(R_T @ data[:, :9].reshape(-1, 3, 3)).as_rotvec()
+        D = np.zeros((len(r), 1, 3, 6))
+        D[:, 0, :, :3] = inverse_right_jacobian(r) @ R_T
+        return Rows(r, D)
+
+    def simulate(self, at: Frames, data: Floats, nuisances: Floats, noise: Floats) -> Floats:
+        """`R Exp(noise)`: errors about the tool's axes. See `Kind.simulate`."""
+        return (at.rotation[:, 0] @ Rotation.from_rotvec(noise).as_matrix()).reshape(-1, 9)
+
+    def fields(self, data: Floats) -> dict[str, Floats]:
+        """See `Kind.fields`."""
+        return {"rotation": data.reshape(-1, 3, 3)}
+
+
+class PoseTracker(Instrument):
+    """Poses, positions or orientations of the tool; positions of targets where a row names one.
+
+    Args:
+        model: Which of them.
+        orientation: Whether orientations take part.
+        position: Whether positions do.
+    """
+
+    labels, optional_labels = ("target", "station"), ("target",)
+    columns = (
+        *POSE_COLUMNS,
+        Column(("target",), "", "Which point of the tool was seen; empty: the tool itself"),
+        Column(("station",), "", "Where it was seen from; each has a frame of its own with frame unknown"),
+    )
+    landmarks = (TARGET,)
+    is_pose = True
+
+    def __init__(self, model: str, orientation: bool, position: bool) -> None:
+        self.model, self.words = model, f"measured {model}s"
+        self.sees_orientation, self.sees_position = orientation, position
+        self.noise = ("position",) * position + ("orientation",) * orientation
+
+    def blocks(self, table: Table, number: int, landmarks: Landmarks) -> list[MeasurementBlock]:
+        """See `Instrument.blocks`."""
+        m = table.measurements
+        labels = m.labels.get("target")
+        if labels is None or not self.sees_position:
+            return [self._block(table, number, np.arange(m.n_configurations), Position(), None)]
+        place = add_points(landmarks, TARGET, table, labels.names)[labels.index]
+        return [
+            self._block(table, number, rows, kind, place[rows] if kind.n_nuisances else None)
+            for kind, chosen in ((Position(), labels.index < 0), (TargetPosition(), labels.index >= 0))
+            if len(rows := np.flatnonzero(chosen))
+        ]
+
+    def _block(
+        self, table: Table, number: int, rows: Integers, position: Kind, nuisances: Integers | None
+    ) -> MeasurementBlock:
+        """Rows of a table, with the kind of their positions and what these depend on."""
+        m = table.measurements
+        parts: list[tuple[Kind, Floats, Floats]] = []
+        for wanted, kind, values, sigma, columns, noise in (
+            (self.sees_orientation, Orientation(), m.rotation, m.sigma_orientation, ANGLES, "orientation"),
+            (self.sees_position, position, m.position, m.sigma_position, "x, y, z", "position"),
+        ):
+            if wanted:
+                measured = require_values(table, values, columns, f"measured {noise}s")
+                measured = measured.reshape(m.n_configurations, kind.width)[rows]
+                parts.append((kind, measured, require_sigma(table, sigma, noise, rows)))
+        kinds, data, sigmas = zip(*parts, strict=True)
+        return simple_block(
+            stack(*kinds),
+            table,
+            number,
+            rows,
+            np.hstack(data),
+            np.hstack(sigmas),
+            nuisances=np.zeros((len(rows), 0), dtype=np.int64) if nuisances is None else nuisances,
+            of=m.labels["target"].of(rows) if "target" in m.labels and self.sees_position else None,
+        )
+
+    def start_frames(
+        self,
+        start: FrameStart,
+        table: Table,
+        blocks: Sequence[MeasurementBlock],
+        flange: tuple[Floats, Floats],
+        landmarks: Landmarks,
+    ) -> None:
+        """Frame and tool from poses; of targets only their orientations say something of the tool."""
+        m, labels = table.measurements, table.measurements.labels.get("target")
+        train = np.flatnonzero(~m.test)
+        R_F, p_F = flange[0][train], flange[1][train]
+        R = m.rotation[train] if self.sees_orientation and m.rotation is not None else None
+        p = m.position[train] if self.sees_position and m.position is not None else None
+        start.align((R_F, p_F), (R, p if labels is None else None))
+        if p is None or labels is None or not any(block.kind.n_nuisances for block in blocks):
+            return
+        coordinates = landmarks.coordinates_of(TARGET, labels.names)
+        known = np.vstack([start.places[coordinates], np.zeros(3)])  # the tool point itself at the end, as row -1
+        target = np.where(labels.index[train] < 0, len(labels.names), labels.index[train])
+        tool = R_F @ start.tool.rotation, p_F + R_F @ start.tool.translation
+        world = Frame(np.eye(3), np.zeros(3))
+        frame, places = targets_from_positions(tool, p, target, known, world, start.unknown_frame)
+        start.places[coordinates] = places[:-1]
+        start.set_frame(frame)
+
+    def predict(self, m: Measurements, poses: Poses, places: Places) -> Measurements:
+        """See `Instrument.predict`."""
+        if "target" not in m.labels:
+            return m
+        labels = m.labels["target"]
+        there = np.where(labels.index[:, None] < 0, 0.0, places_of_rows(places, TARGET, labels))
+        return replace(m, position=poses.position + np.einsum("nij,nj->ni", poses.rotation, there))
+
+
+INSTRUMENTS = (
+    PoseTracker("pose", orientation=True, position=True),
+    PoseTracker("position", orientation=False, position=True),
+    PoseTracker("orientation", orientation=True, position=False),
+)
