@@ -385,8 +385,8 @@ def _train_rows(robot: Robot, data: Dataset) -> list[_Rows]:
         sigma: Floats = s.sigma
         if s.formed:  # each pair as if it were alone
             pairs = usable_pairs(data.tables[s.table], ("distance" in s.kind.names, "angle" in s.kind.names))
-            sigma = {"distance": pairs.sigma_distance, "angle": pairs.sigma_angle}
-            columns = [np.nan_to_num(sigma[part.quantity][s.number], nan=1.0) for part in s.kind.parts]
+            of_pairs = {"distance": pairs.sigma_distance, "angle": pairs.sigma_angle}
+            columns = [np.nan_to_num(of_pairs[part.quantity][s.number], nan=1.0) for part in s.kind.parts]
             sigma = np.stack(columns, axis=1)
         covariance = sigma[train][:, :, None] ** 2 * np.eye(h)
         if s.covariance is not None and not s.formed:
