@@ -56,8 +56,6 @@ UPWARD = {
     "diagnostics/linearity": {"prediction/expected_error"},
     "graph/build": {"observability/indices", "observability/random_configurations"},
     "graph/information": {"observability/indices"},
-    "graph/knowledge": {"observability/indices"},
-    "graph/linearised": {"observability/indices"},
     "observability/cramer_rao": {"prediction/expected_error"},
     "prediction/correction": {"calibration"},
     "prediction/predict": {

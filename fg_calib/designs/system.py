@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from fg_calib.arrays import FrozenArrays
 from fg_calib.designs.rows import StopRows
-from fg_calib.observability.indices import SIGNAL_FLOOR
+from fg_calib.graph.normal_system import SIGNAL_FLOOR
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

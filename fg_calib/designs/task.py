@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arrays import Brief, FrozenArrays
-from fg_calib.graph.factors import eliminate
+from fg_calib.graph.normal_system import eliminate
 from fg_calib.graph.problem import Problem
 from fg_calib.observability.indices import Observability, observability_of_rows
 from fg_calib.observability.observed_quantities import Seen

@@ -37,9 +37,9 @@ from fg_calib.diagnostics.other_sides import MUCH, folds_of, other_sides, withou
 from fg_calib.errors import CalibrationError
 from fg_calib.graph.information import directions
 from fg_calib.graph.noise import NoiseState
+from fg_calib.graph.normal_system import SIGNAL_FLOOR
 from fg_calib.graph.problem import Problem, assembled, noises_at, reweighted_at
 from fg_calib.graph.solver import Solution, SolverOptions, solve, solve_from, solve_image
-from fg_calib.observability.indices import SIGNAL_FLOOR
 from fg_calib.statistics.covariance import spread_of
 from fg_calib.threads import one_blas_thread
 

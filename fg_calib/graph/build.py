@@ -15,6 +15,7 @@ from fg_calib.errors import ProblemError
 from fg_calib.graph.factors import Variables, prior_rows
 from fg_calib.graph.information import observability_of, whitened_triangle
 from fg_calib.graph.knowledge import coordinates_of
+from fg_calib.graph.normal_system import determined
 from fg_calib.graph.problem import Problem, problem_at, start_of, tables_of, variables_of
 from fg_calib.graph.tolerances import with_first_tolerances
 from fg_calib.job import Job
@@ -24,7 +25,7 @@ from fg_calib.measurements.kinds import INSTRUMENTS, Frames, check_derivatives, 
 from fg_calib.measurements.kinds.pair import missing_values
 from fg_calib.measurements.predictions import predict_measurements
 from fg_calib.measurements.table import Table
-from fg_calib.observability.indices import determined, singular_values
+from fg_calib.observability.indices import singular_values
 from fg_calib.observability.random_configurations import Places, frame_names
 from fg_calib.options import (
     FrameKnowledge,

@@ -47,12 +47,6 @@ Floats = NDArray[np.float64]
 GRAM_ROWS = 20_000
 """Sets with more rows than this are reduced by their Gram matrix, if their conditioning allows it."""
 
-_SHARE = 1e-6
-"""Share in an undetermined direction above which a nuisance column is unknown."""
-
-_ROUNDING = 1e-10
-"""Share of a column's length that elimination may leave of nothing."""
-
 
 @dataclass(frozen=True)
 class Variable:
@@ -623,67 +617,6 @@ def dense(linear: gtsam.GaussianFactorGraph, keys: list[int]) -> tuple[Floats, F
     for key in keys:
         ordering.push_back(key)
     return linear.jacobian(ordering)
-
-
-@dataclass(frozen=True)
-class Eliminated(Brief):
-    """A linear system with its nuisance columns eliminated by QR.
-
-    Attributes:
-        own: What the nuisance columns can explain of the right-hand side, shape (rank,).
-        A: The core's columns, less what the nuisance columns can explain of them, shape (m, n_columns).
-        b: The right-hand side, less the same, shape (m,).
-        follow: How the nuisance variables follow the core, shape (n_nuisance, n_columns).
-        inverse: S with S S^T their covariance at a given core, shape (n_nuisance, rank).
-        unknown: Which nuisance columns have a share in a direction that nothing determines, shape (n_nuisance,).
-    """
-
-    own: Floats
-    A: Floats
-    b: Floats
-    follow: Floats
-    inverse: Floats
-    unknown: NDArray[np.bool_]
-
-    @property
-    def rank(self) -> int:
-        """Number of directions of the nuisance variables that the system determines."""
-        return len(self.own)
-
-
-def eliminate(A: Floats, b: Floats, n_columns: int) -> Eliminated:
-    """Eliminate all but the first `n_columns` of a linear system |A x - b|^2.
-
-    What is left of a core column that the nuisance columns explain altogether is rounding, and set to zero.
-
-    Directions of the nuisance columns that nothing determines are left where they are.
-    """
-    core, nuisance = A[:, :n_columns], A[:, n_columns:]
-    k = nuisance.shape[1]
-    if k == 0:
-        return Eliminated(np.zeros(0), core, b, np.zeros((0, n_columns)), np.zeros((0, 0)), np.zeros(0, dtype=np.bool_))
-    Q, inverse, unknown = _basis_of(nuisance)
-    explained = Q.T @ core
-    left = core - Q @ explained
-    left = left - Q @ (Q.T @ left)  # once more: rounding of the first time
-    left[:, np.linalg.norm(left, axis=0) <= _ROUNDING * np.linalg.norm(core, axis=0)] = 0.0
-    own = Q.T @ b
-    return Eliminated(own, left, b - Q @ own, -inverse @ explained, inverse, unknown)
-
-
-def _basis_of(A: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """An orthonormal basis Q of columns, S with `A S = Q`, and which columns nothing determines by themselves."""
-    size = np.linalg.norm(A, axis=0)
-    size[size == 0.0] = 1.0
-    Q, R = np.linalg.qr(A / size)
-    pivots = np.abs(np.diag(R))
-    if len(Q) >= A.shape[1] and pivots.min() > _ROUNDING * pivots.max():
-        return Q, np.linalg.inv(R) / size[:, None], np.zeros(A.shape[1], dtype=np.bool_)
-    U, s, Vt = np.linalg.svd(A / size, full_matrices=True)
-    kept = np.zeros(len(Vt), dtype=np.bool_)
-    kept[: len(s)] = s > _ROUNDING * s.max(initial=0.0)
-    S = (Vt[kept].T / s[kept[: len(s)]]) / size[:, None]
-    return U[:, : len(s)][:, kept[: len(s)]], S, np.any(np.abs(Vt[~kept]) > _SHARE, axis=0)
 
 
 class Reduction:

@@ -6,16 +6,82 @@ from collections.abc import Sequence
 
 import gtsam
 import numpy as np
+import scipy.sparse
 from numpy.typing import NDArray
 
-from fg_calib.graph.factors import Eliminated, Variables, dense, eliminate, prior_rows, unknown_prior_rows
+from fg_calib.graph.error_states import SchurComplement
+from fg_calib.graph.factors import Variables, dense, prior_rows, unknown_prior_rows
+from fg_calib.graph.normal_system import (
+    RANK_TOLERANCE,
+    SIGNAL_FLOOR,
+    Eliminated,
+    LinearRows,
+    NormalSystem,
+    eliminate,
+)
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.robust import effect
-from fg_calib.graph.rows import ErrorColumns, RowSet, correlation_of, felt_errors, whitened_rows
-from fg_calib.observability.indices import RANK_TOLERANCE, SIGNAL_FLOOR, Observability, observability_of_rows
+from fg_calib.graph.rows import At, ErrorColumns, RowSet, correlation_of, felt_errors, whitened_rows
+from fg_calib.observability.indices import Observability, observability_of_rows
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+
+
+def linear_system(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> NormalSystem:
+    """The normal system of a problem at a parameter vector: all train rows, priors and added factors.
+
+    Args:
+        problem: The problem.
+        parameters: The parameter vector.
+        with_loss: Whether a robust loss counts for what it loses of clean data (see `robust.Effect`).
+    """
+    v = problem.variables
+    blocks = [
+        np.column_stack(rows[::-1]) for rows in (unknown_prior_rows(v, parameters), known_rows(problem, parameters))
+    ]
+    A, b = added_system(problem, parameters)
+    blocks += [np.column_stack([A, -b]), *row_triangles(problem, parameters, with_loss=with_loss)]
+    priors = np.column_stack(prior_rows(v, parameters)[::-1])
+    row_sets = _with_loss(problem)[0] if with_loss else problem.rows
+    return NormalSystem(
+        np.vstack(blocks),
+        v.n_columns,
+        v.prior_scales,
+        priors,
+        lambda: linear_rows(problem, row_sets, v.at(parameters)),
+    )
+
+
+def linear_rows(problem: Problem, row_sets: Sequence[RowSet], at: At) -> LinearRows:
+    """Whitened train rows one by one, those of each row set and each of its parts after the other."""
+    found, counts, used, loadings = [], [], [], []
+    shared = next((rows for rows in row_sets if rows.shared is not None), None)
+    for rows in row_sets:
+        found.append(rows.private(at))
+        for part in rows.parts:
+            series = problem.data.series[part.series]
+            counts.append(np.full(part.block.n, part.block.residual_dim))
+            used.append(series.used[series.train].ravel())
+        if shared is not None and shared.shared is not None:
+            none = scipy.sparse.csr_array((len(found[-1]), shared.shared.loadings.shape[1]))
+            loadings.append(none if rows.shared is None else rows.shared.loadings)
+    wide = np.concatenate([np.zeros((0, at.n_columns + at.n_nuisance + 1)), *found])
+    measurement = np.repeat(np.arange(sum(map(len, counts))), np.concatenate([np.zeros(0, dtype=np.int64), *counts]))
+    states = None
+    if shared is not None and shared.shared is not None:
+        alone = len(row_sets) == 1
+        L = shared.shared.loadings if alone else scipy.sparse.csr_array(scipy.sparse.vstack(loadings))
+        states = shared.shared if alone else SchurComplement(L, shared.shared.width)
+    return LinearRows(
+        r=wide[:, -1],
+        A=wide[:, :-1],
+        measurement=measurement,
+        states=states,
+        used=np.concatenate([np.zeros(0, dtype=np.bool_), *used]),
+        configurations=np.zeros(0, dtype=np.int64) if shared is None else shared.configurations,
+        joints=0 if shared is None else shared.joints,
+    )
 
 
 def eliminated(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> Eliminated:
@@ -108,7 +174,12 @@ def known_rows(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
 
 def added_rows(problem: Problem, parameters: Floats) -> Floats:
     """Derivatives of the added factors' whitened rows, shape (n_added, n_columns + n_nuisance)."""
-    variables = problem.variables
+    return added_system(problem, parameters)[0]
+
+
+def added_system(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
+    """The added factors' derivatives, shape (n_added, n_columns + n_nuisance), and minus their errors, (n_added,)."""
+    variables, b = problem.variables, np.zeros(problem.n_added)
     wide = np.zeros((problem.n_added, variables.n_columns + variables.n_nuisance))
     if problem.added:
         graph = gtsam.NonlinearFactorGraph()
@@ -116,9 +187,9 @@ def added_rows(problem: Problem, parameters: Floats) -> Floats:
             graph.add(factor)
         present = set(graph.keyVector())
         chosen = [v for v in variables.items + variables.nuisance if v.key in present]
-        A, _ = dense(graph.linearize(variables.values(parameters)), [v.key for v in chosen])
+        A, b = dense(graph.linearize(variables.values(parameters)), [v.key for v in chosen])
         wide[:, np.concatenate([np.arange(wide.shape[1])[v.columns] for v in chosen])] = A
-    return wide
+    return wide, b
 
 
 def named_triangle(problem: Problem, parameters: Floats) -> Floats:

@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arrays import FrozenArrays
-from fg_calib.graph.factors import Variables, build_variables, custom_factor, eliminate, pose_of
+from fg_calib.graph.factors import Variables, build_variables, custom_factor, pose_of
+from fg_calib.graph.normal_system import determined, eliminate
 from fg_calib.measurements.landmarks import Landmarks
-from fg_calib.observability.indices import determined
 from fg_calib.options import FrameKnowledge, Model
 from fg_calib.robot.model import Robot
 

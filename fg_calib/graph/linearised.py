@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.errors import CalibrationError, SolverError
-from fg_calib.graph.factors import Variables, dense, eliminate
+from fg_calib.graph.factors import Variables, dense
+from fg_calib.graph.normal_system import determined, eliminate
 from fg_calib.graph.problem import Problem
-from fg_calib.observability.indices import determined
 
 Floats = NDArray[np.float64]
 

@@ -2,7 +2,7 @@
 
 An error that reaches one measurement only is that measurement's own: it is added to its private noise. What is left is
 shared: with `y` the rows whitened by their private noise, and `L` how they follow from errors `z ~ N(0, 1)` of
-configurations, the covariance of y is 1 + L L^T (see `sharing`).
+configurations, the covariance of y is 1 + L L^T (see `error_states`).
 
 Where true joint values are estimated the rows are linearised about them: with e the errors of the readings taken so far
 and J their derivatives, the rows less J e are those of the readings themselves, and what the rows say of e is the
@@ -21,10 +21,10 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from fg_calib.arrays import Brief
+from fg_calib.graph.error_states import SharedErrors
 from fg_calib.graph.noise import RowNoise, Source, whitening_of
 from fg_calib.measurements import residuals
 from fg_calib.measurements.residuals import Block, pack, unpack
-from fg_calib.measurements.sharing import SharedErrors
 from fg_calib.robot.kinematics import SPAN, Chain, over_spans
 
 Floats = NDArray[np.float64]

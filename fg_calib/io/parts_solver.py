@@ -37,13 +37,13 @@ from fg_calib.errors import InputError, ProblemError, shown
 from fg_calib.executors import Failure, map_jobs
 from fg_calib.graph.factors import Variables, build_variables, prior_rows
 from fg_calib.graph.noise import RowNoise
+from fg_calib.graph.normal_system import determined
 from fg_calib.graph.problem import Problem, noises_at, start_of, unassembled, variables_of
 from fg_calib.graph.rows import whitened_rows
 from fg_calib.graph.solver import NEAR_ENOUGH, Iteration, SolverOptions, options_of
 from fg_calib.measurements.build import build_dataset
 from fg_calib.measurements.dataset import Measurements, joined
 from fg_calib.measurements.table import Table
-from fg_calib.observability.indices import determined
 from fg_calib.options import POSE_MODELS, Limits, Options, check_number
 from fg_calib.robot.model import Robot
 from fg_calib.statistics.covariance import TangentCovariance, held_frames

@@ -12,8 +12,8 @@ from itertools import chain, combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.graph.factors import eliminate
 from fg_calib.graph.information import whitened_jacobian
+from fg_calib.graph.normal_system import eliminate
 from fg_calib.graph.problem import Problem
 
 Floats = NDArray[np.float64]

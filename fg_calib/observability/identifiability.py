@@ -20,9 +20,10 @@ from fg_calib.arrays import Brief
 from fg_calib.errors import ProblemError
 from fg_calib.graph.build import STRUCTURAL_FLOOR, predicted_problem, random_problem
 from fg_calib.graph.information import observability_of
+from fg_calib.graph.normal_system import SIGNAL_FLOOR
 from fg_calib.graph.problem import Problem
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.observability.indices import SIGNAL_FLOOR, Observability
+from fg_calib.observability.indices import Observability
 from fg_calib.observability.parallel_axes import MissingMotion, missing_motions
 from fg_calib.observability.reasons import LostDirection, explain
 from fg_calib.options import FrameKnowledge, Model, Pairing, check_names, check_number

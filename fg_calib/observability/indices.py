@@ -21,20 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arrays import FrozenArrays
+from fg_calib.graph.normal_system import RANK_TOLERANCE, SIGNAL_FLOOR, SUPPORT_TOLERANCE, determined
 from fg_calib.robot.model import Parameter, names_of
 
 Floats = NDArray[np.float64]
 
 IdentifiabilityClass = Literal["independent", "relative", "ineffective"]
-
-RANK_TOLERANCE = 1e-10
-"""Singular values below this part of the largest are those of directions that the data do not determine."""
-
-SIGNAL_FLOOR = 1e-3
-"""Nor are directions with a smaller signal-to-noise ratio: sigma above 1000 ordinary changes, 1 rad or the reach."""
-
-SUPPORT_TOLERANCE = 1e-6
-"""A parameter takes part in a direction if its unit-free share in it is above this."""
 
 KEEP_ORDER = ("theta", "d", "a", "alpha", "beta", "x", "y", "z", "yaw", "pitch", "roll")
 """Of parameters that only act together the earlier kind is kept, and of one kind the later joint, as in the paper."""
@@ -207,11 +199,6 @@ def observability_of_rows(
 def singular_values(matrix: Floats) -> Floats:
     """Singular values, descending."""
     return np.linalg.svd(matrix, compute_uv=False).astype(np.float64)
-
-
-def determined(singular_values: Floats, floor: float = SIGNAL_FLOOR) -> int:
-    """Number of directions that are determined: above `RANK_TOLERANCE` of the largest, and above the floor."""
-    return int(np.sum(singular_values > max(RANK_TOLERANCE * singular_values.max(initial=0.0), floor)))
 
 
 def observability_indices(singular_values: Floats, n_measurements: int) -> dict[str, float]:

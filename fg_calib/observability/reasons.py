@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.graph.information import named_triangle
+from fg_calib.graph.normal_system import SUPPORT_TOLERANCE
 from fg_calib.graph.problem import Problem
 from fg_calib.observability.confounding import Absorbed
-from fg_calib.observability.indices import SUPPORT_TOLERANCE, Observability
+from fg_calib.observability.indices import Observability
 from fg_calib.observability.observed_quantities import SEES_ORIENTATION, SEES_POSITION, Seen
 from fg_calib.observability.random_configurations import elsewhere
 from fg_calib.robot.inverse import random_readings

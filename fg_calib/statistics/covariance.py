@@ -26,9 +26,9 @@ from numpy.typing import ArrayLike, NDArray
 from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.factors import Variables, prior_rows
 from fg_calib.graph.information import correlation, whitened_triangle
+from fg_calib.graph.normal_system import RANK_TOLERANCE, SIGNAL_FLOOR, SUPPORT_TOLERANCE, determined
 from fg_calib.graph.problem import Problem, by_columns_of
 from fg_calib.graph.solver import Solution
-from fg_calib.observability.indices import RANK_TOLERANCE, SIGNAL_FLOOR, SUPPORT_TOLERANCE, determined
 from fg_calib.robot.model import Robot
 
 Floats = NDArray[np.float64]

@@ -41,12 +41,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
-from fg_calib.graph.factors import Variables, eliminate, prior_rows
+from fg_calib.graph.factors import Variables, prior_rows
 from fg_calib.graph.information import correlation, whitened_triangle
+from fg_calib.graph.normal_system import RANK_TOLERANCE, eliminate
 from fg_calib.graph.problem import Problem, reweighted_at
 from fg_calib.graph.solver import Solution, solve
 from fg_calib.graph.tolerances import ToleranceScale, ToleranceScales, groups_of, prior_parameters, with_scales
-from fg_calib.observability.indices import RANK_TOLERANCE
 from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]

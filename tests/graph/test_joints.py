@@ -10,11 +10,12 @@ from simulated import measure, plus, small_arm, true_robot
 from tolerances import sigmas_apart
 
 from fg_calib.assessment import assess
+from fg_calib.graph import error_states
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.factors import pose_of
 from fg_calib.graph.problem import mahalanobis_distances, noises_at, reweighted_at
 from fg_calib.graph.solver import solve
-from fg_calib.measurements import residuals, sharing
+from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Pairs
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
@@ -292,9 +293,9 @@ def test_eliminated_joint_values_of_pairs_are_the_same_whichever_way_they_are_el
     """Values, their sigmas, and those of the parameters: steps end 3e-5 sigma from the dense way at most."""
     robot, m = measured("direct", 12, seed=3)
     found = []
-    for most, filled in ((sharing.MAX_DENSE, sharing.FILLED), (0, 0)):
-        monkeypatch.setattr(sharing, "MAX_DENSE", most)
-        monkeypatch.setattr(sharing, "FILLED", filled)
+    for most, filled in ((error_states.MAX_DENSE, error_states.MAX_FILL), (0, 0)):
+        monkeypatch.setattr(error_states, "MAX_DENSE", most)
+        monkeypatch.setattr(error_states, "MAX_FILL", filled)
         uncertainty = assess(solve(build_problem(robot, m, model="distance-rotation", encoder="estimated")))
         values = uncertainty.joint_values
         found.append([uncertainty.robot.nominal, uncertainty.covariance, values.error, values.sigma])

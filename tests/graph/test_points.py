@@ -19,8 +19,9 @@ from fg_calib import write_robot
 from fg_calib.assessment import assess
 from fg_calib.errors import InputError, ProblemError
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.factors import eliminate, prior_rows
+from fg_calib.graph.factors import prior_rows
 from fg_calib.graph.information import named_triangle, observability_of, whitened_triangle
+from fg_calib.graph.normal_system import eliminate
 from fg_calib.graph.problem import started_at
 from fg_calib.graph.robust import tuning, weight
 from fg_calib.graph.solver import solve

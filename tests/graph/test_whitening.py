@@ -11,13 +11,13 @@ from sparing import diagonal
 from tolerances import rounding
 
 from fg_calib.assessment import assess
+from fg_calib.graph import error_states
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.information import correlation, whitened_triangle
 from fg_calib.graph.noise import JOINT_NOISE
 from fg_calib.graph.problem import joint_errors, noises_at, reweighted_at
 from fg_calib.graph.solver import solve
 from fg_calib.measurements import residuals
-from fg_calib.measurements import sharing as sharing_module
 from fg_calib.measurements.dataset import Groups, Measurements, Pairs
 from fg_calib.measurements.table import Table
 from fg_calib.options import Pairing
@@ -185,8 +185,8 @@ def eliminated(monkeypatch):
 
     def by(way):
         most = {"dense": 2000, "steps": 0}[way]
-        monkeypatch.setattr(sharing_module, "MAX_DENSE", most)
-        monkeypatch.setattr(sharing_module, "FILLED", min(most, sharing_module.FILLED))
+        monkeypatch.setattr(error_states, "MAX_DENSE", most)
+        monkeypatch.setattr(error_states, "MAX_FILL", min(most, error_states.MAX_FILL))
 
     return by
 
@@ -317,8 +317,8 @@ def test_a_calibration_in_steps_is_the_dense_one(kind, monkeypatch):
     m, pairing = measured_in(kind, robot, np.random.default_rng(6))
     found = []
     for most in (2000, 0):
-        monkeypatch.setattr(sharing_module, "MAX_DENSE", most)
-        monkeypatch.setattr(sharing_module, "FILLED", min(most, sharing_module.FILLED))
+        monkeypatch.setattr(error_states, "MAX_DENSE", most)
+        monkeypatch.setattr(error_states, "MAX_FILL", min(most, error_states.MAX_FILL))
         solution = solve(build_problem(robot, m, model="distance-rotation", pairing=pairing))
         found.append((solution, assess(solution)))
     (dense, of_dense), (steps, of_steps) = found
@@ -332,7 +332,7 @@ def test_a_calibration_in_steps_is_the_dense_one(kind, monkeypatch):
     for a, b in zip(of_steps.goodness.kinds, of_dense.goodness.kinds, strict=True):
         assert a.p_value == pytest.approx(b.p_value, rel=1e-4)
         assert a.expected == pytest.approx(b.expected, rel=1e-6)
-    bound = 4.0 * np.sqrt(2.0 * dense.problem.n_residuals / sharing_module.N_PROBES)
+    bound = 4.0 * np.sqrt(2.0 * dense.problem.n_residuals / error_states.N_PROBES)
     assert abs(steps.problem.n_independent - dense.problem.n_independent) <= bound
 
 

@@ -10,13 +10,13 @@ from scipy.spatial.transform import Rotation
 from sparing import diagonal
 from tolerances import rounding
 
+from fg_calib.graph.error_states import SharedErrors
 from fg_calib.graph.rows import At, Part, RowSet
 from fg_calib.measurements import residuals
 from fg_calib.measurements.kinds import stack
 from fg_calib.measurements.kinds.pair import Distance, RotationAngle, SamePoint
 from fg_calib.measurements.kinds.pose import Orientation, Position
 from fg_calib.measurements.residuals import Block, pack
-from fg_calib.measurements.sharing import SharedErrors
 from fg_calib.robot.kernels import LANES
 from fg_calib.robot.kinematics import SPAN, build_chain
 

@@ -14,13 +14,13 @@ from tolerances import rounding
 from touches import TOOL_POINT, corners, touch
 
 from fg_calib.assessment import assess
+from fg_calib.graph import error_states
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.factors import prior_rows
 from fg_calib.graph.noise import JOINT_NOISE
 from fg_calib.graph.problem import reweighted_at
 from fg_calib.graph.rows import whitener_of
 from fg_calib.graph.solver import solve
-from fg_calib.measurements import sharing
 from fg_calib.measurements.dataset import Measurements, Pairs
 from fg_calib.measurements.table import Table
 from fg_calib.options import Pairing
@@ -165,7 +165,7 @@ def test_components_are_those_of_the_dense_covariance(name, exact, monkeypatch):
     inverse = np.linalg.inv(sum(parts) + F)
     P = inverse - inverse @ J @ np.linalg.solve(J.T @ inverse @ J + rows.T @ rows, J.T @ inverse)
     if not exact:
-        monkeypatch.setattr(sharing, "MAX_EXACT", 0)
+        monkeypatch.setattr(error_states, "MAX_DENSE", 0)
     found = noise_components(solution, spread_of(solution))
     e = inverse @ r  # at the optimum it is P times rows and priors
     assert found.names[-1] == JOINT_NOISE

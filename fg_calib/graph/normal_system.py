@@ -1,0 +1,401 @@
+r"""The one linear Gaussian system of a calibration: step, covariance, rank, error states and residual statistics.
+
+Linearised and whitened by private noise, measurements, priors and other factors read
+
+    r + A s = L z + e,   e ~ N(0, 1),   z ~ N(0, 1),
+
+s a step of the parameters: those of the *core* (robot and measurement frames) and *landmarks*, nuisance parameters
+with or without priors. Error states z are eliminated first (see `error_states`), then the landmarks by QR. A singular
+value decomposition of what is left gives rank, null space, step and covariance of the core. Everything else is the
+posterior of linear functions of (s, z): with R R^T the covariance of the parameters and Z = S^-1 L^T A,
+
+    var(A_i s - L_i z) = L_i S^-1 L_i^T + |(A_i - L_i Z) R|^2.
+
+References:
+    Baarda (1968), A testing procedure for use in geodetic networks. Cook, Weisberg (1982), Residuals and influence.
+    Foerstner (1979), Ein Verfahren zur Schaetzung von Varianz- und Kovarianzkomponenten. AVN 86.
+    Gilmour, Thompson, Cullis (1995), Average information REML. Biometrics 51.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from fg_calib.arrays import Brief
+from fg_calib.graph.error_states import SchurComplement
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Booleans = NDArray[np.bool_]
+Sparse = scipy.sparse.csr_array
+
+RANK_TOLERANCE = 1e-10
+"""Singular values below this share of the largest are those of directions that the data do not determine."""
+
+SIGNAL_FLOOR = 1e-3
+"""Nor are directions with a smaller signal-to-noise ratio: sigma above 1000 ordinary changes, 1 rad or the reach."""
+
+SUPPORT_TOLERANCE = 1e-6
+"""A parameter takes part in a direction if its unit-free share in it is above this."""
+
+MIN_REDUNDANCY = 1e-9
+"""Eigenvalue of a residual's covariance, over that of its noise, below which the fit leaves nothing of it."""
+
+BATCH = 512
+"""Measurements whose covariance is worked out at once."""
+
+
+def determined(singular_values: Floats, floor: float = SIGNAL_FLOOR) -> int:
+    """Number of determined directions: singular values above `RANK_TOLERANCE` of the largest, and above the floor."""
+    return int(np.sum(singular_values > max(RANK_TOLERANCE * singular_values.max(initial=0.0), floor)))
+
+
+@dataclass(frozen=True)
+class Eliminated(Brief):
+    """A linear system with its landmark columns eliminated by QR.
+
+    Attributes:
+        own: What the landmark columns can explain of the right-hand side, shape (rank,).
+        A: The core's columns, minus what the landmark columns can explain of them, shape (m, n_core).
+        b: The right-hand side, minus the same, shape (m,).
+        follow: How the landmarks follow the core, shape (n_landmarks, n_core).
+        inverse: S with S S^T the landmarks' covariance at a given core, shape (n_landmarks, rank).
+        unknown: Which landmark columns have a share in a direction that nothing determines, shape (n_landmarks,).
+    """
+
+    own: Floats
+    A: Floats
+    b: Floats
+    follow: Floats
+    inverse: Floats
+    unknown: Booleans
+
+    @property
+    def rank(self) -> int:
+        """Number of directions of the landmarks that the system determines."""
+        return len(self.own)
+
+
+def eliminate(A: Floats, b: Floats, n_core: int) -> Eliminated:
+    """Eliminate all but the first `n_core` columns of a linear system |A x - b|^2.
+
+    What is left of a core column that the landmark columns explain altogether is rounding, and set to zero. Directions
+    of the landmark columns that nothing determines stay where they are.
+    """
+    core, landmarks = A[:, :n_core], A[:, n_core:]
+    if landmarks.shape[1] == 0:
+        return Eliminated(np.zeros(0), core, b, np.zeros((0, n_core)), np.zeros((0, 0)), np.zeros(0, dtype=np.bool_))
+    Q, inverse, unknown = _basis_of(landmarks)
+    explained = Q.T @ core
+    left = core - Q @ explained
+    left = left - Q @ (Q.T @ left)  # once more: rounding of the first time
+    left[:, np.linalg.norm(left, axis=0) <= RANK_TOLERANCE * np.linalg.norm(core, axis=0)] = 0.0
+    own = Q.T @ b
+    return Eliminated(own, left, b - Q @ own, -inverse @ explained, inverse, unknown)
+
+
+def _basis_of(A: Floats) -> tuple[Floats, Floats, Booleans]:
+    """An orthonormal basis Q of columns, S with `A S = Q`, and which columns nothing determines by themselves."""
+    size = np.linalg.norm(A, axis=0)
+    size[size == 0.0] = 1.0
+    Q, R = np.linalg.qr(A / size)
+    pivots = np.abs(np.diag(R))
+    if len(Q) >= A.shape[1] and pivots.min() > RANK_TOLERANCE * pivots.max():
+        return Q, np.linalg.inv(R) / size[:, None], np.zeros(A.shape[1], dtype=np.bool_)
+    U, s, Vt = np.linalg.svd(A / size, full_matrices=True)
+    kept = np.zeros(len(Vt), dtype=np.bool_)
+    kept[: len(s)] = s > RANK_TOLERANCE * s.max(initial=0.0)
+    S = (Vt[kept].T / s[kept[: len(s)]]) / size[:, None]
+    return U[:, : len(s)][:, kept[: len(s)]], S, np.any(np.abs(Vt[~kept]) > SUPPORT_TOLERANCE, axis=0)
+
+
+@dataclass(frozen=True)
+class LinearRows(Brief):
+    """Linearised measurements, whitened by their private noise: `r + A s = L z + e`.
+
+    Attributes:
+        r: Predicted minus measured, shape (n,).
+        A: Derivatives in core and landmarks, shape (n, n_all).
+        measurement: Which measurement each row is of, from 0 and ascending, shape (n,).
+        states: How rows follow from the error states z; None where no measurements share errors.
+        used: Rows that count; a row that was not measured is zero, shape (n,).
+        configurations: Configurations that have error states, in the order of these.
+        joints: Place of the joint readings' errors among the error states of a configuration.
+    """
+
+    r: Floats
+    A: Floats
+    measurement: Integers
+    states: SchurComplement | None = None
+    used: Booleans | None = None
+    configurations: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    joints: int = 0
+
+    @property
+    def L(self) -> Sparse:  # noqa: N802 -- the matrix of the module's head
+        """How rows follow from the error states, shape (n, m)."""
+        return Sparse((len(self.r), 0)) if self.states is None else self.states.loadings
+
+    def weigh(self, rows: Floats) -> Floats:
+        """C^-1 rows, C = 1 + L L^T, shape (n, k)."""
+        return rows if self.states is None else self.states.weigh(rows)
+
+
+class NormalSystem:
+    """Linearised measurements and priors, error states and landmarks eliminated.
+
+    Args:
+        square_root: Rows [A r] of which only the Gram matrix matters, shape (k, n_all + 1): those of measurements,
+            error states eliminated, and of all that is known of landmarks.
+        n_core: Number of columns of the core, the first ones.
+        scales: By how much each of them may be off, shape (n_core,): rank is judged in these.
+        priors: Rows [K k] of priors on the core alone, shape (q, n_core + 1); none if None.
+        rows: Returns the measurements row by row, for statistics of residuals.
+
+    Attributes:
+        left: The rows with the landmarks eliminated, priors on the core not counted.
+        singular_values: Of rows and priors, columns in `scales`, shape (n_core,).
+        directions: The singular directions as rows, in the columns' own units, shape (n_core, n_core).
+        rank: Number of directions of the core that rows and priors determine.
+        root: R with R R^T the covariance of the core's determined directions, shape (n_core, rank).
+        step: Gauss-Newton step of core and landmarks, of least norm in `scales`, shape (n_all,).
+        decrement: Length of the step, [sigma].
+        cost: Half the sum of squares of rows and priors before the step.
+    """
+
+    def __init__(
+        self,
+        square_root: Floats,
+        n_core: int,
+        scales: Floats,
+        priors: Floats | None = None,
+        rows: Callable[[], LinearRows] | None = None,
+    ) -> None:
+        self.left = left = eliminate(square_root[:, :-1], -square_root[:, -1], n_core)
+        k = np.zeros((0, n_core + 1)) if priors is None else priors
+        A, b = np.vstack([left.A, k[:, :-1]]) * scales, np.concatenate([left.b, -k[:, -1]])
+        tall = np.vstack([A, np.zeros((max(n_core - len(A), 0), n_core))])  # so that all directions are found
+        U, s, Vt = np.linalg.svd(tall, full_matrices=False)
+        self.singular_values: Floats = s
+        self.directions: Floats = Vt * scales
+        self.rank = rank = determined(s)
+        along = U[: len(b), :rank].T @ b
+        self.root: Floats = self.directions[:rank].T / s[:rank]
+        core = self.root @ along
+        self.step: Floats = np.concatenate([core, left.inverse @ left.own + left.follow @ core])
+        self.decrement = float(np.hypot(np.linalg.norm(left.own), np.linalg.norm(along)))
+        self.cost = 0.5 * float(np.sum(square_root[:, -1] ** 2) + np.sum(k[:, -1] ** 2))
+        self._scales, self._loose, self._gather = scales, Vt[rank:], rows
+        self._information = s[:rank, None] * Vt[:rank] / scales
+
+    @property
+    def covariance(self) -> Floats:
+        """Covariance of the core, shape (n_core, n_core)."""
+        return self.root @ self.root.T
+
+    @property
+    def chi_square(self) -> float:
+        """Sum of squares of rows and priors after the step."""
+        return 2.0 * self.cost - self.decrement**2
+
+    @cached_property
+    def full_root(self) -> Floats:
+        """R with R R^T the covariance of core and landmarks, shape (n_all, rank + landmarks' rank)."""
+        own = np.vstack([np.zeros((len(self.root), self.left.rank)), self.left.inverse])
+        return np.hstack([np.vstack([self.root, self.left.follow @ self.root]), own])
+
+    def length(self, step: Floats) -> float:
+        """Length of a step of the core, [sigma]."""
+        return float(np.linalg.norm(self._information @ step[: len(self._scales)]))
+
+    def without_null_space(self, step: Floats) -> Floats:
+        """A step with the same effect on every row, but none along the core's undetermined directions."""
+        drift = self._scales * (self._loose.T @ (self._loose @ (step[: len(self._scales)] / self._scales)))
+        out: Floats = step - np.concatenate([drift, self.left.follow @ drift])
+        return out
+
+    # Statistics of single rows and of error states.
+
+    @cached_property
+    def rows(self) -> LinearRows:
+        """The measurements, row by row."""
+        assert self._gather is not None
+        return self._gather()
+
+    @cached_property
+    def residual(self) -> Floats:
+        """Marginal residuals after the step, e = r + A s, in sigma of the private noise, shape (n,)."""
+        out: Floats = self.rows.r + self.rows.A @ self.step
+        return out
+
+    @cached_property
+    def weighted_residual(self) -> Floats:
+        """Private errors u = C^-1 e = e - L z, shape (n,)."""
+        return self.rows.weigh(self.residual[:, None])[:, 0]
+
+    @cached_property
+    def z(self) -> Floats:
+        """Posterior mean of the error states, shape (m,), [sigma]."""
+        states = self.rows.states
+        return np.zeros(0) if states is None else states.posterior_mean(self.residual[:, None])[:, 0]
+
+    @cached_property
+    def z_variance(self) -> Floats:
+        """Posterior variance of the error states, shape (m,); their prior variance is 1."""
+        states = self.rows.states
+        if states is None:
+            return np.zeros(0)
+        out: Floats = states.variances + np.sum((self._follow @ self.full_root) ** 2, axis=1)
+        return out
+
+    @cached_property
+    def _follow(self) -> Floats:
+        """Z = S^-1 L^T A, how error states follow the parameters, shape (m, n_all)."""
+        states = self.rows.states
+        return np.zeros((0, self.rows.A.shape[1])) if states is None else states.posterior_mean(self.rows.A)
+
+    def z_studentised(self, min_share: float = 1e-6) -> Floats:
+        """Error states over the sigma that their estimates vary by, shape (m,).
+
+        Args:
+            min_share: Share of a state's variance that measurements must determine; nan below.
+        """
+        seen = 1.0 - self.z_variance
+        return self.z / np.sqrt(np.where(seen > min_share, seen, np.nan))
+
+    def leverage(self, A: Floats) -> Floats:
+        """Variance that the estimate gives linear functions A s, shape (n,)."""
+        out: Floats = np.sum((A @ self.full_root) ** 2, axis=1)
+        return out
+
+    @cached_property
+    def studentised(self) -> Floats:
+        """Marginal residuals over their own sigma, shape (n,); nan where the fit leaves nothing of them."""
+        noise = 1.0 + self.rows.L.power(2).sum(axis=1)
+        left = noise - self.leverage(self.rows.A)
+        return self.residual / np.sqrt(np.where(left > MIN_REDUNDANCY * noise, left, np.nan))
+
+    @cached_property
+    def private_covariances(self) -> list[Floats]:
+        """Covariance of the private errors u of each measurement's rows, (h, h) each."""
+        rows, states = self.rows, self.rows.states
+        ends = np.append(np.flatnonzero(np.diff(rows.measurement)) + 1, len(rows.r))
+        moved = self._weighed_root
+        used = np.ones(len(rows.r)) if rows.used is None else rows.used.astype(np.float64)
+        out, start = list[Floats](), 0
+        while start < len(rows.r):
+            first = int(np.searchsorted(ends, start, side="right"))
+            stops = ends[first : first + BATCH]
+            chunk = slice(start, int(stops[-1]))
+            L = rows.L[chunk]
+            common = np.zeros((L.shape[0],) * 2) if states is None else L @ states.solve(L.T.toarray())
+            for stop in stops.tolist():
+                k = slice(start - chunk.start, stop - chunk.start)
+                out.append(np.diag(used[start:stop]) - common[k, k] - moved[start:stop] @ moved[start:stop].T)
+                start = stop
+        return out
+
+    @property
+    def redundancy(self) -> Floats:
+        """Share of each measurement's private noise that its residuals show, shape (k,); adds up to at most n."""
+        return np.array([np.trace(Q) for Q in self.private_covariances])
+
+    @property
+    def deletion(self) -> tuple[Floats, Integers]:
+        """By how much chi-square falls without each measurement, and its degrees of freedom, shapes (k,)."""
+        drops, degrees, start = [], [], 0
+        for Q in self.private_covariances:
+            values, vectors = np.linalg.eigh(Q)
+            kept = values > MIN_REDUNDANCY
+            u = vectors[:, kept].T @ self.weighted_residual[start : start + len(Q)]
+            drops.append(float(np.sum(u**2 / values[kept])))
+            degrees.append(int(kept.sum()))
+            start += len(Q)
+        return np.array(drops), np.array(degrees, dtype=np.int64)
+
+    def predicted_covariance(self, A: Floats, L: Sparse, D: Floats, *, corrected: bool = False) -> Floats:
+        """Covariance of residuals of rows that were not fitted, which may share error states with fitted ones.
+
+        Args:
+            A: Derivatives in core and landmarks, shape (n, n_all).
+            L: How they follow from the error states of `rows`, shape (n, m).
+            D: Covariance of their other noise, shape (n, n).
+            corrected: Whether the estimated error states are taken off them; else their readings are taken as they are.
+        """
+        R, states = self.full_root, self.rows.states
+        moved = A @ R
+        if states is None:
+            return D + moved @ moved.T
+        followed = L @ self._follow @ R
+        if corrected:
+            out: Floats = D + L @ states.solve(L.T.toarray()) + (moved - followed) @ (moved - followed).T
+            return out
+        cross = moved @ followed.T
+        total: Floats = D + (L @ L.T).toarray() + moved @ moved.T - cross - cross.T
+        return total
+
+    # Variance components.
+
+    def project(self, f: Floats) -> Floats:
+        """Data f, shape (n, k), times P = C^-1 - C^-1 A cov A^T C^-1; P r is `weighted_residual`."""
+        weighed = self.rows.weigh(f)
+        out: Floats = weighed - self._weighed_root @ (self.full_root.T @ (self.rows.A.T @ weighed))
+        return out
+
+    @cached_property
+    def _weighed_root(self) -> Floats:
+        """C^-1 A R, shape (n, rank)."""
+        out: Floats = (self.rows.A - self.rows.L @ self._follow) @ self.full_root
+        return out
+
+    def trace(self, E: Sparse) -> float:
+        """Trace of E^T P E, E sparse, shape (n, k); of large systems an estimate (see `error_states.N_PROBES`)."""
+        states = self.rows.states
+        total = float(E.power(2).sum()) if states is None else states.trace(E)
+        return total - float(np.sum((E.T @ self._weighed_root) ** 2))
+
+    def components(self, roots: Sequence[Sparse]) -> VarianceComponents:
+        """REML of factors on variances of noise, one step by average information (Gilmour et al. 1995).
+
+        Args:
+            roots: E_i with E_i E_i^T the part of the rows' covariance C that scales with factor i, shape (n, k_i).
+        """
+        u = self.weighted_residual
+        work = np.column_stack([E @ (E.T @ u) for E in roots])
+        seen = np.array([np.sum((E.T @ u) ** 2) for E in roots])
+        expected = np.array([self.trace(E) for E in roots])
+        information = 0.5 * work.T @ self.project(work)
+        return VarianceComponents(seen, expected, information)
+
+
+@dataclass(frozen=True)
+class VarianceComponents(Brief):
+    """What residuals show of noise of several origins, each known up to a factor on its variance.
+
+    Attributes:
+        seen: u^T V_i u, shape (n,).
+        expected: Its mean, were the noise as taken, shape (n,).
+        information: Average information in the logarithms of the factors, shape (n, n).
+    """
+
+    seen: Floats
+    expected: Floats
+    information: Floats
+
+    @property
+    def step(self) -> Floats:
+        """Step of the logarithms of the factors, shape (n,)."""
+        out: Floats = np.linalg.pinv(self.information) @ (0.5 * (self.seen - self.expected))
+        return out
+
+    @property
+    def sigma(self) -> Floats:
+        """1 sigma of the logarithms of the factors, shape (n,)."""
+        out: Floats = np.sqrt(np.diag(np.linalg.pinv(self.information)))
+        return out

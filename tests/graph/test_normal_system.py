@@ -1,0 +1,209 @@
+"""The normal system against the dense formulas of generalised least squares with C = D + L L^T."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import scipy.sparse
+
+from fg_calib.errors import SolverError
+from fg_calib.graph import error_states
+from fg_calib.graph.error_states import SchurComplement
+from fg_calib.graph.normal_system import LinearRows, NormalSystem, determined, eliminate
+
+WIDTH, H, N_CORE, N_LANDMARKS = 3, 2, 6, 4
+
+
+class Dense:
+    """A random system, whitened rows and priors, and its estimate by formulas that form C."""
+
+    def __init__(self, ends, seed=0, n_poses=20):
+        rng = np.random.default_rng(seed)
+        self.k, n_all = len(ends), N_CORE + N_LANDMARKS
+        L = np.zeros((self.k * H, n_poses * WIDTH))
+        for i, pair in enumerate(ends):
+            for end in pair:
+                L[i * H : i * H + H, end * WIDTH : end * WIDTH + WIDTH] = rng.normal(size=(H, WIDTH))
+        self.L, self.A = L, rng.normal(size=(self.k * H, n_all))
+        self.C = np.eye(len(L)) + L @ L.T
+        self.K = np.diag(rng.uniform(0.3, 1.0, N_CORE))
+        truth = rng.normal(size=n_all)
+        self.r = np.linalg.cholesky(self.C) @ rng.normal(size=len(L)) - self.A @ truth
+        self.prior = rng.normal(size=N_CORE)
+        inverse = np.linalg.inv(self.C)
+        wide = np.hstack([self.K, np.zeros((N_CORE, N_LANDMARKS))])
+        self.covariance = np.linalg.inv(self.A.T @ inverse @ self.A + wide.T @ wide)
+        self.step = -self.covariance @ (self.A.T @ inverse @ self.r + wide.T @ self.prior)
+        self.e = self.r + self.A @ self.step
+        self.P = inverse - inverse @ self.A @ self.covariance @ self.A.T @ inverse
+        self.chi_square = self.e @ inverse @ self.e + np.sum((self.prior + self.K @ self.step[:N_CORE]) ** 2)
+
+    def system(self):
+        states = SchurComplement(scipy.sparse.csr_array(self.L), WIDTH)
+        rows = LinearRows(self.r, self.A, np.repeat(np.arange(self.k), H), states)
+        white = states.whiten(np.column_stack([self.A, self.r]))
+        priors = np.column_stack([self.K, self.prior])
+        return NormalSystem(white, N_CORE, np.ones(N_CORE), priors, lambda: rows)
+
+
+STAR = [(0, i) for i in range(1, 20)]
+CHAIN = list(pairwise(range(20)))
+LOOPS = [tuple(pair) for pair in np.random.default_rng(1).integers(0, 20, (60, 2)).tolist() if pair[0] != pair[1]]
+THRESHOLDS = {
+    "rows": {},
+    "states": {},
+    "sparse": {"MAX_DENSE": 0, "MAX_FILL": 0},
+    "iterative": {"MAX_DENSE": 0, "MAX_FILL": 0, "MAX_LOOP_STATES": -1},
+}
+
+
+@pytest.fixture(params=THRESHOLDS)
+def dense(request, monkeypatch):
+    """Systems that each way of elimination is chosen for."""
+    for name, value in THRESHOLDS[request.param].items():
+        monkeypatch.setattr(error_states, name, value)
+    found = Dense({"rows": STAR, "states": LOOPS, "sparse": CHAIN, "iterative": LOOPS}[request.param])
+    states = SchurComplement(scipy.sparse.csr_array(found.L), WIDTH)
+    names = {"rows": "_DenseRows", "states": "_DenseStates", "sparse": "_SparseStates", "iterative": "_Iterative"}
+    assert type(states._factor).__name__ == names[request.param]
+    return found
+
+
+def close(found, wanted, tolerance=1e-9):
+    np.testing.assert_allclose(found, wanted, rtol=tolerance, atol=tolerance)
+
+
+def test_step_covariance_and_chi_square_are_those_of_generalised_least_squares(dense):
+    system = dense.system()
+    assert system.rank == N_CORE
+    close(system.step, dense.step)
+    close(system.covariance, dense.covariance[:N_CORE, :N_CORE])
+    close(system.full_root @ system.full_root.T, dense.covariance)
+    close(system.chi_square, dense.chi_square)
+    close(system.left.rank, N_LANDMARKS)
+
+
+def test_error_states_have_their_posterior_mean_and_variance(dense):
+    system = dense.system()
+    close(system.z, dense.L.T @ np.linalg.solve(dense.C, dense.e))
+    variance = np.diag(np.eye(dense.L.shape[1]) - dense.L.T @ dense.P @ dense.L)
+    close(system.z_variance, variance)
+    seen = 1.0 - variance
+    close(system.z_studentised()[seen > 1e-6], (system.z / np.sqrt(np.maximum(seen, 1e-300)))[seen > 1e-6])
+    assert np.isnan(system.z_studentised()[seen < 1e-9]).all()
+
+
+def test_residuals_are_studentised_by_their_own_variance(dense):
+    system = dense.system()
+    variance = np.diag(dense.C - dense.A @ dense.covariance @ dense.A.T)
+    close(system.residual, dense.e)
+    close(system.weighted_residual, np.linalg.solve(dense.C, dense.e))
+    kept = variance > 1e-6
+    close(system.studentised[kept], (dense.e[kept] / np.sqrt(variance[kept])))
+    close(system.leverage(dense.A), np.diag(dense.A @ dense.covariance @ dense.A.T))
+
+
+def test_redundancy_is_the_share_of_private_noise_that_residuals_show(dense):
+    blocks = [dense.P[i * H : i * H + H, i * H : i * H + H] for i in range(dense.k)]
+    close(dense.system().redundancy, [np.trace(block) for block in blocks])
+
+
+def test_deleting_a_measurement_lowers_chi_square_by_its_statistic():
+    dense = Dense(LOOPS)
+    drops, degrees = dense.system().deletion
+    assert (degrees == H).all()
+    for i in (0, 7):
+        rest = np.delete(np.arange(len(dense.r)), [i * H, i * H + 1])
+        without = np.linalg.inv(dense.C[np.ix_(rest, rest)])
+        wide = np.hstack([dense.K, np.zeros((N_CORE, N_LANDMARKS))])
+        A, r = dense.A[rest], dense.r[rest]
+        step = -np.linalg.solve(A.T @ without @ A + wide.T @ wide, A.T @ without @ r + wide.T @ dense.prior)
+        e = r + A @ step
+        left = e @ without @ e + np.sum((dense.prior + dense.K @ step[:N_CORE]) ** 2)
+        close(drops[i], dense.chi_square - left, 1e-8)
+
+
+def test_predictions_know_the_errors_that_fitted_rows_share(dense):
+    rng, n = np.random.default_rng(5), 3
+    A, L = rng.normal(size=(n, N_CORE + N_LANDMARKS)), np.zeros((n, dense.L.shape[1]))
+    L[:, :6], D = rng.normal(size=(n, 6)), np.diag(rng.uniform(0.5, 1.0, n))
+    inverse = np.linalg.inv(dense.C)
+    # Residuals of new rows less A s: L z + e + A (s - s_hat), s_hat linear in the fitted noise.
+    gain = -dense.covariance @ dense.A.T @ inverse
+    cross = L @ dense.L.T @ gain.T @ A.T
+    wanted = D + L @ L.T + A @ dense.covariance @ A.T + cross + cross.T
+    system = dense.system()
+    close(system.predicted_covariance(A, scipy.sparse.csr_array(L), D), wanted, 1e-8)
+    # With z known from the fit the covariance is that of the joint posterior of parameters and states.
+    full = np.hstack([dense.A, -dense.L])
+    wide = np.zeros((N_CORE, full.shape[1]))
+    wide[:, :N_CORE] = dense.K
+    precision = full.T @ full + wide.T @ wide
+    precision[N_CORE + N_LANDMARKS :, N_CORE + N_LANDMARKS :] += np.eye(dense.L.shape[1])
+    both = np.hstack([A, -L])
+    close(
+        system.predicted_covariance(A, scipy.sparse.csr_array(L), D, corrected=True),
+        D + both @ np.linalg.inv(precision) @ both.T,
+        1e-8,
+    )
+
+
+def test_variance_components_have_the_gradient_and_information_of_restricted_likelihood(dense):
+    n = len(dense.r)
+    private, shared = scipy.sparse.eye_array(n, format="csr"), scipy.sparse.csr_array(dense.L)
+    V = [np.eye(n), dense.L @ dense.L.T]
+    found = dense.system().components([private, shared])
+    u = np.linalg.solve(dense.C, dense.e)
+    close(found.seen, [u @ v @ u for v in V])
+    if error_states.MAX_DENSE:  # else traces are estimates
+        close(found.expected, [np.trace(dense.P @ v) for v in V], 1e-8)
+    close(found.information, [[0.5 * u @ v @ dense.P @ w @ u for w in V] for v in V], 1e-8)
+    close(found.information @ found.step, 0.5 * (found.seen - found.expected))
+
+
+def test_a_null_direction_stays_where_it_is():
+    rng = np.random.default_rng(2)
+    A = rng.normal(size=(30, 5))
+    A[:, 4] = A[:, 3]
+    system = NormalSystem(np.column_stack([A, rng.normal(size=30)]), 5, np.array([1.0, 1.0, 1.0, 1.0, 3.0]))
+    assert system.rank == 4
+    null = np.array([0.0, 0.0, 0.0, 1.0, -1.0])
+    assert abs(null @ (system.step / np.array([1.0, 1.0, 1.0, 1.0, 9.0]))) < 1e-12  # least norm in the scales
+    moved = system.without_null_space(system.step + 5.0 * null)
+    close(moved, system.step)
+    close(A @ moved, A @ system.step)
+
+
+def test_landmarks_that_nothing_determines_are_named():
+    rng = np.random.default_rng(3)
+    A = rng.normal(size=(30, 6))
+    A[:, 5] = A[:, 4]
+    left = eliminate(A, rng.normal(size=30), 3)
+    assert left.rank == 2
+    assert left.unknown.tolist() == [False, True, True]
+    assert np.linalg.matrix_rank(left.A) == 3
+
+
+def test_degrees_of_freedom_count_rank_by_one_rule():
+    assert determined(np.array([1e3, 1.0, 1e-4])) == 2  # below the floor
+    assert determined(np.array([1e12, 1e3, 1.0])) == 2  # below the share of the largest
+    assert determined(np.array([1.0, 1e-5]), floor=1e-6) == 2
+
+
+@pytest.mark.parametrize("limit", ["MAX_ITERATIONS", "MAX_ITERATIVE_STATES"])
+def test_too_many_errors_that_loops_couple_point_to_poses(limit, monkeypatch):
+    for name, value in THRESHOLDS["iterative"].items() | {(limit, 2)}:
+        monkeypatch.setattr(error_states, name, value)
+    states = SchurComplement(scipy.sparse.csr_array(Dense(LOOPS).L), WIDTH)
+    with pytest.raises(SolverError, match="use model pose with frame unknown"):
+        states.posterior_mean(np.ones((len(LOOPS) * H, 1)))
+
+
+def test_traces_of_many_errors_are_estimated(monkeypatch):
+    dense = Dense(LOOPS)
+    states = SchurComplement(scipy.sparse.csr_array(dense.L), WIDTH)
+    E = scipy.sparse.csr_array(dense.L)
+    exact = np.trace(dense.L.T @ np.linalg.solve(dense.C, dense.L))
+    assert states.trace(E) == pytest.approx(exact, rel=1e-10)
+    monkeypatch.setattr(error_states, "MAX_DENSE", 0)
+    assert states.trace(E) == pytest.approx(exact, rel=0.1)
