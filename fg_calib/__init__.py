@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
     from fg_calib.batch import calibrate_jobs
     from fg_calib.calibration import Calibration, calibrate, calibrate_job, calibrate_parts
-    from fg_calib.designs.comparison import compare_designs
     from fg_calib.designs.design import Design, design
     from fg_calib.diagnostics.inspection import Inspection, inspect_job
     from fg_calib.diagnostics.multistart import look_elsewhere
@@ -71,10 +70,15 @@ if TYPE_CHECKING:
     from fg_calib.robot.kinematics import pose
     from fg_calib.robot.model import Robot
     from fg_calib.robot.reaching import Correction
-    from fg_calib.simulation.configurations import BoardViews, GivenReadings, RandomReadings, TargetViews
-    from fg_calib.simulation.scenario import Scenario, Simulation
-    from fg_calib.simulation.scenario_file import read_scenario
-    from fg_calib.simulation.simulator import simulate
+    from fg_calib.simulation.scenario import (
+        BoardViews,
+        GivenReadings,
+        RandomReadings,
+        Scenario,
+        TargetViews,
+        read_scenario,
+    )
+    from fg_calib.simulation.simulator import Simulation, simulate
     from fg_calib.simulation.write import write_simulation
     from fg_calib.statistics.prior_scales import estimate_tolerances
     from fg_calib.statistics.variance_components import estimate_noise
@@ -87,9 +91,7 @@ _HOMES = {
     "fg_calib.batch": ("calibrate_jobs",),
     "fg_calib.calibration": ("Calibration", "calibrate", "calibrate_job", "calibrate_parts"),
     "fg_calib.prediction.correction": ("correct",),
-    "fg_calib.designs.comparison": ("compare_designs",),
     "fg_calib.designs.design": ("Design", "design"),
-    "fg_calib.simulation.configurations": ("BoardViews", "GivenReadings", "RandomReadings", "TargetViews"),
     "fg_calib.errors": ("CalibrationError", "InputError", "ProblemError", "SolverError"),
     "fg_calib.executors": ("Failure", "dask_executor", "local_processes", "map_jobs"),
     "fg_calib.exports.export": ("Export", "export"),
@@ -104,7 +106,6 @@ _HOMES = {
     "fg_calib.robot.inverse": ("Inverse", "solve_inverse"),
     "fg_calib.robot.reaching": ("Correction",),
     "fg_calib.io.robot_file": ("read_robot", "write_robot"),
-    "fg_calib.simulation.scenario_file": ("read_scenario",),
     "fg_calib.simulation.write": ("write_simulation",),
     "fg_calib.io.tables": ("read_measurements",),
     "fg_calib.io.targets": ("Targets", "read_targets"),
@@ -134,8 +135,10 @@ _HOMES = {
         *("write_comparison", "write_observability", "write_results"),
     ),
     "fg_calib.robot.model": ("Robot",),
-    "fg_calib.simulation.scenario": ("Scenario", "Simulation"),
-    "fg_calib.simulation.simulator": ("simulate",),
+    "fg_calib.simulation.scenario": (
+        *("BoardViews", "GivenReadings", "RandomReadings", "Scenario", "TargetViews", "read_scenario"),
+    ),
+    "fg_calib.simulation.simulator": ("Simulation", "simulate"),
     "fg_calib.io.parts_solver": ("PartsSolution", "cut", "reduce_parts", "solve_parts"),
     "fg_calib.diagnostics.multistart": ("look_elsewhere",),
     "fg_calib.graph.extension": ("DistanceFactor", "RotationAngleFactor", "expand"),
@@ -205,7 +208,6 @@ __all__ = [
     "calibrate_parts",
     "check_setup",
     "compare",
-    "compare_designs",
     "comparison_document",
     "correct",
     "cramer_rao",

@@ -6,18 +6,20 @@ from simulated import small_arm
 
 from fg_calib import Camera, Pairing
 from fg_calib.measurements.dataset import Noise
-from fg_calib.simulation.configurations import Placement, RandomReadings
-from fg_calib.simulation.instruments import (
+from fg_calib.simulation.scenario import (
     BoardCamera,
     Corners,
+    Errors,
     Indicator,
     LengthGauge,
     PairGauge,
+    Placement,
+    RandomReadings,
+    Scenario,
     Sockets,
     Spot,
     Tracker,
 )
-from fg_calib.simulation.scenario import Errors, Scenario
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3, "tool": 5e-3}
 SIGMA = Noise(1e-4, 2e-4, 0.0, distance=1e-4, angle=2e-4, point=1e-4, pixel=0.1)

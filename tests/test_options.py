@@ -29,8 +29,7 @@ from fg_calib import (
     write_robot,
 )
 from fg_calib.errors import InputError
-from fg_calib.simulation.configurations import BoardViews, Placement, RandomReadings
-from fg_calib.simulation.scenario import Errors, Scenario
+from fg_calib.simulation.scenario import BoardViews, Errors, Placement, RandomReadings, Scenario
 
 ROBOT = planar_robot(tolerance={"a": 1e-3, "theta": 1e-3})
 TABLE = measure(ROBOT, 20, np.random.default_rng(0))
@@ -152,9 +151,8 @@ MISTAKES = {
               "did you mean uniform?"),
     "a self-motion": (lambda: BoardViews(BOARD, self_motion="Held"), "board: self_motion: found 'Held', expected one "
                       "of random, held; did you mean held?"),
-    "a board's radius": (lambda: BoardViews(BOARD, radius=-0.5), "board: radius: found -0.5, expected a finite number "
-                         "above 0"),
-    "a number of views": (lambda: RandomReadings(0), "random: count: found 0, expected a whole number above 0"),
+    "a board's radius": (lambda: BoardViews(BOARD, radius=-0.5), "board: radius: found -0.5, expected a number above 0"),
+    "a number of views": (lambda: RandomReadings(0), "random: count: found 0, expected a number above 0"),
     "a scenario's frame": (lambda: scenario(frame="Base"), "scenario: frame: found 'Base', expected one of base, "
                            "unknown; did you mean base?"),
     "a scenario's unit": (lambda: scenario(angle_unit="grad"), "scenario: angle_unit: found 'grad', expected one of "

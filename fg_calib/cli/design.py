@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from fg_calib.cli.output import Json, end, say, show_json, show_report
-from fg_calib.cli.workers import Scheduler, Workers, executor_for, require_one
 
 if TYPE_CHECKING:
     from fg_calib.designs.design import Design
-    from fg_calib.executors import Failure
     from fg_calib.io.units import Units
     from fg_calib.job import Job
     from fg_calib.robot.model import Robot
     from fg_calib.simulation.scenario import Scenario
 
 _Of = Annotated[
-    list[str],
+    str,
     typer.Argument(
         metavar="SCENARIO|JOB",
         help="What measures, and how well: a scenario (a file, or space-robot); or a job, whose rows count already.",
@@ -60,15 +57,6 @@ _Lever = Annotated[
     str | None,
     typer.Option("--lever", metavar="LENGTH", help="Orientations count too, by what they move at this distance."),
 ]
-_Instruments = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--instruments",
-        metavar="FILE ...",
-        readable=False,
-        help="Instruments to compare: files with keys of a scenario that stand in the place of its own.",
-    ),
-]
 _Out = Annotated[
     Path | None, typer.Option("--out", metavar="DIR", readable=False, help="Write tables and a job to fill in there.")
 ]
@@ -85,24 +73,19 @@ def design(
     criterion: _Criterion = "I",
     error: _Frame = None,
     lever: _Lever = None,
-    instruments: _Instruments = None,
     out: _Out = None,
     seed: _Seed = 0,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:
     """Choose which configurations to measure, and say what accuracy to expect of how many."""
+    from fg_calib.designs.design import design as designed
     from fg_calib.io.atomic import require_writable
     from fg_calib.io.units import quantity
 
     if n is not None and target is not None:
         say("error: --n and --target: one of the two")
         raise typer.Exit(2)
-    several = _of_instruments(of, instruments)
-    require_one(workers, scheduler)
-    _require_several(several, workers, scheduler)
-    subjects, units, robot = _read(of[0], several)
+    subject, units, robot = _read(of)
     if out is not None:
         require_writable(out)
     choices: dict[str, Any] = {
@@ -116,105 +99,42 @@ def design(
         "task": None if task is None else _readings(task, robot, units),
         **_candidates(candidates, robot, units),
     }
-    found, failed = _found(subjects, choices, workers, scheduler, several=bool(several))
-    if found:
-        _show(found, units, out, failed, several=bool(several), as_json=as_json)
-    for failure in failed:
-        say(f"{failure.job}: error: {failure.reason}")
-    missed = [name for name, one in found.items() if not one.reached]
-    if failed:
-        raise typer.Exit(1)
-    end([f"the target is not reached{f' with {name}' if several else ''}" for name in missed], "doubtful")
+    found = designed(subject, **choices)
+    _show(found, units, out, as_json=as_json)
+    end([] if found.reached else ["the target is not reached"], "doubtful")
 
 
-def _require_several(instruments: Sequence[Path], workers: int | None, scheduler: str | None) -> None:
-    """End with a line on stderr where nothing could run side by side."""
-    for option, asked in (("--workers", workers), ("--scheduler", scheduler)):
-        if asked is not None and len(instruments) < 2:
-            say(f"error: {option} has no effect without several --instruments: it is they that run side by side")
-            raise typer.Exit(2)
+def _show(found: Design, units: Units, out: Path | None, *, as_json: bool) -> None:
+    """Print a design, and write it."""
+    from fg_calib.report.plan import build_design_report, design_document
+    from fg_calib.report.plan_files import write_design
 
-
-def _found(
-    subjects: Mapping[str, Scenario | Job],
-    choices: Mapping[str, Any],
-    workers: int | None,
-    scheduler: str | None,
-    *,
-    several: bool,
-) -> tuple[dict[str, Design], list[Failure]]:
-    """The designs, and why others of several are missing; what is wrong with the only one is raised."""
-    from fg_calib.designs.comparison import compare_designs
-    from fg_calib.designs.design import design as designed
-    from fg_calib.executors import Failure
-
-    if not several:
-        return {name: designed(one, **choices) for name, one in subjects.items()}, []
-    with executor_for(workers, scheduler, lambda: "nothing has been written") as executor:
-        outcomes = compare_designs(subjects, executor, **choices)
-    found = {name: one for name, one in outcomes.items() if not isinstance(one, Failure)}
-    return found, [one for one in outcomes.values() if isinstance(one, Failure)]
-
-
-def _show(
-    found: Mapping[str, Design],
-    units: Units,
-    out: Path | None,
-    failed: Sequence[Failure],
-    *,
-    several: bool,
-    as_json: bool,
-) -> None:
-    """Print designs, and write them."""
-    from fg_calib.report.plan import (
-        build_design_report,
-        build_instruments_report,
-        design_document,
-        designs_document,
-    )
-    from fg_calib.report.plan_files import write_design, write_designs
-
-    first, names = next(iter(found.values())), tuple[str, ...]()
+    names = tuple[str, ...]()
     try:
         if as_json:
-            show_json(designs_document(found, failed) if several else design_document(first))
+            show_json(design_document(found))
         else:
-            show_report(build_instruments_report(found, failed) if several else build_design_report(first))
+            show_report(build_design_report(found))
     finally:  # also where nobody takes the report
         if out is not None:
-            names = write_designs(out, found, units) if several else write_design(out, first, units)
+            names = write_design(out, found, units)
     say(f"wrote {', '.join(names)} to {out}" if out else "nothing is written: --out DIR writes tables and a job")
 
 
-def _of_instruments(of: Sequence[str], instruments: Sequence[Path] | None) -> list[Path]:
-    """The files of instruments to compare: those after the option too that typer takes for arguments."""
-    if len(of) > 1 and not instruments:
-        say(f"error: {of[1]}: one SCENARIO or JOB")
-        raise typer.Exit(2)
-    return [*(instruments or []), *map(Path, of[1:])] if instruments else []
-
-
-def _read(of: str, instruments: Sequence[Path]) -> tuple[dict[str, Scenario | Job], Units, Robot]:
-    """What is to be designed, by the instruments' names, the units of its tables, and the arm."""
+def _read(of: str) -> tuple[Scenario | Job, Units, Robot]:
+    """What is to be designed, the units of its tables, and the arm."""
     from fg_calib.errors import InputError
     from fg_calib.io.job import is_job, read_job, units_of
     from fg_calib.io.units import Units
-    from fg_calib.report.plan_files import names_of_files
-    from fg_calib.simulation.scenario_file import read_scenario
+    from fg_calib.simulation.scenario import read_scenario
 
     if is_job(of):
-        if instruments:
-            say("error: --instruments has no effect with a job: they stand in the place of a scenario's")
-            raise typer.Exit(2)
         job = read_job(of)
-        return {"": job}, units_of(job), job.robot
+        return job, units_of(job), job.robot
     if "result.json" in (Path(of).name, *(file.name for file in Path(of).glob("*.json"))):
         raise InputError(of, "a result", "a scenario, or the job that the result came from")
-    scenarios: dict[str, Scenario | Job] = {}
-    for name, path in zip(names_of_files(instruments), instruments, strict=True):
-        scenarios[name] = read_scenario(of, instruments=path)
     scenario = read_scenario(of)
-    return scenarios or {"": scenario}, Units(scenario.length_unit, scenario.angle_unit), scenario.robot
+    return scenario, Units(scenario.length_unit, scenario.angle_unit), scenario.robot
 
 
 def _readings(path: Path, robot: Robot, units: Units) -> Any:
@@ -225,8 +145,7 @@ def _readings(path: Path, robot: Robot, units: Units) -> Any:
 
 def _candidates(given: str | None, robot: Robot, units: Units) -> dict[str, Any]:
     """Where the candidates come from."""
-    from fg_calib.simulation.configurations import GivenReadings
-    from fg_calib.simulation.scenario_file import read_scenario
+    from fg_calib.simulation.scenario import GivenReadings, read_scenario
 
     if given is None:
         return {}

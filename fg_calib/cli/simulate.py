@@ -22,7 +22,7 @@ def simulate(
 ) -> None:
     """Simulate a calibration job: the true robot, and what is measured of it, with noise."""
     from fg_calib.simulation import simulator
-    from fg_calib.simulation.scenario_file import read_scenario
+    from fg_calib.simulation.scenario import read_scenario
     from fg_calib.simulation.write import write_simulation
 
     simulation = simulator.simulate(read_scenario(scenario), seed)

@@ -1,60 +1,442 @@
-"""Candidates for measurements: configurations of a table or drawn, among which a design is chosen."""
+"""Candidate poses: everything that the instruments of a scenario would measure at many configurations.
+
+Every instrument measures at all candidates what the nominal arm would show it, without noise, with the sigmas that it
+specifies. So the rows, and what is not seen, are those of `simulate`. Instruments with configurations of their own, and
+those that the tool must contact, have poses of their own.
+
+Pairs have two ends. In a star all pairs share the reference pose, the first candidate; the pose is the other end.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from fg_calib.arguments import checked
+from fg_calib.arrays import Brief
+from fg_calib.designs.information import PoseRows, Posterior, count_measurements, gather_rows
 from fg_calib.errors import InputError
-from fg_calib.options import check_number
+from fg_calib.graph.build import true_problem
+from fg_calib.graph.factors import Variables, unknown_prior_rows
+from fg_calib.graph.information import whitened_jacobian
+from fg_calib.graph.knowledge import coordinates_of
+from fg_calib.graph.problem import Problem
+from fg_calib.measurements.dataset import Noise, form_pairs
+from fg_calib.measurements.landmarks import Landmarks
+from fg_calib.measurements.table import KnownPoint, Table
+from fg_calib.observability.random_configurations import places_of
+from fg_calib.options import PAIR_MODELS, Gauge, Model, Options, Pairing
+from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
-from fg_calib.robot.shape import Box, foot_in
-from fg_calib.simulation.candidates import Candidates, draw_candidates, number_of
-from fg_calib.simulation.configurations import Configurations
-from fg_calib.sizes import MOST_DRAWN
-from fg_calib.threads import single_threaded
+from fg_calib.simulation.obstacles import blocked_foot
+from fg_calib.simulation.scenario import (
+    NOISE_KINDS,
+    BoardCamera,
+    BoardViews,
+    Configurations,
+    Errors,
+    GivenReadings,
+    Instrument,
+    PairGauge,
+    Placement,
+    Scenario,
+    Tracker,
+    override_noise,
+)
+from fg_calib.simulation.simulator import Simulation, simulate
+from fg_calib.simulation.views import Candidates, draw_candidates
 
-__all__ = ["Box", "Candidates", "candidates"]
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+REFERENCE, NONE = -1, -2
+"""Instead of the number of a pose: the reference of a star, and a configuration at which nothing is fitted."""
+
+_ID = re.compile(r"^(?:(\S+) (?:\S+ )?)?p(\d+)$")
+"""How a simulation names a configuration: the instrument whose own it is, if any, and its number."""
+
+MEASURED: Mapping[Model, Model] = {"distance": "position", "rotation": "orientation", "distance-rotation": "pose"}
+"""What is measured for pairs of each model to be formed.
+
+All distances between points determine them but for one motion `x -> U x + t`; all angles of `R_a^T R_b` determine the
+rotations but for `R -> U' R V`. Positions in an unknown frame hold as much as the former. Poses in an unknown frame
+hold more than both together: V is 1 and U' is U, six unknowns fewer. So poses chosen for poses in an unknown frame are
+nearly the best for all pairs formed from them."""
 
 
-@checked
-@single_threaded
-def candidates(
-    robot: Robot,
-    of: Configurations,
-    generator: np.random.Generator,
-    *,
-    n: int | None = None,
-    keep_out: Sequence[Box] = (),
-    apart: float | None = None,
-) -> Candidates:
-    """Configurations in which the arm could be measured.
+@dataclass(frozen=True)
+class Pool(Brief):
+    """Candidate poses.
 
-    Rows of a table are taken in their order. All else is drawn until n were found or 20 n were drawn. Of what a camera
-    sees, views that the arm cannot reach are rejected, where a simulation asks for all.
+    Attributes:
+        scenario: What measures; None where rows of tables are chosen.
+        tables: What it would measure at all candidates.
+        problem: The problem of these tables.
+        readings: Of each pose, shape (n_poses, n_joints), [rad] (prismatic: [m]).
+        group: The instrument whose own pose each is; "" where all others measure.
+        pose_of: The pose of each configuration of the problem, shape (n_configurations,); `REFERENCE` or `NONE`.
+        rows: Rows that each pose would add.
+        given: Poses that were measured already, or will be anyway.
+        found: How the candidates of each group were found.
+        before: The problem of earlier measurements, at its solution; None without any.
+        formed: By the number of a table of poses that pairs are formed from: their model and pairing.
+    """
+
+    scenario: Scenario | None
+    tables: tuple[Table, ...]
+    problem: Problem
+    readings: Floats
+    group: NDArray[np.str_]
+    pose_of: Integers
+    rows: PoseRows
+    given: Integers
+    found: Mapping[str, Candidates] = field(default_factory=dict)
+    before: Problem | None = None
+    formed: Mapping[int, tuple[Model, Pairing]] = field(default_factory=dict)
+
+    @property
+    def robot(self) -> Robot:
+        """The arm, where the rows are linearised."""
+        p = self.problem
+        return p.robot.with_values(p.start[p.variables.robot_span])
+
+    @property
+    def known(self) -> Floats:
+        """Whitened rows of earlier measurements, in the columns of the poses' rows, shape (m, n_columns)."""
+        wide = rows_in_columns_of(self.before, self.problem)
+        return np.pad(wide, ((0, 0), (0, len(self.rows.scales) - wide.shape[1])))
+
+    @property
+    def references(self) -> Integers:
+        """Configurations of the problem that are references, one a star."""
+        return np.flatnonzero(self.pose_of == REFERENCE)
+
+    def groups_of(self, configurations: Integers) -> NDArray[np.str_]:
+        """The instrument whose own some configurations of the problem are; "" for common ones."""
+        names = self.problem.data.names
+        own = [_split_name(names[k])[0] if self.scenario is not None else "" for k in configurations.tolist()]
+        return np.array(own, dtype=np.str_)
+
+    def select_tables(self, poses: Integers, pairing: Pairing | None = None) -> list[Table]:
+        """Select what would be measured at some poses, in their order, after references that have pairs.
+
+        Args:
+            poses: The poses.
+            pairing: How pairs are formed, or measured, instead.
+        """
+        names = self.problem.data.names[: self.problem.data.n_configurations]
+        of_pose: dict[int, list[int]] = {}
+        for k, number in enumerate(self.pose_of.tolist()):
+            of_pose.setdefault(number, []).append(k)
+        wanted = [*self.references.tolist(), *(k for number in poses.tolist() for k in of_pose.get(number, []))]
+        order = {names[k]: place for place, k in enumerate(wanted)}
+        found = [_between_used(select_rows(table, order), known=self.before is not None) for table in self.tables]
+        for number, table in enumerate(found):
+            if number in self.formed:
+                model, own = self.formed[number]
+                found[number] = replace(table, model=model, frame="known", pairing=pairing or own)
+            elif pairing is not None and table.measurements.pairs is not None:
+                found[number] = _with_pairs(self.robot, table, pairing)
+        return [table if _has_rows(table) else select_rows(table, {}) for table in found]
+
+    def posterior(self, poses: Integers, pairing: Pairing | None = None) -> Posterior:
+        """What is known with some poses measured after what was, as a calibration would report it.
+
+        Args:
+            poses: The poses, given ones included.
+            pairing: How pairs are formed, or measured, instead.
+        """
+        before = self.before
+        problem = None
+        if len(poses) or before is None:
+            places = places_of(self.problem, self.problem.start)
+            problem = true_problem(self.robot, self.select_tables(poses, pairing), self.problem.options, places)
+        if before is not None and (problem is None or not problem.rows):  # nothing, or one end of a pair
+            return Posterior(before, whitened_jacobian(before, before.start, with_loss=True))
+        assert problem is not None
+        rows = whitened_jacobian(problem, problem.start)
+        if before is None:
+            return Posterior(problem, rows)
+        # Priors of landmarks are in the rows of earlier measurements, and count once.
+        rows = rows[len(unknown_prior_rows(problem.variables, problem.start)[0]) :]
+        return Posterior(problem, np.vstack([rows, rows_in_columns_of(before, problem)]), count_measurements(before))
+
+
+def select_rows(table: Table, order: Mapping[str, int]) -> Table:
+    """Select the rows of a table at some configurations, in an order by their names."""
+    m = table.measurements
+    ids = m.ids.tolist()
+    rows = np.array(sorted((k for k, n in enumerate(ids) if n in order), key=lambda k: order[ids[k]]), dtype=np.int64)
+    part = m.select(rows)
+    if m.groups is not None:
+        part = replace(part, groups=replace(m.groups, index=m.groups.index[rows]))
+    if m.pairs is not None:
+        place = np.full(len(ids), -1)
+        place[rows] = np.arange(len(rows))
+        a, b = place[m.pairs.a], place[m.pairs.b]
+        kept = np.flatnonzero((a >= 0) & (b >= 0))
+        part = replace(part, pairs=replace(m.pairs.select(kept), a=a[kept], b=b[kept]))
+    return replace(table, measurements=part)
+
+
+def _with_pairs(robot: Robot, table: Table, pairing: Pairing) -> Table:
+    """A table of measured pairs with other pairs of its configurations, as precise as its own."""
+    m = table.measurements
+    assert m.pairs is not None
+    at = pose(robot, m.readings)
+    found = form_pairs(replace(m, pairs=None, position=at.position, rotation=at.rotation), pairing)
+    measured = dict[str, Any]()
+    for kind in ("distance", "angle"):
+        sigma = getattr(m.pairs, f"sigma_{kind}")[:1]
+        unmeasured = not np.isfinite(sigma).all() or not len(sigma)
+        measured[kind] = np.full(found.n_pairs, np.nan) if unmeasured else getattr(found, kind)
+        measured[f"sigma_{kind}"] = np.full(found.n_pairs, np.nan if unmeasured else sigma[0])
+    return replace(table, measurements=replace(m, pairs=replace(found, source=m.pairs.source, **measured)))
+
+
+def _between_used(table: Table, *, known: bool) -> Table:
+    """A table of contact points with lengths between those alone that are used; without lengths that are known."""
+    m = table.measurements
+    if m.groups is None:
+        return table
+    pairs = m.groups.pairs
+    used = np.isin(pairs.a, m.groups.index) & np.isin(pairs.b, m.groups.index) & (not known)
+    return replace(table, measurements=replace(m, groups=replace(m.groups, pairs=pairs.select(np.flatnonzero(used)))))
+
+
+def _has_rows(table: Table) -> bool:
+    """Whether a table holds more than the reference of a star."""
+    m = table.measurements
+    if m.pairs is not None:
+        return bool(m.pairs.n_pairs)
+    return table.model not in PAIR_MODELS or m.groups is not None or m.n_configurations > 1
+
+
+def rows_in_columns_of(before: Problem | None, problem: Problem) -> Floats:
+    """Whitened rows of earlier measurements in the columns of another problem of the same arm and tables.
+
+    Landmarks that the other problem does not have are eliminated.
+
+    Returns:
+        Shape (m, n_columns + n_nuisance) of the other problem.
+    """
+    v = problem.variables
+    n = v.n_columns + v.n_nuisance
+    if before is None:
+        return np.zeros((0, n))
+    A = whitened_jacobian(before, before.start, with_loss=True)
+    columns, own = _columns_by_name(v, problem.data.unknowns), _columns_by_name(before.variables, before.data.unknowns)
+    both = [name for name in own if name in columns]
+    shared = np.concatenate([own[name] for name in both])
+    others = np.setdiff1d(np.arange(A.shape[1]), shared)
+    Q = np.linalg.qr(A[:, others])[0] if len(others) else np.zeros((len(A), 0))
+    out = np.zeros((len(A), n))
+    out[:, np.concatenate([columns[name] for name in both])] = A[:, shared] - Q @ (Q.T @ A[:, shared])
+    return out
+
+
+def _columns_by_name(variables: Variables, unknowns: Landmarks) -> dict[tuple[str, str], Integers]:
+    """Columns of each variable: of the core's by its symbol, of landmarks by letter and name."""
+    found = {("", v.symbol): np.arange(v.columns.start, v.columns.stop) for v in variables.items}
+    for letter, name in zip(unknowns.letters, unknowns.names, strict=True):
+        place = coordinates_of(variables, unknowns, (letter, name))
+        if place is not None:
+            found[letter, name] = place - variables.nuisance_span.start + variables.n_columns
+    return found
+
+
+def draw_groups(scenario: Scenario, n: int, generator: np.random.Generator) -> dict[str, Candidates]:
+    """Draw candidates, by the instrument whose own they are, "" for all others.
 
     Args:
-        robot: The robot, at its nominal values.
-        of: Drawn within the joint limits, of a table, or what a camera or a tracker sees.
-        generator: Draws them: with the same seed the same.
-        n: How many at most; as many as `of` counts if None.
-        keep_out: Boxes that nothing of the arm may be inside, beside those of `of`.
-        apart: Least distance of two candidates, [rad], as `Conditions` has it; that of `of` if None.
+        scenario: The arm, the instruments, and where they may measure.
+        n: How many are drawn for each; of a table all are taken.
+        generator: Draws them.
 
     Raises:
-        InputError: None can be had, which is said with the shares of the reasons; a figure that makes no sense; with
-            self-motion held, the first view of a board is not reached.
+        InputError: None are found.
     """
-    if n is None:
-        n = number_of(of)
-    else:
-        check_number("n", n, above=True, whole=True, most=MOST_DRAWN)
-    of = replace(of, keep_out=(*of.keep_out, *keep_out), apart=of.apart if apart is None else apart)
+    own = {i.name: i.configurations for i in scenario.instruments if i.configurations is not None}
+    groups = own if len(own) == len(scenario.instruments) > 0 else {"": scenario.configurations} | own
+    return {name: find_candidates(scenario.robot, of, n, generator) for name, of in groups.items()}
+
+
+def find_candidates(robot: Robot, of: Configurations, n: int, generator: np.random.Generator) -> Candidates:
+    """Find configurations in which the arm can be measured, at most n.
+
+    Raises:
+        InputError: None are found, with the shares of the reasons; or with self-motion held, the first view of a board
+            is not reached.
+    """
     found = draw_candidates(robot, of, generator, n, "candidates")
-    if len(found.readings) == 0:
-        hint = foot_in(robot, of.keep_out)
+    if not len(found.readings):
+        hint = blocked_foot(robot, of.keep_out)
         raise InputError("candidates", f"none in {found.reasons()}", "some that the arm can take", hint)
     return found
+
+
+def build_pool(
+    scenario: Scenario,
+    found: Mapping[str, Candidates],
+    *,
+    given: Floats | None = None,
+    before: Problem | None = None,
+) -> Pool:
+    """Build the pool of poses at which a scenario's instruments may measure.
+
+    Args:
+        scenario: The arm, the instruments, where they may measure, and how well.
+        found: Candidates, see `draw_groups`.
+        given: Readings of poses that were measured already, or will be anyway, shape (n, n_joints).
+        before: The problem of earlier measurements, at its solution.
+
+    Raises:
+        InputError: The scenario is impossible, or nothing is seen from anywhere.
+    """
+    scenario = _with_instruments(scenario)
+    tables = _measure_all(scenario, found, given)
+    if before is not None:
+        tables = tuple(map(_scale_axes, tables, before.data.tables))
+    gauge: Gauge = "none" if scenario.job.get("gauge") == "none" or scenario.job.get("prior") is False else "prior"
+    options = Options(tables[0].model or "pose", gauge=gauge) if before is None else before.options
+    places = None if before is None else places_of(before, before.start)
+    problem = true_problem(scenario.robot, tables, options, places)
+    data = problem.data
+    if not problem.rows:
+        n = data.n_configurations
+        reason = "one, of which no pair is made" if n == 1 else f"{n}, at none of which anything is measured"
+        raise InputError("candidates", reason, "more configurations")
+    names = [_split_name(name) for name in data.names[: data.n_configurations]]
+    references = _find_references(problem)
+    kept = np.setdiff1d(np.arange(len(names)), references)
+    pose_of = np.full(len(names), REFERENCE)
+    pose_of[kept] = np.arange(len(kept))
+    n_given = 0 if given is None else len(given)
+    if n_given and not any(name == "" and k < n_given for name, k in names):
+        raise InputError("given", "configurations at which nothing is measured", "a job with what was touched")
+    return Pool(
+        scenario=scenario,
+        tables=tables,
+        problem=problem,
+        readings=data.readings[kept],
+        group=np.array([names[k][0] for k in kept], dtype=np.str_),
+        pose_of=pose_of,
+        rows=gather_rows(problem, pose_of, references, alone=before is None),
+        given=np.array([pose_of[k] for k in kept if names[k][0] == "" and names[k][1] < n_given], dtype=np.int64),
+        found=found,
+        before=before,
+        formed={
+            k: (i.model, i.pairing)
+            for k, i in enumerate(scenario.instruments)
+            if isinstance(i, Tracker) and i.model in PAIR_MODELS
+        },
+    )
+
+
+def _measure_all(scenario: Scenario, found: Mapping[str, Candidates], given: Floats | None) -> tuple[Table, ...]:
+    """The tables of all candidates and of given configurations, without noise.
+
+    Raises:
+        InputError: Configurations are given where every instrument has its own.
+    """
+    readings = {name: one.readings for name, one in found.items()}
+    if given is not None:
+        if "" not in readings:
+            reason = "where every instrument has configurations of its own"
+            raise InputError("given", reason, "a job with what was measured")
+        readings[""] = np.vstack([given, readings[""]])
+    return _with_true_points(simulate(_without_noise(scenario, readings), leave_out=True))
+
+
+def _find_references(problem: Problem) -> Integers:
+    """Configurations that all pairs of a table have in common."""
+    found = []
+    for s in problem.pair_series:
+        ends = problem.data.places[s.table][s.ends[s.train]]
+        if len(ends) and np.all(ends[:, 0] == ends[0, 0]):
+            found.append(ends[0, 0])
+    return np.unique(np.array(found, dtype=np.int64))
+
+
+def _with_instruments(scenario: Scenario) -> Scenario:
+    """The scenario with what measures poses, where it names no instrument, as one."""
+    if scenario.instruments:
+        return scenario
+    model = scenario.job.get("model", "distance-rotation")
+    return replace(scenario, instruments=(Tracker(model=model, name="poses", pairing=scenario.pairing),))
+
+
+def _split_name(name: str) -> tuple[str, int]:
+    """The group and the number of a configuration."""
+    found = _ID.match(name)
+    assert found is not None, name
+    return found[1] or "", int(found[2])
+
+
+def _without_noise(scenario: Scenario, readings: Mapping[str, Floats]) -> Scenario:
+    """A scenario of the nominal arm at some readings, without noise; specified noise stays."""
+    stated = scenario.stated_noise or scenario.noise
+    instruments: list[Instrument] = []
+    for i in scenario.instruments:
+        views = i.configurations or scenario.configurations
+        specified = override_noise(override_noise(stated, i.noise), i.stated_noise)
+        changes: dict[str, Any] = {"noise": _zeros(specified), "stated_noise": specified}
+        if i.configurations is not None:
+            changes["configurations"] = GivenReadings(readings[i.name])
+        if isinstance(i, Tracker) and i.model in PAIR_MODELS and i.pairing.strategy != "star":
+            changes |= {"model": MEASURED[i.model], "frame": Placement(np.eye(3), np.zeros(3))}
+        elif isinstance(i, PairGauge):
+            changes["pairs"] = Pairing("star")
+        elif isinstance(i, BoardCamera) and not (i.boards or i.fixed) and isinstance(views, BoardViews):
+            changes["boards"] = {"board": views.board}
+        instruments.append(replace(i, **changes))
+    return replace(
+        scenario,
+        errors=Errors("values", {}),
+        noise=_zeros(stated),
+        stated_noise=stated,
+        validation=None,
+        configurations=GivenReadings(readings.get("", np.zeros((0, scenario.robot.n_joints)))),
+        instruments=tuple(instruments),
+    )
+
+
+def _zeros(noise: Noise) -> Noise:
+    """Zero noise of the kinds that are specified."""
+    nothing: dict[str, Any] = {kind: 0.0 for kind in NOISE_KINDS if getattr(noise, kind) is not None}
+    return replace(noise, joint=0.0, **nothing)
+
+
+def _with_true_points(simulation: Simulation) -> tuple[Table, ...]:
+    """The tables with known points where they truly are."""
+    places = {name: spot for kind in ("targets", "anchors") for name, spot in simulation.truth.get(kind, {}).items()}
+    return tuple(
+        replace(t, known={name: KnownPoint(places[name].xyz, known.tolerance) for name, known in t.known.items()})
+        for t in simulation.tables
+    )
+
+
+def _scale_axes(table: Table, like: Table) -> Table:
+    """A table whose sigmas differ from axis to axis as those of the train rows of another table."""
+    m, of = table.measurements, like.measurements
+    changes = {}
+    for name in ("sigma_position", "sigma_orientation"):
+        sigma, specified = getattr(m, name), getattr(of, name)
+        if sigma is None or specified is None or not np.isfinite(specified[~of.test]).any(axis=0).all():
+            continue
+        axes = np.array([rms_sigma(column, ~of.test) for column in specified.T], dtype=np.float64)
+        changes[name] = sigma * axes / (rms_sigma(specified, ~of.test) or 1.0)
+    return replace(table, measurements=replace(m, **changes))
+
+
+def rms_sigma(sigma: Floats | None, chosen: NDArray[np.bool_]) -> float | None:
+    """Root mean square of specified sigmas, of those chosen; None without any."""
+    if sigma is None or not np.isfinite(sigma[chosen]).any():
+        return None
+    sigma = sigma[chosen]
+    largest = float(np.nanmax(sigma)) or 1.0  # equal values stay what they are, to the last digit
+    return largest * float(np.sqrt(np.nanmean(np.square(sigma / largest))))

@@ -44,7 +44,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from fg_calib.designs.system import System
+from fg_calib.designs.information import System
 from fg_calib.robot.kinematics import over_processors
 
 Floats = NDArray[np.float64]
@@ -111,7 +111,7 @@ class Measure:
         return best, least
 
     def most_helpful(self, information: Floats, n: int) -> Integers:
-        """The n candidates that promise to make the criterion smallest, beside what is there."""
+        """The n candidates that promise to make the criterion smallest."""
         C = _covariance(information)
         promise = self._with(C, np.arange(self.system.n_candidates)) if self._is_cheap else self._bounds(C)
         return np.argsort(promise, kind="stable")[:n]

@@ -1,10 +1,10 @@
-"""Which configurations to measure, in which order, and what is to be expected of how many.
+"""Which configurations to measure, in which order, and what accuracy to expect of how many.
 
     plan = design(read_scenario("scenario.yaml"), n=30)
     plan.readings, plan.expected.position, plan.curve
 
-The criterion is worked out for all candidates at once (see `criteria`); what is reported of a design is worked out anew
-from the rows of its stops alone, by the very code that assesses a calibration.
+The criterion is worked out for all candidates at once (see `criteria`). The expected errors of a design are worked out
+anew from the rows of its poses alone, by the code that assesses a calibration.
 """
 
 from __future__ import annotations
@@ -19,43 +19,38 @@ from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
 from fg_calib.arrays import FrozenArrays, as_floats
-from fg_calib.designs.candidates import Candidates
-from fg_calib.designs.chooser import MOST_STOPS, Chooser, CurvePoint
+from fg_calib.designs.candidates import Pool, build_pool, draw_groups
 from fg_calib.designs.criteria import Criterion
-from fg_calib.designs.cures import Cure, cures_of
-from fg_calib.designs.of_job import pool_of_more, pool_of_rows, solved
-from fg_calib.designs.order import shortest_way, travel
-from fg_calib.designs.plans import OtherPairs, best_plan, other_pairs, with_best_hubs, with_names
-from fg_calib.designs.pool import Pool, drawn, pool_of
-from fg_calib.designs.search import Chosen
-from fg_calib.designs.system import system_of
-from fg_calib.designs.task import N_TASK, Task, is_fitted
+from fg_calib.designs.from_job import pool_for_more_rows, pool_of_rows, solve_for_design
+from fg_calib.designs.information import N_TASK, Posterior, Task, build_system, needs_fit
+from fg_calib.designs.search import MAX_POSES, Chooser, CurvePoint, joint_travel, order_by_nearest
 from fg_calib.errors import InputError, ProblemError
-from fg_calib.graph.problem import Problem
 from fg_calib.job import Job
 from fg_calib.measurements.table import Table
 from fg_calib.observability.indices import Observability
-from fg_calib.options import check, check_flag, check_number
+from fg_calib.options import Pairing, check, check_flag, check_number
 from fg_calib.prediction.expected_error import PoseRms
 from fg_calib.progress import tell
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.model import Robot
-from fg_calib.simulation.configurations import Configurations
-from fg_calib.simulation.scenario import Scenario
+from fg_calib.simulation.scenario import Configurations, Scenario
 from fg_calib.sizes import MOST_DRAWN
 from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-N_STOPS = 30
-"""Stops of a design where nobody says how many, or how good it has to be."""
+N_POSES = 30
+"""Default number of poses of a design."""
 
-LEAST_FITTED = 4
-"""Configurations of a task that a rigid fit does not bring on top of each other, wherever they are."""
+MIN_FITTED = 4
+"""Configurations of a task that a rigid fit does not bring onto each other, wherever they are."""
 
 N_CANDIDATES = 2000
-"""Candidates that are drawn where nobody says how many."""
+"""Default number of candidates that are drawn."""
+
+_JUST = 1.0 + 1e-6
+"""A target is reached to rounding."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -63,31 +58,28 @@ class Design(FrozenArrays):
     """Which configurations to measure.
 
     Attributes:
-        pool: What was chosen from.
-        tables: What is to be measured, in order; none of an instrument none of whose own stops was chosen.
+        pool: The candidates.
+        tables: What is to be measured, in order; none of an instrument none of whose own poses was chosen.
         criterion: By which criterion.
         task: What the calibration is for.
-        readings: The configurations in the order in which to visit them, that of a hub first, shape (n, n_joints),
+        readings: The configurations in the order in which to visit them, reference poses first, shape (n, n_joints),
             [rad] (prismatic: [m]).
-        ids: Their names: those of rows of a job that were chosen, else s1, s2, ... in that order, behind such names
-            that a job has already, shape (n,).
+        ids: Their names: those of chosen rows of a job, else s1, s2, ... after such names of the job, shape (n,).
         group: The instrument that alone measures at each; "" where all others do.
         expected: Expected errors of the tool over the task, with these and what was given.
-        after_fit: The same after the best rigid fit, where they are in the base frame; None where they are fitted.
-        before: The same with what was given alone; None where nothing was.
-        pairs: Which pairs are measured, of configurations in their order, shape (n_pairs, 2); None where none are, or
-            where they are formed from what is measured.
-        pairings: Expected position errors by which pairs are measured, or formed, [m].
-        random: Median of the expected position errors of as many random stops, [m].
-        curve: What is to be expected of how many.
-        asked: How many stops were asked for; None where a target was stated.
-        target: What was to be reached, [m]; None where a number was stated.
-        reached: Whether it is.
-        observability: What the rows determine of the arm.
-        cures: Directions that stay undetermined, with the measurements that would determine them.
+        after_fit: Expected errors after the best rigid fit, where `expected` is in the base frame; else None.
+        before: Expected errors with what was given alone; None without it.
+        pairs: Pairs to be measured directly, of configurations in their order, shape (n_pairs, 2); else None.
+        pairings: Expected position errors by how pairs are measured, or formed, [m].
+        random: Median of the expected position errors of as many random poses, [m].
+        curve: Expected errors by the number of poses.
+        asked: Number of poses that was asked for; None with a target.
+        target: Expected position error that was asked for, [m]; None with a number.
+        reached: Whether the target is reached.
+        observability: What the rows determine of the arm; its `lost` are the directions that stay undetermined.
         unknown: Share of the task that no candidate determines.
-        travel: Joint travel along the stops, [rad].
-        travel_before: The same in the order in which they were chosen.
+        travel: Joint travel along the configurations, [rad].
+        travel_before: Joint travel in the order in which they were chosen, [rad].
     """
 
     pool: Pool
@@ -108,35 +100,29 @@ class Design(FrozenArrays):
     target: float | None
     reached: bool
     observability: Observability
-    cures: tuple[Cure, ...]
     unknown: float
     travel: float
     travel_before: float
 
     @property
     def n(self) -> int:
-        """Number of stops."""
+        """Number of poses."""
         return len(self.readings)
 
     @property
     def structure(self) -> str:
-        """Which pairs are measured directly: star, chain, tree or free; empty where none are."""
+        """Which pairs are measured directly: star or chain; empty where none are."""
         return "" if self.pairs is None else min(self.pairings, key=lambda name: self.pairings[name])
 
     @property
     def n_candidates(self) -> int:
-        """Number of stops to choose from."""
+        """Number of candidate poses."""
         return len(self.pool.readings)
-
-    @property
-    def found(self) -> Mapping[str, Candidates]:
-        """How the candidates came about, by the instrument whose own they are."""
-        return self.pool.found
 
     def __repr__(self) -> str:
         p = self.expected.position
         error = "unknown" if p is None else f"{p * 1e3:.3g} mm"
-        return f"Design of {self.n} stops for {self.pool.robot.name!r}: expected RMS {error}, {self.criterion}"
+        return f"Design of {self.n} poses for {self.pool.robot.name!r}: expected RMS {error}, {self.criterion}"
 
 
 @checked
@@ -160,59 +146,72 @@ def design(
     Args:
         of: A scenario: the arm with its tolerances, the instruments with their noise, and where they may measure. Or a
             job: what was measured counts already, and more is to be measured by the same instruments.
-        n: How many stops; as many as reach the target if None.
+        n: Number of poses; as many as reach the target if None.
         target: Expected RMS position error over the task that is to be reached, [m].
-        criterion: What is made small: `I` the mean square error over the task, or D, A, E, O1 to O5.
-        n_candidates: How many configurations are drawn to choose from; of a table all are taken.
+        criterion: What is minimised: `I` the mean square error over the task, or D, A, E, O1 to O5.
+        n_candidates: Number of configurations that are drawn to choose from; of a table all are taken.
         candidates: Where to measure instead: configurations, or with a job `"rows"`, to choose among its train rows.
-        given: With a scenario: readings of stops that were measured already, or will be anyway, shape (n, n_joints).
+        given: With a scenario: readings of poses that were measured already, or will be anyway, shape (n, n_joints).
         task: Configurations at which the tool is to be right, shape (n, n_joints); random ones within the joint limits
             if None.
         fitted: Whether errors count after the best rigid fit, or in the base frame; the former if None where nothing
             that is measured says where the base is.
-        lever: Length with which orientations count too, [m].
-        seed: Of all that is drawn.
+        lever: Distance from the tool with which orientation errors count, [m].
+        seed: Seed of all draws.
 
     Raises:
-        InputError: A figure makes no sense, or nothing can be measured from anywhere.
+        InputError: A value makes no sense, or nothing can be measured from anywhere.
         ProblemError: What would be measured determines nothing.
     """
     check("criterion", criterion, Criterion)
-    _check_figures(n, target, n_candidates, lever, seed, fitted)
-    given, task = (_readings(name, q, of.robot) for name, q in (("given", given), ("task", task)))
+    _check_values(n, target, n_candidates, lever, seed, fitted)
+    given, task = (_check_readings(name, q, of.robot) for name, q in (("given", given), ("task", task)))
     draw = dict(zip(("candidates", "task", "random"), np.random.default_rng(seed).spawn(3), strict=True))
     if not any(p.estimated for p in of.robot.parameters):
         raise ProblemError(f"robot {of.robot.name}", "nothing to estimate", "at least one parameter that is not fixed")
     tell("looking for candidates")
+    pool = _build_pool(of, candidates, given, n_candidates, draw["candidates"])
+    readings = random_readings(pool.robot, N_TASK, draw["task"]) if task is None else task
+    wanted = Task(readings, needs_fit(pool.problem) if fitted is None else fitted, lever)
+    if wanted.fitted and len(readings) < MIN_FITTED:
+        found = f"{len(readings)} configuration{'s' * (len(readings) > 1)}, of which a rigid fit leaves next to nothing"
+        raise InputError("task", found, f"{MIN_FITTED} or more, or errors in the base frame")
+    return design_from_pool(pool, wanted, draw["random"], n=n, target=target, criterion=criterion)
+
+
+def _build_pool(
+    of: Scenario | Job,
+    candidates: Configurations | Literal["rows"] | None,
+    given: Floats | None,
+    n: int,
+    generator: np.random.Generator,
+) -> Pool:
+    """The pool of a scenario, or of a job that is solved first."""
     if isinstance(of, Job):
-        pool = _pool_of_job(of, n_candidates, draw["candidates"], candidates, given)
-    elif candidates == "rows":
+        if given is not None:
+            raise InputError("given", "with a job", "a scenario: what a job measured counts already")
+        source, problem = "job" if of.path is None else of.path.name, solve_for_design(of)
+        if isinstance(candidates, str):
+            return pool_of_rows(problem, source)
+        return pool_for_more_rows(problem, n, generator, candidates, source)
+    if candidates == "rows":
         raise InputError("candidates", "rows of a scenario, which has none", "a job, or configurations")
-    else:
-        scenario = of if candidates is None else replace(of, configurations=candidates)
-        pool = pool_of(scenario, drawn(scenario, n_candidates, draw["candidates"]), given=given)
-    there = random_readings(pool.robot, N_TASK, draw["task"]) if task is None else task
-    wanted = Task(there, is_fitted(pool.problem) if fitted is None else fitted, lever)
-    if wanted.fitted and len(there) < LEAST_FITTED:
-        found = f"{len(there)} configuration{'s' * (len(there) > 1)}, of which a rigid fit leaves next to nothing"
-        raise InputError("task", found, f"{LEAST_FITTED} or more, or errors in the base frame")
-    if len(pool.hubs) and pool.scenario is not None and given is None:
-        pool = with_best_hubs(pool, wanted, n or N_STOPS, criterion, draw["random"])
-    return design_from(pool, wanted, draw["random"], n=n, target=target, criterion=criterion)
+    scenario = of if candidates is None else replace(of, configurations=candidates)
+    return build_pool(scenario, draw_groups(scenario, n, generator), given=given)
 
 
-def _check_figures(
+def _check_values(
     n: int | None, target: float | None, n_candidates: int, lever: float, seed: int, fitted: bool | None
 ) -> None:
-    """Check the figures of a design.
+    """Check the values that a design is asked for with.
 
     Raises:
         InputError: One makes no sense.
     """
     if n is not None and target is not None:
-        raise InputError("target", "beside n", "one of the two")
+        raise InputError("target", "together with n", "one of the two")
     if n is not None:
-        check_number("n", n, least=1, whole=True, most=MOST_STOPS)
+        check_number("n", n, least=1, whole=True, most=MAX_POSES)
     if target is not None:
         check_number("target", target, above=True)
     check_number("n_candidates", n_candidates, least=2, whole=True, most=MOST_DRAWN)
@@ -222,8 +221,8 @@ def _check_figures(
         check_flag("fitted", fitted)
 
 
-def _readings(name: str, given: object, robot: Robot) -> Floats | None:
-    """Configurations from outside.
+def _check_readings(name: str, given: object, robot: Robot) -> Floats | None:
+    """Check configurations from outside.
 
     Raises:
         InputError: They are no readings of the arm's joints, or none.
@@ -236,24 +235,7 @@ def _readings(name: str, given: object, robot: Robot) -> Floats | None:
     return q
 
 
-def _pool_of_job(
-    job: Job,
-    n_candidates: int,
-    generator: np.random.Generator,
-    candidates: Configurations | Literal["rows"] | None,
-    given: Floats | None,
-) -> Pool:
-    """The pool of a job."""
-    if given is not None:
-        raise InputError("given", "with a job", "a scenario: what a job measured counts already")
-    source = "job" if job.path is None else job.path.name
-    problem = solved(job)
-    if isinstance(candidates, str):
-        return pool_of_rows(problem, source)
-    return pool_of_more(problem, n_candidates, generator, candidates, source)
-
-
-def design_from(
+def design_from_pool(
     pool: Pool,
     task: Task,
     generator: np.random.Generator,
@@ -262,132 +244,118 @@ def design_from(
     target: float | None = None,
     criterion: Criterion = "I",
 ) -> Design:
-    """The design from a pool: see `design`.
-
-    Args:
-        pool: What to choose from.
-        task: What the calibration is for.
-        generator: Draws the random sets that a design is held to.
-        n: How many stops.
-        target: What is to be reached, [m].
-        criterion: What is made small.
-    """
-    choice = _choose(pool, task, generator, n, target, criterion)
+    """Choose from a pool for a task, with random sets to compare with; for the others see `design`."""
+    measurable = np.setdiff1d(np.flatnonzero(np.any(pool.rows.rows, axis=(1, 2))), pool.given)
+    if not len(measurable):
+        raise InputError("candidates", "none at which anything is measured", "some")
+    system = build_system(pool.rows, pool.known, task.quadratic_form(pool.problem)).with_known(pool.given)
+    chooser = Chooser(system.select(measurable), criterion, _error_of_formed_pairs(pool, task, measurable))
+    tell("choosing")
+    wanted = max(1, min((n or N_POSES) - len(pool.references), len(measurable)))
+    found = chooser.thoroughly(wanted, generator) if target is None else chooser.reaching(target, generator)
     tell("working out what to expect")
-    plan, pairings = best_plan(pool, choice.stops, task, choice.others)
-    expected, curve = plan.posterior.error(task), choice.curve(generator, len(pool.hubs))
-    before = pool.posterior(pool.given) if len(pool.given) or pool.before is not None else None
-    ids = plan.names if pool.scenario is None else _new_names(len(plan.readings), pool.before)
+    chosen = measurable[found.candidates]
+    ordered = chosen[order_by_nearest(pool.robot, pool.readings[chosen])]
+    poses = np.concatenate([pool.given, ordered])
+    pairings, pairing = _compare_pairings(pool, poses, task)
+    posterior, tables = pool.posterior(poses, pairing), pool.select_tables(ordered, pairing)
+    configurations = _configurations_of(pool, ordered, tables)
+    data = pool.problem.data
+    names, readings = [data.names[k] for k in configurations], data.readings[configurations]
+    ids = names if pool.scenario is None else _new_names(len(names), pool)
+    expected, curve = posterior.error(task), chooser.curve(found, generator, len(pool.references))
+    error = np.inf if expected.position is None else expected.position
+    before = pool.posterior(pool.given).error(task) if len(pool.given) or pool.before is not None else None
+    used = [t for t in tables if t.measurements.n_configurations]
     return Design(
         pool=pool,
-        tables=tuple(
-            table
-            for table in with_names(plan.tables, dict(zip(plan.names, ids, strict=True)))
-            if table.measurements.n_configurations
-        ),
+        tables=tuple(rename_configurations(t, dict(zip(names, ids, strict=True))) for t in used),
         criterion=criterion,
         task=task,
-        readings=plan.readings,
+        readings=readings,
         ids=np.array(ids),
-        group=plan.group,
+        group=pool.groups_of(configurations),
         expected=expected,
-        after_fit=None if task.fitted else plan.posterior.error(replace(task, fitted=True)),
-        before=None if before is None else before.error(task),
-        pairs=plan.pairs,
+        after_fit=None if task.fitted else posterior.error(replace(task, fitted=True)),
+        before=before,
+        pairs=_measured_pairs(names, tables),
         pairings=pairings,
         random=curve[-1].random[1],
-        curve=curve,
+        curve=(*curve[:-1], replace(curve[-1], designed=error)),
         asked=n if target is None else None,
         target=target,
-        reached=target is None or (expected.position is not None and expected.position <= target * _JUST),
-        observability=plan.posterior.observability,
-        cures=cures_of(plan.posterior),
-        unknown=choice.chooser.system.unknown,
-        travel=travel(pool.robot, plan.readings),
-        travel_before=travel(pool.robot, pool.readings[choice.stops]),
+        reached=target is None or error <= target * _JUST,
+        observability=posterior.observability,
+        unknown=chooser.system.unknown,
+        travel=joint_travel(pool.robot, readings),
+        travel_before=joint_travel(pool.robot, pool.readings[chosen]),
     )
 
 
-def _new_names(n: int, before: Problem | None) -> list[str]:
-    """Names s1, s2, ... of stops: those that configurations have already are left out."""
-    taken = () if before is None else before.data.names
-    first = max((int(name[1:]) for name in taken if _OURS.fullmatch(name)), default=0) + 1
-    return [f"s{k}" for k in range(first, first + n)]
+def _position_error(posterior: Posterior, task: Task) -> float:
+    """Expected RMS position error, [m]; inf if not determined."""
+    found = posterior.error(task).position
+    return np.inf if found is None else found
 
 
-_OURS = re.compile(r"s[0-9]{1,9}")
-
-_JUST = 1.0 + 1e-6
-"""A target is reached to rounding."""
-
-
-@dataclass(frozen=True)
-class _Choice:
-    """What was chosen.
-
-    Attributes:
-        chooser: What chose it.
-        found: Its candidates.
-        able: Which stop of the pool each of its candidates is.
-        others: Other ways to measure as many pairs; None where there are none.
-    """
-
-    chooser: Chooser
-    found: Chosen
-    able: Integers
-    others: OtherPairs | None
-
-    @property
-    def stops(self) -> Integers:
-        """The stops that were chosen."""
-        return self.able[self.found.candidates]
-
-    def of_others(self, candidates: Integers) -> float:
-        """Expected error of other pairs beside those of a star of some candidates, [m]; inf if there are none."""
-        if self.others is None:
-            return np.inf
-        return self.others.least(self.able[candidates], quickly=len(candidates) < len(self.found.candidates))
-
-    def curve(self, generator: np.random.Generator, hubs: int) -> tuple[CurvePoint, ...]:
-        """What to expect of fewer stops, and of as many; hubs count."""
-        return self.chooser.curve(self.found, generator, hubs, self.of_others)
-
-
-def _choose(
-    pool: Pool, task: Task, generator: np.random.Generator, n: int | None, target: float | None, criterion: Criterion
-) -> _Choice:
-    """So many stops, or as few as reach a target."""
-    system = system_of(pool.rows, pool.known, task.form(pool.problem)).with_known(pool.given)
-    able = np.setdiff1d(np.flatnonzero(np.any(pool.rows.rows, axis=(1, 2))), pool.given)
-    if not len(able):
-        raise InputError("candidates", "none at which anything is measured", "some")
-    chooser = Chooser(system.select(able), criterion, _exactly(pool, task, able))
-    tell("choosing")
-    if target is None:
-        of = max(1, min((N_STOPS if n is None else n) - len(pool.hubs), len(able)))
-        found = chooser.thoroughly(of, generator)
-    else:
-        found = chooser.reaching(target, generator)
-    others = other_pairs(pool, len(found.candidates), (criterion, task), generator)
-    choice = _Choice(chooser, found, able, others)
-    if target is None or others is None:
-        return choice
-    return replace(choice, found=chooser.fewer(found, target, choice.of_others, generator))
-
-
-def _exactly(pool: Pool, task: Task, able: Integers) -> Callable[[Integers], float] | None:
+def _error_of_formed_pairs(pool: Pool, task: Task, measurable: Integers) -> Callable[[Integers], float] | None:
     """The error with some candidates where pairs are formed otherwise than in a star; None elsewhere.
 
-    There candidates are chosen as poses in an unknown frame, which hold at least as much (see `MEASURED`), and held to
-    random ones by this error: a chain of pairs may hold far less, and of other stops more.
+    Candidates are chosen there as poses in an unknown frame, which hold at least as much (see `MEASURED`), and compared
+    with random ones by this error: a chain of pairs may hold far less, and of other poses more.
     """
     if not any(pairing.strategy != "star" for _, pairing in pool.formed.values()):
         return None
 
     def error(candidates: Integers) -> float:
-        chosen = able[candidates]
-        stops = chosen[shortest_way(pool.robot, pool.readings[chosen])]
-        found = pool.posterior(np.concatenate([pool.given, stops])).error(task).position
-        return np.inf if found is None else found
+        chosen = measurable[candidates]
+        ordered = chosen[order_by_nearest(pool.robot, pool.readings[chosen])]
+        return _position_error(pool.posterior(np.concatenate([pool.given, ordered])), task)
 
     return error
+
+
+def _compare_pairings(pool: Pool, poses: Integers, task: Task) -> tuple[dict[str, float], Pairing | None]:
+    """Expected errors by how pairs are formed or measured, and the pairing to measure; None leaves it as it is."""
+    if pool.formed:
+        strategies: tuple[Literal["star", "chain", "all"], ...] = ("star", "chain", "all")
+        return {one: _position_error(pool.posterior(poses, Pairing(one)), task) for one in strategies}, None
+    if not any(t.measurements.pairs is not None for t in pool.tables):
+        return {}, None
+    errors = {"star": _position_error(pool.posterior(poses), task)}
+    if pool.scenario is None or pool.before is not None or len(pool.given) or len(pool.tables) > 1:
+        return errors, None
+    errors["chain"] = _position_error(pool.posterior(poses, Pairing("chain")), task)
+    return errors, Pairing("chain") if errors["chain"] < errors["star"] else None
+
+
+def _configurations_of(pool: Pool, ordered: Integers, tables: list[Table]) -> Integers:
+    """Configurations of the problem to visit: references that have pairs, then one a pose."""
+    last = {number: k for k, number in enumerate(pool.pose_of.tolist())}
+    used = {name for table in tables for name in table.measurements.ids.tolist()}
+    references = [k for k in pool.references.tolist() if pool.problem.data.names[k] in used]
+    return np.array([*references, *(last[number] for number in ordered.tolist())], dtype=np.int64)
+
+
+def _measured_pairs(names: list[str], tables: list[Table]) -> Integers | None:
+    """Ends of all pairs that tables measure directly, as places among names, shape (n, 2); None without any."""
+    place, found = {name: k for k, name in enumerate(names)}, []
+    for table in tables:
+        m = table.measurements
+        if m.pairs is not None:
+            where = np.array([place[name] for name in m.ids.tolist()], dtype=np.int64)
+            found.append(where[np.stack([m.pairs.a, m.pairs.b], axis=1)])
+    return np.concatenate(found) if found else None
+
+
+def rename_configurations(table: Table, names: Mapping[str, str]) -> Table:
+    """A table with other names of its configurations."""
+    ids = np.array([names[name] for name in table.measurements.ids.tolist()])
+    return replace(table, measurements=replace(table.measurements, ids=ids))
+
+
+def _new_names(n: int, pool: Pool) -> list[str]:
+    """Names s1, s2, ... of poses, after those of earlier measurements."""
+    taken = () if pool.before is None else pool.before.data.names
+    first = max((int(name[1:]) for name in taken if re.fullmatch(r"s[0-9]{1,9}", name)), default=0) + 1
+    return [f"s{k}" for k in range(first, first + n)]

@@ -1,8 +1,8 @@
-"""Which candidates: one after the other (greedy), then one for another as long as that is better (exchange).
+"""Search for a good set of candidates: greedy choice, exchange, and the order in which to visit them.
 
-Both look at all candidates at every step, by updates of rank h (see `criteria`): a candidate is never factorised anew.
-Exchange takes out one of the chosen at a time and puts in what is best in its place (Fedorov 1972; Mitchell 1974), so
-its end is a set that single exchanges make hardly better: a round of them gains less than `LEAST_GAIN`.
+Greedy choice and exchange look at all candidates at every step, by updates of rank h (see `criteria`). Exchange takes
+out one of the chosen at a time and puts in the best candidate in its place (Fedorov 1972; Mitchell 1974). It ends where
+a sweep over all chosen gains less than `MIN_GAIN`.
 
 References:
     Fedorov (1972), Theory of Optimal Experiments. Academic Press.
@@ -11,35 +11,55 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arrays import FrozenArrays
 from fg_calib.designs.criteria import Criterion, Measure
-from fg_calib.designs.system import System
+from fg_calib.designs.information import System
+from fg_calib.robot.model import Robot
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-MOST_SWEEPS = 10
-"""How often exchange goes through all that were chosen, at most."""
+MAX_SWEEPS = 10
+"""Largest number of sweeps of an exchange."""
 
-LEAST_GAIN = 1e-3
+MIN_GAIN = 1e-3
 """Share of the criterion that a sweep must gain for another one."""
 
-SHORT = 500
-"""Candidates that exchange looks at first: those that would help most beside what was chosen."""
+SHORTLIST = 500
+"""Number of candidates that exchange looks at first: those that would help most."""
 
 _ROUNDING = 1e-12
 """Share of the criterion that an exchange must gain: less may be rounding."""
 
 N_RANDOM = 100
-"""Random sets that a design is held to: if one were better, exchange would start from it."""
+"""Number of random sets that a design is compared with: exchange starts from one that is better."""
 
-SMALL = 40_000
-"""Stops times candidates up to which exchange starts from random sets too: from all of them with a hundredth."""
+SMALL_PROBLEM = 40_000
+"""Poses times candidates up to which exchange starts from random sets too: from all of them at a hundredth."""
+
+MAX_POSES = 500
+"""Largest number of poses with which a target is sought."""
+
+UNKNOWN_SHARE = 1e-9
+"""Share of a task that no candidate determines from which its error is unknown."""
+
+N_EXACT = 20
+"""Number of random sets where each takes a posterior of its own."""
+
+MIN_CURVE = 4
+"""Number of poses with which the curve begins."""
+
+MAX_FEWER = 4
+"""How many poses fewer are tried for a target, each time that fewer suffice."""
+
+N_CURVE = 10
+"""Number of points of the curve, about."""
 
 
 @dataclass(frozen=True)
@@ -55,20 +75,35 @@ class Chosen(FrozenArrays):
     value: float
 
 
+@dataclass(frozen=True)
+class CurvePoint:
+    """Expected error of a number of poses.
+
+    Attributes:
+        n: The number.
+        designed: RMS error over the task with as many designed poses, [m].
+        random: Errors that 10 %, 50 % and 90 % of random sets of as many poses do not exceed, [m].
+    """
+
+    n: int
+    designed: float
+    random: tuple[float, float, float]
+
+
 def choose(system: System, n: int, criterion: Criterion = "I") -> Chosen:
-    """The best n candidates that greedy choice and exchange find.
+    """Choose the best n candidates that greedy choice and exchange find.
 
     Args:
-        system: What is chosen from.
+        system: The candidates.
         n: How many, each at most once.
-        criterion: What is made small.
+        criterion: What is minimised.
     """
     measure = Measure(criterion, system)
-    return exchanged(measure, greedy(measure, n))
+    return exchange(measure, choose_greedily(measure, n))
 
 
-def greedy(measure: Measure, n: int, start: Integers | None = None) -> Integers:
-    """Candidates one after the other, each the best beside those before it."""
+def choose_greedily(measure: Measure, n: int, start: Integers | None = None) -> Integers:
+    """Choose candidates one after the other, each the best in addition to those before it."""
     system = measure.system
     chosen = [] if start is None else start.tolist()
     allowed = np.ones(system.n_candidates, dtype=np.bool_)
@@ -82,41 +117,41 @@ def greedy(measure: Measure, n: int, start: Integers | None = None) -> Integers:
     return np.array(chosen[:n], dtype=np.int64)
 
 
-def exchanged(measure: Measure, chosen: Integers, *, quickly: bool = False) -> Chosen:
-    """Candidates with each exchanged for a better one, until none is.
+def exchange(measure: Measure, chosen: Integers, *, quickly: bool = False) -> Chosen:
+    """Exchange candidates for better ones, until none is better.
 
     Most exchanges are among the few candidates that would help most now: these are tried first, then all.
 
     Args:
         measure: The criterion.
-        chosen: What to start from.
-        quickly: Whether these few are all that is tried.
+        chosen: The first set.
+        quickly: Whether only these few are tried.
     """
     system = measure.system
     now, value = chosen.copy(), measure.value(system.information(chosen))
     if len(chosen) >= system.n_candidates:
         return Chosen(now, value)
-    for _ in range(MOST_SWEEPS):
+    for _ in range(MAX_SWEEPS):
         before = value
-        if system.n_candidates > 2 * SHORT:
-            short = np.union1d(measure.most_helpful(system.information(now), SHORT), now)
+        if system.n_candidates > 2 * SHORTLIST:
+            short = np.union1d(measure.most_helpful(system.information(now), SHORTLIST), now)
             some = Measure(measure.criterion, system.select(short))
-            for _ in range(MOST_SWEEPS):
+            for _ in range(MAX_SWEEPS):
                 last = value
                 places, value = _sweep(some, np.searchsorted(short, now), value)
                 now = short[places]
-                if last - value <= LEAST_GAIN * abs(last):
+                if last - value <= MIN_GAIN * abs(last):
                     break
             if quickly:
                 break
         now, value = _sweep(measure, now, value)
-        if before - value <= LEAST_GAIN * abs(before):
+        if before - value <= MIN_GAIN * abs(before):
             break
     return Chosen(now, measure.value(system.information(now)))
 
 
 def _sweep(measure: Measure, chosen: Integers, value: float) -> tuple[Integers, float]:
-    """Each of the chosen exchanged once for what is best in its place, where that is better."""
+    """Exchange each of the chosen once for the best candidate in its place, where that is better."""
     system, now = measure.system, chosen.copy()
     allowed = np.ones(system.n_candidates, dtype=np.bool_)
     allowed[now] = False
@@ -129,10 +164,10 @@ def _sweep(measure: Measure, chosen: Integers, value: float) -> tuple[Integers, 
     return now, value
 
 
-def random_values(
+def draw_sets(
     measure: Measure, n: int, generator: np.random.Generator, count: int = N_RANDOM
 ) -> tuple[Floats, Integers]:
-    """The criterion of random sets of n, ascending, shape (count,), and the sets, shape (count, n)."""
+    """Draw random sets of n: the criterion, ascending, shape (count,), and the sets, shape (count, n)."""
     system = measure.system
     sets = np.array([generator.choice(system.n_candidates, size=n, replace=False) for _ in range(count)])
     values = np.array([measure.value(system.information(one)) for one in sets])
@@ -140,15 +175,162 @@ def random_values(
     return values[order], sets[order].astype(np.int64)
 
 
-def not_worse_than_random(measure: Measure, found: Chosen, generator: np.random.Generator) -> Chosen:
-    """The same, or what exchange makes of random sets where that is better.
+def improve_by_random_starts(measure: Measure, found: Chosen, generator: np.random.Generator) -> Chosen:
+    """Take what exchange makes of random sets, where that is better.
 
-    Of large pools exchange starts from the best of them alone, and only if that is better. Of small ones, where a set
-    that no single exchange makes better may yet be far from the best, from several.
+    Of large pools exchange starts from the best random set alone, and only if that is better. Of small ones, where a
+    set that no single exchange improves may be far from the best, it starts from several.
     """
     n, of = len(found.candidates), measure.system.n_candidates
-    values, sets = random_values(measure, n, generator)
-    starts = sets[: SMALL // (n * of)]
+    values, sets = draw_sets(measure, n, generator)
+    starts = sets[: SMALL_PROBLEM // (n * of)]
     if not len(starts) and values[0] < found.value:
         starts = sets[:1]
-    return min((found, *(exchanged(measure, one) for one in starts)), key=lambda one: one.value)
+    return min((found, *(exchange(measure, one) for one in starts)), key=lambda one: one.value)
+
+
+class Chooser:
+    """Choice of candidates from a system; the error is always the one over the task.
+
+    Greedy choice does not see that some poses help only together, as the first lengths to an unknown anchor do. A
+    second start therefore minimises the volume of all unknowns, landmarks too.
+
+    Args:
+        system: The candidates.
+        criterion: What is minimised.
+        error: Expected RMS error with some candidates, [m], where the system does not give it; inf if not determined.
+    """
+
+    def __init__(self, system: System, criterion: Criterion, error: Callable[[Integers], float] | None = None) -> None:
+        self.system, self.criterion, self._exact = system, criterion, error
+        self.measure = Measure(criterion, system)
+        self._error = Measure("I", system)
+        of_all = Measure("D", replace(system, core=np.eye(system.rows.shape[2])))
+        self._orders = [(measure, np.zeros(0, dtype=np.int64)) for measure in (self.measure, of_all)]
+
+    def error(self, chosen: Integers) -> float:
+        """Expected RMS error with some candidates, [m]; inf where no candidates determine it."""
+        if self.system.unknown > UNKNOWN_SHARE:
+            return float("inf")
+        if self._exact is not None:
+            return self._exact(chosen)
+        return float(np.sqrt(self._error.value(self.system.information(chosen))))
+
+    def _value(self, candidates: Integers) -> float:
+        return self.measure.value(self.system.information(candidates))
+
+    def starts(self, n: int) -> list[Integers]:
+        """First sets by greedy choice, the best one first."""
+        self._orders = [(m, choose_greedily(m, n, order) if len(order) < n else order) for m, order in self._orders]
+        return sorted((order[:n] for _, order in self._orders), key=self._value)
+
+    def best(self, n: int) -> Chosen:
+        """The best n that exchange finds."""
+        return min((exchange(self.measure, one) for one in self.starts(n)), key=lambda chosen: chosen.value)
+
+    def thoroughly(self, n: int, generator: np.random.Generator) -> Chosen:
+        """The best n that exchange finds, never worse than the best of some random sets."""
+        found = improve_by_random_starts(self.measure, self.best(n), generator)
+        if self._exact is None or self.system.unknown > UNKNOWN_SHARE:
+            return found
+        sets = [self._draw(n, generator) for _ in range(N_EXACT)]
+        best = min((found.candidates, *sets), key=self._exact)
+        return Chosen(best, self._value(best))
+
+    def quickly(self, n: int) -> Chosen:
+        """Nearly as good a set, in a small part of the time."""
+        return exchange(self.measure, self.starts(n)[0], quickly=True)
+
+    def reaching(self, target: float, generator: np.random.Generator) -> Chosen:
+        """As few as reach a target, [m]; as many as allowed where none do."""
+        most = min(MAX_POSES, self.system.n_candidates)
+        if self.system.unknown > UNKNOWN_SHARE:  # no number of poses would do
+            return self.best(min(MIN_CURVE, most))
+        enough = 1
+        while min(map(self.error, self.starts(enough))) > target:
+            if enough == most:
+                return Chosen(self.starts(most)[0], np.inf)
+            enough = min(most, enough + max(1, enough // 10))
+        low, high, found = 0, enough, min(self.starts(enough), key=self.error)
+        while high - low > 1:
+            middle = max(low + 1, high - max(1, (high - low) // 4))
+            better = self.quickly(middle).candidates
+            if self.error(better) <= target:
+                high, found = middle, better
+            else:
+                low = middle
+        last = exchange(self.measure, found)  # by another criterion it may miss the target again
+        last = last if self.error(last.candidates) <= target else Chosen(found, self._value(found))
+        n = len(last.candidates)
+        while n > max(1, len(last.candidates) - MAX_FEWER):
+            n -= 1
+            fewer = self.thoroughly(n, generator)
+            if self.error(fewer.candidates) <= target:
+                last = fewer
+        return last
+
+    def _draw(self, n: int, generator: np.random.Generator) -> Integers:
+        return generator.choice(self.system.n_candidates, size=n, replace=False).astype(np.int64)
+
+    def curve(self, found: Chosen, generator: np.random.Generator, n_references: int) -> tuple[CurvePoint, ...]:
+        """Expected errors of fewer poses, and of as many.
+
+        Args:
+            found: As many.
+            generator: Draws random sets.
+            n_references: Number of reference poses, which count too.
+        """
+        most = len(found.candidates)
+        numbers = np.round(np.geomspace(MIN_CURVE, max(most + n_references, MIN_CURVE), N_CURVE)).astype(np.int64)
+        points = []
+        for k in sorted({n - n_references for n in numbers.tolist() if 0 < n - n_references < most} | {most}):
+            chosen = found.candidates if k == most else self.quickly(k).candidates
+            points.append(CurvePoint(k + n_references, self.error(chosen), self._band(k, generator)))
+        return tuple(points)
+
+    def _band(self, n: int, generator: np.random.Generator) -> tuple[float, float, float]:
+        """Errors that a tenth, half and nine tenths of random sets of n do not exceed."""
+        if self.system.unknown > UNKNOWN_SHARE:
+            return (float("inf"),) * 3
+        if self._exact is None:
+            errors = np.sqrt(draw_sets(self._error, n, generator)[0])
+        else:
+            errors = np.array([self._exact(self._draw(n, generator)) for _ in range(N_EXACT)])
+        low, middle, high = np.quantile(errors, [0.1, 0.5, 0.9], method="nearest").tolist()
+        return low, middle, high
+
+
+# --- the order in which to visit poses ---
+
+
+def joint_travel(robot: Robot, readings: Floats) -> float:
+    """Sum over all steps between configurations, shape (n, n_joints), of the largest joint motion, [rad].
+
+    Motions of prismatic joints count as rotations that move the arm's reach by as much.
+    """
+    steps = np.abs(np.diff(readings * _weights(robot), axis=0))
+    return float(np.sum(steps.max(axis=1, initial=0.0)))
+
+
+def order_by_nearest(robot: Robot, readings: Floats) -> Integers:
+    """Order configurations by nearest neighbour, from the one nearest to all others, shape (n,).
+
+    Args:
+        robot: The arm.
+        readings: The configurations, shape (n, n_joints), [rad] (prismatic: [m]).
+    """
+    q = readings * _weights(robot)
+    n = len(q)
+    if n < 3:
+        return np.arange(n)
+    d = np.abs(q[:, None] - q[None]).max(axis=2)
+    order = [int(np.argmin(d.sum(axis=1)))]
+    while len(order) < n:
+        step = d[order[-1]].copy()
+        step[order] = np.inf
+        order.append(int(np.argmin(step)))
+    return np.array(order, dtype=np.int64)
+
+
+def _weights(robot: Robot) -> Floats:
+    return np.array([1.0 / robot.reach if joint.prismatic else 1.0 for joint in robot.joints])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,12 +11,11 @@ import numpy as np
 from rich.console import Group, RenderableType
 
 from fg_calib.designs.design import Design
-from fg_calib.executors import Failure
 from fg_calib.observability.parallel_axes import missing_motions
 from fg_calib.prediction.expected_error import PoseRms
 from fg_calib.report.shown import SHOWN
 from fg_calib.report.tables import indented, line, plain_table, rounded, section
-from fg_calib.simulation.configurations import RandomReadings
+from fg_calib.simulation.scenario import RandomReadings
 
 SCHEMA = "fg-calib/design/1"
 
@@ -26,10 +24,6 @@ _MOST = 40
 
 UNKNOWN_ABOVE = 10.0
 """Errors [m] that are called unknown: they say how weak the weakest prior is."""
-
-_SHOWN_CHANGE = 0.005
-"""Part of a direction's largest change below which the report leaves one out; design.json has them all."""
-
 
 # --- for programs ---
 
@@ -59,32 +53,16 @@ def design_document(design: Design) -> dict[str, Any]:
         "pairings": {name: _finite(error) for name, error in design.pairings.items()},
         "candidates": {
             name or "all": {"asked": one.asked, "taken": len(one.readings), "rejected": dict(one.rejected)}
-            for name, one in design.found.items()
+            for name, one in design.pool.found.items()
         },
         "stops": [
             {"id": name, "table": table or None, "readings": q}
             for name, table, q in zip(design.ids.tolist(), design.group.tolist(), design.readings.tolist(), strict=True)
         ],
         "pairs": None if design.pairs is None else design.ids[design.pairs].tolist(),
-        "undetermined": [
-            {"relation": cure.relation, "reason": cure.reason, "determined_by": list(cure.by)} for cure in design.cures
-        ],
+        "undetermined": [{"relation": relation} for relation in design.observability.lost],
         "travel": design.travel,
         "travel_unordered": design.travel_before,
-    }
-
-
-def designs_document(designs: Mapping[str, Design], failed: Sequence[Failure] = ()) -> dict[str, Any]:
-    """Designs of several instruments for programs.
-
-    Args:
-        designs: They, by the instruments' names.
-        failed: Why others are missing.
-    """
-    return {
-        "schema": SCHEMA,
-        "instruments": {name: design_document(one) for name, one in designs.items()},
-        "failed": {one.job: one.reason for one in failed},
     }
 
 
@@ -103,39 +81,11 @@ def build_design_report(design: Design) -> RenderableType:
     """
     parts: list[RenderableType] = [line(_headline(design), "bold")]
     parts += section("Expected", *indented(_expected(design)))
-    parts += section("Stops and accuracy", _curve({"designed": design}))
+    parts += section("Stops and accuracy", _curve(design))
     if design.pairings:
         parts += section("Which pairs", _pairs(design))
     parts += section("Where to measure", _stops(design))
-    if design.cures:
-        parts += section("Still undetermined", _cures(design))
     return Group(*parts, *section("Notes", *indented(_notes(design))))
-
-
-def build_instruments_report(designs: Mapping[str, Design], failed: Sequence[Failure] = ()) -> RenderableType:
-    """Designs of several instruments beside each other.
-
-    Args:
-        designs: They, by the instruments' names; at least one.
-        failed: Why others are missing.
-    """
-    first = next(iter(designs.values()))
-    title = f"{first.pool.robot.name}: {len(designs) + len(failed)} instruments"
-    parts: list[RenderableType] = [line(title, "bold")]
-    parts += section("RMS error over the task in mm", _curve(designs, random=False))
-    columns = [("stops", "right"), ("expected", "right"), ("error", "left"), ("undetermined", "right")]
-    table = plain_table(("instrument", "left"), *columns)
-    for name, one in designs.items():
-        reached = str(one.n) if one.reached else f"more than {one.n}"
-        where = error_counts(one)
-        table.add_row(line(name), reached, _mm(one.expected.position), where, str(len(one.cures)))
-    for failure in failed:
-        table.add_row(line(failure.job), "failed", "", "", "")
-    parts += section("With so many stops", table)
-    if len({one.task.fitted for one in designs.values()}) > 1:
-        note = "not the same error of all: --error fitted, or base, compares them by one"
-        parts += section("Notes", *indented([note]))
-    return Group(*parts)
 
 
 def error_counts(design: Design) -> str:
@@ -172,19 +122,13 @@ def _expected(design: Design) -> list[str]:
     return lines
 
 
-def _curve(designs: Mapping[str, Design], *, random: bool = True) -> RenderableType:
-    """Expected errors by the number of stops."""
-    headings = [(f"{name} mm", "right") for name in designs]
-    headings += [("random mm", "right"), ("80 % of random", "right")] if random else []
-    table = plain_table(("stops", "right"), *headings)
-    numbers = sorted({p.n for one in designs.values() for p in one.curve})
-    points = [{p.n: p for p in one.curve} for one in designs.values()]
-    for n in numbers:
-        row = [_figure(of[n].designed) if n in of else "" for of in points]
-        if random and n in points[0]:
-            low, middle, high = points[0][n].random
-            row += [_figure(middle), f"{_figure(low)} to {_figure(high)}"]
-        table.add_row(str(n), *row)
+def _curve(design: Design) -> RenderableType:
+    """Expected errors by the number of poses."""
+    headings = (("stops", "right"), ("designed mm", "right"), ("random mm", "right"), ("80 % of random", "right"))
+    table = plain_table(*headings)
+    for point in design.curve:
+        low, middle, high = point.random
+        table.add_row(str(point.n), _figure(point.designed), _figure(middle), f"{_figure(low)} to {_figure(high)}")
     return table
 
 
@@ -193,8 +137,6 @@ def _pairs(design: Design) -> RenderableType:
     words = {
         "star": "each with the first",
         "chain": "each with the one before",
-        "tree": "each with the best that is there",
-        "free": "the best of all",
         "all": "all that can be formed",
     }
     for name, error in design.pairings.items():
@@ -213,18 +155,9 @@ def _stops(design: Design) -> RenderableType:
     return table
 
 
-def _cures(design: Design) -> RenderableType:
-    table = plain_table(("direction", "left"), ("why", "left"), ("would be determined by", "left"), wrap=True)
-    for cure in design.cures:
-        what = " ".join(f"{v:+.3g} {name}" for name, v in cure.relation.items() if abs(v) >= _SHOWN_CHANGE)
-        by = cure.by[0] if cure.by else "nothing: the arm moves the same whatever it is"
-        table.add_row(line(what), line(cure.reason), by)
-    return table
-
-
 def _notes(design: Design) -> list[str]:
     notes = []
-    for name, one in design.found.items():
+    for name, one in design.pool.found.items():
         of = f" of {name}" if name else ""
         notes.append(f"candidates{of}: {one.reasons()}")
     notes += [f"{name}: none of its own stops was chosen, and it gets no table" for name in _without_stops(design)]
@@ -239,6 +172,11 @@ def _notes(design: Design) -> list[str]:
     best = min(design.pairings, key=lambda name: design.pairings[name], default="")
     if design.pairs is None and best and design.pairings[best] < 0.95 * (design.expected.position or math.inf):
         notes.append(f"pairing: {best} in the job takes more from the same measurements")
+    if design.observability.lost:
+        n = len(design.observability.lost)
+        notes.append(
+            f"{n} direction{'s stay' if n > 1 else ' stays'} undetermined: fg-calib observe says which and why"
+        )
     if design.expected.position is None:
         notes.append("the error over the task depends on what nothing that is measured determines")
     if design.target is not None and not design.reached:

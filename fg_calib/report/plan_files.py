@@ -22,17 +22,17 @@ from fg_calib.io.units import Units
 from fg_calib.io.urdf import write_urdf
 from fg_calib.measurements.table import Table
 from fg_calib.report.figures import empty_figure
-from fg_calib.report.plan import SCHEMA, UNKNOWN_ABOVE, design_document, error_counts
+from fg_calib.report.plan import SCHEMA, UNKNOWN_ABOVE, design_document
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
-from fg_calib.simulation.simulated_tables import instrument_keys, is_filled_in, table_columns, to_fill_in
+from fg_calib.simulation.write import instrument_keys, is_filled_in, table_columns, to_fill_in
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
 
-CONFIGURATIONS, _DOCUMENT, _PICTURE = "configurations.csv", "design.json", "instruments.png"
+CONFIGURATIONS, _DOCUMENT = "configurations.csv", "design.json"
 
 _BEGINS = f'{{\n "schema": "{SCHEMA}"'.encode()
 """How the document of a plan begins."""
@@ -40,38 +40,31 @@ _BEGINS = f'{{\n "schema": "{SCHEMA}"'.encode()
 _JOB_BEGINS = "# fg-calib design\n# What to measure: fill in the tables, then `fg-calib "
 _CALIBRATE, _UPDATE = "calibrate` this file.\n", "update RESULT` this file: RESULT is of what there was.\n"
 
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+_COLOUR = "#0072B2"
 
 
-def draw_designs(designs: Mapping[str, Design]) -> Figure:
-    """Expected errors against the number of stops, with the band of random ones.
+def draw_design(design: Design) -> Figure:
+    """Draw expected errors against the number of poses, with the band of random ones.
 
     Args:
-        designs: They, by the instruments' names.
+        design: The design.
     """
     figure = empty_figure(6.0, 3.8)
     from matplotlib.ticker import LogLocator, NullFormatter, NullLocator
 
     axes = figure.add_subplot()
-    several, first = len(designs) > 1, next(iter(designs.values()))
-    mixed = len({one.task.fitted for one in designs.values()}) > 1
-    for colour, (name, one) in zip(_COLOURS * len(designs), designs.items(), strict=False):
-        n = np.array([p.n for p in one.curve])
-        low, middle, high = _shown([p.random for p in one.curve]).T
-        label = (f"{name}, {error_counts(one)}" if mixed else name) if several else "designed"
-        axes.plot(n, _shown([p.designed for p in one.curve]), "o-", color=colour, markersize=4, label=label)
-        axes.fill_between(n, low, high, color=colour, alpha=0.12, linewidth=0)
-        axes.plot(n, middle, "--", color=colour, linewidth=1.0)
-    if first.target is not None:
-        axes.axhline(first.target * 1e3, color="0.5", linewidth=0.9)
-        axes.annotate(f"{first.target * 1e3:g} mm", (0.0, first.target * 1e3), (2, 3), fontsize=7, color="0.4",
+    n = np.array([p.n for p in design.curve])
+    low, middle, high = _shown([p.random for p in design.curve]).T
+    axes.plot(n, _shown([p.designed for p in design.curve]), "o-", color=_COLOUR, markersize=4, label="designed")
+    axes.fill_between(n, low, high, color=_COLOUR, alpha=0.12, linewidth=0, label="random: 80 % of them")
+    axes.plot(n, middle, "--", color=_COLOUR, linewidth=1.0, label="random: half are better")
+    if design.target is not None:
+        axes.axhline(design.target * 1e3, color="0.5", linewidth=0.9)
+        axes.annotate(f"{design.target * 1e3:g} mm", (0.0, design.target * 1e3), (2, 3), fontsize=7, color="0.4",
                       xycoords=axes.get_yaxis_transform(), textcoords="offset points")  # fmt: skip
-    grey = "0.4" if several else _COLOURS[0]
-    axes.plot([], [], "--", color=grey, linewidth=1.0, label="random: half are better")
-    axes.fill_between([], [], [], color=grey, alpha=0.25, linewidth=0, label="random: 80 % of them")
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.set_xticks(_apart(sorted({p.n for one in designs.values() for p in one.curve})))
+    axes.set_xticks(_apart([p.n for p in design.curve]))
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter("{x:g}")
@@ -82,7 +75,7 @@ def draw_designs(designs: Mapping[str, Design]) -> Figure:
     axes.set_ylabel("expected RMS error over the task [mm]", fontsize=8)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=7.5)
-    axes.set_title(f"{first.pool.robot.name}: what to expect of how many stops", fontsize=9, loc="left")
+    axes.set_title(f"{design.pool.robot.name}: what to expect of how many stops", fontsize=9, loc="left")
     return figure
 
 
@@ -127,28 +120,6 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
     return names
 
 
-def write_designs(folder: Path, designs: Mapping[str, Design], units: Units) -> tuple[str, ...]:
-    """Write designs of several instruments, a folder each, and their picture; all of it or nothing.
-
-    Args:
-        folder: Where to.
-        designs: They, by the instruments' names.
-        units: Of the tables and jobs.
-
-    Returns:
-        The names of the files.
-
-    Raises:
-        InputError: A folder cannot be written: see `write_design`.
-    """
-    each = {name: _filling(folder / name, one, units) for name, one in designs.items()}
-    figure = draw_designs(designs)
-    for name, (_, write, own) in each.items():
-        fill_folder(folder / name, write, own)
-    fill_folder(folder, lambda into: figure.savefig(into / _PICTURE, dpi=160), {_PICTURE: b"\x89PNG"})
-    return (*(f"{name}/{file}" for name, (files, *_) in each.items() for file in files), _PICTURE)
-
-
 def _filling(
     folder: Path, design: Design, units: Units
 ) -> tuple[tuple[str, ...], Callable[[Path], None], Mapping[str, bytes]]:
@@ -166,7 +137,7 @@ def _filling(
         for t in tables
         for name, columns in table_columns(t, robot, units).items()
     }
-    figure = draw_designs({"": design})
+    figure = draw_design(design)
     urdf = "robot.urdf" if robot.urdf is not None and tables else None
     names = [CONFIGURATIONS, _DOCUMENT, "design.png"]
     if tables:
@@ -257,9 +228,3 @@ def _job_text(design: Design, tables: Sequence[Table], units: Units) -> str:
     job |= {"noise": {"joint": joint[0] if len(set(joint)) == 1 else joint}}
     job |= instrument_keys(tables, units)
     return yaml.safe_dump(job, sort_keys=False, default_flow_style=None, allow_unicode=True, width=math.inf)
-
-
-def names_of_files(paths: Sequence[Path]) -> list[str]:
-    """A name for each file: its own without the ending, with a number where others have the same."""
-    stems = [path.stem for path in paths]
-    return [s if stems.count(s) == 1 else f"{s}_{stems[: k + 1].count(s)}" for k, s in enumerate(stems)]

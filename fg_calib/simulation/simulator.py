@@ -1,51 +1,107 @@
-"""Simulation: a true robot, where it stands, and what is measured there.
+"""Simulation: a true robot, where it is sent, and what is measured there.
 
-Truth comes from forward kinematics alone; nothing here knows how a calibration works. With the true robot's pose
-base_T_tool at the readings plus encoder noise, and the measurement frame world_T_base, what is measured is
-
-    world_p_tool = world_R_base base_p_tool + world_p_base + n_position
-    world_R_tool = world_R_base base_R_tool exp(n_orientation)
-
-with independent normal noise along the world's axes and about the tool's axes. The table holds the readings without
-the noise: the arm is not where its encoders say. `measuring` says what other instruments measure.
+Truth comes from forward kinematics alone; nothing here knows how a calibration works. Encoder noise moves the arm: it
+stands where the readings plus that noise say, and the table holds the readings. `measure` says what instruments
+measure; without instruments a tracker measures poses of the tool.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
+from fg_calib.arrays import Brief
 from fg_calib.errors import InputError
 from fg_calib.measurements.dataset import Measurements, Noise
 from fg_calib.measurements.table import Table
-from fg_calib.options import Pairing, check_number
-from fg_calib.robot.inverse import random_readings
-from fg_calib.robot.kinematics import build_chain, forward
+from fg_calib.options import check_number
 from fg_calib.robot.model import Robot
-from fg_calib.robot.shape import foot_in
-from fg_calib.simulation.candidates import draw_candidates, number_of, sifted
-from fg_calib.simulation.configurations import (
-    BoardViews,
+from fg_calib.simulation.measure import Scene, Visits, draw_frame, generator_of, measure, merge_truths
+from fg_calib.simulation.scenario import (
     Configurations,
-    GivenReadings,
+    Errors,
     Placement,
-    RandomReadings,
-    TargetViews,
+    Scenario,
+    Tracker,
+    frame_knowledge,
+    override_noise,
+    values_by_name,
 )
-from fg_calib.simulation.instruments import frame_knowledge, with_figures
-from fg_calib.simulation.measure import Scene, Stops, drawn_frame, measure, share_knowledge, together
-from fg_calib.simulation.scenario import Errors, Scenario, Simulation, figures_by_name
-from fg_calib.simulation.views import reach_all, view_board
+from fg_calib.simulation.views import find_readings
 from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
 
-_PURPOSES = ("errors", "configurations", "validation", "frame", "noise", "noise of validation")
-"""Each, and each instrument, has a generator of its own: changing one thing of a scenario leaves what is drawn for the
-others alone."""
+
+@dataclass(frozen=True)
+class Simulation(Brief):
+    """One run of a scenario.
+
+    Attributes:
+        scenario: What was simulated.
+        seed: The seed.
+        robot: The nominal robot.
+        true_robot: The robot that moved: the same parameters, with their true values.
+        true_readings: Where the joints stood at the scenario's configurations: the readings plus the encoder noise,
+            shape (n_configurations, n_joints), [rad] (prismatic: [m]).
+        frame: world_T_base.
+        tables: What was measured, as `calibrate` takes it: a table for each instrument. Rows of the validation are
+            test rows.
+        truth: Where targets, anchors, planes, boards, sockets and frames truly are, by kind and name: `Spot`, `Plane`,
+            `Placement` (base_T_board, world_T_base); offsets in [m].
+    """
+
+    scenario: Scenario
+    seed: int
+    robot: Robot
+    true_robot: Robot
+    true_readings: Floats
+    frame: Placement
+    tables: tuple[Table, ...]
+    truth: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    @property
+    def measurements(self) -> Measurements:
+        """What the first instrument measured."""
+        return self.tables[0].measurements
+
+    @property
+    def job(self) -> dict[str, Any]:
+        """The keys of the calibration job that are not files or values: model, pairing, frame, ..."""
+        return {**self.scenario.job, "frame": frame_knowledge(self.scenario.frame)}
+
+    def n_configurations(self, *, test: bool) -> int:
+        """Number of different configurations of train or of test rows."""
+        tables = [table.measurements for table in self.tables]
+        return len(set(np.concatenate([m.ids[m.test == test] for m in tables]).tolist()))
+
+    def summary(self) -> dict[str, Any]:
+        """Seed, numbers of rows and truth, for programs: errors and frame in [m] and [rad]."""
+        n_train, n_test = (self.n_configurations(test=test) for test in (False, True))
+        errors = self.true_robot.nominal - self.robot.nominal
+        found = {
+            "scenario": self.scenario.name,
+            "seed": self.seed,
+            "n_configurations": n_train + n_test,
+            "n_train": n_train,
+            "n_test": n_test,
+            "truth": {
+                "errors": {p.name: float(e) for p, e in zip(self.robot.parameters, errors, strict=True) if e != 0.0},
+                "world_T_base": self.frame.summary(),
+            },
+        }
+        if self.scenario.instruments:
+            rows = [(t, t.measurements.source, int(np.sum(t.measurements.test))) for t in self.tables]
+            found["tables"] = [
+                {"table": name, "model": t.model, "n_train": len(t.measurements.test) - n, "n_test": n}
+                for t, name, n in rows
+            ]
+        return found
 
 
 @checked
@@ -53,233 +109,92 @@ others alone."""
 def simulate(scenario: Scenario, seed: int = 0, *, leave_out: bool = False) -> Simulation:
     """Run a scenario.
 
+    Every parameter, every table and every kind of noise has a generator of its own, by its name: changing one leaves
+    what is drawn for the others as it is.
+
     Args:
         scenario: What to simulate.
         seed: Same seed, same simulation.
-        leave_out: Whether stops are left out from which a point to touch is not reached, instead of an error.
+        leave_out: Whether configurations are left out from which a point to touch is not reached, instead of an error.
 
     Raises:
-        InputError: The scenario cannot be: poses that the robot does not reach within its joint limits, names that
-            are no parameters, figures that make no sense.
+        InputError: The scenario is impossible: poses that the robot does not reach within its joint limits, names that
+            are no parameters, values that make no sense.
     """
     check_number("seed", seed, whole=True)
-    n = len(_PURPOSES)
-    children = np.random.default_rng(seed).spawn(n + len(scenario.instruments))
-    draw = dict(zip(_PURPOSES, children, strict=False))
-    true_robot = _true_robot(scenario.robot, scenario.errors, draw["errors"], f"{scenario.source}: errors")
-    frame = _frame(scenario, draw["frame"])
-    if scenario.instruments:
-        return _by_instruments(scenario, seed, true_robot, frame, draw, children[n:], leave_out)
-    return _poses(scenario, seed, true_robot, frame, draw)
-
-
-def _sets(scenario: Scenario) -> list[tuple[str, Configurations, str]]:
-    """Key, configurations, and the purpose of their noise: to calibrate, and to test where that is wanted."""
-    sets = (
-        ("configurations", scenario.configurations, "noise"),
-        ("validation", scenario.validation, "noise of validation"),
-    )
-    return [(key, configurations, noise) for key, configurations, noise in sets if configurations is not None]
-
-
-def _poses(
-    scenario: Scenario, seed: int, true_robot: Robot, frame: Placement, draw: Mapping[str, np.random.Generator]
-) -> Simulation:
-    """Poses of the tool at all configurations."""
-    robot = scenario.robot
-    sets = [
-        _measure(scenario, key, configurations, true_robot, frame, (draw[key], draw[noise]))
-        for key, configurations, noise in _sets(scenario)
-    ]
-    readings, true_readings, rotation, position = (np.concatenate(parts) for parts in zip(*sets, strict=True))
-    n = len(readings)
-    stated = scenario.stated_noise or scenario.noise
-    sigmas = _sigmas(stated, f"{scenario.source}: noise", stated=True)
-    measurements = Measurements(
-        readings=readings,
-        ids=_names(n),
-        test=np.arange(n) >= len(sets[0][0]),
-        position=position,
-        rotation=rotation,
-        sigma_position=np.full((n, 3), sigmas[0]),
-        sigma_orientation=np.full((n, 3), sigmas[1]),
-        sigma_joint=_joint_sigma(stated, robot),
-        source="poses.csv",
-    )
-    pairing = pairing_of(scenario.job.get("pairing", "star"))
-    table = Table(measurements, scenario.job.get("model"), pairing, frame_knowledge(scenario.frame))
-    return Simulation(scenario, seed, robot, true_robot, measurements, true_readings, frame, (table,))
-
-
-def pairing_of(given: object) -> Pairing:
-    """A pairing as a job states it."""
-    if isinstance(given, Mapping):
-        return Pairing("random", given["random"], given.get("seed", 0))
-    return Pairing(given)  # type: ignore[arg-type] # checks it
-
-
-def _by_instruments(
-    scenario: Scenario,
-    seed: int,
-    true_robot: Robot,
-    frame: Placement,
-    draw: Mapping[str, np.random.Generator],
-    own: Sequence[np.random.Generator],
-    leave_out: bool,
-) -> Simulation:
-    """What each instrument measures, where it goes itself or where all go."""
-    common: list[Stops] = []
-    for key, configurations, noise in _sets(scenario):
-        first = sum(map(len, common))
-        place = f"{scenario.source}: {key}"
-        common.append(_stops(scenario, configurations, (draw[key], draw[noise]), place, "p", first, bool(common)))
-    stated = scenario.stated_noise or scenario.noise
+    robot, source = scenario.robot, scenario.source
+    true_robot = _draw_robot(robot, scenario.errors, seed, f"{source}: errors")
+    frame = scenario.frame
+    if not isinstance(frame, Placement):
+        unknown = frame == "unknown"
+        frame = draw_frame(generator_of(seed, "frame")) if unknown else Placement(np.eye(3), np.zeros(3))
+    common: list[Visits] = []
+    for key, of in (("configurations", scenario.configurations), ("validation", scenario.validation)):
+        if of is not None:
+            first = sum(map(len, common))
+            one = _visit(scenario, of, seed, f"{source}: {key}", key)
+            names = np.array([f"p{first + i}" for i in range(len(one))])
+            common.append(replace(one, ids=names, test=np.full(len(one), key == "validation")))
+    specified = scenario.stated_noise or scenario.noise
+    default = Tracker(model="pose", name="poses")
     tables, truths = [], []
-    for instrument, generator in zip(scenario.instruments, own, strict=True):
-        reached, joint, places, noise_draws = generator.spawn(4)
-        stops, configurations = common, instrument.configurations or scenario.configurations
+    for instrument in scenario.instruments or (default,):
+        visits = common
         if instrument.configurations is not None:
-            place = f"{scenario.source}: instruments: {instrument.name}: configurations"
-            mine = _stops(scenario, configurations, (reached, joint), place, f"{instrument.name} p", 0, False)
-            stops = [mine, *common[1:]]
+            place = f"{source}: instruments: {instrument.name}: configurations"
+            own = _visit(scenario, instrument.configurations, seed, place, instrument.name)
+            visits = [replace(own, ids=np.array([f"{instrument.name} p{i}" for i in range(len(own))])), *common[1:]]
         scene = Scene(
-            robot=scenario.robot,
+            robot=robot,
             true_robot=true_robot,
-            stops=together(stops),
-            configurations=configurations,
-            noise=with_figures(scenario.noise, instrument.noise),
-            stated_noise=with_figures(with_figures(stated, instrument.noise), instrument.stated_noise),
-            sigma_joint=_joint_sigma(stated, scenario.robot),
+            visits=Visits.joined(visits),
+            configurations=instrument.configurations or scenario.configurations,
+            noise=override_noise(scenario.noise, instrument.noise),
+            stated_noise=override_noise(override_noise(specified, instrument.noise), instrument.stated_noise),
+            sigma_joint=_joint_sigma(specified, robot),
             frame=frame,
             known_frame=frame_knowledge(scenario.frame) == "known",
-            places=places,
-            draws=noise_draws,
-            source=scenario.source,
+            seed=seed,
+            source=source,
             leave_out=leave_out,
         )
         table, truth = measure(instrument, scene)
+        if instrument is default:
+            table, truth = replace(table, model=scenario.job.get("model"), pairing=scenario.pairing), {}
         tables.append(table)
         truths.append(truth)
-    shared, every = share_knowledge(tables, truths, scenario.source)
-    true_readings = together(common).true_readings
-    return Simulation(
-        scenario, seed, scenario.robot, true_robot, shared[0].measurements, true_readings, frame, shared, every
-    )
+    shared, every = merge_truths(tables, truths, source)
+    return Simulation(scenario, seed, robot, true_robot, Visits.joined(common).true_readings, frame, shared, every)
 
 
-def _stops(
-    scenario: Scenario,
-    configurations: Configurations,
-    generators: tuple[np.random.Generator, np.random.Generator],
-    place: str,
-    prefix: str,
-    first: int,
-    test: bool,
-) -> Stops:
+def _visit(scenario: Scenario, of: Configurations, seed: int, place: str, name: str) -> Visits:
     """Configurations, and where the joints stand there."""
     robot = scenario.robot
-    readings = _readings(robot, configurations, generators[0], place)
+    readings = find_readings(robot, of, generator_of(seed, name, "configurations"), place)
     n = len(readings)
-    off = _joint_sigma(scenario.noise, robot) * generators[1].normal(size=(n, robot.n_joints))
-    return Stops(readings, readings + off, _names(n, prefix, first), np.full(n, test))
+    noise = generator_of(seed, name, "joint noise").normal(size=(n, robot.n_joints))
+    stood = readings + _joint_sigma(scenario.noise, robot) * noise
+    return Visits(readings, stood, np.full(n, ""), np.zeros(n, dtype=np.bool_))
 
 
-def _names(n: int, prefix: str = "p", first: int = 0) -> NDArray[np.str_]:
-    return np.array([f"{prefix}{first + i}" for i in range(n)])
-
-
-def _true_robot(robot: Robot, errors: Errors | None, generator: np.random.Generator, place: str) -> Robot:
+def _draw_robot(robot: Robot, errors: Errors | None, seed: int, place: str) -> Robot:
+    """Draw the robot that moves, each parameter by its name."""
     if errors is None:
         raise InputError(place, "found none", "one of uniform, normal, values: what the arm that moves has")
-    figures = figures_by_name(robot, errors.figures, f"{place}: {errors.law}")
-    figure = np.array([figures.get(p.name, 0.0) for p in robot.parameters])
-    n = len(figure)
+    values = values_by_name(robot, errors.figures, f"{place}: {errors.law}")
     if errors.law == "values":
-        return robot.with_values(robot.nominal + figure)
-    if not (np.isfinite(figure) & (figure >= 0.0)).all():
-        raise InputError(f"{place}: {errors.law}", f"found {figure.min():g}", "numbers not below 0")
-    # One for each parameter, needed or not: fixing one leaves the errors of the others as they are.
-    drawn = generator.uniform(-1.0, 1.0, n) if errors.law == "uniform" else generator.normal(size=n)
-    estimated = np.array([p.estimated for p in robot.parameters])
-    return robot.with_values(robot.nominal + np.where(estimated, figure * drawn, 0.0))
-
-
-def _frame(scenario: Scenario, generator: np.random.Generator) -> Placement:
-    if isinstance(scenario.frame, Placement):
-        return scenario.frame
-    if scenario.frame == "base":
-        return Placement(np.eye(3), np.zeros(3))
-    return drawn_frame(generator)
-
-
-def _measure(
-    scenario: Scenario,
-    key: str,
-    configurations: Configurations,
-    true_robot: Robot,
-    frame: Placement,
-    generators: tuple[np.random.Generator, np.random.Generator],
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Readings, where the joints stood, and the measured rotation and position, one row a configuration."""
-    from scipy.spatial.transform import Rotation
-
-    robot = scenario.robot
-    sigma_position, sigma_orientation = _sigmas(scenario.noise, f"{scenario.source}: noise")
-    readings = _readings(robot, configurations, generators[0], f"{scenario.source}: {key}")
-    n = len(readings)
-    # Standard normal numbers first: another sigma scales the same noise.
-    joint, position, orientation = (generators[1].normal(size=(n, m)) for m in (robot.n_joints, 3, 3))
-    true_readings = readings + _joint_sigma(scenario.noise, robot) * joint
-    at = forward(build_chain(true_robot).without_columns(), true_robot.trig(true_readings))
-    turned = Rotation.from_rotvec(sigma_orientation * orientation).as_matrix()
-    world_R_tool = frame.rotation @ at.rotation @ turned
-    world_p_tool = at.position @ frame.rotation.T + frame.position + sigma_position * position
-    return readings, true_readings, world_R_tool, world_p_tool
-
-
-def _sigmas(noise: Noise, place: str, *, stated: bool = False) -> tuple[float, float]:
-    """Sigma of positions, [m], and of orientations, [rad]; above 0 where a calibration is told them (`stated`)."""
-    sigmas = []
-    for key, figure in (("position", noise.position), ("orientation", noise.orientation)):
-        if figure is None:
-            raise InputError(f"{place}: {key}", "found none", "1 sigma: poses are simulated whole")
-        if not np.isfinite(figure) or figure < 0.0:
-            raise InputError(f"{place}: {key}", f"found {figure}", "a number not below 0")
-        if stated and figure == 0.0:
-            hint = f"a calibration takes nothing for exact: tell it what to assume under job: noise: {key}"
-            raise InputError(f"{place}: {key}", "found 0", "a number above 0", hint)
-        sigmas.append(figure)
-    return sigmas[0], sigmas[1]
+        return robot.with_values(robot.nominal + np.array([values.get(p.name, 0.0) for p in robot.parameters]))
+    error = np.zeros(len(robot.parameters))
+    for k, p in enumerate(robot.parameters):
+        size = values.get(p.name, 0.0)
+        if not np.isfinite(size) or size < 0.0:
+            raise InputError(f"{place}: {errors.law}", f"found {size:g}", "numbers not below 0")
+        if p.estimated:
+            generator = generator_of(seed, "errors", p.name)
+            error[k] = size * (generator.uniform(-1.0, 1.0) if errors.law == "uniform" else generator.normal())
+    return robot.with_values(robot.nominal + error)
 
 
 def _joint_sigma(noise: Noise, robot: Robot) -> Floats:
     """Sigma of the readings, shape (n_joints,), [rad] (prismatic: [m])."""
     return np.broadcast_to(np.asarray(noise.joint, dtype=np.float64), robot.n_joints).copy()
-
-
-def _readings(robot: Robot, configurations: Configurations, generator: np.random.Generator, place: str) -> Floats:
-    """The configurations, shape (n, n_joints), [rad] (prismatic: [m])."""
-    if isinstance(configurations, TargetViews) or sifted(configurations):
-        return _sifted(robot, configurations, generator, place)
-    match configurations:
-        case RandomReadings(count):
-            return random_readings(robot, count, generator)
-        case GivenReadings(readings):
-            return np.asarray(readings, dtype=np.float64)
-        case BoardViews():
-            rotation, position = view_board(configurations, generator)
-            return reach_all(robot, configurations, rotation, position, generator, f"{place}: board")
-
-
-def _sifted(robot: Robot, configurations: Configurations, generator: np.random.Generator, place: str) -> Floats:
-    """As many configurations as are asked for, all of which keep to their conditions.
-
-    Raises:
-        InputError: There are not so many.
-    """
-    n = number_of(configurations)
-    found = draw_candidates(robot, configurations, generator, n, place)
-    if len(found.readings) < n:
-        hint = foot_in(robot, configurations.keep_out) or "ask for fewer, or relax what they have to keep to"
-        raise InputError(place, f"{len(found.readings)} of {n} found in {found.reasons()}", hint=hint)
-    return found.readings

@@ -1,17 +1,275 @@
-"""Where a camera sees a board, and how a reflector is turned towards a tracker: poses that are drawn, and reached."""
+"""Configurations: poses that a camera or a tracker could see, or random ones, with the reasons why others are rejected.
+
+Poses are drawn and brought within reach by inverse kinematics. A pose that the arm does not reach, a configuration that
+is in a box, and one that is near another are rejected, and counted by reason.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
+from fg_calib.arrays import FrozenArrays, as_floats
 from fg_calib.errors import InputError
-from fg_calib.robot.inverse import Inverse, solve_inverse
+from fg_calib.measurements.limits import outside_limits
+from fg_calib.robot.inverse import Inverse, random_readings, solve_inverse
+from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot
-from fg_calib.simulation.configurations import BoardViews, TargetViews
+from fg_calib.simulation.obstacles import blocked_foot, enters
+from fg_calib.simulation.scenario import BoardViews, Configurations, GivenReadings, RandomReadings, TargetViews
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
+Words = NDArray[np.str_]
+
+Draw = Callable[[int], tuple[Floats, Words]]
+"""Draws configurations, shape (n, n_joints), with why each is rejected, "" where it is not."""
+
+REASONS = (
+    *("outside the joint limits", "not seen", "out of range", "outside the region", "out of reach", "in a box"),
+    "near another",
+)
+"""Why a configuration, or a pose, is rejected; of several reasons the first."""
+
+WORD = f"<U{max(map(len, REASONS))}"
+
+MAX_DRAWN_EACH = 20
+"""Configurations that are drawn at most for each that is wanted."""
+
+MAX_DRAWN_IN_VAIN = 1000
+"""Without finding any, no more are drawn."""
+
+DRAWN_MORE = 50
+"""How many times more, of both, where a reflector cannot be rotated: drawing alone is fast."""
+
+MAX_DRAWN_AT_ONCE = 16_384
+"""Most that are drawn at once, for memory."""
+
+N_STARTS, N_STEPS = 4, 20
+"""Starts of the inverse kinematics for each view of a board, and steps from each: most of the time is spent on poses
+that no start reaches."""
+
+N_STARTS_ROTATED = 2
+"""Starts for each rotated reflector: the first is at its place already."""
+
+
+@dataclass(frozen=True)
+class Candidates(FrozenArrays):
+    """Configurations that can be had.
+
+    Attributes:
+        readings: In the order in which they were drawn, shape (n, n_joints), [rad] (prismatic: [m]).
+        asked: Number of poses or configurations that were drawn.
+        rejected: How many of them were not taken, by reason (`REASONS`).
+    """
+
+    readings: Floats
+    asked: int
+    rejected: Mapping[str, int]
+
+    def reasons(self) -> str:
+        """What became of all that were drawn: `1000 drawn: 83 % out of reach, 9.1 % in a box`."""
+        shares = (f"{float(f'{100.0 * n / self.asked:.2g}'):g} % {reason}" for reason, n in self.rejected.items())
+        return f"{self.asked} drawn: {', '.join(shares) or 'none rejected'}"
+
+
+def number_of(of: Configurations) -> int:
+    """How many configurations are asked for."""
+    match of:
+        case BoardViews():
+            return 1 + of.count
+        case GivenReadings():
+            return len(of.readings)
+    return of.count
+
+
+def draw_candidates(robot: Robot, of: Configurations, generator: np.random.Generator, n: int, place: str) -> Candidates:
+    """Draw configurations until enough are found, or too many were rejected.
+
+    Args:
+        robot: The robot, at its nominal values.
+        of: Which configurations, and what they have to keep to.
+        generator: Draws them.
+        n: How many are wanted.
+        place: Of the configurations, for messages.
+
+    Returns:
+        At most n: fewer of a table whose rows are used up, where `MAX_DRAWN_EACH` n were drawn, or where the first
+        `MAX_DRAWN_IN_VAIN` were all rejected.
+
+    Raises:
+        InputError: Self-motion is to be held, and the first view of a board is not reached.
+    """
+    draw = _draw(robot, of, generator, place)
+    patience = DRAWN_MORE if isinstance(of, TargetViews) and not _can_be_rotated(robot) else 1
+    most, hopeless = MAX_DRAWN_EACH * patience * n, MAX_DRAWN_IN_VAIN * patience
+    if isinstance(of, GivenReadings):
+        most = hopeless = len(of.readings)
+    thinning = Thinning(robot, of.apart)
+    taken, n_taken, asked = [np.empty((0, robot.n_joints))], 0, 0
+    counts: Counter[str] = Counter()
+    while n_taken < n and asked < most and (n_taken or asked < hopeless):
+        share = n_taken / asked if n_taken else 1.0
+        k = int(1.1 * (n - n_taken) / share) + 10 if asked else min(n, MAX_DRAWN_IN_VAIN)
+        k = min(k, MAX_DRAWN_AT_ONCE, most - asked)
+        readings, reason = draw(k)
+        good = np.flatnonzero(reason == "")
+        if of.keep_out:
+            reason[good] = np.where(enters(robot, readings[good], of.keep_out), "in a box", "")
+            good = np.flatnonzero(reason == "")
+        reason[good] = np.where(thinning.near(readings[good]), "near another", "")
+        good = np.flatnonzero(reason == "")
+        k = k if n_taken + len(good) < n else int(good[n - n_taken - 1]) + 1  # none after the last that is wanted
+        taken.append(readings[:k][reason[:k] == ""])
+        n_taken, asked = n_taken + len(taken[-1]), asked + k
+        counts.update(reason[:k].tolist())
+    rejected = {why: counts[why] for why in REASONS if counts[why]}
+    return Candidates(np.concatenate(taken), asked, rejected)
+
+
+def _draw(robot: Robot, of: Configurations, generator: np.random.Generator, place: str) -> Draw:
+    """What draws configurations of a kind."""
+    match of:
+        case BoardViews():
+            return _views(robot, of, generator, f"{place}: board")
+        case TargetViews():
+            return lambda k: _target(robot, of, generator, k)
+        case RandomReadings():
+            return lambda k: (random_readings(robot, k, generator), np.full(k, "", dtype=WORD))
+        case GivenReadings():
+            return _rows(robot, of.readings, place)
+
+
+def _rows(robot: Robot, readings: Floats, place: str) -> Draw:
+    """The rows of a table, one after the other."""
+    rows = as_floats(f"{place}: table", readings, f"(n, {robot.n_joints})")
+    outside: Booleans = np.any(outside_limits(rows, robot), axis=1)
+    first = 0
+
+    def draw(k: int) -> tuple[Floats, Words]:
+        nonlocal first
+        chosen = slice(first, first + k)
+        first += k
+        return rows[chosen], np.where(outside[chosen], "outside the joint limits", "").astype(WORD)
+
+    return draw
+
+
+def _views(robot: Robot, views: BoardViews, generator: np.random.Generator, place: str) -> Draw:
+    """Views of a board: the first that is drawn is A."""
+    near: Floats | None = None  # what self-motion is held to
+    first = True
+
+    def draw(k: int) -> tuple[Floats, Words]:
+        nonlocal near, first
+        rotation, position = view_board(replace(views, count=k - 1 if first else k), generator)
+        if first and views.self_motion == "held":
+            posture = None if views.posture is None else np.array(views.posture)
+            found = solve_inverse(robot, position[:1], rotation[:1], generator=generator, near=posture)
+            near = _require_reached(found, place)[0]
+        rotation, position = rotation[-k:], position[-k:]
+        first = False
+        seen = sees_board(views, rotation, position)
+        found = _reach(robot, rotation[seen], position[seen], near, N_STARTS, generator)
+        readings, reason = np.zeros((k, robot.n_joints)), np.where(seen, "", "not seen").astype(WORD)
+        readings[seen], reason[seen] = found.readings, np.where(found.reached, "", "out of reach")
+        return readings, reason
+
+    return draw
+
+
+def _target(robot: Robot, views: TargetViews, generator: np.random.Generator, k: int) -> tuple[Floats, Words]:
+    """Configurations in which a tracker sees a reflector."""
+    starts, places, turns, further = generator.spawn(4)
+    readings, near = random_readings(robot, k, starts), True
+    at = forward(build_chain(robot).without_columns(), robot.trig(readings))
+    target, region = at.position + at.rotation @ views.target, views.region
+    faced = faces(views, at.rotation, target)
+    reason = np.full(k, "", dtype=WORD)
+    if region is not None and _can_be_rotated(robot):
+        target, faced, near = places.uniform(region.lower, region.upper, (k, 3)), np.zeros(k, dtype=np.bool_), False
+    elif region is not None:
+        reason[~region.holds(target)] = "outside the region"
+    away = np.linalg.norm(views.station - target, axis=1)
+    beyond = (away < views.distance[0]) | (away > views.distance[1]) | (away == 0.0)
+    reason[beyond & (reason == "")] = "out of range"
+    rest = (reason == "") & ~faced
+    if not _can_be_rotated(robot):
+        reason[rest] = "not seen"
+        return readings, reason
+    rotation, position = aim(views, target[rest], turns)
+    found = _reach(robot, rotation, position, readings[rest] if near else None, N_STARTS_ROTATED, further)
+    readings[rest], reason[rest] = found.readings, np.where(found.reached, "", "out of reach")
+    return readings, reason
+
+
+def _can_be_rotated(robot: Robot) -> bool:
+    """Whether an arm may bring its tool to a place with any rotation."""
+    return robot.n_joints >= 6
+
+
+def _reach(
+    robot: Robot,
+    rotation: Floats,
+    position: Floats,
+    near: Floats | None,
+    n_starts: int,
+    generator: np.random.Generator,
+) -> Inverse:
+    """Configurations for poses, the inverse kinematics giving up early."""
+    return solve_inverse(robot, position, rotation, near=near, generator=generator, n_starts=n_starts, n_steps=N_STEPS)
+
+
+class Thinning:
+    """Takes configurations one after another, each that is not near one taken before."""
+
+    def __init__(self, robot: Robot, apart: float | None) -> None:
+        """Begin with none taken.
+
+        Args:
+            robot: Whose configurations they are.
+            apart: Least distance of two, as `Conditions` has it; None: any.
+        """
+        self._apart = apart
+        self._unit = np.array([robot.reach if joint.prismatic else 1.0 for joint in robot.joints])
+        self._taken = np.empty((0, robot.n_joints))
+
+    def near(self, readings: Floats) -> Booleans:
+        """Which of further configurations are near others, shape (n,); those that are not are taken."""
+        near = np.zeros(len(readings), dtype=np.bool_)
+        if self._apart is None:
+            return near
+        first = 0
+        while first < len(readings):  # in parts: all pairs of very many would not fit into memory
+            part = slice(first, first + max(1024, len(self._taken) // 4))
+            near[part] = self._near(readings[part] / self._unit, self._apart)
+            first = part.stop
+        return near
+
+    def _near(self, scaled: Floats, apart: float) -> Booleans:
+        near = np.zeros(len(scaled), dtype=np.bool_)
+        if len(self._taken):
+            distance, _ = KDTree(self._taken).query(scaled, p=np.inf, distance_upper_bound=apart)
+            near = np.isfinite(distance)
+        rows = np.flatnonzero(~near)
+        closer = np.nextafter(apart, 0.0)  # less than `apart`, as the query above has it
+        pairs = KDTree(scaled[rows]).query_pairs(closer, p=np.inf, output_type="ndarray").reshape(-1, 2)
+        i, j = rows[pairs[np.argsort(pairs[:, 0], kind="stable")]].T  # i < j
+        before, start, n_behind = np.unique(i, return_index=True, return_counts=True)
+        for one, first, last in zip(before.tolist(), start.tolist(), (start + n_behind).tolist(), strict=True):
+            if not near[one]:
+                near[j[first:last]] = True
+        self._taken = np.concatenate([self._taken, scaled[~near]])
+        return near
+
+
+# --- views ------------------------------------------------------------------------------------------------------------
 
 
 def view_board(views: BoardViews, generator: np.random.Generator) -> tuple[Floats, Floats]:
@@ -24,8 +282,6 @@ def view_board(views: BoardViews, generator: np.random.Generator) -> tuple[Float
     Returns:
         base_R_tool, shape (1 + count, 3, 3), and base_p_tool, shape (1 + count, 3), [m].
     """
-    from scipy.spatial.transform import Rotation
-
     places, rolls, turns = generator.spawn(3)
     A = np.array([[0.0, 0.0, views.height]])
     if views.distance is None:
@@ -139,32 +395,47 @@ def _directions(cosine: Floats, azimuth: Floats) -> Floats:
     return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine], axis=1)
 
 
-def reach_all(
-    robot: Robot, views: BoardViews, rotation: Floats, position: Floats, generator: np.random.Generator, place: str
-) -> Floats:
-    """Configurations that bring the camera to all poses, A first, shape (n_poses, n_joints), [rad] (prismatic: [m]).
+# --- configurations of a scenario -------------------------------------------------------------------------------------
+
+
+def find_readings(robot: Robot, of: Configurations, generator: np.random.Generator, place: str) -> Floats:
+    """Find as many configurations as are asked for, shape (n, n_joints), [rad] (prismatic: [m]).
+
+    Raises:
+        InputError: There are not so many that meet their conditions.
+    """
+    conditions = bool(of.keep_out) or of.apart is not None or isinstance(of, TargetViews)
+    if isinstance(of, BoardViews) and not conditions and of.board_size is None:
+        return _reach_views(robot, of, generator, f"{place}: board")
+    if isinstance(of, GivenReadings) and not conditions:
+        return np.asarray(of.readings, dtype=np.float64)
+    n = number_of(of)
+    found = draw_candidates(robot, of, generator, n, place)
+    if len(found.readings) < n:
+        hint = blocked_foot(robot, of.keep_out) or "ask for fewer, or relax their conditions"
+        raise InputError(place, f"{len(found.readings)} of {n} found in {found.reasons()}", hint=hint)
+    return found.readings
+
+
+def _reach_views(robot: Robot, views: BoardViews, generator: np.random.Generator, place: str) -> Floats:
+    """Configurations that bring the camera to all views of a board, A first.
 
     Raises:
         InputError: One of the poses was not reached.
     """
+    rotation, position = view_board(views, generator)
     if views.self_motion == "random":
-        return require_reached(solve_inverse(robot, position, rotation, generator=generator), place)
+        return _require_reached(solve_inverse(robot, position, rotation, generator=generator), place)
     near = None if views.posture is None else np.array(views.posture)
-    first = require_reached(
+    first = _require_reached(
         solve_inverse(robot, position[:1], rotation[:1], generator=generator, near=near), place, len(rotation)
     )
     others = solve_inverse(robot, position[1:], rotation[1:], generator=generator, near=first[0])
-    return np.concatenate([first, require_reached(others, place, len(rotation), 1)])
+    return np.concatenate([first, _require_reached(others, place, len(rotation), 1)])
 
 
-def require_reached(found: Inverse, place: str, n: int | None = None, first: int = 0) -> Floats:
-    """The solutions for views of a board, or some of them.
-
-    Args:
-        found: The solutions.
-        place: File and key, for messages.
-        n: Number of views, where these are not all.
-        first: Number of the first of these; that of A is 0.
+def _require_reached(found: Inverse, place: str, n: int | None = None, first: int = 0) -> Floats:
+    """The solutions for views of a board, numbered from `first`; A is 0.
 
     Raises:
         InputError: One of the poses was not reached.
@@ -172,18 +443,12 @@ def require_reached(found: Inverse, place: str, n: int | None = None, first: int
     missed = np.flatnonzero(~found.reached)
     if len(missed) == 0:
         return found.readings
-    n = len(found.readings) if n is None else n
-    names = ["A" if first + i == 0 else f"view {first + i}" for i in range(len(found.readings))]
-    listed = ", ".join([*(names[i] for i in missed[:12]), *(["..."] if len(missed) > 12 else [])])
+    names = ["A" if k == 0 else f"view {k}" for k in (first + missed[:12]).tolist()]
     nearest = missed[np.argmin(found.miss_position[missed])]
-    farthest = missed[np.argmax(found.miss_position[missed])]
-    spans = [
-        f"{names[i]} by {found.miss_position[i]:.3g} m and {np.rad2deg(found.miss_rotation[i]):.3g} deg"
-        for i in dict.fromkeys([nearest, farthest])
-    ]
+    by = f"{found.miss_position[nearest]:.3g} m and {np.rad2deg(found.miss_rotation[nearest]):.3g} deg"
     raise InputError(
         place,
-        f"{len(missed)} of {n} views not reached within the joint limits ({listed}): "
-        f"the nearest configurations found miss {' and '.join(spans)}",
+        f"{len(missed)} of {n or len(found.readings)} views not reached within the joint limits ("
+        f"{', '.join(names)}{', ...' if len(missed) > 12 else ''}): the nearest one is missed by {by}",
         hint="move the board nearer or widen the limits",
     )

@@ -1,15 +1,19 @@
-"""Simulations, written as calibration jobs that run as they are."""
+"""Simulations, written as calibration jobs that run as they are; tables of instruments, in the units of a file."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import re
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from fg_calib.arguments import checked
 from fg_calib.errors import InputError
@@ -19,8 +23,21 @@ from fg_calib.io.robot_file import write_robot
 from fg_calib.io.units import Units
 from fg_calib.io.urdf import write_urdf
 from fg_calib.io.yaml import read_yaml
-from fg_calib.simulation.scenario import Simulation
-from fg_calib.simulation.simulated_tables import instrument_keys, table_columns, table_files, truth_in
+from fg_calib.measurements.dataset import Measurements, Pairs
+from fg_calib.measurements.table import Table
+from fg_calib.options import PAIR_MODELS, POSE_MODELS, Pairing
+from fg_calib.robot.model import Robot
+from fg_calib.simulation.scenario import Placement, Plane, Spot
+from fg_calib.simulation.simulator import Simulation
+
+Columns = Mapping[str, Any]
+Floats = NDArray[np.float64]
+
+_FIRST_WORDS = "# fg-calib simulate "
+"""How the job of a simulation begins."""
+
+MEASURED = (*"xyz", "qx", "qy", "qz", "qw", "distance", "angle", *"uv")
+"""Columns of measured values."""
 
 
 @checked
@@ -29,7 +46,7 @@ def write_simulation(folder: Path | str, simulation: Simulation) -> tuple[str, .
 
     The files are `robot_nominal.yaml`, `robot_true.yaml` (each with its `.urdf` where the robot is from one),
     `calibration.yaml`, which names the true robot as `truth`, and `poses.csv`; with instruments a table for each in the
-    place of that, and `truth.yaml`, where things truly are.
+    place of that, and `truth.yaml`, where landmarks truly are.
 
     Args:
         folder: Where to; files of these names are replaced where they are of another simulation.
@@ -41,36 +58,33 @@ def write_simulation(folder: Path | str, simulation: Simulation) -> tuple[str, .
     Raises:
         InputError: The folder cannot be written, or holds another job.
     """
-    scenario, folder = simulation.scenario, Path(folder)
-    units = Units(length=scenario.length_unit, angle=scenario.angle_unit)
+    folder, robots = Path(folder), {"robot_nominal": simulation.robot, "robot_true": simulation.true_robot}
+    units = Units(length=simulation.scenario.length_unit, angle=simulation.scenario.angle_unit)
+    tables = {name: c for t in simulation.tables for name, c in table_columns(t, simulation.robot, units).items()}
+    texts = {"calibration.yaml": _job_text(simulation, units)}
+    if simulation.scenario.instruments:
+        texts["truth.yaml"] = _yaml(_truth(simulation, units))
 
     def write(into: Path) -> None:
-        for name, robot in (("robot_nominal", simulation.robot), ("robot_true", simulation.true_robot)):
-            urdf_name = None if robot.urdf is None else f"{name}.urdf"
-            if urdf_name is not None:
-                write_urdf(into / urdf_name, robot)
-            write_robot(into / f"{name}.yaml", robot, units=units, urdf_name=urdf_name)
-        for name, columns in _tables(simulation, units).items():
+        for name, robot in robots.items():
+            urdf = None if robot.urdf is None else f"{name}.urdf"
+            if urdf is not None:
+                write_urdf(into / urdf, robot)
+            write_robot(into / f"{name}.yaml", robot, units=units, urdf_name=urdf)
+        for name, columns in tables.items():
             write_csv(into / name, columns)
-        if scenario.instruments:
-            write_text(into / "truth.yaml", _yaml(truth_in(simulation, units)))
-        write_text(into / "calibration.yaml", _job_text(simulation, units))
+        for name, text in texts.items():
+            write_text(into / name, text)
 
-    names = simulation_files(simulation)
-    fill_folder(folder, write, _OWN | dict.fromkeys((*names, *_earlier(folder)), b"") | _JOB)
-    return names
-
-
-_FIRST_WORDS = "# fg-calib simulate "
-"""How the job of a simulation begins."""
-
-_URDFS = ("robot_nominal.urdf", "robot_true.urdf")
-_JOB = {"calibration.yaml": _FIRST_WORDS.encode()}
-_OWN = _JOB | dict.fromkeys(("poses.csv", "robot_nominal.yaml", "robot_true.yaml", *_URDFS), b"")
-"""What a simulation may write beside the tables of instruments, and how it begins."""
+    urdfs = [f"{name}.urdf" for name, robot in robots.items() if robot.urdf is not None]
+    names = sorted((*tables, *texts, *urdfs, *(f"{name}.yaml" for name in robots)))
+    always = ("poses.csv", "robot_nominal.yaml", "robot_true.yaml", "robot_nominal.urdf", "robot_true.urdf")
+    job = {"calibration.yaml": _FIRST_WORDS.encode()}
+    fill_folder(folder, write, job | dict.fromkeys((*always, *names, *_earlier_files(folder)), b"") | job)
+    return tuple(names)
 
 
-def _earlier(folder: Path) -> tuple[str, ...]:
+def _earlier_files(folder: Path) -> tuple[str, ...]:
     """The tables of a simulation that is in a folder, by its job."""
     job = folder / "calibration.yaml"
     try:
@@ -85,65 +99,197 @@ def _earlier(folder: Path) -> tuple[str, ...]:
     return (*found, "truth.yaml") if entries else ()
 
 
-def simulation_files(simulation: Simulation) -> tuple[str, ...]:
-    """The names of the files of a simulation."""
-    urdfs = _URDFS if simulation.robot.urdf is not None else ()
-    tables: tuple[str, ...] = ("poses.csv",)
-    if simulation.scenario.instruments:
-        tables = ("truth.yaml", *(name for table in simulation.tables for name in table_files(table)))
-    return tuple(sorted(("calibration.yaml", "robot_nominal.yaml", "robot_true.yaml", *urdfs, *tables)))
+# --- tables -----------------------------------------------------------------------------------------------------------
 
 
-def _tables(simulation: Simulation, units: Units) -> Mapping[str, Mapping[str, Any]]:
-    """The columns of each table."""
-    if not simulation.scenario.instruments:
-        return {"poses.csv": _pose_columns(simulation, units)}
-    return {
-        name: columns
-        for table in simulation.tables
-        for name, columns in table_columns(table, simulation.robot, units).items()
-    }
+def _pairs(m: Measurements) -> tuple[Pairs, tuple[str, ...]] | None:
+    """The pairs of a table and the names of their ends: configurations, or contact points."""
+    if m.pairs is not None:
+        return m.pairs, tuple(m.ids.tolist())
+    if m.groups is not None and m.groups.pairs.n_pairs:
+        return m.groups.pairs, m.groups.names
+    return None
 
 
-def _pose_columns(simulation: Simulation, units: Units) -> Mapping[str, Any]:
-    """The table of poses, in the units of the job."""
-    from scipy.spatial.transform import Rotation
+def table_columns(table: Table, robot: Robot, units: Units) -> dict[str, Columns]:
+    """The columns of each of a table's files, by the file's name.
 
-    m, robot = simulation.measurements, simulation.robot
-    if m.position is None or m.rotation is None:
-        raise ValueError("a simulation measures positions and orientations")
-    quaternion = Rotation.from_matrix(m.rotation.copy()).as_quat(canonical=True)
-    return {
-        "id": m.ids,
-        **{f"q{i + 1}": m.readings[:, i] / units.factor(joint.unit) for i, joint in enumerate(robot.joints)},
-        **{axis: m.position[:, k] / units.factor("m") for k, axis in enumerate("xyz")},
-        **{f"q{axis}": quaternion[:, k] for k, axis in enumerate("xyzw")},
-        "split": np.where(m.test, "test", "train"),
-    }
+    Args:
+        table: The table.
+        robot: The nominal robot.
+        units: Of the files.
+    """
+    m, length = table.measurements, units.factor("m")
+    columns: dict[str, Any] = {"id": m.ids}
+    columns |= {f"q{i + 1}": m.readings[:, i] / units.factor(joint.unit) for i, joint in enumerate(robot.joints)}
+    labels = {name: (of.names, of.index) for name, of in m.labels.items()}
+    if m.groups is not None:
+        labels["group"] = (m.groups.names, m.groups.index)
+    columns |= {name: np.array(["", *names])[index + 1] for name, (names, index) in labels.items()}
+    if m.position is not None:
+        columns |= {axis: m.position[:, k] / length for k, axis in enumerate("xyz")}
+    if m.rotation is not None:
+        quaternion = Rotation.from_matrix(m.rotation.copy()).as_quat(canonical=True)
+        columns |= {f"q{axis}": quaternion[:, k] for k, axis in enumerate("xyzw")}
+    if m.length is not None:
+        columns["distance"] = m.length / length
+    if m.image is not None:
+        columns |= {axis: m.image[:, k] for k, axis in enumerate("uv")}
+        columns |= {f"corner_{axis}": m.image[:, 2 + k] / length for k, axis in enumerate("xy")}
+    for prefix, sigma, unit in (("sigma_", m.sigma_position, "m"), ("sigma_r", m.sigma_orientation, "rad")):
+        if sigma is not None and _differs(sigma):
+            columns |= {f"{prefix}{axis}": sigma[:, k] / units.factor(unit) for k, axis in enumerate("xyz")}
+    found: dict[str, Columns] = {m.source: columns | {"split": np.where(m.test, "test", "train")}}
+    if (between := _pairs(m)) is not None:
+        pairs, names = between
+        measured = {"distance": pairs.distance / length, "angle": pairs.angle / units.factor("rad")}
+        ends = {"a": np.array(names)[pairs.a], "b": np.array(names)[pairs.b]}
+        found[pairs.source] = ends | {name: v for name, v in measured.items() if np.isfinite(v).any()}
+    return found
+
+
+def to_fill_in(columns: Columns, *, touched: bool = False) -> Columns:
+    """The columns of a table with nothing measured yet.
+
+    Args:
+        columns: The columns.
+        touched: Whether something is touched: the joint readings are measured then.
+    """
+    measured = {name: None for name, v in columns.items() if name in MEASURED and np.any(np.asarray(v) != 0.0)}
+    joints = {name: None for name in columns if touched and re.fullmatch(r"q\d+", name)}
+    return dict(columns) | measured | joints
+
+
+def is_filled_in(path: Path) -> bool:
+    """Whether something was written into a table that was to be filled in; a file that is no such table counts.
+
+    Args:
+        path: The file, which need not exist.
+    """
+    import polars as pl
+
+    if not path.exists():
+        return False
+    try:
+        table = pl.read_csv(path, infer_schema=False)
+    except (pl.exceptions.PolarsError, OSError):
+        return True
+    for pattern in (r"q\d+", "|".join(MEASURED)):
+        columns = [c for c in table.columns if re.fullmatch(pattern, c)]
+        if columns and all((table[c].is_null() | (table[c] == "")).all() for c in columns):
+            return False
+    return True
+
+
+# --- the job ----------------------------------------------------------------------------------------------------------
 
 
 def _job_text(simulation: Simulation, units: Units) -> str:
-    m = simulation.measurements
-    joint = [
-        units.from_si(sigma, joint.unit) for sigma, joint in zip(m.sigma_joint, simulation.robot.joints, strict=True)
-    ]
-    of_joints = {"joint": joint[0] if len(set(joint)) == 1 else joint}
-    job: dict[str, Any] = {"robot": "robot_nominal.yaml"}
-    if simulation.scenario.instruments:
-        keys = {key: value for key, value in simulation.scenario.job.items() if key not in ("model", "pairing")}
-        job |= {"truth": "robot_true.yaml", **keys, "units": asdict(units), "noise": of_joints}
-        job |= instrument_keys(simulation.tables, units)
+    scenario, m = simulation.scenario, simulation.measurements
+    job: dict[str, Any] = {"robot": "robot_nominal.yaml", "truth": "robot_true.yaml"}
+    noise = {"joint": joint_noise(m.sigma_joint, simulation.robot, units)}
+    if scenario.instruments:
+        job |= {**scenario.job, "units": asdict(units), "noise": noise} | instrument_keys(simulation.tables, units)
     else:
-        if m.sigma_position is None or m.sigma_orientation is None:
-            raise ValueError("a simulation states its noise")
-        noise = {
-            "position": units.from_si(m.sigma_position[0, 0], "m"),
-            "orientation": units.from_si(m.sigma_orientation[0, 0], "rad"),
-        }
-        job |= {"measurements": "poses.csv", "truth": "robot_true.yaml", **simulation.job}
-        job |= {"units": asdict(units), "noise": noise | of_joints}
-    return f"{_FIRST_WORDS}{simulation.scenario.source} --seed {simulation.seed}\n" + _yaml(job)
+        job |= {"measurements": m.source, **simulation.job, "units": asdict(units), "noise": _noise(m, units) | noise}
+    return f"{_FIRST_WORDS}{scenario.source} --seed {simulation.seed}\n" + _yaml(job)
 
 
 def _yaml(document: Mapping[str, Any]) -> str:
     return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, allow_unicode=True, width=math.inf)
+
+
+def joint_noise(sigma: Floats, robot: Robot, units: Units) -> float | list[float]:
+    """Sigma of the joint readings as a job specifies it: one value, or one a joint."""
+    values = [units.from_si(s, joint.unit) for s, joint in zip(sigma, robot.joints, strict=True)]
+    return values[0] if len(set(values)) == 1 else values
+
+
+def instrument_keys(tables: Sequence[Table], units: Units) -> dict[str, Any]:
+    """Keys of a job for its tables, and for the points that it knows."""
+    found: dict[str, Any] = {"measurements": [_entry(table, units) for table in tables]}
+    for table in tables:
+        if table.known:
+            found["anchors" if table.model == "anchor" else "targets"] = {
+                name: _xyz(point.xyz, units)
+                | ({} if point.tolerance is None else {"tolerance": units.from_si(point.tolerance, "m")})
+                for name, point in table.known.items()
+            }
+    return found
+
+
+def _entry(table: Table, units: Units) -> dict[str, Any]:
+    """A table in the list of a job."""
+    m, between = table.measurements, _pairs(table.measurements)
+    entry: dict[str, Any] = {"table": m.source, "model": table.model}
+    if between is not None:
+        entry["pairs"] = between[0].source
+    elif table.model in PAIR_MODELS and m.groups is None:
+        entry["pairing"] = _pairing(table.pairing)
+    if table.model in POSE_MODELS or table.fixed_camera:
+        entry["frame"] = table.frame
+    if table.offset:
+        entry["offset"] = "estimate"
+    if table.camera is not None:
+        entry["camera"] = asdict(table.camera) | ({"fixed": True} if table.fixed_camera else {})
+    return entry | {"noise": _noise(m, units)}
+
+
+def _noise(m: Measurements, units: Units) -> dict[str, float]:
+    """The sigmas of a table: one a kind."""
+    between = _pairs(m)
+    pairs = None if between is None else between[0]
+    stated: dict[str, tuple[Any, str]] = {
+        "position": (m.sigma_position, "m"),
+        "orientation": (m.sigma_orientation, "rad"),
+        "distance": (m.sigma_length if pairs is None else pairs.sigma_distance, "m"),
+        "angle": (None if pairs is None else pairs.sigma_angle, "rad"),
+        "point": (m.sigma_point, "m"),
+    }
+    values = {
+        name: units.from_si(float(sigma.flat[0]), unit)
+        for name, (sigma, unit) in stated.items()
+        if sigma is not None and np.isfinite(sigma).any() and not _differs(sigma)
+    }
+    return values if m.sigma_pixel is None else values | {"pixel": float(m.sigma_pixel[0, 0])}
+
+
+def _differs(sigma: Floats) -> bool:
+    """Whether sigmas differ from axis to axis."""
+    return sigma.ndim == 2 and bool(np.any(sigma != sigma[:, :1]))
+
+
+def _pairing(pairing: Pairing) -> Any:
+    random = {"random": pairing.count, "seed": pairing.seed}
+    return random if pairing.strategy == "random" else pairing.strategy
+
+
+# --- the truth --------------------------------------------------------------------------------------------------------
+
+
+def _truth(simulation: Simulation, units: Units) -> dict[str, Any]:
+    """Where landmarks truly are, by kind and name, as a scenario would state them, in a file's units."""
+    found: dict[str, Any] = {"units": asdict(units)}
+    for kind, landmarks in simulation.truth.items():
+        found[kind] = {name: _place(landmark, units) for name, landmark in landmarks.items()}
+    return found
+
+
+def _xyz(point: Floats, units: Units) -> dict[str, float]:
+    return {axis: units.from_si(float(v), "m") for axis, v in zip("xyz", point, strict=True)}
+
+
+def _place(landmark: Any, units: Units) -> Any:
+    match landmark:
+        case Placement():
+            with warnings.catch_warnings():  # at a pitch of 90 degrees yaw is 0: as good as any
+                warnings.simplefilter("ignore")
+                angles = Rotation.from_matrix(landmark.rotation.copy()).as_euler("xyz")
+            rpy = {k: units.from_si(float(v), "rad") for k, v in zip(("roll", "pitch", "yaw"), angles, strict=True)}
+            return _xyz(landmark.position, units) | rpy
+        case Spot():
+            return _xyz(landmark.xyz, units)
+        case Plane():
+            normal = [float(v) for v in landmark.normal]
+            return {"normal": normal, "distance": units.from_si(landmark.distance, "m")}
+    return units.from_si(float(landmark), "m")

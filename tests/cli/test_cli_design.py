@@ -237,62 +237,6 @@ def test_more_of_a_job_is_written_as_a_table_to_fill_in(plan, fg_calib, tmp_path
     assert sorted(f.name for f in (tmp_path / "rows").iterdir()) == ["configurations.csv", "design.json", "design.png"]
 
 
-@pytest.mark.slow
-def test_instruments_are_compared_in_folders_of_their_own(plan, fg_calib, tmp_path):
-    good, poor = tmp_path / "good.yaml", tmp_path / "poor.yaml"
-    good.write_text(yaml.safe_dump({"noise": {"position": 0.01, "orientation": 0.001, "joint": 0.0}}))
-    poor.write_text(yaml.safe_dump({"noise": {"position": 1.0, "orientation": 0.1, "joint": 0.0}}))
-    out = tmp_path / "out"
-    ended = fg_calib("design", plan(), "--n", 5, *FEW, "--instruments", good, poor, "--out", out, "--json")
-    assert ended.code == 0, ended.err
-    found = json.loads(ended.out)
-    assert found.keys() == {"schema", "instruments", "failed"}
-    errors = {name: one["expected"]["position"] for name, one in found["instruments"].items()}
-    assert list(errors) == ["good", "poor"]
-    assert errors["good"] < errors["poor"]
-    assert (out / "instruments.png").read_bytes()[1:4] == b"PNG"
-    for name in ("good", "poor"):
-        assert json.loads((out / name / "design.json").read_text())["expected"]["position"] == errors[name]
-        assert (out / name / "calibration.yaml").is_file()
-    said = fg_calib("design", plan(), "--target", "0.3mm", *FEW, "--instruments", good, poor)
-    assert said.code == 3
-    assert "the target is not reached with poor" in said.err
-    assert "good" in said.out
-    assert "more than 25" in said.out
-
-
-@pytest.mark.slow
-def test_instruments_side_by_side_give_the_same_bits_and_one_that_fails_is_no_matter(plan, fg_calib, tmp_path):
-    """One of them may measure nowhere: a box that the arm cannot leave. JSON has every bit of a figure."""
-    everywhere = {"lower": [-9e4, -9e4, -9e4], "upper": [9e4, 9e4, 9e4]}
-    files = {
-        "good": {"noise": {"position": 0.01, "orientation": 0.001, "joint": 0.0}},
-        "caged": {"configurations": {"random": {"count": 20}, "keep_out": [everywhere]}},
-        "poor": {"noise": {"position": 1.0, "orientation": 0.1, "joint": 0.0}},
-    }
-    for name, keys in files.items():
-        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(keys))
-    asked = (
-        "design",
-        plan(),
-        "--n",
-        4,
-        *FEW,
-        "--instruments",
-        *(tmp_path / f"{name}.yaml" for name in files),
-        "--json",
-    )
-    here, there = fg_calib(*asked), fg_calib(*asked, "--workers", 2, "--out", tmp_path / "out")
-    assert (here.code, there.code) == (1, 1)
-    assert here.out == there.out
-    found = json.loads(here.out)
-    assert list(found["instruments"]) == ["good", "poor"]
-    assert list(found["failed"]) == ["caged"]
-    for ended in (here, there):
-        assert ended.err.splitlines()[-1] == f"caged: error: {found['failed']['caged']}"
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["good", "instruments.png", "poor"]
-
-
 # --- what it refuses --------------------------------------------------------------------------------------------------
 
 
@@ -315,11 +259,7 @@ def test_instruments_side_by_side_give_the_same_bits_and_one_that_fails_is_no_ma
         (["--task", "nowhere.csv"], 1, "nowhere.csv"),
         (["--task", "bad.csv"], 1, "bad.csv"),
         (["--given", "bad.csv"], 1, "bad.csv"),
-        (["--instruments", "nowhere.yaml"], 1, "nowhere.yaml"),
-        (["--instruments", "bad.yaml"], 1, "bad.yaml"),
         (["other.yaml"], 2, "other.yaml"),
-        (["--workers", 2], 2, "error: --workers has no effect without several --instruments"),
-        (["--scheduler", "tcp://127.0.0.1:1", "--instruments", "fine.yaml"], 2, "error: --scheduler has no effect"),
     ],
 )
 def test_what_cannot_be_used_is_one_line_and_writes_nothing(

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from fg_calib.designs.rows import StopRows
-from fg_calib.designs.system import System, system_of
+from fg_calib.designs.information import PoseRows, System, build_system
 
 
 def random_system(rng, n_candidates=12, h=2, p=4, nuisances=2, floor=0.1) -> System:
@@ -32,10 +31,10 @@ def random_stops(rng, n_candidates=15, lost=True):
         rows = rows - (rows @ u)[..., None] * u
     always = np.diag([0.0, 1.0 / 2e-3, 0.0, 0.0, 0.0])[1:2]
     v = rng.normal(size=(20, 3))
-    return StopRows(rows, always, scales, 3, 3), direction, v.T @ v / 20
+    return PoseRows(rows, always, scales, 3, 3), direction, v.T @ v / 20
 
 
 def system_with_less(rng) -> System:
     """A system of which one direction of the core is undetermined."""
     stops, _, W = random_stops(rng)
-    return system_of(stops, np.zeros((0, 5)), W)
+    return build_system(stops, np.zeros((0, 5)), W)

@@ -8,7 +8,7 @@ from systems import random_stops, random_system, system_with_less
 from tolerances import rounding
 
 from fg_calib.designs.criteria import MOST_EXACT, Measure
-from fg_calib.designs.system import system_of
+from fg_calib.designs.information import build_system
 
 CRITERIA = ("I", "D", "A", "E", "O1", "O2", "O3", "O4", "O5")
 
@@ -155,7 +155,7 @@ def test_the_task_counts_in_its_own_units_and_without_what_none_determines(lost)
     if lost:
         u = direction / stops.scales
         given -= (given * stops.scales @ u / (u @ u))[:, None] * (u / stops.scales)
-    system = system_of(stops, given, W)
+    system = build_system(stops, given, W)
     chosen = np.array([0, 3, 4, 9, 11])
     A = np.vstack([stops.rows[chosen].reshape(-1, 5), stops.always, given]) * stops.scales
     C = np.linalg.pinv(A.T @ A, rcond=1e-12, hermitian=True)[:3, :3] * np.outer(stops.scales[:3], stops.scales[:3])

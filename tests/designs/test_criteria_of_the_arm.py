@@ -6,7 +6,7 @@ from three_joints import ROBOT
 
 from fg_calib import GivenReadings, design, read_scenario
 from fg_calib.designs.criteria import Measure
-from fg_calib.designs.system import system_of
+from fg_calib.designs.information import build_system
 
 SCENARIO = """\
 robot: robot.yaml
@@ -52,7 +52,7 @@ def singular_values(stops, chosen, n_arm):
 )
 def test_criteria_are_of_the_arm_alone(plan, criterion, formula):
     stops, chosen = plan.pool.rows, np.arange(8)
-    system = system_of(stops, plan.pool.known, plan.task.form(plan.pool.problem))
+    system = build_system(stops, plan.pool.known, plan.task.quadratic_form(plan.pool.problem))
     assert len(system.core) == 12  # of 12 parameters; the frame has 6 more
     # Both invert an information of condition 1e6: 1e-9 of it is left of 1e-16.
     expected = formula(singular_values(stops, chosen, 12))

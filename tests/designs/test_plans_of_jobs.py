@@ -9,18 +9,24 @@ from scipy.spatial.transform import Rotation
 from simulated import small_arm
 
 from fg_calib import InputError, Job, Measurements, Options, calibrate_job
-from fg_calib.designs.design import design
-from fg_calib.designs.of_job import solved
-from fg_calib.designs.plans import with_names
-from fg_calib.designs.task import Posterior
+from fg_calib.designs.design import design, rename_configurations
+from fg_calib.designs.from_job import solve_for_design
+from fg_calib.designs.information import Posterior
 from fg_calib.graph.information import whitened_jacobian
 from fg_calib.measurements.dataset import Noise
 from fg_calib.options import Pairing
 from fg_calib.prediction.expected_error import errors_at
 from fg_calib.robot.kinematics import pose
-from fg_calib.simulation.configurations import GivenReadings, RandomReadings
-from fg_calib.simulation.instruments import Indicator, LengthGauge, PairGauge, Sockets, Tracker
-from fg_calib.simulation.scenario import Errors
+from fg_calib.simulation.scenario import (
+    Errors,
+    GivenReadings,
+    Indicator,
+    LengthGauge,
+    PairGauge,
+    RandomReadings,
+    Sockets,
+    Tracker,
+)
 from fg_calib.simulation.simulator import simulate
 
 NOISE = replace(SIGMA, joint=2e-4)
@@ -67,7 +73,7 @@ def job_of(instrument, n, stated=NOISE, **changes):
 
 def said_by_all_rows(job, plan):
     """Expected error over the plan's task of one job of all rows."""
-    every = solved(replace(job, measurements=(*job.tables, *plan.tables)))
+    every = solve_for_design(replace(job, measurements=(*job.tables, *plan.tables)))
     return Posterior(every, whitened_jacobian(every, every.start)).error(plan.task).position
 
 
@@ -131,7 +137,7 @@ def test_a_table_of_pairs_has_pairs():
         job_of(PairGauge(model="distance", name=name), 20, configurations=GivenReadings(at))
         for name, at in zip(("it", "two"), q, strict=True)
     )
-    renamed = with_names(two.tables, {f"p{k}": f"two{k}" for k in range(20)})
+    renamed = [rename_configurations(two.tables[0], {f"p{k}": f"two{k}" for k in range(20)})]
     plan = design(replace(one, measurements=(*one.tables, *renamed)), n=3, n_candidates=20)
     assert [len(table.measurements.pairs.a) > 0 for table in plan.tables] == [True] * len(plan.tables)
 

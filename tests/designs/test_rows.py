@@ -9,14 +9,21 @@ from simulated import measure, small_arm
 from tolerances import rounding
 
 from fg_calib import Pairing
-from fg_calib.designs.pool import drawn, pool_of
-from fg_calib.designs.rows import stop_rows
+from fg_calib.designs.candidates import build_pool, draw_groups
+from fg_calib.designs.information import gather_rows
 from fg_calib.errors import InputError
 from fg_calib.graph.build import build_problem, true_problem
 from fg_calib.graph.factors import prior_rows
 from fg_calib.graph.information import whitened_jacobian
-from fg_calib.simulation.configurations import Placement, RandomReadings
-from fg_calib.simulation.instruments import BoardCamera, LengthGauge, PairGauge, Sockets, Tracker
+from fg_calib.simulation.scenario import (
+    BoardCamera,
+    LengthGauge,
+    PairGauge,
+    Placement,
+    RandomReadings,
+    Sockets,
+    Tracker,
+)
 
 N = 20
 """Candidates; of cameras, which see few, twice as many."""
@@ -55,7 +62,7 @@ def kinds(*others):
 def pool_with(*instruments, n=N, **changes):
     n = 2 * n if any(isinstance(i, BoardCamera) for i in instruments) else n
     of = scenario(*instruments, n=n, noise=NOISE, **changes)
-    return pool_of(of, drawn(of, n, np.random.default_rng(0)))
+    return build_pool(of, draw_groups(of, n, np.random.default_rng(0)))
 
 
 def square(rows):
@@ -96,7 +103,7 @@ def test_all_stops_together_hold_what_their_problem_holds(kind):
     expected = information_of(pool.problem)
     found = without_last(of_stops(pool.rows), len(expected))
     assert apart(expected, found) < rounding()
-    assert len(pool.rows.rows) == len(pool.readings) == len(pool.group) == pool.stop.max() + 1
+    assert len(pool.rows.rows) == len(pool.readings) == len(pool.group) == pool.pose_of.max() + 1
 
 
 @pytest.mark.parametrize("kind", kinds("formed pairs", "formed lengths"))
@@ -105,7 +112,7 @@ def test_some_stops_hold_what_a_problem_of_them_alone_holds(kind):
     pool = pool_with(*KINDS[kind])
     n = pool.problem.variables.n_columns
     some = np.random.default_rng(1).permutation(len(pool.readings))[: max(2, 3 * len(pool.readings) // 5)]
-    alone = true_problem(pool.robot, pool.tables_of(some), pool.problem.options)
+    alone = true_problem(pool.robot, pool.select_tables(some), pool.problem.options)
     assert alone.variables.n_columns == n
     expected, found = without_last(information_of(alone), n), without_last(of_stops(pool.rows, some), n)
     assert apart(expected, found) < 1e-6  # eliminating unknowns that so few stops hardly hold takes half the digits
@@ -114,9 +121,9 @@ def test_some_stops_hold_what_a_problem_of_them_alone_holds(kind):
 def test_positions_in_a_frame_of_their_own_hold_what_all_distances_between_them_do():
     """Within what pairs spare of their variance, 1e-3 of it, so that too many of them can be whitened."""
     of = scenario(Tracker(model="distance", name="it", pairing=Pairing("all")), n=N)
-    pool = pool_of(of, drawn(of, N, np.random.default_rng(0)))
+    pool = build_pool(of, draw_groups(of, N, np.random.default_rng(0)))
     some = np.arange(2, 14)
-    formed = true_problem(pool.robot, pool.tables_of(some), pool.problem.options)
+    formed = true_problem(pool.robot, pool.select_tables(some), pool.problem.options)
     n = formed.variables.n_columns
     assert apart(information_of(formed), without_last(of_stops(pool.rows, some), n)) < 2e-2
 
@@ -131,7 +138,7 @@ def test_hubs_errors_are_unknowns_of_one_sigma():
 
 def test_no_joint_noise_leaves_nothing_to_share():
     of = scenario(LENGTHS, n=N)
-    pool = pool_of(of, drawn(of, N, np.random.default_rng(0)))
+    pool = build_pool(of, draw_groups(of, N, np.random.default_rng(0)))
     assert len(pool.rows.scales) == pool.problem.variables.n_columns
 
 
@@ -139,7 +146,7 @@ def test_stops_without_train_rows_add_nothing():
     arm = small_arm(tolerance={"a": 2e-3, "theta": 2e-3})
     data = measure(arm, 6, np.random.default_rng(0), n_test=3)
     problem = build_problem(arm, data, model="pose", frame="known")
-    rows = stop_rows(problem, np.arange(9))
+    rows = gather_rows(problem, np.arange(9))
     assert not rows.rows[6:].any()
     assert rows.rows[:6].any(axis=(1, 2)).all()
     assert apart(information_of(problem), of_stops(rows)) < rounding()
@@ -162,7 +169,7 @@ def test_pairs_that_share_errors_but_no_hub_are_refused():
     data = measure(arm, 8, np.random.default_rng(0), sigma_joint=1e-3)
     problem = build_problem(arm, data, model="distance", pairing=Pairing("chain"))
     with pytest.raises(InputError, match=r"each shares an end with others.*pairing star"):
-        stop_rows(problem, np.arange(8))
+        gather_rows(problem, np.arange(8))
 
 
 def test_sockets_of_known_distances_count_once():

@@ -5,13 +5,23 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from fg_calib.design import search
+from simulated import planar_robot, small_arm
 from systems import random_system, system_with_less
 from tolerances import rounding
 
-from fg_calib.designs.chooser import N_EXACT, Chooser
+from fg_calib.designs import search
 from fg_calib.designs.criteria import Measure
-from fg_calib.designs.search import choose, exchanged, greedy, not_worse_than_random, random_values
+from fg_calib.designs.search import (
+    Chooser,
+    choose,
+    choose_greedily,
+    draw_sets,
+    exchange,
+    improve_by_random_starts,
+    joint_travel,
+    order_by_nearest,
+)
+from fg_calib.robot.inverse import random_readings
 
 CRITERIA = ("I", "D", "A", "E", "O1", "O2", "O3", "O4", "O5")
 
@@ -36,7 +46,7 @@ def test_the_best_of_all_sets_is_found_within_a_percent(criterion, n, of):
         system = random_system(np.random.default_rng(seed), of, h=1 + seed % 3)
         best = min(value(system, criterion, one) for one in combinations(range(of), n))
         chooser = Chooser(system, criterion)
-        found = not_worse_than_random(chooser.measure, chooser.best(n), np.random.default_rng(0))
+        found = improve_by_random_starts(chooser.measure, chooser.best(n), np.random.default_rng(0))
         assert gap(criterion, found.value, best) < 0.01, seed
 
 
@@ -49,10 +59,10 @@ def test_no_random_set_of_a_hundred_is_better(criterion):
         system = random_system(rng, 60) if seed else system_with_less(rng)
         n = 8
         chooser = Chooser(system, criterion)
-        found = not_worse_than_random(chooser.measure, chooser.best(n), np.random.default_rng(7))
-        random = random_values(chooser.measure, n, np.random.default_rng(7))[0]
+        found = improve_by_random_starts(chooser.measure, chooser.best(n), np.random.default_rng(7))
+        random = draw_sets(chooser.measure, n, np.random.default_rng(7))[0]
         assert found.value <= random[0] + rounding(random)
-        others = random_values(chooser.measure, n, np.random.default_rng(8))[0]
+        others = draw_sets(chooser.measure, n, np.random.default_rng(8))[0]
         assert gap(criterion, found.value, others[0]) < 0.01
         assert len(set(found.candidates.tolist())) == n
         assert found.value == pytest.approx(value(system, criterion, found.candidates), rel=rounding())
@@ -63,26 +73,21 @@ def test_what_is_drawn_better_is_where_exchange_starts_from():
     system = random_system(np.random.default_rng(2), 40)
     measure = Measure("I", system)
     worst = search.Chosen(np.arange(5), np.inf)
-    found = not_worse_than_random(measure, worst, np.random.default_rng(3))
-    values, sets = random_values(measure, 5, np.random.default_rng(3))
+    found = improve_by_random_starts(measure, worst, np.random.default_rng(3))
+    values, sets = draw_sets(measure, 5, np.random.default_rng(3))
     assert values.tolist() == sorted(measure.value(system.information(one)) for one in sets)
     assert found.value <= values[0]
-    good = exchanged(measure, greedy(measure, 5))
-    assert not_worse_than_random(measure, good, np.random.default_rng(3)).value <= good.value
+    good = exchange(measure, choose_greedily(measure, 5))
+    assert improve_by_random_starts(measure, good, np.random.default_rng(3)).value <= good.value
 
 
-def test_no_random_set_is_better_by_an_error_that_the_system_does_not_say():
-    """As of chains of pairs, for which stops are chosen as poses; an error by the candidates' numbers here."""
+def test_no_random_set_is_better_by_an_error_that_the_system_does_not_give():
+    """As of chains of pairs, for which candidates are chosen as poses; here the error is the sum of their numbers."""
     system = random_system(np.random.default_rng(2), 40)
-    chooser = Chooser(system, "I", lambda chosen: float(np.sum(chosen)))
-    drawn = np.random.default_rng(3)
-    sets = [drawn.choice(40, size=5, replace=False) for _ in range(N_EXACT)]
-    poor, good = (search.Chosen(np.arange(k, k + 5), 1.0) for k in (35, 0))
-    found = chooser.held(poor, np.random.default_rng(3))
-    assert found.candidates.tolist() == min(sets, key=np.sum).tolist()
-    assert found.value == chooser.measure.value(system.information(found.candidates))
-    assert chooser.held(good, np.random.default_rng(3)).candidates.tolist() == good.candidates.tolist()
-    assert Chooser(system, "I").held(poor, np.random.default_rng(3)) is poor
+    found = Chooser(system, "I", lambda chosen: float(np.sum(chosen))).thoroughly(5, np.random.default_rng(3))
+    plain = Chooser(system, "I").thoroughly(5, np.random.default_rng(3))
+    assert np.sum(found.candidates) < np.sum(plain.candidates)
+    assert found.value == Measure("I", system).value(system.information(found.candidates))
 
 
 @pytest.mark.parametrize("criterion", CRITERIA)
@@ -92,25 +97,25 @@ def test_exchange_never_makes_worse_and_ends_where_no_single_one_helps(criterion
         rng = np.random.default_rng(seed)
         system = random_system(rng, 14)
         start = rng.choice(14, 4, replace=False).astype(np.int64)
-        found = exchanged(Measure(criterion, system), start)
+        found = exchange(Measure(criterion, system), start)
         assert found.value <= value(system, criterion, start)
         assert len(np.unique(found.candidates)) == 4
         others = np.setdiff1d(np.arange(14), found.candidates)
         swapped = [
             value(system, criterion, [*np.delete(found.candidates, place), k]) for place in range(4) for k in others
         ]
-        assert min(swapped) > found.value - 4 * search.LEAST_GAIN * abs(found.value)
+        assert min(swapped) > found.value - 4 * search.MIN_GAIN * abs(found.value)
 
 
 @pytest.mark.parametrize("quickly", [False, True])
 def test_exchange_among_a_few_that_help_most_is_exchange_too(quickly, monkeypatch):
-    monkeypatch.setattr(search, "SHORT", 10)
+    monkeypatch.setattr(search, "SHORTLIST", 10)
     for seed in range(3):
         rng = np.random.default_rng(seed)
         system = random_system(rng, 60)
         for criterion in ("I", "E"):
             start = rng.choice(60, 5, replace=False).astype(np.int64)
-            found = exchanged(Measure(criterion, system), start, quickly=quickly)
+            found = exchange(Measure(criterion, system), start, quickly=quickly)
             assert found.value <= value(system, criterion, start)
             assert found.value == pytest.approx(value(system, criterion, found.candidates), rel=rounding())
             assert len(np.unique(found.candidates)) == 5
@@ -119,12 +124,12 @@ def test_exchange_among_a_few_that_help_most_is_exchange_too(quickly, monkeypatc
 def test_greedy_takes_the_best_beside_those_before_it():
     system = random_system(np.random.default_rng(1), 12)
     for criterion in CRITERIA:
-        taken = greedy(Measure(criterion, system), 5)
+        taken = choose_greedily(Measure(criterion, system), 5)
         for k in range(5):
             left = [j for j in range(12) if j not in taken[:k]]
             each = [value(system, criterion, [*taken[:k], j]) for j in left]
             assert value(system, criterion, taken[: k + 1]) <= min(each) + rounding(each, 1e3)
-    assert greedy(Measure("I", system), 5, taken[:2])[:2].tolist() == taken[:2].tolist()
+    assert choose_greedily(Measure("I", system), 5, taken[:2])[:2].tolist() == taken[:2].tolist()
 
 
 @pytest.mark.slow
@@ -180,3 +185,28 @@ def test_a_target_is_of_the_error_whatever_the_criterion(criterion):
     target = np.sqrt(value(system, "I", choose(system, 10).candidates)) * 1.1
     found = Chooser(system, criterion).reaching(target, np.random.default_rng(0))
     assert np.sqrt(value(system, "I", found.candidates)) <= target
+
+
+# --- the order of a visit ---------------------------------------------------------------------------------------------
+
+
+def test_travel_is_the_largest_joint_motion_of_every_step():
+    """A prismatic joint that moves by the arm's reach counts as a rotation of 1 rad."""
+    robot = small_arm()
+    q = np.zeros((3, 4))
+    q[1, 2], q[2, 0] = robot.reach, 0.5
+    assert joint_travel(robot, q[[0, 1]]) == pytest.approx(1.0)
+    assert joint_travel(robot, q[[0, 2]]) == pytest.approx(0.5)
+    assert joint_travel(robot, q) == pytest.approx(2.0)
+    assert joint_travel(robot, q[:1]) == 0.0
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 40])
+def test_every_configuration_is_visited_once_and_next_is_the_nearest(n):
+    robot = planar_robot()
+    q = random_readings(robot, n, np.random.default_rng(n))
+    order = order_by_nearest(robot, q)
+    assert sorted(order.tolist()) == list(range(n))
+    for k in range(n - 1 if n > 2 else 0):
+        steps = [np.abs(q[order[k]] - q[j]).max() for j in order[k + 1 :]]
+        assert steps[0] == min(steps)

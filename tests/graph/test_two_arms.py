@@ -8,9 +8,7 @@ from tolerances import rounding
 from fg_calib import assess, build_problem, read_urdf, simulate, solve
 from fg_calib.measurements.dataset import Noise
 from fg_calib.robot.kinematics import pose
-from fg_calib.simulation.configurations import RandomReadings
-from fg_calib.simulation.instruments import LengthGauge, Spot
-from fg_calib.simulation.scenario import Errors, Scenario
+from fg_calib.simulation.scenario import Errors, LengthGauge, RandomReadings, Scenario, Spot
 
 SIGMA = 5e-5
 TOLERANCE = {"x": 1e-3, "y": 1e-3, "z": 1e-3, "roll": 2e-3, "pitch": 2e-3, "yaw": 2e-3}

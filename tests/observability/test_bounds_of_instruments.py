@@ -11,7 +11,7 @@ from tolerances import rounding
 
 from fg_calib import InputError, Measurements, Table, assess, build_problem, cramer_rao, simulate, solve
 from fg_calib.robot.kinematics import pose
-from fg_calib.simulation.instruments import LengthGauge, Tracker
+from fg_calib.simulation.scenario import LengthGauge, Tracker
 
 SIGMA = 1e-4
 

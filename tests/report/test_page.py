@@ -25,7 +25,7 @@ from fg_calib.report.page.files import FIGURES
 from fg_calib.report.page.sections import correlations, tiles
 from fg_calib.report.slices import slices_of
 from fg_calib.robot.kinematics import pose
-from fg_calib.robot.shape import link_points
+from fg_calib.simulation.obstacles import link_points
 
 LARGE = {"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}
 TITLES = (

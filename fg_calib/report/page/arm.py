@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fg_calib.report.page.run import Run
 from fg_calib.report.shown import SHOWN
-from fg_calib.robot.shape import link_points
+from fg_calib.simulation.obstacles import link_points
 
 Floats = NDArray[np.float64]
 

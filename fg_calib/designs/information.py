@@ -1,0 +1,326 @@
+"""Information that each candidate pose adds, and what a calibration would know after some were measured.
+
+Errors that belong to one pose (its joint readings, the measured pose that its pair is formed from) are that pose's own
+noise, however many rows it has. Errors of a reference pose, which many pairs share, are further unknowns of 1 sigma. So
+the information of a set of poses is exactly the sum of theirs, and a pose adds `A^T A` of as many rows as it has.
+
+`System` holds this information in coordinates that can be determined: `M = M_0 + sum A^T A`. Directions that all
+candidates together leave undetermined are left out: no choice changes anything there. In these coordinates all
+candidates together leave variances of 1. A weak prior (1 rad, or the arm's reach, or what rounding can distinguish)
+gives a set that does not determine everything a covariance too, a large one.
+
+The mean square error over a task is `tr(W C)`, `W = mean v^T v`. v are the derivatives of the tool point, after the
+best rigid fit where the task is *fitted*; C is the covariance of the arm's parameters.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.arrays import Brief, FrozenArrays
+from fg_calib.errors import InputError
+from fg_calib.graph.factors import prior_rows, unknown_prior_rows
+from fg_calib.graph.normal_system import SIGNAL_FLOOR, eliminate
+from fg_calib.graph.problem import Problem
+from fg_calib.graph.rows import RowSet
+from fg_calib.observability.indices import Observability, observability_of_rows
+from fg_calib.observability.observed_quantities import Seen
+from fg_calib.prediction.expected_error import PoseRms, errors_at, without_rigid_motion
+from fg_calib.robot.kinematics import forward, precompute_trig
+from fg_calib.statistics.covariance import TangentCovariance, covariance_of_rows
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+N_TASK = 500
+"""Number of random configurations within the joint limits that are the default task."""
+
+MAX_ROWS = 12
+"""Rows of a pose above which they are compressed to as many as their rank."""
+
+_LOST_SHARE = 1e-10
+"""Share of the rows of a pose that compressing them may lose."""
+
+_ROUNDING = 1e-13
+"""Singular values below this share of the largest are rounding, and so is information below this share."""
+
+_UNDETERMINED_SHARE = 1e-6
+"""Share of a function in undetermined directions above which it is not determined."""
+
+
+# --- rows of each pose ---
+
+
+@dataclass(frozen=True)
+class PoseRows(FrozenArrays):
+    """Whitened rows that each pose would add.
+
+    Attributes:
+        rows: Derivatives in the columns of the problem's core, its landmarks and the shared errors; zeros where a pose
+            has fewer rows than others, shape (n_poses, h, n_columns).
+        always: Rows that hold whatever is measured: priors, and shared errors of 1 sigma, shape (m, n_columns).
+        scales: A change of ordinary size in each column, shape (n_columns,).
+        n_core: Number of columns, the first ones, that are the core's.
+        n_arm: Number of these, the first ones, that are the arm's; the others are of measurement frames.
+    """
+
+    rows: Floats
+    always: Floats
+    scales: Floats
+    n_core: int
+    n_arm: int
+
+
+def gather_rows(
+    problem: Problem, pose_of: Integers, references: Integers | None = None, *, alone: bool = True
+) -> PoseRows:
+    """Gather the rows of a problem by pose.
+
+    Args:
+        problem: The problem, linearised at its start.
+        pose_of: The pose of each configuration, shape (n_configurations,); below 0 for none and for a reference.
+        references: Configurations whose errors many pairs share; none if None.
+        alone: Whether nothing was measured before; else that says what is known of landmarks.
+
+    Raises:
+        InputError: Errors of one pose reach the rows of another that is no reference.
+    """
+    v = problem.variables
+    references = np.zeros(0, dtype=np.int64) if references is None else references
+    n_columns, n_poses = v.n_columns + v.n_nuisance, int(pose_of.max(initial=-1)) + 1
+    width = max((rows.shared.width for rows in problem.rows if rows.shared is not None), default=0)
+    parts = [_derivatives(problem, rows, pose_of, references, width) for rows in problem.rows]
+    whole, private, which = (np.concatenate(one) for one in zip(*parts, strict=True))
+    n_shared = whole.shape[1] - n_columns
+    stacked = _stack(np.hstack([whole, private]), which, n_poses)
+    rows = _whiten(stacked[:, :, : whole.shape[1]], stacked[:, :, whole.shape[1] :])
+    fixed = [np.pad(prior_rows(v, problem.start)[1], ((0, 0), (0, v.n_nuisance)))]
+    if alone:
+        fixed.append(unknown_prior_rows(v, problem.start)[1])
+    of_references = whole[which < 0] if alone else whole[:0]
+    wide = np.vstack([*(np.pad(one, ((0, 0), (0, n_shared))) for one in fixed), of_references])
+    errors = np.hstack([np.zeros((n_shared, n_columns)), np.eye(n_shared)])
+    scales = np.append(v.all_scales, np.ones(n_shared))
+    return PoseRows(rows, np.vstack([wide, errors]), scales, v.n_columns, v.n_robot_columns)
+
+
+def _derivatives(
+    problem: Problem, rows: RowSet, pose_of: Integers, references: Integers, width: int
+) -> tuple[Floats, Floats, Integers]:
+    """Derivatives of rows, with the errors of reference poses; in the errors of their own pose; and their pose."""
+    J = rows.private(problem.variables.at(problem.start))[:, :-1]
+    which = np.concatenate([_poses_of(problem, part.series, part.block.residual_dim, pose_of) for part in rows.parts])
+    private, of_references = np.zeros((len(J), width)), np.zeros((len(J), len(references) * width))
+    if rows.shared is not None:
+        L = rows.shared.loadings.tocoo()
+        configuration = rows.configurations[L.col // rows.shared.width]
+        k = L.col % rows.shared.width
+        for number, reference in enumerate(references.tolist()):
+            mask = configuration == reference
+            of_references[L.row[mask], number * width + k[mask]] = L.data[mask]
+        mask = ~np.isin(configuration, references)
+        if np.any(pose_of[configuration[mask]] != which[L.row[mask]]):
+            found = "pairs of which each shares an end with others, and its errors"
+            raise InputError(problem.data.source, found, "pairing star")
+        private[L.row[mask], k[mask]] = L.data[mask]
+    return np.hstack([J, of_references]), private, which
+
+
+def _poses_of(problem: Problem, series: int, residual_dim: int, pose_of: Integers) -> Integers:
+    """The pose of each row of a series; -1 of rows without a configuration."""
+    s = problem.data.series[series]
+    if not s.kind.ends:
+        return np.full(len(s.train) * residual_dim, -1)
+    found: Integers = np.repeat(pose_of[problem.data.places[s.table][s.ends[s.train]]].max(axis=1), residual_dim)
+    return found
+
+
+def _stack(rows: Floats, which: Integers, n_poses: int) -> Floats:
+    """Rows by pose, zeros below those of a pose that has fewer, shape (n_poses, h, n)."""
+    chosen = np.flatnonzero(which >= 0)
+    order = chosen[np.argsort(which[chosen], kind="stable")]
+    counts = np.bincount(which[chosen], minlength=n_poses)
+    parts = [_compress(rows[part]) for part in np.split(order, np.cumsum(counts)[:-1])]
+    out = np.zeros((n_poses, max(1, *(len(part) for part in parts)), rows.shape[1]))
+    for k, part in zip(range(n_poses), parts, strict=False):
+        out[k, : len(part)] = part
+    return out
+
+
+def _compress(rows: Floats) -> Floats:
+    """As few rows with the same information: an image of a board says as much as the board's pose."""
+    if len(rows) <= MAX_ROWS:
+        return rows
+    _, s, Vt = np.linalg.svd(rows, full_matrices=False)
+    kept = s > _LOST_SHARE * s.max(initial=0.0)
+    out: Floats = s[kept, None] * Vt[kept]
+    return out
+
+
+def _whiten(rows: Floats, loadings: Floats) -> Floats:
+    """Rows of covariance 1 + L L^T, whitened, shapes (n, h, m) and (n, h, k)."""
+    if not loadings.any():
+        return rows
+    C = np.eye(rows.shape[1]) + loadings @ np.swapaxes(loadings, 1, 2)
+    return np.linalg.solve(np.linalg.cholesky(C), rows)
+
+
+# --- the system to choose from ---
+
+
+@dataclass(frozen=True)
+class System(FrozenArrays):
+    """Candidates in coordinates that can be determined.
+
+    Attributes:
+        rows: Of each candidate, shape (n_candidates, h, n).
+        known: Information that is there already, with the weak prior, shape (n, n).
+        task: W, of which `tr(W C)` is the mean square error of the task, C the covariance, shape (n, n).
+        core: P, functions of the arm's parameters that can be determined, orthonormal in changes of ordinary size,
+            shape (p, n).
+        basis: What is determined, in the columns of rows, shape (n_columns, n).
+        unknown: Share of the task's mean square that no candidate determines, in [0, 1].
+    """
+
+    rows: Floats
+    known: Floats
+    task: Floats
+    core: Floats
+    basis: Floats
+    unknown: float
+
+    @property
+    def n_candidates(self) -> int:
+        """Number of candidates."""
+        return len(self.rows)
+
+    def with_known(self, candidates: Integers) -> System:
+        """The system with some candidates measured already."""
+        return replace(self, known=self.information(candidates))
+
+    def select(self, candidates: Integers) -> System:
+        """The system with some of the candidates."""
+        return replace(self, rows=self.rows[candidates])
+
+    def information(self, chosen: Integers) -> Floats:
+        """Information with some candidates measured, shape (n, n)."""
+        A = self.rows[chosen].reshape(-1, self.rows.shape[2])
+        out: Floats = self.known + A.T @ A
+        return out
+
+
+def build_system(poses: PoseRows, given: Floats, task: Floats) -> System:
+    """Build the system of candidate poses.
+
+    Args:
+        poses: Their rows.
+        given: Rows that were measured already, shape (m, n_columns).
+        task: Mean square error of the task as a quadratic form of the core, shape (n_core, n_core).
+    """
+    scales, n, n_arm = poses.scales, poses.n_core, poses.n_arm
+    rows, before = poses.rows * scales, np.vstack([poses.always, given]) * scales
+    # By singular values: those of the information itself are lost in rounding where noise is tiny.
+    _, s, Vt = np.linalg.svd(np.linalg.qr(np.vstack([before, rows.reshape(-1, len(scales))]), mode="r"))
+    values, vectors = np.append(s, np.zeros(len(scales) - len(s))), Vt.T
+    kept = values > max(SIGNAL_FLOOR, _ROUNDING * values[0])
+    Q, lost = vectors[:, kept] / values[kept], vectors[:n, ~kept]
+    weak = np.maximum((SIGNAL_FLOOR / values[kept]) ** 2, _ROUNDING)
+    W = task * np.outer(scales[:n], scales[:n])
+    total = float(np.trace(W))
+    # Functions of the arm that no undetermined direction has a share in.
+    U, s, _ = np.linalg.svd(lost[:n_arm], full_matrices=True) if lost.shape[1] else (np.eye(n_arm), np.zeros(0), None)
+    determined = U[:, int(np.sum(s > _UNDETERMINED_SHARE)) :]
+    return System(
+        rows=rows @ Q,
+        known=(before @ Q).T @ (before @ Q) + np.diag(weak),
+        task=Q[:n].T @ W @ Q[:n],
+        core=determined.T @ Q[:n_arm],
+        basis=scales[:, None] * Q,
+        unknown=float(np.trace(lost.T @ W @ lost)) / total if total > 0.0 else 0.0,
+    )
+
+
+# --- the task, and what is known after measuring ---
+
+
+@dataclass(frozen=True)
+class Task(FrozenArrays):
+    """Configurations at which the tool is to be right after calibration.
+
+    Attributes:
+        readings: The configurations, shape (n, n_joints), [rad] (prismatic: [m]).
+        fitted: Whether errors count after the best rigid fit, instead of in the base frame.
+        lever: Distance from the tool with which orientation errors count, [m]; 0: positions alone.
+    """
+
+    readings: Floats
+    fitted: bool
+    lever: float = 0.0
+
+    def quadratic_form(self, problem: Problem) -> Floats:
+        """W, in the columns of a problem's core, shape (n_columns, n_columns), [m^2]."""
+        v = problem.variables
+        at = forward(v.chains[0].at(problem.start), precompute_trig(problem.robot, self.readings))
+        rotation, position = at.jacobian[:, :3].copy(), at.jacobian[:, 3:].copy()
+        for derivative in (rotation, position):
+            derivative[:, :, v.n_robot_columns :] = 0.0
+        if self.fitted:
+            position, rigid = without_rigid_motion(at.position, position)
+            rotation = rotation - rigid
+        n = position.shape[2]
+        flat = np.vstack([position.reshape(-1, n), self.lever * rotation.reshape(-1, n)])
+        out: Floats = flat.T @ flat / len(self.readings)
+        return out
+
+
+@dataclass(frozen=True)
+class Posterior(Brief):
+    """What is known after some rows were measured.
+
+    Attributes:
+        problem: Their problem, at its start.
+        rows: Whitened derivatives in all its columns, with those of earlier measurements, shape (m, n).
+        n_before: Number of earlier measurements.
+    """
+
+    problem: Problem
+    rows: Floats
+    n_before: int = 0
+
+    @cached_property
+    def covariance(self) -> TangentCovariance:
+        """Covariance of the core."""
+        v = self.problem.variables
+        left = eliminate(self.rows, np.zeros(len(self.rows)), v.n_columns)
+        return covariance_of_rows(v, self.problem.start, left.A)
+
+    def error(self, task: Task) -> PoseRms:
+        """Expected errors of the tool over a task."""
+        base, fitted = errors_at(self.covariance, task.readings)
+        return fitted if task.fitted else base
+
+    @cached_property
+    def observability(self) -> Observability:
+        """What the rows, without priors, determine of the arm."""
+        p, v = self.problem, self.problem.variables
+        left = eliminate(self.rows, np.zeros(len(self.rows)), v.n_robot_columns)
+        return observability_of_rows(
+            left.A @ v.tangent_derivative(p.start)[: v.n_robot_columns, : v.n_robot_columns],
+            p.estimated,
+            scales=np.array([p.robot.scale_of(one.unit) for one in p.estimated]),
+            n_measurements=self.n_before + count_measurements(p),
+        )
+
+
+def count_measurements(problem: Problem) -> int:
+    """Number of measurements of a problem's rows."""
+    return sum(len(s.train) for s in problem.data.series)
+
+
+def needs_fit(problem: Problem) -> bool:
+    """Whether nothing that is measured says where the base is, so that errors count after the best rigid fit."""
+    return Seen.by(problem.data.tables).blind_to_base

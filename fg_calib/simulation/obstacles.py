@@ -1,0 +1,112 @@
+"""The arm as lines in space: where its straight pieces begin and end, and whether they pass through a box."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.robot.model import Axis, Robot
+from fg_calib.simulation.scenario import Box
+
+Floats = NDArray[np.float64]
+Booleans = NDArray[np.bool_]
+
+MAX_CONTACT_M = 1e-9
+"""How deep something may be in a box and still only touch it, [m]: far above rounding, far below any clearance."""
+
+
+def link_points(robot: Robot, readings: Floats) -> Floats:
+    """Points along the arm from the base to the tool, where straight pieces begin and end, shape (n, m, 3), [m].
+
+    Args:
+        robot: The robot.
+        readings: Shape (n, n_joints), [rad] (prismatic: [m]).
+    """
+    n, values = len(readings), robot.nominal
+    R, p = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3))
+    points, moved = [p.copy()], False
+    for e in robot.elements:
+        if e.basis is not None:
+            continue  # what gravity and gears add is not visible at this size
+        value = np.full(n, 0.0 if e.parameter is None else values[e.parameter])
+        value = e.constant + e.sign * (value + (0.0 if e.joint is None else readings[:, e.joint]))
+        if e.axis < Axis.RX:
+            p = p + R[:, :, int(e.axis)] * value[:, None]
+            moved = moved or bool(np.any(value != 0.0))
+            continue
+        if moved:
+            points.append(p.copy())
+            moved = False
+        i, j = (int(e.axis) + 1) % 3, (int(e.axis) + 2) % 3
+        c, s = np.cos(value)[:, None], np.sin(value)[:, None]
+        R[:, :, i], R[:, :, j] = c * R[:, :, i] + s * R[:, :, j], c * R[:, :, j] - s * R[:, :, i]
+    return np.stack([*points, p], axis=1)
+
+
+def enters(robot: Robot, readings: Floats, boxes: Sequence[Box]) -> Booleans:
+    """Whether something of the arm is inside one of some boxes, at each configuration, shape (n,).
+
+    The joints' origins, the straight lines between them and the tool point count; the links' thickness does not, so
+    boxes should be larger by that. A line on the face of a box only touches it. What no joint moves does not count,
+    such as a column up to the shoulder: no configuration keeps it out.
+
+    Args:
+        robot: The robot, at its nominal values.
+        readings: Shape (n, n_joints), [rad] (prismatic: [m]).
+        boxes: What must stay free.
+    """
+    points = link_points(robot, np.concatenate([_probes(robot), readings]))  # (2 + n, m, 3)
+    moves = _moving(points)
+    lines = moves[:-1] | moves[1:]
+    start, end = points[2:, :-1][:, lines], points[2:, 1:][:, lines]  # (n, n_lines, 3)
+    hit = np.zeros(len(readings), dtype=np.bool_)
+    for box in boxes:
+        hit |= _cross(start, end, box).any(axis=1)
+    return hit
+
+
+def blocked_foot(robot: Robot, boxes: Sequence[Box]) -> str:
+    """Which of some boxes keeps every configuration out, as the moving arm begins inside it; empty if none does.
+
+    Args:
+        robot: The robot, at its nominal values.
+        boxes: What must stay free.
+    """
+    points = link_points(robot, _probes(robot))
+    moves = _moving(points)
+    for number, box in enumerate(boxes, start=1):
+        for p in points[0, :-1][~moves[:-1] & moves[1:]]:
+            if np.all((p > box.lower + MAX_CONTACT_M) & (p < box.upper - MAX_CONTACT_M)):
+                at = ", ".join(f"{v:.4g}" for v in p.tolist())
+                return f"keep_out {number} holds the foot of the moving arm, ({at}) m, in every configuration"
+    return ""
+
+
+def _probes(robot: Robot) -> Floats:
+    """Two configurations that show what stands still in all of them."""
+    return np.outer([0.3, 1.1], np.linspace(0.7, 1.0, robot.n_joints))
+
+
+def _moving(points: Floats) -> Booleans:
+    """Which points, shape (n, m, 3), of which the first two are of probes, some joint moves: shape (m,)."""
+    found: Booleans = np.abs(points[0] - points[1]).max(axis=1) > MAX_CONTACT_M
+    return found
+
+
+def _cross(start: Floats, end: Floats, box: Box) -> Booleans:
+    """Which straight lines pass through a box, shape (...) of ends of shape (..., 3), [m].
+
+    On each axis a line start + t (end - start) is between the box's two planes for an interval of t. It is inside the
+    box where the three intervals and [0, 1] overlap.
+    """
+    lower, upper, along = box.lower + MAX_CONTACT_M, box.upper - MAX_CONTACT_M, end - start
+    still = along == 0.0
+    step = np.where(still, 1.0, along)
+    first, last = (lower - start) / step, (upper - start) / step
+    between = (start > lower) & (start < upper)
+    enter = np.where(still, np.where(between, -np.inf, np.inf), np.minimum(first, last)).max(axis=-1)
+    leave = np.where(still, np.where(between, np.inf, -np.inf), np.maximum(first, last)).min(axis=-1)
+    crosses: Booleans = np.maximum(enter, 0.0) <= np.minimum(leave, 1.0)
+    return crosses

@@ -1,0 +1,467 @@
+"""Scenario files: every field in the units of the file, defaults, and one message a mistake."""
+
+import math
+
+import numpy as np
+import pytest
+import yaml
+from simulated import paper_robot
+from tolerances import rounding
+
+from fg_calib import Noise, Pairing, simulate, write_simulation
+from fg_calib.errors import InputError
+from fg_calib.simulation.scenario import (
+    BoardViews,
+    Errors,
+    GivenReadings,
+    Placement,
+    RandomReadings,
+    Sockets,
+    Spot,
+    TargetViews,
+    Tracker,
+    read_scenario,
+)
+
+ROBOT = """\
+convention: mdh
+joints:
+  - {a: 0, alpha: 0, d: 0.5, theta: 0, limits: [-2, 2]}
+  - {a: 0.4, alpha: 0, d: 0, theta: 0, type: prismatic}
+fixed: [a1]
+tolerance: {a: 0.01, alpha: 0.02, d: 0.03, theta: 0.04}
+"""
+ERRORS = "errors: {uniform: {a: 0.01}}\n"
+RANDOM = "configurations: {random: {count: 3}}\n"
+NOISE = "noise: {position: 0.001, orientation: 0.002}\n"
+BOARD = "configurations: {board: {pose: {x: 1, z: 2}, count: 5"
+SHORT = "robot: robot.yaml\n" + ERRORS + RANDOM + NOISE
+REST = """\
+robot: three.yaml
+errors: {normal: tolerance}
+configurations: {random: {count: 20}}
+noise: {position: 0.1, orientation: 0.02, distance: 0.05, angle: 0.01, point: 0.1, pixel: 0.3}
+units: {length: mm, angle: deg}
+"""
+THREE = """\
+convention: mdh
+joints:
+  - {a: 0, alpha: 0, d: 0.5, theta: 0}
+  - {a: 0.4, alpha: 1, d: 0.1, theta: 0}
+  - {a: 0.3, alpha: 1, d: 0.1, theta: 0}
+tool: {x: 0.2, z: 0.1}
+tolerance: {a: 0.001, alpha: 0.002, d: 0.001, theta: 0.002}
+"""
+CAMERA = "camera: {fx: 900, fy: 905, cx: 640, cy: 480, k1: -0.1}"
+CORNERS = "corners: {columns: 8, rows: 6, square: 30}"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "robot.yaml").write_text(ROBOT)
+    (tmp_path / "three.yaml").write_text(THREE)
+    (tmp_path / "table.csv").write_text("q1,q2,split\n10,1,test\n20,2,train\n")
+    (tmp_path / "camera.yaml").write_text("{fx: 900, fy: 905, cx: 640, cy: 480}\n")
+    return tmp_path
+
+
+def read(folder, text):
+    (folder / "scenario.yaml").write_text(text)
+    return read_scenario(folder / "scenario.yaml")
+
+
+def read_instruments(folder, *entries, rest=REST):
+    return read(folder, rest + "instruments:\n" + "".join(f"  - {e}\n" for e in entries))
+
+
+def one(folder, entry):
+    (found,) = read_instruments(folder, entry).instruments
+    return found
+
+
+def test_the_shipped_scenario_is_the_papers(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "space-robot").mkdir()  # a folder of that name, such as the last simulation, is not in the way
+    s = read_scenario("space-robot")
+    paper = paper_robot()
+    assert s.robot.nominal == pytest.approx(paper.nominal)
+    assert [p.name for p in s.robot.parameters if not p.estimated and p.owner == 1] == [
+        *("a1", "alpha1", "d1", "theta1", "beta1")
+    ]
+    assert sum(p.estimated for p in s.robot.parameters) == 30
+    assert s.robot.limits == pytest.approx(np.tile([-math.pi, math.pi], (7, 1)))
+    bound = {"m": 0.01, "rad": math.radians(0.05)}  # Table 6
+    for p in s.robot.parameters:
+        if 1 <= p.owner <= 7:
+            assert p.tolerance == pytest.approx(bound[p.unit] / math.sqrt(3), rel=rounding(1, 10))
+            assert s.errors.figures[p.name] == pytest.approx(bound[p.unit])
+    assert s.errors.law == "uniform"
+    board = s.configurations
+    assert (board.height, board.radius, board.count, board.distance) == (0.5, 0.5, 51, None)
+    assert (board.roll, board.self_motion, board.posture) == (None, "random", None)
+    assert board.board.position.tolist() == [0, 6.5, 2.55]
+    assert board.board.rotation.tolist() == np.eye(3).tolist()
+    assert (s.noise.position, s.noise.orientation) == pytest.approx((1e-3, math.radians(0.01)))
+    assert s.noise.joint == pytest.approx([math.radians(0.005)] * 7)
+    assert s.validation == RandomReadings(500)
+    assert (s.frame, s.job) == ("unknown", {"model": "distance-rotation", "pairing": "star"})
+    assert (s.name, s.source) == ("space-robot", "space-robot")
+    assert (s.length_unit, s.angle_unit) == ("m", "deg")
+
+
+def test_a_short_scenario_has_the_defaults(folder):
+    s = read(folder, SHORT)
+    assert s.robot.name == "robot"
+    assert s.errors == Errors("uniform", {"a1": 0.01, "a2": 0.01})
+    assert s.configurations == RandomReadings(3)
+    assert s.noise == Noise(1e-3, 2e-3, (0.0, 0.0))
+    assert (s.frame, s.validation, s.stated_noise) == ("unknown", None, None)
+    assert s.job == {"model": "distance-rotation"}
+    assert (s.name, s.source, s.length_unit, s.angle_unit) == ("scenario", "scenario.yaml", "m", "rad")
+    assert read(folder, SHORT + "name: mine\n").name == "mine"
+
+
+def test_a_robot_may_stand_in_the_scenario(folder):
+    robot = "robot: {convention: dh, joints: [{a: 1, alpha: 0, d: 0, theta: 0}]}\n"
+    assert read(folder, robot + ERRORS + RANDOM + NOISE).robot.nominal[6] == 0.0
+    assert read(folder, robot + ERRORS + RANDOM + NOISE).robot.convention == "dh"
+
+
+@pytest.mark.parametrize(
+    ("errors", "expected"),
+    [
+        ("{uniform: {a: 10, alpha: 2, a2: 5}}", Errors("uniform", {"a1": 0.01, "a2": 0.005, "alpha1": 2, "alpha2": 2})),
+        ("{uniform: {}}", Errors("uniform", {})),
+        ("{normal: {d: 10, tool.yaw: 3, tool.x: 4}}",
+         Errors("normal", {"d1": 0.01, "d2": 0.01, "tool.x": 0.004, "tool.yaw": 3})),
+        ("{values: {a2: -3, theta1: -1}}", Errors("values", {"a2": -0.003, "theta1": -1})),
+    ],
+)  # fmt: skip
+def test_errors_are_converted_and_shared_out_by_kind(folder, errors, expected):
+    """Lengths in mm and angles in degrees here; a name goes before its kind."""
+    s = read(folder, SHORT.replace(ERRORS, f"errors: {errors}\n") + "units: {length: mm, angle: deg}\n")
+    angles = {"alpha1", "alpha2", "theta1", "tool.yaw"}
+    figures = {name: math.radians(f) if name in angles else f for name, f in expected.figures.items()}
+    assert s.errors.law == expected.law
+    assert s.errors.figures == pytest.approx(figures)
+
+
+def test_normal_errors_may_be_those_of_the_tolerances(folder):
+    s = read(folder, SHORT.replace(ERRORS, "errors: {normal: tolerance}\n") + "units: {length: mm}\n")
+    assert s.errors.law == "normal"
+    assert s.errors.figures == {
+        **{"a1": 0.01, "alpha1": 0.02, "d1": 0.03, "theta1": 0.04},
+        **{"a2": 0.01, "alpha2": 0.02, "d2": 0.03, "theta2": 0.04},
+    }
+
+
+def test_a_board_is_converted_to_si(folder):
+    views = read(
+        folder,
+        SHORT.replace(RANDOM, BOARD.replace("z: 2", "z: 2, yaw: 90") + ", height: 300, radius: 200, roll: 30, "
+        "self_motion: held, posture: [20, 100]}}\n") + "units: {length: mm, angle: deg}\n",
+    ).configurations  # fmt: skip
+    assert views.board.position == pytest.approx([1e-3, 0, 2e-3])
+    assert views.board.rotation == pytest.approx(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]), abs=rounding(1.0))
+    assert (views.height, views.radius, views.count) == pytest.approx((0.3, 0.2, 5))
+    assert views.roll == pytest.approx(math.radians(30))
+    assert views.self_motion == "held"
+    assert views.posture == pytest.approx((math.radians(20), 0.1))  # the second joint slides
+
+
+def test_a_board_has_defaults_in_any_units(folder):
+    views = read(folder, SHORT.replace(RANDOM, BOARD + "}}\n") + "units: {length: mm, angle: deg}\n").configurations
+    assert isinstance(views, BoardViews)
+    assert (views.height, views.radius, views.distance, views.cone) == (0.5, 0.5, None, math.pi / 3)
+    assert (views.roll, views.self_motion, views.posture) == (None, "random", None)
+
+
+def test_a_range_of_distances_is_converted(folder):
+    views = read(
+        folder,
+        SHORT.replace(RANDOM, BOARD + ", distance: [300, 2000], cone: 90}}\n") + "units: {length: mm, angle: deg}\n",
+    ).configurations
+    assert views.distance == pytest.approx((0.3, 2.0))
+    assert views.cone == pytest.approx(math.pi / 2)
+
+
+def test_a_table_gives_its_readings(folder):
+    s = read(folder, SHORT.replace(RANDOM, "configurations: {table: table.csv}\n") + "units: {angle: deg}\n"
+             "validation: {table: table.csv}\n")  # fmt: skip
+    for given in (s.configurations, s.validation):
+        assert isinstance(given, GivenReadings)
+        assert given.readings == pytest.approx(np.array([[math.radians(10), 1], [math.radians(20), 2]]))
+
+
+def test_frames_are_the_base_unknown_or_given(folder):
+    assert read(folder, SHORT + "frame: base\n").frame == "base"
+    assert read(folder, SHORT + "frame: unknown\n").frame == "unknown"
+    given = read(folder, SHORT + "frame: {x: 1000, roll: 90}\nunits: {length: mm, angle: deg}\n").frame
+    assert isinstance(given, Placement)
+    assert given.position.tolist() == [1, 0, 0]
+    assert given.rotation @ [0, 1, 0] == pytest.approx([0, 0, 1])
+
+
+def test_a_job_may_state_another_noise_than_the_true_one(folder):
+    s = read(
+        folder,
+        SHORT + "units: {length: mm, angle: deg}\n"
+        "job: {model: pose, gauge: keep, prefer: [d2], noise: {orientation: 0.5, joint: [1, 2]}}\n",
+    )
+    assert s.job == {"model": "pose", "gauge": "keep", "prefer": ["d2"]}
+    assert (s.noise.position, s.noise.joint) == (1e-6, (0.0, 0.0))
+    assert s.noise.orientation == pytest.approx(math.radians(0.002))
+    assert s.stated_noise.position == 1e-6
+    assert s.stated_noise.orientation == pytest.approx(math.radians(0.5))
+    assert s.stated_noise.joint == pytest.approx((math.radians(1), 2e-3))
+
+
+def test_a_tracker_has_every_figure_in_the_units_of_the_file(folder):
+    text = """
+configurations:
+  tracker:
+    station: {x: 3000, z: 1500}
+    target: {y: 50}
+    axis: [0, 1, 0]
+    acceptance: 40
+    distance: [1000, 8000]
+    region: {lower: [0, -500, 0], upper: [1000, 500, 2000]}
+    count: 7
+  keep_out: [{lower: [-1000, -1000, -1000], upper: [1000, 1000, 0]}]
+  apart: 5
+validation: {tracker: {station: {x: 3000}, count: 8}}
+"""
+    s = read(folder, "units: {length: mm, angle: deg}\n" + SHORT.replace(RANDOM, text))
+    t = s.configurations
+    assert isinstance(t, TargetViews)
+    assert (t.station.tolist(), t.target.tolist(), t.axis.tolist()) == ([3, 0, 1.5], [0, 0.05, 0], [0, 1, 0])
+    assert (t.acceptance, t.distance, t.count) == (pytest.approx(math.radians(40)), (1, 8), 7)
+    assert (t.region.lower.tolist(), t.region.upper.tolist()) == ([0, -0.5, 0], [1, 0.5, 2])
+    assert [(box.lower.tolist(), box.upper.tolist()) for box in t.keep_out] == [([-1, -1, -1], [1, 1, 0])]
+    assert t.apart == pytest.approx(math.radians(5))
+    t = s.validation
+    assert (t.target.tolist(), t.axis.tolist(), t.acceptance) == ([0, 0, 0], [0, 0, 1], math.pi / 6)
+    assert (t.distance, t.region, t.keep_out, t.apart, t.count) == ((0.0, math.inf), None, (), None, 8)
+
+
+@pytest.mark.parametrize("kind", ["name", "file", "folder"])
+def test_what_is_no_scenario_is_one_line(folder, kind):
+    wrong, message = {
+        "name": ("puma", "scenario: found 'puma', expected a file, or one of space-robot"),
+        "file": (folder / "nowhere.yaml", f"{folder / 'nowhere.yaml'}: no such file"),
+        "folder": (folder, f"{folder}: is a folder, expected a file"),
+    }[kind]
+    with pytest.raises(InputError) as caught:
+        read_scenario(wrong)
+    assert str(caught.value) == message
+
+
+def test_figures_are_converted_and_instruments_named(folder):
+    s = read_instruments(
+        folder,
+        "{model: position, stations: 2, targets: {ball: {x: 50, y: 0, z: 100, tolerance: 2}, pin: {x: 1, y: 2, z: 3}}}",
+        "{model: position, name: other, targets: 3, frame: {x: 1000, yaw: 90}}",
+        "{model: position, frame: base}",
+        "{model: anchor, anchors: {bolt: {x: 800, y: 0, z: 0}}, offset: 120, noise: {distance: 0.02}}",
+        "{model: plane, planes: {table: {normal: [0, 0, 2], distance: 300}}, contact: true}",
+        "{model: distance-rotation, pairs: {random: 9, seed: 2}}",
+        "{model: distance, pairing: chain}",
+        "{model: distance, sockets: 4}",
+    )
+    tracker, other, third, wire, table, direct, formed, sockets = s.instruments
+    assert [i.name for i in s.instruments] == [
+        *("position", "other", "position_2", "anchor", "plane", "distance-rotation", "distance", "distance_2")
+    ]
+    assert s.noise == Noise(1e-4, math.radians(0.02), (0.0,) * 3, 5e-5, math.radians(0.01), 1e-4, 0.3)
+    assert s.job == {}
+    assert tracker.stations == 2
+    assert tracker.targets["ball"].xyz == pytest.approx([0.05, 0.0, 0.1])
+    assert (tracker.targets["ball"].tolerance, tracker.targets["pin"].tolerance) == (2e-3, None)
+    assert (other.targets, third.frame) == (3, "base")
+    assert isinstance(other.frame, Placement)
+    assert other.frame.position == pytest.approx([1.0, 0.0, 0.0])
+    assert other.frame.rotation @ [1, 0, 0] == pytest.approx([0, 1, 0])
+    assert wire.anchors["bolt"].xyz == pytest.approx([0.8, 0.0, 0.0])
+    assert (wire.offset, wire.noise) == (pytest.approx(0.12), Noise(distance=2e-5, joint=(0.0,) * 3))
+    assert table.planes["table"].normal.tolist() == [0, 0, 1]
+    assert (table.planes["table"].distance, table.contact) == (pytest.approx(0.3), True)
+    assert (direct.pairs, formed.pairing) == (Pairing("random", 9, 2), Pairing("chain"))
+    assert isinstance(sockets, Sockets)
+    assert sockets.sockets == 4
+
+
+def test_cameras_boards_and_configurations_of_their_own_are_read(folder):
+    eye = one(folder, "{model: pixels, camera: camera.yaml, " + CORNERS + ", boards: {wall: {x: 900, roll: 90}}, "
+              "configurations: {board: {pose: {x: 900}, height: 300, radius: 200, count: 7}}}")  # fmt: skip
+    assert (eye.camera.fy, eye.camera.k1, eye.fixed) == (905, 0.0, False)
+    assert (eye.corners.columns, eye.corners.rows, eye.corners.square) == (8, 6, pytest.approx(0.03))
+    assert np.ptp(eye.corners.points, axis=0) == pytest.approx([0.21, 0.15])
+    assert eye.corners.points.mean(axis=0) == pytest.approx([0.0, 0.0])
+    assert eye.boards["wall"].position == pytest.approx([0.9, 0.0, 0.0])
+    assert isinstance(eye.configurations, BoardViews)
+    assert eye.configurations.height == pytest.approx(0.3)
+    room = one(folder, "{model: pixels, " + CAMERA[:-1] + ", fixed: true}, " + CORNERS + ", frame: {z: 2000}}")
+    assert (room.fixed, room.camera.k1) == (True, -0.1)
+    assert room.frame.position == pytest.approx([0.0, 0.0, 2.0])
+    board = one(folder, "{model: board, configurations: {random: {count: 3}}, boards: {a: {x: 1}}}")
+    assert board.configurations == RandomReadings(3)
+
+
+def test_a_job_states_another_noise_and_other_keys(folder):
+    rest = REST + "job: {loss: huber, noise: {distance: 0.2, joint: 0.01}}\n"
+    s = read_instruments(folder, "{model: anchor, anchors: 2}", "{model: position}", rest=rest)
+    (wire, tracker) = simulate(s).tables
+    assert s.job == {"loss": "huber"}
+    assert wire.measurements.sigma_length[0] == pytest.approx(2e-4)
+    assert tracker.measurements.sigma_position[0, 0] == pytest.approx(1e-4)
+    assert wire.measurements.sigma_joint == pytest.approx([math.radians(0.01)] * 3)
+    assert simulate(s).true_readings.tolist() == wire.measurements.readings.tolist()  # the joints themselves are exact
+
+
+S = "scenario.yaml: "
+IN = S + "instruments"
+
+
+def with_board(more):
+    return SHORT.replace(RANDOM, f"{BOARD}, {more}}}}}\n")
+
+
+def with_tracker(more):
+    return SHORT.replace(RANDOM, f"configurations: {{tracker: {{station: {{x: 3}}, count: 5, {more}}}}}\n")
+
+
+def with_errors(errors):
+    return SHORT.replace(ERRORS, f"errors: {errors}\n")
+
+
+def with_instrument(entry):
+    return REST + f"instruments:\n  - {entry}\n"
+
+
+KEYS = "one of name, robot, units, errors, configurations, noise, frame, validation, job, instruments"
+KINDS = "one of board, tracker, random, table"
+MISTAKES = [
+    ("", S + "an empty file, expected a mapping, key: value"),
+    ("robot: robot.yaml\n", S + "missing keys 'configurations', 'noise'"),
+    (SHORT + "eror: 1\n", S + f"unknown key 'eror', expected {KEYS}; did you mean errors?"),
+    (with_errors("{uniform: {a: 1}, values: {a: 1}}"),
+     S + "errors: found uniform and values, expected one of uniform, normal, values"),
+    (with_errors("{uniform: {a: -1}}"), S + "errors: uniform: a: found -1, expected a number not below 0"),
+    (with_errors("{values: {b2: 1}}"),
+     S + "errors: values: unknown parameter or kind 'b2', expected one of a, alpha, base, d, theta, tool"),
+    (with_errors("{normal: tolerances}"), S + "errors: normal: found 'tolerances', expected a mapping"),
+    (SHORT.replace("{random: {count: 3}}", "{}"), S + f"configurations: found none, expected {KINDS}"),
+    (SHORT.replace("{count: 3}}", "{count: 3}, table: t.csv}"),
+     S + f"configurations: found random and table, expected {KINDS}"),
+    (SHORT.replace("count: 3", "count: 2.5"), S + "configurations: random: count: found 2.5, expected a whole number"),
+    (SHORT.replace("count: 3", "n: 3"),
+     S + "configurations: random: unknown key 'n', expected one of keep_out, apart, count"),
+    (with_board("radius: 0"), S + "configurations: board: radius: found 0, expected a number above 0"),
+    (with_board("radius: 1, distance: [1, 2]"),
+     S + "configurations: board: radius: found 1 m, expected none with distance"),
+    (with_board("distance: [2, 1]"),
+     S + "configurations: board: distance: found [2.0, 1.0], expected the smaller one first"),
+    (with_board("roll: free"), S + "configurations: board: roll: found 'free', expected a finite number"),
+    (with_board("self_motion: held, posture: [3, 0]"),
+     S + "configurations: posture 1: found 3.0, expected within [-2, 2]"),
+    (with_tracker("acceptance: 4"),
+     S + "configurations: tracker: acceptance: found 4 rad, expected at most half a turn"),
+    (with_tracker("axis: [0, 0, 0]"), S + "configurations: tracker: axis: found 0, 0, 0, expected a direction"),
+    (SHORT.replace("0.002}", "0.002, joint: [1]}"),
+     S + "noise: joint: 1 figures, expected one for all or 2, one a joint"),
+    (SHORT + "frame: room\n",
+     S + "frame: found 'room', expected base, unknown, or a mapping of x, y, z, roll, pitch, yaw"),
+    (SHORT + "job: {frame: known}\n",
+     S + "job: found key 'frame', expected none; it follows from the scenario"),
+    (SHORT + "job: {noise: {position: 0}}\n", S + "job: noise: position: found 0, expected a number above 0"),
+    (REST + "instruments: []\n", f"{IN}: found [], expected a list of instruments, each with its model"),
+    (with_instrument("{model: wire}"), f"{IN} 1: model: found 'wire', expected one of pose, position, orientation, "
+     "distance, rotation, distance-rotation, anchor, plane, board, pixels"),
+    (with_instrument("{model: anchor, anchor: 3}"), f"{IN} 1: unknown key 'anchor', expected one of model, name, "
+     "noise, stated_noise, configurations, anchors, offset, contact; did you mean anchors?"),
+    (with_instrument("{model: anchor, anchors: {a: {x: 1, y: 2}}}"), f"{IN} 1: anchors: a: missing key 'z'"),
+    (with_instrument("{model: anchor, anchors: {' a': {x: 1, y: 2, z: 3}}}"),
+     f"{IN} 1: anchors: found name ' a', expected a word"),
+    (with_instrument("{model: anchor, offset: 3, contact: true}"),
+     f"{IN} 1: offset: with contact, expected none: there is no length"),
+    (with_instrument("{model: plane, planes: {a: {normal: [0, 0, 0], distance: 1}}}"),
+     f"{IN} 1: planes: a: normal: found 0, 0, 0, expected a direction"),
+    (with_instrument("{model: position, stations: 2, frame: base}"),
+     f"{IN} 1: stations: 2 with frame base, expected 1"),
+    (with_instrument("{model: pixels}"),
+     f"{IN} 1: camera: found none with model pixels, expected it with model pixels"),
+    (with_instrument("{model: anchor, name: a}\n  - {model: plane, name: A}"),
+     f"{IN} 2: name: A is there already, expected another one"),
+    (REST + "instruments: [{model: anchor}]\njob: {model: anchor}\n",
+     S + "job: found key 'model', expected none; each instrument has its own"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "message"), MISTAKES, ids=range(len(MISTAKES)))
+def test_a_mistake_is_named_in_one_line(folder, text, message):
+    with pytest.raises(InputError) as caught:
+        read(folder, text)
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: RandomReadings(0), "random: count: found 0, expected a number above 0"),
+        (lambda: BoardViews("wall", 3), "board: found 'wall', expected a Placement"),
+        (lambda: Spot([0.0, np.nan, 0.0]), "xyz: row 1: found nan, expected a finite number"),
+        (lambda: Tracker(model="position", name="it", stations=0),
+         "tracker: stations: found 0, expected a number above 0"),
+    ],
+)  # fmt: skip
+def test_types_refuse_from_python_what_they_refuse_from_a_file(make, message):
+    with pytest.raises(InputError) as caught:
+        make()
+    assert str(caught.value) == message
+
+
+@pytest.mark.slow
+def test_the_command_says_what_each_table_has_and_writes_the_truth(fg_calib, folder):
+    tracker = "{model: position, name: tracker, targets: {ball: {x: 50, y: 0, z: 100}}}"
+    wire = "{model: anchor, name: wire, anchors: {bolt: {x: 800, y: 0, z: 0, tolerance: 0}}, offset: 120}"
+    read_instruments(folder, tracker, wire, rest=REST + "validation: {random: {count: 4}}\n")
+    ended = fg_calib("simulate", folder / "scenario.yaml", "--out", folder / "job", "--seed", 2)
+    assert ended.code == 0
+    assert ended.out == (
+        "scenario, seed 2: 20 configurations to calibrate, 4 to test\n"
+        "tracker.csv: model position, 20 rows to calibrate, 4 to test\n"
+        "wire.csv: model anchor, 20 rows to calibrate, 4 to test\n"
+    )
+    truth = yaml.safe_load((folder / "job" / "truth.yaml").read_text())
+    assert truth["units"] == {"length": "mm", "angle": "deg"}
+    assert truth["targets"] == {"ball": {"x": 50.0, "y": 0.0, "z": 100.0}}
+    assert (truth["anchors"], truth["offsets"]) == ({"bolt": {"x": 800.0, "y": 0.0, "z": 0.0}}, {"wire": 120.0})
+    assert set(truth["frames"]["tracker"]) == {"x", "y", "z", "roll", "pitch", "yaw"}
+    job = yaml.safe_load((folder / "job" / "calibration.yaml").read_text())
+    assert [entry["table"] for entry in job["measurements"]] == ["tracker.csv", "wire.csv"]
+    assert job["anchors"] == {"bolt": {"x": 800.0, "y": 0.0, "z": 0.0}}
+    ended = fg_calib("calibrate", folder / "job" / "calibration.yaml", "--out", folder / "result")
+    assert ended.code == 0
+    as_json = fg_calib("simulate", folder / "scenario.yaml", "--out", folder / "job", "--json")
+    assert '"table": "wire.csv"' in as_json.out
+
+
+def test_tables_of_an_earlier_simulation_go_and_those_of_others_stay(folder):
+    """The folder is filled again by a scenario with other instruments, then by one without."""
+    first = simulate(read_instruments(folder, "{model: distance, name: sockets, sockets: 2}", "{model: plane}"))
+    second, plain = simulate(read_instruments(folder, "{model: anchor, name: wire}")), simulate(read(folder, REST))
+    out = folder / "job"
+    assert set(write_simulation(out, first)) == {
+        *("calibration.yaml", "plane.csv", "robot_nominal.yaml", "robot_true.yaml", "sockets.csv"),
+        *("sockets_pairs.csv", "truth.yaml"),
+    }
+    (out / "mine.csv").write_text("a\n")
+    for simulation in (second, plain, first):
+        names = write_simulation(out, simulation)
+        assert {file.name for file in out.iterdir()} == {*names, "mine.csv"}
+    stranger = folder / "stranger"
+    stranger.mkdir()
+    (stranger / "wire.csv").write_text("a\n")
+    with pytest.raises(InputError, match=r"wire.csv: is there already, not written by this command"):
+        write_simulation(stranger, second)
+    assert [file.name for file in stranger.iterdir()] == ["wire.csv"]
