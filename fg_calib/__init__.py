@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from fg_calib.calibration import Calibration, calibrate, calibrate_job, calibrate_parts
     from fg_calib.designs.design import Design, design
     from fg_calib.diagnostics.inspection import Inspection, inspect_job
-    from fg_calib.diagnostics.multistart import look_elsewhere
+    from fg_calib.diagnostics.multistart import multistart
     from fg_calib.diagnostics.setup_check import SetupCheck, check_setup
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
     from fg_calib.executors import Failure, dask_executor, local_processes, map_jobs
@@ -140,7 +140,7 @@ _HOMES = {
     ),
     "fg_calib.simulation.simulator": ("Simulation", "simulate"),
     "fg_calib.io.parts_solver": ("PartsSolution", "cut", "reduce_parts", "solve_parts"),
-    "fg_calib.diagnostics.multistart": ("look_elsewhere",),
+    "fg_calib.diagnostics.multistart": ("multistart",),
     "fg_calib.graph.extension": ("DistanceFactor", "RotationAngleFactor", "expand"),
     "fg_calib.graph.solver": ("Solution", "SolverOptions", "levenberg_marquardt_params", "solve"),
     "fg_calib.assessment": ("Assessment", "assess", "solve_job"),
@@ -228,8 +228,8 @@ __all__ = [
     "inspection_document",
     "levenberg_marquardt_params",
     "local_processes",
-    "look_elsewhere",
     "map_jobs",
+    "multistart",
     "observability_document",
     "observe_configurations",
     "observe_structure",

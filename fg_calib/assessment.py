@@ -11,10 +11,9 @@ from numpy.typing import ArrayLike
 
 from fg_calib.arguments import checked
 from fg_calib.arrays import Floats, FrozenArrays, as_figures
-from fg_calib.diagnostics.findings import MOST_ESTIMATED, Verdict, judge
-from fg_calib.diagnostics.multistart import look_elsewhere
+from fg_calib.diagnostics.multistart import multistart
 from fg_calib.diagnostics.setup_check import check_setup
-from fg_calib.diagnostics.verdict import LIKE_NOISE
+from fg_calib.diagnostics.verdict import LIKE_NOISE, MOST_ESTIMATED, Verdict, judge
 from fg_calib.errors import InputError, SolverError, escaped
 from fg_calib.graph.build import problem_of
 from fg_calib.graph.extension import check_graph
@@ -106,7 +105,7 @@ class Assessment(FrozenArrays):
         tested = self.fit.residuals.held_out(solution.problem.data.labels)
         kinds = {held.kind for held in tested}
         held_out = (*tested, *(held for held in others if held.kind not in kinds))
-        return replace(self, acceptance=accept(solution.problem.options.accept, held_out, self.verdict.findings))
+        return replace(self, acceptance=accept(solution.problem.options.accept, held_out, self.verdict.errors))
 
     def __repr__(self) -> str:
         known = sum(p.sigma is not None for p in self.estimates.parameters if p.identifiability != "fixed")
@@ -114,7 +113,7 @@ class Assessment(FrozenArrays):
         lines = [
             f"Assessment of {self.robot.name!r}: {known} of {len(self.names)} parameters have a known sigma",
             f"  chi-square {chi2.value:.6g}, {chi2.dof} degrees of freedom",
-            *(f"  DOUBTFUL: {finding}" for finding in self.verdict.findings[:6]),
+            *(f"  DOUBTFUL: {finding}" for finding in self.verdict.errors[:6]),
         ]
         return "\n".join(escaped(line if len(line) <= 100 else f"{line[:96]} ...") for line in lines)
 
@@ -172,7 +171,7 @@ class Assessment(FrozenArrays):
     @property
     def trustworthy(self) -> bool:
         """Whether nothing speaks against the result."""
-        return not self.verdict.findings
+        return not self.verdict.errors
 
     def __getattr__(self, name: str) -> Any:
         path = _FORMER.get(name)
@@ -258,7 +257,7 @@ def solve_job(job: Job, problem: Problem | None = None) -> Solution:
                 if check.explanations:
                     raise SolverError(f"{error}; {check}") from error
         raise
-    return look_elsewhere(solution)
+    return multistart(solution)
 
 
 @checked
@@ -304,5 +303,5 @@ def _assess(solution: Solution) -> Assessment:
         identifiability=identifiability,
         verdict=verdict,
         expected_error=None if problem.evaluated else expected_error(problem, whole),
-        acceptance=accept(problem.options.accept, fit.residuals.held_out(problem.data.labels), verdict.findings),
+        acceptance=accept(problem.options.accept, fit.residuals.held_out(problem.data.labels), verdict.errors),
     )

@@ -94,7 +94,7 @@ def calibrate(
     """Estimate a robot's parameters from measurements, with their uncertainties.
 
     It builds the problem, solves it (`estimate_noise=True`: with the noise), looks for other optima, and assesses what
-    it found. For the steps one by one see `build_problem`, `solve`, `look_elsewhere` and `assess`; for jobs in files
+    it found. For the steps one by one see `build_problem`, `solve`, `multistart` and `assess`; for jobs in files
     `calibrate_job`.
 
     Args:

@@ -27,7 +27,7 @@ from fg_calib import (
     compare,
     cramer_rao,
     fit_least_squares,
-    look_elsewhere,
+    multistart,
     pose,
     read_job,
     solve,
@@ -71,7 +71,7 @@ Q = np.random.default_rng(1).uniform(-1.5, 1.5, (4, 4))
 @pytest.mark.parametrize("name", CASES)
 def test_one_call_does_the_steps(found, name):
     robot, m, settings = given(name)
-    solution = look_elsewhere(solve(build_problem(robot, m, **settings)))
+    solution = multistart(solve(build_problem(robot, m, **settings)))
     uncertainty = assess(solution)
     assert np.array_equal(found[name].solution.parameters, solution.parameters)
     assert np.array_equal(found[name].uncertainty.covariance, uncertainty.covariance, equal_nan=True)

@@ -1,14 +1,13 @@
-"""Whether rows are linear within what the parameters may still be off: covariances hold only there.
+"""Nonlinearity within the priors and the posterior: where covariances are optimistic and signs ambiguous.
 
-Where precise rows leave directions to wide tolerances, the rows bend along them by more than their noise. The true arm
-is then on a bent surface, and the covariance on its tangent plane. With the rows linearised at `x + d`, a draw d of the
-covariance away from the estimate x, their optimum seems to be at `x + c`, c = J^+ q, where q is what they are beyond
-linear there: so to second order in d, and without second derivatives. What is odd in d (residuals times how derivatives
-change, and third orders) cancels between d and -d. The arm that explains the rows as well as x + d does were they
-linear is at `x + d - c`.
+With weak priors, nonlinearity makes the covariance optimistic in weak directions: the true arm lies on a curved
+surface, the covariance on its tangent plane. Linearised a posterior sigma d away from the estimate x, at x + d and x -
+d, the rows seem to have their optimum c = J^+ q off it, q the second-order part of the residuals; what is odd in d
+cancels.
 
-Along directions that the rows determine well c may be many sigma although all that the rows see of the arm at
-`x + d - c`, and what single parameters are off, is as the covariance says: then only sums of parameters are affected.
+Norms are not differentiable at 0, nor angles at 180 degrees. A length or an angle is of *ambiguous sign* where the
+prior sigma of its vector is above half the way there: the vector may as well point the other way. It is *curved* where
+the spread of the posterior across the vector changes it by a second-order term that its noise does not hide.
 """
 
 from __future__ import annotations
@@ -17,108 +16,164 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from fg_calib.errors import SolverError
 from fg_calib.graph.linearised import Linearised
-from fg_calib.graph.problem import some_rows, started_at
+from fg_calib.graph.problem import at_parameters, some_rows, started_at
 from fg_calib.graph.solver import Solution
-from fg_calib.prediction.expected_error import without_rigid_motion
-from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.kinematics import forward
-from fg_calib.robot.rotations import nearest_rotation
 from fg_calib.statistics.covariance import Spread
 
 Floats = NDArray[np.float64]
+Booleans = NDArray[np.bool_]
 
-ENOUGH_ROWS = 5_000
+MAX_ROWS = 5_000
 """Residuals that suffice: of more, so many are drawn evenly where that is possible."""
 
-NONE = 0.01
-"""Mean square that single draws find, below which there is none."""
+NEGLIGIBLE = 1e-3
+"""Mean square c / sigma of the first draws, below which there are no more."""
 
-N_DRAWS = 16
-"""Draws by which it is measured where there is some, each with its opposite."""
+N_FIRST, N_DRAWS = 2, 8
+"""Draws of d: sums of all determined directions, each a sigma one way or the other."""
 
-N_CONFIGURATIONS = 100
-"""Random configurations at which the tool is looked at."""
+NEAR_SIGMAS = 5.0
+"""Noise sigmas from 0, or of an angle from 180 degrees, within which the sign of noise matters."""
+
+CURVED_SIGMAS = 0.5
+"""Second-order term of a length or angle over its noise, above which it counts as curved."""
 
 
 @dataclass(frozen=True)
-class Curvature:
-    """By how much mean squares of errors exceed what the covariance says because rows bend: 0 for linear ones.
+class Nonlinearity:
+    """Mean squared errors beyond what the covariance says, over the covariance: 0 of what is linear.
 
     Attributes:
-        sums: Of the estimate along all directions that are determined, in sigma, a direction.
-        parameter: Of the parameter of which it is most, of the robot or of a frame's pose.
-        tool: Of the tool's position after the best rigid fit.
-        name: The parameter's; empty for one of a frame.
+        directions: Of all determined directions, in the mean.
+        parameter: Of the parameter of the robot or of a frame where it is largest.
+        name: That parameter; empty for one of a frame.
     """
 
-    sums: float = 0.0
+    directions: float = 0.0
     parameter: float = 0.0
-    tool: float = 0.0
     name: str = ""
 
 
-def beyond_linear(solution: Solution, spread: Spread) -> Curvature:
-    """What rows that bend make of a solution's errors; infinite where they cannot be linearised a sigma away."""
-    problem, n_columns, rank = solution.problem, spread.variables.n_columns, spread.rank
+def check_linearity(solution: Solution, spread: Spread) -> Nonlinearity:
+    """The nonlinearity of a solution's rows a posterior sigma away; infinite where they cannot be linearised there."""
+    problem, rank, n = solution.problem, spread.rank, spread.variables.n_columns
     if not rank:
-        return Curvature()
-    if problem.n_residuals > ENOUGH_ROWS:
-        problem = some_rows(started_at(problem, solution.parameters), ENOUGH_ROWS / problem.n_residuals) or problem
+        return Nonlinearity()
+    if problem.n_residuals > MAX_ROWS:
+        problem = some_rows(started_at(problem, solution.parameters), MAX_ROWS / problem.n_residuals) or problem
     scales, rng = spread.variables.prior_scales, np.random.default_rng(0)
     root = spread.root[:, :rank]
     scaled = root / scales[:, None]
     in_sigma = (scaled / np.sum(scaled**2, axis=0)).T / scales  # the inverse of `root`, whose columns are orthogonal
     here = Linearised(problem, problem.variables.values(solution.parameters))
-
-    def moved(draw: Floats) -> Floats:
-        """The shift c by a draw and its opposite, shape (n_columns,)."""
-        core = root @ draw
-        step = np.concatenate([core, here.follow @ core])
-        both = [Linearised(problem, problem.variables.moved(here.values, move)).step for move in (step, -step)]
-        out: Floats = (0.5 * (both[0] + both[1]) - here.step)[:n_columns]
-        return out
-
+    shifts: list[Floats] = []
     try:
-        looked = [in_sigma @ moved(rng.choice([-1.0, 1.0], rank)) for _ in range(2)]  # one may cancel by chance
-        if np.max(np.sum(np.square(looked), axis=1)) < NONE * rank:
-            return Curvature()
-        draws = rng.normal(size=(N_DRAWS, rank))
-        c = np.array([moved(draw) for draw in draws])
+        while len(shifts) < N_DRAWS:
+            core = root @ rng.choice([-1.0, 1.0], rank)
+            step = np.concatenate([core, here.follow @ core])
+            plus, minus = (Linearised(problem, problem.variables.moved(here.values, d)).step for d in (step, -step))
+            shifts.append((0.5 * (plus + minus) - here.step)[:n])
+            squares = np.mean((np.array(shifts) @ in_sigma.T) ** 2)
+            if len(shifts) == N_FIRST and squares < NEGLIGIBLE:
+                break
     except SolverError:
-        return Curvature(np.inf, np.inf, np.inf)
+        return Nonlinearity(np.inf, np.inf)
     named = np.nan_to_num(spread.variables.named_derivative(solution.parameters))
     variance = np.sum((named @ root) ** 2, axis=1)
-    of_each = np.divide(np.mean((c @ named.T) ** 2, axis=0), variance, out=np.zeros(n_columns), where=variance > 0.0)
+    square = np.mean((np.array(shifts) @ named.T) ** 2, axis=0)
+    of_each = np.divide(square, variance, out=np.zeros(len(variance)), where=variance > 0.0)
     worst, names = int(np.argmax(of_each)), spread.variables.names
-    return Curvature(
-        sums=float(np.mean((c @ in_sigma.T) ** 2)),
-        parameter=float(of_each[worst]),
-        tool=_of_tool(solution, draws @ root.T, c),
-        name=names[worst] if worst < len(names) else "",
-    )
+    return Nonlinearity(float(squares), float(of_each[worst]), names[worst] if worst < len(names) else "")
 
 
-def _of_tool(solution: Solution, d: Floats, c: Floats) -> float:
-    """`Curvature.tool`: the tool at arms `x + d - c` and `x - d - c`, over what it does where all is linear."""
-    robot, variables = solution.problem.robot, solution.problem.variables
-    trig = robot.trig(random_readings(robot, N_CONFIGURATIONS, np.random.default_rng(1)))
+@dataclass(frozen=True)
+class NonlinearRows:
+    """Lengths and angles between configurations that are not linear in what the parameters may be off.
 
-    def tool(step: Floats) -> Floats:
-        at = variables.chains[0].at(variables.stepped(solution.parameters, step)).without_columns()
-        return forward(at, trig).position
+    Attributes:
+        n_rows: Train lengths and angles that were looked at.
+        n_near: Pairs within `NEAR_SIGMAS` of their noise from 0 or 180 degrees.
+        ambiguous: Names of those of ambiguous sign within the priors, `5-17`.
+        curved: Names of others that are curved within the posterior.
+        ambiguous_share: Part of the determined directions that rests on the ambiguous ones (sum of leverage over rank).
+        curved_leverage: Directions that rest on the curved ones (sum of leverage).
+    """
 
-    p = tool(np.zeros(d.shape[1]))
-    linear = np.stack([0.5 * (tool(step) - tool(-step)) for step in d], axis=2)
-    expected = float(np.mean(without_rigid_motion(p, linear)[0] ** 2))
-    bent = [_fitted(tool(move), p) for step, off in zip(d, c, strict=True) for move in (step - off, -step - off)]
-    return float(np.mean(np.square(bent)) / expected) - 1.0 if expected > 0.0 else 0.0
+    n_rows: int = 0
+    n_near: int = 0
+    ambiguous: tuple[str, ...] = ()
+    curved: tuple[str, ...] = ()
+    ambiguous_share: float = 0.0
+    curved_leverage: float = 0.0
 
 
-def _fitted(points: Floats, to: Floats) -> Floats:
-    """What is left between points and others after the best rigid fit, shape (n, 3)."""
-    a, b = points - points.mean(axis=0), to - to.mean(axis=0)
-    out: Floats = a @ nearest_rotation(b.T @ a).T - b
+def find_nonlinear_rows(solution: Solution, sqrt_cov: Floats, rank: int, table: int | None = None) -> NonlinearRows:
+    """Lengths and angles of ambiguous sign, and curved ones; of many an even sample.
+
+    Args:
+        solution: The solution.
+        sqrt_cov: A square root S of the posterior covariance S S^T of the core, shape (n_columns, k).
+        rank: Number of determined directions.
+        table: Number of the table whose rows are looked at; all if None.
+    """
+    problem, at = solution.problem, at_parameters(solution.problem, solution.parameters)
+    prior = np.diag(problem.variables.prior_scales)
+    n_rows, n_near, ambiguous, curved, share, resting = 0, 0, list[str](), list[str](), 0.0, 0.0
+    for noise in solution.noises:
+        s = noise.series
+        families = [name.partition(".")[0] for name in s.kind.names]
+        is_pair = s.kind.ends == 2 and set(families) <= {"distance", "angle"}
+        if not is_pair or not len(s.train) or table not in (None, s.table):
+            continue
+        rows = s.train[:: -(-len(s.train) // MAX_ROWS)]
+        trig = problem.data.trigs(problem.robot)[s.table]
+        end = forward(at.chains[s.table], trig, s.ends[rows].ravel())
+        p, R = end.position.reshape(-1, 2, 3), end.rotation.reshape(-1, 2, 3, 3)
+        moved = np.diff(end.jacobian.reshape(len(rows), 2, 6, -1)[..., : len(prior)], axis=1)[:, 0]
+        near = np.zeros(len(rows), dtype=np.bool_)
+        for k, family in enumerate(families):
+            used, sigma = s.used[rows, k], noise.sigma[rows, k]
+            if family == "distance":
+                vector, J = p[:, 1] - p[:, 0], moved[:, 3:]
+            else:
+                vector, J = _relative_rotation(R), moved[:, :3]
+            f = np.linalg.norm(vector, axis=1)
+            unit = vector / np.maximum(f, 1e-300)[:, None]
+            prior_along, prior_across = _spread(unit, J @ prior)
+            along, across = _spread(unit, J @ sqrt_cov)
+            to_0, noisy = np.square(f) / 4.0, 4.0 * np.square(sigma)
+            flips = prior_along + prior_across > np.maximum(to_0, noisy)
+            slope = 1.0 / np.maximum(f, 1e-300)
+            if family == "angle":
+                flips |= prior_along > np.maximum(np.square(np.pi - f) / 4.0, noisy)
+                slope = 0.5 / np.tan(0.5 * np.clip(f, 1e-9, np.pi))
+            bends = ~flips & (0.5 * across * slope > CURVED_SIGMAS * sigma)
+            names = problem.end_names
+            places = problem.data.places[s.table][s.ends[rows]]
+            for mask, found in ((flips & used, ambiguous), (bends & used, curved)):
+                found += [f"{names[a + 1]}-{names[b + 1]}" for a, b in places[mask].tolist()]
+            from_singular = np.minimum(f, np.pi - f) if family == "angle" else f
+            near |= (from_singular < NEAR_SIGMAS * sigma) & used
+            leverage = along / np.square(np.maximum(sigma, 1e-300)) * (len(s.train) / len(rows))
+            n_rows += int(used.sum())
+            share += float(leverage[flips & used].sum()) / max(rank, 1)
+            resting += float(leverage[bends & used].sum())
+        n_near += int(near.sum())
+    return NonlinearRows(n_rows, n_near, tuple(ambiguous), tuple(curved), min(share, 1.0), resting)
+
+
+def _relative_rotation(R: Floats) -> Floats:
+    """Rotation vectors, shape (n, 3), in the base frame, from the first to the second of two rotations each."""
+    out: Floats = Rotation.from_matrix(R[:, 1] @ np.swapaxes(R[:, 0], 1, 2)).as_rotvec()
     return out
+
+
+def _spread(unit: Floats, moved: Floats) -> tuple[Floats, Floats]:
+    """Variance along unit vectors and across them, shape (n,) each, of vectors that move by columns (n, 3, k)."""
+    along = np.sum(np.einsum("ni,nik->nk", unit, moved) ** 2, axis=1)
+    return along, np.maximum(np.sum(moved**2, axis=(1, 2)) - along, 0.0)

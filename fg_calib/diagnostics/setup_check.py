@@ -1,10 +1,14 @@
-"""Mistakes in the set-up of a job that explain why residuals before calibration are far too large.
+"""Check of a job's set-up: mistakes that explain why residuals before calibration are far too large.
 
-Each usual mistake is undone on some rows of the table: units, signs, orders of columns, inverted poses, a frame or a
-tool that is not what the job says; then two of them together. A mistake explains the table if undoing it divides the
-excess (see `typical_residuals`) by `REDUCTION` at least and leaves no more than `EXPLAINED`. Where several do, the
-simplest comes first: a unit before the meaning of columns, that before a single joint, and a frame or a tool, which
-bring unknowns of their own, last.
+Each mistake is undone on some rows of a table: units, signs, orders of columns, inverted poses, a frame or a tool that
+is not what the job says; then two of them together. A mistake explains the table if undoing it divides the excess (see
+`nominal_residuals`) by `REDUCTION` at least and leaves no more than `EXPLAINED`. Where several do, the simplest comes
+first: a unit before the meaning of columns, that before a single joint, and a frame or a tool, which bring unknowns of
+their own, last.
+
+Base and tool are one for all tables, so a table that is wrong spoils the residuals of all others; each is therefore
+judged by the base and tool that it determines alone. Only where all tables are right alone can they disagree on base
+and tool, and it is reported of those that disagree with most others: both, where there are two.
 """
 
 from __future__ import annotations
@@ -17,11 +21,18 @@ from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
 from fg_calib.arrays import Brief
-from fg_calib.diagnostics.nominal_residuals import residuals_of
-from fg_calib.diagnostics.setup import Setup, has_places, setup_of, setup_of_table
-from fg_calib.diagnostics.setup_hypotheses import About, Mistake, still_joints, usual_mistakes
-from fg_calib.diagnostics.typical_residuals import TypicalResidual, fitted_residuals, residuals_at
-from fg_calib.initialization.hand_eye import Frame
+from fg_calib.diagnostics.nominal_residuals import (
+    Fitted,
+    Setup,
+    TypicalResidual,
+    fit_setup,
+    nominal_residuals,
+    residuals_at,
+    residuals_in,
+    setup_of,
+)
+from fg_calib.diagnostics.setup_hypotheses import About, Mistake, setup_hypotheses, still_joints
+from fg_calib.graph.problem import Problem
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.table import Table
 from fg_calib.options import FrameKnowledge, Model, check, check_flag
@@ -31,7 +42,7 @@ from fg_calib.threads import one_blas_thread
 Floats = NDArray[np.float64]
 
 FAR = 5.0
-"""Excess above which residuals before a calibration are not what noise and tolerances predict."""
+"""Excess above which residuals before a calibration are not what noise and prior sigmas predict."""
 
 EXPLAINED = 4.0
 """Largest excess that may be left once a mistake is undone."""
@@ -39,21 +50,20 @@ EXPLAINED = 4.0
 REDUCTION = 5.0
 """Undoing a mistake divides the excess by this at least; undoing two, the excess that either alone leaves."""
 
-REST = 1.5
-"""Excess left by a joint that stands still, over that left by another unit of its readings, from which it is the unit.
-"""
+STILL_RATIO = 1.5
+"""Excess left by a joint that stands still over that left by another unit, from which it is the unit."""
 
-_BEST = 4
-"""The best single mistakes are combined with any other; those after them not with mistakes about one joint."""
+N_COMBINED = 4
+"""The best single mistakes, which are combined with any other; those after them are units with columns alone."""
 
+NEGLIGIBLE_EXCESS = 1e-6
+"""Excess below which there is nothing to explain: each unknown takes its own row up."""
 
-NOTHING = 1e-6
-"""Residuals over what is predicted below which there is nothing to explain: each unknown takes its own row up."""
+OTHER_TOOL = "tool or base differ from those of the other tables (another target on the tool, another frame)"
 
-
-_OTHER_TOOL = "the tool is another one, farther off than its tolerance lets it be"
-_OTHER_BASE = (
-    "the measurement frame is not the base (frame: unknown), which is farther off than its tolerance lets it be"
+_WRONG_TOOL = "the tool is another one, farther off than its prior sigma lets it be"
+_WRONG_BASE = (
+    "the measurement frame is not the base (frame: unknown), which is farther off than its prior sigma lets it be"
 )
 
 
@@ -63,7 +73,7 @@ class Explanation:
 
     Attributes:
         mistakes: Each as the end of a sentence "residuals fall if ...".
-        residuals: Once they are undone, by kind.
+        residuals: Residuals once they are undone, by kind.
     """
 
     mistakes: tuple[str, ...]
@@ -71,8 +81,8 @@ class Explanation:
 
     @property
     def excess(self) -> float:
-        """The largest excess of all kinds."""
-        return _excess(self.residuals)
+        """The largest excess of all kinds; infinite without residuals."""
+        return max((residual.excess for residual in self.residuals), default=np.inf)
 
     def __str__(self) -> str:
         return " and ".join(self.mistakes)
@@ -80,14 +90,14 @@ class Explanation:
 
 @dataclass(frozen=True)
 class SetupCheck(Brief):
-    """What residuals before a calibration say of its set-up.
+    """Residuals before a calibration, and what they say of its set-up.
 
     Attributes:
         residuals: As the job says, by kind; empty where there are too few rows to tell.
         explanations: Mistakes that explain them where they are too large, the simplest first.
         table: Which of several tables they are of; empty of one alone.
-        others: The same of others of several tables that have something to say too.
-        unchecked: Tables of which it could not be asked: too few rows, or kinds of somebody else.
+        others: Checks of others of several tables that report something too.
+        unchecked: Tables that could not be checked: too few rows, or custom kinds.
     """
 
     residuals: tuple[TypicalResidual, ...] = ()
@@ -98,8 +108,8 @@ class SetupCheck(Brief):
 
     @property
     def excess(self) -> float:
-        """The largest excess of all kinds."""
-        return _excess(self.residuals)
+        """The largest excess of all kinds; 0 without residuals."""
+        return max((residual.excess for residual in self.residuals), default=0.0)
 
     @property
     def worst(self) -> TypicalResidual:
@@ -108,31 +118,29 @@ class SetupCheck(Brief):
 
     @property
     def far(self) -> bool:
-        """Whether noise and tolerances do not predict these residuals."""
+        """Whether noise and prior sigmas do not predict these residuals."""
         return self.excess > FAR
 
     def __str__(self) -> str:
-        return f"{self.table}: {self._words()}" if self.table else self._words()
-
-    def _words(self) -> str:
+        of_table = f"{self.table}: " if self.table else ""
         if not self.explanations:
-            times = f"{self.excess:.3g} times what noise and tolerances predict"
+            times = f"{self.excess:.3g} times what noise and prior sigmas predict"
             found = f"{self.worst.kind} residuals before calibration are {shown(self.worst)} in the median, {times}"
-            return f"{found}: none of the usual mistakes in a set-up explains it"
+            return f"{of_table}{found}: no common mistake in a set-up explains it"
         first, *others = self.explanations
         after = next(r for r in first.residuals if r.kind == self.worst.kind)
         also = "".join(f", or if {other}" for other in others[:2])
         also += f", or {len(others) - 2} more (--json has all)" if len(others) > 2 else ""
         fall = f"{self.worst.kind} residuals fall from {shown(self.worst)} to {shown(after)} in the median"
-        return f"{fall} if {first}{also}"
+        return f"{of_table}{fall} if {first}{also}"
 
 
 def shown(residual: TypicalResidual) -> str:
     """A typical size with its unit, in mm, degrees or pixels: `812 mm`."""
     factor, unit = {"m": (1e3, "mm"), "rad": (180.0 / np.pi, "deg"), "px": (1.0, "px")}[residual.unit]
-    figure = f"{residual.size * factor:.3g}"
-    plain = "e" in figure and 1.0 < residual.size * factor < 1e9
-    return f"{float(figure):.0f} {unit}" if plain else f"{figure} {unit}"
+    text = f"{residual.size * factor:.3g}"
+    plain = "e" in text and 1.0 < residual.size * factor < 1e9
+    return f"{float(text):.0f} {unit}" if plain else f"{text} {unit}"
 
 
 @checked
@@ -143,25 +151,21 @@ def check_setup(
     frame: FrameKnowledge = "known",
     *,
     doubtful: bool = False,
-    fitted: tuple[Robot, Frame] | None = None,
     table: Table | None = None,
 ) -> SetupCheck:
-    """Compare residuals before a calibration with what noise and tolerances predict, and look for a mistake.
+    """Compare residuals before a calibration with what noise and prior sigmas predict, and look for a mistake.
 
     Args:
-        robot: The nominal robot; what it estimates of base and tool is fitted.
+        robot: The nominal robot; the estimated parameters of its base and tool are fitted.
         measurements: What was measured; train rows are looked at.
         model: Which measurements take part.
         frame: Whether the measurement frame is known.
         doubtful: Look for a mistake even where the residuals are not far from what is predicted.
-        fitted: The robot with base and tool fitted, and world_T_base, where they are known already; where the table
-            alone says better ones, these are taken.
-        table: What else is said of the table: known targets and anchors, an offset, a camera.
+        table: What else is known of the table: targets and anchors, an offset, a camera.
 
     Note:
-        Pairs are formed anew from some of the rows, whatever the job's pairing. Models of places (anchors, planes,
-        boards) and targets are looked at only where `doubtful`: these have to be placed first, a hundred times in all,
-        and two mistakes at once are not looked for there.
+        Models with landmarks (anchors, planes, boards) and targets are looked at only where `doubtful`: these have to
+        be located first, a hundred times in all, and two mistakes at once are not looked for there.
 
     Raises:
         InputError: An option is not one of those possible.
@@ -169,151 +173,208 @@ def check_setup(
     check("model", model, Model)
     check("frame", frame, FrameKnowledge)
     check_flag("doubtful", doubtful)
-    if has_places(measurements, model):
-        given = Table(measurements, model, frame=frame) if table is None else table
-        return _check_placed(robot, given) if doubtful else SetupCheck()
+    given = Table(measurements, model, frame=frame) if table is None else table
     with one_blas_thread:
-        setup = setup_of(robot, measurements, model, frame)
-        if setup is None:
+        setup = setup_of(robot, given)
+        if setup is None or (setup.has_landmarks and not doubtful):
             return SetupCheck()
-        found = SetupCheck(fitted_residuals(setup) if fitted is None else residuals_at(setup, *fitted))
-        if not found.residuals or not (doubtful or found.far) or found.excess < NOTHING:
-            return found
-        if fitted is not None:
-            closed_form = SetupCheck(fitted_residuals(setup))
-            found = min((found, closed_form), key=lambda check: check.excess) if closed_form.residuals else found
-        explanations = _explanations(setup, found)
-        return replace(found, explanations=explanations) if explanations else _held(setup, found) or found
+        return _checked_alone(setup, SetupCheck(nominal_residuals(setup)), doubtful)
 
 
-def _held(setup: Setup, found: SetupCheck) -> SetupCheck | None:
-    """The check with tool or base where the robot says, if one far beyond its tolerance is what explains the table."""
-    if found.far:
-        return None
-    robot, still = setup.robot, np.zeros(3, dtype=np.bool_)
-    checks = [
-        _beyond(found, replace(setup, tool_rotation=False, tool_translation=still), robot.n_joints + 1, _OTHER_TOOL),
-        _beyond(found, replace(setup, frame=False), 0, _OTHER_BASE) if setup.frame and setup.of_base else None,
-    ]
-    return max((check for check in checks if check is not None), key=lambda check: check.excess, default=None)
-
-
-def _beyond(found: SetupCheck, held: Setup, owner: int, words: str) -> SetupCheck | None:
-    """The check with a frame held within its tolerances, if residuals are far beyond what these let them be.
+def check_problem(problem: Problem, before: Floats, *, doubtful: bool = False) -> SetupCheck:
+    """The check of the table of a problem with the most to report; of others in its `others`.
 
     Args:
-        found: With the frame fitted freely.
-        held: The set-up with the frame where the robot says.
-        owner: Whose frame it is (see `Robot.owned_by`).
-        words: The mistake that this is.
+        problem: The problem.
+        before: The parameter vector with base, tool and measurement frame fitted, the arm at nominal.
+        doubtful: Look for a mistake even where the residuals are not far from what is predicted.
     """
-    estimated = [p for p in map(held.robot.parameters.__getitem__, held.robot.owned_by(owner)) if p.estimated]
-    tolerances = np.array([np.nan if p.tolerance is None else p.tolerance for p in estimated])
-    if not tolerances.size or not np.isfinite(tolerances).all():
-        return None
-    lengths = np.array([p.unit == "m" for p in estimated])
-    slack = {"m": float(np.linalg.norm(tolerances[lengths])), "rad": float(np.linalg.norm(tolerances[~lengths]))}
-    if owner == 0:  # what turns the base moves the tool by that times the reach
-        slack["m"] = float(np.hypot(slack["m"], held.robot.reach * slack["rad"]))
-    residuals = fitted_residuals(held)
-    stated = SetupCheck(tuple(replace(r, expected=float(np.hypot(r.expected, slack[r.unit]))) for r in residuals))
-    if not stated.far or found.excess > min(EXPLAINED, stated.excess / REDUCTION):
-        return None
-    return replace(stated, explanations=(Explanation((words,), found.residuals),))
+    every, found = check_tables(problem, before, doubtful=doubtful, with_landmarks=doubtful)
+    found = found or sorted(every, key=lambda one: -one.excess)[:1]
+    first = replace(found[0], others=tuple(found[1:])) if found else SetupCheck()
+    with_model = [k for k, table in enumerate(problem.data.tables) if table.model is not None]
+    of_table = {k: one.residuals for k, one in zip(with_model, every, strict=True)}
+    unchecked = tuple(label for k, label in enumerate(problem.data.labels) if not of_table.get(k))
+    return replace(first, unchecked=unchecked) if doubtful else first
 
 
-def _check_placed(robot: Robot, table: Table) -> SetupCheck:
-    """The check of a table with targets, anchors, planes or boards."""
+def check_tables(
+    problem: Problem, before: Floats, *, doubtful: bool = False, with_landmarks: bool = False
+) -> tuple[list[SetupCheck], list[SetupCheck]]:
+    """The check of each table with a model, and those of them that report something, worst first.
+
+    Args:
+        problem: The problem.
+        before: The parameter vector with base, tool and measurement frame fitted, the arm at nominal.
+        doubtful: Look for a mistake even where the residuals are not far from what is predicted.
+        with_landmarks: Look at tables whose targets, anchors, planes or boards have to be located first.
+    """
+    whole, labels = problem.whole or problem, problem.data.labels
+    checks, setups = list[SetupCheck](), list[Setup | None]()
     with one_blas_thread:
-        setup = setup_of_table(robot, table)
-        found = SetupCheck() if setup is None else SetupCheck(residuals_of(setup))
-        if setup is None or not found.far:
-            return found
-        return replace(found, explanations=_explanations(setup, found))
+        for number, (label, table) in enumerate(zip(labels, problem.data.tables, strict=True)):
+            if table.model is None:
+                continue
+            setup = setup_of(whole.robot, table)
+            one = SetupCheck()
+            if setup is not None and setup.has_landmarks:
+                one = _checked_alone(setup, SetupCheck(nominal_residuals(setup)), True) if with_landmarks else one
+            elif setup is not None:
+                one = SetupCheck(residuals_at(whole, before, whole.robot, number) if _enough(setup) else ())
+                if one.residuals and (doubtful or one.far):
+                    alone = SetupCheck(nominal_residuals(setup))
+                    one = alone if alone.residuals and alone.excess < one.excess else one
+                    one = _checked_alone(setup, one, doubtful)
+            checks.append(replace(one, table=label if len(labels) > 1 else ""))
+            setups.append(None if setup is None or setup.has_landmarks else setup)
+        far = [one for one in checks if one.far] or [one for one in checks if one.explanations]
+        found = sorted(far, key=lambda one: (not one.explanations, -one.excess))
+        if not found and len(checks) > 1:
+            jointly = [residuals_at(whole, before, whole.robot, k) for k in range(len(labels))]
+            numbers = [k for k, table in enumerate(problem.data.tables) if table.model is not None]
+            given = [(s, replace(one, residuals=jointly[k])) for s, one, k in zip(setups, checks, numbers, strict=True)
+                     if s is not None and one.residuals]  # fmt: skip
+            found = _disagreeing(given)
+    return checks, found
 
 
-def _excess(residuals: Sequence[TypicalResidual]) -> float:
-    return max((residual.excess for residual in residuals), default=0.0)
+def _enough(setup: Setup) -> bool:
+    """Whether a table has enough rows to tell residuals from what is fitted to them."""
+    m, pairs = setup.table.measurements, setup.table.measurements.pairs
+    n_free = 6 * (setup.table.frame == "unknown") + len(setup.fitted_tool)
+    n_rows = pairs.n_pairs if pairs is not None and m.groups is None else 3 * m.n_configurations
+    return n_rows >= 2 * n_free + 6
 
 
-@dataclass(frozen=True)
-class _Trial:
-    """Mistakes that were undone, and what is left then."""
-
-    mistakes: tuple[Mistake, ...]
-    residuals: tuple[TypicalResidual, ...]
-
-    @property
-    def excess(self) -> float:
-        return _excess(self.residuals) if self.residuals else np.inf
-
-    @property
-    def left(self) -> float:
-        """Excess of all kinds together: undoing one of two mistakes may leave one kind as bad as before."""
-        return float(np.sum(np.log([residual.excess for residual in self.residuals]))) if self.residuals else np.inf
+def _checked_alone(setup: Setup, found: SetupCheck, doubtful: bool) -> SetupCheck:
+    """The check of a table, and the mistakes that explain its residuals."""
+    if not found.residuals or not (doubtful or found.far) or found.excess < NEGLIGIBLE_EXCESS:
+        return found
+    if setup.has_landmarks and not found.far:
+        return found
+    explanations = _explanations(setup, found)
+    return replace(found, explanations=explanations) if explanations else _with_held_frames(setup, found)
 
 
-def _explanations(setup: Setup, stated: SetupCheck) -> tuple[Explanation, ...]:
+def _with_held_frames(setup: Setup, found: SetupCheck) -> SetupCheck:
+    """The check with tool or base at nominal, if one far beyond its prior sigma is what explains the table."""
+    if found.far or setup.has_landmarks:
+        return found
+    robot = setup.robot
+    held = [(setup.with_tool(frozenset()), robot.n_joints + 1, _WRONG_TOOL)]
+    if setup.of_base and setup.table.frame == "unknown":
+        held.append((replace(setup, table=replace(setup.table, frame="known")), 0, _WRONG_BASE))
+    checks = [found]
+    for one, owner, words in held:
+        parameters = [robot.parameters[i] for i in robot.owned_by(owner)]
+        parameters = [p for p in parameters if p.estimated or (owner == 0 and p.tolerance is not None)]
+        if not parameters or any(p.tolerance is None for p in parameters):
+            continue
+        slack = {unit: float(np.linalg.norm([p.tolerance or 0.0 for p in parameters if p.unit == unit]))
+                 for unit in ("m", "rad")}  # fmt: skip
+        if owner == 0:  # a rotation of the base moves the tool by that times the reach
+            slack["m"] = float(np.hypot(slack["m"], robot.reach * slack["rad"]))
+        residuals = [replace(r, expected=float(np.hypot(r.expected, slack[r.unit]))) for r in nominal_residuals(one)]
+        check_held = SetupCheck(tuple(residuals))
+        if check_held.far and found.excess <= min(EXPLAINED, check_held.excess / REDUCTION):
+            checks.append(replace(check_held, explanations=(Explanation((words,), found.residuals),)))
+    return found if len(checks) == 1 else max(checks[1:], key=lambda one: one.excess)
+
+
+def _disagreeing(given: Sequence[tuple[Setup, SetupCheck]]) -> list[SetupCheck]:
+    """Tables that only a tool and a base of their own fit.
+
+    Args:
+        given: Each table alone, and its residuals with the base and the tool that all tables determine together.
+    """
+    alone = [fit_setup(setup) for setup, _ in given]
+    spoilt = [
+        one.far and Explanation((), fit.residuals).excess <= min(EXPLAINED, one.excess / REDUCTION)
+        for (_, one), fit in zip(given, alone, strict=True)
+    ]
+    if not any(spoilt):
+        return []
+    apart = np.zeros((len(given), len(given)), dtype=np.bool_)
+    for i in range(len(given)):
+        for j in range(i):
+            # What one table hardly determines the other does not agree with by chance: the better of both ways.
+            both = (_excess_with(given[i][0], given[j][0], alone[j]), _excess_with(given[j][0], given[i][0], alone[i]))
+            apart[i, j] = apart[j, i] = min(both) > FAR
+    disagrees = apart.sum(axis=1)
+    named = disagrees == disagrees.max() if disagrees.any() else np.array(spoilt)
+    return [
+        replace(one, explanations=(Explanation((OTHER_TOOL,), fit.residuals),))
+        for (_, one), fit, chosen in zip(given, alone, named, strict=True)
+        if chosen
+    ]
+
+
+def _excess_with(setup: Setup, other: Setup, fit: Fitted) -> float:
+    """The excess of a table with the tool, and the base where both are of it, that another table determines."""
+    return SetupCheck(residuals_in(setup, fit, in_frame=setup.of_base and other.of_base)).excess
+
+
+def _explanations(setup: Setup, given: SetupCheck) -> tuple[Explanation, ...]:
     """Mistakes that explain residuals, the simplest first; two together where no single one does."""
     # Where residuals are no larger than predicted only what has unknowns of its own can make them much smaller.
-    least = About.FRAME if stated.excess < 1.0 else About.UNIT
-    single = [_Trial((m,), residuals_of(m.without)) for m in usual_mistakes(setup) if m.about >= least]
-    most = stated.excess / REDUCTION
-    found = _accepted(single, most)
-    if stated.far and (not found or any(_is_of_readings_unit(e) for e in found)):
-        still = _accepted([_Trial((m,), residuals_of(m.without)) for m in still_joints(setup)], most)
-        found = _unless_still(found, still)
-    return (
-        found
-        if found or not stated.far or setup.table is not None
-        else _accepted(_doubles(single, stated.excess), np.inf)
-    )
+    least = About.FRAME if given.excess < 1.0 else About.UNIT
+    single = [(m, _trial(m)) for m in setup_hypotheses(setup) if m.about >= least]
+    most = given.excess / REDUCTION
+    found = _accepted([((m,), trial) for m, trial in single], most)
+    units = [e for e in found if any("readings" in words and " are in " in words for words in e.mistakes)]
+    if given.far and (not found or units):
+        still = _accepted([((m,), _trial(m)) for m in still_joints(setup)], most)
+        smallest = min((e.excess for e in still), default=np.inf)
+        # Another unit of a joint that does not move may only scale its readings to nothing.
+        others = tuple(e for e in found if e not in units or STILL_RATIO * e.excess < smallest)
+        both = smallest <= 2.0 * min((e.excess for e in others), default=np.inf)
+        found = (*others, *still) if still and both else others
+    if found or not given.far or setup.has_landmarks:
+        return found
+    return _accepted(_doubles(single, given.excess), np.inf)
 
 
-def _is_of_readings_unit(explanation: Explanation) -> bool:
-    """Whether it is that joints' readings are in another unit."""
-    return any("readings" in words and " are in " in words for words in explanation.mistakes)
+_Trial = tuple[tuple[Mistake, ...], Explanation]
+"""Mistakes that were undone, and the residuals that are left then."""
 
 
-def _unless_still(found: tuple[Explanation, ...], still: tuple[Explanation, ...]) -> tuple[Explanation, ...]:
-    """Explanations beside those of a joint that does not move: another unit may but null its readings."""
-    least = min((e.excess for e in still), default=np.inf)
-    others = tuple(e for e in found if not _is_of_readings_unit(e) or REST * e.excess < least)
-    return (*others, *still) if still and least <= 2.0 * min((e.excess for e in others), default=np.inf) else others
+def _trial(*mistakes: Mistake) -> Explanation:
+    """Mistakes with the residuals that are left once they are undone, the last of which has the others undone too."""
+    words = tuple(m.words for m in sorted(mistakes, key=lambda m: m.about))
+    return Explanation(words, nominal_residuals(mistakes[-1].without))
 
 
-def _doubles(single: Sequence[_Trial], stated: float) -> list[_Trial]:
-    """Two mistakes undone together, where that reduces the excess far below `stated` and below either alone."""
-    alone = {trial.mistakes[0].words: trial.excess for trial in single}
-    tried: set[frozenset[str]] = set()
-    good = []
-    for i, first in enumerate(sorted(single, key=lambda trial: trial.left)):
-        (one,) = first.mistakes
-        if i >= _BEST and one.about == About.JOINT:
+def _doubles(single: Sequence[tuple[Mistake, Explanation]], given: float) -> list[_Trial]:
+    """Two mistakes undone together, where that reduces the excess far below `given` and below either alone."""
+    alone = {mistake.words: trial.excess for mistake, trial in single}
+    tried, good = set[frozenset[str]](), list[_Trial]()
+
+    def left(trial: Explanation) -> float:  # of all kinds: undoing one of two may leave one kind as bad as before
+        return float(np.sum(np.log([r.excess for r in trial.residuals]))) if trial.residuals else np.inf
+
+    for rank, (one, _) in enumerate(sorted(single, key=lambda pair: left(pair[1]))):
+        if rank >= N_COMBINED and one.about != About.UNIT:
             continue
-        for two in usual_mistakes(one.without):
+        for two in setup_hypotheses(one.without):
             words = frozenset((one.words, two.words))
-            twice = one.figures == two.figures != ""
-            if words in tried or len(words) < 2 or twice or (i >= _BEST and two.about == About.JOINT):
+            same = words in tried or len(words) < 2 or one.values == two.values != ""
+            if same or (rank >= N_COMBINED and two.about != About.COLUMNS):
                 continue
             tried.add(words)
-            trial = _Trial((one, two), residuals_of(two.without))
-            if trial.excess <= min(stated, *(alone.get(w, np.inf) for w in words)) / REDUCTION:
-                good.append(trial)
+            trial = _trial(one, two)
+            if trial.excess <= min(given, *(alone.get(w, np.inf) for w in words)) / REDUCTION:
+                good.append(((one, two), trial))
     return good
 
 
 def _accepted(trials: Sequence[_Trial], most: float) -> tuple[Explanation, ...]:
     """Trials that leave a small enough excess, at most twice that of the best; the simplest first."""
     good = [
-        trial
-        for trial in trials
+        (mistakes, trial)
+        for mistakes, trial in trials
         if trial.excess <= min(most, EXPLAINED) and all(REDUCTION * r.size <= r.motion for r in trial.residuals)
     ]
-    best = max(min((trial.excess for trial in good), default=0.0), 0.5)
-    chosen = [trial for trial in good if trial.excess <= 2.0 * best]
-    chosen.sort(key=lambda trial: sum(mistake.about for mistake in trial.mistakes))
-    return tuple(
-        Explanation(tuple(m.words for m in sorted(trial.mistakes, key=lambda m: m.about)), trial.residuals)
-        for trial in chosen
-    )
+    best = max(min((trial.excess for _, trial in good), default=0.0), 0.5)
+    chosen = [one for one in good if one[1].excess <= 2.0 * best]
+    chosen.sort(key=lambda one: sum(mistake.about for mistake in one[0]))
+    return tuple(trial for _, trial in chosen)

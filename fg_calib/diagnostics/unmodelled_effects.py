@@ -1,27 +1,33 @@
-"""Whether residuals follow the arm, as noise does not: a test for effects that are not modelled.
+"""Unmodelled effects: a lack-of-fit test, a change point, and a forgotten instrument offset.
 
-Were there nothing but noise, what a fit leaves could not be explained by more parameters than chance allows. The rows
-are fitted again, linearly, with what real arms have beyond their model, stage by stage (Z_1, Z_2, ... beside J of the
-model, whose priors are rows too):
+Each is a score test: the rows are fitted again, linearly, with more columns beside J of the model, whose priors are
+rows too, and what these gain is compared with chance,
 
-1. joints that give way under load, gravity along z of the base: loads at the tool and on every link after the joint;
+    F = |Q^T r|^2 / m over |r - Q Q^T r|^2 / (n - rank J - m)
+
+with r the residuals of the model's fit, Q a basis of what the columns add to J, m its rank and n the residuals that
+noise can make differ freely. It has an F distribution whatever the size of the noise.
+
+*Lack of fit* adds what real arms have beyond their model, stage by stage; the statistics of the stages are independent,
+so that the least of k p-values has the p-value 1 - (1 - p)^k:
+
+1. compliance of joints: gravity along z of the base, loads at the tool and on every link after the joint;
 2. joints that are off by a part of how far the tool reaches out, every small motion of every link, and errors of each
-   joint that go once or twice round with it (eccentric encoders and gears, gains of slides);
+   joint of one and two periods a turn (eccentric encoders and gears, gains of prismatic joints);
 3. the same loads of an arm that is mounted otherwise, gravity along x and y.
 
-    F_s = |Q_s^T r|^2 / m_s over (|r|^2 - |Q_1^T r|^2 - ... - |Q_s^T r|^2) / (n - rank J - m_1 - ... - m_s)
-
-with r the residuals of the model's fit, Q_s a basis of what stage s adds to J and the stages before, m_s its rank and n
-the residuals that noise can make differ freely. Each has an F distribution whatever the size of the noise, so it also
-tells where the noise was stated too small; and they are independent of each other, so that the least of k p-values
-has the p-value 1 - (1 - p)^k.
+A *change point* is a small motion of tool or base from one row of a table on, for every row tried (Bonferroni).
+Whatever else is wrong with a table, a motion from some row on takes up part of it: so nearly all of the misfit has to
+go with the change, and the change has to explain most of what constant small motions of all links leave, too. An
+*offset* is added to every length of a table to anchors; it hides in the arm's parameters: 0.25 mm of a ball bar made
+residuals 1.1 times as large as specified.
 
 Loads: by virtual work the torque about joint k of a weight in direction g at the point x is g . dx / dq_k.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,7 +37,7 @@ from scipy import special
 
 from fg_calib.graph.factors import build_variables, prior_rows, unknown_prior_rows
 from fg_calib.graph.problem import Problem, at_parameters
-from fg_calib.graph.rows import At, RowSet
+from fg_calib.graph.rows import At
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements import residuals
 from fg_calib.measurements.residuals import Block
@@ -47,6 +53,18 @@ MAX_ROWS = 10_000
 LEAST_LEFT = 10
 """Degrees of freedom that a stage must leave."""
 
+LEAST_SIDE, MAX_TRIED = 6, 100
+"""Configurations before and after a change, and rows at which one is tried, evenly spaced if there are more."""
+
+CHANGE_P_VALUE, OFFSET_P_VALUE = 1e-6, 1e-5
+"""P-values below which a change, and an offset, are significant: unmodelled effects mimic a little of either."""
+
+CHANGE_LEFT, CHANGE_EXCESS_LEFT = 0.5, 0.25
+"""Part of chi-square, and of its excess over its degrees of freedom, that a change leaves at most."""
+
+MAX_REDUCED_CHI2, MAX_MEDIAN_RATIO = 25.0, 0.8
+"""Reduced chi-square that a change leaves at most, and part of the median residual: outliers do not move the median."""
+
 _RANK = 1e-8
 """Part of a column that counts as nothing."""
 
@@ -56,14 +74,87 @@ _NOTHING = 1e-10
 LINK = "small motion of link "
 """How names of the columns of links' small motions begin."""
 
+_STAGES = (1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3)
+"""The stages of `_joint_errors`."""
+
+_KINDS = {Axis.TX: "x", Axis.TY: "y", Axis.TZ: "z", Axis.RX: "roll", Axis.RY: "pitch", Axis.RZ: "yaw"}
+
+
+@dataclass(frozen=True)
+class Change:
+    """Something that moved between two rows of a table.
+
+    Attributes:
+        what: `tool` or `base`.
+        configuration: The first after it, by its number among all.
+        left: Part of chi-square that is left with a tool or a base of its own from there on.
+    """
+
+    what: str
+    configuration: int
+    left: float
+
+
+@dataclass(frozen=True)
+class Offset:
+    """An offset that an instrument seems to add to every length.
+
+    Attributes:
+        table: Number of its table.
+        size: The offset, [m].
+        sigma: Its 1 sigma by the noise as estimated, [m].
+    """
+
+    table: int
+    size: float
+    sigma: float
+
+
+@dataclass(frozen=True)
+class LinearFit:
+    """The linearised fit of rows and priors, and its score tests.
+
+    Attributes:
+        r: Residuals of the fit, rows first, then priors, shape (n,).
+        fitted: Orthonormal basis of its columns, shape (n, rank).
+        dof: Degrees of freedom.
+    """
+
+    r: Floats
+    fitted: Floats
+    dof: int
+
+    @classmethod
+    def of(cls, columns: Floats, r: Floats, n: int) -> LinearFit:
+        """The fit of columns, shape (n_rows, m), to residuals of which noise can make n differ freely."""
+        fitted = basis_of(columns)
+        return cls(r - fitted @ (fitted.T @ r), fitted, n - fitted.shape[1])
+
+    def new(self, columns: Floats) -> Floats:
+        """An orthonormal basis of what columns of the rows, shape (n_rows, m), add to the fit."""
+        none = np.zeros((len(self.r) - len(columns), columns.shape[1]))
+        return basis_of(np.concatenate([columns, none]), self.fitted)
+
+    def extended(self, new: Floats) -> LinearFit:
+        """The fit with more columns, by `new`."""
+        fitted = np.hstack([self.fitted, new])
+        return LinearFit(self.r - new @ (new.T @ self.r), fitted, self.dof - new.shape[1])
+
+    def test(self, new: Floats) -> tuple[float, float]:
+        """P-value of what more columns, by `new`, explain, and the part of chi-square that they leave."""
+        total, drop, m = float(self.r @ self.r), float(np.sum((new.T @ self.r) ** 2)), new.shape[1]
+        if not m or self.dof - m < 1:
+            return 1.0, 1.0
+        ratio = (drop / m) / max((total - drop) / (self.dof - m), 1e-300)
+        return float(special.fdtrc(m, self.dof - m, ratio)), (total - drop) / max(total, 1e-300)
+
 
 def probability_of_noise(solution: Solution) -> float | None:
-    """Probability that noise alone follows the arm as much as the residuals of a solution do.
+    """P-value of residuals as systematic as those of a solution, were there noise alone.
 
     Returns:
-        The p-value; None where it cannot be told: too few rows or too many, a robust loss, touched points, anchors or
-        targets (also where they are known), joint values estimated, rows that share errors but are weighted as
-        independent.
+        None where it cannot be told: too few rows or too many, a robust loss, landmarks (also known ones), joint values
+        estimated, rows that share errors but are weighted as independent.
     """
     problem, state = solution.problem, solution.problem.state
     weighted = state.weights is not None or state.joint_errors is not None
@@ -74,37 +165,22 @@ def probability_of_noise(solution: Solution) -> float | None:
     chains = tuple(chain.with_joint_columns() for chain in chains)
     of_stage = np.array([2 if name.startswith(LINK) else 0 for name in names])
     of_stage = np.concatenate([of_stage, np.repeat(_STAGES, problem.robot.n_joints)])
-    errors = [_errors(problem.robot, table.measurements.readings) for table in problem.data.tables]
-    rows = np.concatenate([_rows(row_set, chains, errors) for row_set in problem.rows])
+    errors = [_joint_errors(problem.robot, table.measurements.readings) for table in problem.data.tables]
+    found = []
+    for row_set in problem.rows:
+        private = [_with_joint_errors(part.block, chains[part.table], errors[part.table]) for part in row_set.parts]
+        rows = np.concatenate(private)
+        found.append(rows if row_set.shared is None else row_set.shared.whiten(rows))
+    rows = np.concatenate(found)
     r_prior, J_prior = prior_rows(problem.variables, solution.parameters)
-    of_priors = np.zeros((len(r_prior), rows.shape[1]))
-    of_priors[:, np.flatnonzero(of_stage == 0)] = J_prior
-    of_priors[:, -1] = r_prior
-    return _probability(np.concatenate([rows, of_priors]), of_stage, problem.n_independent + len(r_prior))
-
-
-def _probability(rows: Floats, of_stage: NDArray[np.int64], n: int) -> float | None:
-    """The p-value of residuals; None where no stage leaves enough.
-
-    Args:
-        rows: Whitened derivatives in all columns, and residuals.
-        of_stage: The stage of each column, 0 of the model's, shape (n_columns,).
-        n: Residuals that noise can make differ freely.
-    """
-    r, fitted = rows[:, -1], np.zeros((len(rows), 0))
-    least, stages, left, n_left = 1.0, 0, 0.0, 0
-    for stage in range(of_stage.max() + 1):
-        columns = rows[:, :-1][:, of_stage == stage]
-        new = basis_of(columns, fitted)
-        drop, m = float(np.sum((new.T @ r) ** 2)), new.shape[1]
-        if stage == 0:
-            left, n_left = float(r @ r) - drop, n - m
-        elif m and n_left - m >= LEAST_LEFT:
-            left, n_left, stages = left - drop, n_left - m, stages + 1
-            least = min(least, float(special.fdtrc(m, n_left, (drop / m) / max(left / n_left, 1e-300))))
-        else:
-            continue  # what it does is left to chance
-        fitted = np.hstack([fitted, new])
+    model = np.concatenate([rows[:, :-1][:, of_stage == 0], J_prior])
+    fit = LinearFit.of(model, np.concatenate([rows[:, -1], r_prior]), problem.n_independent + len(r_prior))
+    least, stages = 1.0, 0
+    for stage in range(1, max(_STAGES) + 1):
+        new = fit.new(rows[:, :-1][:, of_stage == stage])
+        if new.shape[1] and fit.dof - new.shape[1] >= LEAST_LEFT:  # else what it does is left to chance
+            least, stages = min(least, fit.test(new)[0]), stages + 1
+            fit = fit.extended(new)
     return -float(np.expm1(stages * np.log1p(-min(least, 1.0 - 1e-16)))) if stages else None
 
 
@@ -118,65 +194,106 @@ def excess_left(solution: Solution, missing: Sequence[MissingMotion]) -> float:
     Returns:
         0 where nothing is left, 1 where they explain nothing; 0 too where there are more rows than `MAX_ROWS`.
     """
-    problem = solution.problem
-    if problem.n_residuals > MAX_ROWS:
+    if solution.problem.n_residuals > MAX_ROWS:
         return 0.0
-    at = at_parameters(problem, solution.parameters)
-    chains, names = with_link_motions(problem, solution.parameters)
-    more = len(names) - at.n_columns
-    columns = np.where(at.columns >= 0, at.columns + more, -1)
-    wide = replace(at, chains=chains, n_columns=len(names), columns=columns)
-    motions = [names.index(name) for name in _columns_of(missing, problem.robot)]
-    more_columns = [i for i, name in enumerate(names) if name.startswith(LINK)]
-    fit = linear_fit(solution, wide, more_columns)
-    new = fit.new(motions)
-    total, drop = float(fit.r @ fit.r), float(np.sum((new.T @ fit.r) ** 2))
-    return float(max(total - drop - (fit.dof - new.shape[1]), 0.0) / max(total - fit.dof, 1e-300))
+    fit, of_links = _with_links(solution)
+    fit_after = fit.extended(fit.new(of_links(_columns_of(missing, solution.problem.robot))))
+    excess, left = (float(one.r @ one.r) - one.dof for one in (fit, fit_after))
+    return max(left, 0.0) / max(excess, 1e-300)
 
 
-@dataclass(frozen=True)
-class LinearFit:
-    """The linearised fit of rows and priors, and the rows' derivatives in columns that it does not have.
+def find_change(solution: Solution) -> Change | None:
+    """The change point of a table: what moved between two of its rows; None without, or where it cannot be told.
 
-    Attributes:
-        J: Derivatives of the rows in all columns, shape (n_rows, n_columns).
-        r: What the fit leaves of rows and priors, shape (n,).
-        fitted: Basis of its columns, shape (n, rank).
-        dof: Degrees of freedom that are left.
+    Note:
+        It is looked for in one table of poses, positions or orientations, without robust losses.
     """
+    problem, state = solution.problem, solution.problem.state
+    other = problem.data.unknowns.names or problem.has_more or state.weights is not None
+    parts = [part.block for rows in problem.rows for part in rows.parts]
+    several = len(problem.data.tables) > 1 or any(rows.shared is not None for rows in problem.rows)
+    pairs = any(block.kind.ends != 1 for block in parts)
+    if other or several or pairs or state.joint_errors is not None or problem.n_residuals > MAX_ROWS:
+        return None
+    fit, of_links = _with_links(solution)
+    links = {"tool": problem.robot.n_joints, "base": 0}
+    motions = {what: of_links([f"{LINK}{link}: {kind}" for kind in FRAME_KINDS]) for what, link in links.items()}
+    at = np.concatenate([np.repeat(block.ends[:, 0], block.residual_dim) for block in parts])
+    first = np.unique(at)
+    first = first[LEAST_SIDE : len(first) - LEAST_SIDE + 1]
+    first = first[np.unique(np.linspace(0, len(first) - 1, min(MAX_TRIED, len(first))).astype(np.int64))]
+    found = [(*fit.test(fit.new(J * (at >= k)[:, None])), what, int(k)) for k in first for what, J in motions.items()]
+    if not found:
+        return None
+    p, left, what, k = min(found)
+    moved = motions[what] * (at >= k)[:, None]
+    after = fit.extended(fit.new(moved))
+    total = float(after.r @ after.r)
+    explained = total - after.dof <= CHANGE_EXCESS_LEFT * max(float(fit.r @ fit.r) - fit.dof, 0.0)
+    before_median, after_median = (float(np.median(np.abs(one.r[: len(at)]))) for one in (fit, after))
+    typical = after_median <= MAX_MEDIAN_RATIO * before_median and total <= MAX_REDUCED_CHI2 * after.dof
+    if not (p * len(found) < CHANGE_P_VALUE and left <= CHANGE_LEFT and explained and typical):
+        return None
+    beside = fit.extended(fit.new(of_links([])))
+    p_beside, left_beside = beside.test(beside.new(moved))
+    return Change(what, k, left) if p_beside < CHANGE_P_VALUE and left_beside <= CHANGE_LEFT else None
 
-    J: Floats
-    r: Floats
-    fitted: Floats
-    dof: int
 
-    def new(self, columns: Sequence[int]) -> Floats:
-        """A basis of what some columns add to the fit, shape (n, m)."""
-        of_rows = self.J[:, list(columns)]
-        return basis_of(np.concatenate([of_rows, np.zeros((len(self.r) - len(of_rows), len(columns)))]), self.fitted)
+def forgotten_offsets(solution: Solution) -> tuple[Offset, ...]:
+    """Offsets of instruments that were not estimated and are significant; none of more rows than `MAX_ROWS`.
+
+    With a robust loss, which cuts residuals off, noise counts as specified at least.
+    """
+    problem = solution.problem
+    tables = [k for k, table in enumerate(problem.data.tables) if table.model == "anchor" and not table.offset]
+    if not tables or problem.n_residuals > MAX_ROWS or problem.has_more:
+        return ()
+    at, found = at_parameters(problem, solution.parameters), []
+    column = at.n_columns + at.n_nuisance
+    for number in tables:
+        series = [s for s in problem.data.series if s.table == number and s.kind.n_nuisances == 4 and len(s.train)]
+        if not series:
+            continue  # contacts alone
+        columns = at.columns.copy()
+        columns[np.unique(series[0].nuisances[:, 3])] = column
+        fit, J = _linear_fit(solution, replace(at, columns=columns, n_nuisance=at.n_nuisance + 1), [column])
+        new = fit.new(J)
+        p, left = fit.test(new)
+        if p < OFFSET_P_VALUE:
+            least = 1e-300 if problem.state.weights is None else 1.0
+            sigma = np.sqrt(max(left * float(fit.r @ fit.r) / (fit.dof - 1), least))
+            per_metre = float(new[: len(J), 0] @ J[:, 0])
+            found.append(Offset(number, -float(new[:, 0] @ fit.r) / per_metre, float(sigma) / abs(per_metre)))
+    return tuple(found)
 
 
-def linear_fit(solution: Solution, wide: At, more: Sequence[int]) -> LinearFit:
-    """The fit of a solution, linearised, beside columns that it does not have.
+def _with_links(solution: Solution) -> tuple[LinearFit, Callable[[Sequence[str]], Floats]]:
+    """The fit of a solution, and the rows' derivatives in links' small motions by name; in all where none is named."""
+    at = at_parameters(solution.problem, solution.parameters)
+    chains, names = with_link_motions(solution.problem, solution.parameters)
+    columns = np.where(at.columns >= 0, at.columns + len(names) - at.n_columns, -1)
+    wide = replace(at, chains=chains, n_columns=len(names), columns=columns)
+    links = [name for name in names if name.startswith(LINK)]
+    fit, J = _linear_fit(solution, wide, [names.index(name) for name in links])
+    return fit, lambda named: J[:, [links.index(name) for name in named or links]]
+
+
+def _linear_fit(solution: Solution, wide: At, more: Sequence[int]) -> tuple[LinearFit, Floats]:
+    """The fit of a solution, linearised, and the rows' derivatives in columns that it does not have, shape (n_rows, m).
 
     Args:
         solution: The solution.
-        wide: The arm and the unknowns at it, with more columns than were estimated.
-        more: These.
+        wide: The arm and the landmarks at it, with more columns than were estimated.
+        more: Numbers of these.
     """
     problem = solution.problem
     r, J = (np.concatenate(parts) for parts in zip(*(rows.linearise(wide) for rows in problem.rows), strict=True))
     r_prior, J_prior = prior_rows(problem.variables, solution.parameters)
     r_unknown, J_unknown = unknown_prior_rows(problem.variables, solution.parameters)
-    own = np.delete(J, list(more), axis=1)
     of_core = np.hstack([J_prior, np.zeros((len(J_prior), problem.variables.n_nuisance))])
-    fitted = basis_of(np.concatenate([own, of_core, J_unknown]))
-    r = np.concatenate([r, r_prior, r_unknown])
-    dof = problem.n_independent + len(r_prior) + len(r_unknown) - fitted.shape[1]
-    return LinearFit(J, r - fitted @ (fitted.T @ r), fitted, dof)
-
-
-_KINDS = {Axis.TX: "x", Axis.TY: "y", Axis.TZ: "z", Axis.RX: "roll", Axis.RY: "pitch", Axis.RZ: "yaw"}
+    columns = np.concatenate([np.delete(J, list(more), axis=1), of_core, J_unknown])
+    n = problem.n_independent + len(r_prior) + len(r_unknown)
+    return LinearFit.of(columns, np.concatenate([r, r_prior, r_unknown]), n), J[:, list(more)]
 
 
 def _columns_of(missing: Sequence[MissingMotion], robot: Robot) -> list[str]:
@@ -216,49 +333,38 @@ def _with_link_motions(robot: Robot) -> Robot:
     return replace(robot, elements=tuple(elements), parameters=tuple(parameters))
 
 
-def _rows(row_set: RowSet, chains: tuple[Chain, ...], errors: Sequence[Floats]) -> Floats:
-    """Whitened derivatives in the chains' columns and the joints' errors, and residuals, one row a scalar."""
-    rows = [_private_rows(part.block, chains[part.table], errors[part.table]) for part in row_set.parts]
-    together = np.concatenate(rows)
-    return together if row_set.shared is None else row_set.shared.whiten(together)
-
-
-def _private_rows(part: Block, chain: Chain, errors: Floats) -> Floats:
+def _with_joint_errors(block: Block, chain: Chain, errors: Floats) -> Floats:
     """[J Z r] of a block before what its rows share is taken out, shape (n_rows, n_columns + n_errors * n_joints + 1).
 
     Args:
-        part: The block.
-        chain: The chain of its table.
-        errors: See `_errors`.
+        block: The block.
+        chain: The chain of its table, with joint columns.
+        errors: See `_joint_errors`.
     """
-    r, J = residuals.linearise(part, chain)
-    own, n = J[:, :, : chain.n_columns], chain.n_joints
+    r, J = residuals.linearise(block, chain)
+    model, n = J[:, :, : chain.n_columns], chain.n_joints
     moved = np.zeros((*r.shape, errors.shape[1], n))
-    for k, rows in enumerate(part.ends.T):
+    for k, rows in enumerate(block.ends.T):
         of_end = J[:, :, chain.n_columns + k * n : chain.n_columns + (k + 1) * n]
         moved += of_end[:, :, None, :] * errors[rows][:, None]
-    return np.concatenate([own, moved.reshape(*r.shape, -1), r[:, :, None]], axis=2).reshape(r.size, -1)
+    return np.concatenate([model, moved.reshape(*r.shape, -1), r[:, :, None]], axis=2).reshape(r.size, -1)
 
 
-_STAGES = (1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3)
-"""The stages of `_errors`."""
+def _joint_errors(robot: Robot, readings: Floats) -> Floats:
+    """What a joint's error may follow by configuration, shape (n, len(_STAGES), n_joints).
 
-
-def _errors(robot: Robot, readings: Floats) -> Floats:
-    """What a joint's error may follow, shape (n, len(_STAGES), n_joints).
-
-    Loads along z; how far the tool reaches out; once and twice round with the joint (of a slide its place and the
-    square of that); loads along x and y.
+    Loads along z; how far the tool reaches out; harmonics of one and two periods a turn (of a prismatic joint its
+    position and the square of that); loads along x and y.
     """
     at = pose(robot, readings)
-    turns, shifts = np.split(at.jacobian[:, :, len(robot.parameters) :], 2, axis=1)  # (n, 3, n_joints) each
+    rotations, shifts = np.split(at.jacobian[:, :, len(robot.parameters) :], 2, axis=1)  # (n, 3, n_joints) each
     of_links = np.zeros_like(shifts)
     for owner in range(1, robot.n_joints):
         link = pose(replace(robot, elements=robot.elements[: end_of_link(robot, owner)]), readings)
         arm = (link.position - at.position)[:, :, None]
-        of_links[:, :, :owner] += (shifts + np.cross(turns, arm, axis=1))[:, :, :owner]
-    slides = np.array([joint.prismatic for joint in robot.joints])
-    cos, sin = np.where(slides, readings, np.cos(readings)), np.where(slides, 0.0, np.sin(readings))
+        of_links[:, :, :owner] += (shifts + np.cross(rotations, arm, axis=1))[:, :, :owner]
+    prismatic = np.array([joint.prismatic for joint in robot.joints])
+    cos, sin = np.where(prismatic, readings, np.cos(readings)), np.where(prismatic, 0.0, np.sin(readings))
     reach = np.repeat(np.linalg.norm(at.position[:, :2], axis=1)[:, None], robot.n_joints, axis=1)
     (x, y, z), (x_links, y_links, z_links) = np.moveaxis(shifts, 1, 0), np.moveaxis(of_links, 1, 0)
     return np.stack([z, z_links, reach, cos, sin, cos * cos, cos * sin, x, x_links, y, y_links], axis=1)

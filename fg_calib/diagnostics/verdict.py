@@ -1,367 +1,593 @@
-"""The verdict: what speaks against a result, and what its reader should know although it may be trusted.
+"""The verdict on a calibration: errors, warnings and notes, by one table of checks.
 
-Statements are *findings*, which make a result not to be trusted, or *cautions*. Sums of squares far above their mean
-are a finding: noise or tolerances stated too small, effects not modelled, or gross errors make sigmas too small and the
-estimate wrong. Within `FACTOR` of their mean they are at most a caution, whatever their distribution: noise is
-never known better. Sums far below it only mean that sigmas are larger than they need be.
+An *error* says why a result is not to be trusted (DOUBTFUL): chi-square far above its mean, say, for noise or prior
+sigmas specified too small, unmodelled effects and gross errors make sigmas too small and the estimate wrong. A
+*warning* says that sigmas may be too small although the result may be trusted; a *note* what else its reader should
+know. Within `FACTOR` of its mean chi-square is no error, whatever its distribution: noise is never known better.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import special
 
-from fg_calib.diagnostics.changes import Change
-from fg_calib.diagnostics.linearity import Curvature
-from fg_calib.diagnostics.offsets import Offset
+from fg_calib.diagnostics.linearity import Nonlinearity, NonlinearRows, check_linearity, find_nonlinear_rows
+from fg_calib.diagnostics.setup_check import SetupCheck, check_problem
+from fg_calib.diagnostics.unmodelled_effects import (
+    Change,
+    Offset,
+    excess_left,
+    find_change,
+    forgotten_offsets,
+    probability_of_noise,
+)
+from fg_calib.graph.information import directions
+from fg_calib.graph.noise import JOINT_NOISE
+from fg_calib.graph.problem import Problem, at_parameters, reweighted_at
+from fg_calib.graph.solver import Solution
 from fg_calib.graph.tolerances import ToleranceScale
-from fg_calib.statistics.goodness_of_fit import CONFIDENCE, FACTOR, ChiSquare, GrossErrors, PredictedFit
+from fg_calib.measurements.kinds import AnchorContact
+from fg_calib.measurements.models.pairs import missing_figures
+from fg_calib.observability.parallel_axes import MissingMotion
+from fg_calib.robot.kinematics import forward
+from fg_calib.statistics.covariance import Spread
+from fg_calib.statistics.goodness_of_fit import (
+    CONFIDENCE,
+    FACTOR,
+    OUTLIER_WEIGHT,
+    ChiSquare,
+    Fit,
+    GrossErrors,
+    PredictedFit,
+)
+from fg_calib.statistics.noise_components import has_joint_noise
 from fg_calib.statistics.prior_consistency import PriorFit
 from fg_calib.statistics.variance_components import LEAST_REDUNDANCY
 
+Floats = NDArray[np.float64]
+Severity = Literal["error", "warning", "note"]
+
 LIKE_NOISE, NOT_NOISE = 1e-3, 1e-6
-"""Probability below which residuals follow the arm more than noise does, and below which true errors are several times
-those that sigmas claim; between the two they may be twice as large (`tests/analysis/test_structure.py`)."""
+"""P-value below which residuals are systematic, and below which true errors are several times those that sigmas claim;
+between the two they may be twice as large (`tests/diagnostics/test_unmodelled_effects.py`)."""
 
-WORTH_SAYING = 1.1
-"""Noise seen over noise stated, or the inverse, below which a difference that is not by chance is not worth a word."""
+NOTABLE_RATIO = 1.1
+"""Estimated over specified noise, or the inverse, below which a significant difference is not reported."""
 
-CERTAIN = 1e-4
-"""Probability below which corrections are too large together: tolerances are guesses, more than noise is."""
+PRIOR_P_VALUE = 1e-4
+"""P-value below which corrections are too large together: prior sigmas are guesses, more than noise is."""
 
-LEAST_REST, LEAST_SHARE = 0.3, 0.01
-"""Directions that rest on rows far from linear, and share of such rows, below which sigmas are honest."""
+AMBIGUOUS_SHARE, MAX_AMBIGUOUS_SHARE = 0.05, 0.3
+"""Part of the information that may rest on lengths and angles of ambiguous sign: with a warning, and no more at all."""
 
-LEAST_FOLDED, MOST_FOLDED = 0.05, 0.3
-"""Part of what the rows say that may rest on vectors of unknown sign: with a caution, and no more at all."""
+CURVED_LEVERAGE, CURVED_SHARE = 0.3, 0.01
+"""Directions that rest on curved lengths and angles, and share of these among all, up to which sigmas are honest."""
 
-LEAST_CURVED, MOST_CURVED = 0.2, 1.0
-"""Mean square of errors beyond what the covariance says, because rows bend: with a caution, and no more at all."""
+NONLINEAR = 0.1
+"""Mean squared errors beyond the covariance, over it, because of nonlinearity, that are reported."""
 
 LARGE_NOISE = 0.2
 """Estimated noise over the motions measured, beyond which it is no noise."""
 
-MOST_KEPT = 3.0
-"""Factor on estimated noise beyond which what was stated is no reason to trust the noise that measurements keep."""
+MAX_KEPT_FACTOR = 3.0
+"""Factor on estimated noise beyond which a specification is no reason to trust noise that could not be estimated."""
 
-_NAMED = 3
-"""Configurations or parameters that a statement names."""
+MAX_OUTLIER_SHARE = 0.5
+"""Share of measurements beyond which they are not outliers but the majority."""
 
+LOST_SIGMA_RATIO = 3.0
+"""Sigma of a parameter over what it is with all outliers, from which these are nearly all that sees it."""
 
-FAR_OFF = 10.0
-"""Tolerance estimated over tolerance stated above which one asks why."""
+EXPLAINED_EXCESS = 0.8
+"""Part of the excess of chi-square left with what a convention has no parameter for, up to which that is the cause.
 
-UNSEEN = 0.5
-"""Corrections of a group that the data tell of, below which they do not tell its scale."""
+Where the fit went far astray what is linear of it is but a part: up to 0.7 were left of textbook tables."""
+
+MOST_ESTIMATED = 2.0
+"""Estimated over specified noise above which an unmodelled effect is more likely."""
+
+MAX_PRIOR_SCALE = 10.0
+"""Estimated over specified prior sigma above which one asks why."""
+
+LEAST_SEEN = 0.5
+"""Corrections of a group that the data determine, below which they do not determine its scale."""
+
+WEAKEST = 0.1
+"""Signal-to-noise ratio below which a direction is not taken for weaker."""
+
+NAMED = 3
+"""Configurations, rows or parameters that a statement names."""
+
+_WITH_MOTION = ("distance", "angle", "orientation", "position")
+"""Kinds of noise whose motions follow from what the arm predicts."""
+
+_TOO_LARGE = frozenset(("too small", "both", "many"))
+"""Verdicts on a kind of noise specified too small."""
 
 
 @dataclass(frozen=True)
 class Statement:
-    """Something about a result, in words.
+    """A statement about a result: one line, and how severe it is."""
+
+    severity: Severity
+    text: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a result is to be trusted, and what its reader should know.
 
     Attributes:
-        text: One line.
-        finding: Whether the result is not to be trusted because of it; else it is a caution.
-        reservation: Whether a caution says that sigmas are too small, so that the verdict has to mention it.
+        errors: Why it is not to be trusted; empty if it is.
+        warnings: Why sigmas may be too small although it is.
+        notes: What else its reader should know.
+        setup: The set-up, by residuals before the calibration.
+        noise_like: P-value of residuals as systematic as these by noise alone; None where that was not tested, because
+            they are as small as specified, or cannot be told.
+        change: What moved while a table was measured; None if nothing did.
     """
 
-    text: str
-    finding: bool
-    reservation: bool = False
+    errors: tuple[str, ...]
+    warnings: tuple[str, ...]
+    notes: tuple[str, ...]
+    setup: SetupCheck = field(default_factory=SetupCheck)
+    noise_like: float | None = None
+    change: Change | None = None
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """The errors."""
+        return self.errors
+
+    @property
+    def reservations(self) -> tuple[str, ...]:
+        """The warnings."""
+        return self.warnings
+
+    @property
+    def cautions(self) -> tuple[str, ...]:
+        """Warnings and notes."""
+        return (*self.warnings, *self.notes)
 
 
-def of_chi2(
-    found: ChiSquare,
+@dataclass(frozen=True)
+class Case:
+    """A solution to be judged, and what its tests found.
+
+    Attributes:
+        solution: The solution.
+        spread: The covariance of what was estimated.
+        fit: How well it fits.
+        change: What moved while a table was measured.
+        noise_like: See `Verdict`.
+    """
+
+    solution: Solution
+    spread: Spread
+    fit: Fit
+    change: Change | None = None
+    noise_like: float | None = None
+
+    @property
+    def problem(self) -> Problem:
+        """The problem solved."""
+        return self.solution.problem
+
+    @property
+    def systematic(self) -> bool:
+        """Whether the residuals are systematic."""
+        return self.noise_like is not None and self.noise_like < LIKE_NOISE
+
+    @cached_property
+    def gross(self) -> GrossErrors | None:
+        """The gross errors that are all that is wrong; None if there are none, or more than these is."""
+        return self.fit.goodness.gross if self.fit.goodness.spoilt and self.change is None else None
+
+    @cached_property
+    def too_large(self) -> bool:
+        """Whether chi-square is too large without the corrections, which are judged by themselves."""
+        if self.fit.priors is None:
+            return self.fit.chi_square.too_large
+        chi2, priors = self.fit.chi_square, self.fit.priors
+        rest, dof = chi2.value - priors.chi2, chi2.dof - len(priors.names)
+        return rest > max(chi2.bounds[1] * dof, 0.0) or any(
+            kind.verdict in _TOO_LARGE for kind in self.fit.goodness.kinds
+        )
+
+
+def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[MissingMotion]) -> Verdict:
+    """The verdict on a solution.
+
+    Args:
+        solution: The solution.
+        spread: The covariance of what was estimated.
+        fit: How well it fits.
+        missing: What the robot's convention has no parameter for.
+    """
+    problem, kinds = solution.problem, {kind.verdict for kind in fit.goodness.kinds}
+    tested = not problem.evaluated and bool(kinds & _TOO_LARGE or solution.estimated_noise is not None)
+    change = find_change(solution) if tested or ("outliers" in kinds and not problem.evaluated) else None
+    noise_like = probability_of_noise(solution) if tested and change is None else None
+    case = Case(solution, spread, fit, change, noise_like)
+    statements = [statement for check in CHECKS for statement in check(case)]
+    systematic = check_systematic(noise_like)
+    doubts = any(s.severity == "error" for s in (*statements, *systematic))
+    statements[:0] = check_optima(solution)  # which fit as well
+    setup, high = SetupCheck(), case.gross is None and (fit.chi_square.too_large or case.systematic)
+    if not problem.evaluated:
+        factor = max((kind.factor for kind in fit.goodness.kinds), default=1.0)
+        setup = check_problem(problem, solution.before, doubtful=doubts or factor > MOST_ESTIMATED)
+    if not setup.explanations:
+        statements += systematic  # a wrong set-up has them as its consequence
+        offsets = () if case.gross is not None else forgotten_offsets(solution)
+        statements += [check_offset(found, problem.data.labels, fit.chi_square.too_large) for found in offsets]
+    asked = high and bool(missing) and not setup.explanations and problem.knowledge is None  # else it was asked before
+    certain = asked and excess_left(solution, missing) <= EXPLAINED_EXCESS
+    fits = not (doubts or solution.estimated_noise is not None)
+    statements[:0] = check_model(setup, missing, fits=fits, high=high, certain=certain)
+    errors, warnings, notes = (
+        tuple(s.text for s in statements if s.severity == severity) for severity in ("error", "warning", "note")
+    )
+    return Verdict(errors, warnings, notes, setup, noise_like, change)
+
+
+def check_solver(case: Case) -> Iterator[Statement]:
+    """Check whether the solver converged, and whether a robust loss left enough."""
+    if not case.solution.converged:
+        yield Statement("error", case.solution.message)
+    weights, data, loss = case.problem.state.weights, case.problem.data, case.problem.options.loss
+    any_outlier = False
+    for s, w in zip(data.series, weights or (), strict=False):
+        n, lost = len(s.train), int(np.sum(w[s.train] < OUTLIER_WEIGHT))
+        any_outlier |= lost > 0
+        if lost > MAX_OUTLIER_SHARE * n:
+            of = f" of {data.labels[s.table]}" if len(data.labels) > 1 else ""
+            text = f"loss {loss} takes {lost} of {n} measurements of {s.kind.names[0].partition('.')[0]}{of}"
+            yield Statement("error", f"{text} for outliers: more than it can tell from noise")
+    names = _lost_to_outliers(case) if any_outlier else []
+    if names:
+        text = f"nearly all measurements that see {_listed(names)} are taken for outliers by loss {loss}"
+        yield Statement("warning", f"{text}: look at them; calibrate without a loss to see what they say")
+
+
+def check_change(case: Case) -> Iterator[Statement]:
+    """Check whether something moved while a table was measured."""
+    if case.change is not None:
+        what, left = case.change.what, 100.0 * case.change.left
+        where = f"from configuration {case.problem.end_names[case.change.configuration + 1]} on the {what} has moved"
+        gain = f"chi-square falls to {left:.2g} % with a {what} of its own from there"
+        yield Statement("error", f"{where} ({gain}): look for a target, a base or an instrument that moved")
+
+
+def check_fit(case: Case) -> list[Statement]:
+    """Check chi-square, but where only the corrections make it too large."""
+    if case.fit.priors is not None and case.fit.chi_square.too_large and not case.too_large:
+        return []
+    evaluated, updated = case.problem.evaluated, case.problem.knowledge is not None
+    chi2, gross = case.fit.chi_square, case.gross
+    return check_chi_square(chi2, evaluated, systematic=case.systematic, gross=gross, updated=updated)
+
+
+def check_chi_square(
+    chi2: ChiSquare,
     evaluated: bool = False,
     *,
-    follow: bool = False,
+    systematic: bool = False,
     gross: GrossErrors | None = None,
     updated: bool = False,
 ) -> list[Statement]:
-    """What chi-square of the fitted rows and priors says.
+    """Check chi-square of the fitted rows and priors.
 
     Args:
-        found: It.
-        evaluated: Whether the arm was taken as it is.
-        follow: Whether residuals follow the arm: sigmas are then too small by more than residuals are too large.
+        chi2: Chi-square.
+        evaluated: Whether the arm was evaluated as it is.
+        systematic: Whether residuals are systematic: sigmas are then too small by more than residuals are too large.
         gross: The gross errors that are all that is wrong; None if there are none, or more than these is.
         updated: Whether the rows were added to an earlier calibration.
     """
-    if found.dof <= 0:
+    if chi2.dof <= 0:
         text = "no degree of freedom is left: nothing says whether the fit is right, or the noise; measure more"
-        return [Statement(text, finding=True)]
-    reduced, (low, high) = found.value / found.dof, found.bounds
+        return [Statement("error", text)]
+    reduced, (low, high) = chi2.value / chi2.dof, chi2.bounds
     outside = f"reduced chi-square {reduced:.3g} is outside [{low:.2f}, {high:.2f}]"
     if reduced > high:
-        cause = "noise stated too small, effects not modelled, or outliers"
+        cause = "noise specified too small, unmodelled effects, or outliers"
         if gross is not None:
             who = f"{'outlier' if gross.n == 1 else f'{gross.n} outliers'} ({_listed(gross.names)})"
             them = "it" if gross.n == 1 else "them"
             cause = f"{who}, {gross.ratio:.3g} without {them}: look at {them}, or let a robust loss do so (loss: gnc)"
         elif updated:
-            cause = "new rows are at odds with the calibration before: has the arm changed? `fg-calib check` says"
+            cause = "new rows contradict the earlier calibration: has the arm changed? See `fg-calib check`"
         if evaluated:
-            cause = "the arm does not predict these test rows, noise stated too small, or outliers"
-        return [Statement(f"{outside}: {cause}", finding=True)]
+            cause = "the arm does not predict these test rows, noise specified too small, or outliers"
+        return [Statement("error", f"{outside}: {cause}")]
     if reduced < low:
-        return [Statement(f"{outside}: noise stated too large; sigmas are larger than they need be", finding=False)]
-    seen = float(np.sqrt(found.ratio))
-    if found.p_value is not None and found.p_value < (1.0 - CONFIDENCE) / 2.0 and seen > WORTH_SAYING:
-        text = f"reduced chi-square {reduced:.3g}: residuals are {seen:.2f} times the noise stated, not by chance"
-        return [Statement(text + "; sigmas may be too small by as much" * (not follow), finding=False)]
+        return [Statement("note", f"{outside}: noise specified too large; sigmas are larger than they need be")]
+    ratio = float(np.sqrt(chi2.ratio))
+    if chi2.p_value is not None and chi2.p_value < (1.0 - CONFIDENCE) / 2.0 and ratio > NOTABLE_RATIO:
+        text = f"reduced chi-square {reduced:.3g}: residuals are significantly larger than the specified noise"
+        text += f" ({ratio:.2f} times)" + "; sigmas may be too small by as much" * (not systematic)
+        return [Statement("note", text)]
     return []
 
 
-def of_structure(noise_like: float | None) -> list[Statement]:
-    """What it means that residuals follow the arm.
-
-    Args:
-        noise_like: Probability that noise alone follows it as much; None if that is not known.
-    """
-    if noise_like is None or noise_like >= LIKE_NOISE:
-        return []
-    certain = noise_like < NOT_NOISE
-    text = "the residuals follow the arm, as noise does not: effects that are not modelled"
-    several = "true errors may be several times those claimed: believe the test rows"
-    errors = several if certain else "true errors may be twice those claimed"
-    return [Statement(f"{text}; {errors}", finding=False, reservation=True)]
+def check_evaluation(case: Case) -> Iterator[Statement]:
+    """Check whether an evaluation has noise of its own: not where it was estimated from the same rows."""
+    if case.problem.evaluated and case.solution.estimated_noise is not None:
+        text = "the noise was estimated from these test rows: nothing says whether the arm predicts them well enough"
+        yield Statement("note", text)
 
 
-def of_change(found: Change | None, names: Sequence[str]) -> list[Statement]:
-    """What it means that something moved while a table was measured.
-
-    Args:
-        found: What moved; None if nothing did.
-        names: Of configurations and groups (see `Measurements.end_names`).
-    """
-    if found is None:
-        return []
-    where = f"from configuration {names[found.configuration + 1]} on the {found.what} is not where it was before"
-    gain = f"chi-square falls to {100.0 * found.left:.2g} % with a {found.what} of its own from there"
-    return [Statement(f"{where} ({gain}): a target, a base or an instrument that moved", finding=True)]
-
-
-def of_offset(found: Offset, labels: Sequence[str], high: bool) -> list[Statement]:
-    """What it means that all lengths to anchors are off by the same.
-
-    Args:
-        found: By how much.
-        labels: Of the tables.
-        high: Whether residuals are too large for the noise: else it is a reservation. The rest is then far from where
-            it will be, and of the figure the linearised fit knows less than its sigma says.
-    """
-    of = f" of {labels[found.table]}" if len(labels) > 1 else ""
-    adds = f"{1e3 * found.size:+.3g} mm"
-    adds = f"some {adds} to each" if high else f"{adds} to each (sigma {1e3 * found.sigma:.2g} mm)"
-    text = (
-        f"the lengths{of} fit better if the instrument adds {adds}, which was not estimated: offset: estimate, or"
-        " calibrate the instrument"
-    )
-    return [Statement(text, finding=high, reservation=not high)]
+def check_kept_noise(case: Case) -> Iterator[Statement]:
+    """Check noise that was to be estimated, and had too few degrees of freedom for that."""
+    estimated, factors = case.solution.estimated_noise, case.problem.state.factors
+    if estimated is None:
+        return
+    kept = [kind.kind for kind in case.fit.goodness.kinds if (kind.table, kind.kind) not in estimated]
+    off = max((factors.get(name, 1.0) for name in estimated), default=1.0) if kept else 1.0
+    if has_joint_noise(case.problem) and JOINT_NOISE not in estimated:
+        kept.append("the joint readings")
+    if kept:
+        text = f"the noise of {', '.join(dict.fromkeys(kept))} could not be estimated: fewer than {LEAST_REDUNDANCY:g}"
+        text += " degrees of freedom are left to it; it is as specified, or 1 mm and 1 mrad where nothing was"
+        wrong = f"; other noise was specified {off:.3g} times too small, and so may this be: measure more"
+        text += wrong * (off > MAX_KEPT_FACTOR and bool(estimated))
+        text += "; nothing says whether it is right: measure more" * (not estimated)
+        yield Statement("error" if not estimated or off > MAX_KEPT_FACTOR else "note", text)
 
 
-def of_evaluation(evaluated: bool, noise_estimated: bool) -> list[Statement]:
-    """What an evaluation lacks whose noise was estimated from the very rows that it is judged by."""
-    if not (evaluated and noise_estimated):
-        return []
-    text = (
-        "the noise was estimated from these test rows: nothing says whether the arm predicts them as well as it should"
-    )
-    return [Statement(text, finding=False)]
-
-
-def of_estimated_noise(kind: str, sigma: float, motion: float) -> list[Statement]:
-    """What it means that estimated noise is as large as the motions that were measured.
-
-    Args:
-        kind: Kind of noise.
-        sigma: What was estimated, [m] or [rad].
-        motion: Typical size of what the arm predicts, [m] or [rad].
-    """
-    if sigma < LARGE_NOISE * motion:
-        return []
-    text = (
-        f"the noise estimated of {kind} is {sigma / motion:.2g} times as large as what was measured moved:"
-        " the arm explains next to nothing of it, so the table or the job is wrong"
-    )
-    return [Statement(text, finding=True)]
-
-
-def of_kept_noise(kept: Sequence[str], every: bool, off: float = 1.0) -> list[Statement]:
-    """What it means that noise was to be estimated, but too few degrees of freedom were left for that.
-
-    Args:
-        kept: What noise stayed as stated.
-        every: Whether these are all there are.
-        off: The largest factor by which other noise was stated too small, where measurements kept theirs.
-    """
-    if not kept:
-        return []
-    text = (
-        f"the noise of {', '.join(kept)} could not be estimated, for fewer than {LEAST_REDUNDANCY:g} degrees of"
-        " freedom are left to it: it is as stated, or 1 mm and 1 mrad where nothing was"
-    )
-    wrong = f"; other noise was stated {off:.3g} times too small, and so may this be: measure more"
-    text += "; nothing says whether it is right: measure more" if every else wrong if off > MOST_KEPT else ""
-    return [Statement(text, finding=every or off > MOST_KEPT)]
-
-
-def of_test(fit: PredictedFit | None, of_fitted: float, names: Sequence[str]) -> list[Statement]:
-    """What the predicted rows say, if they were predicted worse than they should be, and worse than others were fitted.
-
-    Args:
-        fit: Their fit; None without any.
-        of_fitted: Chi-square of the fitted rows over its mean: noise stated too small is not said twice.
-        names: Of configurations and groups (see `Measurements.end_names`).
-    """
+def check_test_rows(case: Case) -> list[Statement]:
+    """Check test rows: predicted worse than they should be, and worse than others were fitted."""
+    fit, of_fitted = case.fit.goodness.test, case.fit.chi_square.ratio
     if fit is None:
         return []
     count = fit.outliers
     most = min(1.0, (count.fitted + 1.0 + 3.0 * np.sqrt(count.fitted + 1.0)) / max(count.of_fitted, 1))
     if count.test and special.bdtrc(count.test - 1, count.of_test, most) < (1.0 - CONFIDENCE) / 2.0:
         text = f"test rows: the loss takes {count.test} of {count.of_test} measurements for outliers"
-        return [Statement(f"{text}, of those fitted {count.fitted} of {count.of_fitted}", finding=True)]
+        return [Statement("error", f"{text}, of those fitted {count.fitted} of {count.of_fitted}")]
     if not fit.n or fit.p_value >= (1.0 - CONFIDENCE) / 2.0:
         return []
     ratio = fit.chi2 / fit.expected
-    if ratio < WORTH_SAYING**2 or FACTOR < of_fitted > ratio / FACTOR:
+    if ratio < NOTABLE_RATIO**2 or FACTOR < of_fitted > ratio / FACTOR:  # noise specified too small is reported once
         return []
-    worst = [names[c.configuration + 1] for c in fit.configurations]
-    suspicious = f"; suspicious: {_listed(worst)}" if worst else ""
-    claim = "the arm does not predict them as well as it claims"
-    return [
-        Statement(
-            f"{predicted_in_words(fit)}: {claim}{suspicious}",
-            finding=ratio > FACTOR,
-            reservation=ratio <= FACTOR,
-        )
-    ]
+    worst = [case.problem.end_names[c.configuration + 1] for c in fit.configurations]
+    text = f"{predicted_in_words(fit)}: the arm does not predict them as well as it claims"
+    text += f"; suspicious: {_listed(worst)}" if worst else ""
+    return [Statement("error" if ratio > FACTOR else "warning", text)]
 
 
-def of_priors(fit: PriorFit | None) -> list[Statement]:
-    """What corrections say of tolerances, if they are too large for these.
-
-    Args:
-        fit: Corrections against tolerances; None without priors.
-    """
+def check_priors(fit: PriorFit | None) -> list[Statement]:
+    """Check corrections against their prior sigmas; nothing without priors."""
     if fit is None:
         return []
-    statements = []
-    causes = "tolerances stated too small, or the measurements are not what the job says"
-    for one in fit.beyond:
-        if one.is_place:
-            text = f"{one.name} lies {one.z:.1f} of its tolerances from where it was said to be"
-            statements.append(Statement(f"{text}: {causes}", True))
+    causes = "prior sigmas (key tolerance) specified too small, or the measurements are not what the job says"
+    found = [
+        Statement("error", f"{one.name} lies {one.z:.1f} prior sigmas from where it was specified: {causes}")
+        for one in fit.beyond
+        if one.is_place
+    ]
     worst = [f"{one.name} {one.z:+.1f}" for one in fit.beyond if not one.is_place]
     if worst:
-        text = f"corrections beyond their tolerances (in sigma of these: {_listed(worst)}): {causes}"
-        statements.append(Statement(text, True))
-    if not statements and fit.p_value is not None and fit.p_value < (1.0 - CONFIDENCE) / 2.0:
+        text = f"corrections beyond their prior sigmas (in sigma of these: {_listed(worst)}): {causes}"
+        found.append(Statement("error", text))
+    if not found and fit.p_value is not None and fit.p_value < (1.0 - CONFIDENCE) / 2.0:
         largest = [f"{fit.names[i]} {fit.z[i]:+.1f}" for i in np.argsort(-np.abs(fit.z))]
-        what = f"corrections are too large for their tolerances (in sigma of these: {_listed(largest)}; sum of squares"
-        text = f"{what} {fit.chi2:.3g} where {fit.expected:.3g} is expected): {causes}"
-        statements.append(Statement(text, fit.chi2 > FACTOR * fit.expected and fit.p_value < CERTAIN))
-    return statements
+        text = f"corrections are too large for their prior sigmas (in sigma of these: {_listed(largest)}; sum of"
+        text += f" squares {fit.chi2:.3g} where {fit.expected:.3g} is expected): {causes}"
+        certain = fit.chi2 > FACTOR * fit.expected and fit.p_value < PRIOR_P_VALUE
+        found.append(Statement("error" if certain else "note", text))
+    return found
 
 
-def of_tolerances(scales: Sequence[ToleranceScale], too_large: bool) -> list[Statement]:
-    """What a reader of tolerances that were estimated should know.
-
-    Args:
-        scales: Them.
-        too_large: Whether residuals are larger than their noise.
-    """
-    statements = []
-    far = [f"{one.group} {one.scale:.3g}" for one in scales if one.scale > FAR_OFF]
+def check_prior_scales(case: Case) -> Iterator[Statement]:
+    """Check prior sigmas that were estimated."""
+    estimated = case.solution.estimated_tolerances
+    scales: Sequence[ToleranceScale] = () if estimated is None else estimated.scales
+    far = [f"{one.group} {one.scale:.3g}" for one in scales if one.scale > MAX_PRIOR_SCALE]
     if far:
-        text = f"corrections are far larger than the tolerances stated ({', '.join(far)} times)"
-        text += ": residuals are too large as well, so corrections may take up what is not modelled" * too_large
-        statements.append(Statement(text, finding=False))
-    unseen = [one.group for one in scales if one.seen < UNSEEN]
+        text = f"corrections are far larger than the prior sigmas specified ({', '.join(far)} times)"
+        text += ": residuals are too large as well, so corrections may hide unmodelled effects" * case.too_large
+        yield Statement("note", text)
+    unseen = [one.group for one in scales if one.seen < LEAST_SEEN]
     if unseen:
-        text = f"the data tell next to nothing of the corrections of {', '.join(unseen)}"
-        statements.append(Statement(f"{text}: the scale of their tolerances goes with the others", finding=False))
-    return statements
+        text = f"the data determine next to nothing of the corrections of {', '.join(unseen)}"
+        yield Statement("note", f"{text}: the scale of their prior sigmas follows the others")
 
 
-def of_bent(n: int, n_rows: int, directions: float) -> list[Statement]:
-    """What it means that rows are not linear in what the parameters may still be off.
+def check_signs(case: Case) -> list[Statement]:
+    """Check lengths and angles near 0 and 180 degrees.
 
-    Args:
-        n: How many there are.
-        n_rows: Of so many rows.
-        directions: Sum of their leverage: how many directions of the parameters rest on them.
+    Near 180 degrees a vector has one other sign only: where there are more rows than they determine, a wrong sign shows
+    in chi-square. Vectors near 0 point anywhere, which fits.
     """
-    if directions < LEAST_REST and n < LEAST_SHARE * max(n_rows, 1):
-        return []
-    text = (
-        f"{n} of {n_rows} lengths and angles are small and bent by what the parameters may still be off:"
-        " sigmas of these may be 10 % too small, or there is a second optimum"
-    )
-    return [Statement(text, finding=False)]
+    sqrt_cov = case.spread.root
+    return check_nonlinear_rows(find_nonlinear_rows(case.solution, sqrt_cov, case.spread.rank))
 
 
-def of_lost(names: Sequence[str], loss: str) -> list[Statement]:
-    """What it means that nearly all measurements that see some parameters count as outliers.
-
-    Args:
-        names: The parameters.
-        loss: The robust loss.
-    """
-    if not names:
-        return []
-    text = (
-        f"nearly all measurements that see {_listed(names)} are taken for outliers by loss {loss}: look at them;"
-        " calibrate without a loss to see what they say"
-    )
-    return [Statement(text, finding=False, reservation=True)]
-
-
-def of_curvature(found: Curvature) -> list[Statement]:
-    """What it means that rows are not linear within what the parameters may still be off, far from any fold.
-
-    Args:
-        found: By how much mean squares of errors exceed what the covariance says.
-    """
-    bend = "the measurements bend within what they leave unknown"
-    if found.tool >= LEAST_CURVED:
-        text = f"{bend}: the tool's errors are {_times(found.tool)} what sigmas say: measure at more configurations"
-        return [Statement(text, found.tool > MOST_CURVED, reservation=True)]
-    if found.parameter >= LEAST_CURVED:
-        who, honest = found.name or "a frame", "; those of the tool are honest"
-        text = f"{bend}: errors of {who} are {_times(found.parameter)} what its sigma says{honest}"
-        return [Statement(text, finding=False, reservation=True)]
-    if found.sums > MOST_CURVED:
-        honest = "those of single parameters and of the tool are honest"
-        text = f"{bend}: errors of sums of parameters are {_times(found.sums)} what the covariance says;"
-        return [Statement(f"{text} {honest}", finding=False)]
+def check_nonlinear_rows(found: NonlinearRows) -> list[Statement]:
+    """Check lengths and angles of ambiguous sign, else curved ones: one statement names them and the remedy."""
+    n = len(found.ambiguous)
+    remedy = "leave these out, or measure longer and wider motions, in which more joints move"
+    if n and found.ambiguous_share >= AMBIGUOUS_SHARE:
+        text = f"the sign of {n} of {found.n_rows} lengths and angles is ambiguous within the prior sigmas"
+        share = f"{100.0 * found.ambiguous_share:.0f} % of the information rests on them"
+        text += f" ({_listed(found.ambiguous)} near 0 or 180 deg; {share}): there may be a better optimum far away, and"
+        text += f" sigmas may be too small; {remedy}"
+        return [Statement("error" if found.ambiguous_share > MAX_AMBIGUOUS_SHARE else "warning", text)]
+    n = len(found.curved)
+    if found.curved_leverage >= CURVED_LEVERAGE or n >= max(CURVED_SHARE * found.n_rows, 1.0):
+        text = (
+            f"{n} of {found.n_rows} lengths and angles ({_listed(found.curved)}) are so short that they are nonlinear"
+        )
+        text += f" within the posterior sigmas, which may be 10 % too small; {remedy}"
+        return [Statement("warning", text)]
     return []
 
 
-def _times(beyond: float) -> str:
-    """Errors over their sigma, in words, by how much the mean of their ratio's square exceeds 1."""
-    return f"some {np.sqrt(1.0 + beyond):.2g} times" if np.isfinite(beyond) else "many times"
+def check_nonlinearity(found: Nonlinearity) -> list[Statement]:
+    """Check whether nonlinearity makes the covariance optimistic."""
+    if found.directions < NONLINEAR:
+        return []
+    text = "the measurements are nonlinear within the posterior sigmas, so the covariance is optimistic in weak"
+    text += f" directions: errors there are {_times(found.directions)} what it says"
+    if found.parameter >= NONLINEAR:
+        text += f", those of {found.name or 'a frame'} {_times(found.parameter)}"
+    return [Statement("warning", f"{text}; measure at more configurations, or specify smaller prior sigmas")]
 
 
-def of_folds(n: int, n_rows: int, share: float) -> list[Statement]:
-    """What it means that vectors may as well point the other way within what the tolerances allow.
+def check_estimated_noise(case: Case) -> Iterator[Statement]:
+    """Check whether estimated noise is small compared with the motions it was estimated from."""
+    for fit in case.fit.goodness.kinds:
+        if (fit.table, fit.kind) in (case.solution.estimated_noise or ()) and fit.kind in _WITH_MOTION:
+            motion = 1.0 if fit.kind == "orientation" else _motion(case, fit.table, fit.kind)
+            ratio = fit.factor * fit.stated_sigma_rms / max(motion, 1e-300)
+            if ratio >= LARGE_NOISE:
+                text = f"the noise estimated of {fit.kind} is {ratio:.2g} times as large as the motions measured"
+                yield Statement("error", f"{text}: the arm explains next to nothing; check the table and the job")
+
+
+def check_tables(case: Case) -> Iterator[Statement]:
+    """Check whether tables lack values that their model needs."""
+    for table in case.problem.data.tables:
+        yield from (Statement("note", text) for text in missing_figures(table))
+
+
+CHECKS: tuple[Callable[[Case], list[Statement] | Iterator[Statement]], ...] = (
+    check_solver,
+    check_change,
+    check_fit,
+    check_evaluation,
+    check_kept_noise,
+    check_test_rows,
+    lambda case: check_priors(case.fit.priors),
+    check_prior_scales,
+    check_signs,
+    lambda case: check_nonlinearity(check_linearity(case.solution, case.spread)),
+    check_estimated_noise,
+    check_tables,
+)
+"""The checks of every solution, in the order of their statements."""
+
+
+def check_systematic(noise_like: float | None) -> list[Statement]:
+    """Check whether residuals are systematic.
 
     Args:
-        n: How many lengths and angles there are of that kind.
-        n_rows: Of so many.
-        share: Part of all that the rows say that these say (by leverage).
+        noise_like: See `Verdict`.
     """
-    if share < LEAST_FOLDED:
+    if noise_like is None or noise_like >= LIKE_NOISE:
         return []
-    text = (
-        f"{n} of {n_rows} lengths and angles are so near 0 or half a turn that tolerances let their vectors point"
-        f" either way, and {100.0 * share:.0f} % of what the rows say rests on them: there may be a better optimum far"
-        " away; measure longer and wider motions, in which more joints move"
-    )
-    return [Statement(text, share > MOST_FOLDED)]
+    certain = noise_like < NOT_NOISE
+    claim = "several times those claimed: rely on the test rows" if certain else "twice those claimed"
+    text = f"the residuals are systematic (p = {noise_like:.1g}): unmodelled effects; true errors may be {claim}"
+    return [Statement("warning", text)]
+
+
+def check_offset(found: Offset, labels: Sequence[str], high: bool) -> Statement:
+    """Check lengths to anchors that are all off by the same.
+
+    Args:
+        found: The offset.
+        labels: Names of the tables.
+        high: Whether residuals are too large for the noise: then the linearised fit knows less of the offset than its
+            sigma says.
+    """
+    of = f" of {labels[found.table]}" if len(labels) > 1 else ""
+    adds = f"{1e3 * found.size:+.3g} mm"
+    adds = f"some {adds} to each" if high else f"{adds} to each (sigma {1e3 * found.sigma:.2g} mm)"
+    text = f"the lengths{of} fit better if the instrument adds {adds}, which was not estimated: use offset: estimate,"
+    return Statement("error" if high else "warning", f"{text} or calibrate the instrument")
+
+
+def check_model(
+    setup: SetupCheck, missing: Sequence[MissingMotion], *, fits: bool, high: bool, certain: bool
+) -> Iterator[Statement]:
+    """Check set-up and model, before all else: where they are wrong no value can be right.
+
+    Args:
+        setup: The set-up, by residuals before the calibration.
+        missing: What the robot's convention has no parameter for.
+        fits: Whether nothing speaks against the calibration although the noise was as specified.
+        high: Whether the residuals are larger than the noise, or systematic.
+        certain: Whether they are because of what the convention has no parameter for.
+    """
+    for check in (setup, *setup.others):
+        if check.explanations:
+            yield Statement("note" if fits else "error", str(check))
+        elif check.far and high:
+            yield Statement("error", str(check))
+    if high and setup.unchecked:
+        text = f"the set-up of {', '.join(setup.unchecked)} was not checked for common mistakes (units, signs, columns)"
+        yield Statement("note", f"{text}: too few rows to locate its landmarks, or custom kinds of measurement")
+    for motion in missing:
+        yield Statement("error" if certain else "note", str(motion))
+
+
+def check_optima(solution: Solution, most: int = 4) -> list[Statement]:
+    """Check for other optima: parameters that differ most, in their prior sigmas, with both corrections."""
+    robot, found = solution.problem.robot, []
+    advice = "; measure positions, or pairs between which more joints move" if solution.problem.pair_series else ""
+    for other in solution.others:
+        apart = {p.name: abs(other[i] - solution.parameters[i]) / p.scale for i, p in enumerate(robot.parameters)}
+        named = sorted((n for n in apart if apart[n] > 0.3 * max(apart.values())), key=lambda n: -apart[n])[:most]
+        words = []
+        for i in map(robot.index, named):
+            p = robot.parameters[i]
+            factor, unit = (1e3, "mm") if p.unit == "m" else (180.0 / np.pi, "deg")
+            here, there = (factor * (at[i] - p.nominal) for at in (solution.parameters, other))
+            words.append(f"{p.name} {here:+.3g} or {there:+.3g} {unit}")
+        text = f"a second optimum that the data cannot distinguish from this one: {', '.join(words)} from nominal"
+        found.append(Statement("error", text + advice))
+    return found
+
+
+def _motion(case: Case, number: int, kind: str) -> float:
+    """How far the arm predicts that what was measured of a kind moved, by the series that moved most.
+
+    Lengths and angles between two ends move by as much as they are. What has one end moves as the tool point does along
+    an axis; in contact as the anchors are apart; at a single one the tool point stays, and the arm moves by its reach.
+    """
+    problem, table, motions = case.problem, case.fit.residuals, [0.0]
+    at = at_parameters(problem, case.solution.parameters)
+    for k, s in enumerate(problem.data.series):
+        if s.table != number or all(name.partition(".")[0] != kind for name in s.kind.names):
+            continue
+        if s.kind.ends == 1:
+            trig = problem.data.trigs(problem.robot)[number]
+            there = forward(at.chains[number].without_columns(), trig, s.ends[s.train, 0]).position
+            if isinstance(s.kind, AnchorContact):
+                there = at.coordinates[s.nuisances[s.train]]
+            stays = not np.ptp(there, axis=0).any()
+            motions.append(problem.robot.reach if stays else float(np.sqrt(np.mean(np.var(there, axis=0)))))
+        else:
+            group = table.groups.index((number, kind))
+            predicted = (table.measured + table.after)[table.used & (table.series == k) & (table.group == group)]
+            motions.append(float(np.sqrt(np.mean(predicted**2))) if len(predicted) else 0.0)
+    return max(motions)
+
+
+def _lost_to_outliers(case: Case) -> list[str]:
+    """Parameters that nearly only outliers see: with these their sigma would be so much smaller."""
+    problem, at = case.problem, case.solution.parameters
+    whole = reweighted_at(problem, at, replace(problem.state, weights=None))
+    sigmas = []
+    for one in (problem, whole):
+        s, V = directions(one, at)
+        sqrt_cov = one.variables.prior_scales[:, None] * V / np.maximum(s, WEAKEST)
+        sigmas.append(np.linalg.norm(sqrt_cov, axis=1)[: problem.variables.n_robot_columns])
+    return [problem.variables.names[i] for i in np.flatnonzero(sigmas[0] > LOST_SIGMA_RATIO * sigmas[1])]
+
+
+def _times(beyond: float) -> str:
+    """Errors over their sigma, in words, by how much the mean of their squared ratio exceeds 1."""
+    return f"some {np.sqrt(1.0 + beyond):.2g} times" if np.isfinite(beyond) else "many times"
 
 
 def chi2_in_words(chi2: float, expected: float, p_value: float) -> str:
@@ -376,10 +602,10 @@ def predicted_in_words(fit: PredictedFit) -> str:
 
 
 def probability(p: float) -> str:
-    """A probability with two figures, none beyond a thousandth from 0 and 1."""
+    """A probability with two digits, none beyond a thousandth from 0 and 1."""
     return "< 0.001" if p < 1e-3 else "> 0.999" if p > 0.999 else f"{p:.2g}" if p < 0.1 else f"{p:.2f}"
 
 
 def _listed(names: Sequence[str]) -> str:
-    more = len(names) - _NAMED
-    return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
+    more = len(names) - NAMED
+    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")

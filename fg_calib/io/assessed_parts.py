@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fg_calib.arrays import Brief
-from fg_calib.diagnostics.verdict import Statement, of_chi2, of_priors
+from fg_calib.diagnostics.verdict import Statement, check_chi_square, check_priors
 from fg_calib.graph.factors import corrections_of, prior_rows
 from fg_calib.graph.information import named_rows
 from fg_calib.io.parts_solver import Part, PartsSolution, problem_of_table, table_of_part
@@ -102,10 +102,10 @@ def assess_parts(solution: PartsSolution, part: Part) -> AssessedParts:
     dof = solution.reduced.n_residuals + n_priors - solution.rank
     chi2 = chi_square_of(solution.chi2, dof, independent=not shared)
     priors = judge_tolerances(variables, solution.parameters, posterior.tangent)
-    statements = [] if solution.converged else [Statement(solution.message, finding=True)]
-    statements += [*of_chi2(chi2), *of_priors(priors)]
-    statements += [Statement(text, finding=False) for text in _missing_figures(solution, table.measurements)]
-    statements += [Statement(UNJUDGED, finding=False), *([Statement(INDEPENDENT, finding=False)] if shared else [])]
+    statements = [] if solution.converged else [Statement("error", solution.message)]
+    statements += [*check_chi_square(chi2), *check_priors(priors)]
+    statements += [Statement("note", text) for text in _missing_figures(solution, table.measurements)]
+    statements += [Statement("note", UNJUDGED), *([Statement("note", INDEPENDENT)] if shared else [])]
     return AssessedParts(
         solution=solution,
         parameters=_parameters(solution, observability),
@@ -114,8 +114,8 @@ def assess_parts(solution: PartsSolution, part: Part) -> AssessedParts:
         n_priors=n_priors,
         priors=priors,
         identifiability=identifiability,
-        findings=tuple(s.text for s in statements if s.finding),
-        cautions=tuple(s.text for s in statements if not s.finding),
+        findings=tuple(s.text for s in statements if s.severity == "error"),
+        cautions=tuple(s.text for s in statements if s.severity != "error"),
         configurations=replace(table.measurements, pairs=None) if options.uses_pairs else None,
         expected_error=expected_error(problem, posterior) if options.uses_pairs else None,
     )

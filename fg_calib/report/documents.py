@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from fg_calib import __version__
 from fg_calib.arguments import checked
 from fg_calib.assessment import Assessment as Uncertainty
+from fg_calib.diagnostics.nominal_residuals import TypicalResidual
 from fg_calib.diagnostics.setup_check import SetupCheck
-from fg_calib.diagnostics.typical_residuals import TypicalResidual
 from fg_calib.errors import InputError
 from fg_calib.graph.noise import JOINT_NOISE
 from fg_calib.graph.problem import Problem

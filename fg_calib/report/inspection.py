@@ -12,9 +12,9 @@ from rich.console import Group, RenderableType
 from fg_calib import __version__
 from fg_calib.arguments import checked
 from fg_calib.diagnostics.inspection import Inspection, JointRange
-from fg_calib.diagnostics.setup import ROWS
+from fg_calib.diagnostics.linearity import NEAR_SIGMAS
+from fg_calib.diagnostics.nominal_residuals import MAX_ROWS
 from fg_calib.diagnostics.setup_check import SetupCheck
-from fg_calib.diagnostics.table_survey import NEAR_KINK
 from fg_calib.job import Job
 from fg_calib.report.documents import observability_document
 from fg_calib.report.identifiability import WEAK, lost_directions, weak_directions
@@ -85,10 +85,10 @@ def _tables(found: Inspection) -> RenderableType:
 
 def _of_pairs(found: Inspection) -> Iterator[str]:
     for t in found.tables:
-        if t.n_near_kink:
+        if t.n_near_singular:
             yield (
-                f"{t.name}: {t.n_near_kink} of {t.n_pairs} train pairs are within {NEAR_KINK:g} sigma of 0 or half a"
-                " turn, where noise of either sign acts the same way: that is counted with, but they tell little"
+                f"{t.name}: {t.n_near_singular} of {t.n_pairs} train pairs are within {NEAR_SIGMAS:g} sigma of 0 or"
+                " 180 degrees, where noise of either sign acts the same way: that is counted with, but they tell little"
             )
     for reason, n in found.n_excluded.items():
         yield f"{n} train pairs take no part: {reason.replace('_', ' ')}"
@@ -127,7 +127,7 @@ def _residuals(found: Inspection) -> list[RenderableType]:
             table.add_row(name, unit, *figures, f"{one.excess:.3g}", _of_excess(check, one.excess))
     if not table.rows:
         return []
-    title = f"Residuals with the arm as drawn, frame and tool fitted (median; at most {ROWS} configurations a table)"
+    title = f"Residuals of the nominal arm, frame and tool fitted (median; at most {MAX_ROWS} configurations a table)"
     return section(title, table)
 
 

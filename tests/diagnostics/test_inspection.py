@@ -120,7 +120,7 @@ MISTAKES = {
         m, rotation=np.swapaxes(m.rotation, 1, 2), position=-np.einsum("nji,nj->ni", m.rotation, m.position)
     ),
     "columns x, y, z hold y, z, x": lambda m: replace(m, position=m.position[:, [1, 2, 0]]),
-    "joint 2 turns the other way": lambda m: replace(m, readings=m.readings * [1, -1, 1, 1, 1, 1]),
+    "joint 2 moves the other way": lambda m: replace(m, readings=m.readings * [1, -1, 1, 1, 1, 1]),
 }
 
 

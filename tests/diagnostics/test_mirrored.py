@@ -9,7 +9,7 @@ from touches import reach_faces
 
 from fg_calib import calibrate
 from fg_calib.diagnostics.mirrored import mirror_images
-from fg_calib.diagnostics.multistart import look_elsewhere
+from fg_calib.diagnostics.multistart import multistart
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.measurements.dataset import Measurements
@@ -88,7 +88,7 @@ def test_planes_whose_side_nothing_tells_stay_as_they_were_started():
     robot, _, _, table = on_planes(np.random.default_rng(3), 0.0)
     solution = solve(build_problem(robot, table))
     assert not list(mirror_images(solution))
-    again = look_elsewhere(solution)
+    again = multistart(solution)
     assert again.parameters == pytest.approx(solution.parameters, abs=0.0)
     assert not again.others
 

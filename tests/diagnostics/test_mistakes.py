@@ -63,8 +63,8 @@ SPOILT = {
     "columns x, y, z hold y, z, x": lambda m: replace(m, position=m.position[:, [1, 2, 0]]),
     "columns x, y, z hold y, x, z": lambda m: replace(m, position=m.position[:, [1, 0, 2]]),
     "z has the wrong sign": lambda m: replace(m, position=m.position * [1, 1, -1]),
-    "joint 2 turns the other way": lambda m: replace(m, readings=m.readings * only(2, -1, 1)),
-    "joint 6 turns the other way": lambda m: replace(m, readings=m.readings * only(6, -1, 1)),
+    "joint 2 moves the other way": lambda m: replace(m, readings=m.readings * only(2, -1, 1)),
+    "joint 6 moves the other way": lambda m: replace(m, readings=m.readings * only(6, -1, 1)),
     "the readings of joints 2 and 3 are exchanged": lambda m: exchanged(m, 2, 3),
     "the joints are in the opposite order": lambda m: replace(m, readings=m.readings[:, ::-1]),
     "the zero of joint 2 is off by 90 deg": lambda m: replace(m, readings=m.readings - only(2, np.pi / 2)),
@@ -185,7 +185,7 @@ def test_a_mistake_is_the_first_finding_of_a_calibration(tmp_path, fg_calib, mod
 
 TWO = [
     ("x, y, z are in mm, not m", "joint readings are in deg, not rad"),
-    ("x, y, z are in mm, not m", "joint 2 turns the other way"),
+    ("x, y, z are in mm, not m", "joint 2 moves the other way"),
     ("joint readings are in deg, not rad", "the poses are inverted"),
     ("x, y, z are in mm, not m", "columns qx, qy, qz, qw hold w, x, y, z"),
 ]
@@ -202,7 +202,7 @@ def test_two_mistakes_at_once_are_named(tmp_path, two):
 
 ANGLES = {
     "roll, pitch, yaw are in deg, not rad": lambda R: R.as_euler("xyz", degrees=True),
-    "roll, pitch, yaw turn about the moving axes x, y, z": lambda R: R.as_euler("XYZ"),
+    "roll, pitch, yaw are rotations about the moving axes x, y, z": lambda R: R.as_euler("XYZ"),
     "columns roll, pitch, yaw hold yaw, pitch, roll": lambda R: R.as_euler("ZYX"),
     "roll, pitch, yaw are angles about the moving axes z, y, z": lambda R: R.as_euler("ZYZ"),
     "roll, pitch, yaw are a rotation vector": lambda R: R.as_rotvec(),
@@ -261,7 +261,7 @@ def test_a_wrong_tool_is_named_though_it_is_estimated(tmp_path, fg_calib, model)
     first = " ".join(ended.out.split("DOUBTFUL: ")[1].split())
     assert ended.code == 3
     assert first.startswith("position residuals fall from 1")
-    assert first.endswith("if the tool is another one, farther off than its tolerance lets it be")
+    assert first.endswith("if the tool is another one, farther off than its prior sigma lets it be")
 
 
 @pytest.mark.sampled(1)
@@ -298,8 +298,8 @@ def test_a_slide_that_goes_the_other_way_or_in_another_unit_is_named():
     arm = small_arm()
     m = measure(true_robot(arm, rng), 50, rng)
     for factor, mistake in (
-        ([1, 1, -1, 1], "joint 3 slides the other way"),
-        ([1, 1, 1e3, 1], "readings of slides are in mm"),
+        ([1, 1, -1, 1], "joint 3 moves the other way"),
+        ([1, 1, 1e3, 1], "readings of prismatic joints are in mm"),
     ):
         assert mistake in named(check_setup(arm, replace(m, readings=m.readings * factor), "pose"))
 
@@ -382,7 +382,7 @@ def test_touched_points_name_a_joint_that_turns_the_other_way(tmp_path):
     job = touches(tmp_path)
     assert not check_setup(job.robot, job.measurements, "distance").far
     spoilt = replace(job.measurements, readings=job.measurements.readings * only(2, -1, 1))
-    assert "joint 2 turns the other way" in named(check_setup(job.robot, spoilt, "distance"))
+    assert "joint 2 moves the other way" in named(check_setup(job.robot, spoilt, "distance"))
 
 
 @pytest.mark.slow

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from fg_calib import Measurements, Robot, calibrate, pose
-from fg_calib.assessment import assess
-from fg_calib.diagnostics.multistart import look_elsewhere
+from fg_calib.diagnostics.multistart import multistart
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.problem import reweighted_at
 from fg_calib.graph.solver import solve, solve_from
-from fg_calib.robot.rotations import rotation_angle
+from fg_calib.measurements.dataset import rotation_angle
+from fg_calib.statistics.assessment import assess
 
 SIGMA, TOLERANCE = 1e-4, 5e-3
 
@@ -69,7 +69,7 @@ def test_of_two_lengths_the_true_sides_are_among_those_told_of(seed, tilt):
     """Four arms explain the pairs, but for what tilted wrists of the other pairs say; from the truth none is better."""
     lengths = TOLERANCE * np.random.default_rng(100 + seed).normal(size=2)
     robot, true, m = wrists(lengths, seed=seed, tilt=tilt)
-    solution = look_elsewhere(solve(build_problem(robot, m, model="distance")))
+    solution = multistart(solve(build_problem(robot, m, model="distance")))
     both = [robot.index("a3"), robot.index("a4")]
     told = np.array([x[both] for x in (solution.parameters, *solution.others)])
     assert len(told) > 1
@@ -141,7 +141,7 @@ def test_a_rejecting_loss_leaves_good_rows_in(seed):
     distance = np.linalg.norm(p[:40] - p[40:], axis=1) + SIGMA * rng.normal(size=40) + 5e-3 * gross
     pairs = {"a": np.arange(40), "b": np.arange(40, 80), "distance": distance, "sigma_distance": SIGMA}
     problem = build_problem(robot, Measurements.from_arrays(q, pairs=pairs), model="distance", loss="geman-mcclure")
-    solution = look_elsewhere(solve(problem))
+    solution = multistart(solve(problem))
     assert solution.objective <= solve_from(solution, true, np.inf).objective + 0.01
     assert np.array_equal(solution.problem.state.weights[0] < 0.2, gross)
 
@@ -210,7 +210,7 @@ def one_joint_a_pair(rows, n_prismatic, *, seed, n, length, angle, model):
 def test_a_start_without_what_may_fold_is_needed(seed):
     """Of 20 distances: without it chi-square is 750 to 27 000, and 7 of 200 such arms end at another optimum."""
     robot, m = one_joint_a_pair(WRIST, 0, seed=seed, n=20, length=1e-3, angle=1e-3, model="distance")
-    solution = look_elsewhere(solve(build_problem(robot, m, model="distance")))
+    solution = multistart(solve(build_problem(robot, m, model="distance")))
     assert solution.converged
     assert 2.0 * solution.objective < 60.0
 
@@ -220,6 +220,6 @@ def test_starts_beside_nominal_are_needed(seed):
     """Of a gantry whose head has its lengths at 0: without them a third of 120 such arms has a chi-square above 1e5."""
     given = {"seed": seed, "n": 40, "length": 1e-2, "angle": 1e-2, "model": "distance-rotation"}
     robot, m = one_joint_a_pair(GANTRY, 3, **given)
-    solution = look_elsewhere(solve(build_problem(robot, m, model="distance-rotation")))
+    solution = multistart(solve(build_problem(robot, m, model="distance-rotation")))
     assert solution.converged
     assert 2.0 * solution.objective < 160.0  # of 80 rows

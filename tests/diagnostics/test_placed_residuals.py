@@ -44,17 +44,17 @@ def inverted(m):
 
 CASES = [
     ("targets", "x, y, z are in m, not mm", lambda m: {"position": m.position / 1e3}),
-    ("targets stations", "joint 2 turns the other way", lambda m: {"readings": sign(m, 1)}),
+    ("targets stations", "joint 2 moves the other way", lambda m: {"readings": sign(m, 1)}),
     ("targets known", "readings of joints 1 and 2 are exchanged", lambda m: {"readings": m.readings[:, [1, 0, 2, 3]]}),
     ("anchors", "distances are in mm, not m", lambda m: {"length": m.length * 1e3}),
-    ("anchors offset", "joint 2 turns the other way", lambda m: {"readings": sign(m, 1)}),
+    ("anchors offset", "joint 2 moves the other way", lambda m: {"readings": sign(m, 1)}),
     ("anchors known", "joint readings are in rad, not deg", in_rad),
     ("planes", "distances are in m, not mm", lambda m: {"length": m.length / 1e3}),
     ("board", "the poses are inverted (board_T_camera instead of camera_T_board)", inverted),
     ("board", "rx, ry, rz are in rad, not deg", lambda m: {"rotation": turned(m.rotation, np.pi / 180)}),
     ("pixels", "columns u, v hold v, u", lambda m: {"image": m.image[:, [1, 0, 2, 3]]}),
     ("pixels", "corner_x, corner_y are in mm, not m", lambda m: {"image": m.image * [1, 1, 1e3, 1e3]}),
-    ("pixels", "joint 2 turns the other way", lambda m: {"readings": sign(m, 1)}),
+    ("pixels", "joint 2 moves the other way", lambda m: {"readings": sign(m, 1)}),
 ]  # fmt: skip
 
 

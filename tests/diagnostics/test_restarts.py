@@ -8,19 +8,19 @@ from jobs import ur5e
 from scipy.stats import chi2
 from simulated import measure, paper_robot, small_arm, true_robot
 
-from fg_calib.assessment import assess, solve_job
-from fg_calib.diagnostics.multistart import _steps, look_elsewhere
+from fg_calib.diagnostics.multistart import _steps, multistart
 from fg_calib.errors import SolverError
 from fg_calib.graph import solver
 from fg_calib.graph.build import build_problem, problem_of
 from fg_calib.graph.solver import solve
 from fg_calib.io.job import read_job
 from fg_calib.io.robot_file import read_robot
-from fg_calib.measurements.dataset import Measurements
+from fg_calib.measurements.dataset import Measurements, rotation_angle
 from fg_calib.options import Pairing
 from fg_calib.robot.inverse import solve_inverse
 from fg_calib.robot.kinematics import pose
-from fg_calib.robot.rotations import rotation_angle
+from fg_calib.statistics.assessment import assess
+from fg_calib.statistics.variance_components import solve_job
 
 ROBOT = """\
 name: pointer
@@ -81,7 +81,7 @@ def test_the_best_of_two_optima_is_kept(tmp_path):
     far = solver.solve(problem)
     wrong = solver.solve_from(far, np.where(np.arange(len(problem.start)) == i, -0.02, far.parameters), np.inf)
     assert wrong.parameters[i] < 0.0
-    best = look_elsewhere(wrong)
+    best = multistart(wrong)
     assert best.cost < wrong.cost - 5.0
     assert best.parameters[i] == pytest.approx(far.parameters[i], abs=1e-9)
     assert best.others == ()  # chi-square decides: the other is 80 worse
@@ -122,7 +122,7 @@ def test_a_descent_from_elsewhere_that_cannot_be_made_is_no_fault_of_the_first(t
     first = solver.solve(problem_of(read_job(pointer(tmp_path, nominal=1e-3, true=0.02))))
     for name in ("solve_from", "_without_folds"):
         monkeypatch.setattr(f"fg_calib.diagnostics.multistart.{name}", fail)
-    found = look_elsewhere(first)
+    found = multistart(first)
     assert found.parameters is first.parameters
     assert found.others == ()
 
@@ -136,7 +136,7 @@ def test_an_optimum_a_radian_away_is_no_other_arm(tmp_path, monkeypatch, off, to
     there[robot.index("theta2")] += off
     other = replace(first, parameters=there, values=first.problem.variables.values(there))
     monkeypatch.setattr("fg_calib.diagnostics.multistart.solve_from", lambda *_: other)
-    assert len(look_elsewhere(first).others) == told
+    assert len(multistart(first).others) == told
 
 
 @pytest.mark.slow
@@ -147,7 +147,7 @@ def test_lost_directions_have_no_second_optimum():
         rng = np.random.default_rng(seed)
         m = measure(true_robot(robot, rng), 40, rng, sigma_joint=1e-4)
         solution = solver.solve(build_problem(robot, m, model="distance-rotation", pairing=Pairing("chain")))
-        again = look_elsewhere(solution)
+        again = multistart(solution)
         assert again.others == ()
         assert 2.0 * (again.cost - solution.cost) == pytest.approx(0.0, abs=1e-6)
 
@@ -167,7 +167,7 @@ def test_an_angle_that_nominal_has_on_the_other_side_of_half_a_turn_bends_no_arm
     distance = np.linalg.norm(at.position[b] - at.position[a], axis=1) + sigma * rng.normal(size=n)
     pairs = {"a": a, "b": b, "distance": distance, "angle": angle, "sigma_distance": sigma, "sigma_angle": sigma}
     first = solve(build_problem(robot, Measurements.from_arrays(q, pairs=pairs), model="distance-rotation"))
-    best = look_elsewhere(first)
+    best = multistart(first)
     assert first.cost > 400.0
     assert 2.0 * best.cost < chi2.ppf(0.999, best.problem.n_residuals)
     assert not best.others
@@ -186,4 +186,4 @@ def test_a_tool_point_that_constant_orientation_hardly_shows_is_looked_for_metre
     assert np.abs(solution.problem.start[robot.index("tool.z")]) < 1.0
     assert solution.converged
     assert np.max(np.abs(_steps(solution)[-1])) > 0.1
-    assert look_elsewhere(solution).cost <= solution.cost
+    assert multistart(solution).cost <= solution.cost

@@ -305,7 +305,7 @@ MISREAD = {
     "x, y, z are in mm, not m": {"position": 1e3},
     "x, y, z are in m, not mm": {"position": 1e-3},
     "joint readings are in rad, not deg": {"readings": np.pi / 180},
-    "joint 4 turns the other way": {"readings": np.array([1, 1, 1, -1, 1, 1])},
+    "joint 4 moves the other way": {"readings": np.array([1, 1, 1, -1, 1, 1])},
 }
 
 
