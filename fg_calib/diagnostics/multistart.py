@@ -52,6 +52,9 @@ CHI2_INDISTINCT = 10.8276
 LEAST_GAIN = 0.01
 """Cost by which another optimum must be lower to count as better."""
 
+MAX_ROUNDS = 2
+"""Optima, each better than the one before, from which others are searched."""
+
 LEAST_POINTS = 4
 """Lengths that distinguish an anchor from its mirror image."""
 
@@ -87,11 +90,13 @@ def multistart(solution: Solution, options: SolverOptions | None = None) -> Solu
             noise, tolerances = solution.estimated_noise, solution.estimated_tolerances
             found.append(replace(other, estimated_noise=noise, estimated_tolerances=tolerances))
 
-    with one_blas_thread:
-        steps = _steps(solution)
-    for step in steps:
-        start = _moved(solution, step)
-        keep(partial(solve_from, solution, start, best().cost + CHI2_INDISTINCT, options))
+    searched: list[Solution] = []
+    while all(best() is not one for one in searched) and len(searched) < MAX_ROUNDS:
+        searched.append(here := best())
+        with one_blas_thread:
+            starts = [_moved(here, step) for step in _steps(here)]
+        for start in starts:
+            keep(partial(solve_from, here, start, best().cost + CHI2_INDISTINCT, options))
     if solution.problem.options.loss == "none":
         for landmark in range(len(solution.problem.data.unknowns.letters)):
             mirrored = _mirrored(best(), landmark)

@@ -66,8 +66,8 @@ PRIOR_P_VALUE = 1e-4
 AMBIGUOUS_SHARE, MAX_AMBIGUOUS_SHARE = 0.05, 0.3
 """Part of the information that may rest on lengths and angles of ambiguous sign: with a warning, and no more at all."""
 
-CURVED_LEVERAGE, CURVED_SHARE = 0.3, 0.01
-"""Directions that rest on curved lengths and angles, and share of these among all, up to which sigmas are honest."""
+CURVED_LEVERAGE = 0.1
+"""Directions that rest on curved lengths and angles, up to which sigmas are honest."""
 
 NONLINEAR = 0.1
 """Mean squared errors beyond the covariance, over it, because of nonlinearity, that are reported."""
@@ -407,22 +407,27 @@ def check_signs(case: Case) -> list[Statement]:
     Near 180 degrees a vector has one other sign only: where there are more rows than they determine, a wrong sign shows
     in chi-square. Vectors near 0 point anywhere, which fits.
     """
-    sqrt_cov = case.spread.root
-    return check_nonlinear_rows(find_nonlinear_rows(case.solution, sqrt_cov, case.spread.rank))
+    found = find_nonlinear_rows(case.solution, case.spread.root, case.spread.rank)
+    return check_nonlinear_rows(found, case.fit.chi_square.too_large)
 
 
-def check_nonlinear_rows(found: NonlinearRows) -> list[Statement]:
-    """Check lengths and angles of ambiguous sign, else curved ones: one statement names them and the remedy."""
+def check_nonlinear_rows(found: NonlinearRows, high: bool = False) -> list[Statement]:
+    """Check lengths and angles of ambiguous sign, else curved ones: one statement names them and the remedy.
+
+    Args:
+        found: The rows.
+        high: Whether residuals are too large for the noise, which a single wrong sign may be the cause of.
+    """
     n = len(found.ambiguous)
     remedy = "leave these out, or measure longer and wider motions, in which more joints move"
-    if n and found.ambiguous_share >= AMBIGUOUS_SHARE:
+    if n and (high or found.ambiguous_share >= AMBIGUOUS_SHARE):
         text = f"the sign of {n} of {found.n_rows} lengths and angles is ambiguous within the prior sigmas"
         share = f"{100.0 * found.ambiguous_share:.0f} % of the information rests on them"
         text += f" ({_listed(found.ambiguous)} near 0 or 180 deg; {share}): there may be a better optimum far away, and"
         text += f" sigmas may be too small; {remedy}"
         return [Statement("error" if found.ambiguous_share > MAX_AMBIGUOUS_SHARE else "warning", text)]
     n = len(found.curved)
-    if found.curved_leverage >= CURVED_LEVERAGE or n >= max(CURVED_SHARE * found.n_rows, 1.0):
+    if found.curved_leverage >= CURVED_LEVERAGE:
         text = (
             f"{n} of {found.n_rows} lengths and angles ({_listed(found.curved)}) are so short that they are nonlinear"
         )

@@ -1,0 +1,294 @@
+"""Where nonlinearity or an ambiguous sign makes sigmas dishonest a warning names the rows and the remedy."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from simulated import measure, small_arm, true_robot
+
+from fg_calib import Measurements, Robot, calibrate, pose
+from fg_calib.assessment import assess
+from fg_calib.diagnostics import linearity
+from fg_calib.diagnostics.linearity import Nonlinearity, NonlinearRows, check_linearity, find_nonlinear_rows
+from fg_calib.diagnostics.verdict import check_nonlinear_rows, check_nonlinearity
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.solver import solve, unsolved
+from fg_calib.options import Pairing
+
+WIDE = {"a": 1e-2, "d": 1e-2, "alpha": 1e-2, "theta": 1e-2}
+SIGMA = 1e-5
+AMBIGUOUS, NONLINEAR = "is ambiguous within the prior sigmas", "nonlinear within the posterior sigmas"
+
+
+def positions(n, sigma, seed):
+    """A wide arm by few positions: the assessed solution, and the true arm."""
+    rng, robot = np.random.default_rng(seed), small_arm(WIDE)
+    true, q = true_robot(robot, rng), rng.uniform(-2.0, 2.0, (n, 4))
+    position = pose(true, q).position + sigma * rng.normal(size=(n, 3))
+    m = Measurements.from_arrays(q, position=position, sigma_position=sigma)
+    solution = solve(build_problem(robot, m, model="position"))
+    return solution, assess(solution), true
+
+
+def by_second_differences(solution, spread, n_draws):
+    """Mean of |R^T J^T q|^2 over directions, q what positions are beyond linear at draws R z, J by differences."""
+    m = solution.problem.data.tables[0].measurements
+    robot = solution.problem.robot.with_values(solution.parameters[solution.problem.variables.robot_span])
+    names = [i for i, p in enumerate(robot.parameters) if p.estimated]
+    root = spread.root[:, : spread.rank]
+
+    def rows(change):
+        values = robot.nominal.copy()
+        values[names] += change
+        return pose(robot.with_values(values), m.readings).position.ravel() / m.sigma_position[0, 0]
+
+    J = np.array([(rows(h) - rows(-h)) / 2e-6 for h in 1e-6 * np.eye(len(names))]).T
+    curved = []
+    for signs in np.random.default_rng(5).choice([-1.0, 1.0], (n_draws, spread.rank)):
+        change = root @ signs
+        q = 0.5 * (rows(change) + rows(-change)) - rows(np.zeros(len(names)))
+        curved.append(np.mean((root.T @ (J.T @ q)) ** 2))
+    return np.mean(curved)
+
+
+@pytest.mark.parametrize("sigma", [1e-5, 1e-4])
+def test_nonlinearity_agrees_with_second_differences(monkeypatch, sigma):
+    """Both are means over 200 draws of a square whose own spread is about its mean."""
+    monkeypatch.setattr(linearity, "N_DRAWS", 200)
+    solution, found, _ = positions(3, sigma, 1)
+    expected = by_second_differences(solution, found.spread, 200)
+    assert check_linearity(solution, found.spread).directions == pytest.approx(expected, rel=0.3)
+
+
+@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.parametrize("sigma", [1e-5, 1e-4])
+def test_true_errors_exceed_their_covariance_by_the_nonlinearity(monkeypatch, sigma):
+    """150 arms: means agree within four of their standard errors, or a third."""
+    monkeypatch.setattr(linearity, "N_DRAWS", 50)
+    seen, expected = [], []
+    for seed in range(150):
+        solution, found, true = positions(3, sigma, 1000 + seed)
+        spread, scales = found.spread, found.spread.variables.prior_scales
+        inverse = np.linalg.pinv(spread.root[:, : spread.rank] / scales[:, None], rcond=1e-14)
+        off = (true.nominal - solution.parameters[solution.problem.variables.robot_span])[
+            [p.estimated for p in true.parameters]
+        ]
+        seen.append(np.mean((inverse @ (off / scales)) ** 2))
+        expected.append(1.0 + check_linearity(solution, spread).directions)
+    error = float(np.hypot(np.std(seen), np.std(expected)) / np.sqrt(len(seen)))
+    assert abs(np.mean(seen) - np.mean(expected)) < max(4.0 * error, np.mean(expected) / 3.0)
+
+
+def test_few_positions_of_a_wide_arm_are_warned_of_and_more_end_it():
+    few, enough = (positions(n, 1e-5, 1)[1].verdict for n in (3, 12))
+    assert any(NONLINEAR in text and "measure at more configurations" in text for text in few.warnings)
+    assert few.errors == ()
+    assert not any(NONLINEAR in text for text in enough.warnings)
+
+
+def test_the_nonlinear_parameter_of_a_frame_or_the_robot_is_named():
+    assert check_nonlinearity(Nonlinearity(0.09, 5.0)) == []
+    (of_a2,), (of_frame,), (alone,), (lost,) = (
+        check_nonlinearity(Nonlinearity(3.0, beyond, name))
+        for beyond, name in ((0.44, "a2"), (8.0, ""), (0.01, "a2"), (np.inf, "a2"))
+    )
+    assert "errors there are some 2 times what it says, those of a2 some 1.2 times; measure at more" in of_a2.text
+    assert "those of a frame some 3 times" in of_frame.text
+    assert "those of" not in alone.text
+    assert "those of a2 many times" in lost.text
+    assert {one.severity for one in (of_a2, of_frame, alone, lost)} == {"warning"}
+
+
+# --- rows --------------------------------------------------------------------------------------------------------
+
+
+ROWS = [[0.5, 0, 0, 0], [2e-3, 0, 0, 0]]
+
+
+def test_rows_of_ambiguous_sign_are_those_that_the_prior_lets_pass_zero_or_half_a_turn():
+    """A wrist of radius 2 mm, by hand: the vector of pair k has the prior sigma 2 |sin(turn / 2)| of a2."""
+    robot = Robot.from_dh(ROWS, "dh")
+    turns = np.array([1e-3, 0.2, 1.5, 3.0])
+    q = np.concatenate([np.zeros((4, 2)), np.stack([np.zeros(4), turns], axis=1)])
+    ends, at = np.arange(4), pose(robot, q).position
+    pairs = {"a": ends, "b": ends + 4, "distance": np.linalg.norm(at[4:] - at[:4], axis=1), "sigma_distance": 1e-5}
+
+    def rows(tolerance):
+        a2 = Robot.from_dh(ROWS, "dh", tolerance={"a": tolerance}).with_estimated(["a2"])
+        problem = build_problem(a2, Measurements.from_arrays(q, pairs=pairs), model="distance")
+        return find_nonlinear_rows(unsolved(problem), np.zeros((1, 0)), 1)
+
+    # At 1 mrad the vector moves by 0.01 mm, below twice the noise; from 0.2 rad on by more than half its length.
+    assert set(rows(1e-2).ambiguous) == {"1-5", "2-6", "3-7"}
+    assert rows(1e-2).n_near == 1
+    assert rows(9e-4).ambiguous == ()
+
+
+def test_one_statement_names_the_rows_and_the_remedy():
+    names = ("0-1", "0-2", "0-3", "0-4")
+    assert check_nonlinear_rows(NonlinearRows(60, 4, names, (), 0.04, 0.0)) == []
+    (few,) = check_nonlinear_rows(NonlinearRows(60, 4, names, ("0-9",), 0.06, 3.0))
+    assert few.severity == "warning"
+    assert few.text.startswith(f"the sign of 4 of 60 lengths and angles {AMBIGUOUS} (0-1, 0-2, 0-3 and 1 more near 0")
+    assert few.text.endswith("leave these out, or measure longer and wider motions, in which more joints move")
+    (many,) = check_nonlinear_rows(NonlinearRows(60, 4, names, (), 0.31, 0.0))
+    assert many.severity == "error"
+    (spoilt,) = check_nonlinear_rows(NonlinearRows(60, 4, names[:1], (), 0.0, 0.0), high=True)
+    assert "(0-1 near 0 or 180 deg" in spoilt.text
+    (curved,) = check_nonlinear_rows(NonlinearRows(60, 0, (), ("0-9",), 0.0, 0.11))
+    assert (curved.severity, NONLINEAR in curved.text, "0-9" in curved.text) == ("warning", True, True)
+
+
+# --- cells where covariances are not honest ------------------------------------------------------------------------
+
+
+def wrists(lengths, *, seed, n=60, k=6, tilt=0.0, nominal=0.0):
+    """Two parallel axes, and across them wrists of which few pairs turn one each: they see its length alone.
+
+    Of `lengths` one each; the other pairs have the wrists upright, where their lengths act along the axes, unseen, but
+    for `tilt`.
+    """
+    rng = np.random.default_rng(seed)
+    rows = [[0.5, 0.0, 0.3, 0.0], [0.4, np.pi / 2, 0.0, 0.0], *([nominal, 0.0, 0.0, 0.0] for _ in lengths)]
+    robot = Robot.from_dh(rows, convention="dh", tolerance={"a": 5e-3, "d": 1e-3, "alpha": 5e-4, "theta": 5e-4})
+    values = true_robot(robot, rng).nominal
+    for i, length in enumerate(lengths):
+        values[robot.index(f"a{3 + i}")] = length
+    n_all = n + k * len(lengths)
+    a, b = (np.zeros((n_all, robot.n_joints)) for _ in range(2))
+    a[:, :2], b[:, :2] = rng.uniform(-2.5, 2.5, (2, n_all, 2))
+    a[:, 2], b[:, 2] = np.pi / 2 + tilt * rng.normal(size=(2, n_all))
+    b[n:] = a[n:]
+    for i in range(len(lengths)):
+        b[n + k * i : n + k * (i + 1), 2 + i] += rng.uniform(1.0, 3.0, k)
+    return robot, pairs_of(robot.with_values(values), a, b, 1e-4, rng)
+
+
+def pairs_of(true, a, b, sigma, rng, *, angles=False):
+    """Measured lengths, and angles, between configurations."""
+    at, ends = [pose(true, q) for q in (a, b)], np.arange(len(a))
+    distance = np.abs(np.linalg.norm(at[1].position - at[0].position, axis=1) + sigma * rng.normal(size=len(a)))
+    pairs = {"a": ends, "b": len(a) + ends, "distance": distance, "sigma_distance": sigma}
+    if angles:
+        turned = Rotation.from_matrix(np.swapaxes(at[0].rotation, 1, 2) @ at[1].rotation).magnitude()
+        pairs |= {"angle": np.abs(turned + sigma * rng.normal(size=len(a))), "sigma_angle": sigma}
+    return Measurements.from_arrays(np.concatenate([a, b]), pairs=pairs)
+
+
+def short_and_wide(seed, n_wide, n_short=40):
+    """An arm of which 40 pairs turn the last joint alone, its radius 0.1 mm to one side by nominal; others are wide."""
+    rng = np.random.default_rng(seed)
+    rows = [[0.3, np.pi / 2, 0.3, 0.0], [0.4, 0.0, 0.0, 0.0], [1e-4, np.pi / 2, 0.0, 0.0]]
+    robot = Robot.from_dh(rows, tolerance={"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3})
+    a, b = rng.uniform(-2.5, 2.5, (2, n_wide + n_short, 3))
+    b[n_wide:, :2] = a[n_wide:, :2]
+    return robot, pairs_of(true_robot(robot, rng), a, b, SIGMA, rng)
+
+
+WRIST = [
+    *([0.0, np.pi / 2, 0.3, 0.0], [0.4, 0.0, 0.0, 0.0], [0.03, np.pi / 2, 0.0, 0.0]),
+    *([0.0, -np.pi / 2, 0.4, 0.0], [0.0, np.pi / 2, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]),
+]
+GANTRY = [
+    *([0.0, -np.pi / 2, 0.1, -np.pi / 2], [0.0, -np.pi / 2, 0.1, -np.pi / 2], [0.0, 0.0, 0.1, 0.0]),
+    *([0.0, np.pi / 2, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]),
+]
+
+
+def one_joint_a_pair(rows, n_prismatic, *, seed, n, tolerance, angles):
+    """An arm of which each pair moves one joint: many a length that nominal has at 0 is the radius of a circle."""
+    rng, revolute = np.random.default_rng(seed), len(rows) - n_prismatic
+    types = ["prismatic"] * n_prismatic + ["revolute"] * revolute
+    sigmas = dict.fromkeys(("a", "d", "tool", "alpha", "theta"), tolerance)
+    robot = Robot.from_dh(rows, types=types, estimate=["tool.x", "tool.z"], tolerance=sigmas)
+    low, high = np.array([0.0] * n_prismatic + [-2.5] * revolute), np.array([0.4] * n_prismatic + [2.5] * revolute)
+    a, joint, each = rng.uniform(low, high, (n, len(rows))), rng.integers(0, len(rows), n), np.arange(n)
+    b = a.copy()
+    b[each, joint] = rng.uniform(low, high, (n, len(rows)))[each, joint]
+    return robot, pairs_of(true_robot(robot, rng), a, b, SIGMA, rng, angles=angles)
+
+
+QUARTER = np.pi / 2
+ARMS = {
+    "SCARA": [(0, 0, 0.35), (0, 0.325, 0), (np.pi, 0.275, 0.05), (0, 0, 0.1)],
+    "UR10": [(0, 0, 0.1273), (QUARTER, 0, 0), (0, -0.612, 0), (0, -0.5723, 0.163941), (QUARTER, 0, 0.1157),
+             (-QUARTER, 0, 0.0922)],
+}  # fmt: skip
+"""alpha, a and d of each joint, modified DH; the SCARA's third is prismatic."""
+
+
+def star(name, wider, seed, model):
+    """A star of poses of an arm whose prior sigmas are 1 mm and 1 mrad times `wider`."""
+    rng, rows = np.random.default_rng(seed), [(a, alpha, d, 0.0, 0.0) for alpha, a, d in ARMS[name]]
+    types = ["prismatic" if name == "SCARA" and i == 2 else "revolute" for i in range(len(rows))]
+    tolerance = dict.fromkeys(("a", "d", "alpha", "theta", "beta"), 1e-3 * wider)
+    robot = Robot.from_dh(rows, "mdh-hayati", types=types, tolerance=tolerance)
+    most = [0.1 if kind == "prismatic" else 2.4 for kind in types]
+    q = np.random.default_rng(3).uniform(-1.0, 1.0, (40, len(rows))) * most
+    m = measure(true_robot(robot, rng), 40, rng, sigma=(5e-5, 1.7e-4), readings=q)
+    return build_problem(robot, m, model=model, pairing=Pairing("star"))
+
+
+CELLS = {
+    "a length of unknown sign": lambda seed: (*wrists([2.7e-3], seed=seed), "distance"),
+    "a length of unknown sign, off on nominal": lambda seed: (*wrists([6e-3], seed=seed, nominal=5e-3), "distance"),
+    "two lengths of unknown sign": lambda seed: (*wrists([3e-3, -4e-3], seed=seed), "distance"),
+    "short pairs beside wide ones": lambda seed: (*short_and_wide(seed, 20), "distance"),
+    "one joint a pair": lambda seed: (
+        *one_joint_a_pair(WRIST, 0, seed=7 + seed, n=20, tolerance=1e-3, angles=False),
+        "distance",
+    ),
+    "a gantry, one joint a pair": lambda seed: (
+        *one_joint_a_pair(GANTRY, 3, seed=100 + seed, n=40, tolerance=1e-2, angles=True),
+        "distance-rotation",
+    ),
+}
+
+
+@pytest.mark.sampled(3)
+@pytest.mark.parametrize("seed", [1, 3])
+@pytest.mark.parametrize("cell", CELLS)
+def test_pairs_of_ambiguous_sign_that_a_result_rests_on_are_named(cell, seed):
+    """Half of such draws end at the arm with the other sign, and their chi-square may be as good."""
+    robot, m, model = CELLS[cell](seed)
+    verdict = calibrate(robot, m, model=model).assessed[1].verdict
+    (said,) = [text for text in (*verdict.errors, *verdict.warnings) if AMBIGUOUS in text]
+    assert "leave these out, or measure longer and wider motions" in said
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(
+    ("name", "wider", "model"),
+    [("SCARA", 10.0, "distance-rotation"), ("SCARA", 10.0, "distance"), ("UR10", 30.0, "distance")],
+)
+def test_stars_at_wide_priors_are_warned_of(name, wider, model, seed):
+    """Mean NEES of 10 draws 2.4 for the SCARA at tolerances times 10, of single draws up to 14."""
+    verdict = assess(solve(star(name, wider, seed, model))).verdict
+    assert any(NONLINEAR in text for text in verdict.warnings)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_stars_at_usual_priors_are_not_warned_of(name):
+    verdict = assess(solve(star(name, 1.0, 0, "distance-rotation"))).verdict
+    assert not any(words in text for text in (*verdict.errors, *verdict.warnings) for words in (AMBIGUOUS, NONLINEAR))
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("seed", [158, 855, 1357])
+def test_an_angle_whose_sign_spoils_the_fit_is_named(seed):
+    """It lies 8 of its sigma or more from 180 degrees, but priors of 2 mrad put nominal on the other side."""
+    rng = np.random.default_rng(seed)
+    robot = small_arm(tolerance={"a": 1e-3, "d": 1e-3, "alpha": 2e-3, "theta": 2e-3})
+    true, n, sigma = true_robot(robot, rng), 14, 2e-4
+    q, a = rng.uniform(-2, 2, (n, 4)), np.arange(n)
+    b = (a + 5) % n
+    at = pose(true, q)
+    turned = Rotation.from_matrix(np.swapaxes(at.rotation[a], 1, 2) @ at.rotation[b]).magnitude()
+    angle = turned + sigma * rng.normal(size=n)
+    angle[np.pi - angle < 8 * sigma] = np.nan
+    distance = np.linalg.norm(at.position[b] - at.position[a], axis=1) + sigma * rng.normal(size=n)
+    pairs = {"a": a, "b": b, "distance": distance, "angle": angle, "sigma_distance": sigma, "sigma_angle": sigma}
+    problem = build_problem(robot, Measurements.from_arrays(q, pairs=pairs), model="distance-rotation")
+    verdict = assess(solve(problem)).verdict
+    assert any("reduced chi-square" in text for text in verdict.errors)
+    assert any(text.startswith("the sign of 1 of 28 lengths and angles") for text in verdict.warnings)

@@ -1,0 +1,247 @@
+"""Unmodelled effects are found, and noise, outliers and forgotten frames are not taken for them."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from instruments import measured_by
+from scipy.spatial.transform import Rotation
+from scipy.stats import binom, kstest
+from simulated import measure, plus, true_robot, write_job
+from sparing import diagonal
+from systematic import ARMS, PLACED, SIGMA, SIGMA_JOINT, arm, measured, of_joint, problem_of
+
+from fg_calib.assessment import assess
+from fg_calib.diagnostics.unmodelled_effects import find_change, forgotten_offsets, probability_of_noise
+from fg_calib.diagnostics.verdict import LIKE_NOISE, NOT_NOISE, check_systematic
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.solver import solve
+from fg_calib.observability.parallel_axes import end_of_link
+from fg_calib.report.text import format_report
+from fg_calib.robot.kinematics import pose
+from fg_calib.statistics.variance_components import estimate_noise
+
+
+def sagging(radians_per_metre, weight_of_links=0.3):
+    """Joints that yield to a weight at the tool and to those of the links."""
+
+    def effect(true, q):
+        at, n = pose(true, q), true.n_joints
+        J = at.jacobian[:, :, len(true.parameters) :]
+        torque = J[:, 5].copy()
+        for owner in range(1, n):
+            link = pose(replace(true, elements=true.elements[: end_of_link(true, owner)]), q)
+            lever = (link.position - at.position)[:, :, None]
+            torque[:, :owner] += weight_of_links * (J[:, 5] + np.cross(J[:, :3], lever, axis=1)[:, 2])[:, :owner]
+        return radians_per_metre * torque
+
+    return effect
+
+
+EFFECTS = {
+    "gravity": sagging(2e-4),
+    "reach": of_joint(1, lambda true, q: 1e-3 * np.linalg.norm(pose(true, q).position[:, :2], axis=1)[:, None]),
+    "gain": of_joint(2, lambda _, q: 3e-4 * q),
+    "backlash": of_joint(1, lambda _, q: 3e-4 * np.sign(np.sin(q))),
+    "eccentricity": of_joint(1, lambda _, q: 3e-4 * np.sin(q + 0.4)),
+}
+"""What moves the tool of the 6R arm by 2 to 4 sigma."""
+
+SYSTEMATIC = r"the residuals are systematic \(p = \S+\): unmodelled effects; true errors may be"
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_an_effect_of_a_few_sigma_is_seen_whatever_noise_is_specified_and_is_no_change(effect):
+    for unit in (1.0, 0.2):
+        robot, m = measured("6R", np.random.default_rng(1), effect=EFFECTS[effect], unit=unit)
+        solution = solve(problem_of(robot, m, "position"))
+        assert probability_of_noise(solution) < NOT_NOISE
+        assert find_change(solution) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "model"), diagonal(ARMS, ["position", "pose", "pairs"]))
+def test_noise_is_not_systematic_and_has_no_change(name, model):
+    robot, m = measured(name, np.random.default_rng(2))
+    solution = solve(problem_of(robot, m, model))
+    assert probability_of_noise(solution) > LIKE_NOISE
+    assert find_change(solution) is None
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("name", "model"), [("6R", "position"), ("scara", "pose"), ("gantry", "pairs"), ("6R", "own")])
+def test_p_values_of_noise_are_uniform(name, model):
+    """Kolmogorov-Smirnov at 0.1 %, and no more below 1 % than chance allows once in a thousand times."""
+    rng = np.random.default_rng(3)
+    solver, unit, model = (estimate_noise, 0.2, "pose") if model == "own" else (solve, 1.0, model)
+    p = [probability_of_noise(solver(problem_of(*measured(name, rng, unit=unit), model))) for _ in range(100)]
+    assert kstest(p, "uniform").pvalue > 1e-3
+    assert np.sum(np.array(p) < 0.01) <= binom.ppf(0.999, 100, 0.01)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_true_errors_are_twice_those_claimed_or_more_where_residuals_are_systematic(effect):
+    """With the noise estimated chi-square is 1, and the tool is off by twice what is claimed or more."""
+    ratios = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        robot, m = measured("6R", rng, effect=EFFECTS[effect])
+        found = assess(estimate_noise(problem_of(robot, m, "position")))
+        assert found.verdict.warnings
+        q = rng.uniform(-2.0, 2.0, (60, 6))
+        true = true_robot(robot, np.random.default_rng(seed))
+        points = pose(true, q + EFFECTS[effect](true, q)).position
+        at = pose(found.robot, q).position
+        rotation, _ = Rotation.align_vectors(points - points.mean(axis=0), at - at.mean(axis=0))
+        off = rotation.apply(at - at.mean(axis=0)) - points + points.mean(axis=0)
+        sigma = found.predict(lambda robot, q=q: pose(robot, q).position, fitted=True).sigma
+        ratios.append(np.sqrt(np.sum(off**2) / np.sum(sigma**2)))
+    assert 1.8 < np.median(ratios) < 4.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("effect", "verdict"), [("backlash", "GOOD, with reservations: "), (None, "GOOD: ")])
+def test_estimated_noise_does_not_hide_unmodelled_effects(fg_calib, tmp_path, effect, verdict):
+    robot, m = measured("6R", np.random.default_rng(1), effect=EFFECTS.get(effect))
+    ended = fg_calib("calibrate", write_job(tmp_path, robot, m, model="position", frame="unknown", noise="estimate"))
+    assert ended.code == 0
+    assert re.search(f"^{verdict}converged", ended.out, flags=re.M)
+    said = f"{SYSTEMATIC} several times those claimed: rely on the test rows"
+    assert (re.search(said, " ".join(ended.out.split())) is not None) == (effect is not None)
+
+
+@pytest.mark.slow
+def test_noise_is_not_offered_to_be_estimated_where_residuals_are_systematic():
+    robot, m = measured("6R", np.random.default_rng(1), effect=EFFECTS["gravity"], n_test=15)
+    found = assess(solve(problem_of(robot, m, "position")))
+    assert found.verdict.noise_like < NOT_NOISE
+    assert not found.noise_may_be_estimated
+
+
+def test_a_warning_of_systematic_residuals_goes_by_the_p_value():
+    assert check_systematic(None) == check_systematic(LIKE_NOISE) == []
+    ((little,), (much,)) = check_systematic(0.99 * LIKE_NOISE), check_systematic(0.99 * NOT_NOISE)
+    assert (little.severity, much.severity) == ("warning", "warning")
+    assert re.fullmatch(f"{SYSTEMATIC} twice those claimed", little.text)
+    assert re.fullmatch(f"{SYSTEMATIC} several times those claimed: rely on the test rows", much.text)
+
+
+# --- change points -----------------------------------------------------------------------------------------------
+
+
+def moved(what, first, rng, n=45):
+    """A table from row `first` of which the target, or the tracker, is half a millimetre away from where it was."""
+    robot = arm("6R")
+    true = true_robot(robot, rng)
+    q = rng.uniform(-2.0, 2.0, (n, 6))
+    values, frame = true.nominal, PLACED
+    if what == "tool":
+        values[[true.index(f"tool.{k}") for k in "xyz"]] += [4e-4, -2e-4, 2e-4]
+    elif what == "base":
+        frame = (PLACED[0], PLACED[1] + [4e-4, -2e-4, 2e-4])
+    parts = [
+        measure(at, len(rows), rng, sigma=SIGMA, sigma_joint=SIGMA_JOINT, frame=place, readings=rows)
+        for at, place, rows in ((true, PLACED, q[:first]), (true.with_values(values), frame, q[first:]))
+    ]
+    together = {
+        name: np.concatenate([getattr(part, name) for part in parts])
+        for name in ("readings", "test", "position", "rotation", "sigma_position", "sigma_orientation")
+    }
+    return robot, replace(parts[0], ids=np.arange(n).astype(str), **together)
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize(("what", "model"), [(w, m) for w in ("tool", "base") for m in ("position", "pose")])
+def test_what_moved_is_reported_with_the_row(what, model):
+    robot, m = moved(what, 22, np.random.default_rng(1))
+    solution = solve(problem_of(robot, m, model))
+    found = assess(solution)
+    assert (found.verdict.change.what, found.verdict.change.configuration) == (what, 22)
+    assert found.verdict.errors[0].startswith(f"from configuration 22 on the {what} has moved (chi-square falls to")
+    assert not found.noise_may_be_estimated
+    report = " ".join(format_report(solution, found).split())
+    assert "robust loss" not in report
+    assert "systematic" not in report
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("row", [2, 25, 43])
+def test_outliers_are_no_change(row):
+    robot, m = moved("nothing", 22, np.random.default_rng(1))
+    for rows in (row, [row, 10]):
+        spoilt = replace(m, position=plus(m.position, rows, 0.005))
+        assert find_change(solve(problem_of(robot, spoilt, "position"))) is None
+
+
+@pytest.mark.slow
+def test_the_last_few_rows_alone_are_outliers_and_no_change():
+    for seed in range(3):
+        robot, m = moved("tool", 41, np.random.default_rng(seed))
+        found = assess(solve(problem_of(robot, m, "pose")))
+        assert found.verdict.change is None
+        assert set(found.fit.goodness.gross.names) <= {"41", "42", "43", "44"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "forgotten", "away"), diagonal(["6R", "scara"], ["frame", "tool"], [1.0, 0.03, 0.003])
+)
+def test_a_frame_or_tool_that_was_forgotten_is_no_change(name, forgotten, away):
+    """From metres, where nothing is linear, down to millimetres."""
+    robot, m = measured(name, np.random.default_rng(2), n=48)
+    if forgotten == "frame":
+        rotation, shift = Rotation.from_rotvec(away * np.array([0.1, -0.2, 0.3])), away * np.array([1.0, 0.5, -0.5])
+        position = rotation.apply(PLACED[0].inv().apply(m.position - PLACED[1])) + shift
+        problem = build_problem(robot, replace(m, position=position), model="position")
+    else:
+        values = robot.nominal
+        values[[robot.index(f"tool.{k}") for k in "xyz"]] += away * np.array([0.1, -0.2, 0.1])
+        known = [p.name for p in robot.parameters if p.estimated and not p.name.startswith("tool")]
+        problem = build_problem(robot.with_values(values).with_estimated(known), m, model="position", frame="unknown")
+    assert find_change(solve(problem)) is None
+
+
+# --- instrument offsets ------------------------------------------------------------------------------------------
+
+
+def lengths(rng, offset, n=60):
+    """An arm, and lengths to anchors with an offset that the job does not mention."""
+    robot, _, table = measured_by("anchors", rng, n=n, sigma_joint=3e-5)
+    m = table.measurements
+    return robot, replace(table, measurements=replace(m, length=m.length + offset))
+
+
+def test_a_forgotten_offset_is_reported_with_its_size():
+    robot, table = lengths(np.random.default_rng(1), 5e-3)
+    solution = solve(build_problem(robot, [table]))
+    (found,) = forgotten_offsets(solution)
+    estimated = solve(build_problem(robot, [replace(table, offset=True)]))
+    unknowns = estimated.problem.data.unknowns
+    place = int(np.flatnonzero(unknowns.owners == [n.startswith("offset") for n in unknowns.names].index(True))[0])
+    estimate = estimated.parameters[estimated.problem.variables.nuisance_span][place]
+    # As it is estimated with all others: linear to a tenth of its sigma.
+    assert found.size == pytest.approx(estimate, abs=0.1 * found.sigma)
+    assert abs(found.size - 5e-3) < 4.0 * found.sigma
+    verdict, healthy = assess(solution).verdict, assess(estimated).verdict
+    assert any("use offset: estimate" in text for text in (*verdict.errors, *verdict.warnings))
+    assert not any("offset: estimate" in text for text in (*healthy.errors, *healthy.warnings, *healthy.notes))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("offset", "loss", "least", "most"), [(0.0, "gnc", 0, 0), (5e-3, "gnc", 8, 12), (0.0, "none", 0, 0)]
+)
+def test_offsets_are_found_behind_a_robust_loss_and_nowhere_by_chance(offset, loss, least, most):
+    """Of 12 tables with gross errors; the loss takes a part of what the offset does to the lengths for outliers."""
+    n = 0
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        robot, table = lengths(rng, offset)
+        m = table.measurements
+        gross = 0.03 * rng.normal(size=len(m.length)) * (rng.random(len(m.length)) < 0.08) * (loss == "gnc")
+        table = replace(table, measurements=replace(m, length=m.length + gross))
+        n += len(forgotten_offsets(solve(build_problem(robot, [table], loss=loss))))
+    assert least <= n <= most
