@@ -53,7 +53,6 @@ FOLDERS = (
 
 UPWARD = {
     "diagnostics/inspection": {"prediction/expected_error"},
-    "diagnostics/linearity": {"prediction/expected_error"},
     "graph/build": {"observability/indices", "observability/random_configurations"},
     "graph/information": {"observability/indices"},
     "observability/cramer_rao": {"prediction/expected_error"},

@@ -23,11 +23,10 @@ from numpy.typing import NDArray
 from fg_calib.arguments import checked
 from fg_calib.errors import CalibrationError
 from fg_calib.graph.information import directions
+from fg_calib.graph.normal_system import SIGNAL_FLOOR
 from fg_calib.graph.problem import Problem, assembled, at_parameters
-from fg_calib.graph.rows import At
 from fg_calib.graph.solver import Solution, SolverOptions, solve, solve_from
-from fg_calib.measurements.kinds import AnchorContact, AnchorDistance, PlaneDistance
-from fg_calib.observability.indices import SIGNAL_FLOOR
+from fg_calib.measurements.kind import Kind
 from fg_calib.robot.kinematics import forward
 from fg_calib.statistics.covariance import spread_of
 from fg_calib.threads import one_blas_thread
@@ -54,9 +53,6 @@ LEAST_GAIN = 0.01
 
 MAX_ROUNDS = 2
 """Optima, each better than the one before, from which others are searched."""
-
-LEAST_POINTS = 4
-"""Lengths that distinguish an anchor from its mirror image."""
 
 MAX_ROWS = 20_000
 """Residuals beyond which weak directions are not searched: a descent takes seconds, and so many rows leave few weak."""
@@ -98,7 +94,7 @@ def multistart(solution: Solution, options: SolverOptions | None = None) -> Solu
         for start in starts:
             keep(partial(solve_from, here, start, best().cost + CHI2_INDISTINCT, options))
     if solution.problem.options.loss == "none":
-        for landmark in range(len(solution.problem.data.unknowns.letters)):
+        for landmark in _mirrored_landmarks(solution.problem):
             mirrored = _mirrored(best(), landmark)
             if mirrored is not None:
                 keep(partial(solve, mirrored, options))
@@ -168,60 +164,43 @@ def _apart(a: Solution, b: Solution) -> bool:
     return bool(np.any((step > SEPARATE_SIGMAS * np.sqrt(variance))[: variables.n_robot_columns]))
 
 
-def _mirrored(solution: Solution, landmark: int) -> Problem | None:
-    """The problem with a plane or an anchor mirrored and the arm at nominal; None where that has no meaning."""
-    unknowns = solution.problem.data.unknowns
-    first = int(np.sum(unknowns.sizes[:landmark]))
-    at = at_parameters(solution.problem, solution.parameters)
-    letter = unknowns.letters[landmark]
-    if letter not in "AF" or at.columns[first] < 0:
-        return None
-    return (_mirrored_anchor if letter == "A" else _mirrored_plane)(solution, at, first)
-
-
-def _mirrored_plane(solution: Solution, at: At, first: int) -> Problem | None:
-    """A plane with its normal the other way, shifted to where its readings are right in the mean.
-
-    None where all readings are the same, and indicate no side.
-    """
-    problem, readings, behind = solution.problem, [np.zeros(0)], -1
+def _mirrored_landmarks(problem: Problem) -> list[tuple[int, ...]]:
+    """Coordinates of the landmarks that may have mirror images: estimated ones that nothing was in contact with."""
+    found, touched = dict[tuple[int, ...], None](), set[int]()
     for s in problem.data.series:
-        if isinstance(s.kind, PlaneDistance):
-            rows = s.train[s.nuisances[s.train, 3] == first]
-            readings.append(s.data[rows, 0])
-            behind = int(s.nuisances[rows[0], 0]) if len(rows) else behind
-    reading = np.concatenate(readings)
-    if np.ptp(reading) == 0.0:
-        return None
-    c, f = (at.coordinates[k : k + 3] for k in (behind, first))
-    through, start = f + 2.0 * float(np.mean(reading)) * (f - c) / np.linalg.norm(f - c), solution.before.copy()
-    start[problem.variables.coordinates[first : first + 3]] = through
-    unknowns = problem.data.unknowns.with_start(behind, through + (f - c))
-    others = np.nan_to_num(np.concatenate(unknowns.starts))
-
-    def with_point_behind(p: Problem) -> Problem:
-        data = replace(problem.data, unknowns=unknowns)
-        return replace(p, data=data, variables=replace(p.variables, others=others))
-
-    whole = None if problem.whole is None else with_point_behind(problem.whole)
-    return assembled(replace(with_point_behind(problem), whole=whole), start)
+        each = np.unique(s.nuisances[s.train], axis=0)
+        if s.kind.is_contact:
+            touched |= set(each.ravel().tolist())
+        elif type(s.kind).mirrored is not Kind.mirrored:
+            found |= dict.fromkeys(map(tuple, each.tolist()))
+    estimated = problem.variables.coordinates >= 0
+    return [key for key in found if estimated[list(key)].any() and not touched & set(key)]
 
 
-def _mirrored_anchor(solution: Solution, at: At, first: int) -> Problem | None:
-    """An anchor mirrored in the plane nearest to its tool points; None of few, or of one that was touched."""
-    problem, points = solution.problem, [np.zeros((0, 3))]
+def _mirrored(solution: Solution, landmark: tuple[int, ...]) -> Problem | None:
+    """The problem with one landmark mirrored and the arm at nominal; None where it has no mirror image."""
+    problem, at, key = solution.problem, at_parameters(solution.problem, solution.parameters), np.array(landmark)
+    points, data = list[Floats](), list[Floats]()
     for s in problem.data.series:
-        if isinstance(s.kind, AnchorDistance | AnchorContact):
-            rows = s.train[s.nuisances[s.train, 0] == first]
-            if isinstance(s.kind, AnchorContact) and len(rows):
-                return None
+        if s.nuisances.shape[1] == len(key) and type(s.kind).mirrored is not Kind.mirrored:
+            kind, rows = s.kind, s.train[np.all(s.nuisances[s.train] == key, axis=1)]
             trig = problem.data.trigs(problem.robot)[s.table]
             points.append(forward(at.chains[s.table].without_columns(), trig, s.ends[rows, 0]).position)
-    p = np.concatenate(points)
-    if len(p) < LEAST_POINTS:
+            data.append(s.data[rows])
+    image = kind.mirrored(np.concatenate(points), np.concatenate(data), at.coordinates[key])
+    if image is None:
         return None
-    middle, across = p.mean(axis=0), np.linalg.svd(p - p.mean(axis=0))[2][2]
-    place, start = problem.variables.coordinates[first : first + 3], solution.before.copy()
-    there = solution.parameters[place]
-    start[place] = there - 2.0 * across * (across @ (there - middle))
-    return assembled(problem, start)
+    start, others = solution.before.copy(), problem.variables.others.copy()
+    places = problem.variables.coordinates[key]
+    start[places[places >= 0]] = image[places >= 0]
+    others[key[places < 0]] = image[places < 0]
+    unknowns = problem.data.unknowns
+    for i in np.unique(unknowns.owners[key[places < 0]]).tolist():  # what is not estimated of it, as a point behind
+        unknowns = unknowns.with_start(unknowns.span(i).start, others[unknowns.span(i)])
+    data_there = replace(problem.data, unknowns=unknowns)
+
+    def there(p: Problem) -> Problem:
+        return replace(p, data=data_there, variables=replace(p.variables, others=others))
+
+    whole = None if problem.whole is None else there(problem.whole)
+    return assembled(replace(there(problem), whole=whole), start)

@@ -26,7 +26,7 @@ from fg_calib.graph.noise import RowNoise
 from fg_calib.graph.problem import Problem, noises_at, tables_of
 from fg_calib.initialization.hand_eye import Frame
 from fg_calib.measurements import residuals
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, Options, Pairing
 from fg_calib.robot.kinematics import Chain, pose
 from fg_calib.robot.model import Robot

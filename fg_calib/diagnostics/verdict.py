@@ -32,8 +32,8 @@ from fg_calib.graph.noise import JOINT_NOISE
 from fg_calib.graph.problem import Problem, at_parameters, reweighted_at
 from fg_calib.graph.solver import Solution
 from fg_calib.graph.tolerances import ToleranceScale
-from fg_calib.measurements.kinds import AnchorContact
-from fg_calib.measurements.models.pairs import missing_figures
+from fg_calib.measurements.kinds.anchor import AnchorContact
+from fg_calib.measurements.kinds.pair import missing_values
 from fg_calib.observability.parallel_axes import MissingMotion
 from fg_calib.robot.kinematics import forward
 from fg_calib.statistics.covariance import Spread
@@ -461,7 +461,7 @@ def check_estimated_noise(case: Case) -> Iterator[Statement]:
 def check_tables(case: Case) -> Iterator[Statement]:
     """Check whether tables lack values that their model needs."""
     for table in case.problem.data.tables:
-        yield from (Statement("note", text) for text in missing_figures(table))
+        yield from (Statement("note", text) for text in missing_values(table))
 
 
 CHECKS: tuple[Callable[[Case], list[Statement] | Iterator[Statement]], ...] = (

@@ -311,7 +311,7 @@ def test_noise_stated_too_small_by_5_is_exit_code_3_with_the_reason_and_results(
     text = (example / JOB).read_text()
     (example / JOB).write_text(re.sub("noise: .*", "noise: {position: 0.0002, orientation: 0.002, joint: 0.001}", text))
     ended = fg_calib("calibrate", example / JOB, "--out", example / "result")
-    finding = "noise stated too small, effects not modelled, or outliers"
+    finding = "noise specified too small, unmodelled effects, or outliers"
     assert ended.code == 3
     assert re.fullmatch(rf"not to be trusted: reduced chi-square \S+ is outside \[0.50, 2.00\]: {finding}\n", ended.err)
     assert ended.out.splitlines()[1].startswith("DOUBTFUL: reduced chi-square")
@@ -330,7 +330,7 @@ def test_noise_stated_too_large_is_a_caution(fg_calib, example, factor):
     ended = fg_calib("calibrate", example / JOB, "--json")
     result = json.loads(ended.out)
     assert (ended.code, result["findings"]) == (0, [])
-    said = [caution for caution in result["cautions"] if "noise stated too large" in caution]
+    said = [caution for caution in result["cautions"] if "noise specified too large" in caution]
     assert bool(said) == (result["reduced_chi2"] < 0.5)
 
 

@@ -106,9 +106,9 @@ def test_what_an_arm_without_tolerances_is_off_by_is_a_caution(tmp_path):
     m = measured(rough)
     found = inspected(arm, m)
     assert found.ready
-    assert "times what noise and tolerances predict: none of the usual mistakes" in found.cautions[0]
+    assert "times what noise and prior sigmas predict: no common mistake" in found.cautions[0]
     found = inspected(ur5e(tmp_path), m)
-    assert "none of the usual mistakes in a set-up explains it" in found.findings[0]
+    assert "no common mistake in a set-up explains it" in found.findings[0]
 
 
 # --- mistakes in the set-up ------------------------------------------------------------------------------------------
@@ -164,7 +164,7 @@ def test_rows_that_disagree_with_the_arm_are_named(arm, model, frame, size):
     m = measured(arm, placed=PLACED if frame == "unknown" else None)
     found = inspected(arm, replace(m, position=plus(m.position, [7, 43], [0.0, size, 0.0])), model, frame)
     (finding,) = found.findings
-    assert finding.startswith("2 measurements disagree with the arm as drawn far more than the others do")
+    assert finding.startswith("2 measurements disagree with the nominal arm far more than the others do")
     rows = {one.row: one for one in found.disagreements.found}
     assert set(rows) == {7, 43}
     assert (rows[7].ends, rows[7].kind, rows[7].test, rows[43].test) == (("7",), "position", False, True)
@@ -233,7 +233,7 @@ def test_a_wrong_row_of_every_instrument_is_named(name):
     (one,) = found.disagreements.found
     assert one.row == (-1 if name == "pairs" else 5)
     assert len(found.findings) == 1
-    assert "one measurement disagrees with the arm as drawn" in found.findings[0]
+    assert "one measurement disagrees with the nominal arm" in found.findings[0]
     assert (one.of != "") == (name in ("targets", "anchors", "planes", "sockets", "stations", "board"))
 
 
@@ -285,7 +285,7 @@ def test_copies_of_rows_are_told_from_repeats(arm):
     again = replace(again, ids=np.arange(51).astype(str), test=np.append(m.test, False))
     found = inspected(arm, again)
     (caution,) = found.cautions
-    assert caution.startswith("measurements: one row is an exact copy of another (3 and 50): what was copied counts")
+    assert caution.startswith("measurements: one row is an exact copy of another (3 and 50): a copy counts as one more measurement")
     assert (found.tables[0].n_copies, found.tables[0].n_repeats) == (1, 0)
     repeated = inspected(arm, replace(again, position=plus(again.position, [50], 1e-5)))
     assert said(repeated) == ()
@@ -339,7 +339,7 @@ def test_a_joint_that_hardly_moves_is_told_of(arm):
     found = inspected(arm, measured(arm, readings=q))
     assert [joint.name for joint in found.joints if joint.still] == ["q4"]
     assert found.ready
-    assert found.cautions[0] == "q4 hardly moves: its zero is not told from what stands before it"
+    assert found.cautions[0] == "q4 hardly moves: its zero is not distinguishable from the link before"
     assert any("not excited by these configurations" in caution for caution in found.cautions)
 
 
@@ -360,7 +360,7 @@ def test_pairs_near_nothing_are_counted():
     q[1:8] = q[0] + 1e-4 * rng.normal(size=(7, 4))  # the star's first
     m = measure(robot, 30, rng, sigma=(1e-4, 1e-4), readings=q)
     found = inspected(robot, m, "distance-rotation", "known")
-    assert (found.tables[0].n_pairs, found.tables[0].n_near_kink) == (29, 7)
+    assert (found.tables[0].n_pairs, found.tables[0].n_near_singular) == (29, 7)
 
 
 def test_pairs_whose_vectors_may_point_either_way_are_told_of():
@@ -370,8 +370,8 @@ def test_pairs_whose_vectors_may_point_either_way_are_told_of():
     q = rng.uniform(-2, 2, (30, 4))
     q[:8] = reach(robot, np.tile(pose(robot, q[:1]).position, (8, 1)), rng)
     found = inspected(robot, measure(robot, 30, rng, sigma=(1e-4, 1e-4), readings=q), "distance", "known")
-    assert found.tables[0].n_folded == 7
-    assert "measurements: 7 of 29 train pairs are so near 0 or half a turn" in found.cautions[-1]
+    assert found.tables[0].n_ambiguous == 7
+    assert "measurements: the sign of 7 of 29 train pairs is ambiguous" in found.cautions[-1]
 
 
 # --- what can be determined ------------------------------------------------------------------------------------------
@@ -415,7 +415,7 @@ def test_as_many_unknowns_as_rows_leave_nothing_to_judge_by():
 def test_noise_to_be_estimated_is_told_of(arm):
     found = inspected(arm, measured(arm), estimate_noise=True)
     assert found.cautions == (
-        "noise is to be estimated: sigmas and accuracy here are for noise as stated, or 1 mm and 1 mrad",
+        "noise is to be estimated: sigmas and accuracy here are for specified noise, or 1 mm and 1 mrad",
     )
 
 

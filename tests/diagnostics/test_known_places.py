@@ -22,8 +22,8 @@ def test_a_place_that_is_twelve_tolerances_off_is_named_and_nothing_else(instrum
         assert not calibrate(robot, table).findings
         robot, _, table = measured_by(f"{instrument} nearly wrong", np.random.default_rng(seed))
         found = calibrate(robot, table)
-        (finding,) = [text for text in found.findings if "tolerances" in text]
-        match = re.match(rf"{name} lies (\S+) of its tolerances from where it was said to be: tolerances", finding)
+        (finding,) = [text for text in found.findings if "prior sigmas" in text]
+        match = re.match(rf"{name} lies (\S+) prior sigmas from where it was specified: prior", finding)
         assert 4.0 < float(match.group(1)) < 16.0  # what the arm takes up of it, and three sigma of its own
         (beyond,) = found.result.priors.beyond_tolerance
         assert beyond.parameter == name

@@ -20,7 +20,7 @@ from fg_calib.graph.solver import solve
 from fg_calib.io.job import read_job
 from fg_calib.io.robot_file import read_robot
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.series import Table
+from fg_calib.measurements.table import Table
 from fg_calib.options import Pairing
 from fg_calib.robot.inverse import solve_inverse
 from fg_calib.robot.kinematics import pose

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from fg_calib import Robot, calibrate
 from fg_calib.assessment import assess
 from fg_calib.diagnostics import nominal_residuals as placed_residuals
-from fg_calib.diagnostics.setup import has_places, setup_of_table
+from fg_calib.diagnostics.nominal_residuals import setup_of
 from fg_calib.diagnostics.setup_check import FAR, check_setup
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import SolverOptions, solve
@@ -88,10 +88,10 @@ def test_what_is_expected_is_what_arms_drawn_from_their_tolerances_show():
 def test_rows_are_drawn_so_that_every_target_and_anchor_is_there():
     for instrument, label in (("targets", "target"), ("anchors", "anchor")):
         robot, _, table = measured_by(instrument, np.random.default_rng(2), n=150)
-        setup = setup_of_table(robot, table)
-        assert len(setup.measurements.readings) <= 80
-        assert set(setup.measurements.labels[label].index) == {0, 1, 2}
-        assert has_places(table.measurements, table.model)
+        setup = setup_of(robot, table)
+        assert len(setup.table.measurements.readings) <= 80
+        assert set(setup.table.measurements.labels[label].index) == {0, 1, 2}
+        assert setup.has_landmarks
 
 
 @pytest.mark.slow
@@ -126,17 +126,17 @@ def test_the_calibration_says_it_first():
 def test_what_no_usual_mistake_explains_is_said_of_instruments_too():
     robot, _, table = measured_by("targets", np.random.default_rng(4))
     mixed = np.random.default_rng(5).permutation(table.measurements.position)
-    assert str(check(robot, table, position=mixed)).endswith("none of the usual mistakes in a set-up explains it")
+    assert str(check(robot, table, position=mixed)).endswith("no common mistake in a set-up explains it")
 
 
 @pytest.mark.slow
 def test_what_could_not_be_checked_is_said(monkeypatch):
-    monkeypatch.setattr(placed_residuals, "_placed_residuals", lambda setup: ())
+    monkeypatch.setattr(placed_residuals, "residuals_at", lambda *_: ())
     robot, _, table = measured_by("planes", np.random.default_rng(6))
     m = table.measurements
     wrong = build_problem(robot, [replace(table, measurements=replace(m, length=m.length / 1e3))])
     found = assess(solve(wrong, SolverOptions(max_iterations=5)))
-    assert any("was not checked for the usual mistakes (units, signs, columns)" in said for said in found.cautions)
+    assert any("was not checked for common mistakes (units, signs, columns)" in said for said in found.cautions)
     good = assess(solve(build_problem(robot, [table])))
     assert not any("was not checked" in said for said in good.cautions)
 

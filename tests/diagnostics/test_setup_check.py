@@ -422,7 +422,7 @@ def test_what_no_usual_mistake_explains_is_said_plainly(tmp_path, fg_calib):
     assert ended.code == 3
     said = " ".join(ended.out.split())
     assert " in the median, " in said
-    assert "times what noise and tolerances predict: none of the usual mistakes in a set-up explains it" in said
+    assert "times what noise and prior sigmas predict: no common mistake in a set-up explains it" in said
     assert "the noise there is" not in said
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, true_robot
 from sparing import diagonal
 
-from fg_calib.diagnostics.table_setups import OTHER_TOOL, check_problem
+from fg_calib.diagnostics.setup_check import OTHER_TOOL, check_problem
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.measurements.dataset import Pairs
@@ -56,7 +56,7 @@ def test_a_forgotten_unknown_frame_of_one_of_two_tables_is_said_of_that_table(tm
 
 MISTAKES = {
     "bar.csv: distance residuals fall from": "if distances are in m, not mm",
-    "bar.csv: distance residuals before calibration are": "none of the usual mistakes in a set-up explains it",
+    "bar.csv: distance residuals before calibration are": "no common mistake in a set-up explains it",
     "cam.csv: position residuals fall from": "if x, y, z are in mm, not m",
 }
 

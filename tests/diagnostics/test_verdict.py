@@ -185,10 +185,10 @@ def test_without_test_rows_nothing_is_said_of_them(fg_calib, tmp_path):
 @pytest.mark.parametrize(
     ("stated", "code", "said"),
     [
-        (4.0, 0, "noise stated too large; sigmas are larger than they need be"),
+        (4.0, 0, "noise specified too large; sigmas are larger than they need be"),
         (1.0, 0, None),
-        (0.8, 0, "times the noise stated, not by chance; sigmas may be too small by as much"),
-        (0.5, 3, "noise stated too small, effects not modelled, or outliers"),
+        (0.8, 0, "significantly larger than the specified noise"),
+        (0.5, 3, "noise specified too small, unmodelled effects, or outliers"),
     ],
 )
 def test_noise_stated_wrong_is_a_caution_or_a_finding_by_how_much(fg_calib, tmp_path, stated, code, said):
@@ -254,7 +254,7 @@ def test_healthy_corrections_are_seldom_called_too_large(name):
     """Each of the two alarms at 0.1 %: more than 1 of 60 is unlikely (0.7 %). The p-value by Kolmogorov-Smirnov."""
     rng = np.random.default_rng(31)
     fits = [assess(solve(healthy(name, rng))) for _ in range(60)]
-    assert sum(any("tolerances" in text for text in fit.findings + fit.cautions) for fit in fits) <= 1
+    assert sum(any("prior sigmas" in text for text in fit.findings + fit.cautions) for fit in fits) <= 1
     assert kstest([fit.priors.p_value for fit in fits], "uniform").pvalue > 1e-3
     sums = np.array([(fit.priors.chi2, fit.priors.expected) for fit in fits])
     assert sums[:, 0].sum() / sums[:, 1].sum() == pytest.approx(1.0, abs=4 * np.sqrt(2 / sums[:, 1].sum()))
@@ -272,7 +272,7 @@ def test_a_correction_far_beyond_its_tolerance_is_a_finding_that_names_it(fg_cal
     m = measure(true.with_values(true.nominal + off), 30, rng, sigma=(1e-4, 1e-4))
     ended = fg_calib("calibrate", write_job(tmp_path, robot, m, model="pose"), "--json")
     assert ended.code == 3
-    found = re.search(r"corrections beyond their tolerances \(in sigma of these: (\S+) ([+-]\S+?)[,)]", ended.err)
+    found = re.search(r"corrections beyond their prior sigmas \(in sigma of these: (\S+) ([+-]\S+?)[,)]", ended.err)
     assert found.group(1) == name
     assert float(found.group(2)) == pytest.approx(error / 2e-3, abs=4)  # the arm's own error is 1 sigma of it
     assert json.loads(ended.out)["priors"]["beyond_tolerance"][0]["parameter"] == name
@@ -284,7 +284,7 @@ def test_tolerances_stated_too_small_for_all_are_a_finding():
     m = measure(true_robot(loose, rng), 30, rng, sigma=(1e-4, 1e-4))
     found = assess(solve(build_problem(robot, m, model="pose")))
     assert found.priors.chi2 > 2 * found.priors.expected
-    assert any("tolerances stated too small" in finding for finding in found.findings)
+    assert any("specified too small" in finding for finding in found.findings)
 
 
 @pytest.mark.slow
@@ -297,7 +297,7 @@ def test_sockets_that_are_not_as_far_apart_as_stated_are_a_finding(fg_calib, tmp
     m = with_distances(m, 1.12 * m.groups.pairs.distance)
     ended = fg_calib("calibrate", write_job(tmp_path, robot, m, model="distance"))
     assert ended.code == 3
-    assert "tolerances" in ended.err
+    assert "prior sigmas" in ended.err
 
 
 def test_without_priors_no_correction_is_too_large():
@@ -591,7 +591,7 @@ def test_lengths_that_tolerances_let_point_either_way_are_a_finding():
     wide = measure(true, 30, rng, sigma=(1e-5, 1e-5))
     beside_poses = (Table(wide, "pose"), Table(near, "distance"))
     told = [
-        any("let their vectors point either way" in text for text in found.findings)
+        any("is ambiguous within the prior sigmas" in text for text in found.findings)
         for found in (
             assess(solve(build_problem(robot, given, model="distance"))) for given in (near, wide, beside_poses)
         )

@@ -209,7 +209,7 @@ def test_doubt_stands_first():
     assert text.startswith("two-links: position\nDOUBTFUL: reduced")
     # A tilt that positions in the arm's plane do not see is no cause.
     assert "axes 1 and 2 are parallel" in text.partition("Notes")[2]
-    assert "noise stated too small" in text
+    assert "noise specified too small" in text
     assert "GOOD" not in text
 
 
