@@ -285,7 +285,7 @@ def test_copies_of_rows_are_told_from_repeats(arm):
     again = replace(again, ids=np.arange(51).astype(str), test=np.append(m.test, False))
     found = inspected(arm, again)
     (caution,) = found.cautions
-    assert caution.startswith("measurements: one row is an exact copy of another (3 and 50): a copy counts as one more measurement")
+    assert caution.startswith("measurements: one row is an exact copy of another (3 and 50): a copy counts")
     assert (found.tables[0].n_copies, found.tables[0].n_repeats) == (1, 0)
     repeated = inspected(arm, replace(again, position=plus(again.position, [50], 1e-5)))
     assert said(repeated) == ()

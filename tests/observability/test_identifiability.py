@@ -98,7 +98,7 @@ DRAWN = [(robot, ranks) for robot, ranks, _ in RANKS] + [
 
 def rank_at(robot, model, seed):
     problem = random_problem(robot, model, seed=seed)
-    assert not problem.data.n_train(SamePoint)
+    assert not problem.data.n_train(lambda kind: isinstance(kind, SamePoint))
     return observability_of(problem, problem.start, (), STRUCTURAL_FLOOR).rank
 
 
