@@ -151,7 +151,7 @@ MISTAKES = {
               "did you mean uniform?"),
     "a self-motion": (lambda: BoardViews(BOARD, self_motion="Held"), "board: self_motion: found 'Held', expected one "
                       "of random, held; did you mean held?"),
-    "a board's radius": (lambda: BoardViews(BOARD, radius=-0.5), "board: radius: found -0.5, expected a number above 0"),
+    "a radius": (lambda: BoardViews(BOARD, radius=-0.5), "board: radius: found -0.5, expected a number above 0"),
     "a number of views": (lambda: RandomReadings(0), "random: count: found 0, expected a number above 0"),
     "a scenario's frame": (lambda: scenario(frame="Base"), "scenario: frame: found 'Base', expected one of base, "
                            "unknown; did you mean base?"),
