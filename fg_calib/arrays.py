@@ -5,15 +5,54 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sized
 from dataclasses import fields
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
+from pydantic import BeforeValidator, PlainSerializer
+from pydantic_core import CoreSchema, core_schema
 
 from fg_calib.errors import InputError, shown
 from fg_calib.sizes import MOST_SIZE, ORDINARY
 
-Floats = NDArray[np.float64]
+
+class _AsLists:
+    """Arrays as JSON has them: nested lists, null for what is not finite."""
+
+    def __init__(self, dtype: DTypeLike) -> None:
+        self._dtype = dtype
+
+    def __get_pydantic_core_schema__(self, *_: object) -> CoreSchema:
+        """The schema of a field with this annotation."""
+        return core_schema.no_info_plain_validator_function(
+            lambda value: value if isinstance(value, np.ndarray) else np.array(value, dtype=self._dtype),
+            serialization=core_schema.plain_serializer_function_ser_schema(_listed),
+        )
+
+    def __get_pydantic_json_schema__(self, *_: object) -> dict[str, Any]:
+        """The JSON schema of a field with this annotation."""
+        return {"type": "array"}
+
+
+def _listed(values: NDArray[Any]) -> list[Any]:
+    finite = np.isfinite(values) if values.dtype.kind == "f" else np.ones(values.shape, dtype=np.bool_)
+    plain: NDArray[Any] = values if finite.all() else values.astype(object)
+    plain = plain if finite.all() else np.where(finite, plain, np.array(None))
+    listed: list[Any] = plain.tolist()
+    return listed
+
+
+Floats = Annotated[NDArray[np.float64], _AsLists(np.float64)]
+Integers = Annotated[NDArray[np.int64], _AsLists(np.int64)]
+Booleans = Annotated[NDArray[np.bool_], _AsLists(np.bool_)]
+"""Arrays that a typed result writes to JSON and reads back, as fields of dataclasses too."""
+
+Figure = Annotated[
+    float,
+    BeforeValidator(lambda value: np.nan if value is None else value),
+    PlainSerializer(lambda value: float(value) if np.isfinite(value) else None, return_type=float | None),
+]
+"""A number that may be nan, for unknown, or infinite: null in JSON."""
 
 NORM_TOLERANCE = 1e-3
 """How far a quaternion or a rotation matrix may be from length 1: more is not rounding."""

@@ -6,53 +6,51 @@ found = calibrate_jobs(["arm1.yaml", "arm2.yaml"], executor)
 
 from __future__ import annotations
 
+import csv
+import io
+import json
+import logging
 import os
 import time
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any, Literal
 
 from fg_calib.arguments import checked
 from fg_calib.calibration import Calibration, calibrate_job
 from fg_calib.errors import InputError, escaped, shown
 from fg_calib.executors import Failure, map_jobs
-from fg_calib.io.atomic import require_own, require_writable
+from fg_calib.io.atomic import fill_folder, require_writable, write_text
 from fg_calib.io.job import read_job
-from fg_calib.io.parts import JobInParts, read_parts
+from fg_calib.io.saved import ResidualFile, require_no_input
 from fg_calib.job import Job
-from fg_calib.progress import keeping_warnings
-from fg_calib.report.batch import JOBS_FILES, JobSummary, summary_of
-from fg_calib.report.documents import ResidualFile, require_no_input
+
+JOBS_FILES = {"jobs.json": b'{\n "schema": "fg-calib/jobs/', "jobs.csv": b"name,job,verdict,"}
+"""The files that are written about many jobs together, and how each begins."""
+
+Verdict = Literal["good", "not accepted", "doubtful", "failed"]
 
 
 @checked
 def calibrate_jobs(jobs: Sequence[Job | Path | str], executor: Executor | None = None) -> list[Calibration | Failure]:
-    """`calibrate_job` of many jobs; one that fails is no matter to the others.
-
-    Each is the same to the last bit wherever it runs. A job that is a path is read where it runs.
+    """`calibrate_job` of many jobs; the results do not depend on the executor.
 
     Args:
-        jobs: The jobs, or the paths of their files.
+        jobs: The jobs, or the paths of their files, which are read where the job runs.
         executor: Where they run, such as `local_processes(4)`; one after the other in this process if None.
 
     Returns:
-        In the order of the jobs a calibration, or a failure that says why there is none.
+        A calibration, or a failure that says why there is none, in the order of the jobs.
 
     Raises:
-        InputError: The jobs are no list of them, or the executor is none.
+        InputError: The jobs are no list of them.
     """
-    expected = "a list of jobs, such as ['job.yaml', read_job('other.yaml')]"
-    if isinstance(jobs, str | bytes | os.PathLike | Job) or not hasattr(jobs, "__iter__"):
-        raise InputError("jobs", f"found {shown(jobs)}", expected)
-    given = list(jobs)
-    for k, job in enumerate(given):
-        if not isinstance(job, Job | str | os.PathLike):
-            raise InputError(f"jobs[{k}]", f"found {shown(job)}", "a job, or the path of its file")
-    paths = [job.path if isinstance(job, Job) else job for job in given]
+    paths = [job.path if isinstance(job, Job) else job for job in jobs]
     names = [f"job {k + 1}" if path is None else str(path) for k, path in enumerate(paths)]
-    return map_jobs(calibrate_job, given, executor, names=names)
+    return map_jobs(calibrate_job, list(jobs), executor, names=names)
 
 
 @dataclass(frozen=True)
@@ -77,110 +75,190 @@ class Order:
     figures: bool = False
     residuals: ResidualFile = "csv"
 
+    def read(self) -> Job:
+        """The job.
 
-def ordered_job(order: Order) -> Job:
-    """The job of an order, read and checked, before anything is calculated.
+        Raises:
+            InputError: It cannot be read, or its result cannot be written.
+        """
+        if self.folder is not None:
+            require_writable(self.folder)
+        given = read_job(self.job)
+        if self.folder is not None:
+            require_no_input(self.folder, given.path, given.inputs)
+        return given if self.folds is None else replace(given, options=replace(given.options, folds=self.folds))
 
-    Raises:
-        InputError: It cannot be read, or its result cannot be written.
+    def save(self, calibration: Calibration) -> None:
+        """Write the files to the folder, if there is one.
+
+        Raises:
+            InputError: The folder cannot be written.
+        """
+        if self.folder is not None:
+            calibration.save(self.folder, residuals=self.residuals, report=self.report, figures=self.figures)
+
+
+@dataclass(frozen=True)
+class JobSummary:
+    """One row of the table of many jobs.
+
+    Attributes:
+        name: The job's name among them, and that of its folder.
+        job: The job's file.
+        verdict: `good`; `not accepted`: a limit of `accept` is exceeded; `doubtful`: not to be trusted; `failed`: there
+            is no result.
+        error: Why there is none; None where there is one.
+        findings: Why it is not to be trusted, a line each.
+        not_accepted: Limits that are exceeded, a line each.
+        robot: The robot's name; None where the job failed, as all below.
+        n_configurations: Number of fitted configurations.
+        rms: Root mean square of residuals after the calibration by kind, of test rows if there are any, [m], [rad] or
+            [px].
+        of_test: Whether they are of test rows.
+        units: Unit of each kind.
+        reduced_chi2: Chi-square over degrees of freedom.
+        seconds: Duration with reading and writing, [s].
+        warnings: Logged warnings, a line each.
     """
-    if order.folder is not None:
-        require_writable(order.folder)
-    given = read_job(order.job)
-    if order.folder is not None:
-        require_no_input(order.folder, given.path, given.inputs)
-    return given if order.folds is None else replace(given, options=replace(given.options, folds=order.folds))
 
+    name: str
+    job: str
+    verdict: Verdict
+    error: str | None = None
+    findings: tuple[str, ...] = ()
+    not_accepted: tuple[str, ...] = ()
+    robot: str | None = None
+    n_configurations: int | None = None
+    rms: dict[str, float] | None = None
+    of_test: bool | None = None
+    units: dict[str, str] | None = None
+    reduced_chi2: float | None = None
+    seconds: float | None = None
+    warnings: tuple[str, ...] = ()
 
-def ordered_parts(order: Order, n_rows: int) -> JobInParts:
-    """The job of an order, its table in parts, read and checked as far as its first rows.
+    @property
+    def reasons(self) -> list[tuple[str, str]]:
+        """Why the job is not good: what kind of reason, and the reason."""
+        failed = [] if self.error is None else [("error", self.error)]
+        doubtful = [("not to be trusted", finding) for finding in self.findings]
+        return [*failed, *doubtful, *(("not accepted", reason) for reason in self.not_accepted)]
 
-    Args:
-        order: The order.
-        n_rows: Rows of a part.
-
-    Raises:
-        InputError: It cannot be read, or not in parts, or its result cannot be written.
-    """
-    if order.folder is not None:
-        require_writable(order.folder)
-    given = read_parts(order.job, n_rows)
-    if order.folder is not None:
-        require_no_input(order.folder, given.path, given.inputs)
-    return given
-
-
-def save_ordered(order: Order, found: Calibration) -> None:
-    """Write what an order asks for to its folder, if it has one.
-
-    Raises:
-        InputError: The folder cannot be written.
-    """
-    if order.folder is None:
-        return
-    found.save(order.folder, residuals=order.residuals)
-    if order.report or order.figures:
-        from fg_calib.pages import write_report
-
-        write_report(order.folder, page=order.report, figures=order.figures)
+    @property
+    def rows(self) -> str:
+        """The rows that `rms` is of: `test`, `train`, or empty."""
+        return {None: "", True: "test", False: "train"}[self.of_test]
 
 
 def carry_out(order: Order) -> JobSummary:
-    """Calibrate and save one of many jobs: what runs on a worker, which sees the files.
+    """Calibrate and save one of many jobs, on a worker that can read and write the files.
 
     Raises:
-        InputError: The job cannot be read, or its folder not be written.
-        ProblemError: The measurements lack what the model needs, or do not suffice.
-        SolverError: GTSAM could not solve a step at all.
+        CalibrationError: There is no result, or it cannot be written.
     """
     clock = time.perf_counter()
-    with keeping_warnings() as said:
-        found = calibrate_job(ordered_job(order))
-        save_ordered(order, found)
-    seconds = time.perf_counter() - clock
-    return summary_of(order.name, order.job, found.result, found.not_accepted, seconds, said)
+    with _logged_warnings() as warnings:
+        found = calibrate_job(order.read())
+        order.save(found)
+    result, not_accepted = found.result, found.not_accepted
+    rms = result.rms_after("test") or result.rms_after("train")
+    return JobSummary(
+        name=order.name,
+        job=str(order.job),
+        verdict="doubtful" if result.findings else "not accepted" if not_accepted else "good",
+        findings=result.findings,
+        not_accepted=not_accepted,
+        robot=result.robot,
+        n_configurations=result.n_configurations,
+        rms=rms,
+        of_test=bool(result.rms_after("test")),
+        units={kind: result.unit_of(kind) for kind in rms},
+        reduced_chi2=result.reduced_chi2,
+        seconds=time.perf_counter() - clock,
+        warnings=tuple(warnings),
+    )
+
+
+@contextmanager
+def _logged_warnings() -> Iterator[list[str]]:
+    """The warnings that the package logs in the block."""
+    said: list[str] = []
+    log, handler = logging.getLogger("fg_calib"), logging.Handler(logging.WARNING)
+    handler.emit = lambda record: said.append(record.getMessage())  # type: ignore[method-assign]
+    before, log.propagate = log.propagate, False
+    log.addHandler(handler)
+    try:
+        yield said
+    finally:
+        log.removeHandler(handler)
+        log.propagate = before
 
 
 def calibrate_into(orders: Sequence[Order], executor: Executor | None = None) -> list[JobSummary]:
-    """Carry out many orders; one that fails is no matter to the others.
+    """Carry out many orders; a failure of one does not affect the others.
 
     Args:
         orders: The orders.
         executor: Where they run; one after the other in this process if None.
     """
-    before = saved_in(orders)
-    found = map_jobs(carry_out, orders, executor, names=[order.name for order in orders])
+    found = map_jobs(carry_out, list(orders), executor, names=[order.name for order in orders])
     return [
-        _failed(order, one, earlier) if isinstance(one, Failure) else one
-        for order, one, earlier in zip(orders, found, before, strict=True)
+        JobSummary(order.name, str(order.job), "failed", one.reason) if isinstance(one, Failure) else one
+        for order, one in zip(orders, found, strict=True)
     ]
 
 
-def _failed(order: Order, failure: Failure, earlier: tuple[int, int] | None) -> JobSummary:
-    """The line of an order that has no result.
+def exit_code(jobs: Sequence[JobSummary]) -> int:
+    """1 if a job has no result, else 3 if one is not to be trusted or not accepted, else 0."""
+    codes = {{"good": 0, "failed": 1}.get(job.verdict, 3) for job in jobs}
+    return next((code for code in (1, 3) if code in codes), 0)
+
+
+def jobs_document(jobs: Sequence[JobSummary], seconds: float) -> dict[str, Any]:
+    """The content of `jobs.json`, in [m], [rad] and [px].
 
     Args:
-        order: The order.
-        failure: Why.
-        earlier: What was saved in its folder before, see `saved_in`.
+        jobs: The summary of each job.
+        seconds: Duration of all of them together, [s].
     """
-    is_earlier = earlier is not None and saved_in([order]) == [earlier]
-    reason = f"{failure.reason}; {EARLIER}" if is_earlier else failure.reason
-    return JobSummary(order.name, str(order.job), "failed", reason)
+    verdicts: tuple[Verdict, ...] = ("good", "not accepted", "doubtful", "failed")
+    return {
+        "schema": "fg-calib/jobs/1",
+        "n": {verdict: sum(job.verdict == verdict for job in jobs) for verdict in verdicts},
+        "exit_code": exit_code(jobs),
+        "seconds": seconds,
+        "jobs": [asdict(job) for job in jobs],
+    }
 
 
-EARLIER = "the result in its folder is of an earlier run"
+def write_jobs(folder: Path, jobs: Sequence[JobSummary], seconds: float) -> None:
+    """Write `jobs.json` and `jobs.csv` to the folder that has the jobs' folders.
 
+    Args:
+        folder: Where to.
+        jobs: The summary of each job.
+        seconds: Duration of all of them together, [s].
 
-def saved_in(orders: Sequence[Order]) -> list[tuple[int, int] | None]:
-    """Which result is in each order's folder: its inode and time of modification; None where there is none."""
-    files = [None if order.folder is None else order.folder / "result.json" for order in orders]
-    found = [file.stat() if file is not None and file.exists() else None for file in files]
-    return [None if one is None else (one.st_ino, one.st_mtime_ns) for one in found]
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    units = {kind: unit for job in jobs for kind, unit in (job.units or {}).items()}
+    heads = ("name", "job", "verdict", "robot", "n_configurations", "reduced_chi2", "seconds")
+    table = io.StringIO()
+    rows = csv.writer(table, lineterminator="\n")
+    rows.writerow([*heads, *(f"rms {kind} [{unit}]" for kind, unit in units.items()), "rows", "reason", "warnings"])
+    for job in jobs:
+        values = [getattr(job, head) for head in heads] + [(job.rms or {}).get(kind) for kind in units]
+        rows.writerow([*values, job.rows, "; ".join(why for _, why in job.reasons), "; ".join(job.warnings)])
+
+    def write(into: Path) -> None:
+        write_text(into / "jobs.json", json.dumps(jobs_document(jobs, seconds), indent=1, allow_nan=False) + "\n")
+        write_text(into / "jobs.csv", table.getvalue())
+
+    fill_folder(folder, write, JOBS_FILES)
 
 
 def job_names(jobs: Sequence[Path]) -> list[str]:
-    """A name for each of many jobs, of which no two are alike: what their folders are called.
+    """A different name for each of many jobs, which its folder gets.
 
     The names of the files without their ending, if these all differ (`a.yaml b.yaml`); else the names of the folders
     that the files are in (`a/job.yaml b/job.yaml`); else both (`a-cold b-cold a-warm` of `a/cold.yaml ...`).
@@ -189,43 +267,20 @@ def job_names(jobs: Sequence[Path]) -> list[str]:
         jobs: The jobs' files.
 
     Raises:
-        InputError: Two have the same name nevertheless, or one has a name that no folder of results can have.
+        InputError: Two have the same name nevertheless.
     """
-    paths = [Path(os.path.abspath(path)) for path in jobs]  # without `..`, which would lead elsewhere
+    paths = [Path(os.path.abspath(path)) for path in jobs]
     rules: tuple[Callable[[Path], str], ...] = (
         lambda path: path.stem,
         lambda path: path.parent.name,
         lambda path: f"{path.parent.name}-{path.stem}",
     )
+    names: list[str] = []
     for rule in rules:
         names = [rule(path) for path in paths]
-        if _usable(names):
+        lower = [name.casefold() for name in names]
+        if len({*lower, "", *JOBS_FILES}) == len(lower) + 1 + len(JOBS_FILES):
             return names
-    times = Counter(name.casefold() for name in names)
-    name = next(name for name in names if times[name.casefold()] > 1 or not _is_folder_name(name))
-    alike = [escaped(str(path)) for path, other in zip(jobs, names, strict=True) if other.casefold() == name.casefold()]
-    if len(alike) > 1:
-        found = f"{', '.join(alike[:3])} would be written to the same folder {name}"
-        raise InputError("JOB", found, "files, or folders, of different names")
-    raise InputError("JOB", f"{alike[0]} would be written to a folder {name}", "a name that a folder can have")
-
-
-def _usable(names: Sequence[str]) -> bool:
-    """Whether folders beside the files of all jobs can have these names; some file systems tell no capitals apart."""
-    different = {name.casefold() for name in (*names, *JOBS_FILES)}
-    return len(different) == len(names) + len(JOBS_FILES) and all(map(_is_folder_name, names))
-
-
-def _is_folder_name(name: str) -> bool:
-    """Whether a folder of results can have a name: it leads nowhere else."""
-    return name not in ("", ".", "..")
-
-
-def require_place(folder: Path) -> None:
-    """Check that results of many jobs can be written to a folder.
-
-    Raises:
-        InputError: They cannot, or files would be replaced that are not of many jobs.
-    """
-    require_writable(folder)
-    require_own(folder, JOBS_FILES)
+    same = max(names, key=names.count)
+    found = [escaped(str(path)) for path, name in zip(jobs, names, strict=True) if name == same]
+    raise InputError("JOB", f"{', '.join(found[:3])} would be written to the folder {shown(same)}", "different names")

@@ -4,82 +4,71 @@
     data = Measurements.from_arrays(q, position=p, sigma_position=1e-4)
     result = calibrate(robot, data, model="position", frame="unknown")
 
-`calibrate_job` does the same of a job, and the command line calls it. What only a calibration of before needs (checks
-and updates by new rows, its history) is imported there: that takes as long as to solve a small one.
+`calibrate_job` does the same for a job, and the command line calls it.
 """
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
-from hashlib import sha256
 from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gtsam
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from pydantic import ValidationError
+from numpy.typing import ArrayLike
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import as_floats, shape_of
-from fg_calib.assessment import Assessment as Uncertainty
-from fg_calib.assessment import assess, solve_job
-from fg_calib.errors import InputError, SolverError, escaped, shown
-from fg_calib.graph.factors import Variables, build_variables, frame_of
+from fg_calib.arrays import Floats, as_floats, shape_of
+from fg_calib.assessment import Assessment, assess, solve_job
+from fg_calib.errors import InputError, SolverError, shown
+from fg_calib.executors import tell
+from fg_calib.graph.factors import build_variables, frame_of
 from fg_calib.graph.knowledge import SIZE, Knowledge
 from fg_calib.graph.problem import tables_of
 from fg_calib.graph.solver import Solution
-from fg_calib.io.atomic import exists, is_folder, noting_reads
+from fg_calib.io.atomic import fill_folder, is_folder, noting_reads, write_text
 from fg_calib.io.job import UNSTATED, read_job, read_table_like
-from fg_calib.io.parts import JobInParts, read_parts
-from fg_calib.io.result import (
-    ROUNDING,
-    Carried,
-    Covariance,
-    KindGoodness,
-    Parameter,
-    Posterior,
-    Previous,
-    Result,
-    read_result,
-)
 from fg_calib.io.result import Knowledge as SavedKnowledge
-from fg_calib.io.robot_file import read_robot
+from fg_calib.io.result import Result, Run, read_result
+from fg_calib.io.saved import (
+    RESULT_FILES,
+    ResidualFile,
+    configuration_frame,
+    joint_frame,
+    read_calibrated_robot,
+    read_table,
+    residual_frame,
+    write_calibration,
+)
 from fg_calib.job import Job
 from fg_calib.measurements.checks import check_readings
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.table import Table
+from fg_calib.monitoring.check import Check, check_rows
 from fg_calib.monitoring.fingerprints import counted_before
-from fg_calib.options import NEAR, Options, Pairing, check_flag, check_names, did_you_mean, listed
-from fg_calib.progress import tell
-from fg_calib.report.documents import ResidualFile, result_of, write_result
-from fg_calib.report.summary import format_result, html, judged, summary
-from fg_calib.report.text import format_report
+from fg_calib.monitoring.new_data import Calibrated, Rows
+from fg_calib.monitoring.update import predicted_before, updated
+from fg_calib.options import Options, check, check_flag, check_names, listed
+from fg_calib.report.figures import Drawn
+from fg_calib.report.html import build_page, draw_figures
+from fg_calib.report.notes import notes_of
+from fg_calib.report.text import format_result, judged, parameter_table_html, summary
 from fg_calib.robot.kinematics import forward
 from fg_calib.robot.model import Robot, names_of
 from fg_calib.statistics.covariance import TangentCovariance
-from fg_calib.statistics.estimates import FrameEstimate
-from fg_calib.statistics.residual_table import ResidualTable
+from fg_calib.statistics.cross_validation import cross_validate
+from fg_calib.statistics.estimates import FrameEstimate, ParameterEstimate
+from fg_calib.statistics.goodness_of_fit import KindFit
 from fg_calib.threads import single_threaded
 
 if TYPE_CHECKING:
-    from fg_calib.io.assessed_parts import AssessedParts
-    from fg_calib.io.history import Run
-    from fg_calib.monitoring.check import Check
-    from fg_calib.monitoring.new_data import Calibrated, Rows
-
-Floats = NDArray[np.float64]
-
-SAME = 1e-12
-"""How far the saved robot's values may be from the estimates in `result.json`, [m] and [rad]: rounding in its units."""
+    import polars as pl
 
 
 @checked
@@ -139,11 +128,9 @@ def calibrate_job(job: Job | Path | str, executor: Executor | None = None) -> Ca
         tell("judging the result")
         uncertainty = assess(solution)
         if given.options.folds is not None:
-            from fg_calib.statistics.cross_validation import cross_validate
-
             folds = cross_validate(given, solve_job, given.options.folds, executor=executor)
             uncertainty = uncertainty.with_folds(folds, solution)
-        return Calibration.of(solution, uncertainty, given.inputs, job=given.document)
+        return Calibration.of(solution, uncertainty, inputs=given.inputs, job=given.document)
 
 
 @contextmanager
@@ -151,38 +138,12 @@ def _estimable(options: Options) -> Iterator[None]:
     """Within, noise or tolerances that rows do not tell at all may be estimated beyond what figures hold: one line."""
     try:
         yield
-    except (ArithmeticError, np.linalg.LinAlgError, ValidationError) as error:
+    except (ArithmeticError, np.linalg.LinAlgError) as error:
         given = {"noise": options.estimate_noise, "tolerance": options.estimate_tolerance is not None}
         asked = " and ".join(name for name, is_estimated in given.items() if is_estimated)
         if not asked:
             raise
         raise SolverError(f"{asked} cannot be estimated from these rows, which leave no error: state it") from error
-
-
-@checked
-def calibrate_parts(job: JobInParts | Path | str, executor: Executor | None = None) -> Calibration:
-    """Calibrate a job whose table is read in parts: what `fg-calib calibrate --parts` does.
-
-    Memory does not grow with the number of rows. No single row is judged, and no outlier, mistake or other optimum
-    looked for: the result says so, and not that it is to be trusted. There is no residual table.
-
-    Args:
-        job: The job, from `read_parts`, or the path of its file.
-        executor: Where parts are reduced; one after the other in this process if None.
-
-    Raises:
-        InputError: The job, or a file that it names, cannot be used, or its table not be cut.
-        ProblemError: Rows of a part share errors with those of others, or cannot be used.
-    """
-    from fg_calib.io.assessed_parts import assess_parts
-    from fg_calib.io.parts_solver import solve_parts
-    from fg_calib.report.parts import result_of_parts
-
-    given = job if isinstance(job, JobInParts) else read_parts(job)
-    solution = solve_parts(given.robot, given.parts, given.options, executor)
-    tell("judging the result")
-    assessed = assess_parts(solution, given.parts[0])
-    return Calibration(solution.robot, result_of_parts(given, assessed), solution.posterior, assessed)
 
 
 def _with_first_sigmas(m: Measurements) -> Measurements:
@@ -242,64 +203,35 @@ class PredictedPoses:
         return f"PredictedPoses, {n} poses, expected RMS error of the position {rms:.3g} mm"
 
 
-class Parameters(Mapping[str, Parameter]):
-    """The parameters of a calibration by name, in the robot's order."""
-
-    def __init__(self, parameters: Sequence[Parameter]) -> None:
-        self._by_name = {p.name: p for p in parameters}
-
-    def __getitem__(self, name: str) -> Parameter:
-        if name not in self._by_name:
-            raise KeyError(" ".join(filter(None, (str(name), did_you_mean(name, self._by_name, NEAR)))))
-        return self._by_name[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._by_name)
-
-    def __len__(self) -> int:
-        return len(self._by_name)
-
-    def __repr__(self) -> str:
-        names = escaped(", ".join(self._by_name))
-        return f"Parameters: {names if len(names) <= 80 else names[:80] + ' ...'}"
-
-
 @dataclass(frozen=True, repr=False, eq=False)
 class Calibration:
-    """What a calibration found; printed it is the report.
+    """A calibrated robot with its typed result and tables; printed it is the report.
 
     Attributes:
         robot: The calibrated robot.
         result: All that `result.json` holds.
         posterior: The covariance of all parameters in the tangent space of the variables.
-        assessed: The solution and its assessment; of one in parts what is known of it; None of one that was loaded.
-        history: The runs that it came from, itself not among them; of one that was loaded itself the last.
+        assessed: The solution and its assessment; None for a loaded calibration.
+        folder: The folder that it was loaded from; None for a new one.
     """
 
     robot: Robot
     result: Result
     posterior: TangentCovariance
-    assessed: tuple[Solution, Uncertainty] | AssessedParts | None = None
-    history: tuple[Run, ...] = ()
+    assessed: tuple[Solution, Assessment] | None = None
+    folder: Path | None = None
 
     @classmethod
     @checked
-    def of(
-        cls,
-        solution: Solution,
-        uncertainty: Uncertainty,
-        inputs: Mapping[str, str] | None = None,
-        **more: Any,
-    ) -> Calibration:
+    def of(cls, solution: Solution, uncertainty: Assessment, **origin: Any) -> Calibration:
         """The calibration of a solution and its assessment.
 
         Args:
             solution: The solution.
             uncertainty: Its assessment.
-            inputs: SHA-256 of the files it came from, by path.
-            more: The job's document, the date, what it came from: see `report.documents.result_of`.
+            origin: Files, job, date and history: see `Result.of`.
         """
-        result = result_of(solution, uncertainty, inputs, **more)
+        result = Result.of(solution, uncertainty, notes=tuple(notes_of(solution, uncertainty)), **origin)
         return cls(uncertainty.robot, result, uncertainty.whole, (solution, uncertainty))
 
     @classmethod
@@ -307,81 +239,92 @@ class Calibration:
     def load(cls, path: Path | str) -> Calibration:
         """The calibration in a folder that `save` or `calibrate --out` wrote, or in its `result.json`.
 
-        It has all but the solution, its assessment and the residuals.
+        It prints, draws and predicts like a new one; the solution and its assessment are not saved.
 
         Raises:
             InputError: There is none, or it is damaged.
         """
-        from fg_calib.io.history import history_of
-
         result, folder = read_result(path), Path(path) if is_folder(Path(path)) else Path(path).parent
-        robot = _saved_robot(folder, result)
-        nominal = robot.with_values([p.nominal for p in result.parameters])  # by its reach columns are scaled
-        posterior = _saved_posterior(nominal, result, f"{folder / 'result.json'}: posterior")
-        return cls(robot, result, posterior, history=history_of(path).runs)
+        robot = _with_priors(read_calibrated_robot(folder, result), result)
+        nominal = robot.with_values([p.nominal for p in result.parameters])  # columns are scaled by its reach
+        posterior = _posterior(nominal, result, f"{folder / 'result.json'}: posterior")
+        return cls(robot, result, posterior, folder=folder)
 
     @checked
-    def save(self, folder: Path | str, *, residuals: ResidualFile = "csv") -> None:
-        """Write what `calibrate --out` writes: `result.json`, the calibrated robot and the residuals, if there are any.
+    def save(
+        self, folder: Path | str, *, residuals: ResidualFile = "csv", report: bool = False, figures: bool = False
+    ) -> None:
+        """Write what `calibrate --out` writes: `result.json`, the calibrated robot and the tables.
 
         Args:
             folder: Where to.
-            residuals: How single residuals are written: `csv`, `parquet`, or `none` where there are millions.
+            residuals: How single residuals are written: `csv`, `parquet`, or `none` for millions of rows.
+            report: Whether to write `report.html` too.
+            figures: Whether to write the figures of the page too, as SVG files.
 
         Raises:
             InputError: The folder cannot be written, or the calibration was itself loaded from one.
         """
-        if self.assessed is not None and not isinstance(self.assessed, tuple):
-            from fg_calib.report.parts import write_result_of_parts
+        check("residuals", residuals, ResidualFile)
+        solution, assessed = self._assessed
+        tables = {"configurations.csv": self.configurations}
+        if residuals != "none":
+            tables[f"residuals.{residuals}"] = self.residuals
+        if assessed.estimates.joint_errors is not None:
+            tables["joints.csv"] = joint_frame(assessed.estimates.joint_errors, solution)
+        drawn = self._drawn
+        pages = {"report.html": build_page(drawn)} if report else {}
+        pages |= draw_figures(drawn) if figures else {}
+        known = {name: table for name, table in tables.items() if table is not None}
+        write_calibration(Path(folder), self.result, self.robot, known, pages)
 
-            write_result_of_parts(folder, self.result, self.assessed)
-            return
-        history = self._history if self.history else None
-        write_result(folder, self.result, self.solution, self.uncertainty, history, residuals)
+    @cached_property
+    def configurations(self) -> pl.DataFrame | None:
+        """Every measured configuration, as `configurations.csv` has it; None if that file is missing."""
+        if self.assessed is not None:
+            return configuration_frame(*self.assessed)
+        return None if self.folder is None else read_table(self.folder, "configurations", self.result)
 
-    def _history(self, digest: str) -> dict[str, str]:
-        """What is written of the runs that it came from, with itself."""
-        from fg_calib.io.history import HISTORY, History, run_of
+    @cached_property
+    def residuals(self) -> pl.DataFrame | None:
+        """Every scalar residual, as `residuals.csv` has it; None if it was not saved."""
+        if self.assessed is not None:
+            return residual_frame(*self.assessed)
+        return None if self.folder is None else read_table(self.folder, "residuals", self.result)
 
-        runs = (*self.history, run_of(self.result, digest, self.history[-1]))
-        return {HISTORY: History(robot=self.result.robot, runs=runs).text()}
+    @property
+    def measured(self) -> Floats | None:
+        """Readings of the measured configurations, shape (n, n_joints), [rad] (prismatic: [m]); None if not saved."""
+        table = self.configurations
+        return None if table is None else table.select(f"q{i + 1}" for i in range(self.robot.n_joints)).to_numpy()
+
+    @property
+    def _drawn(self) -> Drawn:
+        return Drawn(self.result, self.robot, self.posterior, self.configurations, self.residuals)
 
     @property
     def runs(self) -> tuple[Run, ...]:
         """The runs that it came from, and itself."""
-        from fg_calib.io.history import run_of
-
-        if self.assessed is None:
-            return self.history
-        digest = sha256(json.dumps(self.result.document()).encode()).hexdigest()
-        return (*self.history, run_of(self.result, digest, self.history[-1] if self.history else None))
+        return (*self.result.history, self.result.run)
 
     @property
     def calibrated(self) -> Calibrated:
         """What is known of the arm, for new rows."""
-        from fg_calib.monitoring.new_data import Calibrated
-
-        of_result = {p.name: p.prior_sigma for p in self.result.parameters}  # as they were estimated, perhaps
-        nominal = self.posterior.variables.robot
-        nominal = replace(
-            nominal,
-            parameters=tuple(replace(p, tolerance=of_result[p.name] or p.tolerance) for p in nominal.parameters),
-        )
-        values = np.array([p.estimate for p in self.result.parameters])
-        carried = self.result.carried or Carried()
+        result = self.result
+        nominal = _with_priors(self.posterior.variables.robot, result)
+        values = np.array([p.estimate for p in result.parameters])
         known = None
-        if carried.knowledge is not None and not self.result.evaluated_only:
-            known = _saved_knowledge(nominal.with_values(values), carried.knowledge)
-        kept = {*self.result.noise_kept, "joint"}
-        estimated = [kind for kind in self.result.noise_factors or () if kind not in kept]
-        degrees = sum(self.result.goodness[kind].expected or 0.0 for kind in estimated)
+        if result.carried.knowledge is not None and not result.evaluated_only:
+            known = _knowledge(nominal.with_values(values), result.carried.knowledge)
+        estimated = set(result.noise_factors or ()).difference((*result.noise_kept, "joint"))
+        degrees = sum(result.goodness[kind].expected for kind in sorted(estimated))
         return Calibrated(
             robot=nominal,
             values=values,
             posterior=self.posterior,
             knowledge=known,
-            options=_saved_options(self.result),
-            noise=carried.noise,
+            options=replace(result.options, folds=None),
+            noise=result.carried.noise,
             noise_degrees=degrees or None,
         )
 
@@ -409,8 +352,6 @@ class Calibration:
             InputError: The rows cannot be read, or are of another robot; or the calibration is not to be trusted.
             ProblemError: The rows lack what their model needs.
         """
-        from fg_calib.monitoring.check import check_rows
-
         self._require_trust()
         new, _ = self._rows(rows, pairs, like)
         between = all(table.model not in ("pose", "position", "orientation", "board") for table in new.tables)
@@ -418,7 +359,7 @@ class Calibration:
             zip(("distance", "angle") if between else ("position", "orientation"), (limit, limit_angle), strict=True)
         )
         stated = {name: figure for name, figure in stated.items() if figure is not None}
-        limits = replace(_saved_options(self.result).accept, **stated)
+        limits = replace(self.result.options.accept, **stated)
         return check_rows(self.calibrated, new, limits)
 
     @checked
@@ -450,12 +391,7 @@ class Calibration:
             ProblemError: The rows lack what their model needs, or do not suffice.
             SolverError: GTSAM could not solve a step at all.
         """
-        from fg_calib.monitoring.update import predicted_before, updated
-
         self._require_trust()
-        if self.result.in_parts:
-            in_parts = "a calibration in parts, which does not hold what its rows say"
-            raise InputError("update", in_parts, "one that was calibrated whole, without --parts")
         history = self.runs
         new, before = _date(date), history[-1]
         growth = {} if growth is None else growth
@@ -477,13 +413,11 @@ class Calibration:
         uncertainty = assess(found)
         if uncertainty.acceptance is not None and not names:
             uncertainty = uncertainty.with_held_out(predicted_before(self.calibrated, table), found)
-        job = {} if self.result.carried is None else self.result.carried.job
-        previous = Previous(sha256=before.sha256, date=before.date)
-        made = Calibration.of(found, uncertainty, inputs, job=job, date=new, previous=previous)
-        return replace(made, history=history)
+        job = self.result.carried.job
+        return Calibration.of(found, uncertainty, inputs=inputs, job=job, date=new, history=history)
 
     def _require_trust(self) -> None:
-        if self.trustworthy is False:
+        if not self.trustworthy:
             reason = (*self.findings, self.result.solver.message)[0]
             raise InputError(self.result.robot, f"the calibration is not to be trusted: {reason}", "one that is")
 
@@ -493,12 +427,10 @@ class Calibration:
         Raises:
             InputError: They are of another robot, or cannot be read.
         """
-        from fg_calib.monitoring.new_data import Rows
-
-        options, robot = _saved_options(self.result), self.posterior.variables.robot
+        options, robot = replace(self.result.options, folds=None), self.posterior.variables.robot
         if isinstance(given, Path | str) and Path(given).suffix.lower() not in (".yaml", ".yml"):
             path, of_pairs = Path(given), None if pairs is None else Path(pairs)
-            job = {} if self.result.carried is None else self.result.carried.job
+            job = self.result.carried.job
             if not job:
                 found = "the calibration does not say how its tables were read"
                 raise InputError(path.name, found, "a job that names the table")
@@ -526,46 +458,38 @@ class Calibration:
         """The solution.
 
         Raises:
-            InputError: The calibration was loaded, or is one in parts: these do not hold it.
+            InputError: The calibration was loaded.
         """
         return self._assessed[0]
 
     @property
-    def uncertainty(self) -> Uncertainty:
+    def assessment(self) -> Assessment:
         """The assessment of the solution.
 
         Raises:
-            InputError: The calibration was loaded, or is one in parts: these do not hold it.
+            InputError: The calibration was loaded.
         """
         return self._assessed[1]
 
-    @property
-    def residuals(self) -> ResidualTable:
-        """Every residual, before and after.
-
-        Raises:
-            InputError: The calibration was loaded (its residuals are in `residuals.csv`), or is one in parts.
-        """
-        return self.uncertainty.fit.residuals
+    uncertainty = assessment
 
     @property
-    def _assessed(self) -> tuple[Solution, Uncertainty]:
-        if isinstance(self.assessed, tuple):
-            return self.assessed
-        found = "it was loaded from a folder, which holds no solution, assessment or residual table"
-        found = "it was calibrated in parts, without assessment or residual table" if self.result.in_parts else found
-        raise InputError("calibration", found, hint="calibrate again to have them")
+    def _assessed(self) -> tuple[Solution, Assessment]:
+        if self.assessed is None:
+            found = "it was loaded from a folder, which holds no solution and no assessment"
+            raise InputError("calibration", found, hint="calibrate again to have them")
+        return self.assessed
 
     @cached_property
-    def parameters(self) -> Parameters:
+    def parameters(self) -> dict[str, ParameterEstimate]:
         """Every parameter of the robot by name, with `estimate`, `sigma`, `nominal`, `correction`, ..."""
-        return Parameters(self.result.parameters)
+        return {p.name: p for p in self.result.parameters}
 
     def covariance(self, names: Sequence[str] | None = None) -> Floats:
         """Covariance of the errors of parameters, [m] and [rad]; nan where nothing determines them.
 
         Args:
-            names: The parameters, in the order wanted; those that were estimated if None. What is fixed has no error.
+            names: The parameters, in the order wanted; those that were estimated if None. A fixed one has no error.
 
         Raises:
             InputError: There is no such parameter.
@@ -574,19 +498,18 @@ class Calibration:
         names = given.names if names is None else names if isinstance(names, str) else listed("covariance", names)
         check_names("covariance", names, list(self.parameters))
         every = np.zeros((len(given.names) + 1,) * 2)  # the last one stands for what is fixed
-        every[:-1, :-1] = _array(given.matrix, len(given.names))
+        every[:-1, :-1] = given.matrix.reshape(len(given.names), len(given.names))
         rows = [given.names.index(name) if name in given.names else len(given.names) for name in names]
         return every[np.ix_(rows, rows)]
 
     @property
     def frame(self) -> FrameEstimate | None:
         """The measurement frame world_T_base; None where it was not estimated."""
-        f = self.result.frame_estimate
-        return None if f is None else FrameEstimate(*(np.array(v, float) for v in (f.xyz, f.quaternion_xyzw, f.sigma)))
+        return self.result.frame_estimate
 
     @property
-    def goodness(self) -> dict[str, KindGoodness]:
-        """Noise stated and noise seen, by kind; more of it in `uncertainty.goodness`."""
+    def goodness(self) -> dict[str, KindFit]:
+        """Specified and observed noise, by kind."""
         return self.result.goodness
 
     @property
@@ -596,16 +519,14 @@ class Calibration:
 
     @property
     def not_accepted(self) -> tuple[str, ...]:
-        """The limits of `accept` that it does not keep to, or that could not be judged, each in a line."""
-        found = () if self.result.acceptance is None else self.result.acceptance.judgements
-        return tuple(judged(one for one in found if one.verdict != "pass"))
+        """The limits of `accept` that are exceeded or could not be judged, a line each."""
+        judgements = () if self.result.acceptance is None else self.result.acceptance.judgements
+        return tuple(judged(one for one in judgements if one.verdict != "pass"))
 
     @property
-    def trustworthy(self) -> bool | None:
-        """Whether nothing speaks against it; None of one in parts, where no single row was asked."""
-        if self.findings or not self.result.solver.converged:
-            return False
-        return None if self.result.in_parts else True
+    def trustworthy(self) -> bool:
+        """Whether the solver has converged and nothing speaks against the result."""
+        return self.result.trustworthy
 
     @single_threaded
     def predict(self, readings: ArrayLike, *, world: bool = False, table: int | None = None) -> PredictedPoses:
@@ -635,7 +556,7 @@ class Calibration:
 
     def _table_of(self, number: int | None) -> int:
         """The table whose measurement frame is meant."""
-        there = _tables_with_frame(self.posterior.variables)
+        there = [int(v.symbol[2:-1]) for v in self.posterior.variables.frames]
         if number is None and len(there) == 1:
             return there[0]
         if not isinstance(number, Integral) or number not in there:
@@ -647,125 +568,88 @@ class Calibration:
         return "\n".join(summary(self.result))
 
     def __str__(self) -> str:
-        return format_report(*self.assessed) if isinstance(self.assessed, tuple) else format_result(self.result)
+        return format_result(self)
 
     def _repr_html_(self) -> str:
-        return html(self.result)
+        return parameter_table_html(self.result)
 
 
-def _tables_with_frame(variables: Variables) -> list[int]:
-    """The tables whose measurement frame was estimated."""
-    return [int(v.symbol[2:-1]) for v in variables.frames]
+@checked
+def write_report(path: Path | str, folder: Path | str | None = None, *, figures: bool = False) -> None:
+    """Write `report.html` of a saved calibration: one page that needs no other file.
 
-
-def _array(matrix: Sequence[Sequence[float | None]], width: int) -> Floats:
-    """A matrix of a result, nan for None, shape (n, width)."""
-    return np.array(matrix, dtype=np.float64).reshape(len(matrix), width)
-
-
-def _saved_robot(folder: Path, result: Result) -> Robot:
-    """The calibrated robot beside a result: that which the result is of."""
-    files = [folder / f"robot_calibrated.{ending}" for ending in ("yaml", "urdf")]
-    file = next((file for file in files if exists(file)), None)
-    if file is None:
-        raise InputError(str(folder), "neither robot_calibrated.yaml nor robot_calibrated.urdf beside its result.json")
-    links = result.links or (None, None)
-    robot = read_robot(file, base_link=links[0], tip_link=links[1])
-    names, estimates = [p.name for p in result.parameters], [p.estimate for p in result.parameters]
-    same = [p.name for p in robot.parameters] == names
-    if not same or np.abs(robot.nominal - estimates).max(initial=0.0) > SAME:
-        found = "other values" if same else "other parameters"
-        raise InputError(str(file), f"{found} than in result.json", "the files of one calibration")
-    tolerances = [p.prior_sigma for p in result.parameters]
-    parameters = zip(robot.with_estimated(result.covariance.names).parameters, tolerances, strict=True)
-    return replace(robot, parameters=tuple(replace(p, tolerance=p.tolerance or t) for p, t in parameters))
-
-
-def _saved_posterior(robot: Robot, result: Result, place: str) -> TangentCovariance:
-    """The covariance that was saved, of a nominal robot; of version 1 what that of the parameters says."""
-    estimates = result.frames or ({} if result.frame_estimate is None else {"X(0)": result.frame_estimate})
-    frames = [] if estimates else [np.zeros(6)]
-    for frame in estimates.values():
-        x, y, z, w = map(float, np.array(frame.quaternion_xyzw, float))
-        frames.append(frame_of(gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), np.array(frame.xyz, float))))
-    parameters = np.concatenate([[p.estimate for p in result.parameters], *frames])
-    if result.posterior is None:
-        return _posterior_of_names(robot, parameters, result)
-    unknown = [int(symbol[2:-1]) for symbol in estimates]
-    variables = build_variables(robot, [t in unknown for t in range(max(unknown, default=0) + 1)], False)
-    wanted = {v.symbol: variables.names[v.columns] for v in variables.items}
-    saved: Posterior = result.posterior
-    n = variables.n_columns
-    matrices = (saved.covariance, saved.undetermined, saved.undetermined_at_nominal)
-    if saved.variables != wanted or len(saved.covariance) != n or any(len(row) != n for m in matrices for row in m):
-        raise InputError(place, "other variables than the robot and the covariance have", f"{n} columns of them")
-    arrays = [_array(matrix, n) for matrix in matrices]
-    if not all(np.isfinite(array).all() for array in arrays):
-        raise InputError(place, "figures that are not finite", "covariances, and directions that are not determined")
-    found = TangentCovariance(variables, parameters, *arrays)
-    _require_same(found, result.covariance, place)
-    return found
-
-
-def _require_same(found: TangentCovariance, stated: Covariance, place: str) -> None:
-    """Check that a saved posterior says of the robot's parameters what their covariance says, where both know it.
+    Args:
+        path: The folder that `save` or `calibrate --out` wrote, or its `result.json`.
+        folder: Where to; beside the result if None.
+        figures: Whether to write its figures too, as SVG files.
 
     Raises:
-        InputError: It does not.
+        InputError: There is no such calibration, it is damaged, or the folder cannot be written.
     """
-    order = [stated.names.index(name) for name in found.variables.names[: len(stated.names)]]
-    matrix = _array(stated.matrix, len(order))[np.ix_(order, order)]
-    sigma = np.sqrt(matrix.diagonal())
-    if (np.abs(found.named() - matrix) > ROUNDING * np.outer(sigma, sigma)).any():
-        raise InputError(place, "contradicts the covariance of the parameters", "the same of both", "was it changed?")
+    found = Calibration.load(path)
+    assert found.folder is not None
+    texts = {"report.html": build_page(found._drawn), **(draw_figures(found._drawn) if figures else {})}
+
+    def write(into: Path) -> None:
+        for name, text in texts.items():
+            write_text(into / name, text)
+
+    fill_folder(found.folder if folder is None else Path(folder), write, {name: RESULT_FILES[name] for name in texts})
 
 
-def _saved_options(result: Result) -> Options:
-    """The options of a result, its folds not among them."""
-    given = {name: value for name, value in result.options.items() if name in {f.name for f in fields(Options)}}
-    words = str(given.get("pairing", "star")).partition(" ")
-    pairing = Pairing("star") if words[0] not in ("chain", "all") else Pairing(words[0])  # type: ignore[arg-type]
-    if drawn := re.fullmatch(r"random \((\d+), seed (\d+)\)", str(given.get("pairing"))):
-        pairing = Pairing("random", int(drawn[1]), int(drawn[2]))
-    accept = given.get("accept") or {}
-    return Options.of(**{**given, "pairing": pairing, "accept": accept, "folds": None})
+def _with_priors(robot: Robot, result: Result) -> Robot:
+    """A robot with the priors of a result, which may have been estimated, and with its estimated parameters."""
+    robot, prior = robot.with_estimated(result.covariance.names), {p.name: p.prior_sigma for p in result.parameters}
+    return replace(
+        robot, parameters=tuple(replace(p, tolerance=prior[p.name] or p.tolerance) for p in robot.parameters)
+    )
 
 
-def _saved_knowledge(robot: Robot, saved: SavedKnowledge) -> Knowledge:
-    """What was saved of what rows say.
+def _posterior(robot: Robot, result: Result, place: str) -> TangentCovariance:
+    """The saved covariance, of a nominal robot.
 
     Raises:
-        InputError: It is of another robot, or damaged.
+        InputError: It is that of another robot.
+    """
+    poses = [np.zeros(6)] if not result.frames else []
+    for frame in result.frames.values():
+        x, y, z, w = frame.quaternion_xyzw.tolist()
+        poses.append(frame_of(gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), frame.xyz)))
+    unknown = [int(symbol[2:-1]) for symbol in result.frames]
+    variables = build_variables(robot, [t in unknown for t in range(max(unknown, default=0) + 1)], False)
+    saved, n = result.posterior, variables.n_columns
+    if saved.variables != {v.symbol: tuple(variables.names[v.columns]) for v in variables.items}:
+        raise InputError(place, "other variables than the robot and the covariance have", f"{n} columns of them")
+    values = np.concatenate([[p.estimate for p in result.parameters], *poses])
+    matrices = (saved.covariance, saved.undetermined, saved.undetermined_at_nominal)
+    return TangentCovariance(variables, values, *(matrix.reshape(len(matrix), n) for matrix in matrices))
+
+
+def _knowledge(robot: Robot, saved: SavedKnowledge) -> Knowledge:
+    """The information of the rows of a saved result.
+
+    Raises:
+        InputError: It is that of another robot.
     """
     width = len(saved.columns) + len(saved.at)
-    found = Knowledge(
-        robot=robot,
-        unknowns=saved.unknowns,
-        at=np.array(saved.at, dtype=np.float64),
-        rows=_array(saved.rows, width),
-        right=np.array(saved.right, dtype=np.float64),
-        views=saved.views,
-    )
-    sizes = len(saved.at) == SIZE * len(saved.unknowns) and len(saved.right) == len(saved.rows)
-    drawn = saved.nominal
-    if drawn is not None:
-        sizes &= len(drawn.at) == len(saved.at) and len(drawn.parameters) == len(robot.parameters)
-    if found.variables.names != saved.columns or not sizes:
-        raise InputError(
-            "result.json: carried", "knowledge of other parameters than those estimated", "that of one run"
+
+    def at(one: SavedKnowledge, nominal: Knowledge | None = None) -> Knowledge:
+        return Knowledge(
+            robot=robot.with_values(one.parameters),
+            unknowns=saved.unknowns,
+            at=one.at,
+            rows=one.rows.reshape(len(one.rows), width),
+            right=one.right,
+            views=saved.views,
+            nominal=nominal,
         )
-    if drawn is None:
-        return found
-    rows = _array(drawn.rows, width)
-    nominal = Knowledge(
-        robot=robot.with_values(drawn.parameters),
-        unknowns=saved.unknowns,
-        at=np.array(drawn.at, dtype=np.float64),
-        rows=rows,
-        right=np.zeros(len(rows)),
-        views=saved.views,
-    )
-    return replace(found, nominal=nominal)
+
+    found = at(saved, None if saved.nominal is None else at(saved.nominal))
+    if found.variables.names != saved.columns or len(saved.at) != SIZE * len(saved.unknowns):
+        raise InputError(
+            "result.json: carried", "information on other parameters than those estimated", "that of one run"
+        )
+    return found
 
 
 def _date(given: str | None) -> str:
@@ -799,16 +683,3 @@ def _days(before: str, now: str, *, needed: bool) -> float:
     if days < 0.0 and not same_day:
         raise InputError("date", f"{now} is before the calibration, {before}", "a later one")
     return max(days, 0.0)
-
-
-def _posterior_of_names(robot: Robot, parameters: Floats, result: Result) -> TangentCovariance:
-    """Of version 1: what the parameters' own covariance says; what has none there counts as undetermined."""
-    variables = build_variables(robot, [False], False)
-    n = variables.n_columns
-    named = _array(result.covariance.matrix, n)
-    unknown = np.isnan(np.diag(named))
-    E = variables.tangent_derivative(parameters)
-    loose = (E @ np.eye(n)[:, unknown]).T / variables.scales
-    loose = loose / np.linalg.norm(loose, axis=1, keepdims=True)
-    known = np.where(unknown[:, None] | unknown, 0.0, named)
-    return TangentCovariance(variables, parameters, E @ known @ E.T, loose, loose)

@@ -78,7 +78,7 @@ def test_one_call_does_the_steps(found, name):
     assert found[name].findings == uncertainty.findings
     assert found[name].robot == uncertainty.robot
     assert found[name].trustworthy == uncertainty.trustworthy
-    assert found[name].residuals.n == uncertainty.residuals.n
+    assert len(found[name].residuals) == uncertainty.fit.residuals.n
     assert {k: g.p_value for k, g in found[name].goodness.items()} == {
         fit.kind: fit.p_value for fit in uncertainty.goodness.kinds
     }
@@ -100,8 +100,6 @@ def test_parameters_are_found_by_name(found):
     assert a2.estimate == result.robot.parameters[result.robot.index("a2")].nominal
     assert a2.sigma == pytest.approx(np.sqrt(result.uncertainty.covariance[i, i]), rel=1e-15)
     assert "a9" not in result.parameters
-    with pytest.raises(KeyError, match=r"A2 did you mean a2\?"):
-        result.parameters["A2"]
 
 
 def test_covariance_is_in_the_order_asked_for(found):
@@ -165,15 +163,11 @@ def test_what_is_loaded_says_what_was_saved(found, tmp_path, name):
     result = found[name]
     result.save(tmp_path)
     again = Calibration.load(tmp_path)
-    assert again.result.model_copy(update={"files": {}}) == result.result
+    assert again.result.document() | {"files": {}} == result.result.document()
     assert again.parameters == result.parameters
     assert np.array_equal(again.covariance(), result.covariance(), equal_nan=True)
     assert again.robot.nominal == pytest.approx(result.robot.nominal, abs=1e-15)
-    assert (again.trustworthy, again.findings, again.goodness) == (
-        result.trustworthy,
-        result.findings,
-        result.goodness,
-    )
+    assert (again.trustworthy, again.findings) == (result.trustworthy, result.findings)
     for world in (False, True)[: 1 + (result.frame is not None)]:
         before, after = result.predict(Q, world=world), again.predict(Q, world=world)
         # The frame goes through a quaternion; all else is the same figures.
@@ -181,8 +175,8 @@ def test_what_is_loaded_says_what_was_saved(found, tmp_path, name):
         size = np.nanmax(np.abs(before.covariance), initial=0.0)
         assert after.covariance == pytest.approx(before.covariance, rel=1e-10, abs=1e-13 * size, nan_ok=True)
     assert repr(again) == repr(result)
-    assert str(again).startswith(repr(result))
-    for nothing in ("solution", "uncertainty", "residuals"):
+    assert str(again) == str(result)
+    for nothing in ("solution", "assessment"):
         with pytest.raises(InputError, match="it was loaded from a folder"):
             getattr(again, nothing)
     with pytest.raises(InputError, match="it was loaded from a folder"):

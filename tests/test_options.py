@@ -122,14 +122,12 @@ MISTAKES = {
                              "expected a SolverOptions, such as SolverOptions(max_iterations=200)"),
     "a prior that is a word": (lambda: problem(prior="no"), "prior: found 'no', expected True or False"),
     "a bound's prior": (lambda: bound(prior="no"), "prior: found 'no', expected True or False"),
-    "weights that are a word": (lambda: plain(weighted="no"), "weighted: found 'no', expected True or False"),
     **{f"a name to keep {f.__name__}": (
         lambda f=f: f(prefer=["A2"]), "prefer: unknown parameter 'A2', expected one of base.x, base.y, base.z, "
         "base.yaw, base.pitch, base.roll, theta1, d1, a1, alpha1, theta2, d2, ...; did you mean a2?"
     ) for f in (problem, structure, practical)},
     "one name for a list": (lambda: problem(prefer="a2"), "prefer: found 'a2', expected a list of names"),
     "a bound's names": (lambda: bound(kept="a2"), "kept: found 'a2', expected a list of names"),
-    "a baseline's names": (lambda: plain(names="a2"), "names: found 'a2', expected a list of names"),
     "an estimated name": (lambda: ROBOT.with_estimated(["A2"]), "planar: unknown parameter 'A2', expected one of "
                           "base.x, base.y, base.z, base.yaw, base.pitch, base.roll, theta1, d1, a1, alpha1, theta2, "
                           "d2, ...; did you mean a2?"),
@@ -151,7 +149,9 @@ MISTAKES = {
               "did you mean uniform?"),
     "a self-motion": (lambda: BoardViews(BOARD, self_motion="Held"), "board: self_motion: found 'Held', expected one "
                       "of random, held; did you mean held?"),
-    "a radius": (lambda: BoardViews(BOARD, radius=-0.5), "board: radius: found -0.5, expected a number above 0"),
+    "a board's radius": (
+        lambda: BoardViews(BOARD, radius=-0.5), "board: radius: found -0.5, expected a number above 0"
+    ),
     "a number of views": (lambda: RandomReadings(0), "random: count: found 0, expected a number above 0"),
     "a scenario's frame": (lambda: scenario(frame="Base"), "scenario: frame: found 'Base', expected one of base, "
                            "unknown; did you mean base?"),
@@ -184,14 +184,14 @@ def test_a_mistake_is_named_in_one_line(call, message):
 
 
 @pytest.mark.parametrize("figure", [-1.0, NAN, INF, "1"], ids=repr)
-@pytest.mark.parametrize("key", [f.name for f in fields(Noise)])
+@pytest.mark.parametrize("key", [f.name for f in fields(Noise) if f.name != "more"])
 def test_noise_is_a_finite_number_not_below_0(key, figure):
     with pytest.raises(InputError) as caught:
         Noise(**{key: figure})
     assert str(caught.value) == f"noise: {key}: found {figure!r}, expected a finite number not below 0"
 
 
-@pytest.mark.parametrize("key", [f.name for f in fields(Noise) if f.name != "joint"])
+@pytest.mark.parametrize("key", [f.name for f in fields(Noise) if f.name not in ("joint", "more")])
 def test_a_calibration_takes_nothing_for_exact(tmp_path, key):
     (tmp_path / "poses.csv").write_text("q1,q2,x,y,z\n0,0,1,0,0\n")
     with pytest.raises(InputError, match=f"^noise: {key}: found 0.0, expected a finite number above 0$"):

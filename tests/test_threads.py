@@ -48,7 +48,7 @@ for name, change in {
     **{loss: {"loss": loss} for loss in ("huber", "cauchy", "geman-mcclure", "gnc")},
 }.items():
     solution = fg.solve(fg.problem_of(many if "many" in name else job, **change))
-    found[name] = fg.result_document(solution, fg.assess(solution), {})
+    found[name] = fg.Calibration.of(solution, fg.assess(solution)).result.document()
 half, given = len(m.ids) // 2, {"sigma_joint": 1e-4}
 points = fg.Measurements.from_arrays(m.readings[:60], group=[f"g{i % 6}" for i in range(60)], sigma_point=1.0, **given)
 first = {"position": m.position[:half], "sigma_position": 1e-3}

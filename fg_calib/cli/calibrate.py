@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from fg_calib.cli.output import Json, end, say, show_calibration, show_json, show_report
-from fg_calib.cli.workers import Scheduler, Workers, executor_for, require_one
+from fg_calib.cli.output import Json, Scheduler, Workers, end, executor_for, say, show_json, show_report
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from fg_calib.batch import Order
+    from rich.console import RenderableType
+
+    from fg_calib.batch import JobSummary, Order
+    from fg_calib.calibration import Calibration
 
 
 def calibrate(
@@ -45,96 +48,61 @@ def calibrate(
         Literal["csv", "parquet", "none"],
         typer.Option("--residuals", help="How single residuals are written: of millions of rows a CSV is large."),
     ] = "csv",
-    parts: Annotated[
-        int | None,
-        typer.Option("--parts", min=1, metavar="ROWS", help="Read one huge Parquet table in parts of so many rows."),
-    ] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:
     """Estimate a robot's parameters from measurements, with their uncertainties."""
-    from fg_calib.batch import Order, job_names, require_place
+    from fg_calib.batch import Order, job_names
+    from fg_calib.calibration import calibrate_job
+    from fg_calib.io.atomic import require_writable
 
     if out is None and (report or figures):
-        option = "--report" if report else "--figures"
-        raise typer.BadParameter("needs --out, the folder to write to", param_hint=option)
-    require_one(workers, scheduler)
-    if parts is not None:
-        _require_parts_alone(len(jobs), folds, residuals)
-    if len(jobs) == 1:
-        order = Order("", jobs[0], out, folds, report, figures, residuals)
-        with executor_for(workers, scheduler, _written([order])) as executor:
-            _calibrate_one(order, parts, executor, as_json)
-        return
-    names = job_names(jobs)
-    if out is not None:
-        require_place(out)
-    if scheduler is not None:  # whose workers run elsewhere
+        raise typer.BadParameter(
+            "needs --out, the folder to write to", param_hint="--report" if report else "--figures"
+        )
+    several = len(jobs) > 1
+    names = job_names(jobs) if several else [""]
+    if out is not None and several:
+        require_writable(out)
+    if scheduler is not None:  # its workers run elsewhere
         jobs, out = [job.absolute() for job in jobs], None if out is None else out.absolute()
     orders = [
         Order(name, job, None if out is None else out / name, folds, report, figures, residuals)
         for name, job in zip(names, jobs, strict=True)
     ]
-    with executor_for(workers, scheduler, _written(orders)) as executor:
-        _calibrate_many(orders, out, executor, as_json)
+    with executor_for(workers, scheduler) as executor:
+        if several:
+            _calibrate_many(orders, out, executor, as_json)
+        else:
+            found = calibrate_job(orders[0].read(), executor)
+            orders[0].save(found)
+            show_calibration(found, as_json)
 
 
-def _written(orders: Sequence[Order]) -> Callable[[], str]:
-    """What says later of how many orders a result has been written since."""
-    from fg_calib.batch import saved_in
+def show_calibration(found: Calibration, as_json: bool) -> None:
+    """Print a calibration, and end with 3 where it is not to be trusted or not accepted."""
+    from fg_calib.report.text import build_report
 
-    before = saved_in(orders)
-
-    def said() -> str:
-        n = sum(now != then for now, then in zip(saved_in(orders), before, strict=True))
-        return f"results of {n} of {len(orders)} jobs have been written" if n else "nothing has been written"
-
-    return said
-
-
-def _calibrate_one(order: Order, n_rows: int | None, executor: Executor | None, as_json: bool) -> None:
-    """Calibrate one job, its table in parts of so many rows unless that is None."""
-    from fg_calib.batch import ordered_job, ordered_parts, save_ordered
-    from fg_calib.calibration import calibrate_job, calibrate_parts
-
-    if n_rows is None:
-        found = calibrate_job(ordered_job(order), executor)
+    if as_json:
+        show_json(found.result.document())
     else:
-        found = calibrate_parts(ordered_parts(order, n_rows), executor)
-    try:
-        show_calibration(found, as_json)
-    finally:  # also where nobody takes the report
-        save_ordered(order, found)
+        show_report(build_report(found))
     end(found.findings, not_accepted=found.not_accepted)
 
 
-def _require_parts_alone(n_jobs: int, folds: int | None, residuals: str) -> None:
-    """End with a line on stderr where something was asked for that a table in parts does not give."""
-    for given, why in (
-        (n_jobs > 1, "is of one job"),
-        (folds is not None, "holds no rows out: without --folds"),
-        (residuals == "parquet", "keeps no residuals: without --residuals"),
-    ):
-        if given:
-            raise typer.BadParameter(why, param_hint="--parts")
-
-
 def _calibrate_many(orders: Sequence[Order], out: Path | None, executor: Executor | None, as_json: bool) -> None:
-    from fg_calib.batch import calibrate_into
-    from fg_calib.report.batch import build_jobs_table, exit_code, jobs_document, write_jobs
+    from fg_calib.batch import calibrate_into, exit_code, jobs_document, write_jobs
 
     clock = time.perf_counter()
     found = calibrate_into(orders, executor)
     seconds = time.perf_counter() - clock
-    try:
-        if as_json:
-            show_json(jobs_document(found, seconds))
-        else:
-            show_report(build_jobs_table(found, seconds))
-    finally:
-        if out is not None:
-            write_jobs(out, found, seconds)
+    if out is not None:
+        write_jobs(out, found, seconds)
+    if as_json:
+        show_json(jobs_document(found, seconds))
+    else:
+        show_report(_jobs_table(found, seconds))
     for job in found:
         for warning in job.warnings:
             say(f"{job.name}: {warning}")
@@ -142,3 +110,25 @@ def _calibrate_many(orders: Sequence[Order], out: Path | None, executor: Executo
             say(f"{job.name}: {what}: {reason}")
     if code := exit_code(found):
         raise typer.Exit(code)
+
+
+def _jobs_table(jobs: Sequence[JobSummary], seconds: float) -> RenderableType:
+    """Many jobs for the terminal: a line of each, then how many are good; `seconds` is the duration of all together."""
+    from rich.console import Group
+
+    from fg_calib.report.tables import SHOWN, figure, in_order, line, table_of
+
+    units = {kind: unit for job in jobs for kind, unit in (job.units or {}).items()}
+    kinds, rows = in_order(units), []
+    for job in jobs:
+        values = [figure((job.rms or {}).get(kind), units[kind], none="") for kind in kinds]
+        chi2 = "" if job.reduced_chi2 is None else f"{job.reduced_chi2:.3g}"
+        more = f" (and {len(job.reasons) - 1} more)" if len(job.reasons) > 1 else ""
+        reason = job.reasons[0][1] + more if job.reasons else ""
+        took = "" if job.seconds is None else f"{job.seconds:.1f}"
+        rows.append((job.name, job.verdict, job.rows, *values, chi2, took, reason))
+    headings = ("job", "verdict", "rows", *(f"{kind} {SHOWN[units[kind]][1]}" for kind in kinds))
+    table = table_of((*headings, "chi2/dof", "s", "reason"), rows, left=f"lll{'r' * (len(kinds) + 2)}l", wrap=True)
+    verdicts = Counter(job.verdict for job in jobs)
+    counts = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items())
+    return Group(table, line(f"{len(jobs)} jobs in {seconds:.1f} s: {counts}; RMS after the calibration", "bold"))

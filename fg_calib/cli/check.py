@@ -7,9 +7,8 @@ from typing import Annotated
 
 import typer
 
-from fg_calib.cli.output import Json, show_json, show_report
+from fg_calib.cli.output import Json, ResultFolder, show_json, show_report
 
-Result = Annotated[Path, typer.Argument(metavar="RESULT", readable=False, help="What `calibrate --out` wrote.")]
 NewTable = Annotated[
     Path,
     typer.Argument(metavar="TABLE", readable=False, help="New rows: a table like the job's, or a job with several."),
@@ -24,7 +23,7 @@ Like = Annotated[
 
 
 def check(
-    result: Result,
+    result: ResultFolder,
     table: NewTable,
     limit: Annotated[
         str | None, typer.Option("--limit", metavar="LENGTH", help="Largest RMS error of positions, such as 0.5mm.")
@@ -39,7 +38,7 @@ def check(
     """Say whether a calibration is still good by new rows, and what changed if it is not."""
     from fg_calib.calibration import Calibration
     from fg_calib.io.units import Units, quantity
-    from fg_calib.report.check import build_check_report, check_document
+    from fg_calib.report.monitor import build_check_report, check_document
 
     limits = [
         None if given is None else quantity(given, unit, Units(), option)

@@ -7,10 +7,9 @@ from typing import Annotated
 
 import typer
 
-from fg_calib.cli.output import Json, end, say, show_json, show_report
+from fg_calib.cli.output import Json, ResultFolder, end, say, show_json, show_report
 from fg_calib.options import AngleUnit, LengthUnit
 
-_Result = Annotated[Path, typer.Argument(metavar="RESULT", readable=False, help="What `calibrate --out` wrote.")]
 _Targets = Annotated[
     Path, typer.Argument(metavar="TARGETS", readable=False, help="Where the tool is to be: x y z, orientation, q1 ...")
 ]
@@ -25,7 +24,7 @@ _Table = Annotated[int | None, typer.Option("--table", help="Number of the table
 
 
 def correct(
-    result: _Result,
+    result: ResultFolder,
     targets: _Targets,
     out: _Out = None,
     length: _Length = "m",
@@ -39,21 +38,19 @@ def correct(
     from fg_calib.io.targets import read_targets, require_commands, write_commands
     from fg_calib.io.units import Units
     from fg_calib.prediction.correction import correct as correct_targets
-    from fg_calib.report.correction import build_correction_report, correction_document
+    from fg_calib.report.predict import build_correction_report, correction_document
 
     if out is not None:
         require_commands(out)
     found, units = Calibration.load(result), Units(length, angle)
     wanted = read_targets(targets, found.robot, units)
     commands = correct_targets(found, wanted.position, wanted.rotation, near=wanted.readings, world=world, table=table)
-    try:
-        if as_json:
-            show_json(correction_document(found.robot.name, wanted.ids, commands))
-        else:
-            show_report(build_correction_report(wanted.ids, commands, found.robot))
-    finally:  # also where nobody takes the report
-        if out is not None:
-            write_commands(out, wanted.ids, commands, found.robot, units)
+    if out is not None:
+        write_commands(out, wanted.ids, commands, found.robot, units)
+    if as_json:
+        show_json(correction_document(found.robot.name, wanted.ids, commands))
+    else:
+        show_report(build_correction_report(wanted.ids, commands, found.robot))
     say(f"wrote {len(wanted.ids)} commands to {out}" if out else "nothing is written: --out commands.csv writes them")
     left = int((~commands.reached).sum())
     doubts = [f"the calibration was not to be trusted: {finding}" for finding in found.findings]

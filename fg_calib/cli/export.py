@@ -8,8 +8,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from fg_calib.cli.output import BaseLink, Json, TipLink, end, say, show_json
-from fg_calib.cli.progress import hide_progress
+from fg_calib.cli.output import BaseLink, Json, TipLink, end, say, show, show_json
 from fg_calib.errors import escaped
 
 _Arm = Annotated[
@@ -20,7 +19,7 @@ _Arm = Annotated[
 ]
 _To = Annotated[
     Literal["urdf", "ur", "tesseract", "dh", "mdh", "hayati", "zeros", "yaml"],
-    typer.Option("--to", help="What is to read it: see `fg-calib help export`."),
+    typer.Option("--to", help="What is to read it: see the documentation of export."),
 ]
 _Out = Annotated[
     Path | None, typer.Option("--out", metavar="FILE", readable=False, help="A new file; on stdout if not given.")
@@ -98,8 +97,7 @@ def export(
     if as_json:
         show_json(made.document())
     elif out is None:
-        hide_progress()
-        print(_shown(made.text) if sys.stdout.isatty() else made.text, end="")
+        show(_shown(made.text) if sys.stdout.isatty() else made.text.removesuffix("\n"))
     on_stdout = made.text if out is None and not as_json else ""
     for note in made.notes:
         if note not in on_stdout:

@@ -17,7 +17,7 @@ def inspect(
     """Say what a job holds, what looks wrong with it, and what it can determine, without solving it."""
     from fg_calib.diagnostics.inspection import inspect_job
     from fg_calib.io.job import read_job
-    from fg_calib.report.inspection import build_inspection_report, inspection_document
+    from fg_calib.report.inspect import build_inspection_report, inspection_document
 
     given = read_job(job)
     found = inspect_job(given)

@@ -78,8 +78,7 @@ def observe(
     from fg_calib.io.units import Units
     from fg_calib.observability.identifiability import observe_configurations, observe_structure
     from fg_calib.options import Pairing
-    from fg_calib.report.documents import observability_document, write_observability
-    from fg_calib.report.identifiability import build_identifiability_report
+    from fg_calib.report.inspect import build_identifiability_report, observability_document, write_observability
 
     if configurations is None:
         _refuse_idle(context, _OF_A_TABLE, "without --configurations")
@@ -100,14 +99,12 @@ def observe(
         noise = _noise(units, arm, position_noise, orientation_noise, joint_noise)
         table = read_measurements(configurations, arm, units=units, noise=noise)
         found = observe_configurations(arm, table, model, frame=frame, pairing=Pairing(pairing), prefer=names)
-    try:
-        if as_json:
-            show_json(observability_document(found))
-        else:
-            show_report(build_identifiability_report(found))
-    finally:  # also where nobody takes the report
-        if out is not None:
-            write_observability(out, found)
+    if out is not None:
+        write_observability(out, found)
+    if as_json:
+        show_json(observability_document(found))
+    else:
+        show_report(build_identifiability_report(found))
 
 
 def _idle(model: Model) -> tuple[str, ...]:

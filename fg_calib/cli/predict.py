@@ -7,10 +7,9 @@ from typing import Annotated
 
 import typer
 
-from fg_calib.cli.output import Json, end, say, show_json, show_report
+from fg_calib.cli.output import Json, ResultFolder, end, say, show_json, show_report
 from fg_calib.options import AngleUnit, LengthUnit
 
-_Result = Annotated[Path, typer.Argument(metavar="RESULT", readable=False, help="What `calibrate --out` wrote.")]
 _At = Annotated[
     Path | None,
     typer.Option(
@@ -31,7 +30,7 @@ _Angle = Annotated[AngleUnit, typer.Option("--angle", help="Unit of joint values
 
 
 def predict(
-    result: _Result,
+    result: ResultFolder,
     at: _At = None,
     limit: _Limit = None,
     out: _Out = None,
@@ -45,7 +44,7 @@ def predict(
     from fg_calib.io.units import Units, quantity
     from fg_calib.prediction.predict import measured_of, require_prediction, write_prediction
     from fg_calib.prediction.predict import predict as predict_tool
-    from fg_calib.report.prediction import build_prediction_report, prediction_document
+    from fg_calib.report.predict import build_prediction_report, prediction_document
 
     most = None if limit is None else quantity(limit, "m", Units(), "--limit")
     units = Units(length, angle)
@@ -54,14 +53,12 @@ def predict(
     calibration = Calibration.load(result)
     ids, readings = ((), None) if at is None else read_joint_table(at, calibration.robot, units)
     found = predict_tool(calibration, readings, limit=most, measured=measured_of(calibration, result))
-    try:
-        if as_json:
-            show_json(prediction_document(found, calibration.result, ids))
-        else:
-            show_report(build_prediction_report(found, calibration.result, calibration.robot, ids, length))
-    finally:  # also where nobody takes the report
-        if out is not None:
-            write_prediction(out, found, calibration, ids=ids, units=units)
+    if out is not None:
+        write_prediction(out, found, calibration, ids=ids, units=units)
+    if as_json:
+        show_json(prediction_document(found, calibration.result, ids))
+    else:
+        show_report(build_prediction_report(found, calibration.result, calibration.robot, ids, length))
     if out is not None:
         say(f"wrote the prediction to {out}")
     end(calibration.findings)

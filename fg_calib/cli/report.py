@@ -7,13 +7,11 @@ from typing import Annotated
 
 import typer
 
-from fg_calib.cli.output import say
+from fg_calib.cli.output import ResultFolder, say
 
 
 def report(
-    result: Annotated[
-        Path, typer.Argument(metavar="RESULT", readable=False, help="A folder that `calibrate --out` wrote.")
-    ],
+    result: ResultFolder,
     out: Annotated[
         Path | None,
         typer.Option("--out", metavar="DIR", readable=False, help="Write there instead of beside the result."),
@@ -21,7 +19,7 @@ def report(
     figures: Annotated[bool, typer.Option("--figures", help="Write its figures too, as SVG files.")] = False,
 ) -> None:
     """Write report.html of a calibration: one page to look at and to pass on, which needs nothing else."""
-    from fg_calib.pages import write_report
+    from fg_calib.calibration import write_report
 
     write_report(result, out, figures=figures)
     folder = (result if result.is_dir() else result.parent) if out is None else out

@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from fg_calib.cli.output import Json, say_next, show_json
-from fg_calib.cli.progress import hide_progress
+from fg_calib.cli.output import Json, say_next, show, show_json
 from fg_calib.errors import printable
 
 
@@ -30,12 +29,11 @@ def simulate(
     if as_json:
         show_json({"files": [str(out / name) for name in names], **simulation.summary()})
     else:
-        hide_progress()
         n_train, n_test = (simulation.n_configurations(test=test) for test in (False, True))
         counts = f"{n_train} configurations to calibrate, {n_test} to test"
-        print(printable(f"{simulation.scenario.name}, seed {seed}: {counts}"))
+        show(printable(f"{simulation.scenario.name}, seed {seed}: {counts}"))
         for table in simulation.tables if simulation.scenario.instruments else ():
             m = table.measurements
             rows = f"{sum(~m.test)} rows to calibrate, {sum(m.test)} to test"
-            print(printable(f"{m.source}: model {table.model}, {rows}"))
+            show(printable(f"{m.source}: model {table.model}, {rows}"))
     say_next(names, out)

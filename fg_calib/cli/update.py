@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fg_calib.cli.check import Like, NewTable, Pairs, Result
-from fg_calib.cli.output import Json, end, show_calibration
+from fg_calib.cli.calibrate import show_calibration
+from fg_calib.cli.check import Like, NewTable, Pairs
+from fg_calib.cli.output import Json, ResultFolder
 
 if TYPE_CHECKING:
     from fg_calib.robot.model import Robot
 
 
 def update(
-    result: Result,
+    result: ResultFolder,
     table: NewTable,
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", readable=False, help="Write the new result there, with its history.")
@@ -45,11 +46,14 @@ def update(
 ) -> None:
     """Add new rows to a calibration, from what it has learned: its own rows are not read again."""
     from fg_calib.calibration import Calibration
-    from fg_calib.io.atomic import is_folder, require_writable
-    from fg_calib.report.documents import require_apart
+    from fg_calib.errors import InputError
+    from fg_calib.io.atomic import require_writable
+    from fg_calib.io.saved import require_no_input
 
+    if out.resolve() in (result.resolve(), result.parent.resolve() if result.is_file() else result.resolve()):
+        raise InputError(str(out), "the folder of the result that is updated", "another one, for the new result")
     require_writable(out)
-    require_apart(out, [result if is_folder(result) else result.parent], [table, *([] if pairs is None else [pairs])])
+    require_no_input(out, Path("job"), {str(path): "" for path in (table, pairs) if path is not None})
     before = Calibration.load(result)
     found = before.update(
         table,
@@ -60,11 +64,8 @@ def update(
         pairs=pairs,
         like=like,
     )
-    try:
-        show_calibration(found, as_json)
-    finally:  # also where nobody takes the report
-        found.save(out)
-    end(found.findings, not_accepted=found.not_accepted)
+    found.save(out)
+    show_calibration(found, as_json)
 
 
 def _growth(given: Sequence[str], robot: Robot) -> dict[str, float]:

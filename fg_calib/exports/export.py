@@ -28,9 +28,8 @@ from fg_calib.exports.fits import (
 from fg_calib.exports.ros import UrBase, dumped, hash_of, tesseract_text, ur_base_of, ur_kinematics, ur_text
 from fg_calib.exports.tables import TableConvention, in_table
 from fg_calib.exports.urdf import BASE_LINK, TOOL_LINK, calibrated_urdf, new_urdf
-from fg_calib.io.atomic import is_folder, replacing, require_absent
+from fg_calib.io.atomic import replacing, require_absent
 from fg_calib.io.robot_file import robot_text
-from fg_calib.io.saved import read_configurations, require_unchanged
 from fg_calib.io.units import Units
 from fg_calib.io.urdf import encoding_of
 from fg_calib.options import check, check_flag
@@ -410,10 +409,7 @@ def measured_configurations(path: Path | str) -> Floats:
     Raises:
         InputError: There are none, or they are damaged.
     """
-    folder = Path(path) if is_folder(Path(path)) else Path(path).parent
-    calibration = Calibration.load(path)
-    require_unchanged(folder, calibration.result.files)
-    found = read_configurations(folder, calibration.robot.n_joints)
+    found = Calibration.load(path).measured
     if found is None:
-        raise InputError(str(folder), "no configurations.csv", "what `fg-calib calibrate --out` wrote")
-    return found.readings
+        raise InputError(str(path), "no configurations.csv", "what `fg-calib calibrate --out` wrote")
+    return found

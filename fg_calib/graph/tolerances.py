@@ -6,16 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fg_calib.arrays import FrozenArrays
+from fg_calib.arrays import Floats, FrozenArrays, Integers
 from fg_calib.graph.factors import Variables
 from fg_calib.graph.problem import Problem, assembled
 from fg_calib.options import SharedScale
 from fg_calib.robot.model import Parameter, Robot, tolerance_kind
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 FIRST = 1e-3
 """Tolerance that a joint's parameter starts from where none is stated, [m] and [rad]."""

@@ -8,12 +8,12 @@ from pathlib import Path
 
 from fg_calib.arrays import NOTHING
 from fg_calib.errors import InputError
+from fg_calib.executors import tell
 from fg_calib.importers.board import CalibrationBoard
 from fg_calib.importers.opencv import LARGER, decode, find_corners
 from fg_calib.importers.views import Corners
 from fg_calib.io.atomic import read_bytes
 from fg_calib.measurements.dataset import Floats
-from fg_calib.progress import tell
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp", ".jp2")
 

@@ -1,130 +1,84 @@
-"""`result.json` as a typed model: what `calibrate --out` writes, and reads back.
+"""The typed result of a calibration: `result.json` is its dump, and what reads back prints the same.
 
-All in [m] and [rad]; what is unknown or infinite is None. `result.schema.json` beside this file is its JSON schema.
-Version 1 lacks the posterior and reads as well; keys that are not known are left alone.
+Its parts are what the analysis returns. All values are in [m] and [rad]; null is unknown or infinite.
 """
 
 from __future__ import annotations
 
 import json
-import math
-from collections import Counter
-from collections.abc import Iterator
-from datetime import datetime
+import platform
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from functools import cache
+from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
-from pydantic_core import PydanticCustomError
+import scipy
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, WrapSerializer
 
+from fg_calib import __version__
 from fg_calib.arguments import checked
-from fg_calib.arrays import NORM_TOLERANCE, brief
+from fg_calib.arrays import Figure, Floats
+from fg_calib.assessment import Assessment
+from fg_calib.diagnostics.setup_check import SetupCheck
 from fg_calib.errors import InputError
+from fg_calib.graph.noise import JOINT_NOISE
+from fg_calib.graph.problem import Problem
+from fg_calib.graph.solver import Solution
+from fg_calib.graph.tolerances import ToleranceScale
 from fg_calib.io.atomic import exists, is_folder, read_text
 from fg_calib.io.yaml import first_misfit
-from fg_calib.options import FrameKnowledge, Model
+from fg_calib.measurements.table import Table
+from fg_calib.monitoring.fingerprints import fingerprints
+from fg_calib.monitoring.prior_information import knowledge_of
+from fg_calib.observability.identifiability import Identifiability
+from fg_calib.options import FrameKnowledge, Model, Options
+from fg_calib.prediction.expected_error import ExpectedError
+from fg_calib.statistics.acceptance import Acceptance
+from fg_calib.statistics.covariance import TangentCovariance
+from fg_calib.statistics.cross_validation import CrossValidation
+from fg_calib.statistics.estimates import FrameEstimate, JointErrors, LandmarkEstimate, ParameterEstimate
+from fg_calib.statistics.goodness_of_fit import KindFit, PredictedFit
+from fg_calib.statistics.prior_consistency import PriorFit
+from fg_calib.statistics.residual_table import ResidualTable
 
-MOST_WHOLE = 10**15
-"""The most of anything that a result counts: far more than is ever counted, and exact as a float."""
+SCHEMA = "fg-calib/result/2"
+OBSERVABILITY_SCHEMA = "fg-calib/observability/1"
 
-Whole = Annotated[int, Field(ge=0, le=MOST_WHOLE)]
-"""A count."""
-
-IN_PARTS = "gauss-newton in parts"
-"""Name of the solver of a table in parts."""
-
-SCHEMA: Literal["fg-calib/result/2"] = "fg-calib/result/2"
-
-
-def _known(value: object) -> object:
-    """A plain number; None for one that is not finite."""
-    plain = value.item() if isinstance(value, np.generic) else value
-    return None if isinstance(plain, float) and not math.isfinite(plain) else plain
-
-
-def _listed(value: object) -> object:
-    return value.tolist() if isinstance(value, np.ndarray) else value
+KINDS = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad", "point": "m", "pixel": "px"}
+"""Unit of each usual kind of residual."""
 
 
-def _of_errors(matrix: tuple[tuple[float | None, ...], ...]) -> tuple[tuple[float | None, ...], ...]:
-    """The matrix, which must be one that errors can have; for what is None anything would do."""
-    expected = PydanticCustomError("covariance", "a symmetric matrix of variances and covariances of errors")
-    if any(len(row) != len(matrix) for row in matrix):
-        raise expected
-    C = np.array(matrix, float).reshape(len(matrix), len(matrix))
-    variance = C.diagonal()
-    with np.errstate(invalid="ignore"):
-        sigma = np.sqrt(variance)
-        most = np.outer(sigma, sigma)
-        if (variance < 0.0).any() or (np.abs(C - C.T) > ROUNDING * most).any():
-            raise expected
-        if (np.abs(C) > (1.0 + ROUNDING) * most).any():
-            raise expected
-    return matrix
+def _flat(found: Identifiability, handler: Any) -> dict[str, Any]:
+    """Identifiability as `observability.json` has it: the fields of its observability among its own."""
+    document = handler(found)
+    o = found.observability
+    classes = {name: o.named(name) for name in ("independent", "ineffective")} | {"kept": o.kept}
+    return {
+        "schema": OBSERVABILITY_SCHEMA,
+        "n_parameters": len(o.names),
+        **classes,
+        **document.pop("observability"),
+        **document,
+    }
 
 
-def _unit(quaternion: tuple[float, ...]) -> tuple[float, ...]:
-    if abs(math.hypot(*quaternion) - 1.0) > NORM_TOLERANCE:
-        raise PydanticCustomError("quaternion", "x y z w of length 1")
-    return quaternion
-
-
-ROUNDING = 1e-6
-"""How far a covariance may be from symmetric, in products of sigmas: a matrix summed in another order is not."""
-
-NEAR_NOTHING = 1e-9
-"""How far a correction may be from estimate less nominal, [m] and [rad]: rounding, and no error of a robot."""
-
-MOST_FIGURE = 1e150
-"""The most that a figure of a result may be: its square is a number too, and no residuals are as large."""
-
-Bounded = Annotated[float, Field(ge=-MOST_FIGURE, le=MOST_FIGURE)]
-
-Figure = Annotated[Bounded | None, BeforeValidator(_known)]
-"""A number, None where it is unknown or infinite."""
-
-Sigma = Annotated[Annotated[float, Field(ge=0, le=MOST_FIGURE)] | None, BeforeValidator(_known)]
-"""A standard deviation, None where it is unknown or infinite."""
-
-Row = Annotated[tuple[Figure, ...], BeforeValidator(_listed)]
-Matrix = Annotated[tuple[Row, ...], BeforeValidator(_listed)]
-CovarianceMatrix = Annotated[Matrix, AfterValidator(_of_errors)]
-Sigmas = Annotated[tuple[Sigma, ...], BeforeValidator(_listed)]
-Position = Annotated[tuple[Bounded, Bounded, Bounded], BeforeValidator(_listed)]
-Quaternion = Annotated[tuple[float, float, float, float], BeforeValidator(_listed), AfterValidator(_unit)]
-
-
-Choice = str | bool | int | float | tuple[str, ...] | dict[str, float] | None
-"""What an option may be."""
+Observability = Annotated[
+    Identifiability,
+    WrapSerializer(_flat),
+    BeforeValidator(lambda value: {**value, "observability": value} if isinstance(value, dict) else value),
+]
+"""What the data determine; flat in JSON."""
 
 
 class Section(BaseModel):
-    """A part of a result; it may be made of any object that has its fields as attributes."""
+    """A part of a document; it may be made of any object that has its fields as attributes."""
 
     model_config = ConfigDict(
-        frozen=True,
-        from_attributes=True,
-        populate_by_name=True,
-        protected_namespaces=(),
-        allow_inf_nan=False,
-        defer_build=True,  # of the sections that a result has, not of all at import
+        frozen=True, from_attributes=True, populate_by_name=True, protected_namespaces=(), defer_build=True
     )
-
-    def __repr__(self) -> str:
-        return brief(self, (name for name in type(self).model_fields if name in self.model_fields_set))
-
-    def __str__(self) -> str:
-        return repr(self)
-
-    @classmethod
-    def make(cls, **values: Any) -> Self:
-        """The section with these values: arrays, and numbers that are not finite, become what JSON knows."""
-        return cls.model_validate(values)
-
-    def document(self) -> dict[str, Any]:
-        """What is written: the keys that were set, as JSON knows them."""
-        return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
 
 
 class Step(Section):
@@ -133,360 +87,92 @@ class Step(Section):
     cost: Figure
     damping: Figure = Field(alias="lambda")
     step: Figure
-    decrement: Figure = None
+    decrement: Figure | None = None
 
 
-class Solver(Section):
-    """What the solver did."""
+class SolverRun(Section):
+    """How the solver ended."""
 
-    name: str
+    name: str = "gtsam-lm"
     converged: bool
     message: str
-    iterations: Whole
+    iterations: int
     initial_cost: Figure
     cost: Figure
     seconds: Figure
     history: tuple[Step, ...] = ()
 
 
-class KindGoodness(Section):
-    """Noise stated and noise seen of one kind of residuals."""
+class Rms(Section):
+    """Root mean square of residuals before and after the calibration; `unit` of a custom kind."""
 
-    n: Whole
-    stated_sigma_rms: Figure
-    seen_over_stated: Figure
-    chi2: Figure
-    expected: Figure
-    p_value: Figure
-    verdict: str
-
-
-class SuspectConfiguration(Section):
-    """A configuration whose residuals are together larger than noise."""
-
-    id: str
-    n: Whole
-    chi2: Figure
-    expected: Figure
-
-
-class TestRows(Section):
-    """How well the test rows are predicted."""
-
-    __test__ = False  # no test of pytest's
-
-    n_rows: Whole
-    n: Whole
-    n_outliers: Whole
-    n_unknown: Whole
-    chi2: Figure
-    expected: Figure
-    p_value: Figure
-    goodness: dict[str, KindGoodness]
-    n_suspect_rows: Whole
-    suspect_configurations: tuple[SuspectConfiguration, ...]
-
-
-class BeyondTolerance(Section):
-    """A correction far beyond its tolerance."""
-
-    parameter: str
-    correction_over_tolerance: Figure
-    sigma: Figure
-
-
-class Priors(Section):
-    """Corrections against tolerances."""
-
-    n: Whole
-    chi2: Figure
-    expected: Figure
-    p_value: Figure
-    beyond_tolerance: tuple[BeyondTolerance, ...]
-
-
-class Judgement(Section):
-    """A limit that the user set, and what the rows held out say of it."""
-
-    kind: Literal["position", "orientation", "distance", "angle"]
-    limit: Annotated[float, Field(gt=0)]
-    error: Figure
-    noise: Figure
-    n: Whole
-    verdict: Literal["pass", "fail", "not evaluated"]
-    reason: str = ""
-    table: str = ""
-
-
-class Acceptance(Section):
-    """What became of all limits that the user set."""
-
-    verdict: Literal["pass", "fail", "not evaluated"]
-    judgements: tuple[Judgement, ...]
-
-
-class HeldOut(Section):
-    """Residuals of one kind that cross-validation held out: RMS with the nominal arm, the calibrated one, and noise."""
-
-    n: Whole
-    before: Figure
-    after: Figure
-    noise: Figure
-
-
-class Folds(Section):
-    """Cross-validation; `spread` is the jackknife of each parameter (see `analysis.folds`)."""
-
-    n: Whole
-    n_held_out: Whole
-    n_not_converged: Whole
-    of_pairs: bool = False
-    kinds: dict[str, HeldOut]
-    spread: dict[str, Figure]
-
-
-class InFrames(Section):
-    """An error in the base frame, and after the best rigid fit."""
-
-    base: Figure
-    fitted: Figure
-
-
-class ExpectedError(Section):
-    """Expected RMS errors of the tool; `relative`: nothing says where the base is, so only `fitted` tells of them."""
-
-    position: InFrames
-    orientation: InFrames
-    at: str
-    n: Whole
-    of: Whole
-    relative: bool | None = None
-
-
-class Typical(Section):
-    """A typical residual before the calibration beside the one predicted."""
-
-    typical: Figure
-    predicted: Figure
-
-
-class Explanation(Section):
-    """Mistakes that explain the residuals before the calibration."""
-
-    mistakes: tuple[str, ...]
-    residuals: dict[str, Typical]
-
-
-class Setup(Section):
-    """What residuals before the calibration say of its set-up; `table` names the one of several that they are of.
-
-    `others` has the same of other tables that have something to say.
-    """
-
-    table: str = ""
-    residuals: dict[str, Typical]
-    explanations: tuple[Explanation, ...]
-    others: tuple[Setup, ...] = ()
-
-
-class Parameter(Section):
-    """One parameter of the robot after calibration; see `analysis.uncertainty.ParameterEstimate`."""
-
-    name: str
-    unit: Literal["m", "rad"]
-    nominal: Bounded
-    estimate: Bounded
-    correction: Bounded
-    sigma: Sigma
-    prior_sigma: Sigma
-    identifiability: Literal["independent", "relative", "ineffective", "fixed"]
-    stands_for: dict[str, float] | None = None
-    sigma_of_combination: Sigma = None
-
-
-class ToleranceScale(Section):
-    """A factor on tolerances that was estimated, with its 95 % interval; see `graph.tolerances.ToleranceScale`."""
-
-    group: str
-    parameters: Annotated[tuple[str, ...], Field(min_length=1)]
-    scale: Annotated[float, Field(gt=0.0, le=MOST_FIGURE)]
-    low: Annotated[float, Field(gt=0.0, le=MOST_FIGURE)]
-    high: Annotated[float, Field(gt=0.0, le=MOST_FIGURE)]
-    seen: Bounded
+    before: float | None
+    after: float | None
+    unit: str | None = None
 
 
 class Covariance(Section):
-    """Covariance of the errors of parameters."""
+    """Covariance of the errors of parameters, nan where they are not determined."""
 
     names: tuple[str, ...]
-    matrix: CovarianceMatrix
+    matrix: Floats
 
 
 class Posterior(Section):
-    """The covariance in the tangent space of the variables, and what nothing determines: all that predictions need.
+    """The covariance in the tangent space of the variables, and the undetermined directions, for predictions.
 
-    Columns are those of the variables one after the other: the parameters that a vector has; of a pose, the turn about
-    its own x, y, z axes, then the shift along them.
+    Columns are those of the variables one after the other: the parameters of a vector; of a pose, the rotation about
+    its own x, y, z axes, then the translation along them.
     """
 
     variables: dict[str, tuple[str, ...]]
-    covariance: CovarianceMatrix
-    undetermined: Matrix
-    undetermined_at_nominal: Matrix
+    covariance: Floats
+    undetermined: Floats
+    undetermined_at_nominal: Floats
+
+    @classmethod
+    def of(cls, covariance: TangentCovariance) -> Posterior:
+        """The posterior of a tangent covariance."""
+        v = covariance.variables
+        return cls(
+            variables={item.symbol: tuple(v.names[item.columns]) for item in v.items},
+            covariance=covariance.tangent,
+            undetermined=covariance.loose,
+            undetermined_at_nominal=covariance.loose_at_nominal,
+        )
 
 
-class Frame(Section):
-    """The measurement frame world_T_base."""
-
-    xyz: Position
-    quaternion_xyzw: Quaternion
-    sigma: Sigmas
-
-
-class JointScatter(Section):
-    """How one joint's estimated values lie about its readings."""
-
-    name: str
-    sigma: Sigma
-    mean: Figure
-    scatter: Figure
-
-
-class SuspectReading(Section):
-    """A reading that is far from its estimate."""
+class SuspectConfiguration(Section):
+    """A configuration whose residuals together are larger than noise."""
 
     id: str
-    joint: str
-    error: Figure
-    studentised: Figure
-
-
-class JointValues(Section):
-    """Estimated joint values about their readings."""
-
-    n: Whole
-    joints: tuple[JointScatter, ...]
-    suspects: tuple[SuspectReading, ...]
-
-
-class TouchedPoint(Section):
-    """A point that a group of configurations touched, or another unknown, of any number of coordinates."""
-
-    name: str
-    n: Whole
-    xyz: Annotated[tuple[float, ...], BeforeValidator(_listed)]
-    sigma: Sigmas
-    kind: str = "point"
-    units: tuple[str, ...] = ("m", "m", "m")
-
-
-class Rms(Section):
-    """Root mean square of residuals before and after; of a kind of one's own with its unit."""
-
-    before: Figure
-    after: Figure
-    unit: Literal["m", "rad", "px"] | None = None
-
-
-class Relative(Section):
-    """Parameters that are determined only together."""
-
-    parameters: tuple[str, ...]
-    lost: Whole
-    relations: tuple[dict[str, float], ...]
-    keep: tuple[str, ...]
-
-
-class Lost(Section):
-    """A direction that is not determined, and why."""
-
-    relation: Annotated[dict[str, float], Field(min_length=1)]
-    reason: str
-
-
-class Missing(Section):
-    """A motion that the convention has no parameter for."""
-
-    axes: tuple[int, ...]
-    motions: tuple[str, ...]
-    convention: str
-    use: str | None
-    message: str
-
-
-class Correlated(Section):
-    """Two parameters that are strongly correlated."""
-
-    parameters: tuple[str, str]
-    correlation: Figure
-
-
-class Weak(Section):
-    """A direction that is determined badly."""
-
-    signal_to_noise: Figure
-    members: Annotated[dict[str, float], Field(min_length=1)]
-
-
-class Observability(Section):
-    """What `observability.json` holds; sigmas, correlations and weak directions only where the noise is the user's."""
-
-    schema_: str = Field(alias="schema")
-    robot: str = ""
-    model: str
-    kind: str
-    n_configurations: Whole = 0
-    n_parameters: Whole
-    rank: Whole
-    names: tuple[str, ...]
-    singular_values: Row
-    gap: Figure
-    independent: tuple[str, ...]
-    ineffective: tuple[str, ...]
-    relative: tuple[Relative, ...]
-    kept: tuple[str, ...] = ()
-    lost: tuple[Lost, ...] = ()
-    missing: tuple[Missing, ...] = ()
-    null_space: Matrix
-    indices: dict[str, Figure]
-    condition_number: Figure
-    sigma: dict[str, Figure] = {}
-    correlations: tuple[Correlated, ...] = ()
-    weak: tuple[Weak, ...] = ()
-    fixed: tuple[str, ...] = ()
-    with_fixed_known: Observability | None = None
-
-
-class AtNominal(Section):
-    """What rows say of the arm as drawn: its parameters, base and tool as fitted, and the places of what stays."""
-
-    parameters: Annotated[tuple[float, ...], BeforeValidator(_listed)]
-    at: Annotated[tuple[float, ...], BeforeValidator(_listed)] = ()
-    rows: Annotated[tuple[Annotated[tuple[float, ...], BeforeValidator(_listed)], ...], BeforeValidator(_listed)]
+    n: int
+    chi2: Figure
+    expected: Figure
 
 
 class Knowledge(Section):
-    """What rows say of the arm and of what stays with it, linearised at the estimate (see `graph.knowledge`).
+    """The information of the rows, linearised at the estimate, for the next calibration.
 
-    `rows` by the columns of `columns`, those of the arm as in `posterior`, then three of each of `unknowns`.
-    `nominal` are the same rows at the arm as drawn, by which parameters are classed.
+    `rows` by `columns`: those of the arm as in `posterior`, then three of each of `unknowns`. `nominal` holds the same
+    rows at the nominal arm, which parameters are classed by.
     """
 
-    columns: tuple[str, ...]
+    columns: tuple[str, ...] = ()
     unknowns: tuple[tuple[str, str], ...] = ()
-    at: Annotated[tuple[float, ...], BeforeValidator(_listed)] = ()
-    rows: Annotated[tuple[Annotated[tuple[float, ...], BeforeValidator(_listed)], ...], BeforeValidator(_listed)]
-    right: Annotated[tuple[float, ...], BeforeValidator(_listed)]
+    at: Floats
+    rows: Floats
+    right: Floats
     views: tuple[tuple[Model, FrameKnowledge], ...] = ()
-    nominal: AtNominal | None = None
+    parameters: Floats
+    nominal: Knowledge | None = None
 
 
 class Carried(Section):
     """What the next calibration of this arm takes over.
 
-    `job` is the job without robot, by which tables like its own are read; `rows` are fingerprints of the fitted rows,
-    which are not to be counted twice; `noise` the factors on stated sigmas by table
-    and kind, where noise was estimated.
+    `job` is the job without its robot, by which tables like its own are read; `rows` are fingerprints of the fitted
+    rows, so that none counts twice; `noise` the factors on specified sigmas by table and kind, where it was estimated.
     """
 
     job: dict[str, Any] = {}
@@ -496,31 +182,50 @@ class Carried(Section):
 
 
 def _dated(date: str) -> str:
-    """Refuse what is no date; the empty one is unknown."""
     if date:
         datetime.fromisoformat(date)
     return date
 
 
-Date = Annotated[str, AfterValidator(_dated)]
-"""A date as ISO 8601 has it."""
+Date = Annotated[str, BeforeValidator(_dated)]
+"""A date as ISO 8601 has it; empty if it is unknown."""
 
 
-class Previous(Section):
-    """The result that an update came from."""
+class Run(Section):
+    """One run of a history.
 
-    sha256: str
+    Attributes:
+        date: When its rows were measured.
+        n_residuals: Number of fitted residuals.
+        chi2: Chi-square of its rows and the information before.
+        dof: Its degrees of freedom.
+        p_value: Probability of a larger one.
+        verdict: `good` or `doubtful`.
+        parameters: Estimate, sigma and unit of each estimated parameter.
+        inputs: SHA-256 of the files of its rows, by path.
+        rows: Fingerprints of its rows.
+    """
+
     date: Date
+    n_residuals: int
+    chi2: Figure
+    dof: int
+    p_value: float | None
+    verdict: Literal["good", "doubtful"]
+    parameters: dict[str, tuple[float, float | None, str]]
+    inputs: dict[str, str] = {}
+    rows: tuple[str, ...] = ()
 
 
 class Result(Section):
-    """What `result.json` holds; `links` are those of a URDF between which its chain runs, `files` SHA-256 of tables.
+    """All that `result.json` holds.
 
-    `date` is when the rows were measured, so far as is known; when they were calibrated where nobody said.
+    `date` is when the rows were measured, or when they were calibrated if that is unknown. `history` are the runs
+    before this one. `files` holds SHA-256 of the tables written with it, `links` the ends of a URDF's chain.
     """
 
-    schema_: Literal["fg-calib/result/1", "fg-calib/result/2"] = Field(alias="schema")
-    version: str
+    schema_: Literal["fg-calib/result/2"] = Field(alias="schema", default="fg-calib/result/2")
+    version: str = __version__
     robot: str
     model: str
     frame: str
@@ -528,68 +233,314 @@ class Result(Section):
     pair_errors: str | None = None
     encoder: str = "propagated"
     loss: str = "none"
-    n_configurations: Whole
-    n_pairs: Whole
-    n_residuals: Whole
-    n_priors: Whole = 0
-    n_excluded: dict[str, Whole]
-    solver: Solver
-    trustworthy: bool | None = None
+    tables: tuple[tuple[str, str], ...] = ()
+    n_configurations: int
+    n_pairs: int
+    n_residuals: int
+    n_priors: int = 0
+    n_unknowns: int = 0
+    n_determined: int = 0
+    n_excluded: dict[str, int]
+    solver: SolverRun
+    trustworthy: bool
     findings: tuple[str, ...] = ()
     cautions: tuple[str, ...] = ()
     reservations: tuple[str, ...] = ()
-    setup: Setup | None = None
-    probability_of_noise: Figure = None
+    notes: tuple[str, ...] = ()
+    setup: SetupCheck | None = None
+    probability_of_noise: float | None = None
     chi2: Figure
-    dof: Annotated[int, Field(ge=-MOST_WHOLE, le=MOST_WHOLE)]
-    reduced_chi2: Figure
-    chi2_p_value: Figure = None
-    goodness: dict[str, KindGoodness] = {}
+    dof: int
+    reduced_chi2: float | None
+    chi2_p_value: float | None = None
+    chi2_expected: Figure = np.nan
+    chi2_bounds: tuple[Figure, Figure] = (np.nan, np.nan)
+    goodness: dict[str, KindFit] = {}
+    suspect_level: Figure = np.nan
+    suspect_configurations: tuple[SuspectConfiguration, ...] = ()
     evaluated_only: bool = False
-    test: TestRows | None = None
+    test: PredictedFit | None = None
     acceptance: Acceptance | None = None
-    folds: Folds | None = None
-    priors: Priors | None = None
+    folds: CrossValidation | None = None
+    priors: PriorFit | None = None
     expected_error: ExpectedError | None = None
+    sigma_joint: Floats = Field(default_factory=lambda: np.zeros(0))
     noise_factors: dict[str, float] | None = None
     noise_kept: tuple[str, ...] = ()
     tolerance_scales: tuple[ToleranceScale, ...] | None = None
-    suspect_configurations: tuple[SuspectConfiguration, ...] = ()
     residual_rms: dict[str, dict[str, Rms | None]]
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[ParameterEstimate, ...]
     covariance: Covariance
-    posterior: Posterior | None = None
+    posterior: Posterior
     links: tuple[str, str] | None = None
-    frame_estimate: Frame | None
-    frames: dict[Annotated[str, Field(pattern=r"^X\(\d{1,4}\)$")], Frame] = {}
-    joint_values: JointValues | None = None
-    groups: tuple[TouchedPoint, ...] = ()
+    frame_estimate: FrameEstimate | None
+    frames: dict[str, FrameEstimate] = {}
+    joint_values: JointErrors | None = None
+    groups: tuple[LandmarkEstimate, ...] = ()
     observability: Observability
-    options: dict[str, Choice] = {}
+    options: Options
     versions: dict[str, str] = {}
     files: dict[str, str] = {}
     inputs: dict[str, str]
     date: Date = ""
-    previous: Previous | None = None
-    carried: Carried | None = None
+    history: tuple[Run, ...] = ()
+    carried: Carried = Carried()
 
-    @property
-    def in_parts(self) -> bool:
-        """Whether it is of a table in parts, of which no single row was judged."""
-        return self.solver.name == IN_PARTS
+    @classmethod
+    def of(
+        cls,
+        solution: Solution,
+        assessed: Assessment,
+        *,
+        inputs: Mapping[str, str] | None = None,
+        job: Mapping[str, Any] | None = None,
+        date: str | None = None,
+        history: tuple[Run, ...] = (),
+        notes: tuple[str, ...] = (),
+    ) -> Result:
+        """The result of a solution and its assessment.
+
+        Args:
+            solution: The solution.
+            assessed: Its assessment.
+            inputs: SHA-256 of the files that it was read from, by path.
+            job: The document of the job, to read tables like its own.
+            date: When its rows were measured; now if None.
+            history: The runs before it.
+            notes: What a reader should know besides, a sentence each.
+        """
+        problem, options = solution.problem, solution.problem.options
+        urdf = problem.robot.urdf
+        return cls(
+            **_description(problem),
+            **_fit(solution, assessed),
+            **_verdict(assessed),
+            **_estimates(problem, assessed),
+            **_noise_factors(solution, assessed.fit.goodness.kinds),
+            pair_errors=options.pair_errors if problem.pair_series else None,
+            encoder=options.encoder,
+            loss=options.loss,
+            sigma_joint=problem.sigma_joint,
+            links=None if urdf is None else (urdf.base_link, urdf.tip_link),
+            observability=assessed.identifiability,
+            options=options,
+            versions=versions(),
+            inputs=dict(inputs or {}),
+            date=date or datetime.now(UTC).isoformat(timespec="seconds"),
+            history=history,
+            notes=notes,
+            carried=_carried(solution, job or {}),
+        )
 
     @property
     def free_of_frame(self) -> bool:
         """Whether nothing was measured in the base frame, so that errors count after the best rigid fit."""
-        expected = self.expected_error
-        if expected is not None and expected.relative is not None:
-            return expected.relative
+        if self.expected_error is not None:
+            return self.expected_error.relative
         return self.frame_estimate is not None or self.pairing is not None
 
+    @property
+    def estimated(self) -> tuple[ParameterEstimate, ...]:
+        """The parameters that are not fixed."""
+        return tuple(p for p in self.parameters if p.identifiability != "fixed")
 
-def result_schema() -> dict[str, Any]:
-    """The JSON schema of `result.json`."""
-    return Result.model_json_schema(by_alias=True)
+    @property
+    def run(self) -> Run:
+        """This result as one run of a history."""
+        known = set(self.covariance.names)
+        return Run(
+            date=self.date,
+            n_residuals=self.n_residuals,
+            chi2=self.chi2,
+            dof=self.dof,
+            p_value=self.chi2_p_value,
+            verdict="good" if self.trustworthy else "doubtful",
+            parameters={p.name: (p.estimate, p.sigma, p.unit) for p in self.parameters if p.name in known},
+            inputs=self.inputs,
+            rows=self.carried.rows,
+        )
+
+    def unit_of(self, kind: str) -> str:
+        """The unit of a kind of residual: `m`, `rad` or `px`."""
+        for kinds in self.residual_rms.values():
+            rms = kinds.get(kind)
+            if rms is not None and rms.unit is not None:
+                return rms.unit
+        return KINDS.get(kind.partition(",")[0], "m")
+
+    def rms_after(self, split: str) -> dict[str, float]:
+        """RMS of the residuals of `train` or `test` rows after the calibration, by kind."""
+        kinds = self.residual_rms.get(split, {})
+        return {kind: rms.after for kind, rms in kinds.items() if rms is not None and rms.after is not None}
+
+    def document(self) -> dict[str, Any]:
+        """The content of `result.json`."""
+        document: dict[str, Any] = json.loads(self.model_dump_json(by_alias=True))
+        return document
+
+
+def _description(problem: Problem) -> dict[str, Any]:
+    """Robot, tables and counts."""
+    data, frames = problem.data, problem.variables.frames
+    return {
+        "robot": problem.robot.name,
+        "model": " + ".join(dict.fromkeys(table.model or "own" for table in data.tables)),
+        "frame": "unknown" if frames else data.tables[0].frame,
+        "pairing": _pairing(problem),
+        "tables": tuple((label, in_words(table)) for label, table in zip(data.labels, data.tables, strict=True)),
+        "n_configurations": problem.n_configurations,
+        "n_pairs": problem.n_pairs,
+        "n_residuals": problem.n_residuals,
+        "n_priors": problem.n_priors,
+        "n_unknowns": len(problem.variables.all_scales),
+        "n_excluded": problem.n_excluded,
+        "evaluated_only": problem.evaluated,
+    }
+
+
+def _fit(solution: Solution, assessed: Assessment) -> dict[str, Any]:
+    """Solver, chi-square and goodness of fit."""
+    fit, chi2, tolerances = assessed.fit, assessed.fit.chi_square, solution.estimated_tolerances
+    goodness, names = fit.goodness, solution.problem.end_names
+    return {
+        "solver": SolverRun.model_validate(solution),
+        "n_determined": assessed.spread.rank,
+        "chi2": chi2.value,
+        "dof": chi2.dof,
+        "reduced_chi2": chi2.reduced,
+        "chi2_p_value": chi2.p_value,
+        "chi2_expected": chi2.expected,
+        "chi2_bounds": chi2.bounds,
+        "goodness": {key_of(kind, goodness.kinds): kind for kind in goodness.kinds},
+        "suspect_level": goodness.level,
+        "suspect_configurations": tuple(
+            SuspectConfiguration(id=names[c.configuration + 1], n=c.n, chi2=c.chi2, expected=c.expected)
+            for c in goodness.configurations
+        ),
+        "test": goodness.test,
+        "priors": fit.priors,
+        "tolerance_scales": None if tolerances is None else tolerances.scales,
+        "residual_rms": _residual_rms(fit.residuals),
+    }
+
+
+def _verdict(assessed: Assessment) -> dict[str, Any]:
+    """Whether the result is to be trusted and accepted, and by which errors."""
+    verdict = assessed.verdict
+    return {
+        "trustworthy": assessed.trustworthy,
+        "findings": verdict.findings,
+        "cautions": verdict.cautions,
+        "reservations": verdict.reservations,
+        "setup": verdict.setup,
+        "probability_of_noise": verdict.noise_like,
+        "acceptance": assessed.acceptance,
+        "folds": assessed.cross_validation,
+        "expected_error": assessed.expected_error,
+    }
+
+
+def _estimates(problem: Problem, assessed: Assessment) -> dict[str, Any]:
+    """Parameters, frames, landmarks and their covariance."""
+    found = assessed.estimates
+    return {
+        "parameters": found.parameters,
+        "covariance": Covariance(names=assessed.names, matrix=assessed.covariance),
+        "posterior": Posterior.of(assessed.whole),
+        "frame_estimate": found.frame,
+        "frames": {v.symbol: frame for v, frame in zip(problem.variables.frames, found.frames, strict=True)},
+        "joint_values": found.joint_errors,
+        "groups": found.landmarks,
+    }
+
+
+def key_of(fit: KindFit, fits: tuple[KindFit, ...]) -> str:
+    """A kind of noise, with the number of its table where several tables have that kind."""
+    several = sum(other.kind == fit.kind for other in fits) > 1
+    return f"{fit.kind}, table {fit.table + 1}" if several else fit.kind
+
+
+def in_words(table: Table) -> str:
+    """The content of a table."""
+    kinds = [type(own.kind).__name__ for own in table.own]
+    if table.model is None:
+        return ", ".join(kinds)
+    words = [table.model, *kinds]
+    if table.uses_pairs and table.measurements.pairs is not None:
+        words.append("measured pairs")
+    elif table.uses_pairs and (table.measurements.position is not None or table.measurements.rotation is not None):
+        words.append(f"pairs: {table.pairing}")
+    elif table.unknown_frame:
+        words.append("measurement frame unknown")
+    return ", ".join(words)
+
+
+def _pairing(problem: Problem) -> str | None:
+    tables = [table for table in problem.data.tables if table.uses_pairs]
+    if not tables or (tables[0].measurements.pairs is None and not problem.formed):
+        return None
+    return "measured" if tables[0].measurements.pairs is not None else str(tables[0].pairing)
+
+
+def _noise_factors(solution: Solution, fits: tuple[KindFit, ...]) -> dict[str, Any]:
+    """Factors of the estimated noise by key, and the keys of those that could not be estimated."""
+    estimated = solution.estimated_noise
+    if estimated is None:
+        return {}
+    factors = {key_of(fit, fits): fit.own_factor for fit in fits}
+    kept = [key_of(fit, fits) for fit in fits if (fit.table, fit.kind) not in estimated]
+    if np.any(solution.problem.data.sigma_joint > 0.0):
+        factors["joint"] = solution.problem.state.factors.get(JOINT_NOISE, 1.0)
+        kept += ["joint"] if JOINT_NOISE not in estimated else []
+    return {"noise_factors": factors, "noise_kept": tuple(kept)}
+
+
+def _residual_rms(table: ResidualTable) -> dict[str, dict[str, Rms | None]]:
+    """RMS by split and kind, by table too where several tables have a kind."""
+    rms: dict[str, dict[str, Any]] = table.rms()
+    kinds = list(dict.fromkeys(("position", "orientation", "distance", "angle", *table.families)))
+    for number, kind in table.groups:
+        if sum(other == kind for _, other in table.groups) > 1:
+            kinds.append(f"{kind}, table {number + 1}")
+            for split, found in table.rms(number).items():
+                rms[split] |= {kinds[-1]: found[kind]} if kind in found else {}
+    units = {kind: table.unit(kind) for kind in table.families if kind not in KINDS}
+
+    def of(split: str, kind: str) -> Rms | None:
+        found = rms[split].get(kind)
+        return None if found is None else Rms(**found, unit=units.get(kind.partition(", table")[0]))
+
+    return {split: {kind: of(split, kind) for kind in kinds} for split in ("train", "test")}
+
+
+def _carried(solution: Solution, job: Mapping[str, Any]) -> Carried:
+    problem, known = solution.problem, knowledge_of(solution)
+    noise: dict[str, dict[str, float]] = {}
+    for (table, kind), factor in problem.state.factors.items():
+        source = "" if table < 0 else problem.data.tables[table].measurements.source
+        noise.setdefault(source.partition(", station ")[0], {})[kind] = factor
+    knowledge = None
+    if known is not None:
+        nominal = known.nominal
+        assert nominal is not None
+        values: dict[str, Any] = {"columns": known.variables.names, "unknowns": known.unknowns, "views": known.views}
+        at_nominal = Knowledge(at=nominal.at, rows=nominal.rows, right=nominal.right, parameters=nominal.robot.nominal)
+        knowledge = Knowledge(
+            **values,
+            at=known.at,
+            rows=known.rows,
+            right=known.right,
+            parameters=known.robot.nominal,
+            nominal=at_nominal,
+        )
+    return Carried(job=dict(job), rows=fingerprints(problem.data.tables), noise=noise, knowledge=knowledge)
+
+
+@cache
+def versions() -> dict[str, str]:
+    """Versions of the package and the libraries that compute."""
+    libraries = {"gtsam": metadata.version("gtsam"), "numpy": np.__version__, "scipy": scipy.__version__}
+    return {"fg-calib": __version__, "python": platform.python_version(), **libraries}
 
 
 @checked
@@ -606,82 +557,17 @@ def read_result(path: Path | str) -> Result:
     if not exists(path):
         raise InputError(str(path), "no such folder or file", "what `fg-calib calibrate --out` wrote")
     file = path / "result.json" if is_folder(path) else path
-    if is_folder(path) and not exists(file):
+    if not exists(file):
         raise InputError(str(path), "no result.json in this folder", "a folder that `fg-calib calibrate --out` wrote")
     try:
-        document = json.loads(read_text(file), object_pairs_hook=lambda pairs: _unrepeated(pairs, str(file)))
-    except RecursionError:
-        raise InputError(str(file), "nested too deeply", "a result.json") from None
-    except ValueError as error:
+        document = json.loads(read_text(file))
+    except (ValueError, RecursionError) as error:
         raise InputError(str(file), f"not JSON: {str(error).partition(';')[0]}", hint="was it cut off?") from None
     if not isinstance(document, dict) or not str(document.get("schema")).startswith("fg-calib/result/"):
         raise InputError(str(file), "no result of a calibration", f"a result.json of schema {SCHEMA}")
+    if document["schema"] != SCHEMA:
+        raise InputError(str(file), f"schema {document['schema']}", SCHEMA, "calibrate its job again")
     try:
-        result = Result.model_validate(document)
+        return Result.model_validate(document)
     except ValidationError as error:
         raise first_misfit(error, str(file)) from None
-    for key, found, expected in contradictions(result):
-        raise InputError(f"{file}: {key}", found, expected, "was the file changed?")
-    return result
-
-
-def _unrepeated(pairs: list[tuple[str, Any]], place: str) -> dict[str, Any]:
-    """A mapping of JSON, where Python would silently take the last of two values of one key."""
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        (key, _), *_ = Counter(key for key, _ in pairs).most_common(1)
-        raise InputError(f"{place}: {key}", "the key is there twice", "once")
-    return found
-
-
-def contradictions(result: Result) -> Iterator[tuple[str, str, str]]:
-    """What in a result contradicts the rest by definition: the key, what was found and what was expected."""
-    yield from _of_names(result)
-    yield from _of_parameters(result)
-    if result.reduced_chi2 is not None and result.chi2 is not None:
-        expected = result.chi2 / result.dof if result.dof > 0 else math.inf
-        if not math.isclose(result.reduced_chi2, expected, rel_tol=ROUNDING):
-            yield "reduced_chi2", f"found {result.reduced_chi2:.6g}", f"{expected:.6g}, as chi2 and dof say"
-    n_rows = sum(kind.n for kind in result.goodness.values())
-    if result.goodness and n_rows != result.n_residuals:
-        yield "n_residuals", f"found {result.n_residuals}", f"{n_rows}, as goodness says"
-    if result.trustworthy and not result.solver.converged:
-        yield "trustworthy", "true of a solver that has not converged", "false"
-    if result.trustworthy is not None and result.trustworthy == bool(result.findings):
-        found = f"{str(result.trustworthy).lower()} with {len(result.findings)} findings"
-        yield "trustworthy", found, "true without findings, else false"
-    sized = {f"frames: {symbol}": (frame.sigma, 6) for symbol, frame in result.frames.items()}
-    sized |= {"frame_estimate": (result.frame_estimate.sigma, 6)} if result.frame_estimate else {}
-    sized |= {f"group {i}": (group.sigma, len(group.xyz)) for i, group in enumerate(result.groups, start=1)}
-    for key, (sigma, n) in sized.items():
-        if len(sigma) != n:
-            yield f"{key}: sigma", f"{len(sigma)} figures", str(n)
-
-
-def _of_names(result: Result) -> Iterator[tuple[str, str, str]]:
-    names, known = result.covariance.names, [p.name for p in result.parameters]
-    if len(result.covariance.matrix) != len(names):
-        yield "covariance", "another size than its names", f"{len(names)} rows of {len(names)}"
-    for key, given in (("parameters", known), ("covariance: names", list(names))):
-        if len(set(given)) < len(given):
-            yield key, f"{max(given, key=given.count)!r} twice", "different names"
-    for name in set(names).difference(known):
-        yield "covariance: names", f"{name!r}, which is no parameter", "names of parameters"
-    for i, one in enumerate(result.tolerance_scales or (), start=1):
-        for name in set(one.parameters).difference(known):
-            yield f"tolerance_scale {i}: parameters", f"{name!r}, which is no parameter", "names of parameters"
-
-
-def _of_parameters(result: Result) -> Iterator[tuple[str, str, str]]:
-    names, matrix = result.covariance.names, result.covariance.matrix
-    variances = {name: row[i] for i, (name, row) in enumerate(zip(names, matrix, strict=True))}
-    for i, p in enumerate(result.parameters, start=1):
-        variance = variances.get(p.name, 0.0)
-        sigma = None if variance is None else math.sqrt(variance)
-        if (p.sigma is None) != (sigma is None) or not math.isclose(p.sigma or 0.0, sigma or 0.0, rel_tol=ROUNDING):
-            yield f"parameter {i}: sigma", f"found {p.sigma} of {p.name}", f"{sigma}, as the covariance says"
-        off = p.estimate - p.nominal - p.correction
-        off -= 2.0 * math.pi * round(off / (2.0 * math.pi)) if p.unit == "rad" else 0.0
-        if abs(off) > NEAR_NOTHING:
-            expected = f"{p.estimate - p.nominal:.6g}, estimate less nominal"
-            yield f"parameter {i}: correction", f"found {p.correction:.6g} of {p.name}", expected

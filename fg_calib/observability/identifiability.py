@@ -8,15 +8,11 @@ may be weak.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Any, Literal
-
-import numpy as np
-from numpy.typing import NDArray
+from dataclasses import dataclass, replace
+from typing import Literal
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import Brief
+from fg_calib.arrays import Brief, Floats
 from fg_calib.errors import ProblemError
 from fg_calib.graph.build import STRUCTURAL_FLOOR, predicted_problem, random_problem
 from fg_calib.graph.information import observability_of
@@ -30,8 +26,6 @@ from fg_calib.options import FrameKnowledge, Model, Pairing, check_names, check_
 from fg_calib.robot.model import Robot, names_of
 from fg_calib.threads import single_threaded
 
-Floats = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class Identifiability(Brief):
@@ -43,8 +37,7 @@ class Identifiability(Brief):
         kind: On random configurations, or on the user's.
         n_configurations: How many.
         observability: Rank, classes, groups, indices.
-        looked_at: The problem and the parameter vector that it is of, for the reasons; None of what was pickled, which
-            has them.
+        lost: Every null-space direction with its reason.
         with_fixed_known: The same where the parameters that the robot's file calls fixed are known; None if it calls
             none fixed, or if only the others were looked at anyway.
         fixed: Those parameters.
@@ -56,20 +49,10 @@ class Identifiability(Brief):
     kind: Literal["structural", "practical"]
     n_configurations: int
     observability: Observability
-    looked_at: tuple[Problem, Floats] | None = field(repr=False, compare=False)
     with_fixed_known: Identifiability | None = None
     fixed: tuple[str, ...] = ()
     missing: tuple[MissingMotion, ...] = ()
-
-    @cached_property
-    def lost(self) -> tuple[LostDirection, ...]:
-        """Every lost direction with its reason, looked for when they are first asked for."""
-        assert self.looked_at is not None
-        return explain(*self.looked_at, self.observability)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """All but the problem, the reasons among it."""
-        return {**self.__dict__, "lost": self.lost, "looked_at": None}
+    lost: tuple[LostDirection, ...] = ()
 
 
 @checked
@@ -170,6 +153,6 @@ def identifiability_of(
         kind=kind,
         n_configurations=problem.n_configurations,
         observability=observability,
-        looked_at=(problem, parameters),
         missing=missing_motions(problem.robot),
+        lost=explain(problem, parameters, observability),
     )

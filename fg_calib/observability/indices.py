@@ -19,12 +19,11 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import computed_field
 
-from fg_calib.arrays import FrozenArrays
+from fg_calib.arrays import Figure, Floats, FrozenArrays
 from fg_calib.graph.normal_system import RANK_TOLERANCE, SIGNAL_FLOOR, SUPPORT_TOLERANCE, determined
 from fg_calib.robot.model import Parameter, names_of
-
-Floats = NDArray[np.float64]
 
 IdentifiabilityClass = Literal["independent", "relative", "ineffective"]
 
@@ -53,6 +52,7 @@ class RelativeGroup:
     relations: tuple[dict[str, float], ...]
     keep: tuple[str, ...]
 
+    @computed_field  # type: ignore[prop-decorator]
     @property
     def lost(self) -> int:
         """Number of directions that are lost."""
@@ -85,7 +85,7 @@ class WeakDirection:
         members: Its largest members, by name, as shares between -1 and 1.
     """
 
-    signal_to_noise: float
+    signal_to_noise: Figure
     members: dict[str, float]
 
 
@@ -113,15 +113,15 @@ class Observability(FrozenArrays):
     names: tuple[str, ...]
     singular_values: Floats
     rank: int
-    gap: float
+    gap: Figure
     classes: tuple[IdentifiabilityClass, ...]
     relative: tuple[RelativeGroup, ...]
     null_space: Floats
-    indices: dict[str, float]
-    condition_number: float
-    sigma: dict[str, float]
+    indices: dict[str, Figure]
+    condition_number: Figure
+    sigma: dict[str, Figure]
     correlation: Floats
-    correlations: tuple[tuple[str, str, float], ...]
+    correlations: tuple[tuple[str, str, Figure], ...]
     weak: tuple[WeakDirection, ...]
 
     def named(self, wanted: IdentifiabilityClass) -> list[str]:

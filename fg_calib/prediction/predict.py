@@ -17,16 +17,15 @@ from fg_calib.arguments import checked
 from fg_calib.arrays import as_floats
 from fg_calib.calibration import Calibration
 from fg_calib.errors import InputError
-from fg_calib.io.atomic import fill_folder, is_folder, require_own, require_writable, write_text
-from fg_calib.io.job import joint_noise_in
-from fg_calib.io.saved import read_configurations, require_unchanged
+from fg_calib.io.atomic import fill_folder, require_own, require_writable, write_text
 from fg_calib.io.units import Units
 from fg_calib.measurements.checks import check_readings
 from fg_calib.options import check_number
 from fg_calib.prediction.prediction import PredictedErrors, predict_errors
 from fg_calib.prediction.tool_pose import ToolErrorModel
-from fg_calib.report.prediction import prediction_document, write_prediction_table
-from fg_calib.report.slices import write_slices
+from fg_calib.report.charts import write_charts
+from fg_calib.report.figures import error_slices
+from fg_calib.report.predict import prediction_document, write_prediction_table
 from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
@@ -72,14 +71,7 @@ def joint_noise_of(calibration: Calibration) -> Floats | None:
 
     Shape (n_joints,), [rad] (prismatic: [m]).
     """
-    if calibration.assessed is not None:
-        sigma: Floats = calibration.solution.problem.sigma_joint
-    else:
-        job = {} if calibration.result.carried is None else calibration.result.carried.job
-        if not job:
-            return None
-        factor = (calibration.result.noise_factors or {}).get("joint", 1.0)
-        sigma = factor * np.array(joint_noise_in(job, calibration.robot, f"{calibration.result.robot}: carried.job"))
+    sigma = calibration.result.sigma_joint
     return sigma if np.any(sigma > 0.0) else None
 
 
@@ -93,20 +85,10 @@ def measured_of(found: Calibration, folder: Path | None = None) -> Floats:
     Raises:
         InputError: Nothing says what was measured.
     """
-    if found.assessed is not None:
-        readings: Floats = found.solution.problem.data.readings
-        return readings
-    if folder is None:
-        expected = "the folder instead of what was loaded from it, or `measured`"
-        raise InputError("calibration", "it was loaded, and does not say what was measured", expected)
-    folder = folder if is_folder(folder) else folder.parent
-    require_unchanged(folder, found.result.files)
-    saved = read_configurations(folder, found.robot.n_joints)
-    if saved is None and found.result.in_parts:
-        raise InputError(str(folder), "of poses in parts, which keep no configurations", "pairs, or a table whole")
-    if saved is None or not len(saved.ids):
-        raise InputError(str(folder / "configurations.csv"), "no such file", "what `fg-calib calibrate --out` wrote")
-    return saved.readings
+    if found.measured is None:
+        place, expected = str(folder or "calibration"), "configurations.csv, or `measured`"
+        raise InputError(place, "nothing says what was measured", expected)
+    return found.measured
 
 
 def _readings(name: str, given: ArrayLike, found: Calibration) -> Floats:
@@ -121,8 +103,7 @@ def _readings(name: str, given: ArrayLike, found: Calibration) -> Floats:
 FILES = {
     "predict.json": b'{\n "schema": "fg-calib/predict/',
     "predict.csv": b"id,",
-    "predict.png": b"\x89PNG",
-    "predict.svg": b"<?xml",
+    "predict.svg": b"<svg",
 }
 """What `write_prediction` may write, and how it begins."""
 
@@ -164,6 +145,9 @@ def write_prediction(
         write_text(into / "predict.json", text)
         write_prediction_table(into / "predict.csv", found, calibration.robot, units or Units(), ids)
         if not found.given:
-            write_slices(into, found, calibration.result.robot)
+            errors = found.errors
+            write_charts(
+                into, {"predict": error_slices(errors.position, errors.of(found.fitted)[:, 0], found.measured)}
+            )
 
     fill_folder(Path(folder), write, FILES)

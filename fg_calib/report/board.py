@@ -7,8 +7,7 @@ from rich.console import Group, RenderableType
 
 from fg_calib.importers.board_tables import BoardTables
 from fg_calib.importers.views import FIGURES, View
-from fg_calib.report.shown import SHOWN
-from fg_calib.report.tables import WIDTH, indented, line, plain_table, plain_text, section
+from fg_calib.report.tables import SHOWN, WIDTH, indented, line, plain_table, plain_text, section
 
 _MOST_NAMES = 20
 """Names of images in one note."""

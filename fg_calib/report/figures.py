@@ -1,261 +1,385 @@
-"""Figures of identifiability: the spectrum, what moves together, and what is correlated.
-
-Each function returns a matplotlib `Figure` of its own with a canvas that needs no display; pyplot and its global state
-take no part. matplotlib is imported where it is used, so that who draws nothing does not wait for it.
-
-References:
-    Okabe & Ito (2008), Color Universal Design: the two colours, which differ in lightness too.
-"""
+"""The figures of a calibration, of what is identifiable, and of expected errors over the workspace."""
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
-from textwrap import wrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fg_calib.libraries import without_settings
+from fg_calib.arrays import Booleans, Floats
+from fg_calib.io.result import Result
 from fg_calib.observability.identifiability import Identifiability
-from fg_calib.observability.indices import CORRELATED, WEAK
+from fg_calib.prediction.tool_pose import ToolErrorModel
+from fg_calib.prediction.workspace import Workspace, survey
+from fg_calib.report.charts import (
+    BOTTOM,
+    LEFT,
+    NAMES,
+    RIGHT,
+    TOP,
+    WIDTH,
+    Chart,
+    Plot,
+    Scale,
+    bars,
+    colour,
+    framed,
+    legend,
+    limits_of,
+    matrix,
+    short,
+    tag,
+    title,
+    whiskers,
+    words,
+)
+from fg_calib.report.tables import SHOWN, in_words
+from fg_calib.robot.model import Robot
+from fg_calib.simulation.obstacles import link_points
+from fg_calib.statistics.covariance import TangentCovariance
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    import polars as pl
 
-Floats = NDArray[np.float64]
+CELLS = 22
+"""Cells along each side of a slice of the workspace."""
 
-FIGURES = ("spectrum.png", "groups.png", "correlations.png")
-"""What `write_figures` may write."""
+SLAB = 0.12
+"""Thickness of a slice, in widths of the workspace."""
 
-KEPT, LOST = "#0072B2", "#D55E00"
-GREY, PALE = "0.45", "0.93"
+MAX_PARAMETERS = 40
+"""Parameters whose correlations are shown: the most correlated ones."""
 
-NEAR_ZERO = 1e-18
-"""Singular values below this part of the largest, most of them exactly zero, are drawn there: a log axis has no 0."""
+MAX_SIGMA = 5.0
+"""Residuals in their sigma, up to which a histogram distinguishes them."""
 
-_DPI = 160
-_FAINTER = 1.5  # ends of the colours of `draw_groups`, whose +1 and -1 would be nearly black
-_SMALL, _TEXT, _TITLE = 7.0, 8.0, 9.0
+WORST = 5
+"""Dots that are marked by name."""
 
-
-def write_figures(folder: Path, found: Identifiability) -> None:
-    """Write `spectrum.png`, `groups.png` if anything is lost, and `correlations.png` if practical, into a folder."""
-    draw_spectrum(found).savefig(folder / FIGURES[0], dpi=_DPI)
-    if found.lost:
-        draw_groups(found).savefig(folder / FIGURES[1], dpi=_DPI)
-    if found.kind == "practical" and found.observability.kept:
-        draw_correlations(found).savefig(folder / FIGURES[2], dpi=_DPI)
+MIN_WIDTH_M = 1e-3
+"""Least width of a slice."""
 
 
-def draw_spectrum(found: Identifiability) -> Figure:
-    """Singular values on a log axis, kept and lost, with the gap between them.
+@dataclass(frozen=True)
+class Drawn:
+    """What figures are made of.
 
-    Those of a structural analysis are relative to the largest, for its noise is arbitrary; those of a practical one are
-    signal-to-noise ratios, and a line shows where they become weak. Values below `NEAR_ZERO` stand on the lowest tick.
+    Attributes:
+        result: The result.
+        robot: The calibrated robot.
+        posterior: The covariance of its parameters.
+        configurations: Every measured configuration; None if they were not saved.
+        residuals: Every scalar residual; None if they were not saved.
     """
-    o, practical = found.observability, found.kind == "practical"
-    largest = float(o.singular_values[0]) or 1.0
-    unit = 1.0 if practical else largest
-    floor = NEAR_ZERO * largest / unit
-    values = o.singular_values / unit
-    n, rank = len(values), o.rank
-    number = np.arange(1, n + 1)
-    kept, zero = number <= rank, values < floor
-    weak = kept & practical & (values < WEAK)
-    figure, axes = _figure(5.6, 3.6)
-    axes.set_yscale("log")
-    for chosen, marker, colour, face, label in (
-        (kept & ~weak, "o", KEPT, KEPT, f"determined: {rank - int(weak.sum())}"),
-        (weak, "o", KEPT, "white", f"determined, but weak: {int(weak.sum())}"),
-        (~kept & ~zero, "s", LOST, LOST, f"lost: {int(np.sum(~kept & ~zero))}"),
-        (~kept & zero, "v", LOST, LOST, f"lost, zero: {int(np.sum(~kept & zero))}"),
-    ):
+
+    result: Result
+    robot: Robot
+    posterior: TangentCovariance
+    configurations: pl.DataFrame | None
+    residuals: pl.DataFrame | None
+
+    @property
+    def split(self) -> str:
+        """The rows that accuracy is shown of: `test` if there are any, else `train`."""
+        return "test" if self.result.rms_after("test") else "train"
+
+    @cached_property
+    def readings(self) -> Floats:
+        """Readings of the measured configurations, shape (n, n_joints), [rad] (prismatic: [m])."""
+        assert self.configurations is not None
+        return self.configurations.select(f"q{i + 1}" for i in range(self.robot.n_joints)).to_numpy()
+
+    @cached_property
+    def held_out(self) -> Booleans:
+        """Which configurations were held out, shape (n,)."""
+        assert self.configurations is not None
+        return (self.configurations["split"] == "test").to_numpy()
+
+    @cached_property
+    def workspace(self) -> Workspace | None:
+        """Expected errors over the workspace; None where nothing says what was measured."""
+        if self.configurations is None or not len(self.configurations):
+            return None
+        model = ToolErrorModel.of(self.posterior, self.readings)
+        return survey(self.robot, model, self.readings, fitted=self.result.free_of_frame)
+
+    @cached_property
+    def rms(self) -> tuple[str, Floats] | None:
+        """The kind of residual that is nearest to the tool's position, and its RMS by configuration, shape (n,)."""
+        if self.configurations is None:
+            return None
+        kinds = [name.removeprefix("rms_") for name in self.configurations.columns if name.startswith("rms_")]
+        for kind in sorted(kinds, key=lambda k: ["position", "distance", "point", "pixel", k].index(k)):
+            values = self.configurations[f"rms_{kind}"].cast(float).fill_null(np.nan).to_numpy()
+            if np.isfinite(values).any():
+                return kind, values
+        return None
+
+
+def figures_of(drawn: Drawn) -> dict[str, Sequence[Chart]]:
+    """All figures of a calibration by name; those that its tables lack are left out."""
+    correlations, space = correlation_matrix(drawn), drawn.workspace
+    known = space is not None and not drawn.result.evaluated_only and bool(np.isfinite(space.error).any())
+    every: dict[str, Sequence[Chart]] = {
+        "accuracy": [accuracy_bars(drawn)],
+        "joints": error_over_joints(drawn),
+        "ranges": [] if space is None else [joint_ranges(space)],
+        "parameters": parameter_whiskers(drawn.result),
+        "correlations": [] if correlations is None else [correlations],
+        "residuals": residual_charts(drawn),
+        "workspace": workspace_slices(space) if known and space is not None else [],
+    }
+    return {name: charts for name, charts in every.items() if charts}
+
+
+def accuracy_bars(drawn: Drawn) -> Chart:
+    """RMS residuals before and after, by kind."""
+    rows = []
+    for kind, rms in drawn.result.residual_rms[drawn.split].items():
+        if rms is not None:
+            unit = drawn.result.unit_of(kind)
+            values = (("before", rms.before), ("after", rms.after))
+            rows.append((kind, [(when, np.nan if v is None else v, in_words(v, unit)) for when, v in values]))
+    return bars(rows, f"RMS residuals of {drawn.split} rows before and after the calibration")
+
+
+def error_over_joints(drawn: Drawn) -> list[Chart]:
+    """Residuals of configurations over the reading of each joint."""
+    if drawn.rms is None or drawn.configurations is None:
+        return []
+    kind, values = drawn.rms
+    factor, unit, _ = SHOWN.get(drawn.result.unit_of(kind), (1.0, "", 3))
+    rms, test = values * factor, drawn.held_out
+    worst = np.argsort(-np.nan_to_num(rms))[:WORST].tolist()
+    charts = []
+    for i, joint in enumerate(drawn.robot.joints):
+        of_reading, shown, _ = SHOWN[joint.unit]
+        q = drawn.readings[:, i] * of_reading
+        names = f"{short(joint.name, 40)} [{shown}]", f"{kind} residual [{unit}]"
+        plot = Plot(limits_of(q), limits_of(rms, with_zero=True), names)
+        plot.dots(q[~test], rms[~test], "a")
+        plot.dots(q[test], rms[test], "b")
+        for k in worst:
+            if np.isfinite(rms[k]):
+                plot.ring(q[k], rms[k], f"{drawn.configurations['id'][k]}: {rms[k]:.3g} {unit}")
+        charts.append(plot.chart(f"{joint.name}: {_colours(test)}, rings the {len(worst)} largest"))
+    return charts
+
+
+def _colours(test: Booleans) -> str:
+    return ", ".join(["blue fitted"] * (not test.all()) + ["orange held out"] * bool(test.any()))
+
+
+def joint_ranges(space: Workspace) -> Chart:
+    """The readings of every joint within its limits, and the widest gap."""
+    row, elements = 24.0, []
+    for i, joint in enumerate(space.joints):
+        ends = [v for v in (*joint.limits, *joint.range) if np.isfinite(v)]
+        low, high = min(ends), max(ends)
+        scale, y = Scale(low, high if high > low else low + 1.0, NAMES, WIDTH - RIGHT), TOP + row * i
+        factor, unit, _ = SHOWN[joint.unit]
+        (start, end), gap = scale(np.array(joint.range)).tolist(), scale(np.array(joint.gap)).tolist()
+        nothing = f"{joint.name}: nothing between {joint.gap[0] * factor:.4g} and {joint.gap[1] * factor:.4g} {unit}"
+        elements += [
+            words(NAMES - 6.0, y + 10.0, short(joint.name), "tick end"),
+            tag("rect", x=NAMES, y=y, width=WIDTH - RIGHT - NAMES, height=12.0, class_="band"),
+            tag("rect", x=start, y=y + 3.0, width=max(end - start, 1.0), height=6.0, class_="after"),
+            tag("rect", title(nothing), x=gap[0], y=y, width=gap[1] - gap[0], height=12.0, class_="gap"),
+            words(NAMES, y + 21.0, f"{low * factor:.4g}", "tick"),
+            words(WIDTH - RIGHT, y + 21.0, f"{high * factor:.4g} {unit}", "tick end"),
+        ]
+    caption = "pale: between the limits; blue: from the lowest to the highest reading; amber: the widest gap"
+    return framed(caption, WIDTH, TOP + row * len(space.joints), *elements)
+
+
+def parameter_whiskers(result: Result) -> list[Chart]:
+    """Corrections with their sigmas and prior sigmas, lengths and angles apart."""
+    charts = []
+    for unit, what in (("m", "Lengths"), ("rad", "Angles")):
+        factor, name, _ = SHOWN[unit]
+        rows = [
+            (p.name, p.correction * factor, _times(p.sigma, factor), _times(p.prior_sigma, factor))
+            for p in result.estimated
+            if p.unit == unit
+        ]
+        if rows:
+            charts.append(whiskers(rows, f"{what}: correction [{name}]", f"[{name}]"))
+    return charts
+
+
+def _times(value: float | None, factor: float) -> float:
+    return np.nan if value is None else value * factor
+
+
+def correlation_matrix(drawn: Drawn) -> Chart | None:
+    """Correlations of the errors of parameters; None of fewer than two."""
+    names, C = drawn.result.covariance.names, drawn.result.covariance.matrix
+    variance = C.reshape(len(names), len(names)).diagonal()
+    known = np.flatnonzero(np.isfinite(variance) & (variance > 0.0))
+    if len(known) < 2:
+        return None
+    sigma = np.sqrt(variance[known])
+    rho = C[np.ix_(known, known)] / np.outer(sigma, sigma)
+    most = np.max(np.abs(np.where(np.eye(len(known)), 0.0, np.nan_to_num(rho))), axis=1)
+    chosen = np.sort(np.argsort(-most, kind="stable")[:MAX_PARAMETERS])
+    more = "" if len(chosen) == len(known) else f"; the {len(chosen)} most correlated of {len(known)}"
+    below = np.where(np.tri(len(chosen), k=-1, dtype=np.bool_), rho[np.ix_(chosen, chosen)], np.nan)
+    labels = [names[known[k]] for k in chosen]
+    return matrix(labels, labels, below, f"Correlations of the errors: orange positive, blue negative{more}")
+
+
+def residual_charts(drawn: Drawn) -> list[Chart]:
+    """Studentised residuals: their distribution by kind, and row by row."""
+    if drawn.residuals is None:
+        return []
+    rows = drawn.residuals.filter(drawn.residuals["excluded"].is_null()).with_row_index("number")
+    values, test = rows["studentised"].cast(float).fill_null(np.nan).to_numpy(), (rows["split"] == "test").to_numpy()
+    if not np.isfinite(values).any():
+        return []
+    charts, kinds = [], np.array([kind.partition(".")[0] for kind in rows["kind"].to_list()])
+    for kind in dict.fromkeys(kinds.tolist()):
+        mine = (kinds == kind) & np.isfinite(values)
+        fitted = mine & ~test  # rows that were held out share the errors of the estimate
+        chosen, which = (fitted, "fitted") if fitted.any() else (mine, "held-out")
         if chosen.any():
-            shown = np.maximum(values[chosen], floor)
-            line = axes.plot(number[chosen], shown, marker, color=colour, markersize=4.5, label=label)[0]
-            line.set_markerfacecolor(face)
-    if 0 < rank < n:
-        _show_gap(axes, (float(values[rank - 1]), max(float(values[rank]), floor)), rank, n, o.gap)
-    if practical:
-        axes.axhline(WEAK, color=GREY, linewidth=0.9, linestyle="--")
-        axes.annotate(
-            f"weak below {WEAK:g}",
-            (0.0, WEAK),
-            (3, -3),
-            xycoords=("axes fraction", "data"),
-            textcoords="offset points",
-            va="top",
-            color=GREY,
-            fontsize=_SMALL,
-        )
-    axes.set_xlim(0.0, n + 1.0)
-    if not rank:
-        axes.set_ylim(floor / 10.0, 1.0)
-    axes.set_xlabel("number of the singular value", fontsize=_TEXT)
-    axes.set_ylabel("signal-to-noise ratio" if practical else "singular value / largest", fontsize=_TEXT)
-    axes.legend(frameon=False, fontsize=_SMALL, loc="lower left" if 0 < rank < n else "upper right")
-    _title(axes, f"What is determined: rank {rank} of {n}", found)
-    return figure
+            beyond = int(np.sum(np.abs(values[chosen]) > MAX_SIGMA))
+            more = f"; {beyond} beyond {MAX_SIGMA:g} are in the columns at the ends" if beyond else ""
+            caption = f"{kind}: {int(chosen.sum())} {which} rows, and the normal distribution{more}"
+            charts.append(_histogram(values[chosen], caption))
+    return [*charts, _row_by_row(rows, values, test)]
 
 
-def draw_groups(found: Identifiability) -> Figure:
-    """Which parameters move together unseen: a row for each lost direction, a column for each parameter in one.
+def _row_by_row(rows: pl.DataFrame, values: Floats, test: Booleans, most: float = 12.0) -> Chart:
+    shown, order = np.clip(values, -most, most), np.arange(len(values), dtype=np.float64)
+    plot = Plot((0.0, max(len(shown), 2)), limits_of(shown, [-4.0, 4.0]), ("row", "in its sigma"))
+    for level in (-3.0, 3.0):
+        plot.level(level)
+    plot.dots(order[~test], shown[~test], "a")
+    plot.dots(order[test], shown[test], "b")
+    suspects = rows.filter(rows["suspect"]).sort(rows.filter(rows["suspect"])["studentised"].abs(), descending=True)
+    for row in suspects.head(4 * WORST).iter_rows(named=True):
+        name = " ".join(str(row[key]) for key in ("kind", "a", "b", "of") if row.get(key))
+        plot.ring(row["number"], shown[row["number"]], f"{name}: {row['studentised']:+.1f}")
+    rings = ", rings suspicious" if len(suspects) else ""
+    cut = f"; larger ones are drawn at {most:g}" if np.any(np.abs(values) > most) else ""
+    return plot.chart(f"Residuals row by row: {_colours(test)}{rings}{cut}")
 
-    Rows with the same reason stand together; a reason is cut to its first words. Cells hold the change of each
-    parameter, [m] and [rad], the largest of a row being 1 in size. Names in grey are fixed in the robot's file.
+
+def _histogram(values: Floats, caption: str) -> Chart:
+    """The distribution of residuals; a column at each end holds those beyond `MAX_SIGMA`."""
+    most, end = MAX_SIGMA, 0.5
+    edges, beyond = np.linspace(-most, most, 41), np.abs(values) > most
+    density = np.histogram(values[~beyond], edges)[0] / (len(values) * (edges[1] - edges[0]))
+    ends = [float(np.mean(beyond & (np.sign(values) == sign))) / end for sign in (-1.0, 1.0)]
+    heights = limits_of(density, ends, [0.45], with_zero=True)
+    plot = Plot((-most - end, most + end), heights, ("residual, in its sigma", "share per sigma"))
+    for low, high, height in zip(edges[:-1].tolist(), edges[1:].tolist(), density.tolist(), strict=True):
+        if height > 0.0:
+            plot.box(low, 0.0, high, height, class_="column")
+    for sign, height in zip((-1.0, 1.0), ends, strict=True):
+        if height > 0.0:
+            plot.box(sign * most, 0.0, sign * (most + end), height, class_="beyond")
+    x = np.linspace(-most, most, 81)
+    plot.curve(x, np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi), "curve")
+    return plot.chart(caption)
+
+
+def workspace_slices(space: Workspace) -> list[Chart]:
+    """Expected error of the tool in three slices through the middle of the measured configurations."""
+    return error_slices(space.position, space.error, space.measured)
+
+
+def error_slices(position: Floats, error: Floats, measured: Floats) -> list[Chart]:
+    """Expected error of the tool in three slices through the middle of the measured configurations.
+
+    Args:
+        position: Tool positions, shape (n, 3), [m].
+        error: Expected error of each, shape (n,), [m]; nan where it is unknown.
+        measured: Measured tool positions, shape (m, 3), [m].
     """
+    middle = np.median(measured, axis=0)
+    low, high = position.min(axis=0), position.max(axis=0)
+    width = max(float((high - low).max()), MIN_WIDTH_M)
+    thick = SLAB * width
+    low, high = (0.5 * (low + high) + sign * 0.52 * width for sign in (-1.0, 1.0))  # all axes on one scale
+    ends = np.nanquantile(error, [0.05, 0.95]) * 1e3
+    charts = []
+    for across, up, through in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
+        inside = np.abs(position[:, through] - middle[through]) < thick / 2.0
+        x, y = ((float(low[axis]), float(high[axis])) for axis in (across, up))
+        names = f"{'xyz'[across]} [m]", f"{'xyz'[up]} [m]"
+        plot = Plot(x, y, names, (WIDTH, WIDTH - LEFT - RIGHT + TOP + BOTTOM))
+        _draw_cells(plot, position[inside][:, [across, up]], error[inside] * 1e3, ends)
+        near = np.abs(measured[:, through] - middle[through]) < thick / 2.0
+        for kind in ("halo", "measured"):
+            plot.dots(measured[near, across], measured[near, up], kind)
+        where = f"{'xyz'[through]} = {middle[through]:.3g} m, within {thick / 2.0:.2g} m"
+        charts.append(plot.chart(f"Expected error at {where}; dots: measured"))
+    caption = "Colours of the expected error of the tool's position (RMS)"
+    return [*charts, legend(float(ends[0]), float(ends[1]), "mm", caption)]
+
+
+def _draw_cells(plot: Plot, at: Floats, error: Floats, ends: Floats) -> None:
+    """A coloured cell at each place that configurations reach, by the RMS of their errors."""
+    known = np.isfinite(error)
+    edges = [np.linspace(s.low, s.high, CELLS + 1) for s in (plot.x, plot.y)]
+    n, _, _ = np.histogram2d(at[known, 0], at[known, 1], edges)
+    squares, _, _ = np.histogram2d(at[known, 0], at[known, 1], edges, weights=error[known] ** 2)
+    for i, j in np.argwhere(n > 0).tolist():
+        share = (np.sqrt(squares[i, j] / n[i, j]) - ends[0]) / (ends[1] - ends[0] or 1.0)
+        x, y = edges[0][i : i + 2].tolist(), edges[1][j : j + 2].tolist()
+        plot.box(x[0], y[0], x[1], y[1], fill=colour(float(share)))
+
+
+def draw_observability(found: Identifiability) -> dict[str, Sequence[Chart]]:
+    """The singular values, the null-space directions and, of practical analyses, the correlations."""
     o = found.observability
-    rows = [(_short(lost.reason), lost.relation) for lost in found.lost]
-    reasons = list(dict.fromkeys(reason for reason, _ in rows))
-    rows.sort(key=lambda row: reasons.index(row[0]))
-    involved = {name for _, relation in rows for name in relation}
-    names = [name for name in o.names if name in involved]
-    changes = np.full((len(rows), len(names)), np.nan)
-    for i, (_, relation) in enumerate(rows):
-        for name, change in relation.items():
-            changes[i, names.index(name)] = change
-    figure, axes = _figure(2.7 + 0.30 * max(len(names), 6), 1.35 + 0.30 * max(len(rows), 2))
-    _draw_cells(axes, changes, "PuOr", _FAINTER)
-    for (i, j), change in np.ndenumerate(changes):
-        if np.isfinite(change):
-            ink = "white" if abs(change) > 0.85 else "black"
-            axes.text(j, i, _cell(change), ha="center", va="center", fontsize=6, color=ink)
-    _name_columns(axes, names, found.fixed)
-    first = [next(i for i, row in enumerate(rows) if row[0] == reason) for reason in reasons]
-    for start, end, reason in zip(first, [*first[1:], len(rows)], reasons, strict=True):
-        axes.text(
-            -0.015,
-            (start + end - 1) / 2,
-            _balanced(reason),
-            transform=axes.get_yaxis_transform(),
-            ha="right",
-            va="center",
-            fontsize=_SMALL,
-        )
-        if start:
-            axes.axhline(start - 0.5, color=GREY, linewidth=0.8)
-    axes.set_yticks([])
-    grey = "; grey: fixed in the robot's file" if involved & set(found.fixed) else ""
-    axes.set_xlabel(f"change of each parameter [m], [rad], the largest of a row being 1{grey}", fontsize=_TEXT)
-    _title(axes, f"What moves unseen: {len(rows)} of {len(o.names)} directions lost", found)
-    return figure
+    s = np.maximum(o.singular_values / (o.singular_values.max(initial=0.0) or 1.0), 1e-18)
+    number, kept = np.arange(1.0, len(s) + 1.0), np.arange(len(s)) < o.rank
+    plot = Plot((0.0, len(s) + 1.0), limits_of(np.log10(s)), ("number", "singular value / largest"), powers=True)
+    plot.dots(number[kept], np.log10(s[kept]), "large a")
+    plot.dots(number[~kept], np.log10(s[~kept]), "large b")
+    rank = plot.chart(f"rank {o.rank} of {len(o.names)}: blue determined, orange not")
+    figures: dict[str, Sequence[Chart]] = {"singular_values": [rank]}
+    if found.lost:
+        names = [name for name in o.names if any(name in lost.relation for lost in found.lost)]
+        changes = np.array([[lost.relation.get(name, np.nan) for name in names] for lost in found.lost])
+        reasons = [lost.reason.partition(":")[0] for lost in found.lost]
+        caption = "Null-space directions: change of each parameter [m], [rad], orange positive, blue negative"
+        figures["groups"] = [matrix(reasons, names, changes, caption)]
+    if found.kind == "practical" and len(o.kept) > 1:
+        below = np.where(np.tri(len(o.kept), k=-1, dtype=np.bool_), o.correlation, np.nan)
+        caption = "Correlations of the kept parameters: orange positive, blue negative"
+        figures["correlations"] = [matrix(o.kept, o.kept, below, caption)]
+    return figures
 
 
-def draw_correlations(found: Identifiability) -> Figure:
-    """Correlations of the kept parameters, the others held at nominal; a dot where they are above `CORRELATED`.
+def arm_scene(drawn: Drawn, most: int = 300) -> Mapping[str, Any] | None:
+    """What `arm.js` draws: the measured configurations with the arm's shape and residual; None where unknown.
 
-    Raises:
-        ValueError: The analysis is structural: its noise is arbitrary, and so would the correlations be.
+    Args:
+        drawn: The calibration.
+        most: Configurations that are shown; of more, as many that are evenly spaced, and the worst.
     """
-    if found.kind != "practical":
-        raise ValueError("a structural analysis has no correlations: its noise is arbitrary")
-    o = found.observability
-    n = len(o.kept)
-    below = np.where(np.tri(n, k=-1, dtype=np.bool_), o.correlation, np.nan)
-    side = 1.9 + 0.2 * max(n, 10)
-    figure, axes = _figure(side + 0.7, side)
-    image = _draw_cells(axes, below, "RdBu")
-    with np.errstate(invalid="ignore"):
-        strong = np.argwhere(np.abs(below) > CORRELATED)
-    axes.plot(strong[:, 1], strong[:, 0], "o", color="white", markersize=2.5)
-    _name_columns(axes, o.kept, ())
-    axes.set_yticks(range(n), o.kept, fontsize=_SMALL)
-    bar = figure.colorbar(image, ax=axes, shrink=0.6, aspect=24, pad=0.02)
-    bar.set_label("correlation", fontsize=_TEXT)
-    bar.ax.tick_params(labelsize=_SMALL)
-    dots = f"{len(strong)} above {CORRELATED:g} in size (dots)" if len(strong) else f"none above {CORRELATED:g} in size"
-    _title(axes, f"Correlations of {n} kept parameters: {dots}", found)
-    return figure
-
-
-def _show_gap(axes: Axes, ends: tuple[float, float], rank: int, n: int, ratio: float) -> None:
-    """The range without singular values, and how wide it is."""
-    above, below = ends
-    axes.axhspan(below, above, color=PALE, linewidth=0.0, zorder=0)
-    right = rank > n / 2
-    x = rank + 0.5
-    axes.annotate("", (x, below), (x, above), arrowprops={"arrowstyle": "<->", "color": GREY, "linewidth": 0.9})
-    text = f"gap {_power(ratio)}" if np.isfinite(ratio) else "gap: what is lost is 0"
-    axes.annotate(
-        text,
-        (x, float(np.sqrt(above * below))),
-        (-5 if right else 5, 0),
-        textcoords="offset points",
-        ha="right" if right else "left",
-        va="center",
-        fontsize=_TEXT,
-    )
-
-
-def _power(ratio: float) -> str:
-    """A ratio in two digits: `2.5`, `9.3 x 10^13` with a proper sign and exponent."""
-    if ratio < 1e3:
-        return f"{ratio:.2g}"
-    digits, exponent = f"{ratio:.1e}".split("e")
-    return rf"${digits} \times 10^{{{int(exponent)}}}$"
-
-
-def _short(reason: str) -> str:
-    """The first words of a reason, which tell it from the others; its explanation is in the report."""
-    return re.split(r": |, (?=unseen|which)", reason)[0]
-
-
-def _balanced(text: str) -> str:
-    """Text in lines of at most 30 characters that are about equally long."""
-    lines = len(wrap(text, 30))
-    return "\n".join(next(w for k in range(30) if len(w := wrap(text, max(1, len(text) // lines) + k)) <= lines))
-
-
-def _cell(change: float) -> str:
-    """A change in few characters, with a minus as long as its plus: `+1`, `\N{MINUS SIGN}0.5`."""
-    digits = f"{abs(change):.2g}" if abs(change) >= 0.01 else f"{abs(change):.0e}".replace("e-0", "e-")
-    return ("+" if change > 0 else "\N{MINUS SIGN}") + digits.replace("0.", ".")
-
-
-def empty_figure(width: float, height: float) -> Figure:
-    """An empty figure of a size in inches, with a canvas that needs no display."""
-    with without_settings("matplotlibrc", "MPLBACKEND or MPLCONFIGDIR"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _figure(width: float, height: float) -> tuple[Figure, Axes]:
-    """The same with axes."""
-    figure = empty_figure(width, height)
-    axes = figure.add_subplot()
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.tick_params(labelsize=_SMALL)
-    return figure, axes
-
-
-def _draw_cells(axes: Axes, values: Floats, colours: str, end: float = 1.0) -> Any:
-    """A diverging heat map from -`end` to `end` with fine lines between the cells; what is nan stays white."""
-    image = axes.imshow(values, cmap=colours, vmin=-end, vmax=end, aspect="equal", interpolation="nearest")
-    axes.spines[:].set_visible(False)
-    axes.set_xticks(np.arange(-0.5, values.shape[1]), minor=True)
-    axes.set_yticks(np.arange(-0.5, values.shape[0]), minor=True)
-    axes.grid(which="minor", color=PALE, linewidth=0.5)
-    axes.tick_params(which="both", length=0)
-    return image
-
-
-def _name_columns(axes: Axes, names: list[str], fixed: tuple[str, ...]) -> None:
-    """Names under the columns, upright; those of fixed parameters in grey."""
-    axes.set_xticks(range(len(names)), names, rotation=90, fontsize=_SMALL)
-    for label in axes.get_xticklabels():
-        if label.get_text() in fixed:
-            label.set_color("0.55")
-
-
-def _title(axes: Axes, statement: str, found: Identifiability) -> None:
-    """What the figure shows, and of which robot, model and kind of analysis."""
-    random = "random " if found.kind == "structural" else ""
-    about = f"{found.robot}, {found.model}, {found.kind}, {found.n_configurations} {random}configurations"
-    axes.figure.suptitle(f"{statement}\n{about}", fontsize=_TITLE)
+    if drawn.rms is None or drawn.configurations is None or not len(drawn.configurations):
+        return None
+    kind, rms = drawn.rms
+    evenly = np.linspace(0, len(rms) - 1, min(most, len(rms))).astype(np.int64)
+    chosen = np.unique(np.concatenate([evenly, np.argsort(-np.nan_to_num(rms))[:20]]))
+    factor, unit, _ = SHOWN.get(drawn.result.unit_of(kind), (1.0, "", 3))
+    values, links = rms[chosen] * factor, link_points(drawn.robot, drawn.readings[chosen])
+    known = values[np.isfinite(values)]
+    low, high = (float(v) for v in np.quantile(known, [0.0, 0.98])) if len(known) else (0.0, 1.0)
+    items = [
+        {
+            "id": drawn.configurations["id"][k],
+            "test": bool(drawn.held_out[k]),
+            "value": float(f"{value:.4g}") if np.isfinite(value) else None,
+            "links": np.round(points, 4).tolist(),
+        }
+        for k, value, points in zip(chosen.tolist(), values.tolist(), links, strict=True)
+    ]
+    return {"unit": unit, "family": kind, "low": low, "high": high, "items": items}

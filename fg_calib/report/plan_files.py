@@ -21,14 +21,14 @@ from fg_calib.io.robot_file import write_robot
 from fg_calib.io.units import Units
 from fg_calib.io.urdf import write_urdf
 from fg_calib.measurements.table import Table
-from fg_calib.report.figures import empty_figure
+from fg_calib.report.charts import Chart, Plot, limits_of, write_charts
 from fg_calib.report.plan import SCHEMA, UNKNOWN_ABOVE, design_document
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
 from fg_calib.simulation.write import instrument_keys, is_filled_in, table_columns, to_fill_in
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 Floats = NDArray[np.float64]
 
@@ -40,56 +40,25 @@ _BEGINS = f'{{\n "schema": "{SCHEMA}"'.encode()
 _JOB_BEGINS = "# fg-calib design\n# What to measure: fill in the tables, then `fg-calib "
 _CALIBRATE, _UPDATE = "calibrate` this file.\n", "update RESULT` this file: RESULT is of what there was.\n"
 
-_COLOUR = "#0072B2"
 
-
-def draw_design(design: Design) -> Figure:
-    """Draw expected errors against the number of poses, with the band of random ones.
+def draw_design(design: Design) -> Chart:
+    """Draw expected errors over the number of poses, with the range of 80 % of the random ones.
 
     Args:
         design: The design.
     """
-    figure = empty_figure(6.0, 3.8)
-    from matplotlib.ticker import LogLocator, NullFormatter, NullLocator
-
-    axes = figure.add_subplot()
-    n = np.array([p.n for p in design.curve])
-    low, middle, high = _shown([p.random for p in design.curve]).T
-    axes.plot(n, _shown([p.designed for p in design.curve]), "o-", color=_COLOUR, markersize=4, label="designed")
-    axes.fill_between(n, low, high, color=_COLOUR, alpha=0.12, linewidth=0, label="random: 80 % of them")
-    axes.plot(n, middle, "--", color=_COLOUR, linewidth=1.0, label="random: half are better")
-    if design.target is not None:
-        axes.axhline(design.target * 1e3, color="0.5", linewidth=0.9)
-        axes.annotate(f"{design.target * 1e3:g} mm", (0.0, design.target * 1e3), (2, 3), fontsize=7, color="0.4",
-                      xycoords=axes.get_yaxis_transform(), textcoords="offset points")  # fmt: skip
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.set_xticks(_apart([p.n for p in design.curve]))
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter("{x:g}")
-        axis.set_minor_formatter(NullFormatter())
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.tick_params(labelsize=7, which="both")
-    axes.set_xlabel("stops", fontsize=8)
-    axes.set_ylabel("expected RMS error over the task [mm]", fontsize=8)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=7.5)
-    axes.set_title(f"{design.pool.robot.name}: what to expect of how many stops", fontsize=9, loc="left")
-    return figure
-
-
-def _apart(numbers: Sequence[int]) -> list[int]:
-    """Some of ascending numbers of stops, as far apart as figures beneath an axis must be."""
-    found = [numbers[0]]
-    for n in numbers[1:]:
-        if n / found[-1] > (numbers[-1] / numbers[0]) ** _TICK:
-            found.append(n)
-    return found
-
-
-_TICK = 0.04
-"""Least part of an axis between two figures."""
+    n = np.array([float(p.n) for p in design.curve])
+    designed = np.log10(_shown([p.designed for p in design.curve]))
+    low, middle, high = np.log10(_shown([p.random for p in design.curve])).T
+    target = np.nan if design.target is None else np.log10(design.target * 1e3)
+    names = "poses", "expected RMS error over the task [mm]"
+    plot = Plot(limits_of(n), limits_of(designed, low, high, target), names, powers=True)
+    if np.isfinite(target):
+        plot.level(float(target))
+    for values, kind in ((low, "b"), (high, "b"), (middle, "large b"), (designed, "large a")):
+        plot.dots(n, values, kind)
+    caption = f"{design.pool.robot.name}: expected error by the number of poses; blue designed, orange random"
+    return plot.chart(f"{caption} (half, and 80 % of them)")
 
 
 def _shown(errors: Sequence[object]) -> Floats:
@@ -137,16 +106,15 @@ def _filling(
         for t in tables
         for name, columns in table_columns(t, robot, units).items()
     }
-    figure = draw_design(design)
     urdf = "robot.urdf" if robot.urdf is not None and tables else None
-    names = [CONFIGURATIONS, _DOCUMENT, "design.png"]
+    names = [CONFIGURATIONS, _DOCUMENT, "design.svg"]
     if tables:
         names += [*files, "robot.yaml", *([urdf] if urdf else []), "calibration.yaml"]
 
     def write(into: Path) -> None:
         write_csv(into / CONFIGURATIONS, _configurations(design, robot, units))
         write_text(into / _DOCUMENT, json.dumps(design_document(design) | {"files": names}, indent=1) + "\n")
-        figure.savefig(into / "design.png", dpi=160)
+        write_charts(into, {"design": [draw_design(design)]})
         if not tables:
             return
         for name, columns in files.items():

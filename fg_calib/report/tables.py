@@ -1,24 +1,36 @@
-"""What all reports share: plain tables and sections."""
+"""The parts of a terminal report: units, headings, sentences and tables without a frame."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
-from rich.measure import Measurement
+import numpy as np
+from pydantic_core import to_json
+from rich.console import Console, RenderableType
 from rich.padding import Padding
-from rich.style import Style
-from rich.table import Column, Table
+from rich.table import Table
 from rich.text import Text
 
 from fg_calib.errors import escaped
+from fg_calib.observability.indices import Observability
+from fg_calib.observability.reasons import LostDirection
 from fg_calib.options import check_number
-from fg_calib.report.shown import FAMILY_UNIT
+from fg_calib.robot.model import AXIS_OF_KIND, Axis
+
+WEAK = "sigma above a tenth of the prior sigma, or of 1 mrad at the reach"
+"""The definition of a weak direction, for headings."""
 
 WIDTH = 100
-"""Columns of the plain report."""
+"""Columns of a report that is not printed to a terminal."""
+
+SHOWN = {"m": (1e3, "mm", 4), "rad": (180.0 / np.pi, "deg", 5), "px": (1.0, "px", 3)}
+"""Factor, unit and decimals in which a quantity is shown."""
+
+FAMILY_UNIT = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad", "point": "m", "pixel": "px"}
+"""Unit of the usual kinds of residual, in the order in which reports show them."""
 
 
 def in_order(families: Iterable[str]) -> list[str]:
@@ -27,13 +39,7 @@ def in_order(families: Iterable[str]) -> list[str]:
     return [f for f in FAMILY_UNIT if f in there] + [f for f in there if f not in FAMILY_UNIT]
 
 
-INDENT = 2
-"""Columns by which sentences, and rows without room, are indented."""
-
-_WIDEST = 10_000
-
-
-def plain_text(report: RenderableType, width: int) -> str:
+def plain_text(report: RenderableType, width: int = WIDTH) -> str:
     """A report as plain text, without blanks at the ends of lines."""
     check_number("width", width, least=1, whole=True)
     text = io.StringIO()
@@ -46,90 +52,135 @@ def plain_text(report: RenderableType, width: int) -> str:
 
 def width_for(report: RenderableType, width: int) -> int:
     """`width`, or more where the longest word of a report needs it."""
-    return max(width, Console(width=_WIDEST).measure(report).minimum)
+    return max(width, Console(width=10_000).measure(report).minimum)
 
 
-def line(text: str, style: str | Style = "") -> Text:
-    """A line of a report: all of its text comes through here, so that names from files neither steer nor style it."""
+def line(text: str, style: str = "") -> Text:
+    """A line of a report: all text passes here, so that names from files neither steer nor style the terminal."""
     return Text(escaped(text), style=style)
 
 
 def section(title: str, *content: RenderableType) -> list[RenderableType]:
-    """A heading after a blank line, and what stands below it."""
+    """A heading after a blank line, and its content."""
     return [line(""), line(title, "bold"), *content]
 
 
 def indented(lines: Iterable[str]) -> list[RenderableType]:
     """Sentences below a heading or a table."""
-    return [Padding(line(text), (0, 0, 0, INDENT)) for text in lines]
+    return [Padding(line(text), (0, 0, 0, 2)) for text in lines]
+
+
+def table_of(headings: Iterable[str], rows: Iterable[Iterable[object]], *, left: str = "", wrap: bool = False) -> Table:
+    """A table without a frame.
+
+    Args:
+        headings: Of the columns; without any text there is no heading row.
+        rows: Cells.
+        left: The justification of each column: `l` for left, else right; the first is always left, others that are
+            not named are right.
+        wrap: Whether cells wrap at spaces where the terminal is narrow.
+    """
+    titles = list(headings)
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="italic", show_header=any(titles))
+    for k, title in enumerate(titles):
+        is_left = k == 0 or left[k : k + 1] == "l"
+        table.add_column(line(title), justify="left" if is_left else "right", no_wrap=not wrap, overflow="fold")
+    for row in rows:
+        table.add_row(*(cell if isinstance(cell, Text) else line(str(cell)) for cell in row))
+    return table
+
+
+class _Escaped(Table):
+    """A table whose cells of text are no markup."""
+
+    def add_row(self, *cells: RenderableType | None, **options: Any) -> None:
+        """Add a row of cells."""
+        super().add_row(*(line(cell) if isinstance(cell, str) else cell for cell in cells), **options)
 
 
 def plain_table(*columns: tuple[str, str], wrap: bool = False) -> Table:
     """A table without a frame; columns as (heading, justification), which wrap at spaces with `wrap`."""
-    table = _WholeWords(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="italic")
+    table = _Escaped(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="italic")
     for heading, justify in columns:
         table.add_column(line(heading), justify=justify, no_wrap=not wrap, overflow="fold")  # type: ignore[arg-type]
     return table
 
 
-class _WholeWords(Table):
-    """A table without a frame that breaks no word: it wraps at spaces, or gives each row a paragraph of its own."""
-
-    def add_row(self, *cells: RenderableType | None, **options: Any) -> None:
-        """Add a row of cells; text in brackets is no markup."""
-        super().add_row(*(line(cell) if isinstance(cell, str) else cell for cell in cells), **options)
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        widths = self._widths(options.max_width)
-        if widths is None:
-            yield from self._paragraphs()
-            return
-        for column, width in zip(self.columns, widths, strict=True):
-            column.width = width
-        yield from super().__rich_console__(console, options.update_width(options.max_width + 1))  # not one blank less
-
-    def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
-        words = [_longest_word(text) for column in self.columns for text in self._texts(column)]
-        return Measurement(max(words, default=0) + INDENT, options.max_width)
-
-    def _texts(self, column: Column) -> list[str]:
-        """The cells of a column, its heading first."""
-        heading = str(column.header) if self.show_header else ""
-        return [heading, *(str(cell) for cell in column.cells)]
-
-    def _widths(self, most: int) -> list[int] | None:
-        """Widths of the columns, the widest wrapped most; None where `most` is too narrow for their longest words."""
-        texts = [self._texts(column) for column in self.columns]
-        widths = [max(map(len, cells)) for cells in texts]
-        least = [
-            width if column.no_wrap else max(map(_longest_word, cells))
-            for column, width, cells in zip(self.columns, widths, texts, strict=True)
-        ]
-        room = most - len(widths) + 1  # a blank between columns
-        while sum(widths) > room:
-            can = [i for i, width in enumerate(widths) if width > least[i]]
-            if not can:
-                return None
-            widths[max(can, key=lambda i: widths[i])] -= 1
-        return widths
-
-    def _paragraphs(self) -> Iterable[RenderableType]:
-        """The rows one below the other: the first cell if it has words, then the others behind their headings."""
-        columns = [self._texts(column) for column in self.columns]
-        for i, row in enumerate(self.rows, start=1):
-            title, *others = (f"{cells[0]} {cells[i]}".strip() if cells[i] else "" for cells in columns)
-            words = "  ".join(filter(None, others))
-            style = row.style or ""
-            if title or not words:
-                yield line(title, style)
-            if words:
-                yield Padding(line(words, style), (0, 0, 0, INDENT))
-
-
-def _longest_word(text: str) -> int:
-    return max(map(len, text.split()), default=0)
-
-
 def rounded(value: float, decimals: int, sign: str = "") -> str:
-    """A figure with `decimals`; one that rounds to zero has no minus, which rounding errors alone would decide on."""
+    """A value with `decimals`; one that rounds to zero has no minus."""
     return f"{value:{sign}z.{decimals}f}"
+
+
+def figure(value: float | None, unit: str, sign: str = "", none: str = "unknown") -> str:
+    """A value in the unit that is shown, without the unit's name."""
+    if value is None or not np.isfinite(value):
+        return none
+    factor, _, decimals = SHOWN.get(unit, (1.0, unit, 6))
+    return rounded(value * factor, decimals, sign)
+
+
+def in_words(value: float | None, unit: str) -> str:
+    """A value with its unit, in three digits."""
+    factor, name, _ = SHOWN.get(unit, (1.0, unit, 3))
+    return "unknown" if value is None or not np.isfinite(value) else f"{value * factor:.3g} {name}"
+
+
+def shortened(names: list[str], most: int) -> str:
+    """`a, b, c and 4 more`."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def lost_directions(lost: Sequence[LostDirection]) -> RenderableType:
+    """One line a reason, with the directions that have it."""
+    return table_of(("", "because"), relations_by_reason(lost), left="ll", wrap=True)
+
+
+def relations_by_reason(lost: Sequence[LostDirection]) -> list[tuple[str, str]]:
+    """Each reason once, after the directions that have it."""
+    by_reason: dict[str, list[str]] = {}
+    for direction in lost:
+        by_reason.setdefault(direction.reason, []).append(format_relation(direction.relation))
+    return [(", ".join(relations), reason) for reason, relations in by_reason.items()]
+
+
+def format_relation(relation: Mapping[str, float]) -> str:
+    """`d3 - d4` where sizes are equal, else `d6 by +0.5 m with alpha7 by +1 rad`."""
+    names, values = list(relation), list(relation.values())
+    if all(abs(v) == 1.0 for v in values):
+        return names[0] + "".join(f" {'+' if v > 0 else '-'} {n}" for n, v in zip(names[1:], values[1:], strict=True))
+    large = {n: v for n, v in relation.items() if abs(v) >= 0.01}  # the largest is 1
+    text = " with ".join(f"{n} by {v:+.4g} {unit_of(n)}" for n, v in large.items())
+    n_small = len(relation) - len(large)
+    return text + (f" and a little of {n_small} other parameter{'s' * (n_small > 1)}" if n_small else "")
+
+
+def unit_of(name: str) -> str:
+    """`m` or `rad`, by a parameter's name."""
+    kind = name.rsplit(".", 1)[-1].rstrip("0123456789") if "." not in name else name.rsplit(".", 1)[-1]
+    return "m" if AXIS_OF_KIND[kind] < Axis.RX else "rad"
+
+
+def weak_rows(observability: Observability, most: int) -> list[tuple[str, str]]:
+    """Each weak direction: its sigma over the prior sigma, and its largest members."""
+    rows = []
+    for weak in observability.weak[:most]:
+        members = ", ".join(f"{name} {share:+.2f}" for name, share in list(weak.members.items())[:6])
+        rows.append((f"{1.0 / weak.signal_to_noise:.3g}" if weak.signal_to_noise > 0.0 else "unknown", members))
+    return rows
+
+
+def weak_directions(observability: Observability, most: int = 5) -> RenderableType | None:
+    """Weak directions by their largest members; None where no direction is weak."""
+    more = len(observability.weak) - most
+    rows = weak_rows(observability, most) + ([("", f"and {more} more")] if more > 0 else [])
+    return table_of(("sigma / prior", "largest members"), rows, left="ll", wrap=True) if rows else None
+
+
+def plain(document: Any) -> Any:
+    """A document as JSON has it: dataclasses as mappings, arrays as lists, null for what is not finite."""
+    return json.loads(to_json(document, fallback=lambda value: value.tolist(), inf_nan_mode="null"))
+
+
+def json_text(document: Any) -> str:
+    """The text of a JSON file."""
+    return json.dumps(plain(document), indent=1, allow_nan=False) + "\n"

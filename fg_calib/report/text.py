@@ -1,281 +1,551 @@
-"""The calibration report for people: verdict, statistics, residuals, parameters; lengths in mm, angles in degrees."""
+"""The calibration report for people: verdict, statistics, residuals, parameters; lengths in mm, angles in degrees.
+
+It is made of a typed result and its tables, so that a loaded calibration prints like a new one.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from rich.console import Group, RenderableType
 
-from fg_calib.arguments import checked
-from fg_calib.assessment import Assessment as Uncertainty
 from fg_calib.diagnostics.verdict import chi2_in_words, predicted_in_words, probability
-from fg_calib.graph.noise import JOINT_NOISE
-from fg_calib.graph.solver import Solution
-from fg_calib.measurements.table import Table
+from fg_calib.io.result import Result, key_of
+from fg_calib.options import LIMITED
 from fg_calib.prediction.expected_error import ExpectedError
-from fg_calib.report.fit import goodness_of_fit, prediction, suspicious, with_joint_noise
-from fg_calib.report.folds import folds
-from fg_calib.report.identifiability import WEAK, lost_directions, weak_directions
-from fg_calib.report.notes import notes
-from fg_calib.report.parameters import combinations, parameters, tolerances
-from fg_calib.report.shown import SHOWN
-from fg_calib.report.summary import good, judged
-from fg_calib.report.tables import WIDTH, in_order, indented, line, plain_table, plain_text, rounded, section
-from fg_calib.report.tolerances import TITLE
-from fg_calib.statistics.estimates import FrameEstimate
-from fg_calib.statistics.estimates import JointErrors as JointValues
-from fg_calib.statistics.estimates import LandmarkEstimate as PointEstimate
+from fg_calib.report.tables import (
+    SHOWN,
+    WEAK,
+    WIDTH,
+    figure,
+    in_order,
+    in_words,
+    indented,
+    line,
+    lost_directions,
+    plain_text,
+    section,
+    shortened,
+    table_of,
+    weak_directions,
+)
+from fg_calib.robot.model import Robot
+from fg_calib.statistics.acceptance import Judgement
+from fg_calib.statistics.estimates import FrameEstimate, JointErrors, LandmarkEstimate, ParameterEstimate
+from fg_calib.statistics.goodness_of_fit import PREDICTION_VERDICTS, VERDICTS, KindFit
+
+if TYPE_CHECKING:
+    import polars as pl
 
 
-@checked
-def format_report(solution: Solution, uncertainty: Uncertainty, width: int = WIDTH) -> str:
+class Calibrated(Protocol):
+    """What a report is made of: see `calibration.Calibration`."""
+
+    @property
+    def result(self) -> Result:
+        """The typed result."""
+
+    @property
+    def robot(self) -> Robot:
+        """The calibrated robot."""
+
+    @property
+    def residuals(self) -> pl.DataFrame | None:
+        """Every scalar residual."""
+
+    @property
+    def configurations(self) -> pl.DataFrame | None:
+        """Every measured configuration."""
+
+
+def format_result(found: Calibrated, width: int = WIDTH) -> str:
     """The report as plain text."""
-    return plain_text(build_report(solution, uncertainty), width)
+    return plain_text(build_report(found), width)
 
 
-def build_report(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
+def build_report(found: Calibrated) -> RenderableType:
     """The report, to be printed by rich."""
+    result = found.result
+    joint_noise = ", with joint noise" if np.any(result.sigma_joint > 0.0) else ""
     parts: list[RenderableType] = [
-        _verdict(solution, uncertainty),
-        *section("Fit statistics", _statistics(solution, uncertainty)),
-        *section(
-            f"Goodness of fit (1 sigma of a row{with_joint_noise(solution)})", *goodness_of_fit(solution, uncertainty)
-        ),
-        *prediction(solution, uncertainty),
-        *folds(uncertainty),
-        *_expected_error(uncertainty),
-        *section("Residuals (RMS)", _residuals(solution, uncertainty)),
+        *_verdict(result),
+        *section("Fit statistics", _statistics(result)),
+        *section(f"Goodness of fit (1 sigma of a row{joint_noise})", _goodness(result, found.robot)),
+        *_prediction(result),
+        *_cross_validation(result),
+        *expected_tool_error(result.expected_error),
+        *section("Residuals (RMS)", _residuals(result)),
     ]
-    if uncertainty.names or not solution.problem.evaluated:
-        parts += section("Parameters", parameters(uncertainty))
-    if solution.estimated_tolerances is not None:
-        parts += section(TITLE, tolerances(solution.estimated_tolerances, uncertainty))
-    if any(p.stands_for for p in uncertainty.parameters):
-        parts += section("What kept parameters were estimated for", combinations(uncertainty))
-    parts += suspicious(solution, uncertainty)
-    parts += _joint_values(solution, uncertainty.joint_values)
-    for frame, variable in zip(uncertainty.frames, solution.problem.variables.frames, strict=True):
-        labels = solution.problem.data.labels
-        which = "" if len(labels) == 1 else f" of {labels[variable.number]}"
+    if result.estimated or not result.evaluated_only:
+        parts += section("Parameters", _parameters(result))
+    if result.tolerance_scales:
+        title = "Prior sigmas estimated (ratio to the specified ones, with its 95 % interval)"
+        parts += section(title, table_of(TOLERANCE_HEADINGS, tolerance_rows(result), left="rrrl"))
+    if any(p.stands_for for p in result.parameters):
+        parts += section("Combinations that the kept parameters stand for", _combinations(result))
+    parts += _suspicious_rows(found.residuals, result)
+    parts += _suspicious_configurations(result)
+    parts += _joint_values(found)
+    for symbol, frame in result.frames.items():
+        which = "" if len(result.tables) == 1 else f" of {result.tables[int(symbol[2:-1])][0]}"
         parts += section(f"Measurement frame (world_T_base{which})", _frame(frame))
-    parts += _points(solution, uncertainty.points)
-    if uncertainty.identifiability.lost:
-        parts += section("What the data do not determine", lost_directions(uncertainty.identifiability.lost))
-    weak = weak_directions(uncertainty.observability)
+    parts += _landmarks(result.groups)
+    if result.observability.lost:
+        parts += section("Not identifiable from these data", lost_directions(result.observability.lost))
+    weak = weak_directions(result.observability.observability)
     if weak is not None:
-        parts += section(f"What they determine badly ({WEAK})", weak)
-    remarks = indented(notes(solution, uncertainty))
-    if remarks:
-        parts += section("Notes", *remarks)
-    return Group(*parts)
+        parts += section(f"Weakly determined ({WEAK})", weak)
+    notes = [*(text for text in result.cautions if result.findings or text not in result.reservations), *result.notes]
+    return Group(*parts, *(section("Notes", *indented(notes)) if notes else []))
 
 
-def _verdict(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
-    problem, settings = solution.problem, solution.problem.options
-    labels = problem.data.labels
-    tables = [in_words(table) for table in problem.data.tables]
-    if len(labels) > 1:
-        tables = [f"{label} ({words})" for label, words in zip(labels, tables, strict=True)]
-    what = f"{problem.robot.name}: {'; '.join(tables)}"
-    touched = problem.data.n_train(lambda kind: kind.is_contact and kind.turned_back and kind.ends == 1)
-    n_points = sum(v.letter == "L" for v in problem.variables.nuisance)
-    what += f", {n_points} touched points" if touched else ""
-    if problem.state.joint_errors is not None:
-        what += ", joint values estimated"
-    what += "" if settings.loss == "none" else f", loss {settings.loss}"
-    lines: list[RenderableType] = [line(what)]
-    if uncertainty.acceptance is not None:
-        colour = {"pass": "bold green", "fail": "bold red"}.get(uncertainty.acceptance.verdict, "bold yellow")
-        lines += [line(text, colour) for text in judged(uncertainty.acceptance.judgements)]
-    lines += [line(f"DOUBTFUL: {finding}", "bold red") for finding in uncertainty.findings]
-    if uncertainty.trustworthy:
-        lines.append(line(f"{good(uncertainty.reservations)}: {solution.message}", "bold green"))
-        lines += indented(uncertainty.reservations)
-    if solution.problem.evaluated:
-        lines.insert(1, line("EVALUATED ONLY: all rows are test rows, nothing of the arm was calibrated"))
-        if uncertainty.p_value is not None:
-            figures = chi2_in_words(uncertainty.chi2, uncertainty.expected_chi2, uncertainty.p_value)
-            lines.append(line(f"test rows: {figures}"))
-    test = uncertainty.goodness.test
-    if test is not None and test.n:
-        lines.append(line(predicted_in_words(test)))
-    return Group(*lines)
+def verdict_word(result: Result) -> str:
+    """`GOOD`, with its warnings if there are any, or `DOUBTFUL`."""
+    return "DOUBTFUL" if result.findings else "GOOD, with warnings" if result.reservations else "GOOD"
 
 
-def in_words(table: Table) -> str:
-    """What a table is of."""
-    kinds = [type(own.kind).__name__ for own in table.own]
-    if table.model is None:
-        return ", ".join(kinds)
-    words = [table.model, *kinds]
-    if table.uses_pairs and table.measurements.pairs is not None:
-        words.append("measured pairs")
-    elif table.uses_pairs and (table.measurements.position is not None or table.measurements.rotation is not None):
-        words.append(f"pairs: {table.pairing}")
-    elif table.unknown_frame:
-        words.append("measurement frame unknown")
-    return ", ".join(words)
+def judged(judgements: Iterable[Judgement]) -> list[str]:
+    """A line a limit: `PASS: position 0.31 mm (RMS of 30 held-out measurements), limit 0.5 mm`."""
+    lines = []
+    for one in judgements:
+        unit = LIMITED[one.kind]
+        error = "" if one.error is None else f" {in_words(one.error, unit)} (RMS of {one.n} held-out measurements)"
+        reason = f": {one.reason}" if one.reason else ""
+        of = f" of {one.table}" if one.table else ""
+        lines.append(f"{one.verdict.upper()}: {one.kind}{of}{error}, limit {in_words(one.limit, unit)}{reason}")
+    return lines
 
 
-def _statistics(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
-    problem = solution.problem
-    rows = [("configurations", f"{problem.n_configurations}")]
-    if problem.pair_series:
-        rows.append(("pairs", f"{problem.n_pairs}"))
-    touches = problem.data.n_train(lambda kind: kind.is_contact and kind.turned_back and kind.ends == 1)
-    if touches:
-        n_points = sum(v.letter == "L" for v in problem.variables.nuisance)
-        between = problem.data.n_train(lambda kind: kind.ends == 0)
-        rows += [("touches", f"{touches} of {n_points} points"), ("distances of points", f"{between}")]
-    if problem.added:
-        chi2 = 2.0 * sum(factor.error(solution.values) for factor in problem.added)
-        rows.append(("added factors", f"{len(problem.added)} with {problem.n_added} rows, chi-square {chi2:.6g}"))
-    reduced = uncertainty.reduced_chi2
-    low, high = uncertainty.chi2_bounds
-    determined = uncertainty.spread.rank
-    rows += [
-        ("residuals", f"{problem.n_residuals}, and {problem.n_priors} priors"),
-        ("estimated", f"{len(problem.variables.all_scales)} unknowns, {determined} directions determined"),
-        ("chi-square", f"{uncertainty.chi2:.6g} with {uncertainty.dof} degrees of freedom"),
-        (
-            "reduced chi-square",
-            "unknown"
-            if reduced is None
-            else f"{reduced:.4g} (good from {low:.3g} to {high:.3g}){_of_p(uncertainty.p_value)}",
-        ),
+def _verdict(result: Result) -> Iterator[RenderableType]:
+    several = len(result.tables) > 1
+    tables = "; ".join(f"{label} ({words})" if several else words for label, words in result.tables)
+    joints = ", joint positions estimated" if result.joint_values is not None else ""
+    loss = "" if result.loss == "none" else f", loss {result.loss}"
+    yield line(f"{result.robot}: {tables}{joints}{loss}")
+    if result.evaluated_only:
+        yield line("EVALUATED ONLY: all rows are test rows, nothing of the arm was calibrated")
+    if result.acceptance is not None:
+        colour = {"pass": "bold green", "fail": "bold red"}.get(result.acceptance.verdict, "bold yellow")
+        yield from (line(text, colour) for text in judged(result.acceptance.judgements))
+    yield from (line(f"DOUBTFUL: {finding}", "bold red") for finding in result.findings)
+    if not result.findings:
+        yield line(f"{verdict_word(result)}: {result.solver.message}", "bold green")
+        yield from indented(result.reservations)
+    if result.evaluated_only and result.chi2_p_value is not None:
+        yield line(f"test rows: {chi2_in_words(result.chi2, result.chi2_expected, result.chi2_p_value)}")
+    elif result.test is not None and result.test.n:
+        yield line(predicted_in_words(result.test))
+
+
+def _statistics(result: Result) -> RenderableType:
+    low, high = result.chi2_bounds
+    p = "" if result.chi2_p_value is None else f", p-value {probability(result.chi2_p_value)}"
+    reduced = "unknown" if result.reduced_chi2 is None else f"{result.reduced_chi2:.4g}"
+    good = f" (good from {low:.3g} to {high:.3g})" if result.reduced_chi2 is not None else ""
+    solver = result.solver
+    rows = [
+        ("configurations", f"{result.n_configurations}"),
+        *([("pairs", f"{result.n_pairs}")] if result.n_pairs else []),
+        ("residuals", f"{result.n_residuals}, and {result.n_priors} priors"),
+        ("estimated", f"{result.n_unknowns} unknowns, {result.n_determined} directions determined"),
+        ("chi-square", f"{result.chi2:.6g} with {result.dof} degrees of freedom"),
+        ("reduced chi-square", f"{reduced}{good}{p}"),
         (
             "solver",
-            f"{solution.iterations} iterations, {solution.seconds:.2f} s,"
-            f" cost {solution.initial_cost:.6g} -> {solution.cost:.6g}",
+            f"{solver.iterations} iterations, {solver.seconds:.2f} s, cost {solver.initial_cost:.6g} ->"
+            f" {solver.cost:.6g}",
         ),
     ]
-    table = plain_table(("", "left"), ("", "left"))
-    table.show_header = False
-    for row in rows:
-        table.add_row(*row)
-    return table
+    return table_of(("", ""), rows, left="ll")
 
 
-def _of_p(p: float | None) -> str:
-    return "" if p is None else f", p-value {probability(p)}"
+def _named(result: Result, fit: KindFit) -> str:
+    return fit.kind if len(result.tables) == 1 else f"{fit.kind} of {result.tables[fit.table][0]}"
 
 
-def _expected_error(uncertainty: Uncertainty) -> list[RenderableType]:
-    """How far off the tool is expected to be, by the covariance."""
-    doubtful = not uncertainty.trustworthy or bool(uncertainty.reservations)
-    return expected_tool_error(uncertainty.expected_error, ", if model and noise were as stated" * doubtful)
+def _goodness(result: Result, robot: Robot) -> RenderableType:
+    """Specified and estimated noise by kind, and what their ratio means."""
+    factors, fits, rows = result.noise_factors, tuple(result.goodness.values()), list[tuple[str, ...]]()
+    for fit in fits:
+        specified, ratio, words = fit.stated_sigma_rms, fit.seen_over_stated, VERDICTS[fit.verdict]
+        if factors is not None:
+            specified, ratio, words = fit.own_sigma_rms, fit.own_factor, _estimated_noise(result, key_of(fit, fits))
+        known = np.isfinite(ratio)
+        rows.append(
+            (
+                _named(result, fit),
+                SHOWN[fit.unit][1],
+                figure(specified, fit.unit),
+                figure(ratio * specified, fit.unit, none="-"),
+                f"{ratio:.3f}" if known else "-",
+                "-" if fit.p_value is None else probability(fit.p_value),
+                words,
+            )
+        )
+    rows += _joint_noise(result, robot)
+    estimated = "observed" if factors is None else "estimated"
+    headings = ("", "", "specified", estimated, "ratio", "p-value", "")
+    table = table_of(headings, rows, left="llrrrrl", wrap=True)
+    suspicious = bool(result.suspect_configurations) or any(fit.n_beyond for fit in fits)
+    level = f"no row (|studentised residual| above {result.suspect_level:.2f}) and no configuration is suspicious"
+    return Group(table, *indented([] if suspicious or not np.isfinite(result.suspect_level) else [level]))
 
 
-def expected_tool_error(expected: ExpectedError | None, condition: str = "") -> list[RenderableType]:
-    """The section on how far off the tool is expected to be; none where the arm was evaluated as it is.
+def _joint_noise(result: Result, robot: Robot) -> Iterator[tuple[str, ...]]:
+    """A row for the noise of joint readings where noise was estimated; revolute and prismatic joints apart."""
+    ratio = (result.noise_factors or {}).get("joint")
+    for unit in dict.fromkeys(joint.unit for joint in robot.joints) if ratio is not None else ():
+        sigma = np.array([s for s, joint in zip(result.sigma_joint, robot.joints, strict=True) if joint.unit == unit])
+        if ratio is not None and np.any(sigma > 0.0):
+            rms = float(np.sqrt(np.mean(sigma[sigma > 0.0] ** 2)))
+            values = figure(rms / ratio, unit), figure(rms, unit), f"{ratio:.3f}"
+            yield ("joint readings", SHOWN[unit][1], *values, "-", _estimated_noise(result, "joint"))
 
-    Args:
-        expected: How far.
-        condition: Words for the heading.
-    """
-    if expected is None:
+
+def _estimated_noise(result: Result, key: str) -> str:
+    if key in result.noise_kept:
+        return "cannot be estimated from these rows: as specified"
+    return "estimated" if result.solver.converged else "not settled: the estimate has not converged"
+
+
+def _prediction(result: Result) -> list[RenderableType]:
+    """How well the test rows are predicted, by kind."""
+    fit = result.test
+    if fit is None:
         return []
-    table = plain_table(
-        ("", "left"), ("", "left"), ("in the base frame", "right"), ("after the best rigid fit", "right")
-    )
-    for kind, unit in (("position", "m"), ("orientation", "rad")):
-        factor, shown, decimals = SHOWN[unit]
-        values = (getattr(rms, kind) for rms in (expected.base, expected.fitted))
-        table.add_row(kind, shown, *("unknown" if v is None else f"{v * factor:.{decimals}f}" for v in values))
-    which = "" if expected.n == expected.of else f" of {expected.of}"
-    return section(f"Expected tool error (RMS at {expected.n}{which} {expected.at} configurations{condition})", table)
+    rows = []
+    for kind in fit.kinds:
+        ratio = kind.seen_over_stated / kind.factor
+        cells = f"{kind.n}", f"{kind.chi2:.4g}", f"{kind.expected:.4g}", "-" if np.isnan(ratio) else f"{ratio:.3f}"
+        p = "-" if kind.p_value is None else probability(kind.p_value)
+        rows.append((_named(result, kind), *cells, p, PREDICTION_VERDICTS[kind.verdict]))
+    headings = ("", "rows", "chi-square", "expected", "ratio", "p-value", "")
+    notes = []
+    if fit.outliers.test:
+        notes.append(f"{fit.outliers.test} of {fit.outliers.of_test} measurements do not count: outliers by the loss")
+    if fit.n_unknown:
+        notes.append(f"{fit.n_unknown} rows are not judged: they depend on what is not determined")
+    table = table_of(headings, rows, left="lrrrrrl", wrap=True)
+    return section("Prediction of the test rows", table, *indented(notes))
 
 
-def _residuals(solution: Solution, uncertainty: Uncertainty) -> RenderableType:
-    residuals, labels = uncertainty.residuals, solution.problem.data.labels
-    table = plain_table(
-        ("", "left"), ("", "left"), *[(h, "right") for h in ("train before", "after", "test before", "after")]
-    )
-    for number, family in sorted(residuals.groups, key=lambda g: (in_order(residuals.families).index(g[1]), g[0])):
-        rms = residuals.rms(number)
-        if family not in rms["train"] and family not in rms["test"]:
-            continue
-        factor, shown, _ = SHOWN[residuals.unit(family)]
-        figures = [
-            f"{rms[split][family][when] * factor:.4f}" if family in rms[split] else "-"
-            for split in ("train", "test")
-            for when in ("before", "after")
-        ]
-        table.add_row(family if len(labels) == 1 else f"{family} of {labels[number]}", shown, *figures)
-    return table
-
-
-def _joint_values(solution: Solution, found: JointValues | None, limit: int = 5) -> list[RenderableType]:
-    """How estimated joint values lie about their readings, joint by joint, and the readings that are suspect."""
+def _cross_validation(result: Result) -> list[RenderableType]:
+    """How well configurations are predicted by calibrations without them, and how parameters spread."""
+    found = result.folds
     if found is None:
         return []
-    sigma = "stated" if solution.problem.state.factors.get(JOINT_NOISE, 1.0) == 1.0 else "estimated"
-    table = plain_table(("", "left"), *((h, "right") for h in (sigma, "", f"mean error / {sigma}", "scatter")))
-    joints = solution.problem.robot.joints
-    for k, name in enumerate(found.names):
-        factor, shown, decimals = SHOWN[joints[found.joints[k]].unit]
-        scatter = "-" if np.isnan(found.scatter[k]) else f"{found.scatter[k]:.3f}"
-        table.add_row(name, f"{found.sigma[k] * factor:.{decimals}f}", shown, rounded(found.mean[k], 3, "+"), scatter)
-    parts = section(f"Joint readings (estimate minus reading; scatter is 1 where all is as {sigma})", table)
-    if not found.suspects:
-        return parts
-    wrong = plain_table(("", "left"), ("", "left"), ("error", "right"), ("", "left"), ("in its sigma", "right"))
-    names = solution.problem.end_names
-    for i, k in found.suspects[:limit]:
-        factor, shown, decimals = SHOWN[joints[found.joints[k]].unit]
-        error = rounded(found.error[i, k] * factor, decimals, "+")
-        wrong.add_row(
-            names[found.configurations[i] + 1], found.names[k], error, shown, f"{found.studentised[i, k]:+.1f}"
+    rows = []
+    for kind in in_order(found.kinds):
+        held, unit = found.kinds[kind], result.unit_of(kind)
+        values = (f"{v * SHOWN[unit][0]:.4f}" for v in (held.before, held.after, held.noise))
+        rows.append((kind, SHOWN[unit][1], f"{held.n}", *values))
+    table = table_of(("", "", "held out", "before", "after", "specified noise"), rows, left="ll")
+    title = f"Cross-validation ({found.n} folds of configurations, each predicted without it; RMS)"
+    return section(title, table, *indented(spread_in_words(result)))
+
+
+def spread_in_words(result: Result) -> list[str]:
+    """How parameters spread between folds, compared with their sigmas."""
+    found = result.folds
+    assert found is not None
+    lines = []
+    ratio, wide = found.beyond({p.name: p.sigma for p in result.estimated})
+    if ratio:
+        by, median = 100.0 / np.sqrt(2.0 * (found.n - 1)), np.median(list(ratio.values()))
+        lines.append(
+            f"spread of a parameter between folds over its sigma: median {median:.2f} (each is known to {by:.0f} %;"
+            " below 1 where priors determine it)"
         )
-    if len(found.suspects) > limit:
-        wrong.add_row("", f"and {len(found.suspects) - limit} more")
-    return parts + section("Suspicious joint readings", wrong)
+    if found.of_pairs:
+        lines.append("for pairs it is 1.4 to 1.7 times as large, because a pair leaves with either configuration")
+    if wide:
+        named = shortened([f"{name} {ratio[name]:.1f}" for name in wide], 5)
+        lines.append(f"significantly larger than their sigmas: {named}")
+    if found.not_converged:
+        lines.append(f"{found.not_converged} of {found.n} calibrations did not converge")
+    return lines
 
 
-_UNKNOWNS = {
-    "point": "Touched points (from the base), mm",
+def expected_tool_error(expected: ExpectedError | None) -> list[RenderableType]:
+    """The section on the expected error of the tool, by the covariance; none for an evaluation."""
+    if expected is None:
+        return []
+    both = (expected.base, expected.fitted)
+    rows = [
+        (kind, SHOWN[unit][1], *(figure(getattr(rms, kind), unit) for rms in both))
+        for kind, unit in (("position", "m"), ("orientation", "rad"))
+    ]
+    table = table_of(("", "", "in the base frame", "after the best rigid fit"), rows, left="ll")
+    which = "" if expected.n == expected.of else f" of {expected.of}"
+    return section(f"Expected tool error (RMS at {expected.n}{which} {expected.at} configurations)", table)
+
+
+def _residuals(result: Result) -> RenderableType:
+    kinds = [kind for kind in result.residual_rms["train"] if ", table" not in kind]
+    rows = []
+    for kind in in_order(kinds):
+        by_table = [name for name in result.residual_rms["train"] if name.startswith(f"{kind}, table ")]
+        for name in by_table or [kind]:
+            both = [result.residual_rms[split].get(name) for split in ("train", "test")]
+            if any(rms is not None for rms in both):
+                factor, unit, _ = SHOWN[result.unit_of(kind)]
+                values = (None if rms is None else getattr(rms, when) for rms in both for when in ("before", "after"))
+                rows.append((name, unit, *("-" if v is None else f"{v * factor:.4f}" for v in values)))
+    return table_of(("", "", "train before", "after", "test before", "after"), rows, left="ll")
+
+
+PARAMETER_HEADINGS = ("", "estimate", "± sigma", "", "correction", "nominal", "prior", "class")
+
+
+def parameter_rows(parameters: Iterable[ParameterEstimate], *, fixed: bool = True) -> list[tuple[str, ...]]:
+    """A row of cells for each parameter; base and tool fixed at zero are left out.
+
+    Args:
+        parameters: The parameters.
+        fixed: Whether those that are fixed are shown.
+    """
+    rows: list[tuple[str, ...]] = []
+    for p in parameters:
+        unit = SHOWN[p.unit][1]
+        if p.identifiability != "fixed":
+            cells = figure(p.estimate, p.unit), figure(p.sigma, p.unit), unit, figure(p.correction, p.unit, "+")
+            prior = figure(p.prior_sigma, p.unit, none="")
+            rows.append((p.name, *cells, figure(p.nominal, p.unit), prior, p.identifiability))
+        elif fixed and (p.nominal != 0.0 or not p.name.startswith(("base.", "tool."))):
+            rows.append((p.name, figure(p.estimate, p.unit), "", unit, "", "", "", "fixed"))
+    return rows
+
+
+def _parameters(result: Result) -> RenderableType:
+    rows = parameter_rows(result.parameters, fixed=not result.evaluated_only)
+    return table_of(PARAMETER_HEADINGS, rows, left="lrrlrrrl")
+
+
+TOLERANCE_HEADINGS = ("", "specified", "estimated", "", "ratio", "from", "to", "corrections that count")
+
+
+def tolerance_rows(result: Result) -> list[tuple[str, ...]]:
+    """A row of cells for each scale; prior sigmas themselves only where those of a scale are all the same."""
+    by_name = {p.name: p for p in result.parameters}
+    rows: list[tuple[str, ...]] = []
+    for one in result.tolerance_scales or ():
+        members = [by_name[name] for name in one.parameters]
+        first = members[0].prior_sigma
+        same = len({(p.unit, f"{p.prior_sigma or 0.0:.6g}") for p in members}) == 1 and first is not None
+        factor, unit, _ = SHOWN[members[0].unit]
+        sigmas = (f"{first / one.scale * factor:.3g}", f"{first * factor:.3g}", unit) if same and first else ("",) * 3
+        ratios = f"{one.scale:.3g}", f"{one.low:.2g}", f"{one.high:.2g}", f"{one.seen:.1f} of {len(one.parameters)}"
+        rows.append((one.group, *sigmas, *ratios))
+    return rows
+
+
+def _combinations(result: Result) -> RenderableType:
+    rows = [
+        (p.name, figure(p.sigma_of_combination, p.unit), SHOWN[p.unit][1], format_combination(p.stands_for))
+        for p in result.parameters
+        if p.stands_for
+    ]
+    return table_of(("", "sigma", "", "of the sum"), rows, left="lrll", wrap=True)
+
+
+def format_combination(factors: Mapping[str, float]) -> str:
+    """`d5 + d3 + d4`, `a7 + 0.5 beta5`: errors of the parameters, each with its factor."""
+    sizes = {name: "" if abs(f) == 1.0 else f"{abs(f):.4g} " for name, f in factors.items()}
+    terms = (f"{'-' if f < 0.0 else '+'} {sizes[name]}{name}" for name, f in factors.items())
+    return " ".join(terms).removeprefix("+ ")
+
+
+def _suspicious_rows(residuals: pl.DataFrame | None, result: Result) -> list[RenderableType]:
+    """The fitted rows that are larger than noise, then the test rows, the worst first; none if they were not saved."""
+    if residuals is None:
+        return []
+    parts: list[RenderableType] = []
+    for split, word in (("train", ""), ("test", "test ")):
+        judged = residuals.filter((residuals["split"] == split) & residuals["excluded"].is_null())
+        suspects = judged.filter(judged["suspect"])
+        if len(suspects):
+            suspects = suspects[suspects["studentised"].abs().fill_nan(0.0).arg_sort(descending=True)]
+            lines = [*_poses_in_common(judged, suspects, result), *_labels_in_common(judged, suspects)]
+            parts += section(f"Suspicious {word}rows", *indented(lines), _suspects(suspects))
+    return parts
+
+
+def _suspects(suspects: pl.DataFrame, limit: int = 5) -> RenderableType:
+    more = [name for name in ("table", "of") if name in suspects.columns]
+    rows: list[tuple[Any, ...]] = []
+    for row in suspects.head(limit).fill_null("").iter_rows(named=True):
+        residual = figure(row["residual"], row["unit"], "+"), SHOWN[row["unit"]][1]
+        names = row["a"], row["b"], row["kind"], *(row[name] for name in more)
+        rows.append((*names, *residual, f"{row['studentised']:+.1f}", row["flag"]))
+    if len(suspects) > limit:
+        rows.append(("", "", f"and {len(suspects) - limit} more", *[""] * (4 + len(more))))
+    headings = ("a", "b", "", *more, "residual", "", "in its sigma", "")
+    return table_of(headings, rows, left=f"lll{'l' * len(more)}rlrl")
+
+
+def _poses_in_common(judged: pl.DataFrame, suspects: pl.DataFrame, result: Result, limit: int = 5) -> Iterator[str]:
+    """The poses that most of their formed pairs are suspicious of: one wrong pose makes all its pairs suspicious.
+
+    The pose in most suspicious pairs comes first; each next one counts the pairs that those before do not explain. A
+    single suspicious pair does not say which of its two poses is wrong.
+    """
+    if result.pairing in (None, "measured"):
+        return
+    pairs = [set(frame.select("a", "b").unique().drop_nulls().iter_rows()) for frame in (judged, suspects)]
+    in_all, left, lines = Counter(name for pair in pairs[0] for name in pair), pairs[1], []
+    n_suspicious = len(left)
+    while left:
+        of_pose = Counter(name for pair in left for name in pair)
+        wrong = [name for name, n in of_pose.items() if n > 1 and 2 * n > in_all[name]]
+        if not wrong:
+            break
+        worst = min(wrong, key=lambda name: (-of_pose[name], name))
+        words = f"{of_pose[worst]} of {n_suspicious} suspicious pairs, and in {in_all[worst]} pairs in all"
+        lines.append(f"pose {worst} is in {words}")
+        left = {pair for pair in left if worst not in pair}
+    yield from lines[:limit]
+    if len(lines) > limit:
+        yield f"and {len(lines) - limit} more such poses"
+
+
+def _labels_in_common(judged: pl.DataFrame, suspects: pl.DataFrame) -> Iterator[str]:
+    """The target, anchor, corner or table that most suspicious rows are of, but less than half as many others."""
+    for column in ("of", "table"):
+        if column not in suspects.columns or len(suspects.select("a", "b", column).unique()) < 2:
+            continue
+        counts = suspects[column].drop_nulls().value_counts(sort=True)
+        if not len(counts):
+            continue
+        name, found = counts.row(0)
+        n, of_all = len(suspects), int((judged[column] == name).sum())
+        if 2 * found > n and 2.0 * of_all / len(judged) * n <= found:
+            count = f"{found} of {n}" if found < n else "both" if n == 2 else f"all {n}"
+            yield f"{count} suspicious rows are of {name}, as are {of_all} of all {len(judged)} rows"
+
+
+def _suspicious_configurations(result: Result, limit: int = 8) -> list[RenderableType]:
+    """The configurations whose residuals together are larger than noise."""
+    found = result.suspect_configurations
+    rows = [(c.id, f"{c.n}", f"{c.chi2:.4g}", f"{c.expected:.4g}") for c in found[:limit]]
+    table = table_of(("", "rows", "chi-square", "expected"), rows)
+    more = indented([f"and {shortened([c.id for c in found[limit:]], 8)}"] if len(found) > limit else [])
+    return section("Suspicious configurations", table, *more) if found else []
+
+
+def _joint_values(found: Calibrated, limit: int = 5) -> list[RenderableType]:
+    """Estimated joint positions compared with the readings, joint by joint, and the suspicious readings."""
+    values, configurations = found.result.joint_values, found.configurations
+    if values is None:
+        return []
+    units = [found.robot.joints[j].unit for j in values.joints]
+    sigma = "specified" if (found.result.noise_factors or {}).get("joint", 1.0) == 1.0 else "estimated"
+    rows = [
+        (name, figure(values.sigma[k], units[k]), SHOWN[units[k]][1], f"{values.mean[k]:+z.3f}", _scatter(values, k))
+        for k, name in enumerate(values.names)
+    ]
+    table = table_of(("", sigma, "", f"mean error / {sigma}", "scatter"), rows, left="lrl")
+    parts = section(f"Joint readings (estimate minus reading; scatter is 1 where all is as {sigma})", table)
+    wrong = []
+    for i, k in values.suspects[:limit]:
+        at = int(values.configurations[i])
+        name = str(at) if configurations is None else configurations["id"][at]
+        error = figure(values.error[i, k], units[k], "+")
+        wrong.append((name, values.names[k], error, SHOWN[units[k]][1], f"{values.studentised[i, k]:+.1f}"))
+    if len(values.suspects) > limit:
+        wrong.append(("", f"and {len(values.suspects) - limit} more", "", "", ""))
+    more = table_of(("", "", "error", "", "in its sigma"), wrong, left="llrl")
+    return parts + (section("Suspicious joint readings", more) if wrong else [])
+
+
+def _scatter(values: JointErrors, k: int) -> str:
+    scatter = values.scatter[k]
+    return "-" if np.isnan(scatter) else f"{scatter:.3f}"
+
+
+_LANDMARKS = {
+    "point": "Contact points (in the base frame), mm",
     "target": "Targets (in the tool frame), mm",
     "anchor": "Anchors (in the base frame), mm",
-    "offset": "What instruments add to every length, mm",
+    "offset": "Offsets of instruments on lengths, mm",
     "plane": "Planes (unit normal in the base frame, distance from the base in mm)",
     "board": "Boards (in the base frame: rotation vector in deg, position in mm)",
     "unknown": "Other unknowns, [m] and [rad]",
 }
-"""Heading of each kind of unknown."""
-
-_FIGURE = (1.0, "", 7)
+"""Heading of each kind of landmark."""
 
 
-def _points(solution: Solution, points: Sequence[PointEstimate], limit: int = 8) -> list[RenderableType]:
-    """Where touched points and other unknowns of the measurements are; of many the first, `result.json` has all."""
+def _landmarks(landmarks: Sequence[LandmarkEstimate], limit: int = 8) -> list[RenderableType]:
+    """Estimated contact points, targets, anchors, planes and boards; `result.json` has all of many."""
     parts: list[RenderableType] = []
-    for kind, title in _UNKNOWNS.items():
-        chosen = [p for p in points if p.kind == kind]
-        table = plain_table(("", "left"), ("rows", "right"), ("estimate", "right"), ("", "left"), ("sigma", "right"))
+    for kind, title in _LANDMARKS.items():
+        chosen, rows = [p for p in landmarks if p.kind == kind], []
         for p in chosen[:limit]:
-            shown = [_FIGURE if kind == "unknown" else SHOWN.get(unit, _FIGURE) for unit in p.units]
-            xyz = "  ".join(rounded(v * of[0], of[2]) for v, of in zip(p.xyz, shown, strict=True))
-            of_each = zip(p.sigma, shown, strict=True)
-            sigma = "  ".join(f"{v * of[0]:.{of[2]}f}" if np.isfinite(v) else "unknown" for v, of in of_each)
-            table.add_row(p.name, f"{p.n}", xyz, "±", "known" if not p.sigma.any() else sigma)
+            units = ["" if kind == "unknown" else unit for unit in p.units]
+            xyz = "  ".join(figure(v, unit) for v, unit in zip(p.xyz.tolist(), units, strict=True))
+            sigma = "  ".join(figure(v, unit) for v, unit in zip(p.sigma.tolist(), units, strict=True))
+            rows.append((p.name, f"{p.n}", xyz, "±", "known" if not p.sigma.any() else sigma))
         if len(chosen) > limit:
-            table.add_row(f"and {len(chosen) - limit} more", "", "", "", "")
-        parts += section(title, table) if chosen else []
+            rows.append((f"and {len(chosen) - limit} more", "", "", "", ""))
+        parts += section(title, table_of(("", "rows", "estimate", "", "sigma"), rows, left="lrrlr")) if chosen else []
     return parts
 
 
 def _frame(frame: FrameEstimate) -> RenderableType:
-    xyz = "  ".join(rounded(v * 1e3, 4) for v in frame.xyz)
-    q = "  ".join(rounded(v, 8) for v in frame.quaternion_xyzw)
+    rows = [
+        ("xyz", "  ".join(figure(v, "m") for v in frame.xyz.tolist()), "mm"),
+        ("± along its axes", "  ".join(figure(v, "m") for v in frame.sigma[3:].tolist()), "mm"),
+        ("quaternion xyzw", "  ".join(f"{v:z.8f}" for v in frame.quaternion_xyzw.tolist()), ""),
+        ("± about its axes", "  ".join(figure(v, "rad") for v in frame.sigma[:3].tolist()), "deg"),
+    ]
+    return table_of(("", "", ""), rows, left="lrl")
 
-    def sigmas(values: Iterable[float], factor: float, decimals: int) -> str:
-        return "  ".join(f"{v * factor:.{decimals}f}" if np.isfinite(v) else "unknown" for v in values)
 
-    table = plain_table(("", "left"), ("", "right"), ("", "left"))
-    table.show_header = False
-    table.add_row("xyz", xyz, "mm")
-    table.add_row("± along its axes", sigmas(frame.sigma[3:], 1e3, 4), "mm")
-    table.add_row("quaternion xyzw", q, "")
-    table.add_row("± about its axes", sigmas(frame.sigma[:3], 180.0 / np.pi, 5), "deg")
-    return table
+def summary(result: Result, most: int = 3) -> list[str]:
+    """Robot, verdict, counts and residuals in at most ten lines.
+
+    Args:
+        result: The result.
+        most: How many errors or warnings are shown.
+    """
+    texts = [f"DOUBTFUL: {finding}" for finding in result.findings]
+    texts = texts or [f"{verdict_word(result)}: {result.solver.message}", *result.reservations]
+    more = [f"... and {len(texts) - most} more findings"] if len(texts) > most else []
+    chi2 = "" if result.reduced_chi2 is None else f", reduced chi-square {result.reduced_chi2:.3g}"
+    known = sum(p.sigma is not None for p in result.estimated)
+    lines = [
+        f"{result.robot}: {'; '.join(words for _, words in result.tables)}",
+        *([] if result.acceptance is None else judged(result.acceptance.judgements)),
+        *texts[:most],
+        *more,
+        f"{result.n_configurations} configurations, {result.n_residuals} residuals{chi2}",
+        f"{len(result.estimated)} of {len(result.parameters)} parameters estimated, {known} of them with a known sigma",
+        *_rms_lines(result),
+    ]
+    return [str(line(text if len(text) <= WIDTH else f"{text[: WIDTH - 4]} ...")) for text in lines]
+
+
+def _rms_lines(result: Result) -> Iterator[str]:
+    for split, kinds in result.residual_rms.items():
+        found = [
+            f"{kind} {in_words(rms.before, result.unit_of(kind))} -> {in_words(rms.after, result.unit_of(kind))}"
+            for kind, rms in kinds.items()
+            if rms is not None
+        ]
+        if found:
+            yield f"{split} residuals, RMS: {', '.join(found)}"
+
+
+_NOTEBOOK = """<p>{% for text in lines %}{{ text }}<br>{% endfor %}</p>
+<table><thead><tr>{% for cell in headings %}<th>{{ cell }}</th>{% endfor %}</tr></thead><tbody>
+{% for row in rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</tbody></table>"""
+
+
+def parameter_table_html(result: Result) -> str:
+    """The summary and the parameters as HTML, for a notebook."""
+    from jinja2 import Environment
+
+    values = {"headings": PARAMETER_HEADINGS, "rows": parameter_rows(result.parameters), "lines": summary(result)}
+    return Environment(autoescape=True).from_string(_NOTEBOOK).render(values)

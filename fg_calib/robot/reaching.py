@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arrays import FrozenArrays
-from fg_calib.progress import tell
+from fg_calib.executors import tell
 from fg_calib.robot.inverse import N_STARTS, REACHED, Inverse, solve_inverse
 from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot

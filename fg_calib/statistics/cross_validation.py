@@ -25,11 +25,10 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import FrozenArrays
+from fg_calib.arrays import Booleans, Figure, Floats, FrozenArrays, Integers
 from fg_calib.errors import InputError, ProblemError
 from fg_calib.executors import Failure, map_jobs
 from fg_calib.graph.build import problem_of
@@ -39,10 +38,6 @@ from fg_calib.measurements.build import Dataset
 from fg_calib.measurements.table import Table
 from fg_calib.options import check_number
 from fg_calib.statistics.residual_table import HeldOut, pooled, residual_table, same_readings
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Booleans = NDArray[np.bool_]
 
 CHANCE = 1e-3
 """Probability with which noise as specified alone makes the spread of any parameter worth naming."""
@@ -73,7 +68,7 @@ class CrossValidation(FrozenArrays):
     by_table: tuple[HeldOut, ...]
     kinds: dict[str, HeldOut]
     of_pairs: bool
-    spread: dict[str, float]
+    spread: dict[str, Figure]
     not_converged: int
 
     def beyond(self, sigma: Mapping[str, float | None]) -> tuple[dict[str, float], list[str]]:

@@ -10,10 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arrays import FrozenArrays
+from fg_calib.arrays import Floats, FrozenArrays, Integers
 from fg_calib.graph.factors import Variables, corrections_of, pose_of
 from fg_calib.graph.information import eliminated
 from fg_calib.graph.problem import Problem, at_parameters, by_columns_of
@@ -21,9 +20,6 @@ from fg_calib.graph.solver import Solution
 from fg_calib.observability.indices import IdentifiabilityClass, Observability
 from fg_calib.statistics.covariance import Spread, TangentCovariance
 from fg_calib.statistics.residual_table import suspect_level
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 KINDS = {"L": "point", "P": "target", "A": "anchor", "O": "offset", "F": "plane", "B": "board", "N": "unknown"}
 """Kind of a landmark, by the letter of its key."""

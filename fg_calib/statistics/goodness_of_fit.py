@@ -40,9 +40,10 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 from numpy.typing import NDArray
+from pydantic import computed_field
 from scipy import special
 
-from fg_calib.arrays import FrozenArrays
+from fg_calib.arrays import Booleans, Figure, Floats, FrozenArrays, Integers
 from fg_calib.graph.factors import prior_rows
 from fg_calib.graph.information import eliminated
 from fg_calib.graph.noise import JOINT_NOISE, NoiseName
@@ -58,9 +59,6 @@ from fg_calib.statistics.prior_consistency import PriorFit
 from fg_calib.statistics.residual_covariance import Errors, Nuisances, half_of
 from fg_calib.statistics.residual_table import ALARM, ResidualTable, suspect_level
 
-Floats = NDArray[np.float64]
-Booleans = NDArray[np.bool_]
-Integers = NDArray[np.int64]
 Codes = NDArray[np.int8]
 Loadings = scipy.sparse.csr_array
 
@@ -122,22 +120,23 @@ class KindFit:
     kind: str
     unit: str
     n: int
-    stated_sigma_rms: float
-    factor: float
-    seen_over_stated: float
-    chi2: float
-    expected: float
+    stated_sigma_rms: Figure
+    factor: Figure
+    seen_over_stated: Figure
+    chi2: Figure
+    expected: Figure
     p_value: float | None
-    typical: float
-    largest: float
-    degrees: float
+    typical: Figure
+    largest: Figure
+    degrees: Figure
     table: int = 0
     n_beyond: int = 0
     spoilt: bool = False
     rest: KindFit | None = None
-    own_sigma_rms: float = np.nan
-    own_factor: float = 1.0
+    own_sigma_rms: Figure = np.nan
+    own_factor: Figure = 1.0
 
+    @computed_field  # type: ignore[prop-decorator]
     @property
     def verdict(self) -> str:
         """What the figures say, as a key of `VERDICTS`."""
@@ -206,8 +205,8 @@ class SuspectConfiguration:
 
     configuration: int
     n: int
-    chi2: float
-    expected: float
+    chi2: Figure
+    expected: Figure
 
 
 @dataclass(frozen=True)
@@ -257,9 +256,9 @@ class PredictedFit(FrozenArrays):
     n: int
     outliers: OutlierCounts
     n_unknown: int
-    chi2: float
-    expected: float
-    p_value: float
+    chi2: Figure
+    expected: Figure
+    p_value: Figure
     suspects: Integers
     configurations: tuple[SuspectConfiguration, ...]
 

@@ -27,17 +27,14 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
-from fg_calib.arrays import FrozenArrays
+from fg_calib.arrays import Figure, Floats, FrozenArrays
 from fg_calib.graph.factors import Variables, prior_rows, unknown_prior_rows
 from fg_calib.graph.information import eliminated
 from fg_calib.graph.solver import Solution
 from fg_calib.statistics.covariance import Spread
 from fg_calib.statistics.estimates import KINDS
-
-Floats = NDArray[np.float64]
 
 ALARM = 0.001
 """Probability of calling any single correction of a model that holds too large."""
@@ -84,8 +81,8 @@ class PriorFit(FrozenArrays):
     names: tuple[str, ...]
     z: Floats
     sigma: Floats
-    chi2: float
-    expected: float
+    chi2: Figure
+    expected: Figure
     p_value: float | None
     beyond: tuple[Beyond, ...]
 

@@ -11,15 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from fg_calib.arrays import FrozenArrays
+from fg_calib.arrays import Booleans, Figure, Floats, FrozenArrays
 from fg_calib.graph.problem import noises_at
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements.dataset import Labels
 from fg_calib.measurements.kinds import checked_figures
 from fg_calib.measurements.table import MeasurementBlock
 
-Floats = NDArray[np.float64]
-Booleans = NDArray[np.bool_]
 Integers = NDArray[np.int64]
 Codes = NDArray[np.int16]
 Indices = NDArray[np.int32]
@@ -85,12 +83,12 @@ class HeldOut:
     table: str
     kind: str
     n: int
-    before: float
-    after: float
-    noise: float
+    before: Figure
+    after: Figure
+    noise: Figure
     few: bool = False
     far: tuple[str, ...] = ()
-    rest: float = np.nan
+    rest: Figure = np.nan
     by: str = ""
 
 

@@ -26,8 +26,7 @@ from fg_calib.io.robot_file import write_robot
 from fg_calib.job import Job
 from fg_calib.measurements.table import Table
 from fg_calib.options import Options, Pairing
-from fg_calib.report.comparison import format_comparison
-from fg_calib.report.documents import comparison_document
+from fg_calib.report.compare import comparison_document, format_comparison
 from fg_calib.robot.kinematics import pose
 
 TOLERANCE = {"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3}

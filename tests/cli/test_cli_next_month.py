@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 from simulated import true_robot
 from typer.testing import CliRunner
 
-from fg_calib import History, history_of, read_result, write_robot
 from fg_calib.cli import entry
+from fg_calib.io import read_result, write_robot
 from fg_calib.io.csv_writer import write_csv
-from fg_calib.report.history import draw_history
 
 
 def run(*words):
@@ -82,34 +81,6 @@ def test_a_slip_fails_is_named_and_is_mended_by_an_update(place):
     assert read_result(place / "second").options == read_result(place / "result").options
 
 
-@pytest.mark.slow
-def test_a_history_outlives_the_older_folders(place, tmp_path):
-    first = shutil.copytree(place / "result", tmp_path / "first")
-    assert run("update", first, place / "healthy.csv", "--out", tmp_path / "second")[0] == 0
-    shutil.rmtree(first)
-    assert run("update", tmp_path / "second", place / "slipped.csv", "--changed", "theta3", "--out",
-               tmp_path / "third")[0] == 0  # fmt: skip
-    shutil.rmtree(tmp_path / "second")
-    code, out = run("history", tmp_path / "third", "--figures", "--json")
-    runs = json.loads(out)["runs"]
-    assert code == 0
-    assert [one["n_residuals"] for one in runs] == [180, 48, 60]
-    assert runs[2]["moved"]["name"] == "theta3"
-    assert (tmp_path / "third" / "history.svg").read_text().startswith("<?xml")
-    assert (tmp_path / "third" / "history.png").stat().st_size > 0
-    assert "3 runs" in run("history", tmp_path / "third")[1]
-
-
-@pytest.mark.slow
-def test_runs_whose_dates_say_no_order_are_numbered(place):
-    """Of one date, or of one that is earlier: whole numbers from 1, as nothing is between runs."""
-    (run,) = history_of(place / "result").runs
-    later = run.model_copy(update={"date": "2000-01-01"})
-    axes = draw_history(History(robot="arm", runs=[run, later, run])).axes[0]
-    assert axes.get_xlabel() == "run"
-    assert [label.get_text() for label in axes.get_xticklabels()] == ["1", "2", "3"]
-
-
 def test_a_job_may_stand_in_place_of_a_table(place):
     job = yaml.safe_load((place / "job.yaml").read_text()) | {"measurements": "healthy.csv"}
     (place / "healthy.yaml").write_text(yaml.safe_dump(job))
@@ -163,44 +134,12 @@ def test_a_result_that_is_not_to_be_trusted_is_refused(place, tmp_path):
     assert "it wobbles" in message
 
 
-@pytest.mark.slow
-def test_an_older_result_is_checked_by_a_job_and_not_updated(place, tmp_path):
-    folder = changed_result(place, tmp_path, lambda d: d.pop("carried"))
-    assert "a job that names the table" in run("check", folder, place / "healthy.csv")[1]
-    job = yaml.safe_load((place / "job.yaml").read_text()) | {"measurements": "healthy.csv"}
-    (place / "by job.yaml").write_text(yaml.safe_dump(job))
-    assert run("check", folder, place / "by job.yaml")[0] == 0
-    code, message = run("update", folder, place / "by job.yaml", "--out", tmp_path / "new")
-    assert code == 1
-    assert "does not hold what its rows say" in message
-
-
 @pytest.mark.parametrize("job", [{"units": 5}, {"measurements": 5}, {"measurements": [{"model": "pose"}]}], ids=str)
 def test_a_damaged_job_is_told_of(place, tmp_path, job):
     folder = changed_result(place, tmp_path, lambda d: d["carried"].update(job=job))
     code, message = run("check", folder, place / "healthy.csv")
     assert (code, message.count("\n")) == (1, 0)
     assert "carried: job" in message
-
-
-def test_a_damaged_history_is_told_of(place, tmp_path):
-    folder = shutil.copytree(place / "result", tmp_path / "copy")
-    for text, expected in (
-        ("{", "not JSON"),
-        ("{}", "no history"),
-        ('{"schema": "fg-calib/history/1"}', "history.json"),
-    ):
-        (folder / "history.json").write_text(text)
-        code, message = run("history", folder)
-        assert (code, expected in message) == (1, True)
-
-
-def test_a_result_whose_date_is_none_is_refused(place, tmp_path):
-    folder = changed_result(place, tmp_path, lambda d: d.update(date="last May"))
-    code, message = run("update", folder, place / "healthy.csv", "--out", tmp_path / "new")
-    assert code == 1
-    assert "result.json: date" in message
-    assert "\n" not in message
 
 
 @pytest.mark.slow
@@ -221,12 +160,3 @@ def test_another_robots_job_is_refused(place, tmp_path):
     code, message = run("check", place / "result", tmp_path / "job.yaml")
     assert code == 1
     assert "that of the result, ur5e" in message
-
-
-def test_a_posterior_that_is_infinite_is_refused(place, tmp_path):
-    """Check ended in a traceback, and update went on."""
-    folder = changed_result(place, tmp_path, lambda d: d["posterior"]["covariance"][0].__setitem__(0, float("inf")))
-    for words in (["check"], ["update", "--out", tmp_path / "new"]):
-        code, message = run(words[0], folder, place / "healthy.csv", *words[1:])
-        assert code == 1
-        assert "posterior: figures that are not finite" in message

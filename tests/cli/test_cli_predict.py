@@ -6,12 +6,9 @@ import re
 import numpy as np
 import polars as pl
 import pytest
-from schemas import without_defaults
 from simulated import measure, small_arm, true_robot
 
-import fg_calib as package
 from fg_calib import Calibration, calibrate
-from fg_calib.io.prediction import Prediction, prediction_schema
 from fg_calib.prediction import prediction
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
@@ -63,7 +60,7 @@ def test_configurations_in_their_units_get_a_row_each(result, fg_calib, tmp_path
     )
     assert written.select("x", "y", "z").to_numpy() == pytest.approx(poses.position, abs=1e-12)
     assert sorted(file.name for file in out.iterdir()) == ["predict.csv", "predict.json"]
-    assert Prediction.model_validate(json.loads((out / "predict.json").read_text())).n == 3
+    assert json.loads((out / "predict.json").read_text())["n"] == 3
 
 
 @pytest.mark.slow
@@ -152,10 +149,3 @@ def test_a_place_that_is_a_file_is_refused_before_anything_is_worked_out(result,
     ended = fg_calib("predict", result, "--out", tmp_path / "out")
     assert (ended.code, ended.out) == (1, "")
     assert ended.err == f"error: {tmp_path / 'out'}: cannot be written: File exists, expected a folder that can be\n"
-
-
-def test_the_schema_that_is_shipped_is_the_models():
-    """To write it anew: `json.dumps(prediction_schema(), indent=1)`."""
-    file = package.files.result.__file__.replace("result.py", "predict.schema.json")
-    with open(file) as shipped:
-        assert without_defaults(json.load(shipped)) == without_defaults(prediction_schema())

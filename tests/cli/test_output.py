@@ -3,17 +3,14 @@
 import csv
 import json
 import os
-import resource
-import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 import fg_calib
-from fg_calib import Calibration, InputError, cli
+from fg_calib import Calibration, InputError
 from fg_calib.errors import escaped
 
 STEERING = "\x1b[31m\x07\b\x9b2J\x7f\u202e\u2066[/red]"
@@ -167,19 +164,6 @@ def run(arguments, **options):
     return ended.returncode, ended.stdout, ended.stderr
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("closed", [(1,), (2,), (0, 1, 2)])
-def test_closed_streams_are_no_traceback_and_lose_no_result(example, closed):
-    def close():
-        for stream in closed:
-            os.close(stream)
-
-    out = example / "result"
-    code, _, err = run(["calibrate", example / "calibration.yaml", "--out", out], preexec_fn=close)
-    assert (code, err) == (0, "")
-    assert fg_calib.read_result(out).trustworthy
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("command", ["calibrate", "compare", "observe"])
 @pytest.mark.parametrize("stdout", ["/dev/full", "closed pipe"])
@@ -197,127 +181,3 @@ def test_a_report_that_nobody_takes_loses_no_result(example, command, stdout):
     full = "error: the output cannot be written: No space left on device\n"
     assert (code, err) == ((1, full) if stdout == "/dev/full" else (141, ""))
     assert list((example / "out").glob("*.json"))
-
-
-@pytest.mark.long
-def test_a_limit_on_the_size_of_files_is_one_line_after_the_report(example, monkeypatch):
-    def limit():
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
-
-    job = example / "calibration.yaml"
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(example / "cache"))  # which cannot be written either
-    out = example / "result"
-    code, shown, err = run(["calibrate", job, "--out", out], preexec_fn=limit)
-    *notice, error = err.splitlines()
-    assert (code, error) == (1, f"error: {out}/robot_calibrated.yaml: cannot be written: File too large")
-    assert notice == ["compiling the kernels: some seconds, once an installation"]
-    assert "GOOD: converged" in shown
-    assert not out.exists()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("megabytes", [600, 1000, 1400, 2000])
-@pytest.mark.parametrize(("option", "kind"), [("-v", "RLIMIT_AS"), ("-d", "RLIMIT_DATA")])
-def test_a_limit_on_memory_is_one_line(example, megabytes, option, kind):
-    def limit():
-        resource.setrlimit(getattr(resource, kind), (megabytes * 2**20,) * 2)
-
-    ended = run(["calibrate", example / "calibration.yaml"], preexec_fn=limit)
-    expected = f"error: memory: limited to {megabytes} MB, expected at least 2048 MB; see `ulimit {option}`\n"
-    assert ended == (1, "", expected)
-
-
-@pytest.mark.slow
-def test_a_limit_on_open_files_is_one_line(example):
-    def limit():
-        resource.setrlimit(resource.RLIMIT_NOFILE, (20, 20))
-
-    ended = run(["calibrate", example / "calibration.yaml"], preexec_fn=limit)
-    assert ended == (1, "", "error: open files: limited to 20, expected at least 32; see `ulimit -n`\n")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "value", "widest"),
-    [("TERMINAL_WIDTH", "abc", 100), ("COLUMNS", "0", 40), ("COLUMNS", "99999999", 1000), ("COLUMNS", "wide", 100)],
-)
-def test_the_width_of_a_page_is_one_that_pages_have(monkeypatch, name, value, widest):
-    monkeypatch.setenv(name, value)
-    code, shown, err = run(["calibrate", "--help"])
-    assert (code, err) == (0, "")
-    assert "Usage: fg-calib" in shown
-    assert max(map(len, shown.splitlines())) <= widest
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seconds", [0.02, 0.1, 0.2, 0.3, 0.4])
-def test_an_interrupt_is_silent_while_libraries_are_loaded_too(example, seconds):
-    command = [sys.executable, "-c", "import fg_calib.cli as c; print('.', flush=True); c.main()", "calibrate"]
-    with subprocess.Popen(
-        [*command, str(example / "calibration.yaml")], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout.readline() == ".\n"
-        with pytest.raises(subprocess.TimeoutExpired):
-            process.wait(seconds)
-        process.send_signal(signal.SIGINT)
-        shown, err = process.communicate()
-    assert (process.returncode, shown, err) == (-signal.SIGINT, "", "")
-
-
-@pytest.mark.slow
-def test_an_interrupt_ends_a_command_that_has_read_its_tables():
-    """polars listens to interrupts from when it is loaded."""
-    script = """
-import os, signal, sys
-import fg_calib.cli as c
-import fg_calib.cli.entry as entry
-def run():
-    import polars
-    print(".", flush=True)
-    os.kill(os.getpid(), signal.SIGINT)
-    print("still here")
-entry.run = run
-c.main()
-"""
-    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (-signal.SIGINT, ".\n", "")
-
-
-def test_the_command_leaves_interrupts_as_they_were(fg_calib):
-    before = signal.getsignal(signal.SIGINT)
-    assert fg_calib("--version").code == 0
-    assert signal.getsignal(signal.SIGINT) is before
-
-
-@pytest.mark.parametrize(
-    ("edit", "message"),
-    [
-        (
-            ("random: {count: 25}", "random: {count: 1000000000}"),
-            "configurations: random: count: found 1000000000, expected a number not above 1e+06",
-        ),
-        (
-            (
-                "random: {count: 25}",
-                "board: {pose: {x: 1}, count: 1000000000, height: 0.5, radius: 0.5, roll: random, self_motion: random}",
-            ),
-            "configurations: board: count: found 1000000000, expected a number not above 1e+06",
-        ),
-    ],
-)
-def test_a_scenario_of_any_size_is_refused_at_once(fg_calib, folder, tmp_path, edit, message):
-    scenario = folder / "large.yaml"
-    scenario.write_text(SCENARIO.replace(*edit))
-    ended = fg_calib("simulate", scenario, "--out", tmp_path / "out")
-    assert ended == (1, "", f"error: large.yaml: {message}\n")
-
-
-def test_a_robot_of_any_size_is_refused_at_once(fg_calib, tmp_path):
-    robot = tmp_path / "robot.yaml"
-    joints = "".join("- {a: 0.1, alpha: 0, d: 0, theta: 0}\n" for _ in range(201))
-    robot.write_text(f"name: long\nconvention: dh\nunits: {{length: m, angle: deg}}\njoints:\n{joints}")
-    assert fg_calib("observe", robot) == (1, "", "error: robot.yaml: 201 joints, expected at most 200\n")
-
-
-def test_examples_are_where_they_were():
-    assert (Path(cli.EXAMPLES) / "space-robot" / "calibration.yaml").is_file()

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from reported import format_report
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 from simulated import measure, plus, small_arm, true_robot, write_job
@@ -21,7 +22,6 @@ from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.measurements.table import Table
 from fg_calib.options import Pairing
-from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import pose
 from fg_calib.statistics.variance_components import estimate_noise
 

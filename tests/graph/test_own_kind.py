@@ -6,6 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 import scipy.optimize
+from reported import format_report, result_document
 from scipy.stats import chi2
 from simulated import measure, small_arm, true_robot
 
@@ -22,9 +23,7 @@ from fg_calib.measurements.kinds.pair import Distance
 from fg_calib.measurements.table import CustomMeasurements, Table
 from fg_calib.observability.reasons import NOT_EXCITED
 from fg_calib.options import Options
-from fg_calib.report.comparison import format_comparison
-from fg_calib.report.documents import result_document
-from fg_calib.report.text import format_report
+from fg_calib.report.compare import format_comparison
 from fg_calib.robot.kinematics import pose
 
 
@@ -206,7 +205,7 @@ def test_its_rows_are_in_its_unit_and_in_no_other(tmp_path):
     result = calibrate(robot, replace(table, own=(replace(table.own[0], kind=AnchorTurns()),)))
     result.save(tmp_path)
     assert set(pl.read_csv(tmp_path / "residuals.csv")["unit"]) == {"rad"}
-    size = np.degrees(result.residuals.rms()["train"]["anchor"]["after"])
+    size = np.degrees(result.assessment.fit.residuals.rms()["train"]["anchor"]["after"])
     for calibration in (result, Calibration.load(tmp_path)):
         assert f"-> {size:.3g} deg" in repr(calibration)
 

@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 import pytest
 from oracle import central_differences
+from reported import format_report
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, small_arm
 from sparing import diagonal
@@ -23,7 +24,6 @@ from fg_calib.io.csv_writer import write_csv
 from fg_calib.io.robot_file import write_robot
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.observability.identifiability import observe_structure
-from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import pose
 
 BASE = [name.replace("tool", "base") for name in TOOL]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from oracle import central_differences, tool_pose
+from reported import format_report, result_document
 from scipy.optimize import least_squares, minimize
 from scipy.stats import chi2
 from simulated import small_arm, true_robot
@@ -28,8 +29,6 @@ from fg_calib.graph.solver import solve
 from fg_calib.io.tables import read_measurements
 from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Groups, Noise, Pairs, no_pairs
-from fg_calib.report.documents import result_document
-from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import pose
 from fg_calib.statistics.variance_components import estimate_noise
 

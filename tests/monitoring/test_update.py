@@ -40,7 +40,7 @@ def test_an_update_is_a_calibration_of_all_rows(unknown, model, gauge):
     off, of_sigma = difference(updated, calibrate(robot, [old, new], gauge=gauge))
     assert off < 1e-6
     assert of_sigma < 1e-6
-    assert updated.result.options["gauge"] == gauge
+    assert updated.result.options.gauge == gauge
 
 
 @pytest.mark.parametrize("unknown", [False, True])
@@ -192,7 +192,7 @@ def test_an_update_says_what_it_came_from():
     calibration, true, rng = calibrated(8)
     updated = calibration.update(measured(true, 6, rng), date="2026-12-24")
     assert updated.result.date.startswith("2026-12-24")
-    assert updated.result.previous.date == calibration.result.date
+    assert [run.date for run in updated.runs] == [calibration.result.date, updated.result.date]
     assert updated.result.parameters[10].nominal == calibration.result.parameters[10].nominal
     assert updated.result.n_residuals == 36
 

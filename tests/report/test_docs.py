@@ -38,8 +38,6 @@ from fg_calib import (
 from fg_calib.cli import EXAMPLES
 from fg_calib.cli.entry import app
 from fg_calib.importers.calibration_board import read_calibration_board
-from fg_calib.io.result import Result
-from fg_calib.report.guide import TOPICS, read_page
 from fg_calib.robot.kinematics import pose
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -360,13 +358,6 @@ def calibrates_many(code, folder, fg_calib):
     assert reason == "other.yaml: missing key 'model'"
 
 
-def sums_parts(code, folder, fg_calib):
-    assert fg_calib("example", "space-robot", "--out", folder).code == 0
-    drawn, found = run_python(folder, code).splitlines()
-    assert drawn == "52 positions, RMS 15.74 mm"
-    assert found == "52 positions, RMS 1.72 mm"
-
-
 def slow(function, mark=pytest.mark.slow):
     return pytest.param(function, marks=mark)
 
@@ -384,8 +375,7 @@ HOW = {
     "export": [are_typed, exports_an_arm],
     "next-month": [are_typed, slow(checks_and_updates)],
     "observability": [is_printed],
-    "many-jobs": [are_typed, slow(names_each_job), slow(calibrates_many), are_typed,
-                  slow(sums_parts)],
+    "many-jobs": [are_typed, slow(names_each_job), slow(calibrates_many)],
     "simulate": [slow(are_run), is_scenario, are_configurations, slow(draws_candidates),
                  slow(is_scenario, pytest.mark.long)],
     "compare": [slow(is_printed)],
@@ -474,7 +464,6 @@ def names_of_commands():
 
 
 NAMES = {
-    "keys of result.json": [f.alias or name for name, f in Result.model_fields.items()],
     "functions": [name for name in package.__all__ if name.islower()],
     "options": [*names_of_commands()],
     "commands": [*COMMANDS],
@@ -487,47 +476,10 @@ def test_the_pages_name_all_that_a_user_may_meet(what):
     assert [name for name in NAMES[what] if name not in words] == []
 
 
-def test_every_page_is_a_topic_and_stands_in_the_readme():
-    assert set(TOPICS) == set(PAGES) - {"README"}
-    linked = re.findall(r"^- \[[^]]*\]\(docs/([\w-]+)\.md\): ", PAGES["README"].read_text(), flags=re.M)
-    assert linked == list(TOPICS)
-
-
 @pytest.mark.parametrize("page", PAGES)
 def test_links_lead_somewhere(page):
     for link in re.findall(r"\]\((?!http)([^)#]+)\)", PAGES[page].read_text()):
         assert (PAGES[page].parent / link).exists(), link
-
-
-@pytest.mark.parametrize("page", [page for page in TOPICS if page not in GENERATED])
-def test_lines_fit_a_terminal_of_100_columns(page):
-    assert [line for line in PAGES[page].read_text().splitlines() if len(line) > 100 and line[0] != "|"] == []
-
-
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("page", [page for page in TOPICS if page not in GENERATED])
-def test_help_shows_the_page_of_a_topic(page, fg_calib, monkeypatch):
-    """Also where the package is installed without its checkout: its own copy is then what is tested here."""
-    monkeypatch.setenv("COLUMNS", "100")
-    assert read_page(page) == PAGES[page].read_text()
-    ended = fg_calib("help", page)
-    assert (ended.code, ended.err) == (0, "")
-    assert max(map(len, ended.out.splitlines())) <= 100
-    assert "\x1b" not in ended.out
-    title, *_ = PAGES[page].read_text().splitlines()
-    assert title.removeprefix("# ") in ended.out
-    for _, text in snippets(page):
-        assert all(" ".join(line.split()) in " ".join(ended.out.split()) for line in text.splitlines())
-    assert fg_calib("help", page, "--markdown").out == PAGES[page].read_text()
-
-
-def test_an_installed_package_has_its_pages(tmp_path, monkeypatch):
-    monkeypatch.setattr("fg_calib.report.guide._PACKAGE", tmp_path)
-    (tmp_path / "docs").mkdir()
-    (tmp_path / "docs" / "tutorial.md").write_text("# Of the package\n")
-    assert read_page("tutorial") == "# Of the package\n"
-    wheel = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
-    assert wheel["force-include"] == {"docs": "fg_calib/docs"}
 
 
 def test_the_commands_that_are_checked_are_the_readmes():

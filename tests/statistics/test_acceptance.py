@@ -35,7 +35,7 @@ def test_without_limits_nothing_is_judged():
 def test_limits_are_judged_by_the_rms_of_the_test_rows():
     result = calibrated(accept={"position": 5e-4, "orientation": 5e-4})
     one = result.result.acceptance.judgements[0]
-    table = result.residuals
+    table = result.assessment.fit.residuals
     rows = (table.reason_code == 0) & table.test & np.char.startswith(table.kind, "position")
     assert one.error == pytest.approx(np.sqrt(np.sum(table.after[rows] ** 2) / 20), rel=1e-12)
     assert one.noise == pytest.approx(np.sqrt(np.sum(table.sigma[rows] ** 2) / 20), rel=1e-12)
@@ -209,12 +209,11 @@ def test_rows_whose_prediction_nothing_determines_are_not_held_out():
     )
     m = replace(m, test=np.arange(60) >= 40)
     result = calibrate(robot, m, model="position", gauge="none", accept={"position": 1e-3})
-    assert result.residuals.reason[result.residuals.test].tolist() == (
-        [""] * 30 + ["depends on what is not determined"] * 30
-    )
+    table = result.assessment.fit.residuals
+    assert table.reason[table.test].tolist() == ([""] * 30 + ["depends on what is not determined"] * 30)
     (one,) = result.result.acceptance.judgements
     assert (one.n, one.verdict) == (10, "pass")
-    assert one.error == pytest.approx(result.residuals.rms()["test"]["position"]["after"], rel=1e-12)
+    assert one.error == pytest.approx(result.assessment.fit.residuals.rms()["test"]["position"]["after"], rel=1e-12)
 
 
 def test_many_rows_of_one_table_do_not_make_up_for_those_of_another():

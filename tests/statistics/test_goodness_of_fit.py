@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from reported import format_report, result_document
 from scipy.linalg import block_diag
 from scipy.stats import kstest
 from simulated import measure, plus, small_arm, true_robot
@@ -24,8 +25,6 @@ from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Pairs
 from fg_calib.measurements.table import Table
 from fg_calib.options import Pairing
-from fg_calib.report.documents import result_document
-from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.rotations import rotation_angle
 from fg_calib.statistics import goodness_of_fit as goodness_module

@@ -8,6 +8,7 @@ import pytest
 import scipy.linalg
 import scipy.sparse
 from instruments import measured_by
+from reported import format_report
 from scipy.stats import beta
 from simulated import measure, plus, small_arm, true_robot, write_job
 from sparing import diagonal
@@ -17,7 +18,6 @@ from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.options import Pairing
-from fg_calib.report.text import format_report
 from fg_calib.statistics.gross_errors import find_gross_errors, log_chance
 from fg_calib.statistics.residual_covariance import Errors
 

@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 from dense import dense
+from reported import format_report, result_document
 from scipy.optimize import minimize
 from scipy.stats import chi2, kstest
 from simulated import measure, small_arm, true_robot
@@ -24,8 +25,6 @@ from fg_calib.graph.solver import solve
 from fg_calib.measurements.dataset import Measurements, Pairs
 from fg_calib.measurements.table import Table
 from fg_calib.options import Pairing
-from fg_calib.report.documents import result_document
-from fg_calib.report.text import format_report
 from fg_calib.robot.kinematics import pose
 from fg_calib.statistics import variance_components as estimation
 from fg_calib.statistics.covariance import spread_of

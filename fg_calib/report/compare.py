@@ -1,0 +1,350 @@
+"""Several results compared: estimators on one job, two calibrations, the runs of a calibration, many jobs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from fg_calib import __version__
+from fg_calib.arguments import checked
+from fg_calib.baseline.comparison import Comparison, Estimate, PoseError, RealErrors
+from fg_calib.diagnostics.verdict import probability
+from fg_calib.errors import InputError
+from fg_calib.io.atomic import fill_folder, write_text
+from fg_calib.io.result import Result, Run
+from fg_calib.report.tables import (
+    SHOWN,
+    WIDTH,
+    figure,
+    in_order,
+    in_words,
+    indented,
+    json_text,
+    line,
+    plain,
+    plain_text,
+    rounded,
+    section,
+    table_of,
+)
+from fg_calib.report.text import summary
+from fg_calib.robot.model import Robot
+
+ESTIMATORS = {
+    "graph": "graph",
+    "graph-keep": "graph kept",
+    "gauss-newton": "plain GN",
+    "weighted-gauss-newton": "weighted GN",
+    "scipy": "scipy",
+}
+"""Headings of the estimators."""
+
+POSE_ERRORS: tuple[tuple[str, str, Callable[[PoseError], float]], ...] = (
+    ("position, max", "m", lambda e: e.max),
+    ("position, mean", "m", lambda e: e.mean),
+    ("position, RMS", "m", lambda e: e.rms),
+    ("orientation, RMS", "rad", lambda e: e.orientation_rms),
+)
+
+INDEPENDENT = (
+    "The sigma of a change assumes independent calibrations; with common priors or measurements it is too small."
+)
+
+
+@checked
+def format_comparison(comparison: Comparison, width: int = WIDTH) -> str:
+    """`build_comparison_report` as plain text."""
+    return plain_text(build_comparison_report(comparison), width)
+
+
+def build_comparison_report(comparison: Comparison) -> RenderableType:
+    """Estimators compared: errors, residuals, effort, then the parameters of each."""
+    job = comparison.job
+    title = f"{job.robot.name}: {job.model}, judged at {comparison.n_judged} {comparison.judged_on} configurations"
+    parts: list[RenderableType] = [line(title)]
+    parts += [line(f"DOUBTFUL: {finding}", "bold red") for finding in comparison.findings]
+    headings = ("", "", "nominal", *(ESTIMATORS[e.name] for e in comparison.estimates))
+    parts += [line(""), table_of(headings, _accuracy(comparison), left="ll")]
+    parts += section("Corrections (± sigma)", _corrections(comparison))
+    estimators = [(f"  {ESTIMATORS[e.name]}", f"{e.description}; {e.message}") for e in comparison.estimates]
+    nominal = ("  nominal", "the arm before the calibration, tool and measurement frame fitted where unknown")
+    parts += section("Estimators", table_of(("", ""), [nominal, *estimators], left="ll", wrap=True))
+    return Group(*parts, *section("Notes", *indented(_comparison_notes(comparison))))
+
+
+def _accuracy(comparison: Comparison) -> Iterator[Sequence[str | Text]]:
+    estimates = comparison.estimates
+    empty = [""] * (len(estimates) + 2)
+
+    def row(label: str, unit: str, values: Iterable[float | None]) -> tuple[str, ...]:
+        factor, shown, decimals = SHOWN[unit]
+        return (f"  {label}", shown, *("-" if v is None else _large(v * factor, decimals - 1) for v in values))
+
+    errors = [comparison.errors_before, *(e.errors for e in estimates)]
+    for heading, chosen in (
+        ("Real error in the base frame", [None if e is None else e.base for e in errors]),
+        ("Real error after the best rigid fit", [None if e is None else e.fitted for e in errors]),
+    ):
+        if any(chosen):
+            yield line(heading, "bold"), *empty
+            for label, unit, value in POSE_ERRORS:
+                yield row(label, unit, [None if e is None else value(e) for e in chosen])
+    yield line("Error predicted by its sigmas", "bold"), *empty
+    yield row("position, RMS", "m", [None, *(e.predicted_rms for e in estimates)])
+    yield row("after best rigid fit", "m", [None, *(e.predicted_fitted_rms for e in estimates)])
+    before = estimates[0].residual_rms or {}
+    for split in ("train", "test"):
+        if before.get(split):
+            yield line(f"Residuals, {split} rows (RMS)", "bold"), *empty
+        for family in in_order(before.get(split, {})):
+            after = [None if e.residual_rms is None else e.residual_rms[split][family]["after"] for e in estimates]
+            yield row(family, comparison.units[family], [before[split][family]["before"], *after])
+    yield line("Effort", "bold"), *empty
+    efforts = [(f"{len(e.sigma)}", f"{e.iterations}", f"{e.seconds * 1e3:.1f}") for e in estimates]
+    for k, (label, unit) in enumerate((("parameters", ""), ("iterations", ""), ("time", "ms"))):
+        yield f"  {label}", unit, "-", *("-" if e.robot is None else efforts[i][k] for i, e in enumerate(estimates))
+    yield "  converged", "", "-", *("yes" if e.converged else "NO" for e in estimates)
+
+
+def _corrections(comparison: Comparison) -> RenderableType:
+    job, rows = comparison.job, []
+    for p in job.robot.parameters:
+        if not p.estimated:
+            continue
+        factor, unit, decimals = SHOWN[p.unit]
+
+        def correction(robot: Robot, name: str = p.name, f: float = factor, d: int = decimals - 1) -> str:
+            return _large(comparison.correction(robot, name) * f, d, "+")
+
+        def cell(e: Estimate, name: str = p.name, f: float = factor, d: int = decimals - 1) -> str:
+            if e.robot is None or name not in e.sigma:
+                return "-" if e.robot is None else "fixed"
+            sigma = e.sigma[name]
+            shown = _large(sigma * f, d) if np.isfinite(sigma) else "unknown"
+            return f"{correction(e.robot, name, f, d)} ±{shown}"
+
+        truth = [] if job.truth is None else [correction(job.truth)]
+        rows.append((p.name, unit, *truth, *map(cell, comparison.estimates)))
+    truth = [] if job.truth is None else ["truth"]
+    headings = ("", "", *truth, *(ESTIMATORS[e.name] for e in comparison.estimates))
+    return table_of(headings, rows, left="ll", wrap=True)
+
+
+def _large(value: float, decimals: int, sign: str = "") -> str:
+    """A value with `decimals`, or in powers of ten where an estimate diverged."""
+    return rounded(value, decimals, sign) if abs(value) < 1e5 else f"{value:{sign}.1e}"
+
+
+def _comparison_notes(comparison: Comparison) -> Iterator[str]:
+    if comparison.judged_on == "train":
+        yield "no test rows: judged at the train configurations, which is optimistic for every estimator"
+    if comparison.errors_before is None:
+        yield "the truth is unknown: no real errors (key truth of a job)"
+    if any(e.robot is not None and len(e.sigma) < len(comparison.estimates[0].sigma) for e in comparison.estimates):
+        yield "where others are fixed a parameter stands for its combination with them: compare errors, not corrections"
+    yield "predicted errors assume that fixed parameters are exact, so they may be too small in the base frame"
+    yield "residuals are of the rows that the graph uses"
+
+
+@checked
+def comparison_document(comparison: Comparison) -> dict[str, Any]:
+    """What `comparison.json` holds: SI, full precision, None for what is unknown or infinite.
+
+        { "schema": "fg-calib/comparison/1", "version", "robot", "model", "frame", "pairing",
+          "judged_on": "test" | "train", "n_judged", "truth_known", "trustworthy", "findings",
+          "nominal": {"residual_rms": {split: {kind: RMS | null}}, "errors": errors | null},
+          "estimates": [{"name": a key of ESTIMATORS, "description", "ran", "converged", "message", "iterations",
+                         "seconds", "n_estimated", "residual_rms": as above | null, "predicted_position_rms",
+                         "predicted_position_rms_fitted", "errors": errors | null,
+                         "parameters": [{"name", "unit", "nominal", "true", "estimate", "correction", "sigma",
+                                         "held"}]}],
+          "inputs": {path: sha256} }
+
+    with errors = {"base_frame": figures, "best_rigid_fit": figures | null} and figures = {"max", "mean", "rms",
+    "orientation_rms"}. Parameters are those that the job estimates; those that an estimator held at nominal are not
+    thereby known, so their sigma is None. "parameters" is empty where it did not run.
+    """
+    job, first = comparison.job, comparison.estimates[0]
+    of_pairs = next((table for table in job.tables if table.uses_pairs), None)
+    measured = of_pairs is not None and of_pairs.measurements.pairs is not None
+    pairing = "measured" if measured else None if of_pairs is None else str(of_pairs.pairing)
+    unknown = any(table.unknown_frame for table in job.tables)
+    document = {
+        "schema": "fg-calib/comparison/1",
+        "version": __version__,
+        "robot": job.robot.name,
+        "model": job.model,
+        "frame": "unknown" if unknown else job.tables[0].frame,
+        "pairing": pairing,
+        "judged_on": comparison.judged_on,
+        "n_judged": comparison.n_judged,
+        "truth_known": job.truth is not None,
+        "trustworthy": comparison.trustworthy,
+        "findings": list(comparison.findings),
+        "nominal": {
+            "residual_rms": _rms(first, "before"),
+            "errors": _errors(comparison.errors_before),
+        },
+        "estimates": [
+            {
+                "name": e.name,
+                "description": e.description,
+                "ran": e.robot is not None,
+                "converged": e.converged,
+                "message": e.message,
+                "iterations": e.iterations,
+                "seconds": e.seconds,
+                "n_estimated": len(e.sigma),
+                "residual_rms": _rms(e, "after"),
+                "predicted_position_rms": e.predicted_rms,
+                "predicted_position_rms_fitted": e.predicted_fitted_rms,
+                "errors": _errors(e.errors),
+                "parameters": _estimated(comparison, e),
+            }
+            for e in comparison.estimates
+        ],
+        "inputs": job.inputs,
+    }
+    found: dict[str, Any] = plain(document)
+    return found
+
+
+def _rms(estimate: Estimate, when: str) -> dict[str, dict[str, float | None]] | None:
+    """RMS by split and kind."""
+    rms = estimate.residual_rms
+    if rms is None:
+        return None
+    kinds = list(dict.fromkeys(("position", "orientation", "distance", "angle", *rms["train"], *rms["test"])))
+    return {split: {kind: rms[split].get(kind, {}).get(when) for kind in kinds} for split in ("train", "test")}
+
+
+def _errors(errors: RealErrors | None) -> dict[str, Any] | None:
+    if errors is None:
+        return None
+    fitted = None if errors.fitted is None else asdict(errors.fitted)
+    return {"base_frame": asdict(errors.base), "best_rigid_fit": fitted}
+
+
+def _estimated(comparison: Comparison, estimate: Estimate) -> list[dict[str, Any]]:
+    job, robot = comparison.job, estimate.robot
+    if robot is None:
+        return []
+    return [
+        {
+            "name": p.name,
+            "unit": p.unit,
+            "nominal": p.nominal,
+            "true": None if job.truth is None else job.truth.parameters[i].nominal,
+            "estimate": robot.parameters[i].nominal,
+            "correction": comparison.correction(robot, p.name),
+            "sigma": estimate.sigma.get(p.name),
+            "held": p.name not in estimate.sigma,
+        }
+        for i, p in enumerate(job.robot.parameters)
+        if p.estimated
+    ]
+
+
+@checked
+def write_comparison(folder: Path | str, comparison: Comparison) -> None:
+    """Write `comparison.json` into a folder.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    own = {"comparison.json": b'{\n "schema": "fg-calib/comparison/'}
+    text = json_text(comparison_document(comparison))
+    fill_folder(Path(folder), lambda into: write_text(into / "comparison.json", text), own)
+
+
+def changes(old: Result, new: Result) -> list[dict[str, Any]]:
+    """The parameters that one of two calibrations estimated: old, new, change, its sigma, and both over each other.
+
+    Raises:
+        InputError: They are of different robots.
+    """
+    if [p.name for p in old.parameters] != [p.name for p in new.parameters]:
+        raise InputError(new.robot, "other parameters", f"those of {old.robot}")
+    rows = []
+    for a, b in zip(old.parameters, new.parameters, strict=True):
+        if a.identifiability == b.identifiability == "fixed":
+            continue
+        change = b.estimate - a.estimate
+        if b.unit == "rad":
+            change -= 2.0 * np.pi * round(change / (2.0 * np.pi))
+        sigma = None if a.sigma is None or b.sigma is None else float(np.hypot(a.sigma, b.sigma))
+        values = {"old": a.estimate, "new": b.estimate, "change": change, "sigma": sigma}
+        rows.append({"name": b.name, "unit": b.unit, **values, "in_sigma": change / sigma if sigma else None})
+    return rows
+
+
+def changes_document(old: Result, new: Result, folders: tuple[Path, Path]) -> dict[str, Any]:
+    """Two calibrations for programs, in [m] and [rad].
+
+    { "schema": "fg-calib/changes/1", "old": folder, "new": folder,
+      "parameters": [{"name", "unit", "old", "new", "change", "sigma", "in_sigma"}] }
+    """
+    named = {"old": str(folders[0]), "new": str(folders[1])}
+    return {"schema": "fg-calib/changes/1", **named, "parameters": changes(old, new)}
+
+
+def build_changes_report(old: Result, new: Result, folders: tuple[Path, Path]) -> RenderableType:
+    """Two calibrations for the terminal."""
+    parts: list[RenderableType] = []
+    for name, result, folder in (("OLD", old, folders[0]), ("NEW", new, folders[1])):
+        parts += [line(f"{name}  {folder}", "bold"), *indented(summary(result)), line("")]
+    rms = [
+        (kind, split, *(in_words(result.rms_after(split).get(kind), result.unit_of(kind)) for result in (old, new)))
+        for split in ("test", "train")
+        for kind in dict.fromkeys((*old.rms_after(split), *new.rms_after(split)))
+    ]
+    parts += section("Residuals after the calibration (RMS)", table_of(("", "rows", "old", "new"), rms, left="ll"))
+    rows = []
+    for one in changes(old, new):
+        values = (figure(one[key], one["unit"]) for key in ("old", "new"))
+        change, sigma = figure(one["change"], one["unit"], "+"), figure(one["sigma"], one["unit"])
+        z = "" if one["in_sigma"] is None else f"{one['in_sigma']:+z.1f}"
+        rows.append((one["name"], SHOWN[one["unit"]][1], *values, change, sigma, z))
+    table = table_of(("", "", "old", "new", "change", "sigma of it", "in sigma"), rows, left="ll")
+    return Group(*parts, *section("Parameters", table), *indented([INDEPENDENT]))
+
+
+def _largest_change(before: Run, run: Run) -> dict[str, Any] | None:
+    """The parameter that changed most from one run to the next, in the sigma that it had before."""
+    found: list[dict[str, Any]] = []
+    for name, (estimate, _, unit) in run.parameters.items():
+        if name in before.parameters:
+            then, sigma, _ = before.parameters[name]
+            change = estimate - then
+            in_sigma = abs(change) / sigma if sigma else None
+            found.append({"name": name, "unit": unit, "change": change, "in_sigma": in_sigma})
+    return max(found, key=lambda one: one["in_sigma"] or -1.0, default=None)
+
+
+def history_document(robot: str, runs: Sequence[Run]) -> dict[str, Any]:
+    """The runs of a calibration for programs, in [m] and [rad]."""
+    moved = [None, *(_largest_change(*both) for both in pairwise(runs))]
+    listed = [run.model_dump(mode="json") | {"moved": most} for run, most in zip(runs, moved, strict=True)]
+    return {"schema": "fg-calib/history/1", "robot": robot, "runs": listed}
+
+
+def build_history(robot: str, runs: Sequence[Run]) -> RenderableType:
+    """The runs of a calibration for the terminal."""
+    rows = []
+    for run, one in zip(runs, history_document(robot, runs)["runs"], strict=True):
+        p, most = "" if run.p_value is None else probability(run.p_value), ("", "", "")
+        if moved := one["moved"]:
+            sigmas = "unknown" if moved["in_sigma"] is None else f"{moved['in_sigma']:.1f}"
+            change = f"{figure(moved['change'], moved['unit'], '+')} {SHOWN[moved['unit']][1]}"
+            most = moved["name"], change, sigmas
+        rows.append((run.date[:10], f"{run.n_residuals}", f"{run.chi2:.6g}", f"{run.dof}", p, run.verdict, *most))
+    headings = ("date", "residuals", "chi-square", "of", "p-value", "", "changed most", "by", "in sigma")
+    title = line(f"{robot}: {len(runs)} run{'s' * (len(runs) > 1)}", "bold")
+    return Group(title, *section("Runs", table_of(headings, rows, left="lrrrrllrr")))

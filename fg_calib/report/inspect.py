@@ -1,0 +1,309 @@
+"""Reports before a calibration: what a model can identify, and what a job holds."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter
+from rich.console import Group, RenderableType
+
+from fg_calib import __version__
+from fg_calib.arguments import checked
+from fg_calib.diagnostics.inspection import Inspection
+from fg_calib.diagnostics.linearity import NEAR_SIGMAS
+from fg_calib.diagnostics.nominal_residuals import MAX_ROWS
+from fg_calib.diagnostics.setup_check import SetupCheck
+from fg_calib.io.atomic import fill_folder, write_text
+from fg_calib.io.result import Observability as Document
+from fg_calib.io.result import in_words as table_in_words
+from fg_calib.job import Job
+from fg_calib.observability.identifiability import Identifiability
+from fg_calib.observability.indices import CORRELATED, Observability
+from fg_calib.report.charts import write_charts
+from fg_calib.report.figures import draw_observability
+from fg_calib.report.tables import (
+    SHOWN,
+    WEAK,
+    WIDTH,
+    figure,
+    indented,
+    line,
+    lost_directions,
+    plain_text,
+    section,
+    table_of,
+    unit_of,
+    weak_directions,
+)
+from fg_calib.report.text import expected_tool_error
+from fg_calib.statistics.robust_screening import Disagreements
+
+FILES = {
+    "observability.json": b'{\n "schema": "fg-calib/observability/',
+    **dict.fromkeys(("singular_values.svg", "groups.svg", "correlations.svg"), b"<svg"),
+}
+"""The files that `write_observability` may write, and how each begins."""
+
+
+@checked
+def observability_document(found: Identifiability) -> dict[str, Any]:
+    """The content of `observability.json`."""
+    document: dict[str, Any] = json.loads(TypeAdapter(Document).dump_json(found))
+    return document
+
+
+@checked
+def write_observability(folder: Path | str, found: Identifiability) -> None:
+    """Write `observability.json` and its figures into a folder, all of them or none.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+
+    def write(into: Path) -> None:
+        write_text(into / "observability.json", json.dumps(observability_document(found), indent=1) + "\n")
+        write_charts(into, draw_observability(found))
+
+    fill_folder(Path(folder), write, FILES)
+
+
+@checked
+def format_identifiability(found: Identifiability, width: int = WIDTH) -> str:
+    """`build_identifiability_report` as plain text."""
+    return plain_text(build_identifiability_report(found), width)
+
+
+def build_identifiability_report(found: Identifiability) -> RenderableType:
+    """What can be identified, as in the paper's Tables 3 and 4, and why the rest cannot."""
+    where = "random configurations" if found.kind == "structural" else "configurations"
+    model = f"{found.model}, as poses of the board" if found.model == "pixels" else found.model
+    title = f"{found.robot}: {model}, {found.kind}, {found.n_configurations} {where}"
+    parts: list[RenderableType] = [line(title, "bold")]
+    parts += (line(f"NOT MODELLED: {m}", "bold red") for m in found.missing)
+    parts += _classes(found)
+    if found.with_fixed_known is not None:
+        parts += section(f"With {', '.join(found.fixed)} known, as the robot's file says")
+        parts += _classes(found.with_fixed_known)
+    return Group(*parts)
+
+
+def _classes(found: Identifiability) -> list[RenderableType]:
+    o = found.observability
+    relations = (f"[{' '.join(relation)}]" for group in o.relative for relation in group.relations)
+    rows = [
+        ("Independent", ", ".join(o.named("independent")) or "None"),
+        ("Relative", ", ".join(relations) or "None"),
+        ("Ineffective", ", ".join(o.named("ineffective")) or "None"),
+        ("Kept", ", ".join(o.kept) or "None"),
+    ]
+    headings = ("Identifiability", "Kinematic parameters")
+    table = table_of(headings, rows, left="ll", wrap=True)
+    glossary = "independent: identifiable alone; relative: only in combination; ineffective: not identifiable"
+    parts: list[RenderableType] = [line(f"rank {o.rank} of {len(o.names)} ({glossary})"), line(""), table]
+    if found.lost:
+        parts += section("Null-space directions", lost_directions(found.lost))
+    practical = found.kind == "practical"
+    parts += section("Singular values" + (" (signal-to-noise ratios)" if practical else ""), *_singular_values(o))
+    if practical:
+        indices = "  ".join(f"{name} {value:.4g}" for name, value in o.indices.items())
+        parts += section("Observability indices", line(f"{indices}  condition number {o.condition_number:.4g}"))
+        weak = weak_directions(o)
+        if weak is not None:
+            parts += section(f"Weak directions ({WEAK})", weak)
+        parts += section("Sigma of the kept parameters, the others at nominal", _sigmas(o))
+        if o.correlations:
+            correlated = (line(f"{a}, {b}: {rho:+.3f}") for a, b, rho in o.correlations)
+            parts += section(f"Correlations above {CORRELATED:g}", *correlated)
+    return parts
+
+
+def _singular_values(o: Observability) -> list[RenderableType]:
+    kept, dropped = o.singular_values[: o.rank], o.singular_values[o.rank :]
+    lines = [" ".join(f"{v:.3g}" for v in kept) or "none"]
+    if len(dropped):
+        lines.append(f"gap of {o.gap:.1e}, then {len(dropped)} of at most {dropped[0]:.1e}")
+    return [line(text) for text in lines]
+
+
+def _sigmas(o: Observability) -> RenderableType:
+    rows = []
+    for name, sigma in o.sigma.items():
+        unit = unit_of(name)
+        groups = [g for g in o.relative if name in g.keep]
+        rows.append((name, figure(sigma, unit), SHOWN[unit][1], " ".join(groups[0].parameters) if groups else ""))
+    return table_of(("", "sigma", "", "stands for"), rows, left="lrll")
+
+
+@checked
+def format_inspection(found: Inspection, job: Job, width: int = WIDTH) -> str:
+    """`build_inspection_report` as plain text."""
+    return plain_text(build_inspection_report(found, job), width)
+
+
+def build_inspection_report(found: Inspection, job: Job) -> RenderableType:
+    """What looks wrong, then what the tables hold and what they can determine."""
+    words = [table_in_words(table) for table in job.tables]
+    if len(words) > 1:
+        words = [f"{table.measurements.source} ({of})" for table, of in zip(job.tables, words, strict=True)]
+    parts: list[RenderableType] = [line(f"{found.robot}: {'; '.join(words)}")]
+    parts += [line(f"LOOK AT THIS FIRST: {finding}", "bold red") for finding in found.findings]
+    if found.ready:
+        what = "nothing speaks against calibrating this job" + ", see the notes" * bool(found.cautions)
+        parts.append(line(f"READY: {what}", "bold green"))
+    if found.evaluated:
+        parts.append(line("all rows are test rows: the arm is evaluated as it is, nothing would be calibrated"))
+    parts += section("Tables", _tables(found), *indented(_excluded_pairs(found)))
+    parts += section("Joint readings", _joints(found))
+    parts += _residuals(found)
+    parts += _disagreements(found.disagreements)
+    parts += _determined(found)
+    weak = weak_directions(found.identifiability.observability)
+    if weak is not None:
+        parts += section(f"Weakly determined ({WEAK})", weak)
+    parts += expected_tool_error(found.expected_error)
+    return Group(*parts, *(section("Notes", *indented(found.cautions)) if found.cautions else []))
+
+
+def _tables(found: Inspection) -> RenderableType:
+    """Counts of each table, without empty columns."""
+    columns = {
+        "rows": [f"{t.n_rows}" for t in found.tables],
+        "configurations": [f"{t.n_configurations}" for t in found.tables],
+        "test rows": [f"{t.n_test or ''}" for t in found.tables],
+        "train pairs": [f"{t.n_pairs or ''}" for t in found.tables],
+        "test pairs": [f"{t.n_test_pairs or ''}" for t in found.tables],
+        "repeats": [f"{t.n_repeats or ''}" for t in found.tables],
+        "near another": [f"{t.n_near or ''}" for t in found.tables],
+        "of": [", ".join(f"{n} {what}{'s' * (n > 1)}" for what, n in t.labels.items()) for t in found.tables],
+        "residuals to fit": [", ".join(f"{n} {kind}" for kind, n in t.n_residuals.items()) for t in found.tables],
+    }
+    there = {heading: cells for heading, cells in columns.items() if any(cells)}
+    left = "l" + "".join("l" if heading in ("of", "residuals to fit") else "r" for heading in there)
+    rows = zip((t.name for t in found.tables), *there.values(), strict=True)
+    return table_of(("", *there), rows, left=left, wrap=True)
+
+
+def _excluded_pairs(found: Inspection) -> Iterator[str]:
+    for t in found.tables:
+        if t.n_near_singular:
+            yield (
+                f"{t.name}: {t.n_near_singular} of {t.n_pairs} train pairs are within {NEAR_SIGMAS:g} sigma of 0 or 180"
+                " degrees, where norms are not differentiable: they tell little"
+            )
+    for reason, n in found.n_excluded.items():
+        yield f"{n} train pairs are excluded: {reason.replace('_', ' ')}"
+
+
+def _joints(found: Inspection) -> RenderableType:
+    rows = []
+    for joint in found.joints:
+        factor, unit, _ = SHOWN[joint.unit]
+        low, high = (f"{v * factor:.1f}" if math.isfinite(v) else "-" for v in joint.limits)
+        used = "" if joint.share is None else f"{100.0 * joint.share:.0f} %"
+        outside = f"outside in {joint.n_outside} configurations" if joint.n_outside else ""
+        words = outside or ("hardly moves" if joint.still else "")
+        ends = (f"{v * factor:z.1f}" for v in (joint.least, joint.most))
+        rows.append((joint.name, *ends, unit, low, high, used, words))
+    return table_of(("", "from", "to", "", "limits", "", "used", ""), rows, left="lrrlrrrl")
+
+
+def _residuals(found: Inspection) -> list[RenderableType]:
+    """Typical residuals before the calibration compared with the ones that noise and priors predict."""
+    rows = []
+    for check in found.setups:
+        for one in check.residuals:
+            values = (f"{v * SHOWN[one.unit][0]:.3g}" for v in (one.size, one.expected))
+            name = f"{one.kind} of {check.table}" if check.table else one.kind
+            rows.append((name, SHOWN[one.unit][1], *values, f"{one.excess:.3g}", _judged(check, one.excess)))
+    table = table_of(("", "", "observed", "predicted", "ratio", ""), rows, left="llrrrl")
+    title = f"Residuals of the nominal arm, frame and tool fitted (median; at most {MAX_ROWS} configurations a table)"
+    return section(title, table) if rows else []
+
+
+def _judged(check: SetupCheck, excess: float) -> str:
+    if check.far:
+        return "far too large" if excess > 1.0 else ""
+    return "as noise and priors allow" if excess <= 2.0 else "larger than predicted, but not by far"
+
+
+def _disagreements(found: Disagreements, limit: int = 5) -> list[RenderableType]:
+    """Rows that disagree with the nominal arm, the farthest first."""
+    rows = []
+    for one in found.found[:limit]:
+        values = (f"{v * SHOWN[one.unit][0]:.3g}" for v in (one.size, one.expected))
+        names = "-".join(one.ends), one.table, one.of, one.kind
+        rows.append((*names, *values, SHOWN[one.unit][1], "test" * one.test))
+    if len(found.found) > limit:
+        rows.append((f"and {len(found.found) - limit} more", *[""] * 7))
+    looked = "" if found.n >= found.of else f" ({found.n} of {found.of} were looked at)"
+    table = table_of(("", "table", "of", "", "off by", "expected", "", ""), rows, left="llllrrll")
+    return section(f"Rows that disagree with the nominal arm{looked}", table) if rows else []
+
+
+def _determined(found: Inspection) -> list[RenderableType]:
+    """Expected rank and classes, and why the rest is not identifiable."""
+    o = found.identifiability.observability
+    classes = [
+        ("independent", ", ".join(o.named("independent")) or "none"),
+        ("only in combination", ", ".join(f"[{' '.join(group.parameters)}]" for group in o.relative)),
+        ("not identifiable", ", ".join(o.named("ineffective"))),
+    ]
+    rows = f"{found.n_residuals} residuals and {found.n_priors} priors on {found.n_unknowns} unknowns"
+    table = table_of(("", ""), [row for row in classes if row[1]], left="ll", wrap=True)
+    title = f"What these rows can determine: {o.rank} of {len(o.names)} parameters"
+    parts = section(title, line(f"{rows}: {found.dof} degrees of freedom"), table)
+    if found.identifiability.lost:
+        parts += section("Not identifiable from these rows", lost_directions(found.identifiability.lost))
+    return parts
+
+
+@checked
+def inspection_document(found: Inspection, job: Job) -> dict[str, Any]:
+    """The content of `fg-calib inspect --json`: SI, null for what is unknown or infinite.
+
+    { "schema": "fg-calib/inspection/1", "version", "robot", "ready", "findings", "cautions", "evaluated",
+      "tables": [the fields of `TableSurvey`],
+      "joints": [{"name", "unit", "least", "most", "limits": [lower | null, upper | null], "share", "still",
+                  "n_outside"}],
+      "residuals": [{"table", "kind", "unit", "size", "expected", "excess", "n"}],
+      "explanations": [{"table", "mistakes"}],
+      "disagreements": {"found": [the fields of `Disagreement`], "n", "of"},
+      "n_residuals", "n_priors", "n_unknowns", "dof", "n_excluded": {reason: count},
+      "observability": as observability.json,
+      "expected_error": {"base": {"position", "orientation"}, "fitted": {...}, "at", "n", "of", "relative"} | null,
+      "inputs": {path: sha256} }
+    """
+    plain = ("robot", "ready", "evaluated", "n_residuals", "n_priors", "n_unknowns", "dof", "n_excluded")
+    residuals = [(check.table, one) for check in found.setups for one in check.residuals]
+    explanations = [(check.table, one) for check in found.setups for one in check.explanations]
+    return {
+        "schema": "fg-calib/inspection/1",
+        "version": __version__,
+        **{key: getattr(found, key) for key in plain},
+        "findings": list(found.findings),
+        "cautions": list(found.cautions),
+        "tables": [asdict(table) for table in found.tables],
+        "joints": [
+            {key: getattr(joint, key) for key in ("name", "unit", "least", "most", "share", "still", "n_outside")}
+            | {"limits": [v if math.isfinite(v) else None for v in joint.limits]}
+            for joint in found.joints
+        ],
+        "residuals": [
+            {"table": table, **{key: getattr(r, key) for key in ("kind", "unit", "size", "expected", "excess", "n")}}
+            for table, r in residuals
+        ],
+        "explanations": [{"table": table, "mistakes": list(one.mistakes)} for table, one in explanations],
+        "disagreements": {
+            "found": [asdict(one) for one in found.disagreements.found],
+            "n": found.disagreements.n,
+            "of": found.disagreements.of,
+        },
+        "observability": observability_document(found.identifiability),
+        "expected_error": None if found.expected_error is None else asdict(found.expected_error),
+        "inputs": job.inputs,
+    }
