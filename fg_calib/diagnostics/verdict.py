@@ -46,9 +46,8 @@ from fg_calib.statistics.goodness_of_fit import (
     GrossErrors,
     PredictedFit,
 )
-from fg_calib.statistics.noise_components import has_joint_noise
 from fg_calib.statistics.prior_consistency import PriorFit
-from fg_calib.statistics.variance_components import LEAST_REDUNDANCY
+from fg_calib.statistics.variance_components import LEAST_REDUNDANCY, has_joint_noise
 
 Floats = NDArray[np.float64]
 Severity = Literal["error", "warning", "note"]

@@ -1,87 +1,196 @@
-"""Noise estimated from the residuals: a factor on the sigmas stated of each origin, iterated with the fit.
+r"""Noise estimated from the residuals: factors on the specified sigmas by restricted maximum likelihood (REML).
 
-Without joint noise the sum of squared residuals over sigma of each table and kind has a known mean (see `goodness`);
-where it is not met, the sigmas of that kind are multiplied by the root of their ratio and everything is solved again,
-until nothing moves: iterated estimates of variance components (Helmert; Foerstner 1979). Where priors hold much of the
-estimate these steps are all too short in the same proportion, so the proportion seen in the last two lengthens the next
-(a secant step in the logarithm of each factor). A kind that the parameters leave too few degrees of freedom keeps its
-stated noise.
+Noise of several origins, each known up to a factor on its sigma, reaches the rows: `C = sum over i of V_i`, with V_i
+what the noise of one table and kind adds, or that of the joint readings, which is one. With J the rows' derivatives, H
+their information with that of the priors, and `P = C^-1 - C^-1 J H^-1 J^T C^-1`, the derivative of the restricted
+log-likelihood in the logarithm of factor i is `q_i - t_i` with
 
-With joint noise there is one more factor, on that, and rows tell of several at once. Then the factors are those of
-restricted maximum likelihood (see `noise_components`). With q_i the square seen of origin i, t_i its mean and T_ij =
-tr(P V_i P V_j), the steps of the logarithms solve `T step = t log(q / t) / 2`: Fisher's scoring near the end, and far
-from it the root of the ratio where there is one origin, or all are off by the same.
+    q_i = r^T P V_i P r,   t_i = tr(P V_i)
 
-What the residuals cannot tell apart keeps what was stated: an origin that `1 / (T^-1)_ii` gives fewer than
-`LEAST_REDUNDANCY` degrees of freedom beside the others, both where it is estimated and where it is as stated with the
-others estimated, unless what was stated is then `UNLIKELY` sigma from what is seen. So noise that is stated but not
-there goes to nothing, and noise too small to be seen, or not to be told from other noise, stays.
+(Patterson and Thompson 1971), and the average of observed and expected information in two of them is 2 a_ij with
+`a_ij = r^T P V_i P V_j P r` (Gilmour, Thompson and Cullis 1995). P r is C^-1 times the residuals at the estimate. Where
+no rows share errors, q is the sum of squares of a kind and t its redundancy. Steps solve `T step = t log(q / t) / 2`
+with `T_ij = a_ij / sqrt(q_i q_j / t_i t_j)`, which does not depend on the size of the noise: the root of the ratio
+where there is one origin, or all are off by the same. The fit is repeated with the new factors until they settle.
+
+What the residuals cannot distinguish keeps its specified noise: an origin that `1 / (T^-1)_ii` gives fewer than
+`LEAST_REDUNDANCY` degrees of freedom next to the others, both where it is estimated and where it is as specified with
+the others estimated, unless what was specified is then `UNLIKELY` sigma from the estimate. So noise that is specified
+but absent goes to nothing, and noise too small to be determined stays.
+
+Where rows are weighted by more than their noise (`RowSet.spare`: C = sum V_i + S), t_i is tr(P V_i) - tr(P V_i P S). A
+row with robust weight w counts as w rows. Noise of formed pairs beyond the first order counts as that of the poses.
+Where measurements that share errors are asked to count as independent, they do here too.
 
 References:
     Foerstner (1979), Ein Verfahren zur Schaetzung von Varianz- und Kovarianzkomponenten. Allgemeine
     Vermessungs-Nachrichten 86.
+    Gilmour, Thompson and Cullis (1995), Average information REML. Biometrics 51.
+    Patterson and Thompson (1971), Recovery of inter-block information when block sizes are unequal. Biometrika 58(3).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from functools import partial
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.sparse
 from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
-from fg_calib.graph.noise import NoiseName
+from fg_calib.graph.information import linear_system
+from fg_calib.graph.noise import JOINT_NOISE, NoiseName, RowNoise
 from fg_calib.graph.problem import Problem, reweighted_at
+from fg_calib.graph.rows import ErrorColumns, Part, block_diagonal, whitener_of
 from fg_calib.graph.solver import Solution, SolverOptions, solve
-from fg_calib.statistics.covariance import spread_of
-from fg_calib.statistics.goodness_of_fit import KindFit, kind_fits
-from fg_calib.statistics.noise_components import has_joint_noise, noise_components
-from fg_calib.statistics.residual_table import residual_table
 from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
+Sparse = scipy.sparse.csr_array
 
 SETTLED = 1e-5
 """Relative change of a factor below which it has settled: far below what any noise is known to."""
 
-LONGEST = 10.0
-"""A secant step is at most this many times as long as the step it lengthens."""
-
 MAX_ROUNDS = 30
 
-FARTHEST = 3.0
-"""A step of the logarithm of a factor is at most this long where rows tell of several factors."""
-
-UNLIKELY = 3.0
-"""Sigma by which what is seen is off from noise as stated that shows it to be wrong, however little is seen of it."""
-
-NEAR = 0.3
-"""Steps shorter than this are Newton's, by the curvature at the residuals seen, not by its mean."""
-
-LEAST_CURVED = 0.5
-"""Curvature of the likelihood over its mean that is taken for this at least."""
-
-NOTHING = 0.01
-"""Degrees of freedom that noise takes up, below which it need not be made smaller still: it is nothing."""
-
-FLAT = 1e-9
-"""Information on a combination of factors, as a share of that on each alone, below which there is none."""
+MAX_STEP = 3.0
+"""A step of the logarithm of a factor is at most this long."""
 
 LEAST_REDUNDANCY = 3.0
 """Degrees of freedom that a kind must have left for its noise to be estimated."""
 
+UNLIKELY = 3.0
+"""Sigma between estimated and specified noise that shows the latter to be wrong, however few degrees of freedom."""
+
+NEGLIGIBLE = 0.01
+"""Degrees of freedom that noise takes up, below which it need not be made smaller still."""
+
+FLAT = 1e-9
+"""Information on a combination of factors, as a share of that on each alone, below which there is none."""
+
+MAX_EXACT, N_PROBES = 2000, 64
+"""Columns up to which a squared norm is exact, and number of random vectors that estimate it beyond."""
+
 TINY = 1e-100
+
+
+@dataclass(frozen=True)
+class NoiseComponents:
+    """What the residuals say of the noise of each origin, as it is taken to be.
+
+    Attributes:
+        names: The origins.
+        squares: q, the sum of squares that each shows, shape (n,).
+        expected: t, its mean, were the noise as taken, shape (n,).
+        information: T, degrees of freedom in the logarithms of the factors, shape (n, n).
+    """
+
+    names: tuple[NoiseName, ...]
+    squares: Floats
+    expected: Floats
+    information: Floats
+
+    def degrees(self, i: int, others: Floats) -> float:
+        """Degrees of freedom of one origin next to others that are estimated too, by their numbers."""
+        chosen = np.append(others[others != i], i).astype(np.int64)
+        return 1.0 / max(float(_solve(self.information[np.ix_(chosen, chosen)], np.eye(len(chosen))[-1])[-1]), TINY)
+
+
+def has_joint_noise(problem: Problem) -> bool:
+    """Whether the noise of joint readings reaches any fitted row."""
+    return any(
+        source.name == "joints" and bool(np.any(source.loading[noise.series.train]))
+        for noise in problem.noises
+        for source in noise.sources
+    )
+
+
+def noise_components(solution: Solution) -> NoiseComponents:
+    """How much noise of each origin the residuals of a solution show."""
+    problem = solution.problem
+    kinds = {
+        (noise.series.table, family): None
+        for noise in problem.noises
+        if noise.series.used[noise.series.train].any()
+        for family in _families(noise)
+    }
+    names = (*kinds, JOINT_NOISE) if has_joint_noise(problem) else tuple(kinds)
+    system, roots = linear_system(problem, solution.parameters), [_root(problem, name) for name in names]
+    u = system.weighted_residual / np.sqrt(_robust_weights(problem))
+    squares = np.array([np.sum((E.T @ u) ** 2) for E in roots])
+    expected = np.array([system.trace(E) for E in roots])
+    spare = [Sparse((rows.n_rows, 0)) if rows.spare is None else rows.spare for rows in problem.rows]
+    if any(S.shape[1] for S in spare):
+        S = Sparse(scipy.sparse.block_diag(spare))
+        probes, n = S.toarray(), 1
+        if S.shape[1] > MAX_EXACT:
+            probes, n = S @ np.random.default_rng(0).choice([-1.0, 1.0], size=(S.shape[1], N_PROBES)), N_PROBES
+        P_S = system.project(probes)
+        expected -= [np.sum((E.T @ P_S) ** 2) / n for E in roots]
+    squares, expected = np.maximum(squares, TINY), np.maximum(expected, TINY)
+    work = np.column_stack([E @ (E.T @ u) for E in roots]) / np.sqrt(squares / expected)
+    return NoiseComponents(names, squares, expected, work.T @ system.project(work))
+
+
+def _families(noise: RowNoise) -> list[str]:
+    """The kind of noise of each row of a measurement."""
+    return [name.partition(".")[0] for name in noise.series.kind.names]
+
+
+def _robust_weights(problem: Problem) -> Floats:
+    """Robust weight of each row of the linear system, shape (n_rows,)."""
+    given, out = problem.state.weights, [np.zeros(0)]
+    for part in (part for rows in problem.rows for part in rows.parts):
+        train = problem.noises[part.series].series.train
+        weights = np.ones(len(train)) if given is None else np.maximum(given[part.series][train], 1e-12)
+        out.append(np.repeat(weights, part.block.residual_dim))
+    return np.concatenate(out)
+
+
+def _root(problem: Problem, name: NoiseName) -> Sparse:
+    """E with E E^T the part of the rows' covariance that noise of one origin makes, shape (n_rows, k)."""
+    estimated = problem.state.joint_errors is not None
+    shares = ErrorColumns(problem.noises, problem.options.pair_errors == "shared", estimated)
+    parts = [part for rows in problem.rows for part in rows.parts]
+    found = [_root_of_part(problem.noises[part.series], part, name, shares) for part in parts]
+    private = scipy.sparse.block_diag([own for own, _ in found])
+    return Sparse(scipy.sparse.hstack([private, scipy.sparse.vstack([common for _, common in found])]))
+
+
+def _root_of_part(noise: RowNoise, part: Part, name: NoiseName, shares: ErrorColumns) -> tuple[Sparse, Sparse]:
+    """How whitened rows follow from noise of one origin: what is private to each measurement, and what is shared."""
+    train, W = noise.series.train, whitener_of(noise, part)
+    n, h = W.shape[:2]
+    blocks = [np.zeros((n, h, 0))]
+    if name == JOINT_NOISE:
+        sources = [source for source in noise.sources if source.name == "joints"]
+    else:
+        mine = np.array([(noise.series.table, family) == name for family in _families(noise)])
+        sources = [source for source in noise.sources if source.name != "joints" and mine.any()]
+        sources = [source._replace(loading=source.loading * mine[:, None, None]) for source in sources]
+        blocks.append(W @ _square_roots(noise.own_at(train))[:, :, mine])
+    masks = {source.name: shares.mask(source)[train] for source in sources}
+    for source in sources:
+        alone = np.where(masks[source.name][:, None, :, None], 0.0, source.loading[train]).reshape(n, h, -1)
+        blocks += [W @ alone] if alone.any() else []
+    return block_diagonal(np.concatenate(blocks, axis=2)), shares.loading(noise, train, W, masks, sources)
+
+
+def _square_roots(covariance: Floats) -> Floats:
+    """Symmetric square roots of small covariances, shape (n, h, h)."""
+    values, vectors = np.linalg.eigh(covariance)
+    root: Floats = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ np.swapaxes(vectors, 1, 2)
+    return root
 
 
 @checked
 @single_threaded
 def estimate_noise(problem: Problem, options: SolverOptions | None = None) -> Solution:
-    """Estimate the parameters and, with them, a factor on the stated noise of each kind.
+    """Estimate the parameters and, with them, a factor on the specified noise of each kind.
 
     Args:
-        problem: The problem; its stated noise is where the factors start from.
+        problem: The problem; its specified noise is where the factors start from.
         options: Of the solver.
 
     Returns:
@@ -91,127 +200,80 @@ def estimate_noise(problem: Problem, options: SolverOptions | None = None) -> So
     Raises:
         SolverError: GTSAM could not solve a step at all.
     """
-    if not has_joint_noise(problem):
-        return _settled(problem, options, _of_kinds).solution
-    best, asked = _settled(problem, options, _of_origins), set[NoiseName]()
+    best, asked = _settle(problem, options, frozenset()), set[NoiseName]()
     seconds = best.solution.seconds
-    while weak := {name: n for name, n in best.told.degrees.items() if n < LEAST_REDUNDANCY and name not in asked}:
+    while weak := {name: n for name, n in best.degrees.items() if n < LEAST_REDUNDANCY and name not in asked}:
         name = min(weak, key=lambda name: weak[name])
         asked.add(name)
-        kept = best.told.kept | {name}
-        as_stated = _scaled(problem, {**best.solution.problem.state.factors, name: 1.0})
-        other = _settled(as_stated, options, partial(_of_origins, kept=kept))
+        as_specified = _scaled(problem, {**best.solution.problem.state.factors, name: 1.0})
+        other = _settle(as_specified, options, best.kept | {name})
         seconds += other.solution.seconds
-        best = other if name in other.told.cannot_tell else best
+        best = other if name in other.indeterminate else best
     return replace(best.solution, seconds=seconds)
 
 
 @dataclass(frozen=True)
-class _Told:
-    """What a solution tells of its noise.
+class _Settled:
+    """A solution with the noise that its residuals show; not converged where the factors have not settled.
 
     Attributes:
-        steps: Of the logarithms of the factors that are estimated.
-        apart: Whether each step disregards the others.
-        degrees: Degrees of freedom that each of these has beside the others.
-        kept: Origins whose noise is kept as stated.
-        cannot_tell: Those of them that could not be estimated.
+        solution: The solution.
+        degrees: Degrees of freedom of each origin that was estimated, next to the others.
+        kept: Origins whose noise was kept as specified.
+        indeterminate: Origins among them that could not be estimated.
     """
 
-    steps: Mapping[NoiseName, float]
-    apart: bool
-    degrees: Mapping[NoiseName, float] = field(default_factory=dict)
-    kept: frozenset[NoiseName] = frozenset()
-    cannot_tell: frozenset[NoiseName] = frozenset()
-
-
-@dataclass(frozen=True)
-class _Settled:
-    """A solution with the noise it tells of; not converged where the factors have not settled."""
-
     solution: Solution
-    told: _Told
+    degrees: Mapping[NoiseName, float]
+    kept: frozenset[NoiseName]
+    indeterminate: frozenset[NoiseName]
 
 
-def _settled(problem: Problem, options: SolverOptions | None, ask: Callable[[Solution], _Told]) -> _Settled:
-    """Solve and scale the noise until it is what the solution tells."""
-    seconds, last = 0.0, _Steps()
+def _settle(problem: Problem, options: SolverOptions | None, kept: frozenset[NoiseName]) -> _Settled:
+    """Solve and scale the noise until its components are as expected; steps back are at most half of the last one."""
+    seconds, last = 0.0, dict[NoiseName, float]()
     for _ in range(MAX_ROUNDS):
         solution = solve(problem, options)
         seconds += solution.seconds
-        told = ask(solution)
-        solution = replace(solution, estimated_noise=tuple(told.steps), seconds=seconds)
-        last = last.next(told.steps) if told.apart else last.held(told.steps)
-        moves = max(map(abs, last.taken.values()), default=0.0)
+        found = noise_components(solution)
+        steps = _steps(found, kept)
+        solution = replace(solution, estimated_noise=tuple(steps), seconds=seconds)
+        for name, step in steps.items():
+            half = 0.5 * abs(last.get(name, 0.0))
+            steps[name] = float(np.clip(step, -half, half)) if step * last.get(name, 0.0) < 0.0 else step
+        moves = max(map(abs, steps.values()), default=0.0)
         if moves < SETTLED:
-            return _Settled(solution, told)
-        # A solution that has not arrived tells of the noise too: with better factors the next one may.
-        now = problem.state.factors
-        problem = _scaled(problem, {name: now.get(name, 1.0) * float(np.exp(s)) for name, s in last.taken.items()})
-    message = f"not converged: the estimated noise still moved by {moves:.1g} after {MAX_ROUNDS} rounds"
-    solution = replace(solution, converged=False, message=message if solution.converged else solution.message)
-    return _Settled(solution, told)
+            break
+        factors = problem.state.factors
+        last, problem = steps, _scaled(problem, {n: factors.get(n, 1.0) * float(np.exp(s)) for n, s in steps.items()})
+    else:
+        message = f"not converged: the estimated noise still moved by {moves:.1g} after {MAX_ROUNDS} rounds"
+        solution = replace(solution, converged=False, message=message if solution.converged else solution.message)
+    free = np.array([i for i, name in enumerate(found.names) if name in steps], dtype=np.float64)
+    degrees = {name: found.degrees(i, free) for i, name in enumerate(found.names)}
+    off = np.abs(found.squares - found.expected) / np.sqrt(2.0 * np.array(list(degrees.values())))
+    poor = {
+        name
+        for name, d, o in zip(found.names, degrees.values(), off, strict=True)
+        if d < LEAST_REDUNDANCY and o < UNLIKELY
+    }
+    return _Settled(solution, {name: degrees[name] for name in steps}, kept, kept & poor)
 
 
-def _of_kinds(solution: Solution) -> _Told:
-    """Steps to the factors that give each kind the sum of squares that it expects."""
-    fits = kind_fits(solution, spread_of(solution), residual_table(solution))
-    found = {(fit.table, fit.kind): fit for fit in fits if _redundant(fit)}
-    return _Told({name: float(np.log(fit.seen_over_stated / fit.factor)) for name, fit in found.items()}, apart=True)
-
-
-def _of_origins(solution: Solution, kept: frozenset[NoiseName] = frozenset()) -> _Told:
-    """Steps to the factors of restricted maximum likelihood.
-
-    Args:
-        solution: The solution.
-        kept: Origins whose noise is kept as stated.
-    """
-    found = noise_components(solution, spread_of(solution))
-    seen, expected = np.maximum(found.seen, TINY), np.maximum(found.expected, TINY)
-    there = np.array([name not in kept for name in found.names])
-    gone = there & (seen < expected) & (expected < NOTHING)
-    free = np.flatnonzero(there & ~gone)
-    T = found.products
-    step = np.zeros(len(there))
-    wanted = 0.5 * expected * np.log(seen / expected)
-    of_free = np.ix_(free, free)
-    step[free] = np.clip(_solved(T[of_free], wanted[free]), -FARTHEST, FARTHEST)
-    if np.abs(step).max(initial=0.0) < NEAR:
-        step[free] = _solved(_curvature(T[of_free], found.products_seen[of_free]), wanted[free])
-    degrees, cannot = np.zeros(len(there)), set[NoiseName]()
-    for i, name in enumerate(found.names):
-        beside = np.append(free[free != i], i)
-        degrees[i] = 1.0 / max(_solved(T[np.ix_(beside, beside)], np.eye(len(beside))[-1])[-1], TINY)
-        off = abs(seen[i] - expected[i]) / np.sqrt(2.0 * degrees[i])
-        if name in kept and degrees[i] < LEAST_REDUNDANCY and off < UNLIKELY:
-            cannot.add(name)
-    of = {name: i for i, name in enumerate(found.names) if there[i]}
-    return _Told(
-        {name: float(step[i]) for name, i in of.items()},
-        False,
-        {name: float(degrees[i]) for name, i in of.items()},
-        kept,
-        frozenset(cannot),
+def _steps(found: NoiseComponents, kept: frozenset[NoiseName]) -> dict[NoiseName, float]:
+    """Steps of the logarithms of the factors, of the origins whose noise is estimated."""
+    joint, q, t = JOINT_NOISE in found.names, found.squares, found.expected
+    estimated = np.array(
+        [n not in kept and (joint or e >= LEAST_REDUNDANCY) for n, e in zip(found.names, t, strict=True)]
     )
+    free = np.flatnonzero(estimated & ~((q < t) & (t < NEGLIGIBLE)))
+    step = np.zeros(len(t))
+    step[free] = _solve(found.information[np.ix_(free, free)], (0.5 * t * np.log(q / t))[free])
+    step = np.clip(step, -MAX_STEP, MAX_STEP)
+    return {name: float(s) for name, s, of in zip(found.names, step, estimated, strict=True) if of}
 
 
-def _curvature(T: Floats, seen: Floats) -> Floats:
-    """`2 seen - T`, T its mean: half the curvature of the likelihood, in no direction less than `LEAST_CURVED` T.
-
-    T counts degrees of freedom; where noise has next to none it may be singular, and by rounding less than that.
-    """
-    by = np.sqrt(np.maximum(np.diag(T), FLAT))
-    values, vectors = np.linalg.eigh(T / by[:, None] / by)
-    length = np.sqrt(np.maximum(values, FLAT))
-    inverse = vectors / length / by[:, None]  # of the root of T
-    curved, turned = np.linalg.eigh(inverse.T @ (2.0 * seen - T) @ inverse)
-    root = by[:, None] * (vectors * length) @ turned
-    out: Floats = (root * np.maximum(curved, LEAST_CURVED)) @ root.T
-    return out
-
-
-def _solved(T: Floats, b: Floats) -> Floats:
+def _solve(T: Floats, b: Floats) -> Floats:
     """T^-1 b, of least length where T is singular; T symmetric, scaled to a diagonal of 1."""
     by = 1.0 / np.sqrt(np.maximum(np.diag(T), TINY))
     values, vectors = np.linalg.eigh(T * by[:, None] * by)
@@ -220,45 +282,11 @@ def _solved(T: Floats, b: Floats) -> Floats:
     return out
 
 
-@dataclass(frozen=True)
-class _Steps:
-    """Steps of the logarithms of factors, by origin.
-
-    Attributes:
-        wanted: Logarithm of noise seen over noise taken.
-        taken: The steps taken.
-    """
-
-    wanted: Mapping[NoiseName, float] = field(default_factory=dict)
-    taken: Mapping[NoiseName, float] = field(default_factory=dict)
-
-    def next(self, wanted: Mapping[NoiseName, float]) -> _Steps:
-        """The next steps: secant steps, unless what was wanted grew."""
-        taken: dict[NoiseName, float] = {}
-        for kind, step in wanted.items():
-            before = self.taken.get(kind, 0.0)
-            kept = (self.wanted[kind] - step) / before if before else 1.0  # share of the last step that came true
-            taken[kind] = step / max(kept, 1.0 / LONGEST) if kept > 0.0 else step
-        return _Steps(wanted, taken)
-
-    def held(self, wanted: Mapping[NoiseName, float]) -> _Steps:
-        """Steps as wanted, but back no more than half of the last one: so they end where steps jump to and fro."""
-        taken: dict[NoiseName, float] = {}
-        for name, step in wanted.items():
-            before = self.taken.get(name, 0.0)
-            taken[name] = float(np.clip(step, -abs(before) / 2.0, abs(before) / 2.0)) if step * before < 0.0 else step
-        return _Steps(wanted, taken)
-
-
-def _redundant(fit: KindFit) -> bool:
-    return fit.expected >= LEAST_REDUNDANCY and fit.chi2 > 0.0
-
-
 def _scaled(problem: Problem, factors: Mapping[NoiseName, float]) -> Problem:
-    """The problem from its start, with the stated noise of some kinds multiplied by factors."""
+    """The problem from its start, with the specified noise of some kinds multiplied by factors."""
 
-    def anew(p: Problem) -> Problem:
+    def scale(p: Problem) -> Problem:
         return reweighted_at(p, p.start, replace(p.state, factors={**p.state.factors, **factors}))
 
-    scaled = anew(problem)
-    return scaled if problem.whole is None else replace(scaled, whole=anew(problem.whole))
+    whole = None if problem.whole is None else scale(problem.whole)
+    return replace(scale(problem), whole=whole)

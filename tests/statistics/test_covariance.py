@@ -298,19 +298,6 @@ def test_predicted_sigmas_cover_the_truth():
     assert 0.7 < np.std(z) < 1.4  # pairs of a star share a configuration: sigmas are somewhat off, not by factors
 
 
-def test_rows_that_are_not_linear_in_what_is_unknown_are_cautioned_about():
-    """Planar arm, tilts known from priors alone: angles of 20 mrad are bent by them; a generic arm's are not."""
-    rng, calm = np.random.default_rng(1), small_arm(tolerance={"alpha": 3e-3, "theta": 3e-3, "a": 1e-3, "d": 1e-3})
-    wide = measure(true_robot(calm, rng), 30, rng, sigma=(1e-4, 2e-4))
-    assert assess(solve(build_problem(calm, wide, model="distance-rotation"))).cautions == ()
-    robot = scara({"alpha": 3e-3, "beta": 3e-3, "theta": 1e-3, "a": 1e-3, "d": 1e-3})
-    q = rng.uniform(-1.0, 1.0, (30, 3))
-    q[-3:, 2] = q[0].sum() - q[-3:, 0] - q[-3:, 1] + 0.02  # turned by 20 mrad against the first
-    small = measure(true_robot(robot, rng), 30, rng, sigma=(1e-4, 1e-4), readings=q)
-    uncertainty = assess(solve(build_problem(robot, small, model="distance-rotation")))
-    assert any("bent by what the parameters may still be off" in text for text in uncertainty.cautions)
-
-
 @pytest.mark.slow
 def test_the_height_of_a_scaras_targets_is_in_the_sigmas_of_what_follows_it():
     """Monte Carlo: 12 draws, targets 0.8 m below the flange where the fit starts at it; theta2 was 4.8 sigma off."""
