@@ -35,6 +35,7 @@ from fg_calib.graph.build import problem_of
 from fg_calib.graph.solver import Solution
 from fg_calib.job import Job
 from fg_calib.measurements.build import Dataset
+from fg_calib.measurements.kinds import LANDMARKS
 from fg_calib.measurements.table import Table
 from fg_calib.options import check_number
 from fg_calib.statistics.residual_table import HeldOut, pooled, residual_table, same_readings
@@ -45,7 +46,7 @@ CHANCE = 1e-3
 REFERENCE_SHARE = 0.5
 """Share of the measured pairs from which on a configuration that is in them is never held out."""
 
-NEEDED = {"anchor": 4, "plane": 4, "station": 3, "target": 2, "board": 2}
+NEEDED = {"station": 3} | {kind.name: kind.n_configurations for kind in LANDMARKS.values()}
 """Configurations that must be left of those that see an anchor, a station, ...: fewer do not locate it."""
 
 

@@ -21,12 +21,6 @@ from fg_calib.observability.indices import IdentifiabilityClass, Observability
 from fg_calib.statistics.covariance import Spread, TangentCovariance
 from fg_calib.statistics.residual_table import suspect_level
 
-KINDS = {"L": "point", "P": "target", "A": "anchor", "O": "offset", "F": "plane", "B": "board", "N": "unknown"}
-"""Kind of a landmark, by the letter of its key."""
-
-PLANE_ORIGIN = "C"
-"""Letter of the points that the normals of planes come from: constants, not landmarks."""
-
 LEAST_SHARE = 1e-3
 """Share of a reading's variance below which the measurements say nothing of its error."""
 
@@ -90,7 +84,7 @@ class LandmarkEstimate(FrozenArrays):
             vector, [rad], and position in the base frame, [m]; of an offset what the instrument adds, [m]. Of a group
             without train rows the mean of the predicted tool points.
         sigma: 1 sigma of each, the same shape; 0 where it is known, nan where it is not determined, or not estimated.
-        kind: One of `KINDS`.
+        kind: Name of its `LandmarkKind`.
         units: `m` or `rad` of each; empty of a value without unit.
     """
 
@@ -238,9 +232,10 @@ def _landmarks(solution: Solution, whole: Spread) -> tuple[LandmarkEstimate, ...
     at = at_parameters(problem, solution.parameters)
     left = eliminated(by_columns_of(problem, whole.variables), solution.parameters)
     counts, first = _n_rows(problem), np.cumsum([0, *unknowns.sizes])
-    names, found = list(zip(unknowns.letters, unknowns.names, strict=True)), []
-    for i, (letter, name) in enumerate(names):
-        if letter == PLANE_ORIGIN:
+    names, found = unknowns.keys, []
+    for i, (_, name) in enumerate(names):
+        kind = unknowns.kinds[i]
+        if not kind.heading:
             continue
         span = slice(first[i], first[i + 1])
         columns = at.columns[span] - problem.variables.n_columns
@@ -251,10 +246,10 @@ def _landmarks(solution: Solution, whole: Spread) -> tuple[LandmarkEstimate, ...
             C[left.unknown[columns]] = np.nan
         elif not unknowns.known[i]:
             C[:] = np.nan
-        if letter == "F":
-            k = names.index((PLANE_ORIGIN, name))
-            values, C, units = _as_plane(at.coordinates[first[k] : first[k + 1]], values, C)
-        found.append(LandmarkEstimate(name, int(counts[i]), values, np.sqrt(np.diag(C)), KINDS[letter], units))
+        if kind.estimate is not None:
+            k = i if kind.reference is None else names.index((kind.reference.letter, name))
+            values, C, units = kind.estimate(at.coordinates[first[k] : first[k + 1]], values, C)
+        found.append(LandmarkEstimate(name, int(counts[i]), values, np.sqrt(np.diag(C)), kind.name, units))
     return tuple(found)
 
 
@@ -268,16 +263,6 @@ def _n_rows(problem: Problem) -> Integers:
             new = np.all(owners[:, :k] != column[:, None], axis=1)
             counts += np.bincount(column[new], minlength=len(counts))
     return counts
-
-
-def _as_plane(origin: Floats, through: Floats, C: Floats) -> tuple[Floats, Floats, tuple[str, ...]]:
-    """Unit normal and distance of a plane (see `PlaneDistance`), and their covariance."""
-    step = through - origin
-    length = np.linalg.norm(step)
-    n = step / length
-    tilt = (np.eye(3) - np.outer(n, n)) / length
-    J = np.vstack([tilt, n + through @ tilt])
-    return np.append(n, n @ through), J @ C @ J.T, ("", "", "", "m")
 
 
 def _joint_errors(solution: Solution, spread: Spread) -> JointErrors | None:

@@ -25,7 +25,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 from scipy import special
 
@@ -34,7 +33,6 @@ from fg_calib.graph.factors import Variables, prior_rows, unknown_prior_rows
 from fg_calib.graph.information import eliminated
 from fg_calib.graph.solver import Solution
 from fg_calib.statistics.covariance import Spread
-from fg_calib.statistics.estimates import KINDS
 
 ALARM = 0.001
 """Probability of calling any single correction of a model that holds too large."""
@@ -140,8 +138,8 @@ def _corrections(solution: Solution, spread: Spread) -> tuple[tuple[str, ...], F
         own = np.vstack([np.zeros((len(z), left.rank)), of_places @ left.inverse])
         for v in variables.nuisance:
             if v.prior is not None:
-                i = gtsam.symbolIndex(v.key)
-                names += [f"{KINDS[unknowns.letters[i]]} {unknowns.names[i]}"] * len(v.prior[0])
+                item = unknowns.items[v.number]
+                names += [f"{item.kind.name} {item.name}"] * len(v.prior[0])
     A = np.eye(len(own)) - P @ (2.0 * spread.tangent - spread.actual) @ P.T - own @ own.T
     return tuple(names), np.concatenate([z, z_places]), A, len(z_places)
 

@@ -29,8 +29,9 @@ from fg_calib.graph.noise import RowNoise, whitening_of
 from fg_calib.graph.problem import Problem, noises_at, reweighted_at
 from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Booleans, Measurements
+from fg_calib.measurements.kinds import INSTRUMENTS
 from fg_calib.measurements.table import Table
-from fg_calib.options import PAIR_MODELS, Model, Options
+from fg_calib.options import Model, Options
 from fg_calib.robot.kinematics import Chain
 from fg_calib.robot.model import Robot
 from fg_calib.statistics.gross_errors import CHANCE, MOST_FEW
@@ -203,8 +204,9 @@ def _looked_at(table: Table) -> tuple[Table, int, Booleans]:
 def _of_poses(m: Measurements, table: Table) -> Model | None:
     """The model of poses that holds what pairs formed from them do."""
     assert table.model is not None
-    placed_, turned = PAIR_MODELS[table.model]
-    placed_, turned = placed_ and m.position is not None, turned and m.rotation is not None
+    instrument = INSTRUMENTS[table.model]
+    placed_ = instrument.sees_position and m.position is not None
+    turned = instrument.sees_orientation and m.rotation is not None
     return "pose" if placed_ and turned else "position" if placed_ else "orientation"
 
 
