@@ -47,8 +47,7 @@ def bag(
 ) -> None:
     """Make a table of poses from a ROS bag: joint readings and poses while the arm stands still, with their sigmas."""
     from fg_calib.importers.bag import read_bag
-    from fg_calib.importers.standstill import average_stops
-    from fg_calib.importers.stops import require_replaceable, write_stops
+    from fg_calib.importers.standstill import average_stops, require_replaceable, write_stops
     from fg_calib.io.robot_file import read_robot
     from fg_calib.report.bag import bag_document, build_bag_report
 

@@ -40,14 +40,13 @@ def board(
     if (camera is None) != estimate_camera:
         say("error: one of --camera and --estimate-camera is needed, and only one")
         raise typer.Exit(2)
+    from fg_calib.importers.board import image_files, read_calibration_board, read_corners
     from fg_calib.importers.board_tables import (
         BoardTables,
         read_readings,
         require_no_input_of_board,
         write_board_tables,
     )
-    from fg_calib.importers.calibration_board import read_calibration_board
-    from fg_calib.importers.images import image_files, read_corners
     from fg_calib.importers.opencv import opencv
     from fg_calib.importers.views import fit_board
     from fg_calib.io.atomic import read_bytes, require_writable

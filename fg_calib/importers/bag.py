@@ -5,8 +5,7 @@
 | ROS 1 | a file `.bag` |
 | ROS 2 | a folder with `metadata.yaml`, or one file `.db3` (SQLite) or `.mcap` |
 
-Messages are read by the standard definitions of their types; those that a bag brings along are compared with them by
-their hash, and never used. Needs the extra `ros`.
+Messages are read by the definitions of their types in the bag, or by the standard ones. Needs the extra `ros`.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from fg_calib.arguments import checked
 from fg_calib.arrays import NORM_TOLERANCE, Floats
 from fg_calib.errors import CalibrationError, InputError
-from fg_calib.importers.streams import JointStream, PoseStream, Source
+from fg_calib.importers.recording import JointStream, PoseStream, Source
 from fg_calib.robot.model import Robot
 
 JOINT_TYPE = "sensor_msgs/msg/JointState"
@@ -99,90 +98,66 @@ def read_bag(
     return JointStream((stamps - stamps[0]) * 1e-9, readings, source), poses
 
 
-@dataclass(frozen=True)
-class _Topic:
-    name: str
-    kind: str
-
-
 class _Bag:
     """An open bag: its topics, and the messages of one."""
 
-    def __init__(self, name: str, reader: Any, store: Any, ros: int) -> None:
-        self.name, self._reader, self._store, self._ros = name, reader, store, ros
+    def __init__(self, name: str, reader: Any) -> None:
+        self.name, self._reader = name, reader
 
-    def topic(self, name: str | None, kinds: tuple[str, ...], option: str) -> _Topic:
-        """The topic of a name, or the only one with messages of these types."""
-        there = sorted({(c.topic, c.msgtype) for c in self._reader.connections})
-        fitting = [_Topic(*one) for one in there if one[1] in kinds]
-        listed = ", ".join(f"{topic} ({kind})" for topic, kind in there) or "nothing"
+    def topic(self, name: str | None, kinds: tuple[str, ...], option: str) -> tuple[str, str]:
+        """The topic of a name, or the only one with messages of these types; and its type."""
+        every = sorted({(c.topic, c.msgtype) for c in self._reader.connections})
+        fitting = [one for one in every if one[1] in kinds]
+        listed = ", ".join(f"{topic} ({kind})" for topic, kind in every) or "nothing"
         if name is not None:
-            found = [one for one in fitting if one.name == name]
+            found = [one for one in fitting if one[0] == name]
             if not found:
-                others = [kind for topic, kind in there if topic == name]
+                others = [kind for topic, kind in every if topic == name]
                 what = f"topic {name} is of {others[0]}" if others else f"no topic {name}"
                 raise InputError(self.name, what, " or ".join(kinds) if others else "", f"the bag has {listed}")
             return found[0]
-        fitting = [one for one in fitting if one.name.rpartition("/")[2] != "tf_static"]
-        fitting = [one for one in fitting if one.kind != "tf2_msgs/msg/TFMessage"] or fitting
+        fitting = [one for one in fitting if one[0].rpartition("/")[2] != "tf_static"]
+        fitting = [one for one in fitting if one[1] != "tf2_msgs/msg/TFMessage"] or fitting
         if len(fitting) == 1:
             return fitting[0]
         if fitting:
-            fit = ", ".join(f"{one.name} ({one.kind})" for one in fitting)
+            fit = ", ".join(f"{topic} ({kind})" for topic, kind in fitting)
             raise InputError(self.name, f"{len(fitting)} topics fit: {fit}", f"one of them: {option} TOPIC")
         raise InputError(self.name, f"no topic of type {' or '.join(kinds)}", hint=f"the bag has {listed}")
 
-    def messages(self, topic: _Topic) -> Iterator[_Message]:
+    def messages(self, topic: tuple[str, str]) -> Iterator[_Message]:
         """The messages of a topic, in the order in which they were received."""
-        connections = [c for c in self._reader.connections if (c.topic, c.msgtype) == (topic.name, topic.kind)]
-        standard = self._hash(topic.kind)
-        for connection in connections:
-            if connection.digest not in ("", "*", None, standard):
-                what = f"topic {topic.name} has a definition of {topic.kind} that is not the standard one"
-                raise InputError(self.name, what)
-        decode = self._store.deserialize_ros1 if self._ros == 1 else self._store.deserialize_cdr
+        connections = [c for c in self._reader.connections if (c.topic, c.msgtype) == topic]
         n = 0
         for connection, received, raw in self._reader.messages(connections):
-            yield _Message(received, decode(raw, connection.msgtype))
+            yield _Message(received, self._reader.deserialize(raw, connection.msgtype))
             n += 1
         if n < 2:
-            raise InputError(f"{self.name}: topic {topic.name}", _counted(n), "a recording")
-
-    def _hash(self, kind: str) -> str:
-        if self._ros == 1:
-            return str(self._store.generate_msgdef(kind, ros_version=1)[1])
-        return str(self._store.hash_rihs01(kind))
+            raise InputError(f"{self.name}: topic {topic[0]}", _counted(n), "a recording")
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[_Bag]:
-    """A bag while it is read; whatever goes wrong in the library is one line.
+    """A bag while it is read; any failure of the library is one line.
 
     Raises:
         InputError: There is no such bag, or it is damaged.
     """
     try:
-        from rosbags import rosbag1, rosbag2
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+        from rosbags import highlevel, typesys
     except ImportError:
         raise CalibrationError("fg-calib bag needs rosbags: pip install 'fg_calib[ros]'") from None
     _check_ending(path)
     try:
-        if path.suffix == ".bag":
-            store = get_typestore(Stores.ROS1_NOETIC)
-            text = "geometry_msgs/TransformStamped[] transforms"
-            store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
-            with rosbag1.Reader(path) as reader:
-                yield _Bag(path.name, reader, store, 1)
-        else:
-            with rosbag2.Reader(path) as reader2:
-                yield _Bag(path.name, reader2, get_typestore(Stores.ROS2_HUMBLE), 2)
+        store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+        with highlevel.AnyReader([path], default_typestore=store) as reader:
+            yield _Bag(path.name, reader)
     except (CalibrationError, MemoryError):
         raise
     except PermissionError:
         raise InputError(str(path), "may not be read", hint="check the permissions of file and folder") from None
     except Exception as error:  # readers of damaged files raise whatever their libraries do
-        hint = "was the recording cut off? `rosbag reindex` mends a .bag" if path.suffix == ".bag" else ""
+        hint = "was the recording cut off? `rosbag reindex` repairs a .bag" if path.suffix == ".bag" else ""
         raise InputError(path.name, f"a bag that cannot be read: {error or type(error).__name__}", hint=hint) from error
 
 
@@ -209,17 +184,17 @@ def _stamp(header: Any) -> int:
 
 
 def _readings(
-    messages: Iterable[_Message], wanted: tuple[str, ...], topic: _Topic, bag: str
+    messages: Iterable[_Message], wanted: tuple[str, ...], topic: tuple[str, str], bag: str
 ) -> tuple[Any, Floats, Source]:
     """Stamps, [ns], and readings of the joints wanted, shape (n, n_joints), in order of time."""
-    place = f"{bag}: topic {topic.name}"
+    place = f"{bag}: topic {topic[0]}"
     columns: dict[tuple[str, ...], list[int] | None] = {}
     stamps, received, rows, left = [], [], [], 0
     for message in messages:
         m = message.content
         there = tuple(m.name)
         if there not in columns:
-            columns[there] = _columns(there, wanted)
+            columns[there] = [there.index(name) for name in wanted] if set(wanted) <= set(there) else None
         chosen = columns[there]
         if chosen is None or len(m.position) != len(there):
             left += 1
@@ -239,20 +214,15 @@ def _readings(
     if left:
         notes.append(f"{_counted(left)} without the robot's joints left out")
     order, values, lag, more = _in_order(stamps, received, np.array(rows, dtype=np.float64), place)
-    return order, values, Source(topic.name, topic.kind, lag, (*notes, *more))
-
-
-def _columns(there: tuple[str, ...], wanted: tuple[str, ...]) -> list[int] | None:
-    """Where the joints wanted stand in a message; None if one does not."""
-    return [there.index(name) for name in wanted] if set(wanted) <= set(there) else None
+    return order, values, Source(*topic, lag, (*notes, *more))
 
 
 def _poses(
-    messages: Iterable[_Message], topic: _Topic, frames: tuple[str | None, str | None], origin: int, bag: str
+    messages: Iterable[_Message], topic: tuple[str, str], frames: tuple[str | None, str | None], origin: int, bag: str
 ) -> PoseStream:
     """The poses of one frame in another."""
-    place = f"{bag}: topic {topic.name}"
-    take = POSE_TYPES[topic.kind]
+    place = f"{bag}: topic {topic[0]}"
+    take = POSE_TYPES[topic[1]]
     found = [
         (
             (_bare(header.frame_id), _bare(child)),
@@ -272,7 +242,7 @@ def _poses(
     figures = np.array([row for pair, _, row in found if pair == fitting[0]], dtype=np.float64)
     stamps, figures, lag, notes = _in_order(sent, received, figures, place)
     rotation, more = _rotations(figures[:, 3:], place)
-    source = Source(topic.name, topic.kind, lag, (*notes, *more))
+    source = Source(*topic, lag, (*notes, *more))
     return PoseStream((stamps - origin) * 1e-9, figures[:, :3], rotation, source)
 
 

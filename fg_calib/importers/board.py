@@ -1,68 +1,221 @@
-"""A calibration board: what stands on it, and where its corners are."""
+"""Calibration boards: their files, their corners, and the images that show them.
+
+type: charuco            # or checkerboard
+columns: 9               # squares in a row; of a checkerboard the inner corners in a row
+rows: 7
+square: 20
+marker: 14               # charuco alone, as are dictionary and legacy
+dictionary: DICT_5X5_100
+units: {length: mm}
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from pathlib import Path
+from typing import Annotated, Literal
 
-import numpy as np
+from pydantic import Field, StrictBool
 
-from fg_calib.measurements.dataset import Floats, Integers
+from fg_calib.arrays import NOTHING
+from fg_calib.errors import InputError
+from fg_calib.executors import tell
+from fg_calib.importers.opencv import (
+    LARGER,
+    CalibrationBoard,
+    charuco_board,
+    decode,
+    dictionaries,
+    find_corners,
+)
+from fg_calib.importers.views import Corners
+from fg_calib.io.atomic import read_bytes
+from fg_calib.io.units import Units, UnitsOfFile
+from fg_calib.io.yaml import Count, Positive, Schema, read_yaml, shown, validate
+from fg_calib.measurements.dataset import Floats
+from fg_calib.options import did_you_mean
+
+_MOST = 1000
+"""Columns or rows."""
+_LARGEST = 2.0
+"""Side of a square, [m]: larger ones are in another unit."""
+_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp", ".jp2")
+
+_ENOUGH = 3
+"""Images that show the same larger board: it is another one than the file says, and parts of it may look like that."""
+
+
+# --- the file of a board ----------------------------------------------------------------------------------------------
+
+
+class _Board(Schema):
+    type: Literal["checkerboard", "charuco"]
+    columns: Annotated[Count, Field(ge=3, le=_MOST)]
+    rows: Annotated[Count, Field(ge=3, le=_MOST)]
+    square: Positive
+    marker: Positive | None = None
+    dictionary: str | None = None
+    legacy: StrictBool = False
+    upright: StrictBool = False
+    name: str = ""
+    units: UnitsOfFile = Units()
+
+
+def read_calibration_board(path: Path) -> CalibrationBoard:
+    """A calibration board.
+
+    Raises:
+        InputError: The file is missing or cannot be used, or the board looks the same after half a turn and the file
+            does not say `upright: true`.
+    """
+    place = path.name
+    file = validate(_Board, read_yaml(path), place)
+    length = file.units.factor("m")
+    if file.square * length > _LARGEST:
+        found = f"found {shown(file.square)} {file.units.length}"
+        raise InputError(f"{place}: square", found, f"at most {_LARGEST:g} m", "is it in mm? units: {length: mm}")
+    return (_checkerboard if file.type == "checkerboard" else _charuco)(file, length, place)
+
+
+def _checkerboard(file: _Board, length: float, place: str) -> CalibrationBoard:
+    for key in ("marker", "dictionary", "legacy"):
+        if getattr(file, key):
+            raise InputError(f"{place}: {key}", f"found {shown(getattr(file, key))}", "none with a checkerboard")
+    upright = file.upright
+    board = CalibrationBoard(
+        "checkerboard", file.columns, file.rows, file.square * length, upright=upright, name=file.name
+    )
+    if not board.ambiguous and upright:
+        expected = f"none with {file.columns} x {file.rows} inner corners, whose ends differ"
+        raise InputError(f"{place}: upright", "found true", expected)
+    if file.columns == file.rows:
+        found = f"{file.columns} x {file.rows} inner corners look the same from several sides"
+        raise InputError(place, found, "columns + rows odd, or a charuco board")
+    if board.ambiguous and not file.upright:
+        found = f"{file.columns} x {file.rows} inner corners look the same after half a turn"
+        hint = "where the camera never turns more than a quarter about its axis, say upright: true"
+        raise InputError(place, found, "columns + rows odd, or a charuco board", hint)
+    return board
+
+
+def _charuco(file: _Board, length: float, place: str) -> CalibrationBoard:
+    if file.upright:
+        raise InputError(f"{place}: upright", "found true", "none with a charuco board")
+    if file.marker is None or file.dictionary is None:
+        raise InputError(place, f"missing key {'marker' if file.marker is None else 'dictionary'!r}")
+    if file.marker >= file.square:
+        found = f"found {shown(file.marker)}"
+        raise InputError(f"{place}: marker", found, f"a side shorter than a square's, {shown(file.square)}")
+    known = dictionaries()
+    if file.dictionary not in known:
+        found, hint = f"found {shown(file.dictionary)}", did_you_mean(file.dictionary, known)
+        raise InputError(f"{place}: dictionary", found, "one of OpenCV's, such as DICT_5X5_100", hint)
+    board = CalibrationBoard(
+        *("charuco", file.columns, file.rows, file.square * length, file.marker * length, file.dictionary),
+        legacy=file.legacy,
+        name=file.name,
+    )
+    charuco_board(board, place)
+    return board
+
+
+# --- images -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class CalibrationBoard:
-    """A checkerboard, or a ChArUco board, whose white squares hold markers that say which ones they are.
-
-    The board's frame has its origin at the first corner of a checkerboard, between whose first four corners is a
-    black square, or at the outer corner of a ChArUco board's first square; x runs along the rows of corners, y from
-    row to row, z away from who looks at it.
+class FoundCorners:
+    """Corners of a board in some images.
 
     Attributes:
-        type: Which of the two.
-        columns: Of a checkerboard the inner corners in a row, of a ChArUco board the squares in a row, as in OpenCV.
-        rows: Inner corners, or squares, in a column.
-        square: Side of a square, [m].
-        marker: Side of a marker, [m]; 0 for a checkerboard.
-        dictionary: The markers' dictionary, such as `DICT_5X5_100`; empty for a checkerboard.
-        legacy: Whether the ChArUco board was drawn by an OpenCV before 4.6, which began boards with an even number of
-            rows with a white square.
-        upright: Whether the camera never turned more than a quarter turn about its axis between images, seen from the
-            first one: what tells apart the two ends of a checkerboard that looks the same after half a turn.
-        name: What the board is called in a column `board`; without a name there is no such column.
+        images: Where there are any.
+        without: Names of the other images, and why there are none.
+        size: Width and height of the images, [px].
     """
 
-    type: Literal["checkerboard", "charuco"]
-    columns: int
-    rows: int
-    square: float
-    marker: float = 0.0
-    dictionary: str = ""
-    legacy: bool = False
-    upright: bool = False
-    name: str = ""
+    images: tuple[Corners, ...]
+    without: Mapping[str, str]
+    size: tuple[int, int]
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Corners in a row, and rows of them."""
-        fewer = self.type == "charuco"
-        return self.columns - fewer, self.rows - fewer
 
-    @property
-    def corners(self) -> Floats:
-        """Places of the corners in the board's frame, x and y, row by row, shape (n_corners, 2), [m]."""
-        columns, rows = self.shape
-        j, i = np.divmod(np.arange(columns * rows), columns)
-        first = 1.0 if self.type == "charuco" else 0.0
-        return self.square * (np.stack([i, j], axis=1) + first)
+def image_files(given: Sequence[Path]) -> list[Path]:
+    """Files of images: those given, those in a folder, and those of a pattern such as `images/*.png`, in order.
 
-    @property
-    def ambiguous(self) -> bool:
-        """Whether it looks the same after half a turn: a checkerboard whose opposite end squares are of one colour."""
-        return self.type == "checkerboard" and (self.columns + self.rows) % 2 == 0
+    Raises:
+        InputError: There are none, or two of one name: an image is known by its name without the ending.
+    """
+    files: list[Path] = []
+    for path in given:
+        if path.is_dir():
+            found = sorted(f for f in path.iterdir() if f.suffix.lower() in _ENDINGS and not f.name.startswith("."))
+        elif not path.exists() and any(c in path.name for c in "*?["):
+            found = sorted(f for f in path.parent.glob(path.name) if f.is_file())
+        else:
+            found = [path]
+        if not found:
+            raise InputError(str(path), "no images", f"files that end in {', '.join(_ENDINGS)}")
+        files += found
+    names: dict[str, Path] = {}
+    for file in files:
+        name = _name(file)
+        if names.setdefault(name, file) != file:
+            raise InputError(str(file), f"a second image called {name!r}", f"one, as {names[name].name} is called so")
+        if name.lower() in NOTHING or not name.isprintable():
+            raise InputError(str(file), f"an image called {name!r}", "a name that a table can have under id")
+    return list(dict.fromkeys(files))
 
-    def span(self, corners: Integers) -> float:
-        """Least extent of some of its corners, in squares: RMS distance from the line that they are nearest to."""
-        places = self.corners[corners] / self.square
-        off = places - places.mean(axis=0)
-        return float(np.linalg.svd(off, compute_uv=False)[-1] / np.sqrt(len(places)))
+
+def _name(file: Path) -> str:
+    return file.stem.strip()
+
+
+def read_corners(files: Sequence[Path], board: CalibrationBoard) -> FoundCorners:
+    """Corners of a board in images.
+
+    Raises:
+        InputError: An image cannot be read, they have different sizes, none shows the board, or some a larger one.
+    """
+    found: list[Corners] = []
+    without: dict[str, str] = {}
+    size: tuple[int, int] | None = None
+    for k, file in enumerate(files):
+        tell("looking for corners", k, len(files))
+        image = decode(read_bytes(file), file.name)
+        height, width = image.shape
+        if size is None:
+            size = (width, height)
+        if size != (width, height):
+            expected = f"{size[0]} x {size[1]} px as {files[0].name}"
+            raise InputError(file.name, f"an image of {width} x {height} px", expected, "one camera at a time")
+        seen = find_corners(image, board)
+        if isinstance(seen, str):
+            without[file.name] = seen
+            _check_larger(seen, without, board)
+        else:
+            found.append(Corners(_name(file), *seen))
+    if size is None or not found:
+        reasons = "; ".join(dict.fromkeys(without.values()))
+        hint = "are columns, rows and dictionary those of the board? older charuco boards: legacy: true"
+        raise InputError("images", f"the board in none of {len(files)} ({reasons})", "at least one", hint)
+    return FoundCorners(tuple(_upright(found) if board.upright else found), without, size)
+
+
+def _check_larger(reason: str, without: Mapping[str, str], board: CalibrationBoard) -> None:
+    """Whether the images show a larger checkerboard, of which a part would now and then be taken for the board."""
+    alike = [name for name, other in without.items() if other == reason]
+    if reason.startswith(LARGER) and len(alike) >= _ENOUGH:
+        expected = f"{board.columns} x {board.rows} as the board's file says"
+        raise InputError(", ".join(alike), reason, expected, "columns and rows count inner corners")
+
+
+def _upright(found: Sequence[Corners]) -> list[Corners]:
+    """All corners in the order in which the rows run as in the first image, within a quarter turn."""
+    first = _along(found[0])
+    return [one if _along(one) @ first > 0.0 else one._replace(uv=one.uv[::-1].copy()) for one in found]
+
+
+def _along(one: Corners) -> Floats:
+    """From the first half of a board's corners to the second, in the image."""
+    half = len(one.uv) // 2
+    step: Floats = one.uv[-half:].mean(axis=0) - one.uv[:half].mean(axis=0)
+    return step

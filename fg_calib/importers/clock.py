@@ -18,7 +18,7 @@ from scipy.special import ndtr, stdtrit
 
 from fg_calib.arrays import Floats
 from fg_calib.errors import InputError
-from fg_calib.importers.streams import PoseStream, period
+from fg_calib.importers.recording import PoseStream, period
 
 LEAST_CORRELATION = 0.7
 """Below it the poses are not those of the arm's tool."""

@@ -1,9 +1,9 @@
-"""A job for files that are there: `fg-calib init` writes it, and says what only its user can decide."""
+"""A job for files that are there: `fg-calib init` fills a template, and marks what only its user can decide."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,17 +20,7 @@ from fg_calib.robot.model import Robot
 
 _TABLES = (".csv", ".parquet", ".pq")
 
-GUESSES = {
-    "position": (1e-4, "m"),
-    "orientation": (2e-4, "rad"),
-    "distance": (1e-4, "m"),
-    "angle": (2e-4, "rad"),
-    "point": (1e-4, "m"),
-    "pixel": (0.2, "px"),
-}
-"""1 sigma that stands in a job until somebody says better, and its unit: 0.1 mm, 0.2 mrad, 0.2 px."""
-
-_NOISE_OF: dict[str, tuple[str, ...]] = {
+_NOISE: dict[str, tuple[str, ...]] = {
     "pose": ("position", "orientation"),
     "position": ("position",),
     "orientation": ("orientation",),
@@ -39,7 +29,46 @@ _NOISE_OF: dict[str, tuple[str, ...]] = {
     "board": ("position", "orientation"),
     "pixels": ("pixel",),
 }
-"""What noise a model has; pairs have that of what they were measured by."""
+"""Kinds of noise of a model; pairs have those of what they were measured by."""
+
+_OTHER_MODELS = {
+    "pose": "or distance-rotation, which needs no frame; position without the orientations; board if a camera on the "
+    "tool measured where a board is",
+    "position": "or distance, which needs no frame",
+    "orientation": "or rotation, which needs no frame",
+    "anchor": "offset: estimate if the instrument adds a length of its own",
+}
+
+_TEMPLATE = """\
+# A calibration job, written by fg-calib init. Lines with DECIDE are yours to look at; `fg-calib inspect` says what this
+# job looks like.
+robot: {robot}
+{robot_notes}{measurements}units: {units}
+# DECIDE the noise, 1 sigma in the units above: the values are guesses, so it is estimated from residuals;
+# put your instrument's in their place and leave estimate out. joint: repeatability of the joint readings.
+noise: {noise}
+
+# The rest as it is by default:
+# pairing: star        # of models of pairs: star | chain | all | {{random: 3000, seed: 0}}
+# targets: {{smr1: {{x: 0.0, y: 0.0, z: {target}}}}}   # where targets are on the tool, if known
+# anchors: {{bolt: {{x: {anchor}, y: 0.0, z: 0.0}}}}   # where anchors are from the base, if known
+# loss: none           # huber | cauchy | geman-mcclure | gnc where there are gross errors
+# gauge: prior         # what data do not determine: priors fix it; keep: it stays at nominal; none
+# encoder: propagated  # estimated: the true joint values too
+# pair_errors: shared  # independent: pairs of one configuration share no errors
+# A column split with `test` in some rows keeps them out of the fit, to check the prediction.
+"""
+
+_NO_TOLERANCE = """\
+# DECIDE how far off the nominal model may be: the robot file does not say it of all that is estimated;
+# such as tolerance: {a: 0.001, d: 0.001, alpha: 0.1, theta: 0.1}, 1 sigma in its units. Without, nothing fixes what
+# the measurements do not determine (gauge: keep, below, leaves it at nominal).
+"""
+
+_NO_TOOL = """\
+# DECIDE whether exactly the robot file's tool was measured; if not: estimate: [tool.x, tool.y, tool.z]
+# in it (and tool.roll, tool.pitch, tool.yaw where orientations were measured).
+"""
 
 
 @dataclass(frozen=True)
@@ -67,7 +96,7 @@ class _Inputs:
 
 
 def draft_job(files: Sequence[Path], out: Path) -> str:
-    """The text of a job for some files.
+    """Draft the text of a job for some files.
 
     Args:
         files: A robot file, tables, perhaps a camera's file.
@@ -76,20 +105,33 @@ def draft_job(files: Sequence[Path], out: Path) -> str:
     Raises:
         InputError: There is no robot or no table among them, several of what there may be one, or one cannot be used.
     """
-    inputs = _sorted(files)
-    folder = out.parent
-    several = len(inputs.tables) > 1
-    lines = list(_head(inputs, folder))
-    if several:
-        lines += ["measurements:"]
-        for table in inputs.tables:
-            lines += _entry(table, inputs, folder)
+    inputs, folder = _sorted(files), out.parent
+    robot, units = inputs.robot, _common_units(inputs)
+    arm = [p for p in robot.parameters if p.estimated and 1 <= p.owner <= robot.n_joints]
+    tool = [robot.parameters[i] for i in robot.owned_by(robot.n_joints + 1)]
+    notes = _NO_TOLERANCE * any(p.tolerance is None for p in arm) + _NO_TOOL * (not any(p.estimated for p in tool))
+    if len(inputs.tables) == 1:
+        (one,) = inputs.tables
+        lines = [f"measurements: {_path(one.path, folder)}", *_keys(one, inputs, folder)]
     else:
-        lines += _single(inputs.tables[0], inputs, folder)
-    lines += _units(inputs)
-    lines += _noise(inputs)
-    lines += _choices(inputs)
-    return "\n".join(lines) + "\n"
+        lines = ["measurements:"]
+        for table in inputs.tables:
+            lines += [f"  - table: {_path(table.path, folder)}"]
+            lines += [f"    {line}" for line in _keys(table, inputs, folder)]
+            own = _units_of(table)
+            lines += [f"    units: {_flow(own)}"] * (own not in ({}, units))
+    guessed = sorted({key for table in inputs.every for key in table.guessed})
+    why = f"DECIDE: {' and '.join(guessed)} guessed from the values' sizes" if guessed else "as the headers say"
+    length = LENGTHS[units["length"]]
+    return _TEMPLATE.format(
+        robot=_path(inputs.robot_file, folder),
+        robot_notes=notes,
+        measurements="".join(f"{line}\n" for line in lines),
+        units=f"{_flow(units)}  # {why}",
+        noise=_flow(_noise(inputs, units)),
+        target=float(f"{0.1 / length:.3g}"),
+        anchor=float(f"{1.0 / length:.3g}"),
+    )
 
 
 def _sorted(files: Sequence[Path]) -> _Inputs:
@@ -185,100 +227,48 @@ def _with_pairs(tables: Sequence[Recognised], pairs: Recognised | None) -> list[
 
 def _path(file: Path, folder: Path) -> str:
     """A file's path as a job in the folder names it, in quotes where YAML needs them."""
-    return _scalar(os.path.relpath(file.absolute(), folder.absolute()))
+    return _flow([os.path.relpath(file.absolute(), folder.absolute())])[1:-1]
 
 
-def _scalar(text: str) -> str:
-    """Text as a scalar of YAML, also within brackets."""
-    return yaml.safe_dump([text], default_flow_style=True, width=10_000).strip()[1:-1]
+def _flow(value: Any) -> str:
+    """A value of YAML on one line."""
+    return yaml.safe_dump(value, default_flow_style=True, width=10_000, sort_keys=False, allow_unicode=False).strip()
 
 
-def _head(inputs: _Inputs, folder: Path) -> Iterator[str]:
-    yield "# A calibration job, written by fg-calib init. Lines with DECIDE are yours to look at;"
-    yield "# `fg-calib help job` has every key, `fg-calib inspect` says what this job looks like."
-    robot = inputs.robot
-    yield f"robot: {_path(inputs.robot_file, folder)}"
-    arm = [p for p in robot.parameters if p.estimated and 1 <= p.owner <= robot.n_joints]
-    if any(p.tolerance is None for p in arm):
-        yield "# DECIDE how far off the drawing may be: the robot file does not say it of all that is estimated;"
-        yield "# such as tolerance: {a: 0.001, d: 0.001, alpha: 0.1, theta: 0.1}, in its units. Without, nothing holds"
-        yield "# what the measurements do not determine (gauge: keep, below, leaves it at nominal)."
-        if inputs.robot_file.suffix.lower() == ".urdf":
-            urdf = _path(inputs.robot_file, folder)
-            yield f"# robot: {{urdf: {urdf}, estimate: [tool.x, tool.y, tool.z], tolerance: {{...}}}}"
-    tool = [robot.parameters[i] for i in robot.owned_by(robot.n_joints + 1)]
-    if not any(p.estimated for p in tool):
-        yield "# DECIDE whether exactly the robot file's tool was measured; if not: estimate: [tool.x, tool.y, tool.z]"
-        yield "# in it (and tool.roll, tool.pitch, tool.yaw where orientations were measured)."
-
-
-def _single(table: Recognised, inputs: _Inputs, folder: Path) -> Iterator[str]:
-    """The keys of one table alone."""
-    yield f"measurements: {_path(table.path, folder)}"
-    for key, value, comment in _keys(table, inputs, folder):
-        yield f"{key}: {value}{comment}"
-
-
-def _entry(table: Recognised, inputs: _Inputs, folder: Path) -> Iterator[str]:
-    """The entry of one of several tables."""
-    yield f"  - table: {_path(table.path, folder)}"
-    for key, value, comment in _keys(table, inputs, folder):
-        yield f"    {key}: {value}{comment}"
-    own = _units_of(table)
-    if own and own != _common_units(inputs):
-        yield f"    units: {_flow(own)}"
-
-
-def _keys(table: Recognised, inputs: _Inputs, folder: Path) -> Iterator[tuple[str, str, str]]:
-    """Keys of a table with their values and comments."""
+def _keys(table: Recognised, inputs: _Inputs, folder: Path) -> list[str]:
+    """Lines of the keys of a table, with comments."""
+    lines = []
     if inputs.pairs is not None and table is inputs.tables[0]:
-        which = "  # DECIDE whether they are of this table" if len(inputs.tables) > 1 else ""
-        yield "pairs", _path(inputs.pairs.path, folder), which
-    yield "model", str(table.model), _of_model(table)
+        which = "  # DECIDE whether they are of this table" * (len(inputs.tables) > 1)
+        lines.append(f"pairs: {_path(inputs.pairs.path, folder)}{which}")
+    other = _OTHER_MODELS.get(str(table.model))
+    lines.append(f"model: {table.model}" + (f"  # {other}" if other else ""))
     if table.model in POSE_MODELS:
-        yield "frame", "unknown", "  # DECIDE: known only if the measurement frame is the robot's base frame"
-    if table.model == "pixels":
-        assert inputs.camera is not None
-        room = "  # DECIDE: if it stands in the room, {file: ..., fixed: true}, and frame: unknown"
-        yield "camera", _path(inputs.camera, folder), room
+        lines.append("frame: unknown  # DECIDE: known only if the measurement frame is the robot's base frame")
+    if table.model == "pixels" and inputs.camera is not None:
+        room = "DECIDE: if it stands in the room, {file: ..., fixed: true}, and frame: unknown"
+        lines.append(f"camera: {_path(inputs.camera, folder)}  # {room}")
     alone = len(inputs.tables) == 1  # names of several tables would have to agree
     named = {"id": table.maybe_id} if table.maybe_id and alone else {}
     columns: dict[str, Any] = {name: _column(table, name) for name in table.columns} | named
     if columns:
-        yield "columns", _flow(columns), "  # DECIDE whether these are what the names mean"
+        lines.append(f"columns: {_flow(columns)}  # DECIDE whether these are what the names mean")
     if table.counts:
-        yield "# DECIDE scale and zero of each", "reading = (count - zero) * scale, in the units below", ""
+        lines.append("# DECIDE scale and zero of each: reading = (count - zero) * scale, in the units below")
     if table.maybe_id and not alone:
-        same = "  # if the same name in two tables is the same configuration"
-        yield "# DECIDE, among columns", _flow({"id": table.maybe_id}), same
-    unused = [name for name in table.unused if name not in named.values()]
-    if unused:
-        names = printable(", ".join(unused))
-        yield "# not used", names if len(names) <= 90 else f"{names[:86]} ...", ""
+        same = "if the same name in two tables is the same configuration"
+        lines.append(f"# DECIDE, among columns: {_flow({'id': table.maybe_id})}  # {same}")
+    if unused := [name for name in table.unused if name not in named.values()]:
+        lines.append(f"# not used: {printable(', '.join(unused))[:90]}")
+    return lines
 
 
 def _column(table: Recognised, name: str) -> Any:
-    """What the job says of a column that the table calls otherwise, or has in counts or another unit."""
+    """The entry of a column that the table calls otherwise, or has in counts or another unit."""
     column = table.columns[name]
     if name in table.counts:
         return {"name": column, "scale": 1.0, "zero": 0.0}
     return {"name": column, "scale": table.scales[name]} if name in table.scales else column
-
-
-def _of_model(table: Recognised) -> str:
-    other: dict[str | None, str] = {
-        "pose": "or distance-rotation, which needs no frame; position without the orientations; board if a camera on"
-        " the tool measured where a board is",
-        "position": "or distance, which needs no frame",
-        "orientation": "or rotation, which needs no frame",
-        "anchor": "offset: estimate if the instrument adds a length of its own",
-    }
-    return f"  # {other[table.model]}" if table.model in other else ""
-
-
-def _flow(mapping: dict[str, Any]) -> str:
-    """A mapping on one line."""
-    return yaml.safe_dump(mapping, default_flow_style=True, width=10_000, sort_keys=False, allow_unicode=False).strip()
 
 
 def _units_of(table: Recognised) -> dict[str, str]:
@@ -286,65 +276,25 @@ def _units_of(table: Recognised) -> dict[str, str]:
 
 
 def _common_units(inputs: _Inputs) -> dict[str, str]:
-    """The units at the top: those that the first table that says so has."""
+    """The units at the top: those of the first table that states them."""
     found: dict[str, str] = {"length": "m", "angle": "rad"}
     for table in reversed(inputs.every):
         found |= _units_of(table)
     return found
 
 
-def _units(inputs: _Inputs) -> Iterator[str]:
-    guessed = sorted({key for table in inputs.every for key in table.guessed})
-    why = (
-        f"  # DECIDE: {' and '.join(guessed)} guessed from the figures' sizes" if guessed else "  # as the headers say"
-    )
-    yield f"units: {_flow(_common_units(inputs))}{why}"
-
-
-def _noise(inputs: _Inputs) -> Iterator[str]:
-    """Noise as guesses that are estimated until somebody says better."""
-    wanted = dict.fromkeys(kind for table in inputs.tables for kind in _noise_of(table, inputs))
-    units = _common_units(inputs)
-    sizes = {"m": LENGTHS[units["length"]], "rad": ANGLES[units["angle"]], "px": 1.0}
-    figures = {kind: float(f"{GUESSES[kind][0] / sizes[GUESSES[kind][1]]:.2g}") for kind in wanted}
-    yield "# DECIDE the noise, 1 sigma in the units above: the figures are guesses, so it is estimated from residuals;"
-    yield "# put your instrument's in their place and leave estimate out. joint: repeatability of the joint readings."
-    yield f"noise: {_flow({**figures, 'joint': 0.0, 'estimate': True})}"
-
-
-def _lengths(inputs: _Inputs, **metres: float) -> str:
-    """An example of lengths in the job's unit."""
-    factor = LENGTHS[_common_units(inputs)["length"]]
-    return _flow({name: float(f"{value / factor:.3g}") for name, value in metres.items()})
-
-
-def _noise_of(table: Recognised, inputs: _Inputs) -> list[str]:
-    """Kinds of noise that a job has to state for a table, because the table does not."""
-    if table.model not in PAIR_MODELS:
-        return [kind for kind in _NOISE_OF[str(table.model)] if kind not in table.has_sigma]
-    pairs = inputs.pairs if table is inputs.tables[0] else None
-    kinds = ["point"] if "group" in table.present and "point" not in table.has_sigma else []
-    if pairs is None:
-        return kinds
-    return kinds + [kind for kind in ("distance", "angle") if kind in pairs.present and kind not in pairs.has_sigma]
-
-
-def _choices(inputs: _Inputs) -> Iterator[str]:
-    """The other keys with their defaults, as comments."""
-    columns = {name for table in inputs.tables for name in table.present}
-    yield ""
-    yield "# The rest as it is without a word:"
-    if any(table.model in POSE_MODELS for table in inputs.tables):
-        yield "# pairing: star        # of models of pairs: star | chain | all | {random: 3000, seed: 0}"
-    if "target" in columns:
-        near = _lengths(inputs, x=0.0, y=0.0, z=0.1, tolerance=0.001)
-        yield f"# targets: {{smr1: {near}}}   # where targets are on the tool, if known"
-    if "anchor" in columns:
-        near = _lengths(inputs, x=1.0, y=0.0, z=0.0, tolerance=0.002)
-        yield f"# anchors: {{bolt: {near}}}     # where anchors are from the base, if known"
-    yield "# loss: none           # huber | cauchy | geman-mcclure | gnc where there are gross errors"
-    yield "# gauge: prior         # what data do not determine: tolerances hold it; keep: it stays at nominal; none"
-    yield "# encoder: propagated  # estimated: the true joint values too"
-    yield "# pair_errors: shared  # independent: pairs of one configuration share no errors"
-    if "split" not in columns:
-        yield "# A column split with `test` in some rows keeps them out of the fit, to check the prediction."
+def _noise(inputs: _Inputs, units: dict[str, str]) -> dict[str, Any]:
+    """Guesses of noise that the tables do not state: 0.1 mm, 0.2 mrad, 0.2 px."""
+    guesses = dict.fromkeys(("position", "distance", "point"), 1e-4 / LENGTHS[units["length"]])
+    guesses |= dict.fromkeys(("orientation", "angle"), 2e-4 / ANGLES[units["angle"]]) | {"pixel": 0.2}
+    found: dict[str, Any] = {}
+    for table in inputs.tables:
+        if table.model not in PAIR_MODELS:
+            kinds = [kind for kind in _NOISE[str(table.model)] if kind not in table.has_sigma]
+        else:
+            pairs = inputs.pairs if table is inputs.tables[0] else None
+            kinds = ["point"] if "group" in table.present and "point" not in table.has_sigma else []
+            present = () if pairs is None else set(pairs.present) - pairs.has_sigma
+            kinds += [kind for kind in ("distance", "angle") if kind in present]
+        found |= {kind: float(f"{guesses[kind]:.2g}") for kind in kinds}
+    return {**found, "joint": 0.0, "estimate": True}

@@ -14,15 +14,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from fg_calib.arguments import checked
 from fg_calib.arrays import Floats, FrozenArrays
 from fg_calib.errors import InputError
-from fg_calib.importers.autocorrelation import LEAST_SIGMA, correlation_time, is_slow, sigmas_of_means
 from fg_calib.importers.clock import ClockOffset, estimate_offset
-from fg_calib.importers.streams import JointStream, PoseStream, period
+from fg_calib.importers.recording import (
+    LEAST_SIGMA,
+    JointStream,
+    PoseStream,
+    correlation_time,
+    is_slow,
+    period,
+    sigmas_of_means,
+)
+from fg_calib.io.csv_writer import require_own_csv, write_csv
+from fg_calib.io.tables import joint_columns
 from fg_calib.options import check_number
 from fg_calib.robot.model import Robot
 
@@ -315,3 +327,54 @@ def _scatter(residuals: Sequence[Floats]) -> tuple[Scatter, Floats]:
     single = np.median([r.std(axis=0) for r in residuals], axis=0)
     n = float(np.median([len(r) for r in residuals]))
     return Scatter(float(single.max()), float(np.median(sigma, axis=0).max()), tau, is_slow(tau, n)), sigma
+
+
+# --- the table of stops -----------------------------------------------------------------------------------------------
+
+
+_BEGINNING = b"id,begin,seconds,samples,"
+"""How such a table begins."""
+
+
+def require_replaceable(path: Path) -> None:
+    """Check that a table of stops can be written: a CSV that is not there yet, or was written as one.
+
+    Raises:
+        InputError: It cannot.
+    """
+    require_own_csv(path, _BEGINNING)
+
+
+@checked
+def write_stops(path: Path | str, stops: Stops, robot: Robot) -> None:
+    """Write the table of configurations and poses, in m and rad, whole or not at all.
+
+    Columns: `id`; `begin` and `seconds` of what was averaged, from the first joint reading on, and `samples`, which
+    nothing reads; the joints' names (`q1 ... qn` where these mean something else in a table); `x y z`; `qx qy qz qw`
+    where orientations were measured; `sigma_x ...` and `sigma_rx ...`.
+
+    Args:
+        path: The CSV; one that was written as such is replaced.
+        stops: The stops.
+        robot: Whose joints they are of.
+
+    Raises:
+        InputError: It cannot be written, or is another file.
+    """
+    path = Path(path)
+    require_replaceable(path)
+    columns: dict[str, Any] = {
+        "id": np.array(stops.ids),
+        "begin": np.round(stops.interval[:, 0], 3),
+        "seconds": np.round(np.diff(stops.interval, axis=1)[:, 0], 3),
+        "samples": stops.samples.astype(np.int64),
+        **dict(zip(joint_columns(robot), stops.readings.T, strict=True)),
+        **dict(zip("xyz", stops.position.T, strict=True)),
+    }
+    if stops.rotation is not None:
+        quaternion = Rotation.from_matrix(stops.rotation.copy()).as_quat(canonical=True)
+        columns |= {f"q{axis}": quaternion[:, k] for k, axis in enumerate("xyzw")}
+    columns |= {f"sigma_{axis}": stops.sigma_position[:, k] for k, axis in enumerate("xyz")}
+    if stops.sigma_orientation is not None:
+        columns |= {f"sigma_r{axis}": stops.sigma_orientation[:, k] for k, axis in enumerate("xyz")}
+    write_csv(path, columns)

@@ -15,8 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fg_calib.errors import InputError
-from fg_calib.importers.board import CalibrationBoard
-from fg_calib.importers.opencv import both_poses, first_camera
+from fg_calib.importers.opencv import CalibrationBoard, both_poses, first_camera
 from fg_calib.measurements.dataset import Floats, Integers
 from fg_calib.measurements.kind import Frames
 from fg_calib.measurements.kinds import Camera

@@ -6,8 +6,8 @@ from typing import Any
 
 from rich.console import Group, RenderableType
 
+from fg_calib.importers.recording import JointStream, PoseStream, period
 from fg_calib.importers.standstill import Stops
-from fg_calib.importers.streams import JointStream, PoseStream, period
 from fg_calib.report.tables import indented, line, plain_table, section
 
 

@@ -11,9 +11,8 @@ import yaml
 from boards import CAMERA, SIZE, render, views
 from scipy.spatial.transform import Rotation
 
-from fg_calib.importers import images
-from fg_calib.importers.board import CalibrationBoard
-from fg_calib.importers.calibration_board import read_calibration_board
+from fg_calib.importers import board as images
+from fg_calib.importers.board import CalibrationBoard, read_calibration_board
 from fg_calib.importers.opencv import opencv
 from fg_calib.io.instruments import read_camera
 

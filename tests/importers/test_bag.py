@@ -1,8 +1,6 @@
 """ROS bags of every format, written by the tests: what is read of them, and a line for each that cannot be used."""
 
 import gc
-import json
-import re
 import shutil
 import sys
 
@@ -14,9 +12,7 @@ from sparing import diagonal
 
 from fg_calib import InputError, Robot, read_measurements, read_robot, write_robot
 from fg_calib.importers.bag import read_bag
-from fg_calib.importers.standstill import average_stops
-from fg_calib.importers.stops import write_stops
-from fg_calib.io.tables import joint_columns
+from fg_calib.importers.standstill import average_stops, write_stops
 
 pytest.importorskip("rosbags", reason="the extra ros is not installed")
 
@@ -66,12 +62,6 @@ def test_poses_of_every_type_are_read(tmp_path, short, form, pose_type):
     assert poses.rotation == pytest.approx(short.rotation, abs=1e-12)
 
 
-@pytest.mark.parametrize("form", ["sqlite3", "mcap"])
-def test_a_file_of_a_folder_is_a_bag_too(bags, short, form):
-    file = next(file for file in bags[form].iterdir() if file.suffix in (".db3", ".mcap"))
-    assert read_bag(file, arm())[1].position == pytest.approx(short.position, abs=0)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("form", FORMATS)
 def test_a_bag_calibrates_the_arm(tmp_path, fg_calib, form):
@@ -95,35 +85,6 @@ def test_a_bag_calibrates_the_arm(tmp_path, fg_calib, form):
     calibrated = read_robot(tmp_path / "result" / "robot_calibrated.yaml")
     assert np.abs(predicted(calibrated, motion) - motion.true_position).max() < 1e-4
     assert np.abs(predicted(nominal, motion) - motion.true_position).max() > 1e-3
-
-
-@pytest.mark.slow
-def test_the_command_reports_topics_clocks_and_stops(tmp_path, fg_calib, bags):
-    write_robot(tmp_path / "robot.yaml", arm())
-    ended = fg_calib("bag", bags["ros1"], "--robot", tmp_path / "robot.yaml")
-    assert (ended.code, ended.err) == (0, "nothing is written: --out poses.csv writes the table\n")
-    lines = [line.rstrip() for line in ended.out.splitlines()]
-    assert lines[0] == "run.bag: 3 stops found, 3 used, 0 skipped"
-    assert lines[3].split() == ["joints", "/joint_states", "sensor_msgs/msg/JointState", "144", "30"]
-    assert re.fullmatch(r"  poses are stamped \+0\.13[67]\d+ \+- 0\.000\d+ s against the joints", lines[7])
-    assert lines[8].startswith("  from 2 moves; speeds by joints and by poses correlate by 1.000")
-    assert lines[9] == "  this offset is taken out"
-    ended = fg_calib("bag", bags["ros1"], "--robot", tmp_path / "robot.yaml", "--offset", 0.1, "--json")
-    document = json.loads(ended.out)
-    assert document["schema"] == "fg-calib/bag/1"
-    assert (document["n_found"], document["n_written"], document["applied_offset"]) == (3, 3, 0.1)
-    assert document["offset"]["seconds"] == pytest.approx(0.137, abs=1e-3)
-    assert set(document["scatter"]) == {"position", "orientation", "joint"}
-
-
-def test_a_table_that_is_somebody_elses_is_kept(tmp_path, fg_calib, bags):
-    write_robot(tmp_path / "robot.yaml", arm())
-    (tmp_path / "poses.csv").write_text("id,q1\n")
-    ended = fg_calib("bag", bags["ros1"], "--robot", tmp_path / "robot.yaml", "--out", tmp_path / "poses.csv")
-    assert ended.code == 1
-    assert "poses.csv: is there already, not written by this command" in ended.err
-    ended = fg_calib("bag", bags["ros1"], "--robot", tmp_path / "robot.yaml", "--out", tmp_path / "poses.parquet")
-    assert ended.err == f"error: {tmp_path / 'poses.parquet'}: ending '.parquet', expected .csv\n"
 
 
 def predicted(robot, motion):
@@ -156,13 +117,6 @@ def test_the_table_is_read_as_it_was_averaged(tmp_path):
         write_stops(tmp_path / "mine.csv", stops, arm())
 
 
-@pytest.mark.parametrize("name", ["x", "id", "target", "begin", "a,b", "1st"])
-def test_joints_whose_names_mean_something_else_are_numbered(name):
-    robot = Robot.from_dh([[0, 0, 0, 0]] * 2, names=[name, "other"])
-    assert joint_columns(robot) == ("q1", "q2")
-    assert joint_columns(Robot.from_dh([[0, 0, 0, 0]], names=["arm_0-joint"])) == ("arm_0-joint",)
-
-
 # What is chosen, and what is mended
 
 
@@ -192,13 +146,6 @@ def test_transforms_of_one_frame_are_chosen(bag):
         "it has map -> base, camera -> marker"
     )
     assert error(path, child="hand").startswith(f"{path.name}: topic /tf: no poses of these frames, expected one:")
-
-
-def test_transforms_are_taken_where_there_is_nothing_else(bag):
-    poses(bag, form="TFMessage", topic="/tf_static")
-    poses(bag, form="TFMessage", topic="/tf")
-    poses(bag, n=3, topic="/tracker")
-    assert read_bag(bag.close(), arm())[1].source.topic == "/tracker"
 
 
 def test_without_stamps_times_of_receipt_are_used(tmp_path):
@@ -266,13 +213,6 @@ def test_topics_of_which_several_fit(bag):
     assert read_bag(path, arm(), pose="/camera")[1].source.topic == "/camera"
 
 
-def test_a_bag_without_poses(bag):
-    path = bag.close()
-    found = error(path)
-    assert found.startswith(f"{path.name}: no topic of type geometry_msgs/msg/PoseStamped or ")
-    assert found.endswith("; the bag has /joint_states (sensor_msgs/msg/JointState)")
-
-
 def test_a_joint_that_is_not_there(bag):
     poses(bag)
     path = bag.close()
@@ -281,17 +221,6 @@ def test_a_joint_that_is_not_there(bag):
         f"{path.name}: topic /joint_states: no joint tilt, expected the robot's joints among {', '.join(NAMES)}; "
         "name the bag's joints in chain order: --names, or `name` in the robot file"
     )
-
-
-def test_joints_that_are_never_in_one_message(tmp_path):
-    bag = BagWriter(tmp_path, "sqlite3")
-    for k in range(4):
-        half = NAMES[:3] if k % 2 else NAMES[3:]
-        bag.joints(START + k, half, np.zeros(3))
-    poses(bag)
-    path = bag.close()
-    found = f"{path.name}: topic /joint_states: no message has positions of all joints"
-    assert error(path) == f"{found}, expected one with {', '.join(NAMES)}"
 
 
 def test_a_clock_that_was_set_back(bag):
@@ -309,31 +238,6 @@ def test_quaternions_that_are_none(bag):
     path = bag.close()
     assert error(path) == (
         f"{path.name}: topic /pose: quaternion of norm 1.11803, expected 1 within 0.001; 2 of 3 poses"
-    )
-
-
-def test_a_topic_with_one_message(bag):
-    poses(bag, n=1)
-    path = bag.close()
-    assert error(path) == f"{path.name}: topic /pose: 1 message, expected a recording"
-
-
-def test_a_definition_that_is_not_the_standard_one(tmp_path):
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    bag = BagWriter(tmp_path, "ros1")
-    standard, bag.store = bag.store, get_typestore(Stores.EMPTY)
-    text = "builtin_interfaces/Time stamp\nfloat64 x"
-    bag.store.register(get_types_from_msg(text, "sensor_msgs/msg/JointState"))
-    stamp = bag.store.types["builtin_interfaces/msg/Time"](sec=1, nanosec=0)
-    kind = "sensor_msgs/msg/JointState"
-    for k in range(2):
-        bag.write("/joint_states", kind, bag.store.types[kind](stamp=stamp, x=0.0), START + k)
-    bag.store = standard
-    poses(bag)
-    path = bag.close()
-    assert error(path) == (
-        f"{path.name}: topic /joint_states has a definition of sensor_msgs/msg/JointState that is not the standard one"
     )
 
 
@@ -370,28 +274,6 @@ def cut(bag, folder, kept):
     content = file.read_bytes()
     file.write_bytes(content[: int(kept * len(content))])
     return path
-
-
-@pytest.mark.sampled(1)
-@LEFT_OPEN
-@pytest.mark.parametrize("form", FORMATS)
-def test_damage_is_one_line_or_nothing(tmp_path, bags, form):
-    """Bytes that are changed anywhere: what is read, or an `InputError`; nothing else."""
-    generator = np.random.default_rng(0)
-    path = cut(bags[form], tmp_path, 1.0)
-    file = path if path.is_file() else next(f for f in path.iterdir() if f.suffix != ".yaml")
-    content = np.frombuffer(file.read_bytes(), dtype=np.uint8)
-    refused = 0
-    for _ in range(8):
-        damaged = content.copy()
-        where = generator.integers(0, len(content), 40)
-        damaged[where] = generator.integers(0, 256, 40)
-        file.write_bytes(damaged.tobytes())
-        try:
-            read_bag(path, arm())
-        except InputError as found:
-            refused += "\n" not in str(found)
-    assert refused > 0
 
 
 def test_without_rosbags_a_line_says_what_to_install(tmp_path, fg_calib, monkeypatch):

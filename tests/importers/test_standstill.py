@@ -8,9 +8,8 @@ from recordings import arm, correlated, record
 from scipy.spatial.transform import Rotation
 
 from fg_calib import InputError, Robot
-from fg_calib.importers.autocorrelation import correlation_time, is_slow, sigmas_of_means
+from fg_calib.importers.recording import JointStream, PoseStream, Source, correlation_time, is_slow, sigmas_of_means
 from fg_calib.importers.standstill import average_stops, find_standstills
-from fg_calib.importers.streams import JointStream, PoseStream, Source
 
 
 def averaged(motion, **more):

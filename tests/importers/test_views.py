@@ -10,8 +10,7 @@ from scipy.stats import chi2, kstest
 from tolerances import sigmas_apart
 
 from fg_calib.errors import InputError
-from fg_calib.importers.board import CalibrationBoard
-from fg_calib.importers.opencv import find_corners
+from fg_calib.importers.opencv import CalibrationBoard, find_corners
 from fg_calib.importers.views import FIGURES, Corners, camera_derivatives, fit_board
 from fg_calib.measurements.kind import Frames
 from fg_calib.measurements.kinds import Camera

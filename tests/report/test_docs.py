@@ -37,7 +37,7 @@ from fg_calib import (
 )
 from fg_calib.cli import EXAMPLES
 from fg_calib.cli.entry import app
-from fg_calib.importers.calibration_board import read_calibration_board
+from fg_calib.importers.board import read_calibration_board
 from fg_calib.robot.kinematics import pose
 
 ROOT = Path(__file__).resolve().parents[2]

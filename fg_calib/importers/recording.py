@@ -1,22 +1,23 @@
-"""The mean of samples whose noise is correlated, and its sigma.
+"""Recordings: joint readings and poses over time, each by its sender's clock; means of samples with correlated noise.
 
 Of n samples with autocorrelation rho_k the mean of samples of variance s^2 has the variance
 
     s^2 tau / n,    tau = 1 + 2 sum_k (1 - k / n) rho_k
 
 (integrated autocorrelation time, in samples; Sokal 1997, *Monte Carlo Methods in Statistical Mechanics*, Sec. 3). tau
-is estimated from all stops together, as one is too short. As s is estimated too, the variance is that of Student's t.
-Von Neumann's ratio: von Neumann 1941, *Distribution of the Ratio of the Mean Square Successive Difference to the
-Variance*.
+is estimated from all standstills together, as one is too short. As s is estimated too, the variance is Student's.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from fg_calib.arrays import Floats
+from fg_calib.arrays import Floats, FrozenArrays
+from fg_calib.robot.kinematics import build_chain, forward
+from fg_calib.robot.model import Robot
 
 LEAST_SIGMA = 1e-6
 """Of a mean, [m] or [rad]: poses without any scatter are not exact either."""
@@ -35,6 +36,69 @@ _MUCH = 1.5
 
 _BETTER = 12.0
 """What slow noise must gain in twice the logarithm of the likelihood: white noise alone gains it once in 400 times."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a stream is from.
+
+    Attributes:
+        topic: Its topic.
+        kind: Type of its messages.
+        lag: Median of the time of receipt less the stamp, [s]: latency, and how far the two clocks are apart.
+        notes: What was left out or mended, in words.
+    """
+
+    topic: str
+    kind: str
+    lag: float = 0.0
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class JointStream(FrozenArrays):
+    """Joint readings over time.
+
+    Attributes:
+        time: By the sender's clock, ascending, shape (n,), [s].
+        readings: In chain order, shape (n, n_joints), [rad] (prismatic: [m]).
+        source: Where they are from.
+    """
+
+    time: Floats
+    readings: Floats
+    source: Source
+
+    def tool_path(self, robot: Robot) -> PoseStream:
+        """The tool's poses at the readings, of the nominal robot in its base frame."""
+        trig = robot.trig(self.readings)
+        poses = forward(build_chain(robot, {}), trig)
+        return PoseStream(self.time, poses.position, poses.rotation, self.source)
+
+
+@dataclass(frozen=True)
+class PoseStream(FrozenArrays):
+    """Poses over time.
+
+    Attributes:
+        time: By the sender's clock, ascending, shape (n,), [s].
+        position: world_p_tool, shape (n, 3), [m].
+        rotation: world_R_tool, shape (n, 3, 3); None where orientations are not measured.
+        source: Where they are from.
+    """
+
+    time: Floats
+    position: Floats
+    rotation: Floats | None
+    source: Source
+
+
+def period(time: Floats) -> float:
+    """Median time from one sample to the next, [s]."""
+    return float(np.median(np.diff(time)))
+
+
+# --- means of correlated samples --------------------------------------------------------------------------------------
 
 
 def correlation_time(residuals: Sequence[Floats]) -> float:
