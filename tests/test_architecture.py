@@ -51,7 +51,7 @@ FOLDERS = (
 
 UPWARD = {
     "diagnostics/inspection": {"prediction/expected_error"},
-    "graph/build": {"observability/indices", "observability/random_configurations"},
+    "graph/build": {"observability/indices"},
     "graph/information": {"observability/indices"},
     "observability/cramer_rao": {"prediction/expected_error"},
     "prediction/correction": {"calibration"},

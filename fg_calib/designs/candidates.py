@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from fg_calib.arrays import Brief
 from fg_calib.designs.information import PoseRows, Posterior, count_measurements, gather_rows
 from fg_calib.errors import InputError
-from fg_calib.graph.build import true_problem
+from fg_calib.graph.build import places_of, true_problem
 from fg_calib.graph.factors import Variables, unknown_prior_rows
 from fg_calib.graph.information import whitened_jacobian
 from fg_calib.graph.knowledge import coordinates_of
@@ -28,7 +28,6 @@ from fg_calib.graph.problem import Problem
 from fg_calib.measurements.dataset import Noise, form_pairs
 from fg_calib.measurements.landmarks import Landmarks
 from fg_calib.measurements.table import KnownPoint, Table
-from fg_calib.observability.random_configurations import places_of
 from fg_calib.options import PAIR_MODELS, Gauge, Model, Options, Pairing
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot

@@ -19,12 +19,12 @@ from fg_calib.assessment import solve_job
 from fg_calib.designs.candidates import NONE, REFERENCE, Pool, build_pool, draw_groups, rms_sigma
 from fg_calib.designs.information import gather_rows
 from fg_calib.errors import InputError
+from fg_calib.graph.build import places_of
 from fg_calib.graph.factors import pose_of
 from fg_calib.graph.problem import Problem, reweighted_at
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import Noise
 from fg_calib.measurements.table import Table
-from fg_calib.observability.random_configurations import places_of
 from fg_calib.options import PAIR_MODELS, POSE_MODELS
 from fg_calib.robot.kinematics import pose
 from fg_calib.simulation.scenario import (

@@ -28,7 +28,7 @@ from fg_calib.graph.normal_system import SIGNAL_FLOOR, eliminate
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.rows import RowSet
 from fg_calib.observability.indices import Observability, observability_of_rows
-from fg_calib.observability.observed_quantities import Seen
+from fg_calib.observability.observed_quantities import ObservedQuantities
 from fg_calib.prediction.expected_error import PoseRms, errors_at, without_rigid_motion
 from fg_calib.robot.kinematics import forward, precompute_trig
 from fg_calib.statistics.covariance import TangentCovariance, covariance_of_rows
@@ -323,4 +323,4 @@ def count_measurements(problem: Problem) -> int:
 
 def needs_fit(problem: Problem) -> bool:
     """Whether nothing that is measured says where the base is, so that errors count after the best rigid fit."""
-    return Seen.by(problem.data.tables).blind_to_base
+    return ObservedQuantities.of_tables(problem.data.tables).blind_to_base

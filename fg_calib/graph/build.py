@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -26,7 +26,6 @@ from fg_calib.measurements.kinds.pair import missing_values
 from fg_calib.measurements.predictions import predict_measurements
 from fg_calib.measurements.table import Table
 from fg_calib.observability.indices import singular_values
-from fg_calib.observability.random_configurations import Places, frame_names
 from fg_calib.options import (
     FrameKnowledge,
     Gauge,
@@ -45,6 +44,8 @@ from fg_calib.threads import single_threaded
 _log = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
+Places = Mapping[tuple[str, str], Floats]
+"""Coordinates of landmarks, and unknown frames as X, by letter and name."""
 
 QUARTER_TURN = 1e-3
 """Cosine of a pitch at which yaw and roll of a frame may be told apart no more."""
@@ -235,6 +236,21 @@ def true_problem(
     return problem_at(robot, data, options, variables, start)
 
 
+def places_of(problem: Problem, parameters: Floats) -> dict[tuple[str, str], Floats]:
+    """Coordinates of landmarks by letter and name, and unknown measurement frames, called as `frame_names` says."""
+    unknowns, coordinates = problem.data.unknowns, problem.variables.at(parameters).coordinates
+    parts = np.split(coordinates, np.cumsum(unknowns.sizes)[:-1]) if unknowns.sizes else []
+    frames = [parameters[v.places] for v in problem.variables.frames]
+    names = [*unknowns.keys, *frame_names(problem.data, problem.variables)]
+    return dict(zip(names, [*parts, *frames], strict=True))
+
+
+def frame_names(data: Dataset, variables: Variables) -> list[tuple[str, str]]:
+    """Letter and name of each unknown measurement frame: it is called as its table."""
+    return [("X", data.labels[v.number]) for v in variables.frames]
+
+
+@single_threaded
 def random_problem(
     robot: Robot, model: Model, frame: FrameKnowledge = "known", *, n_configurations: int = 0, seed: int = 0
 ) -> Problem:

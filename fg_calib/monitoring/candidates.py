@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arrays import FrozenArrays
+from fg_calib.graph.build import places_of
 from fg_calib.graph.factors import Variable, pose_of
 from fg_calib.graph.knowledge import coordinates_of
 from fg_calib.graph.problem import Problem, problem_at, variables_of
@@ -21,7 +22,7 @@ from fg_calib.measurements.build import build_dataset
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.table import Table
 from fg_calib.monitoring.new_data import Linear, linearised
-from fg_calib.observability.random_configurations import at_configurations, places_of
+from fg_calib.observability.random_configurations import at_configurations
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, Pairing
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.kinematics import build_chain, forward

@@ -13,7 +13,7 @@ from fg_calib.graph.knowledge import SIZE, STAYING, Knowledge, Name, coordinates
 from fg_calib.graph.normal_system import eliminate
 from fg_calib.graph.problem import Problem, by_columns_of
 from fg_calib.graph.solver import Solution
-from fg_calib.observability.observed_quantities import Seen
+from fg_calib.observability.observed_quantities import ObservedQuantities
 
 Floats = NDArray[np.float64]
 
@@ -35,7 +35,7 @@ def knowledge_of(solution: Solution) -> Knowledge | None:
         problem = by_columns_of(problem, problem.whole.variables)
     as_drawn, x = at_nominal(problem, solution.before)
     nominal = _known_at(as_drawn, x, with_loss=False)
-    views = Seen.of(problem).views
+    views = ObservedQuantities.of(problem).views
     nominal = replace(nominal, right=np.zeros(nominal.n), views=views)
     return replace(_known_at(problem, solution.parameters, with_loss=True), views=views, nominal=nominal)
 

@@ -1,13 +1,12 @@
-"""Which unknowns of the measurements take up a lost direction: without them the measurements would show it.
+"""Which landmarks and frames are confounded with a null-space direction: with these known the measurements show it.
 
-With the columns of an unknown projected out the direction is lost, with the unknown held where it is (its columns left
-out) it is seen: both are computed from the whitened rows.
+With the columns of a kind of landmark projected out the direction is lost, with the landmarks held where they are (its
+columns left out) it is seen: both are computed from the whitened rows, leaving one kind out after the other.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import chain, combinations
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,38 +14,26 @@ from numpy.typing import NDArray
 from fg_calib.graph.information import whitened_jacobian
 from fg_calib.graph.normal_system import eliminate
 from fg_calib.graph.problem import Problem
+from fg_calib.measurements.kinds import LANDMARKS
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-_NOTHING = 1e-6
-"""A direction is not seen if its rows are below this part of what its members do one by one, or of what they were."""
+NOT_SEEN = 1e-6
+"""Length of a direction's rows over that of what its members do one by one, up to which it is not seen."""
 
-_ROUNDING = 1e-8
-"""The same of what its members do, as directions are rounded to nine digits."""
+ROUNDING = 1e-8
+"""The part of that which is rounding, as directions are rounded to nine digits."""
 
-_WEAK = 1e-3
-"""Above this part of its rows a direction is not lost to unknowns, but hardly seen."""
+HARDLY_SEEN = 1e-3
+"""Part of a direction's rows that landmarks leave, above which it is not lost to them, but hardly seen."""
 
-_WORDS = {
-    "P": "the unknown places of the targets on the tool",
-    "A": "the unknown anchors",
-    "O": "what the instrument adds to every length",
-    "F": "the unknown planes",
-    "B": "the unknown boards",
-    "L": "the unknown touched points",
-    "N": "unknowns of kinds of your own",
-    "X": "the unknown measurement frame",
-    "": "variables added to the graph",
-}
-"""What takes a direction up, by the letter of its variables."""
-
-_GIVEN = {"P": ("target", "targets"), "A": ("anchor", "anchors")}
-"""Unknowns whose place may be given, and the key of a job that gives it."""
+OTHERS = {"X": "the unknown measurement frame", "": "variables added to the graph"}
+"""Variables that are no landmarks, by the letter of their symbols."""
 
 
-class Absorbed:
-    """What takes each of a problem's lost directions up.
+class Confounding:
+    """What each of a problem's null-space directions is confounded with.
 
     Args:
         problem: The problem.
@@ -58,70 +45,66 @@ class Absorbed:
         variables, n = problem.variables, problem.variables.n_robot_columns
         self._columns: dict[str, list[Integers]] = {}
         for v in (*variables.frames, *variables.nuisance):
-            letter = "X" if v.kind == "frame" else v.symbol[0] if v.kind == "unknown" else ""
+            letter = "X" if v.kind == "frame" else v.letter if v.kind == "unknown" else ""
             self._columns.setdefault(letter, []).append(np.arange(v.columns.start, v.columns.stop))
         self._by: list[tuple[str, ...] | None] = [()] * directions.shape[1]
         if not variables.nuisance:
-            return  # measurement frames alone: they take up what moves the whole arm as one body, nothing else
+            return  # measurement frames alone hide what moves the whole arm as one body, nothing else
         self._A = whitened_jacobian(problem, parameters)
         named = self._A[:, : variables.n_columns] @ variables.tangent_derivative(parameters)[:, :n]
         self._rows = named @ directions
         columns, changes = np.linalg.norm(named, axis=0), np.abs(directions)
-        one_by_one = np.maximum(columns @ changes, _NOTHING * columns.max() * changes.max(axis=0))
-        self._find(np.linalg.norm(self._rows, axis=0), one_by_one)
+        one_by_one = np.maximum(columns @ changes, NOT_SEEN * columns.max() * changes.max(axis=0))
+        size = np.linalg.norm(self._rows, axis=0)
+        shown = np.flatnonzero(size > NOT_SEEN * one_by_one).tolist()
+        left = {letter: self._left(shown, held=(letter,)) for letter in self._columns}
+        alone = {letter: self._left(shown, held=set(self._columns) - {letter}) for letter in self._columns}
+        every = self._left(shown)
+        for i, k in enumerate(shown):
+            most = max(NOT_SEEN * size[k], ROUNDING * one_by_one[k], 10.0 * every[i])
+            needed = tuple(letter for letter in self._columns if left[letter][i] > most)
+            enough = [(letter,) for letter in self._columns if alone[letter][i] <= most]
+            by = enough[0] if enough else needed or tuple(self._columns)
+            self._by[k] = by if every[i] <= HARDLY_SEEN * size[k] else None
 
     def by(self, k: int) -> tuple[str, ...] | None:
-        """Letters of what takes direction k up; none where nothing shows it anyway, None where nothing takes it up."""
+        """Letters of what direction k is confounded with; none where nothing shows it anyway, None where by nothing."""
         return self._by[k]
 
     def words(self, k: int) -> str:
-        """What takes direction k up, and what would help, in words."""
+        """What direction k is confounded with, and which additional knowledge would show it."""
         letters = self._by[k] or ()
+        names = [OTHERS.get(letter) or LANDMARKS[letter].description for letter in letters]
         one = letters in {("O",), ("X",)}
         verb = "takes it up" if one else "take it up together" if len(letters) > 1 else "take it up"
-        return f"{' and '.join(_WORDS[letter] for letter in letters)} {verb}{self._help(letters)}"
+        return f"{' and '.join(names)} {verb}{self._remedy(letters)}"
 
-    def _find(self, size: Floats, one_by_one: Floats) -> None:
-        """The fewest kinds of unknowns that each direction is lost by.
+    def _left(self, directions: Sequence[int], held: Collection[str] = ()) -> Floats:
+        """Length of what landmarks do not explain of directions' rows, but for kinds that are held, shape (n,)."""
+        columns = [c for letter, of in self._columns.items() if letter not in held for c in of]
+        return np.asarray(np.linalg.norm(self._rest(directions, columns), axis=0))
 
-        Args:
-            size: Length of each direction's rows, shape (n,).
-            one_by_one: The same, did its members not cancel each other.
-        """
-        shown = np.flatnonzero(size > _NOTHING * one_by_one).tolist()
-        if not shown:
-            return
-        lost: dict[tuple[str, ...], Floats] = {}  # what each set of kinds leaves of the directions shown
-        every = tuple(self._columns)
-        for letters in (every, *chain.from_iterable(combinations(every, r) for r in range(1, len(every)))):
-            columns = [c for letter in letters for c in self._columns[letter]]
-            lost[letters] = np.linalg.norm(self._left(shown, columns), axis=0)
-        for i, k in enumerate(shown):
-            most = max(_NOTHING * size[k], _ROUNDING * one_by_one[k], 10.0 * lost[every][i])
-            takers = [letters for letters, left in lost.items() if left[i] <= most]
-            self._by[k] = min(takers, key=len) if lost[every][i] <= _WEAK * size[k] else None
-
-    def _left(self, directions: Sequence[int], columns: Sequence[Integers]) -> Floats:
-        """Rows of directions that unknowns with these columns do not explain, shape (m, n)."""
+    def _rest(self, directions: Sequence[int], columns: Sequence[Integers]) -> Floats:
+        """Rows of directions that landmarks with these columns do not explain, shape (m, n)."""
         A = np.column_stack([self._rows[:, list(directions)], *(self._A[:, c] for c in columns)])
         return eliminate(A, np.zeros(len(A)), len(directions)).A
 
-    def _help(self, letters: tuple[str, ...]) -> str:
-        """How many places must be given to see every direction that the same unknowns take up, as well as all would."""
-        if len(letters) != 1 or letters[0] not in _GIVEN:
+    def _remedy(self, letters: tuple[str, ...]) -> str:
+        """How many places must be given to see every direction that the same landmarks hide, as well as all would."""
+        kind = LANDMARKS.get(letters[0]) if len(letters) == 1 else None
+        if kind is None or not kind.key:
             return ""
-        what, key = _GIVEN[letters[0]]
         mine = [k for k, by in enumerate(self._by) if by == letters]
-        others = [c for letter, of in self._columns.items() if letter != letters[0] for c in of]
-        unknowns = self._columns[letters[0]]
+        others = [c for letter, of in self._columns.items() if letter != kind.letter for c in of]
+        places = self._columns[kind.letter]
 
         def seen(n: int) -> tuple[bool, int]:
             """With n places given: whether each direction is seen, and how many of their combinations."""
-            left = self._left(mine, others + unknowns[n:]) / np.linalg.norm(self._rows[:, mine], axis=0)
-            alone = bool(np.all(np.linalg.norm(left, axis=0) > _NOTHING))
-            return alone, int(np.sum(np.linalg.svd(left, compute_uv=False) > _NOTHING))
+            left = self._rest(mine, others + places[n:]) / np.linalg.norm(self._rows[:, mine], axis=0)
+            alone = bool(np.all(np.linalg.norm(left, axis=0) > NOT_SEEN))
+            return alone, int(np.sum(np.linalg.svd(left, compute_uv=False) > NOT_SEEN))
 
-        best = seen(len(unknowns))
-        n = next(n for n in range(1, len(unknowns) + 1) if seen(n) == best)
-        which = f"the place of one {what}" if n == 1 else f"the places of {n} {what}s"
-        return f": to see it, give {which} (key {key})" if best[0] else ""
+        best = seen(len(places))
+        n = next(n for n in range(1, len(places) + 1) if seen(n) == best)
+        which = f"the place of one {kind.name}" if n == 1 else f"the places of {n} {kind.name}s"
+        return f": to see it, give {which} (key {kind.key})" if best[0] else ""

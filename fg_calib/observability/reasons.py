@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from fg_calib.graph.information import named_triangle
 from fg_calib.graph.normal_system import SUPPORT_TOLERANCE
 from fg_calib.graph.problem import Problem
-from fg_calib.observability.confounding import Absorbed
+from fg_calib.observability.confounding import Confounding
 from fg_calib.observability.indices import Observability
-from fg_calib.observability.observed_quantities import SEES_ORIENTATION, SEES_POSITION, Seen
-from fg_calib.observability.random_configurations import elsewhere
+from fg_calib.observability.observed_quantities import ObservedQuantities
+from fg_calib.observability.random_configurations import at_random_configurations
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Parameter
@@ -62,22 +62,22 @@ def explain_relations(
     if not lost:
         return ()
     tables = problem.data.tables
-    motion = _Motion(problem, parameters, Seen.of(problem))
+    motion = _Motion(problem, parameters, ObservedQuantities.of(problem))
     directions = np.array([[relation.get(name, 0.0) for name in names] for relation in lost]).T
-    absorbed, anywhere = Absorbed(problem, parameters, directions), elsewhere(problem, parameters)
-    # What kinds of one's own would show elsewhere is not known.
+    confounding, anywhere = Confounding(problem, parameters, directions), at_random_configurations(problem, parameters)
+    # What custom kinds would show there is not known.
     effect = np.zeros((1, len(directions))) if anywhere is None else named_triangle(anywhere, anywhere.start)
     largest = float(np.linalg.norm(effect, axis=0).max())
     seen = np.linalg.norm(effect @ directions, axis=0) > 1e-6 * largest * np.abs(directions).max(axis=0)
     touched = any(table.measurements.groups is not None for table in tables)
 
     def reason(k: int, direction: Floats) -> str:
-        by = absorbed.by(k)
+        by = confounding.by(k)
         if seen[k] and not (by and touched):  # nor what touches of the same points would
             return NOT_EXCITED
         if by == ():
             return motion.reason(direction)
-        return NO_CAUSE if by is None else BASE if motion.of_base(direction) else absorbed.words(k)
+        return NO_CAUSE if by is None else BASE if motion.of_base(direction) else confounding.words(k)
 
     return tuple(LostDirection(relation, reason(k, directions[:, k])) for k, relation in enumerate(lost))
 
@@ -85,7 +85,7 @@ def explain_relations(
 class _Motion:
     """What a problem's parameters do to the tool at random configurations."""
 
-    def __init__(self, problem: Problem, parameters: Floats, seen: Seen) -> None:
+    def __init__(self, problem: Problem, parameters: Floats, seen: ObservedQuantities) -> None:
         robot = problem.robot.with_values(parameters[problem.variables.robot_span])
         self._parameters = problem.estimated
         self._seen = seen
@@ -105,7 +105,7 @@ class _Motion:
     def reason(self, direction: Floats) -> str:  # noqa: PLR0911 - one return a cause
         """Why a direction, shape (n,), [m] and [rad], has no effect on the measurements."""
         w, dp, turns, moves = self._of_tool(direction)
-        sees_orientation, sees_position = map(self._seen.any_of, (SEES_ORIENTATION, SEES_POSITION))
+        sees_orientation, sees_position = self._seen.orientation, self._seen.position
         if not turns and not moves:
             return self._same_motion(direction)
         if not sees_orientation and not moves:
@@ -129,9 +129,9 @@ class _Motion:
     def of_base(self, direction: Floats) -> bool:
         """Whether a direction moves the arm as if the base alone had moved, and nothing seen says where the base is."""
         w, dp, turns, _ = self._of_tool(direction)
-        if not self._seen.relative(SEES_POSITION) or (turns and not self._seen.relative(SEES_ORIENTATION)):
+        if not self._seen.is_relative(position=True, orientation=turns):
             return False
-        return self._rigid(w, dp, self._seen.any_of(SEES_POSITION))
+        return self._rigid(w, dp, self._seen.position)
 
     def _of_tool(self, direction: Floats) -> tuple[Floats, Floats, bool, bool]:
         """Turns and shifts of the tool, shape (n_configurations, 3), and whether these are any."""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from fg_calib.graph.problem import Problem
 from fg_calib.measurements.build import Dataset
-from fg_calib.observability.observed_quantities import Seen
+from fg_calib.observability.observed_quantities import ObservedQuantities
 from fg_calib.robot.kinematics import forward
 from fg_calib.statistics.covariance import TangentCovariance
 
@@ -78,7 +78,7 @@ def expected_error(problem: Problem, spread: TangentCovariance) -> ExpectedError
     there, at = judged_configurations(data)
     chosen = there[np.unique(np.linspace(0, len(there) - 1, MOST).round().astype(np.int64))]
     base, fitted = errors_at(spread, data.readings[chosen])
-    relative = Seen.of(problem).blind_to_base
+    relative = ObservedQuantities.of(problem).blind_to_base
     return ExpectedError(base, fitted, at, len(chosen), len(there), relative)
 
 

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from jobs import SIGMA, UR5E, ur5e
+from jobs import SIGMA, ur5e
 from scenarios import INSTRUMENTS, scenario
 from scipy.spatial.transform import Rotation
 from simulated import measure, plus, small_arm, true_robot
 from touches import reach
 
-from fg_calib import InputError, Job, Measurements, Options, Robot, Table, inspect_job, simulate
+from fg_calib import Job, Measurements, Options, Robot, Table, inspect_job, simulate
 from fg_calib.io.job import read_job
 from fg_calib.robot.kinematics import pose
 from fg_calib.statistics import robust_screening as disagreement
@@ -79,36 +79,12 @@ def test_a_healthy_table_of_every_instrument_is_ready(name, seed):
     assert found.disagreements.n >= 15
 
 
-@pytest.mark.slow
-def test_the_expected_accuracy_is_that_of_the_calibration(example):
-    """To first order, at nominal instead of at the estimate."""
-    from fg_calib import calibrate_job
-
-    job = read_job(example / "calibration.yaml")
-    before, after = inspect_job(job).expected_error, calibrate_job(job).uncertainty.expected_error
-    assert before.base.position == pytest.approx(after.base.position, rel=0.01)
-    assert before.fitted.orientation == pytest.approx(after.fitted.orientation, rel=0.01)
-
-
 def test_rows_to_test_alone_are_inspected_as_an_evaluation(arm):
     m = measured(arm)
     found = inspected(arm, replace(m, test=np.ones(50, dtype=bool)))
     assert found.evaluated
     assert found.findings == ()
     assert found.expected_error is None
-
-
-@pytest.mark.slow
-def test_what_an_arm_without_tolerances_is_off_by_is_a_caution(tmp_path):
-    """Nobody said that it is not: by 50 mm here, which is 25 times the usual."""
-    arm = ur5e(tmp_path, tolerance={})
-    rough = arm.with_values([p.nominal + 0.05 * (p.kind == "a") for p in arm.parameters])
-    m = measured(rough)
-    found = inspected(arm, m)
-    assert found.ready
-    assert "times what noise and prior sigmas predict: no common mistake" in found.cautions[0]
-    found = inspected(ur5e(tmp_path), m)
-    assert "no common mistake in a set-up explains it" in found.findings[0]
 
 
 # --- mistakes in the set-up ------------------------------------------------------------------------------------------
@@ -144,16 +120,6 @@ def test_a_mistake_in_one_of_two_tables_is_said_of_that_table(arm):
     assert [bool(check.explanations) for check in found.setups] == [False, True]
 
 
-@pytest.mark.slow
-def test_a_mistake_with_targets_is_found_although_they_have_to_be_placed():
-    simulation = simulate(scenario(INSTRUMENTS["targets"]), seed=0)
-    (table,) = simulation.tables
-    m = table.measurements
-    spoilt = replace(table, measurements=replace(m, position=m.position * 1e3))
-    found = inspect_job(Job(None, simulation.robot, (spoilt,), Options()))
-    assert "if x, y, z are in mm, not m" in found.findings[0]
-
-
 # --- single rows -----------------------------------------------------------------------------------------------------
 
 
@@ -171,21 +137,6 @@ def test_rows_that_disagree_with_the_arm_are_named(arm, model, frame, size):
     assert rows[7].size == pytest.approx(size, rel=0.3)
 
 
-@pytest.mark.parametrize(
-    ("rows", "advice"),
-    [
-        ([7], "look at it, or let a robust loss do so (loss: gnc)"),
-        ([43], "look at it; a test row: no loss acts on what is held out"),
-        ([43, 45], "look at them; test rows: no loss acts on what is held out"),
-        ([7, 43], "(loss: gnc); 1 are test rows: no loss acts on what is held out"),
-    ],
-)
-def test_a_robust_loss_is_not_offered_for_test_rows(arm, rows, advice):
-    m = measured(arm)
-    (finding,) = inspected(arm, replace(m, position=plus(m.position, rows, [0.0, 0.3, 0.0]))).findings
-    assert finding.endswith(advice)
-
-
 @pytest.mark.parametrize("n_test", [0, 10])
 def test_limits_that_cannot_be_evaluated_are_told_of(arm, n_test):
     m = measured(arm)
@@ -199,15 +150,6 @@ def test_limits_that_cannot_be_evaluated_are_told_of(arm, n_test):
     ] * (n_test == 0)
     folds = Options(model="pose", frame="unknown", accept={"position": 1e-3}, folds=5)
     assert inspect_job(Job(None, arm, m, folds)).ready
-
-
-def test_a_wrong_orientation_is_named_as_that(arm):
-    m = measured(arm)
-    R = m.rotation.copy()
-    R[3] = R[3] @ Rotation.from_rotvec([0.2, 0.0, 0.0]).as_matrix()
-    (one,) = inspected(arm, replace(m, rotation=R)).disagreements.found
-    assert (one.row, one.kind, one.unit) == (3, "orientation", "rad")
-    assert one.size == pytest.approx(0.2, rel=0.1)
 
 
 @pytest.mark.sampled(2)
@@ -235,29 +177,6 @@ def test_a_wrong_row_of_every_instrument_is_named(name):
     assert len(found.findings) == 1
     assert "one measurement disagrees with the nominal arm" in found.findings[0]
     assert (one.of != "") == (name in ("targets", "anchors", "planes", "sockets", "stations", "board"))
-
-
-def test_a_row_out_of_line_is_named_although_tolerances_would_allow_it(tmp_path):
-    """They are ten times what the arm is off by."""
-    careful = ur5e(tmp_path)
-    m = measured(careful)
-    loose = {kind: 10.0 * sigma for kind, sigma in UR5E["tolerance"].items()}
-    found = inspected(ur5e(tmp_path, tolerance=loose), replace(m, position=plus(m.position, [7], 0.03)))
-    (one,) = found.disagreements.found
-    assert one.row == 7
-    assert one.size < 3.0 * one.expected
-    assert said(inspected(ur5e(tmp_path, tolerance=loose), m)) == ()
-
-
-@pytest.mark.slow
-def test_a_wrong_distance_of_touched_points_is_named_by_these():
-    simulation = simulate(scenario(INSTRUMENTS["sockets"], n=30), seed=1)
-    (table,) = simulation.tables
-    groups = table.measurements.groups
-    off = replace(groups, pairs=replace(groups.pairs, distance=plus(groups.pairs.distance, [0], 1.0)))
-    wrong = replace(table, measurements=replace(table.measurements, groups=off))
-    (one,) = inspect_job(Job(None, simulation.robot, (wrong,), Options())).disagreements.found
-    assert (one.kind, one.row, one.ends) == ("distance", -1, ("it socket 1", "it socket 2"))
 
 
 def test_a_robust_loss_makes_wrong_rows_a_caution(arm):
@@ -304,12 +223,6 @@ def test_copies_of_measured_pairs_are_told_of():
     assert survey.copy == f"{m.ids[m.pairs.a[3]]}-{m.ids[m.pairs.b[3]]}"
 
 
-def test_several_targets_at_one_configuration_are_no_repeats():
-    simulation = simulate(scenario(INSTRUMENTS["targets"]), seed=0)
-    (table,) = inspect_job(Job(None, simulation.robot, tuple(simulation.tables), Options())).tables
-    assert (table.n_rows, table.n_configurations, table.n_repeats, table.labels) == (180, 60, 0, {"target": 3})
-
-
 def test_test_rows_at_train_configurations_are_told_of(arm):
     q = np.random.default_rng(5).uniform(-2, 2, (50, 6))
     q[[41, 42]] = q[[1, 2]] + 5e-4
@@ -323,14 +236,6 @@ def test_test_rows_at_train_configurations_are_told_of(arm):
 def test_a_table_without_test_rows_is_told_of(arm):
     (caution,) = said(inspected(arm, measured(arm, n_test=0, n=50)))
     assert caution.startswith("no test rows")
-
-
-def test_joint_ranges_stand_beside_limits():
-    robot = Robot.from_dh([[0.5, 0.2, 0.1, 0]] * 3, "dh", limits=[[-2, 2], None, [-1, 1]])
-    q = np.random.default_rng(0).uniform(-0.9, 0.9, (20, 3))
-    q[:2, :2] = [[-1.0, -1.0], [1.0, 3.0]]
-    joints = inspected(robot, measure(robot, 20, np.random.default_rng(0), readings=q), "position", "known").joints
-    assert [(j.least, j.most, j.share) for j in joints[:2]] == [(-1.0, 1.0, 0.5), (-1.0, 3.0, None)]
 
 
 def test_a_joint_that_hardly_moves_is_told_of(arm):
@@ -377,23 +282,6 @@ def test_pairs_whose_vectors_may_point_either_way_are_told_of():
 # --- what can be determined ------------------------------------------------------------------------------------------
 
 
-def test_parallel_axes_without_a_parameter_are_told_of():
-    robot = Robot.from_dh(
-        [[0, np.pi / 2, 0.16, 0], [-0.4, 0, 0, 0], [-0.4, 0, 0, 0], [0, np.pi / 2, 0.1, 0]],
-        "dh",
-        tolerance={"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3},
-    )
-    found = inspected(robot, measured(robot))
-    assert found.ready
-    assert any("parallel and convention dh has no parameter for a tilt about y" in c for c in found.cautions)
-
-
-def test_configurations_that_are_all_the_same_determine_nothing(arm):
-    q = np.tile([0.1, -1.0, 1.2, 0.3, 0.4, 0.5], (50, 1))
-    found = inspected(arm, measured(arm, readings=q))
-    assert found.identifiability.observability.rank < 6
-
-
 def test_a_job_whose_rows_determine_nothing_is_not_ready():
     """Lengths alone are to be estimated, and turns alone were measured."""
     robot = Robot.from_dh([[0.5, 0.2, 0.1, 0]] * 3, "dh", tolerance={"a": 1e-3}).with_estimated(["a1", "a2"])
@@ -412,18 +300,6 @@ def test_as_many_unknowns_as_rows_leave_nothing_to_judge_by():
     assert found.findings[-1].startswith("no degree of freedom is left")
 
 
-def test_noise_to_be_estimated_is_told_of(arm):
-    found = inspected(arm, measured(arm), estimate_noise=True)
-    assert found.cautions == (
-        "noise is to be estimated: sigmas and accuracy here are for specified noise, or 1 mm and 1 mrad",
-    )
-
-
-def test_nothing_to_estimate_is_refused_as_by_calibrate(arm):
-    with pytest.raises(InputError, match="nothing to estimate"):
-        inspected(arm.with_estimated([]), measured(arm))
-
-
 @pytest.mark.slow
 def test_the_repr_fits_a_screen(arm):
     found = inspected(arm, measured(arm))
@@ -431,25 +307,3 @@ def test_the_repr_fits_a_screen(arm):
     lines = repr(inspected(arm, MISTAKES["x, y, z are in mm, not m"](measured(arm)))).splitlines()
     assert lines[1].startswith("  LOOK AT THIS FIRST: position residuals fall")
     assert max(map(len, lines)) <= 100
-
-
-@pytest.mark.parametrize("frames", [("known", "known"), ("unknown", "known")])
-def test_a_base_and_a_tool_that_are_far_from_nominal_are_no_mistake_where_they_are_estimated(frames):
-    """Also with several tables, which are compared at the base and the tool that they say together."""
-    estimate = ["base.x", "base.y", "base.z", "base.roll", "base.pitch", "base.yaw", "tool.x", "tool.y", "tool.z"]
-    true = small_arm({"a": 2e-3, "d": 2e-3, "alpha": 4e-3, "theta": 4e-3}, estimate=estimate)
-    rng = np.random.default_rng(3)
-    off = [0.05 * rng.normal() * (p.name in estimate) for p in true.parameters]
-    nominal, true = true.with_values(true.nominal + off), true_robot(true, rng)
-    tables = [
-        Table(
-            replace(
-                measure(true, 30, rng, sigma=SIGMA, frame=PLACED if frame == "unknown" else None), source=f"{k}.csv"
-            ),
-            "position",
-            frame=frame,
-        )
-        for k, frame in enumerate(frames)
-    ]
-    found = inspect_job(Job(None, nominal, tuple(tables), Options()))
-    assert found.findings == ()

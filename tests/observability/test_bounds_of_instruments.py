@@ -9,7 +9,7 @@ from scenarios import INSTRUMENTS, scenario
 from simulated import planar_robot
 from tolerances import rounding
 
-from fg_calib import InputError, Measurements, Table, assess, build_problem, cramer_rao, simulate, solve
+from fg_calib import Measurements, Table, assess, build_problem, cramer_rao, simulate, solve
 from fg_calib.robot.kinematics import pose
 from fg_calib.simulation.scenario import LengthGauge, Tracker
 
@@ -48,16 +48,6 @@ def test_the_bound_is_what_a_calibration_of_the_table_says(instrument):
     scale = np.sqrt(np.diag(bound.covariance))
     assert bound.names == found.names
     assert (found.covariance - bound.covariance) / np.outer(scale, scale) == pytest.approx(0.0, abs=0.05)
-
-
-def test_tables_have_choices_of_their_own():
-    robot, _, table = measured_by("anchors", np.random.default_rng(0))
-    for key, value in (("model", "anchor"), ("frame", "unknown")):
-        with pytest.raises(InputError) as caught:
-            cramer_rao(robot, [table], **{key: value})
-        assert str(caught.value) == f"{key}: found '{value}' with tables, expected none: each table has its own"
-    with pytest.raises(InputError, match=r"^model: found None, expected one of pose, "):
-        cramer_rao(robot, table.measurements)
 
 
 WAYS = {

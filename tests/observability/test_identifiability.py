@@ -4,17 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from simulated import measure, paper_robot, planar_robot, small_arm
+from simulated import measure, paper_robot, small_arm
 from sparing import diagonal
 
 from fg_calib.assessment import assess
-from fg_calib.errors import ProblemError
 from fg_calib.graph.build import STRUCTURAL_FLOOR, build_problem, random_problem
 from fg_calib.graph.information import named_triangle, observability_of
 from fg_calib.graph.solver import solve
 from fg_calib.measurements.kinds.pair import SamePoint
 from fg_calib.measurements.table import Table
-from fg_calib.observability.identifiability import identifiability_of, observe_configurations, observe_structure
+from fg_calib.observability.identifiability import observe_configurations, observe_structure
 from fg_calib.observability.reasons import NO_CAUSE, NOT_EXCITED
 from fg_calib.options import Pairing
 from fg_calib.robot.model import Joint, RobotBuilder
@@ -109,32 +108,6 @@ def test_structural_rank_does_not_depend_on_the_draw(robot, ranks, model):
     assert {rank_at(robot, model, seed) for seed in range(2)} == {ranks[MODELS.index(model)]}
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(("robot", "ranks"), DRAWN, ids=[f"{r.name}-{i}" for i, (r, _) in enumerate(DRAWN)])
-def test_structural_rank_is_the_same_over_200_draws(robot, ranks):
-    """A model after the other: what is drawn is the configurations, whatever the model."""
-    for seed in range(200):
-        model = MODELS[seed % len(MODELS)]
-        assert rank_at(robot, model, seed) == ranks[MODELS.index(model)], (model, seed)
-
-
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("model", ["distance-rotation", "pose"])
-def test_structural_rank_does_not_depend_on_where_limits_lie(model):
-    """A slide of 1.5 to 3 m, a joint of 190 to 350 degrees: no draw leaves them, and none freezes a joint."""
-    gantry = mdh_robot("gantry", [0, 0.1, 0.6, 0.4], [0, -H, 0.5, 1.4], [0, 0.3, 0.1, 0.2], OFF_AXIS, prismatic=(1,))
-    ranks = set()
-    for slide, last in (((0, 1), (-170, 170)), ((1.5, 3.0), (-170, 170)), ((0, 1), (190, 350)), ((-9, -7), (200, 500))):
-        limits = [slide, *np.deg2rad([(-170, 170), (-120, 120), last])]
-        joints = [replace(j, lower=low, upper=up) for j, (low, up) in zip(gantry.joints, limits, strict=True)]
-        robot = replace(gantry, joints=tuple(joints))
-        q = random_problem(robot, model).measurements.readings
-        assert np.all((q >= robot.limits[:, 0]) & (q <= robot.limits[:, 1]))
-        assert np.all(np.ptp(q, axis=0) > 0.9 * np.ptp(robot.limits, axis=1))
-        ranks.add(observe_structure(robot, model).observability.rank)
-    assert len(ranks) == 1
-
-
 def reasons(robot, model, **options):
     found = observe_structure(robot, model, **options)
     return {tuple(sorted(lost.relation)): lost.reason for lost in found.lost}
@@ -197,12 +170,6 @@ def test_what_a_file_calls_fixed_is_looked_at_as_unknown_and_as_known():
     assert (known.observability.rank, len(known.observability.names)) == (23, 30)
     assert "theta2" in known.observability.named("independent")
     assert found.fixed == ("a1", "alpha1", "d1", "theta1", "beta1")
-
-
-def test_a_12_joint_arm_is_analysed():
-    rng = np.random.default_rng(1)
-    robot = mdh_robot("long", rng.uniform(0.1, 0.5, 12), rng.uniform(0.3, 1.2, 12), rng.uniform(0.1, 0.5, 12), OFF_AXIS)
-    assert observe_structure(robot, "pose").observability.rank == 48
 
 
 def test_configurations_that_do_not_move_a_joint_are_named_as_the_reason():
@@ -289,30 +256,6 @@ def test_the_answer_does_not_depend_on_the_unit_of_length(arm, model, tolerance)
             assert [w.signal_to_noise for w in here.weak] == pytest.approx(
                 [w.signal_to_noise for w in metres.weak], rel=1e-6
             )
-
-
-def test_nothing_to_look_at_is_refused():
-    robot = planar_robot()
-    fixed = replace(robot, parameters=tuple(replace(p, estimated=False) for p in robot.parameters))
-    with pytest.raises(ProblemError, match="nothing to estimate"):
-        observe_configurations(fixed, measure(robot, 5, np.random.default_rng(6)), "pose")
-
-
-def test_random_configurations_stay_within_limits_and_repeat_with_their_seed():
-    robot = replace(scara(), joints=tuple(Joint(f"j{i}", i == 2, -0.5, 0.25) for i in range(4)))
-    one, again, other = (random_problem(robot, "pose", seed=s).measurements.readings for s in (1, 1, 2))
-    assert np.array_equal(one, again)
-    assert not np.array_equal(one, other)
-    assert one.min() >= -0.5
-    assert one.max() <= 0.25
-    free = random_problem(scara(), "pose").measurements.readings
-    assert np.abs(free[:, 2]).max() <= 1.0 < np.abs(free[:, 0]).max() <= np.pi
-
-
-def test_structure_and_problem_agree():
-    problem = random_problem(paper_robot(), "distance")
-    found = identifiability_of(problem, problem.start, "structural")
-    assert found.observability.rank == observe_structure(paper_robot(), "distance").observability.rank == 21
 
 
 @pytest.mark.sampled(1)

@@ -1,7 +1,5 @@
 """Bounds: closed form on a planar arm, a dense computation of another kind, and fits of drawn errors and noise."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from simulated import measure, planar_robot, small_arm, true_robot
@@ -132,14 +130,6 @@ def test_the_bound_is_that_of_a_dense_computation(strategy):
     assert bound.covariance == pytest.approx(expected, rel=3e-3, abs=3e-3 * (3e-3) ** 2)
 
 
-def test_the_frames_own_uncertainty_is_in_the_bound():
-    robot = small_arm(tolerance=dict.fromkeys(("a", "alpha", "d", "theta"), 3e-3))
-    measurements = at(robot, spread_readings(12, 4))
-    known, unknown = (cramer_rao(robot, measurements, model="pose", frame=f) for f in ("known", "unknown"))
-    assert np.linalg.eigvalsh(unknown.covariance - known.covariance).min() > -rounding(unknown.covariance)
-    assert unknown.position(measurements.readings).rms > 1.2 * known.position(measurements.readings).rms
-
-
 def test_after_the_best_rigid_fit_the_bound_is_what_real_errors_are():
     robot = small_arm(tolerance=dict.fromkeys(("a", "alpha", "d", "theta"), 1e-4))
     readings = spread_readings(40, 4)
@@ -177,14 +167,6 @@ def test_fits_of_drawn_errors_and_noise_have_the_bounds_error(pair_errors):
         assert np.mean(squares) > 2.0 * np.mean(claims)
     else:
         assert np.mean(claims) == pytest.approx(np.mean(bounds), rel=rounding(1, 1e4))
-
-
-def test_test_rows_say_nothing():
-    robot = planar("a1")
-    measurements = at(robot, spread_readings(N))
-    half = replace(measurements, test=np.arange(N) >= 4)
-    bound = cramer_rao(robot, half, model="position", prior=False)
-    assert bound.covariance[0, 0] == pytest.approx(SIGMA**2 / 4, rel=rounding(1, 10), abs=0)
 
 
 def test_a_parameter_that_cannot_be_kept_is_an_error():

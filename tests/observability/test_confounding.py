@@ -121,12 +121,12 @@ def test_touched_points_take_up_the_size_of_the_arm():
     m = replace(touch(robot, points, 20, rng, sigma=1e-12), sigma_point=np.full(80, 1e-4))
     _, found = looked_at(robot, Table(m, "distance"))
     reasons = by_reason(found)
-    assert "the unknown touched points take it up" in reasons
+    assert "the unknown contact points take it up" in reasons
     assert NOT_EXCITED not in reasons
     assert NO_CAUSE not in reasons
     m = touch(robot, points, 20, rng, sigma=1e-12, distances=[(0, 1, 1e-5), (1, 2, 1e-5)])
     problem, _ = looked_at(robot, Table(replace(m, sigma_point=np.full(80, 1e-4)), "distance"))
-    assert max(seen(problem, relation) for relation in reasons["the unknown touched points take it up"]) > 1.0
+    assert max(seen(problem, relation) for relation in reasons["the unknown contact points take it up"]) > 1.0
 
 
 @pytest.mark.slow
