@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from reported import format_report
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 from simulated import measure, plus, small_arm, true_robot, write_job
