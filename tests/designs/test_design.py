@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scenarios import INSTRUMENTS, SIGMA, WALL, scenario
-from simulated import small_arm
 
 from fg_calib import Pairing
 from fg_calib.designs.design import design
@@ -71,35 +70,6 @@ def test_expected_errors_are_those_of_a_calibration_of_the_stops(kind):
         assert plan.curve[-1].designed == pytest.approx(plan.expected.position, rel=1e-3)
 
 
-@pytest.mark.slow
-def test_the_task_is_what_is_asked_for():
-    """A task at one place of the arm is served better by a design for it than by one for everywhere."""
-    near = np.array([0.3, -0.5, 0.1, 0.8]) + 0.1 * np.random.default_rng(0).normal(size=(20, 4))
-    everywhere, there = planned(INSTRUMENTS["pose"], n=4), planned(INSTRUMENTS["pose"], n=4, task=near)
-    assert there.task.readings.tolist() == near.tolist()
-    of_other = everywhere.pool.posterior(np.arange(4)).error(there.task).position
-    assert there.expected.position < of_other
-    assert there.expected.position < everywhere.expected.position
-
-
-@pytest.mark.slow
-def test_errors_count_in_the_base_where_something_says_where_it_is():
-    base = design(scenario(replace(INSTRUMENTS["pose"], frame="base"), n=20), n=5, n_candidates=30)
-    assert not base.task.fitted
-    of = scenario(replace(INSTRUMENTS["pose"], frame="unknown"), n=20)
-    fitted = design(of, n=5, n_candidates=30)
-    assert fitted.task.fitted
-    assert design(of, n=5, n_candidates=30, fitted=False).expected.position > fitted.expected.position
-
-
-@pytest.mark.slow
-def test_a_lever_makes_orientations_count():
-    of = scenario(INSTRUMENTS["pose"], n=20)
-    plain, weighed = (design(of, n=4, n_candidates=60, lever=lever) for lever in (0.0, 100.0))
-    assert weighed.expected.orientation <= plain.expected.orientation
-    assert plain.expected.position <= weighed.expected.position
-
-
 # --- given, targets, what is undetermined -----------------------------------------------------------------------------
 
 
@@ -132,14 +102,6 @@ def test_a_target_is_reached_with_as_few_as_a_scan_of_all_numbers_finds():
         assert plan.reached
         assert plan.expected.position <= target * (1.0 + 1e-5)
         assert abs(plan.n - fewest) <= 1
-
-
-@pytest.mark.slow
-def test_a_target_that_is_not_reached_is_said():
-    plan = design(scenario(INSTRUMENTS["pose"], n=20), target=1e-9, n_candidates=25)
-    assert not plan.reached
-    assert plan.n == 25
-    assert plan.expected.position > 1e-9
 
 
 @pytest.mark.slow
@@ -263,14 +225,6 @@ def test_all_pairs_that_can_be_formed_hold_the_most():
 
 
 @pytest.mark.slow
-def test_the_same_seed_is_the_same_design_and_another_another():
-    one, same, other = (planned(INSTRUMENTS["pose"], n=5, seed=seed) for seed in (3, 3, 4))
-    assert one.readings.tolist() == same.readings.tolist()
-    assert one.curve == same.curve
-    assert one.readings.tolist() != other.readings.tolist()
-
-
-@pytest.mark.slow
 def test_the_curve_falls_and_designed_stops_are_better_than_random_ones():
     plan = planned(INSTRUMENTS["targets"], n=20, n_candidates=60)
     designed = np.array([p.designed for p in plan.curve])
@@ -282,19 +236,6 @@ def test_the_curve_falls_and_designed_stops_are_better_than_random_ones():
     assert (middle <= high).all()
     assert plan.curve[0].n == 4
     assert plan.random == middle[-1]
-
-
-@pytest.mark.slow
-def test_as_many_as_there_are_and_one():
-    q = np.random.default_rng(4).uniform(-1.5, 1.5, (5, 4))
-    of = scenario(INSTRUMENTS["pose"], n=20)
-    every = design(of, n=9, candidates=GivenReadings(q))
-    assert (every.n, every.asked) == (5, 9)
-    assert sorted(every.readings.tolist()) == sorted(q.tolist())
-    one = design(of, n=1, candidates=GivenReadings(q))
-    assert one.n == 1
-    alone = design(of, n=1, candidates=GivenReadings(q[:1]))
-    assert alone.readings.tolist() == q[:1].tolist()
 
 
 @pytest.mark.parametrize(
@@ -320,10 +261,3 @@ def test_figures_that_make_no_sense_are_refused(options, message):
     of = scenario(INSTRUMENTS["pose"], n=20)
     with pytest.raises(InputError, match=message):
         design(of, **{"n_candidates": 5} | options)
-
-
-@pytest.mark.slow
-def test_a_design_in_a_line():
-    plan = planned(INSTRUMENTS["pose"], n=5)
-    figure = f"{plan.expected.position * 1e3:.3g} mm"
-    assert repr(plan) == f"Design of 5 stops for {small_arm().name!r}: expected RMS {figure}, I"

@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scenarios import SIGMA, TOLERANCE, scenario
-from scipy.spatial.transform import Rotation
 from simulated import small_arm
 
 from fg_calib import InputError, Job, Measurements, Options, calibrate_job
-from fg_calib.designs.design import design, rename_configurations
+from fg_calib.designs.design import design
 from fg_calib.designs.from_job import solve_for_design
 from fg_calib.designs.information import Posterior
 from fg_calib.graph.information import whitened_jacobian
@@ -19,7 +18,6 @@ from fg_calib.prediction.expected_error import errors_at
 from fg_calib.robot.kinematics import pose
 from fg_calib.simulation.scenario import (
     Errors,
-    GivenReadings,
     Indicator,
     LengthGauge,
     PairGauge,
@@ -85,27 +83,6 @@ def test_a_plan_of_touches_expects_what_a_job_of_all_rows_says_of_itself(n):
     assert plan.expected.position == pytest.approx(said_by_all_rows(job, plan), rel=1e-6)
 
 
-def test_the_curve_of_more_touches_ends_with_the_plan():
-    plan = design(job_of(Sockets(name="it", sockets=3), 20), n=5, n_candidates=40)
-    assert plan.curve[-1].designed == pytest.approx(plan.expected.position, rel=1e-3)
-
-
-def test_the_noise_of_test_rows_is_not_that_of_more_rows():
-    rng, arm = np.random.default_rng(0), small_arm(tolerance=TOLERANCE)
-    q = rng.uniform(-1.5, 1.5, (40, 4))
-    at, test = pose(arm, q), np.arange(40) >= 30
-    data = Measurements.from_arrays(
-        q,
-        position=at.position,
-        rotation=at.rotation,
-        sigma_position=np.where(test, 1e-2, 1e-4),
-        sigma_orientation=2e-4,
-        test=test,
-    )
-    plan = design(Job(None, arm, data, Options("pose")), n=4, n_candidates=20)
-    assert plan.tables[0].measurements.sigma_position == pytest.approx(np.full((4, 3), 1e-4))
-
-
 def test_more_rows_are_as_noisy_along_each_axis_as_those_of_the_job():
     """A tracker that says how well it measures along the beam and across goes on doing so."""
     rng, arm = np.random.default_rng(0), small_arm(tolerance=TOLERANCE)
@@ -120,43 +97,6 @@ def test_more_rows_are_as_noisy_along_each_axis_as_those_of_the_job():
     )
     plan = design(Job(None, arm, data, Options("pose")), n=4, n_candidates=20)
     assert plan.tables[0].measurements.sigma_position == pytest.approx(np.tile(sigma, (4, 1)))
-
-
-@pytest.mark.slow
-def test_a_target_takes_no_more_stops_than_a_plan_of_fewer_that_reaches_it():
-    """One more is what its search may miss."""
-    of = scenario(LengthGauge(name="it"), n=20, noise=NOISE)
-    goal = 1.02 * design(of, n=14, n_candidates=60).expected.position
-    assert design(of, target=goal, n_candidates=60).n <= 15
-
-
-def test_a_table_of_pairs_has_pairs():
-    """Of two stars, of which one stop of one is chosen, the other is left out with its hub."""
-    q = np.random.default_rng(0).uniform(-1.5, 1.5, (2, 20, 4))
-    one, two = (
-        job_of(PairGauge(model="distance", name=name), 20, configurations=GivenReadings(at))
-        for name, at in zip(("it", "two"), q, strict=True)
-    )
-    renamed = [rename_configurations(two.tables[0], {f"p{k}": f"two{k}" for k in range(20)})]
-    plan = design(replace(one, measurements=(*one.tables, *renamed)), n=3, n_candidates=20)
-    assert [len(table.measurements.pairs.a) > 0 for table in plan.tables] == [True] * len(plan.tables)
-
-
-def test_gross_errors_of_a_job_that_leaves_them_out_are_no_noise_of_more_rows():
-    """The noise of one tenth of gross errors would be 67 times that of the rows."""
-    rng, arm = np.random.default_rng(0), small_arm(tolerance=TOLERANCE)
-    q = rng.uniform(-1.5, 1.5, (60, 4))
-    at = pose(arm, q)
-    position = at.position + 1e-4 * rng.normal(size=(60, 3))
-    position[:6] += 0.02 * rng.normal(size=(6, 3))
-    rotation = at.rotation @ Rotation.from_rotvec(2e-4 * rng.normal(size=(60, 3))).as_matrix()
-    data = Measurements.from_arrays(
-        q, position=position, rotation=rotation, sigma_position=1e-4, sigma_orientation=2e-4
-    )
-    job = Job(None, arm, data, Options("pose", loss="gnc", estimate_noise=True))
-    found, plan = calibrate_job(job), design(job, n=4, n_candidates=20)
-    said = errors_at(found.posterior, plan.task.readings)[plan.task.fitted].position
-    assert plan.before.position == pytest.approx(said, rel=0.1)
 
 
 def test_tolerances_of_a_plan_are_those_that_its_job_found():

@@ -21,7 +21,6 @@ from fg_calib.simulation.scenario import (
     PairGauge,
     Placement,
     RandomReadings,
-    Sockets,
     Tracker,
 )
 
@@ -136,12 +135,6 @@ def test_hubs_errors_are_unknowns_of_one_sigma():
     assert pool.rows.always[-shared:, -shared:].tolist() == np.eye(shared).tolist()
 
 
-def test_no_joint_noise_leaves_nothing_to_share():
-    of = scenario(LENGTHS, n=N)
-    pool = build_pool(of, draw_groups(of, N, np.random.default_rng(0)))
-    assert len(pool.rows.scales) == pool.problem.variables.n_columns
-
-
 def test_stops_without_train_rows_add_nothing():
     arm = small_arm(tolerance={"a": 2e-3, "theta": 2e-3})
     data = measure(arm, 6, np.random.default_rng(0), n_test=3)
@@ -170,9 +163,3 @@ def test_pairs_that_share_errors_but_no_hub_are_refused():
     problem = build_problem(arm, data, model="distance", pairing=Pairing("chain"))
     with pytest.raises(InputError, match=r"each shares an end with others.*pairing star"):
         gather_rows(problem, np.arange(8))
-
-
-def test_sockets_of_known_distances_count_once():
-    """Distances between touched points are of no stop: they are there whatever is measured."""
-    pool = pool_with(Sockets(name="it", sockets=3))
-    assert len(pool.rows.always) > len(prior_rows(pool.problem.variables, pool.problem.start)[1])

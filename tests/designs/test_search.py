@@ -1,6 +1,5 @@
 """Search against trying every set there is."""
 
-from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -68,19 +67,6 @@ def test_no_random_set_of_a_hundred_is_better(criterion):
         assert found.value == pytest.approx(value(system, criterion, found.candidates), rel=rounding())
 
 
-@pytest.mark.slow
-def test_what_is_drawn_better_is_where_exchange_starts_from():
-    system = random_system(np.random.default_rng(2), 40)
-    measure = Measure("I", system)
-    worst = search.Chosen(np.arange(5), np.inf)
-    found = improve_by_random_starts(measure, worst, np.random.default_rng(3))
-    values, sets = draw_sets(measure, 5, np.random.default_rng(3))
-    assert values.tolist() == sorted(measure.value(system.information(one)) for one in sets)
-    assert found.value <= values[0]
-    good = exchange(measure, choose_greedily(measure, 5))
-    assert improve_by_random_starts(measure, good, np.random.default_rng(3)).value <= good.value
-
-
 def test_no_random_set_is_better_by_an_error_that_the_system_does_not_give():
     """As of chains of pairs, for which candidates are chosen as poses; here the error is the sum of their numbers."""
     system = random_system(np.random.default_rng(2), 40)
@@ -132,24 +118,6 @@ def test_greedy_takes_the_best_beside_those_before_it():
     assert choose_greedily(Measure("I", system), 5, taken[:2])[:2].tolist() == taken[:2].tolist()
 
 
-@pytest.mark.slow
-def test_the_same_is_chosen_again():
-    system = random_system(np.random.default_rng(4), 50)
-    for criterion in CRITERIA:
-        assert choose(system, 6, criterion).candidates.tolist() == choose(system, 6, criterion).candidates.tolist()
-
-
-@pytest.mark.parametrize("criterion", CRITERIA)
-def test_as_many_as_there_are_or_more_are_all_of_them(criterion):
-    system = random_system(np.random.default_rng(4), 6)
-    for n in (6, 9):
-        assert sorted(choose(system, n, criterion).candidates.tolist()) == list(range(6))
-    one = system.select(np.array([3]))
-    found = choose(one, 1, criterion)
-    assert found.candidates.tolist() == [0]
-    assert found.value == pytest.approx(value(system, criterion, [3]), rel=rounding())
-
-
 # --- as few as reach a target -----------------------------------------------------------------------------------------
 
 
@@ -169,14 +137,6 @@ def test_as_few_as_reach_a_target():
 def test_a_target_that_none_reaches_takes_all_there_are():
     system = random_system(np.random.default_rng(0), 9)
     assert len(Chooser(system, "I").reaching(1e-9, np.random.default_rng(0)).candidates) == 9
-
-
-def test_a_target_reached_before_anything_is_measured_takes_one():
-    system = random_system(np.random.default_rng(0), 9)
-    assert (
-        len(Chooser(replace(system, known=1e12 * np.eye(6)), "I").reaching(1.0, np.random.default_rng(0)).candidates)
-        == 1
-    )
 
 
 @pytest.mark.parametrize("criterion", ["D", "O2"])

@@ -7,7 +7,7 @@ import pytest
 from scenarios import SIGMA, scenario
 
 from fg_calib import calibrate_job
-from fg_calib.designs.design import design, rename_configurations
+from fg_calib.designs.design import design
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.job import Job
@@ -21,7 +21,6 @@ from fg_calib.simulation.scenario import (
     LengthGauge,
     PairGauge,
     Plane,
-    RandomReadings,
     Spot,
     Tracker,
 )
@@ -30,7 +29,6 @@ from fg_calib.statistics.covariance import spread_of
 
 NOISE = replace(SIGMA, joint=2e-4)
 SILENT = Noise(0.0, 0.0, 0.0, distance=0.0, angle=0.0, point=0.0, pixel=0.0)
-OWN = RandomReadings(20)
 
 SAME = 1e-6
 """Share by which expected errors may differ: an estimate from figures without noise is so near to the arm as drawn."""
@@ -38,7 +36,6 @@ SAME = 1e-6
 LENGTHS = LengthGauge(name="it", anchors={"a": Spot([1.0, -2.0, 0.5]), "b": Spot([-1.5, 1.0, 1.0])})
 FACES = Indicator(name="it", planes={"floor": Plane([0, 0, 1], -1.0), "wall": Plane([1, 0.1, 0], 2.0)})
 PAIRS = PairGauge(model="distance-rotation", name="it")
-TWO = {f"p{k}": f"two{k}" for k in range(20)}
 
 
 def job_of(instrument, n, noise=SILENT, stated=NOISE, **options):
@@ -67,47 +64,12 @@ def test_a_plan_expects_what_a_job_of_all_rows_says_of_itself(instrument, n, opt
     assert plan.expected.position == pytest.approx((fitted if plan.task.fitted else base).position, rel=SAME)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("instrument", [PAIRS, Tracker(model="distance", name="it")], ids=["measured", "formed"])
-def test_more_is_planned_of_two_tables_of_pairs(instrument):
-    """Each table has a star of its own, with a hub of its own."""
-    one, two = job_of(instrument, 30), job_of(replace(instrument, name="two"), 20)
-    plan = design(
-        replace(one, measurements=(*one.tables, rename_configurations(two.tables[0], TWO))), n=6, n_candidates=20
-    )
-    assert plan.expected.position < plan.before.position
-
-
 def test_more_rows_are_as_noisy_as_those_of_the_job_were_found_to_be():
     noise = replace(SILENT, position=3.0 * SIGMA.position, orientation=3.0 * SIGMA.orientation)
     job = job_of(Tracker(model="pose", name="it"), 60, noise=noise, stated=SIGMA, estimate_noise=True)
     found = calibrate_job(job).result.noise_factors["position"] * SIGMA.position
     plan = design(job, n=4, n_candidates=20)
     assert plan.tables[0].measurements.sigma_position == pytest.approx(np.full((4, 3), found), rel=SAME)
-
-
-@pytest.mark.slow
-def test_pairs_among_the_rows_of_a_job_are_pairs_that_it_has():
-    job = job_of(PAIRS, 30)
-    plan = design(job, n=12, candidates="rows")
-    m = job.tables[0].measurements
-    measured = set(zip(m.ids[m.pairs.a].tolist(), m.ids[m.pairs.b].tolist(), strict=True))
-    assert {tuple(pair) for pair in plan.ids[plan.pairs].tolist()} <= measured
-
-
-@pytest.mark.slow
-def test_the_curve_of_measured_pairs_ends_with_the_plan():
-    plan = design(scenario(PAIRS, n=20, noise=NOISE), n=10, n_candidates=40)
-    assert plan.curve[-1].designed == pytest.approx(plan.expected.position, rel=1e-3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("other", [FACES, PAIRS], ids=["planes", "pairs"])
-def test_an_instrument_none_of_whose_own_stops_is_chosen_is_left_out(other):
-    """Joint noise, and poses that are so good that nothing else is chosen."""
-    good = Tracker(model="pose", name="good", noise=Noise(1e-6, 1e-6), configurations=OWN)
-    plan = design(scenario(good, replace(other, configurations=OWN), noise=NOISE), n=2, n_candidates=20)
-    assert 0.0 < plan.expected.position
 
 
 def test_one_more_pose_of_a_chain_can_be_planned():

@@ -10,7 +10,6 @@ from fg_calib.exports.fits import drawn, errors, poses
 from fg_calib.exports.links import links_of, row_transform
 from fg_calib.exports.tables import (
     FARTHEST,
-    NEARLY_PARALLEL,
     PARALLEL,
     common_normal,
     in_table,
@@ -91,44 +90,6 @@ def test_nearly_parallel_axes_have_the_table_that_is_claimed(convention, tilt):
     assert (said == 0) == (convention == "dh-hayati" or tilt <= PARALLEL)
 
 
-@pytest.mark.parametrize("convention", ["dh", "mdh"])
-@pytest.mark.parametrize("tilt", [1e-6, 1e-5, 1e-4, 1e-3])
-def test_however_far_common_normals_are_they_hold_the_arm(convention, tilt):
-    robot = nearly(tilt, 1.0, 0.4, 0.0)
-    table = in_table(robot, convention, np.inf)
-    assert table.nearly == ()
-    error = errors(table.robot, robot, drawn(robot, 200, 0))
-    assert max(error.position_max, error.rotation_max) < EXACT
-    away = max(abs(p.nominal) for p in table.robot.parameters if p.kind == "d")
-    assert away == pytest.approx(0.4 * abs(np.sin(1.0)) / tilt, rel=0.1)  # the distance along the tilt, over it
-
-
-@pytest.mark.slow
-def test_an_export_may_take_far_common_normals():
-    robot = nearly(1e-4, 1.0, 0.4, 0.0)
-    near, far = (export(robot, "dh", far=far) for far in (False, True))
-    assert (near.details["exact"], far.details["exact"]) == (False, True)
-    assert near.details["reasons"][0].startswith(
-        "axes 2 and 3 are parallel within 0.0057 deg, not exactly: their common "
-    )
-    assert "NOT EXACT: axes 2 and 3" in near.text
-    assert "NOT EXACT" not in far.text
-
-
-@pytest.mark.parametrize("alpha", [1e-3, 0.3, np.pi / 2, 2.0, np.pi - 1e-3, -np.pi / 2])
-@pytest.mark.parametrize("convention", ["dh", "mdh", "dh-hayati"])
-def test_axes_that_meet_have_no_distance(convention, alpha):
-    rows = [[0.0, alpha, 0.2, 0.3], [0.0, -alpha, 0.0, 0.1], [0.0, 0.0, 0.0, -0.2]]
-    robot = Robot.from_dh(rows, "mdh" if convention == "dh" else "dh")
-    table = in_table(robot, convention)
-    assert table.nearly == ()
-    error = errors(table.robot, robot, drawn(robot, 100, 0))
-    assert max(error.position_max, error.rotation_max) < EXACT
-    if convention != "dh-hayati" or abs(np.sin(alpha)) > NEARLY_PARALLEL:  # a row with beta ends elsewhere on the axis
-        lengths = [abs(p.nominal) for p in table.robot.parameters if p.kind == "a"]
-        assert lengths == pytest.approx([0.0] * 3, abs=1e-12)
-
-
 @pytest.mark.sampled(8)
 @pytest.mark.parametrize("there", CONVENTIONS)
 @pytest.mark.parametrize("back", ["dh", "mdh", "dh-hayati"])
@@ -163,15 +124,6 @@ def test_the_axis_of_a_slide_is_put_where_a_row_can_hold_it(convention):
     assert max(error.position_max, error.rotation_max) < EXACT
 
 
-@pytest.mark.slow
-def test_the_best_fit_is_better_than_taking_axes_to_be_parallel():
-    robot = off(scara())
-    start = errors(in_table(robot, "dh").robot, robot, drawn(robot, 1000, 1))
-    made = export(robot, "dh")
-    assert made.details["error"]["position_rms"] < 0.8 * start.position_rms
-    assert len(made.details["reasons"]) == len(in_table(robot, "dh").nearly) > 0
-
-
 def test_links_of_an_arm_are_its_chain():
     robot = off(scara())
     links = links_of(robot)
@@ -190,12 +142,3 @@ def test_what_a_ur10_misses_in_a_table_of_four_figures_is_what_the_page_says():
     made = export(off(ur10()), "dh")
     assert "axes 2 and 3 are parallel within 0.041 deg, not exactly: their common normal is 429 m away" in made.text
     assert made.details["error"]["position_rms"] == pytest.approx(0.17e-3, abs=5e-6)
-
-
-@pytest.mark.slow
-def test_the_best_fit_does_not_depend_on_how_its_figures_are_held(monkeypatch):
-    rms = []
-    for hold in (1e-3, 1e-2, 1e-1):
-        monkeypatch.setattr("fg_calib.exports.fits.HOLD", hold)
-        rms.append(export(off(ur10()), "dh").details["error"]["position_rms"])
-    assert rms == pytest.approx([rms[1]] * 3, rel=1e-3)

@@ -150,24 +150,6 @@ def test_whatever_the_arm_its_exact_formats_are_exact(name, tmp_path):
     assert [zero["reading"] for zero in zeros] == pytest.approx([0.0] * arm.n_joints, abs=EXACT)
 
 
-def test_which_arms_have_exact_tables_of_four_figures(tmp_path):
-    exact = {
-        (name, to): not in_table(off(make(tmp_path)), to).nearly for name, make in ARMS.items() for to in ("dh", "mdh")
-    }
-    parallel = {("ur10", "dh"), ("ur10", "mdh"), ("scara", "dh"), ("scara", "mdh")}
-    # The dh arm is off in what dh has: alpha of its parallel axes, whose common normals stay where they were.
-    assert {key for key, value in exact.items() if not value} == parallel
-
-
-def test_tables_of_arms_as_drawn_are_those_of_the_drawing():
-    drawn_arm = Robot.from_dh([row[:4] for row in UR10], "dh")
-    table = in_table(in_table(drawn_arm, "mdh").robot, "dh").robot
-    assert [[p.nominal for p in table.parameters if p.owner == i + 1] for i in range(6)] == [
-        pytest.approx([theta, d, a, alpha], abs=1e-12) for a, alpha, d, theta, _ in UR10
-    ]
-    assert not any(p.nominal for p in table.parameters if p.owner in (0, 7))
-
-
 def test_tables_are_products_of_their_elementary_transforms():
     arm = off(seven())
     for convention in ("dh", "mdh", "dh-hayati"):
@@ -282,19 +264,6 @@ def test_what_ur_description_has_no_place_for_is_said(ur_urdf):
     assert not any("tool0" in note for note in export(ur_urdf, "ur").notes)  # its tip is tool0 itself
 
 
-def test_the_hash_is_the_controllers_or_one_that_no_controller_has():
-    assert yaml.safe_load(export(ur10(), "ur").text)["kinematics"]["hash"].startswith("fg_calib_")
-    made = export(ur10(), "ur", ur_hash="calib_12788084448423163542")
-    assert yaml.safe_load(made.text)["kinematics"]["hash"] == "calib_12788084448423163542"
-    assert not any("hash" in note for note in made.notes)
-    assert export(off(ur10()), "ur").details["hash"] != export(ur10(), "ur").details["hash"]
-
-
-def test_a_base_may_be_said_to_be_the_other_frame():
-    one, other = (yaml.safe_load(export(ur10(), "ur", ur_base=base).text) for base in ("base", "base_link"))
-    assert abs(one["kinematics"]["shoulder"]["yaw"] - other["kinematics"]["shoulder"]["yaw"]) == pytest.approx(np.pi)
-
-
 # --- Tesseract --------------------------------------------------------------------------------------------------------
 
 
@@ -332,20 +301,6 @@ def test_of_a_urdf_only_figures_of_calibrated_origins_change(tmp_path):
     assert export(robot.with_values(values), "urdf").text == expected
 
 
-def test_a_joint_that_has_moved_by_rounding_alone_stays_as_it_is_written(tmp_path):
-    """What no row and no drawing error moves ends 6e-18 m from where it was."""
-    robot = column(tmp_path)
-    values = robot.nominal
-    values[robot.index("turn.z")] = 0.1001
-    values[robot.index("bend.yaw")] += 3e-17
-    values[robot.index("turn.x")] += 6e-18
-    values[robot.index("roll.roll")] -= 1e-17
-    expected = TREE.replace('<origin xyz="0 0 0.1"/>', '<origin xyz="0.0 0.0 0.1001"/>')
-    assert export(robot.with_values(values), "urdf").text == expected
-    elements = export(robot.with_values(values), "urdf", nominal=robot, calibration_elements=True).text
-    assert elements.count("<calibration") == TREE.count("<calibration")
-
-
 @pytest.mark.parametrize("backwards", [False, True])
 def test_zeros_in_calibration_elements_and_origins_are_together_the_arm(backwards, tmp_path):
     nominal = column(tmp_path, backwards)
@@ -366,33 +321,9 @@ def _joint_lines(text):
     return [part for part in parts if "rising" in part]
 
 
-def test_a_joint_whose_zero_alone_is_off_keeps_its_origin(tmp_path):
-    nominal = column(tmp_path)
-    values = nominal.nominal
-    values[nominal.index("roll.roll")] += 0.01  # about x, its axis
-    text = export(nominal.with_values(values), "urdf", nominal=nominal, calibration_elements=True).text
-    back = read_robot_text(tmp_path, text)
-    assert back.nominal == pytest.approx(nominal.nominal, abs=1e-15)
-    assert float(text.split('rising="')[1].split('"')[0]) == pytest.approx(0.01, abs=1e-15)
-
-
 def read_robot_text(folder, text):
     (folder / "again.urdf").write_text(text)
     return read_urdf(folder / "again.urdf", base_link="floor", tip_link="tip")
-
-
-def test_base_and_tool_of_a_urdf_are_told(tmp_path):
-    column(tmp_path)
-    (tmp_path / "robot.yaml").write_text(
-        "urdf: column.urdf\nbase_link: floor\ntip_link: tip\nunits: {length: mm, angle: deg}\n"
-        "base: {z: 10}\ntool: {x: 5, yaw: 90}\n"
-    )
-    for to in ("urdf", "tesseract"):
-        notes = export(read_robot(tmp_path / "robot.yaml"), to).notes
-        assert notes[:2] == (
-            "it has no place for the frame base, which is before link floor: z 10 (mm, deg)",
-            "it has no place for the frame tool, which is behind link tip: x 5, yaw 90 (mm, deg)",
-        )
 
 
 # --- joint zeros ------------------------------------------------------------------------------------------------------
@@ -446,35 +377,6 @@ def test_zeros_are_the_best_there_are():
     assert made.details["after"]["measured"]["n"] == 40
 
 
-def test_errors_of_zeros_are_those_of_the_arm():
-    nominal, robot = ur10(), off(ur10())
-    made = export(robot, "zeros", nominal=nominal)
-    zeros = np.array([zero["reading"] for zero in made.details["zeros"].values()])
-    q = drawn(robot, 1000, 1)
-    for which, readings in (("before", q), ("after", q + zeros)):
-        found, wanted = ours(nominal, readings), ours(robot, q)
-        miss = np.linalg.norm((found - wanted)[:, :3, 3], axis=1)
-        turn = Rotation.from_matrix(found[:, :3, :3] @ np.swapaxes(wanted[:, :3, :3], 1, 2)).magnitude()
-        error = made.details[which]["workspace"]
-        assert error["position_rms"] == pytest.approx(np.sqrt(np.mean(miss**2)))
-        assert error["position_max"] == pytest.approx(miss.max())
-        assert error["rotation_rms"] == pytest.approx(np.sqrt(np.mean(turn**2)))
-        assert error["rotation_max"] == pytest.approx(turn.max())
-        assert f"{which}, over the joint limits: position {1e3 * error['position_rms']:.4g} mm RMS" in made.text
-
-
-def test_a_tool_that_is_set_as_calibrated_is_no_matter_of_zeros():
-    nominal = ur10()
-    values = nominal.nominal
-    values[nominal.index("tool.x")] += 0.01
-    robot = nominal.with_values(values)
-    kept, told = (export(robot, "zeros", nominal=nominal, tool=tool) for tool in ("nominal", "calibrated"))
-    assert max(abs(zero["reading"]) for zero in told.details["zeros"].values()) < 1e-12
-    assert max(abs(zero["reading"]) for zero in kept.details["zeros"].values()) > 1e-3
-    assert "with the tool as drawn: x 10, y -20, z 100" in kept.text
-    assert "with the tool as calibrated: x 20, y -20, z 100" in told.text
-
-
 # --- what cannot be ---------------------------------------------------------------------------------------------------
 
 UR = ur10()
@@ -520,32 +422,6 @@ def test_what_cannot_be_exported_is_a_line(mistake):
     with pytest.raises(InputError) as caught:
         export(arm, mistake.partition(" ")[0], **options)
     assert str(caught.value).startswith(message)
-
-
-def test_a_file_that_is_there_is_not_replaced(tmp_path):
-    (tmp_path / "arm.urdf").write_text("mine")
-    with pytest.raises(InputError, match=r"arm\.urdf: is there already"):
-        export(UR, "urdf").write(tmp_path / "arm.urdf")
-    with pytest.raises(InputError, match="there is no folder"):
-        export(UR, "urdf").write(tmp_path / "nowhere" / "arm.urdf")
-    assert (tmp_path / "arm.urdf").read_text() == "mine"
-    assert [file.name for file in tmp_path.iterdir()] == ["arm.urdf"]
-
-
-def test_what_of_limits_a_new_urdf_cannot_hold_is_said():
-    limits = [(-1.0, 2.0), (-np.inf, 1.0), (0.0, np.inf)]
-    robot = Robot.from_dh([[0.1, 0.2, 0.3, 0.4]] * 3, types=["revolute", "revolute", "prismatic"], limits=limits)
-    made = export(robot, "urdf")
-    assert [line.strip() for line in made.text.splitlines() if line.strip().startswith("<limit")] == [
-        '<limit lower="-1.0" upper="2.0" effort="0" velocity="0"/>',
-        '<limit lower="0.0" upper="1000.0" effort="0" velocity="0"/>',
-    ]
-    assert made.notes[1:] == (
-        "slides without limits have 1000 m, as URDF knows none without",
-        "joints that turn and have one limit alone are continuous here, without it",
-        "effort and velocity in <limit> are 0, as nobody has stated them",
-    )
-    assert all(f"<!-- {note.replace('--', '- -')} -->" in made.text for note in made.notes)
 
 
 def test_names_that_are_those_of_a_new_urdfs_frames_are_kept(tmp_path):

@@ -1,7 +1,6 @@
 """ROS bags of every format, written by the tests: what is read of them, and a line for each that cannot be used."""
 
 import gc
-import shutil
 import sys
 
 import numpy as np
@@ -202,17 +201,6 @@ def test_topics_that_are_not_there(bag):
     )
 
 
-def test_topics_of_which_several_fit(bag):
-    poses(bag)
-    poses(bag, topic="/camera", form="Odometry")
-    path = bag.close()
-    assert error(path) == (
-        f"{path.name}: 2 topics fit: /camera (nav_msgs/msg/Odometry), /pose (geometry_msgs/msg/PoseStamped), "
-        "expected one of them: --pose TOPIC"
-    )
-    assert read_bag(path, arm(), pose="/camera")[1].source.topic == "/camera"
-
-
 def test_a_joint_that_is_not_there(bag):
     poses(bag)
     path = bag.close()
@@ -232,15 +220,6 @@ def test_a_clock_that_was_set_back(bag):
     )
 
 
-def test_quaternions_that_are_none(bag):
-    for k in range(3):
-        bag.pose(START + k, [0, 0, 0], [0, 0, 0.5 * k, 1])
-    path = bag.close()
-    assert error(path) == (
-        f"{path.name}: topic /pose: quaternion of norm 1.11803, expected 1 within 0.001; 2 of 3 poses"
-    )
-
-
 def test_what_is_no_bag(tmp_path):
     (tmp_path / "empty.bag").touch()
     (tmp_path / "run.txt").write_text("x")
@@ -253,27 +232,7 @@ def test_what_is_no_bag(tmp_path):
     )
 
 
-LEFT_OPEN = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 """Older readers leave damaged files open."""
-
-
-@LEFT_OPEN
-@pytest.mark.parametrize(("form", "kept"), diagonal(FORMATS, [0.02, 0.4, 0.97]))
-def test_a_bag_that_was_cut_off(tmp_path, bags, form, kept):
-    path = cut(bags[form], tmp_path, kept)
-    found = error(path)
-    assert found.startswith(f"{path.name}: ")
-    assert "\n" not in found
-
-
-def cut(bag, folder, kept):
-    """A copy of a bag whose data end early."""
-    path = folder / bag.name
-    (shutil.copytree if bag.is_dir() else shutil.copy)(bag, path)
-    file = path if path.is_file() else next(f for f in path.iterdir() if f.suffix != ".yaml")
-    content = file.read_bytes()
-    file.write_bytes(content[: int(kept * len(content))])
-    return path
 
 
 def test_without_rosbags_a_line_says_what_to_install(tmp_path, fg_calib, monkeypatch):

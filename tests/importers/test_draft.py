@@ -90,19 +90,6 @@ def test_columns_of_other_names_and_units_are_explained(fg_calib, folder):
     assert np.allclose(mine.readings, plain.readings, atol=1e-12)
 
 
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("names", ["joint_{}", "Axis {}"])
-def test_joints_are_recognised_whether_counted_from_0_or_1(fg_calib, folder, names):
-    folder, write = folder
-    first = int(names == "joint_{}")
-    given = drafted(
-        fg_calib, folder, folder / "robot.yaml", write({f"q{i}": names.format(i - first) for i in range(1, 7)})
-    )
-    called = {f"q{i}": names.format(i - first) for i in range(1, 7)}
-    assert given.get("columns", {}) == {known: name for known, name in called.items() if known != name}
-    assert fg_calib("inspect", folder / JOB).code == 0
-
-
 def test_units_that_no_header_says_are_guessed_from_the_figures_and_said_to_be(fg_calib, folder):
     folder, write = folder
     factors = {f"q{i}": 180 / np.pi for i in range(1, 7)} | dict.fromkeys("xyz", 1e3)
@@ -157,41 +144,6 @@ def test_what_only_the_user_knows_is_asked_for(fg_calib, folder):
         assert text.count(question) == 1
 
 
-@pytest.mark.slow
-def test_columns_of_counts_are_recognised_and_their_scale_is_asked_for(fg_calib, folder):
-    folder, write = folder
-    counts = {f"q{i}": 1000.0 for i in range(1, 7)}
-    given = drafted(fg_calib, folder, folder / "robot.yaml", write({f"q{i}": f"Enc{i}" for i in range(1, 7)}, counts))
-    assert given["columns"] == {f"q{i}": {"name": f"Enc{i}", "scale": 1.0, "zero": 0.0} for i in range(1, 7)}
-    text = (folder / JOB).read_text()
-    assert "# DECIDE scale and zero of each: reading = (count - zero) * scale" in text
-    assert "guessed" in text  # the unit of x, y, z
-    (folder / JOB).write_text(text.replace("scale: 1.0", "scale: 0.001"))
-    assert fg_calib("inspect", folder / JOB).code == 0
-
-
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize(
-    ("name", "cells", "found"),
-    [
-        ("Messpunkt", [f"P{i}" for i in range(40)], "Messpunkt"),
-        ("No.", [str(i) for i in range(40)], "No."),
-        ("Bediener", ["Eva"] * 40, None),
-        ("Temperatur", [f"{20 + 0.01 * i:.2f}" for i in range(40)], None),
-        ("Zeit", [f"{i}e-3" for i in range(40)], None),
-    ],
-)
-def test_a_column_that_names_the_rows_is_suggested_as_id(fg_calib, folder, name, cells, found):
-    folder, write = folder
-    table = pl.read_csv(write()).with_columns(pl.Series(name, cells))
-    file = folder / "named.csv"
-    table.write_csv(file)
-    given = drafted(fg_calib, folder, folder / "robot.yaml", file)
-    assert given.get("columns", {}).get("id") == found
-    assert (f"# not used: {name}" in (folder / JOB).read_text()) == (found is None)
-    assert fg_calib("inspect", folder / JOB).code == 0
-
-
 def test_an_existing_file_is_never_overwritten(fg_calib, folder):
     folder, write = folder
     (folder / JOB).write_text("mine")
@@ -204,34 +156,12 @@ def test_an_existing_file_is_never_overwritten(fg_calib, folder):
 REFUSED = {
     "no robot": (["poses.csv"], "error: init: no robot among the files, expected one, such as robot.yaml or a URDF\n"),
     "no table": (["robot.yaml"], "error: init: no table among the files, expected one, such as poses.csv\n"),
-    "two robots": (
-        ["robot.yaml", "other.yaml", "poses.csv"],
-        "error: init: several robot files: robot.yaml, other.yaml",
-    ),
-    "one table twice": (
-        ["robot.yaml", "poses.csv", "../{}/poses.csv"],
-        "error: init: the same table twice: poses.csv, ",
-    ),
     "a picture": (["robot.yaml", "poses.png"], "error: {}/poses.png: ending '.png', expected robot.yaml, a .urdf"),
-    "a job": (["robot.yaml", "job.yaml"], "error: job.yaml: a job, expected a robot"),
     "joints alone": (["robot.yaml", "alone.csv"], "error: alone.csv: joint readings alone, expected what was measured"),
-    "other joints": (
-        ["robot.yaml", "other.csv"],
-        "error: other.csv: neither joint readings nor pairs, expected columns q1 to",
-    ),
     "pairs alone": (
         ["robot.yaml", "pairs.csv"],
         "error: pairs.csv: pairs alone, expected the table of the configurations",
     ),
-    "odd pairs": (
-        ["robot.yaml", "alone.csv", "odd.csv"],
-        "error: odd.csv: column 'distance [mm]', expected distance; ",
-    ),
-    "no camera": (
-        ["robot.yaml", "seen.csv"],
-        "error: seen.csv: images of a camera that is not among the files, expected",
-    ),
-    "not a number": (["robot.yaml", "bad.csv"], "error: bad.csv:2: x: found 'far', expected a finite number"),
     "no file": (["robot.yaml", "none.csv"], "error: "),
 }
 

@@ -7,9 +7,9 @@ import pytest
 from recordings import arm, correlated, record
 from scipy.spatial.transform import Rotation
 
-from fg_calib import InputError, Robot
-from fg_calib.importers.recording import JointStream, PoseStream, Source, correlation_time, is_slow, sigmas_of_means
-from fg_calib.importers.standstill import average_stops, find_standstills
+from fg_calib import InputError
+from fg_calib.importers.recording import JointStream, PoseStream, Source, correlation_time, is_slow
+from fg_calib.importers.standstill import average_stops
 
 
 def averaged(motion, **more):
@@ -61,14 +61,6 @@ def test_the_offset_needs_no_place_of_the_target_on_the_tool():
 
 
 @pytest.mark.slow
-def test_the_offset_of_positions_alone():
-    joints, poses = record(4, sigma_position=5e-4).streams()
-    stops = average_stops(joints, PoseStream(poses.time, poses.position, None, poses.source), arm(1e-3))
-    assert stops.rotation is stops.sigma_orientation is None
-    assert abs(stops.offset.seconds - 0.137) < 5.0 * stops.offset.sigma
-
-
-@pytest.mark.slow
 def test_a_stated_offset_is_used_and_compared(motion):
     stops = averaged(motion, offset=0.13)
     assert stops.applied == 0.13
@@ -109,29 +101,6 @@ def test_poses_of_something_else_are_refused():
         average_stops(joints, poses, arm())
 
 
-@pytest.mark.slow
-def test_short_pauses_are_skipped_and_told():
-    rest = np.full(12, 1.5)
-    rest[4] = 0.7
-    motion = record(8, rest=rest)
-    stops = averaged(motion)
-    assert "stop5" not in stops.ids
-    assert [s.id for s in stops.skipped] == ["stop5"]
-    assert stops.skipped[0].reason.endswith("shorter than 1 s")
-    assert len(averaged(motion, still=0.6).ids) == 12
-
-
-@pytest.mark.slow
-def test_stops_without_poses_are_skipped():
-    motion = record(9)
-    joints, poses = motion.streams()
-    begin = averaged(motion).interval[3, 0] + motion.offset
-    seen = (poses.time < begin) | (poses.time > begin + 2.0)
-    poses = PoseStream(poses.time[seen], poses.position[seen], poses.rotation[seen], poses.source)
-    stops = average_stops(joints, poses, arm(1e-3))
-    assert [(s.id, s.reason) for s in stops.skipped] == [("stop4", "0 poses, fewer than 8")]
-
-
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("change", "reason"),
@@ -156,22 +125,6 @@ def test_an_arm_that_never_rests_is_refused():
     motion = record(11, rest=0.6)
     with pytest.raises(InputError, match=r"no standstill of 2 s, expected the arm at rest.*; the longest pause is"):
         averaged(motion, still=2.0)
-
-
-def test_slides_and_encoders_without_noise_stand_still():
-    robot = Robot.from_dh([[0, 0, 0, 0]], types="prismatic")
-    time = np.arange(0.0, 6.0, 0.01)
-    reading = np.clip(time - 2.0, 0.0, 1.0) * 0.3
-    found = find_standstills(JointStream(time, np.round(reading, 4)[:, None], Source("/j", "")), robot, 1.0)
-    assert np.allclose(found, [(0.0, 2.0), (3.0, 6.0)], atol=0.05)
-
-
-def test_sigma_of_white_noise_is_that_of_students_t():
-    """In closed form: s^2 / n (n - 1) / (n - 3), s^2 the unbiased estimate."""
-    x = np.random.default_rng(0).standard_normal((20, 3))
-    x -= x.mean(axis=0)
-    s2 = x.var(axis=0, ddof=1)
-    assert sigmas_of_means([x], 1.0)[0] == pytest.approx(np.sqrt(s2 / 20 * 19 / 17), rel=1e-12)
 
 
 @pytest.mark.sampled(1)
@@ -201,16 +154,6 @@ def test_sigmas_are_those_of_the_errors(settings, least):
 
 
 @pytest.mark.slow
-def test_the_sigma_of_the_offset_is_that_of_its_errors():
-    """Monte Carlo with a wrong nominal arm, which counts as noise from move to move; 11 moves: Student's t."""
-    found = [averaged(record(200 + s)).offset for s in range(40)]
-    z = np.array([(o.seconds - 0.137) / o.sigma for o in found])
-    assert abs(z.mean()) < 4.0 / np.sqrt(40)
-    expected = 10 / 8 / 1.05**2  # variance of Student's t over the square of its 68 % point
-    assert np.mean(z**2) == pytest.approx(expected, abs=4.0 * np.sqrt(2.0 / 40) * expected)
-
-
-@pytest.mark.slow
 def test_sigmas_of_orientations_are_about_the_tools_axes_and_of_positions_along_the_worlds():
     joints, poses = record(12, sigma_position=1e-9, sigma_orientation=1e-9).streams()
     generator = np.random.default_rng(0)
@@ -236,11 +179,3 @@ def test_slow_noise_is_seen_beneath_white_noise(seconds, most):
         found.append(nees(averaged(motion), motion)[0])
     assert np.mean(found) < most + 3.0 * np.std(found) / np.sqrt(12)
     assert np.mean(found) > 0.2
-
-
-@pytest.mark.slow
-def test_white_noise_alone_is_not_called_slow():
-    generator = np.random.default_rng(4)
-    for n in (12, 70, 500):
-        stops = [x - x.mean(axis=0) for x in generator.standard_normal((12, n, 3))]
-        assert correlation_time(stops) < 1.3

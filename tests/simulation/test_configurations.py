@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from oracle import tool_pose
 from simulated import paper_robot, planar_robot, small_arm
-from tolerances import rounding
 
 from fg_calib.designs.candidates import find_candidates
 from fg_calib.errors import InputError
@@ -89,12 +88,6 @@ def test_rows_of_a_table_outside_the_limits_are_rejected_and_the_order_kept():
     assert draw(ARM, GivenReadings(q), n=2).readings.tolist() == q[1:3].tolist()
 
 
-def test_a_table_is_looked_through_to_its_end():
-    q = np.full((3000, 7), 4.0)
-    q[-1] = 0.0
-    assert draw(ARM, GivenReadings(q)).rejected == {"outside the joint limits": 2999}
-
-
 # --- boxes ------------------------------------------------------------------------------------------------------------
 
 BOXES = [Box([-2.0, 0.2, -1.0], [2.0, 0.5, 2.0]), Box([0.3, -2.0, 0.1], [0.9, -0.4, 0.4])]
@@ -115,14 +108,6 @@ def test_boxes_are_entered_where_points_along_the_links_are_inside(robot):
     assert enters(robot, q, boxes).tolist() == inside.tolist()
 
 
-def test_the_lines_end_at_the_tool_point():
-    q = random_readings(ARM, 20, np.random.default_rng(1))
-    tool = poses_of(ARM, q)[:, :3, 3]
-    assert np.abs(link_points(ARM, q)[:, -1] - tool).max() < rounding(20, 2.0)
-    boxes = [Box(tool[0] - 1e-6, tool[0] + 1e-6)]
-    assert enters(ARM, q, boxes).tolist() == [True] + [False] * 19
-
-
 def test_what_no_joint_moves_and_what_touches_is_not_in_the_way():
     """The column up to the shoulder stands in one box, and on the floor."""
     q = np.zeros((1, 7))
@@ -132,13 +117,6 @@ def test_what_no_joint_moves_and_what_touches_is_not_in_the_way():
     on_the_floor = random_readings(flat, 10, np.random.default_rng(0))
     assert not enters(flat, on_the_floor, [Box([-9, -9, -1], [9, 9, 0])]).any()
     assert enters(flat, on_the_floor, [Box([-9, -9, -1], [9, 9, 1e-6])]).all()
-
-
-def test_nothing_is_kept_of_what_enters_a_box_and_as_much_found_as_without():
-    found = draw(ARM, RandomReadings(200), keep_out=BOXES)
-    assert len(found.readings) == 200
-    assert not enters(ARM, found.readings, BOXES).any()
-    assert list(found.rejected) == ["in a box"]
 
 
 # --- apart ------------------------------------------------------------------------------------------------------------
@@ -157,15 +135,6 @@ def test_all_are_apart_and_none_was_rejected_for_nothing(robot):
     assert found.readings.tolist() == taken.tolist()
     assert found.rejected == {"near another": 1100 - len(taken)}
     assert distances(found.readings / unit).min() >= 1.2
-
-
-def test_drawing_goes_on_until_enough_are_apart_or_gives_up():
-    found = draw(ARM, RandomReadings(300), apart=1.0)
-    assert len(found.readings) == 300
-    assert found.asked > 310
-    few = draw(planar_robot(), RandomReadings(300), apart=1.0)  # +-180 degrees hold 7 x 7 at most
-    assert few.asked == 20 * 300
-    assert len(few.readings) <= 49
 
 
 # --- what a camera sees -----------------------------------------------------------------------------------------------
@@ -219,19 +188,6 @@ def test_the_whole_board_is_in_the_field_of_view():
     assert angle(BOARD.position - T[:, :3, 3], T[:, :3, 2]).max() > 0.05
 
 
-def test_held_self_motion_stays_near_that_of_the_first():
-    held = replace(VIEWS, self_motion="held", roll=0.0, count=30)
-    spread = [np.median(np.ptp(draw(ARM, of).readings, axis=0)) for of in (held, replace(held, self_motion="random"))]
-    assert spread[0] < 0.7 * spread[1]
-
-
-@pytest.mark.slow
-def test_a_first_view_that_is_not_reached_cannot_be_held():
-    away = replace(VIEWS, self_motion="held", board=Placement(np.eye(3), np.array([9.0, 0.0, 0.0])))
-    with pytest.raises(InputError, match=r"^candidates: board: 1 of 1 views not reached within the joint limits \(A\)"):
-        draw(ARM, away)
-
-
 # --- what a tracker sees ----------------------------------------------------------------------------------------------
 
 
@@ -261,29 +217,6 @@ def test_the_tracker_sees_the_reflector(robot, far):
     assert draw(robot, views).readings.tolist() == found.readings.tolist()
 
 
-@pytest.mark.slow
-def test_turned_reflectors_have_any_roll_and_are_all_over_the_workspace():
-    found = draw(ARM, replace(TARGET, distance=(0.0, np.inf), count=300))
-    T = poses_of(ARM, found.readings)
-    anywhere = poses_of(ARM, random_readings(ARM, 300, np.random.default_rng(1)))
-    ratio = T[:, :3, 3].std(axis=0) / anywhere[:, :3, 3].std(axis=0)
-    assert ratio.min() > 0.7
-    _, _, target = seen_by(TARGET, ARM, found.readings)
-    towards = (TARGET.station - target) / np.linalg.norm(TARGET.station - target, axis=1)[:, None]
-    x = T[:, :3, 0]  # across the reflector's axis
-    up = np.cross(towards, np.cross([0.0, 0.0, 1.0], towards))
-    roll = np.arctan2(np.sum(np.cross(up, x) * towards, axis=1), np.sum(up * x, axis=1))
-    assert (np.histogram(roll, bins=6, range=(-np.pi, np.pi))[0] > 15).all()  # of 50 each
-
-
-def test_most_are_turned_to_the_tracker_and_not_waited_for():
-    """Of 1 in 400 random configurations the reflector faces the tracker within 0.1 rad."""
-    narrow = replace(TARGET, acceptance=0.1)
-    found = draw(ARM, narrow)
-    assert found.asked < 8 * 100
-    assert seen_by(narrow, ARM, found.readings)[1].max() <= 0.1 + 1e-8
-
-
 @pytest.mark.parametrize(
     ("robot", "region"),
     [(ARM, Box([0.1, -0.4, 0.0], [0.8, 0.4, 0.9])), (small_arm(), Box([-1.6, -0.7, -0.8], [-0.2, 1.0, 0.8]))],
@@ -310,25 +243,3 @@ def test_nothing_within_reach_is_said_with_the_reasons():
         draw(ARM, GivenReadings(np.array([[4.0] * 7, [0.0] * 7])), keep_out=[Box([-1, -1, 0.9], [1, 1, 1])])
     message = "candidates: none in 2 drawn: 50 % outside the joint limits, 50 % in a box"
     assert str(caught.value) == f"{message}, expected some that the arm can take"
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: RandomReadings(3, apart=0.0), "random: apart: found 0.0, expected a number above 0"),
-        (lambda: draw(ARM, GivenReadings(np.zeros((3, 6)))), "candidates: table: shape (3, 6), expected (n, 7)"),
-        (lambda: Box([0, 0, 0], [1, 0, 1]), "box: upper: found [1.0, 0.0, 1.0] above a lower of [0.0, 0.0, 0.0], "
-         "expected more than lower in x, y and z"),
-        (lambda: replace(VIEWS, field_of_view=2.0),
-         "board: field_of_view: found 2 rad, expected less than a quarter turn"),
-        (lambda: replace(VIEWS, board_size=(1.0, 1.0)), "board: board_size: found (1.0, 1.0), expected none without "
-         "field_of_view"),
-        (lambda: replace(TARGET, axis=[0, 0, 0]), "tracker: axis: found 0, 0, 0, expected a direction"),
-        (lambda: replace(TARGET, distance=(2.0, 1.0)),
-         "tracker: distance: found [2.0, 1.0], expected the smaller one first"),
-    ],
-)  # fmt: skip
-def test_a_figure_that_makes_no_sense_is_one_line(make, message):
-    with pytest.raises(InputError) as caught:
-        make()
-    assert str(caught.value) == message

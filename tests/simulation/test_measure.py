@@ -6,18 +6,17 @@ from functools import cache
 import numpy as np
 import pytest
 from oracle import tool_pose
-from scenarios import CAMERA, EXACT, GRID, INSTRUMENTS, SIGMA, TOLERANCE, WALL, scenario
+from scenarios import CAMERA, EXACT, GRID, INSTRUMENTS, SIGMA, WALL, scenario
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from simulated import paper_robot, small_arm
+from simulated import paper_robot
 from tolerances import rounding
 
-from fg_calib import InputError, Pairing, calibrate, read_job, simulate, write_simulation
+from fg_calib import InputError, calibrate, read_job, simulate, write_simulation
 from fg_calib.measurements.dataset import Noise
 from fg_calib.robot.rotations import rotation_angle
 from fg_calib.simulation.scenario import (
     BoardCamera,
-    BoardViews,
     GivenReadings,
     Indicator,
     LengthGauge,
@@ -296,25 +295,6 @@ def test_a_point_of_one_name_is_one_and_all_are_told_the_same_of_it():
     with pytest.raises(InputError) as caught:
         simulate(scenario(LengthGauge(name="wire", anchors=bolt), LengthGauge(name="bar", anchors=other)))
     assert str(caught.value) == "scenario: instruments: anchors: bolt: at two places, expected one, or other names"
-
-
-def test_boards_are_those_that_the_views_look_at():
-    robot = small_arm(tolerance=TOLERANCE)
-    pose_at = tool_pose(robot, [0.3, 0.4, 0.2, 0.5])
-    # a board 0.4 m ahead of the tool there, facing it, so that the first view is that configuration
-    ahead = Placement(pose_at[:3, :3] @ np.diag([1.0, -1.0, -1.0]), pose_at[:3, 3] + 0.4 * pose_at[:3, 2])
-    views = BoardViews(ahead, count=0, height=0.4, roll=0.0)
-    camera = BoardCamera(model="board", name="eye", configurations=views)
-    s = simulate(scenario(camera, Tracker(model="position", name="tracker")))
-    assert s.tables[0].measurements.position == pytest.approx(np.array([[0.0, 0.0, 0.4]]), abs=2e-2)
-    assert s.truth["boards"]["board"] is ahead
-
-
-def test_a_plain_scenario_has_a_table_too():
-    s = simulate(scenario(job={"model": "distance", "pairing": {"random": 30, "seed": 2}}, noise=Noise(1e-4, 1e-4)))
-    (table,) = s.tables
-    assert (table.model, table.pairing, table.frame) == ("distance", Pairing("random", 30, 2), "unknown")
-    assert s.truth == {}
 
 
 # --- what cannot be ---------------------------------------------------------------------------------------------------

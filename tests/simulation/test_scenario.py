@@ -121,12 +121,6 @@ def test_a_short_scenario_has_the_defaults(folder):
     assert read(folder, SHORT + "name: mine\n").name == "mine"
 
 
-def test_a_robot_may_stand_in_the_scenario(folder):
-    robot = "robot: {convention: dh, joints: [{a: 1, alpha: 0, d: 0, theta: 0}]}\n"
-    assert read(folder, robot + ERRORS + RANDOM + NOISE).robot.nominal[6] == 0.0
-    assert read(folder, robot + ERRORS + RANDOM + NOISE).robot.convention == "dh"
-
-
 @pytest.mark.parametrize(
     ("errors", "expected"),
     [
@@ -146,15 +140,6 @@ def test_errors_are_converted_and_shared_out_by_kind(folder, errors, expected):
     assert s.errors.figures == pytest.approx(figures)
 
 
-def test_normal_errors_may_be_those_of_the_tolerances(folder):
-    s = read(folder, SHORT.replace(ERRORS, "errors: {normal: tolerance}\n") + "units: {length: mm}\n")
-    assert s.errors.law == "normal"
-    assert s.errors.figures == {
-        **{"a1": 0.01, "alpha1": 0.02, "d1": 0.03, "theta1": 0.04},
-        **{"a2": 0.01, "alpha2": 0.02, "d2": 0.03, "theta2": 0.04},
-    }
-
-
 def test_a_board_is_converted_to_si(folder):
     views = read(
         folder,
@@ -167,22 +152,6 @@ def test_a_board_is_converted_to_si(folder):
     assert views.roll == pytest.approx(math.radians(30))
     assert views.self_motion == "held"
     assert views.posture == pytest.approx((math.radians(20), 0.1))  # the second joint slides
-
-
-def test_a_board_has_defaults_in_any_units(folder):
-    views = read(folder, SHORT.replace(RANDOM, BOARD + "}}\n") + "units: {length: mm, angle: deg}\n").configurations
-    assert isinstance(views, BoardViews)
-    assert (views.height, views.radius, views.distance, views.cone) == (0.5, 0.5, None, math.pi / 3)
-    assert (views.roll, views.self_motion, views.posture) == (None, "random", None)
-
-
-def test_a_range_of_distances_is_converted(folder):
-    views = read(
-        folder,
-        SHORT.replace(RANDOM, BOARD + ", distance: [300, 2000], cone: 90}}\n") + "units: {length: mm, angle: deg}\n",
-    ).configurations
-    assert views.distance == pytest.approx((0.3, 2.0))
-    assert views.cone == pytest.approx(math.pi / 2)
 
 
 def test_a_table_gives_its_readings(folder):
@@ -242,18 +211,6 @@ validation: {tracker: {station: {x: 3000}, count: 8}}
     t = s.validation
     assert (t.target.tolist(), t.axis.tolist(), t.acceptance) == ([0, 0, 0], [0, 0, 1], math.pi / 6)
     assert (t.distance, t.region, t.keep_out, t.apart, t.count) == ((0.0, math.inf), None, (), None, 8)
-
-
-@pytest.mark.parametrize("kind", ["name", "file", "folder"])
-def test_what_is_no_scenario_is_one_line(folder, kind):
-    wrong, message = {
-        "name": ("puma", "scenario: found 'puma', expected a file, or one of space-robot"),
-        "file": (folder / "nowhere.yaml", f"{folder / 'nowhere.yaml'}: no such file"),
-        "folder": (folder, f"{folder}: is a folder, expected a file"),
-    }[kind]
-    with pytest.raises(InputError) as caught:
-        read_scenario(wrong)
-    assert str(caught.value) == message
 
 
 def test_figures_are_converted_and_instruments_named(folder):

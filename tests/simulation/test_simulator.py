@@ -3,7 +3,6 @@
 Noise bounds: an empirical sigma of n normal numbers has a relative sigma of 1 / sqrt(2 n); five of them are allowed.
 """
 
-import json
 import re
 from dataclasses import replace
 from math import sqrt
@@ -23,7 +22,6 @@ from fg_calib.io.robot_file import read_robot
 from fg_calib.measurements.dataset import Noise
 from fg_calib.robot.model import Robot
 from fg_calib.simulation.measure import MAX_BASE_M
-from fg_calib.simulation.obstacles import enters
 from fg_calib.simulation.scenario import (
     BoardViews,
     Box,
@@ -32,7 +30,6 @@ from fg_calib.simulation.scenario import (
     Placement,
     RandomReadings,
     Scenario,
-    TargetViews,
     read_scenario,
 )
 from fg_calib.simulation.simulator import simulate
@@ -105,21 +102,6 @@ def test_any_robot_is_simulated(convention):
 
 
 # --- noise ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
-def test_noise_has_its_sigma_along_every_axis(shipped, seed):
-    n = 1500
-    s = simulate(replace(shipped, configurations=RandomReadings(n), validation=None), seed)
-    _, position, turn = measured(s)
-    joint = s.true_readings - s.measurements.readings
-    for noise, sigma in ((position, 1e-3), (turn, np.deg2rad(0.01)), (joint, np.deg2rad(0.005))):
-        assert noise.std(axis=0) == pytest.approx(sigma, rel=5 / sqrt(2 * n))
-        assert np.abs(noise.mean(axis=0)).max() < 5 * sigma / sqrt(n)
-    everything = np.concatenate([position, turn, joint], axis=1)
-    correlation = np.corrcoef(everything.T) - np.eye(everything.shape[1])
-    assert np.abs(correlation).max() < 5 / sqrt(n)
 
 
 def test_encoder_noise_moves_the_arm_and_the_table_holds_the_reading(shipped):
@@ -215,43 +197,6 @@ def test_a_roll_is_held_or_drawn():
     assert again.tolist() == same.tolist()
     roll = np.arctan2(np.sum(drawn[:, :, 0] * zero[:, :, 1], 1), np.sum(drawn[:, :, 0] * zero[:, :, 0], 1))
     assert np.histogram(roll, 4, (-np.pi, np.pi))[0] == pytest.approx(500, abs=5 * sqrt(375))  # binomial
-
-
-def test_a_range_of_distances_is_kept_within_the_cone():
-    n, cone = 4000, np.deg2rad(40)
-    R, p = view_board(BoardViews(TILTED, n, distance=(0.3, 2.0), cone=cone), np.random.default_rng(1))
-    away = p[1:] - BOARD
-    distance = np.linalg.norm(away, axis=1)
-    assert p[0] == pytest.approx(BOARD + 0.5 * TILTED.rotation[:, 2])
-    assert distance.min() >= 0.3
-    assert distance.max() <= 2.0
-    assert distance.mean() == pytest.approx(1.15, abs=5 * 1.7 / sqrt(12 * n))
-    cosine = away @ TILTED.rotation[:, 2] / distance
-    assert cosine.min() >= np.cos(cone) - rounding(10)
-    assert cosine.mean() == pytest.approx((1 + np.cos(cone)) / 2, abs=5 * (1 - np.cos(cone)) / sqrt(12 * n))
-    assert np.abs(np.cross(R[:, :, 2], BOARD - p)).max() < rounding(10.0)
-
-
-def test_a_table_is_where_the_arm_goes(shipped):
-    q = np.random.default_rng(0).uniform(-1, 1, (5, 7))
-    s = simulate(replace(shipped, configurations=GivenReadings(q), validation=GivenReadings(q[:2])))
-    assert s.measurements.readings.tolist() == [*q.tolist(), *q[:2].tolist()]
-    assert s.measurements.test.tolist() == [False] * 5 + [True] * 2
-
-
-def test_configurations_keep_out_of_boxes_and_apart(shipped):
-    """As many as are asked for, of any kind; poses of the tool above the floor say so themselves."""
-    floor, gap = (Box([-20.0, -20.0, -20.0], [20.0, 20.0, -1.0]),), 0.8
-    few = replace(shipped, configurations=RandomReadings(40, keep_out=floor, apart=gap),
-                  validation=TargetViews([20.0, 0.0, 5.0], [0.0, 0.0, 0.1], 10, keep_out=floor))  # fmt: skip
-    s = simulate(exact(few), 3)
-    q, heights = s.measurements.readings, poses_of(s.robot, s.measurements.readings)[:, 2, 3]
-    assert (len(q), np.sum(s.measurements.test)) == (50, 10)
-    assert heights.min() >= -1.0
-    assert not enters(s.robot, q, floor).any()
-    assert np.abs(q[:40, None] - q[:40])[~np.eye(40, dtype=bool)].reshape(-1, 7).max(axis=1).min() >= gap
-    assert poses_of(s.robot, simulate(replace(exact(few), configurations=RandomReadings(40)), 3).measurements.readings)[
-        :, 2, 3].min() < -1.0  # fmt: skip
 
 
 def test_configurations_that_are_not_to_be_had_are_reported(shipped):
@@ -385,23 +330,6 @@ def test_the_command_writes_a_job_that_runs(fg_calib, tmp_path):
     assert fg_calib("calibrate", out / "calibration.yaml", "--out", out / "result").code == 0
 
 
-def test_json_is_all_there_is_on_stdout(fg_calib, tmp_path):
-    ended = fg_calib("simulate", "space-robot", "--out", tmp_path / "demo", "--json")
-    assert ended.code == 0
-    summary = json.loads(ended.out)
-    s = simulate(read_scenario("space-robot"))
-    assert summary["files"] == [str(tmp_path / "demo" / name) for name in FILES]
-    assert (summary["scenario"], summary["seed"]) == ("space-robot", 0)
-    assert (summary["n_configurations"], summary["n_train"], summary["n_test"]) == (552, 52, 500)
-    errors = s.true_robot.nominal - s.robot.nominal
-    assert summary["truth"]["errors"] == {
-        p.name: e for p, e in zip(s.robot.parameters, errors.tolist(), strict=True) if p.estimated
-    }
-    frame = summary["truth"]["world_T_base"]
-    assert frame["xyz"] == s.frame.position.tolist()
-    assert Rotation.from_quat(frame["quaternion_xyzw"]).as_matrix() == pytest.approx(s.frame.rotation)
-
-
 def test_a_urdf_robot_is_written_with_its_urdf(tmp_path):
     (tmp_path / "arm.urdf").write_text(
         '<robot name="arm"><link name="a"/><link name="b"/><link name="c"/>'
@@ -422,20 +350,6 @@ def test_a_urdf_robot_is_written_with_its_urdf(tmp_path):
     assert job.truth.nominal == pytest.approx(s.true_robot.nominal, abs=rounding(10.0))
     assert job.measurements.sigma_joint == pytest.approx([0.01, 0.002])
     assert s.true_robot.nominal[s.robot.index("tool.z")] != 0.1
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "message"),
-    [
-        (["puma"], 1, "error: scenario: found 'puma', expected a file, or one of space-robot\n"),
-        (["space-robot", "--seed", "-1"], 2, None),
-    ],
-)
-def test_wrong_use_is_an_exit_code(fg_calib, tmp_path, arguments, code, message):
-    ended = fg_calib("simulate", *arguments, "--out", tmp_path / "demo")
-    assert (ended.code, ended.out) == (code, "")
-    assert message is None or ended.err == message
-    assert not (tmp_path / "demo").exists()
 
 
 def test_the_shipped_arm_is_the_one_of_the_tests(shipped):
