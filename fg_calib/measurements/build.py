@@ -423,7 +423,7 @@ def start_frames(robot: Robot, data: Dataset, tool: Frame, free: Booleans) -> Fr
         instrument, table = instruments[number], data.tables[number]
         if instrument is not None:
             flange = forward(chain, trigs[number])
-            start.begin(number, table.unknown_frame)
+            start.begin(number, table.unknown_frame, (flange.rotation, flange.position))
             blocks = [block for block in data.series if block.table == number]
-            instrument.start_frames(start, table, blocks, (flange.rotation, flange.position), data.unknowns)
+            instrument.start_frames(start, table, blocks, data.unknowns)
     return start

@@ -70,6 +70,27 @@ class MeasurementBlock(Brief):
     source: str = "measurements"
     of: Labels | None = None
 
+    @classmethod
+    def of_rows(
+        cls, kind: Kind, table: Table, number: int, rows: Integers, data: Floats, sigma: Floats, **more: Any
+    ) -> MeasurementBlock:
+        """One measurement a row of a table, all of its components measured.
+
+        Args:
+            kind: What they are.
+            table: The table.
+            number: Its number.
+            rows: Rows of the table, shape (n,).
+            data: What was measured, shape (n, kind.width).
+            sigma: 1 sigma, shape (n, kind.residual_dim).
+            more: Other fields.
+        """
+        m, n = table.measurements, len(rows)
+        fields: dict[str, Any] = {"ends": rows[:, None], "number": rows, "source": m.source}
+        fields |= {"measured": np.ones((n, kind.residual_dim), dtype=np.bool_), "test": m.test[rows]}
+        fields |= {"nuisances": np.zeros((n, 0), dtype=np.int64)} | more
+        return cls(kind=kind, table=number, data=np.ascontiguousarray(data), sigma=sigma, **fields)
+
     @property
     def n(self) -> int:
         """Number of measurements."""

@@ -12,17 +12,7 @@ from fg_calib.errors import ProblemError
 from fg_calib.initialization.landmarks import anchors_from_lengths, offset_from_lengths
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.kind import Floats, Frames, Kind, Rows, between
-from fg_calib.measurements.kinds.instrument import (
-    Column,
-    Instrument,
-    Places,
-    add_points,
-    places_of_rows,
-    require_labels,
-    require_sigma,
-    require_values,
-    simple_block,
-)
+from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, Places, add_points, places_of_rows
 from fg_calib.measurements.landmarks import LandmarkKind, Landmarks
 from fg_calib.measurements.table import MeasurementBlock, Table
 from fg_calib.robot.kinematics import Poses
@@ -126,10 +116,10 @@ class AnchorGauge(Instrument):
             ProblemError: A column or a sigma is missing.
         """
         m = table.measurements
-        labels = require_labels(table, "anchor")
-        length = require_values(table, m.length, "distance", "lengths to the anchors")
+        labels = self.require_labels(table, "anchor")
+        length = self.require(table, m.length, "distance", "lengths to the anchors")
         rows = np.flatnonzero((labels.index >= 0) & np.isfinite(length))
-        sigma = require_sigma(table, m.sigma_length, "distance", rows)
+        sigma = self.require_sigma(table, m.sigma_length, "distance", rows)
         fitted = rows[~m.test[rows]]
         if table.offset and len(fitted) and not length[fitted].any():
             raise ProblemError(m.source, "contacts alone: all distances are 0", "lengths, or no offset to be estimated")
@@ -139,7 +129,7 @@ class AnchorGauge(Instrument):
         contact = (length[rows] == 0.0) & (not table.offset)
         nuisances = np.hstack([anchors[labels.index[rows]], np.repeat(added, len(rows), axis=0)])
         return [
-            simple_block(
+            MeasurementBlock.of_rows(
                 kind,
                 table,
                 number,
@@ -153,9 +143,7 @@ class AnchorGauge(Instrument):
             if chosen.any()
         ]
 
-    def start_landmarks(
-        self, blocks: Sequence[MeasurementBlock], points: Sequence[Floats], landmarks: Landmarks
-    ) -> None:
+    def start_landmarks(self, blocks: Blocks, points: Sequence[Floats], landmarks: Landmarks) -> None:
         """What each table adds, from its rows alone; then anchors from all tables. See `Instrument.start_landmarks`."""
         at = np.concatenate(landmarks.starts)
         lengths = []

@@ -12,16 +12,7 @@ from scipy.spatial.transform import Rotation
 from fg_calib.initialization.start import FrameStart
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.kind import Floats, Frames, Integers, Kind, Rows
-from fg_calib.measurements.kinds.instrument import (
-    Column,
-    Instrument,
-    Places,
-    places_of_rows,
-    require_labels,
-    require_sigma,
-    require_values,
-    simple_block,
-)
+from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, Places, places_of_rows
 from fg_calib.measurements.kinds.pose import POSE_COLUMNS
 from fg_calib.measurements.landmarks import LandmarkKind, Landmarks
 from fg_calib.measurements.table import MeasurementBlock, Table
@@ -89,19 +80,15 @@ def board_coordinates(table: Table, landmarks: Landmarks) -> tuple[Integers, Int
     names: tuple[str, ...] = (BOARD.name,)
     index = np.zeros(m.n_configurations, dtype=np.int64)
     if "board" in m.labels:
-        labels = require_labels(table, "board")
-        names, index = labels.names, labels.index
+        names, index = m.labels["board"].names, m.labels["board"].index
     return index, landmarks.add(BOARD, names, np.full((len(names), 6), np.nan), m.source)
 
 
-def start_boards(
-    start: FrameStart, flange: tuple[Floats, Floats], rows: Integers, first: Integers, choices: tuple[Floats, Floats]
-) -> None:
+def start_boards(start: FrameStart, rows: Integers, first: Integers, choices: tuple[Floats, Floats]) -> None:
     """Start boards and the camera from camera_T_board: seen from a board, the camera is a tool, and the base unknown.
 
     Args:
         start: What is known so far; what is found is put there.
-        flange: base_T_flange of the configurations.
         rows: Configuration of each pose, shape (n,).
         first: First coordinate of each one's board, shape (n,).
         choices: What each may be, the likeliest first: rotations, shape (n, k, 3, 3), positions, shape (n, k, 3), [m].
@@ -111,7 +98,7 @@ def start_boards(
         chosen = first == board
         R_T = np.swapaxes(choices[0][chosen], 2, 3)
         seen = R_T, -np.einsum("nkij,nkj->nki", R_T, choices[1][chosen])
-        X = start.align_choices((flange[0][rows[chosen]], flange[1][rows[chosen]]), seen, unknown_frame=True)
+        X = start.align_choices(rows[chosen], seen, unknown_frame=True)
         place = [Rotation.from_matrix(X.rotation.T).as_rotvec(), -X.rotation.T @ X.translation]
         start.places[board : board + 6] = np.concatenate(place)
 
@@ -136,17 +123,17 @@ class BoardCamera(Instrument):
         """See `Instrument.blocks`."""
         m = table.measurements
         angles = "qx, qy, qz, qw, or roll, pitch, yaw, or rx, ry, rz"
-        R = require_values(table, m.rotation, angles, "measured orientations")
-        p = require_values(table, m.position, "x, y, z", "measured positions")
+        R = self.require(table, m.rotation, angles, "measured orientations")
+        p = self.require(table, m.position, "x, y, z", "measured positions")
         index, place = board_coordinates(table, landmarks)
         rows = np.arange(m.n_configurations)
         if m.covariance is None:
-            turned = require_sigma(table, m.sigma_orientation, "orientation", rows)
-            sigma = np.hstack([turned, require_sigma(table, m.sigma_position, "position", rows)])
+            turned = self.require_sigma(table, m.sigma_orientation, "orientation", rows)
+            sigma = np.hstack([turned, self.require_sigma(table, m.sigma_position, "position", rows)])
         else:
             sigma = np.sqrt(np.einsum("nii->ni", m.covariance))
         return [
-            simple_block(
+            MeasurementBlock.of_rows(
                 BoardPose(),
                 table,
                 number,
@@ -159,20 +146,13 @@ class BoardCamera(Instrument):
             )
         ]
 
-    def start_frames(
-        self,
-        start: FrameStart,
-        table: Table,
-        blocks: Sequence[MeasurementBlock],
-        flange: tuple[Floats, Floats],
-        landmarks: Landmarks,
-    ) -> None:
+    def start_frames(self, start: FrameStart, table: Table, blocks: Blocks, landmarks: Landmarks) -> None:
         """See `start_boards`."""
         for block in blocks:
             if isinstance(block.kind, BoardPose):
                 train = np.flatnonzero(~block.test)
                 measured = block.data[train, None, :9].reshape(-1, 1, 3, 3), block.data[train, None, 9:]
-                start_boards(start, flange, block.ends[train, 0], block.nuisances[train, 0], measured)
+                start_boards(start, block.ends[train, 0], block.nuisances[train, 0], measured)
 
     def predict(self, m: Measurements, poses: Poses, places: Places) -> Measurements:
         """See `Instrument.predict`."""

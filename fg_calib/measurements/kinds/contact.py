@@ -7,7 +7,6 @@ import numpy as np
 from fg_calib.errors import ProblemError
 from fg_calib.measurements.dataset import Labels
 from fg_calib.measurements.kind import Floats, Frames, Kind, Rows, between
-from fg_calib.measurements.kinds.instrument import simple_block
 from fg_calib.measurements.landmarks import LandmarkKind, Landmarks
 from fg_calib.measurements.table import MeasurementBlock, Table
 
@@ -76,7 +75,9 @@ def contact_blocks(table: Table, number: int, landmarks: Landmarks) -> list[Meas
         of = Labels(groups.names, groups.index[rows])
         where = place[groups.index[rows]]
         found.append(
-            simple_block(TouchedPoint(), table, number, rows, np.zeros((len(rows), 0)), sigma, nuisances=where, of=of)
+            MeasurementBlock.of_rows(
+                TouchedPoint(), table, number, rows, np.zeros((len(rows), 0)), sigma, nuisances=where, of=of
+            )
         )
     if pairs.n_pairs:
         found.append(

@@ -6,7 +6,6 @@ import numpy as np
 
 from fg_calib.errors import InputError
 from fg_calib.measurements.dataset import Labels
-from fg_calib.measurements.kinds.instrument import simple_block
 from fg_calib.measurements.landmarks import LandmarkKind, Landmarks
 from fg_calib.measurements.table import CustomMeasurements, MeasurementBlock, Table
 
@@ -36,7 +35,7 @@ def custom_block(custom: CustomMeasurements, table: Table, number: int, landmark
         which = np.zeros((n, 1), dtype=np.int64) if custom.which is None else np.asarray(custom.which).reshape(n, -1)
         nuisances = place[which].reshape(n, -1)
         of = Labels(custom.names, which[:, 0]) if len(custom.names) > 1 and which.shape[1] == 1 else None
-    return simple_block(
+    return MeasurementBlock.of_rows(
         kind,
         table,
         number,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from fg_calib.errors import ProblemError
 from fg_calib.initialization.start import FrameStart
 from fg_calib.measurements.dataset import Labels, Measurements
-from fg_calib.measurements.kind import Kind
 from fg_calib.measurements.landmarks import LandmarkKind, Landmarks
 from fg_calib.measurements.table import MeasurementBlock, Table
 from fg_calib.robot.kinematics import Poses
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+Blocks = Sequence[MeasurementBlock]
 Places = Callable[[LandmarkKind, str], Floats]
 """Coordinates of a landmark, by its kind and name."""
 
@@ -93,9 +93,7 @@ class Instrument(ABC):
             ProblemError: A column or a sigma is missing.
         """
 
-    def start_landmarks(  # noqa: B027
-        self, blocks: Sequence[MeasurementBlock], points: Sequence[Floats], landmarks: Landmarks
-    ) -> None:
+    def start_landmarks(self, blocks: Blocks, points: Sequence[Floats], landmarks: Landmarks) -> None:  # noqa: B027
         """Start landmarks that tool points and data say, of all tables of the instrument together.
 
         Args:
@@ -104,21 +102,13 @@ class Instrument(ABC):
             landmarks: Where the starts are put.
         """
 
-    def start_frames(  # noqa: B027
-        self,
-        start: FrameStart,
-        table: Table,
-        blocks: Sequence[MeasurementBlock],
-        flange: tuple[Floats, Floats],
-        landmarks: Landmarks,
-    ) -> None:
+    def start_frames(self, start: FrameStart, table: Table, blocks: Blocks, landmarks: Landmarks) -> None:  # noqa: B027
         """Start measurement frame, tool, and landmarks that depend on them.
 
         Args:
-            start: What is known so far; what is found is put there.
+            start: Poses of the flange, and what is known so far; what is found is put there.
             table: A table of the instrument.
             blocks: Its blocks.
-            flange: base_T_flange of its configurations: rotations (n, 3, 3), translations (n, 3), [m].
             landmarks: Which coordinates in `start.places` are of which.
         """
 
@@ -146,74 +136,39 @@ class Instrument(ABC):
         """
         return {}
 
+    def require_labels(self, table: Table, column: str) -> Labels:
+        """What each row is of, by the column of that name.
 
-def simple_block(
-    kind: Kind, table: Table, number: int, rows: Integers, data: Floats, sigma: Floats, **more: Any
-) -> MeasurementBlock:
-    """A block with one measurement a row of a table, all of its components measured.
+        Raises:
+            ProblemError: There is no such column.
+        """
+        labels = table.measurements.labels.get(column)
+        if labels is None:
+            found, expected = f"no column {column}", f"the name of a {column} for model {self.model}"
+            raise ProblemError(table.measurements.source, found, expected)
+        return labels
 
-    Args:
-        kind: What they are.
-        table: The table.
-        number: Its number.
-        rows: Rows of the table, shape (n,).
-        data: What was measured, shape (n, kind.width).
-        sigma: 1 sigma, shape (n, kind.residual_dim).
-        more: Other fields of the block.
-    """
-    m, n = table.measurements, len(rows)
-    fields = {
-        "ends": rows[:, None],
-        "measured": np.ones((n, kind.residual_dim), dtype=np.bool_),
-        "test": m.test[rows],
-        "number": rows,
-        "nuisances": np.zeros((n, 0), dtype=np.int64),
-        "source": m.source,
-    }
-    return MeasurementBlock(
-        kind=kind,
-        table=number,
-        data=np.ascontiguousarray(data),
-        sigma=sigma,
-        **fields | more,  # type: ignore[arg-type]
-    )
+    def require(self, table: Table, values: Floats | None, columns: str, what: str) -> Floats:
+        """What was measured.
 
+        Raises:
+            ProblemError: It was not.
+        """
+        if values is None:
+            found = f"no column{'s' * (',' in columns)} {columns}"
+            raise ProblemError(table.measurements.source, found, f"{what} for model {self.model}")
+        return values
 
-def require_labels(table: Table, column: str) -> Labels:
-    """What each row is of, by the column of that name.
+    def require_sigma(self, table: Table, sigma: Floats | None, noise: str, rows: Integers) -> Floats:
+        """1 sigma of rows of a table.
 
-    Raises:
-        ProblemError: There is no such column.
-    """
-    m = table.measurements
-    labels = m.labels.get(column)
-    if labels is None:
-        raise ProblemError(m.source, f"no column {column}", f"the name of a {column} for model {table.model}")
-    return labels
-
-
-def require_values(table: Table, values: Floats | None, columns: str, what: str) -> Floats:
-    """What was measured.
-
-    Raises:
-        ProblemError: It was not.
-    """
-    if values is None:
-        found = f"no column{'s' * (',' in columns)} {columns}"
-        raise ProblemError(table.measurements.source, found, f"{what} for model {table.model}")
-    return values
-
-
-def require_sigma(table: Table, sigma: Floats | None, noise: str, rows: Integers) -> Floats:
-    """1 sigma of rows of a table.
-
-    Raises:
-        ProblemError: It is not specified.
-    """
-    if sigma is None or not np.isfinite(sigma[rows]).all():
-        expected = f"noise.{noise} or a column sigma_{noise}"
-        raise ProblemError(table.measurements.source, f"no sigma for {noise}", expected)
-    return sigma[rows]
+        Raises:
+            ProblemError: It is not specified.
+        """
+        if sigma is None or not np.isfinite(sigma[rows]).all():
+            expected = f"noise.{noise} or a column sigma_{noise}"
+            raise ProblemError(table.measurements.source, f"no sigma for {noise}", expected)
+        return sigma[rows]
 
 
 def add_points(landmarks: Landmarks, kind: LandmarkKind, table: Table, names: Sequence[str]) -> Integers:

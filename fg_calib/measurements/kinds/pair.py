@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,8 +10,8 @@ from fg_calib.errors import ProblemError, escaped
 from fg_calib.initialization.start import FrameStart
 from fg_calib.measurements.dataset import Pairs, are_same, form_pairs, no_pairs
 from fg_calib.measurements.kind import Floats, Frames, Integers, Kind, Rows, between
-from fg_calib.measurements.kinds.contact import POINT, TouchedPoint, contact_blocks
-from fg_calib.measurements.kinds.instrument import Column, Instrument
+from fg_calib.measurements.kinds.contact import POINT, contact_blocks
+from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument
 from fg_calib.measurements.kinds.pose import ANGLES, POSE_COLUMNS
 from fg_calib.measurements.kinds.stacked import stack
 from fg_calib.measurements.landmarks import Landmarks
@@ -187,7 +185,7 @@ class PairGauge(Instrument):
                 source=pairs.source,
             )
 
-        found, use = [], [k for k in (0, 1) if wanted[k]]
+        found, use = list[MeasurementBlock](), [k for k in (0, 1) if wanted[k]]
         rows = np.flatnonzero(there.any(axis=1))
         if len(rows):
             kind = stack(*((Distance(), RotationAngle())[k] for k in use))
@@ -199,26 +197,18 @@ class PairGauge(Instrument):
             found.append(block(SamePoint(), rows, np.zeros((len(rows), 0)), sigma, np.ones((len(rows), 3), np.bool_)))
         return found + (contact_blocks(table, number, landmarks) if self.sees_position else [])
 
-    def start_frames(
-        self,
-        start: FrameStart,
-        table: Table,
-        blocks: Sequence[MeasurementBlock],
-        flange: tuple[Floats, Floats],
-        landmarks: Landmarks,
-    ) -> None:
+    def start_frames(self, start: FrameStart, table: Table, blocks: Blocks, landmarks: Landmarks) -> None:
         """The tool point from distances of pairs, or from touches of the same points where none was measured."""
         for block in blocks:
             if block.kind.ends == 2 and block.kind.quantity == "distance" and not block.kind.is_contact:
                 rows = np.flatnonzero(block.measured[:, 0] & ~block.test)
                 a, b = block.ends[rows].T
-                start.tool_from_distances(flange, a, b, block.data[rows, 0])
+                start.tool_from_distances(a, b, block.data[rows, 0])
                 return
         for block in blocks:
-            if isinstance(block.kind, TouchedPoint):
+            if block.kind.ends == 1:
                 train = np.flatnonzero(~block.test)
-                at = flange[0][block.ends[train, 0]], flange[1][block.ends[train, 0]]
-                start.tool_from_contacts(at, block.nuisances[train, 0])
+                start.tool_from_contacts(block.ends[train, 0], block.nuisances[train, 0])
                 return
 
     def random_model(self, table: Table) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -15,7 +13,7 @@ from fg_calib.initialization.start import FrameStart
 from fg_calib.measurements.dataset import Labels, Measurements
 from fg_calib.measurements.kind import Floats, Frames, Integers, Kind, Rows
 from fg_calib.measurements.kinds.board import BOARD_COLUMN, BoardCamera, board_coordinates, start_boards
-from fg_calib.measurements.kinds.instrument import Column, require_sigma, require_values, simple_block
+from fg_calib.measurements.kinds.instrument import Blocks, Column
 from fg_calib.measurements.landmarks import Landmarks
 from fg_calib.measurements.table import MeasurementBlock, Table
 from fg_calib.robot.rotations import cross_matrix, left_jacobian
@@ -113,7 +111,7 @@ class PixelCamera(BoardCamera):
     def blocks(self, table: Table, number: int, landmarks: Landmarks) -> list[MeasurementBlock]:
         """See `Instrument.blocks`."""
         m = table.measurements
-        image = require_values(table, m.image, "u, v, corner_x, corner_y", "images of a board's points")
+        image = self.require(table, m.image, "u, v, corner_x, corner_y", "images of a board's points")
         if table.camera is None:
             raise ProblemError(m.source, "no camera", f"the key camera for model {table.model}")
         rows = np.arange(m.n_configurations)
@@ -122,26 +120,23 @@ class PixelCamera(BoardCamera):
         if kind.n_nuisances:
             index, place = board_coordinates(table, landmarks)
             nuisances = place[index]
-        sigma = require_sigma(table, m.sigma_pixel, "pixel", rows)
-        return [simple_block(kind, table, number, rows, image, sigma, nuisances=nuisances, of=_corners(m, image))]
+        sigma = self.require_sigma(table, m.sigma_pixel, "pixel", rows)
+        return [
+            MeasurementBlock.of_rows(
+                kind, table, number, rows, image, sigma, nuisances=nuisances, of=_corners(m, image)
+            )
+        ]
 
-    def start_frames(
-        self,
-        start: FrameStart,
-        table: Table,
-        blocks: Sequence[MeasurementBlock],
-        flange: tuple[Floats, Floats],
-        landmarks: Landmarks,
-    ) -> None:
+    def start_frames(self, start: FrameStart, table: Table, blocks: Blocks, landmarks: Landmarks) -> None:
         """Boards, or the frame, and the tool: first what the board's pose in each image may be."""
         for block in blocks:
             if not isinstance(block.kind, Pixel):
                 continue
             rows, boards, choices = _poses_of_images(table, block, block.kind.camera)
             if block.kind.n_nuisances:
-                start_boards(start, flange, rows, boards, choices)
+                start_boards(start, rows, boards, choices)
             else:
-                start.align_choices((flange[0][rows], flange[1][rows]), choices, unknown_frame=start.unknown_frame)
+                start.align_choices(rows, choices, unknown_frame=start.unknown_frame)
 
     def random_model(self, table: Table) -> str:
         """Poses stand for points, which must be in sight. See `Instrument.random_model`."""

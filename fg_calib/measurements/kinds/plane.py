@@ -11,15 +11,7 @@ from scipy.spatial.transform import Rotation
 from fg_calib.initialization.landmarks import plane_from_distances
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.kind import Floats, Frames, Kind, Rows, between
-from fg_calib.measurements.kinds.instrument import (
-    Column,
-    Instrument,
-    Places,
-    places_of_rows,
-    require_labels,
-    require_sigma,
-    simple_block,
-)
+from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, Places, places_of_rows
 from fg_calib.measurements.landmarks import Estimate, LandmarkKind, Landmarks
 from fg_calib.measurements.table import MeasurementBlock, Table
 from fg_calib.robot.kinematics import Poses
@@ -103,10 +95,10 @@ class PlaneGauge(Instrument):
     def blocks(self, table: Table, number: int, landmarks: Landmarks) -> list[MeasurementBlock]:
         """Distances from planes; 0, on the plane, where no column says them. See `Instrument.blocks`."""
         m = table.measurements
-        labels = require_labels(table, "plane")
+        labels = self.require_labels(table, "plane")
         distance = np.zeros(m.n_configurations) if m.length is None else m.length
         rows = np.flatnonzero((labels.index >= 0) & np.isfinite(distance))
-        sigma = require_sigma(table, m.sigma_length, "distance", rows)
+        sigma = self.require_sigma(table, m.sigma_length, "distance", rows)
         nowhere = np.full((len(labels.names), 3), np.nan)
         places = [
             landmarks.add(kind, labels.names, nowhere, m.source, known=[kind is BEHIND] * len(labels.names))
@@ -114,11 +106,13 @@ class PlaneGauge(Instrument):
         ]
         nuisances = np.hstack([place[labels.index[rows]] for place in places])
         of, data = labels.of(rows), distance[rows, None]
-        return [simple_block(PlaneDistance(), table, number, rows, data, sigma[:, None], nuisances=nuisances, of=of)]
+        return [
+            MeasurementBlock.of_rows(
+                PlaneDistance(), table, number, rows, data, sigma[:, None], nuisances=nuisances, of=of
+            )
+        ]
 
-    def start_landmarks(
-        self, blocks: Sequence[MeasurementBlock], points: Sequence[Floats], landmarks: Landmarks
-    ) -> None:
+    def start_landmarks(self, blocks: Blocks, points: Sequence[Floats], landmarks: Landmarks) -> None:
         """See `Instrument.start_landmarks`."""
         there, nuisances = np.concatenate(points), np.concatenate([block.nuisances for block in blocks])
         distance = np.concatenate([block.data[:, 0] for block in blocks])

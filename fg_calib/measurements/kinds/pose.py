@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,16 +12,7 @@ from fg_calib.initialization.landmarks import targets_from_positions
 from fg_calib.initialization.start import FrameStart
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.kind import Floats, Frames, Integers, Kind, Rows
-from fg_calib.measurements.kinds.instrument import (
-    Column,
-    Instrument,
-    Places,
-    add_points,
-    places_of_rows,
-    require_sigma,
-    require_values,
-    simple_block,
-)
+from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, Places, add_points, places_of_rows
 from fg_calib.measurements.kinds.stacked import stack
 from fg_calib.measurements.landmarks import LandmarkKind, Landmarks
 from fg_calib.measurements.table import MeasurementBlock, Table
@@ -173,11 +163,11 @@ class PoseTracker(Instrument):
             (self.sees_position, position, m.position, m.sigma_position, "x, y, z", "position"),
         ):
             if wanted:
-                measured = require_values(table, values, columns, f"measured {noise}s")
+                measured = self.require(table, values, columns, f"measured {noise}s")
                 measured = measured.reshape(m.n_configurations, kind.width)[rows]
-                parts.append((kind, measured, require_sigma(table, sigma, noise, rows)))
+                parts.append((kind, measured, self.require_sigma(table, sigma, noise, rows)))
         kinds, data, sigmas = zip(*parts, strict=True)
-        return simple_block(
+        return MeasurementBlock.of_rows(
             stack(*kinds),
             table,
             number,
@@ -188,21 +178,14 @@ class PoseTracker(Instrument):
             of=m.labels["target"].of(rows) if "target" in m.labels and self.sees_position else None,
         )
 
-    def start_frames(
-        self,
-        start: FrameStart,
-        table: Table,
-        blocks: Sequence[MeasurementBlock],
-        flange: tuple[Floats, Floats],
-        landmarks: Landmarks,
-    ) -> None:
+    def start_frames(self, start: FrameStart, table: Table, blocks: Blocks, landmarks: Landmarks) -> None:
         """Frame and tool from poses; of targets only their orientations say something of the tool."""
         m, labels = table.measurements, table.measurements.labels.get("target")
         train = np.flatnonzero(~m.test)
-        R_F, p_F = flange[0][train], flange[1][train]
+        R_F, p_F = start.flange[0][train], start.flange[1][train]
         R = m.rotation[train] if self.sees_orientation and m.rotation is not None else None
         p = m.position[train] if self.sees_position and m.position is not None else None
-        start.align((R_F, p_F), (R, p if labels is None else None))
+        start.align(train, (R, p if labels is None else None))
         if p is None or labels is None or not any(block.kind.n_nuisances for block in blocks):
             return
         coordinates = landmarks.coordinates_of(TARGET, labels.names)
