@@ -406,8 +406,8 @@ def _without_noise(scenario: Scenario, readings: Mapping[str, Floats]) -> Scenar
 
 def _zeros(noise: Noise) -> Noise:
     """Zero noise of the kinds that are specified."""
-    nothing: dict[str, Any] = {kind: 0.0 for kind in NOISE_KINDS if getattr(noise, kind) is not None}
-    return replace(noise, joint=0.0, **nothing)
+    nothing: dict[str, Any] = {kind: 0.0 for kind in NOISE_KINDS if noise.get(kind) is not None}
+    return noise.updated(joint=0.0, **nothing)
 
 
 def _with_true_points(simulation: Simulation) -> tuple[Table, ...]:

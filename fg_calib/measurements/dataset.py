@@ -59,6 +59,16 @@ class Noise:
     pixel: float | None = None
     more: Mapping[str, float] = field(default_factory=dict)
 
+    def get(self, kind: str) -> Any:
+        """Sigma of a kind, of `more` too; None where it is not specified."""
+        return self.more.get(kind) if kind not in _NOISE else getattr(self, kind)
+
+    def updated(self, **values: Any) -> Noise:
+        """Other sigmas of some kinds, of `more` too; None leaves one of `more` as it is."""
+        named = {kind: value for kind, value in values.items() if kind in _NOISE}
+        others = {kind: value for kind, value in values.items() if kind not in _NOISE and value is not None}
+        return replace(self, **named, more={**self.more, **others})
+
     def __post_init__(self) -> None:
         for name, figure in self.more.items():
             check_number(f"noise: {name}", figure)
@@ -70,6 +80,9 @@ class Noise:
             for figure in given if f.name == "joint" and isinstance(given, tuple) else (given,):
                 if figure is not None:
                     check_number(f"noise: {f.name}", figure)
+
+
+_NOISE = tuple(f.name for f in fields(Noise) if f.name != "more")
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.errors import InputError
 from fg_calib.measurements.dataset import Groups, Labels, Measurements, Noise, Pairs, form_pairs, no_pairs
-from fg_calib.measurements.kinds import Camera
+from fg_calib.measurements.kinds import INSTRUMENTS, Camera
 from fg_calib.measurements.table import KnownPoint, Table
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, FrameKnowledge
 from fg_calib.robot.inverse import N_STARTS, solve_inverse
@@ -42,6 +42,7 @@ from fg_calib.simulation.scenario import (
     LengthGauge,
     PairGauge,
     Placement,
+    PlainInstrument,
     Plane,
     Sockets,
     Spot,
@@ -134,20 +135,19 @@ def measure(instrument: Instrument, scene: Scene) -> tuple[Table, Truth]:
         InputError: A value of the noise is missing, nothing is seen, or a point is not reached.
     """
     work = _Work(instrument, scene)
-    match instrument:
-        case Tracker():
-            return work.poses(instrument)
-        case PairGauge():
-            return work.pairs(instrument)
-        case LengthGauge():
-            return work.lengths(instrument)
-        case Indicator():
-            return work.distances(instrument)
-        case Sockets():
-            return work.contacts(instrument)
-        case BoardCamera():
-            return work.boards(instrument) if instrument.model == "board" else work.pixels(instrument)
-    raise InputError("instruments", f"found a {type(instrument).__name__}", "an instrument of fg_calib")
+    methods: dict[type, Any] = {
+        Tracker: work.poses,
+        PairGauge: work.pairs,
+        LengthGauge: work.lengths,
+        Indicator: work.distances,
+        Sockets: work.contacts,
+        BoardCamera: work.boards if instrument.model == "board" else work.pixels,
+        PlainInstrument: work.plain,
+    }
+    if type(instrument) not in methods:
+        raise InputError("instruments", f"found a {type(instrument).__name__}", "an instrument of fg_calib")
+    found: tuple[Table, Truth] = methods[type(instrument)](instrument)
+    return found
 
 
 def draw_frame(generator: np.random.Generator) -> Placement:
@@ -188,7 +188,7 @@ class _Work:
         return np.full(shape, sigma)
 
     def _value(self, noise: Noise, kind: str) -> float:
-        value = getattr(noise, kind)
+        value = noise.get(kind)
         if value is None:
             raise InputError(f"{self.place}: noise: {kind}", "found none", f"1 sigma, for model {self.model}")
         return float(value)
@@ -330,6 +330,14 @@ class _Work:
         if i.stations > 1 and known:
             raise InputError(f"{self.place}: stations", f"{i.stations} with frame base", "1")
         return [first, *(draw_frame(self.places) for _ in range(i.stations - 1))], known
+
+    def plain(self, i: PlainInstrument) -> tuple[Table, Truth]:
+        """Columns that the model alone has."""
+        model, n, at = INSTRUMENTS[self.model], len(self.visits), self.at()
+        exact = model.predict(self.rows(), at, lambda kind, name: np.zeros(kind.size))
+        columns = {name: exact.columns[name] + self.noise(name, n) for name in model.generic_columns}
+        sigmas = {name: self.stated(name, n) for name in model.generic_columns}
+        return Table(replace(exact, columns=columns, sigmas=sigmas), i.model), {}
 
     def pairs(self, i: PairGauge) -> tuple[Table, Truth]:
         """Distances and angles between configurations."""

@@ -90,7 +90,7 @@ from typing import Annotated, Any, Literal, TypeVar, cast, dataclass_transform
 import numpy as np
 import pydantic
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, ValidationError, ValidationInfo
+from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, ValidationError, ValidationInfo, create_model
 from pydantic_core import core_schema
 
 from fg_calib.arguments import checked
@@ -115,7 +115,7 @@ from fg_calib.io.yaml import (
     validate,
 )
 from fg_calib.measurements.dataset import Noise
-from fg_calib.measurements.kinds import Camera
+from fg_calib.measurements.kinds import GENERIC_COLUMNS, Camera
 from fg_calib.measurements.limits import LIMIT_SLACK
 from fg_calib.options import (
     NEAR,
@@ -534,7 +534,7 @@ ConfigurationsInFile = Annotated[Configurations, InFile(_ConfigurationsInFile, _
 # --- noise and landmarks ----------------------------------------------------------------------------------------------
 
 
-class _NoiseInFile(Schema):
+class _NoiseOfFields(Schema):
     position: LengthFromZero | None = None
     orientation: AngleFromZero | None = None
     joint: Any = None  # one value, or one a joint
@@ -544,13 +544,19 @@ class _NoiseInFile(Schema):
     pixel: NotNegative | None = None
 
 
+_GENERIC: dict[str, Any] = {
+    name: (LengthFromZero | None if column.unit == "length" else AngleFromZero | None, None)
+    for name, column in GENERIC_COLUMNS.items()
+}
+_NoiseInFile = create_model("_NoiseInFile", __base__=_NoiseOfFields, **_GENERIC)
+
 NOISE_KINDS = tuple(kind for kind in _NoiseInFile.model_fields if kind != "joint")
 
 
-def _noise(given: _NoiseInFile, context: FileContext) -> Noise:
+def _noise(given: Any, context: FileContext) -> Noise:
     values = {kind: getattr(given, kind) for kind in NOISE_KINDS}
     joint = 0.0 if given.joint is None else given.joint
-    return Noise(**values, joint=joint_noise(joint, context.units, context.robot, ""))
+    return Noise().updated(**values, joint=joint_noise(joint, context.units, context.robot, ""))
 
 
 NoiseInFile = Annotated[Noise, InFile(_NoiseInFile, _noise)]
@@ -693,6 +699,11 @@ FrameOfInstrument = Annotated[str | Placement | None, InFile(Any, _frame_in_file
 
 
 @schema(kw_only=True)
+class PlainInstrument(Instrument):
+    """An instrument that measures the columns of its model at every configuration, landmarks in turn."""
+
+
+@schema(kw_only=True)
 class Tracker(Instrument):
     """Poses, positions or orientations of the tool, or positions of targets on it; pairs formed from these.
 
@@ -832,8 +843,8 @@ class Sockets(Instrument):
 
 def override_noise(noise: Noise, more: Noise) -> Noise:
     """A noise with the values of another where it has some; the joints' stay."""
-    values = {kind: getattr(more, kind) for kind in NOISE_KINDS}
-    return replace(noise, **{name: value for name, value in values.items() if value is not None})
+    values = {kind: more.get(kind) for kind in NOISE_KINDS}
+    return noise.updated(**{name: value for name, value in values.items() if value is not None})
 
 
 def frame_knowledge(frame: str | Placement) -> FrameKnowledge:
@@ -1029,7 +1040,7 @@ def _job(file: _ScenarioInFile, noise: Noise, source: str, context: FileContext)
         return given, None
     found: Noise = read_as(NoiseInFile, specified, f"{place}: noise", context)
     for kind in NOISE_KINDS:
-        if getattr(found, kind) == 0.0:
+        if found.get(kind) == 0.0:
             raise InputError(f"{place}: noise: {kind}", "found 0", "a number above 0")
     return given, found if "joint" in specified else replace(found, joint=noise.joint)
 
@@ -1074,4 +1085,5 @@ def _class_for(entry: Mapping[str, Any]) -> type[Instrument]:
     if model in PAIR_MODELS:
         return Sockets if "sockets" in entry else PairGauge if "pairs" in entry else Tracker
     other: dict[str, type[Instrument]] = {"anchor": LengthGauge, "plane": Indicator}
-    return Tracker if model in POSE_MODELS else other.get(model, BoardCamera)
+    other |= {"board": BoardCamera, "pixels": BoardCamera} | dict.fromkeys(POSE_MODELS, Tracker)
+    return other.get(model, PlainInstrument)

@@ -24,6 +24,7 @@ from fg_calib.io.units import Units
 from fg_calib.io.urdf import write_urdf
 from fg_calib.io.yaml import read_yaml
 from fg_calib.measurements.dataset import Measurements, Pairs
+from fg_calib.measurements.kinds import GENERIC_COLUMNS
 from fg_calib.measurements.table import Table
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, Pairing
 from fg_calib.robot.model import Robot
@@ -133,6 +134,7 @@ def table_columns(table: Table, robot: Robot, units: Units) -> dict[str, Columns
         columns |= {f"q{axis}": quaternion[:, k] for k, axis in enumerate("xyzw")}
     if m.length is not None:
         columns["distance"] = m.length / length
+    columns |= {name: values / units.factor(GENERIC_COLUMNS[name].si) for name, values in m.columns.items()}
     if m.image is not None:
         columns |= {axis: m.image[:, k] for k, axis in enumerate("uv")}
         columns |= {f"corner_{axis}": m.image[:, 2 + k] / length for k, axis in enumerate("xy")}
@@ -245,6 +247,7 @@ def _noise(m: Measurements, units: Units) -> dict[str, float]:
         "distance": (m.sigma_length if pairs is None else pairs.sigma_distance, "m"),
         "angle": (None if pairs is None else pairs.sigma_angle, "rad"),
         "point": (m.sigma_point, "m"),
+        **{name: (sigma, GENERIC_COLUMNS[name].si) for name, sigma in m.sigmas.items()},
     }
     values = {
         name: units.from_si(float(sigma.flat[0]), unit)

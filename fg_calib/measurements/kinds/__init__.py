@@ -36,7 +36,16 @@ LANDMARKS: dict[str, LandmarkKind] = {
 }
 """Kinds of landmarks, by the letter of their symbols."""
 
+GENERIC_COLUMNS: dict[str, Column] = {
+    column.names[0]: column
+    for i in INSTRUMENTS.values()
+    for column in i.columns
+    if column.names[0] in i.generic_columns
+}
+"""Columns that `Measurements.columns` holds, which are kinds of noise too."""
+
 __all__ = [
+    "GENERIC_COLUMNS",
     "INSTRUMENTS",
     "LANDMARKS",
     "Camera",

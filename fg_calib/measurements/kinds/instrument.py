@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from fg_calib.errors import ProblemError
 from fg_calib.initialization.start import FrameStart
 from fg_calib.measurements.dataset import Labels, Measurements
+from fg_calib.measurements.kind import Frames, Kind
 from fg_calib.measurements.landmarks import LandmarkKind, Landmarks
 from fg_calib.measurements.table import MeasurementBlock, Table
 from fg_calib.robot.kinematics import Poses
@@ -38,6 +40,11 @@ class Column(NamedTuple):
     unit: str
     meaning: str
     generic: bool = False
+
+    @property
+    def si(self) -> str:
+        """Unit in which `Measurements` holds it: `m`, `rad`, `px` or none."""
+        return {"length": "m", "angle": "rad", "pixel": "px"}.get(self.unit, "")
 
 
 class Instrument(ABC):
@@ -169,6 +176,31 @@ class Instrument(ABC):
             expected = f"noise.{noise} or a column sigma_{noise}"
             raise ProblemError(table.measurements.source, f"no sigma for {noise}", expected)
         return sigma[rows]
+
+
+class ColumnInstrument(Instrument):
+    """An instrument with one kind, one generic column and no landmarks; an empty cell is not measured.
+
+    Attributes:
+        kind: What it measures, one number of one configuration.
+    """
+
+    kind: Kind
+
+    def blocks(self, table: Table, number: int, landmarks: Landmarks) -> list[MeasurementBlock]:
+        """See `Instrument.blocks`."""
+        m, (name,) = table.measurements, self.generic_columns
+        values = self.require(table, m.columns.get(name), name, self.words)
+        rows = np.flatnonzero(np.isfinite(values))
+        sigma = self.require_sigma(table, m.sigmas.get(name), name, rows)
+        return [MeasurementBlock.of_rows(self.kind, table, number, rows, values[rows, None], sigma[:, None])]
+
+    def predict(self, m: Measurements, poses: Poses, places: Places) -> Measurements:
+        """See `Instrument.predict`."""
+        n, (name,) = len(poses.position), self.generic_columns
+        at = Frames(poses.rotation[:, None], poses.position[:, None])
+        values = self.kind.simulate(at, np.zeros((n, 1)), np.zeros((n, 0)), np.zeros((n, 1)))
+        return replace(m, columns={name: values[:, 0]})
 
 
 def add_points(landmarks: Landmarks, kind: LandmarkKind, table: Table, names: Sequence[str]) -> Integers:
