@@ -35,8 +35,7 @@ if TYPE_CHECKING:
     from fg_calib.measurements.table import CustomMeasurements, KnownPoint, Table
     from fg_calib.observability.identifiability import observe_configurations, observe_structure
     from fg_calib.options import Limits, Options, Pairing
-    from fg_calib.prediction.correction import correct
-    from fg_calib.prediction.predict import predict
+    from fg_calib.predictions import correct, predict
     from fg_calib.robot.model import Robot
     from fg_calib.simulation.scenario import Scenario
     from fg_calib.simulation.simulator import simulate
@@ -64,8 +63,7 @@ _import, __dir__ = attach(
         "fg_calib.measurements.table": "KnownPoint CustomMeasurements Table",
         "fg_calib.observability.identifiability": "observe_configurations observe_structure",
         "fg_calib.options": "Limits Options Pairing",
-        "fg_calib.prediction.correction": "correct",
-        "fg_calib.prediction.predict": "predict write_prediction",
+        "fg_calib.predictions": "correct predict write_prediction",
         "fg_calib.robot.model": "Robot",
         "fg_calib.simulation.scenario": "Scenario",
         "fg_calib.simulation.simulator": "simulate",

@@ -23,7 +23,8 @@ from fg_calib.job import Job
 from fg_calib.monitoring.prior_information import at_nominal
 from fg_calib.observability.identifiability import Identifiability, identifiability_of
 from fg_calib.observability.indices import Observability
-from fg_calib.prediction.expected_error import ExpectedError, expected_error, without_rigid_motion
+from fg_calib.prediction.tool_pose import ExpectedError, expected_error
+from fg_calib.robot.kinematics import without_rigid_motion
 from fg_calib.robot.model import Robot
 from fg_calib.statistics.acceptance import Acceptance, accept
 from fg_calib.statistics.covariance import Spread, spread_of, with_left_out, with_unsure_tolerances

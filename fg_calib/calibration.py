@@ -55,11 +55,11 @@ from fg_calib.monitoring.fingerprints import counted_before
 from fg_calib.monitoring.new_data import Calibrated, Rows
 from fg_calib.monitoring.update import predicted_before, updated
 from fg_calib.options import Options, check, check_flag, check_names, listed
+from fg_calib.prediction.tool_pose import predict_poses
 from fg_calib.report.figures import Drawn
 from fg_calib.report.html import build_page, draw_figures
 from fg_calib.report.notes import notes_of
 from fg_calib.report.text import format_result, judged, parameter_table_html, summary
-from fg_calib.robot.kinematics import forward
 from fg_calib.robot.model import Robot, names_of
 from fg_calib.statistics.covariance import TangentCovariance
 from fg_calib.statistics.cross_validation import cross_validate
@@ -543,16 +543,18 @@ class Calibration:
         check_flag("world", world)
         shape_of("readings", readings, f"(n, {self.robot.n_joints})")
         q = as_floats("readings", np.atleast_2d(readings), f"(n, {self.robot.n_joints})")
+        return PredictedPoses(*predict_poses(self.posterior, q, self.table_in_world(table) if world else None))
+
+    def table_in_world(self, number: int | None = None) -> int:
+        """The number of the table whose estimated measurement frame is meant.
+
+        Raises:
+            InputError: There is no such frame, or there are several.
+        """
         v = self.posterior.variables
-        if world and v.n_robot_columns == v.n_columns:
+        if v.n_robot_columns == v.n_columns:
             raise InputError("world", "the measurement frame was not estimated, or not saved", "the base frame")
-        known = build_variables(v.robot, [False]).chains[0]
-        chain = v.chains[self._table_of(table)] if world else known
-        at = forward(chain.at(self.posterior.parameters), v.robot.trig(q))
-        jacobian = np.zeros((len(q), 6, v.n_columns))
-        jacobian[:, :, : at.jacobian.shape[2]] = at.jacobian[:, [3, 4, 5, 0, 1, 2]]
-        covariance = [self.posterior.covariance(rows) for rows in jacobian]
-        return PredictedPoses(at.position, at.rotation, np.array(covariance).reshape(-1, 6, 6))
+        return self._table_of(number)
 
     def _table_of(self, number: int | None) -> int:
         """The table whose measurement frame is meant."""

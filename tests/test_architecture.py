@@ -32,8 +32,8 @@ FOLDERS = (
     "graph",
     "observability",
     "statistics",
-    "diagnostics",
     "prediction",
+    "diagnostics",
     "monitoring",
     "assessment",
     "baseline",
@@ -43,6 +43,8 @@ FOLDERS = (
     "importers",
     "report",
     "calibration",
+    "predictions",
+    "predictions",
     "batch",
     "exports",
     "cli",
@@ -50,21 +52,8 @@ FOLDERS = (
 """From the ground up: a folder (or module of the package itself) imports from those before it."""
 
 UPWARD = {
-    "diagnostics/inspection": {"prediction/expected_error"},
     "graph/build": {"observability/indices"},
     "graph/information": {"observability/indices"},
-    "observability/cramer_rao": {"prediction/expected_error"},
-    "prediction/correction": {"calibration"},
-    "prediction/predict": {
-        "calibration",
-        "io/atomic",
-        "io/job",
-        "io/saved",
-        "io/units",
-        "report/charts",
-        "report/figures",
-        "report/predict",
-    },
     "statistics/robust_screening": {"diagnostics/nominal_residuals"},
 }
 """Imports that still run upwards: none is added."""

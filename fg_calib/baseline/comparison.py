@@ -40,7 +40,7 @@ from fg_calib.graph.factors import corrections_of
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
 from fg_calib.job import Job
-from fg_calib.prediction.expected_error import PoseRms, errors_at, judged_configurations, pose_rms
+from fg_calib.prediction.tool_pose import PoseRms, errors_at, judged_configurations, pose_rms
 from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot
 from fg_calib.robot.rotations import rotation_vector

@@ -37,7 +37,7 @@ def correct(
     from fg_calib.calibration import Calibration
     from fg_calib.io.targets import read_targets, require_commands, write_commands
     from fg_calib.io.units import Units
-    from fg_calib.prediction.correction import correct as correct_targets
+    from fg_calib.predictions import correct as correct_targets
     from fg_calib.report.predict import build_correction_report, correction_document
 
     if out is not None:

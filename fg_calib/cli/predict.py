@@ -42,8 +42,8 @@ def predict(
     from fg_calib.calibration import Calibration
     from fg_calib.io.prediction import read_joint_table
     from fg_calib.io.units import Units, quantity
-    from fg_calib.prediction.predict import measured_of, require_prediction, write_prediction
-    from fg_calib.prediction.predict import predict as predict_tool
+    from fg_calib.predictions import measured_of, require_prediction, write_prediction
+    from fg_calib.predictions import predict as predict_tool
     from fg_calib.report.predict import build_prediction_report, prediction_document
 
     most = None if limit is None else quantity(limit, "m", Units(), "--limit")

@@ -30,7 +30,7 @@ from fg_calib.job import Job
 from fg_calib.measurements.table import Table
 from fg_calib.observability.indices import Observability
 from fg_calib.options import Pairing, check, check_flag, check_number
-from fg_calib.prediction.expected_error import PoseRms
+from fg_calib.prediction.tool_pose import PoseRms
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.model import Robot
 from fg_calib.simulation.scenario import Configurations, Scenario

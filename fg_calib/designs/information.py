@@ -29,8 +29,8 @@ from fg_calib.graph.problem import Problem
 from fg_calib.graph.rows import RowSet
 from fg_calib.observability.indices import Observability, observability_of_rows
 from fg_calib.observability.observed_quantities import ObservedQuantities
-from fg_calib.prediction.expected_error import PoseRms, errors_at, without_rigid_motion
-from fg_calib.robot.kinematics import forward, precompute_trig
+from fg_calib.prediction.tool_pose import PoseRms, errors_at
+from fg_calib.robot.kinematics import forward, without_rigid_motion
 from fg_calib.statistics.covariance import TangentCovariance, covariance_of_rows
 
 Floats = NDArray[np.float64]
@@ -264,7 +264,7 @@ class Task(FrozenArrays):
     def quadratic_form(self, problem: Problem) -> Floats:
         """W, in the columns of a problem's core, shape (n_columns, n_columns), [m^2]."""
         v = problem.variables
-        at = forward(v.chains[0].at(problem.start), precompute_trig(problem.robot, self.readings))
+        at = forward(v.chains[0].at(problem.start), problem.robot.trig(self.readings))
         rotation, position = at.jacobian[:, :3].copy(), at.jacobian[:, 3:].copy()
         for derivative in (rotation, position):
             derivative[:, :, v.n_robot_columns :] = 0.0

@@ -35,7 +35,7 @@ from fg_calib.monitoring.fingerprints import fingerprints
 from fg_calib.monitoring.prior_information import knowledge_of
 from fg_calib.observability.identifiability import Identifiability
 from fg_calib.options import FrameKnowledge, Model, Options
-from fg_calib.prediction.expected_error import ExpectedError
+from fg_calib.prediction.tool_pose import ExpectedError
 from fg_calib.statistics.acceptance import Acceptance
 from fg_calib.statistics.covariance import TangentCovariance
 from fg_calib.statistics.cross_validation import CrossValidation

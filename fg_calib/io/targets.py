@@ -27,8 +27,8 @@ from fg_calib.io.poses import PoseColumns
 from fg_calib.io.tables import find_joint_columns, header_for, joint_columns, read_ids, read_readings
 from fg_calib.io.units import Units
 from fg_calib.measurements.dataset import Floats, Noise
+from fg_calib.prediction.correction import Correction
 from fg_calib.robot.model import Robot
-from fg_calib.robot.reaching import Correction
 
 _BEGINNING = b"id,reached,"
 """How a table of commands begins."""

@@ -23,7 +23,7 @@ from fg_calib.measurements.kinds.custom import custom_block
 from fg_calib.measurements.landmarks import Landmarks
 from fg_calib.measurements.table import MeasurementBlock, Table
 from fg_calib.options import NEAR, did_you_mean
-from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot
 
 _log = logging.getLogger(__name__)
@@ -66,7 +66,7 @@ class Dataset(Brief):
         """Readings of each table for the kernels, remembered, as parameters change nothing of them."""
         key = (tuple(joint.prismatic for joint in robot.joints), robot.bases)
         if key not in self._trigs:
-            self._trigs[key] = tuple(precompute_trig(robot, table.measurements.readings) for table in self.tables)
+            self._trigs[key] = tuple(robot.trig(table.measurements.readings) for table in self.tables)
         return self._trigs[key]
 
     @property
@@ -397,7 +397,7 @@ def _start_landmarks(
                  and b.kind.n_nuisances and is_ours(b.kind) and not b.test.all()]  # fmt: skip
         if train and instrument.sees_landmarks:
             chain = build_chain(robot)
-            trigs = [precompute_trig(robot, tables[block.table].measurements.readings) for block in train]
+            trigs = [robot.trig(tables[block.table].measurements.readings) for block in train]
             ends = [block.ends[:, 0] for block in train]
             points = [forward(chain, trig, rows).position for trig, rows in zip(trigs, ends, strict=True)]
             instrument.start_landmarks(train, points, landmarks)

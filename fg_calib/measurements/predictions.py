@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fg_calib.measurements.dataset import Labels, Measurements
 from fg_calib.measurements.kinds import INSTRUMENTS
-from fg_calib.robot.kinematics import build_chain, forward, precompute_trig
+from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot
 
 Floats = NDArray[np.float64]
@@ -27,7 +27,7 @@ def predict_measurements(robot: Robot, m: Measurements, model: str) -> Measureme
         model: Which measurements take part.
     """
     train = np.flatnonzero(~m.test)
-    poses, n = forward(build_chain(robot), precompute_trig(robot, m.readings[train])), len(train)
+    poses, n = forward(build_chain(robot), robot.trig(m.readings[train])), len(train)
     instrument = INSTRUMENTS[model]
 
     def specified(sigma: Floats | None, shape: tuple[int, ...]) -> Floats:

@@ -42,8 +42,7 @@ from fg_calib.graph.problem import Problem
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.table import Table
 from fg_calib.options import FrameKnowledge, Model, Options, PairErrors, Pairing, check, check_flag, check_names
-from fg_calib.prediction.expected_error import without_rigid_motion
-from fg_calib.robot.kinematics import build_chain, forward
+from fg_calib.robot.kinematics import build_chain, forward, without_rigid_motion
 from fg_calib.robot.model import Robot
 from fg_calib.threads import single_threaded
 

@@ -1,77 +1,146 @@
-"""What to command so that the calibrated arm reaches its targets.
+"""Commands for a controller with the nominal model, so that the calibrated arm reaches its targets.
 
-A controller that cannot be told the true geometry goes wherever its nominal model says. It is given joint values with
-which the true arm is at the target; or, where it only takes poses, the pose for which its own model finds just these
-joint values: a wrong pose for the right place.
+The controller is given joint values with which the true arm is at the target; or, where it only takes poses, the pose
+for which its own model finds these joint values: a wrong pose for the right place.
+
+An arm of fewer than six joints, or one that a limit stops, reaches the point of many a pose, but not its orientation.
+There the point is kept, and the orientation made as near as the remaining freedom allows, by Gauss-Newton steps in the
+null space of the point's derivative Jv: q + Jv^+ p + N (Jw N)^+ (w - Jw Jv^+ p), with p and w what is missing of
+position and orientation, and N a basis of that null space.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import as_floats, as_rotations
+from fg_calib.arrays import Floats, FrozenArrays, as_floats, as_rotations
 from fg_calib.errors import InputError
+from fg_calib.executors import tell
 from fg_calib.measurements.checks import check_readings
-from fg_calib.prediction.expected_error import errors_at
-from fg_calib.robot.inverse import REACHED
+from fg_calib.prediction.tool_pose import errors_at, predict_poses
+from fg_calib.robot.inverse import N_STARTS, REACHED, Inverse, solve_inverse
 from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot
-from fg_calib.robot.reaching import Correction, misses, reach
+from fg_calib.robot.rotations import rotation_vector
+from fg_calib.statistics.covariance import TangentCovariance
 
-if TYPE_CHECKING:
-    from fg_calib.calibration import Calibration
+Booleans = NDArray[np.bool_]
+Integers = NDArray[np.int64]
 
-Floats = NDArray[np.float64]
+LARGE_CHANGE = 0.1
+"""Change of a joint, [rad] (prismatic: [m]), beyond which it is near a singularity or on another branch."""
+
+_N_STEPS = 30
+"""Steps that rotate the tool; they converge in a few, linearly where the pose is far out of reach."""
+
+_N_HALVINGS = 8
+"""How often such a step is halved."""
+
+_N_NEAR = 20
+"""Starts near where the arm is to stay: for a pose, and again for one that was reached far from there."""
+
+_AT_ONCE = 5000
+"""Targets at once: so many fit caches and memory, and progress is reported between them."""
+
+_RCOND = 1e-6
+"""Singular values of the point's derivative below this share of the largest do not move it."""
 
 
-@checked
-def correct(
-    calibration: Calibration,
+@dataclass(frozen=True, eq=False, repr=False)
+class Correction(FrozenArrays):
+    """Commands for n targets.
+
+    Attributes:
+        readings: Joint values to command, within the limits, shape (n, n_joints), [rad] (prismatic: [m]).
+        position: Tool point of the nominal arm with them, from the base: the pose to command where the controller takes
+            poses, shape (n, 3), [m].
+        rotation: Its orientation there, shape (n, 3, 3).
+        nominal_readings: Joint values of the nominal arm for the targets, shape (n, n_joints).
+        uncorrected: Errors of the calibrated arm at these, position and orientation, shape (n, 2), [m] and [rad]; nan
+            where the nominal arm does not reach the target either.
+        missed: Errors with the correction, shape (n, 2), [m] and [rad]; 0 but for rounding where it reaches them.
+        expected: RMS errors that the calibration's uncertainty leaves, of position and orientation, in the frame of the
+            targets, shape (n, 2), [m] and [rad]; nan where they depend on what is not determined.
+        expected_fitted: RMS position error after the best rigid fit of all targets: how well they fit each other,
+            wherever the base is, [m]; nan where it is not determined.
+        turns: Whether the targets state an orientation.
+    """
+
+    readings: Floats
+    position: Floats
+    rotation: Floats
+    nominal_readings: Floats
+    uncorrected: Floats
+    missed: Floats
+    expected: Floats
+    expected_fitted: float
+    turns: bool
+
+    @cached_property
+    def reached(self) -> Booleans:
+        """Which targets the calibrated arm reaches, shape (n,)."""
+        return np.asarray((self.missed < REACHED).all(axis=1))
+
+    @cached_property
+    def changed(self) -> Floats:
+        """The joint values to command minus the nominal ones, shape (n, n_joints)."""
+        return self.readings - self.nominal_readings
+
+    @cached_property
+    def far(self) -> Booleans:
+        """Where a joint changes by more than a calibration alone explains, shape (n,)."""
+        return np.asarray((np.abs(self.changed) > LARGE_CHANGE).any(axis=1))
+
+    def __repr__(self) -> str:
+        return f"Correction, {len(self.readings)} targets, {int(self.reached.sum())} reached"
+
+
+def correct_targets(
+    posterior: TangentCovariance,
+    robot: Robot,
+    nominal: Robot,
     position: ArrayLike | None = None,
     rotation: ArrayLike | None = None,
     *,
     near: ArrayLike | None = None,
-    world: bool = False,
     table: int | None = None,
 ) -> Correction:
-    """What to command so that the calibrated arm reaches targets.
+    """Commands with which the calibrated arm reaches targets.
 
     Args:
-        calibration: The calibration; the nominal arm, as the controller knows it, is that which it began with.
-        position: Where the tool point is to be, shape (n, 3), or (3,) of one target, [m]. If None the targets are the
-            poses of the nominal arm at `near`: what a program of joint values was meant to reach.
-        rotation: How the tool is to be turned, shape (n, 3, 3), or (3, 3); any if None.
-        near: Joint values to stay near, shape (n, n_joints) or (n_joints,), [rad] (prismatic: [m]): of an arm that
-            reaches a target in several ways they choose one. If None that is the first that is found, searched for from
-            the middle of the limits and, where that leads nowhere, from anywhere.
-        world: Whether the targets are in the measurement frame, instead of the base frame.
-        table: Number of the table whose measurement frame it is, from 0; there must be one if there are several.
+        posterior: The covariance of the calibration, at its estimate.
+        robot: The calibrated robot.
+        nominal: The robot that the controller knows.
+        position: Tool points wanted, shape (n, 3), or (3,) of one target, [m]. If None the targets are the poses of the
+            nominal arm at `near`.
+        rotation: Orientations wanted, shape (n, 3, 3), or (3, 3); any if None.
+        near: Joint values to stay near, shape (n, n_joints) or (n_joints,), [rad] (prismatic: [m]). If None the first
+            solution is taken, searched for from the middle of the limits, then from anywhere.
+        table: Number of the table in whose measurement frame the targets are; the base frame if None.
 
     Raises:
-        InputError: Targets or joint values are not of such a shape, not finite, or outside the limits; there is no
-            measurement frame.
+        InputError: Targets or joint values are not of such a shape, not finite, or outside the limits.
     """
-    robot, nominal = calibration.robot, nominal_robot(calibration)
-    target, turned, start = _targets(nominal, position, rotation, near)
-    if world and position is None:
-        raise InputError("world", "joint values reach poses in the base frame", "targets with positions")
-    if world:
-        target, turned = _from_base(calibration, target, turned, table)
-    first = reach(nominal, target, turned, start, anywhere=near is None) if position is not None else None
-    uncorrected = start if first is None else first.readings
-    off = np.column_stack(misses(robot, uncorrected, target, turned))
-    if first is not None:
+    target, turned, start = _check_targets(nominal, position, rotation, near)
+    if table is not None:
+        target, turned = _in_base(posterior, target, turned, table)
+    uncorrected = start
+    off = np.zeros((len(target), 2))
+    if position is not None:
+        first = reach(nominal, target, turned, start, anywhere=near is None)
+        uncorrected = first.readings
         off[first.miss_position >= REACHED] = np.nan
         off[first.miss_rotation >= REACHED, 1] = np.nan
+    off += np.column_stack(misses(robot, uncorrected, target, turned))
     found = reach(robot, target, turned, uncorrected)
     commanded = forward(build_chain(nominal), nominal.trig(found.readings))
-    expected = calibration.predict(found.readings, world=world, table=table)
-    _, fitted = errors_at(calibration.posterior, found.readings)
-    sigmas = (expected.sigma_position, expected.sigma_rotation)
+    covariance = predict_poses(posterior, found.readings, table)[2]
+    variance = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, 2, 3).sum(axis=2)
+    fitted = errors_at(posterior, found.readings)[1].position
     return Correction(
         readings=found.readings,
         position=commanded.position,
@@ -79,18 +148,13 @@ def correct(
         nominal_readings=uncorrected,
         uncorrected=off,
         missed=np.column_stack([found.miss_position, found.miss_rotation]),
-        expected=np.column_stack([np.linalg.norm(sigma, axis=1) for sigma in sigmas]),
-        expected_fitted=np.nan if fitted.position is None else fitted.position,
+        expected=np.sqrt(variance),
+        expected_fitted=np.nan if fitted is None else fitted,
         turns=turned is not None,
     )
 
 
-def nominal_robot(calibration: Calibration) -> Robot:
-    """The robot that a calibration began with."""
-    return calibration.robot.with_values([p.nominal for p in calibration.result.parameters])
-
-
-def _targets(
+def _check_targets(
     nominal: Robot, position: ArrayLike | None, rotation: ArrayLike | None, near: ArrayLike | None
 ) -> tuple[Floats, Floats | None, Floats]:
     """Points, orientations and joint values to stay near, checked, a row a target."""
@@ -120,12 +184,113 @@ def _middle(robot: Robot) -> Floats:
     return np.where(both, 0.5 * (np.where(both, lower, 0.0) + np.where(both, upper, 0.0)), np.clip(0.0, lower, upper))
 
 
-def _from_base(
-    calibration: Calibration, position: Floats, rotation: Floats | None, table: int | None
+def _in_base(
+    posterior: TangentCovariance, position: Floats, rotation: Floats | None, table: int
 ) -> tuple[Floats, Floats | None]:
-    """Targets in the measurement frame as they are from the base."""
-    somewhere = _middle(calibration.robot)
-    here, there = calibration.predict(somewhere), calibration.predict(somewhere, world=True, table=table)
-    turn = there.rotation[0] @ here.rotation[0].T  # world_R_base
-    shift = there.position[0] - turn @ here.position[0]
-    return (position - shift) @ turn, None if rotation is None else turn.T @ rotation
+    """Targets given in a measurement frame, in the base frame."""
+    q = _middle(posterior.variables.robot)[None]
+    base, world = predict_poses(posterior, q, None), predict_poses(posterior, q, table)
+    R = world[1][0] @ base[1][0].T  # world_R_base
+    t = world[0][0] - R @ base[0][0]
+    return (position - t) @ R, None if rotation is None else R.T @ rotation
+
+
+def reach(robot: Robot, position: Floats, rotation: Floats | None, near: Floats, *, anywhere: bool = False) -> Inverse:
+    """Configurations at poses, near given ones; the nearest orientation where only the point is in reach.
+
+    Args:
+        robot: The robot, at its nominal values.
+        position: base_p_tool, shape (n, 3), [m].
+        rotation: base_R_tool, shape (n, 3, 3); any if None.
+        near: Configurations to stay near, shape (n, n_joints), [rad] (prismatic: [m]).
+        anywhere: Whether these are starts alone, and any configuration will do.
+
+    Returns:
+        Within the joint limits; the miss of a point that is itself out of reach is not 0.
+    """
+    n = len(position)
+    parts = []
+    for first in range(0, max(n, 1), _AT_ONCE):
+        tell("reaching targets", first, n)
+        rows = slice(first, first + _AT_ONCE)
+        found = _reach(robot, position[rows], None if rotation is None else rotation[rows], near[rows], anywhere)
+        parts.append((found.readings, found.miss_position, found.miss_rotation))
+    return Inverse(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def _reach(robot: Robot, position: Floats, rotation: Floats | None, near: Floats, anywhere: bool) -> Inverse:
+    def solve(rows: Integers, near: Floats | None, n_starts: int) -> Inverse:
+        turned = None if rotation is None else rotation[rows]
+        return solve_inverse(robot, position[rows], turned, near=near, n_starts=n_starts)
+
+    q = near.copy()
+    found = solve(np.arange(len(near)), near, 1 if anywhere else _N_NEAR)
+    q, reached = found.readings.copy(), found.reached.copy()
+    rows = np.flatnonzero(~reached)
+    if len(rows):  # from random starts all over the limits
+        others = solve(rows, None, N_STARTS)
+        q[rows[others.reached]] = others.readings[others.reached]
+        reached[rows] = others.reached
+    changed = np.abs(q - near).max(axis=1)
+    rows = np.flatnonzero(reached & (changed > LARGE_CHANGE))
+    if len(rows) and not anywhere:  # near a singularity the steps may have ended on another branch
+        spread = changed[rows, None, None] * np.linspace(0.0, 1.0, _N_NEAR)[:, None]
+        about = np.random.default_rng(0).normal(size=(len(rows), _N_NEAR, robot.n_joints))
+        starts = np.clip(near[rows, None] + spread * about, *robot.limits.T)
+        others = solve(np.repeat(rows, _N_NEAR), starts.reshape(-1, robot.n_joints), 1)
+        candidates = others.readings.reshape(starts.shape)
+        change = np.abs(candidates - near[rows, None]).max(axis=2)
+        change[~others.reached.reshape(change.shape)] = np.inf
+        best = change.argmin(axis=1)
+        better = change[np.arange(len(rows)), best] < changed[rows]
+        q[rows[better]] = candidates[better, best[better]]
+    rows = np.flatnonzero(~reached)
+    if rotation is not None and len(rows):
+        points = solve_inverse(robot, position[rows], near=near[rows], n_starts=_N_NEAR)
+        for k, start in zip(rows[points.reached], points.readings[points.reached], strict=True):
+            q[k] = _rotate(robot, start, position[k], rotation[k])
+    return Inverse(q, *misses(robot, q, position, rotation))
+
+
+def misses(robot: Robot, readings: Floats, position: Floats, rotation: Floats | None) -> tuple[Floats, Floats]:
+    """Distances of the tool from points and angles from orientations, shapes (n,), [m] and [rad].
+
+    Args:
+        robot: The robot, at its nominal values.
+        readings: Shape (n, n_joints), [rad] (prismatic: [m]).
+        position: Shape (n, 3), [m].
+        rotation: Shape (n, 3, 3); if None any will do, and the angle is 0.
+    """
+    at = forward(build_chain(robot), robot.trig(readings))
+    distance = np.linalg.norm(position - at.position, axis=1)
+    if rotation is None:
+        return distance, np.zeros(len(distance))
+    return distance, np.linalg.norm(rotation_vector(rotation @ np.swapaxes(at.rotation, 1, 2)), axis=1)
+
+
+def _rotate(robot: Robot, q: Floats, position: Floats, rotation: Floats) -> Floats:
+    """The configuration nearest in orientation with the tool point in place, from one whose point is there."""
+    chain = build_chain(robot).with_joint_columns()
+    lower, upper = robot.limits.T
+
+    def step(q: Floats) -> tuple[Floats, float]:
+        at = forward(chain, robot.trig(q[None]))
+        p, w = position - at.position[0], rotation_vector(rotation[None] @ np.swapaxes(at.rotation, 1, 2))[0]
+        Jw, Jv = at.jacobian[0, :3], at.jacobian[0, 3:]
+        _, size, Vt = np.linalg.svd(Jv)
+        free = Vt[int(np.sum(size > _RCOND * size[0])) :].T  # (n_joints, n_free)
+        back = np.linalg.pinv(Jv, rcond=_RCOND) @ p
+        turn: Floats = back + free @ (np.linalg.pinv(Jw @ free, rcond=_RCOND) @ (w - Jw @ back))
+        return turn, float(np.linalg.norm(w))
+
+    best, (dq, left) = q, step(q)
+    for _ in range(_N_STEPS):
+        for halving in range(_N_HALVINGS):
+            at_point = solve_inverse(robot, position, near=np.clip(best + 0.5**halving * dq, lower, upper), n_starts=1)
+            moved, (further, now) = at_point.readings[0], step(at_point.readings[0])
+            if at_point.reached[0] and now < left - REACHED * 1e-3:
+                break
+        else:
+            return best
+        best, dq, left = moved, further, now
+    return best

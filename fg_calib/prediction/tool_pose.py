@@ -1,36 +1,178 @@
-"""How far off the tool is expected to be at any configuration, by the covariance of the estimate.
+"""Expected errors of the calibrated arm's tool, by the covariance of the estimate.
 
-With (w, v) the derivatives of the tool's orientation and position in what was estimated and Cov the covariance, the
-mean square of the position error at one configuration is tr(v Cov v^T), and that of the orientation error the same of
-w (see `accuracy` for their mean over several). *Fitted* is what is left after the one rotation and shift that fit the
-measured configurations best, and then hold all over the workspace: the part of the derivatives v at the measured
-points that rigid motions G can make is G v, and the same motion is taken away everywhere else.
+With (w, v) the derivatives of the tool's orientation and position in the estimate (see `kinematics`) and Cov its
+covariance, the mean square of the position error at a configuration is tr(v Cov v^T), and that of the orientation error
+tr(w Cov w^T). Over several configurations it is the mean of these. *Base* is in the robot's base frame. *Fitted* is
+after the rotation and translation that bring the estimated points nearest to the true ones, to first order: the part of
+v that the six rigid motions of all points can make is subtracted, and the rotation found with it from w. It counts
+where the arm works relative to what was measured, and does not depend on the base, which measurements in an unknown
+frame do not determine. Over the workspace, the rigid motion is that of the measured configurations.
 
-Errors of the joint readings are no part of that: of readings whose errors have sigma s, they are sum_j s_j^2 |v_j|^2,
-v_j being the derivative of the tool's position in joint j, and independent of it.
+Errors of the joint readings are not included: readings with errors of sigma s add sum_j s_j^2 |v_j|^2, where v_j is the
+derivative of the tool's position in joint j.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.arrays import FrozenArrays
+from fg_calib.arrays import Floats, FrozenArrays
 from fg_calib.graph.factors import build_variables
-from fg_calib.prediction.expected_error import without_rigid_motion
-from fg_calib.robot.kinematics import Chain, forward
+from fg_calib.graph.problem import Problem
+from fg_calib.measurements.build import Dataset
+from fg_calib.observability.observed_quantities import ObservedQuantities
+from fg_calib.robot.kinematics import Chain, forward, without_rigid_motion
 from fg_calib.statistics.covariance import TangentCovariance
 
-Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
-_MOST_MEASURED = 1000
-"""Measured configurations that the rigid motion is fitted to; of more, so many that are evenly spaced."""
+MAX_CONFIGURATIONS = 1000
+"""Configurations up to which all are looked at; of more, as many evenly spaced."""
 
 _AT_ONCE = 2000
-"""Configurations that are looked at at once: derivatives of all would fill the memory."""
+"""Configurations at once: derivatives of all would fill the memory."""
+
+
+@dataclass(frozen=True)
+class PoseRms:
+    """Expected RMS errors of the tool; None where they depend on what is not determined.
+
+    Attributes:
+        position: [m].
+        orientation: [rad].
+    """
+
+    position: float | None
+    orientation: float | None
+
+
+@dataclass(frozen=True)
+class ExpectedError:
+    """Expected errors of the tool over some configurations.
+
+    Attributes:
+        base: In the base frame.
+        fitted: After the best rigid fit.
+        at: Whether at the test configurations, or, where there are none, at the train ones.
+        n: Number of configurations looked at.
+        of: Number of configurations that there are.
+        relative: Whether no measurement determines the base, so that `fitted` alone describes the measurements.
+    """
+
+    base: PoseRms
+    fitted: PoseRms
+    at: Literal["test", "train"]
+    n: int
+    of: int
+    relative: bool = False
+
+
+def expected_error(problem: Problem, covariance: TangentCovariance) -> ExpectedError:
+    """Expected errors of the tool at the test configurations; where there are none, at the train configurations.
+
+    Args:
+        problem: What was solved.
+        covariance: The covariance of its solution, what was left out to fix the gauge included.
+    """
+    judged, at = judged_configurations(problem.data)
+    chosen = _evenly(judged)
+    base, fitted = errors_at(covariance, problem.data.readings[chosen])
+    return ExpectedError(base, fitted, at, len(chosen), len(judged), ObservedQuantities.of(problem).blind_to_base)
+
+
+def judged_configurations(data: Dataset) -> tuple[Integers, Literal["test", "train"]]:
+    """The test configurations of all tables, or, where there are none, the train ones; and which they are."""
+    test = data.held_out
+    return np.flatnonzero(test if test.any() else ~test), "test" if test.any() else "train"
+
+
+def _evenly(rows: Integers) -> Integers:
+    """At most `MAX_CONFIGURATIONS` rows, evenly spaced."""
+    chosen: Integers = rows[np.unique(np.linspace(0, len(rows) - 1, MAX_CONFIGURATIONS).round().astype(np.int64))]
+    return chosen
+
+
+def errors_at(covariance: TangentCovariance, readings: Floats) -> tuple[PoseRms, PoseRms]:
+    """Expected errors over configurations, in the base frame and after the best rigid fit.
+
+    Args:
+        covariance: The covariance at the estimate.
+        readings: Shape (n, n_joints), [rad] (prismatic: [m]).
+    """
+    points, motion, _ = tool_derivatives(covariance, base_chain(covariance), readings)
+    return pose_rms(points, motion, covariance.variance)
+
+
+def pose_rms(points: Floats, jacobian: Floats, variance: Callable[[Floats], Floats]) -> tuple[PoseRms, PoseRms]:
+    """Expected errors from derivatives, in the base frame and after the best rigid fit.
+
+    Args:
+        points: Tool points, shape (n, 3), [m].
+        jacobian: (w, v) of each, shape (n, 6, n_columns).
+        variance: Of linear functions of the columns, shape (m, n_columns), nan where not determined: shape (m,).
+    """
+    w, v = jacobian[:, :3], jacobian[:, 3:]
+    v_fitted, turn = without_rigid_motion(points, v)
+    rms = [_rms(variance(rows.reshape(-1, rows.shape[2]))) for rows in (v, w, v_fitted, w - turn)]
+    if rms[2] is None:  # points that are not determined fit nothing: orientations by their own best rotation
+        rms[3] = _rms(variance((w - w.mean(axis=0)).reshape(-1, w.shape[2])))
+    return PoseRms(*rms[:2]), PoseRms(*rms[2:])
+
+
+def _rms(variance: Floats) -> float | None:
+    """RMS length of vectors from the variances of their coordinates, shape (3 n,); None where one is unknown.
+
+    A mean below 0 is the rounding of far larger variances that cancel: it is unknown too.
+    """
+    mean = float(np.mean(variance))
+    return float(np.sqrt(3.0 * mean)) if 0.0 <= mean < np.inf else None
+
+
+def base_chain(covariance: TangentCovariance) -> Chain:
+    """The arm in its base frame, at the estimate, with derivatives in the joints too."""
+    chain = build_variables(covariance.variables.robot, [False]).chains[0]
+    return chain.at(covariance.parameters).with_joint_columns()
+
+
+def tool_derivatives(covariance: TangentCovariance, chain: Chain, readings: Floats) -> tuple[Floats, Floats, Floats]:
+    """Tool points, shape (n, 3), [m], and (w, v) in the columns, shape (n, 6, n_columns), and in the joints.
+
+    Args:
+        covariance: The covariance, whose columns are meant.
+        chain: From `base_chain`.
+        readings: Shape (n, n_joints), [rad] (prismatic: [m]).
+    """
+    at = forward(chain, covariance.variables.robot.trig(readings))
+    motion = np.zeros((len(readings), 6, covariance.variables.n_columns))
+    motion[:, :, : chain.n_columns] = at.jacobian[:, :, : chain.n_columns]
+    return at.position, motion, at.jacobian[:, :, chain.n_columns :]
+
+
+def predict_poses(
+    covariance: TangentCovariance, readings: Floats, table: int | None = None
+) -> tuple[Floats, Floats, Floats]:
+    """Tool points, shape (n, 3), [m], orientations, shape (n, 3, 3), and their joint covariance, shape (n, 6, 6).
+
+    The covariance is of position, then of the rotation vector, along and about the axes of the frame; nan where it
+    depends on what is not determined.
+
+    Args:
+        covariance: The covariance at the estimate.
+        readings: Shape (n, n_joints), [rad] (prismatic: [m]).
+        table: Number of the table in whose estimated measurement frame the poses are; the base frame if None.
+    """
+    v = covariance.variables
+    chain = build_variables(v.robot, [False]).chains[0] if table is None else v.chains[table]
+    at = forward(chain.at(covariance.parameters), v.robot.trig(readings))
+    rows = np.zeros((len(readings), 6, v.n_columns))
+    rows[:, :, : chain.n_columns] = at.jacobian[:, [3, 4, 5, 0, 1, 2]]
+    covariances = np.array([covariance.covariance(one) for one in rows]).reshape(-1, 6, 6)
+    return at.position, at.rotation, covariances
 
 
 @dataclass(frozen=True)
@@ -39,10 +181,10 @@ class ToolErrors(FrozenArrays):
 
     Attributes:
         readings: The configurations, shape (n, n_joints), [rad] (prismatic: [m]).
-        position: Where the tool is, from the base, shape (n, 3), [m].
+        position: Tool points in the base frame, shape (n, 3), [m].
         base: Errors in the base frame, shape (n, 2); nan where they depend on what is not determined.
         fitted: Errors after the best rigid fit of the measured configurations, shape (n, 2); nan likewise.
-        joint_noise: What errors of the joint readings add, shape (n, 2); None where their noise is not known.
+        joint_noise: Contribution of errors of the joint readings, shape (n, 2); None where their noise is not known.
     """
 
     readings: Floats
@@ -57,19 +199,19 @@ class ToolErrors(FrozenArrays):
 
 
 @dataclass(frozen=True)
-class ToolErrorModel(FrozenArrays):
-    """What a covariance says of the tool's error anywhere.
+class ToolPoseUncertainty(FrozenArrays):
+    """Expected errors of the tool at any configuration, by a covariance.
 
     Attributes:
-        spread: The covariance.
-        chain: The arm from its base, at the estimate.
+        covariance: The covariance.
+        chain: The arm in its base frame, at the estimate.
         sigma_joint: Of joint readings, shape (n_joints,), [rad] (prismatic: [m]); None where it is not known.
         centre: Mean of the measured points, shape (3,), [m].
         shift: How the best rigid fit moves it, in the columns, shape (3, n_columns).
-        turn: How the best rigid fit turns about it, in the columns, shape (3, n_columns).
+        turn: How the best rigid fit rotates about it, in the columns, shape (3, n_columns).
     """
 
-    spread: TangentCovariance
+    covariance: TangentCovariance
     chain: Chain
     sigma_joint: Floats | None
     centre: Floats
@@ -77,54 +219,40 @@ class ToolErrorModel(FrozenArrays):
     turn: Floats
 
     @classmethod
-    def of(cls, spread: TangentCovariance, measured: Floats, sigma_joint: Floats | None = None) -> ToolErrorModel:
+    def of(
+        cls, covariance: TangentCovariance, measured: Floats, sigma_joint: Floats | None = None
+    ) -> ToolPoseUncertainty:
         """The model of a covariance.
 
         Args:
-            spread: The covariance.
+            covariance: The covariance.
             measured: Readings of the measured configurations, shape (m, n_joints), [rad] (prismatic: [m]).
             sigma_joint: Of joint readings, shape (n_joints,); None where it is not known.
         """
-        chain = build_variables(spread.variables.robot, [False]).chains[0].at(spread.parameters)
-        nothing = np.zeros((3, spread.variables.n_columns))
-        model = cls(spread, chain.with_joint_columns(), sigma_joint, np.zeros(3), nothing, nothing)
-        evenly = np.linspace(0, len(measured) - 1, min(_MOST_MEASURED, len(measured)))
-        points, motion, _ = model._derivatives(measured[np.unique(evenly.astype(np.int64))])
+        chain = base_chain(covariance)
+        points, motion, _ = tool_derivatives(covariance, chain, measured[_evenly(np.arange(len(measured)))])
         w, v = motion[:, :3], motion[:, 3:]
         left, turn = without_rigid_motion(points, v)
-        if not np.isfinite(spread.variance(left.reshape(3 * len(left), left.shape[2]))).all():
+        if not np.isfinite(covariance.variance(left.reshape(3 * len(left), left.shape[2]))).all():
             turn = w.mean(axis=0)  # points that are not determined fit nothing: orientations by their own best rotation
-        return cls(spread, model.chain, sigma_joint, points.mean(axis=0), (v - left).mean(axis=0), turn)
+        return cls(covariance, chain, sigma_joint, points.mean(axis=0), (v - left).mean(axis=0), turn)
 
-    def motions(self, readings: Floats, *, fitted: bool) -> tuple[Floats, Floats]:
-        """Tool points, shape (n, 3), [m], and (w, v) in the columns, shape (n, 6, n_columns).
-
-        Args:
-            readings: Shape (n, n_joints), [rad] (prismatic: [m]).
-            fitted: Whether less the best rigid fit, instead of in the base frame.
-        """
-        points, motion, _ = self._derivatives(readings)
-        return points, self._without_fit(points, motion) if fitted else motion
+    def motions(self, readings: Floats, *, fitted: bool) -> Floats:
+        """(w, v) in the columns, after the best rigid fit or in the base frame, shape (n, 6, n_columns)."""
+        points, motion, _ = tool_derivatives(self.covariance, self.chain, readings)
+        return self._without_fit(points, motion) if fitted else motion
 
     def at(self, readings: Floats) -> ToolErrors:
         """Expected errors at joint readings, shape (n, n_joints), [rad] (prismatic: [m])."""
         n = len(readings)
         position, base, fitted, noise = np.empty((n, 3)), np.empty((n, 2)), np.empty((n, 2)), np.zeros((n, 2))
-        for rows in _parts(n):
-            position[rows], motion, of_joints = self._derivatives(readings[rows])
+        for rows in (slice(start, start + _AT_ONCE) for start in range(0, n, _AT_ONCE)):
+            position[rows], motion, of_joints = tool_derivatives(self.covariance, self.chain, readings[rows])
             base[rows] = self._rms(motion)
             fitted[rows] = self._rms(self._without_fit(position[rows], motion))
             if self.sigma_joint is not None:
                 noise[rows] = _lengths(np.square(of_joints * self.sigma_joint).sum(axis=2))
         return ToolErrors(readings, position, base, fitted, None if self.sigma_joint is None else noise)
-
-    def _derivatives(self, readings: Floats) -> tuple[Floats, Floats, Floats]:
-        """Tool points, and (w, v) in the columns and in the joints."""
-        at = forward(self.chain, self.spread.variables.robot.trig(readings))
-        n = self.chain.n_columns
-        motion = np.zeros((len(readings), 6, self.spread.variables.n_columns))
-        motion[:, :, :n] = at.jacobian[:, :, :n]
-        return at.position, motion, at.jacobian[:, :, n:]
 
     def _without_fit(self, points: Floats, motion: Floats) -> Floats:
         moved = np.cross(self.turn[None], (points - self.centre)[:, :, None], axis=1) + self.shift
@@ -132,18 +260,11 @@ class ToolErrorModel(FrozenArrays):
         return left
 
     def _rms(self, motion: Floats) -> Floats:
-        return _lengths(self.spread.variance(motion.reshape(6 * len(motion), motion.shape[2])).reshape(-1, 6))
+        return _lengths(self.covariance.variance(motion.reshape(6 * len(motion), motion.shape[2])).reshape(-1, 6))
 
 
 def _lengths(variance: Floats) -> Floats:
-    """RMS lengths from the variances of (w, v), shape (n, 6): of v, then of w, shape (n, 2).
-
-    A variance below 0 is what rounding leaves of far larger ones that cancel: that is not known either.
-    """
+    """RMS lengths of v, then of w, from the variances of (w, v), shape (n, 6): shape (n, 2); nan below 0 (rounding)."""
     sums = variance.reshape(-1, 2, 3).sum(axis=2)[:, ::-1]
     with np.errstate(invalid="ignore"):
         return np.asarray(np.sqrt(np.where(sums >= 0.0, sums, np.nan)))
-
-
-def _parts(n: int) -> Iterator[slice]:
-    return (slice(start, start + _AT_ONCE) for start in range(0, n, _AT_ONCE))

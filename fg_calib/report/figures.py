@@ -12,7 +12,7 @@ import numpy as np
 from fg_calib.arrays import Booleans, Floats
 from fg_calib.io.result import Result
 from fg_calib.observability.identifiability import Identifiability
-from fg_calib.prediction.tool_pose import ToolErrorModel
+from fg_calib.prediction.tool_pose import ToolPoseUncertainty
 from fg_calib.prediction.workspace import Workspace, survey
 from fg_calib.report.charts import (
     BOTTOM,
@@ -103,7 +103,7 @@ class Drawn:
         """Expected errors over the workspace; None where nothing says what was measured."""
         if self.configurations is None or not len(self.configurations):
             return None
-        model = ToolErrorModel.of(self.posterior, self.readings)
+        model = ToolPoseUncertainty.of(self.posterior, self.readings)
         return survey(self.robot, model, self.readings, fitted=self.result.free_of_frame)
 
     @cached_property

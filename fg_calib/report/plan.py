@@ -12,7 +12,7 @@ from rich.console import Group, RenderableType
 
 from fg_calib.designs.design import Design
 from fg_calib.observability.parallel_axes import missing_motions
-from fg_calib.prediction.expected_error import PoseRms
+from fg_calib.prediction.tool_pose import PoseRms
 from fg_calib.report.tables import SHOWN, indented, line, plain_table, rounded, section
 from fg_calib.simulation.scenario import RandomReadings
 

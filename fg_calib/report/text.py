@@ -15,7 +15,7 @@ from rich.console import Group, RenderableType
 from fg_calib.diagnostics.verdict import chi2_in_words, predicted_in_words, probability
 from fg_calib.io.result import Result, key_of
 from fg_calib.options import LIMITED
-from fg_calib.prediction.expected_error import ExpectedError
+from fg_calib.prediction.tool_pose import ExpectedError
 from fg_calib.report.tables import (
     SHOWN,
     WEAK,

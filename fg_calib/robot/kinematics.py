@@ -205,11 +205,6 @@ def _without_idle(chain: Chain, changing: set[int]) -> Chain:
     return replace(chain, **{name: getattr(chain, name)[keep] for name in names})
 
 
-def precompute_trig(robot: Robot, readings: Floats, given: Floats | None = None) -> Floats:
-    """`Robot.trig`, under its former name."""
-    return robot.trig(readings, given)
-
-
 @dataclass(frozen=True)
 class Poses(Brief):
     """Tool poses with their derivatives.
@@ -250,6 +245,32 @@ def forward(chain: Chain, trig: Floats, rows: Integers | None = None) -> Poses:
     for _ in over_spans(run, n):
         pass
     return Poses(rotation, position, jacobian)
+
+
+_RIGID_RCOND = 1e-10
+"""Singular values of rigid motions below this share of the largest move no point."""
+
+
+def without_rigid_motion(points: Floats, derivative: Floats) -> tuple[Floats, Floats]:
+    """Derivatives of points minus the nearest rigid motion of all of them, and its rotation.
+
+    Args:
+        points: Shape (n, 3), [m].
+        derivative: Of the points in anything, shape (n, 3, m).
+
+    Returns:
+        Shapes (n, 3, m) and (3, m), the latter in [rad] over the unit of what it is differentiated by.
+    """
+    p = points - points.mean(axis=0)
+    translations = np.tile(np.eye(3), (len(p), 1))  # (3 n, 3)
+    rotations = np.cross(np.eye(3)[None], p[:, None]).transpose(0, 2, 1).reshape(-1, 3)  # axis x p, a column an axis
+    motions = np.hstack([translations, rotations])
+    flat, nearest = derivative.reshape(len(motions), -1), np.linalg.pinv(motions, rcond=_RIGID_RCOND)
+    found: Floats = nearest @ flat
+    left: Floats = flat - motions @ found
+    left = left - motions @ (nearest @ left)  # once more: rounding of the first time
+    left[:, np.linalg.norm(left, axis=0) <= _RIGID_RCOND * np.linalg.norm(flat, axis=0)] = 0.0
+    return left.reshape(derivative.shape), found[3:]
 
 
 LEAST_TURNING = 1e-4

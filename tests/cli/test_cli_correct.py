@@ -131,7 +131,7 @@ def test_a_table_that_is_no_commands_is_not_replaced(result, fg_calib, tmp_path)
 
 def test_the_nominal_arm_is_that_of_the_robot_file(result):
     from fg_calib.cli import EXAMPLES
-    from fg_calib.prediction.correction import nominal_robot
+    from fg_calib.predictions import nominal_robot
 
     given = read_robot(EXAMPLES / "space-robot" / "robot_nominal.yaml")
     assert nominal_robot(Calibration.load(result)).nominal == pytest.approx(given.nominal, abs=1e-15)

@@ -9,7 +9,7 @@ import pytest
 from simulated import measure, small_arm, true_robot
 
 from fg_calib import Calibration, calibrate
-from fg_calib.prediction import prediction
+from fg_calib.prediction import workspace
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 JOINTS = ["q1", "q2", "q3", "q4"]
@@ -27,7 +27,7 @@ def result(tmp_path_factory):
 @pytest.fixture
 def few(monkeypatch):
     """Few configurations all over the workspace."""
-    monkeypatch.setattr(prediction, "N_DRAWN", 400)
+    monkeypatch.setattr(workspace, "N_DRAWN", 400)
 
 
 def in_degrees(q, robot):

@@ -14,7 +14,7 @@ from fg_calib.designs.information import Posterior
 from fg_calib.graph.information import whitened_jacobian
 from fg_calib.measurements.dataset import Noise
 from fg_calib.options import Pairing
-from fg_calib.prediction.expected_error import errors_at
+from fg_calib.prediction.tool_pose import errors_at
 from fg_calib.robot.kinematics import pose
 from fg_calib.simulation.scenario import (
     Errors,

@@ -13,7 +13,7 @@ from fg_calib.graph.solver import solve
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import Noise
 from fg_calib.options import Options, Pairing
-from fg_calib.prediction.expected_error import errors_at
+from fg_calib.prediction.tool_pose import errors_at
 from fg_calib.simulation.scenario import (
     Errors,
     GivenReadings,

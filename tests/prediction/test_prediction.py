@@ -7,10 +7,10 @@ from tolerances import rounding
 
 from fg_calib import Calibration, InputError, Measurements, assess, build_problem, calibrate, pose, predict, solve
 from fg_calib.io.job import joint_noise_in
-from fg_calib.prediction import prediction
-from fg_calib.prediction.predict import joint_noise_of
-from fg_calib.prediction.prediction import predict_errors, summed_up
-from fg_calib.prediction.tool_pose import ToolErrorModel
+from fg_calib.prediction import workspace
+from fg_calib.prediction.tool_pose import ToolPoseUncertainty
+from fg_calib.prediction.workspace import predict_errors, summed_up
+from fg_calib.predictions import joint_noise_of
 from fg_calib.statistics.covariance import spread_of
 
 LARGE = {"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}
@@ -35,7 +35,7 @@ def in_unknown_frame():
 
 def small(monkeypatch):
     """Few configurations instead of thousands."""
-    monkeypatch.setattr(prediction, "N_DRAWN", 300)
+    monkeypatch.setattr(workspace, "N_DRAWN", 300)
 
 
 def test_given_configurations_have_the_errors_of_predicted_poses(calibrated):
@@ -68,7 +68,7 @@ def test_orientations_after_the_best_fit_lack_its_rotation(in_unknown_frame):
 def test_joint_noise_moves_the_tool_as_differences_say(calibrated):
     result, m = calibrated
     q = np.random.default_rng(5).uniform(-2.0, 2.0, (6, 4))
-    model = ToolErrorModel.of(result.posterior, m.readings, JOINTS)
+    model = ToolPoseUncertainty.of(result.posterior, m.readings, JOINTS)
     step, squares = 1e-6, np.zeros(6)
     for j, sigma in enumerate(JOINTS):
         ahead, behind = (pose(result.robot, q + s * step * np.eye(4)[j]).position for s in (1, -1))
@@ -215,7 +215,7 @@ def test_arms_that_were_calibrated_are_as_far_off_as_expected(frame):
         m = measure(true, 25, rng, sigma=(2e-4, 2e-4))
         solution = solve(build_problem(robot, m, model="pose", frame=frame))
         estimate = robot.with_values(solution.parameters[solution.problem.variables.robot_span])
-        model = ToolErrorModel.of(spread_of(solution), m.readings)
+        model = ToolPoseUncertainty.of(spread_of(solution), m.readings)
         worst = predict_errors(estimate, model, m.readings, q, fitted=frame == "unknown").worst
         errors = model.at(q).of(frame == "unknown")[:, 0]
         off = pose(estimate, q).position - pose(true, q).position

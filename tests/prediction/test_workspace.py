@@ -7,8 +7,7 @@ from tolerances import rounding
 
 from fg_calib import calibrate
 from fg_calib.prediction import workspace
-from fg_calib.prediction.expected_error import errors_at
-from fg_calib.prediction.tool_pose import ToolErrorModel
+from fg_calib.prediction.tool_pose import ToolPoseUncertainty, errors_at
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Joint, RobotBuilder
 
@@ -30,7 +29,7 @@ def survey_at(calibrated, readings, monkeypatch, **options):
 
 
 def surveyed(result, readings, **options):
-    return workspace.survey(result.robot, ToolErrorModel.of(result.posterior, readings), readings, **options)
+    return workspace.survey(result.robot, ToolPoseUncertainty.of(result.posterior, readings), readings, **options)
 
 
 def test_errors_in_the_base_frame_are_those_of_predicted_poses(calibrated, monkeypatch):

@@ -16,7 +16,7 @@ from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import SolverOptions, solve
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.options import Pairing
-from fg_calib.prediction.expected_error import pose_rms
+from fg_calib.prediction.tool_pose import pose_rms
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Joint, Robot, RobotBuilder
 from fg_calib.statistics.goodness_of_fit import chi2_bounds

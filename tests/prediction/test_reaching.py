@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 from simulated import small_arm
 
 from fg_calib import Robot, pose
+from fg_calib.prediction.correction import misses, reach
 from fg_calib.robot.inverse import REACHED, random_readings
-from fg_calib.robot.reaching import misses, reach
 
 NEAR = np.array([0.3, -0.4, 0.1, 0.5])
 

@@ -1,7 +1,7 @@
-"""What to expect of a calibrated arm's tool: errors at configurations, or all over the workspace.
+"""Predictions of a calibration: expected errors of its tool, and commands that correct the nominal arm.
 
-It is what the covariance says: what is left of the noise and tolerances that were stated. What the model lacks, such as
-joints that give way, is no part of it.
+Expected errors are those of the covariance: of the specified noise and prior sigmas. Unmodelled effects, such as
+compliance, are not part of them.
 """
 
 from __future__ import annotations
@@ -21,11 +21,13 @@ from fg_calib.io.atomic import fill_folder, require_own, require_writable, write
 from fg_calib.io.units import Units
 from fg_calib.measurements.checks import check_readings
 from fg_calib.options import check_number
-from fg_calib.prediction.prediction import PredictedErrors, predict_errors
-from fg_calib.prediction.tool_pose import ToolErrorModel
+from fg_calib.prediction.correction import Correction, correct_targets
+from fg_calib.prediction.tool_pose import ToolPoseUncertainty
+from fg_calib.prediction.workspace import PredictedErrors, predict_errors
 from fg_calib.report.charts import write_charts
 from fg_calib.report.figures import error_slices
 from fg_calib.report.predict import prediction_document, write_prediction_table
+from fg_calib.robot.model import Robot
 from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
@@ -62,7 +64,7 @@ def predict(
         raise InputError(found.result.robot, "the arm was only evaluated: nothing was estimated", "a calibration")
     there = _readings("measured", measured, found) if measured is not None else measured_of(found, folder)
     at = None if readings is None else _readings("readings", readings, found)
-    model = ToolErrorModel.of(found.posterior, there, joint_noise_of(found))
+    model = ToolPoseUncertainty.of(found.posterior, there, joint_noise_of(found))
     return predict_errors(found.robot, model, there, at, fitted=found.result.free_of_frame, limit=limit)
 
 
@@ -98,6 +100,45 @@ def _readings(name: str, given: ArrayLike, found: Calibration) -> Floats:
         raise InputError(name, "no configurations", "one or more")
     check_readings(readings, found.robot, name)
     return readings
+
+
+@checked
+def correct(
+    calibration: Calibration,
+    position: ArrayLike | None = None,
+    rotation: ArrayLike | None = None,
+    *,
+    near: ArrayLike | None = None,
+    world: bool = False,
+    table: int | None = None,
+) -> Correction:
+    """Commands with which the calibrated arm reaches targets.
+
+    Args:
+        calibration: The calibration; the nominal arm, as the controller knows it, is that which it began with.
+        position: Where the tool point is to be, shape (n, 3), or (3,) of one target, [m]. If None the targets are the
+            poses of the nominal arm at `near`: what a program of joint values was meant to reach.
+        rotation: Orientations wanted, shape (n, 3, 3), or (3, 3); any if None.
+        near: Joint values to stay near, shape (n, n_joints) or (n_joints,), [rad] (prismatic: [m]): of an arm that
+            reaches a target in several ways they choose one. If None that is the first that is found, searched for from
+            the middle of the limits and, where that leads nowhere, from anywhere.
+        world: Whether the targets are in the measurement frame, instead of the base frame.
+        table: Number of the table whose measurement frame it is, from 0; there must be one if there are several.
+
+    Raises:
+        InputError: Targets or joint values are not of such a shape, not finite, or outside the limits; there is no
+            measurement frame.
+    """
+    if world and position is None:
+        raise InputError("world", "joint values reach poses in the base frame", "targets with positions")
+    number = calibration.table_in_world(table) if world else None
+    nominal, posterior = nominal_robot(calibration), calibration.posterior
+    return correct_targets(posterior, calibration.robot, nominal, position, rotation, near=near, table=number)
+
+
+def nominal_robot(calibration: Calibration) -> Robot:
+    """The robot that a calibration began with."""
+    return calibration.robot.with_values([p.nominal for p in calibration.result.parameters])
 
 
 FILES = {
