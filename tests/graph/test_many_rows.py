@@ -19,7 +19,6 @@ from fg_calib.graph.noise import whitening_of
 from fg_calib.graph.problem import noises_at, reweighted_at, some_rows
 from fg_calib.measurements import residuals
 from fg_calib.measurements.residuals import pack, unpack
-from fg_calib.monitoring import fingerprints
 from fg_calib.robot import kinematics
 from fg_calib.robot.kinematics import SPAN, pose
 from fg_calib.threads import processors
@@ -132,13 +131,6 @@ def test_small_covariances_are_whitened_by_the_rows_in_use(d):
     assert np.abs(W @ (C * both) @ np.swapaxes(W, 1, 2) - np.eye(d) * both).max() < 1e-12
     with pytest.raises(InputError, match="lost in rounding"):
         whitening_of(-C, np.ones_like(used))
-
-
-def test_fingerprints_of_many_rows_are_the_smallest_different_ones():
-    rng = np.random.default_rng(0)
-    for n, most in ((500, 10**15), (40_000, 10**15), (40_000, 1500), (40_000, 700)):
-        hashes = rng.integers(0, most, n).astype(np.uint64)
-        assert np.array_equal(fingerprints._smallest(hashes), np.unique(hashes)[: fingerprints.MOST])
 
 
 def test_every_bit_is_the_same_on_any_number_of_threads(monkeypatch):

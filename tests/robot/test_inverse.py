@@ -198,7 +198,6 @@ def test_one_pose_or_position_in_one_call():
         ({"rotation": 2 * np.eye(3)}, "rotation: row 0: found .*, expected a rotation matrix"),
         ({"near": [0, 0]}, r"near: shape \(2,\), expected \(4\)"),
         ({"n_starts": 0}, "n_starts: found 0"),
-        ({"generator": 3}, "generator: found 3, expected a Generator"),
     ],
 )
 def test_targets_are_checked(given, message):
