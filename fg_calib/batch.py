@@ -9,12 +9,10 @@ from __future__ import annotations
 import csv
 import io
 import json
-import logging
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -118,7 +116,6 @@ class JobSummary:
         units: Unit of each kind.
         reduced_chi2: Chi-square over degrees of freedom.
         seconds: Duration with reading and writing, [s].
-        warnings: Logged warnings, a line each.
     """
 
     name: str
@@ -134,7 +131,6 @@ class JobSummary:
     units: dict[str, str] | None = None
     reduced_chi2: float | None = None
     seconds: float | None = None
-    warnings: tuple[str, ...] = ()
 
     @property
     def reasons(self) -> list[tuple[str, str]]:
@@ -156,9 +152,8 @@ def carry_out(order: Order) -> JobSummary:
         CalibrationError: There is no result, or it cannot be written.
     """
     clock = time.perf_counter()
-    with _logged_warnings() as warnings:
-        found = calibrate_job(order.read())
-        order.save(found)
+    found = calibrate_job(order.read())
+    order.save(found)
     result, not_accepted = found.result, found.not_accepted
     rms = result.rms_after("test") or result.rms_after("train")
     return JobSummary(
@@ -174,23 +169,7 @@ def carry_out(order: Order) -> JobSummary:
         units={kind: result.unit_of(kind) for kind in rms},
         reduced_chi2=result.reduced_chi2,
         seconds=time.perf_counter() - clock,
-        warnings=tuple(warnings),
     )
-
-
-@contextmanager
-def _logged_warnings() -> Iterator[list[str]]:
-    """The warnings that the package logs in the block."""
-    said: list[str] = []
-    log, handler = logging.getLogger("fg_calib"), logging.Handler(logging.WARNING)
-    handler.emit = lambda record: said.append(record.getMessage())  # type: ignore[method-assign]
-    before, log.propagate = log.propagate, False
-    log.addHandler(handler)
-    try:
-        yield said
-    finally:
-        log.removeHandler(handler)
-        log.propagate = before
 
 
 def calibrate_into(orders: Sequence[Order], executor: Executor | None = None) -> list[JobSummary]:
@@ -245,10 +224,10 @@ def write_jobs(folder: Path, jobs: Sequence[JobSummary], seconds: float) -> None
     heads = ("name", "job", "verdict", "robot", "n_configurations", "reduced_chi2", "seconds")
     table = io.StringIO()
     rows = csv.writer(table, lineterminator="\n")
-    rows.writerow([*heads, *(f"rms {kind} [{unit}]" for kind, unit in units.items()), "rows", "reason", "warnings"])
+    rows.writerow([*heads, *(f"rms {kind} [{unit}]" for kind, unit in units.items()), "rows", "reason"])
     for job in jobs:
         values = [getattr(job, head) for head in heads] + [(job.rms or {}).get(kind) for kind in units]
-        rows.writerow([*values, job.rows, "; ".join(why for _, why in job.reasons), "; ".join(job.warnings)])
+        rows.writerow([*values, job.rows, "; ".join(why for _, why in job.reasons)])
 
     def write(into: Path) -> None:
         write_text(into / "jobs.json", json.dumps(jobs_document(jobs, seconds), indent=1, allow_nan=False) + "\n")

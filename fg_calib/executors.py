@@ -6,6 +6,7 @@ of its own. Long work reports its progress to a listener, such as the command li
 
 from __future__ import annotations
 
+import logging
 import os
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -180,6 +181,7 @@ def local_processes(n_workers: int) -> ProcessPoolExecutor:
 def _start_worker(n_threads: int) -> None:
     """Limit a worker's threads, and end it when the process that started it ends."""
     limit_threads(n_threads)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
     parent = parent_process()
 
     def end_with_parent() -> None:

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from fg_calib.cli.output import BaseLink, Json, TipLink, say, show_json, show_report
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from fg_calib.importers.recording import JointStream, PoseStream
+    from fg_calib.importers.standstill import Stops
 
 _Bag = Annotated[Path, typer.Argument(metavar="BAG", help="A ROS bag: .bag, .db3, .mcap, or a folder of ROS 2.")]
 _Robot = Annotated[Path, typer.Option("--robot", metavar="ROBOT", help="The robot: robot.yaml or a URDF.")]
@@ -49,7 +55,6 @@ def bag(
     from fg_calib.importers.bag import read_bag
     from fg_calib.importers.standstill import average_stops, require_replaceable, write_stops
     from fg_calib.io.robot_file import read_robot
-    from fg_calib.report.bag import bag_document, build_bag_report
 
     if out is not None:
         require_replaceable(out)
@@ -57,15 +62,98 @@ def bag(
     called = [name.strip() for name in names.split(",") if name.strip()]
     of_joints, of_pose = read_bag(recording, arm, joints=joints, pose=pose, parent=parent, child=child, names=called)
     stops = average_stops(of_joints, of_pose, arm, still=still, offset=offset, most_offset=most_offset)
-    try:
-        if as_json:
-            show_json(bag_document(recording.name, of_joints, of_pose, stops))
-        else:
-            show_report(build_bag_report(recording.name, of_joints, of_pose, stops))
-    finally:  # also where nobody takes the report
-        if out is not None:
-            write_stops(out, stops, arm)
-    if out is None:
-        say("nothing is written: --out poses.csv writes the table")
+    if out is not None:
+        write_stops(out, stops, arm)
+    if as_json:
+        show_json(_document(recording.name, of_joints, of_pose, stops))
     else:
-        say(f"wrote {len(stops.ids)} poses to {out}")
+        show_report(_report(recording.name, of_joints, of_pose, stops))
+    say(
+        "nothing is written: --out poses.csv writes the table"
+        if out is None
+        else f"wrote {len(stops.ids)} poses to {out}"
+    )
+
+
+def _document(name: str, joints: JointStream, poses: PoseStream, stops: Stops) -> dict[str, Any]:
+    """The content of the recording for programs: [m], [rad], [s]."""
+    from fg_calib.importers.recording import period
+    from fg_calib.report.tables import plain
+
+    topics = {
+        what: {
+            "topic": stream.source.topic,
+            "type": stream.source.kind,
+            "messages": len(stream.time),
+            "period": period(stream.time),
+            "notes": stream.source.notes,
+        }
+        for what, stream in (("joints", joints), ("pose", poses))
+    }
+    scatter = {
+        what: {"single": s.single, "mean": s.mean, "correlation_samples": s.correlation, "slow": s.slow}
+        for what, s in stops.scatter.items()
+    }
+    document: dict[str, Any] = plain(
+        {
+            "schema": "fg-calib/bag/1",
+            "bag": name,
+            "topics": topics,
+            "offset": stops.offset,
+            "applied_offset": stops.applied,
+            "n_found": len(stops.ids) + len(stops.skipped),
+            "n_written": len(stops.ids),
+            "skipped": [{"id": s.id, "begin": s.begin, "reason": s.reason} for s in stops.skipped],
+            "scatter": scatter,
+        }
+    )
+    return document
+
+
+def _report(name: str, joints: JointStream, poses: PoseStream, stops: Stops) -> RenderableType:
+    """The content of the recording for the terminal: topics, clocks, scatter and what is left out."""
+    from rich.console import Group
+
+    from fg_calib.importers.recording import period
+    from fg_calib.report.tables import indented, line, section, table_of
+
+    n, skipped = len(stops.ids), len(stops.skipped)
+    streams = [
+        (what, s.source.topic, s.source.kind, len(s.time), f"{1.0 / period(s.time):.4g}")
+        for what, s in (("joints", joints), ("poses", poses))
+    ]
+    units = {"position": "mm", "joint": "mrad or mm"}
+    scatter = [
+        (
+            what,
+            *(f"{v * 1e3:.3g} {units.get(what, 'mrad')}" for v in (s.single, s.mean)),
+            f"{s.correlation:.3g} samples",
+        )
+        for what, s in stops.scatter.items()
+    ]
+    slow = [what for what, s in stops.scatter.items() if s.slow and what != "joint"]
+    rough = [f"noise of {' and '.join(slow)} is slower than the stops are long: its sigmas are rough"] if slow else []
+    return Group(
+        line(f"{name}: {n + skipped} stops found, {n} used, {skipped} skipped", "bold"),
+        table_of(("", "topic", "type", "messages", "Hz"), streams, left="lll"),
+        *indented(f"{s.source.topic}: {note}" for s in (joints, poses) for note in s.source.notes),
+        *section("Clocks", *indented(_clocks(stops))),
+        *section("Scatter during stops", table_of(("", "of one", "of the mean", "correlated over"), scatter)),
+        *indented(rough),
+        *section("Skipped", *indented(f"{s.id} at {s.begin:.1f} s: {s.reason}" for s in stops.skipped)),
+    )
+
+
+def _clocks(stops: Stops) -> list[str]:
+    offset, applied = stops.offset, stops.applied
+    if offset is None:
+        return [f"offset {applied:.6g} s as specified; it could not be estimated"]
+    lines = [
+        f"poses are stamped {offset.seconds:+.6f} +- {offset.sigma:.6f} s against the joints",
+        f"from {offset.n_moves} moves; speeds by joints and by poses correlate by {offset.correlation:.3f}",
+        "this offset is taken out" if applied == offset.seconds else f"specified and used: {applied:.6g} s",
+    ]
+    if offset.others:
+        listed = ", ".join(f"{other:+.2f}" for other in offset.others[:3])
+        lines.append(f"motions repeat: offsets of {listed} s fit nearly as well; --offset specifies it")
+    return lines

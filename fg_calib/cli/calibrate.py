@@ -104,8 +104,6 @@ def _calibrate_many(orders: Sequence[Order], out: Path | None, executor: Executo
     else:
         show_report(_jobs_table(found, seconds))
     for job in found:
-        for warning in job.warnings:
-            say(f"{job.name}: {warning}")
         for what, reason in job.reasons:
             say(f"{job.name}: {what}: {reason}")
     if code := exit_code(found):

@@ -106,18 +106,13 @@ def design(
 
 def _show(found: Design, units: Units, out: Path | None, *, as_json: bool) -> None:
     """Print a design, and write it."""
-    from fg_calib.report.plan import build_design_report, design_document
-    from fg_calib.report.plan_files import write_design
+    from fg_calib.report.design import build_design_report, design_document, write_design
 
-    names = tuple[str, ...]()
-    try:
-        if as_json:
-            show_json(design_document(found))
-        else:
-            show_report(build_design_report(found))
-    finally:  # also where nobody takes the report
-        if out is not None:
-            names = write_design(out, found, units)
+    names = write_design(out, found, units) if out is not None else ()
+    if as_json:
+        show_json(design_document(found))
+    else:
+        show_report(build_design_report(found))
     say(f"wrote {', '.join(names)} to {out}" if out else "nothing is written: --out DIR writes tables and a job")
 
 

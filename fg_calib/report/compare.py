@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -172,71 +171,29 @@ def comparison_document(comparison: Comparison) -> dict[str, Any]:
     thereby known, so their sigma is None. "parameters" is empty where it did not run.
     """
     job, first = comparison.job, comparison.estimates[0]
-    of_pairs = next((table for table in job.tables if table.uses_pairs), None)
-    measured = of_pairs is not None and of_pairs.measurements.pairs is not None
-    pairing = "measured" if measured else None if of_pairs is None else str(of_pairs.pairing)
-    unknown = any(table.unknown_frame for table in job.tables)
-    document = {
-        "schema": "fg-calib/comparison/1",
-        "version": __version__,
-        "robot": job.robot.name,
-        "model": job.model,
-        "frame": "unknown" if unknown else job.tables[0].frame,
-        "pairing": pairing,
-        "judged_on": comparison.judged_on,
-        "n_judged": comparison.n_judged,
-        "truth_known": job.truth is not None,
-        "trustworthy": comparison.trustworthy,
-        "findings": list(comparison.findings),
-        "nominal": {
-            "residual_rms": _rms(first, "before"),
-            "errors": _errors(comparison.errors_before),
-        },
-        "estimates": [
-            {
-                "name": e.name,
-                "description": e.description,
-                "ran": e.robot is not None,
-                "converged": e.converged,
-                "message": e.message,
-                "iterations": e.iterations,
-                "seconds": e.seconds,
-                "n_estimated": len(e.sigma),
-                "residual_rms": _rms(e, "after"),
-                "predicted_position_rms": e.predicted_rms,
-                "predicted_position_rms_fitted": e.predicted_fitted_rms,
-                "errors": _errors(e.errors),
-                "parameters": _estimated(comparison, e),
-            }
-            for e in comparison.estimates
-        ],
-        "inputs": job.inputs,
-    }
-    found: dict[str, Any] = plain(document)
-    return found
+    pairs = next((table for table in job.tables if table.uses_pairs), None)
+    measured = pairs is not None and pairs.measurements.pairs is not None
+    document: dict[str, Any] = plain(
+        {
+            "schema": "fg-calib/comparison/1",
+            "version": __version__,
+            "robot": job.robot.name,
+            "model": job.model,
+            "frame": "unknown" if any(table.unknown_frame for table in job.tables) else job.tables[0].frame,
+            "pairing": "measured" if measured else None if pairs is None else str(pairs.pairing),
+            **{key: getattr(comparison, key) for key in ("judged_on", "n_judged", "trustworthy", "findings")},
+            "truth_known": job.truth is not None,
+            "nominal": {"residual_rms": _rms(first, "before"), "errors": _errors(comparison.errors_before)},
+            "estimates": [_estimate(comparison, e) for e in comparison.estimates],
+            "inputs": job.inputs,
+        }
+    )
+    return document
 
 
-def _rms(estimate: Estimate, when: str) -> dict[str, dict[str, float | None]] | None:
-    """RMS by split and kind."""
-    rms = estimate.residual_rms
-    if rms is None:
-        return None
-    kinds = list(dict.fromkeys(("position", "orientation", "distance", "angle", *rms["train"], *rms["test"])))
-    return {split: {kind: rms[split].get(kind, {}).get(when) for kind in kinds} for split in ("train", "test")}
-
-
-def _errors(errors: RealErrors | None) -> dict[str, Any] | None:
-    if errors is None:
-        return None
-    fitted = None if errors.fitted is None else asdict(errors.fitted)
-    return {"base_frame": asdict(errors.base), "best_rigid_fit": fitted}
-
-
-def _estimated(comparison: Comparison, estimate: Estimate) -> list[dict[str, Any]]:
-    job, robot = comparison.job, estimate.robot
-    if robot is None:
-        return []
-    return [
+def _estimate(comparison: Comparison, e: Estimate) -> dict[str, Any]:
+    job, robot = comparison.job, e.robot
+    parameters = [
         {
             "name": p.name,
             "unit": p.unit,
@@ -244,12 +201,35 @@ def _estimated(comparison: Comparison, estimate: Estimate) -> list[dict[str, Any
             "true": None if job.truth is None else job.truth.parameters[i].nominal,
             "estimate": robot.parameters[i].nominal,
             "correction": comparison.correction(robot, p.name),
-            "sigma": estimate.sigma.get(p.name),
-            "held": p.name not in estimate.sigma,
+            "sigma": e.sigma.get(p.name),
+            "held": p.name not in e.sigma,
         }
-        for i, p in enumerate(job.robot.parameters)
-        if p.estimated
+        for i, p in enumerate(job.robot.parameters if robot is not None else ())
+        if robot is not None and p.estimated
     ]
+    return {
+        **{key: getattr(e, key) for key in ("name", "description", "converged", "message", "iterations", "seconds")},
+        "ran": robot is not None,
+        "n_estimated": len(e.sigma),
+        "residual_rms": _rms(e, "after"),
+        "predicted_position_rms": e.predicted_rms,
+        "predicted_position_rms_fitted": e.predicted_fitted_rms,
+        "errors": _errors(e.errors),
+        "parameters": parameters,
+    }
+
+
+def _rms(estimate: Estimate, when: str) -> dict[str, dict[str, float | None]] | None:
+    """RMS by split and kind."""
+    rms = estimate.residual_rms
+    if rms is None:
+        return None
+    kinds = dict.fromkeys(("position", "orientation", "distance", "angle", *rms["train"], *rms["test"]))
+    return {split: {kind: rms[split].get(kind, {}).get(when) for kind in kinds} for split in ("train", "test")}
+
+
+def _errors(errors: RealErrors | None) -> dict[str, Any] | None:
+    return None if errors is None else {"base_frame": errors.base, "best_rigid_fit": errors.fitted}
 
 
 @checked

@@ -90,22 +90,6 @@ def table_of(headings: Iterable[str], rows: Iterable[Iterable[object]], *, left:
     return table
 
 
-class _Escaped(Table):
-    """A table whose cells of text are no markup."""
-
-    def add_row(self, *cells: RenderableType | None, **options: Any) -> None:
-        """Add a row of cells."""
-        super().add_row(*(line(cell) if isinstance(cell, str) else cell for cell in cells), **options)
-
-
-def plain_table(*columns: tuple[str, str], wrap: bool = False) -> Table:
-    """A table without a frame; columns as (heading, justification), which wrap at spaces with `wrap`."""
-    table = _Escaped(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="italic")
-    for heading, justify in columns:
-        table.add_column(line(heading), justify=justify, no_wrap=not wrap, overflow="fold")  # type: ignore[arg-type]
-    return table
-
-
 def rounded(value: float, decimals: int, sign: str = "") -> str:
     """A value with `decimals`; one that rounds to zero has no minus."""
     return f"{value:{sign}z.{decimals}f}"

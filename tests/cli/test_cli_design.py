@@ -12,7 +12,7 @@ from simulated import small_arm, true_robot
 
 from fg_calib.io.robot_file import write_robot
 from fg_calib.io.units import Units
-from fg_calib.report.plan_files import FINEST
+from fg_calib.report.design import FINEST
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 ARM = small_arm(tolerance=TOLERANCE)

@@ -1,0 +1,361 @@
+"""The report of `fg-calib design`, and the tables and the job that it writes: what to measure, and what to expect."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from rich.console import Group, RenderableType
+
+from fg_calib.arrays import Floats
+from fg_calib.designs.design import Design
+from fg_calib.errors import InputError
+from fg_calib.io.atomic import exists, fill_folder, read_bytes, read_text, write_text
+from fg_calib.io.csv_writer import write_csv
+from fg_calib.io.robot_file import write_robot
+from fg_calib.io.units import Units
+from fg_calib.io.urdf import write_urdf
+from fg_calib.measurements.table import Table
+from fg_calib.observability.parallel_axes import missing_motions
+from fg_calib.prediction.tool_pose import PoseRms
+from fg_calib.report.charts import Chart, Plot, limits_of, write_charts
+from fg_calib.report.tables import SHOWN, indented, json_text, line, plain, rounded, section, table_of
+from fg_calib.robot.kinematics import pose
+from fg_calib.robot.model import Robot
+from fg_calib.simulation.scenario import RandomReadings
+from fg_calib.simulation.write import instrument_keys, is_filled_in, table_columns, to_fill_in
+
+SCHEMA = "fg-calib/design/1"
+
+MAX_POSES_LISTED = 40
+"""Poses that the report lists; the table has all."""
+
+UNKNOWN_ABOVE = 10.0
+"""Errors [m] that are called unknown: they only say how weak the weakest prior is."""
+
+
+def design_document(design: Design) -> dict[str, Any]:
+    """A design for programs, in [m] and [rad]; null for what is unknown."""
+    document: dict[str, Any] = plain(
+        {
+            "schema": SCHEMA,
+            "robot": design.pool.robot.name,
+            "n_given": len(design.pool.given),
+            "fitted": design.task.fitted,
+            "undetermined_share": design.unknown,
+            **{key: getattr(design, key) for key in ("criterion", "n", "target", "reached", "expected", "before")},
+            **{key: getattr(design, key) for key in ("random", "pairings", "travel")},
+            "travel_unordered": design.travel_before,
+            "curve": [{"n": p.n, "designed": p.designed, "random": p.random} for p in design.curve],
+            "candidates": {
+                name or "all": {"asked": one.asked, "taken": len(one.readings), "rejected": one.rejected}
+                for name, one in design.pool.found.items()
+            },
+            "stops": [
+                {"id": name, "table": table or None, "readings": q}
+                for name, table, q in zip(design.ids.tolist(), design.group.tolist(), design.readings, strict=True)
+            ],
+            "pairs": None if design.pairs is None else design.ids[design.pairs].tolist(),
+            "undetermined": [{"relation": relation} for relation in design.observability.lost],
+        }
+    )
+    return document
+
+
+def build_design_report(design: Design) -> RenderableType:
+    """A design for the terminal."""
+    words = {"star": "each with the first", "chain": "each with the one before", "all": "all that can be formed"}
+    pairs = [
+        (name, _figure(error), words[name] + ", chosen" * (name == design.structure))
+        for name, error in design.pairings.items()
+    ]
+    curve = [
+        (f"{p.n}", _figure(p.designed), _figure(p.random[1]), f"{_figure(p.random[0])} to {_figure(p.random[2])}")
+        for p in design.curve
+    ]
+    headings = ("poses", "designed mm", "random mm", "80 % of random")
+    return Group(
+        line(_headline(design), "bold"),
+        *section("Expected", *indented(_expected(design))),
+        *section("Poses and accuracy", table_of(headings, curve, left="r")),
+        *(section("Which pairs", table_of(("pairs", "expected mm", ""), pairs, left="lrl")) if pairs else []),
+        *section("Where to measure", _poses(design)),
+        *section("Notes", *indented(_notes(design))),
+    )
+
+
+def _headline(design: Design) -> str:
+    poses = f"{design.n} pose{'s' * (design.n > 1)}"
+    if design.pairs is not None:
+        poses += f" in {len(design.pairs)} pair{'s' * (len(design.pairs) > 1)}"
+    if design.target is None:
+        return f"{design.pool.robot.name}: where to measure at {poses}"
+    reached = "for" if design.reached else "do not reach"
+    return f"{design.pool.robot.name}: {poses} {reached} an expected RMS error of {_mm(design.target)}"
+
+
+def _expected(design: Design) -> Iterator[str]:
+    where = "after the best rigid fit" if design.task.fitted else "in the base frame"
+    yield f"RMS error of the tool over the task, {where}: {_pose(design.expected)}"
+    if design.before is not None:
+        yield f"with the present measurements: {_pose(design.before)}"
+    last = design.curve[-1].n
+    random = "random poses, as many" if design.structure in ("", "star") else f"stars of {last} random poses"
+    ratio = f" ({design.random / design.expected.position:.2f} times that)" if design.expected.position else ""
+    yield f"{random}: {_mm(design.random)}{ratio}"
+    equal = next((p.n for p in design.curve if p.designed <= design.random), None)
+    if equal is not None and equal < last:
+        yield f"{equal} designed poses are as good as {last} random ones"
+
+
+def _poses(design: Design) -> RenderableType:
+    joints, own = design.pool.robot.joints, bool(np.any(design.group != ""))
+    chosen = zip(design.ids.tolist(), design.group.tolist(), design.readings.tolist(), strict=True)
+    rows = [
+        (
+            name,
+            *(rounded(v * SHOWN[joint.unit][0], 1) for v, joint in zip(q, joints, strict=True)),
+            *([group or "all others"] if own else []),
+        )
+        for name, group, q in list(chosen)[:MAX_POSES_LISTED]
+    ]
+    names = [f"{joint.name} {SHOWN[joint.unit][1]}" for joint in joints]
+    return table_of(("pose", *names, *["table"] * own), rows, left=f"l{'r' * len(names)}l")
+
+
+def _notes(design: Design) -> Iterator[str]:
+    for name, one in design.pool.found.items():
+        yield f"candidates{f' of {name}' if name else ''}: {one.reasons()}"
+    for name in sorted(set(design.pool.group.tolist()).difference(design.group.tolist(), [""])):
+        yield f"{name}: none of its own poses was chosen, and it gets no table"
+    for name, (low, high) in _lengths(design).items():
+        yield f"{name}: lengths of {_mm(low)} to {_mm(high)}"
+    yield from map(str, missing_motions(design.pool.robot))
+    scenario = design.pool.scenario
+    free = scenario is not None and isinstance(scenario.configurations, RandomReadings)
+    if design.pool.before is not None and free and not scenario.configurations.keep_out:  # type: ignore[union-attr]
+        yield "a job has no obstacles and no lines of sight: --candidates SCENARIO takes those of a scenario"
+    travel = math.degrees(design.travel), math.degrees(design.travel_before)
+    yield f"joint travel along the poses {travel[0]:.0f} deg, {travel[1]:.0f} unordered"
+    if design.n > MAX_POSES_LISTED:
+        yield f"{design.n - MAX_POSES_LISTED} more poses: --out writes them all"
+    best = min(design.pairings, key=lambda name: design.pairings[name], default="")
+    if design.pairs is None and best and design.pairings[best] < 0.95 * (design.expected.position or math.inf):
+        yield f"pairing: {best} in the job is more accurate with the same measurements"
+    if lost := len(design.observability.lost):
+        yield f"{lost} direction{'s are' if lost > 1 else ' is'} not identifiable: fg-calib observe says which and why"
+    if design.expected.position is None:
+        yield "the error over the task depends on what the measurements do not determine"
+    if design.target is not None and not design.reached:
+        yield _why_missed(design)
+    if design.asked is not None and design.n < design.asked and design.pairs is None:
+        yield f"no more than {design.n} poses were found of {design.asked}: --candidates draws more"
+    after = math.inf if design.after_fit is None else design.after_fit.position or math.inf
+    if design.after_fit is not None and after < 0.5 * (design.expected.position or 0.0):
+        best_fit = f"after the best rigid fit {_pose(design.after_fit)}"
+        yield f"most of it is the position of the base: {best_fit}; --error fitted chooses for that"
+
+
+def _why_missed(design: Design) -> str:
+    """What would reach a target that was missed: the last half of the poses may have gained less than a tenth."""
+    half = min(design.curve, key=lambda p: abs(p.n - design.n / 2))
+    if half.designed < 1.1 * design.curve[-1].designed:
+        return "more poses would not do: lower noise, other measurements or a wider range of poses would"
+    more = design.n >= design.n_candidates
+    return "all candidates are taken: --candidates draws more" if more else "more poses may do: specify them with --n"
+
+
+def _lengths(design: Design) -> dict[str, tuple[float, float]]:
+    """The shortest and the longest length that each instrument would measure, [m]: of ball bars and wires."""
+    found = {}
+    for table in design.tables:
+        m = table.measurements
+        between = m.pairs if m.groups is None else m.groups.pairs
+        lengths = m.length if between is None else between.distance
+        if lengths is not None and table.model != "plane" and np.nan_to_num(lengths).any():
+            found[Path(m.source).stem] = (float(np.nanmin(lengths)), float(np.nanmax(lengths)))
+    return found
+
+
+def _pose(error: PoseRms) -> str:
+    turn = "unknown" if error.orientation is None else f"{math.degrees(error.orientation):.4f} deg"
+    return f"{_mm(error.position)}, {turn}"
+
+
+def _mm(value: float | None) -> str:
+    return "unknown" if value is None or not math.isfinite(value) else f"{_figure(value)} mm"
+
+
+def _figure(value: float) -> str:
+    if value >= UNKNOWN_ABOVE:
+        return "unknown"
+    return f"{value * 1e3:.3g}" if value < 0.9995 else f"{value * 1e3:.0f}"
+
+
+CONFIGURATIONS, _DOCUMENT = "configurations.csv", "design.json"
+
+_BEGINS = f'{{\n "schema": "{SCHEMA}"'.encode()
+"""How the document of a plan begins."""
+
+_JOB_BEGINS = "# fg-calib design\n# What to measure: fill in the tables, then `fg-calib "
+_CALIBRATE, _UPDATE = "calibrate` this file.\n", "update RESULT` this file: RESULT is of what there was.\n"
+
+
+def draw_design(design: Design) -> Chart:
+    """Draw expected errors over the number of poses, with the range of 80 % of the random ones.
+
+    Args:
+        design: The design.
+    """
+    n = np.array([float(p.n) for p in design.curve])
+    designed = np.log10(_shown([p.designed for p in design.curve]))
+    low, middle, high = np.log10(_shown([p.random for p in design.curve])).T
+    target = np.nan if design.target is None else np.log10(design.target * 1e3)
+    names = "poses", "expected RMS error over the task [mm]"
+    plot = Plot(limits_of(n), limits_of(designed, low, high, target), names, powers=True)
+    if np.isfinite(target):
+        plot.level(float(target))
+    for values, kind in ((low, "b"), (high, "b"), (middle, "large b"), (designed, "large a")):
+        plot.dots(n, values, kind)
+    caption = f"{design.pool.robot.name}: expected error by the number of poses; blue designed, orange random"
+    return plot.chart(f"{caption} (half, and 80 % of them)")
+
+
+def _shown(errors: Sequence[object]) -> Floats:
+    """Errors [mm] for a picture, NaN where they are unknown."""
+    found: Floats = np.array(errors, dtype=np.float64)
+    return np.where(found < UNKNOWN_ABOVE, 1e3 * found, np.nan)
+
+
+def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
+    """Write where to measure, the job to be filled in, and what to expect.
+
+    Files of an earlier plan that this one has not are removed.
+
+    Args:
+        folder: Where to.
+        design: The design.
+        units: Of the tables and the job.
+
+    Returns:
+        The names of the files.
+
+    Raises:
+        InputError: The folder cannot be written, or holds files of these names that are no design's, or tables that
+            have been filled in.
+    """
+    names, write, own = _filling(folder, design, units)
+    fill_folder(folder, write, own)
+    return names
+
+
+def _filling(
+    folder: Path, design: Design, units: Units
+) -> tuple[tuple[str, ...], Callable[[Path], None], Mapping[str, bytes]]:
+    """The names of a plan's files, and what writes them.
+
+    Raises:
+        InputError: A table of this or an earlier plan has been filled in, or has the name of another file.
+    """
+    robot = design.pool.robot if design.pool.before is None else design.pool.before.robot
+    tables = design.tables if design.pool.scenario is not None else ()
+    files = {
+        name: to_fill_in(dict(columns) | _told(t.measurements.readings, robot, units, columns), touched=_is_touched(t))
+        for t in tables
+        for name, columns in table_columns(t, robot, units).items()
+    }
+    urdf = "robot.urdf" if robot.urdf is not None and tables else None
+    names = [CONFIGURATIONS, _DOCUMENT, "design.svg"]
+    if tables:
+        names += [*files, "robot.yaml", *([urdf] if urdf else []), "calibration.yaml"]
+
+    def write(into: Path) -> None:
+        write_csv(into / CONFIGURATIONS, _configurations(design, robot, units))
+        write_text(into / _DOCUMENT, json_text(design_document(design) | {"files": names}))
+        write_charts(into, {"design": [draw_design(design)]})
+        if not tables:
+            return
+        for name, columns in files.items():
+            write_csv(into / name, columns)
+        if urdf is not None:
+            write_urdf(into / urdf, robot)
+        write_robot(into / "robot.yaml", robot, units=units, urdf_name=urdf)
+        then = _CALIBRATE if design.pool.before is None else _UPDATE
+        write_text(into / "calibration.yaml", _JOB_BEGINS + then + _job_text(design, tables, units))
+
+    for name in files:
+        if name in (CONFIGURATIONS, "robot.yaml", "calibration.yaml"):
+            raise InputError(f"instruments: {Path(name).stem}", "the name of a file of the plan", "another name")
+    before = _files_before(folder)
+    for name in (*files, *before):
+        if name.endswith(".csv") and name != CONFIGURATIONS and is_filled_in(folder / name):
+            raise InputError(str(folder / name), "a table that has been filled in", "another folder")
+    whose = {_DOCUMENT: _BEGINS}  # first: it says of the others whose they are
+    own = whose | dict.fromkeys([*before, *names], b"") | {"calibration.yaml": _JOB_BEGINS.encode()} | whose
+    return tuple(names), write, own
+
+
+def _files_before(folder: Path) -> list[str]:
+    """Names of the files of an earlier plan in a folder; none where there was none."""
+    path = folder / _DOCUMENT
+    if not exists(path) or not read_bytes(path).startswith(_BEGINS):
+        return []
+    with suppress(ValueError, TypeError, AttributeError):  # changed by hand
+        return [name for name in json.loads(read_text(path)).get("files", ()) if Path(name).name == name]
+    return []
+
+
+def _is_touched(table: Table) -> bool:
+    """Whether something is touched, so that it is the joint readings that are measured."""
+    m = table.measurements
+    contact = table.model in ("anchor", "plane") and not np.any(0.0 if m.length is None else m.length)
+    return m.groups is not None or contact
+
+
+def _configurations(design: Design, robot: Robot, units: Units) -> dict[str, Any]:
+    """Where to go, in order, and where the tool then is by the arm as it is known."""
+    at = pose(design.pool.robot, design.readings).position
+    names = [f"q{i + 1}" for i in range(robot.n_joints)]
+    tables = {"table": np.where(design.group == "", "all", design.group)} if np.any(design.group != "") else {}
+    tool = {f"tool_{axis}": _shortened(at[:, k], units.factor("m"), "m") for k, axis in enumerate("xyz")}
+    return {"id": design.ids, **_told(design.readings, robot, units, names), **tables, **tool}
+
+
+def _told(readings: Floats, robot: Robot, units: Units, names: Collection[str]) -> dict[str, Floats]:
+    """The columns of joint readings among these names, shortened; such as would be beyond a limit then are whole."""
+    found = {}
+    for i, (joint, (lower, upper)) in enumerate(zip(robot.joints, robot.limits, strict=True)):
+        q, factor = readings[:, i], units.factor(joint.unit)
+        short = _shortened(q, factor, joint.unit)
+        found[f"q{i + 1}"] = np.where((short < lower / factor) | (short > upper / factor), q / factor, short)
+    return {name: column for name, column in found.items() if name in names}
+
+
+def _shortened(values: Floats, factor: float, unit: str) -> Floats:
+    """Values in another unit, in as many decimals as `FINEST` needs."""
+    out: Floats = np.round(values / factor, round(math.log10(factor / FINEST[unit])))
+    return out
+
+
+FINEST = {"rad": 1e-8, "m": 1e-9}
+"""What a figure that an arm is to be moved by is rounded to: far below what encoders and trackers tell apart."""
+
+
+def _job_text(design: Design, tables: Sequence[Table], units: Units) -> str:
+    """The job of the tables that are to be filled in."""
+    scenario = design.pool.scenario
+    assert scenario is not None
+    robot, sigma = design.pool.robot, tables[0].measurements.sigma_joint
+    joint = [units.from_si(s, j.unit) for s, j in zip(sigma, robot.joints, strict=True)]
+    keys = {key: value for key, value in scenario.job.items() if key not in ("model", "pairing", "noise")}
+    job: dict[str, Any] = {"robot": "robot.yaml", **keys, "units": asdict(units)}
+    job |= {"noise": {"joint": joint[0] if len(set(joint)) == 1 else joint}}
+    job |= instrument_keys(tables, units)
+    return yaml.safe_dump(job, sort_keys=False, default_flow_style=None, allow_unicode=True, width=math.inf)
