@@ -1,7 +1,7 @@
 """Whether a calibration is still good: new rows against the calibrated arm, and what changed if it is not.
 
 The rows say no more than noise and the calibration's own uncertainty make of them, or they do not: by chi-square, and
-by what single changes explain of it (see `suspects`), which sees a slip of one joint long before chi-square of many
+by what single changes explain of it (see `hypotheses`), which sees a slip of one joint long before chi-square of many
 rows does. Where limits are set they decide: an arm within them is good although its rows show a change, as long as that
 change stays within them everywhere.
 
@@ -19,18 +19,22 @@ import numpy as np
 from scipy import special
 
 from fg_calib.diagnostics.setup_check import check_tables
-from fg_calib.monitoring.change_hypotheses import (
+from fg_calib.monitoring.discriminating_design import Advice, separating
+from fg_calib.monitoring.hypotheses import (
+    CERTAIN,
+    WRONG,
+    HypothesisTest,
     best_refined,
+    check_hypotheses,
     effect_elsewhere,
     excludes,
     explains,
     likely_changes,
     merged,
-    suspects_of,
+    quantile,
     within,
+    zero_names,
 )
-from fg_calib.monitoring.discriminating_design import Advice, separating
-from fg_calib.monitoring.hypotheses import CERTAIN, WRONG, Found, quantile, zero_names
 from fg_calib.monitoring.new_data import Calibrated, Linear, Rows, linear, placed
 from fg_calib.options import LIMITED, Limits
 from fg_calib.statistics.acceptance import LEAST
@@ -49,7 +53,7 @@ POWER = 0.9
 """Probability with which a slip is to be found that is called detectable."""
 
 ALSO_SHOWN = 3
-"""Suspects that are told apart from the best, and shown beside it."""
+"""Suspects that are distinguished from the best, and shown beside it."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +72,7 @@ class Explanation:
         told_apart_from: What the rows say it is rather not, were it this.
         not_told_apart_from: Other changes that explain the rows as well.
         same: Parameters whose change makes the same of the arm everywhere, but for less than the noise of one row: they
-            need not be told apart.
+            need not be distinguished.
     """
 
     parameters: tuple[str, ...]
@@ -104,7 +108,7 @@ class Check:
         deploy: Whether to go on: with the calibration as it is, or with the change that explains the rows.
         detectable: Of each joint's zero the slip that these rows would show in 9 of 10 cases, [rad] (prismatic: [m]);
             None where they show none at all.
-        advice: What to measure to tell apart what these rows do not; None where there is nothing to.
+        advice: What to measure to distinguish what these rows do not; None where there is nothing to.
     """
 
     verdict: Verdict
@@ -144,15 +148,15 @@ def check_rows(calibrated: Calibrated, rows: Rows, limits: Limits) -> Check:
     whole = linear(calibrated, placed(calibrated, rows, calibrated.values))
     few = _too_few(whole)
     gross: list[str] = []
-    found: list[Found] = []
+    found: list[HypothesisTest] = []
     at = whole
     if not few:
-        found = suspects_of(calibrated, at)
+        found = check_hypotheses(calibrated, at)
         best = likely_changes(found, at)
-        while len(best) == 1 and best[0].suspect.kind == "row" and len(gross) < _most_gross(whole):
-            gross += best[0].suspect.names
-            at = at.without(best[0].suspect.columns)
-            found = [f for f in suspects_of(calibrated, at) if f.suspect.names[0] not in gross]
+        while len(best) == 1 and best[0].hypothesis.kind == "row" and len(gross) < _most_gross(whole):
+            gross += best[0].hypothesis.names
+            at = at.without(best[0].hypothesis.columns)
+            found = [f for f in check_hypotheses(calibrated, at) if f.hypothesis.names[0] not in gross]
             best = likely_changes(found, at)
     return _judged(calibrated, rows, limits, at, found, gross, few)
 
@@ -176,19 +180,19 @@ def _judged(
     rows: Rows,
     limits: Limits,
     at: Linear,
-    found: list[Found],
+    found: list[HypothesisTest],
     gross: list[str],
     few: str,
 ) -> Check:
     p_value = _p_value(calibrated, at) if at.dof > 0 else None
     likely = likely_changes(found, at)
-    if any(f.suspect.kind != "row" for f in likely):
+    if any(f.hypothesis.kind != "row" for f in likely):
         found = best_refined(calibrated, rows, at, found, likely) if not gross else found
         likely = likely_changes(found, at) or likely
     rms, noise, counts = _rms(calibrated, rows, at, gross)
-    alike = {f.suspect.names for f in likely}
+    alike = {f.hypothesis.names for f in likely}
     likely = merged(calibrated, likely, noise)
-    alike -= {f.suspect.names for f in likely}
+    alike -= {f.hypothesis.names for f in likely}
     stated = {kind: limit for kind in LIMITED if (limit := getattr(limits, kind)) is not None}
     elsewhere = effect_elsewhere(calibrated, likely[0]) if likely else None
     reasons, cautions = _reasons(at, p_value, found, likely, rms, noise, counts, stated, elsewhere, few)
@@ -200,7 +204,7 @@ def _judged(
     if verdict == "pass" and (missing or any(counts[kind] < LEAST for kind in stated if kind in counts)):
         what = missing or [kind for kind in stated if counts[kind] < LEAST]
         verdict, reasons = "not_evaluated", [f"a limit of {what[0]}, and fewer than {LEAST} rows to judge it by"]
-    alone = len(likely) == 1 and likely[0].suspect.kind != "row"
+    alone = len(likely) == 1 and likely[0].hypothesis.kind != "row"
     explained = bool(likely) and explains(likely[0], at)
     advice = separating(calibrated, at, likely, WRONG / max(len(found), 1)) if len(likely) > 1 else None
     made = Check(
@@ -214,7 +218,7 @@ def _judged(
         rms=rms,
         noise=noise,
         limits=stated,
-        explanations=_explanations([f for f in found if f.suspect.names not in alike], likely, at),
+        explanations=_explanations([f for f in found if f.hypothesis.names not in alike], likely, at),
         gross_rows=tuple(gross),
         deploy=verdict == "pass" or (verdict == "fail" and alone and explained),
         detectable=_detectable(calibrated, at, found),
@@ -241,9 +245,9 @@ def _unless_misread(found: Check, at: Linear) -> Check:
     return replace(nothing, verdict="not_evaluated", reasons=named, deploy=False)
 
 
-def _detectable(calibrated: Calibrated, at: Linear, found: Sequence[Found]) -> dict[str, float | None]:
+def _detectable(calibrated: Calibrated, at: Linear, found: Sequence[HypothesisTest]) -> dict[str, float | None]:
     """The slip of each joint's zero that is found with a probability of `POWER`."""
-    sigma = {name: float(f.sigma[0]) for f in found if f.k == 1 for name in (*f.suspect.names, *f.suspect.same)}
+    sigma = {name: float(f.sigma[0]) for f in found if f.k == 1 for name in (*f.hypothesis.names, *f.hypothesis.same)}
     least = np.sqrt(quantile(CERTAIN / max(len(found), 1), 1)) + special.ndtri(POWER)
     sizes = {name: least * sigma.get(name, np.nan) for name in zero_names(calibrated.robot)}
     return {name: float(size) if np.isfinite(size) else None for name, size in sizes.items()}
@@ -276,8 +280,8 @@ def _rms(
 def _reasons(
     at: Linear,
     p_value: float | None,
-    found: Sequence[Found],
-    likely: Sequence[Found],
+    found: Sequence[HypothesisTest],
+    likely: Sequence[HypothesisTest],
     rms: dict[str, float],
     noise: dict[str, float],
     counts: dict[str, int],
@@ -295,7 +299,7 @@ def _reasons(
         if rms[kind] ** 2 - noise[kind] ** 2 <= limit**2:
             cautions.append(f"{kind}: the noise stated hides whether the arm is within the limit")
         reasons.append(f"{kind}: RMS error {_shown(rms[kind], LIMITED[kind])}, limit {_shown(limit, LIMITED[kind])}")
-    changed = [f for f in likely if f.suspect.kind != "row"]
+    changed = [f for f in likely if f.hypothesis.kind != "row"]
     far = [kind for kind, size in (elsewhere or {}).items() if kind in limits and size > limits[kind]]
     reduced = at.chi2 / at.dof
     if changed and (not limits or far or elsewhere is None):
@@ -315,13 +319,13 @@ def _reasons(
     return reasons, cautions
 
 
-def _without_change(found: Sequence[Found], at: Linear) -> str:
+def _without_change(found: Sequence[HypothesisTest], at: Linear) -> str:
     """What residuals mean that are too large where no change is certain whatever the noise."""
-    of_arm = [f for f in found if f.suspect.kind != "row"]
+    of_arm = [f for f in found if f.hypothesis.kind != "row"]
     best = min(of_arm, key=lambda f: (not explains(f, at), f.k, f.left), default=None)
     if best is None or best.p_value >= CERTAIN or not explains(best, at):
         return ", and no change of the arm explains that: is the noise of these rows stated too small?"
-    change = " and ".join(best.suspect.names)
+    change = " and ".join(best.hypothesis.names)
     return f": their noise is stated too small, or a change such as of {change}; they are too few to say which"
 
 
@@ -329,31 +333,33 @@ def _shown(value: float, unit: str) -> str:
     return f"{value * 1e3:.4g} mm" if unit == "m" else f"{np.rad2deg(value):.4g} deg"
 
 
-def _explanations(found: Sequence[Found], likely: Sequence[Found], at: Linear) -> tuple[Explanation, ...]:
+def _explanations(
+    found: Sequence[HypothesisTest], likely: Sequence[HypothesisTest], at: Linear
+) -> tuple[Explanation, ...]:
     if not likely:
         return ()
-    names = {f.suspect.names for f in likely}
-    others = sorted((f for f in found if f.suspect.names not in names), key=lambda f: f.left)
+    names = {f.hypothesis.names for f in likely}
+    others = sorted((f for f in found if f.hypothesis.names not in names), key=lambda f: f.left)
     others = [f for f in others if not any(within(g, f) for g in likely)][:ALSO_SHOWN]
     scale = max(1.0, likely[0].left / max(at.dof - likely[0].k, 1))
     shown = [*likely, *others]
 
-    def explanation(f: Found) -> Explanation:
-        apart = tuple(g.suspect.names for g in shown if g is not f and excludes(f, g, scale, len(found)))
-        rivals = tuple(g.suspect.names for g in likely if g is not f and not excludes(f, g, scale, len(found)))
-        sized = f.suspect.kind != "row"
+    def explanation(f: HypothesisTest) -> Explanation:
+        apart = tuple(g.hypothesis.names for g in shown if g is not f and excludes(f, g, scale, len(found)))
+        rivals = tuple(g.hypothesis.names for g in likely if g is not f and not excludes(f, g, scale, len(found)))
+        sized = f.hypothesis.kind != "row"
         return Explanation(
-            parameters=f.suspect.names,
-            kind=f.suspect.kind,
+            parameters=f.hypothesis.names,
+            kind=f.hypothesis.kind,
             change=tuple(map(float, f.change)) if sized else (),
             sigma=tuple(float(s) if np.isfinite(s) else None for s in f.sigma) if sized else (),
-            units=f.suspect.units if sized else (),
+            units=f.hypothesis.units if sized else (),
             chi2_drop=f.drop,
             p_value=f.p_value,
-            likely=f.suspect.names in names,
+            likely=f.hypothesis.names in names,
             told_apart_from=apart,
             not_told_apart_from=rivals,
-            same=f.suspect.same,
+            same=f.hypothesis.same,
         )
 
     return tuple(map(explanation, shown))

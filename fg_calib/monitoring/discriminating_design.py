@@ -1,4 +1,4 @@
-"""Which configurations to measure beside those there are, so that explanations that these leave open are told apart.
+"""Which configurations to measure beside those there are, so that explanations that these leave open are distinguished.
 
 Of random configurations that could be measured like the rows there are (see `candidates`) those are taken, one after
 the other, that make the least difference of two explanations largest: with a_i d_i what explanation i makes of all
@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from fg_calib.arrays import FrozenArrays
 from fg_calib.monitoring.candidates import candidates
-from fg_calib.monitoring.change_hypotheses import motion
-from fg_calib.monitoring.hypotheses import Found, columns_of, quantile
+from fg_calib.monitoring.hypotheses import HypothesisTest, columns_of, motion, quantile
 from fg_calib.monitoring.new_data import Calibrated, Linear
 
 Floats = NDArray[np.float64]
@@ -55,16 +54,18 @@ class Advice(FrozenArrays):
     enough: bool
 
 
-def separating(calibrated: Calibrated, rows: Linear, likely: Sequence[Found], probability: float) -> Advice | None:
+def separating(
+    calibrated: Calibrated, rows: Linear, likely: Sequence[HypothesisTest], probability: float
+) -> Advice | None:
     """What to measure to tell the likely explanations apart; None where nothing measured like them helps.
 
     Args:
         calibrated: The arm.
         rows: The rows there are.
         likely: Explanations that they leave open.
-        probability: Of calling the true one told apart, one of them.
+        probability: Of calling the true one distinguished, one of them.
     """
-    known = [f for f in likely if f.suspect.kind != "row"]
+    known = [f for f in likely if f.hypothesis.kind != "row"]
     new = candidates(rows) if len(known) > 1 else None
     if new is None:
         return None
@@ -72,13 +73,13 @@ def separating(calibrated: Calibrated, rows: Linear, likely: Sequence[Found], pr
     needed = float(np.sqrt(quantile(probability, max(f.k for f in known)))) + MARGIN
     X = rows.system
     N = X.T @ X
-    own = [columns_of(f.suspect, calibrated)(rows) for f in known]
+    own = [columns_of(f.hypothesis, calibrated)(rows) for f in known]
     G = [rows.stacked(c) for c in own]
     cross = [X.T @ g for g in G]
     square = [[a.T @ b for b in G] for a in G]
     of_new = [_columns(calibrated, rows, f, new.columns, new.joints) for f in known]
     chosen: list[int] = []
-    sigma, between = [], (known[0].suspect.names, known[1].suspect.names)
+    sigma, between = [], (known[0].hypothesis.names, known[1].hypothesis.names)
     while len(chosen) < MOST_ADVISED:
         best, best_k, pair = -1.0, -1, (0, 1)
         for k in range(len(fitted)):
@@ -88,7 +89,7 @@ def separating(calibrated: Calibrated, rows: Linear, likely: Sequence[Found], pr
                 best, best_k, pair = D, k, worst
         chosen.append(best_k)
         sigma.append(float(np.sqrt(max(best, 0.0))))
-        between = known[pair[0]].suspect.names, known[pair[1]].suspect.names
+        between = known[pair[0]].hypothesis.names, known[pair[1]].hypothesis.names
         if sigma[0] < LEAST:
             return None
         if sigma[-1] >= needed:
@@ -99,10 +100,12 @@ def separating(calibrated: Calibrated, rows: Linear, likely: Sequence[Found], pr
 
 
 def _apart(
-    calibrated: Calibrated, known: Sequence[Found], between: Sequence[tuple[str, ...]], readings: Floats
+    calibrated: Calibrated, known: Sequence[HypothesisTest], between: Sequence[tuple[str, ...]], readings: Floats
 ) -> Floats:
     """How far the tool is apart by two explanations, shape (n,), [m]."""
-    one, other = (motion(calibrated, next(f for f in known if f.suspect.names == names), readings) for names in between)
+    one, other = (
+        motion(calibrated, next(f for f in known if f.hypothesis.names == names), readings) for names in between
+    )
     out: Floats = np.linalg.norm((one - other)[:, 1], axis=1)
     return out
 
@@ -113,7 +116,7 @@ def _least(
     square: list[list[Floats]],
     fitted: Floats,
     of_new: list[Floats],
-    known: Sequence[Found],
+    known: Sequence[HypothesisTest],
 ) -> tuple[float, tuple[int, int]]:
     """The least of what is left of one explanation with another fitted, and of which two."""
     X = fitted.reshape(-1, fitted.shape[2])
@@ -136,17 +139,17 @@ def _least(
     return best, pair
 
 
-def _columns(calibrated: Calibrated, rows: Linear, found: Found, columns: Floats, joints: Floats) -> Floats:
-    """Derivatives of candidates in a suspect, shape (n, h, k).
+def _columns(calibrated: Calibrated, rows: Linear, found: HypothesisTest, columns: Floats, joints: Floats) -> Floats:
+    """Derivatives of candidates in a hypothesis, shape (n, h, k).
 
     Args:
         calibrated: The arm.
         rows: The rows there are.
-        found: The suspect.
+        found: The hypothesis.
         columns: Derivatives in their columns, shape (n, h, n_columns + n_nuisance).
         joints: Derivatives in the joints' zeros, shape (n, h, n_joints).
     """
     n, h, wide = columns.shape
     flat = replace(rows, columns=columns.reshape(-1, wide), joints=joints.reshape(n * h, -1))
-    out: Floats = columns_of(found.suspect, calibrated)(flat).reshape(n, h, -1)
+    out: Floats = columns_of(found.hypothesis, calibrated)(flat).reshape(n, h, -1)
     return out
