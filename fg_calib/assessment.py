@@ -31,7 +31,7 @@ from fg_calib.statistics.covariance import Spread, spread_of, with_left_out, wit
 from fg_calib.statistics.cross_validation import CrossValidation
 from fg_calib.statistics.estimates import Estimates, estimates_at
 from fg_calib.statistics.goodness_of_fit import Fit, chi_square, judge_fit
-from fg_calib.statistics.outliers import judged_without_gross_errors
+from fg_calib.statistics.outliers import judge_without_outliers
 from fg_calib.statistics.prior_consistency import judge_priors
 from fg_calib.statistics.prior_scales import estimate_tolerances
 from fg_calib.statistics.residual_table import HeldOut, residual_table
@@ -289,7 +289,7 @@ def _assess(solution: Solution) -> Assessment:
     whole = with_unsure_tolerances(solution, with_left_out(solution, spread))
     identifiability = identifiability_of(*at_nominal(problem.whole or problem, solution.before), "practical")
     table = residual_table(solution)
-    goodness = judged_without_gross_errors(solution, spread, table, judge_fit(solution, spread, table))
+    goodness = judge_without_outliers(solution, spread, table, judge_fit(solution, spread, table))
     table = table.without(goodness.unknown(table))
     fit = Fit(chi_square(solution, spread), table, goodness, judge_priors(solution, spread))
     verdict = judge(solution, spread, fit, identifiability.missing)

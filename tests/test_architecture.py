@@ -54,7 +54,6 @@ FOLDERS = (
 UPWARD = {
     "graph/build": {"observability/indices"},
     "graph/information": {"observability/indices"},
-    "statistics/robust_screening": {"diagnostics/nominal_residuals"},
 }
 """Imports that still run upwards: none is added."""
 

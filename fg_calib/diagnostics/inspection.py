@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from fg_calib.arguments import checked
 from fg_calib.diagnostics.linearity import find_nonlinear_rows
+from fg_calib.diagnostics.robust_screening import Disagreements, find_disagreements, fit_roughly
 from fg_calib.diagnostics.setup_check import SetupCheck, check_tables
 from fg_calib.diagnostics.setup_hypotheses import MOTION_M, MOTION_RAD
 from fg_calib.errors import escaped
@@ -32,7 +33,6 @@ from fg_calib.observability.reasons import NOT_EXCITED
 from fg_calib.prediction.tool_pose import ExpectedError, expected_error
 from fg_calib.robot.model import Robot
 from fg_calib.statistics.covariance import spread_of, with_left_out
-from fg_calib.statistics.robust_screening import Disagreements, find_disagreements, fit_roughly
 from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]

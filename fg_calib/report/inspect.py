@@ -17,6 +17,7 @@ from fg_calib.arguments import checked
 from fg_calib.diagnostics.inspection import Inspection
 from fg_calib.diagnostics.linearity import NEAR_SIGMAS
 from fg_calib.diagnostics.nominal_residuals import MAX_ROWS
+from fg_calib.diagnostics.robust_screening import Disagreements
 from fg_calib.diagnostics.setup_check import SetupCheck
 from fg_calib.io.atomic import fill_folder, write_text
 from fg_calib.io.result import Observability as Document
@@ -41,7 +42,6 @@ from fg_calib.report.tables import (
     weak_directions,
 )
 from fg_calib.report.text import expected_tool_error
-from fg_calib.statistics.robust_screening import Disagreements
 
 FILES = {
     "observability.json": b'{\n "schema": "fg-calib/observability/',

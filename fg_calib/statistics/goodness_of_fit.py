@@ -1,29 +1,23 @@
-"""Goodness of fit: do the residuals look like the noise that was stated, kind by kind, row by row?
+"""Goodness of fit: do the residuals look like the specified noise, kind by kind, row by row?
 
 With C the covariance of the rows' noise, J their derivatives and Cov the covariance of a generalised least-squares
-estimate (priors included), the residuals have covariance `A = C - J Cov J^T`, whatever errors the rows share. So the
-*leverage* of a row, `J_i Cov J_i^T / sigma_i^2`, is what the fit takes off its variance, and over the rows of one kind
+estimate (priors included), the residuals have covariance `A = C - J Cov J^T`, whatever errors the rows share (see
+`residual_covariance`). So the *leverage* of a row, `J_i Cov J_i^T / sigma_i^2`, is what the fit takes off its variance,
+and over the rows of one kind
 
     sum (r_i / sigma_i)^2    has mean  n - sum of leverage,  and variance  2 tr(A^2)  with A in units of sigma.
 
 It is compared with a chi-square distribution of `nu = (tr A)^2 / tr(A^2)` degrees of freedom, scaled to that mean
-(Satterthwaite 1946). p-values are upper ones: the probability that noise as stated makes a sum as large; near 0 the
-residuals are too large, near 1 too small. C is `D + L L^T`, D diagonal and L sparse, so no n x n matrix is formed.
-
-Rows weighted as independent although they share errors are another matter: with K the inverse of J^T W J and priors,
-`A = (1 - J K J^T W) C (1 - J K J^T W)^T` and what the priors add. It is worked out for up to `MAX_DENSE` rows; beyond
-that the mean is that of all rows, shared among the kinds by leverage, and there is no p-value.
+(Satterthwaite 1946). p-values are upper ones: the probability that the specified noise makes a sum as large; near 0 the
+residuals are too large, near 1 too small. Of more than `MAX_INDEPENDENT` rows weighted as independent although they
+share errors the mean is that of all rows, shared among the kinds by leverage, and there is no p-value.
 
 A row with robust weight w counts as w rows. There is no p-value where weights or noise came from the residuals.
 
-Rows that were predicted, never fitted, miss by their own noise and by what the estimate is off: `A = C + J Cov J^T`,
-less what both have from errors of configurations that fitted rows took part in as well (`Errors.of_prediction`).
-Each kind is judged by the sum of its studentised squares. All of them together are judged by `r^T A^-1 r`, which
-sees what misses where the arm is well known although it may be off by more elsewhere. Where the noise was estimated,
-this is a ratio of two variances (F); with a robust loss measurements that it would call outliers count for nothing.
-
-A point that test rows alone touched is taken for the mean of what touched it, at B e with e the rows without it. With N
-the derivatives of all rows in such points, `N B e` is what this adds to them, to derivatives and errors alike.
+Rows that were predicted, never fitted, miss by their own noise and by what the estimate is off. Each kind is judged by
+the sum of its studentised squares. All of them together are judged by `r^T A^-1 r`, which is sensitive where the arm is
+well known although it may be off by more elsewhere. Where the noise was estimated, this is a ratio of two variances
+(F); with a robust loss measurements that it would call outliers count for nothing.
 
 References:
     Satterthwaite (1946), An approximate distribution of estimates of variance components. Biometrics Bulletin 2(6).
@@ -32,19 +26,15 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
-import scipy.sparse
 from numpy.typing import NDArray
 from pydantic import computed_field
 from scipy import special
 
 from fg_calib.arrays import Booleans, Figure, Floats, FrozenArrays, Integers
-from fg_calib.graph.factors import prior_rows
 from fg_calib.graph.information import eliminated
 from fg_calib.graph.noise import JOINT_NOISE, NoiseName
 from fg_calib.graph.problem import Problem, mahalanobis_distances, noises_at
@@ -53,16 +43,13 @@ from fg_calib.graph.solver import Solution
 from fg_calib.measurements.residuals import squares_along
 from fg_calib.robot.kinematics import SPAN
 from fg_calib.statistics.covariance import Spread
-from fg_calib.statistics.gross_errors import MOST_FEW, find_gross_errors
-from fg_calib.statistics.low_rank import Dense, LowRank
 from fg_calib.statistics.prior_consistency import PriorFit
-from fg_calib.statistics.residual_covariance import Errors, Nuisances, half_of
-from fg_calib.statistics.residual_table import ALARM, ResidualTable, suspect_level
+from fg_calib.statistics.residual_covariance import ResidualCovariance, RowErrors, RowModel, square_root
+from fg_calib.statistics.residual_table import ALARM, MAX_OUTLIER_SHARE, ResidualTable, suspect_level
 
 Codes = NDArray[np.int8]
-Loadings = scipy.sparse.csr_array
 
-MAX_DENSE = 3000
+MAX_INDEPENDENT = 3000
 """Rows up to which the covariance of residuals is formed where they are weighted as independent but are not."""
 
 MAX_KEPT = 300_000
@@ -80,13 +67,17 @@ FLAGS = ("", "suspect", "outlier", "excluded", "test")
 LEAST_VARIANCE = 1e-6
 """Variance of a residual, over that of its noise, below which the row is met whatever was measured."""
 
-MAX_TOGETHER = 200
-"""Rows of one configuration up to which they may be one gross error."""
-
 LEAST_GAIN = 0.3
 """Part of the excess of chi-square that is left at most without outliers, where more than these is wrong."""
 
-_CHUNK, _FEW = 4 * SPAN, SPAN // 4
+CONFIDENCE = 0.999
+"""A sum of squares outside this central interval of its distribution is not by chance."""
+
+FACTOR = 2.0
+"""A reduced chi-square between 1 / FACTOR and FACTOR is good whatever its distribution: noise is never known better."""
+
+_CHUNK, _CHUNK_WITH_STATES = 4 * SPAN, SPAN // 4
+"""Measurements whose rows are linearised at once: those with private noise alone, and others."""
 
 _MEDIAN = 0.6744897501960817
 """Median of the size of a standard normal figure."""
@@ -157,7 +148,7 @@ class KindFit:
         far = self.largest > suspect_level(self.n) * np.sqrt(max(self.typical, 1.0) * ratio)
         if share > 0.65 or not far:
             return "too small"  # the median of few rows varies: perhaps none of them is far from the others
-        many = self.n_beyond > MOST_FEW * self.n
+        many = self.n_beyond > MAX_OUTLIER_SHARE * self.n
         return "many" if many else "outliers" if share < 0.35 else "both"
 
     def _without_gross_errors(self, rest: KindFit) -> str:
@@ -328,14 +319,13 @@ def judge_fit(solution: Solution, spread: Spread, table: ResidualTable) -> Goodn
         spread: Its covariance.
         table: Its residuals.
     """
-    rows = _Rows(solution, spread, table)
-    weight = rows.weight
+    rows = RowStatistics(solution, spread, table)
     level = suspect_level(int(np.sum(table.reason_code == 0)))
     with np.errstate(invalid="ignore"):
         suspicious = np.abs(rows.studentised) > level
     flag = np.zeros(table.n, dtype=np.int8)
     flag[suspicious] = FLAGS.index("suspect")
-    flag[weight < OUTLIER_WEIGHT] = FLAGS.index("outlier")
+    flag[rows.weight < OUTLIER_WEIGHT] = FLAGS.index("outlier")
     flag[table.test] = FLAGS.index("test")
     flag[table.reason_code != 0] = FLAGS.index("excluded")
 
@@ -344,62 +334,42 @@ def judge_fit(solution: Solution, spread: Spread, table: ResidualTable) -> Goodn
         return found[np.argsort(-np.abs(rows.studentised[found]), kind="stable")]
 
     return Goodness(
-        kinds=rows.kinds(),
+        kinds=rows.fit_kinds(),
         leverage=rows.leverage,
         studentised=rows.studentised,
-        weight=weight,
+        weight=rows.weight,
         flag=flag,
         level=level,
         suspects=worst_first((flag == FLAGS.index("suspect")) | (flag == FLAGS.index("outlier"))),
-        configurations=rows.fitted.configurations(),
-        test=rows.predicted_fit(worst_first(suspicious & (flag == FLAGS.index("test")))),
+        configurations=rows.fitted.suspect_configurations() if not rows.robust else (),
+        test=rows.fit_predicted(worst_first(suspicious & (flag == FLAGS.index("test")))),
     )
 
 
-def gross_errors(solution: Solution, spread: Spread, table: ResidualTable) -> Booleans | None:
-    """Rows of the table that spoil the fit, few of it, shape (n,); None if there are none, or it cannot be told.
-
-    Args:
-        solution: The solution, or parameters near which the problem is linear.
-        spread: The covariance there.
-        table: The residuals there.
-    """
-    return _Rows(solution, spread, table).gross_errors()
-
-
-def kind_fits(solution: Solution, spread: Spread, table: ResidualTable) -> tuple[KindFit, ...]:
-    """Goodness of fit by kind alone (see `judge_fit`)."""
-    return _Rows(solution, spread, table).kinds()
-
-
 @dataclass(frozen=True)
-class _Part:
+class JudgedRows:
     """Rows that are judged together: those fitted, or those predicted.
 
     Attributes:
         table: All rows.
-        rows: Those of the part.
+        rows: Those that are judged.
         squares: Their squared residuals over sigma, by robust weight.
         means: Means of these.
         covariance: Of the residuals over sigma; None where that is not known.
         shared: Whether rows share errors of configurations.
-        judged: Whether there are p-values, and configurations worth a look.
-        n_ends: Number of configurations and groups.
-        behind: Degrees of freedom behind the noise that rows were divided by, by kind; infinite where it was stated.
+        noise_degrees: Degrees of freedom of the noise that rows were divided by, by kind; infinite where specified.
     """
 
     table: ResidualTable
     rows: Integers
     squares: Floats
     means: Floats
-    covariance: LowRank | Dense | None
+    covariance: ResidualCovariance | None
     shared: bool
-    judged: bool
-    n_ends: int
-    behind: Floats
+    noise_degrees: dict[int, float] = field(default_factory=dict)
 
     def of_kind(self, code: int) -> Integers:
-        """Places in the part of one of the table's groups."""
+        """Places among the judged rows of one of the table's groups."""
         return np.flatnonzero(self.table.group[self.rows] == code)
 
     def degrees(self, chosen: Integers) -> float:
@@ -407,274 +377,226 @@ class _Part:
         if self.covariance is not None:
             trace, square = self.covariance.moments(chosen)
         else:
-            v = self.means[chosen]
-            trace = float(np.sum(v))
-            v *= v
-            square = float(np.sum(v))
+            trace, square = float(np.sum(self.means[chosen])), float(np.sum(self.means[chosen] ** 2))
         nu = trace**2 / square if square > 0.0 else 1.0
         return nu if self.covariance is not None or not self.shared else min(nu, 3.0)
 
-    def p_value(self, chosen: Integers, chi2: float, degrees: float) -> float:
-        """Probability of a sum of squares as large, with the rows' `degrees` of freedom."""
-        ratio = chi2 / float(np.sum(self.means[chosen]))
-        return upper_probability(ratio, degrees, self.degrees_behind(chosen))
-
-    def degrees_behind(self, chosen: Integers) -> float:
-        """Degrees of freedom behind the noise that some rows were divided by."""
-        if not np.isfinite(self.behind).any():
-            return np.inf
+    def degrees_of_noise(self, chosen: Integers) -> float:
+        """Degrees of freedom of the noise that some rows were divided by."""
         by_kind = np.bincount(self.table.group[self.rows[chosen]], self.means[chosen], len(self.table.groups))
-        variance = float(np.sum(by_kind**2 / self.behind))
+        variance = sum(float(by_kind[code]) ** 2 / degrees for code, degrees in self.noise_degrees.items())
         return float(np.sum(by_kind)) ** 2 / variance if variance > 0.0 else np.inf
 
-    def configurations(self) -> tuple[SuspectConfiguration, ...]:
+    def suspect_configurations(self) -> tuple[SuspectConfiguration, ...]:
         """Configurations whose rows are too large together, the least likely first."""
-        if not self.judged:
-            return ()  # outliers have been found already
-        place, end = self.table.row_ends(self.rows)
-        chi2, expected = (np.bincount(end, v[place], self.n_ends) for v in (self.squares, self.means))
-        count = np.bincount(end, minlength=self.n_ends)
-        looked_at = np.flatnonzero(expected > 1e-3)
-        limit = ALARM / max(1, len(looked_at))
+        (place, end), n = self.table.row_ends(self.rows), len(self.table.names)
+        chi2, expected = (np.bincount(end, v[place], n) for v in (self.squares, self.means))
+        count, known = np.bincount(end, minlength=n), expected > 1e-3
+        limit = ALARM / max(1, int(np.sum(known)))
         # No effective number of degrees of freedom is below 1, where the tail is heaviest.
-        least = 2.0 * special.erfcinv(limit) ** 2
-        found = []
-        for k in looked_at[chi2[looked_at] > least * expected[looked_at]]:
-            nu = max(1.0, self.degrees(np.unique(place[end == k])))
-            ratio = chi2[k] / expected[k]
-            if special.gammaincc(nu / 2.0, nu / 2.0 * ratio) < limit:
+        least, found = 2.0 * special.erfcinv(limit) ** 2, []
+        for k in np.flatnonzero(known & (chi2 > least * expected)).tolist():
+            nu, ratio = max(1.0, self.degrees(np.unique(place[end == k]))), chi2[k] / expected[k]
+            if upper_probability(ratio, nu) < limit:
                 strength = 0.5 * nu * (ratio - 1.0 - np.log(ratio))  # -log p, nearly; never underflows
-                found.append(
-                    (strength, SuspectConfiguration(int(k), int(count[k]), float(chi2[k]), float(expected[k])))
-                )
+                found.append((strength, SuspectConfiguration(k, int(count[k]), float(chi2[k]), float(expected[k]))))
         return tuple(one for _, one in sorted(found, key=lambda pair: -pair[0]))
 
 
-class _Rows:
+class RowStatistics:
     """The rows of a residual table with the variance of their residuals.
+
+    Args:
+        solution: The solution.
+        spread: Its covariance.
+        table: Its residuals.
 
     Attributes:
         leverage: See `Goodness`.
         studentised: See `Goodness`.
         weight: See `Goodness`.
+        robust: Whether a robust loss weights the rows.
         fitted: The rows fitted.
+        errors: What the fitted rows follow from, over sigma; None where that takes too much memory.
         predicted: The rows predicted that can be judged.
     """
 
     def __init__(self, solution: Solution, spread: Spread, table: ResidualTable) -> None:
-        problem = self._problem = solution.problem
-        self._table = table
-        self._spread = spread
-        self._solution = solution
-        self._noises = solution.noises
-        self._robust = problem.state.weights is not None
-        self.weight: Floats = np.broadcast_to(1.0, table.n)
-        if self._robust:
-            self.weight = np.ones(table.n)
+        problem = self.problem = solution.problem
+        self.table, self.spread, self.solution, self._noises = table, spread, solution, solution.noises
+        self.robust, self.carried = problem.state.weights is not None, not problem.missing_correlation
+        self.weight: Floats = np.ones(table.n) if self.robust else np.broadcast_to(1.0, table.n)
         for number, weights in enumerate(problem.state.weights or ()):
-            mine = table.series == number
+            mine = table.rows_of(number)
             self.weight[mine] = weights[table.measurement[mine]]
         fitted, test = np.flatnonzero(table.used), np.flatnonzero(table.test & (table.reason_code == 0))
         self._shared = any(noise.sources for noise in self._noises)
-        self._carried = not problem.missing_correlation
-        most = MAX_KEPT if self._carried and self._shared else MAX_DENSE
+        most = MAX_KEPT if self.carried and self._shared else MAX_INDEPENDENT
         keep = np.zeros(table.n, dtype=np.bool_)
-        keep[fitted] = len(fitted) <= most and not self._robust
+        keep[fitted] = len(fitted) <= most and not self.robust
         keep[test] = len(test) <= MAX_KEPT
-        of_kept = np.flatnonzero(keep)
-        all_kept = self._read(keep)
+        kept, of_kept = np.flatnonzero(keep), self._read(keep)
         w = self.weight
         variance = np.where(table.used, 1.0 - 2.0 * w, 1.0)  # in place, as of a million rows each array counts
         variance *= self.leverage
         variance += 1.0
-        covariance, self._errors = None, None
+        covariance, self.errors = None, None
         if keep[fitted].all():
-            self._errors = all_kept.at(np.searchsorted(of_kept, fitted))
-            covariance = self._residual_covariance(fitted, self._errors)
-        if isinstance(covariance, Dense):
-            variance[fitted] = covariance.diagonal
-        self.studentised = np.sqrt(np.maximum(variance, 1e-12))
+            self.errors = of_kept.at(np.searchsorted(kept, fitted))
+            if self.carried:
+                covariance = self.errors.fitted(spread.tangent)
+            else:
+                of = table.measurement_number[fitted]
+                covariance = self.errors.fitted_as_independent(spread.tangent, of)
+                variance[fitted] = covariance.diagonal
         with np.errstate(invalid="ignore", divide="ignore"):
-            self.studentised *= table.sigma
-            np.divide(table.after, self.studentised, out=self.studentised)
+            self.studentised: Floats = table.after / (table.sigma * np.sqrt(np.maximum(variance, 1e-12)))
+            squares = (table.after / table.sigma) ** 2
         self.studentised[variance < LEAST_VARIANCE] = np.nan
-        squares = table.after / table.sigma
-        squares *= squares
-        of_test = squares[test]
-        if self._robust:
-            squares, variance = w * squares, w * variance
-        if len(fitted) < table.n:
-            squares, variance = squares[fitted], variance[fitted]
-        self.fitted = self._part(fitted, squares, variance, covariance)
-        self.predicted, self._outliers, self._n_unknown = self._predict(test, of_test, of_kept, all_kept)
+        chosen = slice(None) if len(fitted) == table.n else fitted
+        of_fitted, means = w[chosen] * squares[chosen], w[chosen] * variance[chosen]
+        self.fitted = JudgedRows(table, fitted, of_fitted, means, covariance, self._shared)
+        self.predicted = self._predict(test, squares[test], kept, of_kept)
 
-    def kinds(self) -> tuple[KindFit, ...]:
+    def _read(self, keep: Booleans) -> RowErrors:
+        """Leverage of every row; what the rows to keep follow from, over sigma."""
+        table, tangent = self.table, self.spread.tangent
+        model = RowModel(self.problem, self.solution.parameters, self._noises)
+        self.leverage: Floats = np.full(table.n, np.nan)
+        kept, root, asked = [model.empty()], square_root(tangent), keep | table.test
+        for number, noise in enumerate(self._noises):
+            measured, last = noise.series.measured, table.rows_of(number).start
+            step = _CHUNK if model.is_plain(number) else _CHUNK_WITH_STATES
+            for start in range(0, noise.series.n, step):
+                chunk = slice(start, min(start + step, noise.series.n))
+                first, last = last, last + int(np.sum(measured[chunk]))
+                rows = slice(first, last)
+                if model.is_plain(number) and not asked[rows].any():
+                    moments = noise.moments_at(chunk)
+                    squares = squares_along(noise.rows_at(chunk, moments), model.chain(number), root)
+                    of_rows = (squares + np.maximum(moments.variance, 0.0))[measured[chunk]]
+                    self.leverage[rows] = of_rows / table.sigma[rows] ** 2 - 1.0
+                    continue
+                found = model.errors(number, np.arange(chunk.start, chunk.stop))
+                found = found.at(np.flatnonzero(measured[chunk])).over(table.sigma[rows])
+                leverage, test = np.einsum("ij,ij->i", found.J @ tangent, found.J), table.test[rows]
+                leverage[test] = self.spread.variance(found.J[test])
+                self.leverage[rows] = leverage + np.sum(found.own**2, axis=1) + (found.noise - 1.0)
+                kept.append(found.at(np.flatnonzero(keep[rows])))
+        self.leverage[~np.isfinite(self.leverage)] = np.nan
+        return RowErrors.joined(kept)
+
+    def fit_kinds(self) -> tuple[KindFit, ...]:
         """The fit of the fitted rows by kind."""
-        part, groups = self.fitted, range(len(self._table.groups))
-        excess = np.zeros(len(groups))
-        if not self._carried and part.covariance is None:
-            leverage = self.weight[part.rows] * self.leverage[part.rows]
-            by_kind = np.array([np.nansum(leverage[part.of_kind(code)]) for code in groups])
-            excess = self._spread.excess * by_kind / by_kind.sum() if by_kind.sum() > 0.0 else excess
-        known = not self._robust and self._solution.estimated_noise is None
+        part, excess = self.fitted, np.zeros(len(self.table.groups))
+        if not self.carried and part.covariance is None:
+            leverage = np.nan_to_num(self.weight[part.rows] * self.leverage[part.rows])
+            by_kind = np.bincount(self.table.group[part.rows], leverage, len(excess))
+            excess[:] = self.spread.excess * by_kind / max(float(by_kind.sum()), 1e-300)
+        known = not self.robust and self.solution.estimated_noise is None
         known &= part.covariance is not None or not self._shared
-        found = (self._kind(part, code, float(excess[code]), known) for code in groups)
-        return tuple(fit for fit in found if fit is not None)
+        return self._fit_kinds(part, excess, known)
 
-    def gross_errors(self) -> Booleans | None:
-        """Rows of the table that spoil the fit, few of it; None if there are none, or it cannot be told."""
-        problem, rows = self._problem, self.fitted.rows
-        if self._robust or not self._carried or self._errors is None:
-            return None
-        unknowns = self._spread.rank + self._errors.own.shape[1]
-        dof = problem.n_independent + problem.n_priors + problem.n_added + problem.n_known - unknowns
-        z = self._table.after[rows] / self._table.sigma[rows]
-        found = find_gross_errors(
-            z,
-            self._errors,
-            self._spread.tangent,
-            self._units(),
-            dof,
-            prior_rows(problem.variables, self._solution.parameters),
-        )
-        if found is None:
-            return None
-        out = np.zeros(self._table.n, dtype=np.bool_)
-        out[rows[found]] = True
-        return out
-
-    def _units(self) -> list[Integers]:
-        """Places among the fitted rows of what may be one gross error: a measurement, all of one configuration."""
-        rows = self.fitted.rows
-        _, of = np.unique(self._measurement(rows), return_inverse=True)
-        order = np.argsort(of, kind="stable")
-        units = np.split(order, np.flatnonzero(np.diff(of[order])) + 1)
-        ends = np.concatenate([self._table.a[rows], self._table.b[rows]])
-        place = np.tile(np.arange(len(rows)), 2)[ends >= 0]
-        ends = ends[ends >= 0]
-        order = np.argsort(ends, kind="stable")
-        of_ends = np.split(place[order], np.flatnonzero(np.diff(ends[order])) + 1)
-        most = min(MAX_TOGETHER, MOST_FEW * len(rows))
-        several = [those for those in of_ends if len(those) <= most and len(np.unique(of[those])) > 1]
-        return [*units, *(np.unique(those) for those in several)]
-
-    def predicted_fit(self, suspects: Integers) -> PredictedFit | None:
+    def fit_predicted(self, suspects: Integers) -> PredictedFit | None:
         """The fit of the predicted rows; None without any that can be judged.
 
         Args:
             suspects: The rows of the table among them that are too large.
         """
-        part = self.predicted
-        if not (len(part.rows) or self._outliers.test):
+        part, table = self.predicted, self.table
+        test = np.flatnonzero(table.test & (table.reason_code == 0))
+        outliers = self._count_outliers(test)
+        if not (len(part.rows) or outliers.test):
             return None
-        chosen = self._chosen(part)
-        chi2, expected, nu = self._whitened(part, chosen)
-        behind = part.degrees_behind(np.arange(len(part.rows)))
-        found = (self._kind(part, code, 0.0, True) for code in range(len(self._table.groups)))
+        chosen = np.arange(len(part.rows))
+        if part.covariance is not None and len(chosen):
+            chosen = np.unique(np.linspace(0, len(chosen) - 1, min(len(chosen), MAX_WHITENED)).round().astype(np.int64))
+            z = np.sign(table.after[part.rows[chosen]]) * np.sqrt(part.squares[chosen])
+            chi2, expected, nu = part.covariance.at(chosen).whitened(z)
+        else:
+            chi2, expected, nu = float(np.sum(part.squares)), float(np.sum(part.means)), part.degrees(chosen)
+        of_noise = part.degrees_of_noise(np.arange(len(part.rows)))
         return PredictedFit(
-            kinds=tuple(fit for fit in found if fit is not None),
+            kinds=self._fit_kinds(part, np.zeros(len(table.groups)), known=True),
             n_rows=len(part.rows),
             n=len(chosen),
-            outliers=self._outliers,
-            n_unknown=self._n_unknown,
+            outliers=outliers,
+            n_unknown=int(np.sum(~np.isfinite(self.leverage[test]))),
             chi2=chi2,
             expected=expected,
-            p_value=upper_probability(chi2 / expected, nu, behind) if len(part.rows) else 1.0,
+            p_value=upper_probability(chi2 / expected, nu, of_noise) if len(part.rows) else 1.0,
             suspects=suspects,
-            configurations=part.configurations(),
+            configurations=part.suspect_configurations() if not self.robust else (),
         )
 
-    def _chosen(self, part: _Part) -> Integers:
-        """Which of the predicted rows are looked at together: of many that are whitened some, evenly spaced."""
-        n = len(part.rows)
-        if part.covariance is None:
-            return np.arange(n)
-        return np.unique(np.linspace(0, n - 1, min(n, MAX_WHITENED)).round().astype(np.int64))
+    def _fit_kinds(self, part: JudgedRows, excess: Floats, known: bool) -> tuple[KindFit, ...]:
+        """The fit of each of the table's groups, whose chi-square has a mean lower by `excess`."""
+        specified, private = self._specified_sigmas()
+        found = []
+        for code, (number, family) in enumerate(self.table.groups):
+            chosen = part.of_kind(code)
+            if not len(chosen):
+                continue
+            rows = part.rows[chosen]
+            total, mean = float(np.sum(part.squares[chosen])), float(np.sum(part.means[chosen]))
+            expected, degrees, size = mean - excess[code], part.degrees(chosen), np.abs(self.studentised[rows])
+            enough = expected >= 1.0
+            factor = own_factor = self.problem.state.factors.get((number, family), 1.0)
+            if (number, family) in self._with_joint_noise():
+                factor = float(np.sqrt(np.mean(self.table.sigma[rows] ** 2) / np.mean(specified[rows] ** 2)))
+            p_value = (
+                upper_probability(total / mean, degrees, part.degrees_of_noise(chosen)) if enough and known else None
+            )
+            found.append(
+                KindFit(
+                    kind=family,
+                    unit=self.table.unit(family),
+                    n=len(rows),
+                    stated_sigma_rms=float(np.sqrt(np.mean(self.table.sigma[rows] ** 2))) / factor,
+                    factor=factor,
+                    seen_over_stated=factor * float(np.sqrt(total / expected)) if enough else np.nan,
+                    chi2=total,
+                    expected=max(float(expected), 0.0),
+                    p_value=p_value,
+                    typical=float(np.nanmedian(size)) / _MEDIAN if enough else np.nan,
+                    largest=float(np.nanmax(size)) if enough else np.nan,
+                    degrees=degrees,
+                    table=number,
+                    n_beyond=int(np.sum(size > suspect_level(len(rows)))),
+                    own_sigma_rms=float(np.sqrt(np.mean(private[rows] ** 2))),
+                    own_factor=own_factor,
+                )
+            )
+        return tuple(found)
 
-    def _whitened(self, part: _Part, chosen: Integers) -> tuple[float, float, float]:
-        """Sum of the squares of the chosen predicted rows, whitened together; its mean, and its degrees of freedom.
-
-        What pairs formed from poses do not share counts as `PRIVATE_SHARE` of their variance at least, as in the fit.
-        """
-        if not isinstance(part.covariance, LowRank) or not len(chosen):
-            return float(np.sum(part.squares)), float(np.sum(part.means)), part.degrees(chosen)
-        z = np.sign(self._table.after[part.rows[chosen]]) * np.sqrt(part.squares[chosen])
-        return part.covariance.at(chosen).whitened(z)
-
-    def _part(self, rows: Integers, squares: Floats, means: Floats, covariance: LowRank | Dense | None) -> _Part:
-        behind = np.full(len(self._table.groups), np.inf)
-        n_ends = len(self._table.names)
-        return _Part(self._table, rows, squares, means, covariance, self._shared, not self._robust, n_ends, behind)
-
-    def _kind(self, part: _Part, code: int, excess: float, known: bool) -> KindFit | None:
-        """The fit of one of the table's groups, whose chi-square has a mean lower by `excess`; None without rows."""
-        chosen = part.of_kind(code)
-        if not len(chosen):
-            return None
-        chi2, expected = float(np.sum(part.squares[chosen])), float(np.sum(part.means[chosen])) - excess
-        rows, (table, family) = part.rows[chosen], self._table.groups[code]
-        factor = self._factor(rows, (table, family))
-        enough, degrees = expected >= 1.0, part.degrees(chosen)
-        size = np.abs(self.studentised[rows])
-        n_beyond, largest = int(np.sum(size > suspect_level(len(rows)))), float(np.nanmax(size)) if enough else np.nan
-        typical = float(np.nanmedian(size, overwrite_input=True)) / _MEDIAN if enough else np.nan
-        return KindFit(
-            kind=family,
-            table=table,
-            unit=self._table.unit(family),
-            n=len(rows),
-            stated_sigma_rms=float(np.sqrt(np.mean(self._table.sigma[rows] ** 2))) / factor,
-            factor=factor,
-            seen_over_stated=factor * float(np.sqrt(chi2 / expected)) if enough else np.nan,
-            chi2=chi2,
-            expected=max(expected, 0.0),
-            p_value=part.p_value(chosen, chi2, degrees) if enough and known else None,
-            typical=typical,
-            largest=largest,
-            degrees=degrees,
-            n_beyond=n_beyond,
-            own_sigma_rms=float(np.sqrt(np.mean(self._stated[1][rows] ** 2))),
-            own_factor=self._problem.state.factors.get((table, family), 1.0),
-        )
-
-    def _factor(self, rows: Integers, group: NoiseName) -> float:
-        """What the sigmas of rows of one group were multiplied by: RMS sigma as taken over RMS sigma as stated."""
-        if group not in self._with_joint_noise:
-            return self._problem.state.factors.get(group, 1.0)
-        as_taken, as_stated = (float(np.mean(sigma[rows] ** 2)) for sigma in (self._table.sigma, self._stated[0]))
-        return float(np.sqrt(as_taken / as_stated))
-
-    @cached_property
-    def _with_joint_noise(self) -> frozenset[NoiseName]:
+    def _with_joint_noise(self) -> set[NoiseName]:
         """Groups of rows that have noise of the joint readings."""
-        return frozenset(
+        return {
             (noise.series.table, name.partition(".")[0])
             for noise in self._noises
             if any(source.name == "joints" and source.loading.any() for source in noise.sources)
             for name in noise.series.kind.names
-        )
+        }
 
-    @cached_property
-    def _stated(self) -> tuple[Floats, Floats]:
-        """1 sigma of each row of the table with all noise as stated, and that without the joints', shapes (n,)."""
-        problem, table, noises, total = self._problem, self._table, self._noises, self._table.sigma
+    def _specified_sigmas(self) -> tuple[Floats, Floats]:
+        """1 sigma of each row with all noise as specified, and that without the joints', shapes (n,)."""
+        problem, noises, total = self.problem, self._noises, self.table.sigma
         if problem.state.factors:
-            as_stated = replace(problem, state=replace(problem.state, factors={}))
-            noises = noises_at(as_stated, self._solution.parameters, at_readings=True)
+            as_specified = replace(problem, state=replace(problem.state, factors={}))
+            noises = noises_at(as_specified, self.solution.parameters, at_readings=True)
             total = np.concatenate([noise.sigma[noise.series.measured] for noise in noises])
-        if not self._with_joint_noise:
+        if not any(source.name == "joints" for noise in noises for source in noise.sources):
             return total, total
-        own = total**2
+        private = total**2
         for number, noise in enumerate(noises):
             for source in noise.sources:
                 if source.name == "joints":
-                    own[table.rows_of(number)] -= np.einsum("nii->ni", source.variance)[noise.series.measured]
-        return total, np.sqrt(np.maximum(own, 0.0))
+                    variance = np.einsum("nii->ni", source.variance)[noise.series.measured]
+                    private[self.table.rows_of(number)] -= variance
+        return total, np.sqrt(np.maximum(private, 0.0))
 
-    def _predict(
-        self, test: Integers, squares: Floats, kept: Integers, of_kept: Errors
-    ) -> tuple[_Part, OutlierCounts, int]:
-        """The predicted rows that can be judged; `PredictedFit.outliers`, and how many rows are not known.
+    def _predict(self, test: Integers, squares: Floats, kept: Integers, of_kept: RowErrors) -> JudgedRows:
+        """The predicted rows that can be judged: those known, and no outliers.
 
         Args:
             test: Predicted rows of the table.
@@ -682,113 +604,57 @@ class _Rows:
             kept: Rows of the table that `of_kept` is of.
             of_kept: What these follow from.
         """
-        unknown = ~np.isfinite(self.leverage[test])
-        outlier = self._robust_weights(test) < OUTLIER_WEIGHT
-        outliers = OutlierCounts()
-        if self._robust:
-            fitted = self.fitted.rows
-            counted = (test[outlier], test, fitted[self.weight[fitted] < OUTLIER_WEIGHT], fitted)
-            outliers = OutlierCounts(*(len(np.unique(self._measurement(rows))) for rows in counted))
-        judged = ~unknown & ~outlier & ~(self.leverage[test] < LEAST_VARIANCE - 1.0)
-        rows = test[judged]
+        judged = np.isfinite(self.leverage[test]) & (self._robust_weights(test) >= OUTLIER_WEIGHT)
+        judged &= ~(self.leverage[test] < LEAST_VARIANCE - 1.0)
+        rows, table = test[judged], self.table
         means, covariance = 1.0 + self.leverage[rows], None
         if np.isin(rows, kept).all():
             found = of_kept.at(np.searchsorted(kept, rows))
-            covariance = found.of_prediction(self._spread.tangent, self._spread.actual)
+            covariance = found.predicted(self.spread.tangent, self.spread.actual)
             means = covariance.diagonal
             covariance = covariance.over(np.sqrt(means))
             with np.errstate(invalid="ignore"):
-                size = self._table.sigma[rows] * np.sqrt(means)
-            self.studentised[rows] = self._table.after[rows] / size
-        part = self._part(rows, squares[judged] / means, np.ones(len(rows)), covariance)
-        estimated = set(self._solution.estimated_noise or ())
-        for code, group in enumerate(self._table.groups):
-            if group in estimated or (JOINT_NOISE in estimated and group in self._with_joint_noise):
-                part.behind[code] = max(1.0, self.fitted.degrees(self.fitted.of_kind(code)))
-        return part, outliers, int(np.sum(unknown))
+                self.studentised[rows] = table.after[rows] / (table.sigma[rows] * np.sqrt(means))
+        estimated, joint = set(self.solution.estimated_noise or ()), self._with_joint_noise()
+        degrees = {
+            code: max(1.0, self.fitted.degrees(self.fitted.of_kind(code)))
+            for code, group in enumerate(table.groups)
+            if group in estimated or (JOINT_NOISE in estimated and group in joint)
+        }
+        return JudgedRows(table, rows, squares[judged] / means, np.ones(len(rows)), covariance, self._shared, degrees)
 
-    def _measurement(self, rows: Integers) -> Integers:
-        """A number for the measurement of each of some rows."""
-        out: Integers = self._table.series[rows].astype(np.int64) * 2**32 + self._table.measurement[rows]
-        return out
+    def _count_outliers(self, test: Integers) -> OutlierCounts:
+        if not self.robust:
+            return OutlierCounts()
+        fitted, number = self.fitted.rows, self.table.measurement_number
+        outliers = (test[self._robust_weights(test) < OUTLIER_WEIGHT], fitted[self.weight[fitted] < OUTLIER_WEIGHT])
+        return OutlierCounts(*(len(np.unique(number[rows])) for rows in (outliers[0], test, outliers[1], fitted)))
 
     def _robust_weights(self, rows: Integers) -> Floats:
         """The weights that the loss would give to predicted rows, shape (n,)."""
-        out, table = np.ones(len(rows)), self._table
-        for number, noise in enumerate(self._noises if self._robust else ()):
+        out, table, loss = np.ones(len(rows)), self.table, self.problem.options.loss
+        for number, noise in enumerate(self._noises if self.robust else ()):
             mine = np.flatnonzero(table.series[rows] == number)
-            measurement = table.measurement[rows[mine]]
-            e, residual_dim = noise.lengths()
+            measurement, (e, residual_dim) = table.measurement[rows[mine]], noise.lengths()
             n = len(e)
             count = np.maximum(np.bincount(measurement, minlength=n), 1)
             more = np.bincount(measurement, np.nan_to_num(self.leverage[rows[mine]]), n) / count
-            loss = self._problem.options.loss
             c = np.array([tuning(loss, max(h, 1)) for h in range(residual_dim.max(initial=0) + 1)])[residual_dim]
             out[mine] = weight(loss, e / np.sqrt(np.maximum(1.0 + more, LEAST_VARIANCE)), c)[measurement]
         return out
 
-    def _read(self, keep: Booleans) -> Errors:
-        """Leverage of every row; what the rows to keep follow from, over sigma."""
-        table = self._table
-        nuisances = Nuisances(self._problem, self._solution.parameters, self._noises)
-        self.leverage = np.full(table.n, np.nan)
-        kept, half = [], half_of(self._spread.tangent)
-        asked = keep | table.test
-        for number, noise in enumerate(self._noises):
-            measured, last = noise.series.measured, table.rows_of(number).start
-            step = _CHUNK if nuisances.none_in(number) else _FEW
-            for start in range(0, noise.series.n, step):
-                chunk = slice(start, min(start + step, noise.series.n))
-                first, last = last, last + int(np.sum(measured[chunk]))
-                rows = slice(first, last)
-                if nuisances.none_in(number) and not asked[rows].any():  # they follow from the core and own noise alone
-                    moments = noise.moments_at(chunk)
-                    squares = squares_along(noise.rows_at(chunk, moments), nuisances.chain(number), half)
-                    of_rows = (squares + np.maximum(moments.variance, 0.0))[measured[chunk]]
-                    self.leverage[rows] = of_rows / table.sigma[rows] ** 2 - 1.0
-                    continue
-                grid = np.flatnonzero(measured[chunk])
-                found = nuisances.errors(number, np.arange(chunk.start, chunk.stop)).at(grid).over(table.sigma[rows])
-                leverage = np.einsum("ij,ij->i", found.J @ self._spread.tangent, found.J)
-                leverage[table.test[rows]] = self._spread.variance(found.J[table.test[rows]])
-                self.leverage[rows] = leverage + np.sum(found.own**2, axis=1) + (found.of_noise - 1.0)
-                kept.append(found.at(np.flatnonzero(keep[rows])))
-        self.leverage[~np.isfinite(self.leverage)] = np.nan
-        return Errors.of_all(kept or [nuisances.nothing()])
 
-    def _residual_covariance(self, fitted: Integers, found: Errors) -> LowRank | Dense:
-        """Of the fitted rows, from what they follow from."""
-        if self._carried:
-            return found.of_fit(self._spread.tangent)
-        C = (found.L @ found.L.T).toarray() + np.diag(found.private)
-        measurement = self._measurement(fitted)
-        weighted_as = np.where(measurement[:, None] == measurement, C, 0.0)
-        J = np.hstack([found.J, found.own])
-        WJ = np.linalg.solve(weighted_as, J)
-        K = scipy.linalg.block_diag(self._spread.tangent, np.eye(found.own.shape[1]))
-        X = J @ (K @ (WJ.T @ C))
-        covariance = K + K @ (WJ.T @ ((C - weighted_as) @ WJ)) @ K
-        return Dense(C - X - X.T + J @ covariance @ J.T)
-
-
-def upper_probability(ratio: float, nu: float, behind: float = np.inf) -> float:
+def upper_probability(ratio: float, nu: float, of_noise: float = np.inf) -> float:
     """Probability that a sum of squares exceeds its mean by a factor.
 
     Args:
         ratio: The factor.
         nu: Degrees of freedom of the sum.
-        behind: Degrees of freedom that the variance in its mean was estimated from.
+        of_noise: Degrees of freedom that the variance in its mean was estimated from.
     """
-    if np.isfinite(behind):
-        return float(special.fdtrc(nu, behind, ratio))
+    if np.isfinite(of_noise):
+        return float(special.fdtrc(nu, of_noise, ratio))
     return float(special.gammaincc(nu / 2.0, nu / 2.0 * ratio))
-
-
-CONFIDENCE = 0.999
-"""A sum of squares outside this central interval of its distribution is not by chance."""
-
-FACTOR = 2.0
-"""A reduced chi-square between 1 / FACTOR and FACTOR is good whatever its distribution: noise is never known better."""
 
 
 @dataclass(frozen=True)
@@ -862,18 +728,6 @@ def chi2_bounds(dof: int, expected: float | None = None, independent: int | None
     ratio = 1.0 if expected is None else expected / dof
     low, high = (2.0 * special.gammaincinv(k / 2.0, p) / k for p in ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))
     return ratio * min(float(low), 1.0 / FACTOR), max(1.0, ratio) * max(float(high), FACTOR)
-
-
-def chi_square_of(value: float, dof: int, *, independent: bool) -> ChiSquare:
-    """Chi-square of rows whose noise is as they are weighted by.
-
-    Args:
-        value: Sum of squared whitened residuals and priors.
-        dof: Residuals and priors, less the determined directions.
-        independent: Whether no rows share errors: where some may, nothing says how probable it is.
-    """
-    p_value = float(special.gammaincc(dof / 2.0, value / 2.0)) if independent and dof > 0 else None
-    return ChiSquare(value, dof, float(max(dof, 0)), chi2_bounds(dof), p_value)
 
 
 def _weighted_chi2(solution: Solution) -> tuple[float, int, float]:

@@ -1,41 +1,209 @@
-"""Goodness of fit where a few gross errors spoil it: the fit is made again without them.
+"""Outliers: the few measurements that spoil a fit, found in the linearised problem, and the fit without them.
 
-Which they are is found in the linearised problem (`gross_errors`); far off as they are they may have led the fit where
-the problem is not linear, so the search goes on from the fit without those found so far. Measurements that this fit
-predicts well after all are none.
+One wrong row of a table with many unknowns makes most residuals too large, for the fit gives way to it: how many are
+too large says nothing. So measurements are left out, the worst first, until what is left fits. With e the residuals, C
+the covariance of their noise and A their own (see `goodness_of_fit`), the fit without the rows S follows from this one:
+
+    u = C^-1 e,  Q = C^-1 A C^-1;   chi-square falls by T = u_S^T Q_SS^-1 u_S,  u becomes u - Q_:S Q_SS^-1 u_S,
+                                                                                Q becomes Q - Q_:S Q_SS^-1 Q_S:.
+
+What is left out at once is a measurement, or all those of one configuration, whose reading may be wrong. The worst is
+the one whose drop is least likely by chance, whatever the size of the noise: with Gaussian noise what is left of
+chi-square, over what it was, has a beta distribution. After k of N, the k are taken for outliers if a drop as large by
+any k of N (Bonferroni) is no chance, for the k for which that is least likely.
+
+Far off as outliers are they may have led the fit where the problem is not linear, so the search goes on from the fit
+without those found so far, or from the nominal arm. Measurements that this fit predicts well are no outliers.
+
+References:
+    Cook, Weisberg (1982), Residuals and Influence in Regression, section 2.2.
+    Hadi, Simonoff (1993), Procedures for the identification of multiple outliers in linear models. JASA 88(424).
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import scipy.linalg
+import scipy.sparse
 from numpy.typing import NDArray
+from scipy import special
 
 from fg_calib.errors import SolverError
+from fg_calib.graph.factors import prior_rows
+from fg_calib.graph.noise import PRIVATE_SHARE
 from fg_calib.graph.problem import Problem, assembled
 from fg_calib.graph.solver import Solution, solve
 from fg_calib.statistics.covariance import Spread, spread_of
-from fg_calib.statistics.goodness_of_fit import Goodness, GrossErrors, chi_square, gross_errors, judge_fit
-from fg_calib.statistics.gross_errors import MOST_FEW
-from fg_calib.statistics.residual_table import ResidualTable, residual_table
+from fg_calib.statistics.goodness_of_fit import Goodness, GrossErrors, RowStatistics, chi_square, judge_fit
+from fg_calib.statistics.residual_covariance import RowErrors
+from fg_calib.statistics.residual_table import CHANCE, MAX_OUTLIER_SHARE, ResidualTable, residual_table
 
+Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
 Integers = NDArray[np.int64]
+Sparse = scipy.sparse.csr_array
 
 MAX_ROWS = 20_000
-"""Rows up to which gross errors are looked for: of more, few of them spoil little."""
+"""Rows up to which outliers are looked for: of more, few of them spoil little."""
 
-ROUNDS = 3
+MAX_SHARED_ROWS = 3000
+"""The same where rows share errors: the inverse of their covariance is dense."""
+
+MAX_UNIT = 200
+"""Rows of one configuration up to which they may be one outlier."""
+
+MAX_ROUNDS = 3
 """How often the fit is made again."""
+
+BATCH_SHARE = 0.1
+"""Part of those left out so far that is left out in one step: one by one at first."""
+
+LEAST_INFORMATION = 1e-6
+"""Part of a row's information below which the others say nothing of it: it is met whatever was measured."""
 
 FINE = ("as stated", "too large", "unknown")
 """Verdicts of kinds that nothing spoils."""
 
 
-def judged_without_gross_errors(solution: Solution, spread: Spread, table: ResidualTable, fit: Goodness) -> Goodness:
-    """The goodness of a fit, by kind beside that of the fit without gross errors where a few spoil it.
+def find_outliers(
+    z: Floats,
+    errors: RowErrors,
+    tangent: Floats,
+    units: Sequence[Integers],
+    dof: float,
+    priors: tuple[Floats, Floats] | None = None,
+) -> Booleans | None:
+    """The few measurements that spoil a fit, shape (n,); None if there are none, or not few, or it is not known.
+
+    Args:
+        z: Residuals over the sigma of their noise, at the optimum or where the problem is linear, shape (n,).
+        errors: What they follow from, over the same sigma.
+        tangent: Covariance of the core, which goes with rows weighted by C^-1.
+        units: Rows that may be left out together: of a measurement, of a configuration.
+        dof: Degrees of freedom of rows and priors.
+        priors: Whitened residuals of the core's priors there, and their derivatives.
+    """
+    W = _inverse_noise(errors)
+    if W is None or dof < 1.0:
+        return None
+    r_prior, J_prior = priors if priors is not None else (np.zeros(0), np.zeros((0, len(tangent))))
+    P = errors.root(tangent)
+    B, along = W @ P, tangent @ (J_prior.T @ r_prior)
+    # At the optimum of the linearised problem, where priors and rows lead to:
+    e = z - errors.J @ along - P @ (B.T @ z)
+    u = W @ e
+    step = -along - tangent @ (errors.J.T @ (W @ z))
+    search = _Search(W, u, B, units, float(e @ u) + float(np.sum((r_prior + J_prior @ step) ** 2)), dof)
+    while np.any(search.leave_out()):
+        pass
+    return search.best()
+
+
+def _inverse_noise(errors: RowErrors) -> Sparse | None:
+    """C^-1 of rows by their noise, shape (n, n); None if too many rows share errors."""
+    d, L = np.maximum(errors.private, PRIVATE_SHARE * errors.noise), errors.L
+    if not L.nnz:
+        return Sparse(scipy.sparse.diags_array(1.0 / d))
+    if len(d) > MAX_SHARED_ROWS:
+        return None
+    factor = scipy.linalg.cho_factor((L @ L.T).toarray() + np.diag(d))
+    return Sparse(scipy.linalg.cho_solve(factor, np.eye(len(d))))
+
+
+class _Search:
+    """Units left out of a fit, step by step.
+
+    Args:
+        W: C^-1, shape (n, n).
+        u: See the module's head, shape (n,).
+        B: With Q = C^-1 - B B^T, shape (n, m).
+        units: Rows that may be left out together.
+        chi2: Chi-square with all of them.
+        dof: Its degrees of freedom.
+    """
+
+    def __init__(self, W: Sparse, u: Floats, B: Floats, units: Sequence[Integers], chi2: float, dof: float) -> None:
+        self._W, self._n_units, self._many = W, len(units), False
+        self._steps = [(np.zeros(len(u), dtype=np.bool_), u, B, chi2, dof, 0)]
+        self._units = [
+            np.array([unit for unit in units if len(unit) == size]) for size in sorted({len(unit) for unit in units})
+        ]
+        self._least, self._Q = [], []
+        for rows in self._units:
+            grid = np.broadcast_arrays(rows[:, :, None], rows[:, None, :])
+            block = np.asarray(W[grid[0].ravel(), grid[1].ravel()]).reshape(grid[0].shape)
+            self._least.append(LEAST_INFORMATION * np.einsum("mii->m", block) / rows.shape[1])
+            self._Q.append(block - B[rows] @ np.swapaxes(B[rows], 1, 2))
+
+    def leave_out(self) -> Booleans:
+        """Leave out the worst; the rows that were, none if there is nothing that may be."""
+        out, u, B, chi2, dof, count = self._steps[-1]
+        found = []
+        for rows, Q, least in zip(self._units, self._Q, self._least, strict=True):
+            values, V = np.linalg.eigh(Q)
+            kept = values > least[:, None]
+            squares = np.einsum("mij,mi->mj", V, u[rows]) ** 2 / np.where(kept, values, 1.0)
+            drops, ranks = np.sum(np.where(kept, squares, 0.0), axis=1), kept.sum(axis=1)
+            found += [
+                (log_chance(1.0 - drop / chi2, dof - rank, rank), *unit)
+                for drop, rank, unit in zip(drops.tolist(), ranks.tolist(), rows.tolist(), strict=True)
+                if 0 < rank < dof and drop < chi2
+            ]
+        new = np.zeros_like(out)
+        for chance, *unit in sorted(found)[: max(1, int(BATCH_SHARE * count))]:
+            if chance < 0.0 and not new[unit].any() and not out[unit].all():
+                new[unit], count = True, count + 1
+        self._many = bool(np.sum(out | new) > MAX_OUTLIER_SHARE * len(out))
+        if not new.any() or self._many:
+            return np.zeros_like(out)
+        chosen = np.flatnonzero(new & ~out)
+        columns = self._W[:, chosen].toarray() - B @ B[chosen].T
+        values, V = np.linalg.eigh(columns[chosen])
+        kept = values > LEAST_INFORMATION * float(np.trace(columns[chosen])) / len(chosen)
+        half = V[:, kept] / np.sqrt(values[kept])
+        F, step = columns @ half, half.T @ u[chosen]
+        self._Q = [Q - F[of] @ np.swapaxes(F[of], 1, 2) for of, Q in zip(self._units, self._Q, strict=True)]
+        left = max(chi2 - float(step @ step), 1e-12 * chi2)
+        self._steps.append((out | new, u - F @ step, np.hstack([B, F]), left, dof - float(kept.sum()), count))
+        return new
+
+    def best(self) -> Booleans | None:
+        """What was left out when the gain was least likely by chance; None if it may be, or more should be."""
+        (chi2, dof), n = self._steps[0][3:5], self._n_units
+        chances = [
+            log_chance(left / chi2, now, dof - now) - float(special.betaln(k + 1, n - k + 1) + np.log(n + 1.0))
+            for *_, left, now, k in self._steps[1:]
+        ]  # times the number of ways to choose k of n
+        best = int(np.argmin(chances)) if chances else 0
+        if not chances or chances[best] > np.log(CHANCE) or (self._many and best == len(chances) - 1):
+            return None
+        return self._steps[best + 1][0]
+
+
+def log_chance(left: float, dof: float, m: float) -> float:
+    """Logarithm of the probability that m unknowns more leave no more than a part of chi-square; at most a bound of it.
+
+    The part has the beta distribution of (dof / 2, m / 2), whose density integrates to less than
+    left^(dof / 2) / (dof / 2) / B(dof / 2, m / 2), for m = 1 times (1 - left)^(-1/2).
+
+    Args:
+        left: The part.
+        dof: Degrees of freedom that are left.
+        m: Unknowns more.
+    """
+    if m <= 0.0 or dof <= 0.0 or left >= 1.0:
+        return 0.0
+    a, b = 0.5 * dof, 0.5 * m
+    bound = a * np.log(max(left, 1e-300)) - np.log(a) - special.betaln(a, b) + min(b - 1.0, 0.0) * np.log1p(-left)
+    return min(float(bound), 0.0)
+
+
+def judge_without_outliers(solution: Solution, spread: Spread, table: ResidualTable, fit: Goodness) -> Goodness:
+    """The goodness of a fit, by kind with that of the fit without outliers where a few spoil it.
 
     Args:
         solution: The solution.
@@ -44,26 +212,60 @@ def judged_without_gross_errors(solution: Solution, spread: Spread, table: Resid
         fit: Its goodness of fit.
     """
     robust = solution.problem.state.weights is not None or solution.estimated_noise is not None
-    spoilt = any(kind.verdict not in FINE for kind in fit.kinds)
-    if robust or not spoilt or solution.problem.evaluated or solution.problem.has_more or table.n > MAX_ROWS:
+    if robust or _is_fine(fit) or solution.problem.evaluated or solution.problem.has_more or table.n > MAX_ROWS:
         return fit
-    found = _fit_without(solution, table, (solution, spread, table))
-    if found is None or not _fits(found[2]):
-        # The arm as drawn is nearer to the truth than a fit that went far astray.
-        drawn = replace(solution, parameters=solution.before, values=solution.problem.variables.values(solution.before))
-        at_drawn = _fit_without(solution, table, (drawn, spread_of(drawn), residual_table(drawn)))
-        found = at_drawn if at_drawn is not None and (found is None or _fits(at_drawn[2])) else found
-    return fit if found is None else _beside(fit, table, *found)
+    found = _fit_without_outliers(solution, table, (solution, spread, table))
+    if found is None or not _is_fine(found[2]):  # the nominal arm is nearer to the truth than a fit that went astray
+        values = solution.problem.variables.values(solution.before)
+        nominal = replace(solution, parameters=solution.before, values=values)
+        other = _fit_without_outliers(solution, table, (nominal, spread_of(nominal), residual_table(nominal)))
+        found = other if other is not None and (found is None or _is_fine(other[2])) else found
+    return fit if found is None else _combined(fit, table, *found)
 
 
 _State = tuple[Solution, Spread, ResidualTable]
 
 
-def _fits(fit: Goodness) -> bool:
+def _is_fine(fit: Goodness) -> bool:
     return all(kind.verdict in FINE for kind in fit.kinds)
 
 
-def _fit_without(solution: Solution, table: ResidualTable, now: _State) -> tuple[Booleans, _State, Goodness] | None:
+def _outlier_rows(state: _State) -> Booleans | None:
+    """Rows of a table that spoil a fit, shape (n,); None if there are none, or it is not known."""
+    solution, spread, table = state
+    problem, statistics = solution.problem, RowStatistics(*state)
+    rows, errors = statistics.fitted.rows, statistics.errors
+    if statistics.robust or not statistics.carried or errors is None:
+        return None
+    dof = problem.n_independent + problem.n_priors + problem.n_added + problem.n_known
+    dof -= spread.rank + errors.own.shape[1]
+    z, priors = table.after[rows] / table.sigma[rows], prior_rows(problem.variables, solution.parameters)
+    found = find_outliers(z, errors, spread.tangent, _units(table, rows), dof, priors)
+    if found is None:
+        return None
+    out = np.zeros(table.n, dtype=np.bool_)
+    out[rows[found]] = True
+    return out
+
+
+def _units(table: ResidualTable, rows: Integers) -> list[Integers]:
+    """Places among the fitted rows of what may be one outlier: a measurement, all of one configuration."""
+    _, of = np.unique(table.measurement_number[rows], return_inverse=True)
+    place, end = table.row_ends(rows)
+    most = min(MAX_UNIT, MAX_OUTLIER_SHARE * len(rows))
+    several = (np.unique(unit) for unit in _grouped(place, end) if len(unit) <= most)
+    return [*_grouped(np.arange(len(rows)), of), *(unit for unit in several if len(np.unique(of[unit])) > 1)]
+
+
+def _grouped(values: Integers, key: Integers) -> list[Integers]:
+    """Values with the same key together, shape (n,) each."""
+    order = np.argsort(key, kind="stable")
+    return np.split(values[order], np.flatnonzero(np.diff(key[order])) + 1)
+
+
+def _fit_without_outliers(
+    solution: Solution, table: ResidualTable, now: _State
+) -> tuple[Booleans, _State, Goodness] | None:
     """Rows left out, the fit without them, and its goodness; None without any.
 
     Args:
@@ -72,9 +274,9 @@ def _fit_without(solution: Solution, table: ResidualTable, now: _State) -> tuple
         now: Where the problem is linearised at first.
     """
     out, best = np.zeros(table.n, dtype=np.bool_), None
-    for _ in range(ROUNDS):
-        more = gross_errors(*now)
-        if more is None or np.sum(out | more) > MOST_FEW * np.sum(table.used):
+    for _ in range(MAX_ROUNDS):
+        more = _outlier_rows(now)
+        if more is None or np.sum(out | more) > MAX_OUTLIER_SHARE * np.sum(table.used):
             break
         out = out | more
         try:
@@ -82,35 +284,28 @@ def _fit_without(solution: Solution, table: ResidualTable, now: _State) -> tuple
         except SolverError:
             break
         now = (again, spread_of(again), residual_table(again))
-        rest = judge_fit(*now)
-        out = _missed(table, out, rest)
+        rest, number = judge_fit(*now), table.measurement_number
+        with np.errstate(invalid="ignore"):  # those are no outliers that the fit without them predicts
+            out = out & np.isin(number, number[out & (np.abs(rest.studentised) > rest.level)])
         if not out.any():
             break
         best = (out, now, rest)
-        if _fits(rest):
+        if _is_fine(rest):
             break
     return best
 
 
 def _without(solution: Solution, table: ResidualTable, out: Booleans) -> Problem:
     """The problem whose rows left out are predicted, not fitted; from where the arm is nominal."""
-    data, series = solution.problem.data, []
-    for number, s in enumerate(solution.problem.data.series):
+    data, blocks = solution.problem.data, []
+    for number, s in enumerate(data.series):
         test = s.test.copy()
         test[table.measurement[out & (table.series == number)]] = True
-        series.append(replace(s, test=test))
-    return assembled(solution.problem, solution.before, data=replace(data, series=tuple(series)))
+        blocks.append(replace(s, test=test))
+    return assembled(solution.problem, solution.before, data=replace(data, series=tuple(blocks)))
 
 
-def _missed(table: ResidualTable, out: Booleans, rest: Goodness) -> Booleans:
-    """Those of the rows left out whose measurements the fit without them does not predict."""
-    number = _measurement(table)
-    with np.errstate(invalid="ignore"):
-        missed = np.unique(number[out & (np.abs(rest.studentised) > rest.level)])
-    return out & np.isin(number, missed)
-
-
-def _beside(fit: Goodness, table: ResidualTable, out: Booleans, now: _State, rest: Goodness) -> Goodness:
+def _combined(fit: Goodness, table: ResidualTable, out: Booleans, now: _State, rest: Goodness) -> Goodness:
     """The fit's kinds with those of the fit without the rows left out."""
     size = np.where(out, np.abs(rest.studentised), 0.0)
     wrong = {table.groups[code] for code in np.unique(table.group[size > rest.level])}
@@ -120,11 +315,9 @@ def _beside(fit: Goodness, table: ResidualTable, out: Booleans, now: _State, res
         for kind in fit.kinds
     )
     rows = np.flatnonzero(out)
-    rows = rows[np.argsort(-size[rows], kind="stable")]
-    names = ("", *table.names)
+    rows, names = rows[np.argsort(-size[rows], kind="stable")], ("", *table.names)
     ends = dict.fromkeys((names[table.a[i] + 1], names[table.b[i] + 1]) for i in rows)
-    n = len(np.unique(_measurement(table)[rows]))
-    chi2 = chi_square(now[0], now[1])
+    n, chi2 = len(np.unique(table.measurement_number[rows])), chi_square(now[0], now[1])
     return replace(fit, kinds=kinds, gross=GrossErrors(n, _names(list(ends)), chi2.value / max(chi2.dof, 1)))
 
 
@@ -134,13 +327,9 @@ def _names(ends: list[tuple[str, str]]) -> tuple[str, ...]:
     while ends:
         count = Counter(name for both in ends for name in filter(None, both))
         worst = max(count, key=lambda name: count[name])
-        alone = worst if count[worst] > 1 else " and ".join(filter(None, ends[0]))
-        found.append(alone)
-        ends = [both for both in ends if worst not in both] if count[worst] > 1 else ends[1:]
+        if count[worst] > 1:
+            found.append(worst)
+            ends = [both for both in ends if worst not in both]
+        else:
+            found.append(" and ".join(filter(None, ends.pop(0))))
     return tuple(found)
-
-
-def _measurement(table: ResidualTable) -> Integers:
-    """A number for the measurement of each row, shape (n,)."""
-    out: Integers = table.series.astype(np.int64) * 2**32 + table.measurement
-    return out

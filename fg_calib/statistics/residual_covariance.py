@@ -1,115 +1,192 @@
-"""What residuals follow from at the estimate: noise, parameters, nuisances; and their covariance, in low rank.
+"""Covariance of residuals: what each row follows from, noise, parameters and landmarks, kept in low rank.
 
-See `goodness` for what is made of it.
+With C = D + L L^T the covariance of the noise, T that of the estimate and J the derivatives, fitted residuals have the
+covariance `C - J T J^T`. Predicted ones have `C + J K J^T - J Q^T - Q J^T`, K what the estimate is off and Q its
+covariance with errors of configurations that fitted rows took part in as well. Where rows are weighted by W as
+independent although they share errors, fitted ones have `(1 - J T J^T W) C (1 - J T J^T W)^T` and what the priors add.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
+import scipy.linalg
 import scipy.sparse
 from numpy.typing import NDArray
 
 from fg_calib.graph.information import eliminated, felt
-from fg_calib.graph.noise import RowNoise
+from fg_calib.graph.noise import PRIVATE_SHARE, RowNoise
 from fg_calib.graph.problem import Problem, at_parameters, says_where
 from fg_calib.graph.rows import ErrorColumns
 from fg_calib.measurements import residuals
 from fg_calib.robot.kinematics import Chain
-from fg_calib.statistics.low_rank import Loadings, LowRank, are_all, squares_of_rows, times
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
 Integers = NDArray[np.int64]
+Sparse = scipy.sparse.csr_array
 
 
 @dataclass(frozen=True)
-class Errors:
-    """What residuals follow from.
+class ResidualCovariance:
+    """Covariance `D + L L^T + P S P^T` of rows.
 
     Attributes:
-        J: Derivatives in the core, the nuisances following it, shape (n, n_columns).
-        own: What nuisances are off by themselves, shape (n, n_nuisance): by errors of 1 sigma.
+        P: Shape (n, k).
+        L: Sparse, shape (n, n_errors).
+        d: Diagonal of D, shape (n,).
+        sign: Diagonal of S, 1 or -1, shape (k,).
+    """
+
+    P: Floats
+    L: Sparse
+    d: Floats
+    sign: Floats
+
+    @property
+    def diagonal(self) -> Floats:
+        """Variances, shape (n,)."""
+        out: Floats = self.d + row_squares(self.L) + (self.P * self.P) @ self.sign
+        return out
+
+    def at(self, rows: Integers) -> ResidualCovariance:
+        """The part at some rows."""
+        return ResidualCovariance(self.P[rows], self.L[rows], self.d[rows], self.sign)
+
+    def over(self, scale: Floats) -> ResidualCovariance:
+        """The covariance of rows divided by a scale, shape (n,)."""
+        return ResidualCovariance(self.P / scale[:, None], _scaled(self.L, scale), self.d / scale**2, self.sign)
+
+    def moments(self, rows: Integers) -> tuple[float, float]:
+        """Trace, and trace of the square, of the part at some rows."""
+        part = self.at(rows)
+        P, L, d, sign = part.P, part.L, part.d, part.sign
+        others = part.diagonal - d
+        square = d @ d + 2.0 * d @ others + Sparse(L.T @ L).power(2).sum()
+        square += 2.0 * np.sum((L.T @ P) ** 2 @ sign) + sign @ (P.T @ P) ** 2 @ sign
+        return float(np.sum(d + others)), float(square)
+
+    def whitened(self, z: Floats) -> tuple[float, float, float]:
+        """Sum of the squares of all rows, whitened together; its mean, and its degrees of freedom.
+
+        D counts as `PRIVATE_SHARE` of the noise at least.
+
+        Args:
+            z: The rows, shape (n,).
+        """
+        added = np.maximum(PRIVATE_SHARE * (self.d + row_squares(self.L)) - self.d, 0.0)
+        A = np.diag(self.d + added) + (self.P * self.sign) @ self.P.T + (self.L @ self.L.T).toarray()
+        factor = scipy.linalg.cho_factor(A, lower=True)
+        chi2, n = float(z @ scipy.linalg.cho_solve(factor, z)), float(len(z))
+        if not added.any():
+            return chi2, n, n
+        root = np.sqrt(added)
+        B = root[:, None] * scipy.linalg.cho_solve(factor, np.diag(root))  # 1 - B has the moments of the sum
+        expected = n - float(np.trace(B))
+        return chi2, expected, expected**2 / (expected - float(np.trace(B)) + float(np.sum(B * B)))
+
+
+@dataclass(frozen=True)
+class RowErrors:
+    """What rows follow from.
+
+    Attributes:
+        J: Derivatives in the core, landmarks following it, shape (n, n_columns).
+        own: Landmarks' errors at a given core, of 1 sigma, shape (n, n_landmark_errors).
         private: Variance of each row's private noise, shape (n,).
         L: How rows follow from other noise, sparse, shape (n, n_errors): from errors of 1 sigma.
-        felt: `L M^T`, M what the fit made of those errors (see `information.felt`), shape (n, n_columns + n_nuisance);
-            no columns where fitted and predicted rows share none.
+        felt: `L M^T`, M what the fit made of those errors (see `information.felt`), shape (n, n_columns +
+            n_landmark_errors); no columns where fitted and predicted rows share none.
     """
 
     J: Floats
     own: Floats
     private: Floats
-    L: Loadings
+    L: Sparse
     felt: Floats
 
     @property
-    def of_noise(self) -> Floats:
+    def noise(self) -> Floats:
         """Variance of rows by noise alone, shape (n,)."""
-        return self.private + squares_of_rows(self.L)
+        return self.private + row_squares(self.L)
 
-    def of_estimate(self, covariance: Floats) -> Floats:
-        """P with P P^T the covariance of rows by what the estimate is off, shape (n, n_columns + n_nuisance).
+    def at(self, rows: Integers) -> RowErrors:
+        """What some of the rows follow from."""
+        return RowErrors(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+    def over(self, sigma: Floats) -> RowErrors:
+        """What rows divided by their sigma, shape (n,), follow from."""
+        J, own, felt_ = (values / sigma[:, None] for values in (self.J, self.own, self.felt))
+        return RowErrors(J, own, self.private / sigma**2, _scaled(self.L, sigma), felt_)
+
+    @staticmethod
+    def joined(parts: Sequence[RowErrors]) -> RowErrors:
+        """What several groups of rows, one after the other, follow from."""
+        J, own, private, felt_ = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("J", "own", "private", "felt")
+        )
+        return RowErrors(J, own, private, Sparse(scipy.sparse.vstack([part.L for part in parts])), felt_)
+
+    def root(self, covariance: Floats) -> Floats:
+        """P with P P^T the covariance of rows by what the estimate is off, shape (n, n_columns + n_landmark_errors).
 
         Args:
             covariance: Of the core.
         """
-        return np.hstack([self.J @ half_of(covariance), self.own])
+        return np.hstack([self.J @ square_root(covariance), self.own])
 
-    def of_prediction(self, tangent: Floats, actual: Floats) -> LowRank:
-        """Covariance of predicted rows, whose noise the estimate may have felt: `C + J K J^T - J Q^T - Q J^T`.
+    def fitted(self, tangent: Floats) -> ResidualCovariance:
+        """Covariance of fitted rows.
 
-        With K what the estimate is off and e errors of rows, their covariance is -T M, so that Q = L M^T T; and
-        `-P R^T - R P^T = ((P - R) (P - R)^T - (P + R) (P + R)^T) / 2`.
+        Args:
+            tangent: T, the covariance of the core.
+        """
+        P = self.root(tangent)
+        return ResidualCovariance(P, self.L, self.private, -np.ones(P.shape[1]))
+
+    def fitted_as_independent(self, tangent: Floats, measurement: Integers) -> ResidualCovariance:
+        """Covariance of fitted rows that were weighted as if measurements shared no errors.
+
+        Args:
+            tangent: T, the covariance of the core by those weights.
+            measurement: Number of each row's measurement, shape (n,).
+        """
+        C = (self.L @ self.L.T).toarray() + np.diag(self.private)
+        weighted_as = np.where(measurement[:, None] == measurement, C, 0.0)
+        P = self.root(tangent)
+        weighed = np.linalg.solve(weighted_as, P)
+        inner = np.eye(P.shape[1]) + weighed.T @ (C - weighted_as) @ weighed
+        return _with_cross(P @ square_root(inner), P, C @ weighed, self.L, self.private)
+
+    def predicted(self, tangent: Floats, actual: Floats) -> ResidualCovariance:
+        """Covariance of predicted rows, whose errors the estimate may have felt.
 
         Args:
             tangent: T, the covariance of the core by the noise that rows are weighted by.
             actual: K, its covariance.
         """
-        P = self.of_estimate(actual)
-        sign = np.ones(P.shape[1])
-        if self.felt.shape[1]:
-            half, n = half_of(tangent), len(tangent)
-            A, B = self.of_estimate(tangent), np.hstack([self.felt[:, :n] @ half, self.felt[:, n:]])
-            P = np.hstack([P, (A - B) / np.sqrt(2.0), (A + B) / np.sqrt(2.0)])
-            sign = np.concatenate([sign, np.ones(A.shape[1]), -np.ones(A.shape[1])])
-        return LowRank(P, self.L, self.private, sign)
-
-    def of_fit(self, tangent: Floats) -> LowRank:
-        """Covariance of fitted rows: `C - J T J^T`.
-
-        Args:
-            tangent: T, the covariance of the core.
-        """
-        P = self.of_estimate(tangent)
-        return LowRank(P, self.L, self.private, -np.ones(P.shape[1]))
-
-    def at(self, rows: Integers) -> Errors:
-        """Those of some rows."""
-        if are_all(rows, len(self.private)):
-            return self
-        return Errors(self.J[rows], self.own[rows], self.private[rows], self.L[rows], self.felt[rows])
-
-    def over(self, sigma: Floats) -> Errors:
-        """Those of rows divided by something, shape (n,)."""
-        by = 1.0 / sigma
-        J, own, felt = (values * by[:, None] for values in (self.J, self.own, self.felt))
-        return Errors(J, own, self.private * by**2, times(self.L, by), felt)
-
-    @classmethod
-    def of_all(cls, parts: Sequence[Errors]) -> Errors:
-        """Those of several rows, one after the other."""
-        if len(parts) == 1:
-            return parts[0]
-        J, own, private, felt = (
-            np.concatenate([getattr(part, name) for part in parts]) for name in ("J", "own", "private", "felt")
-        )
-        return cls(J, own, private, Loadings(scipy.sparse.vstack([part.L for part in parts])), felt)
+        P = self.root(actual)
+        if not self.felt.shape[1]:
+            return ResidualCovariance(P, self.L, self.private, np.ones(P.shape[1]))
+        n = len(tangent)
+        felt_ = np.hstack([self.felt[:, :n] @ square_root(tangent), self.felt[:, n:]])
+        return _with_cross(P, self.root(tangent), felt_, self.L, self.private)
 
 
-class Nuisances:
-    """Which errors rows follow from, nuisances being estimated, or means of what touched them, or known.
+def _with_cross(P: Floats, A: Floats, B: Floats, L: Sparse, d: Floats) -> ResidualCovariance:
+    """Covariance `D + L L^T + P P^T - A B^T - B A^T`."""
+    columns = np.hstack([P, (A - B) / np.sqrt(2.0), (A + B) / np.sqrt(2.0)])
+    n, m = P.shape[1], A.shape[1]
+    return ResidualCovariance(columns, L, d, np.concatenate([np.ones(n + m), -np.ones(m)]))
+
+
+class RowModel:
+    """What the rows of every block follow from at the estimate.
+
+    Landmarks are estimated, known, or, where test rows alone touched them, the mean of what touched them: at B e with e
+    those rows without the landmark. With N the derivatives in such landmarks, `N B e` is added to the rows.
 
     Args:
         problem: The problem.
@@ -120,89 +197,98 @@ class Nuisances:
     def __init__(self, problem: Problem, parameters: Floats, noises: Sequence[RowNoise]) -> None:
         self._at = at_parameters(problem, parameters)
         self._noises, self._columns, self._n = noises, ErrorColumns(noises), problem.variables.n_columns
-        there, n = self._at.columns >= 0, len(self._at.columns)
+        estimated, n = self._at.columns >= 0, len(self._at.columns)
         self._follow, self._inverse = np.zeros((n, self._n)), np.zeros((n, 0))
-        self._wanted = self._columns.predicted(noises)
-        self._felt = felt(problem, parameters, self._columns, self._wanted)
-        if there.any():
-            left, of_nuisance = eliminated(problem, parameters), self._at.columns[there] - self._n
+        self._common = self._columns.predicted(noises)
+        self._felt = felt(problem, parameters, self._columns, self._common)
+        if estimated.any():
+            left, column = eliminated(problem, parameters), self._at.columns[estimated] - self._n
             self._inverse = np.zeros((n, left.rank))
             core, others = np.split(self._felt, [self._n])
             self._felt = np.vstack([core + left.follow.T @ others, left.inverse.T @ others])
-            self._follow[there], self._inverse[there] = left.follow[of_nuisance], left.inverse[of_nuisance]
-        series = problem.data.series
-        self._apart = [says_where(problem.data, s) & ~there[s.nuisances].any(axis=1) for s in series]
-        reserved = [s.n * s.kind.residual_dim * of.any() for s, of in zip(series, self._apart, strict=True)]
-        unknowns = problem.data.unknowns
-        said: Booleans = there | np.repeat(np.array(unknowns.known, dtype=np.bool_), unknowns.sizes)
-        for s, of in zip(series, self._apart, strict=True):
-            said[s.nuisances[of].ravel()] = True
-        self._unsaid: list[Booleans] = [np.any(~said[s.nuisances], axis=1) for s in series]
-        self._first = self._columns.n_errors + np.cumsum([0, *reserved])
-        self._averaged = scipy.sparse.csr_array((n, int(self._first[-1])))
-        for number, of in enumerate(self._apart):
-            touches = np.flatnonzero(of)
-            if len(touches):
-                found, _ = self._nuisances_known(number, touches)
-                place = series[number].nuisances[touches].ravel()
+            self._follow[estimated], self._inverse[estimated] = left.follow[column], left.inverse[column]
+        blocks, unknowns = problem.data.series, problem.data.unknowns
+        self._means = [says_where(problem.data, s) & ~estimated[s.nuisances].any(axis=1) for s in blocks]
+        located = estimated | np.repeat(np.array(unknowns.known, dtype=np.bool_), unknowns.sizes)
+        for s, touches in zip(blocks, self._means, strict=True):
+            located[s.nuisances[touches].ravel()] = True
+        self._nowhere: list[Booleans] = [np.any(~located[s.nuisances], axis=1) for s in blocks]
+        counts = [s.n * s.kind.residual_dim * of.any() for s, of in zip(blocks, self._means, strict=True)]
+        self._first = self._columns.n_errors + np.cumsum([0, *counts])
+        self._averaged = Sparse((n, int(self._first[-1])))
+        for number, touches in enumerate(self._means):
+            if touches.any():
+                J, _, L, _ = self._given_landmarks(number, np.flatnonzero(touches))
+                place = blocks[number].nuisances[touches].ravel()
                 share = 1.0 / np.bincount(place)[place]
-                B = scipy.sparse.csr_array((share, (place, np.arange(len(place)))), shape=(n, len(place)))
-                self._follow += np.asarray(B @ found.J)
-                self._averaged = self._averaged + B @ found.L
+                B = Sparse((share, (place, np.arange(len(place)))), shape=(n, len(place)))
+                self._follow += np.asarray(B @ J)
+                self._averaged = self._averaged + B @ L
 
-    def none_in(self, number: int) -> bool:
-        """Whether rows of a series follow from the core and from noise of their own alone."""
+    def is_plain(self, number: int) -> bool:
+        """Whether rows of a block follow from the core and private noise alone."""
         noise = self._noises[number]
         return not (noise.sources or noise.series.nuisances.shape[1])
 
     def chain(self, number: int) -> Chain:
-        """The chain of a series at the estimate."""
+        """The chain of a block at the estimate."""
         return self._at.chains[self._noises[number].series.table]
 
-    def nothing(self) -> Errors:
+    def empty(self) -> RowErrors:
         """What no rows follow from."""
-        felt = self._felt.shape[0] if len(self._wanted) else 0
-        L = scipy.sparse.csr_array((0, int(self._first[-1])))
-        return Errors(
-            np.zeros((0, self._n)), np.zeros((0, self._inverse.shape[1])), np.zeros(0), L, np.zeros((0, felt))
-        )
+        J, own, felt_ = (np.zeros((0, k)) for k in (self._n, self._inverse.shape[1], self._felt_width))
+        return RowErrors(J, own, np.zeros(0), Sparse((0, int(self._first[-1]))), felt_)
 
-    def errors(self, number: int, rows: Integers) -> Errors:
-        """What rows of a series follow from."""
-        known, N = self._nuisances_known(number, rows)
-        J, own, L = known.J, known.own, known.L
+    @property
+    def _felt_width(self) -> int:
+        return self._felt.shape[0] if len(self._common) else 0
+
+    def errors(self, number: int, rows: Integers) -> RowErrors:
+        """What the rows of some measurements of a block follow from."""
+        J, private, L, N = self._given_landmarks(number, rows)
+        own = np.zeros((len(J), self._inverse.shape[1]))
         if N.shape[1]:
-            unsaid = np.repeat(self._unsaid[number][rows], len(J) // max(len(rows), 1))
-            anywhere = np.where(unsaid, np.nan, 0.0)[:, None]  # a point that no row says anything of
-            J, own, L = J + anywhere + N @ self._follow, N @ self._inverse, L + N @ self._averaged
-        return Errors(J, own, known.private, L, L[:, self._wanted] @ self._felt.T if len(self._wanted) else known.felt)
+            nowhere = np.repeat(self._nowhere[number][rows], len(J) // max(len(rows), 1))
+            J = J + np.where(nowhere, np.nan, 0.0)[:, None] + N @ self._follow
+            own, L = N @ self._inverse, L + N @ self._averaged
+        felt_ = L[:, self._common] @ self._felt.T if self._felt_width else np.zeros((len(J), 0))
+        return RowErrors(J, own, private, L, felt_)
 
-    def _nuisances_known(self, number: int, rows: Integers) -> tuple[Errors, Loadings]:
-        """The same if nuisances were known; derivatives in these, sparse, shape (n residual_dim, n_coordinates).
+    def _given_landmarks(self, number: int, rows: Integers) -> tuple[Floats, Floats, Sparse, Sparse]:
+        """J, private variance and L of rows were their landmarks known; derivatives in these, sparse.
 
         The noise of touches whose mean a point is stands among L, after the errors of configurations.
         """
         noise, width = self._noises[number], int(self._first[-1])
-        J = residuals.linearise(noise.rows_at(rows), self._at.chains[noise.series.table])[1]
-        n, residual_dim = J.shape[:2]
-        of_core, in_nuisances = J[:, :, : self._n].reshape(n * residual_dim, -1), J[:, :, self._n :]
-        row = np.broadcast_to(np.arange(n * residual_dim).reshape(n, residual_dim, 1), in_nuisances.shape).ravel()
-        place = np.broadcast_to(noise.series.nuisances[rows][:, None], in_nuisances.shape).ravel()
-        N = scipy.sparse.csr_array((in_nuisances.ravel(), (row, place)), shape=(n * residual_dim, len(self._follow)))
+        J = residuals.linearise(noise.rows_at(rows), self.chain(number))[1]
+        n, h = J.shape[:2]
+        in_landmarks = J[:, :, self._n :]
+        row = np.broadcast_to(np.arange(n * h).reshape(n, h, 1), in_landmarks.shape).ravel()
+        place = np.broadcast_to(noise.series.nuisances[rows][:, None], in_landmarks.shape).ravel()
+        N = Sparse((in_landmarks.ravel(), (row, place)), shape=(n * h, len(self._follow)))
         private = np.maximum(noise.moments_at(rows).variance, 0.0).ravel()
-        apart = np.flatnonzero(np.repeat(self._apart[number][rows], residual_dim))
         L = self._columns.loading(noise, rows)
-        L = scipy.sparse.csr_array((L.data, L.indices, L.indptr), shape=(n * residual_dim, width))
-        if len(apart):
-            column = self._first[number] + (rows[:, None] * residual_dim + np.arange(residual_dim)).ravel()[apart]
-            L = L + scipy.sparse.csr_array((np.sqrt(private[apart]), (apart, column)), shape=L.shape)
-            private[apart] = 0.0
-        none = np.zeros((n * residual_dim, 0))
-        return Errors(of_core, none, private, L, none), N
+        L = Sparse((L.data, L.indices, L.indptr), shape=(n * h, width))
+        mean = np.flatnonzero(np.repeat(self._means[number][rows], h))
+        if len(mean):
+            column = self._first[number] + (rows[:, None] * h + np.arange(h)).ravel()[mean]
+            L = L + Sparse((np.sqrt(private[mean]), (mean, column)), shape=L.shape)
+            private[mean] = 0.0
+        return J[:, :, : self._n].reshape(n * h, -1), private, L, N
 
 
-def half_of(covariance: Floats) -> Floats:
+def square_root(covariance: Floats) -> Floats:
     """H with H H^T a covariance, shape (n, n)."""
     values, vectors = np.linalg.eigh(covariance)
     out: Floats = vectors * np.sqrt(np.maximum(values, 0.0))
     return out
+
+
+def row_squares(L: Sparse) -> Floats:
+    """Sum of the squares of each row of a sparse matrix, shape (n,)."""
+    return np.asarray(L.power(2).sum(axis=1), dtype=np.float64).ravel()
+
+
+def _scaled(L: Sparse, scale: Floats) -> Sparse:
+    """Rows of a sparse matrix, each divided by a scale, shape (n,)."""
+    return Sparse((L.data / np.repeat(scale, np.diff(L.indptr)), L.indices, L.indptr), shape=L.shape)

@@ -11,9 +11,9 @@ from simulated import measure, plus, small_arm, true_robot
 from touches import reach
 
 from fg_calib import Job, Measurements, Options, Robot, Table, inspect_job, simulate
+from fg_calib.diagnostics import robust_screening as disagreement
 from fg_calib.io.job import read_job
 from fg_calib.robot.kinematics import pose
-from fg_calib.statistics import robust_screening as disagreement
 
 PLACED = (Rotation.from_euler("xyz", [0.3, -0.7, 1.9]), np.array([1.0, -2.0, 0.5]))
 """World_T_base of a tracker beside the robot."""

@@ -29,7 +29,7 @@ from fg_calib.robot.rotations import rotation_angle
 from fg_calib.statistics import goodness_of_fit as goodness_module
 from fg_calib.statistics import variance_components as noise
 from fg_calib.statistics.covariance import spread_of
-from fg_calib.statistics.goodness_of_fit import FLAGS, KindFit, kind_fits
+from fg_calib.statistics.goodness_of_fit import FLAGS, KindFit, RowStatistics
 from fg_calib.statistics.residual_table import residual_table
 from fg_calib.statistics.variance_components import estimate_noise
 
@@ -128,7 +128,7 @@ def factors_of(solution):
 
 
 def kinds_of(solution):
-    return kind_fits(solution, spread_of(solution), residual_table(solution))
+    return RowStatistics(solution, spread_of(solution), residual_table(solution)).fit_kinds()
 
 
 def test_leverages_are_those_of_the_hat_matrix():
@@ -601,10 +601,10 @@ def test_rows_that_count_as_independent_but_are_not_have_their_covariance_with_t
     left = np.eye(len(J)) - J @ K @ J.T
     A = np.linalg.inv(W) @ (left @ C @ left.T + J @ K @ prior @ K @ J.T) @ np.linalg.inv(W).T
     variance = np.diag(A) / table.sigma**2
-    for fit in kind_fits(solution, spread, table):
+    for fit in RowStatistics(solution, spread, table).fit_kinds():
         family = table.family == table.families.index(fit.kind)
         assert fit.expected == pytest.approx(variance[family].sum(), rel=1e-4), fit.kind
-    assert [fit.kind for fit in kind_fits(solution, spread, table)] == ["distance", "point"]
+    assert [fit.kind for fit in RowStatistics(solution, spread, table).fit_kinds()] == ["distance", "point"]
 
 
 def differences(function, x, step=1e-5):

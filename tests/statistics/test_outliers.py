@@ -18,14 +18,14 @@ from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.options import Pairing
-from fg_calib.statistics.gross_errors import find_gross_errors, log_chance
-from fg_calib.statistics.residual_covariance import Errors
+from fg_calib.statistics.outliers import find_outliers, log_chance
+from fg_calib.statistics.residual_covariance import RowErrors
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 
 
 def linear(rng, n=40, m=6, scale=1.0, shifts=(), tied=0.5):
-    """Rows of a random linear model by twos, which share errors by fours; what `find_gross_errors` takes of them."""
+    """Rows of a random linear model by twos, which share errors by fours; what `find_outliers` takes of them."""
     J = rng.normal(size=(n, m))
     L = tied * scipy.linalg.block_diag(*[np.ones((4, 1))] * (n // 4))
     C = np.eye(n) + L @ L.T
@@ -36,7 +36,7 @@ def linear(rng, n=40, m=6, scale=1.0, shifts=(), tied=0.5):
     tangent = np.linalg.inv(J.T @ W @ J)
     z = y - J @ tangent @ J.T @ W @ y
     nothing = np.zeros((n, 0))
-    errors = Errors(J, nothing, np.ones(n), scipy.sparse.csr_array(L), nothing)
+    errors = RowErrors(J, nothing, np.ones(n), scipy.sparse.csr_array(L), nothing)
     units = list(np.arange(n).reshape(-1, 2))
     return (z, errors, tangent, units, float(n - m)), (y, J, C)
 
@@ -51,7 +51,7 @@ def test_what_is_found_is_what_refits_find():
         r = y[kept] - J[kept] @ np.linalg.solve(J[kept].T @ W @ J[kept], J[kept].T @ W @ y[kept])
         left[pair] = r @ W @ r
     assert min(left, key=left.get) == (2, 10)
-    assert np.flatnonzero(find_gross_errors(*given)).tolist() == [4, 5, 20, 21]
+    assert np.flatnonzero(find_outliers(*given)).tolist() == [4, 5, 20, 21]
 
 
 def test_where_the_problem_is_linearised_is_no_matter():
@@ -62,7 +62,7 @@ def test_where_the_problem_is_linearised_is_no_matter():
     tangent = np.linalg.inv(J.T @ W @ J + J_prior.T @ J_prior)
     for x in (-tangent @ J.T @ W @ y, np.zeros(6), 30.0 * rng.normal(size=6)):
         given = (y + J @ x, errors, tangent, units, dof + 6.0, (J_prior @ x, J_prior))
-        assert np.flatnonzero(find_gross_errors(*given)).tolist() == [4, 5]
+        assert np.flatnonzero(find_outliers(*given)).tolist() == [4, 5]
 
 
 @pytest.mark.slow
@@ -84,14 +84,14 @@ def test_anchors_exchanged_where_the_fit_goes_far_astray_are_outliers(swapped):
 def test_many_equal_outliers_do_not_hide_each_other(size):
     shifts = [([2 * k, 2 * k + 1], size) for k in range(4)]
     (z, *rest), _ = linear(np.random.default_rng(2), n=80, shifts=shifts)
-    assert np.flatnonzero(find_gross_errors(z, *rest)).tolist() == list(range(8))
+    assert np.flatnonzero(find_outliers(z, *rest)).tolist() == list(range(8))
 
 
 def test_a_table_half_of_which_is_wrong_has_no_outliers():
     signs = np.random.default_rng(3).normal(size=20)
     shifts = [([2 * k, 2 * k + 1], 1e3 * sign) for k, sign in enumerate(signs)]
     given, _ = linear(np.random.default_rng(3), n=80, shifts=shifts)
-    assert find_gross_errors(*given) is None
+    assert find_outliers(*given) is None
 
 
 @pytest.mark.slow
@@ -99,7 +99,7 @@ def test_a_table_half_of_which_is_wrong_has_no_outliers():
 def test_noise_of_any_size_has_no_gross_errors(scale):
     """CHANCE is 1e-4 for each number of rows left out: of 200 tables one at most."""
     rng = np.random.default_rng(4)
-    assert sum(find_gross_errors(*linear(rng, scale=scale)[0]) is not None for _ in range(200)) <= 1
+    assert sum(find_outliers(*linear(rng, scale=scale)[0]) is not None for _ in range(200)) <= 1
 
 
 @pytest.mark.parametrize("dof", [3.0, 30.0, 300.0])

@@ -34,7 +34,7 @@ from fg_calib.measurements.table import Table
 from fg_calib.options import Model, Options
 from fg_calib.robot.kinematics import Chain
 from fg_calib.robot.model import Robot
-from fg_calib.statistics.gross_errors import CHANCE, MOST_FEW
+from fg_calib.statistics.residual_table import CHANCE, MAX_OUTLIER_SHARE
 from fg_calib.threads import one_blas_thread
 
 Floats = NDArray[np.float64]
@@ -174,7 +174,7 @@ def find_disagreements(fit: RoughFit, labels: Sequence[str]) -> Disagreements:
             bad = np.flatnonzero(_are_far(d, s.used.sum(axis=1)))
             covariance = _covariance(noise, chains[s.table], fit.robot)
             flagged += _described(fit, noise, covariance, (d, bad), labels[s.table])
-    if len(flagged) > MOST_FEW * max(n, 1):
+    if len(flagged) > MAX_OUTLIER_SHARE * max(n, 1):
         flagged = []
     return Disagreements(tuple(sorted(flagged, key=lambda one: -one.ratio)), n, total)
 
