@@ -22,7 +22,6 @@ from fg_calib.arrays import NOTHING
 from fg_calib.errors import InputError
 from fg_calib.executors import tell
 from fg_calib.importers.opencv import (
-    LARGER,
     CalibrationBoard,
     charuco_board,
     decode,
@@ -41,9 +40,6 @@ _MOST = 1000
 _LARGEST = 2.0
 """Side of a square, [m]: larger ones are in another unit."""
 _ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp", ".jp2")
-
-_ENOUGH = 3
-"""Images that show the same larger board: it is another one than the file says, and parts of it may look like that."""
 
 
 # --- the file of a board ----------------------------------------------------------------------------------------------
@@ -190,7 +186,6 @@ def read_corners(files: Sequence[Path], board: CalibrationBoard) -> FoundCorners
         seen = find_corners(image, board)
         if isinstance(seen, str):
             without[file.name] = seen
-            _check_larger(seen, without, board)
         else:
             found.append(Corners(_name(file), *seen))
     if size is None or not found:
@@ -198,14 +193,6 @@ def read_corners(files: Sequence[Path], board: CalibrationBoard) -> FoundCorners
         hint = "are columns, rows and dictionary those of the board? older charuco boards: legacy: true"
         raise InputError("images", f"the board in none of {len(files)} ({reasons})", "at least one", hint)
     return FoundCorners(tuple(_upright(found) if board.upright else found), without, size)
-
-
-def _check_larger(reason: str, without: Mapping[str, str], board: CalibrationBoard) -> None:
-    """Whether the images show a larger checkerboard, of which a part would now and then be taken for the board."""
-    alike = [name for name, other in without.items() if other == reason]
-    if reason.startswith(LARGER) and len(alike) >= _ENOUGH:
-        expected = f"{board.columns} x {board.rows} as the board's file says"
-        raise InputError(", ".join(alike), reason, expected, "columns and rows count inner corners")
 
 
 def _upright(found: Sequence[Corners]) -> list[Corners]:

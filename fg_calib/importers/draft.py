@@ -248,27 +248,13 @@ def _keys(table: Recognised, inputs: _Inputs, folder: Path) -> list[str]:
     if table.model == "pixels" and inputs.camera is not None:
         room = "DECIDE: if it stands in the room, {file: ..., fixed: true}, and frame: unknown"
         lines.append(f"camera: {_path(inputs.camera, folder)}  # {room}")
-    alone = len(inputs.tables) == 1  # names of several tables would have to agree
-    named = {"id": table.maybe_id} if table.maybe_id and alone else {}
-    columns: dict[str, Any] = {name: _column(table, name) for name in table.columns} | named
-    if columns:
+    if table.columns:
+        scales = table.scales
+        columns = {k: {"name": c, "scale": scales[k]} if k in scales else c for k, c in table.columns.items()}
         lines.append(f"columns: {_flow(columns)}  # DECIDE whether these are what the names mean")
-    if table.counts:
-        lines.append("# DECIDE scale and zero of each: reading = (count - zero) * scale, in the units below")
-    if table.maybe_id and not alone:
-        same = "if the same name in two tables is the same configuration"
-        lines.append(f"# DECIDE, among columns: {_flow({'id': table.maybe_id})}  # {same}")
-    if unused := [name for name in table.unused if name not in named.values()]:
-        lines.append(f"# not used: {printable(', '.join(unused))[:90]}")
+    if table.unused:
+        lines.append(f"# not used: {printable(', '.join(table.unused))[:90]}")
     return lines
-
-
-def _column(table: Recognised, name: str) -> Any:
-    """The entry of a column that the table calls otherwise, or has in counts or another unit."""
-    column = table.columns[name]
-    if name in table.counts:
-        return {"name": column, "scale": 1.0, "zero": 0.0}
-    return {"name": column, "scale": table.scales[name]} if name in table.scales else column
 
 
 def _units_of(table: Recognised) -> dict[str, str]:

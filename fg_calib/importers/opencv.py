@@ -26,11 +26,6 @@ _SEARCHED = 1600
 """Longest side, [px], to which an image is reduced before a checkerboard is searched in it: in 12 megapixels without a
 board the search takes seconds, or minutes where there is much texture."""
 
-_LEAST_SHAPE = (4, 3)
-"""Corners of the smallest checkerboard that is looked for where that of the file is not found."""
-
-LARGER = "a larger board"
-"""How the reason begins that a checkerboard has more corners than the file says."""
 
 FEWEST_CORNERS = 6
 """Of a ChArUco board: four say where it is, and more are needed to say how well."""
@@ -205,22 +200,11 @@ def _checkerboard(cv2: Any, image: Image, board: CalibrationBoard) -> tuple[Inte
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
         found, uv = cv2.findChessboardCornersSB(small, board.shape, flags=flags)
     if not found:
-        return _another(cv2, small, board)
+        return "no board"
     columns, rows = board.shape
     uv = (uv.astype(np.float64) + 0.5) * scale - 0.5
     grid = in_order(image, uv.reshape(rows, columns, 2))
     return np.arange(columns * rows), grid.reshape(-1, 2)
-
-
-def _another(cv2: Any, image: Image, board: CalibrationBoard) -> str:
-    """Why a checkerboard is not found: one of other dimensions is, or none."""
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
-    seen, _, cells = cv2.findChessboardCornersSBWithMeta(image, _LEAST_SHAPE, flags=flags)
-    there, stated = sorted(cells.shape) if seen else [], sorted(board.shape)
-    if not seen or there == stated:
-        return "no board"
-    larger = there[0] >= stated[0] and there[1] >= stated[1]
-    return f"{LARGER if larger else 'another board or part of one'}: {there[1]} x {there[0]} inner corners"
 
 
 def _charuco(cv2: Any, image: Image, board: CalibrationBoard) -> tuple[Integers, Floats] | str:

@@ -16,7 +16,7 @@ from fg_calib.io.pairs import PAIR_COLUMNS
 from fg_calib.io.table_columns import COLUMNS, COVARIANCE
 from fg_calib.io.tables import KNOWN
 from fg_calib.io.units import ANGLES, LENGTHS
-from fg_calib.options import Model, did_you_mean
+from fg_calib.options import Model
 from fg_calib.robot.model import Robot
 
 Kind = Literal["joints", "pairs"]
@@ -29,18 +29,6 @@ UNITS |= {"inch": "in", "inches": "in", '"': "in"}
 _BRACKETED = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]$")
 _SUFFIXED = re.compile(r"^(?P<name>.*?)[_\s](?P<unit>um|mm|cm|m|in|deg|rad|mrad|px)$", re.IGNORECASE)
 _JOINT = re.compile(r"^(?:actual[ _])?(?:q|j|a|axis|joint|theta|th)[ _-]?(?:pos|position|angle)?[ _-]?0*(\d+)$", re.I)
-_COUNTS = re.compile(
-    r"^(?:c|cnt|counts?|ticks?|enc|encoders?)[ _-]?(?:pos|position|counts?|j|q|axis)?[ _-]?0*(\d+)$", re.I
-)
-"""Counts of joints' encoders."""
-
-_NAMES = re.compile(
-    r"^(?:(?:row|point|pose|measurement|mess|mp)[ _-]?)?(?:id|name|no|nr|number|label|point|punkt)\.?$", re.I
-)
-
-_FIGURE = r"^[-+]?[0-9]*[.,]?[0-9]+([eE][-+]?[0-9]+)?$"
-"""A cell that holds a figure, not a name."""
-
 _SYNONYMS: Mapping[str, tuple[str, ...]] = {
     **{axis: (f"pos_{axis}", f"position_{axis}", f"p{axis}", f"tcp_{axis}", f"t{axis}") for axis in "xyz"},
     **{f"q{axis}": (f"q_{axis}", f"quat_{axis}", f"orientation_{axis}") for axis in "xyzw"},
@@ -70,8 +58,6 @@ class Recognised:
         scales: Of columns whose header states another unit: what one is in those of the table.
         guessed: Which of the units are guesses from the figures.
         unused: Columns that mean nothing.
-        counts: Names of joints whose readings are in counts of their encoders.
-        maybe_id: A column that may name the rows, each by another name, where none is called id; empty without.
     """
 
     path: Path
@@ -84,8 +70,6 @@ class Recognised:
     scales: Mapping[str, float] = field(default_factory=dict)
     guessed: tuple[str, ...] = ()
     unused: tuple[str, ...] = ()
-    counts: tuple[str, ...] = ()
-    maybe_id: str = ""
 
     @property
     def has_sigma(self) -> frozenset[str]:
@@ -106,10 +90,7 @@ def recognise(path: Path, robot: Robot) -> Recognised:
         InputError: It cannot be read, or is neither of configurations nor of pairs.
     """
     header = Header.read(path, "table")
-    joints, counts = _joints(header.columns, robot), False
-    if not joints:
-        joints = _numbered(header.columns, robot, _COUNTS)
-        counts = bool(joints)
+    joints = _joints(header.columns, robot)
     ends = {"a", "b"} <= {name.lower() for name in header.columns}
     if not joints and not ends:
         raise _unknown(header, robot)
@@ -118,7 +99,7 @@ def recognise(path: Path, robot: Robot) -> Recognised:
     columns = {**joints, **called}
     present = tuple(called)
     units = {name: _unit(header.columns, column) for name, column in columns.items()}
-    lengths, angles = _of_units(present, robot, {} if counts else joints)
+    lengths, angles = _of_units(present, robot, joints)
     length, angle = (_most([units[name] for name in names], of) for names, of in ((lengths, LENGTHS), (angles, ANGLES)))
     guessed: list[str] = []
     unused = tuple(c for c in header.columns if c not in columns.values())
@@ -147,8 +128,6 @@ def recognise(path: Path, robot: Robot) -> Recognised:
         scales=scales,
         guessed=tuple(guessed),
         unused=unused,
-        counts=tuple(joints) if counts else (),
-        maybe_id="" if "id" in present else _names_rows(header, unused),
     )
 
 
@@ -167,31 +146,19 @@ def _joints(columns: Sequence[str], robot: Robot) -> dict[str, str]:
     for wanted in (names, numbers):
         if all(name.lower() in bare for name in wanted) and not KNOWN & set(wanted):
             return {name: bare[name.lower()] for name in wanted}
-    return _numbered(columns, robot, _JOINT)
+    return _numbered(columns, robot)
 
 
-def _numbered(columns: Sequence[str], robot: Robot, pattern: re.Pattern[str]) -> dict[str, str]:
-    """Columns of a pattern with a number for each joint, from 0 or 1, by `q1`, ...; empty where not all are there."""
+def _numbered(columns: Sequence[str], robot: Robot) -> dict[str, str]:
+    """Columns with a number for each joint, from 0 or 1, by `q1`, ...; empty where not all are there."""
     found: dict[int, str] = {}
     for c in columns:
-        if match := pattern.match(_bare(c)):
+        if match := _JOINT.match(_bare(c)):
             found.setdefault(int(match[1]), c)
     for first in (1, 0):
         if set(found) == set(range(first, first + robot.n_joints)):
             return {f"q{i - first + 1}": found[i] for i in sorted(found)}
     return {}
-
-
-def _names_rows(header: Header, columns: Sequence[str]) -> str:
-    """The column whose cells name the rows, each otherwise: one that is called so, else the first of words."""
-    frame = Table.read(header, numbers=(), texts=columns).frame if columns else None
-    for c in sorted(columns, key=lambda c: _NAMES.match(_bare(c)) is None):
-        assert frame is not None
-        cells = frame[c].drop_nulls()
-        words = _NAMES.match(_bare(c)) is not None or not cells.str.contains(_FIGURE).any()
-        if words and cells.len() == frame.height == cells.n_unique():
-            return c
-    return ""
 
 
 def _bare(column: str) -> str:
@@ -214,7 +181,6 @@ def _called(columns: Sequence[str], known: set[str]) -> dict[str, str]:
         lambda c: c.lower(),
         lambda c: _bare(c).lower(),
         lambda c: next((name for name, others in _SYNONYMS.items() if _bare(c).lower() in others), ""),
-        lambda c: did_you_mean(_bare(c), [k for k in known if len(k) > 3], 0.85).removeprefix("did you mean ")[:-1],
     )
     for step in steps:
         for c in tuple(left):

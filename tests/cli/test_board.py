@@ -374,17 +374,6 @@ def test_what_cannot_be_used_is_named(case, job, fg_calib):
     assert not (job / "out").exists()
 
 
-def test_images_of_a_larger_board_are_refused_after_the_third(job, fg_calib, monkeypatch):
-    """Parts of it may look like the stated board: the second image does."""
-    (job / "board.yaml").write_text(yaml.safe_dump(CHECKERBOARD | {"columns": 7}))
-    larger = "a larger board: 9 x 6 inner corners"
-    search = iter([larger, (np.arange(42), np.zeros((42, 2))), larger, larger])
-    monkeypatch.setattr(images, "find_corners", lambda image, board: next(search))
-    ended = run(fg_calib, job)
-    assert (ended.code, ended.out) == (1, "")
-    assert ended.err.startswith(f"error: view0.png, view2.png, view3.png: {larger}, expected 7 x 6 as the board's file")
-
-
 def test_a_principal_point_outside_the_images_is_told(job, fg_calib, caplog):
     (job / "camera.yaml").write_text(yaml.safe_dump(asdict(CAMERA) | {"cx": 960.0}))
     assert run(fg_calib, job).code == 3
