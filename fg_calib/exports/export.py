@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -15,18 +15,19 @@ from fg_calib.arguments import checked
 from fg_calib.arrays import as_floats
 from fg_calib.calibration import Calibration
 from fg_calib.errors import InputError, printable, shown
-from fg_calib.exports.fits import (
+from fg_calib.exports.dh import (
     N_FITTED,
     N_JUDGED,
     PoseErrors,
+    TableConvention,
     drawn,
     errors,
     fit_parameters,
     fit_zeros,
+    in_table,
     with_frames_of,
 )
 from fg_calib.exports.ros import UrBase, dumped, hash_of, tesseract_text, ur_base_of, ur_kinematics, ur_text
-from fg_calib.exports.tables import TableConvention, in_table
 from fg_calib.exports.urdf import BASE_LINK, TOOL_LINK, calibrated_urdf, new_urdf
 from fg_calib.io.atomic import replacing, require_absent
 from fg_calib.io.robot_file import robot_text
@@ -171,25 +172,25 @@ def export(
     check("tool", tool, ToolOfZeros)
     check_flag("far", far)
     check_flag("calibration_elements", calibration_elements)
-    _require_use(
-        to,
-        configurations=configurations is not None,
-        tool=tool != "calibrated",
-        far=far,
-        calibration_elements=calibration_elements,
-        ur_base=ur_base is not None,
-        ur_hash=ur_hash is not None,
-    )
-    if to == "urdf":
-        part = _urdf(found, calibration_elements)
-    elif to == "ur":
-        part = _ur(found, ur_base, ur_hash)
-    elif to == "tesseract":
-        part = _tesseract(found)
-    elif to == "zeros":
-        part = _zeros(found, tool, configurations)
-    else:
-        part = _yaml(found) if to == "yaml" else _table(found, to, far)
+    given = {
+        "configurations": configurations is not None,
+        "tool": tool != "calibrated",
+        "far": far,
+        "calibration_elements": calibration_elements,
+        "ur_base": ur_base is not None,
+        "ur_hash": ur_hash is not None,
+    }
+    for name, is_given in given.items():
+        if is_given and to not in _FORMATS_OF[name]:
+            raise InputError(name, f"means nothing for {to}", f"the format {' or '.join(_FORMATS_OF[name])}")
+    formats: dict[str, Callable[[], Export]] = {
+        "urdf": lambda: _urdf(found, calibration_elements),
+        "ur": lambda: _ur(found, ur_base, ur_hash),
+        "tesseract": lambda: _tesseract(found),
+        "zeros": lambda: _zeros(found, tool, configurations),
+        "yaml": lambda: _yaml(found),
+    }
+    part = formats[to]() if to in formats else _table(found, to, far)
     if not isinstance(arm, Calibration):
         return part
     return replace(part, findings=_findings(arm), not_accepted=arm.not_accepted)
@@ -231,17 +232,6 @@ _FORMATS_OF: Mapping[str, tuple[str, ...]] = {
     **{"calibration_elements": ("urdf",), "ur_base": ("ur",), "ur_hash": ("ur",)},
 }
 """The formats for which an option means something."""
-
-
-def _require_use(to: str, **given: bool) -> None:
-    """Check that each option that was given means something for the format.
-
-    Raises:
-        InputError: One means nothing.
-    """
-    for name, is_given in given.items():
-        if is_given and to not in _FORMATS_OF[name]:
-            raise InputError(name, f"means nothing for {to}", f"the format {' or '.join(_FORMATS_OF[name])}")
 
 
 def _commented(comments: tuple[str, ...], text: str) -> str:

@@ -30,8 +30,7 @@ import yaml
 from numpy.typing import NDArray
 
 from fg_calib.errors import InputError
-from fg_calib.exports.links import row_transform, transform
-from fg_calib.exports.tables import in_table
+from fg_calib.exports.dh import in_table, row_transform, transform
 from fg_calib.exports.urdf import frame_matrix, urdf_joints
 from fg_calib.robot.model import FRAME_KINDS, Robot, frame_values
 

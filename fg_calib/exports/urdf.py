@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.errors import InputError
-from fg_calib.exports.links import Links, inverse, links_of, rigid, transform
+from fg_calib.exports.dh import Links, inverse, links_of, rigid, transform
 from fg_calib.io.urdf import ROUNDING, urdf_text
 from fg_calib.robot.model import FRAME_KINDS, Joint, Robot, frame_of_matrix, frame_values
 

@@ -11,7 +11,7 @@ from simulated import measure
 from sparing import as_case
 
 from fg_calib import Calibration, calibrate, read_robot, read_urdf, write_robot
-from fg_calib.exports.fits import drawn, errors
+from fg_calib.exports.dh import drawn, errors
 from fg_calib.robot.model import Robot
 
 TOLERANCE = {"a": 5e-4, "d": 5e-4, "alpha": 5e-4, "theta": 5e-4, "beta": 5e-4}

@@ -6,15 +6,18 @@ from exported import matrix, off, scara, ur10
 from scipy.spatial.transform import Rotation
 
 from fg_calib import Robot, export
-from fg_calib.exports.fits import drawn, errors, poses
-from fg_calib.exports.links import links_of, row_transform
-from fg_calib.exports.tables import (
+from fg_calib.exports.dh import (
     FARTHEST,
     PARALLEL,
     common_normal,
+    drawn,
+    errors,
     in_table,
     left_over,
+    links_of,
     plane_crossing,
+    poses,
+    row_transform,
 )
 from fg_calib.robot.model import CONVENTIONS
 

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from sparing import as_case
 
 from fg_calib import InputError, Robot, export, read_robot, read_urdf
-from fg_calib.exports.fits import drawn, poses
-from fg_calib.exports.tables import in_table
+from fg_calib.exports.dh import drawn, in_table, poses
 from fg_calib.robot.model import CONVENTIONS
 
 EXACT = 1e-9  # [m] and [rad], as the issue states
