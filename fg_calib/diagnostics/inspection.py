@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from fg_calib.arguments import checked
+from fg_calib.arrays import Brief
 from fg_calib.diagnostics.linearity import find_nonlinear_rows
 from fg_calib.diagnostics.robust_screening import Disagreements, find_disagreements, fit_roughly
 from fg_calib.diagnostics.setup_check import SetupCheck, check_tables
 from fg_calib.diagnostics.setup_hypotheses import MOTION_M, MOTION_RAD
-from fg_calib.errors import escaped
 from fg_calib.graph.build import problem_of
 from fg_calib.graph.information import eliminated
 from fg_calib.graph.problem import Problem, tables_of
@@ -126,8 +126,8 @@ class TableSurvey:
     n_ambiguous: int
 
 
-@dataclass(frozen=True, repr=False)
-class Inspection:
+@dataclass(frozen=True)
+class Inspection(Brief):
     """A job before it is solved.
 
     Attributes:
@@ -168,18 +168,6 @@ class Inspection:
     def ready(self) -> bool:
         """Whether nothing is to be looked at first."""
         return not self.findings
-
-    def __repr__(self) -> str:
-        o = self.identifiability.observability
-        rows, tables = sum(t.n_rows for t in self.tables), len(self.tables)
-        lines = [
-            f"Inspection of {self.robot!r}: {rows} rows in {tables} table{'s' * (tables > 1)},"
-            f" rank {o.rank} of {len(o.names)}",
-            *(f"  LOOK AT THIS FIRST: {finding}" for finding in self.findings[:6]),
-            *(["  ready"] if self.ready else []),
-            *([f"  {len(self.cautions)} notes"] if self.cautions else []),
-        ]
-        return "\n".join(escaped(line if len(line) <= 100 else f"{line[:96]} ...") for line in lines)
 
 
 @checked

@@ -61,11 +61,6 @@ NEGLIGIBLE_EXCESS = 1e-6
 
 OTHER_TOOL = "tool or base differ from those of the other tables (another target on the tool, another frame)"
 
-_WRONG_TOOL = "the tool is another one, farther off than its prior sigma lets it be"
-_WRONG_BASE = (
-    "the measurement frame is not the base (frame: unknown), which is farther off than its prior sigma lets it be"
-)
-
 
 @dataclass(frozen=True)
 class Explanation:
@@ -252,33 +247,7 @@ def _checked_alone(setup: Setup, found: SetupCheck, doubtful: bool) -> SetupChec
         return found
     if setup.has_landmarks and not found.far:
         return found
-    explanations = _explanations(setup, found)
-    return replace(found, explanations=explanations) if explanations else _with_held_frames(setup, found)
-
-
-def _with_held_frames(setup: Setup, found: SetupCheck) -> SetupCheck:
-    """The check with tool or base at nominal, if one far beyond its prior sigma is what explains the table."""
-    if found.far or setup.has_landmarks:
-        return found
-    robot = setup.robot
-    held = [(setup.with_tool(frozenset()), robot.n_joints + 1, _WRONG_TOOL)]
-    if setup.of_base and setup.table.frame == "unknown":
-        held.append((replace(setup, table=replace(setup.table, frame="known")), 0, _WRONG_BASE))
-    checks = [found]
-    for one, owner, words in held:
-        parameters = [robot.parameters[i] for i in robot.owned_by(owner)]
-        parameters = [p for p in parameters if p.estimated or (owner == 0 and p.tolerance is not None)]
-        if not parameters or any(p.tolerance is None for p in parameters):
-            continue
-        slack = {unit: float(np.linalg.norm([p.tolerance or 0.0 for p in parameters if p.unit == unit]))
-                 for unit in ("m", "rad")}  # fmt: skip
-        if owner == 0:  # a rotation of the base moves the tool by that times the reach
-            slack["m"] = float(np.hypot(slack["m"], robot.reach * slack["rad"]))
-        residuals = [replace(r, expected=float(np.hypot(r.expected, slack[r.unit]))) for r in nominal_residuals(one)]
-        check_held = SetupCheck(tuple(residuals))
-        if check_held.far and found.excess <= min(EXPLAINED, check_held.excess / REDUCTION):
-            checks.append(replace(check_held, explanations=(Explanation((words,), found.residuals),)))
-    return found if len(checks) == 1 else max(checks[1:], key=lambda one: one.excess)
+    return replace(found, explanations=_explanations(setup, found))
 
 
 def _disagreeing(given: Sequence[tuple[Setup, SetupCheck]]) -> list[SetupCheck]:

@@ -29,20 +29,8 @@ N_STILL, STILL_EXCESS_RATIO = 10, 3.0
 """Positions at which each joint may stand still that are tried first, and excess left there over the least of all
 joints, up to which a joint is looked at more closely."""
 
-LENGTHS = {
-    1e-3: "mm, not m",
-    1e3: "m, not mm",
-    1e-2: "cm, not m",
-    1e2: "m, not cm",
-    1e-1: "mm, not cm",
-    1e1: "cm, not mm",
-    0.0254: "inches, not m",
-    2.54: "inches, not cm",
-    25.4: "inches, not mm",
-    1.0 / 0.0254: "m, not inches",
-    1.0 / 2.54: "cm, not inches",
-    1.0 / 25.4: "mm, not inches",
-}
+_UNITS = {"mm": 1e-3, "m": 1.0, "cm": 1e-2, "inches": 0.0254}
+LENGTHS = {_UNITS[one] / _UNITS[other]: f"{one}, not {other}" for one, other in permutations(_UNITS, 2)}
 ANGLES = {np.pi / 180.0: "deg, not rad", 180.0 / np.pi: "rad, not deg"}
 """Units that are meant by values in another, by the factor that converts them."""
 

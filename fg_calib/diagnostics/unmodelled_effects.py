@@ -41,9 +41,9 @@ from fg_calib.graph.rows import At
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements import residuals
 from fg_calib.measurements.residuals import Block
-from fg_calib.observability.parallel_axes import MissingMotion, end_of_link
+from fg_calib.observability.parallel_axes import end_of_link
 from fg_calib.robot.kinematics import Chain, pose
-from fg_calib.robot.model import FRAME_KINDS, Axis, Element, Parameter, Robot
+from fg_calib.robot.model import FRAME_KINDS, Element, Parameter, Robot
 
 Floats = NDArray[np.float64]
 
@@ -76,8 +76,6 @@ LINK = "small motion of link "
 
 _STAGES = (1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3)
 """The stages of `_joint_errors`."""
-
-_KINDS = {Axis.TX: "x", Axis.TY: "y", Axis.TZ: "z", Axis.RX: "roll", Axis.RY: "pitch", Axis.RZ: "yaw"}
 
 
 @dataclass(frozen=True)
@@ -184,24 +182,6 @@ def probability_of_noise(solution: Solution) -> float | None:
     return -float(np.expm1(stages * np.log1p(-min(least, 1.0 - 1e-16)))) if stages else None
 
 
-def excess_left(solution: Solution, missing: Sequence[MissingMotion]) -> float:
-    """Part of the excess of chi-square that is left if links may make the small motions that a convention leaves out.
-
-    Args:
-        solution: The solution.
-        missing: What the convention leaves out.
-
-    Returns:
-        0 where nothing is left, 1 where they explain nothing; 0 too where there are more rows than `MAX_ROWS`.
-    """
-    if solution.problem.n_residuals > MAX_ROWS:
-        return 0.0
-    fit, of_links = _with_links(solution)
-    fit_after = fit.extended(fit.new(of_links(_columns_of(missing, solution.problem.robot))))
-    excess, left = (float(one.r @ one.r) - one.dof for one in (fit, fit_after))
-    return max(left, 0.0) / max(excess, 1e-300)
-
-
 def find_change(solution: Solution) -> Change | None:
     """The change point of a table: what moved between two of its rows; None without, or where it cannot be told.
 
@@ -294,18 +274,6 @@ def _linear_fit(solution: Solution, wide: At, more: Sequence[int]) -> tuple[Line
     columns = np.concatenate([np.delete(J, list(more), axis=1), of_core, J_unknown])
     n = problem.n_independent + len(r_prior) + len(r_unknown)
     return LinearFit.of(columns, np.concatenate([r, r_prior, r_unknown]), n), J[:, list(more)]
-
-
-def _columns_of(missing: Sequence[MissingMotion], robot: Robot) -> list[str]:
-    """Names of the columns (see `with_link_motions`) of motions that a convention or a frame's angles leave out."""
-    found = []
-    for motion in missing:
-        if motion.frame:  # a tilt of the frame that it is of, whichever way
-            link = min(max(motion.axes[0] - 1, 0), robot.n_joints)
-            found += [f"{LINK}{link}: {kind}" for kind in ("roll", "pitch", "yaw")]
-        else:
-            found += [f"{LINK}{axis}: {_KINDS[axes]}" for axis in motion.axes[:-1] for axes in motion.motions]
-    return list(dict.fromkeys(found))
 
 
 def with_link_motions(problem: Problem, parameters: Floats) -> tuple[tuple[Chain, ...], tuple[str, ...]]:

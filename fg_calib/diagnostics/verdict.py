@@ -9,7 +9,7 @@ know. Within `FACTOR` of its mean chi-square is no error, whatever its distribut
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
 
@@ -22,20 +22,17 @@ from fg_calib.diagnostics.setup_check import SetupCheck, check_problem
 from fg_calib.diagnostics.unmodelled_effects import (
     Change,
     Offset,
-    excess_left,
     find_change,
     forgotten_offsets,
     probability_of_noise,
 )
-from fg_calib.graph.information import directions
 from fg_calib.graph.noise import JOINT_NOISE
-from fg_calib.graph.problem import Problem, at_parameters, reweighted_at
+from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
 from fg_calib.graph.tolerances import ToleranceScale
-from fg_calib.measurements.kinds.anchor import AnchorContact
 from fg_calib.measurements.kinds.pair import missing_values
 from fg_calib.observability.parallel_axes import MissingMotion
-from fg_calib.robot.kinematics import forward
+from fg_calib.robot.kinematics import pose
 from fg_calib.statistics.covariance import Spread
 from fg_calib.statistics.goodness_of_fit import (
     CONFIDENCE,
@@ -80,14 +77,6 @@ MAX_KEPT_FACTOR = 3.0
 MAX_OUTLIER_SHARE = 0.5
 """Share of measurements beyond which they are not outliers but the majority."""
 
-LOST_SIGMA_RATIO = 3.0
-"""Sigma of a parameter over what it is with all outliers, from which these are nearly all that sees it."""
-
-EXPLAINED_EXCESS = 0.8
-"""Part of the excess of chi-square left with what a convention has no parameter for, up to which that is the cause.
-
-Where the fit went far astray what is linear of it is but a part: up to 0.7 were left of textbook tables."""
-
 MOST_ESTIMATED = 2.0
 """Estimated over specified noise above which an unmodelled effect is more likely."""
 
@@ -96,9 +85,6 @@ MAX_PRIOR_SCALE = 10.0
 
 LEAST_SEEN = 0.5
 """Corrections of a group that the data determine, below which they do not determine its scale."""
-
-WEAKEST = 0.1
-"""Signal-to-noise ratio below which a direction is not taken for weaker."""
 
 NAMED = 3
 """Configurations, rows or parameters that a statement names."""
@@ -226,10 +212,8 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
         statements += systematic  # a wrong set-up has them as its consequence
         offsets = () if case.gross is not None else forgotten_offsets(solution)
         statements += [check_offset(found, problem.data.labels, fit.chi_square.too_large) for found in offsets]
-    asked = high and bool(missing) and not setup.explanations and problem.knowledge is None  # else it was asked before
-    certain = asked and excess_left(solution, missing) <= EXPLAINED_EXCESS
     fits = not (doubts or solution.estimated_noise is not None)
-    statements[:0] = check_model(setup, missing, fits=fits, high=high, certain=certain)
+    statements[:0] = check_model(setup, missing, fits=fits, high=high, updated=problem.knowledge is not None)
     errors, warnings, notes = (
         tuple(s.text for s in statements if s.severity == severity) for severity in ("error", "warning", "note")
     )
@@ -241,18 +225,12 @@ def check_solver(case: Case) -> Iterator[Statement]:
     if not case.solution.converged:
         yield Statement("error", case.solution.message)
     weights, data, loss = case.problem.state.weights, case.problem.data, case.problem.options.loss
-    any_outlier = False
     for s, w in zip(data.series, weights or (), strict=False):
         n, lost = len(s.train), int(np.sum(w[s.train] < OUTLIER_WEIGHT))
-        any_outlier |= lost > 0
         if lost > MAX_OUTLIER_SHARE * n:
             of = f" of {data.labels[s.table]}" if len(data.labels) > 1 else ""
             text = f"loss {loss} takes {lost} of {n} measurements of {s.kind.names[0].partition('.')[0]}{of}"
             yield Statement("error", f"{text} for outliers: more than it can tell from noise")
-    names = _lost_to_outliers(case) if any_outlier else []
-    if names:
-        text = f"nearly all measurements that see {_listed(names)} are taken for outliers by loss {loss}"
-        yield Statement("warning", f"{text}: look at them; calibrate without a loss to see what they say")
 
 
 def check_change(case: Case) -> Iterator[Statement]:
@@ -314,13 +292,6 @@ def check_chi_square(
         text += f" ({ratio:.2f} times)" + "; sigmas may be too small by as much" * (not systematic)
         return [Statement("note", text)]
     return []
-
-
-def check_evaluation(case: Case) -> Iterator[Statement]:
-    """Check whether an evaluation has noise of its own: not where it was estimated from the same rows."""
-    if case.problem.evaluated and case.solution.estimated_noise is not None:
-        text = "the noise was estimated from these test rows: nothing says whether the arm predicts them well enough"
-        yield Statement("note", text)
 
 
 def check_kept_noise(case: Case) -> Iterator[Statement]:
@@ -447,14 +418,31 @@ def check_nonlinearity(found: Nonlinearity) -> list[Statement]:
 
 
 def check_estimated_noise(case: Case) -> Iterator[Statement]:
-    """Check whether estimated noise is small compared with the motions it was estimated from."""
+    """Check whether estimated noise is small compared with the motions it was estimated from.
+
+    Lengths and angles between two ends move by as much as they are; what has one end moves with the tool.
+    """
+    problem, table = case.problem, case.fit.residuals
     for fit in case.fit.goodness.kinds:
-        if (fit.table, fit.kind) in (case.solution.estimated_noise or ()) and fit.kind in _WITH_MOTION:
-            motion = 1.0 if fit.kind == "orientation" else _motion(case, fit.table, fit.kind)
-            ratio = fit.factor * fit.stated_sigma_rms / max(motion, 1e-300)
-            if ratio >= LARGE_NOISE:
-                text = f"the noise estimated of {fit.kind} is {ratio:.2g} times as large as the motions measured"
-                yield Statement("error", f"{text}: the arm explains next to nothing; check the table and the job")
+        if (fit.table, fit.kind) not in (case.solution.estimated_noise or ()) or fit.kind not in _WITH_MOTION:
+            continue
+        if problem.data.tables[fit.table].uses_pairs:
+            rows = table.used & (table.group == table.groups.index((fit.table, fit.kind)))
+            motion = float(np.sqrt(np.mean((table.measured + table.after)[rows] ** 2)))
+        else:
+            motion = 1.0 if fit.kind == "orientation" else _tool_motion(case, fit.table)
+        ratio = fit.factor * fit.stated_sigma_rms / max(motion, 1e-300)
+        if ratio >= LARGE_NOISE:
+            text = f"the noise estimated of {fit.kind} is {ratio:.2g} times as large as the motions measured"
+            yield Statement("error", f"{text}: the arm explains next to nothing; check the table and the job")
+
+
+def _tool_motion(case: Case, table: int) -> float:
+    """Standard deviation of the tool point along an axis over a table's configurations, [m]; the reach if it stays."""
+    robot = case.problem.robot.with_values(case.solution.parameters[case.problem.variables.robot_span])
+    p = pose(robot, case.problem.data.tables[table].measurements.readings).position
+    spread = float(np.sqrt(np.mean(np.var(p, axis=0))))
+    return spread if spread > 1e-3 * robot.reach else robot.reach
 
 
 def check_tables(case: Case) -> Iterator[Statement]:
@@ -467,7 +455,6 @@ CHECKS: tuple[Callable[[Case], list[Statement] | Iterator[Statement]], ...] = (
     check_solver,
     check_change,
     check_fit,
-    check_evaluation,
     check_kept_noise,
     check_test_rows,
     lambda case: check_priors(case.fit.priors),
@@ -511,7 +498,7 @@ def check_offset(found: Offset, labels: Sequence[str], high: bool) -> Statement:
 
 
 def check_model(
-    setup: SetupCheck, missing: Sequence[MissingMotion], *, fits: bool, high: bool, certain: bool
+    setup: SetupCheck, missing: Sequence[MissingMotion], *, fits: bool, high: bool, updated: bool
 ) -> Iterator[Statement]:
     """Check set-up and model, before all else: where they are wrong no value can be right.
 
@@ -520,7 +507,7 @@ def check_model(
         missing: What the robot's convention has no parameter for.
         fits: Whether nothing speaks against the calibration although the noise was as specified.
         high: Whether the residuals are larger than the noise, or systematic.
-        certain: Whether they are because of what the convention has no parameter for.
+        updated: Whether the rows were added to an earlier calibration, which the convention did for.
     """
     for check in (setup, *setup.others):
         if check.explanations:
@@ -531,7 +518,7 @@ def check_model(
         text = f"the set-up of {', '.join(setup.unchecked)} was not checked for common mistakes (units, signs, columns)"
         yield Statement("note", f"{text}: too few rows to locate its landmarks, or custom kinds of measurement")
     for motion in missing:
-        yield Statement("error" if certain else "note", str(motion))
+        yield Statement("error" if high and not (setup.explanations or updated) else "note", str(motion))
 
 
 def check_optima(solution: Solution, most: int = 4) -> list[Statement]:
@@ -550,43 +537,6 @@ def check_optima(solution: Solution, most: int = 4) -> list[Statement]:
         text = f"a second optimum that the data cannot distinguish from this one: {', '.join(words)} from nominal"
         found.append(Statement("error", text + advice))
     return found
-
-
-def _motion(case: Case, number: int, kind: str) -> float:
-    """How far the arm predicts that what was measured of a kind moved, by the series that moved most.
-
-    Lengths and angles between two ends move by as much as they are. What has one end moves as the tool point does along
-    an axis; in contact as the anchors are apart; at a single one the tool point stays, and the arm moves by its reach.
-    """
-    problem, table, motions = case.problem, case.fit.residuals, [0.0]
-    at = at_parameters(problem, case.solution.parameters)
-    for k, s in enumerate(problem.data.series):
-        if s.table != number or all(name.partition(".")[0] != kind for name in s.kind.names):
-            continue
-        if s.kind.ends == 1:
-            trig = problem.data.trigs(problem.robot)[number]
-            there = forward(at.chains[number].without_columns(), trig, s.ends[s.train, 0]).position
-            if isinstance(s.kind, AnchorContact):
-                there = at.coordinates[s.nuisances[s.train]]
-            stays = not np.ptp(there, axis=0).any()
-            motions.append(problem.robot.reach if stays else float(np.sqrt(np.mean(np.var(there, axis=0)))))
-        else:
-            group = table.groups.index((number, kind))
-            predicted = (table.measured + table.after)[table.used & (table.series == k) & (table.group == group)]
-            motions.append(float(np.sqrt(np.mean(predicted**2))) if len(predicted) else 0.0)
-    return max(motions)
-
-
-def _lost_to_outliers(case: Case) -> list[str]:
-    """Parameters that nearly only outliers see: with these their sigma would be so much smaller."""
-    problem, at = case.problem, case.solution.parameters
-    whole = reweighted_at(problem, at, replace(problem.state, weights=None))
-    sigmas = []
-    for one in (problem, whole):
-        s, V = directions(one, at)
-        sqrt_cov = one.variables.prior_scales[:, None] * V / np.maximum(s, WEAKEST)
-        sigmas.append(np.linalg.norm(sqrt_cov, axis=1)[: problem.variables.n_robot_columns])
-    return [problem.variables.names[i] for i in np.flatnonzero(sigmas[0] > LOST_SIGMA_RATIO * sigmas[1])]
 
 
 def _times(beyond: float) -> str:

@@ -298,12 +298,3 @@ def test_as_many_unknowns_as_rows_leave_nothing_to_judge_by():
     assert found.dof == 1
     found = inspected(robot.with_estimated(["a1", "a2", "d1"]), m, "position", "known", gauge="none")
     assert found.findings[-1].startswith("no degree of freedom is left")
-
-
-@pytest.mark.slow
-def test_the_repr_fits_a_screen(arm):
-    found = inspected(arm, measured(arm))
-    assert repr(found) == "Inspection of 'ur5e': 50 rows in 1 table, rank 23 of 30\n  ready"
-    lines = repr(inspected(arm, MISTAKES["x, y, z are in mm, not m"](measured(arm)))).splitlines()
-    assert lines[1].startswith("  LOOK AT THIS FIRST: position residuals fall")
-    assert max(map(len, lines)) <= 100

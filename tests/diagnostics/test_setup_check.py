@@ -24,8 +24,6 @@ from fg_calib.robot.inverse import solve_inverse
 PLACED = (Rotation.from_euler("xyz", [0.3, -0.7, 1.9]), np.array([1.0, -2.0, 0.5]))
 """World_T_base of a tracker beside the robot."""
 
-FRAME_KINDS = ("x", "y", "z", "roll", "pitch", "yaw")
-
 
 def measured(robot, seed=0, *, placed=None, n=50):
     """What is measured of a robot whose errors are those its tolerances say."""
@@ -211,40 +209,6 @@ def test_a_mistake_in_the_robot_is_named(tmp_path, model, mistake):
     if "frame" in mistake and model != "pose":
         mistake = "the tool point is another one"  # how it is turned does not show in pairs
     assert mistake in named(check)
-
-
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("model", ["pose", "position"])
-def test_a_wrong_tool_is_named_though_it_is_estimated(tmp_path, fg_calib, model):
-    """Its corrections alone were told of, d6 +22 of its tolerances first, where the file had the flange as the tool."""
-    point = {"estimate": ["tool.x", "tool.y", "tool.z"], "tolerance": UR5E["tolerance"] | {"tool": 0.002}}
-    m = measured(ur5e(tmp_path, **point))
-    assert not check_setup(ur5e(tmp_path, **point), m, model, doubtful=True).explanations
-    ur5e(tmp_path, **point, tool=UR5E["tool"] | {"x": 0, "y": 0, "z": 0})
-    ended = fg_calib("calibrate", write_job(tmp_path, m, model=model))
-    first = " ".join(ended.out.split("DOUBTFUL: ")[1].split())
-    assert ended.code == 3
-    assert first.startswith("position residuals fall from 1")
-    assert first.endswith("if the tool is another one, farther off than its prior sigma lets it be")
-
-
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize(("model", "kinds"), [("pose", FRAME_KINDS), ("position", FRAME_KINDS[:3])])
-def test_a_forgotten_unknown_frame_is_named_though_the_base_is_estimated(tmp_path, fg_calib, model, kinds):
-    """Fitted freely when the set-up was checked, its residuals were small: only corrections were told of."""
-    names = [f"base.{kind}" for kind in kinds]
-    estimated = {"estimate": names, "tolerance": UR5E["tolerance"] | dict.fromkeys(names, 0.002)}
-    robot = ur5e(tmp_path, **estimated)
-    m = measured(robot)
-    assert not check_setup(robot, m, model, doubtful=True).explanations
-    placed = PLACED if len(kinds) > 3 else (Rotation.identity(), PLACED[1])
-    ended = fg_calib(
-        "calibrate", write_job(tmp_path, measured(ur5e(tmp_path, **estimated), placed=placed), model=model)
-    )
-    first = " ".join(ended.out.split("DOUBTFUL: ")[1].split())
-    assert ended.code == 3
-    assert first.startswith("position residuals fall from")
-    assert "if the measurement frame is not the base (frame: unknown), which is farther off than" in first
 
 
 @pytest.mark.slow

@@ -83,19 +83,6 @@ def test_a_mistake_in_one_of_three_tables_is_said_of_that_table(tmp_path, mistak
     assert MISTAKES[mistake] in found[0]
 
 
-@pytest.mark.slow
-def test_all_tables_that_have_an_explanation_of_their_own_are_named(tmp_path):
-    rng = np.random.default_rng(3)
-    robot = ur5e(tmp_path, estimate=["tool.x", "tool.y", "tool.z"], tolerance=TOLERANCE)
-    first, bar, cam = three_tables(true_robot(robot, rng), rng, "cam")
-    pairs = bar.measurements.pairs
-    bar = replace(bar, measurements=replace(bar.measurements, pairs=replace(pairs, distance=pairs.distance * 1e-3)))
-    found = said(robot, [first, bar, cam], (0, 1, 2))
-    assert len(found) == 2
-    assert any(text.startswith("cam.csv: position residuals fall from ") for text in found)
-    assert any(text.startswith("bar.csv: distance residuals fall from ") for text in found)
-
-
 @pytest.mark.parametrize(("n_right", "named"), [(1, {"one.csv", "other.csv"}), (2, {"other.csv"})])
 def test_another_tool_is_said_of_the_table_that_disagrees_with_most_others(tmp_path, n_right, named):
     rng = np.random.default_rng(5)

@@ -103,7 +103,7 @@ def test_true_errors_are_twice_those_claimed_or_more_where_residuals_are_systema
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("effect", "verdict"), [("backlash", "GOOD, with reservations: "), (None, "GOOD: ")])
+@pytest.mark.parametrize(("effect", "verdict"), [("backlash", "GOOD, with warnings: "), (None, "GOOD: ")])
 def test_estimated_noise_does_not_hide_unmodelled_effects(fg_calib, tmp_path, effect, verdict):
     robot, m = measured("6R", np.random.default_rng(1), effect=EFFECTS.get(effect))
     ended = fg_calib("calibrate", write_job(tmp_path, robot, m, model="position", frame="unknown", noise="estimate"))

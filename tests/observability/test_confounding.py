@@ -14,7 +14,6 @@ from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.table import KnownPoint, Table
 from fg_calib.observability.identifiability import identifiability_of
 from fg_calib.observability.reasons import BASE, NO_CAUSE, NOT_EXCITED
-from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
 
 TARGETS_DO = "the unknown places of the targets on the tool take it up"
@@ -71,23 +70,6 @@ def test_how_many_places_must_be_given_is_counted():
     assert len(relations) == 6
     for names, rank in ((["t0"], 3), (["t0", "t1"], 5), (["t0", "t1", "t2"], 6)):
         assert looked_at(robot, given(table, names))[1].observability.rank == rank
-
-
-@pytest.mark.slow
-def test_a_joint_that_hardly_moves_is_still_the_reason_with_targets():
-    """Targets or not: a joint that was not moved says nothing of its own axis."""
-    robot, true, table = measured_by("targets", np.random.default_rng(0))
-    m = table.measurements
-    q = m.readings.copy()
-    q[:, 1] = 0.3
-    at = pose(true, q)
-    where = at.position + np.einsum("nij,nj->ni", at.rotation, TARGETS[m.labels["target"].index])
-    still = replace(table, measurements=replace(m, readings=q, position=where))
-    _, found = looked_at(robot, given(still, ["t0", "t1", "t2"]))
-    assert NOT_EXCITED in by_reason(found)
-    _, found = looked_at(robot, still)
-    assert NOT_EXCITED in by_reason(found)
-    assert any(reason.startswith(TARGETS_DO) for reason in by_reason(found))
 
 
 def test_unknown_anchors_beside_a_known_one_take_up_the_turn_about_it():

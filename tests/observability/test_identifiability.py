@@ -12,7 +12,6 @@ from fg_calib.graph.build import STRUCTURAL_FLOOR, build_problem, random_problem
 from fg_calib.graph.information import named_triangle, observability_of
 from fg_calib.graph.solver import solve
 from fg_calib.measurements.kinds.pair import SamePoint
-from fg_calib.measurements.table import Table
 from fg_calib.observability.identifiability import observe_configurations, observe_structure
 from fg_calib.observability.reasons import NO_CAUSE, NOT_EXCITED
 from fg_calib.options import Pairing
@@ -162,16 +161,6 @@ def test_the_kept_set_follows_the_users_order():
     assert not {"d4", "d5", "theta3"} & set(kept)
 
 
-def test_what_a_file_calls_fixed_is_looked_at_as_unknown_and_as_known():
-    robot = paper_robot(fixed=["a1", "alpha1", "d1", "theta1", "beta1"])
-    found = observe_structure(robot, "distance-rotation")
-    assert (found.observability.rank, len(found.observability.names)) == (23, 35)
-    known = found.with_fixed_known
-    assert (known.observability.rank, len(known.observability.names)) == (23, 30)
-    assert "theta2" in known.observability.named("independent")
-    assert found.fixed == ("a1", "alpha1", "d1", "theta1", "beta1")
-
-
 def test_configurations_that_do_not_move_a_joint_are_named_as_the_reason():
     rng = np.random.default_rng(2)
     robot = generic(OFF_AXIS)
@@ -271,20 +260,3 @@ def test_reasons_are_found_where_the_tool_turned_out_to_be(model):
     assert found.lost
     assert NOT_EXCITED not in {lost.reason for lost in found.lost}
     assert not any("last axis" in lost.reason for lost in found.lost)
-
-
-def test_reasons_of_a_mixture_are_those_of_what_all_its_tables_see():
-    """Positions and orientations in two frames of their own, and what `options.model` alone would have said."""
-    rng = np.random.default_rng(8)
-    robot = paper_robot()
-    m = measure(robot, 150, rng)
-    tables = (Table(m, "position", frame="unknown"), Table(m, "orientation"))
-    found = assess(solve(build_problem(robot, tables))).identifiability
-    reasons = {name: lost.reason for lost in found.lost for name in lost.relation}
-    # Angles of the first link are seen by orientations in the base's frame, its lengths by nothing.
-    assert set(reasons) & {"a1", "d1"}
-    assert "alpha1" not in reasons
-    assert "blind to the base" in reasons["a1"]
-    alone = assess(solve(build_problem(robot, Table(m, "orientation")))).identifiability
-    reasons = {name: lost.reason for lost in alone.lost for name in lost.relation}
-    assert reasons["a2"] == "the tool only moves without turning, unseen by orientation"

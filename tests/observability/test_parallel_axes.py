@@ -169,14 +169,6 @@ def test_a_bad_fit_says_first_what_the_convention_lacks(tmp_path, fg_calib, mode
     assert result["observability"]["missing"][0]["axes"] == [2, 3, 4]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("noise", ["estimate", {"position": 5e-5, "orientation": 1e-4, "estimate": True}])
-def test_estimated_noise_does_not_make_it_good(tmp_path, fg_calib, noise):
-    ended = fg_calib("calibrate", textbook_job(tmp_path, noise=noise))
-    assert ended.code == 3
-    assert words(ended.out).partition("DOUBTFUL: ")[2].startswith(SAID)
-
-
 def stated(factor):
     """The noise of `textbook_job`, stated too small by a factor."""
     return {"position": 5e-5 / factor, "orientation": 1e-4 / factor}
