@@ -5,7 +5,7 @@ import polars as pl
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fg_calib import InputError, Measurements, Noise, Options, Robot, Units, build_problem, pose, read_measurements
+from fg_calib import InputError, Measurements, Noise, Options, Robot, Units, read_measurements
 from fg_calib.io.csv_writer import write_csv
 from fg_calib.measurements.checks import check_readings
 
@@ -244,24 +244,6 @@ def test_three_sigmas_of_three_rows_may_mean_two_things():
 RAGGED = [[1.0], [1.0, 2.0]]
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: Measurements.from_arrays(Q, position=P, sigma_position=RAGGED), "sigma_position: found "),
-        (lambda: Measurements.from_arrays(Q, sigma_joint=RAGGED), "sigma_joint: found "),
-        (lambda: Robot.from_dh([[1, 2, 3, 4], [1]], "dh"), "rows: found "),
-        (lambda: Robot.from_dh([[0.1, 0.2, 0.3, 0.4]], "dh", tool=RAGGED), "tool: found "),
-        (lambda: pose(Robot.from_dh([[0.1, 0.2, 0.3, 0.4]], "dh"), RAGGED), "readings: found "),
-        (lambda: build_problem("robot", Measurements.from_arrays(Q)), "robot: found 'robot', expected a Robot"),
-        (lambda: Measurements.from_arrays([[10**400, 1, 1]]), "readings: found "),
-    ],
-)
-def test_what_numpy_makes_no_array_of_is_one_line(call, message):
-    with pytest.raises(InputError, match=f"^{message}") as error:
-        call()
-    assert "\n" not in str(error.value)
-
-
 PAIRS = {"a": ["p0", "p1"], "b": ["p2", "p6"], "distance": [0.5, 0.25]}
 IDS = [f"p{i}" for i in range(N)]
 
@@ -284,48 +266,6 @@ def test_numbers_beside_ids_that_are_numbers_are_ids():
     assert Measurements.from_arrays(Q, ids=ids, pairs={"a": ["5"], "b": ["6"], "angle": [0.1]}).pairs.a.tolist() == [0]
 
 
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        ({"ids": [None, *IDS[1:]]}, "ids: row 0: found None, expected a name: a word or a whole number"),
-        ({"ids": [*IDS[:-1], np.nan]}, "ids: row 6: found nan, expected a name: a word or a whole number"),
-        ({"ids": ["", *IDS[1:]]}, "ids: row 0: found '', expected a name: a word or a whole number"),
-        ({"ids": [(1, 2), *IDS[1:]]}, "ids: found [(1, 2), 'p1', 'p2', 'p3', 'p4', 'p5', ...], expected names"),
-        ({"ids": [1, "1", *IDS[2:]]}, "ids: row 1: found '1', expected different ids"),
-        ({"ids": (i for i in IDS)}, "ids: found a generator, expected names; list(...) makes a list of it"),
-        ({"group": ["left", {1: 2}, *5 * [None]]}, "group: row 1: found {1: 2}, expected a name, or None for none: a "
-         "word or a whole number"),
-        ({"position": P.astype(str).astype(object)}, "position: found ndarray of shape (7, 3), expected numbers of "
-         "shape (7, 3)"),
-        ({"position": P + 0j}, "position: found ndarray of shape (7, 3), complex128, expected numbers of shape (7, 3)"),
-        ({"position": np.full((N, 3), "2026-01-01", dtype="datetime64[s]")}, "position: found ndarray of shape (7, 3), "
-         "datetime64[s], expected numbers of shape (7, 3)"),
-        ({"position": [np.ma.masked_array(row, [False, True, False]) for row in P]}, "position: found a masked array, "
-         "expected numbers of shape (7, 3); nan where something was not measured"),
-        ({"position": [[True, 1.0, 2.0], *P[1:].tolist()]}, "position: found [[True, 1.0, 2.0], ..."),
-        ({"sigma_position": True}, "sigma_position: found True, expected ..."),
-        ({"position": (row for row in P)}, "position: found a generator, expected numbers of shape (7, 3); list(...) "
-         "makes a list of it"),
-        ({"source": 3}, "source: found 3, expected text"),
-        ({"pairs": [1, 2]}, "pairs: found [1, 2], expected a mapping of arrays by the names a, b, distance, angle, or a"
-         " frame of polars or pandas"),
-        ({"pairs": pl.LazyFrame(PAIRS).select("nowhere")}, "pairs: a lazy frame that cannot be collected: ..."),
-        ({"pairs": pl.DataFrame(PAIRS | {" a": PAIRS["a"]})}, "pairs: two columns called 'a', expected different "
-         "names"),
-        ({"ids": IDS, "pairs": PAIRS | {"a": [0, 7], "b": [1, 2]}}, "pairs: a: row 1: found 7, expected an id (the row "
-         "number where no ids were given), or a row number, 0 to 6"),
-        ({"ids": np.arange(N) + 5, "pairs": PAIRS | {"a": [5, 0], "b": [6, 7]}}, "pairs: a: row 1: found 0, expected an"
-         " id (the row number where no ids were given); row numbers are understood where no id or group is a number"),
-        ({"pairs": PAIRS | {"a": [None, "p1"]}}, "pairs: a: row 0: found None, expected a name: a word or a whole "
-         "number"),
-    ],
-)  # fmt: skip
-def test_what_is_no_array_or_name_is_named(given, said):
-    with pytest.raises(InputError) as found:
-        Measurements.from_arrays(Q, **given)
-    assert says(found.value, said)
-
-
 def says(error, expected):
     """Whether that is the message; `...` at its end stands for the words of polars, which change."""
     start, others, _ = expected.partition("...")
@@ -333,28 +273,6 @@ def says(error, expected):
 
 
 COLUMNS = {"q1": Q[:, 0], "q2": Q[:, 1]} | dict(zip("xyz", P.T, strict=True))
-
-
-@pytest.mark.parametrize(
-    ("frame", "said"),
-    [
-        (pl.LazyFrame(COLUMNS).with_columns(pl.col("no")), "frame: a lazy frame that cannot be collected: ..."),
-        (pl.scan_csv("/nowhere.csv"), "frame: a lazy frame that cannot be collected: No such file or directory (os "
-         "error 2): /nowhere.csv"),
-        (pl.DataFrame(COLUMNS | {" x": P[:, 0]}), "frame: two columns called 'x', expected different names"),
-        (COLUMNS | {"x ": P[:, 0]}, "frame: two columns called 'x', expected different names"),
-        (COLUMNS | {1: P[:, 0], "1": P[:, 0]}, "frame: two columns called '1', expected different names"),
-        (pl.DataFrame(COLUMNS | {"id": [{"a": i} for i in range(N)]}),
-         "frame: id: type Struct({'a': Int64}), expected text"),
-        (pl.DataFrame(COLUMNS | {"x": pl.Series([1] * N).cast(pl.Duration)}),
-         "frame: x: type Duration(time_unit='us'), expected numbers"),
-        (3, "frame: found a int, expected a path, or a frame of polars or pandas"),
-    ],
-)  # fmt: skip
-def test_what_is_wrong_with_a_frame_is_one_line(frame, said):
-    with pytest.raises(InputError) as found:
-        Measurements.from_frame(frame, ROBOT)
-    assert says(found.value, said)
 
 
 def test_frames_of_pandas_with_two_columns_of_a_name_are_refused():

@@ -105,6 +105,50 @@ def test_derivatives_are_those_of_central_differences(kind, convention):
     assert found == pytest.approx(expected, abs=1e-7 * max(1.0, size))
 
 
+def frames_of(n, ends, rng):
+    turned = Rotation.random(n * ends, random_state=rng.integers(1000)).as_matrix()
+    return Frames(turned.reshape(n, ends, 3, 3), rng.normal(size=(n, ends, 3)))
+
+
+@EVERY_KIND
+def test_simulated_data_leave_minus_their_noise_as_residuals(kind):
+    n, rng = 6, np.random.default_rng(8)
+    at, nuisances = frames_of(n, kind.ends, rng), rng.normal(size=(n, kind.n_nuisances))
+    nuisances += 5.0 * isinstance(kind, AnchorDistance)  # an offset and anchors that leave no length below 0
+    noise = 1e-3 * rng.normal(size=(n, kind.residual_dim))
+    data = kind.simulate(at, np.zeros((n, kind.width)), nuisances, noise)
+    if kind.width:  # of a contact nothing is measured: the arm is where the point is
+        assert kind.rows(at, data, nuisances).residual == pytest.approx(-noise, abs=2e-6)  # rotations to second order
+
+
+def test_simulated_pixels_keep_the_corners_that_are_given():
+    rng = np.random.default_rng(9)
+    at = Frames(np.eye(3)[None, None], np.zeros((1, 1, 3)))
+    corner, board = np.array([[0.0, 0.0, 0.1, -0.2]]), np.array([[0.1, 0.2, 0.3, 0.1, -0.1, 2.0]])
+    kind, noise = Pixel(Camera(900, 880, 640, 480, k1=-0.1)), rng.normal(size=(1, 2))
+    data = kind.simulate(at, corner, board, noise)
+    assert data[:, 2:] == pytest.approx(corner[:, 2:])
+    assert kind.rows(at, data, board).residual == pytest.approx(-noise, abs=rounding(1000.0))
+
+
+def test_the_mirror_image_of_an_anchor_is_as_far_from_points_in_a_plane():
+    rng = np.random.default_rng(10)
+    points, anchor = np.column_stack([rng.normal(size=(9, 2)), np.full(9, 0.3)]), np.array([0.2, 0.1, 1.3, 0.05])
+    image = AnchorDistance().mirrored(points, np.zeros((9, 1)), anchor)
+    assert image == pytest.approx([0.2, 0.1, -0.7, 0.05], abs=rounding(1.0))
+    assert AnchorDistance().mirrored(points[:3], np.zeros((3, 1)), anchor) is None
+
+
+def test_the_mirror_image_of_a_plane_has_the_same_readings_in_the_mean():
+    c, f = np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 1.0])
+    points = np.array([[0.0, 0.0, 1.1], [1.0, 0.0, 1.3]])
+    image = PlaneDistance().mirrored(points, np.array([[0.1], [0.3]]), np.concatenate([c, f]))
+    there = Frames(np.tile(np.eye(3), (2, 1, 1, 1)), points[:, None])
+    readings = PlaneDistance().rows(there, np.zeros((2, 1)), np.tile(image, (2, 1))).residual[:, 0]
+    assert readings == pytest.approx([0.3, 0.1], abs=rounding(1.0))  # from the other side, in the mean the same
+    assert PlaneDistance().mirrored(points, np.zeros((2, 1)), np.concatenate([c, f])) is None
+
+
 @pytest.mark.parametrize("kind", COMPILED, ids=name_of)
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_compiled_twins_compute_what_numpy_does(kind, convention):

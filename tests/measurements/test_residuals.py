@@ -88,63 +88,7 @@ def test_distance_and_angle_and_their_derivatives(convention):
                 assert J[0] == pytest.approx((W @ differences)[rows], abs=2e-7)
 
 
-@pytest.mark.sampled(3)
-@pytest.mark.parametrize("convention", CONVENTIONS)
-def test_same_point_residual_and_its_derivatives(convention):
-    rng = np.random.default_rng(12)
-    robot = random_robot(convention, 5, rng)
-    m, n = len(robot.parameters), 5
-    q = rng.uniform(-3, 3, (2, n))
-    W = np.tril(rng.normal(size=(3, 3)))
-
-    def formula(x):
-        A, B = (tool_pose(robot, q, x[:m]) for q in (x[m : m + n], x[m + n :]))
-        return W @ (B[:3, 3] - A[:3, 3])
-
-    block = same_point_block(robot.trig(q), np.array([0]), np.array([1]), W[None])
-    r, J = residuals.linearise(block, chain_of(robot))
-    x = np.concatenate([robot.nominal, *q])
-    assert r[0] == pytest.approx(formula(x), abs=100 * ROUNDING)
-    expected = central_differences(formula, x)
-    # Parameters: up to a turn of the vector, which leaves its length; joints: as they are.
-    d = np.linalg.solve(W, formula(x))
-    turned = np.linalg.solve(W, J[0] - expected)
-    assert d @ turned == pytest.approx(0.0, abs=1e-7)  # central differences by steps of 1e-6
-    assert turned[:, m:] == pytest.approx(0.0, abs=1e-7)
-    # Base columns, and what of the first joint comes before its reading, move both tools as one body.
-    rigid = np.abs(J[0]).max(axis=0) <= 100 * ROUNDING
-    assert rigid[:6].all()
-    assert rigid.sum() >= 7
-
-
 POSES = [(True, True), (True, False), (False, True)]
-
-
-@pytest.mark.sampled(3)
-@pytest.mark.parametrize(("convention", "kinds", "size"), diagonal(CONVENTIONS, POSES, [1e-7, 0.5, 2.9]))
-def test_orientation_and_position_and_their_derivatives(convention, kinds, size):
-    rng = np.random.default_rng(13)
-    robot = random_robot(convention, 6, rng)
-    m = len(robot.parameters)
-    q = rng.uniform(-3, 3, 6)
-    T = tool_pose(robot, q)
-    off = rng.normal(size=3)
-    measured_R = T[:3, :3] @ Rotation.from_rotvec(size * off / np.linalg.norm(off)).as_matrix()
-    measured_p = rng.normal(size=3)
-    rows = np.concatenate([[k] * 3 for k in kinds]).astype(bool)
-    W = np.tril(rng.normal(size=(rows.sum(), rows.sum())))
-
-    def formula(x):
-        P = tool_pose(robot, x[m:], x[:m])
-        log = Rotation.from_matrix(measured_R.T @ P[:3, :3]).as_rotvec()
-        return W @ np.concatenate([log, P[:3, 3] - measured_p])[rows]
-
-    block = pose_block(robot.trig(q[None]), measured_R[None], measured_p[None], W[None], kinds)
-    r, J = residuals.linearise(block, chain_of(robot))
-    x = np.concatenate([robot.nominal, q])
-    assert r[0] == pytest.approx(formula(x), abs=rounding(10.0))
-    # the log's higher derivatives grow towards half a turn
-    assert J[0] == pytest.approx(central_differences(formula, x), abs=1e-7 if size < 1 else 1e-5)
 
 
 @pytest.mark.parametrize("angle", [np.pi - 1e-3, np.pi - 1e-9, np.pi])
