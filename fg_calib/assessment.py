@@ -32,8 +32,7 @@ from fg_calib.statistics.cross_validation import CrossValidation
 from fg_calib.statistics.estimates import Estimates, estimates_at
 from fg_calib.statistics.goodness_of_fit import Fit, chi_square, judge_fit
 from fg_calib.statistics.outliers import judge_without_outliers
-from fg_calib.statistics.prior_consistency import judge_priors
-from fg_calib.statistics.prior_scales import estimate_tolerances
+from fg_calib.statistics.priors import estimate_tolerances, judge_priors
 from fg_calib.statistics.residual_table import HeldOut, residual_table
 from fg_calib.statistics.variance_components import estimate_noise
 from fg_calib.threads import one_blas_thread, single_threaded

@@ -43,7 +43,7 @@ from fg_calib.statistics.goodness_of_fit import (
     GrossErrors,
     PredictedFit,
 )
-from fg_calib.statistics.prior_consistency import PriorFit
+from fg_calib.statistics.priors import PriorFit
 from fg_calib.statistics.variance_components import LEAST_REDUNDANCY, has_joint_noise
 
 Floats = NDArray[np.float64]

@@ -41,7 +41,7 @@ from fg_calib.statistics.covariance import TangentCovariance
 from fg_calib.statistics.cross_validation import CrossValidation
 from fg_calib.statistics.estimates import FrameEstimate, JointErrors, LandmarkEstimate, ParameterEstimate
 from fg_calib.statistics.goodness_of_fit import KindFit, PredictedFit
-from fg_calib.statistics.prior_consistency import PriorFit
+from fg_calib.statistics.priors import PriorFit
 from fg_calib.statistics.residual_table import ResidualTable
 
 SCHEMA = "fg-calib/result/2"

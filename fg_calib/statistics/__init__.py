@@ -6,7 +6,7 @@ __getattr__, __dir__ = attach(
     __name__,
     {
         "fg_calib.statistics.cross_validation": "cross_validate",
-        "fg_calib.statistics.prior_scales": "estimate_tolerances",
+        "fg_calib.statistics.priors": "estimate_tolerances",
         "fg_calib.statistics.variance_components": "estimate_noise",
     },
 )

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.arrays import Floats, FrozenArrays, Integers
 from fg_calib.graph.factors import Variables, corrections_of, pose_of
-from fg_calib.graph.information import eliminated
+from fg_calib.graph.information import eliminated, linear_system
 from fg_calib.graph.problem import Problem, at_parameters, by_columns_of
 from fg_calib.graph.solver import Solution
 from fg_calib.observability.indices import IdentifiabilityClass, Observability
@@ -169,7 +169,7 @@ def estimates_at(solution: Solution, spread: Spread, whole: Spread, observabilit
         parameters=_parameters(solution, spread, whole, observability),
         frames=estimate_frames(solution.problem.variables, solution.parameters, whole),
         landmarks=_landmarks(solution, whole),
-        joint_errors=_joint_errors(solution, spread),
+        joint_errors=_joint_errors(solution),
     )
 
 
@@ -265,13 +265,13 @@ def _n_rows(problem: Problem) -> Integers:
     return counts
 
 
-def _joint_errors(solution: Solution, spread: Spread) -> JointErrors | None:
+def _joint_errors(solution: Solution) -> JointErrors | None:
     problem, data = solution.problem, solution.problem.data
     if problem.state.joint_errors is None:
         return None
     joints = np.flatnonzero(data.sigma_joint > 0.0)
     sigma = problem.sigma_joint[joints]
-    rows, share = _share_of_variance(solution, spread, len(joints))
+    rows, share = _share_of_variance(solution, len(joints))
     error = problem.state.joint_errors[np.ix_(rows, joints)]
     with np.errstate(invalid="ignore", divide="ignore"):
         studentised = np.where(share > LEAST_SHARE, error / (sigma * np.sqrt(share)), np.nan)
@@ -289,25 +289,12 @@ def _joint_errors(solution: Solution, spread: Spread) -> JointErrors | None:
     )
 
 
-def _share_of_variance(solution: Solution, spread: Spread, n_joints: int) -> tuple[Integers, Floats]:
-    """Configurations of the fitted rows, and by which share of its prior variance each estimated error varies.
-
-    With z the errors in sigma, z = G r at given parameters, that is 1 - var(z | rows) - (G J) Cov (G J)^T.
-    """
-    problem = solution.problem
-    values, vectors = np.linalg.eigh(spread.tangent)
-    half = vectors * np.sqrt(np.maximum(values, 0.0))
-    left, at = eliminated(problem, solution.parameters), problem.variables.at(solution.parameters)
-    n = problem.variables.n_columns
-    found, shares = [np.zeros(0, dtype=np.int64)], [np.zeros((0, n_joints))]
-    for rows in problem.rows:
-        if rows.shared is not None:
-            J = rows.private(at)[:, :-1]
-            J = np.hstack([(J[:, :n] + J[:, n:] @ left.follow) @ half, J[:, n:] @ left.inverse])
-            Z = rows.shared.most_likely(J)
-            of_z = (1.0 - rows.shared.variances - np.sum(Z**2, axis=1)).reshape(len(rows.configurations), -1)
-            found.append(rows.configurations)
-            shares.append(of_z[:, rows.joints : rows.joints + n_joints])
-    configurations = np.concatenate(found)
-    order = np.argsort(configurations)
-    return configurations[order], np.concatenate(shares)[order]
+def _share_of_variance(solution: Solution, n_joints: int) -> tuple[Integers, Floats]:
+    """Configurations of the fitted rows, and by which share of its prior variance each estimated error varies."""
+    system = linear_system(solution.problem, solution.parameters)
+    rows = system.rows
+    if rows.states is None:
+        return np.zeros(0, dtype=np.int64), np.zeros((0, n_joints))
+    order = np.argsort(rows.configurations)
+    share = 1.0 - system.z_variance.reshape(len(order), rows.states.width)
+    return rows.configurations[order], share[order, rows.joints : rows.joints + n_joints]

@@ -43,7 +43,7 @@ from fg_calib.graph.solver import Solution
 from fg_calib.measurements.residuals import squares_along
 from fg_calib.robot.kinematics import SPAN
 from fg_calib.statistics.covariance import Spread
-from fg_calib.statistics.prior_consistency import PriorFit
+from fg_calib.statistics.priors import PriorFit
 from fg_calib.statistics.residual_covariance import ResidualCovariance, RowErrors, RowModel, square_root
 from fg_calib.statistics.residual_table import ALARM, MAX_OUTLIER_SHARE, ResidualTable, suspect_level
 

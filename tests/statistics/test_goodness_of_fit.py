@@ -2,11 +2,10 @@
 
 import re
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
-from reported import format_report, result_document
+from reported import format_report
 from scipy.linalg import block_diag
 from scipy.stats import kstest
 from simulated import measure, plus, small_arm, true_robot
@@ -101,26 +100,6 @@ def test_p_values_are_uniform_and_the_noise_seen_is_the_noise_there_is(name, n_r
         assert np.sqrt(chi2 / expected) == pytest.approx(1.0, abs=4 * np.sqrt(1 / 12 / n_runs))
 
 
-@pytest.mark.parametrize("errors", ["", " independent"])
-@pytest.mark.slow
-def test_the_noise_seen_is_unbiased_whether_rows_count_as_independent_or_not(errors):
-    """All pairs of 12 poses share so much that the sum of squares is far below rows less parameters.
-
-    About 10 degrees of freedom a run and kind: 4 sigma are 4 * sqrt(2 / 10 / 60) / 2 = 0.11.
-    """
-    rng = np.random.default_rng(1)
-    robot = small_arm(tolerance=TOLERANCE)
-    sums = np.zeros((2, 2))
-    for _ in range(60):
-        fits = kinds_of(solve(case(f"all{errors}", robot, rng, n=12)))
-        sums += [(fit.chi2, fit.expected) for fit in fits]
-    assert fits[0].n > 50
-    ratio = np.sqrt(sums[:, 0] / sums[:, 1])
-    assert ratio == pytest.approx(
-        1.0, abs=0.06
-    )  # about 10 degrees of freedom a run and kind: 4 * sqrt(1 / 20 / 60) / 2
-
-
 def factors_of(solution):
     """The factors that noise was estimated with, by kind, of the only table."""
     assert all(table == 0 or name == "joint" for table, name in solution.problem.state.factors)
@@ -183,19 +162,6 @@ def test_a_configuration_wrong_by_50_sigma_is_the_first_suspect(name, wrong):
     assert re.search(rf"Suspicious rows\n(  pose {wrong} is in .*\n)?.*\n(\d+ +)?{wrong} ", text)
 
 
-@pytest.mark.long
-@pytest.mark.usefixtures("without_reasons")
-def test_clean_tables_seldom_have_a_suspect():
-    """1 % of tables have a suspect row, as many a suspect configuration: more than 4 of 60 are unlikely (0.1 %)."""
-    rng = np.random.default_rng(5)
-    robot = small_arm(tolerance=TOLERANCE)
-    suspicious = np.zeros(2)
-    for k in range(60):
-        goodness = assess(solve(case(["pose joint", "star", "all"][k % 3], robot, rng))).goodness
-        suspicious += [len(goodness.suspects) > 0, len(goodness.configurations) > 0]
-    assert np.all(suspicious <= 4)
-
-
 @pytest.mark.slow
 def test_verdicts_tell_outliers_from_noise_stated_wrong():
     rng = np.random.default_rng(6)
@@ -208,73 +174,6 @@ def test_verdicts_tell_outliers_from_noise_stated_wrong():
     m = replace(m, position=plus(m.position, ([3, 30], 0), 0.02))
     fits = assess(solve(build_problem(robot, m, model="pose"))).goodness.kinds
     assert {fit.kind: fit.verdict for fit in fits} == {"orientation": "as stated", "position": "outliers"}
-
-
-@pytest.mark.parametrize("name", ["pose", "star", "all", "direct joint"])
-@pytest.mark.long
-@pytest.mark.usefixtures("without_reasons")
-def test_noise_stated_wrong_by_two_is_found(name):
-    """The mean of its logarithm over some fits, 4 of its own sigmas about the truth."""
-    rng = np.random.default_rng(8)
-    robot = small_arm(tolerance=TOLERANCE)
-    factors, n_fits = [], 25 if name == "pose" else 9
-    for _ in range(n_fits):
-        if name == "direct joint":  # a factor is on all the noise of a row, joint noise with it
-            problem = case(name, robot, rng, n=24)
-            truth = 1.0
-        else:
-            problem, truth = case(name, robot, rng, n=24, stated=2.0), 0.5
-        solution = estimate_noise(problem)
-        assert solution.converged
-        factors.append(list(factors_of(solution).values()))
-    logs = np.log(np.array(factors) / truth)
-    assert np.all(np.abs(logs.mean(axis=0)) < 4 * logs.std(axis=0) / np.sqrt(n_fits))
-    assert np.all(logs.std(axis=0) < 0.35)
-
-
-@pytest.mark.slow
-def test_estimated_noise_gives_each_kind_the_sum_of_squares_it_expects():
-    rng = np.random.default_rng(9)
-    robot = small_arm(tolerance=TOLERANCE)
-    solution = estimate_noise(case("all", robot, rng, 20, 2.0))
-    uncertainty = assess(solution)
-    assert uncertainty.p_value is None
-    factors = factors_of(solution)
-    assert tuple(factors) == ("distance", "angle") == tuple(fit.kind for fit in uncertainty.goodness.kinds)
-    for fit in uncertainty.goodness.kinds:
-        assert fit.factor == factors[fit.kind]
-        assert fit.chi2 == pytest.approx(fit.expected, rel=3e-3)  # twice SETTLED
-        assert fit.p_value is None
-    document = result_document(solution, uncertainty)
-    assert tuple(document["noise_factors"].items()) == (
-        ("distance", factors["distance"]),
-        ("angle", factors["angle"]),
-    )
-    text = " ".join(format_report(solution, uncertainty).split())
-    assert "distance and angle noise was estimated from these residuals: chi-square says nothing about it" in text
-
-
-@cache
-def noise_estimated_from(name, stated):
-    """What all noise is found to be, over what it is, where `stated` times as much was stated."""
-    robot = small_arm(tolerance=TOLERANCE)
-    problem = case(name, robot, np.random.default_rng(14), 24, stated)
-    m = problem.measurements
-    joint = replace(m, sigma_joint=stated * m.sigma_joint)
-    solution = estimate_noise(build_problem(robot, joint, problem.options))
-    assert solution.converged, solution.message
-    return stated * np.array(list(factors_of(solution).values()))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "wrong"),
-    [("pose", 25.0), ("all", 25.0), ("all", 1 / 25), ("star", 1 / 25), ("star", 25.0), ("pose", 1 / 25)],
-)
-def test_estimated_noise_is_the_same_wherever_it_starts(name, wrong):
-    """To a hundredth of the factor, whose own sigma is some ten times that: rows near kinks are judged as stated."""
-    found = [noise_estimated_from(name, stated) for stated in (1.0, wrong)]
-    assert found[1] == pytest.approx(found[0], rel=0.01)
 
 
 def test_a_solution_that_has_not_arrived_does_not_end_the_estimate_of_the_noise(monkeypatch):
@@ -291,17 +190,6 @@ def test_a_solution_that_has_not_arrived_does_not_end_the_estimate_of_the_noise(
     assert not rounds[0].converged
     assert solution.converged, solution.message
     assert factors_of(solution) == pytest.approx(expected, rel=1e-4)  # 10 times SETTLED
-
-
-def test_noise_that_could_not_be_estimated_is_not_called_estimated():
-    problem = case("pose", small_arm(tolerance=TOLERANCE), np.random.default_rng(16), 24, 2.0)
-    solution = estimate_noise(problem, SolverOptions(max_iterations=1))
-    assert not solution.converged
-    uncertainty = assess(solution)
-    assert uncertainty.findings[0].startswith("not converged: 1 iterations, ")
-    text = " ".join(format_report(solution, uncertainty).split())
-    assert "not settled: the estimate has not converged" in text
-    assert "was estimated from these residuals" not in text
 
 
 @pytest.mark.slow
@@ -653,14 +541,3 @@ def test_predicted_pairs_that_share_joint_noise_with_fitted_ones_have_their_cova
     assert np.max(apart / np.diag(A)) > 1.3
     assert predicted == pytest.approx(r / np.sqrt(np.diag(A)), abs=0.02)
     assert uncertainty.goodness.test.chi2 == pytest.approx(r @ np.linalg.solve(A, r), rel=0.02)
-
-
-@pytest.mark.slow
-def test_noise_that_could_not_be_estimated_is_said_and_is_no_good_result():
-    rng = np.random.default_rng(3)
-    robot = small_arm(tolerance=TOLERANCE)
-    found = assess(estimate_noise(build_problem(robot, measure(true_robot(robot, rng), 2, rng), model="pose")))
-    assert found.findings == (
-        "the noise of orientation, position could not be estimated, for fewer than 3 degrees of freedom are left to it:"
-        " it is as stated, or 1 mm and 1 mrad where nothing was; nothing says whether it is right: measure more",
-    )

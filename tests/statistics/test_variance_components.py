@@ -6,7 +6,6 @@ from functools import cache
 import numpy as np
 import pytest
 from dense import dense
-from reported import format_report, result_document
 from scipy.optimize import minimize
 from scipy.stats import chi2, kstest
 from simulated import measure, small_arm, true_robot
@@ -242,53 +241,6 @@ def test_joint_noise_that_is_not_there_goes_to_nothing():
     assert JOINT_NOISE in solution.estimated_noise
     assert found.pop(JOINT_NOISE) < 0.3
     assert list(found.values()) == pytest.approx([3.0, 3.0], rel=4 / np.sqrt(2 * 60))
-
-
-@pytest.mark.slow
-def test_noise_that_is_drowned_keeps_what_was_stated_and_is_said_to(monkeypatch):
-    """Own noise of a hundredth of what the joints add."""
-    rng = np.random.default_rng(5)
-    robot = small_arm(tolerance=TOLERANCE)
-    m = measure(true_robot(robot, rng), 20, rng, sigma=(1e-6, 1e-6), sigma_joint=SIGMA_JOINT)
-    solution = estimate_noise(build_problem(robot, stated(m, 2.0, 2.0), model="position"))
-    assert solution.converged
-    assert solution.estimated_noise == (JOINT_NOISE,)
-    assert factors_of(solution)[0, "position"] == 1.0
-    assert factors_of(solution)[JOINT_NOISE] == pytest.approx(0.5, rel=4 / np.sqrt(2 * 44))
-    found = assess(solution)
-    assert "the noise of position could not be estimated" in found.cautions[0]
-    document = result_document(solution, found)
-    assert document["noise_kept"] == ["position"]
-    assert document["noise_factors"] == {"position": 1.0, "joint": factors_of(solution)[JOINT_NOISE]}
-    text = " ".join(format_report(solution, found).split())
-    assert "not to be told from other noise: as stated" in text
-    assert "joint noise was estimated from these residuals" in text
-
-
-def test_a_report_tells_own_noise_and_that_of_the_joints():
-    """Stated and estimated: position 1/3 mm by its factor; joints 2 mrad and, of the slide, 2 mm by theirs."""
-    solution, _ = estimated("pose")
-    found, factors = assess(solution), factors_of(solution)
-    assert found.trustworthy
-    assert not any("noise" in text for text in found.reservations)
-    lines = [" ".join(line.split()) for line in format_report(solution, found).splitlines()]
-    by = factors[0, "position"]
-    assert f"position mm 0.3333 {by / 3:.4f} {by:.3f} - estimated" in lines
-    by = factors[JOINT_NOISE]
-    assert f"joint readings mm 2.0000 {2 * by:.4f} {by:.3f} - estimated" in lines
-    assert f"joint readings deg 0.11459 {0.11459 * by:.5f} {by:.3f} - estimated" in lines
-    document = result_document(solution, found)
-    assert document["noise_kept"] == []
-    assert document["noise_factors"] == {"orientation": factors[0, "orientation"], "position": factors[0, "position"],
-                                         "joint": by}  # fmt: skip
-    for fit in found.goodness.kinds:  # all noise together is what is seen
-        assert fit.seen_over_stated / fit.factor == pytest.approx(1.0, abs=0.2)
-        rows = found.residuals.used & (found.residuals.kind_code == [k.name for k in found.residuals.kinds].index(
-            f"{fit.kind}.x"))  # fmt: skip
-        assert rows.any()
-    rms = {f.kind: f.stated_sigma_rms * f.factor for f in found.goodness.kinds}
-    sigma = found.residuals.sigma[found.residuals.used & np.char.startswith(found.residuals.kind, "position")]
-    assert rms["position"] == pytest.approx(np.sqrt(np.mean(sigma**2)))
 
 
 @pytest.mark.slow

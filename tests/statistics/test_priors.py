@@ -1,28 +1,26 @@
 """Scales of prior sigmas: their posterior against dense formulas, and estimated with the fit of whole arms."""
 
 import contextlib
-import json
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal, norm
-from simulated import TOOL, measure, small_arm, true_robot, write_job
+from simulated import TOOL, measure, small_arm, true_robot
 from tolerances import NEGLIGIBLE, rounding, sigmas_apart
 
 from fg_calib.assessment import assess
-from fg_calib.calibration import Calibration, calibrate, calibrate_job
+from fg_calib.calibration import calibrate
 from fg_calib.errors import InputError, SolverError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.graph.tolerances import FIRST
-from fg_calib.io.result import read_result
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.options import Options, Pairing
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
-from fg_calib.statistics.prior_scales import (
+from fg_calib.statistics.priors import (
     COMMON_SIGMA,
     GROUP_SIGMA,
     Corrections,
@@ -222,14 +220,6 @@ def test_joints_without_tolerances_start_from_a_millimetre_and_a_milliradian():
     assert set(arm.values()) == {FIRST}
 
 
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("model", ["position", "distance", "distance-rotation"])
-def test_rows_of_every_model_tell_the_scales(model):
-    found = estimate_tolerances(drawn_problem(model, n=30, estimate_tolerance="kind")[0]).estimated_tolerances
-    for one in found.scales:
-        assert one.low / 2.0 < TRUE[one.group] / STATED[one.group] < 2.0 * one.high
-
-
 @pytest.mark.slow
 def test_pairs_taken_for_independent_do_not_tell_of_more_corrections():
     """All pairs of ten poses: what they share is counted in what they say of corrections, and the estimate is that."""
@@ -255,16 +245,6 @@ def test_noise_and_tolerances_are_estimated_together():
         assert one.low < TRUE[one.group] / STATED[one.group] < one.high
 
 
-@pytest.mark.slow
-def test_with_a_robust_loss_gross_errors_do_not_reach_the_scales():
-    problem, _ = drawn_problem(n=30, estimate_tolerance="kind", loss="cauchy")
-    position = problem.measurements.position.copy()
-    position[:2] += 0.05
-    problem = build_problem(problem.robot, replace(problem.measurements, position=position), problem.options)
-    for one in estimate_tolerances(problem).estimated_tolerances.scales:
-        assert one.low < TRUE[one.group] / STATED[one.group] < one.high
-
-
 def test_an_arm_that_is_only_evaluated_keeps_its_tolerances():
     problem, _ = drawn_problem(n=0, n_test=12, frame="unknown", estimate_tolerance="kind")
     assert estimate_tolerances(problem).estimated_tolerances is None
@@ -279,34 +259,6 @@ def test_without_priors_there_is_nothing_to_estimate(choices):
 def test_an_unknown_group_is_refused():
     with pytest.raises(InputError, match=r"^estimate_tolerance: found 'kinds', expected one of kind, joint"):
         Options.of(estimate_tolerance="kinds")
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("without_reasons", "without_mistakes")
-def test_scales_are_in_the_report_the_result_and_the_saved_robot(tmp_path):
-    rng = np.random.default_rng(0)
-    true = true_robot(small_arm(tolerance=TRUE), rng)
-    m: Measurements = measure(true, 12, rng, sigma=(1e-4, 1e-4))
-    job = write_job(tmp_path, small_arm(tolerance=STATED), m, model="pose", tolerance="estimate")
-    found = calibrate_job(job)
-    same = calibrate(small_arm(tolerance=STATED), m, model="pose", estimate_tolerance="kind")
-    assert [s.group for s in same.result.tolerance_scales] == [s.group for s in found.result.tolerance_scales]
-    assert "Tolerances estimated" in str(found)
-    found.save(tmp_path / "result")
-    loaded = Calibration.load(tmp_path / "result")
-    assert loaded.result.tolerance_scales == found.result.tolerance_scales
-    assert "Tolerances estimated" in str(loaded)
-    by_kind = {one.group: one.scale * STATED[one.group] for one in found.result.tolerance_scales}
-    for p in loaded.robot.parameters:
-        if p.tolerance is not None:
-            assert p.tolerance == pytest.approx(by_kind[p.kind], rel=1e-9)
-    np.testing.assert_allclose(loaded.covariance(), found.covariance(), rtol=1e-9)
-    file = tmp_path / "result" / "result.json"
-    document = json.loads(file.read_text())
-    document["tolerance_scales"][1]["parameters"][0] = "elbow"
-    file.write_text(json.dumps(document))
-    with pytest.raises(InputError, match="tolerance_scale 2: parameters: 'elbow', which is no parameter"):
-        read_result(file)
 
 
 @pytest.mark.parametrize("seed", [1, 3])
