@@ -241,7 +241,7 @@ def rows_in_columns_of(before: Problem | None, problem: Problem) -> Floats:
 def _columns_by_name(variables: Variables, unknowns: Landmarks) -> dict[tuple[str, str], Integers]:
     """Columns of each variable: of the core's by its symbol, of landmarks by letter and name."""
     found = {("", v.symbol): np.arange(v.columns.start, v.columns.stop) for v in variables.items}
-    for letter, name in zip(unknowns.letters, unknowns.names, strict=True):
+    for letter, name in unknowns.keys:
         place = coordinates_of(variables, unknowns, (letter, name))
         if place is not None:
             found[letter, name] = place - variables.nuisance_span.start + variables.n_columns

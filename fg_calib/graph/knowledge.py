@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.factors import Variables, build_variables, custom_factor, pose_of
 from fg_calib.graph.normal_system import determined, eliminate
+from fg_calib.measurements.kinds import LANDMARKS
 from fg_calib.measurements.landmarks import Landmarks
 from fg_calib.options import FrameKnowledge, Model
 from fg_calib.robot.model import Robot
@@ -31,7 +32,7 @@ from fg_calib.robot.model import Robot
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-STAYING = "PA"
+STAYING = tuple(letter for letter, kind in LANDMARKS.items() if kind.stays)
 """Letters of the unknowns that may stay where they are: targets on the tool, anchors beside the arm."""
 
 SIZE = 3
@@ -211,7 +212,7 @@ class Knowledge(FrozenArrays):
 
 def coordinates_of(variables: Variables, unknowns: Landmarks, name: Name) -> Integers | None:
     """Where an unknown's coordinates stand in a parameter vector; None for one that is not there, or not estimated."""
-    names = list(zip(unknowns.letters, unknowns.names, strict=True))
+    names = unknowns.keys
     if name not in names:
         return None
     i = names.index(name)

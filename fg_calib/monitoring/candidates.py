@@ -216,7 +216,7 @@ def _alone(whole: Problem, number: int, table: Table) -> Problem:
     x[v.robot_span] = start[whole.variables.robot_span]
     for frame in v.frames:
         x[frame.places] = start[_frame(whole, number).places]
-    for name in zip(data.unknowns.letters, data.unknowns.names, strict=True):
+    for name in data.unknowns.keys:
         there, here = (coordinates_of(p, d.unknowns, name) for p, d in ((whole.variables, whole.data), (v, data)))
         if there is not None and here is not None:
             x[here] = start[there]
@@ -235,7 +235,7 @@ def _columns(whole: Problem, number: int, alone: Problem) -> Integers:
     found[: v.n_robot_columns] = np.arange(v.n_robot_columns)
     for frame in v.frames:
         found[frame.columns] = np.arange(w.n_columns)[_frame(whole, number).columns]
-    for name in zip(alone.data.unknowns.letters, alone.data.unknowns.names, strict=True):
+    for name in alone.data.unknowns.keys:
         there, here = (coordinates_of(p.variables, p.data.unknowns, name) for p in (whole, alone))
         if there is not None and here is not None:
             found[here - v.nuisance_span.start + v.n_columns] = there - w.nuisance_span.start + w.n_columns

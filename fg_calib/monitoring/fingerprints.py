@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from fg_calib.arrays import Floats
 from fg_calib.measurements.dataset import Measurements
+from fg_calib.measurements.kinds import LANDMARKS
 from fg_calib.measurements.table import Table
 
 Words = NDArray[np.uint64]
@@ -54,7 +55,7 @@ def _of_rows(m: Measurements) -> Words:
         v.reshape(n, -1) for v in (m.position, m.rotation, m.length, m.image, *m.columns.values()) if v is not None
     ]
     measured = np.any([np.isfinite(v).all(axis=1) for v in values], axis=0) & np.ones(n, dtype=np.bool_)
-    labels = [m.labels[key] for key in ("target", "anchor", "plane", "board") if key in m.labels]
+    labels = [m.labels[key] for key in (kind.name for kind in LANDMARKS.values()) if key in m.labels]
     names = [(label.names, label.index) for label in labels]
     if m.groups is not None:
         names.append((m.groups.names, m.groups.index))

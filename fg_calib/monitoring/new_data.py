@@ -18,15 +18,16 @@ from numpy.typing import NDArray
 from fg_calib.diagnostics.unmodelled_effects import basis_of
 from fg_calib.errors import ProblemError
 from fg_calib.graph.factors import build_variables, unknown_prior_rows
-from fg_calib.graph.knowledge import Knowledge, columns_in, coordinates_of
+from fg_calib.graph.knowledge import STAYING, Knowledge, columns_in, coordinates_of
 from fg_calib.graph.noise import JOINT_NOISE, NoiseName, NoiseState
 from fg_calib.graph.problem import Problem, assembled, at_parameters, problem_at, start_of, tables_of, variables_of
 from fg_calib.graph.rows import At, RowSet
 from fg_calib.graph.solver import Solution, solve
 from fg_calib.measurements import residuals
 from fg_calib.measurements.build import build_dataset
+from fg_calib.measurements.kinds import INSTRUMENTS, LANDMARKS
 from fg_calib.measurements.table import KnownPoint, Table
-from fg_calib.options import POSE_MODELS, Options
+from fg_calib.options import Options
 from fg_calib.robot.model import Robot, names_of
 from fg_calib.statistics.covariance import TangentCovariance
 
@@ -36,7 +37,10 @@ Integers = NDArray[np.int64]
 _NOTHING = 1e-9
 """Part of a column's length that counts as nothing."""
 
-TABLES_OF = {"P": tuple(POSE_MODELS), "A": ("anchor",)}
+TABLES_OF = {
+    letter: tuple(model for model, one in INSTRUMENTS.items() if LANDMARKS[letter] in one.landmarks)
+    for letter in STAYING
+}
 """Models whose tables have unknowns of a letter."""
 
 

@@ -79,7 +79,7 @@ def _known_at(problem: Problem, x: Floats, *, with_loss: bool) -> Knowledge:
 
 def _staying(problem: Problem) -> list[Name]:
     unknowns = problem.data.unknowns
-    return [name for name in zip(unknowns.letters, unknowns.names, strict=True) if name[0] in STAYING]
+    return [name for name in unknowns.keys if name[0] in STAYING]
 
 
 def _place(problem: Problem, name: Name) -> NDArray[np.int64] | None:

@@ -22,6 +22,7 @@ from fg_calib.graph.knowledge import Knowledge, coordinates_of
 from fg_calib.graph.problem import Problem, assembled, at_parameters, problem_at, variables_of
 from fg_calib.graph.solver import Solution, solve
 from fg_calib.measurements.build import build_dataset
+from fg_calib.measurements.kinds.pose import TARGET
 from fg_calib.monitoring.hypotheses import motions, zero_names
 from fg_calib.monitoring.new_data import Calibrated, Placed, Rows, placed
 from fg_calib.monitoring.prior_information import with_tolerances
@@ -55,7 +56,7 @@ def updated(
     if known is None:
         found = "a calibration that does not hold what its rows say"
         raise InputError("update", found, "one that this version of fg-calib wrote, with an arm that was estimated")
-    known = known.about([name for name in known.unknowns if name[0] == "P" or anchors_stay])
+    known = known.about([name for name in known.unknowns if name[0] == TARGET.letter or anchors_stay])
     robot = calibrated.robot
     if growth or changed:
         known = _with_change(calibrated, known, growth, changed)

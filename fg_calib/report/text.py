@@ -16,6 +16,7 @@ from fg_calib.assessment import Assessment
 from fg_calib.diagnostics.verdict import chi2_in_words, predicted_in_words, probability
 from fg_calib.graph.solver import Solution
 from fg_calib.io.result import Result, key_of
+from fg_calib.measurements.kinds import LANDMARKS
 from fg_calib.options import LIMITED
 from fg_calib.prediction.tool_pose import ExpectedError
 from fg_calib.report.tables import (
@@ -472,15 +473,7 @@ def _scatter(values: JointErrors, k: int) -> str:
     return "-" if np.isnan(scatter) else f"{scatter:.3f}"
 
 
-_LANDMARKS = {
-    "point": "Contact points (in the base frame), mm",
-    "target": "Targets (in the tool frame), mm",
-    "anchor": "Anchors (in the base frame), mm",
-    "offset": "Offsets of instruments on lengths, mm",
-    "plane": "Planes (unit normal in the base frame, distance from the base in mm)",
-    "board": "Boards (in the base frame: rotation vector in deg, position in mm)",
-    "unknown": "Other unknowns, [m] and [rad]",
-}
+_LANDMARKS = {kind.name: kind.heading for kind in LANDMARKS.values() if kind.heading}
 """Heading of each kind of landmark."""
 
 

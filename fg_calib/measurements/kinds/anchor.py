@@ -30,7 +30,7 @@ OFFSET = LandmarkKind(
     "O",
     "offset",
     "what the instrument adds to every length",
-    "What instruments add to every length, mm",
+    "Offsets of instruments on lengths, mm",
     units=("m",),
     is_one=True,
 )

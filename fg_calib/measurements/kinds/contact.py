@@ -11,7 +11,7 @@ from fg_calib.measurements.landmarks import LandmarkKind, Landmarks
 from fg_calib.measurements.table import MeasurementBlock, Table
 
 POINT = LandmarkKind(
-    "L", "point", "the unknown contact points", "Contact points (from the base), mm", must_be_fitted=False
+    "L", "point", "the unknown contact points", "Contact points (in the base frame), mm", must_be_fitted=False
 )
 
 
