@@ -4,7 +4,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from fg_calib.io.csv_writer import write_csv
+from fg_calib.io.columns import write_csv
 from fg_calib.io.robot_file import read_robot
 
 SIGMA = (5e-5, 1e-4)

@@ -5,7 +5,7 @@ import yaml
 from oracle import random_robot
 from scipy.spatial.transform import Rotation
 
-from fg_calib.io.csv_writer import write_csv
+from fg_calib.io.columns import write_csv
 from fg_calib.io.robot_file import write_robot
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.robot.kinematics import pose

@@ -40,7 +40,7 @@ def predict(
 ) -> None:
     """Say how far off the calibrated tool is expected to be: over the workspace, or at configurations."""
     from fg_calib.calibration import Calibration
-    from fg_calib.io.prediction import read_joint_table
+    from fg_calib.io.tables import read_joint_table
     from fg_calib.io.units import Units, quantity
     from fg_calib.predictions import measured_of, require_prediction, write_prediction
     from fg_calib.predictions import predict as predict_tool

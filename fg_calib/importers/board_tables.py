@@ -15,11 +15,9 @@ from fg_calib import __version__
 from fg_calib.errors import InputError
 from fg_calib.importers.views import FIGURES, BoardFit, View
 from fg_calib.io.atomic import fill_folder, require_own, write_text
-from fg_calib.io.columns import Header, Table
-from fg_calib.io.csv_writer import write_csv
-from fg_calib.io.table_columns import COVARIANCE
-from fg_calib.io.tables import KNOWN
+from fg_calib.io.columns import KNOWN, Table, write_csv
 from fg_calib.io.units import Units
+from fg_calib.measurements.kinds.board import COVARIANCE
 
 BOARD_FILES = {
     "board.json": b'{\n "schema": "fg-calib/board/',
@@ -51,19 +49,19 @@ def read_readings(path: Path) -> Readings:
     Raises:
         InputError: The table cannot be used.
     """
-    header = Header.read(path, "configurations").understood(KNOWN)
-    if "id" not in header.columns:
-        raise InputError(header.name, "no column id", "the name of each row's image without its ending")
-    kept = [column for column in header.columns if column not in KNOWN]
+    table = Table.read(path, "configurations")
+    columns = {name.lower() if name.lower() in KNOWN else name: name for name in reversed(table.columns)}
+    if "id" not in columns:
+        raise InputError(table.name, "no column id", "the name of each row's image without its ending")
+    kept = [name for name in reversed(columns) if name not in KNOWN]
     if not kept:
-        raise InputError(header.name, "no columns of joint readings", "q1, q2 and so on, or the joints' names")
-    kept += header.present("split")
-    table = Table.read(header, (), ["id", *kept])
-    ids = table.texts("id", "the name of an image without its ending")
-    table.require(ids.is_first_distinct().to_numpy(), "id", "one row an image")
-    comma = r"^([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)$" if header.separator != "," else r"$^"  # of decimals: we write points
+        raise InputError(table.name, "no columns of joint readings", "q1, q2 and so on, or the joints' names")
+    kept += ["split"] if "split" in columns else []
+    ids = table.texts(columns["id"], "the name of an image without its ending")
+    table.require(ids.is_first_distinct().to_numpy(), columns["id"], "one row an image")
+    comma = r"^([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)$" if table.separator != "," else r"$^"  # of decimals: we write points
     return Readings(
-        tuple(ids), {name: tuple(table.frame[name].fill_null("").str.replace(comma, "$1.$2")) for name in kept}
+        tuple(ids), {name: tuple(table.texts(columns[name]).fill_null("").str.replace(comma, "$1.$2")) for name in kept}
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -11,11 +11,9 @@ from typing import Literal
 import numpy as np
 
 from fg_calib.errors import InputError
-from fg_calib.io.columns import Header, Table
-from fg_calib.io.pairs import PAIR_COLUMNS
-from fg_calib.io.table_columns import COLUMNS, COVARIANCE
-from fg_calib.io.tables import KNOWN
+from fg_calib.io.columns import KNOWN, OF_CONFIGURATIONS, OF_PAIRS, Table, names_of
 from fg_calib.io.units import ANGLES, LENGTHS
+from fg_calib.measurements.kinds.board import COVARIANCE
 from fg_calib.options import Model
 from fg_calib.robot.model import Robot
 
@@ -45,7 +43,7 @@ _BIG_ANGLE, _BIG_LENGTH = 13.0, 30.0
 
 @dataclass(frozen=True)
 class Recognised:
-    """A table, recognised by its header.
+    """A table, recognised by its table.
 
     Attributes:
         path: Its file.
@@ -89,21 +87,21 @@ def recognise(path: Path, robot: Robot) -> Recognised:
     Raises:
         InputError: It cannot be read, or is neither of configurations nor of pairs.
     """
-    header = Header.read(path, "table")
-    joints = _joints(header.columns, robot)
-    ends = {"a", "b"} <= {name.lower() for name in header.columns}
+    table = Table.read(path, "table")
+    joints = _joints(table.columns, robot)
+    ends = {"a", "b"} <= {name.lower() for name in table.columns}
     if not joints and not ends:
-        raise _unknown(header, robot)
-    known = set(PAIR_COLUMNS) if not joints else KNOWN
-    called = _called([c for c in header.columns if c not in joints.values()], known)
+        raise _unknown(table, robot)
+    known = names_of(OF_PAIRS.values()) if not joints else KNOWN
+    called = _called([c for c in table.columns if c not in joints.values()], known)
     columns = {**joints, **called}
     present = tuple(called)
-    units = {name: _unit(header.columns, column) for name, column in columns.items()}
+    units = {name: _unit(table.columns, column) for name, column in columns.items()}
     lengths, angles = _of_units(present, robot, joints)
     length, angle = (_most([units[name] for name in names], of) for names, of in ((lengths, LENGTHS), (angles, ANGLES)))
     guessed: list[str] = []
-    unused = tuple(c for c in header.columns if c not in columns.values())
-    figures = _figures(header, columns, [*lengths, *angles])
+    unused = tuple(c for c in table.columns if c not in columns.values())
+    figures = _figures(table, columns, [*lengths, *angles])
     if length is None and lengths:
         length = "mm" if _largest(figures, lengths) > _BIG_LENGTH else "m"
         guessed.append("length")
@@ -131,11 +129,11 @@ def recognise(path: Path, robot: Robot) -> Recognised:
     )
 
 
-def _unknown(header: Header, robot: Robot) -> InputError:
+def _unknown(table: Table, robot: Robot) -> InputError:
     n, names = robot.n_joints, ", ".join(joint.name for joint in robot.joints)
     expected = f"columns {'q1' if n == 1 else f'q1 to q{n}'}, or the joints' names {names}; or a and b of pairs"
-    hint = f"the columns are {', '.join(header.columns)}"
-    return InputError(header.name, "neither joint readings nor pairs", expected, hint)
+    hint = f"the columns are {', '.join(table.columns)}"
+    return InputError(table.name, "neither joint readings nor pairs", expected, hint)
 
 
 def _joints(columns: Sequence[str], robot: Robot) -> dict[str, str]:
@@ -173,7 +171,7 @@ def _unit(columns: Sequence[str], column: str) -> str | None:
     return None if match is None else UNITS.get(match["unit"].strip().lower())
 
 
-def _called(columns: Sequence[str], known: set[str]) -> dict[str, str]:
+def _called(columns: Sequence[str], known: Collection[str]) -> dict[str, str]:
     """By known name, what the table calls it: the same, in another case or with a unit, a synonym, nearly the same."""
     found = {c: c for c in columns if c in known}
     left = [c for c in columns if c not in known]
@@ -193,7 +191,7 @@ def _called(columns: Sequence[str], known: set[str]) -> dict[str, str]:
 
 def _of_units(present: Sequence[str], robot: Robot, joints: Mapping[str, str]) -> tuple[list[str], list[str]]:
     """Names of the columns of lengths, and of those of angles."""
-    kinds = {name: meaning.unit for _, meanings in COLUMNS for meaning in meanings for name in meaning.names}
+    kinds = {name: one.unit for one in (*OF_CONFIGURATIONS.values(), *OF_PAIRS.values()) for name in one.names}
     lengths = [name for name in present if kinds.get(name) == "length"]
     angles = [name for name in present if kinds.get(name) == "angle"]
     for name, joint in zip(joints, robot.joints, strict=False):
@@ -207,10 +205,9 @@ def _most(stated: Sequence[str | None], of: Mapping[str, float]) -> str | None:
     return max(dict.fromkeys(found), key=found.count) if found else None
 
 
-def _figures(header: Header, columns: Mapping[str, str], names: Sequence[str]) -> dict[str, float]:
+def _figures(table: Table, columns: Mapping[str, str], names: Sequence[str]) -> dict[str, float]:
     """The largest size of the figures of some columns, by known name."""
     given = [columns[name] for name in names]
-    table = Table.read(header, numbers=given, texts=())
     sizes = np.nanmax(np.abs(table.numbers(given, optional=True)), axis=0, initial=0.0) if given else np.zeros(0)
     return dict(zip(names, sizes.tolist(), strict=True))
 

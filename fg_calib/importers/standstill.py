@@ -33,7 +33,7 @@ from fg_calib.importers.recording import (
     period,
     sigmas_of_means,
 )
-from fg_calib.io.csv_writer import require_own_csv, write_csv
+from fg_calib.io.columns import require_own_csv, write_csv
 from fg_calib.io.tables import joint_columns
 from fg_calib.options import check_number
 from fg_calib.robot.model import Robot

@@ -1,4 +1,4 @@
-"""Columns of a CSV or Parquet file: read, checked, and named in messages by line or row."""
+"""Tables of named columns: which columns have a meaning, one reader of CSV, Parquet and frames, one writer."""
 
 from __future__ import annotations
 
@@ -6,24 +6,25 @@ import csv
 import logging
 import os
 import re
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from io import BytesIO, TextIOWrapper
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from io import BytesIO, StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from fg_calib.arrays import NOTHING, as_figures, check_different
+from fg_calib.arrays import NOTHING, as_figures, as_frame, check_different
 from fg_calib.errors import InputError
-from fg_calib.io.atomic import decoded, digest_of, read_bytes
-from fg_calib.io.frames import as_polars, cells, of_polars, select
-from fg_calib.io.parquet import parquet_columns, parquet_rows, read_parquet
-from fg_calib.io.units import ANGLES, LENGTHS, Units
+from fg_calib.io.atomic import decoded, read_bytes, replacing, require_own
 from fg_calib.io.yaml import number_hint, shown
+from fg_calib.libraries import require_polars
 from fg_calib.measurements.dataset import Booleans, Floats, Integers
-from fg_calib.options import check_names, did_you_mean
+from fg_calib.measurements.kinds import INSTRUMENTS
+from fg_calib.measurements.kinds import Column as ColumnSet
+from fg_calib.options import Model, check_names, did_you_mean
 from fg_calib.sizes import LEAST_SIZE, MOST_SIZE, ORDINARY
 
 if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it
@@ -31,23 +32,51 @@ if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need
 
 _log = logging.getLogger(__name__)
 
-PIECE = 200_000
-"""Rows of a Parquet file that are read together where it is read by pieces."""
 
-_ENDINGS = (".csv", ".parquet", ".pq")
+OF_CONFIGURATIONS: Mapping[str, ColumnSet] = {
+    of.names[0]: of
+    for of in (
+        ColumnSet(("id",), "", "Name of the configuration; the same id is the same one, in all tables"),
+        ColumnSet(("split",), "", "train (or empty) or test: test rows are predicted, never fitted"),
+        *(of for instrument in INSTRUMENTS.values() for of in instrument.columns),
+    )
+}
+"""The columns of a table of configurations besides the joint readings, those that belong together by the first."""
+
+OF_PAIRS: Mapping[str, ColumnSet] = {
+    of.names[0]: of
+    for of in (
+        ColumnSet(("a", "b"), "", "The two configurations (ids, or 0-based rows) or contact points"),
+        ColumnSet(("distance",), "length", "The distance between them; empty: not measured"),
+        ColumnSet(("angle",), "angle", "The rotation angle between them, 0 to 180 degrees; empty: not measured"),
+        ColumnSet(("sigma_distance",), "length", "1 sigma of the distance"),
+        ColumnSet(("sigma_angle",), "angle", "1 sigma of the angle"),
+        OF_CONFIGURATIONS["split"],
+    )
+}
+"""The columns of a table of pairs, likewise."""
+
+
+def names_of(sets: Iterable[ColumnSet]) -> frozenset[str]:
+    """The names of columns."""
+    return frozenset(name for one in sets for name in one.names)
+
+
+KNOWN = names_of(OF_CONFIGURATIONS.values())
+"""Names of the columns of a table of configurations, besides the joint readings."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """What a table calls a column, and how its figures are meant: (figure - zero) * scale, as counts of an encoder are.
+    """A table's own name of a column, and how its values convert: (value - zero) * scale, as encoder counts do.
 
     Attributes:
         name: In the table's header.
-        scale: What one of its units is in those of the table.
-        zero: The figure that means 0.
+        scale: One of its units, in the unit of the table.
+        zero: The value that means 0.
 
     Raises:
-        InputError: The name is empty, or a figure is not finite; a scale of 0 is none.
+        InputError: The name is empty, a number is not finite, or the scale is 0.
     """
 
     name: str
@@ -58,505 +87,507 @@ class Column:
         if not isinstance(self.name, str) or not self.name.strip():
             raise InputError("columns: name", f"found {shown(self.name)}", "the name of a column")
         for key in ("scale", "zero"):
-            figure = as_figures(f"columns: {self.name}: {key}", getattr(self, key), "a number")
-            if figure.shape or not np.isfinite(figure) or (key == "scale" and figure == 0.0):
-                expected = "a finite number" if key == "zero" else "a finite number other than 0"
+            number = as_figures(f"columns: {self.name}: {key}", getattr(self, key), "a number")
+            if number.ndim or not np.isfinite(number) or (key == "scale" and number == 0.0):
+                expected = "a finite number other than 0" if key == "scale" else "a finite number"
                 raise InputError(f"columns: {self.name}: {key}", f"found {shown(getattr(self, key))}", expected)
+            object.__setattr__(self, key, float(number))
 
 
 @dataclass(frozen=True)
-class Header:
-    """A table's content and the names of its columns.
+class Table:
+    """A table of named columns.
 
     Attributes:
-        path: Its file; what it is called where it is in none.
-        columns: Names of the columns.
-        content: The bytes of the file; where it stands if it is read some rows at a time.
-        frame: The table, where it is in no file.
-        separator: What stands between the cells of a CSV. Where it is no comma, numbers may have decimal commas.
-        meant: By column, how its figures are meant, where that is not as they stand.
+        name: File name, or what a frame is called, for messages.
+        columns: Names of all its columns, as they are known.
+        frame: The columns of use as they were read, without blank rows; those of a CSV are texts.
+        rows: Row of the file that each row of `frame` is, counted from 0 after the header, shape (n_rows,).
+        text: The bytes of a CSV.
+        separator: The character between the cells of a CSV. Where it is no comma, numbers may have decimal commas.
+        renamed: By column, its conversion, where the table has its own name for it.
     """
 
-    path: Path
+    name: str
     columns: tuple[str, ...]
-    content: bytes | Path = field(default=b"", repr=False)
-    frame: pl.DataFrame | None = None
+    frame: pl.DataFrame
+    rows: Integers
+    text: bytes = field(default=b"", repr=False)
     separator: str = ","
-    meant: Mapping[str, Column] = field(default_factory=dict)
-
-    @property
-    def name(self) -> str:
-        """File name, for messages."""
-        return self.path.name
-
-    @property
-    def is_csv(self) -> bool:
-        """Whether it is a CSV, else a Parquet file or a frame."""
-        return self.frame is None and self.path.suffix.lower() == ".csv"
-
-    def parquet(self, columns: Sequence[str], span: tuple[int, int] | None = None) -> pl.DataFrame:
-        """Columns of a Parquet file or a frame.
-
-        Args:
-            columns: Their names.
-            span: Of a file, the first row and how many at most; all if None.
-
-        Raises:
-            InputError: It cannot be read.
-        """
-        if self.frame is not None:
-            return select(self.frame, columns)
-        chosen = sorted(self.columns.index(c) for c in columns)
-        frame = read_parquet(self.content, chosen, self.name, span)
-        frame.columns = [self.columns[i] for i in chosen]  # without blanks around them
-        return select(frame, columns)
+    renamed: Mapping[str, Column] = field(default_factory=dict)
 
     @classmethod
-    def read(cls, table: Path | str | Any, name: str, *, by_rows: bool = False) -> Header:
-        """Read the header of a file, or of a frame by this name.
+    def read(
+        cls,
+        table: Path | str | Any,
+        name: str,
+        known: Iterable[str] | None = None,
+        *,
+        joints: Iterable[str] = (),
+        columns: Mapping[str, Column] | None = None,
+    ) -> Table:
+        """Read the columns of a CSV, a Parquet file or a frame that have a known name.
 
         Args:
-            table: The file, or the frame.
-            name: What the frame is called.
-            by_rows: Whether some rows are to be read at a time, without the file as a whole: of a Parquet file.
+            table: The file, or a frame of polars or pandas, or a mapping of columns.
+            name: What a frame is called in messages.
+            known: Names of columns that have a meaning, also if written in another case; None to read all columns.
+            joints: Names that the robot gives to columns.
+            columns: By known name, what the table calls a column.
 
         Raises:
-            InputError: It cannot be read, or not so.
+            InputError: It cannot be read, it has no rows, or `columns` does not fit.
         """
-        if isinstance(table, str) and not table:
-            raise InputError(name, "found ''", "a path, or a frame of polars or pandas")
-        if not isinstance(table, os.PathLike | str):
-            frame = as_polars(table, name)
-            if by_rows:
-                raise InputError(name, "a frame in memory", "a Parquet file, where some rows are read at a time")
-            return cls(Path(name), tuple(frame.columns), frame=frame)
-        path = Path(table)
-        if by_rows:
-            return cls._of_rows(path)
-        if path.suffix.lower() not in _ENDINGS:
-            read_bytes(path)
-            raise InputError(path.name, f"ending {path.suffix!r}", f"one of {', '.join(_ENDINGS)}")
-        content = read_bytes(path)
-        header = cls(path, (), content)
-        if not header.is_csv:
-            return header._named(header.name, parquet_columns(content, header.name))
-        content = _with_newlines(content)
-        header = replace(header, content=content, separator=_separator(decoded(content, header.name)))
-        line, columns = next(header.csv_rows(), (1, []))
-        return header._named(f"{header.name}:{line}", columns)
-
-    @classmethod
-    def _of_rows(cls, path: Path) -> Header:
-        """The header of a Parquet file that is read some rows at a time."""
-        digest_of(path)
-        found = path
-        if path.suffix.lower() not in _ENDINGS[1:]:
-            expected = "a Parquet file, where some rows are read at a time"
-            raise InputError(path.name, f"ending {path.suffix!r}", expected, "polars: scan_csv(...).sink_parquet(...)")
-        return cls(path, (), found)._named(path.name, parquet_columns(found, path.name))
-
-    def _named(self, place: str, columns: Sequence[str]) -> Header:
-        """The same with the names of its columns, which stand at a place."""
-        columns = [column.strip() for column in columns]
-        if not any(columns):
-            raise InputError(place, "no names of columns" if columns else "an empty file", "a header and rows")
-        if len(columns) == 1 and "|" in columns[0]:
-            raise InputError(place, f"one column {shown(columns[0])}", "columns with , ; or tab between", "not '|'")
-        check_different(place, columns)
-        return replace(self, columns=tuple(columns))
+        source = _Source.of(table, name)
+        names = list(source.columns)
+        chosen = list(range(len(names)))
+        if known is not None:
+            known, joints = set(known), set(joints)
+            names = _understood(source.name, _rename(source, columns or {}, known | joints), known, joints)
+            chosen = [i for i, column in enumerate(names) if column in known or column in joints]
+        frame, rows = source.read(chosen)
+        frame.columns = [names[i] for i in chosen]
+        if len(rows) == 0 and chosen:
+            raise InputError(source.name, "no rows", "at least one")
+        return cls(source.name, tuple(names), frame, rows, source.text, source.separator, dict(columns or {}))
 
     @property
-    def by_rows(self) -> bool:
-        """Whether some rows are read at a time."""
-        return isinstance(self.content, Path)
-
-    @property
-    def text(self) -> bytes:
-        """The bytes of a CSV."""
-        assert isinstance(self.content, bytes)
-        return self.content
-
     def n_rows(self) -> int:
-        """Number of rows of a Parquet file.
-
-        Raises:
-            InputError: It cannot be read.
-        """
-        return parquet_rows(self.content, self.name)
-
-    def csv_rows(self) -> Iterator[tuple[int, list[str]]]:
-        """Cells of the header and of each row, with the line where it begins.
-
-        Blank lines count from the header on, as in polars.
-        """
-        file = TextIOWrapper(BytesIO(self.text), encoding="utf-8-sig", errors="replace", newline="")
-        csv.field_size_limit(max(len(self.text), csv.field_size_limit()))
-        reader = csv.reader(file, delimiter=self.separator)
-        started, line = False, 1
-        try:
-            for cells in reader:
-                started = started or bool(cells)
-                if started:
-                    yield line, cells
-                line = reader.line_num + 1
-        except csv.Error as error:
-            raise InputError(f"{self.name}:{reader.line_num}", f"not a CSV: {error}") from None
-
-    def renamed(self, columns: Mapping[str, Column], known: Iterable[str]) -> Header:
-        """The same with columns called as they are known.
-
-        Args:
-            columns: By known name, what the table calls it; a column that has that name already is not used.
-            known: Columns that mean something.
-
-        Raises:
-            InputError: A name is not known, or the table has no such column.
-        """
-        place = f"{self.name}: columns"
-        check_names(place, columns, sorted(known), "column")
-        names = list(self.columns)
-        places = {}
-        for name, column in columns.items():
-            check_names(f"{place}: {name}", [column.name.strip()], self.columns, "column")
-            places[name] = self.columns.index(column.name.strip())
-        check_different(f"{place}: the table's", [column.name.strip() for column in columns.values()])
-        for name, i in places.items():
-            if name in names and names.index(name) not in places.values():
-                names[names.index(name)] = f"{name} (the table's)"
-            names[i] = name
-        return replace(self._with_names(names), meant=dict(columns))
-
-    def _with_names(self, names: Sequence[str]) -> Header:
-        frame = self.frame
-        if frame is not None:
-            frame = frame.clone()
-            frame.columns = list(names)
-        return replace(self, columns=tuple(names), frame=frame)
-
-    def understood(self, known: Iterable[str], others: Iterable[str] = ()) -> Header:
-        """The same with the columns that are known by another case called as they are known.
-
-        What looks as if it was to mean something, but does not, is warned of.
-
-        Args:
-            known: Columns that mean something.
-            others: Names that somebody else has given.
-
-        Raises:
-            InputError: A known name stands behind a #, as if the header were a comment.
-        """
-        known, others = set(known), set(others)
-        names, given = list(self.columns), set(self.columns)
-        for i, name in enumerate(names):
-            if name in known or name in others:
-                continue
-            if name.startswith("#") and (bare := name.lstrip("# ").lower()) in known:
-                raise InputError(self.name, f"column {shown(name)}", f"{bare}, or another name")
-            if name.lower() in known and name.lower() not in given:
-                names[i] = name.lower()
-            elif hint := _meaning(name, known, given):
-                _log.warning("%s: column %r is not used; %s", self.name, name, hint)
-        return self._with_names(names)
+        """Number of rows."""
+        return len(self.rows)
 
     def present(self, *columns: str) -> tuple[str, ...]:
         """Those of `columns` that the table has."""
         return tuple(c for c in columns if c in self.columns)
 
-    def group(self, columns: tuple[str, ...]) -> tuple[str, ...]:
-        """`columns` if the table has all of them, `()` if it has none of them."""
-        present = self.present(*columns)
-        if present and present != columns:
-            missing = next(c for c in columns if c not in present)
-            raise InputError(self.name, f"no column {missing}", f"{' '.join(columns)} together")
-        return present
-
-    def sigmas(self, single: str, axes: tuple[str, ...]) -> tuple[str, ...]:
-        """The columns that state a sigma: one for all axes, or one an axis, or none."""
-        if single in self.columns and self.present(*axes):
-            raise InputError(self.name, f"both {single} and {self.present(*axes)[0]}", "one of the two")
-        return self.present(single) or self.group(axes)
-
-
-@dataclass(frozen=True)
-class Table:
-    """The columns of use: numbers as floats, texts without blanks around them; empty cells are null.
-
-    Attributes:
-        header: The table's content.
-        frame: Its columns of use, without blank rows.
-        rows: Where each row stands in the table, 0-based, shape (n_rows,).
-    """
-
-    header: Header
-    frame: pl.DataFrame
-    rows: Integers
-
-    @classmethod
-    def read(
-        cls, header: Header, numbers: Sequence[str], texts: Sequence[str], span: tuple[int, int] | None = None
-    ) -> Table:
-        """Read the columns of `numbers` and `texts`.
-
-        Args:
-            header: Of the table.
-            numbers: Columns of numbers.
-            texts: Columns of words.
-            span: Of a Parquet file, the first row and how many at most; all if None.
+    def has(self, first: str, model: Model | None = None) -> bool:
+        """Whether the table has the columns that belong together, by the first, and the model reads them.
 
         Raises:
-            InputError: It cannot be read, or there is no row.
+            InputError: It has some of them only.
         """
-        frame, rows = (
-            _read_csv(header, numbers, texts) if header.is_csv else _read_parquet(header, numbers, texts, span)
-        )
-        if frame.height == 0:
-            raise InputError(header.name, "no rows", "at least one")
-        return cls(header, frame, rows)
+        of = OF_CONFIGURATIONS[first]
+        if model is not None and of not in INSTRUMENTS[model].columns:
+            return False
+        if not self.present(*of.names):
+            return False
+        self.require_columns(of.names)
+        return True
 
-    @classmethod
-    def pieces(
-        cls, header: Header, numbers: Sequence[str], texts: Sequence[str], span: tuple[int, int] | None = None
-    ) -> Iterator[Table]:
-        """The same some rows at a time, as polars keeps the memory that it once took for all."""
-        if header.is_csv or header.frame is not None:
-            yield cls.read(header, numbers, texts)
-            return
-        first, left = span or (0, sys.maxsize)
-        begun = False
-        while left > 0:
-            wanted = min(PIECE, left)
-            frame, rows = _read_parquet(header, numbers, texts, (first, wanted))
-            if frame.height == 0 and not begun:
-                raise InputError(header.name, "no rows", "at least one")
-            if frame.height:
-                yield cls(header, frame, rows)
-            if frame.height < wanted:
-                return
-            first, left, begun = first + wanted, left - wanted, True
-
-    @property
-    def n_rows(self) -> int:
-        """Number of rows."""
-        return self.frame.height
+    def require_columns(self, columns: Sequence[str]) -> None:
+        """Raise where the table lacks one of columns that belong together."""
+        if missing := [name for name in columns if name not in self.columns]:
+            raise InputError(self.name, f"no column {missing[0]}", f"{' '.join(columns)} together")
 
     def numbers(self, columns: Sequence[str], *, optional: bool = False) -> Floats:
-        """The columns, shape (n_rows, n_columns); an empty cell is nan if `optional`, else an error."""
+        """The columns as numbers, shape (n_rows, n_columns).
+
+        Args:
+            columns: Their names.
+            optional: Whether a cell may be empty; it is nan then.
+
+        Raises:
+            InputError: A cell is empty, or no finite number.
+        """
+        import polars as pl
+
         for column in columns:
-            good = cells(self.frame, column).is_finite().fill_null(optional)
-            self.require(good.to_numpy(), column, "a finite number")
-        values = np.empty((self.n_rows, len(columns)))
-        for i, name in enumerate(columns):
-            values[:, i] = self.frame[name].to_numpy()
-            if (meant := self.header.meant.get(name)) is not None:
-                values[:, i] = (values[:, i] - meant.zero) * meant.scale
-        size = np.abs(values)
-        for column, good in zip(columns, ((size <= MOST_SIZE) | np.isnan(values)).T, strict=True):
-            self.require(good, column, ORDINARY)
+            kind = self.frame[column].dtype
+            if not (kind.is_numeric() or kind in (pl.String, pl.Null)):
+                raise InputError(f"{self.name}: {column}", f"type {kind}", "numbers")
+        # Columns are numbered, as polars takes names such as * for patterns.
+        given = pl.DataFrame([self.frame[column].alias(str(k)) for k, column in enumerate(columns)])
+        read = given.select(_number(name, kind, self.separator != ",") for name, kind in given.schema.items())
+        finite = read.select(pl.all().is_finite().fill_null(optional)).to_numpy()
+        values: Floats = np.array(read.to_numpy(), dtype=np.float64).reshape(self.n_rows, len(columns))
+        for k, column in enumerate(columns):
+            self.require(finite[:, k], column, "a finite number")
+            if (own := self.renamed.get(column)) is not None:
+                values[:, k] = (values[:, k] - own.zero) * own.scale
+            self.require(~(np.abs(values[:, k]) > MOST_SIZE), column, ORDINARY)
         return values
 
     def positive(self, columns: Sequence[str], default: float | None, factor: float) -> Floats:
-        """Columns of positive figures, times `factor`; an empty cell is `default`, an error if that is None."""
+        """Columns of positive numbers, times `factor`; an empty cell is `default`, an error if that is None."""
         values = self.numbers(columns, optional=default is not None)
         for column, value in zip(columns, values.T, strict=True):
             self.require(~(value <= 0.0), column, "a number above 0")
             self.require(~(value < LEAST_SIZE), column, ORDINARY)
         return values * factor if default is None else np.where(np.isnan(values), default, values * factor)
 
-    def texts(self, column: str, expected: str) -> pl.Series:
-        """The column, without an empty cell."""
-        texts = self.frame[column]
-        self.require(texts.is_not_null().to_numpy(), column, expected)
+    def texts(self, column: str, expected: str = "") -> pl.Series:
+        """The column without blanks around its cells, null where they are empty: an error if something is expected.
+
+        Whole numbers have no fraction: pandas makes floats of them where cells are empty.
+        """
+        import polars as pl
+
+        cells = self.frame[column].alias("cells")
+        if cells.dtype.is_nested() or cells.dtype == pl.Object:
+            raise InputError(f"{self.name}: {column}", f"type {cells.dtype}", "text")
+        if cells.dtype.is_float() and bool(((cells % 1 == 0) & (cells.abs() <= MOST_SIZE)).all()):
+            cells = cells.cast(pl.Int64)
+        texts = cells.to_frame().select(_stripped(pl.col("cells").cast(pl.String)))["cells"]
+        if expected:
+            self.require(texts.is_not_null().to_numpy(), column, expected)
         return texts
 
     def names(self, column: str, expected: str) -> pl.Series:
-        """The column, null where it is empty, without a word that stands for nothing elsewhere."""
-        names = self.frame[column]
+        """The column as texts, without a word such as NA that stands for nothing."""
+        names = self.texts(column)
         nothing = names.str.to_lowercase().is_in(NOTHING).fill_null(False)
         self.require(~nothing.to_numpy(), column, expected)
         return names
 
     def test_rows(self) -> Booleans:
         """True where `split` says test, shape (n_rows,)."""
-        if "split" not in self.header.columns:
+        if "split" not in self.columns:
             return np.zeros(self.n_rows, dtype=np.bool_)
-        split = self.frame["split"].fill_null("train")
+        split = self.texts("split").fill_null("train")
         self.require(split.is_in(["train", "test"]).to_numpy(), "split", "train or test")
         return (split == "test").to_numpy()
 
     def require(self, good: Booleans, column: str, expected: str, hint: str = "") -> None:
         """Raise for the first cell of `column` that is not `good`, shape (n_rows,)."""
         if not good.all():
-            place, cell = self._look_up(int(np.argmin(good)), column)
+            row = int(np.argmin(good))
+            cell = self.frame[column][row]
+            cell = cell.strip() if isinstance(cell, str) else cell
             found = "an empty cell" if cell in {None, ""} else shown(cell)
-            raise InputError(f"{place}: {column}", f"found {found}", expected, hint or number_hint(cell))
+            raise InputError(f"{self.place(row)}: {column}", f"found {found}", expected, hint or number_hint(cell))
 
     def place(self, row: int) -> str:
-        """File and line of a row (the header is line 1); of a Parquet file the 0-based row."""
-        return self._look_up(row, self.header.columns[0])[0]
-
-    def _look_up(self, row: int, column: str) -> tuple[str, Any]:
-        """Place and original content of a cell, for messages; slow, since it reads the file again."""
-        wanted = int(self.rows[row])
-        name, columns = self.header.name, self.header.columns
-        if self.header.is_csv:
-            line, row_of_file = next(found for i, found in enumerate(self.header.csv_rows()) if i == wanted + 1)
-            return f"{name}:{line}", row_of_file[columns.index(column)].strip()
-        span = (wanted, 1) if self.header.by_rows else None
-        return f"{name}: row {wanted}", self.header.parquet([column], span)[column][0 if span else wanted]
+        """File and line of a row (the header is line 1); of a Parquet file or a frame the 0-based row."""
+        k = int(self.rows[row])
+        return f"{self.name}:{_records(self.text)[k + 1][0]}" if self.text else f"{self.name}: row {k}"
 
 
-_SIGMA = "sigma_"
-
-
-def _meaning(name: str, known: set[str], given: set[str]) -> str:
-    """What a column may have been meant to be, by its name; else nothing."""
-    if name.lower() in known:
-        return f"{name.lower()} is"
-    sigmas = sorted(column for column in known if column.startswith(_SIGMA))
-    if not name.lower().startswith("sigma"):
-        return did_you_mean(name, known - given, 0.85)
-    rest = name.lower().removeprefix(_SIGMA)  # else every sigma would be much like every other
-    like = did_you_mean(rest, [column.removeprefix(_SIGMA) for column in sigmas if column not in given], 0.85)
-    return like.replace("mean ", f"mean {_SIGMA}") or f"sigmas are {', '.join(sigmas)}"
-
-
-def _read_csv(header: Header, numbers: Sequence[str], texts: Sequence[str]) -> tuple[pl.DataFrame, Integers]:
+def _number(name: str, kind: pl.DataType, decimal_comma: bool) -> pl.Expr:
+    """A column as numbers: null where a cell is empty, nan where a text is no number."""
     import polars as pl
 
-    last = header.columns[-1]
-    wanted = list(dict.fromkeys((*numbers, *texts, last)))
-    chosen = sorted(header.columns.index(c) for c in wanted)
-    start = _start_of_header(header.text)
-    try:
-        frame = of_polars(
-            header.name,
-            lambda: pl.read_csv(
-                BytesIO(header.text[start:]), columns=chosen, infer_schema=False, separator=header.separator
-            ),
-        )
-    except InputError:
-        _check_lengths(header)
-        _check_quotes(header)
-        raise
-    frame.columns = [header.columns[i] for i in chosen]  # without blanks around them
-    _check_same_rows(header, frame.height)
-    rows = np.arange(frame.height)
-    nothing = np.logical_and.reduce([cells(frame, column).is_null().to_numpy() for column in wanted])
-    if nothing.any():  # lines that are blank, and rows whose cells of use are empty
-        blank = np.array([not any(cells) for _, cells in header.csv_rows()][1:], dtype=np.bool_)
-        rows = rows[~(nothing & blank)]
-        frame = frame[rows]
-    if cells(frame, last).is_null().any():  # polars takes a cell that is missing at the end for an empty one
-        _check_lengths(header)
-    return _columns(frame, numbers, texts, decimal_comma=header.separator != ","), rows
+    column = pl.col(name)
+    if kind != pl.String:
+        return column.cast(pl.Float64)
+    text = _stripped(column)
+    digits = text.str.replace(r"^([^.,]*),([^.,]*)$", "$1.$2") if decimal_comma else text
+    return pl.when(text.is_not_null()).then(digits.cast(pl.Float64, strict=False).fill_null(float("nan"))).alias(name)
 
 
-def _read_parquet(
-    header: Header, numbers: Sequence[str], texts: Sequence[str], span: tuple[int, int] | None = None
-) -> tuple[pl.DataFrame, Integers]:
-    frame, first = header.parquet(list(dict.fromkeys((*numbers, *texts))), span), 0 if span is None else span[0]
-    for column, kind in frame.schema.items():
-        if column in numbers and not (kind.is_numeric() or str(kind) in ("String", "Null")):
-            raise InputError(f"{header.name}: {column}", f"type {kind}", "numbers")
-        if kind.is_nested() or str(kind) == "Object":
-            raise InputError(f"{header.name}: {column}", f"type {kind}", "text")
-    return of_polars(header.name, lambda: _columns(frame, numbers, texts)), np.arange(first, first + frame.height)
+def _stripped(column: pl.Expr) -> pl.Expr:
+    return column.str.strip_chars().replace("", None)
 
 
-def _columns(
-    frame: pl.DataFrame, numbers: Sequence[str], texts: Sequence[str], *, decimal_comma: bool = False
-) -> pl.DataFrame:
-    """Columns of numbers, and of texts: all at once, as polars takes a while for every question."""
-    import polars as pl
+_ENDINGS = (".csv", ".parquet", ".pq")
 
-    given = {c: cells(frame, c) for c in (*numbers, *texts)}
-    numbered = pl.DataFrame({str(k): column for k, column in enumerate(given.values())})  # no name means more
-    read = [
-        _text(column, pl.col(name)) if c in texts else _number(column, pl.col(name), decimal_comma)
-        for (c, column), name in zip(given.items(), numbered.columns, strict=True)
-    ]
-    found = numbered.select(read)
-    found.columns = list(given)
+
+@dataclass(frozen=True)
+class _Source:
+    """Where a table is read from: the text of a CSV, the content of a Parquet file, or a frame.
+
+    Attributes:
+        name: What it is called in messages.
+        columns: Names of its columns, without blanks around them.
+        place: Where they stand, for messages.
+        text: The bytes of a CSV, whose lines end in a newline alone.
+        separator: The character between its cells.
+        content: The bytes of a Parquet file.
+        frame: The frame.
+    """
+
+    name: str
+    columns: tuple[str, ...] = ()
+    place: str = ""
+    text: bytes = b""
+    separator: str = ","
+    content: bytes = b""
+    frame: pl.DataFrame | None = None
+
+    @classmethod
+    def of(cls, table: Path | str | Any, name: str) -> _Source:
+        """Open a table and read the names of its columns.
+
+        Raises:
+            InputError: It is missing, or is no table, or has the same name twice.
+        """
+        import polars as pl
+
+        if isinstance(table, str) and not table:
+            raise InputError(name, "found ''", "a path, or a frame of polars or pandas")
+        if not isinstance(table, os.PathLike | str):
+            with _one_line(name, "no table"):
+                frame = _as_polars(table, name)
+            return cls(name, tuple(column.strip() for column in frame.columns), name, frame=frame)._checked()
+        path = Path(table)
+        content = read_bytes(path)
+        if path.suffix.lower() not in _ENDINGS:
+            hint = "save the sheet as CSV" if path.suffix.lower() in (".xlsx", ".xls", ".ods") else ""
+            raise InputError(path.name, f"ending {path.suffix!r}", f"one of {', '.join(_ENDINGS)}", hint)
+        if path.suffix.lower() != ".csv":
+            with _one_line(path.name, "not a Parquet file"):
+                names = list(pl.read_parquet_schema(BytesIO(content)))
+            return cls(path.name, tuple(n.strip() for n in names), path.name, content=content)._checked()
+        for end in (b"\r\r\n", b"\r\n", b"\r"):
+            content = content.replace(end, b"\n")
+        header = re.sub(r'"[^"]*"?', "", decoded(content, path.name).lstrip("\n").partition("\n")[0])
+        separator = max(",;\t", key=header.count)
+        line, record = next(iter(_records(content, 1)), (1, b""))
+        _require_closed(f"{path.name}:{line}", record)
+        text = record.decode(errors="replace").removeprefix("\ufeff")
+        try:
+            names = [cell.strip() for cell in next(csv.reader(StringIO(text, newline=""), delimiter=separator), [])]
+        except csv.Error as error:
+            raise InputError(f"{path.name}:{line}", f"not a CSV: {error}") from None
+        return cls(path.name, tuple(names), f"{path.name}:{line}", content, separator)._checked()
+
+    def _checked(self) -> _Source:
+        names = self.columns
+        if not any(names):
+            found = "an empty file" if not names else "no names of columns"
+            raise InputError(self.place, found, "a header and rows")
+        if len(names) == 1 and "|" in names[0]:
+            raise InputError(self.place, f"one column {shown(names[0])}", "columns with , ; or tab between", "not '|'")
+        check_different(self.place, names)
+        return self
+
+    def read(self, chosen: Sequence[int]) -> tuple[pl.DataFrame, Integers]:
+        """Columns by their numbers, in ascending order, and the rows of the file that their rows are."""
+        import polars as pl
+
+        if self.text:
+            return self._read_csv(chosen)
+        frame = self.frame
+        if frame is None:
+            with _one_line(self.name, "not a Parquet file"):
+                frame = pl.read_parquet(BytesIO(self.content), columns=list(chosen))
+        else:
+            frame = pl.DataFrame([frame[frame.columns[i]] for i in chosen])
+        return frame, np.arange(frame.height)
+
+    def _read_csv(self, chosen: Sequence[int]) -> tuple[pl.DataFrame, Integers]:
+        import polars as pl
+
+        last = len(self.columns) - 1
+        wanted = sorted({*chosen, last})
+        start = len(self.text) - len(self.text.removeprefix(b"\xef\xbb\xbf").lstrip(b"\n"))
+        try:
+            with _one_line(self.name, "not a CSV"):
+                frame = pl.read_csv(
+                    BytesIO(self.text[start:]), columns=wanted, infer_schema=False, separator=self.separator
+                )
+        except InputError:
+            self._check_lengths()
+            raise
+        if b'"' in self.text and len(_records(self.text)) != frame.height + 1:
+            self._check_lengths()
+            raise InputError(self.name, "quotes within cells", "whole cells in quotes, or none")
+        rows = np.arange(frame.height)
+        frame.columns = [str(i) for i in wanted]
+        empty = frame.select(pl.all_horizontal(pl.all().is_null()))[:, 0].to_numpy()
+        if empty.any():  # lines that are blank, and rows whose cells of use are empty
+            records = _records(self.text)
+            separator = self.separator.encode()
+            rows = np.array([k for k in rows if not empty[k] or records[k + 1][1].replace(separator, b"").strip()])
+            frame = frame[rows]
+        if frame[str(last)].is_null().any():  # polars takes a cell that is missing at the end for an empty one
+            self._check_lengths()
+        return frame.select([str(i) for i in chosen]), rows
+
+    def _check_lengths(self) -> None:
+        """Raise for the first row of a CSV that has more or fewer cells than the header."""
+        for line, record in _records(self.text):
+            _require_closed(f"{self.name}:{line}", record)
+            n = re.sub(rb'"[^"]*"?', b"", record).count(self.separator.encode()) + 1
+            if record and n != len(self.columns):
+                hint = "a quote joins it with lines below: is one missing?" if b"\n" in record else ""
+                found = f"{n} cell{'s' * (n != 1)}"
+                raise InputError(f"{self.name}:{line}", found, f"{len(self.columns)} as in the header", hint)
+
+
+def _records(text: bytes, most: int | None = None) -> list[tuple[int, bytes]]:
+    """The header and the rows of a CSV, each with the line where it begins; a line break in quotes joins lines.
+
+    Blank lines count from the header on, as in polars.
+    """
+    records: list[tuple[int, bytes]] = []
+    parts: list[bytes] = []
+    for line, part in enumerate(text.removesuffix(b"\n").split(b"\n"), start=1):
+        if not parts and not part and not records:
+            continue
+        parts.append(part)
+        joined = b"\n".join(parts)
+        if joined.count(b'"') % 2 == 0:
+            records.append((line - len(parts) + 1, joined))
+            parts = []
+            if most is not None and len(records) == most:
+                return records
+    if parts:
+        records.append((text.removesuffix(b"\n").count(b"\n") + 2 - len(parts), b"\n".join(parts)))
+    return records
+
+
+def _require_closed(place: str, record: bytes) -> None:
+    if record.count(b'"') % 2:
+        raise InputError(place, "a quote that is not closed", "whole cells in quotes, or none")
+
+
+def _rename(source: _Source, columns: Mapping[str, Column], known: set[str]) -> list[str]:
+    """The names of a table's columns, those with an own name called as they are known.
+
+    Raises:
+        InputError: A known name is not known, or the table has no such column.
+    """
+    place = f"{source.name}: columns"
+    check_names(place, columns, sorted(known), "column")
+    names, places = list(source.columns), {}
+    for name, column in columns.items():
+        check_names(f"{place}: {name}", [column.name.strip()], source.columns, "column")
+        places[name] = names.index(column.name.strip())
+    check_different(f"{place}: the table's", [column.name.strip() for column in columns.values()])
+    found = list(names)
+    for name, i in places.items():
+        if name in names and names.index(name) not in places.values():
+            found[names.index(name)] = f"{name} (the table's)"
+        found[i] = name
     return found
 
 
-def _with_newlines(content: bytes) -> bytes:
-    """Every line ends with a newline alone, whatever mixture of ends it had: readers do not take others alike."""
-    for end in (b"\r\r\n", b"\r\n", b"\r"):
-        content = content.replace(end, b"\n")
-    return content
+def _understood(table: str, names: Sequence[str], known: set[str], joints: set[str]) -> list[str]:
+    """Names of columns, those of another case called as they are known; warns of names that only look known.
+
+    Raises:
+        InputError: A known name stands behind a #, as if the header were a comment.
+    """
+    found, given = list(names), set(names)
+    for i, name in enumerate(names):
+        if name in known or name in joints:
+            continue
+        if name.startswith("#") and (bare := name.lstrip("# ").lower()) in known:
+            raise InputError(table, f"column {shown(name)}", f"{bare}, or another name")
+        if name.lower() in known and name.lower() not in given:
+            found[i] = name.lower()
+        elif hint := _similar(name, known, given):
+            _log.warning("%s: column %r is not used; %s", table, name, hint)
+    return found
 
 
-def _separator(text: str) -> str:
-    """What stands between the cells of a CSV: a comma, unless its header has more semicolons or tabs."""
-    header = re.sub(r'"[^"]*"?', "", text.lstrip("\n").partition("\n")[0])
-    return max(",;\t", key=header.count)
+def _similar(name: str, known: set[str], given: set[str]) -> str:
+    """The known column that a name may mean; else nothing."""
+    if name.lower() in known:
+        return f"{name.lower()} is"
+    if not name.lower().startswith("sigma"):
+        return did_you_mean(name, known - given, 0.85)
+    sigmas = sorted(column.removeprefix("sigma_") for column in known if column.startswith("sigma_"))
+    rest = name.lower().removeprefix("sigma_")  # else every sigma would be much like every other
+    like = did_you_mean(rest, [column for column in sigmas if f"sigma_{column}" not in given], 0.85)
+    return like.replace("mean ", "mean sigma_") or f"sigmas are {', '.join(f'sigma_{column}' for column in sigmas)}"
 
 
-def _start_of_header(content: bytes) -> int:
-    """Where the first line begins that is not blank, behind a byte order mark."""
-    start = 3 if content.startswith(b"\xef\xbb\xbf") else 0
-    while content[start : start + 1] in (b"\n", b"\r") and start < len(content):
-        start += 1
-    return start
+def _as_polars(table: Any, name: str) -> pl.DataFrame:
+    """A frame of polars from one of polars or pandas, or from a mapping of columns; nan is an empty cell.
 
-
-def _text(cells: pl.Series, column: pl.Expr) -> pl.Expr:
-    """Text without blanks around it, whole numbers without a fraction; null if nothing is left.
-
-    Args:
-        cells: The cells.
-        column: What stands for them.
+    Raises:
+        InputError: It is no table.
     """
     import polars as pl
 
-    if cells.dtype.is_float() and bool(((cells % 1 == 0) & (cells.abs() <= MOST_SIZE)).all()):
-        column = column.cast(pl.Int64)  # pandas has floats beside nan
-    if cells.dtype.is_integer():
-        return column.cast(pl.String)
-    return column.cast(pl.String).str.strip_chars().replace("", None)
+    frame = table if isinstance(table, Mapping) else as_frame(name, table)
+    if frame is None or not (isinstance(frame, Mapping | pl.DataFrame) or hasattr(frame, "to_dict")):
+        raise InputError(name, f"found a {type(table).__name__}", "a path, or a frame of polars or pandas")
+    if not isinstance(frame, pl.DataFrame):
+        columns = frame if isinstance(frame, Mapping) else frame.to_dict("list")
+        check_different(name, columns)
+        frame = pl.DataFrame({str(key): _series(values) for key, values in columns.items()})
+    if not frame.columns:
+        raise InputError(name, "a frame without columns", "a frame with rows")
+    names = frame.columns
+    numbered = [frame[column].alias(str(k)) for k, column in enumerate(names)]  # polars takes * for a pattern
+    frame = pl.DataFrame([one.fill_nan(None) if one.dtype.is_float() else one for one in numbered])
+    frame.columns = names
+    return frame
 
 
-def _number(cells: pl.Series, column: pl.Expr, decimal_comma: bool) -> pl.Expr:
-    """Numbers, also from text: nan where it is none, null where it is empty."""
+def _series(values: Any) -> Any:
+    """A column with None for pandas' missing values; cells of several types become texts, so that none is lost."""
     import polars as pl
 
-    if cells.dtype != pl.String:
-        return column.cast(pl.Float64)
-    texts = _text(cells, column)
-    if decimal_comma:  # in a text with a point too one of them groups thousands, or it is no number
-        texts = texts.str.replace(r"^([^.,]*),([^.,]*)$", "$1.$2")
-    numbers = texts.cast(pl.Float64, strict=False).fill_null(float("nan"))
-    return pl.when(texts.is_not_null()).then(numbers)
+    if not isinstance(values, list):
+        return values
+    missing = ("NAType", "NaTType")
+    cells = [
+        None if type(value).__name__ in missing or (isinstance(value, float) and value != value) else value  # noqa: PLR0124
+        for value in values
+    ]
+    try:
+        return pl.Series(cells)
+    except (pl.exceptions.PolarsError, TypeError, OverflowError):
+        return pl.Series([None if value is None else str(value) for value in cells], dtype=pl.String)
 
 
-def _check_same_rows(header: Header, n_rows: int) -> None:
-    """Raise where polars and the standard library do not read the same rows, which only quotes can make them do."""
-    if b'"' in header.text and sum(1 for _ in header.csv_rows()) != n_rows + 1:
-        _check_lengths(header)
-        _check_quotes(header)
-        raise InputError(header.name, "quotes within cells", "whole cells in quotes, or none")
+@contextmanager
+def _one_line(name: str, what: str) -> Iterator[None]:
+    """Errors of polars, and panics of its Rust, become one line.
+
+    Raises:
+        InputError: It makes nothing of a table.
+    """
+    require_polars(name)
+    try:
+        yield
+    except (InputError, MemoryError):
+        raise
+    except BaseException as error:  # of a frame's objects polars may raise anything
+        if type(error).__name__ == "PanicException":
+            raise InputError(name, f"{what}: polars cannot read it", hint="write it anew") from None
+        if not isinstance(error, Exception):
+            raise
+        first = str(error).strip().partition("\n")[0]
+        raise InputError(name, f"{what}: {first or type(error).__name__}") from None
 
 
-def _check_lengths(header: Header) -> None:
-    """Raise for the first row of a CSV that has more or fewer cells than the header."""
-    for line, row in header.csv_rows():
-        if row and len(row) != len(header.columns):
-            goes_on = any("\n" in cell for cell in row)
-            hint = "a quote joins it with lines below: is one missing?" if goes_on else ""
-            found = f"{len(row)} cell{'s' * (len(row) != 1)}"
-            raise InputError(f"{header.name}:{line}", found, f"{len(header.columns)} as in the header", hint)
+def require_own_csv(path: Path, beginning: bytes) -> None:
+    """Check that a table can be written: a CSV that is not there yet, or was written as one of that kind.
+
+    Args:
+        path: Where.
+        beginning: How tables of that kind begin.
+
+    Raises:
+        InputError: It cannot.
+    """
+    if path.suffix.lower() != ".csv":
+        raise InputError(str(path), f"ending {path.suffix!r}", ".csv")
+    if not path.parent.is_dir():
+        raise InputError(str(path), f"there is no folder {path.parent}")
+    require_own(path.parent, {path.name: beginning})
 
 
-def _check_quotes(header: Header) -> None:
-    """Raise for the first line of a CSV with a quote that is not closed in it."""
-    for line, text in enumerate(header.text.split(b"\n"), start=1):
-        if text.count(b'"') % 2:
-            raise InputError(f"{header.name}:{line}", "a quote that is not closed", "whole cells in quotes, or none")
+def write_csv(path: Path | str, columns: Mapping[str, ArrayLike | None]) -> None:
+    """Write a CSV, whole or not at all; floats read back exactly.
+
+    Args:
+        path: The file to write.
+        columns: The columns by name, all of one length; None for one that is still to be filled in.
+
+    Raises:
+        InputError: The folder does not exist or may not be written to.
+    """
+    import polars as pl
+
+    given = {name: np.asarray(values) for name, values in columns.items() if values is not None}
+    frame = pl.DataFrame(given)
+    write_table(path, frame.with_columns(pl.lit(None).alias(n) for n in columns if n not in given).select(*columns))
 
 
-def unit_hint(figure: float, unit: str, units: Units, limits: tuple[float, float]) -> str:
-    """A question whether a figure is in the smaller unit, where it would then lie within the limits, [m] or [rad]."""
-    smaller, factor = ("mm", LENGTHS["mm"]) if unit == "m" else ("deg", ANGLES["deg"])
-    large = units.name(unit) == unit
-    return f"is the table in {smaller}?" if large and limits[0] <= figure * factor <= limits[1] else ""
+def write_table(path: Path | str, frame: pl.DataFrame) -> None:
+    """Write a frame as Parquet if the file's name ends so, else as CSV; whole or not at all, floats read back exactly.
+
+    Raises:
+        InputError: The folder does not exist or may not be written to.
+    """
+    require_polars(str(path))
+    with replacing(Path(path)) as temporary:
+        if temporary.suffix == ".parquet":
+            frame.write_parquet(temporary)
+        else:
+            frame.write_csv(temporary)

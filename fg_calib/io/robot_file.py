@@ -26,14 +26,13 @@ from pydantic import Field
 from fg_calib.arguments import checked
 from fg_calib.errors import InputError
 from fg_calib.io.atomic import write_text
-from fg_calib.io.units import UNITS, Units, UnitsOfFile
+from fg_calib.io.units import Units, UnitsOfFile
 from fg_calib.io.yaml import (
     Bound,
     FilePath,
     Number,
     Positive,
     Schema,
-    Section,
     meaning,
     read_yaml,
     shown,
@@ -80,9 +79,9 @@ class _Robot(Schema):
     """The keys that both forms of a robot file have."""
 
     name: str | None = meaning("The robot's name", None)
-    units: UnitsOfFile = meaning("Of the figures in this file", Units(), kind="mapping")
-    base: FrameValues = meaning("Base frame to frame 0, or to the first link of a URDF", FrameValues(), kind="frame")
-    tool: FrameValues = meaning("Last frame to tool frame", FrameValues(), kind="frame")
+    units: UnitsOfFile = meaning("Of the figures in this file", Units())
+    base: FrameValues = meaning("Base frame to frame 0, or to the first link of a URDF", FrameValues())
+    tool: FrameValues = meaning("Last frame to tool frame", FrameValues())
     fixed: tuple[str, ...] = meaning("Parameters of the joints that are known exactly, never estimated", ())
     estimate: tuple[str, ...] = meaning(
         "Parameters of base and tool that are estimated, which others are not: tool.x", ()
@@ -90,7 +89,6 @@ class _Robot(Schema):
     tolerance: dict[str, Positive] = meaning(
         "1 sigma of true minus nominal, by kind (a, theta, tool, ...) or by name: used as priors",
         {},
-        kind="mapping of numbers above 0",
     )
 
     def choices(self, place: str) -> dict[str, Any]:
@@ -122,23 +120,13 @@ class _Row(Schema):
 
 class _DhRobot(_Robot):
     convention: Literal["dh", "mdh", "mdh-hayati", "dh-hayati"] = meaning("Order of one joint's transforms")
-    joints: Annotated[list[_Row], Field(min_length=1)] = meaning("A row a joint, in chain order", kind="list of rows")
+    joints: Annotated[list[_Row], Field(min_length=1)] = meaning("A row a joint, in chain order")
 
 
 class _UrdfRobot(_Robot):
     urdf: FilePath = meaning("A URDF, in place of convention and joints; the path is relative to this file")
     base_link: str | None = meaning("Link where the chain starts; the root if left out", None)
     tip_link: str | None = meaning("Link where the chain ends; the only leaf if left out", None)
-
-
-SECTIONS = (
-    Section("", _DhRobot, "By rows of a Denavit-Hartenberg convention:"),
-    Section("", _UrdfRobot, "Or a URDF with what it cannot hold itself (a path to the .urdf alone will do too):"),
-    UNITS,
-    Section("joints: each row", _Row, required=("a", "alpha", "d", "theta")),
-    Section("base, tool", FrameValues),
-)
-"""The mappings of a robot file, for the reference."""
 
 
 @checked

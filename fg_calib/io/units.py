@@ -11,7 +11,7 @@ from typing import Annotated
 from pydantic import BeforeValidator
 
 from fg_calib.errors import InputError
-from fg_calib.io.yaml import Positive, Schema, Section, meaning, refuse_unknown_keys, shown, validate
+from fg_calib.io.yaml import Positive, Schema, refuse_unknown_keys, shown, validate
 from fg_calib.options import AngleUnit, LengthUnit, did_you_mean, set_checked
 from fg_calib.sizes import LEAST_SIZE
 
@@ -104,13 +104,5 @@ class _Figure(Schema):
 _QUANTITY = re.compile(r"\s*(?P<number>[^\s]*[0-9.])\s*(?P<unit>[A-Za-z]*)\s*")
 
 
-class _Units(Schema):
-    length: LengthUnit = meaning("Of lengths", "m")
-    angle: AngleUnit = meaning("Of angles", "rad")
-
-
-UnitsOfFile = Annotated[Units, BeforeValidator(refuse_unknown_keys(*_Units.model_fields))]
+UnitsOfFile = Annotated[Units, BeforeValidator(refuse_unknown_keys("length", "angle"))]
 """Units under a file's key `units`."""
-
-UNITS = Section("units", _Units)
-"""The keys of `units`, for the reference."""

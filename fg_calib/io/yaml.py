@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass
-from datetime import date
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from reprlib import Repr
-from typing import Annotated, Any, NoReturn, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
+from fg_calib import errors
 from fg_calib.errors import InputError
 from fg_calib.io.atomic import read_text
 from fg_calib.options import did_you_mean
@@ -96,32 +94,9 @@ class Schema(BaseModel):
         return refuse_unknown_keys(*cls.model_fields)(value)
 
 
-def meaning(words: str, default: Any = ..., *, kind: str = "") -> Any:
-    """A key of a schema with what it means: what the reader knows, `fg-calib help` and the reference say.
-
-    Args:
-        words: What it means, a sentence without its full stop.
-        default: What it is where it is left out; ... where it must not be.
-        kind: What it may be, where its type does not say.
-    """
-    return Field(default, description=words, json_schema_extra={"kind": kind})
-
-
-@dataclass(frozen=True)
-class Section:
-    """A mapping of a file, as the reference shows it.
-
-    Attributes:
-        title: Where it stands.
-        schema: Its keys.
-        words: What there is to say before them.
-        required: Keys that must be given although the schema alone does not say so.
-    """
-
-    title: str
-    schema: type[BaseModel]
-    words: str = ""
-    required: tuple[str, ...] = ()
+def meaning(words: str, default: Any = ...) -> Any:
+    """A key of a schema with what it means; its default is ... where it is required."""
+    return Field(default, description=words)
 
 
 AnySchema = TypeVar("AnySchema", bound=Schema)
@@ -228,21 +203,8 @@ _EXPECTED = {
 
 
 def shown(value: object) -> str:
-    """A found value for a message: its repr, cut to 60 characters; of what is nested or long only the beginning."""
-    if value is None:
-        return "nothing"
-    if isinstance(value, date):
-        return str(value)
-    try:
-        text = repr(value[:100]) if isinstance(value, str) else _REPR.repr(value)
-    except ValueError:  # Python shows no whole number of more than 4300 digits
-        return "a number of thousands of digits"
-    return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-_REPR = Repr()
-_REPR.maxstring = _REPR.maxlong = _REPR.maxother = 100
-_REPR.maxlist = _REPR.maxdict = _REPR.maxtuple = 20
+    """A found value for a message: its repr, cut to 60 characters."""
+    return "nothing" if value is None else errors.shown(value)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -279,119 +241,65 @@ def _of_yaml(error: yaml.MarkedYAMLError, name: str) -> InputError:
     return InputError(f"{name}:{mark.line + 1}" if mark else name, found, hint=hint)
 
 
-MOST_VALUES = 50_000
-"""Values that a file may hold, what its aliases stand for counted each time: a second's work, and far above any robot's
-or job's; what is long is a table."""
-
-
 class _Loader(yaml.SafeLoader):
-    """The safe loader, which by itself would let the later of two equal keys win, and take any scalar for a key."""
+    """The safe loader with different keys that are words, and numbers of base 10.
 
-    def __init__(self, stream: str) -> None:
-        super().__init__(stream)
-        self._n_values = 0
+    YAML 1.1 reads 045 as 37 and 1:30 as 90; dates and merge keys have no meaning in our files.
+    """
 
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        """The next node, if there are not too many before it: a long file is given up where it becomes too long."""
-        self._n_values += 1
-        if self._n_values > MOST_VALUES:
-            raise yaml.MarkedYAMLError(
-                problem=f"more than {MOST_VALUES} values in one file",
-                problem_mark=self.peek_event().start_mark,  # type: ignore[no-untyped-call]
-            )
-        node: yaml.Node | None = super().compose_node(parent, index)
-        return node
-
-    def get_single_node(self) -> yaml.Node | None:
-        """The document's node, which is of a size that can be looked at."""
-        node: yaml.Node | None = super().get_single_node()
-        if node is not None:
-            self._size(node, {})
-        return node
-
-    def _size(self, node: yaml.Node, known: dict[int, int]) -> int:
-        """Number of values in a node, aliases expanded."""
-        if id(node) in known:
-            if not known[id(node)]:
-                self._refuse(node, "an alias of what it stands in")
-            return known[id(node)]
-        known[id(node)] = 0  # within
-        size = 1
-        if not isinstance(node, yaml.ScalarNode):
-            for child in node.value:
-                size += sum(self._size(one, known) for one in (child if isinstance(child, tuple) else (child,)))
-        if size > MOST_VALUES:
-            self._refuse(node, f"aliases that stand for more than {MOST_VALUES} values")
-        known[id(node)] = size
-        return size
-
-    @staticmethod
-    def _refuse(node: yaml.Node, problem: str) -> NoReturn:
-        raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
+    yaml_implicit_resolvers: ClassVar = {  # type: ignore[misc]
+        first: [(tag, pattern) for tag, pattern in known if tag.rpartition(":")[2] in ("bool", "null")]
+        for first, known in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         """The value of a node.
 
         Raises:
-            yaml.MarkedYAMLError: Python cannot make it: no such date, too many digits.
+            yaml.MarkedYAMLError: Python cannot make it: too many digits, half of a pair of surrogates.
         """
         try:
-            return super().construct_object(node, deep)
+            value = super().construct_object(node, deep)
+            if isinstance(value, str):
+                value.encode()
+            return value
         except (ValueError, LookupError, AttributeError, TypeError, OverflowError):
             tag = node.tag.removeprefix("tag:yaml.org,2002:")
-            self._refuse(node, f"{shown(getattr(node, 'value', None))} is no YAML of type {tag}")
+            found = f"{shown(getattr(node, 'value', None))} is no YAML of type {tag}"
+            raise yaml.MarkedYAMLError(problem=found, problem_mark=node.start_mark) from None
 
-    def construct_number(self, node: yaml.ScalarNode) -> float:
-        """A number of base 10, or with a prefix that says another: YAML 1.1 reads 045 as 37, and 1:30 as 90."""
-        other = re.fullmatch(r"[-+]?0(?P<base>[xb])?[0-9a-f_]+", node.value, re.IGNORECASE)
-        if "_" in node.value:
-            self._refuse(node, f"{shown_word(node.value)} has an underscore, expected a number without it")
-        if ":" in node.value or other:
-            base = "60" if other is None else {"x": "16", "b": "2"}.get((other["base"] or "").lower(), "8")
-            self._refuse(node, f"{shown_word(node.value)} is a number of base {base} in YAML, expected one of base 10")
-        return self.construct_yaml_int(node) if node.tag.endswith(":int") else self.construct_yaml_float(node)
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """A mapping; its keys are words.
 
-    def construct_scalar(self, node: yaml.ScalarNode | yaml.MappingNode) -> Any:
-        """The text of a scalar, which is one of Unicode: half of a pair of surrogates is none."""
-        text = super().construct_scalar(node)
-        if isinstance(text, str) and not text.isascii():
-            try:
-                text.encode()
-            except UnicodeEncodeError:
-                self._refuse(node, f"{shown(text)} is no text of Unicode")
-        return text
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        """Construct a mapping of different words."""
+        Raises:
+            yaml.MarkedYAMLError: A key is no word, or stands there twice.
+        """
+        found: dict[str, Any] = {}
         if not isinstance(node, yaml.MappingNode):
-            self._refuse(node, "a tag of a mapping, expected a mapping behind it")
-        seen = set()
+            raise yaml.MarkedYAMLError(problem="no mapping behind the tag of one", problem_mark=node.start_mark)
         for key_node, value_node in node.value:
-            key = key_node.value if isinstance(key_node, yaml.ScalarNode) else None
-            if key is None or key_node.tag not in {"tag:yaml.org,2002:str", "tag:yaml.org,2002:merge"}:
-                found = f"key {shown_word(key) if key is not None else 'that is no word'}"
-                self._refuse(key_node, f"{found}, expected a word{_of_comma(key, value_node)}")
-            if hint := _of_comma(key, value_node):
-                self._refuse(key_node, f"key {shown(key)}{hint}")
-            if key in seen:
-                self._refuse(key_node, f"key {shown(key)} stands here twice")
-            seen.add(key)
-        return super().construct_mapping(node, deep)
+            key, problem = key_node.value, ""
+            if not isinstance(key_node, yaml.ScalarNode):
+                problem = "a key that is no word, expected a word"
+            elif re.fullmatch(r"\d+([eE][-+]?\d+)?", key) and value_node.value == "":  # of `{a: 0,5}`
+                problem = f"key {shown(key)}, expected a word; {_DECIMAL_COMMA}"
+            elif key in found:
+                problem = f"key {shown(key)} stands here twice"
+            if problem:
+                raise yaml.MarkedYAMLError(problem=problem, problem_mark=key_node.start_mark)
+            found[key] = self.construct_object(value_node, deep=True)
+        return found
 
 
-def _refuse_tag(loader: _Loader, node: yaml.Node) -> NoReturn:
-    loader._refuse(node, f"tag {shown(node.tag)}, expected a value without it")
-
-
-_Loader.add_constructor(None, _refuse_tag)
-for _tag in ("int", "float"):
-    _Loader.add_constructor(f"tag:yaml.org,2002:{_tag}", _Loader.construct_number)
-
-
-def _of_comma(key: str | None, value: yaml.Node) -> str:
-    """A hint where `{a: 0,5}` made the fraction a key: it is a number in a flow mapping, and nothing stands for it."""
-    fraction = key is not None and re.fullmatch(r"\d+([eE][-+]?\d+)?", key) and value.value == ""
-    return f"; {_DECIMAL_COMMA}" if fraction else ""
+for _tag, _pattern, _first in (
+    ("int", r"[-+]?(0|[1-9][0-9]*)", "-+0123456789"),
+    (
+        "float",
+        r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        "-+.0123456789",
+    ),
+):
+    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^({_pattern})$"), list(_first))
 
 
 def shown_word(text: str) -> str:

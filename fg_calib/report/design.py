@@ -18,7 +18,7 @@ from fg_calib.arrays import Floats
 from fg_calib.designs.design import Design
 from fg_calib.errors import InputError
 from fg_calib.io.atomic import exists, fill_folder, read_bytes, read_text, write_text
-from fg_calib.io.csv_writer import write_csv
+from fg_calib.io.columns import write_csv
 from fg_calib.io.robot_file import write_robot
 from fg_calib.io.units import Units
 from fg_calib.io.urdf import write_urdf

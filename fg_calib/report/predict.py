@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib import __version__
 from fg_calib.arrays import Floats
-from fg_calib.io.csv_writer import write_csv
+from fg_calib.io.columns import require_own_csv, write_csv
 from fg_calib.io.result import Result
 from fg_calib.io.tables import joint_columns
 from fg_calib.io.units import Units
@@ -367,3 +367,54 @@ def _correction_notes(ids: Sequence[str], correction: Correction) -> Iterator[st
         )
     if np.isnan(correction.expected).any():
         yield "The expected error is unknown where it depends on what the calibration did not determine."
+
+
+_COMMANDS_BEGIN = b"id,reached,"
+"""How a table of commands begins."""
+
+
+def require_commands(path: Path) -> None:
+    """Check that a table of commands can be written: a CSV that is not there yet, or was written as one.
+
+    Raises:
+        InputError: It cannot.
+    """
+    require_own_csv(path, _COMMANDS_BEGIN)
+
+
+def write_commands(path: Path, ids: tuple[str, ...], correction: Correction, robot: Robot, units: Units) -> None:
+    """Write a table of commands, whole or not at all.
+
+    Columns: `id`; `reached`: yes, or no; joint values by the joints' names (`q1 ... qn` where these mean something else
+    in a table); `x y z qx qy qz qw`, the pose to command from the base; `uncorrected_position` and
+    `uncorrected_orientation`, how far the nominal values miss; `missed_position` and `missed_orientation`, what is left
+    where a target is out of reach; `expected_position` and `expected_orientation`, the RMS error to expect. Figures are
+    in the units given; an empty cell is unknown.
+
+    Args:
+        path: The CSV; one that was written as such is replaced.
+        ids: The targets' names.
+        correction: What to command.
+        robot: Whose joints they are of.
+        units: Of the figures.
+
+    Raises:
+        InputError: It cannot be written, or is another file.
+    """
+    length, angle = units.factor("m"), units.factor("rad")
+    quaternion = Rotation.from_matrix(correction.rotation.copy()).as_quat(canonical=True)
+    readings = correction.readings / [units.factor(joint.unit) for joint in robot.joints]
+    columns: dict[str, Any] = {
+        "id": np.array(ids, dtype=np.str_),
+        "reached": np.where(correction.reached, "yes", "no"),
+        **dict(zip(joint_columns(robot), readings.T, strict=True)),
+        **dict(zip("xyz", correction.position.T / length, strict=True)),
+        **{f"q{axis}": quaternion[:, k] for k, axis in enumerate("xyzw")},
+    }
+    for name in ("uncorrected", "missed", "expected"):
+        errors = getattr(correction, name)
+        columns[f"{name}_position"] = errors[:, 0] / length
+        if correction.turns or name == "expected":
+            columns[f"{name}_orientation"] = errors[:, 1] / angle
+    require_commands(path)
+    write_csv(path, columns)

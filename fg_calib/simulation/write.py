@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from fg_calib.arguments import checked
 from fg_calib.errors import InputError
 from fg_calib.io.atomic import fill_folder, read_text, write_text
-from fg_calib.io.csv_writer import write_csv
+from fg_calib.io.columns import write_csv
 from fg_calib.io.robot_file import write_robot
 from fg_calib.io.units import Units
 from fg_calib.io.urdf import write_urdf

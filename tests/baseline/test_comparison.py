@@ -20,7 +20,7 @@ from fg_calib.baseline.least_squares import fit_least_squares
 from fg_calib.errors import InputError
 from fg_calib.graph.build import build_problem, problem_of
 from fg_calib.graph.solver import solve
-from fg_calib.io.csv_writer import write_csv
+from fg_calib.io.columns import write_csv
 from fg_calib.io.job import read_job
 from fg_calib.io.robot_file import write_robot
 from fg_calib.job import Job

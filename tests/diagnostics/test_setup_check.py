@@ -16,7 +16,7 @@ from fg_calib.diagnostics import setup_check as mistakes
 from fg_calib.diagnostics.setup_check import EXPLAINED, FAR, REDUCTION, check_setup
 from fg_calib.errors import SolverError
 from fg_calib.graph import solver
-from fg_calib.io.csv_writer import write_csv
+from fg_calib.io.columns import write_csv
 from fg_calib.io.job import read_job
 from fg_calib.options import MODELS, PAIR_MODELS, POSE_MODELS
 from fg_calib.robot.inverse import solve_inverse

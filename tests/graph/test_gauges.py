@@ -15,7 +15,7 @@ from fg_calib.graph.build import build_problem
 from fg_calib.graph.information import whitened_triangle
 from fg_calib.graph.problem import by_columns_of
 from fg_calib.graph.solver import solve
-from fg_calib.io.csv_writer import write_csv
+from fg_calib.io.columns import write_csv
 from fg_calib.io.robot_file import write_robot
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.monitoring.prior_information import knowledge_of

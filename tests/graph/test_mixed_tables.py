@@ -21,7 +21,7 @@ from fg_calib.errors import InputError, ProblemError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.problem import assembled
 from fg_calib.graph.solver import solve
-from fg_calib.io.csv_writer import write_csv
+from fg_calib.io.columns import write_csv
 from fg_calib.measurements.dataset import Groups, Pairs, no_pairs
 from fg_calib.measurements.table import Table
 from fg_calib.options import Pairing

@@ -13,30 +13,21 @@ import polars as pl
 import pytest
 
 from fg_calib import InputError, Robot, read_job, read_measurements
-from fg_calib.io import yaml as schema
-from fg_calib.io.atomic import read_bytes
 from fg_calib.io.yaml import read_yaml
 from fg_calib.sizes import ORDINARY
 
 ROWS_OF_DH = [[0.5, 0.1, 0.2, 0.0], [0.4, 0.2, 0.1, 0.0], [0.3, 0.0, 0.1, 0.0]]
 ARM = Robot.from_dh(ROWS_OF_DH, convention="dh")
 ROWS = "q1,q2,q3,x,y,z\n0.1,0.2,0.3,1,2,3\n0.4,0.5,0.6,4,5,6\n"
-LAUGHS = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
-    f"a{i + 1}: &a{i + 1} [{', '.join([f'*a{i}'] * 9)}]\n" for i in range(24)
-)
-MERGES = "a0: &a0 {k: 1}\n" + "".join(f"a{i + 1}: &a{i + 1}\n  <<: [{', '.join([f'*a{i}'] * 9)}]\n" for i in range(12))
 UTF_16 = "UTF-16 or UTF-32 text, expected UTF-8 text; save it as UTF-8"
 
 YAML = {
-    LAUGHS: "robot.yaml:5: aliases that stand for more than 50000 values",
-    MERGES: "robot.yaml:11: aliases that stand for more than 50000 values",
-    "a: &a [*a]\n": "robot.yaml:1: an alias of what it stands in",
+    "a: &a [*a]\n": "robot.yaml:1: found unconstructable recursive node",
     "a: " + "[" * 3000: "robot.yaml: nested too deeply, expected a mapping, key: value",
     "a: !!int ''\n": "robot.yaml:1: '' is no YAML of type int",
     "a: !!bool abc\n": "robot.yaml:1: 'abc' is no YAML of type bool",
     "a: !!timestamp x\n": "robot.yaml:1: 'x' is no YAML of type timestamp",
     "a: !!float x\n": "robot.yaml:1: 'x' is no YAML of type float",
-    "a: {b: 0,0005}\n": "robot.yaml:1: key 0005, expected a word; is it a decimal comma? numbers have a decimal point",
     "a: 1".encode("utf-16"): f"robot.yaml: {UTF_16}",
 }
 
@@ -50,24 +41,10 @@ def test_no_yaml_hangs_or_ends_in_a_traceback(tmp_path, text):
     assert str(error.value) == YAML[text]
 
 
-def test_a_long_yaml_is_given_up_where_it_becomes_too_long(tmp_path, monkeypatch):
-    """Not when all of it has been read: 900 000 names took 17 s. The mapping, its key and the list are values too."""
-    monkeypatch.setattr(schema, "MOST_VALUES", 1000)
-    file = tmp_path / "robot.yaml"
-    for text, line in (("fixed: [" + 9000 * "a1, " + "]", 1), ("fixed:\n" + 9000 * "- a1\n", 999)):
-        file.write_text(text)
-        with pytest.raises(InputError) as error:
-            read_yaml(file)
-        assert str(error.value) == f"robot.yaml:{line}: more than 1000 values in one file"
-    file.write_text("fixed:\n" + 997 * "- a1\n")
-    assert len(read_yaml(file)["fixed"]) == 997
-
-
 TABLES = {
     ROWS.encode("utf-16"): f"poses.csv: {UTF_16}",
-    ROWS.replace("0.2", "9" * 200_000): f"poses.csv:2: q2: found '{'9' * 56}..., expected a finite number",
-    ROWS.replace("0.2", '"0.2'): "poses.csv:2: 2 cells, expected 6 as in the header; "
-    "a quote joins it with lines below: is one missing?",
+    ROWS.replace("0.2", "9" * 200_000): f"poses.csv:2: q2: found '{'9' * 47}...999999..., expected a finite number",
+    ROWS.replace("0.2", '"0.2'): "poses.csv:2: a quote that is not closed, expected whole cells in quotes, or none",
     "\n\n" + ROWS.replace("0.2", ""): "poses.csv:4: q2: found an empty cell, expected a finite number",
     ROWS.replace("0.2", "1e200"): f"poses.csv:2: q2: found '1e200', expected {ORDINARY}",
     ROWS + ",,,,,7\n": "poses.csv:4: q1: found an empty cell, expected a finite number",
@@ -133,7 +110,7 @@ def test_cells_of_several_types_are_all_read(tmp_path):
     columns = {"q1": [1, 0.5], "q2": ["0.25", 1], "q3": [np.float32(0.5), 10**400], "id": [1, "b"]}
     with pytest.raises(InputError) as error:
         read_measurements(columns, ARM)
-    assert str(error.value) == f"frame: row 1: q3: found '1{'0' * 55}..., expected a finite number"
+    assert str(error.value) == f"frame: row 1: q3: found '1{'0' * 46}...000000..., expected a finite number"
     found = read_measurements(columns | {"q3": [0.5, 0.75]}, ARM)
     assert found.readings.tolist() == [[1.0, 0.25, 0.5], [0.5, 1.0, 0.75]]
     assert found.ids.tolist() == ["1", "b"]
@@ -177,23 +154,6 @@ def test_columns_that_look_as_if_they_were_used_are_told_of(tmp_path, caplog):
     said = f"sigmas are {', '.join(f'sigma_{name}' for name in sigmas)}"
     expected = [f"poses.csv: column {name!r} is not used; {said}" for name in names[:4]]
     assert caplog.messages == [*expected, "poses.csv: column 'X' is not used; x is"]
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda folder: folder / "nothing", "nothing: no such file"),
-        (lambda folder: folder, ": is a folder, expected a file"),
-        (lambda folder: folder / ("x" * 5000), "cannot be read: File name too long, expected a file"),
-        (lambda folder: folder / "a\0b", "cannot be read: "),
-        (lambda folder: os.mkfifo(folder / "pipe") or folder / "pipe", "pipe: is a pipe or a device, expected a file"),
-    ],
-)
-def test_what_is_no_file_is_one_line(tmp_path, make, message):
-    with pytest.raises(InputError) as error:
-        read_bytes(make(tmp_path))
-    assert message in str(error.value)
-    assert len(str(error.value)) < 300
 
 
 @pytest.mark.slow

@@ -228,12 +228,10 @@ MISTAKES = {
     ),
     "a: 1\n\tb: 2\n": "robot.yaml:2: found character '\\t' that cannot start any token",
     "a: 1\nb: \x01\n": "robot.yaml:2: character 0x01, expected printable text",
-    "a: 2024-13-45\n": "robot.yaml:1: '2024-13-45' is no YAML of type timestamp",
     b"a: 1\nb: \xe9\n": "robot.yaml:2: byte 0xe9, expected UTF-8 text; is it Latin-1 or Windows text? save it as UTF-8",
     "name: a\nname: b\n": "robot.yaml:2: key 'name' stands here twice",
     "base:\n  x: 1\n  x: 2\n": "robot.yaml:3: key 'x' stands here twice",
-    "1: 2\n": "robot.yaml:1: key 1, expected a word",
-    "[1]: 2\n": "robot.yaml:1: key that is no word, expected a word",
+    "[1]: 2\n": "robot.yaml:1: a key that is no word, expected a word",
     "name: a\n": "robot.yaml: missing keys 'convention', 'joints'",
     "convention: dh\n": "robot.yaml: missing key 'joints'",
     f"convension: dh\njoints:\n{ROW}": (
@@ -257,9 +255,6 @@ MISTAKES = {
         "robot.yaml: joint 1: a: found nan, expected a finite number (and 2 more)"
     ),
     HEAD + "  - {a: 0, alpha: 0, d: yes, theta: 0}\n": ("robot.yaml: joint 1: d: found True, expected a finite number"),
-    HEAD + "  - {a: 0, alpha: 0, d: 1e999, theta: 0}\n": (
-        "robot.yaml: joint 1: d: found '1e999', expected a finite number"
-    ),
     HEAD + "  - {a: 0, alpha: 0, d: 0, theta: 0, beta: 0.1}\n": (
         "robot.yaml: joint 1: beta: found 0.1, expected none: the convention dh has no beta; dh-hayati has"
     ),

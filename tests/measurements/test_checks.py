@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fg_calib import InputError, Measurements, Noise, Options, Robot, Units, read_measurements
-from fg_calib.io.csv_writer import write_csv
+from fg_calib.io.columns import write_csv
 from fg_calib.measurements.checks import check_readings
 
 RNG = np.random.default_rng(3)

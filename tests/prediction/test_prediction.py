@@ -6,7 +6,6 @@ from simulated import measure, small_arm, true_robot
 from tolerances import rounding
 
 from fg_calib import Calibration, InputError, Measurements, assess, build_problem, calibrate, pose, predict, solve
-from fg_calib.io.job import joint_noise_in
 from fg_calib.prediction import workspace
 from fg_calib.prediction.tool_pose import ToolPoseUncertainty
 from fg_calib.prediction.workspace import predict_errors, summed_up
@@ -229,27 +228,3 @@ def test_arms_that_were_calibrated_are_as_far_off_as_expected(frame):
     ratio = np.sqrt(real.mean(axis=0) / expected.mean(axis=0))
     # The square of an error with two degrees of freedom scatters by its mean: half of that over sqrt(n), 4 sigma.
     assert ratio == pytest.approx(np.ones(2), abs=4 * 0.5 / np.sqrt(n))
-
-
-@pytest.mark.parametrize(
-    ("job", "sigma"),
-    [
-        ({"measurements": "poses.csv", "noise": {"position": 1e-4, "joint": 0.01}}, np.full(4, 0.01)),
-        ({"measurements": "poses.csv", "noise": "estimate"}, np.zeros(4)),
-        ({"measurements": "poses.csv"}, np.zeros(4)),
-        ({"measurements": [{"table": "a.csv"}], "noise": {"joint": [1, 2, 3, 4]}}, np.arange(1.0, 5.0)),
-        ({"measurements": [{"table": "a.csv", "noise": {"joint": 5}}], "noise": {"joint": 1}}, np.full(4, 5.0)),
-        ({"measurements": [{"table": "a.csv", "noise": {"position": 5}}], "noise": {"joint": 1}}, np.full(4, 1.0)),
-    ],
-)
-def test_joint_noise_is_read_from_a_job_in_its_units(job, sigma):
-    """In mm and degrees; of a list of tables the first entry's, or what holds for all."""
-    robot = small_arm()
-    units = [1e-3 if joint.prismatic else np.pi / 180.0 for joint in robot.joints]
-    found = joint_noise_in({"model": "pose", "units": {"length": "mm", "angle": "deg"}} | job, robot, "job")
-    assert found == pytest.approx(sigma * units, rel=1e-12)
-
-
-def test_joint_noise_of_a_damaged_job_is_one_line():
-    with pytest.raises(InputError, match="job: unit"):
-        joint_noise_in({"model": "pose", "measurements": "a.csv", "units": {"length": "ell"}}, small_arm(), "job")
