@@ -140,7 +140,7 @@ class Inspection(Brief):
         expected_error: How far off the calibrated tool is expected to be; None where the arm is only evaluated.
         n_residuals: Scalar residuals of the fit.
         n_priors: Scalar priors.
-        n_unknowns: Scalars that are estimated, of the arm and beside it.
+        n_unknowns: Scalars that are estimated, of the arm and of all else.
         dof: Residuals and priors, less the determined directions.
         n_excluded: Train pairs that take no part, by reason.
         evaluated: Whether all rows are test rows: the arm is taken as it is.

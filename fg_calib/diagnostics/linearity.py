@@ -152,17 +152,17 @@ def find_nonlinear_rows(solution: Solution, sqrt_cov: Floats, rank: int, table: 
             if family == "angle":
                 flips |= prior_along > np.maximum(np.square(np.pi - f) / 4.0, noisy)
                 slope = 0.5 / np.tan(0.5 * np.clip(f, 1e-9, np.pi))
-            bends = ~flips & (0.5 * across * slope > CURVED_SIGMAS * sigma)
+            curves = ~flips & (0.5 * across * slope > CURVED_SIGMAS * sigma)
             names = problem.end_names
             places = problem.data.places[s.table][s.ends[rows]]
-            for mask, found in ((flips & used, ambiguous), (bends & used, curved)):
+            for mask, found in ((flips & used, ambiguous), (curves & used, curved)):
                 found += [f"{names[a + 1]}-{names[b + 1]}" for a, b in places[mask].tolist()]
             from_singular = np.minimum(f, np.pi - f) if family == "angle" else f
             near |= (from_singular < NEAR_SIGMAS * sigma) & used
             leverage = along / np.square(np.maximum(sigma, 1e-300)) * (len(s.train) / len(rows))
             n_rows += int(used.sum())
             share += float(leverage[flips & used].sum()) / max(rank, 1)
-            resting += float(leverage[bends & used].sum())
+            resting += float(leverage[curves & used].sum())
         n_near += int(near.sum())
     return NonlinearRows(n_rows, n_near, tuple(ambiguous), tuple(curved), min(share, 1.0), resting)
 

@@ -166,7 +166,7 @@ def nominal_residuals(setup: Setup) -> tuple[TypicalResidual, ...]:
 
 
 def residuals_in(setup: Setup, fit: Fitted, *, in_frame: bool = True) -> tuple[TypicalResidual, ...]:
-    """Residuals of a set-up by kind with the tool, and the world_T_base, that were fitted elsewhere.
+    """Residuals of a set-up by kind with the tool, and the world_T_base, of another fit.
 
     Args:
         setup: The set-up.
@@ -197,7 +197,7 @@ def fit_setup(setup: Setup) -> Fitted:
         problem = problem_of_tables(setup.robot, tables_of(table, options := Options(gauge="none")), options)
         start = problem.start
         direct = setup.table.model in POSE_MODELS and not setup.has_landmarks
-        parameters = start if direct else placed(problem)
+        parameters = start if direct else fit_landmarks(problem)
     except (InputError, ProblemError, SolverError, RuntimeError, np.linalg.LinAlgError):
         return nothing
     found = residuals_at(problem, parameters, setup.robot)
@@ -228,7 +228,7 @@ def residuals_at(
     variables = build_variables(robot, [t.unknown_frame for t in problem.data.tables])
     of_arm, of_frame = problem.variables.robot_span, problem.variables.frame_span
     values = np.concatenate([parameters[of_arm], parameters[of_frame]])
-    scale = tolerances_of(robot, variables.names)
+    scale = prior_sigmas_of(robot, variables.names)
     found: list[TypicalResidual] = []
     for noise in noises_at(sampled, parameters):
         chain = variables.chains[noise.series.table].at(values)
@@ -236,8 +236,8 @@ def residuals_at(
     return tuple(found) if all(np.isfinite([r.size, r.expected]).all() for r in found) else ()
 
 
-def placed(problem: Problem) -> Floats:
-    """The parameter vector with what is unknown where the rows, whitened as at the start, say it is.
+def fit_landmarks(problem: Problem) -> Floats:
+    """The parameter vector with frames, tool and landmarks fitted to the rows, whitened as at the start.
 
     Args:
         problem: A problem of the arm as it is (see `Problem.evaluated`).
@@ -267,7 +267,7 @@ def placed(problem: Problem) -> Floats:
     return parameters
 
 
-def tolerances_of(robot: Robot, names: tuple[str, ...]) -> Floats:
+def prior_sigmas_of(robot: Robot, names: tuple[str, ...]) -> Floats:
     """1 sigma of the arm's parameters in the order of the columns, 0 of those that were fitted, shape (n_columns,)."""
     scale, by_name = np.zeros(len(names)), {p.name: p for p in robot.parameters}
     for column, name in enumerate(names):

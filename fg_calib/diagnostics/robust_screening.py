@@ -1,13 +1,13 @@
-"""Measurements that disagree with the arm as drawn far more than the others do: gross errors, told early.
+"""Measurements that disagree with the nominal arm far more than the others do: gross errors, told early.
 
-The arm stays as drawn. Measurement frame, base, tool and what else is unknown are fitted to all rows, train and test,
+The arm stays nominal. Measurement frame, base, tool and what else is unknown are fitted to all rows, train and test,
 from their start in closed form, each measurement with a weight (Cauchy's) that falls with its distance
 
     d^2 = r^T (J T^2 J^T + N)^-1 r
 
 with r its residual, J the derivatives in the arm's estimated parameters, T their tolerances (or usual errors, see
 `typical_residuals`) and N the covariance of its noise. All rows have the arm's errors in common, which may be larger
-than the tolerances say, or far smaller: so it is the distances beside their median that tell. Far is what is so beside
+than the tolerances say, or far smaller: so it is the distances over their median that count. Far is what is so beside
 noise and tolerances too, or what is farther than any arm's errors spread distances that are all small. Pairs formed
 from poses are looked at as these poses in an unknown frame, for one wrong pose spoils many pairs.
 """
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from fg_calib.diagnostics.nominal_residuals import placed, tolerances_of
+from fg_calib.diagnostics.nominal_residuals import fit_landmarks, prior_sigmas_of
 from fg_calib.errors import InputError, ProblemError, SolverError
 from fg_calib.graph.build import problem_of_tables
 from fg_calib.graph.factors import build_variables
@@ -64,7 +64,7 @@ _CAUCHY = 2.4
 
 @dataclass(frozen=True)
 class Disagreement:
-    """A measurement that disagrees with the arm as drawn.
+    """A measurement that disagrees with the nominal arm.
 
     Attributes:
         table: Name of its table; empty of one alone.
@@ -93,7 +93,7 @@ class Disagreement:
 
 @dataclass(frozen=True)
 class Disagreements:
-    """Measurements that disagree with the arm as drawn, the farthest first.
+    """Measurements that disagree with the nominal arm, the farthest first.
 
     Attributes:
         found: They; empty where there are none, or not few.
@@ -108,7 +108,7 @@ class Disagreements:
 
 @dataclass(frozen=True)
 class RoughFit:
-    """The arm as drawn, with measurement frames, base, tool and other unknowns fitted to what most rows say.
+    """The nominal arm, with measurement frames, base, tool and other unknowns fitted to what most rows say.
 
     Attributes:
         robot: The nominal robot.
@@ -140,7 +140,7 @@ class RoughFit:
 
 
 def fit_roughly(robot: Robot, tables: Sequence[Table]) -> RoughFit | None:
-    """The arm as drawn where most rows of some tables say that it stands; None if they do not.
+    """The nominal arm at the frames that most rows of some tables determine; None if they do not.
 
     Args:
         robot: The nominal robot.
@@ -157,7 +157,7 @@ def fit_roughly(robot: Robot, tables: Sequence[Table]) -> RoughFit | None:
 
 
 def find_disagreements(fit: RoughFit, labels: Sequence[str]) -> Disagreements:
-    """The measurements that disagree with the arm as drawn.
+    """The measurements that disagree with the nominal arm.
 
     Args:
         fit: What most rows say.
@@ -241,7 +241,7 @@ def _fitted(problem: Problem, robot: Robot) -> tuple[Floats, tuple[RowNoise, ...
         if last == _ROUNDS - 1 or not problem.variables.keys:
             break
         problem = reweighted_at(problem, parameters, replace(problem.state, weights=tuple(weights)))
-        parameters = placed(problem)
+        parameters = fit_landmarks(problem)
     return parameters, noises, tuple(distances)
 
 
@@ -264,7 +264,7 @@ def _typical(z: Floats, used: Booleans) -> float:
 def _covariance(noise: RowNoise, chain: Chain, robot: Robot) -> Floats:
     """Covariance of each measurement's rows by noise and tolerances, shape (n, residual_dim, residual_dim)."""
     names = build_variables(robot, []).names
-    J = residuals.linearise(noise.rows, chain)[1][:, :, : len(names)] * tolerances_of(robot, names)
+    J = residuals.linearise(noise.rows, chain)[1][:, :, : len(names)] * prior_sigmas_of(robot, names)
     out: Floats = noise.total + J @ np.swapaxes(J, 1, 2)
     return out
 

@@ -1,6 +1,6 @@
 """Unmodelled effects: a lack-of-fit test, a change point, and a forgotten instrument offset.
 
-Each is a score test: the rows are fitted again, linearly, with more columns beside J of the model, whose priors are
+Each is a score test: the rows are fitted again, linearly, with more columns than J of the model, whose priors are
 rows too, and what these gain is compared with chance,
 
     F = |Q^T r|^2 / m over |r - Q Q^T r|^2 / (n - rank J - m)
@@ -17,7 +17,7 @@ so that the least of k p-values has the p-value 1 - (1 - p)^k:
 3. the same loads of an arm that is mounted otherwise, gravity along x and y.
 
 A *change point* is a small motion of tool or base from one row of a table on, for every row tried (Bonferroni).
-Whatever else is wrong with a table, a motion from some row on takes up part of it: so nearly all of the misfit has to
+Whatever else is wrong with a table, a motion from some row on explains part of it: so nearly all of the misfit has to
 go with the change, and the change has to explain most of what constant small motions of all links leave, too. An
 *offset* is added to every length of a table to anchors; it hides in the arm's parameters: 0.25 mm of a ball bar made
 residuals 1.1 times as large as specified.
@@ -214,9 +214,9 @@ def find_change(solution: Solution) -> Change | None:
     typical = after_median <= MAX_MEDIAN_RATIO * before_median and total <= MAX_REDUCED_CHI2 * after.dof
     if not (p * len(found) < CHANGE_P_VALUE and left <= CHANGE_LEFT and explained and typical):
         return None
-    beside = fit.extended(fit.new(of_links([])))
-    p_beside, left_beside = beside.test(beside.new(moved))
-    return Change(what, k, left) if p_beside < CHANGE_P_VALUE and left_beside <= CHANGE_LEFT else None
+    with_links = fit.extended(fit.new(of_links([])))
+    p_with, left_with = with_links.test(with_links.new(moved))
+    return Change(what, k, left) if p_with < CHANGE_P_VALUE and left_with <= CHANGE_LEFT else None
 
 
 def forgotten_offsets(solution: Solution) -> tuple[Offset, ...]:

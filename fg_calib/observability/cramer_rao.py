@@ -12,7 +12,7 @@ and what is held stays at its nominal value: its estimated error is 0. So the er
 
 whose covariance follows from that of n, which is 1, and that of x, the squared tolerances. With everything kept and
 with priors this is the Bayesian Cramér-Rao bound (J^T J + P^T P)^-1 (Van Trees 1968, section 2.4.3). Without priors and
-with what the rows determine kept it is the Cramér-Rao bound (J_K^T J_K)^-1, and beside it what the held parameters'
+with what the rows determine kept it is the Cramér-Rao bound (J_K^T J_K)^-1, and in addition what the held parameters'
 own errors do to the tool that the kept ones do not make up for; for the paper's gauges this is nothing in the tool's
 position. Where rows share errors but are weighted as independent, n has the covariance C of the rows so weighted: the
 estimator is then another, its error larger, and what it claims, (S^T S)^-1, is neither.
@@ -159,7 +159,7 @@ def cramer_rao(
             pairs.
         prior: Whether the tolerances are priors.
         kept: The parameters that are estimated, all if None; the others stay at nominal and keep their errors.
-            Directions that nothing determines are left where they are, by minimum norm, metres beside radians.
+            Directions that nothing determines are left where they are, by minimum norm, metres and radians alike.
         pair_errors: `shared`: the exact noise of pairs; `independent`: pairs are weighted as if independent.
 
     Raises:

@@ -282,7 +282,8 @@ def test_the_mistake_stands_first_in_report_and_result(tmp_path, fg_calib):
     assert result["findings"][0].endswith("if x, y, z are in mm, not m")
     (explanation,) = result["setup"]["explanations"]
     assert explanation["mistakes"] == ["x, y, z are in mm, not m"]
-    before, after = (one["residuals"]["position"]["typical"] for one in (result["setup"], explanation))
+    kinds = [{r["kind"]: r["size"] for r in one["residuals"]} for one in (result["setup"], explanation)]
+    before, after = (sizes["position"] for sizes in kinds)
     assert before > 100.0
     assert after < 0.01
 
