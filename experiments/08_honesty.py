@@ -40,21 +40,6 @@ from typing import Any
 import numpy as np
 from arms import Arm, build_arms, random_rotations
 from draws import Over, add_workers, draws_on, here
-from matplotlib.figure import Figure
-from numpy.typing import NDArray
-from scipy import stats
-from scipy.spatial.transform import Rotation
-
-import fg_calib
-from fg_calib.graph.build import predicted_problem
-from fg_calib.graph.factors import prior_rows
-from fg_calib.graph.information import whitened_triangle
-from fg_calib.graph.problem import Problem, reweighted_at
-from fg_calib.measurements import residuals
-from fg_calib.measurements.dataset import Measurements, Noise, Pairs
-from fg_calib.options import Pairing
-from fg_calib.robot.kinematics import pose
-from fg_calib.robot.rotations import rotation_angle
 from fg_calib.simulation.configurations import BoardViews, GivenReadings, Placement
 from fg_calib.simulation.instruments import (
     BoardCamera,
@@ -65,6 +50,21 @@ from fg_calib.simulation.instruments import (
     Sockets,
     Tracker,
 )
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+import fg_calib
+from fg_calib.graph.build import predicted_problem
+from fg_calib.graph.information import whitened_triangle
+from fg_calib.graph.problem import Problem, reweighted_at
+from fg_calib.graph.variables import prior_rows
+from fg_calib.measurements import residuals
+from fg_calib.measurements.dataset import Measurements, Noise, Pairs
+from fg_calib.options import Pairing
+from fg_calib.robot.kinematics import pose
+from fg_calib.robot.rotations import rotation_angle
 from fg_calib.simulation.scenario import Errors
 
 Floats = NDArray[np.float64]

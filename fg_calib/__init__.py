@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
     from fg_calib.exports.export import export
     from fg_calib.graph.build import build_problem
-    from fg_calib.graph.extension import DistanceFactor, RotationAngleFactor
+    from fg_calib.graph.factors import DistanceFactor, RotationAngleFactor
     from fg_calib.graph.problem import Problem
     from fg_calib.graph.solver import Solution, SolverOptions, solve
     from fg_calib.io.job import read_job
@@ -52,7 +52,7 @@ _import, __dir__ = attach(
         "fg_calib.errors": "CalibrationError InputError ProblemError SolverError",
         "fg_calib.exports.export": "export",
         "fg_calib.graph.build": "build_problem",
-        "fg_calib.graph.extension": "DistanceFactor RotationAngleFactor",
+        "fg_calib.graph.factors": "DistanceFactor RotationAngleFactor",
         "fg_calib.graph.problem": "Problem",
         "fg_calib.graph.solver": "Solution SolverOptions solve",
         "fg_calib.io.job": "read_job",
@@ -74,7 +74,7 @@ _import, __dir__ = attach(
         "fg_calib.diagnostics.multistart": "multistart",
         "fg_calib.executors": "Failure dask_executor local_processes map_jobs",
         "fg_calib.exports": "Export",
-        "fg_calib.graph": "expand levenberg_marquardt_params problem_of",
+        "fg_calib.graph": "levenberg_marquardt_params problem_of",
         "fg_calib.io": "Column Targets Units read_measurements read_result read_targets read_urdf write_robot",
         "fg_calib.measurements": "Camera",
         "fg_calib.monitoring": "Check Explanation",

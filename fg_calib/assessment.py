@@ -16,8 +16,7 @@ from fg_calib.diagnostics.setup_check import check_setup
 from fg_calib.diagnostics.verdict import LIKE_NOISE, MOST_ESTIMATED, Verdict, judge
 from fg_calib.errors import InputError, SolverError, escaped
 from fg_calib.graph.build import problem_of
-from fg_calib.graph.extension import check_graph
-from fg_calib.graph.problem import Problem
+from fg_calib.graph.problem import Problem, check_graph
 from fg_calib.graph.solver import Solution, solve
 from fg_calib.job import Job
 from fg_calib.monitoring.prior_information import at_nominal

@@ -28,10 +28,10 @@ from fg_calib.arrays import Floats, as_floats, shape_of
 from fg_calib.assessment import Assessment, assess, solve_job
 from fg_calib.errors import InputError, SolverError, shown
 from fg_calib.executors import tell
-from fg_calib.graph.factors import build_variables, frame_of
 from fg_calib.graph.knowledge import SIZE, Knowledge
 from fg_calib.graph.problem import tables_of
 from fg_calib.graph.solver import Solution
+from fg_calib.graph.variables import build_variables, frame_of
 from fg_calib.io.atomic import fill_folder, is_folder, noting_reads, write_text
 from fg_calib.io.job import UNSTATED, read_job, read_table_like
 from fg_calib.io.result import Knowledge as SavedKnowledge

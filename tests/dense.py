@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.graph.noise import JOINT_NOISE
+from fg_calib.graph.noise_models import JOINT_NOISE
 from fg_calib.measurements import residuals
 from fg_calib.measurements.kinds.contact import PointDistance, TouchedPoint
 from fg_calib.measurements.kinds.pair import Distance, RotationAngle, SamePoint
@@ -213,7 +213,6 @@ def dense(problem, parameters):
     Returns:
         Shapes (n, n_columns + n_nuisance + 1), (n, n_configurations, n_joints) and (n, n).
     """
-    assert problem.state.spread is None
     every = [SeriesRows(problem, parameters, i) for i in range(len(problem.data.series))]
     n_configurations = problem.data.n_configurations
     reached = {}

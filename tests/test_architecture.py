@@ -52,7 +52,6 @@ FOLDERS = (
 """From the ground up: a folder (or module of the package itself) imports from those before it."""
 
 UPWARD = {
-    "graph/build": {"observability/indices"},
     "graph/information": {"observability/indices"},
 }
 """Imports that still run upwards: none is added."""

@@ -46,11 +46,12 @@ from typing import Any
 
 import gtsam
 import numpy as np
+from fg_calib.graph.rows import Part, RowSet
 from numpy.typing import NDArray
 
 import fg_calib
-from fg_calib.graph.factors import Variables, build_variables, row_factor
-from fg_calib.graph.rows import Part, RowSet
+from fg_calib.graph.factors import row_factor
+from fg_calib.graph.variables import Variables, build_variables
 from fg_calib.measurements import residuals
 from fg_calib.measurements.kinds import stack
 from fg_calib.measurements.kinds.pair import Distance, RotationAngle

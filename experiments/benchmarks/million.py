@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import fg_calib
-from fg_calib.graph.factors import build_variables
+from fg_calib.graph.variables import build_variables
 from fg_calib.measurements import residuals
 from fg_calib.measurements.kinds import stack
 from fg_calib.measurements.kinds.pair import Distance, RotationAngle

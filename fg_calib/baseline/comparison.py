@@ -36,9 +36,9 @@ from fg_calib.assessment import Assessment, assess, solve_job
 from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
 from fg_calib.errors import CalibrationError, ProblemError
 from fg_calib.graph.build import problem_of
-from fg_calib.graph.factors import corrections_of
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
+from fg_calib.graph.variables import corrections_of
 from fg_calib.job import Job
 from fg_calib.prediction.tool_pose import PoseRms, errors_at, judged_configurations, pose_rms
 from fg_calib.robot.kinematics import build_chain, forward

@@ -20,8 +20,8 @@ from fg_calib.designs.candidates import NONE, REFERENCE, Pool, build_pool, draw_
 from fg_calib.designs.information import gather_rows
 from fg_calib.errors import InputError
 from fg_calib.graph.build import places_of
-from fg_calib.graph.factors import pose_of
-from fg_calib.graph.problem import Problem, reweighted_at
+from fg_calib.graph.problem import Problem, relinearized_at
+from fg_calib.graph.variables import pose_of
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import Noise
 from fg_calib.measurements.table import Table
@@ -65,7 +65,7 @@ def solve_for_design(job: Job) -> Problem:
     solution = solve_job(replace(job, options=options))
     if solution.problem.evaluated:
         raise InputError(str(job.path or "job"), "test rows alone", "train rows: what was measured is what counts")
-    return reweighted_at(solution.problem, solution.parameters)
+    return relinearized_at(solution.problem, solution.parameters)
 
 
 def pool_for_more_rows(

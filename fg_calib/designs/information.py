@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 
 from fg_calib.arrays import Brief, FrozenArrays
 from fg_calib.errors import InputError
-from fg_calib.graph.factors import prior_rows, unknown_prior_rows
+from fg_calib.graph.error_states import WhitenedBlock
 from fg_calib.graph.normal_system import SIGNAL_FLOOR, eliminate
 from fg_calib.graph.problem import Problem
-from fg_calib.graph.rows import RowSet
+from fg_calib.graph.variables import prior_rows, unknown_prior_rows
 from fg_calib.observability.indices import Observability, observability_of_rows
 from fg_calib.observability.observed_quantities import ObservedQuantities
 from fg_calib.prediction.tool_pose import PoseRms, errors_at
@@ -109,7 +109,7 @@ def gather_rows(
 
 
 def _derivatives(
-    problem: Problem, rows: RowSet, pose_of: Integers, references: Integers, width: int
+    problem: Problem, rows: WhitenedBlock, pose_of: Integers, references: Integers, width: int
 ) -> tuple[Floats, Floats, Integers]:
     """Derivatives of rows, with the errors of reference poses; in the errors of their own pose; and their pose."""
     J = rows.private(problem.variables.at(problem.start))[:, :-1]

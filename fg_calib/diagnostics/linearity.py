@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fg_calib.errors import SolverError
-from fg_calib.graph.linearised import Linearised
-from fg_calib.graph.problem import at_parameters, some_rows, started_at
+from fg_calib.graph.problem import at_parameters, linear_system, subsampled, with_initial
 from fg_calib.graph.solver import Solution
 from fg_calib.robot.kinematics import forward
 from fg_calib.statistics.covariance import Spread
@@ -65,18 +64,20 @@ def check_linearity(solution: Solution, spread: Spread) -> Nonlinearity:
     if not rank:
         return Nonlinearity()
     if problem.n_residuals > MAX_ROWS:
-        problem = some_rows(started_at(problem, solution.parameters), MAX_ROWS / problem.n_residuals) or problem
+        problem = subsampled(with_initial(problem, solution.parameters), MAX_ROWS / problem.n_residuals) or problem
     scales, rng = spread.variables.prior_scales, np.random.default_rng(0)
     root = spread.root[:, :rank]
     scaled = root / scales[:, None]
     in_sigma = (scaled / np.sum(scaled**2, axis=0)).T / scales  # the inverse of `root`, whose columns are orthogonal
-    here = Linearised(problem, problem.variables.values(solution.parameters))
+    here, variables = linear_system(problem, solution.parameters), problem.variables
+    values = variables.values(solution.parameters)
     shifts: list[Floats] = []
     try:
         while len(shifts) < N_DRAWS:
             core = root @ rng.choice([-1.0, 1.0], rank)
-            step = np.concatenate([core, here.follow @ core])
-            plus, minus = (Linearised(problem, problem.variables.moved(here.values, d)).step for d in (step, -step))
+            step = np.concatenate([core, here.left.follow @ core])
+            there = [variables.parameters(variables.moved(values, d)) for d in (step, -step)]
+            plus, minus = (linear_system(problem, x).step for x in there)
             shifts.append((0.5 * (plus + minus) - here.step)[:n])
             squares = np.mean((np.array(shifts) @ in_sigma.T) ** 2)
             if len(shifts) == N_FIRST and squares < NEGLIGIBLE:

@@ -24,8 +24,8 @@ from fg_calib.arguments import checked
 from fg_calib.errors import CalibrationError
 from fg_calib.graph.information import directions
 from fg_calib.graph.normal_system import SIGNAL_FLOOR
-from fg_calib.graph.problem import Problem, assembled, at_parameters
-from fg_calib.graph.solver import Solution, SolverOptions, solve, solve_from
+from fg_calib.graph.problem import Problem, at_parameters, with_factors
+from fg_calib.graph.solver import Solution, SolverOptions, solve
 from fg_calib.measurements.kind import Kind
 from fg_calib.robot.kinematics import forward
 from fg_calib.statistics.covariance import spread_of
@@ -92,7 +92,7 @@ def multistart(solution: Solution, options: SolverOptions | None = None) -> Solu
         with one_blas_thread:
             starts = [_moved(here, step) for step in _steps(here)]
         for start in starts:
-            keep(partial(solve_from, here, start, best().cost + CHI2_INDISTINCT, options))
+            keep(partial(_solve_from, here, start, options))
     if solution.problem.options.loss == "none":
         for landmark in _mirrored_landmarks(solution.problem):
             mirrored = _mirrored(best(), landmark)
@@ -108,11 +108,17 @@ def multistart(solution: Solution, options: SolverOptions | None = None) -> Solu
     return replace(kept, others=tuple(one.parameters for one in others), seconds=seconds)
 
 
+def _solve_from(solution: Solution, start: Floats, options: SolverOptions | None) -> Solution:
+    """The optimum from another start, with the costs of the solution's own start."""
+    other = solve(solution.problem, options, start=start)
+    return replace(other, before=solution.before, initial_cost=solution.initial_cost)
+
+
 def _moved(solution: Solution, step: Floats) -> Floats:
     """The parameter vector a step of the core from the estimate, landmarks as they are there."""
     variables = solution.problem.variables
     whole = np.concatenate([step, np.zeros(variables.n_nuisance)])
-    return variables.parameters(variables.moved(solution.values, whole))
+    return variables.parameters(variables.moved(variables.values(solution.parameters), whole))
 
 
 def _steps(solution: Solution) -> list[Floats]:
@@ -124,7 +130,9 @@ def _steps(solution: Solution) -> list[Floats]:
     s_nominal, V_nominal = directions(problem, nominal)
     ratio = np.linalg.norm((V.T @ V_nominal) / np.maximum(s, SIGNAL_FLOOR)[:, None], axis=0)
     ratio *= np.maximum(s_nominal, SIGNAL_FLOOR)  # 1 of what is linear, less the farther a square is from its vertex
-    moved = V_nominal.T @ (variables.step(variables.values(nominal), solution.values)[: len(scales)] / scales)
+    moved = V_nominal.T @ (
+        variables.step(variables.values(nominal), variables.values(solution.parameters))[: len(scales)] / scales
+    )
     square = (ratio < SQUARE_SIGMA_RATIO) & (np.abs(moved) > SIGNAL_FLOOR)
     if square.any():
         steps.append(-2.0 * scales * (V_nominal[:, square] @ (moved[square] / (1.0 - ratio[square]))))
@@ -159,7 +167,7 @@ def _is_an_arm(other: Solution, best: Solution) -> bool:
 def _apart(a: Solution, b: Solution) -> bool:
     """Whether the robots of two solutions differ by more than the sigma at either, in some column."""
     variables, eye = a.problem.variables, np.eye(a.problem.variables.n_columns)
-    step = np.abs(variables.step(a.values, b.values)[: len(eye)])
+    step = np.abs(variables.step(*(variables.values(one.parameters) for one in (a, b)))[: len(eye)])
     variance = np.maximum(*(spread_of(one).variance(eye) for one in (a, b)))  # nan where nothing determines it
     return bool(np.any((step > SEPARATE_SIGMAS * np.sqrt(variance))[: variables.n_robot_columns]))
 
@@ -203,4 +211,4 @@ def _mirrored(solution: Solution, landmark: tuple[int, ...]) -> Problem | None:
         return replace(p, data=data_there, variables=replace(p.variables, others=others))
 
     whole = None if problem.whole is None else there(problem.whole)
-    return assembled(replace(there(problem), whole=whole), start)
+    return with_factors(replace(there(problem), whole=whole), start)

@@ -21,9 +21,9 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.errors import InputError, ProblemError, SolverError
 from fg_calib.graph.build import problem_of_tables
-from fg_calib.graph.factors import build_variables, pose_of
-from fg_calib.graph.noise import RowNoise
+from fg_calib.graph.noise_models import RowNoise
 from fg_calib.graph.problem import Problem, noises_at, tables_of
+from fg_calib.graph.variables import build_variables, pose_of
 from fg_calib.initialization.hand_eye import Frame
 from fg_calib.measurements import residuals
 from fg_calib.measurements.table import Table

@@ -24,9 +24,9 @@ from scipy import special
 from fg_calib.diagnostics.nominal_residuals import fit_landmarks, prior_sigmas_of
 from fg_calib.errors import InputError, ProblemError, SolverError
 from fg_calib.graph.build import problem_of_tables
-from fg_calib.graph.factors import build_variables
-from fg_calib.graph.noise import RowNoise, whitening_of
-from fg_calib.graph.problem import Problem, noises_at, reweighted_at
+from fg_calib.graph.noise_models import RowNoise, whitening_of
+from fg_calib.graph.problem import Problem, noises_at, relinearized_at
+from fg_calib.graph.variables import build_variables
 from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Booleans, Measurements
 from fg_calib.measurements.kinds import INSTRUMENTS
@@ -240,7 +240,7 @@ def _fitted(problem: Problem, robot: Robot) -> tuple[Floats, tuple[RowNoise, ...
             weights.append(share / (1.0 + (d / _CAUCHY) ** 2))
         if last == _ROUNDS - 1 or not problem.variables.keys:
             break
-        problem = reweighted_at(problem, parameters, replace(problem.state, weights=tuple(weights)))
+        problem = relinearized_at(problem, parameters, replace(problem.state, weights=tuple(weights)))
         parameters = fit_landmarks(problem)
     return parameters, noises, tuple(distances)
 

@@ -35,10 +35,10 @@ import scipy.linalg
 from numpy.typing import NDArray
 from scipy import special
 
-from fg_calib.graph.factors import build_variables, prior_rows, unknown_prior_rows
+from fg_calib.graph.error_states import State
 from fg_calib.graph.problem import Problem, at_parameters
-from fg_calib.graph.rows import At
 from fg_calib.graph.solver import Solution
+from fg_calib.graph.variables import build_variables, prior_rows, unknown_prior_rows
 from fg_calib.measurements import residuals
 from fg_calib.measurements.residuals import Block
 from fg_calib.observability.parallel_axes import end_of_link
@@ -258,7 +258,7 @@ def _with_links(solution: Solution) -> tuple[LinearFit, Callable[[Sequence[str]]
     return fit, lambda named: J[:, [links.index(name) for name in named or links]]
 
 
-def _linear_fit(solution: Solution, wide: At, more: Sequence[int]) -> tuple[LinearFit, Floats]:
+def _linear_fit(solution: Solution, wide: State, more: Sequence[int]) -> tuple[LinearFit, Floats]:
     """The fit of a solution, linearised, and the rows' derivatives in columns that it does not have, shape (n_rows, m).
 
     Args:

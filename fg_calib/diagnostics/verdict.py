@@ -26,7 +26,7 @@ from fg_calib.diagnostics.unmodelled_effects import (
     forgotten_offsets,
     probability_of_noise,
 )
-from fg_calib.graph.noise import JOINT_NOISE
+from fg_calib.graph.noise_models import JOINT_NOISE
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
 from fg_calib.graph.tolerances import ToleranceScale

@@ -6,7 +6,7 @@ __getattr__, __dir__ = attach(
     __name__,
     {
         "fg_calib.graph.build": "build_problem problem_of",
-        "fg_calib.graph.extension": "DistanceFactor RotationAngleFactor expand",
+        "fg_calib.graph.factors": "DistanceFactor RotationAngleFactor",
         "fg_calib.graph.problem": "Problem",
         "fg_calib.graph.solver": "Solution SolverOptions levenberg_marquardt_params solve",
     },

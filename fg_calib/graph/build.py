@@ -12,12 +12,19 @@ from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
 from fg_calib.errors import ProblemError
-from fg_calib.graph.factors import Variables, prior_rows
-from fg_calib.graph.information import observability_of, whitened_triangle
 from fg_calib.graph.knowledge import coordinates_of
-from fg_calib.graph.normal_system import determined
-from fg_calib.graph.problem import Problem, problem_at, start_of, tables_of, variables_of
+from fg_calib.graph.normal_system import determined, identifiable_subset
+from fg_calib.graph.problem import (
+    Problem,
+    linear_system,
+    named_rows,
+    problem_at,
+    start_of,
+    tables_of,
+    variables_of,
+)
 from fg_calib.graph.tolerances import with_first_tolerances
+from fg_calib.graph.variables import Variables, preference, prior_rows
 from fg_calib.job import Job
 from fg_calib.measurements.build import Dataset, build_dataset, check_repeats
 from fg_calib.measurements.dataset import Measurements
@@ -25,7 +32,6 @@ from fg_calib.measurements.kinds import INSTRUMENTS, Frames, check_derivatives, 
 from fg_calib.measurements.kinds.pair import missing_values
 from fg_calib.measurements.predictions import predict_measurements
 from fg_calib.measurements.table import Table
-from fg_calib.observability.indices import singular_values
 from fg_calib.options import (
     FrameKnowledge,
     Gauge,
@@ -130,14 +136,18 @@ def problem_of_tables(robot: Robot, tables: Sequence[Table], options: Options) -
 def kept_of(problem: Problem, prefer: Sequence[str]) -> list[str]:
     """The parameters that gauge `keep` estimates.
 
-    At a pitch of a quarter turn yaw and roll of a frame are relative for want of coordinates, not of data: a frame that
+    At a pitch of 90 degrees yaw and roll of a frame are relative for want of coordinates, not of data: a frame that
     lacks nothing else is kept whole, as a pose.
     """
-    kept = observability_of(problem, problem.start, prefer).kept
-    for v in problem.variables.items:
-        if v.kind in ("base", "tool") and abs(np.cos(problem.start[v.parameters[4]])) < QUARTER_TURN:
-            lacking = set(problem.variables.names[v.columns]).difference(kept)
-            if len(lacking) == 1 and lacking <= {problem.variables.names[v.columns][k] for k in (3, 5)}:
+    v, estimated = problem.variables, problem.estimated
+    rows = named_rows(v, problem.start, linear_system(problem, problem.start).left.A)
+    ranks = [preference(p, prefer) for p in estimated]
+    found = identifiable_subset(rows, np.array([problem.robot.scale_of(p.unit) for p in estimated]), ranks)
+    kept = [v.names[i] for i in found]
+    for item in v.items:
+        if item.kind in ("base", "tool") and abs(np.cos(problem.start[item.parameters[4]])) < QUARTER_TURN:
+            lacking = set(v.names[item.columns]).difference(kept)
+            if len(lacking) == 1 and lacking <= {v.names[item.columns][k] for k in (3, 5)}:
                 kept += lacking
     return kept
 
@@ -312,8 +322,8 @@ def _check_enough(problem: Problem) -> None:
         return
     anywhere = random_problem(problem.robot, table.model, table.frame)
     priors = prior_rows(problem.variables, problem.start)[1]
-    stacked = np.vstack([whitened_triangle(anywhere, anywhere.start), priors])
-    needed = determined(singular_values(stacked * problem.variables.prior_scales), STRUCTURAL_FLOOR)
+    stacked = np.vstack([linear_system(anywhere, anywhere.start).left.A, priors]) * problem.variables.prior_scales
+    needed = determined(np.linalg.svd(stacked)[1].astype(np.float64), STRUCTURAL_FLOOR)
     if rows < needed:
         found = f"{rows + n_nuisance} residuals{' and priors' * (problem.n_priors > 0)}"
         expected = f"at least {needed + n_nuisance} to determine what model {table.model} can"

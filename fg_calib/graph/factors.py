@@ -1,599 +1,276 @@
-"""GTSAM's side: which parameters are which variable, and measurements and priors as factors.
+"""GTSAM factors: one a measurement, as in `problem.graph`, and one a block, as the solver's damped steps take them.
 
-| key | variable |
-|---|---|
-| `K(i)` | estimated parameters of joint i, a vector of just those |
-| `K(0)`, `K(n + 1)` | the same of the base, and of the tool, where not all six of its parameters are estimated |
-| `B(0)`, `T(0)` | the base frame, and the tool frame, as a Pose3 where all six are |
-| `X(t)` | world_T_base of table t as a Pose3, where its measurement frame is unknown |
-| `L(g)` | base_p of the physical point that group g touches, a Point3 |
-| `N(i)` | an unknown of a kind of measurement of one's own, a vector |
-
-The last two, and variables that somebody adds to the graph, are *nuisance* variables: they are estimated too, but not
-what a calibration is for. Their columns follow those of the *core* (robot and measurement frame) and are eliminated
-before anything is said of the core.
-
-Pose3's tangent is rotation first, and a step moves the frame in itself (`pose * Exp(step)`).
-
-Priors are rows (value - nominal) / tolerance. Of a Pose3 they act on x, y and z as they stand, and on its turn away
-from nominal, `Log(R_nominal^T R)`, whose components about the frame's own x, y and z axes take the tolerances of roll,
-pitch and yaw. The angles themselves would not do: at a pitch of a quarter turn they are no coordinates.
+In `problem.graph` a pair has one `DistanceFactor` and one `RotationAngleFactor`, any other measurement one factor. What
+measurements share are variables `E(k)`, the errors of configuration k in units of their sigma, each with a prior; where
+the distance and the angle of one pair are correlated they share a variable `e(i)`.
 
 GTSAM 4.3 ends the interpreter when a custom factor leaves a Jacobian unset or gets its rows wrong, and returns the
-initial values without a word when it gets the columns wrong. So `custom_factor` alone fills its lists, after checks.
+initial values without a word when it gets the columns wrong. So `CheckedFactor` alone fills its lists, after checks.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Literal
+from dataclasses import replace
+from itertools import chain
+from numbers import Real
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
+import scipy.sparse
+from numpy.typing import ArrayLike, NDArray
 
-from fg_calib.arrays import Brief
-from fg_calib.errors import SolverError
-from fg_calib.graph.rows import At, RowSet
-from fg_calib.measurements.landmarks import Landmarks
-from fg_calib.robot.kinematics import Chain, build_chain
-from fg_calib.robot.model import FRAME_KINDS, Robot, names_of
-from fg_calib.robot.rotations import QUARTER_TURN, yaw_pitch_roll
+from fg_calib.arrays import as_floats
+from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError, shown
+from fg_calib.graph.error_states import State, WhitenedBlock, WhitenedSeries
+from fg_calib.graph.variables import Variable, Variables, prior_rows
+from fg_calib.measurements.kinds import Kind
+from fg_calib.measurements.kinds.pair import Distance, RotationAngle
+from fg_calib.measurements.residuals import Block, unpack
+from fg_calib.options import check_number
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Sparse = scipy.sparse.csr_array
+Linearise = Callable[[gtsam.Values], tuple[Floats, Floats]]
 
-GRAM_ROWS = 20_000
-"""Sets with more rows than this are reduced by their Gram matrix, if their conditioning allows it."""
-
-
-@dataclass(frozen=True)
-class Variable:
-    """One GTSAM variable.
-
-    Attributes:
-        key: GTSAM's key.
-        symbol: How it is written: `K(3)`, `T(0)`, `X(0)`.
-        kind: A vector of parameters, the pose of tool, base or measurement frame, an unknown of the measurements such
-            as a touched point, or somebody's own: of any of GTSAM's types, its parameters are tangent coordinates at
-            its start.
-        parameters: Indices into the parameter vector of `Variables.parameters`, in the variable's own order;
-            for poses in the order of `FRAME_KINDS`.
-        columns: Its columns in a Jacobian.
-        scales: Of a nuisance variable: a change of ordinary size in each of its columns.
-        prior: Of a nuisance variable: where it was said to be, and 1 sigma of that; None where nothing was.
-    """
-
-    key: int
-    symbol: str
-    kind: Literal["vector", "tool", "base", "frame", "unknown", "own"]
-    parameters: tuple[int, ...]
-    columns: slice
-    scales: tuple[float, ...] = ()
-    prior: tuple[tuple[float, ...], tuple[float, ...]] | None = None
-
-    @cached_property
-    def places(self) -> NDArray[np.int64]:
-        """`parameters` to index with."""
-        return np.array(self.parameters, dtype=np.int64)
-
-    @property
-    def number(self) -> int:
-        """Number in its symbol: of a measurement frame that of its table."""
-        return int(gtsam.symbolIndex(self.key))
-
-    @property
-    def letter(self) -> str:
-        """Letter of its symbol."""
-        return chr(gtsam.symbolChr(self.key))
-
-    @property
-    def is_pose(self) -> bool:
-        """Whether it is a Pose3; else it is a vector."""
-        return self.kind in ("tool", "base", "frame")
+UNCORRELATED = 1e-12
+"""Correlation of a pair's distance and angle below which they share no error."""
 
 
-@dataclass(frozen=True)
-class Variables(Brief):
-    """All variables of a problem, and the way between GTSAM's values and the parameter vector.
-
-    The parameter vector has the robot's parameters, then six for each unknown measurement frame (at least one) in the
-    order of `FRAME_KINDS`, then the values of the nuisance variables.
-
-    Attributes:
-        robot: The robot, nominal.
-        items: The core variables in the order of their columns.
-        names: Name of each estimated scalar, shape (n_columns,): a parameter's, or `frame.x` ... `frame.yaw` (with the
-            table's number, if several frames are unknown). Of a pose the names stand in `FRAME_KINDS`' order although
-            its columns are tangent directions.
-        chains: The kinematic chain with these columns from the measurement frame of each table.
-        priors: Whether the robot's tolerances are priors.
-        nuisance: The nuisance variables; their columns follow those of the core.
-        coordinates: Of the measurements' unknown coordinates, where each stands in the parameter vector; -1 for those
-            that are not estimated.
-        own: Start of the variables that somebody added.
-    """
-
-    robot: Robot
-    items: tuple[Variable, ...]
-    names: tuple[str, ...]
-    chains: tuple[Chain, ...]
-    priors: bool
-    nuisance: tuple[Variable, ...] = ()
-    coordinates: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    others: Floats = field(default_factory=lambda: np.zeros(0))
-    own: gtsam.Values = field(default_factory=gtsam.Values, compare=False)
-
-    @property
-    def n_columns(self) -> int:
-        """Number of columns of the core's Jacobian: the dimension of its tangent space."""
-        return len(self.names)
-
-    @property
-    def n_nuisance(self) -> int:
-        """Number of columns of the nuisance variables."""
-        return sum(len(v.parameters) for v in self.nuisance)
-
-    @property
-    def keys(self) -> list[int]:
-        """GTSAM's keys in the order of the columns, the core's first."""
-        return [v.key for v in self.items + self.nuisance]
-
-    @property
-    def robot_span(self) -> slice:
-        """Where the robot's parameters stand in the parameter vector."""
-        return slice(0, len(self.robot.parameters))
-
-    @property
-    def frames(self) -> tuple[Variable, ...]:
-        """The unknown measurement frames."""
-        return tuple(v for v in self.items if v.kind == "frame")
-
-    @property
-    def frame_span(self) -> slice:
-        """Where the measurement frames' values stand in the parameter vector."""
-        first = len(self.robot.parameters)
-        return slice(first, first + 6 * max(1, len(self.frames)))
-
-    @property
-    def nuisance_span(self) -> slice:
-        """Where the nuisance values stand in the parameter vector."""
-        return slice(self.frame_span.stop, self.frame_span.stop + self.n_nuisance)
-
-    @property
-    def n_robot_columns(self) -> int:
-        """Number of columns without the measurement frames', which come last."""
-        return self.n_columns - 6 * len(self.frames)
-
-    @cached_property
-    def scales(self) -> Floats:
-        """A change of ordinary size in each column (see `Robot.scale_of`), shape (n_columns,)."""
-        angle, length = self.robot.scale_of("rad"), self.robot.scale_of("m")
-        scales = np.repeat([angle, length], 3)
-        parts = [
-            scales
-            if v.is_pose
-            else np.array([length if self.robot.parameters[i].unit == "m" else angle for i in v.parameters])
-            for v in self.items
-        ]
-        return np.concatenate([np.zeros(0), *parts])
-
-    @cached_property
-    def prior_scales(self) -> Floats:
-        """`scales`, but where there is a prior its sigma: how far each column may be off, shape (n_columns,)."""
-        scales = self.scales.copy()
-        for v in self.items if self.priors else ():
-            if v.kind != "frame":
-                order = [v.parameters[i] for i in _ALONG_TANGENT] if v.is_pose else v.parameters
-                tolerance = [self.robot.parameters[i].tolerance for i in order]
-                stated = np.array([t is not None for t in tolerance])
-                scales[v.columns] = np.where(stated, np.array(tolerance, dtype=np.float64), scales[v.columns])
-        return scales
-
-    @property
-    def all_scales(self) -> Floats:
-        """`scales`, then those of the nuisance columns, shape (n_columns + n_nuisance,)."""
-        return np.concatenate([self.scales, *(v.scales for v in self.nuisance)])
-
-    @cached_property
-    def stated(self) -> dict[str, tuple[list[int], Floats]]:
-        """Of each core variable, by its symbol: which of its parameters have a prior, and 1 / sigma of these."""
-        found = {}
-        for v in self.items:
-            of_v = () if v.kind == "frame" or not self.priors else v.parameters
-            tolerances = [self.robot.parameters[i].tolerance for i in of_v]
-            weights = np.array([1.0 / t for t in tolerances if t is not None])
-            found[v.symbol] = [k for k, t in enumerate(tolerances) if t is not None], weights
-        return found
-
-    def nominal(self) -> Floats:
-        """The parameter vector at the robot's nominal values, measurement frame and nuisance values zero."""
-        return self._nominal.copy()
-
-    @cached_property
-    def _nominal(self) -> Floats:
-        return np.concatenate([self.robot.nominal, np.zeros(self.nuisance_span.stop - len(self.robot.parameters))])
-
-    def values(self, parameters: Floats) -> gtsam.Values:
-        """GTSAM's values at a parameter vector."""
-        values, off = gtsam.Values(), gtsam.VectorValues()
-        for v in self.items + self.nuisance:
-            chosen = parameters[v.places]
-            if v.kind == "own":
-                off.insert(v.key, chosen)
-            else:
-                values.insert(v.key, pose_of(chosen) if v.is_pose else chosen)
-        if off.size():
-            values.insert(self.own.retract(off))
-        return values
-
-    def parameters(self, values: gtsam.Values, only: Sequence[Variable] | None = None) -> Floats:
-        """The parameter vector at GTSAM's values; what is not a variable (or not in `only`) keeps its nominal value."""
-        parameters = self.nominal()
-        for v in self.items + self.nuisance if only is None else only:
-            of_v = v.places
-            if v.kind == "own":
-                parameters[of_v] = local_coordinates(self.own, values, v.key)
-            elif v.is_pose:
-                near = None if v.kind == "frame" else parameters[of_v]
-                parameters[of_v] = frame_of(values.atPose3(v.key), near)
-            else:
-                parameters[of_v] = values.atVector(v.key)
-        return parameters
-
-    def stepped(self, parameters: Floats, step: Floats) -> Floats:
-        """The parameter vector after a tangent step of the core, shape (n_columns,)."""
-        after = parameters.copy()
-        for v in self.items:
-            of_v, part = v.places, step[v.columns]
-            if not v.is_pose:
-                after[of_v] += part
-            elif part.any():
-                after[of_v] = frame_of(pose_of(parameters[of_v]).retract(part), parameters[of_v])
-        return after
-
-    def step(self, start: gtsam.Values, end: gtsam.Values) -> Floats:
-        """The tangent step from some values to others, shape (n_columns + n_nuisance,)."""
-        return np.concatenate(
-            [
-                local_coordinates(start, end, v.key)
-                if v.kind == "own"
-                else gtsam.Pose3.Logmap(start.atPose3(v.key).between(end.atPose3(v.key)))
-                if v.is_pose
-                else end.atVector(v.key) - start.atVector(v.key)
-                for v in self.items + self.nuisance
-            ]
-        )
-
-    def moved(self, values: gtsam.Values, step: Floats) -> gtsam.Values:
-        """Some values after a tangent step, shape (n_columns + n_nuisance,)."""
-        delta = gtsam.VectorValues()
-        for v in self.items + self.nuisance:
-            delta.insert(v.key, step[v.columns])
-        return values.retract(delta)
-
-    def with_unknowns(self, unknowns: Landmarks, estimated: NDArray[np.bool_]) -> Variables:
-        """The same with the measurements' unknowns as nuisance variables, those that are estimated."""
-        column, place = self.n_columns + self.n_nuisance, self.nuisance_span.stop
-        coordinates: list[int] = []
-        more: list[Variable] = []
-        taken = {v.symbol for v in self.items}  # the base has the letter of boards
-        for index, (letter, size) in enumerate(zip(unknowns.letters, unknowns.sizes, strict=True)):
-            if not estimated[index]:
-                coordinates += [-1] * size
-                continue
-            parameters = tuple(range(place, place + size))
-            number = len(unknowns.letters) if f"{letter}({index})" in taken else index
-            symbol, scales = f"{letter}({number})", tuple(map(self.robot.scale_of, unknowns.units[index]))
-            key, columns = gtsam.symbol(letter, number), slice(column, column + size)
-            tolerance, prior = unknowns.tolerances[index], None
-            if tolerance is not None:
-                prior = (tuple(unknowns.starts[index].tolist()), size * (tolerance,))
-            more.append(Variable(key, symbol, "unknown", parameters, columns, scales, prior))
-            coordinates += parameters
-            column, place = column + size, place + size
-        others = np.nan_to_num(np.concatenate([np.zeros(0), *unknowns.starts]))
-        found = np.array(coordinates, dtype=np.int64)
-        return replace(self, nuisance=self.nuisance + tuple(more), coordinates=found, others=others)
-
-    def at(self, parameters: Floats, fallback: Floats | None = None) -> At:
-        """The arm and the measurements' unknowns at a parameter vector.
-
-        Args:
-            parameters: The parameter vector.
-            fallback: Values of the unknown coordinates that are not estimated; `others` if None.
-        """
-        estimated = self.coordinates >= 0
-        others = self.others if fallback is None else fallback
-        columns = np.where(estimated, self.coordinates - self.nuisance_span.start + self.n_columns, -1)
-        values = np.where(estimated, parameters[self.coordinates], others)
-        chains = tuple(chain.at(parameters) for chain in self.chains)
-        return At(chains, values, columns, self.n_columns, self.n_nuisance)
-
-    def without_own(self) -> Variables:
-        """The same without somebody's own variables."""
-        return replace(self, nuisance=tuple(v for v in self.nuisance if v.kind != "own"), own=gtsam.Values())
-
-    def with_own(self, start: gtsam.Values) -> Variables:
-        """The same with somebody's own variables, of any type, by their start."""
-        variables = self
-        for key in list(start.keys()):
-            n, place, symbol = only_key(start, key).dim(), variables.nuisance_span.stop, str(gtsam.Symbol(key)).strip()
-            column = variables.n_columns + variables.n_nuisance
-            parameters, columns = tuple(range(place, place + n)), slice(column, column + n)
-            added = Variable(key, symbol, "own", parameters, columns, scales=(1.0,) * n)
-            variables = replace(variables, nuisance=(*variables.nuisance, added))
-        return replace(variables, own=start)
-
-    def columns_of(self, fewer: Variables, parameters: Floats) -> Floats:
-        """What each column of the variables of fewer of the parameters is in these, shape (n_columns, fewer.n_columns).
-
-        Args:
-            fewer: Those.
-            parameters: The parameter vector, of either.
-        """
-        by_name = dict(zip(self.names, self.tangent_derivative(parameters).T, strict=True))
-        poses = {v.key: np.eye(self.n_columns)[v.columns] for v in self.items if v.is_pose}
-        rows = [poses.get(v.key, np.array([by_name[name] for name in fewer.names[v.columns]])) for v in fewer.items]
-        return np.vstack([np.zeros((0, self.n_columns)), *rows]).T
-
-    def named_derivative(self, parameters: Floats) -> Floats:
-        """Derivative of the named scalars in the columns, shape (n_columns, n_columns).
-
-        The identity but for poses, where it maps the tangent (rotation first) to x, y, z, yaw, pitch, roll.
-
-        Note:
-            At a pitch of a quarter turn roll and yaw have no derivative; their rows are then nan.
-        """
-        D = np.eye(self.n_columns)
-        for v in self.items:
-            if v.is_pose:
-                D[v.columns, v.columns] = _frame_derivative(parameters[v.places])
-        return D
-
-    def tangent_derivative(self, parameters: Floats) -> Floats:
-        """Derivative of the columns in the named scalars: the inverse of `named_derivative`, finite everywhere.
-
-        At a pitch of a quarter turn it is singular: there roll and yaw turn a frame about the same axis.
-        """
-        E = np.eye(self.n_columns)
-        for v in self.items:
-            if v.is_pose:
-                E[v.columns, v.columns] = _tangent_derivative(parameters[v.places])
-        return E
-
-    def describe(self, key: int) -> str:
-        """A key in words: `K(3) (a3, alpha3, d3)`."""
-        for v in self.items + self.nuisance:
-            if v.key == key:
-                kind = "point" if v.symbol.startswith("L(") else v.kind
-                return f"{v.symbol} ({', '.join(self.names[v.columns]) or kind})"
-        return str(gtsam.Symbol(key))
-
-
-def build_variables(robot: Robot, frames: Sequence[bool], priors: bool = True) -> Variables:
-    """The variables of a robot's estimated parameters, and of the measurement frames that are unknown.
+class CheckedFactor(gtsam.CustomFactor):
+    """A factor over whitened residuals whose shapes and derivatives are checked.
 
     Args:
-        robot: The robot.
-        frames: Of each table, whether its measurement frame is unknown.
-        priors: Whether the robot's tolerances are priors.
-    """
-    items: list[Variable] = []
-    names: list[str] = []
-    columns: dict[int, int] = {}
-    tool_tangent = base_tangent = None
-    for owner in range(robot.n_joints + 2):
-        owned = robot.owned_by(owner)
-        chosen = [i for i in owned if robot.parameters[i].estimated]
-        if not chosen:
-            continue
-        first = len(names)
-        names += names_of(robot.parameters[i] for i in chosen)
-        span = slice(first, len(names))
-        if owner == robot.n_joints + 1 and len(chosen) == 6:
-            tool_tangent = first
-            items.append(Variable(gtsam.symbol("T", 0), "T(0)", "tool", tuple(chosen), span))
-        elif owner == 0 and len(chosen) == 6:
-            base_tangent = first
-            items.append(Variable(gtsam.symbol("B", 0), "B(0)", "base", tuple(chosen), span))
-        else:
-            columns |= {i: first + k for k, i in enumerate(chosen)}
-            items.append(Variable(gtsam.symbol("K", owner), f"K({owner})", "vector", tuple(chosen), span))
-    place, tangents = len(robot.parameters), {}
-    for table in np.flatnonzero(frames).tolist():
-        tangents[table] = (len(names), place)
-        prefix = "frame" if sum(frames) == 1 else f"frame{table + 1}"
-        span = slice(len(names), len(names) + 6)
-        names += [f"{prefix}.{kind}" for kind in FRAME_KINDS]
-        key = gtsam.symbol("X", table)
-        items.append(Variable(key, f"X({table})", "frame", tuple(range(place, place + 6)), span))
-        place += 6
-    chains = []
-    for table in range(len(frames)):
-        tangent, source = tangents.get(table, (None, 0))
-        chain = build_chain(
-            robot,
-            columns,
-            tool_tangent=tool_tangent,
-            base_tangent=base_tangent,
-            frame_tangent=tangent,
-            frame=tangent is not None,
-        )
-        moved = np.where(
-            chain.source >= len(robot.parameters), chain.source - len(robot.parameters) + source, chain.source
-        )
-        chains.append(replace(chain, source=moved, n_columns=len(names)))
-    return Variables(robot, tuple(items), tuple(names), tuple(chains), priors)
-
-
-def only_key(values: gtsam.Values, key: int) -> gtsam.Values:
-    """The value of one key alone."""
-    one = gtsam.Values(values)
-    for other in list(values.keys()):
-        if other != key:
-            one.erase(other)
-    return one
-
-
-def local_coordinates(start: gtsam.Values, end: gtsam.Values, key: int) -> Floats:
-    """The tangent step from a variable's value to another, whatever its type."""
-    step: Floats = only_key(start, key).localCoordinates(only_key(end, key)).at(key)
-    return step
-
-
-def pose_of(frame: Floats) -> gtsam.Pose3:
-    """The pose of x, y, z, yaw, pitch, roll, [m] and [rad]."""
-    x, y, z, yaw, pitch, roll = (float(v) for v in frame)
-    return gtsam.Pose3(gtsam.Rot3.Ypr(yaw, pitch, roll), np.array([x, y, z]))
-
-
-def frame_of(pose: gtsam.Pose3, near: Floats | None = None) -> Floats:
-    """x, y, z, yaw, pitch, roll of a pose, [m] and [rad].
-
-    Args:
-        pose: The pose.
-        near: Of the angles that make the same rotation those nearest to the angles of this frame, in the same order,
-            are taken; those within half a turn and a quarter turn of pitch if None.
-    """
-    angles = yaw_pitch_roll(pose.rotation().matrix(), None if near is None else np.asarray(near)[3:])
-    return np.concatenate([pose.translation(), angles])
-
-
-def corrections_of(robot: Robot, values: Floats) -> Floats:
-    """Parameter values minus a robot's nominal ones, shape (n_parameters,), [m] and [rad].
-
-    Angles of a frame (base, tool, origins of a URDF's joints) by the shorter way. Near a pitch of a quarter turn yaw
-    and roll change by much where the frame has turned by little; if they change by more than twice what it has turned,
-    its turn about its own z, y and x axes stands in place of the differences of yaw, pitch and roll.
-    """
-    off = values - robot.nominal
-    for owner in range(robot.n_joints + 2):
-        frame = [i for i in robot.owned_by(owner) if robot.parameters[i].kind in FRAME_KINDS]
-        if len(frame) == 6:
-            angles = frame[3:]
-            off[angles] = np.remainder(off[angles] + np.pi, 2.0 * np.pi) - np.pi
-            R = pose_of(robot.nominal[frame]).rotation()
-            turn = gtsam.Rot3.Logmap(R.between(pose_of(values[frame]).rotation()))
-            if np.abs(off[angles]).max() > 2.0 * np.linalg.norm(turn):
-                off[angles] = turn[::-1]
-    return off
-
-
-_ALONG_TANGENT = (5, 4, 3, 0, 1, 2)
-"""Which of `FRAME_KINDS` goes with each direction of a pose's tangent: roll, pitch, yaw with turns about x, y, z."""
-
-
-def _frame_derivative(frame: Floats) -> Floats:
-    """Derivative of x, y, z, yaw, pitch, roll in Pose3's tangent (rotation first, in itself), shape (6, 6)."""
-    pitch, roll = frame[4], frame[5]
-    secant = 1.0 / np.cos(pitch) if abs(np.cos(pitch)) > QUARTER_TURN else np.nan
-    D = np.zeros((6, 6))
-    D[:3, 3:] = pose_of(frame).rotation().matrix()
-    # Body rates of Rz(yaw) Ry(pitch) Rx(roll), solved for the angles' rates.
-    D[3, :3] = [0.0, np.sin(roll) * secant, np.cos(roll) * secant]
-    D[4, :3] = [0.0, np.cos(roll), -np.sin(roll)]
-    D[5, :3] = [1.0, np.sin(roll) * np.sin(pitch) * secant, np.cos(roll) * np.sin(pitch) * secant]
-    return D
-
-
-def _tangent_derivative(frame: Floats) -> Floats:
-    """Derivative of Pose3's tangent (rotation first, in itself) in x, y, z, yaw, pitch, roll, shape (6, 6)."""
-    pitch, roll = frame[4], frame[5]
-    E = np.zeros((6, 6))
-    E[3:, :3] = pose_of(frame).rotation().matrix().T
-    # Body rates of Rz(yaw) Ry(pitch) Rx(roll).
-    E[0, 3:] = [-np.sin(pitch), 0.0, 1.0]
-    E[1, 3:] = [np.cos(pitch) * np.sin(roll), np.cos(roll), 0.0]
-    E[2, 3:] = [np.cos(pitch) * np.cos(roll), -np.sin(roll), 0.0]
-    return E
-
-
-Residual = Callable[[gtsam.Values], Floats]
-Linearised = Callable[[gtsam.Values], tuple[Floats, Floats]]
-
-
-def custom_factor(
-    variables: Sequence[Variable], n_rows: int, residual: Residual, linearise: Linearised
-) -> gtsam.CustomFactor:
-    """A factor over whitened residuals: the one place where GTSAM's Jacobian lists are filled.
-
-    Args:
-        variables: The variables it depends on.
+        variables: The variables it depends on; their columns follow each other.
         n_rows: Number of residuals.
-        residual: Whitened residuals at some values, shape (n_rows,).
-        linearise: The same with their derivatives, shape (n_rows, n_columns), in the variables' columns.
+        linearise: Whitened residuals at some values, shape (n_rows,), and their derivatives, shape (n_rows, n_columns).
+        residual: The residuals alone, where that is quicker.
 
     Raises:
         SolverError: On linearising, if shapes are wrong or a derivative is not finite.
     """
-    spans = [v.columns for v in variables]
-    n_columns = max(s.stop for s in spans)
-    symbols = ", ".join(v.symbol for v in variables)
 
-    def evaluate(_: gtsam.CustomFactor, values: gtsam.Values, H: list[Floats] | None) -> Floats:
-        if H is None:
-            r = residual(values)
-            if r.shape != (n_rows,):
-                raise SolverError(f"factor on {symbols}: residual of shape {r.shape}, expected ({n_rows},)")
+    def __init__(
+        self,
+        variables: Sequence[Variable],
+        n_rows: int,
+        linearise: Linearise,
+        residual: Callable[[gtsam.Values], Floats] | None = None,
+    ) -> None:
+        spans = [v.columns for v in variables]
+        n_columns = max(s.stop for s in spans)
+        symbols = ", ".join(v.symbol for v in variables)
+
+        def evaluate(_: gtsam.CustomFactor, values: gtsam.Values, H: list[Floats] | None) -> Floats:
+            if H is None:
+                r = linearise(values)[0] if residual is None else residual(values)
+                if r.shape != (n_rows,):
+                    raise SolverError(f"factor on {symbols}: residual of shape {r.shape}, expected ({n_rows},)")
+                return r
+            r, J = linearise(values)
+            if r.shape != (n_rows,) or J.shape != (n_rows, n_columns):
+                expected = f"({n_rows},), ({n_rows}, {n_columns})"
+                raise SolverError(f"factor on {symbols}: shapes {r.shape}, {J.shape}, expected {expected}")
+            if not (np.isfinite(r).all() and np.isfinite(J).all()):
+                raise SolverError(f"factor on {symbols}: a residual or derivative is not finite")
+            for i, span in enumerate(spans):
+                H[i] = J[:, span]
             return r
-        r, J = linearise(values)
-        if r.shape != (n_rows,) or J.shape != (n_rows, n_columns):
-            expected = f"({n_rows},), ({n_rows}, {n_columns})"
-            raise SolverError(f"factor on {symbols}: shapes {r.shape}, {J.shape}, expected {expected}")
-        if not (np.isfinite(r).all() and np.isfinite(J).all()):
-            raise SolverError(f"factor on {symbols}: a residual or derivative is not finite")
-        for i, span in enumerate(spans):
-            H[i] = J[:, span]
-        return r
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(n_rows), [v.key for v in variables], evaluate)
+        super().__init__(gtsam.noiseModel.Unit.Create(n_rows), [v.key for v in variables], evaluate)
 
 
-def row_factor(rows: RowSet, variables: Variables) -> gtsam.CustomFactor:
-    """Whitened rows as one factor; those of one measurement are that measurement's own factor.
+class MeasurementFactor(CheckedFactor):
+    """The rows of one measurement, minus what the errors that it shares make of them.
 
-    A set of more rows than the variables have columns is handed to GTSAM as the triangular factor of
-    [J r]: with `[J r] = Q [[R, z], [0, rho]]` the residual (z, rho) and the Jacobian (R, 0) have the same cost,
-    gradient and Gauss-Newton Hessian in n_columns + 1 rows.
+    Args:
+        variables: The problem's variables.
+        series: The measurement's whitened rows.
+        errors: The error variables that it depends on, and the rows' derivatives in them, shape (n_rows, width) each.
     """
-    with_core = any(part.block.kind.ends for part in rows.parts)
-    local, chosen, ours = factor_columns(variables, rows.coordinates, with_core=with_core)
-    n_all, n_rows = len(chosen) + 1, rows.n_rows
-    with_right = np.append(chosen, variables.n_columns + variables.n_nuisance)
 
-    def at(values: gtsam.Values) -> At:
-        return variables.at(variables.parameters(values, ours))
-
-    if n_rows <= n_all:
+    def __init__(
+        self, variables: Variables, series: WhitenedSeries, errors: Sequence[tuple[int, str, Floats]] = ()
+    ) -> None:
+        local, chosen, ours = factor_columns(variables, series.nuisances, with_core=series.block.kind.ends > 0)
+        start, shared = len(chosen), list[Variable]()
+        for key, symbol, loading in errors:
+            shared.append(Variable(key, symbol, "own", (), slice(start, start := start + loading.shape[1])))
+        G = np.hstack([np.zeros((series.n_rows, 0)), *(loading for _, _, loading in errors)])
 
         def linearise(values: gtsam.Values) -> tuple[Floats, Floats]:
-            r, J = rows.linearise(at(values))
-            return r, J[:, chosen]
+            found = np.concatenate(list(series.linearise(variables.at(variables.parameters(values, ours)))))
+            z = np.concatenate([np.zeros(0), *(values.atVector(v.key) for v in shared)])
+            return found[:, -1] - G @ z, np.hstack([found[:, chosen], -G])
 
-        return custom_factor(local, n_rows, lambda values: rows.linearise(at(values).without_columns())[0], linearise)
+        super().__init__([*local, *shared], series.n_rows, linearise)
 
-    reduce = Reduction(rows)
 
-    def reduced_residual(values: gtsam.Values) -> Floats:
-        r = np.zeros(n_all)
-        r[0] = np.sqrt(rows.squared_norm(at(values)))
+class DistanceFactor(MeasurementFactor):
+    """A distance that the tool point moved between two configurations.
+
+    Args:
+        variables: The variables, `problem.variables`.
+        start: Joint readings of the first configuration, shape (n_joints,), [rad] (prismatic: [m]).
+        end: Readings of the second.
+        distance: Measured, [m].
+        sigma: Its 1 sigma, [m].
+
+    Raises:
+        InputError: The readings are of other joints, or a number is impossible.
+    """
+
+    def __init__(self, variables: Variables, start: ArrayLike, end: ArrayLike, distance: float, sigma: float) -> None:
+        super().__init__(variables, _of_readings(Distance(), variables, (start, end), ("distance", distance), sigma))
+
+
+class RotationAngleFactor(MeasurementFactor):
+    """An angle in [0, pi] that the tool rotated by between two configurations, [rad]; else as `DistanceFactor`."""
+
+    def __init__(self, variables: Variables, start: ArrayLike, end: ArrayLike, angle: float, sigma: float) -> None:
+        if isinstance(angle, Real) and angle > np.pi:
+            raise InputError("angle", f"found {shown(angle)}", "0 to pi, in rad")
+        super().__init__(variables, _of_readings(RotationAngle(), variables, (start, end), ("angle", angle), sigma))
+
+
+def _of_readings(
+    kind: Kind, variables: Variables, ends: tuple[ArrayLike, ArrayLike], measured: tuple[str, float], sigma: float
+) -> WhitenedSeries:
+    if not isinstance(variables, Variables):
+        raise InputError("variables", f"found {shown(variables)}", "the variables of a problem")
+    check_number(*measured)
+    check_number("sigma", sigma, above=True)
+    n = variables.robot.n_joints
+    readings = [as_floats(name, q, f"({n})") for name, q in zip(("start", "end"), ends, strict=True)]
+    trig = variables.robot.trig(np.array(readings))
+    data, whitening = np.array([[float(measured[1])]]), np.array([[1.0 / float(sigma)]])
+    block = Block(kind, trig, np.array([[0, 1]]), data, whitening, np.zeros((1, 0)))
+    return WhitenedSeries(block, 0, 0, np.zeros((1, 0), dtype=np.int64))
+
+
+def measurement_factors(
+    blocks: Sequence[WhitenedBlock], variables: Variables, at: State
+) -> tuple[list[gtsam.NonlinearFactor], gtsam.Values]:
+    """Factors of one measurement each with the priors of the error variables that they share, and these' estimates.
+
+    Args:
+        blocks: The whitened rows.
+        variables: The problem's variables.
+        at: Where the error variables are estimated.
+    """
+    factors, values, number = list[gtsam.NonlinearFactor](), gtsam.Values(), 0
+
+    def add_error(key: int, z: Floats) -> None:
+        factors.append(gtsam.PriorFactorVector(key, np.zeros(len(z)), gtsam.noiseModel.Unit.Create(len(z))))
+        values.insert(key, z)
+
+    for block in blocks:
+        z, first = block.posterior_mean(at), 0
+        u = block.private(at.without_columns())[:, -1]
+        if block.states is not None:
+            u = u - block.states.loadings @ z.ravel()
+        for part in block.parts:
+            h = part.block.residual_dim
+            for k in range(part.block.n):
+                one, rows = part.only(k), slice(first, first := first + h)
+                errors = [] if block.states is None else _errors_of(block, block.states.loadings[rows])
+                number += 1
+                if not (variables.items or np.any(variables.coordinates[one.nuisances] >= 0)):
+                    continue  # nothing that it depends on is estimated
+                if all(type(kind) in _PAIR_FACTORS for kind in one.block.kind.parts):
+                    made, shared = _pair_factors(one, variables, errors, number)
+                    factors += made
+                    if shared.any():
+                        add_error(gtsam.symbol("e", number), np.array([shared @ u[rows]]))
+                else:
+                    factors.append(MeasurementFactor(variables, one, errors))
+        for k, of_k in zip(block.configurations.tolist(), z, strict=True):
+            add_error(gtsam.symbol("E", k), of_k)
+    return factors, values
+
+
+Errors = list[tuple[int, str, Floats]]
+
+
+def _errors_of(block: WhitenedBlock, L: Sparse) -> Errors:
+    """The error variables that some rows depend on, and their derivatives."""
+    assert block.states is not None
+    width = block.states.width
+    used = np.unique(L.indices // width)
+    G = L[:, (used[:, None] * width + np.arange(width)).ravel()].toarray()
+    keys = block.configurations[used].tolist()
+    return [(gtsam.symbol("E", k), f"E({k})", G[:, i * width : (i + 1) * width]) for i, k in enumerate(keys)]
+
+
+def _pair_factors(
+    pair: WhitenedSeries, variables: Variables, errors: Errors, number: int
+) -> tuple[list[MeasurementFactor], Floats]:
+    """The factors of one pair's distance and angle, with a variable `e(number)` for what correlates them.
+
+    Their private covariance is `diag(private) + common common^T`, with the same share of either variance in common.
+
+    Returns:
+        The factors, and the posterior mean of `e(number)` per private whitened residual, zeros where there is none.
+    """
+    kinds, found = pair.block.kind.parts, list[MeasurementFactor]()
+    W = unpack(pair.block.whitening, len(kinds))[0]
+    used = np.flatnonzero(np.diag(W))
+    inverse = np.linalg.inv(W[np.ix_(used, used)])
+    C = inverse @ inverse.T
+    private, common, mean = np.diag(C).copy(), np.zeros(len(used)), np.zeros(len(kinds))
+    if len(used) == 2 and abs(C[0, 1]) > UNCORRELATED * np.sqrt(C[0, 0] * C[1, 1]):
+        common = np.sqrt(abs(C[0, 1])) * np.array([1.0, np.sign(C[0, 1])]) * (private / private[::-1]) ** 0.25
+        private -= common**2
+        mean = W @ common
+    for i, k in enumerate(used.tolist()):
+        weight = 1.0 / np.sqrt(private[i])
+        row = inverse[i] * weight
+        of_errors = [(key, symbol, (row @ G[used])[None]) for key, symbol, G in errors]
+        if common[i]:
+            of_errors.append((gtsam.symbol("e", number), f"e({number})", np.array([[common[i] * weight]])))
+        block = replace(pair.block, kind=kinds[k], data=pair.block.data[:, k : k + 1], whitening=np.array([[weight]]))
+        offset = None if pair.offset is None else (pair.offset[:, used] @ row)[:, None]
+        factor = _PAIR_FACTORS[type(kinds[k])]
+        found.append(factor.__new__(factor))
+        MeasurementFactor.__init__(found[-1], variables, replace(pair, block=block, offset=offset), of_errors)
+    return found, mean
+
+
+_PAIR_FACTORS: dict[type, type[MeasurementFactor]] = {Distance: DistanceFactor, RotationAngle: RotationAngleFactor}
+
+
+def reduced_factor(block: WhitenedBlock, variables: Variables) -> CheckedFactor:
+    """A block as one factor: the triangular factor of [J r] has the same cost, gradient and Gauss-Newton Hessian.
+
+    With `[J r] = Q [[R, z], [0, rho]]` the residual is (z, rho) and the Jacobian (R, 0): n_columns + 1 rows.
+    """
+    with_core = any(part.block.kind.ends for part in block.parts)
+    local, chosen, ours = factor_columns(variables, block.coordinates, with_core=with_core)
+    n_rows = len(chosen) + 1
+    with_right = np.append(chosen, variables.n_columns + variables.n_nuisance)
+
+    def at(values: gtsam.Values) -> State:
+        return variables.at(variables.parameters(values, ours))
+
+    def residual(values: gtsam.Values) -> Floats:
+        r = np.zeros(n_rows)
+        r[0] = np.sqrt(block.squared_norm(at(values)))
         return r
 
-    def reduced_linearise(values: gtsam.Values) -> tuple[Floats, Floats]:
-        R = reduce(at(values))[:, with_right]
-        if len(R) > n_all:
+    def linearise(values: gtsam.Values) -> tuple[Floats, Floats]:
+        R = block.triangle(at(values))[:, with_right]
+        if len(R) > n_rows:
             R = np.linalg.qr(R, mode="r")  # type: ignore[assignment]
         return R[:, -1], R[:, :-1]
 
-    return custom_factor(local, n_all, reduced_residual, reduced_linearise)
+    return CheckedFactor(local, n_rows, linearise, residual)
 
 
 def factor_columns(
-    variables: Variables, coordinates: NDArray[np.int64], *, with_core: bool
-) -> tuple[list[Variable], NDArray[np.int64], tuple[Variable, ...]]:
-    """What a factor on the core and some nuisance coordinates depends on.
+    variables: Variables, coordinates: Integers, *, with_core: bool
+) -> tuple[list[Variable], Integers, tuple[Variable, ...]]:
+    """The variables of a factor on the core and some landmark coordinates.
 
     Returns:
         Its variables with columns of their own, one after the other; which of all columns these are; the variables.
@@ -611,94 +288,8 @@ def factor_columns(
     return local, np.concatenate(chosen), core + nuisance
 
 
-def dense(linear: gtsam.GaussianFactorGraph, keys: list[int]) -> tuple[Floats, Floats]:
-    """The linear graph as one matrix in the order of the columns, and its right-hand side."""
-    ordering = gtsam.Ordering()
-    for key in keys:
-        ordering.push_back(key)
-    return linear.jacobian(ordering)
-
-
-class Reduction:
-    """Square root of [J r]^T [J r], chosen by the conditioning met at the first linearisation.
-
-    The QR reduction keeps the conditioning. The Gram matrix takes a third of the time and squares it, which is
-    harmless where every singular value is either that of a dead direction or above 1e-5 of the largest.
-    """
-
-    def __init__(self, rows: RowSet) -> None:
-        self._rows = rows
-        self._gram = False
-        self._decided = rows.n_rows <= GRAM_ROWS
-
-    def __call__(self, at: At) -> Floats:
-        """A square matrix R with R^T R = [J r]^T [J r], shape (n_columns + n_nuisance + 1,) * 2."""
-        if self._gram:
-            return square_root(self._rows.gram(at))
-        R = self._rows.triangle(at)
-        if not self._decided:
-            self._decided = True
-            self._gram = well_conditioned(R[:, :-1])
-        return R
-
-
-def square_root(gram: Floats) -> Floats:
-    """A square matrix R with R^T R = gram, which may be singular."""
-    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    eigenvalues, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
-    root: Floats = np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] * vectors.T * scale
-    return root
-
-
-def well_conditioned(R: Floats) -> bool:
-    """Whether the singular values of R, columns scaled to length 1, are dead or above 1e-5 of the largest."""
-    lengths = np.linalg.norm(R, axis=0)
-    s = np.linalg.svd(R[:, lengths > 0.0] / lengths[lengths > 0.0], compute_uv=False)
-    largest = s.max(initial=0.0)  # 0 where rows depend on no column: angles of pairs on a tool point
-    return not bool(np.any((s > 1e-12 * largest) & (s < 1e-5 * largest)))
-
-
-def prior_rows(variables: Variables, parameters: Floats, only: Variable | None = None) -> tuple[Floats, Floats]:
-    """Whitened priors and their derivatives, shapes (n_priors,), (n_priors, n_columns): see the module's head.
-
-    Args:
-        variables: The variables.
-        parameters: The parameter vector.
-        only: The variable whose priors are wanted; all if None.
-    """
-    nominal = variables.nominal()
-    items = variables.items if only is None else (only,)
-    n = sum(len(variables.stated[v.symbol][0]) for v in items)
-    r, J, first = np.zeros(n), np.zeros((n, variables.n_columns)), 0
-    for v in items:
-        stated, weight = variables.stated[v.symbol]
-        if not stated:
-            continue
-        of_v, rows = v.places, slice(first, first + len(stated))
-        if v.is_pose:
-            off, D = _off_nominal(parameters[of_v], nominal[of_v])
-        else:
-            off, D = parameters[of_v] - nominal[of_v], np.eye(len(of_v))
-        r[rows], J[rows, v.columns], first = weight * off[stated], weight[:, None] * D[stated], rows.stop
-    return r, J
-
-
-def _off_nominal(frame: Floats, nominal: Floats) -> tuple[Floats, Floats]:
-    """How far a frame is from nominal, shape (6,), and the derivative in Pose3's tangent, shape (6, 6).
-
-    x, y, z less their nominal values, then the turn from nominal about its own z, y and x axes, [m] and [rad]. The
-    derivative of the turn r = Log(R_nominal^T R) is the inverse right Jacobian of SO(3) at r.
-    """
-    R = pose_of(frame).rotation()
-    turn = gtsam.Rot3.Logmap(pose_of(nominal).rotation().between(R))
-    D = np.zeros((6, 6))
-    D[:3, 3:] = R.matrix()
-    D[3:, :3] = gtsam.Rot3.LogmapDerivative(turn)[::-1]
-    return np.concatenate([frame[:3] - nominal[:3], turn[::-1]]), D
-
-
 def prior_factors(variables: Variables) -> list[gtsam.NonlinearFactor]:
-    """One factor for each variable that has parameters with a tolerance, or that was said to be somewhere."""
+    """One factor for each variable that has parameters with a prior, or that was said to be somewhere."""
     factors: list[gtsam.NonlinearFactor] = []
     for v in variables.items:
         n_rows = len(variables.stated[v.symbol][0])
@@ -711,30 +302,117 @@ def prior_factors(variables: Variables) -> list[gtsam.NonlinearFactor]:
     return factors
 
 
-def unknown_prior_rows(variables: Variables, parameters: Floats) -> tuple[Floats, Floats]:
-    """Whitened priors of the measurements' unknowns and their derivatives, shapes (n,), (n, n_columns + n_nuisance)."""
-    r, J = [np.zeros(0)], [np.zeros((0, variables.n_columns + variables.n_nuisance))]
-    for v in variables.nuisance:
-        if v.prior is not None:
-            mean, sigma = (np.array(figures) for figures in v.prior)
-            rows = np.zeros((len(sigma), variables.n_columns + variables.n_nuisance))
-            rows[:, v.columns] = np.diag(1.0 / sigma)
-            r.append((parameters[v.places] - mean) / sigma)
-            J.append(rows)
-    return np.concatenate(r), np.vstack(J)
-
-
 def _prior_factor(variables: Variables, variable: Variable, n_rows: int) -> gtsam.NonlinearFactor:
     """GTSAM's own, which calls no Python, of a vector all of which has a prior; of poses, and of parts, ours."""
     if not variable.is_pose and n_rows == len(variable.parameters):
         mean, sigma = variables.nominal()[variable.places], 1.0 / variables.stated[variable.symbol][1]
         return gtsam.PriorFactorVector(variable.key, mean, gtsam.noiseModel.Diagonal.Sigmas(sigma))
-    local = Variable(
-        variable.key, variable.symbol, variable.kind, variable.parameters, slice(0, len(variable.parameters))
-    )
 
     def rows(values: gtsam.Values) -> tuple[Floats, Floats]:
         r, J = prior_rows(variables, variables.parameters(values, [variable]), variable)
         return r, J[:, variable.columns]
 
-    return custom_factor([local], n_rows, lambda values: rows(values)[0], rows)
+    return CheckedFactor([replace(variable, columns=slice(0, len(variable.parameters)))], n_rows, rows)
+
+
+def linearize_factors(
+    factors: Sequence[gtsam.NonlinearFactor], variables: Variables, values: gtsam.Values
+) -> tuple[Floats, Floats]:
+    """Factors' whitened residuals and derivatives at some values, shapes (n,), (n, n_columns + n_nuisance)."""
+    n = variables.n_columns + variables.n_nuisance
+    if not factors:
+        return np.zeros(0), np.zeros((0, n))
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in factors:
+        graph.add(factor)
+    present, ordering = set(graph.keyVector()), gtsam.Ordering()
+    chosen = [v for v in variables.items + variables.nuisance if v.key in present]
+    for v in chosen:
+        ordering.push_back(v.key)
+    A, b = graph.linearize(values).jacobian(ordering)
+    wide = np.zeros((len(b), n))
+    wide[:, np.concatenate([np.arange(n)[v.columns] for v in chosen])] = A
+    return -b, wide
+
+
+def check_added(
+    factors: Sequence[gtsam.NonlinearFactor], initial: gtsam.Values, variables: Variables, errors: gtsam.Values
+) -> gtsam.Values:
+    """Check factors that a user added to a problem's graph, and the initial values.
+
+    Args:
+        factors: All that were added.
+        initial: The initial values.
+        variables: The problem's own variables.
+        errors: Its error variables.
+
+    Returns:
+        The start of the variables that the factors bring with them.
+
+    Raises:
+        ProblemError: A factor has no finite weight, error or derivative, or values and variables do not match.
+    """
+    for factor in factors:
+        _check_noise(factor)
+    _check_initial(initial, variables)
+    added = gtsam.Values(initial)
+    keys_of_errors = list(errors.keys())
+    for key in [*variables.keys, *filter(initial.exists, keys_of_errors)]:
+        added.erase(key)
+    found = set(chain.from_iterable(factor.keys() for factor in factors))
+    on_errors = found.intersection(keys_of_errors)
+    if on_errors:
+        place, symbol = "problem.graph", str(gtsam.Symbol(min(on_errors))).strip()
+        raise ProblemError(place, f"an added factor on the error variable {symbol}", "factors on other variables")
+    for key in sorted(found.difference(variables.keys).symmetric_difference(added.keys())):
+        symbol = str(gtsam.Symbol(key)).strip()
+        if key in found:
+            raise ProblemError("problem.initial", f"no value of {symbol}", "one for every variable of an added factor")
+        raise ProblemError("problem.initial", f"a value of {symbol}", "none without a factor on it in problem.graph")
+    for factor in factors:
+        _check_start(factor, initial)
+    return added
+
+
+def _check_initial(initial: gtsam.Values, variables: Variables) -> None:
+    """Check that every variable of the problem has an initial value, of its own type and size."""
+    for v in variables.items + variables.nuisance:
+        if not initial.exists(v.key):
+            raise ProblemError("problem.initial", f"no value of {v.symbol}", "one for every variable of the problem")
+        expected = "a gtsam.Pose3" if v.is_pose else f"{len(v.parameters)} finite numbers"
+        try:
+            value = initial.atPose3(v.key).matrix() if v.is_pose else initial.atVector(v.key)
+        except RuntimeError:
+            raise ProblemError(f"problem.initial: {v.symbol}", "a value of another type", expected) from None
+        if not v.is_pose and len(value) != len(v.parameters):
+            raise ProblemError(f"problem.initial: {v.symbol}", f"{len(value)} numbers", expected)
+        if not np.isfinite(value).all():
+            raise ProblemError(f"problem.initial: {v.symbol}", "a number that is not finite", expected)
+
+
+def _check_noise(factor: gtsam.NonlinearFactor | None) -> None:
+    """Check that the rows of an added factor have finite weights: else nothing could be counted or whitened."""
+    if factor is None:
+        raise ProblemError("problem.graph", "None among its factors", "factors")
+    name, model = type(factor).__name__, factor.noiseModel() if isinstance(factor, gtsam.NoiseModelFactor) else None
+    if model is None:
+        expected = "one with a noise model, such as PriorFactorVector, BetweenFactorPose3 or CustomFactor"
+        raise ProblemError("problem.graph", f"an added {name}", expected)
+    if model.isConstrained():
+        expected = "sigmas above 0: a thousandth of what matters is as good as 0"
+        raise ProblemError("problem.graph", f"an added {name} with a constrained noise model", expected)
+
+
+def _check_start(factor: gtsam.NonlinearFactor, initial: gtsam.Values) -> None:
+    """Check that an added factor has an error where it starts, and a derivative that fits its variables."""
+    symbols = ", ".join(str(gtsam.Symbol(key)).strip() for key in list(factor.keys()))
+    place = f"problem.graph: added {type(factor).__name__} on {symbols}"
+    try:
+        error = factor.error(initial)
+        factor.linearize(initial)
+    except CalibrationError:
+        raise
+    except Exception as raised:
+        raise ProblemError(place, f"raised {type(raised).__name__}: {raised}") from raised
+    if not np.isfinite(error):
+        raise ProblemError(place, f"an error of {error:g} at the initial values", "a finite one")

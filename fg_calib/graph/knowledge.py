@@ -22,8 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arrays import FrozenArrays
-from fg_calib.graph.factors import Variables, build_variables, custom_factor, pose_of
+from fg_calib.graph.factors import CheckedFactor
 from fg_calib.graph.normal_system import determined, eliminate
+from fg_calib.graph.variables import Variables, build_variables, pose_of
 from fg_calib.measurements.kinds import LANDMARKS
 from fg_calib.measurements.landmarks import Landmarks
 from fg_calib.options import FrameKnowledge, Model
@@ -201,13 +202,13 @@ class Knowledge(FrozenArrays):
         s, D = self.step_to(variables, unknowns, parameters)
         return self.right + self.rows @ s, self.rows @ D
 
-    def factor(self, variables: Variables, unknowns: Landmarks) -> gtsam.CustomFactor:
+    def factor(self, variables: Variables, unknowns: Landmarks) -> CheckedFactor:
         """The rows as a factor on all variables of a problem."""
 
         def rows(values: gtsam.Values) -> tuple[Floats, Floats]:
             return self.at_parameters(variables, unknowns, variables.parameters(values))
 
-        return custom_factor([*variables.items, *variables.nuisance], self.n, lambda values: rows(values)[0], rows)
+        return CheckedFactor([*variables.items, *variables.nuisance], self.n, rows)
 
 
 def coordinates_of(variables: Variables, unknowns: Landmarks, name: Name) -> Integers | None:

@@ -1,4 +1,4 @@
-"""The calibration problem: measurements gathered in series, whitened, as a GTSAM graph with a start.
+"""The calibration problem: measurements gathered in series, whitened, with a start, and its GTSAM graph.
 
 `build_problem` makes it, `solve` solves it; in between it can be looked at: the graph, the initial values, which rows
 take part and why the others do not.
@@ -7,7 +7,7 @@ take part and why the others do not.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -17,20 +17,27 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from fg_calib.arrays import FrozenArrays
-from fg_calib.errors import ProblemError, shown
+from fg_calib.errors import ProblemError, SolverError, shown
+from fg_calib.graph.error_states import (
+    SchurComplement,
+    State,
+    WhitenedBlock,
+    correlation_of,
+    share_errors,
+    whitened_rows,
+)
 from fg_calib.graph.factors import (
-    Variables,
-    build_variables,
-    frame_of,
-    pose_of,
+    check_added,
+    linearize_factors,
+    measurement_factors,
     prior_factors,
-    prior_rows,
-    row_factor,
-    unknown_prior_rows,
+    reduced_factor,
 )
 from fg_calib.graph.knowledge import Knowledge
-from fg_calib.graph.noise import JOINT_NOISE, NoiseState, Place, RowNoise, row_noise, same_everywhere
-from fg_calib.graph.rows import At, RowSet, share_errors, whitened_rows
+from fg_calib.graph.noise_models import JOINT_NOISE, NoiseState, RowNoise, TableState, row_noise, same_everywhere
+from fg_calib.graph.normal_system import RANK_TOLERANCE, LinearRows, NormalSystem
+from fg_calib.graph.robust import effect
+from fg_calib.graph.variables import Variables, build_variables, frame_of, pose_of, prior_rows, unknown_prior_rows
 from fg_calib.initialization.hand_eye import Frame
 from fg_calib.measurements.build import Dataset, start_frames
 from fg_calib.measurements.dataset import Measurements
@@ -56,11 +63,8 @@ class Problem(FrozenArrays):
         start: Initial parameter vector (see `Variables`).
         state: What has been learned of the measurements' noise.
         rows: The whitened train rows.
-        graph: Factors and priors, as GTSAM's own tools take them. Factors added to it are solved and assessed with it.
-        initial: GTSAM's initial values; those of variables that added factors bring with them are inserted here.
         whole: The problem with everything estimated, where this one leaves parameters out to fix the gauge.
-        factors: The factors that `graph` was made of.
-        added: Those among them that somebody added (see `extension`).
+        added: Factors that a user added to `graph`.
         evaluated: Whether there are test rows alone: the arm is taken as it is, and measurement frame, base and tool,
             where they are estimated, are fitted to these.
         knowledge: What earlier rows say of the arm; None without any.
@@ -72,32 +76,65 @@ class Problem(FrozenArrays):
     variables: Variables
     start: Floats
     state: NoiseState
-    rows: tuple[RowSet, ...]
-    graph: gtsam.NonlinearFactorGraph
-    initial: gtsam.Values
+    rows: tuple[WhitenedBlock, ...]
     whole: Problem | None = None
-    factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     added: tuple[gtsam.NonlinearFactor, ...] = ()
     evaluated: bool = False
     knowledge: Knowledge | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but GTSAM's objects, whose factors call back into Python: they are made anew of the rows.
+        """All but what follows from the rest.
 
         Raises:
-            ProblemError: Somebody added factors, which would be lost.
+            ProblemError: A user added factors, which would be lost.
         """
-        if self.added or self.graph.size() != self.factors.size():
+        if self.added or self._more_factors:
             raise ProblemError("problem.graph", "added factors", "none: GTSAM's factors cannot be written")
-        left = ("graph", "factors", "initial", "known", "noises")
-        return {name: value for name, value in self.__dict__.items() if name not in left}
+        return {f.name: getattr(self, f.name) for f in fields(self)}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take over a state, and make GTSAM's objects of it."""
-        super().__setstate__(state)
-        graph = _graph_of(self, self.rows)
-        initial = self.variables.values(self.start)
-        self.__dict__.update(graph=graph, factors=gtsam.NonlinearFactorGraph(graph), initial=initial)
+    @cached_property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """One factor a measurement, error variables where measurements share errors, and priors.
+
+        Factors that a user adds are solved and assessed with it.
+        """
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in self.own_factors:
+            graph.add(factor)
+        return graph
+
+    @cached_property
+    def initial(self) -> gtsam.Values:
+        """GTSAM's initial values; a user inserts here those of variables that added factors bring with them."""
+        values = self.variables.values(self.start)
+        values.insert(self._measured[1])
+        return values
+
+    @cached_property
+    def own_factors(self) -> tuple[gtsam.NonlinearFactor, ...]:
+        """The factors that `graph` is made of."""
+        return (*self._measured[0], *prior_factors(self.variables), *known_factors(self), *self.added)
+
+    @cached_property
+    def _measured(self) -> tuple[list[gtsam.NonlinearFactor], gtsam.Values]:
+        return measurement_factors(self.rows, self.variables, self.variables.at(self.start))
+
+    @property
+    def _more_factors(self) -> tuple[gtsam.NonlinearFactor, ...]:
+        """The factors in `graph` that it was not made of.
+
+        Raises:
+            ProblemError: Factors were removed or replaced.
+        """
+        graph = self.__dict__.get("graph")
+        if graph is None:
+            return ()
+        n, own = graph.size(), self.own_factors
+        kept = sum(graph.at(i) is own[i] for i in range(min(n, len(own))))
+        if kept < len(own):
+            found = f"{kept} of the problem's {len(own)} factors"
+            raise ProblemError("problem.graph", found, "all of them, in their places")
+        return tuple(graph.at(i) for i in range(len(own), n))
 
     def __repr__(self) -> str:
         v, models = self.variables, ", ".join(str(table.model) for table in self.data.tables)
@@ -147,7 +184,7 @@ class Problem(FrozenArrays):
 
     @property
     def pair_series(self) -> tuple[MeasurementBlock, ...]:
-        """MeasurementBlock of pairs of configurations."""
+        """Series of pairs of configurations."""
         return tuple(s for s in self.data.series if s.kind.ends == 2)
 
     @property
@@ -234,49 +271,79 @@ def _n_different(numbers: Sequence[Integers]) -> int:
     return int(np.sum(seen))
 
 
-def assembled(problem: Problem, start: Floats, state: NoiseState | None = None, **changes: Any) -> Problem:
+def with_factors(problem: Problem, start: Floats, state: NoiseState | None = None, **changes: Any) -> Problem:
     """A problem with its rows whitened, and started, at a parameter vector.
 
     Args:
-        problem: The problem, of which rows and graph are made anew.
+        problem: The problem, of which the rows are made anew.
         start: The parameter vector.
         state: What has been learned of the noise; None for what the problem has.
         changes: What else of the problem is to change.
     """
     p = replace(problem, start=start, state=state or problem.state, **changes)
-    noises = noises_at(p, start, fitted=True)
-    if p.state.spread is not None and not any(noise.bends for noise in noises):
-        # Test rows may be shorter than any train row.
-        p = p if any(s.test.any() for s in p.pair_series) else replace(p, state=replace(p.state, spread=None))
-    rows = _row_sets(p, noises)
-    graph = _graph_of(p, rows)
-    factors, initial = gtsam.NonlinearFactorGraph(graph), p.variables.values(start)
-    return replace(p, rows=rows, initial=initial, graph=graph, factors=factors)
+    return replace(p, rows=_whitened(p, noises_at(p, start, fitted=True)))
 
 
-def _graph_of(problem: Problem, rows: tuple[RowSet, ...]) -> gtsam.NonlinearFactorGraph:
-    """Rows, a problem's priors and what somebody added as factors; rows that depend on no variable are none."""
+def with_user_factors(problem: Problem) -> Problem:
+    """The problem with what a user added to its graph, and changed in its initial values, as a part of it.
+
+    Raises:
+        ProblemError: Factors were removed or replaced, an added variable has no start, or there is no factor of it.
+    """
+    if not problem.__dict__.keys() & {"graph", "initial"}:
+        return problem
+    more, variables = problem._more_factors, problem.variables.without_own()
+    own = check_added((*problem.added, *more), problem.initial, variables, problem._measured[1])
+    if more and problem.whole is not None:
+        raise ProblemError("problem.graph", "added factors with gauge keep", "gauge prior or none")
+    if not more and problem.variables.values(problem.start).equals(_without_errors(problem), 0.0):
+        return problem
+    variables = variables.with_own(own)
+    start = variables.parameters(problem.initial)
+    return with_factors(problem, start, variables=variables, added=(*problem.added, *more))
+
+
+def _without_errors(problem: Problem) -> gtsam.Values:
+    values = gtsam.Values(problem.initial)
+    for key in filter(values.exists, list(problem._measured[1].keys())):
+        values.erase(key)
+    return values
+
+
+def check_graph(problem: Problem) -> None:
+    """Check that nothing was added to the graph of a problem that has been solved.
+
+    Raises:
+        ProblemError: Its graph has other factors than it was solved with.
+    """
+    n = len(problem._more_factors)
+    if n:
+        raise ProblemError("solution.problem.graph", f"{n} factors added since it was solved", "to be solved again")
+
+
+def reduced_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
+    """Every block of rows, whatever its size, as one factor, with priors and added factors, for damped steps."""
     graph = gtsam.NonlinearFactorGraph()
-    for row_set in rows:
-        if depends(row_set, problem.variables):
-            graph.add(row_factor(row_set, problem.variables))
+    for block in problem.rows:
+        if depends(block, problem.variables):
+            graph.add(reduced_factor(block, problem.variables))
     for factor in (*prior_factors(problem.variables), *known_factors(problem), *problem.added):
         graph.add(factor)
     return graph
 
 
-def depends(rows: RowSet, variables: Variables) -> bool:
-    """Whether rows depend on any variable: on the core, or on an unknown that is estimated."""
+def depends(rows: WhitenedBlock, variables: Variables) -> bool:
+    """Whether rows depend on any variable: on the core, or on a landmark that is estimated."""
     return bool(variables.items) or bool(np.any(variables.coordinates[rows.coordinates] >= 0))
 
 
-def known_factors(problem: Problem) -> list[gtsam.CustomFactor]:
+def known_factors(problem: Problem) -> list[gtsam.NonlinearFactor]:
     """What earlier rows say as a factor, where they say anything."""
     known = problem.known
     return [] if known is None else [known.factor(problem.variables, problem.data.unknowns)]
 
 
-def _row_sets(problem: Problem, noises: tuple[RowNoise, ...]) -> tuple[RowSet, ...]:
+def _whitened(problem: Problem, noises: tuple[RowNoise, ...]) -> tuple[WhitenedBlock, ...]:
     """The train rows whitened by their noise."""
     state, sharing = problem.state, problem.options.pair_errors == "shared"
     weights = None
@@ -301,7 +368,7 @@ def noises_at(
     return tuple(row_noise(s, places[s.table], problem.state) for s in series)
 
 
-def _places(problem: Problem, parameters: Floats, at_readings: bool) -> list[Place]:
+def _places(problem: Problem, parameters: Floats, at_readings: bool) -> list[TableState]:
     data, errors = problem.data, problem.state.joint_errors
     trigs = data.trigs(problem.robot)
     if errors is not None and not at_readings:
@@ -310,12 +377,12 @@ def _places(problem: Problem, parameters: Floats, at_readings: bool) -> list[Pla
     at = at_parameters(problem, parameters, trigs)
     estimated = problem.options.encoder == "estimated"
     return [
-        Place(table.measurements, place, trig, chain, at.coordinates, estimated)
+        TableState(table.measurements, place, trig, chain, at.coordinates, estimated)
         for table, place, trig, chain in zip(data.tables, data.places, trigs, at.chains, strict=True)
     ]
 
 
-def at_parameters(problem: Problem, parameters: Floats, trigs: Sequence[Floats] | None = None) -> At:
+def at_parameters(problem: Problem, parameters: Floats, trigs: Sequence[Floats] | None = None) -> State:
     """The arm and the measurements' unknowns at a parameter vector; test rows alone say where the others are.
 
     Args:
@@ -391,7 +458,7 @@ def says_where(data: Dataset, series: MeasurementBlock) -> Booleans:
     return says
 
 
-def reweighted_at(problem: Problem, parameters: Floats, state: NoiseState | None = None) -> Problem:
+def relinearized_at(problem: Problem, parameters: Floats, state: NoiseState | None = None) -> Problem:
     """The same problem with its rows whitened, and started, at other parameters.
 
     Args:
@@ -401,11 +468,11 @@ def reweighted_at(problem: Problem, parameters: Floats, state: NoiseState | None
     """
     same = all(same_everywhere(s, problem.data.sigma_joint) for s in problem.data.series)
     if (state is None or state is problem.state) and same:
-        return started_at(problem, parameters)
-    return assembled(problem, parameters, state)
+        return with_initial(problem, parameters)
+    return with_factors(problem, parameters, state)
 
 
-def some_rows(problem: Problem, share: float) -> Problem | None:
+def subsampled(problem: Problem, share: float) -> Problem | None:
     """The same problem with some of its train rows, drawn evenly, whitened at its start.
 
     Args:
@@ -413,50 +480,24 @@ def some_rows(problem: Problem, share: float) -> Problem | None:
         share: Which share of each series.
 
     Returns:
-        None where single rows count for more than others do: where they have robust weights, or depend on unknowns of
-        their own.
+        None where single rows count for more than others do: where they have robust weights, or depend on landmarks.
     """
     if problem.variables.nuisance or problem.options.loss != "none" or problem.state.weights is not None:
         return None
     rng, series = np.random.default_rng(0), []
     for s in problem.data.series:
         series.append(s.select(np.sort(rng.permutation(s.train)[: round(share * len(s.train))])))
-    return assembled(replace(problem, data=replace(problem.data, series=tuple(series))), problem.start)
+    return with_factors(replace(problem, data=replace(problem.data, series=tuple(series))), problem.start)
 
 
-def started_at(problem: Problem, start: Floats) -> Problem:
+def with_initial(problem: Problem, start: Floats) -> Problem:
     """The same problem, its rows as they are whitened, with another start: a parameter vector."""
-    return replace(problem, start=start, initial=problem.variables.values(start))
+    return replace(problem, start=start)
 
 
-def by_columns_of(problem: Problem, variables: Variables) -> Problem:
+def in_variables_of(problem: Problem, variables: Variables) -> Problem:
     """The same problem and rows by the columns of the variables of more, or the same, parameters."""
-    state = problem.state
-    if state.spread is not None:
-        state = replace(state, spread=variables.columns_of(problem.variables, problem.start) @ state.spread)
-    return replace(problem, variables=variables, state=state)
-
-
-def same_rows(a: Problem, b: Problem) -> bool:
-    """Whether two problems have the very same rows, to the last figure."""
-    return _equal(a.rows, b.rows)
-
-
-def _equal(a: Any, b: Any) -> bool:
-    """Whether two rows' data are equal: arrays, sparse arrays, tuples and dataclasses of them."""
-    if a is b or type(a) is not type(b):
-        return a is b
-    if isinstance(a, np.ndarray):
-        return np.array_equal(a, b)
-    if isinstance(a, tuple):
-        return len(a) == len(b) and all(map(_equal, a, b))
-    if isinstance(a, scipy.sparse.csr_array):
-        return _equal((a.data, a.indices, a.indptr), (b.data, b.indices, b.indptr))
-    return (
-        all(_equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(a) if f.compare)
-        if is_dataclass(a)
-        else bool(a == b)
-    )
+    return replace(problem, variables=variables)
 
 
 def mahalanobis_distances(problem: Problem, parameters: Floats) -> list[tuple[Floats, Integers]]:
@@ -475,7 +516,7 @@ def mahalanobis_distances(problem: Problem, parameters: Floats) -> list[tuple[Fl
 
 
 def joint_errors(problem: Problem, parameters: Floats) -> Floats:
-    """What the train rows say of the errors of the joint readings: true values less readings, to first order.
+    """Posterior mean of the errors of the joint readings: true values minus readings, to first order.
 
     Returns:
         Shape (n_configurations, n_joints), [rad] (prismatic: [m]); about the joint values that the problem has.
@@ -484,11 +525,152 @@ def joint_errors(problem: Problem, parameters: Floats) -> Floats:
     joints = np.flatnonzero(sigma > 0.0)
     found = np.zeros((problem.data.n_configurations, len(sigma)))
     at = problem.variables.at(parameters)
-    for rows in problem.rows:
-        if rows.shared is not None:
-            z = rows.most_likely(at)[:, rows.joints : rows.joints + len(joints)]
-            found[np.ix_(rows.configurations, joints)] = -sigma[joints] * z
+    for block in problem.rows:
+        if block.states is not None:
+            z = block.posterior_mean(at)[:, block.joints : block.joints + len(joints)]
+            found[np.ix_(block.configurations, joints)] = -sigma[joints] * z
     return found
+
+
+def linear_system(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> NormalSystem:
+    """The normal system of a problem at a parameter vector: all train rows, priors and added factors.
+
+    Args:
+        problem: The problem.
+        parameters: The parameter vector.
+        with_loss: Whether a robust loss counts for what it loses of clean data (see `robust.Effect`).
+
+    Raises:
+        SolverError: A residual or derivative is not finite.
+    """
+    v = problem.variables
+    r, J = prior_rows(v, parameters)
+    rows, priors = square_root(problem, parameters, with_loss=with_loss), np.column_stack([J, r])
+    if not (np.isfinite(rows).all() and np.isfinite(priors).all()):
+        raise SolverError("a residual or derivative is not finite")
+    at = v.at(parameters)
+
+    def gather() -> LinearRows:
+        return _linear_rows(problem, _with_loss(problem)[0] if with_loss else problem.rows, at)
+
+    return NormalSystem(rows, v.n_columns, v.prior_scales, priors, gather)
+
+
+def square_root(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> Floats:
+    """Rows [A r] with the Gram matrix of train rows, landmarks' priors and added factors, error states eliminated.
+
+    Args:
+        problem: The problem.
+        parameters: The parameter vector.
+        with_loss: Whether a robust loss counts for what it loses of clean data (see `robust.Effect`).
+
+    Returns:
+        Shape (m, n_columns + n_nuisance + 1).
+    """
+    v, at = problem.variables, problem.variables.at(parameters)
+    blocks, variance = _with_loss(problem) if with_loss else (problem.rows, 1.0)
+    others = [unknown_prior_rows(v, parameters), known_rows(problem, parameters), added_rows(problem, parameters)]
+    stacked = [np.column_stack([J, r]) for r, J in others]
+    return np.vstack([*stacked, *(block.triangle(at) / np.sqrt(variance) for block in blocks)])
+
+
+def named_rows(variables: Variables, parameters: Floats, J: Floats) -> Floats:
+    """Whitened rows of the core by named parameters, measurement frames projected out: shape (m, n_robot_columns).
+
+    At a pitch of 90 degrees of base or tool the columns of yaw and roll are parallel: only their sum acts.
+    """
+    n = variables.n_robot_columns
+    out: Floats = J @ variables.tangent_derivative(parameters)[:, :n]
+    if n == variables.n_columns:
+        return out
+    length = np.linalg.norm(out, axis=0)
+    U, s, _ = np.linalg.svd(J[:, n:], full_matrices=False)
+    Q = U[:, s > RANK_TOLERANCE * s.max(initial=0.0)]
+    out = out - Q @ (Q.T @ out)
+    # What projecting leaves of a column that was all frame is rounding.
+    out[:, np.linalg.norm(out, axis=0) <= RANK_TOLERANCE * length] = 0.0
+    return out
+
+
+def _linear_rows(problem: Problem, blocks: Sequence[WhitenedBlock], at: State) -> LinearRows:
+    """Whitened train rows one by one, those of each block and each of its parts after the other."""
+    rows, loadings, counts, used = [np.zeros((0, at.n_columns + at.n_nuisance + 1))], [], [np.zeros(0, np.int64)], []
+    shared = next((block for block in blocks if block.states is not None), None)
+    for block in blocks:
+        rows.append(block.private(at))
+        for part in block.parts:
+            series = problem.data.series[part.series]
+            counts.append(np.full(part.block.n, part.block.residual_dim))
+            used.append(series.used[series.train].ravel())
+        if shared is not None and shared.states is not None:
+            none = scipy.sparse.csr_array((len(rows[-1]), shared.states.loadings.shape[1]))
+            loadings.append(none if block.states is None else block.states.loadings)
+    wide, states, count = np.concatenate(rows), None, np.concatenate(counts)
+    if shared is not None and shared.states is not None:
+        L = scipy.sparse.csr_array(scipy.sparse.vstack(loadings))
+        states = shared.states if len(blocks) == 1 else SchurComplement(L, shared.states.width)
+    return LinearRows(
+        r=wide[:, -1],
+        A=wide[:, :-1],
+        measurement=np.repeat(np.arange(len(count)), count),
+        states=states,
+        used=np.concatenate([np.zeros(0, dtype=np.bool_), *used]),
+        configurations=np.zeros(0, dtype=np.int64) if shared is None else shared.configurations,
+        joints=0 if shared is None else shared.joints,
+    )
+
+
+def _with_loss(problem: Problem) -> tuple[tuple[WhitenedBlock, ...], float]:
+    """The rows, and the factor by which a robust loss makes the variance of the estimate larger.
+
+    Measurements of fewer rows lose less or more than others; they count relative to those that lose least.
+    """
+    state, loss = problem.state, problem.options.loss
+    if state.weights is None:
+        return problem.rows, 1.0
+    dims = [s.used.sum(axis=1) for s in problem.data.series]
+    largest = max(int(d.max(initial=0)) for d in dims)
+    of_dim = np.array([effect(loss, max(dim, 1)).variance for dim in range(largest + 1)])
+    of_train = np.concatenate([d[s.train] for d, s in zip(dims, problem.data.series, strict=True)])
+    present = np.unique(of_train[of_train > 0])
+    variance = float(of_dim[present].min(initial=np.inf)) if len(present) else 1.0
+    if len(present) <= 1:
+        return problem.rows, variance
+    share = np.minimum(variance / of_dim, 1.0)
+    weights = tuple(w * share[d] for w, d in zip(state.weights, dims, strict=True))
+    counted = replace(problem, state=replace(state, weights=weights))
+    return _whitened(counted, noises_at(counted, problem.start, fitted=True)), variance
+
+
+def known_rows(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
+    """What earlier rows say, whitened, and its derivatives, shapes (n_known,), (n_known, n_columns + n_nuisance)."""
+    v = problem.variables
+    if problem.known is None:
+        return np.zeros(0), np.zeros((0, v.n_columns + v.n_nuisance))
+    return problem.known.at_parameters(v, problem.data.unknowns, parameters)
+
+
+def added_rows(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
+    """The added factors' whitened rows and derivatives, shapes (n_added,), (n_added, n_columns + n_nuisance)."""
+    v = problem.variables
+    return linearize_factors(problem.added, v, v.values(parameters))
+
+
+def correlation(problem: Problem, parameters: Floats) -> Floats | None:
+    """J^T (C - 1) J of the train rows where they share errors but count as independent, else None.
+
+    Args:
+        problem: The problem.
+        parameters: The parameter vector.
+
+    Returns:
+        With J the whitened Jacobian, landmarks eliminated, and C the covariance of the whitened rows, shape
+        (n_columns, n_columns).
+    """
+    if not problem.missing_correlation:
+        return None
+    follow = linear_system(problem, parameters).left.follow
+    return correlation_of(problem.noises, problem.rows, problem.variables.at(parameters), follow)
 
 
 def frames_only(problem: Problem) -> Problem | None:
@@ -501,8 +683,8 @@ def frames_only(problem: Problem) -> Problem | None:
     variables = variables_of(robot, problem.data, problem.options)
     options = replace(problem.options, encoder="propagated", pair_errors="independent")  # good enough for a start
     start = problem.start[: variables.nuisance_span.stop]
-    state = replace(problem.state, joint_errors=None, spread=None)  # of other columns
-    return assembled(
+    state = replace(problem.state, joint_errors=None)
+    return with_factors(
         problem, start, state, robot=robot, variables=variables, options=options, added=(), knowledge=None, whole=None
     )
 
@@ -533,14 +715,13 @@ def problem_at(
     robot: Robot, data: Dataset, options: Options, variables: Variables, start: Floats, **more: Any
 ) -> Problem:
     """A problem with its rows whitened at a start."""
-    return assembled(unassembled(robot, data, options, variables, start, **more), start)
+    return with_factors(without_rows(robot, data, options, variables, start, **more), start)
 
 
-def unassembled(
+def without_rows(
     robot: Robot, data: Dataset, options: Options, variables: Variables, start: Floats, **more: Any
 ) -> Problem:
-    """A problem that has no rows and no graph yet."""
+    """A problem whose rows have not been whitened."""
     estimated = options.encoder == "estimated" and bool(np.any(data.sigma_joint > 0.0))
     state = NoiseState(joint_errors=np.zeros_like(data.readings) if estimated else None)
-    empty = gtsam.NonlinearFactorGraph()
-    return Problem(robot, data, options, variables, start, state, (), empty, gtsam.Values(), **more)
+    return Problem(robot, data, options, variables, start, state, (), **more)

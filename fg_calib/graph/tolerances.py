@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fg_calib.arrays import Floats, FrozenArrays, Integers
-from fg_calib.graph.factors import Variables
-from fg_calib.graph.problem import Problem, assembled
+from fg_calib.graph.problem import Problem, with_factors
+from fg_calib.graph.variables import Variables
 from fg_calib.options import SharedScale
 from fg_calib.robot.model import Parameter, Robot, tolerance_kind
 
@@ -103,4 +103,4 @@ def with_scales(problem: Problem, by: SharedScale, scales: Mapping[str, float]) 
         for p in problem.robot.parameters
     )
     robot = replace(problem.robot, parameters=parameters)
-    return assembled(problem, problem.start, robot=robot, variables=replace(problem.variables, robot=robot))
+    return with_factors(problem, problem.start, robot=robot, variables=replace(problem.variables, robot=robot))

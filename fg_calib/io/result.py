@@ -24,7 +24,7 @@ from fg_calib.arrays import Figure, Floats
 from fg_calib.assessment import Assessment
 from fg_calib.diagnostics.setup_check import SetupCheck
 from fg_calib.errors import InputError
-from fg_calib.graph.noise import JOINT_NOISE
+from fg_calib.graph.noise_models import JOINT_NOISE
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
 from fg_calib.graph.tolerances import ToleranceScale

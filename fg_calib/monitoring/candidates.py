@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.build import places_of
-from fg_calib.graph.factors import Variable, pose_of
 from fg_calib.graph.knowledge import coordinates_of
 from fg_calib.graph.problem import Problem, problem_at, variables_of
+from fg_calib.graph.variables import Variable, pose_of
 from fg_calib.measurements.build import build_dataset
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.table import Table

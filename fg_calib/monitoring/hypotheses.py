@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 from scipy import special
 
 from fg_calib.errors import CalibrationError
-from fg_calib.graph.factors import build_variables
-from fg_calib.graph.rows import RowSet
+from fg_calib.graph.error_states import WhitenedBlock
+from fg_calib.graph.variables import build_variables
 from fg_calib.monitoring.new_data import Calibrated, Linear, Placed, Rows, linear, placed
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.kinematics import forward
@@ -277,7 +277,7 @@ def gross_rows(rows: Linear) -> list[ChangeHypothesis]:
     """The rows of each configuration that few others share measurements with; none of very many."""
     problem = rows.placed.problem
     places = problem.data.places
-    of_configuration: dict[int, list[tuple[RowSet, int, Integers]]] = {}
+    of_configuration: dict[int, list[tuple[WhitenedBlock, int, Integers]]] = {}
     start, m, n_columns = 0, len(rows.columns), 0
     for row_set in problem.rows:
         first = 0
@@ -304,7 +304,7 @@ def gross_rows(rows: Linear) -> list[ChangeHypothesis]:
     return found
 
 
-def _of_errors(row_set: RowSet, start: int, at: Integers, m: int) -> Floats:
+def _of_errors(row_set: WhitenedBlock, start: int, at: Integers, m: int) -> Floats:
     """Columns of errors of some whitened rows of a set, shape (m, n).
 
     Args:

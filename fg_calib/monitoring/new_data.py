@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from fg_calib.diagnostics.unmodelled_effects import basis_of
 from fg_calib.errors import ProblemError
-from fg_calib.graph.factors import build_variables, unknown_prior_rows
+from fg_calib.graph.error_states import State, WhitenedBlock
 from fg_calib.graph.knowledge import STAYING, Knowledge, columns_in, coordinates_of
-from fg_calib.graph.noise import JOINT_NOISE, NoiseName, NoiseState
-from fg_calib.graph.problem import Problem, assembled, at_parameters, problem_at, start_of, tables_of, variables_of
-from fg_calib.graph.rows import At, RowSet
+from fg_calib.graph.noise_models import JOINT_NOISE, NoiseName, NoiseState
+from fg_calib.graph.problem import Problem, at_parameters, problem_at, start_of, tables_of, variables_of, with_factors
 from fg_calib.graph.solver import Solution, solve
+from fg_calib.graph.variables import build_variables, unknown_prior_rows
 from fg_calib.measurements import residuals
 from fg_calib.measurements.build import build_dataset
 from fg_calib.measurements.kinds import INSTRUMENTS, LANDMARKS
@@ -179,7 +179,7 @@ def placed(calibrated: Calibrated, rows: Rows, values: Floats) -> Placed:
             x[variables.frame_span] = start.parameters[variables.frame_span]
             there = variables.coordinates >= 0
             x[variables.coordinates[there]] = at_parameters(start.problem, start.parameters).coordinates[there]
-        return assembled(problem_at(arm, data, options, variables, x), x, state)
+        return with_factors(problem_at(arm, data, options, variables, x), x, state)
 
     held = problem(robot.with_estimated([]), rows.at_known_places(known, None), None)
     if not held.n_residuals:
@@ -291,7 +291,7 @@ def linearised(problem: Problem) -> tuple[Floats, Floats, Floats]:
     return every[:, :n], every[:, n + 1 :], every[:, n]
 
 
-def _of_joints(rows: RowSet, at: At) -> Floats:
+def _of_joints(rows: WhitenedBlock, at: State) -> Floats:
     """Derivatives of rows in the joints' zeros, the same for all configurations, shape (n_rows, n_joints)."""
     found = []
     for part in rows.parts:

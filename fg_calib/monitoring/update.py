@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from fg_calib.errors import InputError, ProblemError
 from fg_calib.graph.build import kept_of
 from fg_calib.graph.knowledge import Knowledge, coordinates_of
-from fg_calib.graph.problem import Problem, assembled, at_parameters, problem_at, variables_of
+from fg_calib.graph.problem import Problem, at_parameters, problem_at, variables_of, with_factors
 from fg_calib.graph.solver import Solution, solve
 from fg_calib.measurements.build import build_dataset
 from fg_calib.measurements.kinds.pose import TARGET
@@ -102,7 +102,7 @@ def _problem(calibrated: Calibrated, robot: Robot, known: Knowledge, rows: Rows,
             if place is not None:
                 x[place] = known.place(name)
         made = problem_at(arm, data, options, v, x, whole=whole, knowledge=known)
-        return assembled(made, x, replace(made.state, factors=state.factors))
+        return with_factors(made, x, replace(made.state, factors=state.factors))
 
     whole = problem(robot, None)
     if not whole.n_residuals:

@@ -22,13 +22,17 @@ from numpy.typing import NDArray
 from pydantic import computed_field
 
 from fg_calib.arrays import Figure, Floats, FrozenArrays
-from fg_calib.graph.normal_system import RANK_TOLERANCE, SIGNAL_FLOOR, SUPPORT_TOLERANCE, determined
+from fg_calib.graph.normal_system import (
+    RANK_TOLERANCE,
+    SIGNAL_FLOOR,
+    SUPPORT_TOLERANCE,
+    determined,
+    first_independent,
+)
+from fg_calib.graph.variables import preference
 from fg_calib.robot.model import Parameter, names_of
 
 IdentifiabilityClass = Literal["independent", "relative", "ineffective"]
-
-KEEP_ORDER = ("theta", "d", "a", "alpha", "beta", "x", "y", "z", "yaw", "pitch", "roll")
-"""Of parameters that only act together the earlier kind is kept, and of one kind the later joint, as in the paper."""
 
 WEAK = 10.0
 """A direction is weak if its sigma is above one over this of what it may be off: tolerance, else an ordinary change."""
@@ -259,9 +263,9 @@ def _groups(
     if n_lost <= 0:
         return ()
     # Eliminate the parameters one would rather give up: each relation then holds one of them and kept ones only.
-    order = sorted(alive, key=lambda i: (-_preference(parameters[i], prefer), i))
+    order = sorted(alive, key=lambda i: (-preference(parameters[i], prefer), i))
     N = null[:, order]
-    dropped = _first_independent(N, n_lost)
+    dropped = first_independent(N, n_lost)
     relations = np.linalg.lstsq(N[:, dropped].T, np.eye(n_lost), rcond=None)[0].T @ N  # (n_lost, n_alive)
     relations[np.abs(relations) < SUPPORT_TOLERANCE] = 0.0
     names = names_of(parameters)
@@ -279,34 +283,6 @@ def _groups(
             )
         )
     return tuple(sorted(found, key=lambda g: names.index(g.parameters[0])))
-
-
-def _preference(parameter: Parameter, prefer: Sequence[str]) -> int:
-    """Rank in the order of keeping, 0 first: the user's choice, then base and tool, then `KEEP_ORDER`.
-
-    Base and tool are estimated only where the user asks for it, and may be far from nominal.
-    """
-    if parameter.name in prefer:
-        return list(prefer).index(parameter.name)
-    if parameter.name.startswith(("base.", "tool.")):
-        return len(prefer)
-    return len(prefer) + 1 + KEEP_ORDER.index(parameter.kind)
-
-
-def _first_independent(N: Floats, count: int) -> list[int]:
-    """The first columns of N, in order, that are clearly linearly independent."""
-    chosen: list[int] = []
-    basis = np.zeros((len(N), 0))
-    for clearly in (1e-2, SUPPORT_TOLERANCE, 0.0):
-        for i in range(N.shape[1]):
-            if len(chosen) == count:
-                return chosen
-            rest = N[:, i] - basis @ (basis.T @ N[:, i])
-            rest -= basis @ (basis.T @ rest)
-            if i not in chosen and np.linalg.norm(rest) > clearly:
-                chosen.append(i)
-                basis = np.column_stack([basis, rest / np.linalg.norm(rest)])
-    return chosen
 
 
 def _connected(relations: Floats) -> list[tuple[set[int], list[int]]]:

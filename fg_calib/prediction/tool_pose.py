@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arrays import Floats, FrozenArrays
-from fg_calib.graph.factors import build_variables
 from fg_calib.graph.problem import Problem
+from fg_calib.graph.variables import build_variables
 from fg_calib.measurements.build import Dataset
 from fg_calib.observability.observed_quantities import ObservedQuantities
 from fg_calib.robot.kinematics import Chain, forward, without_rigid_motion

@@ -563,7 +563,8 @@ def notes_of(solution: Solution, assessed: Assessment) -> Iterator[str]:
         if not table.uses_pairs and table.measurements.pairs is not None:
             yield f"{table.measurements.pairs.source} is not used: model {table.model} is of poses, not of pairs"
     if problem.added:
-        chi2 = 2.0 * sum(factor.error(solution.values) for factor in problem.added)
+        values = problem.variables.values(solution.parameters)
+        chi2 = 2.0 * sum(factor.error(values) for factor in problem.added)
         yield f"{len(problem.added)} added factors with {problem.n_added} rows: chi-square {chi2:.6g}"
     if problem.formed and problem.missing_correlation and problem.n_pairs >= problem.n_configurations:
         yield (

@@ -24,11 +24,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fg_calib.arrays import FrozenArrays
-from fg_calib.graph.factors import Variables, prior_rows
 from fg_calib.graph.information import correlation, whitened_triangle
 from fg_calib.graph.normal_system import RANK_TOLERANCE, SIGNAL_FLOOR, SUPPORT_TOLERANCE, determined
-from fg_calib.graph.problem import Problem, by_columns_of
+from fg_calib.graph.problem import Problem, in_variables_of
 from fg_calib.graph.solver import Solution
+from fg_calib.graph.variables import Variables, prior_rows
 from fg_calib.robot.model import Robot
 
 Floats = NDArray[np.float64]
@@ -266,7 +266,7 @@ def _errors(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
     by_name = dict(zip(whole.names, derivative.T, strict=True))
     left_out = [by_name[p.name] for p in problem.whole.estimated if p.name not in own.names]
     N = np.array(left_out).reshape(-1, whole.n_columns).T
-    J = whitened_triangle(by_columns_of(problem, whole), parameters)
+    J = whitened_triangle(in_variables_of(problem, whole), parameters)
     U, s, Vt = np.linalg.svd((J @ M) * own.scales, full_matrices=False)
     rank = determined(s)
     G = own.scales[:, None] * ((Vt[:rank].T / s[:rank]) @ (U[:, :rank].T @ (J @ N)))

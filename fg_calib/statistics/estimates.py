@@ -13,10 +13,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fg_calib.arrays import Floats, FrozenArrays, Integers
-from fg_calib.graph.factors import Variables, corrections_of, pose_of
 from fg_calib.graph.information import eliminated, linear_system
-from fg_calib.graph.problem import Problem, at_parameters, by_columns_of
+from fg_calib.graph.problem import Problem, at_parameters, in_variables_of
 from fg_calib.graph.solver import Solution
+from fg_calib.graph.variables import Variables, corrections_of, pose_of
 from fg_calib.observability.indices import IdentifiabilityClass, Observability
 from fg_calib.statistics.covariance import Spread, TangentCovariance
 from fg_calib.statistics.residual_table import suspect_level
@@ -230,7 +230,7 @@ def _landmarks(solution: Solution, whole: Spread) -> tuple[LandmarkEstimate, ...
     if not unknowns.names:
         return ()
     at = at_parameters(problem, solution.parameters)
-    left = eliminated(by_columns_of(problem, whole.variables), solution.parameters)
+    left = eliminated(in_variables_of(problem, whole.variables), solution.parameters)
     counts, first = _n_rows(problem), np.cumsum([0, *unknowns.sizes])
     names, found = unknowns.keys, []
     for i, (_, name) in enumerate(names):

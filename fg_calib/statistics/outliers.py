@@ -33,10 +33,10 @@ from numpy.typing import NDArray
 from scipy import special
 
 from fg_calib.errors import SolverError
-from fg_calib.graph.factors import prior_rows
-from fg_calib.graph.noise import PRIVATE_SHARE
-from fg_calib.graph.problem import Problem, assembled
+from fg_calib.graph.noise_models import PRIVATE_SHARE
+from fg_calib.graph.problem import Problem, with_factors
 from fg_calib.graph.solver import Solution, solve
+from fg_calib.graph.variables import prior_rows
 from fg_calib.statistics.covariance import Spread, spread_of
 from fg_calib.statistics.goodness_of_fit import Goodness, GrossErrors, RowStatistics, chi_square, judge_fit
 from fg_calib.statistics.residual_covariance import RowErrors
@@ -216,8 +216,7 @@ def judge_without_outliers(solution: Solution, spread: Spread, table: ResidualTa
         return fit
     found = _fit_without_outliers(solution, table, (solution, spread, table))
     if found is None or not _is_fine(found[2]):  # the nominal arm is nearer to the truth than a fit that went astray
-        values = solution.problem.variables.values(solution.before)
-        nominal = replace(solution, parameters=solution.before, values=values)
+        nominal = replace(solution, parameters=solution.before)
         other = _fit_without_outliers(solution, table, (nominal, spread_of(nominal), residual_table(nominal)))
         found = other if other is not None and (found is None or _is_fine(other[2])) else found
     return fit if found is None else _combined(fit, table, *found)
@@ -302,7 +301,7 @@ def _without(solution: Solution, table: ResidualTable, out: Booleans) -> Problem
         test = s.test.copy()
         test[table.measurement[out & (table.series == number)]] = True
         blocks.append(replace(s, test=test))
-    return assembled(solution.problem, solution.before, data=replace(data, series=tuple(blocks)))
+    return with_factors(solution.problem, solution.before, data=replace(data, series=tuple(blocks)))
 
 
 def _combined(fit: Goodness, table: ResidualTable, out: Booleans, now: _State, rest: Goodness) -> Goodness:

@@ -57,12 +57,12 @@ from scipy import special
 
 from fg_calib.arguments import checked
 from fg_calib.arrays import Figure, Floats, FrozenArrays, Integers
-from fg_calib.graph.factors import Variables, prior_rows, unknown_prior_rows
 from fg_calib.graph.information import correlation, eliminated, whitened_triangle
 from fg_calib.graph.normal_system import RANK_TOLERANCE, eliminate
-from fg_calib.graph.problem import Problem, reweighted_at
+from fg_calib.graph.problem import Problem, relinearized_at
 from fg_calib.graph.solver import Solution, solve
 from fg_calib.graph.tolerances import ToleranceScale, ToleranceScales, groups_of, prior_parameters, with_scales
+from fg_calib.graph.variables import Variables, prior_rows, unknown_prior_rows
 from fg_calib.statistics.covariance import Spread
 from fg_calib.threads import single_threaded
 
@@ -126,7 +126,7 @@ def estimate_tolerances(problem: Problem, solve_with: Callable[[Problem], Soluti
         scale = scale * np.exp(step)
         noise = replace(problem.state, factors=solution.problem.state.factors)
         now = with_scales(
-            reweighted_at(problem, problem.start, noise), by, dict(zip(groups, scale.tolist(), strict=True))
+            relinearized_at(problem, problem.start, noise), by, dict(zip(groups, scale.tolist(), strict=True))
         )
     low, high = np.exp(found.interval)
     figures = (v.tolist() for v in (scale, low, high, found.mean.determined))

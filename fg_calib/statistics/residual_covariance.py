@@ -16,10 +16,10 @@ import scipy.linalg
 import scipy.sparse
 from numpy.typing import NDArray
 
+from fg_calib.graph.error_states import ErrorStates
 from fg_calib.graph.information import eliminated, felt
-from fg_calib.graph.noise import PRIVATE_SHARE, RowNoise
+from fg_calib.graph.noise_models import PRIVATE_SHARE, RowNoise
 from fg_calib.graph.problem import Problem, at_parameters, says_where
-from fg_calib.graph.rows import ErrorColumns
 from fg_calib.measurements import residuals
 from fg_calib.robot.kinematics import Chain
 
@@ -196,7 +196,7 @@ class RowModel:
 
     def __init__(self, problem: Problem, parameters: Floats, noises: Sequence[RowNoise]) -> None:
         self._at = at_parameters(problem, parameters)
-        self._noises, self._columns, self._n = noises, ErrorColumns(noises), problem.variables.n_columns
+        self._noises, self._columns, self._n = noises, ErrorStates(noises), problem.variables.n_columns
         estimated, n = self._at.columns >= 0, len(self._at.columns)
         self._follow, self._inverse = np.zeros((n, self._n)), np.zeros((n, 0))
         self._common = self._columns.predicted(noises)

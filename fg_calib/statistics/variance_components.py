@@ -18,9 +18,9 @@ What the residuals cannot distinguish keeps its specified noise: an origin that 
 the others estimated, unless what was specified is then `UNLIKELY` sigma from the estimate. So noise that is specified
 but absent goes to nothing, and noise too small to be determined stays.
 
-Where rows are weighted by more than their noise (`RowSet.spare`: C = sum V_i + S), t_i is tr(P V_i) - tr(P V_i P S). A
-row with robust weight w counts as w rows. Noise of formed pairs beyond the first order counts as that of the poses.
-Where measurements that share errors are asked to count as independent, they do here too.
+Where rows are weighted by more than their noise (`WhitenedBlock.spare`: C = sum V_i + S), t_i is tr(P V_i) -
+tr(P V_i P S). A row with robust weight w counts as w rows. Noise of formed pairs beyond the first order counts as that
+of the poses. Where measurements that share errors are asked to count as independent, they do here too.
 
 References:
     Foerstner (1979), Ein Verfahren zur Schaetzung von Varianz- und Kovarianzkomponenten. Allgemeine
@@ -39,10 +39,10 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
+from fg_calib.graph.error_states import ErrorStates, WhitenedSeries, block_diagonal, whitener_of
 from fg_calib.graph.information import linear_system
-from fg_calib.graph.noise import JOINT_NOISE, NoiseName, RowNoise
-from fg_calib.graph.problem import Problem, reweighted_at
-from fg_calib.graph.rows import ErrorColumns, Part, block_diagonal, whitener_of
+from fg_calib.graph.noise_models import JOINT_NOISE, NoiseName, RowNoise
+from fg_calib.graph.problem import Problem, relinearized_at
 from fg_calib.graph.solver import Solution, SolverOptions, solve
 from fg_calib.threads import single_threaded
 
@@ -151,14 +151,14 @@ def _robust_weights(problem: Problem) -> Floats:
 def _root(problem: Problem, name: NoiseName) -> Sparse:
     """E with E E^T the part of the rows' covariance that noise of one origin makes, shape (n_rows, k)."""
     estimated = problem.state.joint_errors is not None
-    shares = ErrorColumns(problem.noises, problem.options.pair_errors == "shared", estimated)
+    shares = ErrorStates(problem.noises, problem.options.pair_errors == "shared", estimated)
     parts = [part for rows in problem.rows for part in rows.parts]
     found = [_root_of_part(problem.noises[part.series], part, name, shares) for part in parts]
     private = scipy.sparse.block_diag([own for own, _ in found])
     return Sparse(scipy.sparse.hstack([private, scipy.sparse.vstack([common for _, common in found])]))
 
 
-def _root_of_part(noise: RowNoise, part: Part, name: NoiseName, shares: ErrorColumns) -> tuple[Sparse, Sparse]:
+def _root_of_part(noise: RowNoise, part: WhitenedSeries, name: NoiseName, shares: ErrorStates) -> tuple[Sparse, Sparse]:
     """How whitened rows follow from noise of one origin: what is private to each measurement, and what is shared."""
     train, W = noise.series.train, whitener_of(noise, part)
     n, h = W.shape[:2]
@@ -286,7 +286,7 @@ def _scaled(problem: Problem, factors: Mapping[NoiseName, float]) -> Problem:
     """The problem from its start, with the specified noise of some kinds multiplied by factors."""
 
     def scale(p: Problem) -> Problem:
-        return reweighted_at(p, p.start, replace(p.state, factors={**p.state.factors, **factors}))
+        return relinearized_at(p, p.start, replace(p.state, factors={**p.state.factors, **factors}))
 
     whole = None if problem.whole is None else scale(problem.whole)
     return replace(scale(problem), whole=whole)

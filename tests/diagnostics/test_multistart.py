@@ -81,7 +81,7 @@ def test_the_best_of_two_optima_is_kept(tmp_path):
     problem = problem_of(read_job(pointer(tmp_path, nominal=1e-3, true=0.02, tolerance=1e-3)))
     i = problem.robot.index("d2")
     far = solver.solve(problem)
-    wrong = solver.solve_from(far, np.where(np.arange(len(problem.start)) == i, -0.02, far.parameters), np.inf)
+    wrong = solver.solve(problem, start=np.where(np.arange(len(problem.start)) == i, -0.02, far.parameters))
     assert wrong.parameters[i] < 0.0
     best = multistart(wrong)
     assert best.cost < wrong.cost - 5.0
@@ -109,7 +109,7 @@ def test_what_data_see_has_one_optimum_and_costs_nothing_more(tmp_path, monkeypa
     def never(*_):
         raise AssertionError("solved again although nothing is weak")
 
-    monkeypatch.setattr("fg_calib.diagnostics.multistart.solve_from", never)
+    monkeypatch.setattr("fg_calib.diagnostics.multistart._solve_from", never)
     solution = solve_job(read_job(path))
     assert solution.others == ()
     assert assess(solution).trustworthy
@@ -122,7 +122,7 @@ def test_a_descent_from_elsewhere_that_cannot_be_made_is_no_fault_of_the_first(t
         raise SolverError("the linear system has no unique solution near J1")
 
     first = solver.solve(problem_of(read_job(pointer(tmp_path, nominal=1e-3, true=0.02))))
-    monkeypatch.setattr("fg_calib.diagnostics.multistart.solve_from", fail)
+    monkeypatch.setattr("fg_calib.diagnostics.multistart._solve_from", fail)
     found = multistart(first)
     assert found.parameters is first.parameters
     assert found.others == ()
@@ -135,8 +135,8 @@ def test_an_optimum_a_radian_away_is_no_other_arm(tmp_path, monkeypatch, off, re
     robot, there = first.problem.robot, first.parameters.copy()
     there[robot.index("d2")] *= -1.0
     there[robot.index("theta2")] += off
-    other = replace(first, parameters=there, values=first.problem.variables.values(there))
-    monkeypatch.setattr("fg_calib.diagnostics.multistart.solve_from", lambda *_: other)
+    other = replace(first, parameters=there)
+    monkeypatch.setattr("fg_calib.diagnostics.multistart._solve_from", lambda *_: other)
     assert len(multistart(first).others) == reported
 
 

@@ -15,7 +15,7 @@ from touches import TOOL_POINT, corners, touch
 from fg_calib import assess
 from fg_calib.baseline.least_squares import fit_least_squares
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.problem import reweighted_at
+from fg_calib.graph.problem import relinearized_at
 from fg_calib.graph.solver import SolverOptions, solve
 from fg_calib.io.robot_file import read_robot
 from fg_calib.io.tables import read_measurements
@@ -118,7 +118,7 @@ def test_solving_again_from_the_answer_moves_nothing(name, gauge, draws):
         assert solution.converged, solution.message
         if options.get("loss", "none") == "none":
             assert solution.iterations <= MOST
-        again = solve(reweighted_at(solution.problem, solution.parameters))
+        again = solve(relinearized_at(solution.problem, solution.parameters))
         assert again.converged, again.message
         spread, scales = spread_of(solution), solution.problem.variables.prior_scales
         variables = solution.problem.variables

@@ -11,18 +11,8 @@ from tolerances import rounding
 
 from fg_calib.errors import SolverError
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.factors import (
-    Reduction,
-    build_variables,
-    custom_factor,
-    frame_of,
-    pose_of,
-    prior_rows,
-    row_factor,
-    square_root,
-    well_conditioned,
-)
-from fg_calib.graph.rows import RowSet
+from fg_calib.graph.factors import CheckedFactor, MeasurementFactor, reduced_factor
+from fg_calib.graph.variables import build_variables, frame_of, pose_of, prior_rows
 from fg_calib.measurements import residuals
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import forward
@@ -84,7 +74,7 @@ def test_a_reduced_block_equals_its_rows_in_cost_gradient_and_hessian(model):
     problem = problem_of(model, n=40)
     variables, (rows,), values = problem.variables, problem.rows, problem.initial
     assert rows.n_rows > variables.n_columns + 1
-    factor = row_factor(rows, variables)
+    factor = reduced_factor(rows, variables)
     r, J = rows.linearise(variables.at(variables.parameters(values)))
     assert factor.error(values) == pytest.approx(0.5 * r @ r, rel=rounding(1, 10))
     A, b = factor.linearize(values).jacobian()
@@ -99,7 +89,7 @@ def one_by_one(rows, variables):
     assert rows.shared is None
     for i in range(part.block.n):
         one = replace(part, block=residuals.rows_of(part.block, slice(i, i + 1)), nuisances=part.nuisances[i : i + 1])
-        graph.add(row_factor(RowSet((one,)), variables))
+        graph.add(MeasurementFactor(variables, one))
     return graph
 
 
@@ -108,7 +98,7 @@ def one_by_one(rows, variables):
 def test_single_row_factors_and_the_block_have_the_same_cost_and_gradient(model):
     problem = problem_of(model, n=15)
     (rows,), values = problem.rows, problem.initial
-    whole, single = row_factor(rows, problem.variables), one_by_one(rows, problem.variables)
+    whole, single = reduced_factor(rows, problem.variables), one_by_one(rows, problem.variables)
     assert single.size() == rows.parts[0].block.n
     assert single.error(values) == pytest.approx(whole.error(values), rel=rounding(1, 10))
     G = whole.linearize(values).augmentedInformation()
@@ -203,38 +193,11 @@ def test_a_wrong_shape_or_a_number_that_is_none_is_an_error_and_not_the_end_of_t
         "not finite": lambda _: (np.zeros(3), np.full((3, n), np.nan)),
     }
     for word, linearise in cases.items():
-        factor = custom_factor(variables.items, 3, lambda _: np.zeros(3), linearise)
+        factor = CheckedFactor(variables.items, 3, linearise)
         with pytest.raises(SolverError, match=word):
             factor.linearize(values)
     with pytest.raises(SolverError, match="residual of shape"):
-        custom_factor(variables.items, 3, lambda _: np.zeros(2), cases["shapes"]).error(values)
-
-
-def test_a_square_root_of_a_singular_gram_matrix_gives_it_back():
-    J = np.random.default_rng(4).normal(size=(50, 6))
-    J[:, 3] = J[:, 1]
-    J[:, 5] = 0.0
-    G = J.T @ J
-    R = square_root(G)
-    assert R.T @ R == pytest.approx(G, abs=rounding(np.abs(G).max()))
-
-
-def test_large_blocks_change_to_the_gram_matrix_only_if_well_conditioned():
-    rng = np.random.default_rng(5)
-    J = rng.normal(size=(30, 4))
-    assert well_conditioned(J)
-    assert well_conditioned(np.hstack([J, J[:, :1], np.zeros((30, 1))]))  # dead directions do not matter
-    assert well_conditioned(np.zeros((30, 3)))  # nor do they where there is nothing else
-    assert not well_conditioned(np.hstack([J, J[:, :1] + 1e-7 * rng.normal(size=(30, 1))]))
-
-    problem = problem_of("distance-rotation", n=150, frame="known", estimate=())
-    (rows,), at = problem.rows, problem.variables.at(problem.start)
-    assert rows.n_rows > 20_000
-    reduce = Reduction(rows)
-    first, second = reduce(at), reduce(at)
-    assert np.allclose(first, np.triu(first))
-    assert not np.allclose(second, np.triu(second))
-    assert second.T @ second == pytest.approx(first.T @ first, abs=rounding(np.abs(first.T @ first).max(), 100))
+        CheckedFactor(variables.items, 3, cases["shapes"]).error(values)
 
 
 def test_fixed_parameters_have_no_column():

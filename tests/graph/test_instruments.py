@@ -376,12 +376,6 @@ def test_rows_that_were_fitted_are_compared_with_those_that_were_fitted():
     assert text.startswith("  both suspicious rows are of a1, as are 20 of all 60 rows\n")
 
 
-def test_configurations_name_what_their_suspicious_rows_are_of():
-    text = suspicious(shifted("targets", [0, 1, 5], 0.01), "test configurations")
-    assert re.search(r"^c20 .* (t0, t1|t1, t0)$", text, flags=re.M)
-    assert re.search(r"^c21 .* t2$", text, flags=re.M)
-
-
 def test_a_board_and_a_base_of_six_unknowns_are_two_variables():
     """Both have the letter B; only the priors say which of them moved."""
     robot, _, table = measured_by("board", np.random.default_rng(3))

@@ -12,9 +12,9 @@ from tolerances import sigmas_apart
 from fg_calib.assessment import assess
 from fg_calib.graph import error_states
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.factors import pose_of
-from fg_calib.graph.problem import mahalanobis_distances, noises_at, reweighted_at
+from fg_calib.graph.problem import mahalanobis_distances, noises_at, relinearized_at
 from fg_calib.graph.solver import solve
+from fg_calib.graph.variables import pose_of
 from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Pairs
 from fg_calib.options import Pairing
@@ -106,7 +106,7 @@ def everything_given_the_noise(solution):
 
     Returns:
         The robot's parameters, chi-square, the covariance of those that are estimated, and the degrees of freedom: of
-        what rows have to themselves for numerical safety alone, a share of none (see `RowSet.n_spare`).
+        what rows have to themselves for numerical safety alone, a share of none (see `WhitenedBlock.n_spare`).
     """
     problem = solution.problem
     robot, (noise,), (series,) = problem.robot, problem.noises, problem.data.series
@@ -234,7 +234,7 @@ def test_derivatives_in_the_true_joint_values_are_those_of_the_rows():
     for model, pairing in (("pose", "star"), ("distance-rotation", "star"), ("distance", "all")):
         problem = build_problem(robot, m, model=model, pairing=Pairing(pairing), encoder="estimated")
         errors = 1e-2 * rng.normal(size=m.readings.shape)
-        problem = reweighted_at(problem, problem.start, replace(problem.state, joint_errors=errors))
+        problem = relinearized_at(problem, problem.start, replace(problem.state, joint_errors=errors))
         (noise,), (chain,) = noises_at(problem, problem.start), problem.variables.at(problem.start).chains
         (source,) = (s for s in noise.sources if s.name == "joints")
         J = source.loading / m.sigma_joint

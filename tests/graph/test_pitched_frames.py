@@ -18,8 +18,8 @@ from sparing import diagonal
 
 from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.factors import build_variables, corrections_of, frame_of, pose_of, prior_rows
 from fg_calib.graph.solver import solve
+from fg_calib.graph.variables import build_variables, corrections_of, frame_of, pose_of, prior_rows
 from fg_calib.io.columns import write_csv
 from fg_calib.io.robot_file import write_robot
 from fg_calib.measurements.dataset import Measurements

@@ -20,12 +20,12 @@ from fg_calib import write_robot
 from fg_calib.assessment import assess
 from fg_calib.errors import InputError, ProblemError
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.factors import prior_rows
 from fg_calib.graph.information import named_triangle, observability_of, whitened_triangle
 from fg_calib.graph.normal_system import eliminate
-from fg_calib.graph.problem import started_at
+from fg_calib.graph.problem import with_initial
 from fg_calib.graph.robust import tuning, weight
 from fg_calib.graph.solver import solve
+from fg_calib.graph.variables import prior_rows
 from fg_calib.io.tables import read_measurements
 from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Groups, Noise, Pairs, no_pairs
@@ -229,7 +229,7 @@ def test_what_moves_arm_and_points_as_one_body_stays_where_it_is(distances):
     # Another place to start the points from changes nothing.
     start = problem.start.copy()
     start[problem.variables.nuisance_span] += 0.01 * np.random.default_rng(4).normal(size=12)
-    again = solve(started_at(problem, start))
+    again = solve(with_initial(problem, start))
     span = problem.variables.robot_span
     apart = [
         abs(again.parameters[span][i] - p.estimate) / p.sigma for i, p in enumerate(uncertainty.parameters) if p.sigma

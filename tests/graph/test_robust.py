@@ -12,7 +12,7 @@ from tolerances import rounding
 
 from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.problem import mahalanobis_distances, reweighted_at
+from fg_calib.graph.problem import mahalanobis_distances, relinearized_at
 from fg_calib.graph.robust import EFFICIENCY, HALF_WEIGHT, Weighting, cost, effect, tuning, weight
 from fg_calib.graph.solver import solve
 from fg_calib.measurements import residuals
@@ -108,7 +108,7 @@ def test_the_optimum_is_that_of_gtsams_robust_noise_on_factors_of_one_measuremen
     assert solution.converged
     # One factor a measurement, its noise model robust, whitened as the plain problem whitens at this estimate.
     plain = replace(solution.problem.state, weights=None)
-    problem = reweighted_at(solution.problem, solution.parameters, plain)
+    problem = relinearized_at(solution.problem, solution.parameters, plain)
     (rows,), variables = problem.rows, problem.variables
     assert rows.shared is None
     block = rows.parts[0].block

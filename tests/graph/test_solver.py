@@ -12,9 +12,9 @@ from tolerances import rounding
 
 from fg_calib.errors import SolverError
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.factors import prior_rows
-from fg_calib.graph.problem import reweighted_at
+from fg_calib.graph.problem import relinearized_at
 from fg_calib.graph.solver import SolverOptions, solve
+from fg_calib.graph.variables import prior_rows
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 
@@ -164,7 +164,7 @@ def test_rows_are_reweighted_at_the_estimate():
     solution = solve(problem)
     assert solution.converged
     there = build_problem(robot.with_values(solution.parameters[:-6]), problem.measurements, model="distance-rotation")
-    there = reweighted_at(there, there.start, solution.problem.state)
+    there = relinearized_at(there, there.start, solution.problem.state)
     for found, expected in zip(solution.problem.data.series, there.data.series, strict=True):
         assert np.array_equal(found.used, expected.used)
     (at_start,), (found,), (expected,) = problem.noises, solution.problem.noises, there.noises

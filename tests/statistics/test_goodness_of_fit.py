@@ -15,10 +15,10 @@ from touches import SIGMA, TOOL_POINT, corners, touch
 from fg_calib.assessment import assess
 from fg_calib.graph import problem as problem_module
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.factors import prior_rows
-from fg_calib.graph.noise import NoiseState
-from fg_calib.graph.rows import ErrorColumns
+from fg_calib.graph.error_states import ErrorStates
+from fg_calib.graph.noise_models import NoiseState
 from fg_calib.graph.solver import SolverOptions, solve
+from fg_calib.graph.variables import prior_rows
 from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Pairs
 from fg_calib.measurements.table import Table
@@ -292,7 +292,7 @@ def test_robust_weights_count_rows_and_flag_outliers():
     m = replace(m, position=plus(m.position, 5, 0.05))
     problem = build_problem(robot, m, model="pose")
     state = NoiseState(weights=(np.where(np.arange(30) == 5, 0.0, 1.0),))
-    solution = solve(problem_module.reweighted_at(problem, problem.start, state))
+    solution = solve(problem_module.relinearized_at(problem, problem.start, state))
     assert solution.problem.state.weights is not None
     uncertainty = assess(solution)
     table, goodness = uncertainty.residuals, uncertainty.goodness
@@ -467,7 +467,7 @@ def test_rows_that_count_as_independent_but_are_not_have_their_covariance_with_t
     problem, spread, table = solution.problem, spread_of(solution), residual_table(solution)
     at, n_core = problem.variables.at(solution.parameters), problem.variables.n_columns
     J = np.concatenate([rows.linearise(at)[1] for rows in problem.rows])
-    errors, W, C = ErrorColumns(problem.noises), [], []
+    errors, W, C = ErrorStates(problem.noises), [], []
     for rows, given in zip(problem.rows, problem.noises, strict=True):
         (part,), residual_dim = rows.parts, rows.parts[0].block.residual_dim
         shaped = [residuals.unpack(block.whitening, residual_dim) for block in (part.block, given.rows)]

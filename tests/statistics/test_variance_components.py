@@ -13,11 +13,11 @@ from touches import TOOL_POINT, corners, touch
 
 from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.factors import prior_rows
-from fg_calib.graph.noise import JOINT_NOISE
-from fg_calib.graph.problem import reweighted_at
-from fg_calib.graph.rows import whitener_of
+from fg_calib.graph.error_states import whitener_of
+from fg_calib.graph.noise_models import JOINT_NOISE
+from fg_calib.graph.problem import relinearized_at
 from fg_calib.graph.solver import solve
+from fg_calib.graph.variables import prior_rows
 from fg_calib.measurements.dataset import Measurements, Pairs
 from fg_calib.measurements.table import Table
 from fg_calib.options import Pairing
@@ -146,8 +146,8 @@ DENSE = ["pose", "star of distances", "tables", "frame unknown", "encoder estima
 def test_components_are_those_of_the_dense_covariance(name):
     problem, _ = draw(name, np.random.default_rng(1), own=0.8, joint=1.3, n=14)
     state = replace(problem.state, factors={(0, "position"): 1.7, (0, "distance"): 0.6, JOINT_NOISE: 1.4})
-    solution = solve(reweighted_at(problem, problem.start, state))
-    problem = reweighted_at(solution.problem, solution.parameters, replace(solution.problem.state, spread=None))
+    solution = solve(relinearized_at(problem, problem.start, state))
+    problem = relinearized_at(solution.problem, solution.parameters, replace(solution.problem.state))
     solution = replace(solution, problem=problem)
     J, r, parts, rows, of_priors = dense_model(solution)
     F = spare_of(problem) if "distances" in name else np.zeros((len(r), len(r)))

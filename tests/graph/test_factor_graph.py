@@ -1,6 +1,4 @@
-"""Factors and variables that a user adds to the graph are solved, counted, and present in covariance, rank, classes."""
-
-from dataclasses import replace
+"""The factor graph: one factor a measurement, GTSAM's own optimum and marginals, and what a user adds to it."""
 
 import gtsam
 import numpy as np
@@ -11,14 +9,12 @@ from tolerances import rounding
 from fg_calib.assessment import assess
 from fg_calib.errors import InputError, ProblemError, SolverError
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.extension import DistanceFactor, RotationAngleFactor, expand
-from fg_calib.graph.factors import prior_factors
+from fg_calib.graph.factors import DistanceFactor, RotationAngleFactor
+from fg_calib.graph.problem import linear_system, reduced_graph, relinearized_at
 from fg_calib.graph.solver import levenberg_marquardt_params, solve
-from fg_calib.measurements.dataset import Pairs
 from fg_calib.options import Pairing
-from fg_calib.robot.kinematics import forward, pose
+from fg_calib.robot.kinematics import forward
 from fg_calib.robot.rotations import rotation_angle
-from fg_calib.statistics.variance_components import estimate_noise
 
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3, "beta": 1e-3}
 ANCHOR = gtsam.symbol("a", 0)
@@ -90,21 +86,18 @@ def dense_covariance(solution, n):
     ordering = gtsam.Ordering()
     for key in problem.variables.keys:
         ordering.push_back(key)
-    A, _ = problem.graph.linearize(solution.values).jacobian(ordering)
+    A, _ = reduced_graph(problem).linearize(solution.values).jacobian(ordering)
     scales = np.concatenate([problem.variables.prior_scales, np.ones(A.shape[1] - n)])
     inverse = np.linalg.pinv(A * scales, rcond=1e-10) * scales[:, None]
     return (inverse @ inverse.T)[:n, :n]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("way", ["in place", "in a copy"])
-def test_factors_on_our_variables_are_solved_and_assessed(way):
+def test_factors_on_our_variables_are_solved_and_assessed():
     problem = problem_of()
-    graph = problem.graph if way == "in place" else gtsam.NonlinearFactorGraph(problem.graph)
     own = [prior_on_k3(problem), known_distance(problem)]
     for factor in own:
-        graph.add(factor)
-    plain, solution = solve(problem_of()), solve(replace(problem, graph=graph))
+        problem.graph.add(factor)
+    plain, solution = solve(problem_of()), solve(problem)
     before, after = assess(plain), assess(solution)
     a3 = next(p for p in after.parameters if p.name == "a3")
     assert solution.converged
@@ -119,22 +112,6 @@ def test_factors_on_our_variables_are_solved_and_assessed(way):
     C = dense_covariance(solution, problem.variables.n_columns)
     sigma = np.sqrt(np.diag(after.spread.tangent))
     assert sigma == pytest.approx(np.sqrt(np.diag(C)), rel=1e-6)  # conditioning of 1e4 squared times rounding
-
-
-def test_the_optimum_is_that_of_gtsams_own_optimiser():
-    problem = problem_of()
-    for factor in (prior_on_k3(problem, 1e-4), known_distance(problem)):
-        problem.graph.add(factor)
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setLinearSolverType("MULTIFRONTAL_QR")
-    parameters.setlambdaUpperBound(1e12)
-    parameters.setRelativeErrorTol(1e-14)
-    graph, initial = gtsam.NonlinearFactorGraph(problem.graph), gtsam.Values(problem.initial)
-    solution = solve(problem)
-    theirs = gtsam.LevenbergMarquardtOptimizer(solution.problem.graph, initial, parameters).optimize()
-    sigma = np.sqrt(np.diag(assess(solution).spread.tangent))
-    assert np.abs(problem.variables.step(solution.values, theirs) / sigma).max() < 1e-4  # where GTSAM stops
-    assert graph.error(solution.values) < graph.error(initial)
 
 
 @pytest.mark.slow
@@ -195,9 +172,16 @@ def test_a_graph_without_one_of_its_factors_is_refused(change):
         graph.add(problem.graph.at(i))
     if change == "replaced":
         graph.replace(0, prior_on_k3(problem))
-    for use in (solve, estimate_noise):
-        with pytest.raises(ProblemError, match=rf"^problem\.graph: {n - 1} of the problem's {n} factors, expected all"):
-            use(replace(problem, graph=graph))
+    with pytest.raises(ProblemError, match=rf"^problem\.graph: {n - 1} of the problem's {n} factors, expected all"):
+        solve(with_graph(problem, graph))
+
+
+def with_graph(problem, graph):
+    """The problem with its graph exchanged, as a user's code might do in place."""
+    problem.graph.resize(0)
+    for i in range(graph.size()):
+        problem.graph.add(graph.at(i))
+    return problem
 
 
 def test_a_variable_needs_a_start_and_a_factor():
@@ -233,50 +217,55 @@ def test_a_start_of_ones_own_is_where_the_solver_begins():
     assert np.abs(moved.parameters - still.parameters).max() < rounding(1, 1e4)
 
 
-# --- our rows as factors of one measurement each ----------------------------------------------------------------------
-
-EXPANDED = {
+SHARED = {
     "poses": ({"model": "pose"}, 0.0),
     "poses, joint noise": ({"model": "pose", "frame": "unknown"}, 5e-4),
     "star": ({"model": "distance-rotation"}, 0.0),
+    "star, joint noise": ({"model": "distance-rotation"}, 5e-4),
     "chain, joint noise": ({"model": "distance", "pairing": Pairing("chain")}, 5e-4),
     "all pairs as if independent": (
         {"model": "distance-rotation", "pairing": Pairing("all"), "pair_errors": "independent"},
-        0.0,
+        5e-4,
     ),
-    "poses, much joint noise": ({"model": "pose", "frame": "unknown"}, 0.03),
     "joint values estimated": ({"model": "distance-rotation", "encoder": "estimated"}, 0.03),
 }
 
 
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("name", EXPANDED)
-def test_the_expanded_graph_has_the_same_optimum(name):
-    options, sigma_joint = EXPANDED[name]
-    rng = np.random.default_rng(4)
-    robot = paper_robot(TOLERANCE)
+@pytest.mark.parametrize("name", SHARED)
+def test_optimum_and_marginals_are_those_of_gtsam_on_the_graph(name):
+    """One factor a measurement, error variables where measurements share errors: to 1e-6 sigma, and sigmas to 1e-6."""
+    options, sigma_joint = SHARED[name]
+    rng, robot = np.random.default_rng(4), paper_robot(TOLERANCE)
     m = measure(true_robot(robot, rng), 14, rng, sigma_joint=sigma_joint)
     solution = solve(build_problem(robot, m, **options))
-    problem = solution.problem  # its rows are whitened at the estimate
-    graph, initial = expand(problem)
-    n_measurements = sum(part.block.n for rows in problem.rows for part in rows.parts)
-    shared = [rows for rows in problem.rows if rows.shared is not None]
-    n_errors = sum(len(rows.configurations) for rows in shared)
-    assert bool(shared) == (name in ("star", "chain, joint noise", "joint values estimated"))
-    assert graph.size() == n_measurements + n_errors + len(prior_factors(problem.variables))
-    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, initial, levenberg_marquardt_params())
-    values = optimizer.optimize()
-    assert graph.error(values) == pytest.approx(solution.cost, rel=1e-9)
-    sigma = np.sqrt(np.diag(assess(solution).spread.tangent))
-    off = problem.variables.step(solution.values, values) / sigma
-    assert np.abs(off).max() < 1e-4  # where GTSAM stops
+    problem = relinearized_at(solution.problem, solution.parameters)
+    graph, variables = problem.graph, problem.variables
+    factors = [graph.at(i) for i in range(graph.size())]
+    n_pairs = sum(isinstance(factor, DistanceFactor) for factor in factors)
+    assert n_pairs == (0 if "poses" in name else problem.n_pairs)
+    if options["model"] == "distance-rotation":
+        assert sum(isinstance(factor, RotationAngleFactor) for factor in factors) == n_pairs
+    letters = {chr(gtsam.symbolChr(key)) for key in graph.keyVector()}
+    assert ("E" in letters) == (name not in ("poses", "poses, joint noise", "all pairs as if independent"))
+    parameters = levenberg_marquardt_params()
+    values = gtsam.LevenbergMarquardtOptimizer(graph, problem.initial, parameters).optimize()
+    assert graph.error(values) == pytest.approx(solution.weighted_cost, rel=1e-9)
+    assert graph.error(solution.values) == pytest.approx(solution.weighted_cost, rel=1e-6)
+    system = linear_system(solution.problem, solution.parameters)
+    sigma = np.sqrt(np.diag(system.covariance))
+    ours = variables.values(solution.parameters)
+    assert np.abs(variables.step(ours, values) / sigma).max() < 1e-6
+    marginals = gtsam.Marginals(graph, values)
+    for v in variables.items:
+        theirs = marginals.marginalCovariance(v.key)
+        np.testing.assert_allclose(np.sqrt(np.diag(theirs)), sigma[v.columns], rtol=1e-6)
 
 
-def test_the_expanded_graph_can_be_solved_incrementally():
+def test_the_graph_can_be_solved_incrementally():
     rng = np.random.default_rng(5)
     robot = paper_robot(TOLERANCE)
     solution = solve(build_problem(robot, measure(true_robot(robot, rng), 12, rng), model="distance-rotation"))
-    graph, initial = expand(solution.problem)
+    graph, initial = solution.problem.graph, solution.problem.initial
     params = gtsam.ISAM2Params()
     params.setFactorization("QR")
     params.relinearizeSkip = 1
@@ -288,36 +277,26 @@ def test_the_expanded_graph_can_be_solved_incrementally():
     assert graph.error(isam.calculateBestEstimate()) == pytest.approx(solution.cost, rel=1e-6)
 
 
-@pytest.mark.slow
-def test_pair_factors_by_name_are_the_rows_of_a_table():
-    """Against the problem that the same pairs make as a table; and usable with GTSAM's marginals."""
-    rng = np.random.default_rng(6)
-    robot = paper_robot(TOLERANCE)
-    true = true_robot(robot, rng)
-    m = measure(true, 40, rng)
-    at, a, b = pose(true, m.readings), np.arange(39), np.arange(1, 40)
-    distance = np.linalg.norm(at.position[b] - at.position[a], axis=1)
-    angle = rotation_angle(np.swapaxes(at.rotation[a], 1, 2) @ at.rotation[b])[0]
-    sigma = (np.full(39, 1e-3), np.full(39, 2e-4))
-    pairs = Pairs(a, b, distance, angle, *sigma, np.zeros(39, bool))
-    whole = build_problem(robot, replace(m, pairs=pairs), model="distance-rotation")
-    graph = gtsam.NonlinearFactorGraph()
-    for factor in prior_factors(whole.variables):
-        graph.add(factor)
-    for i in range(39):
-        ends = m.readings[a[i]], m.readings[b[i]]
-        graph.add(DistanceFactor(whole.variables, *ends, distance[i], 1e-3))
-        graph.add(RotationAngleFactor(whole.variables, *ends, angle[i], 2e-4))
-    # The rows of a table know that noise lengthens distances near 0: a millionth of their chi-square here.
-    assert graph.error(whole.initial) == pytest.approx(whole.graph.error(whole.initial), rel=1e-5)
-    solution = solve(whole)
-    values = gtsam.LevenbergMarquardtOptimizer(graph, whole.initial, levenberg_marquardt_params()).optimize()
-    sigmas = np.sqrt(np.diag(assess(solution).spread.tangent))
-    assert np.abs(whole.variables.step(solution.values, values) / sigmas).max() < 1e-2
-    key = gtsam.symbol("K", 3)
-    ours = sigmas[next(v.columns for v in whole.variables.items if v.key == key)]
-    theirs = np.sqrt(np.diag(gtsam.Marginals(graph, values).marginalCovariance(key)))
-    assert ours == pytest.approx(theirs, rel=1e-3)
+def test_a_factor_on_an_error_variable_is_refused():
+    rng, robot = np.random.default_rng(5), small_arm({"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3})
+    problem = build_problem(robot, measure(robot, 8, rng), model="distance")
+    key = next(key for key in problem.graph.keyVector() if chr(gtsam.symbolChr(key)) == "E")
+    problem.graph.add(
+        gtsam.PriorFactorVector(key, problem.initial.atVector(key), UNIT(problem.initial.atVector(key).size))
+    )
+    with pytest.raises(ProblemError, match=r"^problem\.graph: an added factor on the error variable E\d"):
+        solve(problem)
+
+
+def test_pair_factors_by_name_have_the_error_of_their_measurement():
+    problem = problem_of()
+    variables, values = problem.variables, problem.variables.values(problem.start)
+    at = forward(variables.chains[0].at(problem.start), problem.robot.trig(READINGS))
+    length = np.linalg.norm(at.position[1] - at.position[0])
+    angle = rotation_angle((at.rotation[0].T @ at.rotation[1])[None])[0][0]
+    factor = DistanceFactor(variables, *READINGS, length - 3e-3, 1e-3)
+    assert factor.error(values) == pytest.approx(0.5 * 3.0**2, rel=1e-9)
+    assert RotationAngleFactor(variables, *READINGS, angle + 2e-3, 1e-3).error(values) == pytest.approx(2.0, rel=1e-9)
 
 
 @pytest.mark.parametrize("figure", [np.nan, -1.0, "far"])
@@ -405,9 +384,9 @@ def fails(*_):
 
 UNIT = gtsam.noiseModel.Unit.Create
 DAMAGES = {
-    "emptied": (lambda p: p.graph.resize(0), "problem.graph: 0 of the problem's 6 factors, expected all of them, in "
+    "emptied": (lambda p: p.graph.resize(0), "problem.graph: 0 of the problem's 17 factors, expected all of them, in "
                 "their places"),
-    "longer": (lambda p: p.graph.resize(9), "problem.graph: None among its factors, expected factors"),
+    "longer": (lambda p: p.graph.resize(20), "problem.graph: None among its factors, expected factors"),
     "no start": (lambda p: p.initial.erase(K1), "problem.initial: no value of K(1), expected one for every variable of "
                  "the problem"),
     "no starts": (lambda p: p.initial.clear(), "problem.initial: no value of K(1), expected one for every variable of "
@@ -428,13 +407,12 @@ DAMAGES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("function", [solve, expand])
 @pytest.mark.parametrize("name", DAMAGES)
-def test_what_is_wrong_with_a_graph_is_said_in_one_line(name, function):
+def test_what_is_wrong_with_a_graph_is_said_in_one_line(name):
     damage, said = DAMAGES[name]
     problem = damaged(damage)
     with pytest.raises(ProblemError) as found:
-        function(problem)
+        solve(problem)
     assert str(found.value) == said
 
 
@@ -460,19 +438,8 @@ def test_a_derivative_that_is_nan_is_named():
             H[0] = np.full((1, 4), np.nan, order="F")
         return np.array([float(np.sum(values.atVector(K1)))])
 
-    with pytest.raises(SolverError, match=r"^a derivative of a factor that somebody added is not finite$"):
+    with pytest.raises(SolverError, match=r"^a residual or derivative is not finite$"):
         solve(damaged(custom(error)))
-
-
-def test_what_was_added_is_expanded_too():
-    def anchored(problem):
-        problem.graph.add(gtsam.PriorFactorVector(ANCHOR, np.ones(3), UNIT(3)))
-        problem.initial.insert(ANCHOR, np.zeros(3))
-
-    without, _ = expand(damaged(lambda _: None))
-    graph, initial = expand(damaged(anchored))
-    assert graph.size() == without.size() + 1
-    assert initial.exists(ANCHOR)
 
 
 def test_an_angle_is_at_most_half_a_turn():

@@ -1,0 +1,571 @@
+"""The variables of a calibration: which parameters are which GTSAM variable, and their priors as rows.
+
+| key | variable |
+|---|---|
+| `K(i)` | estimated parameters of joint i, a vector of just those |
+| `K(0)`, `K(n + 1)` | the same of the base, and of the tool, where not all six of its parameters are estimated |
+| `B(0)`, `T(0)` | the base frame, and the tool frame, as a Pose3 where all six are |
+| `X(t)` | world_T_base of table t as a Pose3, where its measurement frame is unknown |
+| `L(g)` | base_p of the physical point that group g touches, a Point3 |
+| `N(i)` | an unknown of a kind of measurement of one's own, a vector |
+
+The last two, and variables that somebody adds to the graph, are *nuisance* variables: they are estimated too, but not
+what a calibration is for. Their columns follow those of the *core* (robot and measurement frame) and are eliminated
+before anything is said of the core.
+
+Pose3's tangent is rotation first, and a step moves the frame in itself (`pose * Exp(step)`).
+
+Priors are rows (value - nominal) / tolerance. Of a Pose3 they act on x, y and z as they stand, and on its turn away
+from nominal, `Log(R_nominal^T R)`, whose components about the frame's own x, y and z axes take the tolerances of roll,
+pitch and yaw. The angles themselves would not do: at a pitch of a quarter turn they are no coordinates.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from fg_calib.arrays import Brief
+from fg_calib.graph.error_states import State
+from fg_calib.measurements.landmarks import Landmarks
+from fg_calib.robot.kinematics import Chain, build_chain
+from fg_calib.robot.model import FRAME_KINDS, Parameter, Robot, names_of
+from fg_calib.robot.rotations import QUARTER_TURN, yaw_pitch_roll
+
+Floats = NDArray[np.float64]
+
+KEEP_ORDER = ("theta", "d", "a", "alpha", "beta", "x", "y", "z", "yaw", "pitch", "roll")
+"""Of parameters that only act together the earlier kind is kept, and of one kind the later joint, as in the paper."""
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One GTSAM variable.
+
+    Attributes:
+        key: GTSAM's key.
+        symbol: How it is written: `K(3)`, `T(0)`, `X(0)`.
+        kind: A vector of parameters, the pose of tool, base or measurement frame, an unknown of the measurements such
+            as a touched point, or somebody's own: of any of GTSAM's types, its parameters are tangent coordinates at
+            its start.
+        parameters: Indices into the parameter vector of `Variables.parameters`, in the variable's own order;
+            for poses in the order of `FRAME_KINDS`.
+        columns: Its columns in a Jacobian.
+        scales: Of a nuisance variable: a change of ordinary size in each of its columns.
+        prior: Of a nuisance variable: where it was said to be, and 1 sigma of that; None where nothing was.
+    """
+
+    key: int
+    symbol: str
+    kind: Literal["vector", "tool", "base", "frame", "unknown", "own"]
+    parameters: tuple[int, ...]
+    columns: slice
+    scales: tuple[float, ...] = ()
+    prior: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+
+    @cached_property
+    def places(self) -> NDArray[np.int64]:
+        """`parameters` to index with."""
+        return np.array(self.parameters, dtype=np.int64)
+
+    @property
+    def number(self) -> int:
+        """Number in its symbol: of a measurement frame that of its table."""
+        return int(gtsam.symbolIndex(self.key))
+
+    @property
+    def letter(self) -> str:
+        """Letter of its symbol."""
+        return chr(gtsam.symbolChr(self.key))
+
+    @property
+    def is_pose(self) -> bool:
+        """Whether it is a Pose3; else it is a vector."""
+        return self.kind in ("tool", "base", "frame")
+
+
+@dataclass(frozen=True)
+class Variables(Brief):
+    """All variables of a problem, and the way between GTSAM's values and the parameter vector.
+
+    The parameter vector has the robot's parameters, then six for each unknown measurement frame (at least one) in the
+    order of `FRAME_KINDS`, then the values of the nuisance variables.
+
+    Attributes:
+        robot: The robot, nominal.
+        items: The core variables in the order of their columns.
+        names: Name of each estimated scalar, shape (n_columns,): a parameter's, or `frame.x` ... `frame.yaw` (with the
+            table's number, if several frames are unknown). Of a pose the names stand in `FRAME_KINDS`' order although
+            its columns are tangent directions.
+        chains: The kinematic chain with these columns from the measurement frame of each table.
+        priors: Whether the robot's tolerances are priors.
+        nuisance: The nuisance variables; their columns follow those of the core.
+        coordinates: Of the measurements' unknown coordinates, where each stands in the parameter vector; -1 for those
+            that are not estimated.
+        own: Start of the variables that somebody added.
+    """
+
+    robot: Robot
+    items: tuple[Variable, ...]
+    names: tuple[str, ...]
+    chains: tuple[Chain, ...]
+    priors: bool
+    nuisance: tuple[Variable, ...] = ()
+    coordinates: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    others: Floats = field(default_factory=lambda: np.zeros(0))
+    own: gtsam.Values = field(default_factory=gtsam.Values, compare=False)
+
+    @property
+    def n_columns(self) -> int:
+        """Number of columns of the core's Jacobian: the dimension of its tangent space."""
+        return len(self.names)
+
+    @property
+    def n_nuisance(self) -> int:
+        """Number of columns of the nuisance variables."""
+        return sum(len(v.parameters) for v in self.nuisance)
+
+    @property
+    def keys(self) -> list[int]:
+        """GTSAM's keys in the order of the columns, the core's first."""
+        return [v.key for v in self.items + self.nuisance]
+
+    @property
+    def robot_span(self) -> slice:
+        """Where the robot's parameters stand in the parameter vector."""
+        return slice(0, len(self.robot.parameters))
+
+    @property
+    def frames(self) -> tuple[Variable, ...]:
+        """The unknown measurement frames."""
+        return tuple(v for v in self.items if v.kind == "frame")
+
+    @property
+    def frame_span(self) -> slice:
+        """Where the measurement frames' values stand in the parameter vector."""
+        first = len(self.robot.parameters)
+        return slice(first, first + 6 * max(1, len(self.frames)))
+
+    @property
+    def nuisance_span(self) -> slice:
+        """Where the nuisance values stand in the parameter vector."""
+        return slice(self.frame_span.stop, self.frame_span.stop + self.n_nuisance)
+
+    @property
+    def n_robot_columns(self) -> int:
+        """Number of columns without the measurement frames', which come last."""
+        return self.n_columns - 6 * len(self.frames)
+
+    @cached_property
+    def scales(self) -> Floats:
+        """A change of ordinary size in each column (see `Robot.scale_of`), shape (n_columns,)."""
+        angle, length = self.robot.scale_of("rad"), self.robot.scale_of("m")
+        scales = np.repeat([angle, length], 3)
+        parts = [
+            scales
+            if v.is_pose
+            else np.array([length if self.robot.parameters[i].unit == "m" else angle for i in v.parameters])
+            for v in self.items
+        ]
+        return np.concatenate([np.zeros(0), *parts])
+
+    @cached_property
+    def prior_scales(self) -> Floats:
+        """`scales`, but where there is a prior its sigma: how far each column may be off, shape (n_columns,)."""
+        scales = self.scales.copy()
+        for v in self.items if self.priors else ():
+            if v.kind != "frame":
+                order = [v.parameters[i] for i in _ALONG_TANGENT] if v.is_pose else v.parameters
+                tolerance = [self.robot.parameters[i].tolerance for i in order]
+                stated = np.array([t is not None for t in tolerance])
+                scales[v.columns] = np.where(stated, np.array(tolerance, dtype=np.float64), scales[v.columns])
+        return scales
+
+    @property
+    def all_scales(self) -> Floats:
+        """`scales`, then those of the nuisance columns, shape (n_columns + n_nuisance,)."""
+        return np.concatenate([self.scales, *(v.scales for v in self.nuisance)])
+
+    @cached_property
+    def stated(self) -> dict[str, tuple[list[int], Floats]]:
+        """Of each core variable, by its symbol: which of its parameters have a prior, and 1 / sigma of these."""
+        found = {}
+        for v in self.items:
+            of_v = () if v.kind == "frame" or not self.priors else v.parameters
+            tolerances = [self.robot.parameters[i].tolerance for i in of_v]
+            weights = np.array([1.0 / t for t in tolerances if t is not None])
+            found[v.symbol] = [k for k, t in enumerate(tolerances) if t is not None], weights
+        return found
+
+    def nominal(self) -> Floats:
+        """The parameter vector at the robot's nominal values, measurement frame and nuisance values zero."""
+        return self._nominal.copy()
+
+    @cached_property
+    def _nominal(self) -> Floats:
+        return np.concatenate([self.robot.nominal, np.zeros(self.nuisance_span.stop - len(self.robot.parameters))])
+
+    def values(self, parameters: Floats) -> gtsam.Values:
+        """GTSAM's values at a parameter vector."""
+        values, off = gtsam.Values(), gtsam.VectorValues()
+        for v in self.items + self.nuisance:
+            chosen = parameters[v.places]
+            if v.kind == "own":
+                off.insert(v.key, chosen)
+            else:
+                values.insert(v.key, pose_of(chosen) if v.is_pose else chosen)
+        if off.size():
+            values.insert(self.own.retract(off))
+        return values
+
+    def parameters(self, values: gtsam.Values, only: Sequence[Variable] | None = None) -> Floats:
+        """The parameter vector at GTSAM's values; what is not a variable (or not in `only`) keeps its nominal value."""
+        parameters = self.nominal()
+        for v in self.items + self.nuisance if only is None else only:
+            of_v = v.places
+            if v.kind == "own":
+                parameters[of_v] = local_coordinates(self.own, values, v.key)
+            elif v.is_pose:
+                near = None if v.kind == "frame" else parameters[of_v]
+                parameters[of_v] = frame_of(values.atPose3(v.key), near)
+            else:
+                parameters[of_v] = values.atVector(v.key)
+        return parameters
+
+    def stepped(self, parameters: Floats, step: Floats) -> Floats:
+        """The parameter vector after a tangent step of the core, shape (n_columns,)."""
+        after = parameters.copy()
+        for v in self.items:
+            of_v, part = v.places, step[v.columns]
+            if not v.is_pose:
+                after[of_v] += part
+            elif part.any():
+                after[of_v] = frame_of(pose_of(parameters[of_v]).retract(part), parameters[of_v])
+        return after
+
+    def step(self, start: gtsam.Values, end: gtsam.Values) -> Floats:
+        """The tangent step from some values to others, shape (n_columns + n_nuisance,)."""
+        return np.concatenate(
+            [
+                local_coordinates(start, end, v.key)
+                if v.kind == "own"
+                else gtsam.Pose3.Logmap(start.atPose3(v.key).between(end.atPose3(v.key)))
+                if v.is_pose
+                else end.atVector(v.key) - start.atVector(v.key)
+                for v in self.items + self.nuisance
+            ]
+        )
+
+    def moved(self, values: gtsam.Values, step: Floats) -> gtsam.Values:
+        """Some values after a tangent step, shape (n_columns + n_nuisance,)."""
+        delta = gtsam.VectorValues()
+        for v in self.items + self.nuisance:
+            delta.insert(v.key, step[v.columns])
+        return values.retract(delta)
+
+    def with_unknowns(self, unknowns: Landmarks, estimated: NDArray[np.bool_]) -> Variables:
+        """The same with the measurements' unknowns as nuisance variables, those that are estimated."""
+        column, place = self.n_columns + self.n_nuisance, self.nuisance_span.stop
+        coordinates: list[int] = []
+        more: list[Variable] = []
+        taken = {v.symbol for v in self.items}  # the base has the letter of boards
+        for index, (letter, size) in enumerate(zip(unknowns.letters, unknowns.sizes, strict=True)):
+            if not estimated[index]:
+                coordinates += [-1] * size
+                continue
+            parameters = tuple(range(place, place + size))
+            number = len(unknowns.letters) if f"{letter}({index})" in taken else index
+            symbol, scales = f"{letter}({number})", tuple(map(self.robot.scale_of, unknowns.units[index]))
+            key, columns = gtsam.symbol(letter, number), slice(column, column + size)
+            tolerance, prior = unknowns.tolerances[index], None
+            if tolerance is not None:
+                prior = (tuple(unknowns.starts[index].tolist()), size * (tolerance,))
+            more.append(Variable(key, symbol, "unknown", parameters, columns, scales, prior))
+            coordinates += parameters
+            column, place = column + size, place + size
+        others = np.nan_to_num(np.concatenate([np.zeros(0), *unknowns.starts]))
+        found = np.array(coordinates, dtype=np.int64)
+        return replace(self, nuisance=self.nuisance + tuple(more), coordinates=found, others=others)
+
+    def at(self, parameters: Floats, fallback: Floats | None = None) -> State:
+        """The arm and the measurements' unknowns at a parameter vector.
+
+        Args:
+            parameters: The parameter vector.
+            fallback: Values of the unknown coordinates that are not estimated; `others` if None.
+        """
+        estimated = self.coordinates >= 0
+        others = self.others if fallback is None else fallback
+        columns = np.where(estimated, self.coordinates - self.nuisance_span.start + self.n_columns, -1)
+        values = np.where(estimated, parameters[self.coordinates], others)
+        chains = tuple(chain.at(parameters) for chain in self.chains)
+        return State(chains, values, columns, self.n_columns, self.n_nuisance)
+
+    def without_own(self) -> Variables:
+        """The same without somebody's own variables."""
+        return replace(self, nuisance=tuple(v for v in self.nuisance if v.kind != "own"), own=gtsam.Values())
+
+    def with_own(self, start: gtsam.Values) -> Variables:
+        """The same with somebody's own variables, of any type, by their start."""
+        variables = self
+        for key in list(start.keys()):
+            n, place, symbol = only_key(start, key).dim(), variables.nuisance_span.stop, str(gtsam.Symbol(key)).strip()
+            column = variables.n_columns + variables.n_nuisance
+            parameters, columns = tuple(range(place, place + n)), slice(column, column + n)
+            added = Variable(key, symbol, "own", parameters, columns, scales=(1.0,) * n)
+            variables = replace(variables, nuisance=(*variables.nuisance, added))
+        return replace(variables, own=start)
+
+    def columns_of(self, fewer: Variables, parameters: Floats) -> Floats:
+        """What each column of the variables of fewer of the parameters is in these, shape (n_columns, fewer.n_columns).
+
+        Args:
+            fewer: Those.
+            parameters: The parameter vector, of either.
+        """
+        by_name = dict(zip(self.names, self.tangent_derivative(parameters).T, strict=True))
+        poses = {v.key: np.eye(self.n_columns)[v.columns] for v in self.items if v.is_pose}
+        rows = [poses.get(v.key, np.array([by_name[name] for name in fewer.names[v.columns]])) for v in fewer.items]
+        return np.vstack([np.zeros((0, self.n_columns)), *rows]).T
+
+    def named_derivative(self, parameters: Floats) -> Floats:
+        """Derivative of the named scalars in the columns, shape (n_columns, n_columns).
+
+        The identity but for poses, where it maps the tangent (rotation first) to x, y, z, yaw, pitch, roll.
+
+        Note:
+            At a pitch of a quarter turn roll and yaw have no derivative; their rows are then nan.
+        """
+        D = np.eye(self.n_columns)
+        for v in self.items:
+            if v.is_pose:
+                D[v.columns, v.columns] = _frame_derivative(parameters[v.places])
+        return D
+
+    def tangent_derivative(self, parameters: Floats) -> Floats:
+        """Derivative of the columns in the named scalars: the inverse of `named_derivative`, finite everywhere.
+
+        At a pitch of a quarter turn it is singular: there roll and yaw turn a frame about the same axis.
+        """
+        E = np.eye(self.n_columns)
+        for v in self.items:
+            if v.is_pose:
+                E[v.columns, v.columns] = _tangent_derivative(parameters[v.places])
+        return E
+
+    def describe(self, key: int) -> str:
+        """A key in words: `K(3) (a3, alpha3, d3)`."""
+        for v in self.items + self.nuisance:
+            if v.key == key:
+                kind = "point" if v.symbol.startswith("L(") else v.kind
+                return f"{v.symbol} ({', '.join(self.names[v.columns]) or kind})"
+        return str(gtsam.Symbol(key))
+
+
+def build_variables(robot: Robot, frames: Sequence[bool], priors: bool = True) -> Variables:
+    """The variables of a robot's estimated parameters, and of the measurement frames that are unknown.
+
+    Args:
+        robot: The robot.
+        frames: Of each table, whether its measurement frame is unknown.
+        priors: Whether the robot's tolerances are priors.
+    """
+    items: list[Variable] = []
+    names: list[str] = []
+    columns: dict[int, int] = {}
+    tool_tangent = base_tangent = None
+    for owner in range(robot.n_joints + 2):
+        owned = robot.owned_by(owner)
+        chosen = [i for i in owned if robot.parameters[i].estimated]
+        if not chosen:
+            continue
+        first = len(names)
+        names += names_of(robot.parameters[i] for i in chosen)
+        span = slice(first, len(names))
+        if owner == robot.n_joints + 1 and len(chosen) == 6:
+            tool_tangent = first
+            items.append(Variable(gtsam.symbol("T", 0), "T(0)", "tool", tuple(chosen), span))
+        elif owner == 0 and len(chosen) == 6:
+            base_tangent = first
+            items.append(Variable(gtsam.symbol("B", 0), "B(0)", "base", tuple(chosen), span))
+        else:
+            columns |= {i: first + k for k, i in enumerate(chosen)}
+            items.append(Variable(gtsam.symbol("K", owner), f"K({owner})", "vector", tuple(chosen), span))
+    place, tangents = len(robot.parameters), {}
+    for table in np.flatnonzero(frames).tolist():
+        tangents[table] = (len(names), place)
+        prefix = "frame" if sum(frames) == 1 else f"frame{table + 1}"
+        span = slice(len(names), len(names) + 6)
+        names += [f"{prefix}.{kind}" for kind in FRAME_KINDS]
+        key = gtsam.symbol("X", table)
+        items.append(Variable(key, f"X({table})", "frame", tuple(range(place, place + 6)), span))
+        place += 6
+    chains = []
+    for table in range(len(frames)):
+        tangent, source = tangents.get(table, (None, 0))
+        chain = build_chain(
+            robot,
+            columns,
+            tool_tangent=tool_tangent,
+            base_tangent=base_tangent,
+            frame_tangent=tangent,
+            frame=tangent is not None,
+        )
+        moved = np.where(
+            chain.source >= len(robot.parameters), chain.source - len(robot.parameters) + source, chain.source
+        )
+        chains.append(replace(chain, source=moved, n_columns=len(names)))
+    return Variables(robot, tuple(items), tuple(names), tuple(chains), priors)
+
+
+def only_key(values: gtsam.Values, key: int) -> gtsam.Values:
+    """The value of one key alone."""
+    one = gtsam.Values(values)
+    for other in list(values.keys()):
+        if other != key:
+            one.erase(other)
+    return one
+
+
+def local_coordinates(start: gtsam.Values, end: gtsam.Values, key: int) -> Floats:
+    """The tangent step from a variable's value to another, whatever its type."""
+    step: Floats = only_key(start, key).localCoordinates(only_key(end, key)).at(key)
+    return step
+
+
+def pose_of(frame: Floats) -> gtsam.Pose3:
+    """The pose of x, y, z, yaw, pitch, roll, [m] and [rad]."""
+    x, y, z, yaw, pitch, roll = (float(v) for v in frame)
+    return gtsam.Pose3(gtsam.Rot3.Ypr(yaw, pitch, roll), np.array([x, y, z]))
+
+
+def frame_of(pose: gtsam.Pose3, near: Floats | None = None) -> Floats:
+    """x, y, z, yaw, pitch, roll of a pose, [m] and [rad].
+
+    Args:
+        pose: The pose.
+        near: Of the angles that make the same rotation those nearest to the angles of this frame, in the same order,
+            are taken; those within half a turn and a quarter turn of pitch if None.
+    """
+    angles = yaw_pitch_roll(pose.rotation().matrix(), None if near is None else np.asarray(near)[3:])
+    return np.concatenate([pose.translation(), angles])
+
+
+def corrections_of(robot: Robot, values: Floats) -> Floats:
+    """Parameter values minus a robot's nominal ones, shape (n_parameters,), [m] and [rad].
+
+    Angles of a frame (base, tool, origins of a URDF's joints) by the shorter way. Near a pitch of a quarter turn yaw
+    and roll change by much where the frame has turned by little; if they change by more than twice what it has turned,
+    its turn about its own z, y and x axes stands in place of the differences of yaw, pitch and roll.
+    """
+    off = values - robot.nominal
+    for owner in range(robot.n_joints + 2):
+        frame = [i for i in robot.owned_by(owner) if robot.parameters[i].kind in FRAME_KINDS]
+        if len(frame) == 6:
+            angles = frame[3:]
+            off[angles] = np.remainder(off[angles] + np.pi, 2.0 * np.pi) - np.pi
+            R = pose_of(robot.nominal[frame]).rotation()
+            turn = gtsam.Rot3.Logmap(R.between(pose_of(values[frame]).rotation()))
+            if np.abs(off[angles]).max() > 2.0 * np.linalg.norm(turn):
+                off[angles] = turn[::-1]
+    return off
+
+
+_ALONG_TANGENT = (5, 4, 3, 0, 1, 2)
+"""Which of `FRAME_KINDS` goes with each direction of a pose's tangent: roll, pitch, yaw with turns about x, y, z."""
+
+
+def _frame_derivative(frame: Floats) -> Floats:
+    """Derivative of x, y, z, yaw, pitch, roll in Pose3's tangent (rotation first, in itself), shape (6, 6)."""
+    pitch, roll = frame[4], frame[5]
+    secant = 1.0 / np.cos(pitch) if abs(np.cos(pitch)) > QUARTER_TURN else np.nan
+    D = np.zeros((6, 6))
+    D[:3, 3:] = pose_of(frame).rotation().matrix()
+    # Body rates of Rz(yaw) Ry(pitch) Rx(roll), solved for the angles' rates.
+    D[3, :3] = [0.0, np.sin(roll) * secant, np.cos(roll) * secant]
+    D[4, :3] = [0.0, np.cos(roll), -np.sin(roll)]
+    D[5, :3] = [1.0, np.sin(roll) * np.sin(pitch) * secant, np.cos(roll) * np.sin(pitch) * secant]
+    return D
+
+
+def _tangent_derivative(frame: Floats) -> Floats:
+    """Derivative of Pose3's tangent (rotation first, in itself) in x, y, z, yaw, pitch, roll, shape (6, 6)."""
+    pitch, roll = frame[4], frame[5]
+    E = np.zeros((6, 6))
+    E[3:, :3] = pose_of(frame).rotation().matrix().T
+    # Body rates of Rz(yaw) Ry(pitch) Rx(roll).
+    E[0, 3:] = [-np.sin(pitch), 0.0, 1.0]
+    E[1, 3:] = [np.cos(pitch) * np.sin(roll), np.cos(roll), 0.0]
+    E[2, 3:] = [np.cos(pitch) * np.cos(roll), -np.sin(roll), 0.0]
+    return E
+
+
+def prior_rows(variables: Variables, parameters: Floats, only: Variable | None = None) -> tuple[Floats, Floats]:
+    """Whitened priors and their derivatives, shapes (n_priors,), (n_priors, n_columns): see the module's head.
+
+    Args:
+        variables: The variables.
+        parameters: The parameter vector.
+        only: The variable whose priors are wanted; all if None.
+    """
+    nominal = variables.nominal()
+    items = variables.items if only is None else (only,)
+    n = sum(len(variables.stated[v.symbol][0]) for v in items)
+    r, J, first = np.zeros(n), np.zeros((n, variables.n_columns)), 0
+    for v in items:
+        stated, weight = variables.stated[v.symbol]
+        if not stated:
+            continue
+        of_v, rows = v.places, slice(first, first + len(stated))
+        if v.is_pose:
+            off, D = _off_nominal(parameters[of_v], nominal[of_v])
+        else:
+            off, D = parameters[of_v] - nominal[of_v], np.eye(len(of_v))
+        r[rows], J[rows, v.columns], first = weight * off[stated], weight[:, None] * D[stated], rows.stop
+    return r, J
+
+
+def _off_nominal(frame: Floats, nominal: Floats) -> tuple[Floats, Floats]:
+    """How far a frame is from nominal, shape (6,), and the derivative in Pose3's tangent, shape (6, 6).
+
+    x, y, z less their nominal values, then the turn from nominal about its own z, y and x axes, [m] and [rad]. The
+    derivative of the turn r = Log(R_nominal^T R) is the inverse right Jacobian of SO(3) at r.
+    """
+    R = pose_of(frame).rotation()
+    turn = gtsam.Rot3.Logmap(pose_of(nominal).rotation().between(R))
+    D = np.zeros((6, 6))
+    D[:3, 3:] = R.matrix()
+    D[3:, :3] = gtsam.Rot3.LogmapDerivative(turn)[::-1]
+    return np.concatenate([frame[:3] - nominal[:3], turn[::-1]]), D
+
+
+def unknown_prior_rows(variables: Variables, parameters: Floats) -> tuple[Floats, Floats]:
+    """Whitened priors of the measurements' unknowns and their derivatives, shapes (n,), (n, n_columns + n_nuisance)."""
+    r, J = [np.zeros(0)], [np.zeros((0, variables.n_columns + variables.n_nuisance))]
+    for v in variables.nuisance:
+        if v.prior is not None:
+            mean, sigma = (np.array(figures) for figures in v.prior)
+            rows = np.zeros((len(sigma), variables.n_columns + variables.n_nuisance))
+            rows[:, v.columns] = np.diag(1.0 / sigma)
+            r.append((parameters[v.places] - mean) / sigma)
+            J.append(rows)
+    return np.concatenate(r), np.vstack(J)
+
+
+def preference(parameter: Parameter, prefer: Sequence[str]) -> int:
+    """Rank in the order of keeping, 0 first: the user's choice, then base and tool, then `KEEP_ORDER`.
+
+    Base and tool are estimated only where the user asks for it, and may be far from nominal.
+    """
+    if parameter.name in prefer:
+        return list(prefer).index(parameter.name)
+    if parameter.name.startswith(("base.", "tool.")):
+        return len(prefer)
+    return len(prefer) + 1 + KEEP_ORDER.index(parameter.kind)
