@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from fg_calib.arrays import FrozenArrays, as_floats
@@ -227,15 +226,14 @@ def _reach(
 
 
 class Thinning:
-    """Takes configurations one after another, each that is not near one taken before."""
+    """Takes configurations one after another, each that is not near one taken before.
+
+    Args:
+        robot: Whose configurations they are.
+        apart: Least distance of two, as `Conditions` has it; None: any.
+    """
 
     def __init__(self, robot: Robot, apart: float | None) -> None:
-        """Begin with none taken.
-
-        Args:
-            robot: Whose configurations they are.
-            apart: Least distance of two, as `Conditions` has it; None: any.
-        """
         self._apart = apart
         self._unit = np.array([robot.reach if joint.prismatic else 1.0 for joint in robot.joints])
         self._taken = np.empty((0, robot.n_joints))
@@ -245,27 +243,10 @@ class Thinning:
         near = np.zeros(len(readings), dtype=np.bool_)
         if self._apart is None:
             return near
-        first = 0
-        while first < len(readings):  # in parts: all pairs of very many would not fit into memory
-            part = slice(first, first + max(1024, len(self._taken) // 4))
-            near[part] = self._near(readings[part] / self._unit, self._apart)
-            first = part.stop
-        return near
-
-    def _near(self, scaled: Floats, apart: float) -> Booleans:
-        near = np.zeros(len(scaled), dtype=np.bool_)
-        if len(self._taken):
-            distance, _ = KDTree(self._taken).query(scaled, p=np.inf, distance_upper_bound=apart)
-            near = np.isfinite(distance)
-        rows = np.flatnonzero(~near)
-        closer = np.nextafter(apart, 0.0)  # less than `apart`, as the query above has it
-        pairs = KDTree(scaled[rows]).query_pairs(closer, p=np.inf, output_type="ndarray").reshape(-1, 2)
-        i, j = rows[pairs[np.argsort(pairs[:, 0], kind="stable")]].T  # i < j
-        before, start, n_behind = np.unique(i, return_index=True, return_counts=True)
-        for one, first, last in zip(before.tolist(), start.tolist(), (start + n_behind).tolist(), strict=True):
-            if not near[one]:
-                near[j[first:last]] = True
-        self._taken = np.concatenate([self._taken, scaled[~near]])
+        for k, q in enumerate(readings / self._unit):
+            near[k] = bool(np.any(np.abs(self._taken - q).max(axis=1) < self._apart))
+            if not near[k]:
+                self._taken = np.vstack([self._taken, q])
         return near
 
 
