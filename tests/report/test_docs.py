@@ -311,17 +311,6 @@ def exports_an_arm(code, folder, fg_calib):
     assert read_robot(folder / "arm_hayati.yaml").n_joints == 2
 
 
-def are_instruments(text, folder, fg_calib):
-    joints = [{"a": 0.3, "alpha": 0.1 * k, "d": 0.1, "theta": 0} for k in range(6)]
-    plan = {"robot": {"name": "arm", "convention": "dh", "joints": joints}, "units": {"length": "mm", "angle": "deg"},
-            "errors": {"values": {}}, "configurations": {"random": {"count": 1}},
-            "noise": {"position": 1, "orientation": 1}}  # fmt: skip
-    (folder / "plan.yaml").write_text(yaml.safe_dump(plan))
-    (folder / "camera.yaml").write_text(text)
-    scenario = read_scenario(folder / "plan.yaml", instruments=folder / "camera.yaml")
-    assert [i.model for i in scenario.instruments] == ["pixels"]
-
-
 def designs_a_calibration(code, folder, fg_calib):
     exec(code, made := {})
     assert made["plan"].expected.position < made["plan"].random
@@ -370,7 +359,7 @@ HOW = {
     "from-bags-and-images": [are_typed, is_job, are_typed, is_board, is_board],
     "believe-it": [is_key_of_a_job],
     "correct": [are_typed, corrects_a_program],
-    "design": [are_typed, are_instruments, slow(designs_a_calibration)],
+    "design": [are_typed, slow(designs_a_calibration)],
     "predict": [are_typed, slow(predicts_an_arm)],
     "export": [are_typed, exports_an_arm],
     "next-month": [are_typed, slow(checks_and_updates)],
