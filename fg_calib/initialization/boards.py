@@ -53,12 +53,6 @@ LEAST_NOISE = 1e-6
 """What points may be off by without being far off, [sigma]."""
 
 
-def board_from_image(camera: Camera, image: Floats, sigma: Floats | None = None) -> Frame | None:
-    """camera_T_board from the image of a board's points: the best of `boards_from_image`; None if there is none."""
-    found = boards_from_image(camera, image, sigma)
-    return found[0][1] if found else None
-
-
 def boards_from_image(camera: Camera, image: Floats, sigma: Floats | None = None) -> list[tuple[float, Frame]]:
     """Every camera_T_board that explains the image of a board's points, the best first.
 

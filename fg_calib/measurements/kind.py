@@ -116,10 +116,6 @@ class Kind(ABC):
             return np.zeros((len(noise), 0))
         return self.rows(at, np.zeros((len(noise), self.width)), nuisances).residual + noise
 
-    def fields(self, data: Floats) -> dict[str, Floats]:
-        """Data by the names of the fields of `Measurements`; of kinds that no table has, nothing."""
-        return {}
-
     def mirrored(self, points: Floats, data: Floats, nuisances: Floats) -> Floats | None:
         """Nuisances of one landmark at its mirror image, which the same data may fit nearly as well; None of none.
 

@@ -4,11 +4,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fg_calib.initialization.boards import board_from_image, boards_from_image, undistorted
+from fg_calib.initialization.boards import boards_from_image, undistorted
 from fg_calib.measurements.kinds import Camera
 
 CAMERA = Camera(fx=900, fy=880, cx=640, cy=480)
 CORNERS = np.array([[0.08 * i, 0.08 * j] for i in range(4) for j in range(3)])
+
+
+def board_from_image(*arguments):
+    found = boards_from_image(*arguments)
+    return found[0][1] if found else None
 
 
 def image_of(rotation, place, noise=0.0, camera=CAMERA, corners=CORNERS):

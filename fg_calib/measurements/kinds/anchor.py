@@ -61,10 +61,6 @@ class AnchorDistance(Kind):
         """See `Kind.simulate`."""
         return np.abs(super().simulate(at, data, nuisances, noise))
 
-    def fields(self, data: Floats) -> dict[str, Floats]:
-        """See `Kind.fields`."""
-        return {"length": data[:, 0]}
-
     def mirrored(self, points: Floats, data: Floats, nuisances: Floats) -> Floats | None:
         """The anchor mirrored in the plane that its tool points are nearest to; None of few. See `Kind.mirrored`."""
         if len(points) < LEAST_LENGTHS:
@@ -90,10 +86,6 @@ class AnchorContact(Kind):
         D = np.zeros((n, 1, 3, 6))
         D[:, 0, :, 3:] = np.eye(3)
         return Rows(at.position[:, 0] - nuisances, D, np.tile(-np.eye(3), (n, 1, 1)))
-
-    def fields(self, data: Floats) -> dict[str, Floats]:
-        """See `Kind.fields`."""
-        return {"length": np.zeros(len(data))}
 
 
 class AnchorGauge(Instrument):

@@ -69,10 +69,6 @@ class BoardPose(Kind):
         shift = np.einsum("nij,nj->ni", R_T, nuisances[:, 3:] - at.position[:, 0]) + noise[:, 3:]
         return np.hstack([(error @ R_T @ board).reshape(-1, 9), shift])
 
-    def fields(self, data: Floats) -> dict[str, Floats]:
-        """See `Kind.fields`."""
-        return {"rotation": data[:, :9].reshape(-1, 3, 3), "position": data[:, 9:]}
-
 
 def board_coordinates(table: Table, landmarks: Landmarks) -> tuple[Integers, Integers]:
     """Which board each row is of, the only one where no column says, and the boards' coordinates, shape (n, 6)."""

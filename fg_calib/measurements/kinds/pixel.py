@@ -69,10 +69,6 @@ class Pixel(Kind):
         seen = np.hstack([np.zeros((len(data), 2)), data[:, 2:]])
         return np.hstack([self.rows(at, seen, nuisances).residual + noise, data[:, 2:]])
 
-    def fields(self, data: Floats) -> dict[str, Floats]:
-        """See `Kind.fields`."""
-        return {"image": data}
-
 
 class RoomPixel(Pixel):
     """Where a camera fixed in the room sees a point of a board on the tool, minus where it did, [px].

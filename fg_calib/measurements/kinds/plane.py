@@ -63,10 +63,6 @@ class PlaneDistance(Kind):
         N = np.concatenate([-tilt, tilt - n], axis=1)[:, None]
         return Rows(height[:, None] - data[:, :1], D, N)
 
-    def fields(self, data: Floats) -> dict[str, Floats]:
-        """See `Kind.fields`."""
-        return {"length": data[:, 0]}
-
     def mirrored(self, points: Floats, data: Floats, nuisances: Floats) -> Floats | None:
         """The plane with its normal the other way, shifted to where the readings are those from there, in the mean.
 

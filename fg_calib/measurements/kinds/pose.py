@@ -60,10 +60,6 @@ class Position(Kind):
         D[:, 0, :, 3:] = np.eye(3)
         return Rows(at.position[:, 0] - data[:, :3], D)
 
-    def fields(self, data: Floats) -> dict[str, Floats]:
-        """See `Kind.fields`."""
-        return {"position": data}
-
 
 class TargetPosition(Kind):
     """`p + R t - measured` in the frame that the chain starts in, [m]; its derivative is `dp + w x R t + R dt`.
@@ -81,10 +77,6 @@ class TargetPosition(Kind):
         D = np.zeros((len(data), 1, 3, 6))
         D[:, 0, :, :3], D[:, 0, :, 3:] = -cross_matrix(arm), np.eye(3)
         return Rows(at.position[:, 0] + arm - data[:, :3], D, R)
-
-    def fields(self, data: Floats) -> dict[str, Floats]:
-        """See `Kind.fields`."""
-        return {"position": data}
 
 
 class Orientation(Kind):
@@ -110,10 +102,6 @@ class Orientation(Kind):
     def simulate(self, at: Frames, data: Floats, nuisances: Floats, noise: Floats) -> Floats:
         """`R Exp(noise)`: errors about the tool's axes. See `Kind.simulate`."""
         return (at.rotation[:, 0] @ Rotation.from_rotvec(noise).as_matrix()).reshape(-1, 9)
-
-    def fields(self, data: Floats) -> dict[str, Floats]:
-        """See `Kind.fields`."""
-        return {"rotation": data.reshape(-1, 3, 3)}
 
 
 class PoseTracker(Instrument):

@@ -57,11 +57,6 @@ class Stacked(Kind):
         each = zip(self.parts, self._split(data), values, errors, strict=True)
         return np.hstack([part.simulate(at, *arguments) for part, *arguments in each])
 
-    def fields(self, data: Floats) -> dict[str, Floats]:
-        """See `Kind.fields`."""
-        each = zip(self.parts, self._split(data), strict=True)
-        return {name: values for part, own in each for name, values in part.fields(own).items()}
-
     def twins(self) -> Integers:
         """See `Kind.twins`; none at all if a part has none."""
         twins, row, column = [], 0, 0
