@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, StrictBool
+from pydantic import BeforeValidator, Field, StrictBool, create_model
 
 from fg_calib.arguments import checked
 from fg_calib.errors import InputError
@@ -22,7 +22,7 @@ from fg_calib.io.units import Units, UnitsOfFile, quantity
 from fg_calib.io.yaml import Count, FilePath, NotNegative, Number, Positive, Schema, Seed, read_yaml, shown, validate
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import Noise
-from fg_calib.measurements.kinds import Camera
+from fg_calib.measurements.kinds import GENERIC_COLUMNS, Camera
 from fg_calib.measurements.table import KnownPoint, Table
 from fg_calib.options import (
     LIMITED,
@@ -48,10 +48,11 @@ UNSTATED = Noise(position=1e-3, orientation=1e-3, distance=1e-3, angle=1e-3, poi
 """Where the noise starts from if it is to be estimated and nothing was stated."""
 
 _UNITS = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad", "point": "m"}
+_UNITS |= {name: column.si for name, column in GENERIC_COLUMNS.items()}
 """Units of the kinds of noise; that of joints is in the joint's unit, that of pixels in pixels."""
 
 
-class _Noise(Schema):
+class _NoiseOfFields(Schema):
     position: Positive | None = None
     orientation: Positive | None = None
     joint: Any = 0.0
@@ -60,6 +61,10 @@ class _Noise(Schema):
     point: Positive | None = None
     pixel: Positive | None = None
     estimate: StrictBool = False
+
+
+_GENERIC: dict[str, Any] = dict.fromkeys(GENERIC_COLUMNS, (Positive | None, None))
+_Noise = create_model("_Noise", __base__=_NoiseOfFields, **_GENERIC)
 
 
 class _OneJointNoise(Schema):
@@ -299,7 +304,7 @@ def _table(entry: _Entry, place: str, file: _Job, robot: Robot, path: Path, poin
         own, _ = _noise(entry.noise, units, robot, f"{place}: noise")
         if entry.noise == "estimate" or "estimate" in entry.noise:
             raise InputError(f"{place}: noise", "estimate in the entry of a table", "the key noise of the whole job")
-        noise = replace(noise, **{key: getattr(own, key) for key in entry.noise})
+        noise = noise.updated(**{key: own.get(key) for key in entry.noise})
     measurements = read_measurements(
         folder / entry.table,
         robot,
@@ -463,14 +468,14 @@ def _noise(given: object, units: Units, robot: Robot, place: str) -> tuple[Noise
         given = {"estimate": True}
     if given is not None and not isinstance(given, dict):
         raise InputError(place, f"found {shown(given)}", "a mapping of sigmas, or estimate")
-    file = validate(_Noise, given or {}, place)
+    file: Any = validate(_Noise, given or {}, place)
     stated: dict[str, Any] = {
         key: units.sigma(sigma, unit, f"{place}: {key}")
         for key, unit in _UNITS.items()
         if (sigma := getattr(file, key)) is not None
     }
     noise = Noise(joint=joint_noise(file.joint, units, robot, place), pixel=file.pixel)
-    noise = replace(noise, **stated)
+    noise = noise.updated(**stated)
     if not file.estimate:
         return noise, False
     missing = {f.name: getattr(UNSTATED, f.name) for f in fields(Noise)[:-1] if getattr(noise, f.name) is None}
