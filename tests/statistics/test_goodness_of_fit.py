@@ -541,3 +541,22 @@ def test_predicted_pairs_that_share_joint_noise_with_fitted_ones_have_their_cova
     assert np.max(apart / np.diag(A)) > 1.3
     assert predicted == pytest.approx(r / np.sqrt(np.diag(A)), abs=0.02)
     assert uncertainty.goodness.test.chi2 == pytest.approx(r @ np.linalg.solve(A, r), rel=0.02)
+
+
+def test_degrees_of_freedom_count_core_and_landmarks():
+    """Five points touched eight times: three coordinates each come off, and every parameter, for all have priors."""
+    rng = np.random.default_rng(31)
+    robot = small_arm(tolerance=TOLERANCE | {"tool": 5e-3}, estimate=TOOL_POINT)
+    true = true_robot(robot, rng)
+    problem = build_problem(robot, touch(true, corners(true, 5, rng), 8, rng), model="distance")
+    n_estimated = sum(p.estimated for p in robot.parameters)
+    assert problem.n_residuals == 5 * 8 * 3
+    assert assess(solve(problem)).fit.chi_square.dof == 5 * 8 * 3 + n_estimated - n_estimated - 5 * 3
+
+
+def test_estimated_noise_is_its_factor_times_the_specified_noise():
+    solution = estimate_noise(case("pose", small_arm(tolerance=TOLERANCE), np.random.default_rng(32), 40, 2.0))
+    for fit in assess(solution).fit.goodness.kinds:
+        assert fit.factor == factors_of(solution)[fit.kind]
+        assert fit.factor == pytest.approx(0.5, rel=0.4)
+        assert fit.seen_over_stated == pytest.approx(fit.factor, rel=1e-3)

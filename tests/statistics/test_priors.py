@@ -273,3 +273,18 @@ def test_two_rows_that_tell_no_tolerance_at_all_are_one_line(seed):
     with contextlib.suppress(SolverError):  # or it is calibrated, where rounding falls otherwise
         found = calibrate(robot, m, model="position", frame="unknown", estimate_tolerance="kind")
         assert np.isfinite(found.result.chi2)
+
+
+def test_a_correction_varies_by_what_the_data_take_off_its_prior_variance():
+    """Prior T and posterior s: the correction over T has the variance 1 - (s / T)^2."""
+    problem, _ = drawn_problem("pose", n=4)
+    found = assess(solve(problem))
+    by_name = {p.name: p for p in found.estimates.parameters}
+    priors = found.fit.priors
+    assert len(priors.names) == 16
+    for name, z, sigma in zip(priors.names, priors.z, priors.sigma, strict=True):
+        p = by_name[name]
+        assert z == pytest.approx(p.correction / p.prior_sigma, rel=1e-6)
+        assert sigma == pytest.approx(np.sqrt(1.0 - (p.sigma / p.prior_sigma) ** 2), rel=1e-6, abs=1e-6)
+    assert priors.chi2 == pytest.approx(np.sum(priors.z**2))
+    assert priors.expected == pytest.approx(np.sum(priors.sigma**2))
