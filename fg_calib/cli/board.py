@@ -56,7 +56,7 @@ def board(
     from fg_calib.importers.opencv import opencv
     from fg_calib.importers.views import fit_board
     from fg_calib.io.atomic import read_bytes, require_writable
-    from fg_calib.io.camera import read_camera, read_camera_of_images
+    from fg_calib.io.job import read_camera, read_camera_of_images
     from fg_calib.io.units import Units
 
     opencv()

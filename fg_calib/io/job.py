@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, fields, replace
+from dataclasses import MISSING, astuple, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,12 +14,23 @@ from pydantic import BeforeValidator, Field, StrictBool, create_model
 from fg_calib.arguments import checked
 from fg_calib.errors import InputError
 from fg_calib.io.atomic import exists, is_folder, noting_reads
-from fg_calib.io.camera import camera_of, read_camera
 from fg_calib.io.columns import Column
 from fg_calib.io.robot_file import read_robot, robot_from_mapping
 from fg_calib.io.tables import read_measurements, read_points
 from fg_calib.io.units import Units, UnitsOfFile, quantity
-from fg_calib.io.yaml import Count, FilePath, NotNegative, Number, Positive, Schema, Seed, read_yaml, shown, validate
+from fg_calib.io.yaml import (
+    Count,
+    FilePath,
+    NotNegative,
+    Number,
+    Positive,
+    Schema,
+    Seed,
+    read_yaml,
+    refuse_unknown_keys,
+    shown,
+    validate,
+)
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import Noise
 from fg_calib.measurements.kinds import GENERIC_COLUMNS, Camera
@@ -500,3 +511,59 @@ def joint_noise(given: object, units: Units, robot: Robot, place: str) -> tuple[
             words = " and ".join(f"{given} {units.name(unit)} for {name}" for unit, name in sorted(kinds.items()))
             _log.warning("%s: joint: %s is %s; a list has one figure a joint", place, given, words)
     return tuple(units.sigma(s, j.unit, f"{place}: joint") for s, j in zip(sigmas, robot.joints, strict=True))
+
+
+_INTRINSICS: dict[str, Any] = {f.name: (Number, ... if f.default is MISSING else f.default) for f in fields(Camera)}
+_PixelCount = Annotated[Count, Field(gt=0)]
+_CameraSigmas = Annotated[dict[str, NotNegative], BeforeValidator(refuse_unknown_keys(*_INTRINSICS))]
+_OF_IMAGES: dict[str, Any] = {"width": (_PixelCount | None, None), "height": (_PixelCount | None, None)}
+_OF_IMAGES |= {"sigma": (_CameraSigmas | None, None)}
+"""What a camera's file may say besides its intrinsics: the size of its images, and how well it is known."""
+
+_Camera = create_model("_Camera", __base__=Schema, **_INTRINSICS, **_OF_IMAGES)
+
+
+def read_camera(path: Path) -> Camera:
+    """A camera's intrinsics: fx, fy, cx, cy in pixels, and the distortion k1 k2 p1 p2 k3 of OpenCV.
+
+    Raises:
+        InputError: The file is missing or cannot be used.
+    """
+    return camera_of(read_yaml(path), path.name)
+
+
+def read_camera_of_images(path: Path, size: tuple[int, int]) -> Camera:
+    """`read_camera` of images of a size.
+
+    Args:
+        path: The file.
+        size: Width and height of the images, [px].
+
+    Raises:
+        InputError: The file cannot be used, or says that it is of images of another size.
+    """
+    given = read_yaml(path)
+    camera = camera_of(given, path.name)
+    for name, found in zip(("width", "height"), size, strict=True):
+        said = given.get(name)
+        if said is not None and said != found:
+            hint = "the intrinsics of other images would have to be scaled"
+            raise InputError(f"{path.name}: {name}", f"found {said}", f"{found} px as the images have", hint)
+    for name, most in zip(("cx", "cy"), size, strict=True):
+        if not 0.0 <= getattr(camera, name) <= most:
+            words = "%s: %s = %g px is outside the images of %d x %d px; is it the camera that took them?"
+            _log.warning(words, path.name, name, getattr(camera, name), *size)
+    return camera
+
+
+def camera_of(given: object, place: str) -> Camera:
+    """A camera from a mapping.
+
+    Raises:
+        InputError: It is no camera.
+    """
+    file = validate(_Camera, given, place)
+    try:
+        return Camera(**{f.name: getattr(file, f.name) for f in fields(Camera)})
+    except InputError as error:
+        raise InputError(error.place.replace("camera", place, 1), error.found, error.expected) from None

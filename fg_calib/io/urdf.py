@@ -180,7 +180,7 @@ def _check_spelling(joint: _UrdfJoint, place: str) -> None:
 def write_urdf(path: Path | str, robot: Robot) -> None:
     """Write the URDF the robot was read from with the origins of its moving joints at the nominal values.
 
-    Everything else is kept byte for byte: see `urdf_text`. A URDF has no place for base and tool: `write_robot` writes
+    Other elements and comments stay: see `urdf_text`. A URDF has no place for base and tool: `write_robot` writes
     them beside it.
 
     Raises:
@@ -206,9 +206,9 @@ _DECLARED = re.compile(r"""\ufeff?<\?xml[^>]*?\sencoding\s*=\s*["']([\w.-]+)["']
 
 
 def urdf_text(text: str, origins: Mapping[str, Mapping[str, float]], zeros: Mapping[str, float] | None = None) -> str:
-    """A URDF with other origins of some joints and nothing else changed: comments, blanks and quotes stay.
+    """A URDF with other origins of some joints; comments and other elements stay.
 
-    A figure of `<origin>` that is the one wanted but for `ROUNDING` stays, an attribute of such figures as written.
+    A number of `<origin>` that is the one wanted but for `ROUNDING` stays, an attribute of such numbers as written.
 
     Args:
         text: The URDF, as it was read.
@@ -216,86 +216,48 @@ def urdf_text(text: str, origins: Mapping[str, Mapping[str, float]], zeros: Mapp
         zeros: By joint what is to be added to its reading, [rad] or [m]: it is added to `rising` of the joint's
             `<calibration>`, which it gets if it has none.
     """
-    data = text.encode()
-    edits: list[tuple[int, int, str]] = []  # from, to, instead
-    for name, place in _places(data).items():
+    from lxml import etree
+
+    parser = etree.XMLParser(resolve_entities=False, load_dtd=False, no_network=True)
+    root = etree.fromstring(text.encode(encoding_of(text)), parser)
+    for joint in root.findall("joint"):
+        name = joint.get("name", "")
         if name in origins:
-            wanted = {attribute: [origins[name][kind] for kind in kinds] for attribute, kinds in _ORIGIN.items()}
-            edits += _edits(data, place, "origin", wanted)
+            _set(joint, "origin", {key: [origins[name][kind] for kind in kinds] for key, kinds in _ORIGIN.items()})
         if zeros is not None and abs(zeros.get(name, 0.0)) > ROUNDING:
-            before = _figures(_attributes(data, place.get("calibration")).get("rising", (0, 0, "0"))[2])
-            edits += _edits(data, place, "calibration", {"rising": [sum(before) + zeros[name]]})
-    for start, end, instead in sorted(edits, reverse=True):
-        data = data[:start] + instead.encode() + data[end:]
-    return data.decode()
+            rising = sum(_figures(_attribute(joint, "calibration", "rising", "0")))
+            _set(joint, "calibration", {"rising": [rising + zeros[name]]})
+    before, after = _PROLOGUE.match(text), _EPILOGUE.search(text)
+    written = etree.tostring(root, encoding="unicode", with_tail=False)
+    if "\r\n" in text:  # which every parser of XML reads as one newline
+        written = written.replace("\n", "\r\n")
+    return (before[0] if before else "") + written + (after[1] if after else "")
 
 
-def _places(data: bytes) -> dict[str, dict[str, int]]:
-    """Where the tags of each joint of a URDF in UTF-8 begin, and those of the first of its elements of each name.
-
-    The document was read before, and holds no entities.
-    """
-    from xml.parsers.expat import ParserCreate
-
-    parser = ParserCreate("utf-8")
-    found: dict[str, dict[str, int]] = {}
-    within: list[dict[str, int] | None] = []  # of each open element, the joint that it is
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        joint = found.setdefault(attributes.get("name", ""), {}) if len(within) == 1 and tag == "joint" else None
-        parent = within[-1] if within else None
-        for place in (joint, parent):
-            if place is not None:
-                place.setdefault(tag, parser.CurrentByteIndex)
-        within.append(joint)
-
-    def end(_: str) -> None:
-        within.pop()
-
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.Parse(data, True)
-    return found
+_PROLOGUE = re.compile(r"\ufeff?(?:\s|<\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>\[]*(?:\[[^\]]*\]\s*)?>)*", re.DOTALL)
+_EPILOGUE = re.compile(r"</robot\s*>((?:\s|<!--(?:(?!-->).)*-->|<\?(?:(?!\?>).)*\?>)*)\Z", re.DOTALL)
+"""What stands before and after the root element."""
 
 
-_TAG = re.compile(rb"""<[^\s/>]+((?:\s+[^\s=/>]+\s*=\s*(?:"[^"]*"|'[^']*'))*)\s*/?>""")
-_NAMED = re.compile(rb"""([^\s=]+)\s*=\s*("[^"]*"|'[^']*')""")
-
-
-def _attributes(data: bytes, tag: int | None) -> dict[str, tuple[int, int, str]]:
-    """By name where the values of the attributes of the tag at a place are, without quotes, and what they are."""
-    if tag is None or (read := _TAG.match(data, tag)) is None:
-        return {}
-    named = (found for found in _NAMED.finditer(data, read.start(1), read.end(1)))
-    return {n[1].decode(): (n.start(2) + 1, n.end(2) - 1, n[2][1:-1].decode()) for n in named}
-
-
-def _edits(
-    data: bytes, place: Mapping[str, int], tag: str, wanted: Mapping[str, Sequence[float]]
-) -> list[tuple[int, int, str]]:
-    """What to write where so that a joint's element has attributes with these figures; 0 is what is left out."""
-    present = _attributes(data, place.get(tag))
-    words, changed = {}, {}
-    for name, figures in wanted.items():
-        read = _figures(present[name][2]) if name in present else [0.0] * len(figures)
-        pairs = zip(read or [math.nan] * len(figures), figures, strict=True)
-        kept = [was if abs(was - figure) <= ROUNDING else float(figure) for was, figure in pairs]
+def _set(joint: Element, tag: str, wanted: Mapping[str, Sequence[float]]) -> None:
+    """Give a joint's element attributes with these numbers; 0 is what a missing one means."""
+    element = joint.find(tag)
+    words, changed = {}, []
+    for name, numbers in wanted.items():
+        given = None if element is None else element.get(name)
+        read = [0.0] * len(numbers) if given is None else _figures(given)
+        pairs = zip(read or [math.nan] * len(numbers), numbers, strict=True)
+        kept = [was if abs(was - number) <= ROUNDING else float(number) for was, number in pairs]
         words[name] = " ".join(map(repr, kept))
         if kept != read:
-            changed[name] = words[name]
-    if not changed:
-        return []
-    if tag not in place:
-        opened = _TAG.match(data, place["joint"])
-        behind = place["joint"] if opened is None else opened.end()
-        blanks = re.match(rb"\s*", data[behind:])
-        indent = "" if blanks is None else blanks[0].decode()
-        new = "".join(f' {name}="{figures}"' for name, figures in words.items())
-        return [(behind, behind, f"{indent}<{tag}{new}/>")]
-    edits = [(*present[name][:2], figures) for name, figures in changed.items() if name in present]
-    read_tag = _TAG.match(data, place[tag])
-    end = place[tag] if read_tag is None else read_tag.end(1)
-    new = "".join(f' {name}="{figures}"' for name, figures in changed.items() if name not in present)
-    return [*edits, (end, end, new)] if new else edits
+            changed.append(name)
+    if element is None and changed:
+        element = joint.makeelement(tag, dict(words))
+        element.tail = joint.text
+        joint.insert(0, element)
+    for name in changed:
+        if element is not None:
+            element.set(name, words[name])
 
 
 def _parse(data: bytes, place: str, encoding: str | None = None) -> tuple[str, Element]:

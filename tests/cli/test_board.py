@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from fg_calib.importers import board as images
 from fg_calib.importers.board import CalibrationBoard, read_calibration_board
 from fg_calib.importers.opencv import opencv
-from fg_calib.io.camera import read_camera
+from fg_calib.io.job import read_camera
 
 cv2 = pytest.importorskip("cv2", reason="no OpenCV: pip install 'fg_calib[camera]'")
 

@@ -10,9 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.calibration import calibrate, calibrate_job
 from fg_calib.errors import InputError
-from fg_calib.io.camera import read_camera
 from fg_calib.io.columns import write_csv
-from fg_calib.io.job import read_job
+from fg_calib.io.job import read_camera, read_job
 from fg_calib.io.robot_file import write_robot
 from fg_calib.io.tables import read_measurements
 from fg_calib.measurements.dataset import Noise
