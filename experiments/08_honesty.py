@@ -57,8 +57,7 @@ from scipy.spatial.transform import Rotation
 
 import fg_calib
 from fg_calib.graph.build import predicted_problem
-from fg_calib.graph.information import whitened_triangle
-from fg_calib.graph.problem import Problem, reweighted_at
+from fg_calib.graph.problem import Problem, reweighted_at, whitened_triangle
 from fg_calib.graph.variables import prior_rows
 from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Measurements, Noise, Pairs

@@ -21,9 +21,8 @@ from fg_calib.arrays import Brief
 from fg_calib.designs.information import PoseRows, Posterior, count_measurements, gather_rows
 from fg_calib.errors import InputError
 from fg_calib.graph.build import places_of, true_problem
-from fg_calib.graph.information import whitened_jacobian
 from fg_calib.graph.knowledge import coordinates_of
-from fg_calib.graph.problem import Problem
+from fg_calib.graph.problem import Problem, whitened_jacobian
 from fg_calib.graph.variables import Variables, unknown_prior_rows
 from fg_calib.measurements.dataset import Noise, form_pairs
 from fg_calib.measurements.landmarks import Landmarks

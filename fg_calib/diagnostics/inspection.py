@@ -21,8 +21,7 @@ from fg_calib.diagnostics.robust_screening import Disagreements, find_disagreeme
 from fg_calib.diagnostics.setup_check import SetupCheck, check_tables
 from fg_calib.diagnostics.setup_hypotheses import MOTION_M, MOTION_RAD
 from fg_calib.graph.build import problem_of
-from fg_calib.graph.information import eliminated
-from fg_calib.graph.problem import Problem, tables_of
+from fg_calib.graph.problem import Problem, eliminated, tables_of
 from fg_calib.graph.solver import Solution, unsolved
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import Measurements

@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
 from fg_calib.errors import CalibrationError
-from fg_calib.graph.information import directions
 from fg_calib.graph.normal_system import SIGNAL_FLOOR
-from fg_calib.graph.problem import Problem, at_parameters, with_factors
+from fg_calib.graph.problem import Problem, at_parameters, directions, with_factors
 from fg_calib.graph.solver import Solution, SolverOptions, solve
 from fg_calib.measurements.kind import Kind
 from fg_calib.robot.kinematics import forward

@@ -151,33 +151,6 @@ class SchurComplement:
         return _SparseStates(L, width, graph) if n_loops * width <= MAX_LOOP_STATES else _Iterative(L, width)
 
 
-class SharedErrors(SchurComplement):
-    """The elimination with what the variance components of several origins ask for."""
-
-    def most_likely(self, rows: Floats) -> Floats:
-        """The posterior mean of the states."""
-        return self.posterior_mean(rows)
-
-    def roughly_weighed(self, rows: Floats) -> Floats:
-        """C^-1 rows."""
-        return self.weigh(rows)
-
-    def energy(self, E: Sparse) -> float:
-        """Trace of E^T C^-1 E."""
-        return self.trace(E)
-
-    def products(self, roots: Sequence[Sparse]) -> tuple[Floats, Floats]:
-        """Traces of E_i^T C^-1 E_i, shape (k,), and squared Frobenius norms of E_i^T C^-1 E_j, shape (k, k)."""
-        small = min(self.loadings.shape) <= MAX_DENSE
-        rng = np.random.default_rng(0)
-        probed = [E.toarray() if small else E @ rng.choice([-1.0, 1.0], size=(E.shape[1], N_PROBES)) for E in roots]
-        found = [self.weigh(X) if E.nnz else X for E, X in zip(roots, probed, strict=True)]
-        traces = np.array([np.vdot(X, Y) for X, Y in zip(probed, found, strict=True)])
-        squares = np.array([[np.sum((E.T @ Y) ** 2) for Y in found] for E in roots])
-        n = 1 if small else N_PROBES
-        return traces / n, 0.5 * (squares + squares.T) / n
-
-
 class _Factor(Protocol):
     """S^-1."""
 
@@ -386,14 +359,14 @@ class WhitenedBlock(Brief):
     """
 
     parts: tuple[WhitenedSeries, ...]
-    states: SharedErrors | None = None
+    states: SchurComplement | None = None
     configurations: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     joints: int = 0
     spare: Sparse | None = None
     _triangles: dict[bytes, Floats] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
-    def shared(self) -> SharedErrors | None:
+    def shared(self) -> SchurComplement | None:
         """`states`."""
         return self.states
 
@@ -407,7 +380,7 @@ class WhitenedBlock(Brief):
         """How many degrees of freedom the rows have by `spare` alone: its trace over the rows' covariance."""
         if self.spare is None:
             return 0.0
-        return float(self.spare.power(2).sum()) if self.states is None else self.states.energy(self.spare)
+        return float(self.spare.power(2).sum()) if self.states is None else self.states.trace(self.spare)
 
     @property
     def coordinates(self) -> Integers:
@@ -456,12 +429,12 @@ class WhitenedBlock(Brief):
         if self.states is None:
             return np.zeros((0, 0))
         r = self.private(at.without_columns())[:, -1:]
-        return self.states.most_likely(r)[:, 0].reshape(len(self.configurations), -1)
+        return self.states.posterior_mean(r)[:, 0].reshape(len(self.configurations), -1)
 
     def weighed(self, at: State) -> Floats:
         """C^-1 J, C the covariance of all rows whitened by their private noise, shape (all rows, n_all_columns)."""
         J = self.private(at)[:, :-1]
-        return J if self.states is None else J - self.states.loadings @ self.states.most_likely(J)
+        return J if self.states is None else J - self.states.loadings @ self.states.posterior_mean(J)
 
     def _whitened(self, at: State) -> Floats:
         rows = self.private(at)
@@ -745,7 +718,7 @@ class ErrorStates:
         spare = _stacked([E for _, _, E in together], apart=True)
         joints = self._first.get("joints", 0)
         parts = tuple(part for part, _, _ in together)
-        return WhitenedBlock(parts, SharedErrors(L, self.width), used, joints, spare if spare.nnz else None)
+        return WhitenedBlock(parts, SchurComplement(L, self.width), used, joints, spare if spare.nnz else None)
 
 
 def _stacked(matrices: Sequence[Sparse], *, apart: bool = False) -> Sparse:

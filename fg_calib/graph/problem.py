@@ -19,10 +19,12 @@ from numpy.typing import NDArray
 from fg_calib.arrays import FrozenArrays
 from fg_calib.errors import ProblemError, SolverError, shown
 from fg_calib.graph.error_states import (
+    ErrorStates,
     SchurComplement,
     State,
     WhitenedBlock,
     correlation_of,
+    felt_errors,
     share_errors,
     whitened_rows,
 )
@@ -35,7 +37,7 @@ from fg_calib.graph.factors import (
 )
 from fg_calib.graph.knowledge import Knowledge
 from fg_calib.graph.noise_models import JOINT_NOISE, NoiseState, RowNoise, TableState, row_noise, same_everywhere
-from fg_calib.graph.normal_system import RANK_TOLERANCE, LinearRows, NormalSystem
+from fg_calib.graph.normal_system import RANK_TOLERANCE, Eliminated, LinearRows, NormalSystem
 from fg_calib.graph.robust import effect
 from fg_calib.graph.variables import Variables, build_variables, frame_of, pose_of, prior_rows, unknown_prior_rows
 from fg_calib.initialization.hand_eye import Frame
@@ -590,6 +592,56 @@ def named_rows(variables: Variables, parameters: Floats, J: Floats) -> Floats:
     # What projecting leaves of a column that was all frame is rounding.
     out[:, np.linalg.norm(out, axis=0) <= RANK_TOLERANCE * length] = 0.0
     return out
+
+
+def eliminated(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> Eliminated:
+    """The rows with the landmarks eliminated."""
+    return linear_system(problem, parameters, with_loss=with_loss).left
+
+
+def whitened_jacobian(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> Floats:
+    """A square root of what train rows, landmarks' priors and added factors say: (m, n_columns + n_nuisance)."""
+    return square_root(problem, parameters, with_loss=with_loss)[:, :-1]
+
+
+def whitened_triangle(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> Floats:
+    """A square root of what the train rows and added factors say of the core, shape (m, n_columns)."""
+    return linear_system(problem, parameters, with_loss=with_loss).left.A
+
+
+def row_triangles(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> list[Floats]:
+    """A square root of [J r] of each block, shape (n_columns + n_nuisance + 1,) * 2 each."""
+    blocks, variance = _with_loss(problem) if with_loss else (problem.rows, 1.0)
+    return [block.triangle(problem.variables.at(parameters)) / np.sqrt(variance) for block in blocks]
+
+
+def directions(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
+    """Signal-to-noise ratios of data and priors at some parameters, and their unit-free directions as columns."""
+    system = linear_system(problem, parameters)
+    return system.singular_values, (system.directions / problem.variables.prior_scales).T
+
+
+def named_triangle(problem: Problem, parameters: Floats) -> Floats:
+    """`whitened_triangle` by named parameters, the measurement frames projected out: shape (m, n_robot_columns)."""
+    return named_rows(problem.variables, parameters, whitened_triangle(problem, parameters))
+
+
+def felt(problem: Problem, parameters: Floats, errors: ErrorStates, wanted: Integers) -> Floats:
+    """M: the estimate is off by `-K M e` because of errors e of configurations, K its covariance.
+
+    Args:
+        problem: The problem.
+        parameters: The parameter vector.
+        errors: The errors of all configurations.
+        wanted: Numbers of those that are asked for.
+
+    Returns:
+        M by core and nuisance variables, these not eliminated, shape (n_columns + n_nuisance, len(wanted)).
+    """
+    if not len(wanted):
+        return np.zeros((problem.variables.n_columns + problem.variables.n_nuisance, 0))
+    row_sets, variance = _with_loss(problem)
+    return felt_errors(problem.noises, row_sets, problem.variables.at(parameters), errors, wanted) / variance
 
 
 def _linear_rows(problem: Problem, blocks: Sequence[WhitenedBlock], at: State) -> LinearRows:

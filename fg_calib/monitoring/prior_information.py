@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.graph.information import row_triangles
 from fg_calib.graph.knowledge import SIZE, STAYING, Knowledge, Name, coordinates_of
 from fg_calib.graph.normal_system import eliminate
-from fg_calib.graph.problem import Problem, in_variables_of
+from fg_calib.graph.problem import Problem, in_variables_of, row_triangles
 from fg_calib.graph.solver import Solution
 from fg_calib.graph.variables import prior_rows, unknown_prior_rows
 from fg_calib.observability.observed_quantities import ObservedQuantities

@@ -11,9 +11,8 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.graph.information import whitened_jacobian
 from fg_calib.graph.normal_system import eliminate
-from fg_calib.graph.problem import Problem
+from fg_calib.graph.problem import Problem, whitened_jacobian
 from fg_calib.measurements.kinds import LANDMARKS
 
 Floats = NDArray[np.float64]

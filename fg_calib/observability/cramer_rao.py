@@ -37,8 +37,7 @@ from fg_calib.arguments import checked
 from fg_calib.arrays import Brief
 from fg_calib.errors import InputError, shown
 from fg_calib.graph.build import predicted_problem, true_problem
-from fg_calib.graph.information import correlation, named_triangle
-from fg_calib.graph.problem import Problem
+from fg_calib.graph.problem import Problem, correlation, named_triangle
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.table import Table
 from fg_calib.options import FrameKnowledge, Model, Options, PairErrors, Pairing, check, check_flag, check_names

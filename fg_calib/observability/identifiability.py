@@ -11,20 +11,42 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
+
 from fg_calib.arguments import checked
 from fg_calib.arrays import Brief, Floats
 from fg_calib.errors import ProblemError
 from fg_calib.graph.build import STRUCTURAL_FLOOR, predicted_problem, random_problem
-from fg_calib.graph.information import observability_of
 from fg_calib.graph.normal_system import SIGNAL_FLOOR
-from fg_calib.graph.problem import Problem
+from fg_calib.graph.problem import Problem, named_triangle
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.observability.indices import Observability
+from fg_calib.observability.indices import Observability, observability_of_rows
 from fg_calib.observability.parallel_axes import MissingMotion, missing_motions
 from fg_calib.observability.reasons import LostDirection, explain
 from fg_calib.options import FrameKnowledge, Model, Pairing, check_names, check_number
 from fg_calib.robot.model import Robot, names_of
 from fg_calib.threads import single_threaded
+
+
+def observability_of(
+    problem: Problem, parameters: Floats, prefer: Sequence[str] = (), floor: float = SIGNAL_FLOOR
+) -> Observability:
+    """What the train rows, without priors, determine of the robot's parameters around a parameter vector.
+
+    Args:
+        problem: The problem.
+        parameters: The parameter vector (see `Variables`).
+        prefer: Parameters to keep, first choice first, where only combinations are determined.
+        floor: Signal-to-noise ratio below which a direction counts as not determined.
+    """
+    return observability_of_rows(
+        named_triangle(problem, parameters),
+        problem.estimated,
+        scales=np.array([problem.robot.scale_of(p.unit) for p in problem.estimated]),
+        n_measurements=sum(len(s.train) for s in problem.data.series),
+        prefer=prefer,
+        floor=floor,
+    )
 
 
 @dataclass(frozen=True)

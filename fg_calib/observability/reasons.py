@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.graph.information import named_triangle
 from fg_calib.graph.normal_system import SUPPORT_TOLERANCE
-from fg_calib.graph.problem import Problem
+from fg_calib.graph.problem import Problem, named_triangle
 from fg_calib.observability.confounding import Confounding
 from fg_calib.observability.indices import Observability
 from fg_calib.observability.observed_quantities import ObservedQuantities

@@ -24,9 +24,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fg_calib.arrays import FrozenArrays
-from fg_calib.graph.information import correlation, whitened_triangle
 from fg_calib.graph.normal_system import RANK_TOLERANCE, SIGNAL_FLOOR, SUPPORT_TOLERANCE, determined
-from fg_calib.graph.problem import Problem, in_variables_of
+from fg_calib.graph.problem import Problem, correlation, in_variables_of, whitened_triangle
 from fg_calib.graph.solver import Solution
 from fg_calib.graph.variables import Variables, prior_rows
 from fg_calib.robot.model import Robot

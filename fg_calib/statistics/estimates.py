@@ -13,8 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fg_calib.arrays import Floats, FrozenArrays, Integers
-from fg_calib.graph.information import eliminated, linear_system
-from fg_calib.graph.problem import Problem, at_parameters, in_variables_of
+from fg_calib.graph.problem import Problem, at_parameters, eliminated, in_variables_of, linear_system
 from fg_calib.graph.solver import Solution
 from fg_calib.graph.variables import Variables, corrections_of, pose_of
 from fg_calib.observability.indices import IdentifiabilityClass, Observability

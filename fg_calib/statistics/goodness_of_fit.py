@@ -35,9 +35,8 @@ from pydantic import computed_field
 from scipy import special
 
 from fg_calib.arrays import Booleans, Figure, Floats, FrozenArrays, Integers
-from fg_calib.graph.information import eliminated
 from fg_calib.graph.noise_models import JOINT_NOISE, NoiseName
-from fg_calib.graph.problem import Problem, mahalanobis_distances, noises_at
+from fg_calib.graph.problem import Problem, eliminated, mahalanobis_distances, noises_at
 from fg_calib.graph.robust import effect, tuning, weight
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements.residuals import squares_along

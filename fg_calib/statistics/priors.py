@@ -57,9 +57,8 @@ from scipy import special
 
 from fg_calib.arguments import checked
 from fg_calib.arrays import Figure, Floats, FrozenArrays, Integers
-from fg_calib.graph.information import correlation, eliminated, whitened_triangle
 from fg_calib.graph.normal_system import RANK_TOLERANCE, eliminate
-from fg_calib.graph.problem import Problem, relinearized_at
+from fg_calib.graph.problem import Problem, correlation, eliminated, relinearized_at, whitened_triangle
 from fg_calib.graph.solver import Solution, solve
 from fg_calib.graph.tolerances import ToleranceScale, ToleranceScales, groups_of, prior_parameters, with_scales
 from fg_calib.graph.variables import Variables, prior_rows, unknown_prior_rows

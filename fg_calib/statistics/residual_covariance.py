@@ -17,9 +17,8 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from fg_calib.graph.error_states import ErrorStates
-from fg_calib.graph.information import eliminated, felt
 from fg_calib.graph.noise_models import PRIVATE_SHARE, RowNoise
-from fg_calib.graph.problem import Problem, at_parameters, says_where
+from fg_calib.graph.problem import Problem, at_parameters, eliminated, felt, says_where
 from fg_calib.measurements import residuals
 from fg_calib.robot.kinematics import Chain
 

@@ -40,9 +40,8 @@ from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
 from fg_calib.graph.error_states import ErrorStates, WhitenedSeries, block_diagonal, whitener_of
-from fg_calib.graph.information import linear_system
 from fg_calib.graph.noise_models import JOINT_NOISE, NoiseName, RowNoise
-from fg_calib.graph.problem import Problem, relinearized_at
+from fg_calib.graph.problem import Problem, linear_system, relinearized_at
 from fg_calib.graph.solver import Solution, SolverOptions, solve
 from fg_calib.threads import single_threaded
 

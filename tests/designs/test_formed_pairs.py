@@ -6,8 +6,8 @@ from simulated import small_arm
 
 from fg_calib import Measurements, Pairing
 from fg_calib.graph.build import true_problem
-from fg_calib.graph.information import whitened_jacobian
 from fg_calib.graph.noise_models import PRIVATE_SHARE
+from fg_calib.graph.problem import whitened_jacobian
 from fg_calib.measurements.table import Table
 from fg_calib.options import Options
 from fg_calib.robot.kinematics import forward, pose

@@ -11,7 +11,7 @@ from fg_calib import InputError, Job, Measurements, Options, calibrate_job
 from fg_calib.designs.design import design
 from fg_calib.designs.from_job import solve_for_design
 from fg_calib.designs.information import Posterior
-from fg_calib.graph.information import whitened_jacobian
+from fg_calib.graph.problem import whitened_jacobian
 from fg_calib.measurements.dataset import Noise
 from fg_calib.options import Pairing
 from fg_calib.prediction.tool_pose import errors_at

@@ -12,8 +12,7 @@ from simulated import TOOL, measure, paper_robot, small_arm, true_robot
 
 from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.information import whitened_triangle
-from fg_calib.graph.problem import in_variables_of
+from fg_calib.graph.problem import in_variables_of, whitened_triangle
 from fg_calib.graph.solver import solve
 from fg_calib.io.columns import write_csv
 from fg_calib.io.robot_file import write_robot

@@ -12,9 +12,8 @@ from tolerances import rounding
 from fg_calib import Calibration, InputError, Measurements, Pairing, Table, assess, solve
 from fg_calib.graph import noise_models, solver
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.information import row_triangles
 from fg_calib.graph.noise_models import whitening_of
-from fg_calib.graph.problem import linear_system, noises_at, relinearized_at, subsampled
+from fg_calib.graph.problem import linear_system, noises_at, relinearized_at, row_triangles, subsampled
 from fg_calib.measurements import residuals
 from fg_calib.measurements.residuals import pack, unpack
 from fg_calib.robot import kinematics

@@ -20,15 +20,15 @@ from fg_calib import write_robot
 from fg_calib.assessment import assess
 from fg_calib.errors import InputError, ProblemError
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.information import named_triangle, observability_of, whitened_triangle
 from fg_calib.graph.normal_system import eliminate
-from fg_calib.graph.problem import with_initial
+from fg_calib.graph.problem import named_triangle, whitened_triangle, with_initial
 from fg_calib.graph.robust import tuning, weight
 from fg_calib.graph.solver import solve
 from fg_calib.graph.variables import prior_rows
 from fg_calib.io.tables import read_measurements
 from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Groups, Noise, Pairs, no_pairs
+from fg_calib.observability.identifiability import observability_of
 from fg_calib.robot.kinematics import pose
 from fg_calib.statistics.variance_components import estimate_noise
 

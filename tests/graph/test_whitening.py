@@ -13,9 +13,8 @@ from tolerances import rounding
 from fg_calib.assessment import assess
 from fg_calib.graph import error_states
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.information import correlation, whitened_triangle
 from fg_calib.graph.noise_models import JOINT_NOISE
-from fg_calib.graph.problem import joint_errors, noises_at, relinearized_at
+from fg_calib.graph.problem import correlation, joint_errors, noises_at, relinearized_at, whitened_triangle
 from fg_calib.graph.solver import solve
 from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Groups, Measurements, Pairs

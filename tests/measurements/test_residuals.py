@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from sparing import diagonal
 from tolerances import rounding
 
-from fg_calib.graph.error_states import SharedErrors, State, WhitenedBlock, WhitenedSeries
+from fg_calib.graph.error_states import SchurComplement, State, WhitenedBlock, WhitenedSeries
 from fg_calib.measurements import residuals
 from fg_calib.measurements.kinds import stack
 from fg_calib.measurements.kinds.pair import Distance, RotationAngle, SamePoint
@@ -167,7 +167,9 @@ def test_rows_that_share_errors_are_whitened_together_and_their_parts_can_be_div
     block, chain = random_block("pairs", n, rng := np.random.default_rng(0))
     chain = replace(chain, joint_columns=False)
     loading = scipy.sparse.csr_array(rng.normal(size=(n * block.residual_dim, n_shared)))
-    correlated = WhitenedBlock((WhitenedSeries(block, 0, 0, np.zeros((n, 0), dtype=np.int64)),), SharedErrors(loading))
+    correlated = WhitenedBlock(
+        (WhitenedSeries(block, 0, 0, np.zeros((n, 0), dtype=np.int64)),), SchurComplement(loading)
+    )
     some = residuals.residual(residuals.rows_of(correlated.parts[0].block, slice(0, 2)), chain)
     assert np.array_equal(some, residuals.residual(block, chain)[:2])
     at = State((chain,), np.zeros(0), np.zeros(0, dtype=np.int64), chain.n_columns, 0)

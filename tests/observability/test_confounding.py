@@ -9,7 +9,7 @@ from instruments import TARGETS, measured_by
 from touches import corners, touch
 
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.information import named_triangle
+from fg_calib.graph.problem import named_triangle
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.table import KnownPoint, Table
 from fg_calib.observability.identifiability import identifiability_of

@@ -9,10 +9,10 @@ from sparing import diagonal
 
 from fg_calib.assessment import assess
 from fg_calib.graph.build import STRUCTURAL_FLOOR, build_problem, random_problem
-from fg_calib.graph.information import named_triangle, observability_of
+from fg_calib.graph.problem import named_triangle
 from fg_calib.graph.solver import solve
 from fg_calib.measurements.kinds.pair import SamePoint
-from fg_calib.observability.identifiability import observe_configurations, observe_structure
+from fg_calib.observability.identifiability import observability_of, observe_configurations, observe_structure
 from fg_calib.observability.reasons import NO_CAUSE, NOT_EXCITED
 from fg_calib.options import Pairing
 from fg_calib.robot.model import Joint, RobotBuilder

@@ -6,7 +6,7 @@ from simulated import measure, paper_robot
 from tolerances import rounding
 
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.information import observability_of
+from fg_calib.observability.identifiability import observability_of
 from fg_calib.observability.indices import RelativeGroup, observability_indices, observability_of_rows
 from fg_calib.options import Pairing
 from fg_calib.robot.model import Parameter
