@@ -415,7 +415,7 @@ def test_other_pairs_of_the_same_poses_are_not_the_same():
         ({"measurements": [{"model": "position"}]}, "job.yaml: measurement 1: missing key 'table'"),
         (
             {"pairs": "lengths.csv"},
-            "job.yaml: pairs: beside a list of tables, expected the key in the table's own entry",
+            "job.yaml: pairs: next to a list of tables, expected the key in the table's own entry",
         ),
         (
             {"measurements": [{"table": "tracker.csv", "model": "position", "loss": "huber"}]},
