@@ -1,8 +1,7 @@
-"""fg_calib: what a user calls, the solve alone, scipy with its derivatives, and GTSAM with a factor a measurement."""
+"""fg_calib: `calibrate` as a user calls it, and `solve` alone."""
 
 from __future__ import annotations
 
-import gtsam
 import numpy as np
 import protocol
 
@@ -17,19 +16,15 @@ def robot_of(work: dict) -> fg_calib.Robot:
     values, estimated = work["values"], work["estimated"]
     rows, free = values[6:-6].reshape(-1, 5), estimated[6:-6].reshape(-1, 5)
     fixed = [f"{JOINT[k]}{i + 1}" for i, k in np.argwhere(~free)]
-    length, angle = work["off"].tolist()
-    tolerance = {kind: length if kind in "ad" else angle for kind in JOINT}
     if not work["frames_known"]:
         free_tool = [f"tool.{kind}" for kind in FRAME]
-        return fg_calib.Robot.from_dh(rows, "mdh-hayati", fixed=fixed, estimate=free_tool, tolerance=tolerance)
+        return fg_calib.Robot.from_dh(rows, "mdh-hayati", fixed=fixed, estimate=free_tool)
     tool = dict(zip(FRAME, values[-6:], strict=True))
-    return fg_calib.Robot.from_dh(rows, "mdh-hayati", fixed=fixed, tool=tool, tolerance=tolerance)
+    return fg_calib.Robot.from_dh(rows, "mdh-hayati", fixed=fixed, tool=tool)
 
 
 class Prepared(protocol.Peer):
     """Robot and measurements in memory."""
-
-    gauge = "none"
 
     def __init__(self, work: dict) -> None:
         self.robot = robot_of(work)
@@ -41,8 +36,8 @@ class Prepared(protocol.Peer):
             measured = {"position": work["position"], "rotation": work["rotation"]}
             sigmas = {"sigma_position": sigma[0], "sigma_orientation": sigma[1]}
             self.data, self.model = fg_calib.Measurements.from_arrays(q, **measured, **sigmas), "pose"
-        self.choices = {"model": self.model, "frame": "known" if work["frames_known"] else "unknown"}
-        self.choices["gauge"] = self.gauge
+        frame = "known" if work["frames_known"] else "unknown"
+        self.choices = {"model": self.model, "frame": frame, "gauge": "none"}
 
 
 class Calibrate(Prepared):
@@ -69,12 +64,6 @@ class Calibrate(Prepared):
         }
 
 
-class Told(Calibrate):
-    """The same with how far parameters may be off as priors: its ordinary use, and more than other peers are told."""
-
-    gauge = "prior"
-
-
 class Solve(Prepared):
     """`build_problem` and `solve`, without uncertainty."""
 
@@ -96,30 +85,5 @@ class Solve(Prepared):
         return world[:3, 3] + there.position @ world[:3, :3].T, world[:3, :3] @ there.rotation
 
 
-class Scipy(Solve):
-    """scipy's `least_squares` with the package's derivatives, whitened."""
-
-    @staticmethod
-    def unable(work: dict) -> str | None:
-        """It starts frames at the identity."""
-        return None if work["frames_known"] else "starts frames at the identity"
-
-    def solve(self) -> None:
-        """One call."""
-        found = fg_calib.fit_least_squares(self.robot, self.data, model=self.model, method="scipy", weighted=True)
-        self.at(found.parameters)
-
-
-class OneByOne(Solve):
-    """GTSAM's Levenberg-Marquardt on a Python factor a pair, or a pose."""
-
-    def solve(self) -> None:
-        """The graph, one factor a measurement, and its optimum."""
-        problem = fg_calib.build_problem(self.robot, self.data, **self.choices)
-        graph, initial = fg_calib.expand(problem)
-        values = gtsam.LevenbergMarquardtOptimizer(graph, initial, fg_calib.levenberg_marquardt_params()).optimize()
-        self.at(problem.variables.parameters(values))
-
-
 if __name__ == "__main__":
-    protocol.main({"calibrate": Calibrate, "told": Told, "solve": Solve, "scipy": Scipy, "one by one": OneByOne})
+    protocol.main({"calibrate": Calibrate, "solve": Solve})

@@ -49,18 +49,5 @@ class Pybotics(protocol.Peer):
         return T[:, :3, 3], T[:, :3, :3]
 
 
-class VectorResidual(Pybotics):
-    """The residuals by hand that are smooth where they are zero: three a position, and signed distances."""
-
-    def residuals(self, x: np.ndarray) -> np.ndarray:
-        """Position errors, or signed distances."""
-        work = self.work
-        self.handler.apply_optimization_vector(x)
-        p = self.poses(work["q"])[:, :3, 3]
-        if work["kind"] == "pose":
-            return (p - work["position"]).ravel()
-        return np.linalg.norm(p[work["b"]] - p[work["a"]], axis=1) - work["distance"]
-
-
 if __name__ == "__main__":
-    protocol.main({"own": Pybotics, "vector": VectorResidual})
+    protocol.main({"own": Pybotics})

@@ -5,12 +5,11 @@
 | poses | 60 poses in the base frame, noise 0.1 mm and 0.1 mrad | mean norm, 200 configurations without noise |
 | pairs | 300 of the 1770 distances between these 60, noise 0.1 mm | RMS over all pairs of the 200 |
 | many | 5000 poses | as poses |
-| repeats | one arm and its 60 configurations, noise drawn anew | spread of estimates, against the sigma claimed |
 | real | 1046 poses of a real UR10, frame and tool unknown | RMS, 449 poses never fitted |
 
 The simulated arm is a UR10 in modified DH, its a, alpha, d and theta off by 1 mm and 2 mrad (1 sigma), with a tool at
-(50, 30, 100) mm that is known. The real one has Hayati's angles too, as parallel axes need them. Nobody is told how far
-parameters may be off, but fg_calib where it is run once more with that.
+(50, 30, 100) mm that is known. The real one has Hayati's angles too, as parallel axes need them. No peer is told how
+far parameters may be off.
 """
 
 from __future__ import annotations
@@ -33,12 +32,11 @@ UR10 = [(0, 0, 0.1273), (90, 0, 0), (0, -0.612, 0), (0, -0.5723, 0.163941), (90,
 
 TOOL = (0.05, 0.03, 0.1)
 OFF = (1e-3, 2e-3)
-OFF_REAL = (3e-3, 3.5e-3)
-"""1 sigma of true minus nominal, [m] and [rad]: told to the one peer that is run once more with it."""
+"""1 sigma of true minus nominal, [m] and [rad]."""
 
 SIGMA = (1e-4, 1e-4)
 SIGMA_REAL = (3e-4, 6e-4)
-"""1 sigma an axis, [m] and [rad]; of the real arm what a geometric model leaves (see `01_ur10_real_data.py`)."""
+"""1 sigma an axis, [m] and [rad]; of the real arm what a geometric model leaves (see `real_data.py`)."""
 
 N_VALIDATION = 200
 N_PAIRS = 300
@@ -83,14 +81,14 @@ def of_joints(kinds: str) -> NDArray[np.bool_]:
     return np.array([False] * 6 + [kind in kinds for _ in UR10 for kind in "aldtb"] + [False] * 6)
 
 
-def simulated(n: int, draws: int, seed: int, pairs: bool = False, one_arm: bool = False) -> Work:
-    """Draws of an arm measured at `n` configurations; `one_arm`: noise alone is drawn anew."""
+def simulated(n: int, draws: int, seed: int, pairs: bool = False) -> Work:
+    """Draws of an arm measured at `n` configurations."""
     values, estimated = nominal(), of_joints("aldt")
     sigma = np.where([turns for turns, _, _ in chain.elements(len(UR10))], OFF[1], OFF[0])
     validation = np.random.default_rng([seed, 1]).uniform(-np.pi, np.pi, (N_VALIDATION, len(UR10)))
     rows: dict[str, list[Any]] = {}
     for draw in range(draws):
-        rng, noise = (np.random.default_rng([seed, 2, 0 if one_arm else draw]), np.random.default_rng([seed, 3, draw]))
+        rng, noise = (np.random.default_rng([seed, 2, draw]), np.random.default_rng([seed, 3, draw]))
         true = values + estimated * sigma * rng.normal(size=values.shape)
         q = rng.uniform(-np.pi, np.pi, (n, len(UR10)))
         p, R = chain.forward(true, q)
@@ -108,7 +106,6 @@ def simulated(n: int, draws: int, seed: int, pairs: bool = False, one_arm: bool 
     arrays = {name: np.array(value) for name, value in rows.items()}
     truth = arrays.pop("true_position"), arrays.pop("true_rotation")
     arrays |= {"q_val": validation, "values": values, "estimated": estimated, "sigma": np.array(SIGMA)}
-    arrays["off"] = np.array(OFF)
     return Work("distance" if pairs else "pose", True, arrays, *truth)
 
 
@@ -128,7 +125,6 @@ def real(folder: Path, repeats: int) -> Work:
     start = start_of_frames(nominal(), ~joints, train | {"sigma": sigma, "kind": "pose"})
     arrays = {name: np.repeat(value[None], repeats, axis=0) for name, value in train.items()}
     arrays |= {"q_val": q[test], "values": start, "estimated": np.ones_like(joints), "sigma": sigma}
-    arrays["off"] = np.array(OFF_REAL)
     there = (np.repeat(x[None, test], repeats, axis=0) for x in (p, R))
     return Work("pose", False, arrays, *there)
 

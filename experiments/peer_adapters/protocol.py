@@ -31,7 +31,7 @@ from pathlib import Path
 import numpy as np
 
 AGAIN = 5.0
-SHARED = ("q_val", "values", "estimated", "sigma", "off")
+SHARED = ("q_val", "values", "estimated", "sigma")
 """Arrays of a work file that do not have one row a draw."""
 
 
