@@ -59,7 +59,7 @@ from fg_calib import (
     simulate,
     solve,
 )
-from fg_calib.observability import cramer_rao
+from fg_calib.observability.cramer_rao import cramer_rao
 from fg_calib.statistics import estimate_tolerances
 
 Floats = NDArray[np.float64]
@@ -195,7 +195,7 @@ def draw(task: Task) -> Row:
     except CalibrationError:
         return {"solved": False}
     found = assess(solution)
-    names, C = list(found.covariance.names), found.covariance.matrix
+    names, C = list(found.names), found.covariance
     known = np.isfinite(np.diag(C))
     names, C = [n for n, k in zip(names, known, strict=True) if k], C[np.ix_(known, known)]
     columns = [true.index(name) for name in names]
