@@ -223,9 +223,12 @@ def through_the_graph(robot: Robot, model: str, null_space: Floats) -> Row:
     )
     problem = build_problem(weak, rows, model=model, pairing=Pairing("star"))
     ordering = gtsam.Ordering()
-    for key in problem.variables.keys:
+    keys = problem.variables.keys
+    for key in [*keys, *(key for key in problem.graph.keyVector() if key not in keys)]:
         ordering.push_back(key)
-    hessian = problem.graph.linearize(problem.initial).hessian(ordering)[0]
+    full = problem.graph.linearize(problem.initial).hessian(ordering)[0]
+    n = null_space.shape[1]  # the poses' errors, which pairs share, come last and are eliminated
+    hessian = full[:n, :n] - full[:n, n:] @ np.linalg.solve(full[n:, n:], full[n:, :n])
     values, vectors = np.linalg.eigh(hessian)
     fixed = values < 2.0  # the prior's information is 1
     scales = np.array([robot.scale_of(p.unit) for p in robot.parameters if p.estimated])

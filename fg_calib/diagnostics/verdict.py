@@ -213,7 +213,9 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
         offsets = () if case.gross is not None else forgotten_offsets(solution)
         statements += [check_offset(found, problem.data.labels, fit.chi_square.too_large) for found in offsets]
     fits = not (doubts or solution.estimated_noise is not None)
-    statements[:0] = check_model(setup, missing, fits=fits, high=high, updated=problem.knowledge is not None)
+    statements[:0] = check_model(setup, fits=fits, high=high)
+    explained = setup.explanations or problem.knowledge is not None  # by a mistake; or the convention did before
+    statements += [Statement("error" if high and not explained else "note", str(motion)) for motion in missing]
     errors, warnings, notes = (
         tuple(s.text for s in statements if s.severity == severity) for severity in ("error", "warning", "note")
     )
@@ -497,17 +499,13 @@ def check_offset(found: Offset, labels: Sequence[str], high: bool) -> Statement:
     return Statement("error" if high else "warning", f"{text} or calibrate the instrument")
 
 
-def check_model(
-    setup: SetupCheck, missing: Sequence[MissingMotion], *, fits: bool, high: bool, updated: bool
-) -> Iterator[Statement]:
-    """Check set-up and model, before all else: where they are wrong no value can be right.
+def check_model(setup: SetupCheck, *, fits: bool, high: bool) -> Iterator[Statement]:
+    """Check the set-up, before all else: where it is wrong no value can be right.
 
     Args:
         setup: The set-up, by residuals before the calibration.
-        missing: What the robot's convention has no parameter for.
         fits: Whether nothing speaks against the calibration although the noise was as specified.
         high: Whether the residuals are larger than the noise, or systematic.
-        updated: Whether the rows were added to an earlier calibration, which the convention did for.
     """
     for check in (setup, *setup.others):
         if check.explanations:
@@ -517,8 +515,6 @@ def check_model(
     if high and setup.unchecked:
         text = f"the set-up of {', '.join(setup.unchecked)} was not checked for common mistakes (units, signs, columns)"
         yield Statement("note", f"{text}: too few rows to locate its landmarks, or custom kinds of measurement")
-    for motion in missing:
-        yield Statement("error" if high and not (setup.explanations or updated) else "note", str(motion))
 
 
 def check_optima(solution: Solution, most: int = 4) -> list[Statement]:
