@@ -34,6 +34,8 @@ from scipy.spatial.transform import Rotation
 
 import fg_calib
 from fg_calib import Measurements, Robot, assess, build_problem, calibrate_job, pose, read_job, read_robot, solve
+from fg_calib.report.figures import Drawn
+from fg_calib.report.html import build_page
 
 ROOT = HERE.parent
 EXAMPLE = Path(fg_calib.__file__).parent / "examples" / "space-robot"
@@ -100,7 +102,8 @@ def steps(task: Task) -> Row:
     }
     if case != "60 UR10 poses":
         found = calibrate_job(job)
-        row["page"] = median_of(found.page, max(repeats // 5, 1))
+        drawn = Drawn(found.result, found.robot, found.posterior, found.configurations, found.residuals)
+        row["page"] = median_of(lambda: build_page(drawn), max(repeats // 5, 1))
     return row
 
 

@@ -15,7 +15,7 @@ import verify  # noqa: E402
 QUICK = [
     ("paper", "identifiability"),
     ("paper", "claims"),
-    ("real_data", "ur10_pairs"),
+    ("real_data", "panda"),
     ("validation", "landmarks"),
     ("validation", "outliers"),
     ("validation", "monitoring"),
