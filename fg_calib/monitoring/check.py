@@ -5,8 +5,8 @@ by what single changes explain of it (see `hypotheses`), which sees a slip of on
 rows does. Where limits are set they decide: an arm within them is good although its rows show a change, as long as that
 change stays within them everywhere.
 
-Rows of one configuration that are gross errors are named and left out of the judgement; noise that is stated too small
-is no change of the arm.
+Rows of one configuration that are gross errors are named and left out of the judgement; noise that is specified too
+small is no change of the arm.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ import numpy as np
 from scipy import special
 
 from fg_calib.diagnostics.setup_check import check_tables
-from fg_calib.monitoring.discriminating_design import Advice, separating
+from fg_calib.monitoring.discriminating_design import Advice, advise_configurations
 from fg_calib.monitoring.hypotheses import (
     CERTAIN,
     WRONG,
     HypothesisTest,
-    best_refined,
-    check_hypotheses,
-    effect_elsewhere,
     excludes,
-    explains,
+    fit_changes,
+    is_part_of,
     likely_changes,
-    merged,
+    merge_alike,
+    motion,
     quantile,
-    within,
+    refine_best,
+    rms_motion,
     zero_names,
 )
-from fg_calib.monitoring.new_data import Calibrated, Linear, Rows, linear, placed
+from fg_calib.monitoring.new_data import Calibrated, Linear, Rows, linearise_new_data, place_new_data
 from fg_calib.options import LIMITED, Limits
 from fg_calib.statistics.acceptance import LEAST
 from fg_calib.statistics.goodness_of_fit import FACTOR
@@ -53,7 +53,7 @@ POWER = 0.9
 """Probability with which a slip is to be found that is called detectable."""
 
 ALSO_SHOWN = 3
-"""Suspects that are distinguished from the best, and shown beside it."""
+"""Changes that the rows exclude and that are shown with the likely ones."""
 
 
 @dataclass(frozen=True)
@@ -67,9 +67,9 @@ class Explanation:
         sigma: 1 sigma of that; None where it is not determined.
         units: `m` or `rad` of each.
         chi2_drop: By how much chi-square falls with it.
-        p_value: Probability that chance explains as much, all that was tried counted.
-        likely: Whether the rows do not tell it from the change that explains most, or it is that itself.
-        told_apart_from: What the rows say it is rather not, were it this.
+        p_value: Probability that chance explains as much, all hypotheses counted.
+        likely: Whether it explains most, or the rows do not distinguish it from the change that does.
+        told_apart_from: Changes that the rows would exclude, were it this one.
         not_told_apart_from: Other changes that explain the rows as well.
         same: Parameters whose change makes the same of the arm everywhere, but for less than the noise of one row: they
             need not be distinguished.
@@ -99,9 +99,9 @@ class Check:
         n: Number of measurements.
         chi2: Of the rows, by their noise and the calibration's uncertainty, after what is free was fitted.
         dof: Its degrees of freedom.
-        p_value: Probability of one as large, were arm and noise as stated.
+        p_value: Probability of one as large, were arm and noise as specified.
         rms: RMS of residuals by kind, frame fitted, the arm as calibrated, [m] and [rad].
-        noise: RMS noise stated of the same.
+        noise: RMS of the noise specified for them.
         limits: What they may be, as far as a limit was set.
         explanations: What changed, the best first; none where nothing is certain.
         gross_rows: Configurations whose rows are gross errors, left out of all that is said here.
@@ -145,84 +145,84 @@ def check_rows(calibrated: Calibrated, rows: Rows, limits: Limits) -> Check:
         ProblemError: The rows lack what their model needs.
     """
     rows = replace(rows, tables=tuple(table.all_train() for table in rows.tables))
-    whole = linear(calibrated, placed(calibrated, rows, calibrated.values))
-    few = _too_few(whole)
+    at = linearise_new_data(calibrated, place_new_data(calibrated, rows, calibrated.values))
+    few = _too_few(at)
     gross: list[str] = []
-    found: list[HypothesisTest] = []
-    at = whole
-    if not few:
-        found = check_hypotheses(calibrated, at)
-        best = likely_changes(found, at)
-        while len(best) == 1 and best[0].hypothesis.kind == "row" and len(gross) < _most_gross(whole):
-            gross += best[0].hypothesis.names
-            at = at.without(best[0].hypothesis.columns)
-            found = [f for f in check_hypotheses(calibrated, at) if f.hypothesis.names[0] not in gross]
-            best = likely_changes(found, at)
-    return _judged(calibrated, rows, limits, at, found, gross, few)
-
-
-def _most_gross(rows: Linear) -> int:
-    return max(1, int(MOST_GROSS * rows.placed.problem.n_configurations))
+    found: list[HypothesisTest] = [] if few else fit_changes(calibrated, at)
+    likely = likely_changes(found)
+    most_gross = max(1, int(MOST_GROSS * at.placed.problem.n_configurations))
+    while len(likely) == 1 and likely[0].hypothesis.kind == "row" and len(gross) < most_gross:
+        gross += likely[0].hypothesis.names
+        at = at.without(likely[0].hypothesis.columns)
+        found = [f for f in fit_changes(calibrated, at) if f.hypothesis.names[0] not in gross]
+        likely = likely_changes(found)
+    if any(f.hypothesis.kind != "row" for f in likely) and not gross:
+        found = refine_best(calibrated, rows, found, likely)
+        likely = likely_changes(found) or likely
+    return _judge(calibrated, at, limits, found, likely, gross, few, _rms(calibrated, rows, at, gross))
 
 
 def _too_few(rows: Linear) -> str:
     """Why the rows cannot be judged; empty if they can."""
-    n = rows.placed.problem.n_independent
+    if rows.dof >= LEAST_DOF:
+        return ""
     fitted = "frame, station and whatever else does not stay with the arm"
-    if rows.dof < LEAST_DOF:
-        used = f"{n} figures, of which {rows.n_free} go to {fitted}"
-        return f"{used}: {rows.dof} left to judge by, at least {LEAST_DOF} needed"
-    return ""
+    used = f"{rows.placed.problem.n_independent} figures, of which {rows.n_free} go to {fitted}"
+    return f"{used}: {rows.dof} left to judge by, at least {LEAST_DOF} needed"
 
 
-def _judged(
+@dataclass(frozen=True)
+class _Rms:
+    """RMS of residuals and of noise of a kind, [m] or [rad], and the number of measurements."""
+
+    residual: float
+    noise: float
+    n: int
+
+
+def _judge(
     calibrated: Calibrated,
-    rows: Rows,
-    limits: Limits,
     at: Linear,
+    limits: Limits,
     found: list[HypothesisTest],
+    likely: list[HypothesisTest],
     gross: list[str],
     few: str,
+    rms: dict[str, _Rms],
 ) -> Check:
+    noise = {kind: one.noise for kind, one in rms.items()}
+    names = {f.hypothesis.names for f in likely}
+    likely = merge_alike(calibrated, likely, noise)
+    alike = names - {f.hypothesis.names for f in likely}
+    found = [f for f in found if f.hypothesis.names not in alike]
+    limit = {kind: value for kind in LIMITED if (value := getattr(limits, kind)) is not None}
     p_value = _p_value(calibrated, at) if at.dof > 0 else None
-    likely = likely_changes(found, at)
-    if any(f.hypothesis.kind != "row" for f in likely):
-        found = best_refined(calibrated, rows, at, found, likely) if not gross else found
-        likely = likely_changes(found, at) or likely
-    rms, noise, counts = _rms(calibrated, rows, at, gross)
-    alike = {f.hypothesis.names for f in likely}
-    likely = merged(calibrated, likely, noise)
-    alike -= {f.hypothesis.names for f in likely}
-    stated = {kind: limit for kind in LIMITED if (limit := getattr(limits, kind)) is not None}
-    elsewhere = effect_elsewhere(calibrated, likely[0]) if likely else None
-    reasons, cautions = _reasons(at, p_value, found, likely, rms, noise, counts, stated, elsewhere, few)
+    reasons, cautions = ([few], []) if few else _reasons(calibrated, at, p_value, found, likely, rms, limit)
     if gross:
-        names = ", ".join(gross)
-        cautions.insert(0, f"gross errors at {names}: left out here; measure again")
-    missing = [kind for kind in stated if kind not in rms]
+        cautions.insert(0, f"gross errors at {', '.join(gross)}: left out here; measure again")
+    unjudged = [kind for kind in limit if kind not in rms or rms[kind].n < LEAST]
     verdict: Verdict = "not_evaluated" if few else "fail" if reasons else "pass"
-    if verdict == "pass" and (missing or any(counts[kind] < LEAST for kind in stated if kind in counts)):
-        what = missing or [kind for kind in stated if counts[kind] < LEAST]
-        verdict, reasons = "not_evaluated", [f"a limit of {what[0]}, and fewer than {LEAST} rows to judge it by"]
+    if verdict == "pass" and unjudged:
+        verdict, reasons = "not_evaluated", [f"a limit of {unjudged[0]}, and fewer than {LEAST} rows to judge it by"]
+    explained = bool(likely) and likely[0].explains
     alone = len(likely) == 1 and likely[0].hypothesis.kind != "row"
-    explained = bool(likely) and explains(likely[0], at)
-    advice = separating(calibrated, at, likely, WRONG / max(len(found), 1)) if len(likely) > 1 else None
+    several = len(likely) > 1
     made = Check(
         verdict=verdict,
-        reasons=(few,) if few else tuple(reasons),
+        reasons=tuple(reasons),
         cautions=tuple(cautions),
         n=sum(len(s.train) for s in at.placed.problem.data.series),
         chi2=at.chi2,
         dof=at.dof,
         p_value=p_value,
-        rms=rms,
+        rms={kind: one.residual for kind, one in rms.items()},
         noise=noise,
-        limits=stated,
-        explanations=_explanations([f for f in found if f.hypothesis.names not in alike], likely, at),
+        limits=limit,
+        explanations=_explanations(found, likely),
         gross_rows=tuple(gross),
         deploy=verdict == "pass" or (verdict == "fail" and alone and explained),
-        detectable=_detectable(calibrated, at, found),
-        advice=advice,
+        detectable=_detectable(calibrated, found),
+        advice=advise_configurations(calibrated, at, likely, WRONG / max(len(found), 1)) if several else None,
     )
     return made if explained or verdict != "fail" else _unless_misread(made, at)
 
@@ -245,108 +245,93 @@ def _unless_misread(found: Check, at: Linear) -> Check:
     return replace(nothing, verdict="not_evaluated", reasons=named, deploy=False)
 
 
-def _detectable(calibrated: Calibrated, at: Linear, found: Sequence[HypothesisTest]) -> dict[str, float | None]:
+def _detectable(calibrated: Calibrated, found: Sequence[HypothesisTest]) -> dict[str, float | None]:
     """The slip of each joint's zero that is found with a probability of `POWER`."""
-    sigma = {name: float(f.sigma[0]) for f in found if f.k == 1 for name in (*f.hypothesis.names, *f.hypothesis.same)}
+    sigma = {f.hypothesis.names[0]: float(f.sigma[0]) for f in found if f.hypothesis.kind == "zero"}
     least = np.sqrt(quantile(CERTAIN / max(len(found), 1), 1)) + special.ndtri(POWER)
-    sizes = {name: least * sigma.get(name, np.nan) for name in zero_names(calibrated.robot)}
-    return {name: float(size) if np.isfinite(size) else None for name, size in sizes.items()}
+    sizes = {name: float(least * sigma.get(name, np.nan)) for name in zero_names(calibrated.robot)}
+    return {name: size if np.isfinite(size) else None for name, size in sizes.items()}
 
 
-def _rms(
-    calibrated: Calibrated, rows: Rows, at: Linear, gross: Sequence[str]
-) -> tuple[dict[str, float], dict[str, float], dict[str, int]]:
-    """RMS of residuals and of noise by kind, and the number of measurements, by what is no gross error.
-
-    Frames are fitted without gross errors, too, and the arm is as calibrated.
-    """
+def _rms(calibrated: Calibrated, rows: Rows, at: Linear, gross: Sequence[str]) -> dict[str, _Rms]:
+    """RMS by kind without gross errors, frames fitted without these, the arm as calibrated."""
     solution, data = at.placed.solution, at.placed.problem.data
     if gross:
         wrong = [data.names.index(name) for name in gross]
         tables = (t.tested_on(np.isin(k, wrong)) for t, k in zip(rows.tables, data.places, strict=True))
-        solution = placed(calibrated, replace(rows, tables=tuple(tables)), calibrated.values).solution
+        solution = place_new_data(calibrated, replace(rows, tables=tuple(tables)), calibrated.values).solution
     table = residual_table(solution)
     counted, first = table.used & ~table.test, table.is_first_of_family()
-    rms, noise, counts = {}, {}, {}
+    found = {}
     for k, family in enumerate(table.families):
         mine = counted & (table.family == k)
         n = int(np.sum(mine & first))
         if n:
-            rms[family], noise[family] = (float(np.sqrt(np.sum(v[mine] ** 2) / n)) for v in (table.after, table.sigma))
-            counts[family] = n
-    return rms, noise, counts
+            residual, noise = (float(np.sqrt(np.sum(v[mine] ** 2) / n)) for v in (table.after, table.sigma))
+            found[family] = _Rms(residual, noise, n)
+    return found
 
 
 def _reasons(
+    calibrated: Calibrated,
     at: Linear,
     p_value: float | None,
     found: Sequence[HypothesisTest],
     likely: Sequence[HypothesisTest],
-    rms: dict[str, float],
-    noise: dict[str, float],
-    counts: dict[str, int],
+    rms: dict[str, _Rms],
     limits: dict[str, float],
-    elsewhere: dict[str, float] | None,
-    few: str,
 ) -> tuple[list[str], list[str]]:
     """Why the calibration is not good any more, and cautions."""
     reasons, cautions = [], []
-    if few or p_value is None:
-        return [], []
     for kind, limit in limits.items():
-        if kind not in rms or counts[kind] < LEAST or rms[kind] <= limit:
+        one = rms.get(kind)
+        if one is None or one.n < LEAST or one.residual <= limit:
             continue
-        if rms[kind] ** 2 - noise[kind] ** 2 <= limit**2:
-            cautions.append(f"{kind}: the noise stated hides whether the arm is within the limit")
-        reasons.append(f"{kind}: RMS error {_shown(rms[kind], LIMITED[kind])}, limit {_shown(limit, LIMITED[kind])}")
-    changed = [f for f in likely if f.hypothesis.kind != "row"]
-    far = [kind for kind, size in (elsewhere or {}).items() if kind in limits and size > limits[kind]]
-    reduced = at.chi2 / at.dof
-    if changed and (not limits or far or elsewhere is None):
-        what = (
-            f"; at other configurations up to {_shown((elsewhere or {})[far[0]], LIMITED[far[0]])} RMS" if far else ""
-        )
-        reasons.append(f"the rows show a change: chi-square falls by {changed[0].drop:.4g} with it{what}")
-    elif changed:
-        cautions.append("the rows show a change, within the limits everywhere")
-    elif p_value < CERTAIN and reduced > FACTOR and not limits:
-        what = f"residuals are {np.sqrt(reduced):.2g} times as large as noise and calibration allow"
-        reasons.append(f"{what}{_without_change(found, at)}")
-    elif p_value < CERTAIN:
-        cautions.append(
-            f"residuals are {np.sqrt(reduced):.3g} times as large as noise and calibration allow, like noise"
-        )
+        if one.residual**2 - one.noise**2 <= limit**2:
+            cautions.append(f"{kind}: the specified noise hides whether the arm is within the limit")
+        reasons.append(f"{kind}: RMS error {_shown(one.residual, kind)}, limit {_shown(limit, kind)}")
+    change = next((f for f in likely if f.hypothesis.kind != "row"), None)
+    excess = float(np.sqrt(at.chi2 / at.dof))
+    if change is not None:
+        sizes = dict(zip(("orientation", "position"), rms_motion(motion(calibrated, change)).tolist(), strict=True))
+        far = [kind for kind, size in sizes.items() if size > limits.get(kind, np.inf)]
+        where = f"; over the whole workspace {_shown(sizes[far[0]], far[0])} RMS" if far else ""
+        if far or not limits or change.hypothesis.kind == "frame":
+            reasons.append(f"the rows show a change: chi-square falls by {change.drop:.4g} with it{where}")
+        else:
+            cautions.append("the rows show a change, within the limits everywhere")
+    elif p_value is not None and p_value < CERTAIN:
+        what = f"residuals are {excess:.3g} times as large as noise and calibration allow"
+        if excess**2 > FACTOR and not limits:
+            reasons.append(f"{what}{_without_change(found)}")
+        else:
+            cautions.append(f"{what}, like noise")
     return reasons, cautions
 
 
-def _without_change(found: Sequence[HypothesisTest], at: Linear) -> str:
+def _without_change(found: Sequence[HypothesisTest]) -> str:
     """What residuals mean that are too large where no change is certain whatever the noise."""
-    of_arm = [f for f in found if f.hypothesis.kind != "row"]
-    best = min(of_arm, key=lambda f: (not explains(f, at), f.k, f.left), default=None)
-    if best is None or best.p_value >= CERTAIN or not explains(best, at):
-        return ", and no change of the arm explains that: is the noise of these rows stated too small?"
-    change = " and ".join(best.hypothesis.names)
-    return f": their noise is stated too small, or a change such as of {change}; they are too few to say which"
+    able = [f for f in found if f.hypothesis.kind != "row" and f.explains and f.p_value < CERTAIN]
+    if not able:
+        return ", and no change of the arm explains that: is the noise of these rows specified too small?"
+    change = " and ".join(min(able, key=lambda f: (f.k, f.left)).hypothesis.names)
+    return f": their noise is specified too small, or a change such as of {change}; they are too few to say which"
 
 
-def _shown(value: float, unit: str) -> str:
-    return f"{value * 1e3:.4g} mm" if unit == "m" else f"{np.rad2deg(value):.4g} deg"
+def _shown(value: float, kind: str) -> str:
+    return f"{value * 1e3:.4g} mm" if LIMITED[kind] == "m" else f"{np.rad2deg(value):.4g} deg"
 
 
-def _explanations(
-    found: Sequence[HypothesisTest], likely: Sequence[HypothesisTest], at: Linear
-) -> tuple[Explanation, ...]:
+def _explanations(found: Sequence[HypothesisTest], likely: Sequence[HypothesisTest]) -> tuple[Explanation, ...]:
+    """The likely changes, and the best of those that they exclude."""
     if not likely:
         return ()
-    names = {f.hypothesis.names for f in likely}
-    others = sorted((f for f in found if f.hypothesis.names not in names), key=lambda f: f.left)
-    others = [f for f in others if not any(within(g, f) for g in likely)][:ALSO_SHOWN]
-    scale = max(1.0, likely[0].left / max(at.dof - likely[0].k, 1))
-    shown = [*likely, *others]
+    names, scale = {f.hypothesis.names for f in likely}, likely[0].scale
+    others = [f for f in found if f.hypothesis.names not in names and not any(is_part_of(g, f) for g in likely)]
+    shown = [*likely, *sorted(others, key=lambda f: f.left)[:ALSO_SHOWN]]
 
     def explanation(f: HypothesisTest) -> Explanation:
-        apart = tuple(g.hypothesis.names for g in shown if g is not f and excludes(f, g, scale, len(found)))
-        rivals = tuple(g.hypothesis.names for g in likely if g is not f and not excludes(f, g, scale, len(found)))
+        excluded = {g.hypothesis.names: excludes(f, g, scale) for g in shown if g is not f}
         sized = f.hypothesis.kind != "row"
         return Explanation(
             parameters=f.hypothesis.names,
@@ -357,8 +342,8 @@ def _explanations(
             chi2_drop=f.drop,
             p_value=f.p_value,
             likely=f.hypothesis.names in names,
-            told_apart_from=apart,
-            not_told_apart_from=rivals,
+            told_apart_from=tuple(other for other, out in excluded.items() if out),
+            not_told_apart_from=tuple(other for other, out in excluded.items() if not out and other in names),
             same=f.hypothesis.same,
         )
 

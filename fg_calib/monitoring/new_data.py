@@ -1,4 +1,4 @@
-"""New rows of an arm that was calibrated before, beside what that calibration says of it.
+"""New rows of an arm that was calibrated before, with what that calibration says of it.
 
 The rows are whitened by their noise and linearised at the calibrated arm, measurement frames and whatever else does not
 stay with the arm fitted to them. What the arm and its targets may be off is then counted by columns `J B` with rows
@@ -13,35 +13,26 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fg_calib.arrays import Floats, Integers
 from fg_calib.diagnostics.unmodelled_effects import basis_of
 from fg_calib.errors import ProblemError
 from fg_calib.graph.error_states import State, WhitenedBlock
-from fg_calib.graph.knowledge import STAYING, Knowledge, columns_in, coordinates_of
+from fg_calib.graph.knowledge import Knowledge, columns_in, coordinates_of
 from fg_calib.graph.noise_models import JOINT_NOISE, NoiseName, NoiseState
 from fg_calib.graph.problem import Problem, at_parameters, problem_at, start_of, tables_of, variables_of, with_factors
 from fg_calib.graph.solver import Solution, solve
 from fg_calib.graph.variables import build_variables, unknown_prior_rows
 from fg_calib.measurements import residuals
 from fg_calib.measurements.build import build_dataset
-from fg_calib.measurements.kinds import INSTRUMENTS, LANDMARKS
+from fg_calib.measurements.kinds import INSTRUMENTS
 from fg_calib.measurements.table import KnownPoint, Table
 from fg_calib.options import Options
 from fg_calib.robot.model import Robot, names_of
 from fg_calib.statistics.covariance import TangentCovariance
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-
 _NOTHING = 1e-9
 """Part of a column's length that counts as nothing."""
-
-TABLES_OF = {
-    letter: tuple(model for model, one in INSTRUMENTS.items() if LANDMARKS[letter] in one.landmarks)
-    for letter in STAYING
-}
-"""Models whose tables have unknowns of a letter."""
 
 
 @dataclass(frozen=True)
@@ -124,13 +115,17 @@ class Rows:
         """
         if known is None:
             return self.tables
-        places = {letter: {n: KnownPoint(known.place((letter, n)), tolerance) for k, n in known.unknowns if k == letter}
-                  for letter in TABLES_OF}  # fmt: skip
-        found = []
-        for table in self.tables:
-            more = {n: k for letter, of in places.items() if table.model in TABLES_OF[letter] for n, k in of.items()}
-            found.append(replace(table, known={**table.known, **more}).by_itself())
-        return tuple(found)
+
+        def with_places(table: Table) -> Table:
+            letters = {kind.letter for kind in INSTRUMENTS[str(table.model)].landmarks} if table.model else set()
+            places = {
+                name: KnownPoint(known.place((letter, name)), tolerance)
+                for letter, name in known.unknowns
+                if letter in letters
+            }
+            return replace(table, known={**table.known, **places}).by_itself()
+
+        return tuple(map(with_places, self.tables))
 
 
 @dataclass(frozen=True)
@@ -148,7 +143,7 @@ class Placed:
     pinned: tuple[tuple[str, str], ...]
 
 
-def placed(calibrated: Calibrated, rows: Rows, values: Floats) -> Placed:
+def place_new_data(calibrated: Calibrated, rows: Rows, values: Floats) -> Placed:
     """New rows at an arm that is held.
 
     Args:
@@ -252,7 +247,7 @@ class Linear:
         return wide
 
 
-def linear(calibrated: Calibrated, at: Placed) -> Linear:
+def linearise_new_data(calibrated: Calibrated, at: Placed) -> Linear:
     """The rows and what is known as a linear system."""
     problem = at.problem
     J, joints, r = linearised(problem)

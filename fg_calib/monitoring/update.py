@@ -14,8 +14,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fg_calib.arrays import Floats
 from fg_calib.errors import InputError, ProblemError
 from fg_calib.graph.build import kept_of
 from fg_calib.graph.knowledge import Knowledge, coordinates_of
@@ -24,14 +24,12 @@ from fg_calib.graph.solver import Solution, solve
 from fg_calib.measurements.build import build_dataset
 from fg_calib.measurements.kinds.pose import TARGET
 from fg_calib.monitoring.hypotheses import motions, zero_names
-from fg_calib.monitoring.new_data import Calibrated, Placed, Rows, placed
+from fg_calib.monitoring.new_data import Calibrated, Placed, Rows, place_new_data
 from fg_calib.monitoring.prior_information import with_tolerances
 from fg_calib.options import NEAR, did_you_mean, known_names
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.model import Robot, names_of, tolerance_kind
 from fg_calib.statistics.residual_table import HeldOut, residual_table
-
-Floats = NDArray[np.float64]
 
 
 def updated(
@@ -61,7 +59,7 @@ def updated(
     if growth or changed:
         known = _with_change(calibrated, known, growth, changed)
         robot = replace(robot, parameters=tuple(replace(p, tolerance=None) for p in robot.parameters))
-    at = placed(replace(calibrated, knowledge=known), rows, calibrated.values)
+    at = place_new_data(replace(calibrated, knowledge=known), rows, calibrated.values)
     return solve(_problem(calibrated, robot, known, rows, at))
 
 
@@ -73,7 +71,7 @@ def predicted_before(calibrated: Calibrated, rows: Rows) -> tuple[HeldOut, ...]:
         rows: The rows; test rows count as the others do.
     """
     rows = replace(rows, tables=tuple(table.all_train() for table in rows.tables))
-    solution = placed(calibrated, rows, calibrated.values).solution
+    solution = place_new_data(calibrated, rows, calibrated.values).solution
     table = residual_table(solution)
     tested = replace(table, test=np.ones_like(table.test), n_fitted=0, seen=np.zeros_like(table.seen))
     found = tested.held_out(solution.problem.data.labels)
@@ -200,7 +198,7 @@ def _zero(robot: Robot, name: str, by_name: Mapping[str, Floats]) -> Floats:
     Raises:
         InputError: It is none.
     """
-    of, _, _ = motions(robot, random_readings(robot, 20, np.random.default_rng(0)))
+    of = motions(robot, random_readings(robot, 20, np.random.default_rng(0)))
     owner = f"{name.removesuffix('.zero')}."
     own = [n for n in by_name if n.startswith(owner)]
     A, b = np.array([of[n].ravel() for n in own]).T, of[name].ravel()

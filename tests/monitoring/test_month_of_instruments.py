@@ -4,19 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from month import OF_INSTRUMENTS, months_of
+from month import OF_INSTRUMENTS, calibrated, measured, months_of, placed
 from scenarios import SIGMA, TOLERANCE
 from scipy import stats
 from simulated import small_arm
 
 from fg_calib import calibrate
 from fg_calib.measurements.dataset import Noise
-from fg_calib.monitoring import candidates
-from fg_calib.monitoring.new_data import linear, linearised, placed
+from fg_calib.monitoring.discriminating_design import _linearised_candidates
+from fg_calib.monitoring.new_data import linearise_new_data, linearised, place_new_data
 from fg_calib.simulation.scenario import Errors
-
-UNADVISED = ("contact", "faces", "sockets")
-"""Nobody touches anything at random configurations."""
 
 
 def likely(check):
@@ -73,51 +70,20 @@ def test_an_update_is_a_calibration_of_all_rows_whatever_the_instrument(kind):
         assert one.sigma == pytest.approx(other.sigma, rel=1e-5)
 
 
-def candidates_of(kind):
-    """The calibrated arm's rows of a month, and the candidates for them."""
-    robot, _, old, new = months_of(kind, 2)
-    calibration = calibrate(robot, old)
-    rows, _ = calibration._rows(new, None, None)
-    at = linear(calibration.calibrated, placed(calibration.calibrated, rows, calibration.calibrated.values))
-    return at, candidates.candidates(at)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", sorted(OF_INSTRUMENTS.keys() - set(UNADVISED)))
-def test_columns_of_candidates_are_differences_of_their_residuals(kind):
-    """With the arm, frame and whatever else the rows have fitted moved by a little, at the same measured values."""
-    at, found = candidates_of(kind)
-    whole = at.placed.problem
-    v = whole.variables
-    q, table = candidates._drawn(whole, 0)
-    step = 1e-7 * np.random.default_rng(0).normal(size=v.n_columns + v.n_nuisance)
+def test_columns_of_candidates_are_differences_of_their_residuals():
+    """With the arm and the frame that the rows have fitted moved by a little."""
+    calibration, true, rng = calibrated(2, unknown=True)
+    rows, _ = calibration._rows(measured(true, 8, rng, frame=placed(rng)), None, None)
+    known = calibration.calibrated
+    at = linearise_new_data(known, place_new_data(known, rows, known.values))
+    q = np.random.default_rng(0).uniform(-1.0, 1.0, (5, 6))
+    found, of = _linearised_candidates(at, q)
+    problem = found.placed.problem
+    v = problem.variables
+    step = 1e-6 * np.random.default_rng(1).normal(size=v.n_columns + v.n_nuisance)
 
     def residuals(sign):
-        x = v.stepped(whole.start, sign * step)
-        x[v.nuisance_span] += sign * step[v.n_columns :]
-        _, _, r = linearised(candidates._alone(replace(whole, start=x), 0, table))
-        return r
+        return linearised(replace(problem, start=v.stepped(problem.start, sign * step[: v.n_columns])))[2]
 
-    of = candidates._candidate_of_rows(candidates._alone(whole, 0, table))
-    difference = 0.5 * (residuals(1.0) - residuals(-1.0))
-    rows = {tuple(np.round(reading, 12)): k for k, reading in enumerate(q)}
-    assert len(found.readings) >= candidates.LEAST_CANDIDATES
-    for reading, columns in zip(found.readings, found.columns, strict=True):
-        expected = difference[of == rows[tuple(np.round(reading, 12))]]
-        assert columns @ step == pytest.approx(expected, rel=1e-4, abs=1e-4 * np.abs(difference).max())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", UNADVISED)
-def test_contacts_have_no_candidates(kind):
-    assert candidates_of(kind)[1] is None
-
-
-@pytest.mark.slow
-def test_where_lengths_leave_a_change_open_configurations_are_advised():
-    """Of wires to three anchors a slip of joint 4 looks like a change of the tool."""
-    robot, _, old, new = months_of("anchors", 3, n_new=14, slip={"theta4": 2e-2})
-    found = calibrate(robot, old).check(new)
-    assert len(likely(found)) > 1
-    assert found.advice is not None
-    assert len(found.advice.readings) > 0
+    assert found.columns @ step == pytest.approx(0.5 * (residuals(1.0) - residuals(-1.0)), rel=1e-5, abs=1e-9)
+    assert [int(np.sum(of == k)) for k in range(5)] == [6] * 5
