@@ -223,7 +223,10 @@ def residuals_at(
         table: Number of the table that is asked for; all if None.
     """
     series = [s for s in problem.data.series if table is None or s.table == table]
-    some = tuple(s.select(s.train[_spread(len(s.train), 3 * MAX_ROWS)]) for s in series if len(s.train))
+    series = [
+        s for s in series if len(s.train) and s.kind.ends
+    ]  # rows of landmarks alone have none of the arm's errors
+    some = tuple(s.select(s.train[_spread(len(s.train), 3 * MAX_ROWS)]) for s in series)
     sampled = replace(problem, data=replace(problem.data, series=some))
     variables = build_variables(robot, [t.unknown_frame for t in problem.data.tables])
     of_arm, of_frame = problem.variables.robot_span, problem.variables.frame_span

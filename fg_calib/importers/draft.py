@@ -1,49 +1,66 @@
-"""A job for files that are there: `fg-calib init` fills a template, and marks what only its user can decide."""
+"""A job for files that are there: `fg-calib init` recognises tables by their headers and fills a template.
+
+Lines marked DECIDE are what only the user knows.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from fg_calib.errors import InputError, printable
-from fg_calib.importers.recognise import Recognised, recognise
+from fg_calib.io.columns import KNOWN, OF_CONFIGURATIONS, OF_PAIRS, Table, names_of
 from fg_calib.io.robot_file import read_robot
 from fg_calib.io.units import ANGLES, LENGTHS
 from fg_calib.io.yaml import read_yaml
+from fg_calib.measurements.kinds import INSTRUMENTS
+from fg_calib.measurements.kinds.board import COVARIANCE
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, Model
 from fg_calib.robot.model import Robot
 
 _TABLES = (".csv", ".parquet", ".pq")
 
-_NOISE: dict[str, tuple[str, ...]] = {
-    "pose": ("position", "orientation"),
-    "position": ("position",),
-    "orientation": ("orientation",),
-    "anchor": ("distance",),
-    "plane": ("distance",),
-    "board": ("position", "orientation"),
-    "pixels": ("pixel",),
+_UNIT = r"um|mm|cm|m|inch|in|mrad|rad|radians|degrees|deg|°|px"
+_HEADER = re.compile(rf"^(?P<name>.*?\S)(?:\s*[\[(]\s*(?P<bracket>{_UNIT})\s*[\])]|[_\s](?P<suffix>{_UNIT}))$", re.I)
+_SPELLINGS = {"inch": "in", "radians": "rad", "degrees": "deg", "°": "deg"}
+_JOINT = re.compile(r"^(?:actual[ _])?(?:q|j|a|axis|joint|theta|th)[ _-]?(?:pos|position|angle)?[ _-]?0*(\d+)$")
+_SYNONYMS = {
+    **{f"{stem}{axis}": axis for axis in "xyz" for stem in ("pos_", "position_", "p", "tcp_", "t")},
+    **{f"{stem}{axis}": f"q{axis}" for axis in "xyzw" for stem in ("q_", "quat_", "orientation_")},
+    **dict.fromkeys(("reflector", "smr", "marker"), "target"),
+    **{"configuration": "id", "config": "id", "dist": "distance", "length": "distance"},
 }
-"""Kinds of noise of a model; pairs have those of what they were measured by."""
+"""Known columns by other names that tables have for them."""
+
+_MODELS: dict[str, Model] = {
+    **{"u": "pixels", "board": "board", COVARIANCE[0]: "board", "anchor": "anchor", "plane": "plane"},
+    "group": "distance",
+}
+"""Models by a column that no other has, in order of precedence."""
 
 _OTHER_MODELS = {
-    "pose": "or distance-rotation, which needs no frame; position without the orientations; board if a camera on the "
-    "tool measured where a board is",
+    "pose": "or distance-rotation, which needs no frame; board if a camera on the tool measured where a board is",
     "position": "or distance, which needs no frame",
     "orientation": "or rotation, which needs no frame",
-    "anchor": "offset: estimate if the instrument adds a length of its own",
 }
+
+_BIG_ANGLE, _BIG_LENGTH = 13.0, 30.0
+"""Joint readings beyond two turns in rad are in deg; places farther than this in m are in mm."""
 
 _TEMPLATE = """\
 # A calibration job, written by fg-calib init. Lines with DECIDE are yours to look at; `fg-calib inspect` says what this
 # job looks like.
 robot: {robot}
-{robot_notes}{measurements}units: {units}
+{notes}measurements:
+{entries}
+units: {units}  # {why}
 # DECIDE the noise, 1 sigma in the units above: the values are guesses, so it is estimated from residuals;
 # put your instrument's in their place and leave estimate out. joint: repeatability of the joint readings.
 noise: {noise}
@@ -72,27 +89,128 @@ _NO_TOOL = """\
 
 
 @dataclass(frozen=True)
-class _Inputs:
-    """The files of a job, sorted.
+class _Recognised:
+    """A table, recognised by its header.
 
     Attributes:
-        robot_file: The robot's file.
-        robot: The robot.
-        tables: Tables of configurations.
-        pairs: The table of pairs, if there is one.
-        camera: The camera's file, if there is one.
+        path: Its file.
+        model: Model of its measurements; None of joint readings alone, and of pairs.
+        present: Known columns that it has, except those of joints.
+        columns: Header of each column that the table calls otherwise, by the known name.
+        units: Its units of `length` and `angle`, if it has such columns.
+        guessed: Which of the units are guesses from the sizes of the values.
+        unused: Columns without a meaning.
+        pairs: The table of pairs that are of its configurations, if there is one.
     """
 
-    robot_file: Path
-    robot: Robot
-    tables: tuple[Recognised, ...]
-    pairs: Recognised | None
-    camera: Path | None
+    path: Path
+    model: Model | None
+    present: tuple[str, ...]
+    columns: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    guessed: tuple[str, ...] = ()
+    unused: tuple[str, ...] = ()
+    pairs: _Recognised | None = None
 
     @property
-    def every(self) -> tuple[Recognised, ...]:
-        """All tables."""
-        return (*self.tables, *(() if self.pairs is None else (self.pairs,)))
+    def tables(self) -> tuple[_Recognised, ...]:
+        """The table, and that of its pairs."""
+        return (self,) if self.pairs is None else (self, self.pairs)
+
+    @property
+    def noise(self) -> list[str]:
+        """Kinds of noise that its model needs and no column specifies."""
+        kinds = INSTRUMENTS[str(self.model)].noise
+        if self.model in PAIR_MODELS:  # nothing is formed from contact points but what was measured between them
+            kinds = tuple(kind for kind in kinds if self.pairs is not None and kind in self.pairs.present)
+            kinds = (*(("point",) if "group" in self.present else ()), *kinds)
+        columns = {"position": "x", "orientation": "rx", "pixel": "u"}
+        present = {name for table in self.tables for name in table.present}
+        if COVARIANCE[0] in present:
+            return []
+        return [k for k in kinds if not {f"sigma_{k}", f"sigma_{columns.get(k, k)}"} & present]
+
+
+# --- a table ----------------------------------------------------------------------------------------------------------
+
+
+def _recognise(path: Path, robot: Robot) -> tuple[_Recognised, bool]:
+    """What a table holds, and whether it is one of pairs.
+
+    Raises:
+        InputError: It cannot be read, is neither of configurations nor of pairs, or mixes units.
+    """
+    table = Table.read(path, "table")
+    headers = [_HEADER.match(column) for column in table.columns]
+    bare = [match["name"].lower() if match else c.lower() for match, c in zip(headers, table.columns, strict=True)]
+    stated = [(match["bracket"] or match["suffix"]).lower() if match else "" for match in headers]
+    joints = _find_joints(bare, robot)
+    is_pairs = not joints and {"a", "b"} <= {column.lower() for column in table.columns}
+    if not joints and not is_pairs:
+        numbered = "q1" if robot.n_joints == 1 else f"q1 to q{robot.n_joints}"
+        names = ", ".join(joint.name for joint in robot.joints)
+        expected = f"columns {numbered}, or the joints' names {names}; or a and b of pairs"
+        hint = f"the columns are {', '.join(table.columns)}"
+        raise InputError(table.name, "neither joint readings nor pairs", expected, hint)
+    known, found = names_of(OF_PAIRS.values()) if is_pairs else KNOWN, dict[str, int]()
+    for k in sorted(set(range(len(bare))) - set(joints.values()), key=lambda k: table.columns[k] not in known):
+        name = table.columns[k].lower() if is_pairs else bare[k] if bare[k] in known else _SYNONYMS.get(bare[k], "")
+        if name in known:
+            found.setdefault(name, k)
+    kinds = {name: of.unit for of in (*OF_CONFIGURATIONS.values(), *OF_PAIRS.values()) for name in of.names}
+    kinds |= {n: "length" if joint.prismatic else "angle" for n, joint in zip(joints, robot.joints, strict=False)}
+    every, units, guessed = joints | found, dict[str, str](), list[str]()
+    for kind, known_units in (("length", LENGTHS), ("angle", ANGLES)):
+        of_kind = [(n, k) for n, k in every.items() if kinds.get(n) == kind]
+        there = {_SPELLINGS.get(stated[k], stated[k]) for _, k in of_kind if stated[k]}
+        if len(there) > 1 or not there <= known_units.keys():
+            raise InputError(table.name, f"{kind}s in {', '.join(sorted(there))}", f"one of {', '.join(known_units)}")
+        if of_kind:
+            units[kind] = there.pop() if there else _guess_unit(table, kind, dict(of_kind))
+            guessed += [kind] if not any(stated[k] for _, k in of_kind) else []
+    return _Recognised(
+        path=path,
+        model=None if is_pairs else _find_model(set(found)),
+        present=tuple(found),
+        columns={name: table.columns[k] for name, k in every.items() if name != table.columns[k]},
+        units=units,
+        guessed=tuple(guessed),
+        unused=tuple(c for k, c in enumerate(table.columns) if k not in every.values()),
+    ), is_pairs
+
+
+def _find_joints(bare: Sequence[str], robot: Robot) -> dict[str, int]:
+    """Columns of joint readings by the names under which they are read; empty where not all are there."""
+    place = {name: k for k, name in reversed(list(enumerate(bare)))}
+    names = [joint.name for joint in robot.joints]
+    if not KNOWN & set(names) and all(name.lower() in place for name in names):
+        return {name: place[name.lower()] for name in names}
+    numbered = {int(match[1]): k for name, k in place.items() if (match := _JOINT.match(name))}
+    first = 0 if 0 in numbered else 1
+    wanted = range(first, first + robot.n_joints)
+    return {f"q{i - first + 1}": numbered[i] for i in wanted} if set(numbered) == set(wanted) else {}
+
+
+def _guess_unit(table: Table, kind: str, columns: Mapping[str, int]) -> str:
+    """The unit of columns whose headers state none, by their largest value."""
+    given = [table.columns[k] for name, k in columns.items() if not name.startswith("sigma_")]
+    largest = np.nanmax(np.abs(table.numbers(given, optional=True)), initial=0.0) if given else 0.0
+    if kind == "length":
+        return "mm" if largest > _BIG_LENGTH else "m"
+    return "deg" if largest > _BIG_ANGLE else "rad"
+
+
+def _find_model(present: set[str]) -> Model | None:
+    """The model whose columns a table of configurations has."""
+    for column, model in _MODELS.items():
+        if column in present:
+            return model
+    own = [model for model, i in INSTRUMENTS.items() if set(i.generic_columns) & present]
+    position, orientation = {"x", "y", "z"} <= present, bool({"qw", "roll", "rx"} & present)
+    return own[0] if own else {of: model for model, of in POSE_MODELS.items()}.get((orientation, position))
+
+
+# --- the job ----------------------------------------------------------------------------------------------------------
 
 
 def draft_job(files: Sequence[Path], out: Path) -> str:
@@ -105,37 +223,38 @@ def draft_job(files: Sequence[Path], out: Path) -> str:
     Raises:
         InputError: There is no robot or no table among them, several of what there may be one, or one cannot be used.
     """
-    inputs, folder = _sorted(files), out.parent
-    robot, units = inputs.robot, _common_units(inputs)
+    robots, paths, cameras = _sort(files)
+    robot = read_robot(robots[0])
+    tables = _with_pairs([_recognise(path, robot) for path in paths])
+    for table in tables:
+        if table.model is None:
+            hint = f"its other columns are {', '.join(table.unused)}" if table.unused else ""
+            raise InputError(table.path.name, "joint readings alone", "what was measured at them, or pairs", hint)
+        if "camera" in INSTRUMENTS[table.model].options and not cameras:
+            raise InputError(table.path.name, "images of a camera that is not among the files", "camera.yaml too")
+    every, units = [one for table in tables for one in table.tables], {"length": "m", "angle": "rad"}
+    for one in reversed(every):  # those of the first table
+        units |= one.units
+    guessed = sorted({kind for one in every for kind in one.guessed})
     arm = [p for p in robot.parameters if p.estimated and 1 <= p.owner <= robot.n_joints]
     tool = [robot.parameters[i] for i in robot.owned_by(robot.n_joints + 1)]
-    notes = _NO_TOLERANCE * any(p.tolerance is None for p in arm) + _NO_TOOL * (not any(p.estimated for p in tool))
-    if len(inputs.tables) == 1:
-        (one,) = inputs.tables
-        lines = [f"measurements: {_path(one.path, folder)}", *_keys(one, inputs, folder)]
-    else:
-        lines = ["measurements:"]
-        for table in inputs.tables:
-            lines += [f"  - table: {_path(table.path, folder)}"]
-            lines += [f"    {line}" for line in _keys(table, inputs, folder)]
-            own = _units_of(table)
-            lines += [f"    units: {_flow(own)}"] * (own not in ({}, units))
-    guessed = sorted({key for table in inputs.every for key in table.guessed})
-    why = f"DECIDE: {' and '.join(guessed)} guessed from the values' sizes" if guessed else "as the headers say"
-    length = LENGTHS[units["length"]]
+    length, angle = LENGTHS[units["length"]], ANGLES[units["angle"]]
+    size = {"orientation": 2e-4 / angle, "angle": 2e-4 / angle, "pixel": 0.2}
+    noise = {kind: float(f"{size.get(kind, 1e-4 / length):.2g}") for table in tables for kind in table.noise}
     return _TEMPLATE.format(
-        robot=_path(inputs.robot_file, folder),
-        robot_notes=notes,
-        measurements="".join(f"{line}\n" for line in lines),
-        units=f"{_flow(units)}  # {why}",
-        noise=_flow(_noise(inputs, units)),
+        robot=_path(robots[0], out.parent),
+        notes=_NO_TOLERANCE * any(p.tolerance is None for p in arm) + _NO_TOOL * (not any(p.estimated for p in tool)),
+        entries="\n".join(line for table in tables for line in _entry(table, cameras, units, out.parent)),
+        units=_flow(units),
+        why=f"DECIDE: {' and '.join(guessed)} guessed from the values' sizes" if guessed else "as the headers say",
+        noise=_flow({**noise, "joint": 0.0, "estimate": True}),
         target=float(f"{0.1 / length:.3g}"),
         anchor=float(f"{1.0 / length:.3g}"),
     )
 
 
-def _sorted(files: Sequence[Path]) -> _Inputs:
-    """The files, each by what it is.
+def _sort(files: Sequence[Path]) -> tuple[list[Path], list[Path], list[Path]]:
+    """Files of the robot, of tables and of the camera.
 
     Raises:
         InputError: See `draft_job`.
@@ -143,12 +262,16 @@ def _sorted(files: Sequence[Path]) -> _Inputs:
     robots, tables, cameras = list[Path](), list[Path](), list[Path]()
     for file in files:
         ending = file.suffix.lower()
-        if ending in (".urdf", ".xacro"):
-            robots.append(file)
-        elif ending in _TABLES:
+        if ending in _TABLES:
             tables.append(file)
+        elif ending in (".urdf", ".xacro"):
+            robots.append(file)
         elif ending in (".yaml", ".yml"):
-            (robots if _is_robot(file) else cameras).append(file)
+            keys = read_yaml(file).keys()
+            if not {"joints", "urdf", "fx"} & keys:
+                what = "a job" if "measurements" in keys else f"keys {', '.join(map(str, keys))}"
+                raise InputError(file.name, what, "a robot (joints, or urdf) or a camera (fx, fy, cx, cy)")
+            (cameras if "fx" in keys else robots).append(file)
         else:
             expected = f"robot.yaml, a .urdf, camera.yaml, or a table: {', '.join(_TABLES)}"
             raise InputError(str(file), f"ending {ending!r}", expected)
@@ -158,71 +281,47 @@ def _sorted(files: Sequence[Path]) -> _Inputs:
     if not robots or not tables:
         missing, expected = ("table", "poses.csv") if robots else ("robot", "robot.yaml or a URDF")
         raise InputError("init", f"no {missing} among the files", f"one, such as {expected}")
-    twice = [table.name for k, table in enumerate(tables) if any(_same_file(table, other) for other in tables[:k])]
-    if twice:
-        raise InputError("init", f"the same table twice: {twice[0]}", "every table once")
-    robot = read_robot(robots[0])
-    recognised = [recognise(table, robot) for table in tables]
-    pairs = _pairs_among(recognised)
-    measured = _with_pairs([table for table in recognised if table.kind == "joints"], pairs)
-    for table in measured:
-        if table.model is None:
-            hint = f"its other columns are {', '.join(table.unused)}" if table.unused else ""
-            raise InputError(table.path.name, "joint readings alone", "what was measured at them, or pairs", hint)
-        if table.model == "pixels" and not cameras:
-            raise InputError(table.path.name, "images of a camera that is not among the files", "camera.yaml too")
-    return _Inputs(robots[0], robot, tuple(measured), pairs, cameras[0] if cameras else None)
+    return robots, tables, cameras
 
 
-def _same_file(one: Path, other: Path) -> bool:
-    """Whether two paths lead to one file; one that is not there is told of when it is read."""
-    return one.exists() and other.exists() and one.samefile(other)
-
-
-def _pairs_among(tables: Sequence[Recognised]) -> Recognised | None:
-    """The table of pairs among some.
+def _with_pairs(recognised: Sequence[tuple[_Recognised, bool]]) -> list[_Recognised]:
+    """Tables of configurations, that first which the pairs are of: at which nothing else was measured, if any.
 
     Raises:
-        InputError: There are several, it stands alone, or it has columns of other names: a job cannot explain these.
+        InputError: There are several tables of pairs, or one alone.
     """
-    pairs = [table for table in tables if table.kind == "pairs"]
+    pairs, tables = ([one for one, is_pairs in recognised if is_pairs == which] for which in (True, False))
     if len(pairs) > 1:
         raise InputError("init", f"several tables of pairs: {', '.join(t.path.name for t in pairs)}", "one")
     if not pairs:
-        return None
-    (one,) = pairs
-    if len(tables) == 1:
-        raise InputError(one.path.name, "pairs alone", "the table of the configurations that they are of too")
-    for name, column in one.columns.items():
-        if column.lower() != name:
-            hint = "a job's key columns is of configurations: rename it in the table"
-            raise InputError(one.path.name, f"column {column!r}", name, hint)
-    return one
+        return tables
+    if not tables:
+        expected = "the table of the configurations that they are of too"
+        raise InputError(pairs[0].path.name, "pairs alone", expected)
+    first, *others = sorted(tables, key=lambda t: 0 if t.model is None else 1 if "group" in t.present else 2)
+    measured = ("distance" in pairs[0].present, "angle" in pairs[0].present)
+    model = {of: model for model, of in PAIR_MODELS.items()}.get(measured, "distance")
+    return [replace(first, model=model, pairs=pairs[0]), *others]
 
 
-def _is_robot(file: Path) -> bool:
-    """Whether a YAML file is a robot's, and not a camera's.
-
-    Raises:
-        InputError: It is neither.
-    """
-    mapping = read_yaml(file)
-    if {"joints", "urdf"} & mapping.keys():
-        return True
-    if "fx" in mapping:
-        return False
-    found = "a job" if "measurements" in mapping else f"keys {', '.join(map(str, mapping))}"
-    raise InputError(file.name, found, "a robot (joints, or urdf) or a camera (fx, fy, cx, cy)")
-
-
-def _with_pairs(tables: Sequence[Recognised], pairs: Recognised | None) -> list[Recognised]:
-    """The tables, that first which the pairs are of: at which nothing else was measured, or points were touched."""
-    if pairs is None:
-        return list(tables)
-    distance, angle = "distance" in pairs.present, "angle" in pairs.present
-    model: Model = "distance-rotation" if distance and angle else "rotation" if angle else "distance"
-    ranked = sorted(tables, key=lambda t: 0 if t.model is None else 1 if "group" in t.present else 2)
-    return [replace(ranked[0], model=model), *ranked[1:]]
+def _entry(table: _Recognised, cameras: Sequence[Path], units: Mapping[str, str], folder: Path) -> list[str]:
+    """Lines of a table in the job's list of measurements."""
+    other = _OTHER_MODELS.get(str(table.model))
+    lines = [f"table: {_path(table.path, folder)}", f"model: {table.model}" + (f"  # {other}" if other else "")]
+    if table.pairs is not None:
+        lines.append(f"pairs: {_path(table.pairs.path, folder)}")
+    if table.model in POSE_MODELS:
+        lines.append("frame: unknown  # DECIDE: known only if the measurement frame is the robot's base frame")
+    if "camera" in INSTRUMENTS[str(table.model)].options:
+        room = "DECIDE: if it stands in the room, {file: ..., fixed: true}, and frame: unknown"
+        lines.append(f"camera: {_path(cameras[0], folder)}  # {room}")
+    if table.columns:
+        lines.append(f"columns: {_flow(dict(table.columns))}  # DECIDE whether these are what the names mean")
+    if dict(table.units).items() - units.items():
+        lines.append(f"units: {_flow(dict(table.units))}")
+    if table.unused:
+        lines.append(f"# not used: {printable(', '.join(table.unused))[:90]}")
+    return [("  - " if k == 0 else "    ") + line for k, line in enumerate(lines)]
 
 
 def _path(file: Path, folder: Path) -> str:
@@ -233,54 +332,3 @@ def _path(file: Path, folder: Path) -> str:
 def _flow(value: Any) -> str:
     """A value of YAML on one line."""
     return yaml.safe_dump(value, default_flow_style=True, width=10_000, sort_keys=False, allow_unicode=False).strip()
-
-
-def _keys(table: Recognised, inputs: _Inputs, folder: Path) -> list[str]:
-    """Lines of the keys of a table, with comments."""
-    lines = []
-    if inputs.pairs is not None and table is inputs.tables[0]:
-        which = "  # DECIDE whether they are of this table" * (len(inputs.tables) > 1)
-        lines.append(f"pairs: {_path(inputs.pairs.path, folder)}{which}")
-    other = _OTHER_MODELS.get(str(table.model))
-    lines.append(f"model: {table.model}" + (f"  # {other}" if other else ""))
-    if table.model in POSE_MODELS:
-        lines.append("frame: unknown  # DECIDE: known only if the measurement frame is the robot's base frame")
-    if table.model == "pixels" and inputs.camera is not None:
-        room = "DECIDE: if it stands in the room, {file: ..., fixed: true}, and frame: unknown"
-        lines.append(f"camera: {_path(inputs.camera, folder)}  # {room}")
-    if table.columns:
-        scales = table.scales
-        columns = {k: {"name": c, "scale": scales[k]} if k in scales else c for k, c in table.columns.items()}
-        lines.append(f"columns: {_flow(columns)}  # DECIDE whether these are what the names mean")
-    if table.unused:
-        lines.append(f"# not used: {printable(', '.join(table.unused))[:90]}")
-    return lines
-
-
-def _units_of(table: Recognised) -> dict[str, str]:
-    return {key: unit for key in ("length", "angle") if (unit := getattr(table, key)) is not None}
-
-
-def _common_units(inputs: _Inputs) -> dict[str, str]:
-    """The units at the top: those of the first table that states them."""
-    found: dict[str, str] = {"length": "m", "angle": "rad"}
-    for table in reversed(inputs.every):
-        found |= _units_of(table)
-    return found
-
-
-def _noise(inputs: _Inputs, units: dict[str, str]) -> dict[str, Any]:
-    """Guesses of noise that the tables do not state: 0.1 mm, 0.2 mrad, 0.2 px."""
-    guesses = dict.fromkeys(("position", "distance", "point"), 1e-4 / LENGTHS[units["length"]])
-    guesses |= dict.fromkeys(("orientation", "angle"), 2e-4 / ANGLES[units["angle"]]) | {"pixel": 0.2}
-    found: dict[str, Any] = {}
-    for table in inputs.tables:
-        if table.model not in PAIR_MODELS:
-            kinds = [kind for kind in _NOISE[str(table.model)] if kind not in table.has_sigma]
-        else:
-            pairs = inputs.pairs if table is inputs.tables[0] else None
-            kinds = ["point"] if "group" in table.present and "point" not in table.has_sigma else []
-            present = () if pairs is None else set(pairs.present) - pairs.has_sigma
-            kinds += [kind for kind in ("distance", "angle") if kind in present]
-        found |= {kind: float(f"{guesses[kind]:.2g}") for kind in kinds}
-    return {**found, "joint": 0.0, "estimate": True}
