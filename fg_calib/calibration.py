@@ -320,7 +320,6 @@ class Calibration:
         return Calibrated(
             robot=nominal,
             values=values,
-            posterior=self.posterior,
             knowledge=known,
             options=replace(result.options, folds=None),
             noise=result.carried.noise,

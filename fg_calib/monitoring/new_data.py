@@ -1,16 +1,17 @@
 """New rows of an arm that was calibrated before, with what that calibration says of it.
 
 The rows are whitened by their noise and linearised at the calibrated arm, measurement frames and whatever else does not
-stay with the arm fitted to them. What the arm and its targets may be off is then counted by columns `J B` with rows
-`u ~ N(0, 1)` of their own, B B^T the covariance of the calibration; what nothing determined, frames, anchors, planes,
-boards, touched points and offsets have columns without. So the smallest sum of squares is chi-square by the covariance
-`N + J B B^T J^T` after what is free has been fitted.
+stay with the arm fitted to them. What the arm and its targets may be off is fitted, too, with the calibration's
+information as rows `R s` of its own, R^T R its inverse covariance; what nothing determined, frames, anchors, planes,
+boards, touched points and offsets have no such rows. So the smallest sum of squares is chi-square by the covariance
+`N + J Sigma J^T` after what is free has been fitted.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -22,14 +23,14 @@ from fg_calib.graph.knowledge import Knowledge, columns_in, coordinates_of
 from fg_calib.graph.noise_models import JOINT_NOISE, NoiseName, NoiseState
 from fg_calib.graph.problem import Problem, at_parameters, problem_at, start_of, tables_of, variables_of, with_factors
 from fg_calib.graph.solver import Solution, solve
-from fg_calib.graph.variables import build_variables, unknown_prior_rows
+from fg_calib.graph.variables import unknown_prior_rows
 from fg_calib.measurements import residuals
 from fg_calib.measurements.build import build_dataset
 from fg_calib.measurements.kinds import INSTRUMENTS
 from fg_calib.measurements.table import KnownPoint, Table
+from fg_calib.monitoring.prior_information import with_tolerances
 from fg_calib.options import Options
 from fg_calib.robot.model import Robot, names_of
-from fg_calib.statistics.covariance import TangentCovariance
 
 _NOTHING = 1e-9
 """Part of a column's length that counts as nothing."""
@@ -42,8 +43,7 @@ class Calibrated:
     Attributes:
         robot: The nominal robot, with its tolerances; what the calibration is of is estimated.
         values: Its parameters as calibrated, shape (n_parameters,).
-        posterior: Their covariance.
-        knowledge: What the calibration's rows say; None where that was not saved.
+        knowledge: What the calibration's rows say; None where the arm was evaluated only.
         options: Its options.
         noise: What stated sigmas are multiplied by, by table and kind, where noise was estimated.
         noise_degrees: Degrees of freedom that it was estimated by; None where it was stated, or is not known.
@@ -51,11 +51,18 @@ class Calibrated:
 
     robot: Robot
     values: Floats
-    posterior: TangentCovariance
     knowledge: Knowledge | None
     options: Options
     noise: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     noise_degrees: float | None = None
+
+    @cached_property
+    def information(self) -> Knowledge | None:
+        """What rows and tolerances say."""
+        if self.knowledge is None or not self.options.has_priors:
+            return self.knowledge
+        estimated = {p.name: p.tolerance for p in self.robot.parameters if p.estimated and p.tolerance is not None}
+        return with_tolerances(self.knowledge, self.robot.nominal, estimated)
 
     def state_for(self, tables: Sequence[Table], like: Sequence[str]) -> NoiseState:
         """The noise of new tables: as it was found, of the only table if there was one.
@@ -248,29 +255,41 @@ class Linear:
 
 
 def linearise_new_data(calibrated: Calibrated, at: Placed) -> Linear:
-    """The rows and what is known as a linear system."""
-    problem = at.problem
+    """The rows and what is known as a linear system.
+
+    What is fitted are the arm and the landmarks that the calibration knows, held by its information, and everything
+    else of the rows, held by what the job says of it.
+    """
+    problem, v = at.problem, at.problem.variables
     J, joints, r = linearised(problem)
-    known, free = _fitted(calibrated, at)
-    stated, prior_of_free = _stated(at, free)
-    m, k = len(r), known.shape[1]
-    system = np.zeros((m + k + len(stated), k + free.shape[1]))
-    directions = np.hstack([known, free])
-    system[:m] = J @ directions
-    system[m : m + k, :k] = np.eye(k)
-    system[m + k :, k:] = prior_of_free
+    stated, J_stated = unknown_prior_rows(v, problem.start)
+    pinned = np.concatenate([np.zeros(0, dtype=np.int64), *(_columns_of(problem, name) for name in at.pinned)])
+    own = ~np.any(J_stated[:, pinned] != 0.0, axis=1)  # what it says of landmarks that the calibration knows is in it
+    stated, J_stated = stated[own], J_stated[own]
+    every, known = np.eye(v.n_columns + v.n_nuisance), np.zeros((v.n_columns + v.n_nuisance, 0))
+    information = np.zeros((0, 0))
+    if calibrated.information is not None:
+        knowledge = calibrated.information.about(at.pinned)
+        arm = np.zeros((len(every), knowledge.variables.n_columns))
+        arm[: v.n_columns] = columns_in(v, knowledge.variables, problem.start)
+        known, information = np.hstack([arm, every[:, pinned]]), knowledge.rows
+    frames = [np.arange(v.n_columns)[f.columns] for f in v.frames]
+    free = np.concatenate([*frames, np.setdiff1d(np.arange(v.n_columns, len(every)), pinned)])
+    directions = np.hstack([known, every[:, free.astype(np.int64)]])
+    of_known = np.hstack([information, np.zeros((len(information), len(free)))])
+    system = np.vstack([J @ directions, of_known, J_stated @ directions])
     fitted = basis_of(system)
-    rank = fitted.shape[1]
+    n_given = len(information) + len(stated)
     return Linear(
         placed=at,
-        r=np.concatenate([r, np.zeros(k), stated]),
+        r=np.concatenate([r, np.zeros(len(information)), stated]),
         system=system,
         directions=directions,
         fitted=fitted,
         columns=J,
         joints=joints,
-        dof=problem.n_independent + k + len(stated) - rank,
-        n_free=rank - k - len(stated),
+        dof=problem.n_independent + n_given - fitted.shape[1],
+        n_free=fitted.shape[1] - n_given,
     )
 
 
@@ -298,53 +317,9 @@ def _of_joints(rows: WhitenedBlock, at: State) -> Floats:
     return np.vstack(found)
 
 
-def _fitted(calibrated: Calibrated, at: Placed) -> tuple[Floats, Floats]:
-    """What is known up to its covariance, in its own sigma, and what is free, in the problem's columns.
-
-    Returns:
-        Shapes (n_columns + n_nuisance, k) and (n_columns + n_nuisance, n).
-    """
-    v, posterior = at.problem.variables, calibrated.posterior
-    n_all, n_arm = v.n_columns + v.n_nuisance, posterior.variables.n_robot_columns
-    arm = build_variables(posterior.variables.robot, [False], False)
-    M = np.zeros((n_all, n_arm))
-    M[: v.n_columns] = columns_in(v, arm, at.problem.start)
-    scales = posterior.variables.scales[:n_arm]
-    w, V = np.linalg.eigh(posterior.tangent[:n_arm, :n_arm] / np.outer(scales, scales))
-    B = scales[:, None] * V * np.sqrt(np.maximum(w, 0.0))
-    loose = posterior.loose[:, :n_arm].T
-    free_places = [np.arange(v.n_columns + v.n_nuisance)[f.columns] for f in v.frames]
-    pinned: list[Integers] = []
-    own = np.zeros((n_all, 0))
-    if at.pinned:
-        assert calibrated.knowledge is not None
-        known = calibrated.knowledge.about(at.pinned)
-        follow, root, unknown = known.follow()
-        pinned = [_columns_of(at.problem, name) for name in at.pinned]
-        of_pinned = np.concatenate(pinned)
-        M[of_pinned] += follow
-        own = np.zeros((n_all, root.shape[1]))
-        own[of_pinned] = root
-        free_places += [of_pinned[unknown]]
-    others = np.arange(v.n_columns, n_all)
-    free_places.append(np.setdiff1d(others, np.concatenate([np.zeros(0, dtype=np.int64), *pinned])))
-    free = np.hstack([M @ loose, np.eye(n_all)[:, np.concatenate(free_places)]])
-    return np.hstack([M @ B, own]), free
-
-
 def _columns_of(problem: Problem, name: tuple[str, str]) -> Integers:
     v = problem.variables
     place = coordinates_of(v, problem.data.unknowns, name)
     assert place is not None
     out: Integers = place - v.nuisance_span.start + v.n_columns
     return out
-
-
-def _stated(at: Placed, free: Floats) -> tuple[Floats, Floats]:
-    """What the job says of unknowns that are not the calibration's, as rows by what is free."""
-    v = at.problem.variables
-    r, J = unknown_prior_rows(v, at.problem.start)
-    pinned = [_columns_of(at.problem, name) for name in at.pinned]
-    of_pinned = np.concatenate([np.zeros(0, dtype=np.int64), *pinned])
-    mine = ~np.any(J[:, of_pinned] != 0.0, axis=1)
-    return r[mine], J[mine] @ free

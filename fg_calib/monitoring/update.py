@@ -25,7 +25,6 @@ from fg_calib.measurements.build import build_dataset
 from fg_calib.measurements.kinds.pose import TARGET
 from fg_calib.monitoring.hypotheses import motions, zero_names
 from fg_calib.monitoring.new_data import Calibrated, Placed, Rows, place_new_data
-from fg_calib.monitoring.prior_information import with_tolerances
 from fg_calib.options import NEAR, did_you_mean, known_names
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.model import Robot, names_of, tolerance_kind
@@ -57,7 +56,9 @@ def updated(
     known = known.about([name for name in known.unknowns if name[0] == TARGET.letter or anchors_stay])
     robot = calibrated.robot
     if growth or changed:
-        known = _with_change(calibrated, known, growth, changed)
+        information = replace(calibrated, knowledge=known).information
+        assert information is not None
+        known = _with_change(calibrated, information, growth, changed)
         robot = replace(robot, parameters=tuple(replace(p, tolerance=None) for p in robot.parameters))
     at = place_new_data(replace(calibrated, knowledge=known), rows, calibrated.values)
     return solve(_problem(calibrated, robot, known, rows, at))
@@ -133,11 +134,7 @@ def _with_change(
     calibrated: Calibrated, known: Knowledge, growth: Mapping[str, float], changed: Sequence[str]
 ) -> Knowledge:
     """What is known of an arm that may have changed since, the tolerances among it."""
-    robot = calibrated.robot
-    if calibrated.options.has_priors:
-        tolerances = {p.name: p.tolerance for p in robot.parameters if p.estimated and p.tolerance is not None}
-        known = with_tolerances(known, robot.nominal, tolerances)
-    sigma = _growth_of(robot, known, growth)
+    sigma = _growth_of(calibrated.robot, known, growth)
     named = _named_columns(known)
     directions = [named[name] * size for name, size in sigma.items()]
     free = _changes(known, changed)
