@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from fg_calib.arguments import checked
 from fg_calib.arrays import Brief
 from fg_calib.diagnostics.linearity import find_nonlinear_rows
-from fg_calib.diagnostics.robust_screening import Disagreements, find_disagreements, fit_roughly
+from fg_calib.diagnostics.robust_screening import Disagreements, find_disagreements
 from fg_calib.diagnostics.setup_check import SetupCheck, check_tables
 from fg_calib.diagnostics.setup_hypotheses import MOTION_M, MOTION_RAD
 from fg_calib.graph.build import problem_of
@@ -229,13 +229,12 @@ def _check_set_up(
 
     Where a mistake in the set-up was found single rows are not looked for: all disagree.
     """
-    fit = fit_roughly(job.robot, tables)
     whole = problem.whole or problem
     judged = replace(whole, robot=job.robot) if problem.evaluated else whole
-    every, setups = check_tables(judged, whole.start if fit is None else fit.start(whole), with_landmarks=True)
-    if fit is None or any(check.explanations for check in setups):
-        return every, setups, Disagreements((), 0, 0)
-    return every, setups, find_disagreements(fit, problem.data.labels if len(tables) > 1 else ("",))
+    every, setups = check_tables(judged, whole.start, with_landmarks=True)
+    if any(check.explanations for check in setups):
+        return every, setups, Disagreements()
+    return every, setups, find_disagreements(job.robot, tables, problem.data.labels if len(tables) > 1 else ("",))
 
 
 def _survey(at_nominal: Solution, number: int, table: Table) -> TableSurvey:

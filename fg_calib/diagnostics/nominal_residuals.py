@@ -12,9 +12,11 @@ excess of a fifth to one.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -22,13 +24,15 @@ from scipy.spatial.transform import Rotation
 from fg_calib.errors import InputError, ProblemError, SolverError
 from fg_calib.graph.build import problem_of_tables
 from fg_calib.graph.noise_models import RowNoise
-from fg_calib.graph.problem import Problem, noises_at, tables_of
+from fg_calib.graph.problem import Problem, noises_at, reduced_graph, tables_of
+from fg_calib.graph.solver import levenberg_marquardt_params
 from fg_calib.graph.variables import build_variables, pose_of
 from fg_calib.initialization.hand_eye import Frame
 from fg_calib.measurements import residuals
+from fg_calib.measurements.kinds import INSTRUMENTS, Instrument
 from fg_calib.measurements.table import Table
-from fg_calib.options import PAIR_MODELS, POSE_MODELS, Options, Pairing
-from fg_calib.robot.kinematics import Chain, pose
+from fg_calib.options import Options, Pairing
+from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
 
 Floats = NDArray[np.float64]
@@ -37,13 +41,10 @@ USUAL_LENGTH, USUAL_ANGLE = 2e-3, 5e-3
 """1 sigma of true minus nominal where a parameter has no prior: 2 mm and 5 mrad (0.3 degrees)."""
 
 MAX_ROWS, MAX_IMAGES, MAX_CORNERS = 60, 20, 8
-"""Train configurations that are looked at, spread over the table; images, and corners of each."""
+"""Train configurations that are looked at, drawn from the table; images, and corners of each."""
 
-STEPS, HALVINGS = 6, 4
-"""Gauss-Newton steps from the start in closed form that suffice where the set-up is right, and halvings of each."""
-
-FARTHEST = 1e6
-"""A coordinate beyond all measurements, [m]."""
+MAX_STEPS = 6
+"""Steps from the start in closed form that suffice where the set-up is right."""
 
 _UNITS: dict[str, Literal["m", "rad", "px"]] = {"orientation": "rad", "angle": "rad", "pixel": "px"}
 
@@ -89,6 +90,11 @@ class Setup:
     of_base: bool = False
 
     @property
+    def instrument(self) -> Instrument:
+        """The instrument of the table."""
+        return INSTRUMENTS[str(self.table.model)]
+
+    @property
     def tool(self) -> tuple[str, ...]:
         """Names of the tool's parameters, in the order x, y, z, yaw, pitch, roll."""
         return tuple(self.robot.parameters[i].name for i in self.robot.owned_by(self.robot.n_joints + 1))
@@ -101,8 +107,8 @@ class Setup:
     @property
     def has_landmarks(self) -> bool:
         """Whether landmarks have to be located before anything can be said of the table."""
-        model = self.table.model
-        return model not in (*POSE_MODELS, *PAIR_MODELS) or "target" in self.table.measurements.labels
+        without = self.instrument.is_pose or self.instrument.uses_pairs
+        return not without or "target" in self.table.measurements.labels
 
     def with_tool(self, fitted: frozenset[str]) -> Setup:
         """The set-up with these of the tool's parameters fitted."""
@@ -121,41 +127,35 @@ class Fitted(NamedTuple):
 def setup_of(robot: Robot, table: Table) -> Setup | None:
     """Some train rows of a table as the job says they are; None if the table has no train rows.
 
-    Pairs are formed anew from some of the rows, whatever the job's pairing. Rows of landmarks are drawn at random, for
-    rows in turn may be of one target or anchor.
+    Pairs are formed anew from some of the rows, whatever the job's pairing. Rows are drawn at random, for rows in turn
+    may be of one target or anchor.
     """
-    m, model = table.measurements, table.model
+    m, rng = table.measurements, np.random.default_rng(0)
     rows, pairs = np.flatnonzero(~m.test), None
-    if model is None or not len(rows):
+    if table.model is None or not len(rows):
         return None
-    if model in PAIR_MODELS and m.pairs is not None:
+    if table.uses_pairs and m.pairs is not None:
         train = np.flatnonzero(~m.pairs.test)
-        pairs = m.pairs.select(train[_spread(len(train), 3 * MAX_ROWS)])
-    rows = rows if m.groups is None else rows[np.argsort(m.groups.index[rows], kind="stable")]
-    if model == "pixels" or "target" in m.labels or model not in (*POSE_MODELS, *PAIR_MODELS):
-        rng, names = np.random.default_rng(0), np.unique(m.ids[rows])
-        most = MAX_IMAGES if model == "pixels" else max(10, MAX_ROWS * len(names) // len(rows))
-        rows = rng.permutation(rows[np.isin(m.ids[rows], rng.permutation(names)[:most])])
-        if model == "pixels":  # some corners of each image
-            _, image = np.unique(m.ids[rows], return_inverse=True)
-            rows = np.concatenate([rows[image == i][:MAX_CORNERS] for i in range(image.max() + 1)])
-    elif pairs is None or m.groups is not None:
-        rows = rows[_spread(len(rows), MAX_ROWS)]
+        pairs = m.pairs.select(train[evenly(len(train), 3 * MAX_ROWS)])
+    if m.image is not None:
+        images = rng.permutation(np.unique(m.ids[rows]))[:MAX_IMAGES]
+        rows = np.concatenate([rows[m.ids[rows] == image][:MAX_CORNERS] for image in images])
     else:
-        rows = rows[:0]
+        rows = rng.permutation(rows)[: MAX_ROWS if pairs is None or m.groups is not None else 0]
     rows = np.unique(rows if pairs is None else np.concatenate([rows, pairs.a, pairs.b]))
     groups = None if m.groups is None else replace(m.groups, index=m.groups.index[rows])
     if pairs is not None:
         pairs = replace(pairs, a=np.searchsorted(rows, pairs.a), b=np.searchsorted(rows, pairs.b))
-    base = {robot.parameters[i].name for i in robot.owned_by(0) if robot.parameters[i].estimated}
-    free = model in POSE_MODELS and table.frame == "known" and bool(base)
-    robot = robot.with_estimated([p.name for p in robot.parameters if p.estimated and not (free and p.name in base)])
     some = replace(m.select(rows), pairs=pairs, groups=groups)
-    table = replace(table, measurements=some, pairing=Pairing("chain"), own=())
-    return Setup(robot, replace(table, frame="unknown") if free else table, of_base=table.frame == "known")
+    some_rows = replace(table, measurements=some, pairing=Pairing("chain"), own=())
+    base = {robot.parameters[i].name for i in robot.owned_by(0) if robot.parameters[i].estimated}
+    if base and INSTRUMENTS[table.model].is_pose and table.frame == "known":  # the base is fitted as a frame
+        robot = robot.with_estimated([p.name for p in robot.parameters if p.estimated and p.name not in base])
+        some_rows = replace(some_rows, frame="unknown")
+    return Setup(robot, some_rows, of_base=table.frame == "known")
 
 
-def _spread(n: int, most: int) -> NDArray[np.int64]:
+def evenly(n: int, most: int) -> NDArray[np.int64]:
     """At most so many of n numbers, evenly spread."""
     return np.unique(np.linspace(0, n - 1, min(most, n)).astype(np.int64))
 
@@ -173,70 +173,41 @@ def residuals_in(setup: Setup, fit: Fitted, *, in_frame: bool = True) -> tuple[T
         fit: Tool and world_T_base.
         in_frame: Whether world_T_base is taken; else it is fitted.
     """
-    robot, tool = setup.robot, setup.robot.owned_by(setup.robot.n_joints + 1)
-    values = robot.nominal
+    values, tool = setup.robot.nominal, setup.robot.owned_by(setup.robot.n_joints + 1)
     values[tool] = fit.robot.nominal[tool]
-    held = replace(setup, robot=robot.with_values(values)).with_tool(frozenset())
+    fixed = replace(setup, robot=setup.robot.with_values(values)).with_tool(frozenset())
     m, X = setup.table.measurements, fit.world_T_base
-    if in_frame and setup.table.model in POSE_MODELS:
-        R, p = m.rotation, m.position
-        R = None if R is None else X.rotation.T @ R
-        p = None if p is None else (p - X.translation) @ X.rotation
-        held = replace(held, table=replace(held.table, measurements=replace(m, rotation=R, position=p), frame="known"))
-    return fit_setup(held).residuals
+    if in_frame and setup.instrument.is_pose:
+        R = None if m.rotation is None else X.rotation.T @ m.rotation
+        p = None if m.position is None else (m.position - X.translation) @ X.rotation
+        fixed = replace(
+            fixed, table=replace(fixed.table, measurements=replace(m, rotation=R, position=p), frame="known")
+        )
+    return fit_setup(fixed).residuals
 
 
 def fit_setup(setup: Setup) -> Fitted:
     """Frame, tool and landmarks of a set-up fitted, the arm at nominal."""
-    m = setup.table.measurements
-    tests = np.ones(m.n_configurations, dtype=np.bool_)  # test rows alone: the arm is evaluated as it is
-    pairs = None if m.pairs is None else replace(m.pairs, test=np.ones(m.pairs.n_pairs, dtype=np.bool_))
-    table = replace(setup.table, measurements=replace(m, test=tests, pairs=pairs)).by_itself()
-    nothing = Fitted((), setup.robot, Frame(np.eye(3), np.zeros(3)))
+    frame, options = Frame(np.eye(3), np.zeros(3)), Options(gauge="none")
     try:
-        problem = problem_of_tables(setup.robot, tables_of(table, options := Options(gauge="none")), options)
-        start = problem.start
-        direct = setup.table.model in POSE_MODELS and not setup.has_landmarks
-        parameters = start if direct else fit_landmarks(problem)
+        problem = nominal_problem(setup.robot, tables_of(setup.table, options), options)
+        located = setup.instrument.is_pose and not setup.has_landmarks  # in closed form
+        parameters = problem.start if located else fit_landmarks(problem)
     except (InputError, ProblemError, SolverError, RuntimeError, np.linalg.LinAlgError):
-        return nothing
-    found = residuals_at(problem, parameters, setup.robot)
+        return Fitted((), setup.robot, frame)
     n_free = problem.variables.n_columns + problem.variables.n_nuisance
-    if problem.n_residuals < 2 * n_free + 6 + setup.has_landmarks * n_free:
-        found = ()
-    frame = nothing.world_T_base
+    enough = problem.n_residuals >= 2 * n_free + 6 + setup.has_landmarks * n_free
     for v in problem.variables.frames:
         X = pose_of(parameters[v.places])
         frame = Frame(X.rotation().matrix(), X.translation())
+    found = residuals_at(problem, parameters, setup.robot) if enough else ()
     return Fitted(found, setup.robot.with_values(parameters[problem.variables.robot_span]), frame)
 
 
-def residuals_at(
-    problem: Problem, parameters: Floats, robot: Robot, table: int | None = None
-) -> tuple[TypicalResidual, ...]:
-    """Residuals by kind at a parameter vector.
-
-    Args:
-        problem: The problem; at most `3 * MAX_ROWS` rows of a series are looked at.
-        parameters: The parameter vector.
-        robot: The robot with what is estimated of the arm.
-        table: Number of the table that is asked for; all if None.
-    """
-    series = [s for s in problem.data.series if table is None or s.table == table]
-    series = [
-        s for s in series if len(s.train) and s.kind.ends
-    ]  # rows of landmarks alone have none of the arm's errors
-    some = tuple(s.select(s.train[_spread(len(s.train), 3 * MAX_ROWS)]) for s in series)
-    sampled = replace(problem, data=replace(problem.data, series=some))
-    variables = build_variables(robot, [t.unknown_frame for t in problem.data.tables])
-    of_arm, of_frame = problem.variables.robot_span, problem.variables.frame_span
-    values = np.concatenate([parameters[of_arm], parameters[of_frame]])
-    scale = prior_sigmas_of(robot, variables.names)
-    found: list[TypicalResidual] = []
-    for noise in noises_at(sampled, parameters):
-        chain = variables.chains[noise.series.table].at(values)
-        found += _by_kind(noise, chain, scale, robot.with_values(parameters[of_arm]))
-    return tuple(found) if all(np.isfinite([r.size, r.expected]).all() for r in found) else ()
+def nominal_problem(robot: Robot, tables: Sequence[Table], options: Options) -> Problem:
+    """The problem of frames, base, tool and landmarks with the arm at nominal: every row is a test row."""
+    tests = [t.tested_on(np.ones(t.measurements.n_configurations, dtype=np.bool_)).by_itself() for t in tables]
+    return problem_of_tables(robot, tests, options)
 
 
 def fit_landmarks(problem: Problem) -> Floats:
@@ -245,65 +216,76 @@ def fit_landmarks(problem: Problem) -> Floats:
     Args:
         problem: A problem of the arm as it is (see `Problem.evaluated`).
     """
-    variables, values = problem.variables, problem.initial
-    parameters = variables.parameters(values)
-
-    def cost(at: Floats) -> float:
-        return sum(rows.squared_norm(variables.at(at)) for rows in problem.rows)
-
-    least = cost(parameters)
-    for _ in range(STEPS if variables.n_columns + variables.n_nuisance else 0):
-        found = [rows.linearise(variables.at(parameters)) for rows in problem.rows]
-        r, J = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        size = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
-        step = -np.linalg.lstsq(J / size, r, rcond=1e-10)[0] / size
-        before = least
-        for _ in range(HALVINGS):
-            moved = variables.moved(values, step)
-            at = variables.parameters(moved)
-            if np.abs(at).max() < FARTHEST and (left := cost(at)) < least:
-                values, parameters, least = moved, at, left
-                break
-            step = 0.5 * step
-        if not least < (1.0 - 1e-3) * before:
-            break
-    return parameters
+    if not problem.variables.keys:
+        return problem.start
+    params = levenberg_marquardt_params()
+    params.setMaxIterations(MAX_STEPS)
+    params.setRelativeErrorTol(1e-3)
+    optimizer = gtsam.LevenbergMarquardtOptimizer(reduced_graph(problem), problem.initial, params)
+    return problem.variables.parameters(optimizer.optimize())
 
 
-def prior_sigmas_of(robot: Robot, names: tuple[str, ...]) -> Floats:
-    """1 sigma of the arm's parameters in the order of the columns, 0 of those that were fitted, shape (n_columns,)."""
-    scale, by_name = np.zeros(len(names)), {p.name: p for p in robot.parameters}
-    for column, name in enumerate(names):
+def residuals_at(
+    problem: Problem, parameters: Floats, robot: Robot, table: int | None = None
+) -> tuple[TypicalResidual, ...]:
+    """Residuals by kind at a parameter vector; rows of landmarks alone, which have none of the arm's errors, left out.
+
+    Args:
+        problem: The problem; at most `3 * MAX_ROWS` rows of a series are looked at.
+        parameters: The parameter vector.
+        robot: The robot with what is estimated of the arm.
+        table: Number of the table that is asked for; all if None.
+    """
+    series = [s for s in problem.data.series if table in (None, s.table) and len(s.train) and s.kind.ends]
+    some = tuple(s.select(s.train[evenly(len(s.train), 3 * MAX_ROWS)]) for s in series)
+    sampled = replace(problem, data=replace(problem.data, series=some))
+    there = robot.with_values(parameters[problem.variables.robot_span])
+    found: list[TypicalResidual] = []
+    for noise, of_arm in with_arm_errors(sampled, parameters, robot):
+        found += _by_kind(noise, np.einsum("nii->ni", of_arm) + noise.sigma**2, there)
+    return tuple(found) if all(np.isfinite([r.size, r.expected]).all() for r in found) else ()
+
+
+def with_arm_errors(problem: Problem, parameters: Floats, robot: Robot) -> Iterator[tuple[RowNoise, Floats]]:
+    """The rows of each series, and their covariance by the arm's errors, shape (n, residual_dim, residual_dim).
+
+    Args:
+        problem: The problem.
+        parameters: The parameter vector.
+        robot: The robot with what is estimated of the arm, whose prior sigmas are usual ones where it has none.
+    """
+    variables, scale = build_variables(robot, [t.unknown_frame for t in problem.data.tables]), list[float]()
+    by_name = {p.name: p for p in robot.parameters if 1 <= p.owner <= robot.n_joints}
+    for name in variables.names:
         p = by_name.get(name)
-        if p is not None and 1 <= p.owner <= robot.n_joints:
-            usual = USUAL_LENGTH if p.unit == "m" else USUAL_ANGLE
-            scale[column] = usual if p.tolerance is None else p.tolerance
-    return scale
+        usual = 0.0 if p is None else USUAL_LENGTH if p.unit == "m" else USUAL_ANGLE
+        scale.append(usual if p is None or p.tolerance is None else p.tolerance)
+    values = np.concatenate([parameters[problem.variables.robot_span], parameters[problem.variables.frame_span]])
+    for noise in noises_at(problem, parameters):
+        chain = variables.chains[noise.series.table].at(values)
+        J = residuals.linearise(noise.rows, chain)[1][:, :, : len(scale)] * scale
+        yield noise, J @ np.swapaxes(J, 1, 2)
 
 
-def _by_kind(noise: RowNoise, chain: Chain, scale: Floats, robot: Robot) -> list[TypicalResidual]:
+def _by_kind(noise: RowNoise, variance: Floats, robot: Robot) -> Iterator[TypicalResidual]:
     """Residuals of one series, by kind of noise.
 
     Args:
         noise: Its rows and their noise.
-        chain: The chain with columns for all that is estimated of the arm.
-        scale: 1 sigma of each column.
+        variance: Variance of each row by noise and the arm's errors, shape (n, residual_dim).
         robot: The robot, tool and base fitted.
     """
-    kinds = np.array([name.partition(".")[0] for name in noise.series.kind.names])
-    r, J = residuals.linearise(noise.rows, chain)
-    variance = np.sum((J[:, :, : len(scale)] * scale) ** 2, axis=2) + noise.sigma**2
-    used, found = noise.series.used, []
+    kinds, used = np.array([name.partition(".")[0] for name in noise.series.kind.names]), noise.series.used
+    squares = noise.residual() ** 2
     for kind in dict.fromkeys(kinds.tolist()):
         of = (kinds == kind) & used.any(axis=0)
         rows = used[:, of].any(axis=1)
         if rows.any():
             size, expected = (
-                float(np.median(np.sqrt(np.where(used, v, 0.0)[:, of].sum(axis=1)[rows]))) for v in (r**2, variance)
+                float(np.median(np.sqrt(np.where(used, v, 0.0)[:, of].sum(axis=1)[rows]))) for v in (squares, variance)
             )
             unit, motion = _UNITS.get(kind, "m"), _motion(noise, kind, robot)
-            found.append(TypicalResidual(kind, unit, size, max(expected, 1e-9), motion, int(rows.sum())))
-    return found
+            yield TypicalResidual(kind, unit, size, max(expected, 1e-9), motion, int(rows.sum()))
 
 
 def _motion(noise: RowNoise, kind: str, robot: Robot) -> float:
@@ -312,9 +294,8 @@ def _motion(noise: RowNoise, kind: str, robot: Robot) -> float:
     if kind == "pixel" and m.image is not None:
         points = m.image[:, :2]
     else:
-        ends = np.unique(noise.series.ends) if noise.series.ends.size else np.arange(m.n_configurations)
-        at = pose(robot, m.readings[ends])
-        if kind in ("orientation", "angle"):
+        at = pose(robot, m.readings[np.unique(noise.series.ends)])
+        if _UNITS.get(kind) == "rad":
             return float(np.median(Rotation.from_matrix(at.rotation[0].T @ at.rotation).magnitude()))
         points = at.position
     return float(np.median(np.linalg.norm(points - points.mean(axis=0), axis=1)))

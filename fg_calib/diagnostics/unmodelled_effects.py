@@ -1,4 +1,4 @@
-"""Unmodelled effects: a lack-of-fit test, a change point, and a forgotten instrument offset.
+"""Unmodelled effects: lack of fit, a change point, a missing convention parameter, a forgotten instrument offset.
 
 Each is a score test: the rows are fitted again, linearly, with more columns than J of the model, whose priors are
 rows too, and what these gain is compared with chance,
@@ -16,11 +16,11 @@ so that the least of k p-values has the p-value 1 - (1 - p)^k:
    joint of one and two periods a turn (eccentric encoders and gears, gains of prismatic joints);
 3. the same loads of an arm that is mounted otherwise, gravity along x and y.
 
-A *change point* is a small motion of tool or base from one row of a table on, for every row tried (Bonferroni).
-Whatever else is wrong with a table, a motion from some row on explains part of it: so nearly all of the misfit has to
-go with the change, and the change has to explain most of what constant small motions of all links leave, too. An
-*offset* is added to every length of a table to anchors; it hides in the arm's parameters: 0.25 mm of a ball bar made
-residuals 1.1 times as large as specified.
+A *change point* is a small motion of tool or base from one row of a table on, for every row tried (Bonferroni). Other
+effects explain a part of it, so it has to explain nearly all of the misfit, also next to constant small motions of all
+links. A *missing convention parameter* is the same test of small motions between links. An *offset* is added to every
+length of a table to anchors; it hides in the arm's parameters: 0.25 mm of a ball bar made residuals 1.1 times as large
+as specified.
 
 Loads: by virtual work the torque about joint k of a weight in direction g at the point x is g . dx / dq_k.
 """
@@ -40,15 +40,16 @@ from fg_calib.graph.problem import Problem, at_parameters
 from fg_calib.graph.solver import Solution
 from fg_calib.graph.variables import build_variables, prior_rows, unknown_prior_rows
 from fg_calib.measurements import residuals
+from fg_calib.measurements.kinds import LANDMARKS
 from fg_calib.measurements.residuals import Block
-from fg_calib.observability.parallel_axes import end_of_link
+from fg_calib.observability.parallel_axes import MissingMotion, end_of_link
 from fg_calib.robot.kinematics import Chain, pose
-from fg_calib.robot.model import FRAME_KINDS, Element, Parameter, Robot
+from fg_calib.robot.model import AXIS_OF_KIND, FRAME_KINDS, Element, Parameter, Robot
 
 Floats = NDArray[np.float64]
 
 MAX_ROWS = 10_000
-"""Rows up to which residuals are tested: more would take long, and are seldom needed to tell."""
+"""Rows up to which residuals are tested: more would take long, and are seldom needed."""
 
 LEAST_LEFT = 10
 """Degrees of freedom that a stage must leave."""
@@ -56,14 +57,11 @@ LEAST_LEFT = 10
 LEAST_SIDE, MAX_TRIED = 6, 100
 """Configurations before and after a change, and rows at which one is tried, evenly spaced if there are more."""
 
-CHANGE_P_VALUE, OFFSET_P_VALUE = 1e-6, 1e-5
-"""P-values below which a change, and an offset, are significant: unmodelled effects mimic a little of either."""
+P_VALUE = 1e-6
+"""P-value below which a change, an offset and a missing parameter are significant: other effects mimic a little."""
 
-CHANGE_LEFT, CHANGE_EXCESS_LEFT = 0.5, 0.25
-"""Part of chi-square, and of its excess over its degrees of freedom, that a change leaves at most."""
-
-MAX_REDUCED_CHI2, MAX_MEDIAN_RATIO = 25.0, 0.8
-"""Reduced chi-square that a change leaves at most, and part of the median residual: outliers do not move the median."""
+CHANGE_LEFT, MISSING_LEFT = 0.25, 0.8
+"""Part of the excess of chi-square that a change, and a missing parameter of the convention, leave at most."""
 
 _RANK = 1e-8
 """Part of a column that counts as nothing."""
@@ -139,12 +137,13 @@ class LinearFit:
         return LinearFit(self.r - new @ (new.T @ self.r), fitted, self.dof - new.shape[1])
 
     def test(self, new: Floats) -> tuple[float, float]:
-        """P-value of what more columns, by `new`, explain, and the part of chi-square that they leave."""
+        """P-value of what more columns, by `new`, explain, and the part of the excess of chi-square that they leave."""
         total, drop, m = float(self.r @ self.r), float(np.sum((new.T @ self.r) ** 2)), new.shape[1]
         if not m or self.dof - m < 1:
             return 1.0, 1.0
         ratio = (drop / m) / max((total - drop) / (self.dof - m), 1e-300)
-        return float(special.fdtrc(m, self.dof - m, ratio)), (total - drop) / max(total, 1e-300)
+        left = max(total - drop - (self.dof - m), 0.0) / max(total - self.dof, 1e-300)
+        return float(special.fdtrc(m, self.dof - m, ratio)), left
 
 
 def probability_of_noise(solution: Solution) -> float | None:
@@ -199,24 +198,33 @@ def find_change(solution: Solution) -> Change | None:
     links = {"tool": problem.robot.n_joints, "base": 0}
     motions = {what: of_links([f"{LINK}{link}: {kind}" for kind in FRAME_KINDS]) for what, link in links.items()}
     at = np.concatenate([np.repeat(block.ends[:, 0], block.residual_dim) for block in parts])
-    first = np.unique(at)
-    first = first[LEAST_SIDE : len(first) - LEAST_SIDE + 1]
+    first = np.unique(at)[LEAST_SIDE : 1 - LEAST_SIDE]
     first = first[np.unique(np.linspace(0, len(first) - 1, min(MAX_TRIED, len(first))).astype(np.int64))]
     found = [(*fit.test(fit.new(J * (at >= k)[:, None])), what, int(k)) for k in first for what, J in motions.items()]
     if not found:
         return None
     p, left, what, k = min(found)
     moved = motions[what] * (at >= k)[:, None]
-    after = fit.extended(fit.new(moved))
-    total = float(after.r @ after.r)
-    explained = total - after.dof <= CHANGE_EXCESS_LEFT * max(float(fit.r @ fit.r) - fit.dof, 0.0)
-    before_median, after_median = (float(np.median(np.abs(one.r[: len(at)]))) for one in (fit, after))
-    typical = after_median <= MAX_MEDIAN_RATIO * before_median and total <= MAX_REDUCED_CHI2 * after.dof
-    if not (p * len(found) < CHANGE_P_VALUE and left <= CHANGE_LEFT and explained and typical):
-        return None
     with_links = fit.extended(fit.new(of_links([])))
     p_with, left_with = with_links.test(with_links.new(moved))
-    return Change(what, k, left) if p_with < CHANGE_P_VALUE and left_with <= CHANGE_LEFT else None
+    significant = p * len(found) < P_VALUE and p_with < P_VALUE
+    return Change(what, k, left) if significant and max(left, left_with) <= CHANGE_LEFT else None
+
+
+def explains_misfit(solution: Solution, motion: MissingMotion) -> bool:
+    """Whether a motion that the convention has no parameter for explains a part of the misfit; assumed of many rows."""
+    problem = solution.problem
+    if problem.n_residuals > MAX_ROWS:
+        return True
+    if motion.frame:
+        link = min(max(motion.axes[0] - 1, 0), problem.robot.n_joints)
+        names = [f"{LINK}{link}: {kind}" for kind in ("roll", "pitch", "yaw")]
+    else:
+        kinds = {AXIS_OF_KIND[kind]: kind for kind in FRAME_KINDS}
+        names = [f"{LINK}{axis}: {kinds[axes]}" for axis in motion.axes[:-1] for axes in motion.motions]
+    fit, of_links = _with_links(solution)
+    p, left = fit.test(fit.new(of_links(names)))
+    return p < P_VALUE and left <= MISSING_LEFT
 
 
 def forgotten_offsets(solution: Solution) -> tuple[Offset, ...]:
@@ -224,26 +232,25 @@ def forgotten_offsets(solution: Solution) -> tuple[Offset, ...]:
 
     With a robust loss, which cuts residuals off, noise counts as specified at least.
     """
-    problem = solution.problem
-    tables = [k for k, table in enumerate(problem.data.tables) if table.model == "anchor" and not table.offset]
-    if not tables or problem.n_residuals > MAX_ROWS or problem.has_more:
+    problem, found = solution.problem, list[Offset]()
+    unknowns, series = problem.data.unknowns, [s for s in problem.data.series if len(s.train)]
+    offsets = [i for i, letter in enumerate(unknowns.letters) if LANDMARKS[letter].is_one]
+    if not offsets or problem.n_residuals > MAX_ROWS or problem.has_more:
         return ()
-    at, found = at_parameters(problem, solution.parameters), []
-    column = at.n_columns + at.n_nuisance
-    for number in tables:
-        series = [s for s in problem.data.series if s.table == number and s.kind.n_nuisances == 4 and len(s.train)]
-        if not series:
+    at = at_parameters(problem, solution.parameters)
+    column, columns = at.n_columns + at.n_nuisance, at.columns
+    for place in np.flatnonzero(np.isin(unknowns.owners, offsets) & (columns < 0)).tolist():
+        tables = [s.table for s in series if np.any(s.nuisances[s.train] == place)]
+        if not tables:
             continue  # contacts alone
-        columns = at.columns.copy()
-        columns[np.unique(series[0].nuisances[:, 3])] = column
-        fit, J = _linear_fit(solution, replace(at, columns=columns, n_nuisance=at.n_nuisance + 1), [column])
+        wide = np.where(np.arange(len(columns)) == place, column, columns)
+        fit, J = _linear_fit(solution, replace(at, columns=wide, n_nuisance=at.n_nuisance + 1), [column])
         new = fit.new(J)
-        p, left = fit.test(new)
-        if p < OFFSET_P_VALUE:
+        if fit.test(new)[0] < P_VALUE:
+            after, per_metre = fit.extended(new), float(new[: len(J), 0] @ J[:, 0])
             least = 1e-300 if problem.state.weights is None else 1.0
-            sigma = np.sqrt(max(left * float(fit.r @ fit.r) / (fit.dof - 1), least))
-            per_metre = float(new[: len(J), 0] @ J[:, 0])
-            found.append(Offset(number, -float(new[:, 0] @ fit.r) / per_metre, float(sigma) / abs(per_metre)))
+            sigma = np.sqrt(max(float(after.r @ after.r) / after.dof, least))
+            found.append(Offset(tables[0], -float(new[:, 0] @ fit.r) / per_metre, float(sigma) / abs(per_metre)))
     return tuple(found)
 
 
@@ -276,21 +283,13 @@ def _linear_fit(solution: Solution, wide: State, more: Sequence[int]) -> tuple[L
     return LinearFit.of(columns, np.concatenate([r, r_prior, r_unknown]), n), J[:, list(more)]
 
 
-def with_link_motions(problem: Problem, parameters: Floats) -> tuple[tuple[Chain, ...], tuple[str, ...]]:
+def with_link_motions(problem: Problem, at: Floats) -> tuple[tuple[Chain, ...], tuple[str, ...]]:
     """The chains at a parameter vector with columns for the links' small motions too, and the columns' names.
 
     Six columns are called `LINK` and the number of their joint: those of the base 0, those of the tool as many as there
     are joints.
     """
-    robot = _with_link_motions(problem.robot)
-    variables = build_variables(robot, [table.unknown_frame for table in problem.data.tables])
-    n, n_more = len(problem.robot.parameters), len(robot.parameters) - len(problem.robot.parameters)
-    values = np.concatenate([parameters[:n], np.zeros(n_more), parameters[problem.variables.frame_span]])
-    return tuple(chain.at(values) for chain in variables.chains), variables.names
-
-
-def _with_link_motions(robot: Robot) -> Robot:
-    """The robot with six more parameters, all zero, at the end of each link, the base's and the tool's among them."""
+    robot = problem.robot
     elements, parameters = list(robot.elements), list(robot.parameters)
     for owner in range(robot.n_joints, -1, -1):
         place = end_of_link(robot, owner)
@@ -298,7 +297,11 @@ def _with_link_motions(robot: Robot) -> Robot:
             more = Parameter(f"{LINK}{owner}: {kind}", kind, owner, 0.0)
             elements.insert(place, Element(more.axis, parameter=len(parameters)))
             parameters.append(more)
-    return replace(robot, elements=tuple(elements), parameters=tuple(parameters))
+    wide = replace(robot, elements=tuple(elements), parameters=tuple(parameters))
+    variables = build_variables(wide, [table.unknown_frame for table in problem.data.tables])
+    none = np.zeros(len(parameters) - len(robot.parameters))
+    values = np.concatenate([at[: len(robot.parameters)], none, at[problem.variables.frame_span]])
+    return tuple(chain.at(values) for chain in variables.chains), variables.names
 
 
 def _with_joint_errors(block: Block, chain: Chain, errors: Floats) -> Floats:

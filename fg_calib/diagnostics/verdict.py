@@ -22,6 +22,7 @@ from fg_calib.diagnostics.setup_check import SetupCheck, check_problem
 from fg_calib.diagnostics.unmodelled_effects import (
     Change,
     Offset,
+    explains_misfit,
     find_change,
     forgotten_offsets,
     probability_of_noise,
@@ -214,8 +215,10 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
         statements += [check_offset(found, problem.data.labels, fit.chi_square.too_large) for found in offsets]
     fits = not (doubts or solution.estimated_noise is not None)
     statements[:0] = check_model(setup, fits=fits, high=high)
-    explained = setup.explanations or problem.knowledge is not None  # by a mistake; or the convention did before
-    statements += [Statement("error" if high and not explained else "note", str(motion)) for motion in missing]
+    asked = high and not setup.explanations and problem.knowledge is None  # else the convention did before
+    statements += [
+        Statement("error" if asked and explains_misfit(solution, motion) else "note", str(motion)) for motion in missing
+    ]
     errors, warnings, notes = (
         tuple(s.text for s in statements if s.severity == severity) for severity in ("error", "warning", "note")
     )

@@ -187,7 +187,7 @@ def test_a_robust_loss_makes_wrong_rows_a_caution(arm):
 
 
 def test_of_a_long_table_some_rows_are_looked_at_and_it_is_said(arm, monkeypatch):
-    monkeypatch.setattr(disagreement, "MOST_ROWS", 25)
+    monkeypatch.setattr(disagreement, "MAX_ROWS", 25)
     m = measured(arm)
     found = inspected(arm, replace(m, position=plus(m.position, [49], 0.05)))
     assert [one.row for one in found.disagreements.found] == [49]

@@ -152,7 +152,9 @@ def test_doubt_stands_first():
     m = planar_measurements()
     text = report(planar_arm(), replace(m, sigma_position=m.sigma_position / 5), model="position")
     assert text.startswith("two-links: position\nDOUBTFUL: reduced")
-    assert "\nDOUBTFUL: axes 1 and 2 are parallel" in text
+    # A tilt that positions in the arm's plane do not see is no cause.
+    assert "axes 1 and 2 are parallel" in text.partition("Notes")[2]
+    assert "noise specified too small" in text
     assert "GOOD" not in text
 
 
