@@ -7,8 +7,9 @@ what its reader should know, as in the verdict on a calibration.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +17,11 @@ from scipy.spatial import cKDTree
 
 from fg_calib.arguments import checked
 from fg_calib.arrays import Brief
-from fg_calib.diagnostics.linearity import find_nonlinear_rows
+from fg_calib.diagnostics.linearity import find_ambiguous_rows
 from fg_calib.diagnostics.robust_screening import Disagreements, find_disagreements
 from fg_calib.diagnostics.setup_check import SetupCheck, check_tables
 from fg_calib.diagnostics.setup_hypotheses import MOTION_M, MOTION_RAD
+from fg_calib.diagnostics.verdict import Statement, listed
 from fg_calib.graph.build import problem_of
 from fg_calib.graph.problem import Problem, eliminated, tables_of
 from fg_calib.graph.solver import Solution, unsolved
@@ -42,9 +44,6 @@ AMBIGUOUS_SHARE = 0.05
 
 NEAR = 1e-3
 """How far each reading of two configurations may be apart that are nearly the same, [rad] (prismatic: [m])."""
-
-NAMED = 3
-"""Configurations or joints that a statement names."""
 
 
 @dataclass(frozen=True)
@@ -160,8 +159,8 @@ class Inspection(Brief):
     dof: int
     n_excluded: dict[str, int]
     evaluated: bool
-    findings: tuple[str, ...]
-    cautions: tuple[str, ...]
+    findings: tuple[str, ...] = ()
+    cautions: tuple[str, ...] = ()
 
     @property
     def ready(self) -> bool:
@@ -186,7 +185,6 @@ def inspect_job(job: Job) -> Inspection:
     every, setups, disagreements = _check_set_up(problem, job, tables)
     at_nominal = unsolved(problem)
     spread = spread_of(at_nominal)
-    expected = None if problem.evaluated else expected_error(problem, with_left_out(at_nominal, spread))
     n_directions = spread.rank + eliminated(problem, problem.start).rank
     found = Inspection(
         robot=job.robot.name,
@@ -195,31 +193,17 @@ def inspect_job(job: Job) -> Inspection:
         setups=tuple(next((s for s in setups if s.table == check.table), check) for check in every),
         disagreements=disagreements,
         identifiability=identifiability_of(problem.whole or problem, problem.start, "practical"),
-        expected_error=expected,
+        expected_error=None if problem.evaluated else expected_error(problem, with_left_out(at_nominal, spread)),
         n_residuals=problem.n_residuals,
         n_priors=problem.n_priors,
         n_unknowns=problem.variables.n_columns + problem.variables.n_nuisance,
         dof=problem.n_independent + problem.n_priors - n_directions,
         n_excluded={reason: n for reason, n in problem.n_excluded.items() if n},
         evaluated=problem.evaluated,
-        findings=(),
-        cautions=(),
     )
-    kinds = {name.partition(".")[0] for s in problem.data.series for name in s.kind.names}
-    errors, notes = list[str](), list[str]()
-    suspicious = {one.table for one in disagreements.found}
-    for check in setups:
-        if check.explanations or (check.far and check.table not in suspicious):
-            (errors if check.explanations or _has_priors(job) else notes).append(str(check))
-    if disagreements.found:
-        robust = job.options.loss != "none" and not any(one.test for one in disagreements.found)
-        (notes if robust else errors).append(_in_words(disagreements, job.options.loss))
-    errors += [*_check_counts(found), *_check_limits(found, job, kinds)]
-    notes += [*map(str, found.identifiability.missing), *_check_coverage(found, job)]
-    for survey in found.tables:
-        notes += _check_table(survey)
-    notes += _check_noise(found, job)
-    return replace(found, findings=tuple(errors), cautions=tuple(notes))
+    statements = list(chain(_check_rows(found, job, setups), _check_result(found, job), _check_tables(found, job)))
+    errors, notes = (tuple(s.text for s in statements if s.severity == severity) for severity in ("error", "note"))
+    return replace(found, findings=errors, cautions=notes)
 
 
 def _check_set_up(
@@ -240,11 +224,10 @@ def _check_set_up(
 def _survey(at_nominal: Solution, number: int, table: Table) -> TableSurvey:
     """The counts of a table, with the test rows that it states."""
     m, problem = table.measurements, at_nominal.problem
-    measured_pairs = table.uses_pairs and m.pairs is not None
-    copies, copy, repeats = _same_pairs(m) if measured_pairs else _same_rows(m)
+    copies, copy, repeats = _same_rows(m, table.uses_pairs)
     near, leaked = _neighbours(m)
     series = [s for s in problem.data.series if s.table == number]
-    pairs = find_nonlinear_rows(at_nominal, np.zeros((problem.variables.n_columns, 0)), 0, number)
+    pairs = find_ambiguous_rows(at_nominal, np.zeros((problem.variables.n_columns, 0)), 0, number)
     n_residuals = Counter[str]()
     for s in series:
         for name, n in zip(s.kind.names, s.used[s.train].sum(axis=0).tolist(), strict=True):
@@ -266,41 +249,35 @@ def _survey(at_nominal: Solution, number: int, table: Table) -> TableSurvey:
         n_near=near,
         n_leaked=leaked,
         n_near_singular=pairs.n_near,
-        n_ambiguous=len(set(pairs.ambiguous)),
+        n_ambiguous=len(set(pairs.names)),
     )
 
 
-def _same_rows(m: Measurements) -> tuple[int, str, int]:
-    """See `_same`, of rows."""
-    columns = [m.readings, *(of.index[:, None] for of in m.labels.values())]
-    columns += [] if m.groups is None else [m.groups.index[:, None]]
-    columns += [] if m.image is None else [m.image[:, 2:]]
-    measured = [v.reshape(m.n_configurations, -1) for v in (m.position, m.rotation, m.length, m.image) if v is not None]
-    return _same(np.hstack(columns), measured, m.ids.tolist())
-
-
-def _same_pairs(m: Measurements) -> tuple[int, str, int]:
-    """See `_same`, of measured pairs, whichever end is a."""
-    assert m.pairs is not None
-    a, b = np.sort(np.stack([m.pairs.a, m.pairs.b]), axis=0)
-    names = [f"{m.ids[i]}-{m.ids[j]}" for i, j in zip(a.tolist(), b.tolist(), strict=True)]
-    return _same(np.stack([a, b], axis=1), [np.stack([m.pairs.distance, m.pairs.angle], axis=1)], names)
-
-
-def _same(places: Floats | Integers, measured: Sequence[Floats], names: Sequence[str]) -> tuple[int, str, int]:
-    """How many rows equal an earlier one, names of two, and how many have its place but other values.
+def _same_rows(m: Measurements, measured_pairs: bool) -> tuple[int, str, int]:
+    """How many rows, or measured pairs, equal an earlier one, two names, and how many have its place but other values.
 
     Args:
-        places: Where each row was measured, shape (n, k).
-        measured: Measured values, shape (n, width) each; nan where not measured.
-        names: Names of the rows.
+        m: The measurements.
+        measured_pairs: Whether its pairs are looked at, whichever end is a.
     """
-    values = np.hstack([places, *(np.nan_to_num(v, nan=-1e300) for v in measured)]) + 0.0  # no -0
-    (first, of), n = np.unique(values, axis=0, return_index=True, return_inverse=True)[1:], len(places)
+    if measured_pairs and m.pairs is not None:
+        a, b = np.sort(np.stack([m.pairs.a, m.pairs.b]), axis=0)
+        names = [f"{m.ids[i]}-{m.ids[j]}" for i, j in zip(a.tolist(), b.tolist(), strict=True)]
+        columns, measured = [a[:, None], b[:, None]], [m.pairs.distance[:, None], m.pairs.angle[:, None]]
+    else:
+        names, n = m.ids.tolist(), m.n_configurations
+        columns = [m.readings, *(of.index[:, None] for of in m.labels.values())]
+        columns += [] if m.groups is None else [m.groups.index[:, None]]
+        columns += [] if m.image is None else [m.image[:, 2:]]
+        measured = [v.reshape(n, -1) for v in (m.position, m.rotation, m.length, m.image) if v is not None]
+    if not measured:
+        return 0, "", len(names) - len(np.unique(np.hstack(columns) + 0.0, axis=0))
+    values = np.hstack([*columns, *(np.nan_to_num(v, nan=-1e300) for v in measured)]) + 0.0  # no -0
+    first, of = np.unique(values, axis=0, return_index=True, return_inverse=True)[1:]
     same: Integers = first[of.ravel()]
-    copied = np.flatnonzero(same != np.arange(n)) if measured else np.arange(0)
-    two = dict.fromkeys([names[same[copied[0]]], names[copied[0]]] if len(copied) else [])
-    return len(copied), " and ".join(two), n - len(np.unique(places + 0.0, axis=0)) - len(copied)
+    copied = np.flatnonzero(same != np.arange(len(same))).tolist()
+    two = dict.fromkeys([names[same[copied[0]]], names[copied[0]]] if copied else [])
+    return len(copied), " and ".join(two), len(first) - len(np.unique(np.hstack(columns) + 0.0, axis=0))
 
 
 def _neighbours(m: Measurements) -> tuple[int, int]:
@@ -327,101 +304,87 @@ def _joints(problem: Problem, robot: Robot) -> tuple[JointRange, ...]:
     )  # fmt: skip
 
 
-def _has_priors(job: Job) -> bool:
-    """Whether everything that is estimated of the arm has a prior."""
+def _check_rows(found: Inspection, job: Job, setups: Sequence[SetupCheck]) -> Iterator[Statement]:
+    """Check set-up, single rows and readings."""
     arm = [p for p in job.robot.parameters if p.estimated and 1 <= p.owner <= job.robot.n_joints]
-    return job.options.has_priors and all(p.tolerance is not None for p in arm)
-
-
-def _in_words(disagreements: Disagreements, loss: str) -> str:
-    """Rows that disagree with the nominal arm, and a way out."""
-    found = disagreements.found
-    several, first = len(found) > 1, found[0]
-    many_tables = len({one.table for one in found}) > 1
-    names = [f"{'-'.join(one.ends)}{f' of {one.table}' * many_tables}" for one in found]
-    who = _listed(list(dict.fromkeys(names)))
-    count = f"{len(found)} measurements disagree" if several else "one measurement disagrees"
-    of = "" if many_tables or not first.table else f" of {first.table}"
-    what = f"{count} with the nominal arm far more than the others do ({who}{of})"
-    tested = sum(one.test for one in found)
-    advice = f"look at {'them' if several else 'it'}"
-    if tested < len(found) and loss == "none":
-        advice += ", or let a robust loss do so (loss: gnc)"
-    if tested:
-        rows = "a test row" if not several else "test rows" if tested == len(found) else f"{tested} are test rows"
-        advice += f"; {rows}: no loss acts on what is held out"
-    return f"{what}: {advice}" if tested or loss == "none" else what
-
-
-def _check_counts(found: Inspection) -> Iterator[str]:
-    """Check what makes any result worthless: impossible readings, nothing determined, nothing to check it by."""
+    has_priors = job.options.has_priors and all(p.tolerance is not None for p in arm)
+    wrong, loss = found.disagreements.found, job.options.loss
+    for check in setups:
+        if check.explanations or (check.far and all(check.table != one.table for one in wrong)):
+            yield Statement("error" if check.explanations or has_priors else "note", str(check))
+    if wrong:
+        tables, tested = {one.table for one in wrong}, sum(one.test for one in wrong)
+        names = [f"{'-'.join(one.ends)}{f' of {one.table}' * (len(tables) > 1)}" for one in wrong]
+        text = "one measurement disagrees" if len(wrong) == 1 else f"{len(wrong)} measurements disagree"
+        of = f" of {wrong[0].table}" * (len(tables) == 1 and bool(wrong[0].table))
+        text += f" with the nominal arm far more than the others do ({listed(list(dict.fromkeys(names)))}{of})"
+        if tested or loss == "none":
+            text += f": look at {'it' if len(wrong) == 1 else 'them'}"
+            text += ", or let a robust loss do so (loss: gnc)" * (loss == "none" and tested < len(wrong))
+            text += f"; no loss acts on test rows, of which these are {tested}" * bool(tested)
+        yield Statement("error" if tested or loss == "none" else "note", text)
     for joint in found.joints:
         if joint.n_outside:
-            yield f"{joint.name} is outside its limits in {joint.n_outside} configurations: is it in another unit?"
-    o = found.identifiability.observability
-    if o.names and not o.rank:
-        yield "these rows determine none of the parameters that are estimated"
+            text = f"{joint.name} is outside its limits in {joint.n_outside} configurations: is it in another unit?"
+            yield Statement("error", text)
+
+
+def _check_result(found: Inspection, job: Job) -> Iterator[Statement]:
+    """Check what makes any result worthless: nothing determined, nothing to check it by; and what it will lack."""
+    observability, accept = found.identifiability.observability, job.options.accept
+    tested = any(table.n_test or table.n_test_pairs for table in found.tables)
+    if observability.names and not observability.rank:
+        yield Statement("error", "these rows determine none of the parameters that are estimated")
     if found.dof <= 0:
-        yield "no degree of freedom is left: nothing would say whether the fit is right, or the noise; measure more"
-
-
-def _check_limits(found: Inspection, job: Job, kinds: Collection[str]) -> Iterator[str]:
-    """Check limits that would not be evaluated, whatever the arm is like; `kinds` is what the tables measure."""
-    given = [f.name for f in fields(job.options.accept) if getattr(job.options.accept, f.name) is not None]
+        text = "no degree of freedom is left: nothing would say whether the fit is right, or the noise; measure more"
+        yield Statement("error", text)
+    measured = {kind for table in found.tables for kind in table.n_residuals}
+    given = [f.name for f in fields(accept) if getattr(accept, f.name) is not None]
     for kind in given:
-        if kind not in kinds:
-            yield f"accept: nothing in this job measures any {kind}: its limit cannot be evaluated"
-    held_out = job.options.folds is not None or _has_test_rows(found)
-    if not (held_out or found.evaluated) and any(kind in kinds for kind in given):
-        yield "accept: limits are judged by what is held out, and nothing is: add test rows (column split), or folds"
-
-
-def _has_test_rows(found: Inspection) -> bool:
-    return any(table.n_test or table.n_test_pairs for table in found.tables)
-
-
-def _check_coverage(found: Inspection, job: Job) -> Iterator[str]:
-    """Check joints that hardly move, directions that are not excited, and test rows."""
+        if kind not in measured:
+            text = f"accept: nothing in this job measures any {kind}: its limit cannot be evaluated"
+            yield Statement("error", text)
+    if not (tested or job.options.folds is not None or found.evaluated) and measured & set(given):
+        text = "accept: limits are judged by what is held out, and nothing is: add test rows (column split), or folds"
+        yield Statement("error", text)
+    yield from (Statement("note", str(motion)) for motion in found.identifiability.missing)
     still = [joint.name for joint in found.joints if joint.still]
     if still:
         what = "moves: its zero is" if len(still) == 1 else "move: their zeros are"
-        yield f"{_listed(still)} hardly {what} not distinguishable from the link before"
-    lost = [d for d in found.identifiability.lost if d.reason == NOT_EXCITED]
-    if lost:
-        what = "one direction is" if len(lost) == 1 else f"{len(lost)} directions are"
-        yield f"{what} not excited by these configurations although the model sees more: move every joint more"
-    if not found.evaluated and not _has_test_rows(found):
-        yield "no test rows: nothing would check how well the calibration predicts (column split)"
+        yield Statement("note", f"{listed(still)} hardly {what} not distinguishable from the link before")
+    n = sum(direction.reason == NOT_EXCITED for direction in found.identifiability.lost)
+    if n:
+        what = "one direction is" if n == 1 else f"{n} directions are"
+        text = f"{what} not excited by these configurations although the model sees more: move every joint more"
+        yield Statement("note", text)
+    if not found.evaluated and not tested:
+        text = "no test rows: nothing would check how well the calibration predicts (column split)"
+        yield Statement("note", text)
     if job.options.gauge == "none" and found.identifiability.lost:
-        yield "gauge none: what is not determined has no sigma"
+        yield Statement("note", "gauge none: what is not determined has no sigma")
 
 
-def _check_table(t: TableSurvey) -> Iterator[str]:
-    """Check the rows of a table: copies, leaked test rows, pairs of ambiguous sign."""
-    if t.n_copies:
-        what = "one row is an exact copy" if t.n_copies == 1 else f"{t.n_copies} rows are exact copies"
-        yield f"{t.name}: {what} of another ({t.copy}): a copy counts as one more measurement; remove it"
-    if t.n_leaked:
-        what = "one test row is" if t.n_leaked == 1 else f"{t.n_leaked} test rows are"
-        yield f"{t.name}: {what} at configurations of train rows: no check of a prediction"
-    if t.n_pairs and t.n_ambiguous > AMBIGUOUS_SHARE * t.n_pairs:
-        yield (
-            f"{t.name}: the sign of {t.n_ambiguous} of {t.n_pairs} train pairs is ambiguous within the prior sigmas"
-            " (near 0 or 180 deg): measure longer and wider motions, in which more joints move"
-        )
-
-
-def _check_noise(found: Inspection, job: Job) -> Iterator[str]:
-    """Check noise and prior sigmas that are to be estimated, and tables too short to be checked."""
+def _check_tables(found: Inspection, job: Job) -> Iterator[Statement]:
+    """Check each table for copies, leaked test rows, pairs of ambiguous sign; noise and priors to be estimated."""
+    for t in found.tables:
+        if t.n_copies:
+            what = "one row is an exact copy" if t.n_copies == 1 else f"{t.n_copies} rows are exact copies"
+            text = f"{t.name}: {what} of another ({t.copy}): a copy counts as one more measurement; remove it"
+            yield Statement("note", text)
+        if t.n_leaked:
+            what = "one test row is" if t.n_leaked == 1 else f"{t.n_leaked} test rows are"
+            yield Statement("note", f"{t.name}: {what} at configurations of train rows: no check of a prediction")
+        if t.n_pairs and t.n_ambiguous > AMBIGUOUS_SHARE * t.n_pairs:
+            text = f"{t.name}: the sign of {t.n_ambiguous} of {t.n_pairs} train pairs is ambiguous within the prior"
+            text += " sigmas (near 0 or 180 deg): measure longer and wider motions, in which more joints move"
+            yield Statement("note", text)
     if job.options.estimate_noise:
-        yield "noise is to be estimated: sigmas and accuracy here are for specified noise, or 1 mm and 1 mrad"
+        text = "noise is to be estimated: sigmas and accuracy here are for specified noise, or 1 mm and 1 mrad"
+        yield Statement("note", text)
     if job.options.estimate_tolerance:
-        yield "prior sigmas are to be estimated: accuracy here is for those specified, or 1 mm and 1 mrad"
+        text = "prior sigmas are to be estimated: accuracy here is for those specified, or 1 mm and 1 mrad"
+        yield Statement("note", text)
     unseen = [t.name for t, check in zip(found.tables, found.setups, strict=False) if not check.residuals]
     if unseen and len(found.setups) == len(found.tables):
-        yield f"{_listed(unseen)}: too few rows to look for common mistakes (units, signs, columns) before solving"
-
-
-def _listed(names: list[str]) -> str:
-    more = len(names) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
+        text = f"{listed(unseen)}: too few rows to look for common mistakes (units, signs, columns) before solving"
+        yield Statement("note", text)

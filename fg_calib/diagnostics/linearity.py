@@ -1,4 +1,4 @@
-"""Nonlinearity within the priors and the posterior: where covariances are optimistic and signs ambiguous.
+"""Nonlinearity within the posterior, which makes covariances optimistic, and signs ambiguous within the priors.
 
 With weak priors, nonlinearity makes the covariance optimistic in weak directions: the true arm lies on a curved
 surface, the covariance on its tangent plane. Linearised a posterior sigma d away from the estimate x, at x + d and x -
@@ -6,8 +6,7 @@ d, the rows seem to have their optimum c = J^+ q off it, q the second-order part
 cancels.
 
 Norms are not differentiable at 0, nor angles at 180 degrees. A length or an angle is of *ambiguous sign* where the
-prior sigma of its vector is above half the way there: the vector may as well point the other way. It is *curved* where
-the spread of the posterior across the vector changes it by a second-order term that its noise does not hide.
+prior sigma of its vector is above half the way there: the vector may as well point the other way.
 """
 
 from __future__ import annotations
@@ -19,28 +18,24 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fg_calib.errors import SolverError
-from fg_calib.graph.problem import at_parameters, linear_system, subsampled, with_initial
+from fg_calib.graph.problem import Problem, at_parameters, linear_system, noises_at, subsampled, with_initial
 from fg_calib.graph.solver import Solution
 from fg_calib.robot.kinematics import forward
 from fg_calib.statistics.covariance import Spread
 
 Floats = NDArray[np.float64]
-Booleans = NDArray[np.bool_]
 
 MAX_ROWS = 5_000
 """Residuals that suffice: of more, so many are drawn evenly where that is possible."""
 
-NEGLIGIBLE = 1e-3
-"""Mean square c / sigma of the first draws, below which there are no more."""
+NEGLIGIBLE, NONLINEAR = 1e-3, 0.1
+"""Mean squared errors beyond the covariance, over it: below which the first draws suffice, above which it matters."""
 
 N_FIRST, N_DRAWS = 2, 8
 """Draws of d: sums of all determined directions, each a sigma one way or the other."""
 
 NEAR_SIGMAS = 5.0
 """Noise sigmas from 0, or of an angle from 180 degrees, within which the sign of noise matters."""
-
-CURVED_SIGMAS = 0.5
-"""Second-order term of a length or angle over its noise, above which it counts as curved."""
 
 
 @dataclass(frozen=True)
@@ -51,11 +46,13 @@ class Nonlinearity:
         directions: Of all determined directions, in the mean.
         parameter: Of the parameter of the robot or of a frame where it is largest.
         name: That parameter; empty for one of a frame.
+        rows: Names of the measurements with the largest second-order part over their noise; empty below `NONLINEAR`.
     """
 
     directions: float = 0.0
     parameter: float = 0.0
     name: str = ""
+    rows: tuple[str, ...] = ()
 
 
 def check_linearity(solution: Solution, spread: Spread) -> Nonlinearity:
@@ -70,8 +67,7 @@ def check_linearity(solution: Solution, spread: Spread) -> Nonlinearity:
     scaled = root / scales[:, None]
     in_sigma = (scaled / np.sum(scaled**2, axis=0)).T / scales  # the inverse of `root`, whose columns are orthogonal
     here, variables = linear_system(problem, solution.parameters), problem.variables
-    values = variables.values(solution.parameters)
-    shifts: list[Floats] = []
+    values, shifts = variables.values(solution.parameters), list[Floats]()
     try:
         while len(shifts) < N_DRAWS:
             core = root @ rng.choice([-1.0, 1.0], rank)
@@ -89,32 +85,41 @@ def check_linearity(solution: Solution, spread: Spread) -> Nonlinearity:
     square = np.mean((np.array(shifts) @ named.T) ** 2, axis=0)
     of_each = np.divide(square, variance, out=np.zeros(len(variance)), where=variance > 0.0)
     worst, names = int(np.argmax(of_each)), spread.variables.names
-    return Nonlinearity(float(squares), float(of_each[worst]), names[worst] if worst < len(names) else "")
+    rows = _nonlinear_rows(problem, solution.parameters, there) if squares >= NONLINEAR else ()
+    return Nonlinearity(float(squares), float(of_each[worst]), names[worst] if worst < len(names) else "", rows)
+
+
+def _nonlinear_rows(problem: Problem, parameters: Floats, there: list[Floats]) -> tuple[str, ...]:
+    """Names of the measurements with the largest second-order part over their noise at two opposite steps."""
+    found = dict[str, float]()
+    for here, plus, minus in zip(*(noises_at(problem, x) for x in (parameters, *there)), strict=True):
+        q = 0.5 * (plus.residual() + minus.residual()) - here.residual()
+        size = np.max(np.abs(q) / here.sigma * here.series.used, axis=1)
+        for ends, of in zip(problem.data.places[here.series.table][here.series.ends], size.tolist(), strict=True):
+            found["-".join(problem.end_names[i + 1] for i in ends)] = of
+    least = 0.5 * max(found.values(), default=0.0)
+    return tuple(sorted((name for name in found if found[name] >= least), key=lambda name: -found[name]))
 
 
 @dataclass(frozen=True)
-class NonlinearRows:
-    """Lengths and angles between configurations that are not linear in what the parameters may be off.
+class AmbiguousRows:
+    """Lengths and angles between configurations whose sign is ambiguous within the priors.
 
     Attributes:
         n_rows: Train lengths and angles that were looked at.
         n_near: Pairs within `NEAR_SIGMAS` of their noise from 0 or 180 degrees.
-        ambiguous: Names of those of ambiguous sign within the priors, `5-17`.
-        curved: Names of others that are curved within the posterior.
-        ambiguous_share: Part of the determined directions that rests on the ambiguous ones (sum of leverage over rank).
-        curved_leverage: Directions that rest on the curved ones (sum of leverage).
+        names: Names of the ambiguous ones, `5-17`.
+        share: Part of the determined directions that rests on these (sum of leverage over rank).
     """
 
     n_rows: int = 0
     n_near: int = 0
-    ambiguous: tuple[str, ...] = ()
-    curved: tuple[str, ...] = ()
-    ambiguous_share: float = 0.0
-    curved_leverage: float = 0.0
+    names: tuple[str, ...] = ()
+    share: float = 0.0
 
 
-def find_nonlinear_rows(solution: Solution, sqrt_cov: Floats, rank: int, table: int | None = None) -> NonlinearRows:
-    """Lengths and angles of ambiguous sign, and curved ones; of many an even sample.
+def find_ambiguous_rows(solution: Solution, sqrt_cov: Floats, rank: int, table: int | None = None) -> AmbiguousRows:
+    """Lengths and angles of ambiguous sign; of many an even sample.
 
     Args:
         solution: The solution.
@@ -124,57 +129,32 @@ def find_nonlinear_rows(solution: Solution, sqrt_cov: Floats, rank: int, table: 
     """
     problem, at = solution.problem, at_parameters(solution.problem, solution.parameters)
     prior = np.diag(problem.variables.prior_scales)
-    n_rows, n_near, ambiguous, curved, share, resting = 0, 0, list[str](), list[str](), 0.0, 0.0
-    for noise in solution.noises:
+    n_rows, n_near, names, share = 0, 0, list[str](), 0.0
+    for noise in (noise for noise in solution.noises if len(noise.series.train)):
         s = noise.series
-        families = [name.partition(".")[0] for name in s.kind.names]
-        is_pair = s.kind.ends == 2 and set(families) <= {"distance", "angle"}
-        if not is_pair or not len(s.train) or table not in (None, s.table):
+        if s.kind.ends != 2 or not set(s.kind.names) <= {"distance", "angle"} or table not in (None, s.table):
             continue
         rows = s.train[:: -(-len(s.train) // MAX_ROWS)]
-        trig = problem.data.trigs(problem.robot)[s.table]
-        end = forward(at.chains[s.table], trig, s.ends[rows].ravel())
-        p, R = end.position.reshape(-1, 2, 3), end.rotation.reshape(-1, 2, 3, 3)
+        end = forward(at.chains[s.table], problem.data.trigs(problem.robot)[s.table], s.ends[rows].ravel())
+        R = end.rotation.reshape(-1, 2, 3, 3)
         moved = np.diff(end.jacobian.reshape(len(rows), 2, 6, -1)[..., : len(prior)], axis=1)[:, 0]
-        near = np.zeros(len(rows), dtype=np.bool_)
-        for k, family in enumerate(families):
-            used, sigma = s.used[rows, k], noise.sigma[rows, k]
-            if family == "distance":
-                vector, J = p[:, 1] - p[:, 0], moved[:, 3:]
+        places, near = problem.data.places[s.table][s.ends[rows]], np.zeros(len(rows), dtype=np.bool_)
+        for k, unit in enumerate(s.kind.units):
+            used, sigma, is_length = s.used[rows, k], noise.sigma[rows, k], unit == "m"
+            if is_length:
+                vector, J = np.diff(end.position.reshape(-1, 2, 3), axis=1)[:, 0], moved[:, 3:]
             else:
-                vector, J = _relative_rotation(R), moved[:, :3]
+                vector, J = Rotation.from_matrix(R[:, 1] @ np.swapaxes(R[:, 0], 1, 2)).as_rotvec(), moved[:, :3]
             f = np.linalg.norm(vector, axis=1)
-            unit = vector / np.maximum(f, 1e-300)[:, None]
-            prior_along, prior_across = _spread(unit, J @ prior)
-            along, across = _spread(unit, J @ sqrt_cov)
-            to_0, noisy = np.square(f) / 4.0, 4.0 * np.square(sigma)
-            flips = prior_along + prior_across > np.maximum(to_0, noisy)
-            slope = 1.0 / np.maximum(f, 1e-300)
-            if family == "angle":
-                flips |= prior_along > np.maximum(np.square(np.pi - f) / 4.0, noisy)
-                slope = 0.5 / np.tan(0.5 * np.clip(f, 1e-9, np.pi))
-            curves = ~flips & (0.5 * across * slope > CURVED_SIGMAS * sigma)
-            names = problem.end_names
-            places = problem.data.places[s.table][s.ends[rows]]
-            for mask, found in ((flips & used, ambiguous), (curves & used, curved)):
-                found += [f"{names[a + 1]}-{names[b + 1]}" for a, b in places[mask].tolist()]
-            from_singular = np.minimum(f, np.pi - f) if family == "angle" else f
-            near |= (from_singular < NEAR_SIGMAS * sigma) & used
-            leverage = along / np.square(np.maximum(sigma, 1e-300)) * (len(s.train) / len(rows))
+            to_180 = np.inf if is_length else np.pi - f
+            direction = vector / np.maximum(f, 1e-300)[:, None]
+            prior_along, along = (np.sum((direction[:, None] @ J @ S) ** 2, axis=(1, 2)) for S in (prior, sqrt_cov))
+            flips = np.sum((J @ prior) ** 2, axis=(1, 2)) > np.maximum(f / 2.0, 2.0 * sigma) ** 2
+            flips |= prior_along > np.maximum(to_180 / 2.0, 2.0 * sigma) ** 2
+            names += ["-".join(problem.end_names[i + 1] for i in pair) for pair in places[flips & used]]
             n_rows += int(used.sum())
+            near |= used & (np.minimum(f, to_180) < NEAR_SIGMAS * sigma)
+            leverage = along / np.square(np.maximum(sigma, 1e-300)) * (len(s.train) / len(rows))
             share += float(leverage[flips & used].sum()) / max(rank, 1)
-            resting += float(leverage[curves & used].sum())
         n_near += int(near.sum())
-    return NonlinearRows(n_rows, n_near, tuple(ambiguous), tuple(curved), min(share, 1.0), resting)
-
-
-def _relative_rotation(R: Floats) -> Floats:
-    """Rotation vectors, shape (n, 3), in the base frame, from the first to the second of two rotations each."""
-    out: Floats = Rotation.from_matrix(R[:, 1] @ np.swapaxes(R[:, 0], 1, 2)).as_rotvec()
-    return out
-
-
-def _spread(unit: Floats, moved: Floats) -> tuple[Floats, Floats]:
-    """Variance along unit vectors and across them, shape (n,) each, of vectors that move by columns (n, 3, k)."""
-    along = np.sum(np.einsum("ni,nik->nk", unit, moved) ** 2, axis=1)
-    return along, np.maximum(np.sum(moved**2, axis=(1, 2)) - along, 0.0)
+    return AmbiguousRows(n_rows, n_near, tuple(names), min(share, 1.0))

@@ -35,7 +35,7 @@ from fg_calib.diagnostics.setup_hypotheses import About, Mistake, setup_hypothes
 from fg_calib.graph.problem import Problem
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.table import Table
-from fg_calib.options import FrameKnowledge, Model, check, check_flag
+from fg_calib.options import FrameKnowledge, Model
 from fg_calib.robot.model import Robot
 from fg_calib.threads import one_blas_thread
 
@@ -50,11 +50,8 @@ EXPLAINED = 4.0
 REDUCTION = 5.0
 """Undoing a mistake divides the excess by this at least; undoing two, the excess that either alone leaves."""
 
-STILL_RATIO = 1.5
-"""Excess left by a joint that stands still over that left by another unit, from which it is the unit."""
-
 N_COMBINED = 4
-"""The best single mistakes, which are combined with any other; those after them are units with columns alone."""
+"""The best single mistakes, each of which is combined with any other."""
 
 NEGLIGIBLE_EXCESS = 1e-6
 """Excess below which there is nothing to explain: each unknown takes its own row up."""
@@ -133,9 +130,8 @@ class SetupCheck(Brief):
 def shown(residual: TypicalResidual) -> str:
     """A typical size with its unit, in mm, degrees or pixels: `812 mm`."""
     factor, unit = {"m": (1e3, "mm"), "rad": (180.0 / np.pi, "deg"), "px": (1.0, "px")}[residual.unit]
-    text = f"{residual.size * factor:.3g}"
-    plain = "e" in text and 1.0 < residual.size * factor < 1e9
-    return f"{float(text):.0f} {unit}" if plain else f"{text} {unit}"
+    size = residual.size * factor
+    return f"{size:.0f} {unit}" if 1e3 <= size < 1e9 else f"{size:.3g} {unit}"
 
 
 @checked
@@ -165,9 +161,6 @@ def check_setup(
     Raises:
         InputError: An option is not one of those possible.
     """
-    check("model", model, Model)
-    check("frame", frame, FrameKnowledge)
-    check_flag("doubtful", doubtful)
     given = Table(measurements, model, frame=frame) if table is None else table
     with one_blas_thread:
         setup = setup_of(robot, given)
@@ -205,32 +198,24 @@ def check_tables(
         with_landmarks: Look at tables whose targets, anchors, planes or boards have to be located first.
     """
     whole, labels = problem.whole or problem, problem.data.labels
-    checks, setups = list[SetupCheck](), list[Setup | None]()
+    checks, joint = list[SetupCheck](), list[tuple[Setup, SetupCheck]]()
     with one_blas_thread:
         for number, (label, table) in enumerate(zip(labels, problem.data.tables, strict=True)):
             if table.model is None:
                 continue
-            setup = setup_of(whole.robot, table)
-            one = SetupCheck()
-            if setup is not None and setup.has_landmarks:
-                one = _checked_alone(setup, SetupCheck(nominal_residuals(setup)), True) if with_landmarks else one
-            elif setup is not None:
-                one = SetupCheck(residuals_at(whole, before, whole.robot, number) if _enough(setup) else ())
+            setup, one = setup_of(whole.robot, table), SetupCheck()
+            if setup is not None and setup.has_landmarks and with_landmarks:
+                one = _checked_alone(setup, SetupCheck(nominal_residuals(setup)), True)
+            elif setup is not None and not setup.has_landmarks and _enough(setup):
+                one = together = SetupCheck(residuals_at(whole, before, whole.robot, number))
                 if one.residuals and (doubtful or one.far):
                     alone = SetupCheck(nominal_residuals(setup))
-                    one = alone if alone.residuals and alone.excess < one.excess else one
-                    one = _checked_alone(setup, one, doubtful)
+                    one = _checked_alone(setup, alone if 0.0 < alone.excess < one.excess else one, doubtful)
+                joint.append((setup, replace(together, table=label)))
             checks.append(replace(one, table=label if len(labels) > 1 else ""))
-            setups.append(None if setup is None or setup.has_landmarks else setup)
         far = [one for one in checks if one.far] or [one for one in checks if one.explanations]
         found = sorted(far, key=lambda one: (not one.explanations, -one.excess))
-        if not found and len(checks) > 1:
-            jointly = [residuals_at(whole, before, whole.robot, k) for k in range(len(labels))]
-            numbers = [k for k, table in enumerate(problem.data.tables) if table.model is not None]
-            given = [(s, replace(one, residuals=jointly[k])) for s, one, k in zip(setups, checks, numbers, strict=True)
-                     if s is not None and one.residuals]  # fmt: skip
-            found = _disagreeing(given)
-    return checks, found
+        return checks, found or (_disagreeing(joint) if len(checks) > 1 else [])
 
 
 def _enough(setup: Setup) -> bool:
@@ -287,63 +272,46 @@ def _explanations(setup: Setup, given: SetupCheck) -> tuple[Explanation, ...]:
     """Mistakes that explain residuals, the simplest first; two together where no single one does."""
     # Where residuals are no larger than predicted only what has unknowns of its own can make them much smaller.
     least = About.FRAME if given.excess < 1.0 else About.UNIT
-    single = [(m, _trial(m)) for m in setup_hypotheses(setup) if m.about >= least]
-    most = given.excess / REDUCTION
-    found = _accepted([((m,), trial) for m, trial in single], most)
-    units = [e for e in found if any("readings" in words and " are in " in words for words in e.mistakes)]
-    if given.far and (not found or units):
-        still = _accepted([((m,), _trial(m)) for m in still_joints(setup)], most)
-        smallest = min((e.excess for e in still), default=np.inf)
-        # Another unit of a joint that does not move may only scale its readings to nothing.
-        others = tuple(e for e in found if e not in units or STILL_RATIO * e.excess < smallest)
-        both = smallest <= 2.0 * min((e.excess for e in others), default=np.inf)
-        found = (*others, *still) if still and both else others
-    if found or not given.far or setup.has_landmarks:
-        return found
-    return _accepted(_doubles(single, given.excess), np.inf)
+    single, most = [_trial(m) for m in setup_hypotheses(setup) if m.about >= least], given.excess / REDUCTION
+    found = _accepted(single, most)
+    if given.far and (not found or any("readings" in str(one) for one in found)):
+        found = _accepted([*single, *map(_trial, still_joints(setup))], most)
+    return found if found or not given.far or setup.has_landmarks else _accepted(_doubles(single, given.excess), np.inf)
 
 
 _Trial = tuple[tuple[Mistake, ...], Explanation]
 """Mistakes that were undone, and the residuals that are left then."""
 
 
-def _trial(*mistakes: Mistake) -> Explanation:
+def _trial(*mistakes: Mistake) -> _Trial:
     """Mistakes with the residuals that are left once they are undone, the last of which has the others undone too."""
     words = tuple(m.words for m in sorted(mistakes, key=lambda m: m.about))
-    return Explanation(words, nominal_residuals(mistakes[-1].without))
+    return mistakes, Explanation(words, nominal_residuals(mistakes[-1].without))
 
 
-def _doubles(single: Sequence[tuple[Mistake, Explanation]], given: float) -> list[_Trial]:
+def _doubles(single: Sequence[_Trial], given: float) -> list[_Trial]:
     """Two mistakes undone together, where that reduces the excess far below `given` and below either alone."""
-    alone = {mistake.words: trial.excess for mistake, trial in single}
-    tried, good = set[frozenset[str]](), list[_Trial]()
+    alone, found = {one.words: trial.excess for (one,), trial in single}, dict[frozenset[str], _Trial]()
 
     def left(trial: Explanation) -> float:  # of all kinds: undoing one of two may leave one kind as bad as before
         return float(np.sum(np.log([r.excess for r in trial.residuals]))) if trial.residuals else np.inf
 
-    for rank, (one, _) in enumerate(sorted(single, key=lambda pair: left(pair[1]))):
-        if rank >= N_COMBINED and one.about != About.UNIT:
-            continue
+    for (one,), _ in sorted(single, key=lambda pair: left(pair[1]))[:N_COMBINED]:
         for two in setup_hypotheses(one.without):
             words = frozenset((one.words, two.words))
-            same = words in tried or len(words) < 2 or one.values == two.values != ""
-            if same or (rank >= N_COMBINED and two.about != About.COLUMNS):
-                continue
-            tried.add(words)
-            trial = _trial(one, two)
-            if trial.excess <= min(given, *(alone.get(w, np.inf) for w in words)) / REDUCTION:
-                good.append(((one, two), trial))
-    return good
+            if words not in found and len(words) == 2 and not one.values == two.values != "":
+                found[words] = _trial(one, two)
+    return [trial for words, trial in found.items()
+            if trial[1].excess <= min(given, *(alone.get(w, np.inf) for w in words)) / REDUCTION]  # fmt: skip
 
 
 def _accepted(trials: Sequence[_Trial], most: float) -> tuple[Explanation, ...]:
     """Trials that leave a small enough excess, at most twice that of the best; the simplest first."""
     good = [
-        (mistakes, trial)
-        for mistakes, trial in trials
-        if trial.excess <= min(most, EXPLAINED) and all(REDUCTION * r.size <= r.motion for r in trial.residuals)
+        one
+        for one in trials
+        if one[1].excess <= min(most, EXPLAINED) and all(REDUCTION * r.size <= r.motion for r in one[1].residuals)
     ]
     best = max(min((trial.excess for _, trial in good), default=0.0), 0.5)
     chosen = [one for one in good if one[1].excess <= 2.0 * best]
-    chosen.sort(key=lambda one: sum(mistake.about for mistake in one[0]))
-    return tuple(trial for _, trial in chosen)
+    return tuple(trial for _, trial in sorted(chosen, key=lambda one: sum(mistake.about for mistake in one[0])))

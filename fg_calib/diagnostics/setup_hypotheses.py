@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from itertools import combinations, permutations
+from functools import partial
+from itertools import chain, combinations, permutations
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fg_calib.diagnostics.nominal_residuals import Setup, nominal_residuals
-from fg_calib.options import PAIR_MODELS, POSE_MODELS
 from fg_calib.robot.model import CONVENTIONS
 
 Floats = NDArray[np.float64]
@@ -25,9 +25,8 @@ MAX_REACH, MIN_REACH = 50.0, 0.02
 MOTION_RAD, MOTION_M = 0.1, 0.01
 """Range of a joint's readings, below which another unit is no explanation but a joint that does not move."""
 
-N_STILL, STILL_EXCESS_RATIO = 10, 3.0
-"""Positions at which each joint may stand still that are tried first, and excess left there over the least of all
-joints, up to which a joint is looked at more closely."""
+N_STILL = 10
+"""Positions at which each joint may stand still that are tried first."""
 
 _UNITS = {"mm": 1e-3, "m": 1.0, "cm": 1e-2, "inches": 0.0254}
 LENGTHS = {_UNITS[one] / _UNITS[other]: f"{one}, not {other}" for one, other in permutations(_UNITS, 2)}
@@ -68,14 +67,13 @@ _Found = Iterator[tuple[str, Setup]]
 
 def setup_hypotheses(setup: Setup) -> Iterator[Mistake]:
     """Every mistake that is known, undone in a set-up."""
-    for what, factors, convert in (*_quantities(setup), *_quantities_of_joints(setup)):
-        for factor, unit in factors.items():
-            without = convert(factor)
-            if without is not None:
-                about = About.JOINT if what.startswith("readings of joint ") else About.UNIT
+    for what, units, convert in _quantities(setup):
+        about = About.JOINT if what.startswith("readings of joint ") else About.UNIT
+        for factor, unit in units.items():
+            if (without := convert(factor)) is not None:
                 yield Mistake(about, f"{what} are in {unit}", without, what)
-    for about, hypotheses in HYPOTHESES:
-        for words, without in hypotheses(setup):
+    for about, hypotheses in HYPOTHESES.items():
+        for words, without in chain.from_iterable(found(setup) for found in hypotheses):
             yield Mistake(about, words, without)
 
 
@@ -104,10 +102,13 @@ def _quantities(setup: Setup) -> _Quantities:
             return _measured(setup, position=position, length=length, pairs=of_pairs, groups=of_groups)
 
         yield ("distances" if pairs is not None or m.position is None else "x, y, z"), LENGTHS, scaled
-    if setup.table.model == "pixels" and image is not None:
+    if image is not None:
         yield "corner_x, corner_y", LENGTHS, lambda f: _measured(setup, image=image * [1.0, 1.0, f, f])
-    yield "readings of prismatic joints", LENGTHS, lambda f: _joints(setup, prismatic, f)
-    yield "joint readings", ANGLES, lambda f: _joints(setup, ~prismatic, f)
+    groups_of_joints = {"readings of prismatic joints": prismatic, "joint readings": ~prismatic}
+    several = [i for i, kind in enumerate(prismatic) if np.sum(prismatic == kind) > 1]
+    groups_of_joints |= {f"readings of joint {i + 1}": np.arange(len(prismatic)) == i for i in several}
+    for what, joints in groups_of_joints.items():
+        yield what, LENGTHS if prismatic[joints].any() else ANGLES, partial(_joints, setup, joints)
     if pairs is not None and np.isfinite(pairs.angle).any():
         yield "angles of pairs", ANGLES, lambda f: _measured(setup, pairs=replace(pairs, angle=pairs.angle * f))
     if angles is not None:
@@ -115,15 +116,6 @@ def _quantities(setup: Setup) -> _Quantities:
     elif m.rotation is not None and rotations:
         vector, rad = Rotation.from_matrix(m.rotation.copy()).as_rotvec(), {180.0 / np.pi: "rad, not deg"}
         yield "rx, ry, rz", rad, lambda f: _rotated(setup, Rotation.from_rotvec(vector * f))
-
-
-def _quantities_of_joints(setup: Setup) -> _Quantities:
-    """The readings of one joint; where it is the only one of its kind, they are those of all."""
-    prismatic = [joint.prismatic for joint in setup.robot.joints]
-    for i, slides in enumerate(prismatic):
-        if prismatic.count(slides) > 1:
-            only, units = np.arange(len(prismatic)) == i, LENGTHS if slides else ANGLES
-            yield f"readings of joint {i + 1}", units, lambda f, only=only: _joints(setup, only, f)  # type: ignore[misc]
 
 
 def _joints(setup: Setup, joints: Booleans, factor: float) -> Setup | None:
@@ -141,10 +133,9 @@ def _inverted(setup: Setup) -> _Found:
         return
     inverse = Rotation.from_matrix(m.rotation.copy()).inv()
     if m.position is not None and lengths:
-        of_board = setup.table.model == "board"
-        which = "board_T_camera instead of camera_T_board" if of_board else "tool_T_world instead of world_T_tool"
-        inverted = _measured(_rotated(setup, inverse), position=-inverse.apply(m.position.copy()))
-        yield f"the poses are inverted ({which})", inverted
+        measured, fixed = ("board", "camera") if setup.instrument.sees_landmarks else ("tool", "world")
+        words = f"the poses are inverted ({measured}_T_{fixed} instead of {fixed}_T_{measured})"
+        yield words, _measured(_rotated(setup, inverse), position=-inverse.apply(m.position.copy()))
     if rotations:
         yield "the orientations are inverted", _rotated(setup, inverse)
 
@@ -158,7 +149,7 @@ def _columns(setup: Setup) -> _Found:
             yield words, _measured(setup, position=m.position[:, np.argsort(order)])
         for k in range(3):
             yield f"{'xyz'[k]} has the wrong sign", _measured(setup, position=m.position * (1.0 - 2.0 * np.eye(3)[k]))
-    if setup.table.model == "pixels" and image is not None:
+    if image is not None:
         yield "columns u, v hold v, u", _measured(setup, image=image[:, [1, 0, 2, 3]])
         yield "columns corner_x, corner_y hold y, x", _measured(setup, image=image[:, [0, 1, 3, 2]])
 
@@ -200,77 +191,56 @@ def _conventions(setup: Setup) -> _Found:
     yield words, replace(setup, robot=replace(robot, convention=other, elements=elements))
 
 
-def _signs_and_zeros(setup: Setup) -> _Found:
-    """A joint that moves the other way, or whose zero is a quarter or half a turn away."""
+def _joint_columns(setup: Setup) -> _Found:
+    """A joint that moves the other way, or whose zero is a quarter or half a turn away; columns of joints exchanged."""
     q, joints = setup.table.measurements.readings, setup.robot.joints
-    for i, joint in enumerate(joints):
-        only = np.arange(len(joints)) == i
-        words = f"joint {i + 1} moves the other way (the sign of its readings)"
-        yield words, _measured(setup, readings=np.where(only, -q, q))
-        for degrees in () if joint.prismatic else (90, -90, 180):
-            words = f"the zero of joint {i + 1} is off by {degrees} deg"
-            yield words, _measured(setup, readings=q + np.deg2rad(degrees) * only)
-
-
-def _swaps(setup: Setup) -> _Found:
-    """The readings of two joints exchanged, or of all in the opposite order."""
-    q, n = setup.table.measurements.readings, setup.robot.n_joints
+    n, others = len(joints), dict[str, Floats]()
+    for i, only in enumerate(np.eye(n)):
+        others[f"joint {i + 1} moves the other way (the sign of its readings)"] = q * (1.0 - 2.0 * only)
+        for degrees in () if joints[i].prismatic else (90, -90, 180):
+            others[f"the zero of joint {i + 1} is off by {degrees} deg"] = q + np.deg2rad(degrees) * only
     for i, j in combinations(range(n), 2):
-        order = np.arange(n)
-        order[[i, j]] = j, i
-        yield f"the readings of joints {i + 1} and {j + 1} are exchanged", _measured(setup, readings=q[:, order])
+        order = [j if k == i else i if k == j else k for k in range(n)]
+        others[f"the readings of joints {i + 1} and {j + 1} are exchanged"] = q[:, order]
     if n > 3:
-        yield "the joints are in the opposite order", _measured(setup, readings=q[:, ::-1])
+        others["the joints are in the opposite order"] = q[:, ::-1]
+    for words, readings in others.items():
+        yield words, _measured(setup, readings=readings)
 
 
 def _frame(setup: Setup) -> _Found:
     """A measurement frame that is not the base."""
-    if setup.table.model in POSE_MODELS and setup.table.frame == "known":
+    if setup.instrument.is_pose and setup.table.frame == "known":
         words = "the measurement frame is not the base (frame: unknown)"
         yield words, replace(setup, table=replace(setup.table, frame="unknown"))
 
 
 def _tool(setup: Setup) -> _Found:
-    """A tool that is not where the robot's file says; targets whose coordinates are in the frame of the flange."""
+    """A tool that is not where the robot's file says."""
     rotations, lengths = _sees(setup)
-    rotations = rotations and setup.table.model in POSE_MODELS
     point, fitted = frozenset(setup.tool[:3]), setup.fitted_tool
     if setup.tool and lengths and not point <= fitted:
         yield "the tool point is another one (estimate: [tool.x, tool.y, tool.z])", setup.with_tool(fitted | point)
-    if setup.tool and rotations and not fitted & frozenset(setup.tool[3:]):
+    if setup.tool and rotations and setup.instrument.is_pose and not fitted & frozenset(setup.tool[3:]):
         words = "the tool frame is another one (estimate: all of tool.x ... tool.yaw)"
         yield words, setup.with_tool(frozenset(setup.tool if lengths else (*setup.tool[3:], *fitted)))
-    known = setup.table.known
-    if not known or not setup.tool or fitted & frozenset(setup.tool[3:]) or setup.table.model not in POSE_MODELS:
-        return
-    x, y, z, yaw, pitch, roll = setup.robot.nominal[setup.robot.owned_by(setup.robot.n_joints + 1)]
-    R, t = Rotation.from_euler("xyz", [roll, pitch, yaw]), np.array([x, y, z])
-    if np.any(t) or R.magnitude() > 0.0:
-        moved = {name: replace(point, xyz=R.inv().apply(point.xyz - t)) for name, point in known.items()}
-        words = "the targets' coordinates are in the frame of the flange, not of the tool"
-        yield words, replace(setup, table=replace(setup.table, known=moved))
 
 
-HYPOTHESES: tuple[tuple[About, Callable[[Setup], _Found]], ...] = (
-    (About.COLUMNS, _inverted),
-    (About.COLUMNS, _columns),
-    (About.COLUMNS, _orientations),
-    (About.COLUMNS, _conventions),
-    (About.JOINT, _signs_and_zeros),
-    (About.JOINT, _swaps),
-    (About.FRAME, _frame),
-    (About.TOOL, _tool),
-)
+HYPOTHESES: dict[About, tuple[Callable[[Setup], _Found], ...]] = {
+    About.COLUMNS: (_inverted, _columns, _orientations, _conventions),
+    About.JOINT: (_joint_columns,),
+    About.FRAME: (_frame,),
+    About.TOOL: (_tool,),
+}
 """Hypotheses that are no unit, by what they are about."""
 
 
 def still_joints(setup: Setup) -> Iterator[Mistake]:
-    """Joints whose readings change, each standing still where that explains most; those that explain least left out."""
+    """Joints whose readings change, each standing still where that explains most."""
     from scipy.optimize import minimize_scalar  # here, for it takes as long to import as a small calibration
 
     q, joints = setup.table.measurements.readings, setup.robot.joints
     least = [MOTION_M if joint.prismatic else MOTION_RAD for joint in joints]
-    moving = np.flatnonzero(np.ptp(q, axis=0) > least).tolist()
 
     def at(i: int, position: float) -> Setup:
         return _measured(setup, readings=np.where(np.arange(len(joints)) == i, position, q))
@@ -278,23 +248,15 @@ def still_joints(setup: Setup) -> Iterator[Mistake]:
     def excess(position: float, i: int) -> float:
         return max((residual.excess for residual in nominal_residuals(at(i, position))), default=np.inf)
 
-    turn = np.linspace(-np.pi, np.pi, N_STILL, endpoint=False)
-    places = {i: np.linspace(q[:, i].min(), q[:, i].max(), N_STILL) if joints[i].prismatic else turn for i in moving}
-    tried = {i: [(excess(position, i), position) for position in places[i]] for i in moving}
-    smallest = min((min(found)[0] for found in tried.values()), default=np.inf)
-    for i, found in tried.items():
-        best, position = min(found)
-        if best <= STILL_EXCESS_RATIO * smallest:
-            step = float(places[i][1] - places[i][0])
-            refined = minimize_scalar(
-                lambda position, i=i: excess(position, i),
-                bounds=(position - step, position + step),
-                method="bounded",
-                options={"xatol": 0.03 * step},
-            )
-            words = f"joint {i + 1} does not move: its readings change, but the arm does not follow"
-            there = at(i, float(refined.x) if refined.fun < best else position)
-            yield Mistake(About.JOINT, f"{words} (joint or encoder stuck)", there)
+    for i in np.flatnonzero(np.ptp(q, axis=0) > least).tolist():
+        low, high = (float(q[:, i].min()), float(q[:, i].max())) if joints[i].prismatic else (-np.pi, np.pi)
+        step = (high - low) / N_STILL
+        best, position = min((excess(place, i), place) for place in np.arange(low, high, step).tolist())
+        bounds = position - step, position + step
+        refined = minimize_scalar(excess, bounds=bounds, args=(i,), method="bounded", options={"xatol": 0.03 * step})
+        there = at(i, float(refined.x) if refined.fun < best else position)
+        words = f"joint {i + 1} does not move: its readings change, but the arm does not follow"
+        yield Mistake(About.JOINT, f"{words} (joint or encoder stuck)", there)
 
 
 def _measured(setup: Setup, **changes: Any) -> Setup:
@@ -313,11 +275,5 @@ def _robot(setup: Setup, values: Floats) -> Setup:
 
 
 def _sees(setup: Setup) -> tuple[bool, bool]:
-    """Whether the model uses orientations and lengths."""
-    model = setup.table.model
-    if model in POSE_MODELS:
-        return POSE_MODELS[model]
-    if model in PAIR_MODELS:
-        with_distance, with_angle = PAIR_MODELS[model]
-        return with_angle, with_distance
-    return model == "board", model != "pixels"
+    """Whether orientations and lengths are measured."""
+    return setup.instrument.sees_orientation, setup.instrument.sees_position and setup.table.measurements.image is None

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from fg_calib.diagnostics.linearity import Nonlinearity, NonlinearRows, check_linearity, find_nonlinear_rows
+from fg_calib.diagnostics.linearity import NONLINEAR, AmbiguousRows, Nonlinearity, check_linearity, find_ambiguous_rows
+from fg_calib.diagnostics.nominal_residuals import residuals_at
 from fg_calib.diagnostics.setup_check import SetupCheck, check_problem
 from fg_calib.diagnostics.unmodelled_effects import (
     Change,
@@ -33,7 +34,6 @@ from fg_calib.graph.solver import Solution
 from fg_calib.graph.tolerances import ToleranceScale
 from fg_calib.measurements.kinds.pair import missing_values
 from fg_calib.observability.parallel_axes import MissingMotion
-from fg_calib.robot.kinematics import pose
 from fg_calib.statistics.covariance import Spread
 from fg_calib.statistics.goodness_of_fit import (
     CONFIDENCE,
@@ -63,17 +63,8 @@ PRIOR_P_VALUE = 1e-4
 AMBIGUOUS_SHARE, MAX_AMBIGUOUS_SHARE = 0.05, 0.3
 """Part of the information that may rest on lengths and angles of ambiguous sign: with a warning, and no more at all."""
 
-CURVED_LEVERAGE = 0.1
-"""Directions that rest on curved lengths and angles, up to which sigmas are honest."""
-
-NONLINEAR = 0.1
-"""Mean squared errors beyond the covariance, over it, because of nonlinearity, that are reported."""
-
 LARGE_NOISE = 0.2
 """Estimated noise over the motions measured, beyond which it is no noise."""
-
-MAX_KEPT_FACTOR = 3.0
-"""Factor on estimated noise beyond which a specification is no reason to trust noise that could not be estimated."""
 
 MAX_OUTLIER_SHARE = 0.5
 """Share of measurements beyond which they are not outliers but the majority."""
@@ -281,7 +272,7 @@ def check_chi_square(
     if reduced > high:
         cause = "noise specified too small, unmodelled effects, or outliers"
         if gross is not None:
-            who = f"{'outlier' if gross.n == 1 else f'{gross.n} outliers'} ({_listed(gross.names)})"
+            who = f"{'outlier' if gross.n == 1 else f'{gross.n} outliers'} ({listed(gross.names)})"
             them = "it" if gross.n == 1 else "them"
             cause = f"{who}, {gross.ratio:.3g} without {them}: look at {them}, or let a robust loss do so (loss: gnc)"
         elif updated:
@@ -301,20 +292,17 @@ def check_chi_square(
 
 def check_kept_noise(case: Case) -> Iterator[Statement]:
     """Check noise that was to be estimated, and had too few degrees of freedom for that."""
-    estimated, factors = case.solution.estimated_noise, case.problem.state.factors
+    estimated = case.solution.estimated_noise
     if estimated is None:
         return
     kept = [kind.kind for kind in case.fit.goodness.kinds if (kind.table, kind.kind) not in estimated]
-    off = max((factors.get(name, 1.0) for name in estimated), default=1.0) if kept else 1.0
     if has_joint_noise(case.problem) and JOINT_NOISE not in estimated:
         kept.append("the joint readings")
     if kept:
         text = f"the noise of {', '.join(dict.fromkeys(kept))} could not be estimated: fewer than {LEAST_REDUNDANCY:g}"
         text += " degrees of freedom are left to it; it is as specified, or 1 mm and 1 mrad where nothing was"
-        wrong = f"; other noise was specified {off:.3g} times too small, and so may this be: measure more"
-        text += wrong * (off > MAX_KEPT_FACTOR and bool(estimated))
         text += "; nothing says whether it is right: measure more" * (not estimated)
-        yield Statement("error" if not estimated or off > MAX_KEPT_FACTOR else "note", text)
+        yield Statement("note" if estimated else "error", text)
 
 
 def check_test_rows(case: Case) -> list[Statement]:
@@ -334,7 +322,7 @@ def check_test_rows(case: Case) -> list[Statement]:
         return []
     worst = [case.problem.end_names[c.configuration + 1] for c in fit.configurations]
     text = f"{predicted_in_words(fit)}: the arm does not predict them as well as it claims"
-    text += f"; suspicious: {_listed(worst)}" if worst else ""
+    text += f"; suspicious: {listed(worst)}" if worst else ""
     return [Statement("error" if ratio > FACTOR else "warning", text)]
 
 
@@ -350,11 +338,11 @@ def check_priors(fit: PriorFit | None) -> list[Statement]:
     ]
     worst = [f"{one.name} {one.z:+.1f}" for one in fit.beyond if not one.is_place]
     if worst:
-        text = f"corrections beyond their prior sigmas (in sigma of these: {_listed(worst)}): {causes}"
+        text = f"corrections beyond their prior sigmas (in sigma of these: {listed(worst)}): {causes}"
         found.append(Statement("error", text))
     if not found and fit.p_value is not None and fit.p_value < (1.0 - CONFIDENCE) / 2.0:
         largest = [f"{fit.names[i]} {fit.z[i]:+.1f}" for i in np.argsort(-np.abs(fit.z))]
-        text = f"corrections are too large for their prior sigmas (in sigma of these: {_listed(largest)}; sum of"
+        text = f"corrections are too large for their prior sigmas (in sigma of these: {listed(largest)}; sum of"
         text += f" squares {fit.chi2:.3g} where {fit.expected:.3g} is expected): {causes}"
         certain = fit.chi2 > FACTOR * fit.expected and fit.p_value < PRIOR_P_VALUE
         found.append(Statement("error" if certain else "note", text))
@@ -377,77 +365,57 @@ def check_prior_scales(case: Case) -> Iterator[Statement]:
 
 
 def check_signs(case: Case) -> list[Statement]:
-    """Check lengths and angles near 0 and 180 degrees.
+    """Check lengths and angles near 0 and 180 degrees, and what is not linear within the posterior.
 
     Near 180 degrees a vector has one other sign only: where there are more rows than they determine, a wrong sign shows
     in chi-square. Vectors near 0 point anywhere, which fits.
     """
-    found = find_nonlinear_rows(case.solution, case.spread.root, case.spread.rank)
-    return check_nonlinear_rows(found, case.fit.chi_square.too_large)
+    rows = find_ambiguous_rows(case.solution, case.spread.root, case.spread.rank)
+    return check_linear(rows, check_linearity(case.solution, case.spread), case.fit.chi_square.too_large)
 
 
-def check_nonlinear_rows(found: NonlinearRows, high: bool = False) -> list[Statement]:
-    """Check lengths and angles of ambiguous sign, else curved ones: one statement names them and the remedy.
+def check_linear(rows: AmbiguousRows, nonlinear: Nonlinearity, high: bool = False) -> list[Statement]:
+    """Check ambiguous signs, else nonlinearity, by which the covariance is optimistic: one statement with the remedy.
 
     Args:
-        found: The rows.
+        rows: Lengths and angles of ambiguous sign.
+        nonlinear: Nonlinearity within the posterior.
         high: Whether residuals are too large for the noise, which a single wrong sign may be the cause of.
     """
-    n = len(found.ambiguous)
-    remedy = "leave these out, or measure longer and wider motions, in which more joints move"
-    if n and (high or found.ambiguous_share >= AMBIGUOUS_SHARE):
-        text = f"the sign of {n} of {found.n_rows} lengths and angles is ambiguous within the prior sigmas"
-        share = f"{100.0 * found.ambiguous_share:.0f} % of the information rests on them"
-        text += f" ({_listed(found.ambiguous)} near 0 or 180 deg; {share}): there may be a better optimum far away, and"
-        text += f" sigmas may be too small; {remedy}"
-        return [Statement("error" if found.ambiguous_share > MAX_AMBIGUOUS_SHARE else "warning", text)]
-    n = len(found.curved)
-    if found.curved_leverage >= CURVED_LEVERAGE:
-        text = (
-            f"{n} of {found.n_rows} lengths and angles ({_listed(found.curved)}) are so short that they are nonlinear"
+    curved = nonlinear.directions >= NONLINEAR
+    if rows.names and (high or curved or rows.share >= AMBIGUOUS_SHARE):
+        text = f"the sign of {len(rows.names)} of {rows.n_rows} lengths and angles is ambiguous within the prior sigmas"
+        text += (
+            f" ({listed(rows.names)} near 0 or 180 deg; {100.0 * rows.share:.0f} % of the information rests on them)"
         )
-        text += f" within the posterior sigmas, which may be 10 % too small; {remedy}"
-        return [Statement("warning", text)]
-    return []
-
-
-def check_nonlinearity(found: Nonlinearity) -> list[Statement]:
-    """Check whether nonlinearity makes the covariance optimistic."""
-    if found.directions < NONLINEAR:
+        text += ": there may be a better optimum far away, and sigmas may be too small; leave these out, or measure"
+        text += " longer and wider motions, in which more joints move"
+        return [Statement("error" if rows.share > MAX_AMBIGUOUS_SHARE else "warning", text)]
+    if not curved:
         return []
-    text = "the measurements are nonlinear within the posterior sigmas, so the covariance is optimistic in weak"
-    text += f" directions: errors there are {_times(found.directions)} what it says"
-    if found.parameter >= NONLINEAR:
-        text += f", those of {found.name or 'a frame'} {_times(found.parameter)}"
+    text = f"the measurements are nonlinear within the posterior sigmas (most: {listed(nonlinear.rows)}), so the"
+    text += (
+        f" covariance is optimistic in weak directions: errors there are {_times(nonlinear.directions)} what it says"
+    )
+    if nonlinear.parameter >= NONLINEAR:
+        text += f", those of {nonlinear.name or 'a frame'} {_times(nonlinear.parameter)}"
     return [Statement("warning", f"{text}; measure at more configurations, or specify smaller prior sigmas")]
 
 
 def check_estimated_noise(case: Case) -> Iterator[Statement]:
-    """Check whether estimated noise is small compared with the motions it was estimated from.
-
-    Lengths and angles between two ends move by as much as they are; what has one end moves with the tool.
-    """
-    problem, table = case.problem, case.fit.residuals
+    """Check whether estimated noise is small compared with the motions it was estimated from."""
+    problem, robot = case.problem, case.problem.robot
     for fit in case.fit.goodness.kinds:
         if (fit.table, fit.kind) not in (case.solution.estimated_noise or ()) or fit.kind not in _WITH_MOTION:
             continue
-        if problem.data.tables[fit.table].uses_pairs:
-            rows = table.used & (table.group == table.groups.index((fit.table, fit.kind)))
-            motion = float(np.sqrt(np.mean((table.measured + table.after)[rows] ** 2)))
-        else:
-            motion = 1.0 if fit.kind == "orientation" else _tool_motion(case, fit.table)
-        ratio = fit.factor * fit.stated_sigma_rms / max(motion, 1e-300)
+        typical = residuals_at(problem, case.solution.parameters, robot, fit.table)
+        motion = next((r.motion for r in typical if r.kind == fit.kind), 0.0)
+        still = 1e-3 * robot.reach if fit.unit == "m" else 0.0  # about a single anchor the tool point stays
+        motion = motion if motion > still else robot.reach
+        ratio = fit.factor * fit.stated_sigma_rms / motion
         if ratio >= LARGE_NOISE:
             text = f"the noise estimated of {fit.kind} is {ratio:.2g} times as large as the motions measured"
             yield Statement("error", f"{text}: the arm explains next to nothing; check the table and the job")
-
-
-def _tool_motion(case: Case, table: int) -> float:
-    """Standard deviation of the tool point along an axis over a table's configurations, [m]; the reach if it stays."""
-    robot = case.problem.robot.with_values(case.solution.parameters[case.problem.variables.robot_span])
-    p = pose(robot, case.problem.data.tables[table].measurements.readings).position
-    spread = float(np.sqrt(np.mean(np.var(p, axis=0))))
-    return spread if spread > 1e-3 * robot.reach else robot.reach
 
 
 def check_tables(case: Case) -> Iterator[Statement]:
@@ -465,7 +433,6 @@ CHECKS: tuple[Callable[[Case], list[Statement] | Iterator[Statement]], ...] = (
     lambda case: check_priors(case.fit.priors),
     check_prior_scales,
     check_signs,
-    lambda case: check_nonlinearity(check_linearity(case.solution, case.spread)),
     check_estimated_noise,
     check_tables,
 )
@@ -559,6 +526,7 @@ def probability(p: float) -> str:
     return "< 0.001" if p < 1e-3 else "> 0.999" if p > 0.999 else f"{p:.2g}" if p < 0.1 else f"{p:.2f}"
 
 
-def _listed(names: Sequence[str]) -> str:
+def listed(names: Sequence[str]) -> str:
+    """The first names, and how many more there are."""
     more = len(names) - NAMED
     return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")

@@ -1,5 +1,7 @@
 """Where nonlinearity or an ambiguous sign makes sigmas dishonest a warning names the rows and the remedy."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -8,8 +10,8 @@ from simulated import measure, small_arm, true_robot
 from fg_calib import Measurements, Robot, calibrate, pose
 from fg_calib.assessment import assess
 from fg_calib.diagnostics import linearity
-from fg_calib.diagnostics.linearity import Nonlinearity, NonlinearRows, check_linearity, find_nonlinear_rows
-from fg_calib.diagnostics.verdict import check_nonlinear_rows, check_nonlinearity
+from fg_calib.diagnostics.linearity import AmbiguousRows, Nonlinearity, check_linearity, find_ambiguous_rows
+from fg_calib.diagnostics.verdict import check_linear
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve, unsolved
 from fg_calib.options import Pairing
@@ -87,11 +89,13 @@ def test_few_positions_of_a_wide_arm_are_warned_of_and_more_end_it():
 
 
 def test_the_nonlinear_parameter_of_a_frame_or_the_robot_is_named():
-    assert check_nonlinearity(Nonlinearity(0.09, 5.0)) == []
+    none = AmbiguousRows()
+    assert check_linear(none, Nonlinearity(0.09, 5.0)) == []
     (of_a2,), (of_frame,), (alone,), (lost,) = (
-        check_nonlinearity(Nonlinearity(3.0, beyond, name))
+        check_linear(none, Nonlinearity(3.0, beyond, name, ("0-1", "0-2")))
         for beyond, name in ((0.44, "a2"), (8.0, ""), (0.01, "a2"), (np.inf, "a2"))
     )
+    assert "within the posterior sigmas (most: 0-1, 0-2), so the covariance is optimistic" in of_a2.text
     assert "errors there are some 2 times what it says, those of a2 some 1.2 times; measure at more" in of_a2.text
     assert "those of a frame some 3 times" in of_frame.text
     assert "those of" not in alone.text
@@ -116,27 +120,26 @@ def test_rows_of_ambiguous_sign_are_those_that_the_prior_lets_pass_zero_or_half_
     def rows(tolerance):
         a2 = Robot.from_dh(ROWS, "dh", tolerance={"a": tolerance}).with_estimated(["a2"])
         problem = build_problem(a2, Measurements.from_arrays(q, pairs=pairs), model="distance")
-        return find_nonlinear_rows(unsolved(problem), np.zeros((1, 0)), 1)
+        return find_ambiguous_rows(unsolved(problem), np.zeros((1, 0)), 1)
 
     # At 1 mrad the vector moves by 0.01 mm, below twice the noise; from 0.2 rad on by more than half its length.
-    assert set(rows(1e-2).ambiguous) == {"1-5", "2-6", "3-7"}
+    assert set(rows(1e-2).names) == {"1-5", "2-6", "3-7"}
     assert rows(1e-2).n_near == 1
-    assert rows(9e-4).ambiguous == ()
+    assert rows(9e-4).names == ()
 
 
 def test_one_statement_names_the_rows_and_the_remedy():
-    names = ("0-1", "0-2", "0-3", "0-4")
-    assert check_nonlinear_rows(NonlinearRows(60, 4, names, (), 0.04, 0.0)) == []
-    (few,) = check_nonlinear_rows(NonlinearRows(60, 4, names, ("0-9",), 0.06, 3.0))
+    names, linear = ("0-1", "0-2", "0-3", "0-4"), Nonlinearity()
+    assert check_linear(AmbiguousRows(60, 4, names, 0.04), linear) == []
+    (few,) = check_linear(AmbiguousRows(60, 4, names, 0.06), Nonlinearity(3.0))
     assert few.severity == "warning"
     assert few.text.startswith(f"the sign of 4 of 60 lengths and angles {AMBIGUOUS} (0-1, 0-2, 0-3 and 1 more near 0")
     assert few.text.endswith("leave these out, or measure longer and wider motions, in which more joints move")
-    (many,) = check_nonlinear_rows(NonlinearRows(60, 4, names, (), 0.31, 0.0))
+    (many,) = check_linear(AmbiguousRows(60, 4, names, 0.31), linear)
     assert many.severity == "error"
-    (spoilt,) = check_nonlinear_rows(NonlinearRows(60, 4, names[:1], (), 0.0, 0.0), high=True)
-    assert "(0-1 near 0 or 180 deg" in spoilt.text
-    (curved,) = check_nonlinear_rows(NonlinearRows(60, 0, (), ("0-9",), 0.0, 0.11))
-    assert (curved.severity, NONLINEAR in curved.text, "0-9" in curved.text) == ("warning", True, True)
+    for high, nonlinear in ((True, 0.0), (False, 0.1)):
+        (spoilt,) = check_linear(AmbiguousRows(60, 4, names[:1], 0.0), Nonlinearity(nonlinear), high)
+        assert "(0-1 near 0 or 180 deg" in spoilt.text
 
 
 # --- cells where covariances are not honest ------------------------------------------------------------------------
@@ -252,7 +255,8 @@ def test_pairs_of_ambiguous_sign_that_a_result_rests_on_are_named(cell, seed):
     """Half of such draws end at the arm with the other sign, and their chi-square may be as good."""
     robot, m, model = CELLS[cell](seed)
     verdict = calibrate(robot, m, model=model).assessed[1].verdict
-    (said,) = [text for text in (*verdict.errors, *verdict.warnings) if AMBIGUOUS in text]
+    (said,) = [text for text in (*verdict.errors, *verdict.warnings) if AMBIGUOUS in text or NONLINEAR in text]
+    assert re.search(r"ambiguous within the prior sigmas \(\d+-\d+", said)
     assert "leave these out, or measure longer and wider motions" in said
 
 
@@ -264,7 +268,9 @@ def test_pairs_of_ambiguous_sign_that_a_result_rests_on_are_named(cell, seed):
 def test_stars_at_wide_priors_are_warned_of(name, wider, model, seed):
     """Mean NEES of 10 draws 2.4 for the SCARA at tolerances times 10, of single draws up to 14."""
     verdict = assess(solve(star(name, wider, seed, model))).verdict
-    assert any(NONLINEAR in text for text in verdict.warnings)
+    (said,) = [text for text in (*verdict.errors, *verdict.warnings) if AMBIGUOUS in text or NONLINEAR in text]
+    assert re.search(r"nonlinear within the posterior sigmas \(most: 0-\d+", said)
+    assert said.endswith("measure at more configurations, or specify smaller prior sigmas")
 
 
 @pytest.mark.parametrize("name", ARMS)

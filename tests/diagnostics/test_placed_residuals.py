@@ -7,16 +7,12 @@ import pytest
 from instruments import measured_by
 from scipy.spatial.transform import Rotation
 
-from fg_calib import Robot
 from fg_calib.assessment import assess
 from fg_calib.diagnostics import nominal_residuals as placed_residuals
 from fg_calib.diagnostics.nominal_residuals import setup_of
 from fg_calib.diagnostics.setup_check import check_setup
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import SolverOptions, solve
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.table import KnownPoint, Table
-from fg_calib.robot.kinematics import pose
 
 
 def check(robot, table, **changes):
@@ -92,25 +88,6 @@ def test_rows_are_drawn_so_that_every_target_and_anchor_is_there():
         assert len(setup.table.measurements.readings) <= 80
         assert set(setup.table.measurements.labels[label].index) == {0, 1, 2}
         assert setup.has_landmarks
-
-
-@pytest.mark.slow
-def test_targets_in_the_frame_of_the_flange_are_named():
-    rng = np.random.default_rng(3)
-    rows = [[0, np.pi / 2, 0.4, 0], [0.5, 0, 0, 0], [0.1, np.pi / 2, 0, 0], [0, -np.pi / 2, 0.5, 0],
-            [0, np.pi / 2, 0, 0], [0, 0, 0.1, 0]]  # fmt: skip
-    tolerance = {"a": 1e-4, "d": 1e-4, "alpha": 2e-4, "theta": 2e-4}
-    robot = Robot.from_dh(rows, convention="dh", tool=[0.1, 0, 0.2, 0.3, 0, 0.5], tolerance=tolerance)
-    q, places = rng.uniform(-2, 2, (40, 6)), np.array([[0.05, 0.02, 0.1], [-0.1, 0.1, 0.2], [0.1, -0.15, 0.25]])
-    at = pose(robot, q)
-    flange = at.rotation @ Rotation.from_euler("xyz", [0.3, 0, 0.5]).inv().as_matrix()
-    origin = at.position - flange @ [0.1, 0, 0.2]
-    seen = np.concatenate([origin + flange @ place for place in places])
-    target = np.repeat(["t0", "t1", "t2"], 40)
-    m = Measurements.from_arrays(np.tile(q, (3, 1)), position=seen, sigma_position=1e-5, target=target)
-    known = {f"t{k}": KnownPoint(place) for k, place in enumerate(places)}
-    said = str(check(robot, Table(m, "position", frame="unknown", known=known)))
-    assert "the targets' coordinates are in the frame of the flange, not of the tool" in said
 
 
 @pytest.mark.slow
