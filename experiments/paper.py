@@ -345,7 +345,7 @@ def validate(task: Task) -> Row:
     for who in ESTIMATORS:
         fitted = fit(simulation, model, who)
         row[who] = position_errors(fitted, true, readings)
-        row[f"bound {who}"] = bound_of(simulation, model, who).position(readings).rms
+        row[f"bound {who}"] = bound_of(simulation, model, who).position(readings)
         row["traces"][who] = _errors_of(fitted, true, readings)
     return row
 
@@ -419,7 +419,7 @@ def claim(task: Task) -> Row:
             errors = position_errors(fit(simulation, model, who), true, readings)
             bound = bound_of(simulation, model, who).position(readings)
             row |= {f"{model} {who} {key}": errors[key] for key in ("max", "mean", "rms")}
-            row[f"{model} {who} bound"] = bound.rms
+            row[f"{model} {who} bound"] = bound
     return row
 
 
@@ -490,8 +490,8 @@ def frame(task: Task) -> Row:
         robot = solve(build_problem(s.robot, fitted, **options)).robot
         row |= {
             case: position_errors(robot, s.true_robot, readings)["rms"],
-            f"{case}: bound": bound.position(readings).rms,
-            f"{case}: claimed": bound.position(readings, claimed=True).rms,
+            f"{case}: bound": bound.position(readings),
+            f"{case}: claimed": bound.position(readings, claimed=True),
         }
     return row
 

@@ -217,7 +217,7 @@ def draw(task: Task) -> Row:
     }
     if seed % BOUND_EVERY == 0:
         bound = cramer_rao(true, simulation.tables, **options)
-        row["bound"] = bound.position(q, fitted=True).rms ** 2
+        row["bound"] = bound.position(q, fitted=True) ** 2
     return row
 
 

@@ -67,7 +67,7 @@ found["noise"] = [noise.cost, *noise.parameters.tolist()]
 all_pairs = {"model": job.options.model, "pairing": fg.Pairing("all")}
 found["compare"] = fg.comparison_document(fg.compare(job))
 bound = fg.cramer_rao(job.robot, job.measurements, **all_pairs)
-found["bound"] = [bound.covariance.tolist(), bound.position(job.measurements.readings, fitted=True).rms]
+found["bound"] = [bound.covariance.tolist(), bound.position(job.measurements.readings, fitted=True)]
 plain = fg.fit_least_squares(job.robot, job.measurements, weighted=True, **all_pairs)
 found["plain"] = [plain.robot.nominal.tolist(), plain.covariance.tolist()]
 for name, seen in {

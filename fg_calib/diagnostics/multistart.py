@@ -13,9 +13,7 @@ Note:
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,9 +48,6 @@ CHI2_INDISTINCT = 10.8276
 LEAST_GAIN = 0.01
 """Cost by which another optimum must be lower to count as better."""
 
-MAX_ROUNDS = 2
-"""Optima, each better than the one before, from which others are searched."""
-
 MAX_ROWS = 20_000
 """Residuals beyond which weak directions are not searched: a descent takes seconds, and so many rows leave few weak."""
 
@@ -72,33 +67,15 @@ def multistart(solution: Solution, options: SolverOptions | None = None) -> Solu
     if solution.problem.evaluated or not solution.converged:
         return solution
     found = [solution]
-
-    def best() -> Solution:
-        return min(found, key=lambda one: one.objective)
-
-    def keep(descent: Callable[[], Solution | None]) -> None:
-        try:
-            other = descent()
-        except CalibrationError:  # a start without a solution says nothing against the first
-            return
-        if other is not None and other.converged:
-            noise, tolerances = solution.estimated_noise, solution.estimated_tolerances
-            found.append(replace(other, estimated_noise=noise, estimated_tolerances=tolerances))
-
-    searched: list[Solution] = []
-    while all(best() is not one for one in searched) and len(searched) < MAX_ROUNDS:
-        searched.append(here := best())
-        with one_blas_thread:
-            starts = [_moved(here, step) for step in _steps(here)]
-        for start in starts:
-            keep(partial(_solve_from, here, start, options))
-    if solution.problem.options.loss == "none":
-        for landmark in _mirrored_landmarks(solution.problem):
-            mirrored = _mirrored(best(), landmark)
-            if mirrored is not None:
-                keep(partial(solve, mirrored, options))
-    kept = best() if solution.objective - best().objective > LEAST_GAIN else solution
-    others: list[Solution] = []
+    with one_blas_thread:
+        starts = [_moved(solution, step) for step in _steps(solution)]
+    for start in starts:
+        found += _solve_from(solution, solution.problem, options, start)
+    for landmark in _mirrored_landmarks(solution.problem) if solution.problem.options.loss == "none" else ():
+        mirrored = _mirrored(min(found, key=_objective), landmark)
+        found += [] if mirrored is None else _solve_from(solution, mirrored, options)
+    best, others = min(found, key=_objective), list[Solution]()
+    kept = best if solution.objective - best.objective > LEAST_GAIN else solution
     for one in found:
         indistinct = 2.0 * (one.objective - kept.objective) < CHI2_INDISTINCT
         if indistinct and _is_an_arm(one, kept) and all(_apart(one, other) for other in (kept, *others)):
@@ -107,10 +84,22 @@ def multistart(solution: Solution, options: SolverOptions | None = None) -> Solu
     return replace(kept, others=tuple(one.parameters for one in others), seconds=seconds)
 
 
-def _solve_from(solution: Solution, start: Floats, options: SolverOptions | None) -> Solution:
-    """The optimum from another start, with the costs of the solution's own start."""
-    other = solve(solution.problem, options, start=start)
-    return replace(other, before=solution.before, initial_cost=solution.initial_cost)
+def _objective(solution: Solution) -> float:
+    return solution.objective
+
+
+def _solve_from(
+    solution: Solution, problem: Problem, options: SolverOptions | None, start: Floats | None = None
+) -> list[Solution]:
+    """The optimum from another start, as a later stage of a solution; none where there is no solution from there."""
+    try:
+        other = solve(problem, options, start=start)
+    except CalibrationError:  # says nothing against the first
+        return []
+    if start is not None:
+        other = replace(other, before=solution.before, initial_cost=solution.initial_cost)
+    noise, tolerances = solution.estimated_noise, solution.estimated_tolerances
+    return [replace(other, estimated_noise=noise, estimated_tolerances=tolerances)] if other.converged else []
 
 
 def _moved(solution: Solution, step: Floats) -> Floats:
@@ -187,7 +176,7 @@ def _mirrored_landmarks(problem: Problem) -> list[tuple[int, ...]]:
 def _mirrored(solution: Solution, landmark: tuple[int, ...]) -> Problem | None:
     """The problem with one landmark mirrored and the arm at nominal; None where it has no mirror image."""
     problem, at, key = solution.problem, at_parameters(solution.problem, solution.parameters), np.array(landmark)
-    points, data = list[Floats](), list[Floats]()
+    points, data, variables = list[Floats](), list[Floats](), problem.variables
     for s in problem.data.series:
         if s.nuisances.shape[1] == len(key) and type(s.kind).mirrored is not Kind.mirrored:
             kind, rows = s.kind, s.train[np.all(s.nuisances[s.train] == key, axis=1)]
@@ -197,17 +186,12 @@ def _mirrored(solution: Solution, landmark: tuple[int, ...]) -> Problem | None:
     image = kind.mirrored(np.concatenate(points), np.concatenate(data), at.coordinates[key])
     if image is None:
         return None
-    start, others = solution.before.copy(), problem.variables.others.copy()
-    places = problem.variables.coordinates[key]
-    start[places[places >= 0]] = image[places >= 0]
-    others[key[places < 0]] = image[places < 0]
+    places, start, others = variables.coordinates[key], solution.before.copy(), variables.others.copy()
+    start[places[places >= 0]], others[key[places < 0]] = image[places >= 0], image[places < 0]
     unknowns = problem.data.unknowns
-    for i in np.unique(unknowns.owners[key[places < 0]]).tolist():  # what is not estimated of it, as a point behind
+    for i in np.unique(unknowns.owners[key[places < 0]]).tolist():  # what is not estimated of it
         unknowns = unknowns.with_start(unknowns.span(i).start, others[unknowns.span(i)])
-    data_there = replace(problem.data, unknowns=unknowns)
-
-    def there(p: Problem) -> Problem:
-        return replace(p, data=data_there, variables=replace(p.variables, others=others))
-
-    whole = None if problem.whole is None else there(problem.whole)
-    return with_factors(replace(there(problem), whole=whole), start)
+    there, whole = replace(problem.data, unknowns=unknowns), problem.whole
+    if whole is not None:
+        whole = replace(whole, data=there, variables=replace(whole.variables, others=others))
+    return with_factors(problem, start, data=there, variables=replace(variables, others=others), whole=whole)

@@ -51,7 +51,7 @@ REDUCTION = 5.0
 """Undoing a mistake divides the excess by this at least; undoing two, the excess that either alone leaves."""
 
 N_COMBINED = 4
-"""The best single mistakes, each of which is combined with any other."""
+"""The best single mistakes, each of which is combined with any other; those after them are units with columns."""
 
 NEGLIGIBLE_EXCESS = 1e-6
 """Excess below which there is nothing to explain: each unknown takes its own row up."""
@@ -296,10 +296,11 @@ def _doubles(single: Sequence[_Trial], given: float) -> list[_Trial]:
     def left(trial: Explanation) -> float:  # of all kinds: undoing one of two may leave one kind as bad as before
         return float(np.sum(np.log([r.excess for r in trial.residuals]))) if trial.residuals else np.inf
 
-    for (one,), _ in sorted(single, key=lambda pair: left(pair[1]))[:N_COMBINED]:
-        for two in setup_hypotheses(one.without):
-            words = frozenset((one.words, two.words))
-            if words not in found and len(words) == 2 and not one.values == two.values != "":
+    for rank, ((one,), _) in enumerate(sorted(single, key=lambda pair: left(pair[1]))):
+        others = list(About) if rank < N_COMBINED else [About.COLUMNS] if one.about == About.UNIT else []
+        for two in setup_hypotheses(one.without) if others else ():
+            words, same = frozenset((one.words, two.words)), one.values == two.values != ""
+            if words not in found and len(words) == 2 and not same and two.about in others:
                 found[words] = _trial(one, two)
     return [trial for words, trial in found.items()
             if trial[1].excess <= min(given, *(alone.get(w, np.inf) for w in words)) / REDUCTION]  # fmt: skip

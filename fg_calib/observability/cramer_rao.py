@@ -21,7 +21,6 @@ A covariance depends on second moments alone, so tolerances serve for uniform er
 
 References:
     Van Trees (1968), Detection, Estimation, and Modulation Theory, Part I. Wiley.
-    Sobol (1967), The distribution of points in a cube and the approximate evaluation of integrals. USSR Comp. Math. 7.
 """
 
 from __future__ import annotations
@@ -31,7 +30,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from fg_calib.arguments import checked
 from fg_calib.arrays import Brief
@@ -53,25 +51,6 @@ RCOND = 1e-10
 
 _ENTERS = 1e-6
 """Share of an error above which it counts as entering the estimate's error."""
-
-_SAMPLES = 512
-"""Draws from the bound for the expected mean and maximum, evenly spread: their error is below a percent."""
-
-
-@dataclass(frozen=True)
-class PositionBound(Brief):
-    """Errors of the tool point over some configurations, as a bound expects them.
-
-    Attributes:
-        rms: Root of the mean square of the distances between estimated and true tool point, over configurations and
-            over errors and noise, [m].
-        mean: Mean of the distances, if the errors are normal, [m].
-        max: Mean of the largest distance, if the errors are normal, [m].
-    """
-
-    rms: float
-    mean: float
-    max: float
 
 
 @dataclass(frozen=True)
@@ -95,8 +74,8 @@ class Bound(Brief):
 
     @checked
     @single_threaded
-    def position(self, readings: Floats, *, fitted: bool = False, claimed: bool = False) -> PositionBound:
-        """The bound on the tool point at joint readings.
+    def position(self, readings: Floats, *, fitted: bool = False, claimed: bool = False) -> float:
+        """The bound on the root mean square error of the tool point at joint readings, over errors and noise, [m].
 
         Args:
             readings: Shape (n, n_joints), [rad] (prismatic: [m]).
@@ -109,23 +88,8 @@ class Bound(Brief):
         G = at.jacobian[:, 3:]
         if fitted:
             G, _ = without_rigid_motion(at.position, G)
-        G = G.reshape(-1, len(self.names))  # (3 n, n_names)
-        variance, V = np.linalg.eigh(self.claimed if claimed else self.covariance)
-        V = V * np.sign(V[np.argmax(np.abs(V), axis=0), np.arange(len(variance))])  # its signs are anyone's choice
-        half = (G @ (V * np.sqrt(np.maximum(variance, 0.0))))[:, ::-1]  # (3 n, n_names), the largest first
-        z = _normal(half.shape[1]).T
-        distance = np.linalg.norm((half @ z).reshape(len(readings), 3, -1), axis=1)  # (n, samples)
-        return PositionBound(
-            rms=float(np.sqrt(np.sum(half**2) / len(readings))),
-            mean=float(distance.mean()),
-            max=float(distance.max(axis=0).mean()),
-        )
-
-
-def _normal(n: int) -> Floats:
-    """Normal figures, evenly spread (Sobol 1967), most evenly the first of them: shape (_SAMPLES, n)."""
-    figures: Floats = qmc.MultivariateNormalQMC(np.zeros(n), engine=qmc.Sobol(n, seed=0)).random(_SAMPLES)
-    return figures
+        covariance = self.claimed if claimed else self.covariance
+        return float(np.sqrt(np.einsum("nij,jk,nik->", G, covariance, G) / len(readings)))
 
 
 @checked

@@ -20,6 +20,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import computed_field
+from scipy.sparse.csgraph import connected_components
 
 from fg_calib.arrays import Figure, Floats, FrozenArrays
 from fg_calib.graph.normal_system import (
@@ -285,15 +286,12 @@ def _groups(
     return tuple(sorted(found, key=lambda g: names.index(g.parameters[0])))
 
 
-def _connected(relations: Floats) -> list[tuple[set[int], list[int]]]:
+def _connected(relations: Floats) -> list[tuple[list[int], list[int]]]:
     """Relations that share a parameter, together: (parameters, relations) of each group."""
-    groups: list[tuple[set[int], list[int]]] = []
-    for r, relation in enumerate(relations):
-        support: set[int] = set(np.flatnonzero(relation).tolist())
-        touching = [g for g in groups if g[0] & support]
-        groups = [g for g in groups if not g[0] & support]
-        groups.append((support.union(*(g[0] for g in touching)), [r, *(k for g in touching for k in g[1])]))
-    return groups
+    shares = relations != 0.0
+    n, group = connected_components(shares.astype(np.int64) @ shares.T)
+    of_group = [np.flatnonzero(group == k) for k in range(n)]
+    return [(np.flatnonzero(shares[rows].any(axis=0)).tolist(), rows.tolist()) for rows in of_group]
 
 
 def _chained(relations: Floats) -> Floats:

@@ -53,7 +53,7 @@ def at_random_configurations(problem: Problem, parameters: Floats) -> Problem | 
             different[model, table.frame, named[0], frozenset(named[1]), table.offset] = table
     if not different:
         return None
-    n = max(LEAST, -(-max(300, 10 * len(robot.parameters)) // len(different)))
+    n = LEAST
     generator = np.random.default_rng(0)
     tables = [
         at_configurations(robot, table, random_readings(robot, n, generator), places, f"random {i}")

@@ -117,9 +117,8 @@ class _Motion:
             return f"the tool only moves without turning, unseen by {self._seen}"
         if self.of_base(direction):
             return BASE
-        if self._seen.pairs and not moves and self._constant(np.einsum("nji,nj->ni", self._R, w)):
-            return self._tool_turned(direction)
-        if self._seen.pairs and not sees_position and self._constant(np.einsum("nji,nj->ni", self._R, w)):
+        in_tool = np.einsum("nji,nj->ni", self._R, w)
+        if self._seen.pairs and not (moves and sees_position) and self._constant(in_tool):
             return self._tool_turned(direction)
         if self._seen.pairs and self._common_axis is not None and self._tilts(w, dp, self._common_axis):
             return "parallel axes, all of them: it only tilts the arm out of its plane, unseen to first order"

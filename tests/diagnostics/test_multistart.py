@@ -118,11 +118,11 @@ def test_what_data_see_has_one_optimum_and_costs_nothing_more(tmp_path, monkeypa
 def test_a_descent_from_elsewhere_that_cannot_be_made_is_no_fault_of_the_first(tmp_path, monkeypatch):
     """Elsewhere a step may have no solution at all, or noise be lost in rounding."""
 
-    def fail(*_):
+    def fail(*_, **__):
         raise SolverError("the linear system has no unique solution near J1")
 
     first = solver.solve(problem_of(read_job(pointer(tmp_path, nominal=1e-3, true=0.02))))
-    monkeypatch.setattr("fg_calib.diagnostics.multistart._solve_from", fail)
+    monkeypatch.setattr("fg_calib.diagnostics.multistart.solve", fail)
     found = multistart(first)
     assert found.parameters is first.parameters
     assert found.others == ()
@@ -136,7 +136,7 @@ def test_an_optimum_a_radian_away_is_no_other_arm(tmp_path, monkeypatch, off, re
     there[robot.index("d2")] *= -1.0
     there[robot.index("theta2")] += off
     other = replace(first, parameters=there)
-    monkeypatch.setattr("fg_calib.diagnostics.multistart._solve_from", lambda *_: other)
+    monkeypatch.setattr("fg_calib.diagnostics.multistart._solve_from", lambda *_: [other])
     assert len(multistart(first).others) == reported
 
 
