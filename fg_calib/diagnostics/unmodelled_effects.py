@@ -205,10 +205,11 @@ def find_change(solution: Solution) -> Change | None:
         return None
     p, left, what, k = min(found)
     moved = motions[what] * (at >= k)[:, None]
-    with_links = fit.extended(fit.new(of_links([])))
+    with_links, after = fit.extended(fit.new(of_links([]))), fit.extended(fit.new(moved))
     p_with, left_with = with_links.test(with_links.new(moved))
-    significant = p * len(found) < P_VALUE and p_with < P_VALUE
-    return Change(what, k, left) if significant and max(left, left_with) <= CHANGE_LEFT else None
+    if max(p * len(found), p_with) >= P_VALUE or max(left, left_with) > CHANGE_LEFT:
+        return None
+    return Change(what, k, float(np.sum(after.r**2) / np.sum(fit.r**2)))
 
 
 def explains_misfit(solution: Solution, motion: MissingMotion) -> bool:

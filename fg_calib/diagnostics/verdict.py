@@ -10,28 +10,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from fg_calib.diagnostics import unmodelled_effects as effects
 from fg_calib.diagnostics.linearity import NONLINEAR, AmbiguousRows, Nonlinearity, check_linearity, find_ambiguous_rows
 from fg_calib.diagnostics.nominal_residuals import residuals_at
 from fg_calib.diagnostics.setup_check import SetupCheck, check_problem
-from fg_calib.diagnostics.unmodelled_effects import (
-    Change,
-    Offset,
-    explains_misfit,
-    find_change,
-    forgotten_offsets,
-    probability_of_noise,
-)
 from fg_calib.graph.noise_models import JOINT_NOISE
 from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
-from fg_calib.graph.tolerances import ToleranceScale
 from fg_calib.measurements.kinds.pair import missing_values
 from fg_calib.observability.parallel_axes import MissingMotion
 from fg_calib.statistics.covariance import Spread
@@ -115,17 +106,7 @@ class Verdict:
     notes: tuple[str, ...]
     setup: SetupCheck = field(default_factory=SetupCheck)
     noise_like: float | None = None
-    change: Change | None = None
-
-    @property
-    def findings(self) -> tuple[str, ...]:
-        """The errors."""
-        return self.errors
-
-    @property
-    def reservations(self) -> tuple[str, ...]:
-        """The warnings."""
-        return self.warnings
+    change: effects.Change | None = None
 
     @property
     def cautions(self) -> tuple[str, ...]:
@@ -142,40 +123,21 @@ class Case:
         spread: The covariance of what was estimated.
         fit: How well it fits.
         change: What moved while a table was measured.
-        noise_like: See `Verdict`.
+        gross: The gross errors that are all that is wrong; None if there are none, or more than these is.
+        too_large: Whether chi-square is too large without the corrections, which are judged by themselves.
     """
 
     solution: Solution
     spread: Spread
     fit: Fit
-    change: Change | None = None
-    noise_like: float | None = None
+    change: effects.Change | None
+    gross: GrossErrors | None
+    too_large: bool
 
     @property
     def problem(self) -> Problem:
         """The problem solved."""
         return self.solution.problem
-
-    @property
-    def systematic(self) -> bool:
-        """Whether the residuals are systematic."""
-        return self.noise_like is not None and self.noise_like < LIKE_NOISE
-
-    @cached_property
-    def gross(self) -> GrossErrors | None:
-        """The gross errors that are all that is wrong; None if there are none, or more than these is."""
-        return self.fit.goodness.gross if self.fit.goodness.spoilt and self.change is None else None
-
-    @cached_property
-    def too_large(self) -> bool:
-        """Whether chi-square is too large without the corrections, which are judged by themselves."""
-        if self.fit.priors is None:
-            return self.fit.chi_square.too_large
-        chi2, priors = self.fit.chi_square, self.fit.priors
-        rest, dof = chi2.value - priors.chi2, chi2.dof - len(priors.names)
-        return rest > max(chi2.bounds[1] * dof, 0.0) or any(
-            kind.verdict in _TOO_LARGE for kind in self.fit.goodness.kinds
-        )
 
 
 def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[MissingMotion]) -> Verdict:
@@ -187,29 +149,33 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
         fit: How well it fits.
         missing: What the robot's convention has no parameter for.
     """
-    problem, kinds = solution.problem, {kind.verdict for kind in fit.goodness.kinds}
-    tested = not problem.evaluated and bool(kinds & _TOO_LARGE or solution.estimated_noise is not None)
-    change = find_change(solution) if tested or ("outliers" in kinds and not problem.evaluated) else None
-    noise_like = probability_of_noise(solution) if tested and change is None else None
-    case = Case(solution, spread, fit, change, noise_like)
+    problem, kinds, chi2, goodness = solution.problem, fit.goodness.kinds, fit.chi_square, fit.goodness
+    verdicts = {kind.verdict for kind in kinds}
+    tested = not problem.evaluated and bool(verdicts & _TOO_LARGE or solution.estimated_noise is not None)
+    change = effects.find_change(solution) if tested or ("outliers" in verdicts and not problem.evaluated) else None
+    noise_like = effects.probability_of_noise(solution) if tested and change is None else None
+    too_large, gross = chi2.too_large, goodness.gross if goodness.spoilt and change is None else None
+    if fit.priors is not None:
+        rest, dof = chi2.value - fit.priors.chi2, chi2.dof - len(fit.priors.names)
+        too_large = rest > max(chi2.bounds[1] * dof, 0.0) or bool(verdicts & _TOO_LARGE)
+    case = Case(solution, spread, fit, change, gross, too_large)
     statements = [statement for check in CHECKS for statement in check(case)]
     systematic = check_systematic(noise_like)
-    doubts = any(s.severity == "error" for s in (*statements, *systematic))
+    doubts = any(s.severity == "error" for s in statements)
     statements[:0] = check_optima(solution)  # which fit as well
-    setup, high = SetupCheck(), case.gross is None and (fit.chi_square.too_large or case.systematic)
+    setup, high = SetupCheck(), gross is None and (chi2.too_large or bool(systematic))
     if not problem.evaluated:
-        factor = max((kind.factor for kind in fit.goodness.kinds), default=1.0)
+        factor = max((kind.factor for kind in kinds), default=1.0)
         setup = check_problem(problem, solution.before, doubtful=doubts or factor > MOST_ESTIMATED)
     if not setup.explanations:
         statements += systematic  # a wrong set-up has them as its consequence
-        offsets = () if case.gross is not None else forgotten_offsets(solution)
-        statements += [check_offset(found, problem.data.labels, fit.chi_square.too_large) for found in offsets]
-    fits = not (doubts or solution.estimated_noise is not None)
-    statements[:0] = check_model(setup, fits=fits, high=high)
+        offsets = () if gross is not None else effects.forgotten_offsets(solution)
+        statements += [check_offset(found, problem.data.labels, chi2.too_large) for found in offsets]
+    statements[:0] = check_model(setup, fits=not (doubts or solution.estimated_noise is not None), high=high)
     asked = high and not setup.explanations and problem.knowledge is None  # else the convention did before
-    statements += [
-        Statement("error" if asked and explains_misfit(solution, motion) else "note", str(motion)) for motion in missing
-    ]
+    for motion in missing:
+        certain = asked and effects.explains_misfit(solution, motion)
+        statements.append(Statement("error" if certain else "note", str(motion)))
     errors, warnings, notes = (
         tuple(s.text for s in statements if s.severity == severity) for severity in ("error", "warning", "note")
     )
@@ -242,26 +208,19 @@ def check_fit(case: Case) -> list[Statement]:
     """Check chi-square, but where only the corrections make it too large."""
     if case.fit.priors is not None and case.fit.chi_square.too_large and not case.too_large:
         return []
-    evaluated, updated = case.problem.evaluated, case.problem.knowledge is not None
-    chi2, gross = case.fit.chi_square, case.gross
-    return check_chi_square(chi2, evaluated, systematic=case.systematic, gross=gross, updated=updated)
+    updated = case.problem.knowledge is not None
+    return check_chi_square(case.fit.chi_square, case.gross, evaluated=case.problem.evaluated, updated=updated)
 
 
 def check_chi_square(
-    chi2: ChiSquare,
-    evaluated: bool = False,
-    *,
-    systematic: bool = False,
-    gross: GrossErrors | None = None,
-    updated: bool = False,
+    chi2: ChiSquare, gross: GrossErrors | None = None, *, evaluated: bool = False, updated: bool = False
 ) -> list[Statement]:
     """Check chi-square of the fitted rows and priors.
 
     Args:
         chi2: Chi-square.
-        evaluated: Whether the arm was evaluated as it is.
-        systematic: Whether residuals are systematic: sigmas are then too small by more than residuals are too large.
         gross: The gross errors that are all that is wrong; None if there are none, or more than these is.
+        evaluated: Whether the arm was evaluated as it is.
         updated: Whether the rows were added to an earlier calibration.
     """
     if chi2.dof <= 0:
@@ -285,8 +244,7 @@ def check_chi_square(
     ratio = float(np.sqrt(chi2.ratio))
     if chi2.p_value is not None and chi2.p_value < (1.0 - CONFIDENCE) / 2.0 and ratio > NOTABLE_RATIO:
         text = f"reduced chi-square {reduced:.3g}: residuals are significantly larger than the specified noise"
-        text += f" ({ratio:.2f} times)" + "; sigmas may be too small by as much" * (not systematic)
-        return [Statement("note", text)]
+        return [Statement("note", f"{text} ({ratio:.2f} times); sigmas may be too small by as much or more")]
     return []
 
 
@@ -330,36 +288,30 @@ def check_priors(fit: PriorFit | None) -> list[Statement]:
     """Check corrections against their prior sigmas; nothing without priors."""
     if fit is None:
         return []
-    causes = "prior sigmas (key tolerance) specified too small, or the measurements are not what the job says"
     found = [
-        Statement("error", f"{one.name} lies {one.z:.1f} prior sigmas from where it was specified: {causes}")
-        for one in fit.beyond
-        if one.is_place
+        f"{one.name} lies {one.z:.1f} prior sigmas from where it was specified" for one in fit.beyond if one.is_place
     ]
-    worst = [f"{one.name} {one.z:+.1f}" for one in fit.beyond if not one.is_place]
-    if worst:
-        text = f"corrections beyond their prior sigmas (in sigma of these: {listed(worst)}): {causes}"
-        found.append(Statement("error", text))
+    if worst := [f"{one.name} {one.z:+.1f}" for one in fit.beyond if not one.is_place]:
+        found.append(f"corrections beyond their prior sigmas (in sigma of these: {listed(worst)})")
+    certain = bool(found)
     if not found and fit.p_value is not None and fit.p_value < (1.0 - CONFIDENCE) / 2.0:
         largest = [f"{fit.names[i]} {fit.z[i]:+.1f}" for i in np.argsort(-np.abs(fit.z))]
         text = f"corrections are too large for their prior sigmas (in sigma of these: {listed(largest)}; sum of"
-        text += f" squares {fit.chi2:.3g} where {fit.expected:.3g} is expected): {causes}"
+        found.append(f"{text} squares {fit.chi2:.3g} where {fit.expected:.3g} is expected)")
         certain = fit.chi2 > FACTOR * fit.expected and fit.p_value < PRIOR_P_VALUE
-        found.append(Statement("error" if certain else "note", text))
-    return found
+    causes = "prior sigmas (key tolerance) specified too small, or the measurements are not what the job says"
+    return [Statement("error" if certain else "note", f"{text}: {causes}") for text in found]
 
 
 def check_prior_scales(case: Case) -> Iterator[Statement]:
     """Check prior sigmas that were estimated."""
     estimated = case.solution.estimated_tolerances
-    scales: Sequence[ToleranceScale] = () if estimated is None else estimated.scales
-    far = [f"{one.group} {one.scale:.3g}" for one in scales if one.scale > MAX_PRIOR_SCALE]
-    if far:
+    scales = () if estimated is None else estimated.scales
+    if far := [f"{one.group} {one.scale:.3g}" for one in scales if one.scale > MAX_PRIOR_SCALE]:
         text = f"corrections are far larger than the prior sigmas specified ({', '.join(far)} times)"
         text += ": residuals are too large as well, so corrections may hide unmodelled effects" * case.too_large
         yield Statement("note", text)
-    unseen = [one.group for one in scales if one.seen < LEAST_SEEN]
-    if unseen:
+    if unseen := [one.group for one in scales if one.seen < LEAST_SEEN]:
         text = f"the data determine next to nothing of the corrections of {', '.join(unseen)}"
         yield Statement("note", f"{text}: the scale of their prior sigmas follows the others")
 
@@ -453,7 +405,7 @@ def check_systematic(noise_like: float | None) -> list[Statement]:
     return [Statement("warning", text)]
 
 
-def check_offset(found: Offset, labels: Sequence[str], high: bool) -> Statement:
+def check_offset(found: effects.Offset, labels: Sequence[str], high: bool) -> Statement:
     """Check lengths to anchors that are all off by the same.
 
     Args:

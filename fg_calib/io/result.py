@@ -429,9 +429,9 @@ def _verdict(assessed: Assessment) -> dict[str, Any]:
     verdict = assessed.verdict
     return {
         "trustworthy": assessed.trustworthy,
-        "findings": verdict.findings,
+        "findings": verdict.errors,
         "cautions": verdict.cautions,
-        "reservations": verdict.reservations,
+        "reservations": verdict.warnings,
         "setup": verdict.setup,
         "probability_of_noise": verdict.noise_like,
         "acceptance": assessed.acceptance,
