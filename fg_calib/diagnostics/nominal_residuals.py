@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import gtsam
 import numpy as np
@@ -26,8 +26,7 @@ from fg_calib.graph.build import problem_of_tables
 from fg_calib.graph.noise_models import RowNoise
 from fg_calib.graph.problem import Problem, noises_at, reduced_graph, tables_of
 from fg_calib.graph.solver import levenberg_marquardt_params
-from fg_calib.graph.variables import build_variables, pose_of
-from fg_calib.initialization.hand_eye import Frame
+from fg_calib.graph.variables import build_variables
 from fg_calib.measurements import residuals
 from fg_calib.measurements.kinds import INSTRUMENTS, Instrument
 from fg_calib.measurements.table import Table
@@ -82,12 +81,10 @@ class Setup:
     Attributes:
         robot: The nominal robot; the parameters of its tool that are estimated are fitted.
         table: The rows; pairs among them.
-        of_base: Whether the frame that is fitted as world_T_base is the base, which all tables share.
     """
 
     robot: Robot
     table: Table
-    of_base: bool = False
 
     @property
     def instrument(self) -> Instrument:
@@ -114,14 +111,6 @@ class Setup:
         """The set-up with these of the tool's parameters fitted."""
         names = [p.name for p in self.robot.parameters if p.estimated and p.name not in self.tool]
         return replace(self, robot=self.robot.with_estimated([*names, *sorted(fitted)]))
-
-
-class Fitted(NamedTuple):
-    """Residuals of a set-up by kind, and the robot (tool fitted) and world_T_base that they are of."""
-
-    residuals: tuple[TypicalResidual, ...]
-    robot: Robot
-    world_T_base: Frame  # noqa: N815
 
 
 def setup_of(robot: Robot, table: Table) -> Setup | None:
@@ -152,7 +141,7 @@ def setup_of(robot: Robot, table: Table) -> Setup | None:
     if base and INSTRUMENTS[table.model].is_pose and table.frame == "known":  # the base is fitted as a frame
         robot = robot.with_estimated([p.name for p in robot.parameters if p.estimated and p.name not in base])
         some_rows = replace(some_rows, frame="unknown")
-    return Setup(robot, some_rows, of_base=table.frame == "known")
+    return Setup(robot, some_rows)
 
 
 def evenly(n: int, most: int) -> NDArray[np.int64]:
@@ -162,46 +151,16 @@ def evenly(n: int, most: int) -> NDArray[np.int64]:
 
 def nominal_residuals(setup: Setup) -> tuple[TypicalResidual, ...]:
     """Residuals of a set-up by kind, frame, tool and landmarks fitted; empty if there are too few rows, or no fit."""
-    return fit_setup(setup).residuals
-
-
-def residuals_in(setup: Setup, fit: Fitted, *, in_frame: bool = True) -> tuple[TypicalResidual, ...]:
-    """Residuals of a set-up by kind with the tool, and the world_T_base, of another fit.
-
-    Args:
-        setup: The set-up.
-        fit: Tool and world_T_base.
-        in_frame: Whether world_T_base is taken; else it is fitted.
-    """
-    values, tool = setup.robot.nominal, setup.robot.owned_by(setup.robot.n_joints + 1)
-    values[tool] = fit.robot.nominal[tool]
-    fixed = replace(setup, robot=setup.robot.with_values(values)).with_tool(frozenset())
-    m, X = setup.table.measurements, fit.world_T_base
-    if in_frame and setup.instrument.is_pose:
-        R = None if m.rotation is None else X.rotation.T @ m.rotation
-        p = None if m.position is None else (m.position - X.translation) @ X.rotation
-        fixed = replace(
-            fixed, table=replace(fixed.table, measurements=replace(m, rotation=R, position=p), frame="known")
-        )
-    return fit_setup(fixed).residuals
-
-
-def fit_setup(setup: Setup) -> Fitted:
-    """Frame, tool and landmarks of a set-up fitted, the arm at nominal."""
-    frame, options = Frame(np.eye(3), np.zeros(3)), Options(gauge="none")
+    options = Options(gauge="none")
     try:
         problem = nominal_problem(setup.robot, tables_of(setup.table, options), options)
         located = setup.instrument.is_pose and not setup.has_landmarks  # in closed form
         parameters = problem.start if located else fit_landmarks(problem)
     except (InputError, ProblemError, SolverError, RuntimeError, np.linalg.LinAlgError):
-        return Fitted((), setup.robot, frame)
+        return ()
     n_free = problem.variables.n_columns + problem.variables.n_nuisance
     enough = problem.n_residuals >= 2 * n_free + 6 + setup.has_landmarks * n_free
-    for v in problem.variables.frames:
-        X = pose_of(parameters[v.places])
-        frame = Frame(X.rotation().matrix(), X.translation())
-    found = residuals_at(problem, parameters, setup.robot) if enough else ()
-    return Fitted(found, setup.robot.with_values(parameters[problem.variables.robot_span]), frame)
+    return residuals_at(problem, parameters, setup.robot) if enough else ()
 
 
 def nominal_problem(robot: Robot, tables: Sequence[Table], options: Options) -> Problem:

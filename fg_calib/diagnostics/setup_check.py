@@ -8,7 +8,7 @@ their own, last.
 
 Base and tool are one for all tables, so a table that is wrong spoils the residuals of all others; each is therefore
 judged by the base and tool that it determines alone. Only where all tables are right alone can they disagree on base
-and tool, and it is reported of those that disagree with most others: both, where there are two.
+and tool, and it is reported of those that are farthest off: both, where there are two.
 """
 
 from __future__ import annotations
@@ -21,16 +21,7 @@ from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
 from fg_calib.arrays import Brief
-from fg_calib.diagnostics.nominal_residuals import (
-    Fitted,
-    Setup,
-    TypicalResidual,
-    fit_setup,
-    nominal_residuals,
-    residuals_at,
-    residuals_in,
-    setup_of,
-)
+from fg_calib.diagnostics.nominal_residuals import Setup, TypicalResidual, nominal_residuals, residuals_at, setup_of
 from fg_calib.diagnostics.setup_hypotheses import About, Mistake, setup_hypotheses, still_joints
 from fg_calib.graph.problem import Problem
 from fg_calib.measurements.dataset import Measurements
@@ -55,6 +46,9 @@ N_COMBINED = 4
 
 NEGLIGIBLE_EXCESS = 1e-6
 """Excess below which there is nothing to explain: each unknown takes its own row up."""
+
+FARTHEST_SHARE = 0.7
+"""Excess of a table over that of the one that is farthest off, from which it is named too: two tables are both."""
 
 OTHER_TOOL = "tool or base differ from those of the other tables (another target on the tool, another frame)"
 
@@ -235,37 +229,20 @@ def _checked_alone(setup: Setup, found: SetupCheck, doubtful: bool) -> SetupChec
     return replace(found, explanations=_explanations(setup, found))
 
 
-def _disagreeing(given: Sequence[tuple[Setup, SetupCheck]]) -> list[SetupCheck]:
-    """Tables that only a tool and a base of their own fit.
+def _disagreeing(joint: Sequence[tuple[Setup, SetupCheck]]) -> list[SetupCheck]:
+    """Tables that only a tool and a base of their own fit; those that are farthest off.
 
     Args:
-        given: Each table alone, and its residuals with the base and the tool that all tables determine together.
+        joint: Each table alone, and its residuals with the base and the tool that all tables determine together.
     """
-    alone = [fit_setup(setup) for setup, _ in given]
+    alone = [Explanation((OTHER_TOOL,), nominal_residuals(setup)) for setup, _ in joint]
     spoilt = [
-        one.far and Explanation((), fit.residuals).excess <= min(EXPLAINED, one.excess / REDUCTION)
-        for (_, one), fit in zip(given, alone, strict=True)
+        replace(one, explanations=(other,))
+        for (_, one), other in zip(joint, alone, strict=True)
+        if one.far and other.excess <= min(EXPLAINED, one.excess / REDUCTION)
     ]
-    if not any(spoilt):
-        return []
-    apart = np.zeros((len(given), len(given)), dtype=np.bool_)
-    for i in range(len(given)):
-        for j in range(i):
-            # What one table hardly determines the other does not agree with by chance: the better of both ways.
-            both = (_excess_with(given[i][0], given[j][0], alone[j]), _excess_with(given[j][0], given[i][0], alone[i]))
-            apart[i, j] = apart[j, i] = min(both) > FAR
-    disagrees = apart.sum(axis=1)
-    named = disagrees == disagrees.max() if disagrees.any() else np.array(spoilt)
-    return [
-        replace(one, explanations=(Explanation((OTHER_TOOL,), fit.residuals),))
-        for (_, one), fit, chosen in zip(given, alone, named, strict=True)
-        if chosen
-    ]
-
-
-def _excess_with(setup: Setup, other: Setup, fit: Fitted) -> float:
-    """The excess of a table with the tool, and the base where both are of it, that another table determines."""
-    return SetupCheck(residuals_in(setup, fit, in_frame=setup.of_base and other.of_base)).excess
+    farthest = max((one.excess for one in spoilt), default=0.0)
+    return [one for one in spoilt if one.excess > FARTHEST_SHARE * farthest]
 
 
 def _explanations(setup: Setup, given: SetupCheck) -> tuple[Explanation, ...]:
