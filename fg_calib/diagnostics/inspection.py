@@ -67,20 +67,15 @@ class JointRange:
     n_outside: int
 
     @property
-    def range(self) -> float:
-        """How far it moves."""
-        return self.most - self.least
-
-    @property
     def share(self) -> float | None:
         """Part of the range within its limits that it moves; None without limits."""
         width = self.limits[1] - self.limits[0]
-        return self.range / width if 0.0 < width < np.inf else None
+        return (self.most - self.least) / width if 0.0 < width < np.inf else None
 
     @property
     def still(self) -> bool:
         """Whether it hardly moves."""
-        return bool(self.range < (MOTION_M if self.unit == "m" else MOTION_RAD))
+        return bool(self.most - self.least < (MOTION_M if self.unit == "m" else MOTION_RAD))
 
 
 @dataclass(frozen=True)
@@ -100,7 +95,6 @@ class TableSurvey:
         n_copies: Rows, or measured pairs, that are the same as one before them in every value.
         copy: Two that are the same; empty without.
         n_repeats: Those at the readings of one before them, with other values: they show the noise.
-        n_near: Configurations within `NEAR` of another, but not the same.
         n_leaked: Test rows at, or within `NEAR` of, a configuration of train rows.
         n_near_singular: Train pairs within `linearity.NEAR_SIGMAS` of 0 or, an angle, of 180 degrees.
         n_ambiguous: Train pairs whose sign is ambiguous within the prior sigmas.
@@ -118,7 +112,6 @@ class TableSurvey:
     n_copies: int
     copy: str
     n_repeats: int
-    n_near: int
     n_leaked: int
     n_near_singular: int
     n_ambiguous: int
@@ -225,7 +218,6 @@ def _survey(at_nominal: Solution, number: int, table: Table) -> TableSurvey:
     """The counts of a table, with the test rows that it states."""
     m, problem = table.measurements, at_nominal.problem
     copies, copy, repeats = _same_rows(m, table.uses_pairs)
-    near, leaked = _neighbours(m)
     series = [s for s in problem.data.series if s.table == number]
     pairs = find_ambiguous_rows(at_nominal, np.zeros((problem.variables.n_columns, 0)), 0, number)
     n_residuals = Counter[str]()
@@ -246,8 +238,7 @@ def _survey(at_nominal: Solution, number: int, table: Table) -> TableSurvey:
         n_copies=copies,
         copy=copy,
         n_repeats=repeats,
-        n_near=near,
-        n_leaked=leaked,
+        n_leaked=_n_leaked(m),
         n_near_singular=pairs.n_near,
         n_ambiguous=len(set(pairs.names)),
     )
@@ -280,17 +271,12 @@ def _same_rows(m: Measurements, measured_pairs: bool) -> tuple[int, str, int]:
     return len(copied), " and ".join(two), len(first) - len(np.unique(np.hstack(columns) + 0.0, axis=0))
 
 
-def _neighbours(m: Measurements) -> tuple[int, int]:
-    """How many configurations are nearly another, and how many test rows are at or near those of train rows."""
-    q, first = np.unique(m.readings, axis=0, return_index=True)
-    near = 0
-    if len(first) > 1:
-        distance, _ = cKDTree(q).query(q, k=2, p=np.inf, distance_upper_bound=NEAR)
-        near = int(np.sum(np.isfinite(np.asarray(distance)[:, 1])))
+def _n_leaked(m: Measurements) -> int:
+    """How many test rows are at, or within `NEAR` of, a configuration of train rows."""
     if not m.test.any() or m.test.all():
-        return near, 0
+        return 0
     distance, _ = cKDTree(m.readings[~m.test]).query(m.readings[m.test], p=np.inf, distance_upper_bound=NEAR)
-    return near, int(np.sum(np.isfinite(distance)))
+    return int(np.sum(np.isfinite(distance)))
 
 
 def _joints(problem: Problem, robot: Robot) -> tuple[JointRange, ...]:
@@ -352,10 +338,10 @@ def _check_result(found: Inspection, job: Job) -> Iterator[Statement]:
     if still:
         what = "moves: its zero is" if len(still) == 1 else "move: their zeros are"
         yield Statement("note", f"{listed(still)} hardly {what} not distinguishable from the link before")
-    n = sum(direction.reason == NOT_EXCITED for direction in found.identifiability.lost)
-    if n:
-        what = "one direction is" if n == 1 else f"{n} directions are"
-        text = f"{what} not excited by these configurations although the model sees more: move every joint more"
+    if n := sum(direction.reason == NOT_EXCITED for direction in found.identifiability.lost):
+        text = (
+            f"directions not excited by these configurations although the model sees more: {n}; move every joint more"
+        )
         yield Statement("note", text)
     if not found.evaluated and not tested:
         text = "no test rows: nothing would check how well the calibration predicts (column split)"
@@ -368,12 +354,11 @@ def _check_tables(found: Inspection, job: Job) -> Iterator[Statement]:
     """Check each table for copies, leaked test rows, pairs of ambiguous sign; noise and priors to be estimated."""
     for t in found.tables:
         if t.n_copies:
-            what = "one row is an exact copy" if t.n_copies == 1 else f"{t.n_copies} rows are exact copies"
-            text = f"{t.name}: {what} of another ({t.copy}): a copy counts as one more measurement; remove it"
-            yield Statement("note", text)
+            text = f"{t.name}: rows that are exact copies of others: {t.n_copies} ({t.copy}); each counts as one more"
+            yield Statement("note", f"{text} measurement: remove it")
         if t.n_leaked:
-            what = "one test row is" if t.n_leaked == 1 else f"{t.n_leaked} test rows are"
-            yield Statement("note", f"{t.name}: {what} at configurations of train rows: no check of a prediction")
+            text = f"{t.name}: test rows at configurations of train rows, no check of a prediction: {t.n_leaked}"
+            yield Statement("note", text)
         if t.n_pairs and t.n_ambiguous > AMBIGUOUS_SHARE * t.n_pairs:
             text = f"{t.name}: the sign of {t.n_ambiguous} of {t.n_pairs} train pairs is ambiguous within the prior"
             text += " sigmas (near 0 or 180 deg): measure longer and wider motions, in which more joints move"

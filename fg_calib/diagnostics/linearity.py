@@ -44,14 +44,10 @@ class Nonlinearity:
 
     Attributes:
         directions: Of all determined directions, in the mean.
-        parameter: Of the parameter of the robot or of a frame where it is largest.
-        name: That parameter; empty for one of a frame.
         rows: Names of the measurements with the largest second-order part over their noise; empty below `NONLINEAR`.
     """
 
     directions: float = 0.0
-    parameter: float = 0.0
-    name: str = ""
     rows: tuple[str, ...] = ()
 
 
@@ -79,20 +75,16 @@ def check_linearity(solution: Solution, spread: Spread) -> Nonlinearity:
             if len(shifts) == N_FIRST and squares < NEGLIGIBLE:
                 break
     except SolverError:
-        return Nonlinearity(np.inf, np.inf)
-    named = np.nan_to_num(spread.variables.named_derivative(solution.parameters))
-    variance = np.sum((named @ root) ** 2, axis=1)
-    square = np.mean((np.array(shifts) @ named.T) ** 2, axis=0)
-    of_each = np.divide(square, variance, out=np.zeros(len(variance)), where=variance > 0.0)
-    worst, names = int(np.argmax(of_each)), spread.variables.names
-    rows = _nonlinear_rows(problem, solution.parameters, there) if squares >= NONLINEAR else ()
-    return Nonlinearity(float(squares), float(of_each[worst]), names[worst] if worst < len(names) else "", rows)
+        return Nonlinearity(np.inf)
+    return Nonlinearity(
+        float(squares), _nonlinear_rows(problem, [solution.parameters, *there]) if squares >= NONLINEAR else ()
+    )
 
 
-def _nonlinear_rows(problem: Problem, parameters: Floats, there: list[Floats]) -> tuple[str, ...]:
-    """Names of the measurements with the largest second-order part over their noise at two opposite steps."""
+def _nonlinear_rows(problem: Problem, points: list[Floats]) -> tuple[str, ...]:
+    """Names of the measurements with the largest second-order part over their noise at points x, x + d, x - d."""
     found = dict[str, float]()
-    for here, plus, minus in zip(*(noises_at(problem, x) for x in (parameters, *there)), strict=True):
+    for here, plus, minus in zip(*(noises_at(problem, point) for point in points), strict=True):
         q = 0.5 * (plus.residual() + minus.residual()) - here.residual()
         size = np.max(np.abs(q) / here.sigma * here.series.used, axis=1)
         for ends, of in zip(problem.data.places[here.series.table][here.series.ends], size.tolist(), strict=True):

@@ -345,13 +345,11 @@ def check_linear(rows: AmbiguousRows, nonlinear: Nonlinearity, high: bool = Fals
         return [Statement("error" if rows.share > MAX_AMBIGUOUS_SHARE else "warning", text)]
     if not curved:
         return []
-    text = f"the measurements are nonlinear within the posterior sigmas (most: {listed(nonlinear.rows)}), so the"
-    text += (
-        f" covariance is optimistic in weak directions: errors there are {_times(nonlinear.directions)} what it says"
-    )
-    if nonlinear.parameter >= NONLINEAR:
-        text += f", those of {nonlinear.name or 'a frame'} {_times(nonlinear.parameter)}"
-    return [Statement("warning", f"{text}; measure at more configurations, or specify smaller prior sigmas")]
+    most = f" (most: {listed(nonlinear.rows)})" * bool(nonlinear.rows)
+    beyond = f"some {np.sqrt(1.0 + nonlinear.directions):.2g}" if np.isfinite(nonlinear.directions) else "many"
+    text = f"the measurements are nonlinear within the posterior sigmas{most}, so the covariance is optimistic in weak"
+    text += f" directions: errors there are {beyond} times what it says; measure at more configurations, or specify"
+    return [Statement("warning", f"{text} smaller prior sigmas")]
 
 
 def check_estimated_noise(case: Case) -> Iterator[Statement]:
@@ -455,11 +453,6 @@ def check_optima(solution: Solution, most: int = 4) -> list[Statement]:
         text = f"a second optimum that the data cannot distinguish from this one: {', '.join(words)} from nominal"
         found.append(Statement("error", text + advice))
     return found
-
-
-def _times(beyond: float) -> str:
-    """Errors over their sigma, in words, by how much the mean of their squared ratio exceeds 1."""
-    return f"some {np.sqrt(1.0 + beyond):.2g} times" if np.isfinite(beyond) else "many times"
 
 
 def chi2_in_words(chi2: float, expected: float, p_value: float) -> str:

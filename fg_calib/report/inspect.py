@@ -178,7 +178,6 @@ def _tables(found: Inspection) -> RenderableType:
         "train pairs": [f"{t.n_pairs or ''}" for t in found.tables],
         "test pairs": [f"{t.n_test_pairs or ''}" for t in found.tables],
         "repeats": [f"{t.n_repeats or ''}" for t in found.tables],
-        "near another": [f"{t.n_near or ''}" for t in found.tables],
         "of": [", ".join(f"{n} {what}{'s' * (n > 1)}" for what, n in t.labels.items()) for t in found.tables],
         "residuals to fit": [", ".join(f"{n} {kind}" for kind, n in t.n_residuals.items()) for t in found.tables],
     }
