@@ -137,29 +137,36 @@ class BagWriter:
 
     def pose(self, stamp, position, quaternion, form="PoseStamped", topic="/pose", received=None, frames=("w", "t")):
         package = {"Odometry": "nav_msgs", "TFMessage": "tf2_msgs"}.get(form, "geometry_msgs")
-        kind, (parent, child) = f"{package}/msg/{form}", frames
-        header, g = self.header(stamp, parent), "geometry_msgs/msg"
+        kind, (parent, child), g = f"{package}/msg/{form}", frames, "geometry_msgs/msg"
         x = dict(zip("xyz", map(float, position), strict=True))
-        q = self.make(f"{g}/Quaternion", **dict(zip("xyzw", map(float, quaternion), strict=True)))
-        if form in ("TransformStamped", "TFMessage"):
-            transform = self.make(f"{g}/Transform", translation=self.make(f"{g}/Vector3", **x), rotation=q)
-            message = self.make(f"{g}/TransformStamped", header=header, child_frame_id=child, transform=transform)
-            if form == "TFMessage":
-                message = self.make(kind, transforms=[message])
-        else:
-            pose = self.make(f"{g}/Pose", position=self.make(f"{g}/Point", **x), orientation=q)
-            if form == "PoseStamped":
-                message = self.make(kind, header=header, pose=pose)
-            else:
-                pose = self.make(f"{g}/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
-                more = {}
-                if form == "Odometry":
-                    zero = self.make(f"{g}/Vector3", x=0.0, y=0.0, z=0.0)
-                    twist = self.make(f"{g}/Twist", linear=zero, angular=zero)
-                    twist = self.make(f"{g}/TwistWithCovariance", twist=twist, covariance=np.zeros(36))
-                    more = {"child_frame_id": child, "twist": twist}
-                message = self.make(kind, header=header, pose=pose, **more)
-        self.write(topic, kind, message, stamp if received is None else received)
+        given = {
+            "header": self.header(stamp, parent),
+            "position": self.make(f"{g}/Point", **x),
+            "translation": self.make(f"{g}/Vector3", **x),
+            "orientation": self.make(f"{g}/Quaternion", **dict(zip("xyzw", map(float, quaternion), strict=True))),
+            "covariance": np.zeros(36),
+            "child_frame_id": child,
+            "linear": self.make(f"{g}/Vector3", x=0.0, y=0.0, z=0.0),
+        }
+        given |= {"rotation": given["orientation"], "angular": given["linear"]}
+
+        def build(name, *fields):
+            """A message of these fields, which are given or were built before."""
+            return self.make(name, **{field: given[field] for field in fields})
+
+        given["transform"] = build(f"{g}/Transform", "translation", "rotation")
+        given["transforms"] = [build(f"{g}/TransformStamped", "header", "child_frame_id", "transform")]
+        given["pose"] = build(f"{g}/Pose", "position", "orientation")
+        if form in ("PoseWithCovarianceStamped", "Odometry"):
+            given["pose"] = build(f"{g}/PoseWithCovariance", "pose", "covariance")
+            given["twist"] = build(f"{g}/Twist", "linear", "angular")
+            given["twist"] = build(f"{g}/TwistWithCovariance", "twist", "covariance")
+        fields = {
+            "TransformStamped": ("header", "child_frame_id", "transform"),
+            "TFMessage": ("transforms",),
+            "Odometry": ("header", "child_frame_id", "pose", "twist"),
+        }.get(form, ("header", "pose"))
+        self.write(topic, kind, build(kind, *fields), stamp if received is None else received)
 
     def close(self):
         self.writer.close()

@@ -53,11 +53,12 @@ def bag(
 ) -> None:
     """Make a table of poses from a ROS bag: joint readings and poses while the arm stands still, with their sigmas."""
     from fg_calib.importers.bag import read_bag
-    from fg_calib.importers.standstill import average_stops, require_replaceable, write_stops
+    from fg_calib.importers.standstill import TABLE_BEGINNING, average_stops, write_stops
+    from fg_calib.io.columns import require_own_csv
     from fg_calib.io.robot_file import read_robot
 
     if out is not None:
-        require_replaceable(out)
+        require_own_csv(out, TABLE_BEGINNING)
     arm = read_robot(robot, base_link=base_link, tip_link=tip_link)
     called = [name.strip() for name in names.split(",") if name.strip()]
     of_joints, of_pose = read_bag(recording, arm, joints=joints, pose=pose, parent=parent, child=child, names=called)

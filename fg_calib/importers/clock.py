@@ -1,10 +1,10 @@
 """How far the clock of measured poses is ahead of that of joint readings.
 
-The nominal arm says how the tool moved at each joint reading. Its speed, and how fast it turned, depend on no frame, so
-they can be laid over those of the measured poses: the offset at which they correlate best is right to a few
-milliseconds. Each move between two stops then gives an offset of its own, by least squares on how far the tool is from
-where the move began and where it ends; the scatter of these is the sigma of their mean, so that all that differs from
-move to move is counted: noise of poses and stamps, and the error of the nominal arm.
+The nominal arm gives the tool's motion at each joint reading. Its speed and angular speed depend on no frame and are
+correlated with those of the measured poses: the offset of the highest correlation is right to a few milliseconds. Each
+move between two stops then gives an offset, by least squares on the distances from the places where the move began and
+ends. The scatter of these offsets is the sigma of their mean, so that noise of poses and stamps, and errors of the
+nominal arm, are counted.
 """
 
 from __future__ import annotations
@@ -12,26 +12,33 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import correlate, correlation_lags, find_peaks
 from scipy.special import ndtr, stdtrit
 
 from fg_calib.arrays import Floats
 from fg_calib.errors import InputError
 from fg_calib.importers.recording import PoseStream, period
 
-LEAST_CORRELATION = 0.7
+MIN_CORRELATION = 0.7
 """Below it the poses are not those of the arm's tool."""
 
-_LEAST_MOVES = 2
-_MOST_GRID = 2**20
-_SMALLEST_MOVE = {"position": 5e-3, "orientation": 5e-3}
-"""Moves below it, [m] and [rad], say little of time."""
+MIN_MOVES = 2
+MIN_MOVE = 5e-3
+"""Smaller moves, [m] or [rad], give no offset."""
+
+MARGIN_S = 0.2
+"""Part of the stops before and after a move that belongs to it, [s]."""
+
+MAX_GRID = 2**20
+"""Samples at most of the speeds that are correlated."""
 
 
 @dataclass(frozen=True)
 class ClockOffset:
-    """The stamp of a pose less that of the joint reading of the same moment.
+    """The stamp of a pose minus that of the joint reading of the same moment.
 
     Attributes:
         seconds: The offset, [s].
@@ -59,204 +66,143 @@ def estimate_offset(tool: PoseStream, poses: PoseStream, stops: Sequence[tuple[f
     Raises:
         InputError: The poses do not follow the joints, or there are not enough moves between stops.
     """
-    expected = tool.source.lag - poses.source.lag
-    coarse, correlation, others = _align_speeds(tool, poses, expected)
-    if correlation < LEAST_CORRELATION:
-        raise InputError(
-            f"topics {tool.source.topic} and {poses.source.topic}",
-            f"the poses do not move as the joints do (correlation {correlation:.2f})",
-            "poses of this robot's tool",
-            "or state the offset of the clocks: --offset 0",
-        )
-    offsets, weights = _offsets_of_moves(tool, poses, stops, coarse)
-    if len(offsets) < _LEAST_MOVES:
-        found = f"{len(offsets)} moves between stops that tell the offset of the clocks"
-        raise InputError(
-            f"topics {tool.source.topic} and {poses.source.topic}", found, f"at least {_LEAST_MOVES}", "see --offset"
-        )
-    mean, sigma = _weighted_mean(offsets, weights)
-    return ClockOffset(mean, sigma, len(offsets), correlation, others)
-
-
-def _weighted_mean(offsets: Floats, weights: Floats) -> tuple[float, float]:
-    """Weighted mean, and its sigma from the scatter whatever the weights are (sandwich estimate).
-
-    Student's: of a few moves the scatter is hardly known, so half the interval that holds 68 % is wider.
-    """
-    mean = float(np.average(offsets, weights=weights))
+    place = f"topics {tool.source.topic} and {poses.source.topic}"
+    coarse, correlation, others = _align_speeds(tool, poses)
+    if correlation < MIN_CORRELATION:
+        found = f"the poses do not move as the joints do (correlation {correlation:.2f})"
+        hint = "or specify the offset of the clocks: --offset 0"
+        raise InputError(place, found, "poses of this robot's tool", hint)
+    moves = [_fit_move(tool, poses, before, after, coarse) for before, after in pairwise(stops)]
+    offsets, weights = np.reshape([move for move in moves if move is not None], (-1, 2)).T
+    if len(offsets):
+        off = np.abs(offsets - np.median(offsets))
+        good = off <= 5.0 * 1.4826 * np.median(off) + 1e-6  # without moves that are far off all others
+        offsets, weights = offsets[good], weights[good]
     n = len(offsets)
-    variance = n / (n - 1) * np.sum((weights * (offsets - mean)) ** 2) / np.sum(weights) ** 2
-    return mean, float(np.sqrt(variance) * stdtrit(n - 1, ndtr(1.0)))
+    if n < MIN_MOVES:
+        raise InputError(
+            place, f"{n} moves between stops that show the offset", f"at least {MIN_MOVES}", "see --offset"
+        )
+    mean = float(np.average(offsets, weights=weights))
+    variance = n / (n - 1) * np.sum((weights * (offsets - mean)) ** 2) / np.sum(weights) ** 2  # for any weights
+    student = stdtrit(n - 1, ndtr(1.0))  # half the interval of 68 %: of few moves the scatter is hardly known
+    return ClockOffset(mean, float(np.sqrt(variance) * student), n, correlation, others)
 
 
-def _align_speeds(tool: PoseStream, poses: PoseStream, expected: float) -> tuple[float, float, tuple[float, ...]]:
+# --- the coarse offset ------------------------------------------------------------------------------------------------
+
+
+def _align_speeds(tool: PoseStream, poses: PoseStream) -> tuple[float, float, tuple[float, ...]]:
     """Offset at which the speeds correlate best, [s], their correlation, and other offsets that fit nearly as well.
 
-    Args:
-        tool: The tool by the joints.
-        poses: The tool as measured.
-        expected: The offset by times of receipt, [s]: where several fit, the nearest to it is taken.
+    Of several that fit, the one nearest to the offset by times of receipt is taken.
     """
-    step = max(period(tool.time), period(poses.time), 0.01)
+    expected = tool.source.lag - poses.source.lag
     span = max(np.ptp(tool.time), np.ptp(poses.time))
-    step = max(step, float(span) / _MOST_GRID)
-    best = (np.zeros(1), np.full(1, -1.0))
-    for kind in _kinds(tool, poses):
-        lags, correlation = _correlate(_speed(tool, kind, step), _speed(poses, kind, step))
-        if correlation.max() > best[1].max():
-            best = (lags * step + (poses.time[0] - tool.time[0]), correlation)
-    lags, correlation = best
-    inner = correlation[1:-1]
-    peaks = np.flatnonzero((inner >= correlation[:-2]) & (inner > correlation[2:])) + 1
+    step = max(period(tool.time), period(poses.time), 0.01, float(span) / MAX_GRID)
+    found = [_correlate(*(_speed(stream, values, step) for stream, values in zip((tool, poses), pair, strict=True)))
+             for pair in _quantities(tool, poses)]  # fmt: skip
+    lags, correlation = max(found, key=lambda of: float(of[1].max()))
+    lags = lags * step + (poses.time[0] - tool.time[0])
     top = float(correlation.max())
-    peaks = peaks[1.0 - correlation[peaks] <= 1.5 * (1.0 - top) + 0.01]
-    if not len(peaks):
-        return float(lags[np.argmax(correlation)]), top, ()
+    peaks, _ = find_peaks(np.concatenate([[-2.0], correlation, [-2.0]]), height=top - 0.5 * (1.0 - top) - 0.01)
+    peaks -= 1
     chosen = peaks[np.argmin(np.abs(lags[peaks] - expected))]
-    main = np.abs(lags[peaks] - lags[chosen]) < 0.5  # ripples of the same peak
-    chosen = peaks[main][np.argmax(correlation[peaks[main]])]
-    return float(lags[chosen]), float(correlation[chosen]), tuple(float(x) for x in lags[peaks[~main]])
+    same = np.abs(lags[peaks] - lags[chosen]) < 0.5  # ripples of one peak
+    chosen = peaks[same][np.argmax(correlation[peaks[same]])]
+    return float(lags[chosen]), float(correlation[chosen]), tuple(lags[peaks[~same]].tolist())
 
 
-def _kinds(tool: PoseStream, poses: PoseStream) -> tuple[str, ...]:
-    return ("position",) if tool.rotation is None or poses.rotation is None else ("position", "orientation")
+def _quantities(tool: PoseStream, poses: PoseStream) -> list[tuple[Floats, Floats]]:
+    """Positions, and rotation matrices over sqrt(2), whose distances are small angles: of the tool and as measured."""
+    both = [(tool.position, poses.position)]
+    if tool.rotation is not None and poses.rotation is not None:
+        both.append((tool.rotation.reshape(-1, 9) / np.sqrt(2.0), poses.rotation.reshape(-1, 9) / np.sqrt(2.0)))
+    return both
 
 
-def _values(stream: PoseStream, kind: str) -> Floats:
-    """Positions, shape (n, 3), or rotation matrices over sqrt(2), shape (n, 9): their distances are small angles."""
-    if kind == "position" or stream.rotation is None:
-        return stream.position
-    rows: Floats = stream.rotation.reshape(-1, 9) / np.sqrt(2.0)
-    return rows
-
-
-def _speed(stream: PoseStream, kind: str, step: float) -> Floats:
+def _speed(stream: PoseStream, values: Floats, step: float) -> Floats:
     """Speed on a grid of this step that begins with the stream, shape (n,), [m/s] or [rad/s]."""
     width = max(0.1, 4.0 * step)
     grid = np.arange(stream.time[0], stream.time[-1], step)
-    values = _values(stream, kind)
-    moved = [
-        np.interp(grid + width / 2, stream.time, column) - np.interp(grid - width / 2, stream.time, column)
-        for column in values.T
-    ]
-    speed: Floats = np.linalg.norm(moved, axis=0) / width
+    moved = _interpolate(grid + width / 2, stream.time, values) - _interpolate(grid - width / 2, stream.time, values)
+    speed: Floats = np.linalg.norm(moved, axis=1) / width
     return speed
 
 
 def _correlate(a: Floats, b: Floats) -> tuple[Floats, Floats]:
-    """Lags of b behind a in samples, and the correlation coefficient of what overlaps at each; -1 where little does."""
-    size = 1 << (len(a) + len(b)).bit_length()
-
-    def products(x: Floats, y: Floats) -> Floats:
-        """Sums over i of x[i] y[i + lag], lags from 1 - len(a) to len(b) - 1."""
-        found = np.fft.irfft(np.conj(np.fft.rfft(x, size)) * np.fft.rfft(y, size), size)
-        return np.concatenate([found[size - len(a) + 1 :], found[: len(b)]])
-
+    """Lags of b behind a in samples, and the correlation of what overlaps at each; -1 where little does."""
     a, b = a - a.mean(), b - b.mean()
     one_a, one_b = np.ones_like(a), np.ones_like(b)
-    n = np.maximum(np.round(products(one_a, one_b)), 1.0)
-    mean_a, mean_b = products(a, one_b) / n, products(one_a, b) / n
-    variance = (products(a * a, one_b) / n - mean_a**2) * (products(one_a, b * b) / n - mean_b**2)
-    covariance = products(a, b) / n - mean_a * mean_b
-    least = 1e-6 * a.var() * b.var()
-    good = (n >= 0.5 * min(len(a), len(b))) & (variance > least) & (least > 0.0)
-    correlation = np.where(good, covariance / np.sqrt(np.where(good, variance, 1.0)), -1.0)
-    return np.arange(1 - len(a), len(b)).astype(np.float64), correlation
+    overlap = correlate(one_b, one_a, method="fft")
+    energy = correlate(one_b, a * a, method="fft") * correlate(b * b, one_a, method="fft")
+    enough = (overlap >= 0.5 * min(len(a), len(b))) & (energy > 1e-6 * np.sum(a * a) * np.sum(b * b))
+    correlation = np.where(enough, correlate(b, a, method="fft") / np.sqrt(np.where(enough, energy, 1.0)), -1.0)
+    return correlation_lags(len(b), len(a)).astype(np.float64), correlation
 
 
-def _offsets_of_moves(
-    tool: PoseStream, poses: PoseStream, stops: Sequence[tuple[float, float]], coarse: float
-) -> tuple[Floats, Floats]:
-    """The offset that each move gives, [s], and its weight; without moves that are far off all others."""
-    kinds = _kinds(tool, poses)
-    fits: dict[str, dict[int, _Fit]] = {kind: {} for kind in kinds}
-    for kind in kinds:
-        for k, (before, after) in enumerate(pairwise(stops)):
-            fit = _fit_move(tool, poses, kind, before, after, coarse)
-            if fit is not None:
-                fits[kind][k] = fit
-    offsets, weights = [], []
-    variance = {kind: np.mean([f.variance for f in fits[kind].values()]) if fits[kind] else 1.0 for kind in kinds}
-    for k in range(len(stops) - 1):
-        found = [
-            (fits[kind][k].offset, fits[kind][k].information / max(float(variance[kind]), 1e-18))
-            for kind in kinds
-            if k in fits[kind]
-        ]
-        if found:
-            offset, information = np.transpose(found)
-            offsets.append(np.average(offset, weights=information))
-            weights.append(information.sum())
-    delta, weight = np.array(offsets), np.array(weights)
-    if len(delta):
-        off = np.abs(delta - np.median(delta))
-        good = off <= 5.0 * 1.4826 * np.median(off) + 1e-6
-        delta, weight = delta[good], weight[good]
-    return delta, weight
+# --- moves ------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """Offset of one move, [s], squared slopes summed, [1/s^2], and the mean square of what is left."""
+class _Fit(NamedTuple):
+    """The offset that a quantity gives on one move, [s], and its weight: information over the mean square residual."""
 
     offset: float
-    information: float
-    variance: float
-
-
-_MARGIN = 0.2
-"""Of the stops around a move this much belongs to it, [s]."""
+    weight: float
 
 
 def _fit_move(
-    tool: PoseStream, poses: PoseStream, kind: str, before: tuple[float, float], after: tuple[float, float],
-    coarse: float,
-) -> _Fit | None:  # fmt: skip
-    """Least squares of the offset on one move; None where it moves too little or was not seen."""
-    begin, end = before[1] - _MARGIN, after[0] + _MARGIN
-    predicted = _progress(tool, kind, before, after, (begin - 1.0, end + 1.0), 0.0)
-    seen = _progress(poses, kind, before, after, (begin, end), coarse)
-    if predicted is None or seen is None or len(seen[0]) < 10 or np.diff(seen[0]).max() > 0.25 * (end - begin):
+    tool: PoseStream, poses: PoseStream, before: tuple[float, float], after: tuple[float, float], coarse: float
+) -> _Fit | None:
+    """Weighted mean of the offsets by positions and by orientations; None where neither shows the move."""
+    measured_time = poses.time - coarse
+    found = [_fit(tool.time, a, measured_time, b, before, after) for a, b in _quantities(tool, poses)]
+    fits = [fit for fit in found if fit is not None]
+    if not fits:
         return None
-    slope = np.gradient(predicted[1], predicted[0], axis=0)  # (n, 2)
-    offset = coarse
+    offsets, weights = np.transpose(fits)
+    return _Fit(coarse + float(np.average(offsets, weights=weights)), float(weights.sum()))
+
+
+def _fit(
+    tool_time: Floats, tool: Floats, time: Floats, values: Floats, before: tuple[float, float],
+    after: tuple[float, float],
+) -> _Fit | None:  # fmt: skip
+    """Least squares of the offset on one move by one quantity; None where it moves too little or was not seen."""
+    begin, end = before[1] - MARGIN_S, after[0] + MARGIN_S
+    wide = _progress(tool_time, tool, before, after, (begin - 1.0, end + 1.0))
+    seen = _progress(time, values, before, after, (begin, end))
+    if wide is None or seen is None or len(seen[0]) < 10 or np.diff(seen[0]).max() > 0.25 * (end - begin):
+        return None
+    slope, offset = np.gradient(wide[1], wide[0], axis=0), 0.0
     for _ in range(20):
-        at = seen[0] - offset
-        left = seen[1] - _interpolate(at, predicted[0], predicted[1])
-        g = _interpolate(at, predicted[0], slope)
+        g = _interpolate(seen[0] - offset, wide[0], slope)
+        residual = seen[1] - _interpolate(seen[0] - offset, *wide)
         information = float(np.sum(g * g))
-        if information == 0.0:
-            return None
-        change = -float(np.sum(g * left)) / information
+        change = -float(np.sum(g * residual)) / max(information, 1e-12)
         offset += change
-        if abs(offset - coarse) > 0.5 * (end - begin):
+        if abs(offset) > 0.5 * (end - begin):
             return None
         if abs(change) < 1e-7:
-            return _Fit(offset, information, float(np.mean(left**2)))
+            return _Fit(offset, information / max(float(np.mean(residual**2)), 1e-18))
     return None
 
 
 def _progress(
-    stream: PoseStream, kind: str, before: tuple[float, float], after: tuple[float, float],
-    within: tuple[float, float], offset: float,
-) -> tuple[Floats, Floats] | None:  # fmt: skip
+    time: Floats, values: Floats, before: tuple[float, float], after: tuple[float, float], within: tuple[float, float]
+) -> tuple[Floats, Floats] | None:
     """Times, shape (n,), and distances from where a move began and from where it ends, shape (n, 2), over its length.
 
-    None where the stops were not seen, or are one place. Times are the stream's; all that is given is the joints'.
+    None where the stops were not seen, or are one place.
     """
-    values = _values(stream, kind)
-    ends = []
-    for stop in (before, after):
-        a, b = np.searchsorted(stream.time, np.asarray(stop) + offset)
-        if b - a < 3:
-            return None
-        ends.append(values[a:b].mean(axis=0))
-    length = np.linalg.norm(ends[1] - ends[0])
-    a, b = np.searchsorted(stream.time, np.asarray(within) + offset)
-    if length < _SMALLEST_MOVE[kind] or b - a < 3:
+    (a, b), (c, d), (e, f) = (np.searchsorted(time, span) for span in (before, after, within))
+    if min(b - a, d - c, f - e) < 3:
         return None
-    far = np.linalg.norm(values[a:b, None, :] - np.stack(ends), axis=2) / length
-    return stream.time[a:b], far
+    ends = np.stack([values[a:b].mean(axis=0), values[c:d].mean(axis=0)])
+    length = float(np.linalg.norm(ends[1] - ends[0]))
+    if length < MIN_MOVE:
+        return None
+    return time[e:f], np.linalg.norm(values[e:f, None, :] - ends, axis=2) / length
 
 
 def _interpolate(at: Floats, time: Floats, values: Floats) -> Floats:

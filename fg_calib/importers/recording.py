@@ -14,28 +14,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import toeplitz
+from scipy.optimize import brute
 
 from fg_calib.arrays import Floats, FrozenArrays
 from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot
 
-LEAST_SIGMA = 1e-6
-"""Of a mean, [m] or [rad]: poses without any scatter are not exact either."""
+MIN_SIGMA = 1e-6
+"""1 sigma of a mean, at least, [m] or [rad]: poses without any scatter are not exact either."""
 
-_WINDOW = 3.0
-"""Autocorrelations are summed up to so many times the time itself."""
+MAX_BLOCKS = 64
+"""Blocks at most in which the samples of a stop are averaged before their correlation is estimated."""
 
-_BLOCKS = 64
-"""Blocks at most that a stop is averaged in where its slow noise is looked for."""
+MIN_GAIN = 12.0
+"""Gain in twice the log-likelihood from which noise counts as correlated: white noise reaches it once in 400 times."""
 
-_WHITE = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95, 0.98)
-"""Shares of white noise that are tried."""
-
-_MUCH = 1.5
-"""How much more slow noise must say than the sum, which holds for noise of any shape that ends within a stop."""
-
-_BETTER = 12.0
-"""What slow noise must gain in twice the logarithm of the likelihood: white noise alone gains it once in 400 times."""
+MAX_TIME_SHARE = 1.0 / 6.0
+"""Share of a stop that the correlation time may have: averaging slower noise reduces it too little to be relied on."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +41,8 @@ class Source:
     Attributes:
         topic: Its topic.
         kind: Type of its messages.
-        lag: Median of the time of receipt less the stamp, [s]: latency, and how far the two clocks are apart.
-        notes: What was left out or mended, in words.
+        lag: Median of the time of receipt minus the stamp, [s]: latency, and the offset of the two clocks.
+        notes: What was left out or put in order, in words.
     """
 
     topic: str
@@ -71,8 +67,7 @@ class JointStream(FrozenArrays):
 
     def tool_path(self, robot: Robot) -> PoseStream:
         """The tool's poses at the readings, of the nominal robot in its base frame."""
-        trig = robot.trig(self.readings)
-        poses = forward(build_chain(robot, {}), trig)
+        poses = forward(build_chain(robot, {}), robot.trig(self.readings))
         return PoseStream(self.time, poses.position, poses.rotation, self.source)
 
 
@@ -102,100 +97,72 @@ def period(time: Floats) -> float:
 
 
 def correlation_time(residuals: Sequence[Floats]) -> float:
-    """Integrated autocorrelation time of noise, in samples, at least 1.
+    """Integrated autocorrelation time of noise over a stop, in samples, at least 1.
 
-    The autocovariance of what is left of a stop after its mean is too small by about the variance v of that mean, which
-    is therefore added: v = A / (1 - B) with the sums A of the covariances and B of ones up to the lag where the sum
-    ends. That lag is the first beyond three times the time itself (Sokal's window). Where there is none within half a
-    stop, or where that says much more, noise is white and AR(1) together: `_time_of_white_and_slow`.
+    Noise is white and AR(1) together, by maximum likelihood of the steps from sample to sample, which do not depend on
+    a stop's mean. It is white where correlation gains too little likelihood (`MIN_GAIN`).
 
     Args:
-        residuals: Of each stop, less its mean, shape (n, k).
+        residuals: Of each stop, minus its mean, shape (n, k).
     """
-    steps = [np.sqrt(np.mean(np.diff(r, axis=0) ** 2, axis=0)) for r in residuals]
-    scaled = [r / np.where(s > 0.0, s, 1.0) for r, s in zip(residuals, steps, strict=True)]  # stops count alike
+    scales = [np.sqrt(np.mean(np.diff(r, axis=0) ** 2, axis=0)) for r in residuals]
+    scaled = [r / np.where(s > 0.0, s, 1.0) for r, s in zip(residuals, scales, strict=True)]  # stops count alike
     n = int(np.median([len(r) for r in scaled]))
-    longest = n // 2
-    products = np.zeros(longest + 1)
-    counts = np.zeros(longest + 1)
-    for r in scaled:
-        size = 1 << (2 * len(r)).bit_length()
-        spectrum = np.abs(np.fft.rfft(r, size, axis=0)) ** 2
-        here = min(longest + 1, len(r))
-        products[:here] += np.fft.irfft(spectrum, size, axis=0)[:here].sum(axis=1)
-        counts[:here] += (len(r) - np.arange(here)) * r.shape[1]
-    if products[0] <= 0.0:
+    size = -(-n // MAX_BLOCKS)
+    n_blocks = n // size
+    whole = [r[: n_blocks * size].reshape(n_blocks, size, -1).mean(axis=1) for r in scaled if len(r) >= n_blocks * size]
+    steps = np.diff(np.concatenate(whole, axis=1), axis=0)  # (n_blocks - 1, n_series)
+    if n_blocks < 3 or not steps.any():
         return 1.0
-    covariance = products / np.maximum(counts, 1.0)
-    weight = np.append(1.0, 2.0 * (1.0 - np.arange(1, longest + 1) / n))
-    total, ones = np.cumsum(weight * covariance), np.cumsum(weight) / n
-    of_mean = total / n / np.maximum(1.0 - ones, 0.1)
-    tau = np.maximum(n * of_mean / (covariance[0] + of_mean), 1.0)
-    over = np.arange(longest + 1) >= _WINDOW * tau
-    slow = _time_of_white_and_slow(scaled, n, float(covariance[0]))
-    if not over.any():
-        return max(slow, n / (2.0 * _WINDOW))
-    fast = float(tau[np.argmax(over)])
-    return slow if slow > _MUCH * fast else fast
+    within = np.arange(1 - size, size)
+    lags = np.abs(size * np.arange(n_blocks)[:, None] + within)  # between samples of two blocks, (n_blocks, 2 size - 1)
 
+    most = float(np.log(20.0 * n))  # slower noise is indistinguishable from a walk
 
-def _time_of_white_and_slow(scaled: Sequence[Floats], n: int, square: float) -> float:
-    """Integrated time over a stop of n samples where noise is white and AR(1) together; 1 where white alone will do.
+    def fit(log_time: float, logit: float) -> tuple[float, float]:
+        """Twice the negative log-likelihood, and the variance of a stop's mean."""
+        white, time = 1.0 / (1.0 + np.exp(-logit)), 1.0 + np.exp(min(log_time, most))
+        rho = np.where(lags == 0, 1.0, (1.0 - white) * ((time - 1.0) / (time + 1.0)) ** lags)
+        V = toeplitz(rho @ (size - np.abs(within)) / size**2)
+        L = np.linalg.cholesky(np.diff(np.diff(V, axis=0), axis=1))
+        misfit = float(np.sum(np.linalg.solve(L, steps) ** 2))
+        cost = 2.0 * steps.shape[1] * np.log(np.diag(L)).sum() + steps.size * np.log(misfit)
+        return cost, float(V.mean()) * misfit / steps.size
 
-    By the likelihood of the steps from sample to sample, which know nothing of a stop's mean, on a grid of how much is
-    white and how slow the rest is. Long stops are averaged in blocks. What is slower than ten stops cannot be told from
-    a walk.
+    def cost(x: Floats) -> float:
+        return fit(*x)[0]
 
-    Args:
-        scaled: Of each stop, shape (n_samples, k).
-        n: Samples of a stop.
-        square: Mean square of the residuals.
-    """
-    size = -(-n // _BLOCKS)
-    length = n // size
-    whole = [r[: length * size].reshape(length, size, -1).mean(axis=1) for r in scaled if len(r) >= length * size]
-    steps = np.diff(np.concatenate(whole, axis=1), axis=0)  # (length - 1, n_series)
-    lags = np.abs(np.subtract.outer(np.arange(length), np.arange(length)))
-    best, found = np.inf, 1.0
-    for time in np.geomspace(1.0, 20.0 * length, 30):
-        slow = ((time - 1.0) / (time + 1.0)) ** lags
-        for share in _WHITE if time > 1.0 else (1.0,):
-            V = share * np.eye(length) + (1.0 - share) * slow
-            L = np.linalg.cholesky(np.diff(np.diff(V, axis=0), axis=1))
-            misfit = float(np.sum(np.linalg.solve(L, steps) ** 2))
-            cost = 2.0 * steps.shape[1] * np.log(np.diag(L)).sum() + steps.size * np.log(max(misfit, 1e-300))
-            if time == 1.0:
-                best = cost - _BETTER  # of white noise alone
-            elif cost < best:
-                best, of_mean = cost, float(V.mean()) * misfit / steps.size
-                found = n * of_mean / (square + of_mean)
-    return found
+    (least, of_mean), white = fit(*brute(cost, ((-2.0, most), (-6.0, 4.0)), Ns=8)), fit(0.0, 50.0)
+    if white[0] - least < MIN_GAIN:
+        of_mean = white[1]
+    square = float(np.mean(np.concatenate(scaled) ** 2))  # of residuals: the variance of the mean is missing in it
+    return max(1.0, n * of_mean / (square + of_mean))
 
 
 def is_slow(tau: float, n: float) -> bool:
-    """Whether noise is correlated over so much of a stop of n samples that averaging it is not worth counting."""
-    return tau > n / (2.0 * _WINDOW)
+    """Whether noise is correlated over so much of a stop of n samples that its mean's sigma is rough."""
+    return tau > MAX_TIME_SHARE * n
 
 
 def sigmas_of_means(residuals: Sequence[Floats], tau: float) -> Floats:
     """Sigma of each stop's mean of correlated samples, shape (n_stops, k).
 
     The variance of Student's t, for the scatter is estimated from the same samples: with 2 n tau / (tau^2 + 1) - 1
-    degrees of freedom, those of the mean square of AR(1) noise (Bartlett), n - 1 of white noise. Of slow noise a stop
-    hardly shows the scatter, which is then that of all stops together.
+    degrees of freedom, those of the mean square of AR(1) noise (Bartlett), n - 1 of white noise. The scatter of slow
+    noise is that of all stops together, as one stop hardly shows it.
 
     Args:
-        residuals: Of each stop, less its mean, shape (n, k).
+        residuals: Of each stop, minus its mean, shape (n, k).
         tau: Integrated autocorrelation time, in samples.
     """
     each = np.array([len(r) for r in residuals], dtype=np.float64)[:, None]
     square = np.array([np.mean(r**2, axis=0) for r in residuals])
     middle = float(np.median(each))
     if is_slow(tau, middle):
-        variance = square.mean(axis=0) * np.minimum(tau / each, 1.0) / (1.0 - tau / middle)
+        variance = square.mean(axis=0) * np.minimum(tau / each, 1.0) / (1.0 - min(tau / middle, 0.99))
     else:
         part = np.minimum(tau / each, 0.5)
         freedom = np.maximum(2.0 * each * tau / (tau**2 + 1.0) - 1.0, 3.0)
         variance = square * part / (1.0 - part) * (freedom / (freedom - 2.0))
-    sigma: Floats = np.maximum(np.sqrt(variance), LEAST_SIGMA)
+    sigma: Floats = np.maximum(np.sqrt(variance), MIN_SIGMA)
     return sigma

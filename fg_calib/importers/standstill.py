@@ -2,12 +2,11 @@
 
 A stop is where all joints stay within a few scatters for long enough; its beginning and end, in which the arm may still
 swing, are left out. The sigma is that of the mean, from the scatter within the stop, with the autocorrelation of all
-stops (`correlated`).
+stops (`recording`).
 
 Note:
-    What stays the same during a stop does not scatter: neither errors of the instrument in one place, nor noise that
-    wanders more slowly than several stops last. Noise that is slow beside a stop is told from white noise by the steps
-    from sample to sample.
+    Errors that are constant during a stop do not scatter: those of the instrument in one place, and noise that is
+    slower than several stops.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from fg_calib.arrays import Floats, FrozenArrays
 from fg_calib.errors import InputError
 from fg_calib.importers.clock import ClockOffset, estimate_offset
 from fg_calib.importers.recording import (
-    LEAST_SIGMA,
+    MIN_SIGMA,
     JointStream,
     PoseStream,
     correlation_time,
@@ -38,20 +37,17 @@ from fg_calib.io.tables import joint_columns
 from fg_calib.options import check_number
 from fg_calib.robot.model import Robot
 
-LEAST_SAMPLES = 8
+MIN_SAMPLES = 8
 """Poses, and joint readings, of which a mean is taken."""
 
-_SCATTERS = 3.0
+STILL_SCATTERS = 3.0
 """Joints stand still within so many of their scatters."""
-_LEAST_SCATTER = {"rad": 1e-4, "m": 2e-5}
-"""Of joint readings, [rad] or [m]: encoders may be coarse, or without noise."""
-_DRIFT = 6.0
-_LEAST_DRIFT = {"position": 5e-5, "orientation": 1e-4}
-"""A pose drifts during a stop by more than so many sigmas, and by more than this, [m] and [rad]."""
-_ODD_SCATTER = 10.0
-"""Stops whose poses scatter by more than so many times the usual are left out."""
-_CALM = 3.0
-"""Stops whose poses scatter by no more than so many times the usual say how noise is correlated."""
+
+MIN_SCATTER = {"rad": 1e-4, "m": 2e-5}
+"""Scatter of joint readings, at least, [rad] or [m]: encoders may be coarse, or without noise."""
+
+MAX_SCATTER_RATIO = 10.0
+"""Stops whose poses scatter by more than so many times the median are left out: they drift, swing or are hidden."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +125,7 @@ def average_stops(
         poses: Poses of the tool, in one frame.
         robot: The nominal robot.
         still: How long the arm stands still at least, [s].
-        offset: The stamp of a pose less that of the joint reading of the same moment, [s]; estimated if None.
+        offset: The stamp of a pose minus that of the joint reading of the same moment, [s]; estimated if None.
         most_offset: The largest offset that may be estimated, [s].
 
     Raises:
@@ -138,45 +134,52 @@ def average_stops(
     check_number("still", still, above=True)
     found = find_standstills(joints, robot, still)
     long = [(a, b) for a, b in found if b - a >= still]
-    place = f"topic {joints.source.topic}"
     if not long:
         hint = f"the longest pause is {max(b - a for a, b in found):.2g} s" if found else ""
-        raise InputError(place, f"no standstill of {still:g} s", "the arm at rest for a while, several times", hint)
+        expected = "the arm at rest for a while, several times"
+        raise InputError(f"topic {joints.source.topic}", f"no standstill of {still:g} s", expected, hint)
     estimate, applied = _offset(joints, poses, robot, [_inner(stop) for stop in long], offset, most_offset)
-    candidates, skipped = [], []
-    for k, stop in enumerate(found):
-        taken = _Samples.of(f"stop{k + 1}", joints, poses, _inner(stop), applied)
-        reason = f"{stop[1] - stop[0]:.2g} s, shorter than {still:g} s" if stop not in long else taken.lack()
-        if reason:
-            skipped.append(Skipped(taken.id, stop[0] - float(joints.time[0]), reason))
-        else:
-            candidates.append(taken)
-    good, odd = _without_odd(candidates)
-    skipped += [Skipped(taken.id, taken.begin - float(joints.time[0]), reason) for taken, reason in odd]
+    stops = [_Samples.of(f"stop{k + 1}", joints, poses, _inner(stop), applied) for k, stop in enumerate(found)]
+    reasons = {}
+    for sample, (begin, end) in zip(stops, found, strict=True):
+        few = min((len(sample.readings), "joint readings"), (len(sample.position), "poses"))
+        if end - begin < still:
+            reasons[sample.id] = f"{end - begin:.2g} s, shorter than {still:g} s"
+        elif few[0] < MIN_SAMPLES:
+            reasons[sample.id] = f"{few[0]} {few[1]}, fewer than {MIN_SAMPLES}"
+    residuals = {sample.id: sample.residuals() for sample in stops if sample.id not in reasons}
+    for kind in ("position", "orientation"):
+        rms = {name: float(np.sqrt(np.mean(of[kind] ** 2))) for name, of in residuals.items() if kind in of}
+        usual = max(float(np.median(list(rms.values()))), MIN_SIGMA) if rms else 0.0
+        for name, size in rms.items():
+            if size > MAX_SCATTER_RATIO * usual:
+                reasons.setdefault(name, f"the {kind} scatters {size / usual:.0f} times as much as usual")
+    good = [sample for sample in stops if sample.id not in reasons]
+    skipped = [Skipped(s.id, s.begin - float(joints.time[0]), reasons[s.id]) for s in stops if s.id in reasons]
     if not good:
-        reasons = "; ".join(f"{s.id}: {s.reason}" for s in skipped[:3])
-        raise InputError(f"topic {poses.source.topic}", f"no stop of {len(found)} can be used", hint=reasons)
-    return _averaged(good, sorted(skipped, key=lambda s: s.begin), estimate, applied)
+        hint = "; ".join(f"{s.id}: {s.reason}" for s in skipped[:3])
+        raise InputError(f"topic {poses.source.topic}", f"no stop of {len(found)} can be used", hint=hint)
+    return _average(good, [residuals[s.id] for s in good], skipped, estimate, applied)
 
 
 def _offset(
     joints: JointStream, poses: PoseStream, robot: Robot, stops: Sequence[tuple[float, float]],
-    stated: float | None, most: float | None,
+    specified: float | None, most: float | None,
 ) -> tuple[ClockOffset | None, float]:  # fmt: skip
-    """The offset of the clocks as estimated, and the one that is used: as stated, where it is."""
-    for name, figure, least in (("offset", stated, -np.inf), ("most offset", most, 0.0)):
-        if figure is not None:
-            check_number(name, figure, least=least)
+    """The offset of the clocks as estimated, and the one that is used: the specified one, where there is one."""
+    for name, value, least in (("offset", specified, -np.inf), ("most offset", most, 0.0)):
+        if value is not None:
+            check_number(name, value, least=least)
     try:
         estimate = estimate_offset(joints.tool_path(robot), poses, stops)
     except InputError:
-        if stated is None:
+        if specified is None:
             raise
-        return None, stated
+        return None, specified
     if most is not None and abs(estimate.seconds) > most:
         found = f"an offset of {estimate.seconds:.4g} +- {estimate.sigma:.2g} s against the joints' clock"
         raise InputError(f"topic {poses.source.topic}", found, f"at most {most:g} s")
-    return estimate, estimate.seconds if stated is None else stated
+    return estimate, estimate.seconds if specified is None else specified
 
 
 def find_standstills(joints: JointStream, robot: Robot, still: float) -> list[tuple[float, float]]:
@@ -186,10 +189,8 @@ def find_standstills(joints: JointStream, robot: Robot, still: float) -> list[tu
     calmest windows, or what encoders may hide.
     """
     time, readings = joints.time, joints.readings
-    width = 0.5 * still
-    rate = period(time)
-    first = np.arange(len(time))
-    end = np.searchsorted(time, time + width + 0.5 * rate)
+    width, rate = 0.5 * still, period(time)
+    first, end = np.arange(len(time)), np.searchsorted(time, time + width + 0.5 * rate)
     n = end - first
     whole = (time + width <= time[-1] + 0.5 * rate) & (n >= max(3.0, 0.5 * width / rate))
     if not whole.any():
@@ -199,16 +200,12 @@ def find_standstills(joints: JointStream, robot: Robot, still: float) -> list[tu
     sums, squares = (np.vstack([np.zeros(robot.n_joints), np.cumsum(x, axis=0)]) for x in (centred, centred**2))
     mean = (sums[end] - sums[first]) / n
     scatter = np.sqrt(np.maximum((squares[end] - squares[first]) / n - mean**2, 0.0))  # (n_windows, n_joints)
-    least = [_LEAST_SCATTER[joint.unit] for joint in robot.joints]
-    limit = _SCATTERS * np.maximum(np.quantile(scatter, 0.02, axis=0), least)
-    calm = np.all(scatter <= limit, axis=1)
+    least = [MIN_SCATTER[joint.unit] for joint in robot.joints]
+    calm = np.all(scatter <= STILL_SCATTERS * np.maximum(np.quantile(scatter, 0.02, axis=0), least), axis=1)
     begins, ends = time[first[calm]], time[end[calm] - 1]
-    if not len(begins):
-        return []
-    apart = np.flatnonzero(begins[1:] > np.maximum.accumulate(ends)[:-1])
-    return list(
-        zip(begins[np.append(0, apart + 1)].tolist(), ends[np.append(apart, len(ends) - 1)].tolist(), strict=True)
-    )
+    gaps = np.flatnonzero(begins[1:] > np.maximum.accumulate(ends)[:-1])
+    parts = zip(np.split(begins, gaps + 1), np.split(ends, gaps + 1), strict=True)
+    return [(float(a[0]), float(b[-1])) for a, b in parts if len(a)]
 
 
 def _inner(stop: tuple[float, float]) -> tuple[float, float]:
@@ -220,14 +217,14 @@ def _inner(stop: tuple[float, float]) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class _Samples:
-    """What was measured during one stop; residuals as rotation vectors about the mean's axes."""
+    """What was measured during one stop; rotations are relative to their mean, about its axes."""
 
     id: str
     begin: float
     end: float
     readings: Floats
     position: Floats
-    turned: Floats | None
+    rotation_vectors: Floats | None
     rotation: Floats | None
 
     @classmethod
@@ -236,73 +233,35 @@ class _Samples:
     ) -> _Samples:
         a, b = np.searchsorted(joints.time, stop)
         c, d = np.searchsorted(poses.time, np.asarray(stop) + offset)
-        turned = rotation = None
+        vectors = rotation = None
         if poses.rotation is not None and d > c:
             single = Rotation.from_matrix(poses.rotation[c:d].copy())
             mean = single.mean()
-            turned, rotation = (mean.inv() * single).as_rotvec(), mean.as_matrix()
-        return cls(name, *stop, joints.readings[a:b], poses.position[c:d], turned, rotation)
-
-    def lack(self) -> str:
-        """Why there is no mean; empty if there is one."""
-        for n, what in ((len(self.readings), "joint readings"), (len(self.position), "poses")):
-            if n < LEAST_SAMPLES:
-                return f"{n} {what}, fewer than {LEAST_SAMPLES}"
-        return ""
+            vectors, rotation = (mean.inv() * single).as_rotvec(), mean.as_matrix()
+        return cls(name, *stop, joints.readings[a:b], poses.position[c:d], vectors, rotation)
 
     def residuals(self) -> dict[str, Floats]:
-        """Measurements less their mean by quantity, each of shape (n, 3), [m] or [rad]."""
-        found = {"position": self.position - self.position.mean(axis=0)}
-        return found if self.turned is None else {**found, "orientation": self.turned - self.turned.mean(axis=0)}
+        """Measurements minus their mean by quantity, each of shape (n, k), [m] or [rad]."""
+        values = {"position": self.position, "orientation": self.rotation_vectors, "joint": self.readings}
+        return {kind: v - v.mean(axis=0) for kind, v in values.items() if v is not None}
 
 
-def _without_odd(stops: Sequence[_Samples]) -> tuple[list[_Samples], list[tuple[_Samples, str]]]:
-    """Stops in which the pose neither drifts nor scatters far more than usual, and the others with the reason."""
-    if not stops:
-        return [], []
-    good, odd = [], []
-    residuals = [stop.residuals() for stop in stops]
-    usual, tau = {}, {}
-    for kind in residuals[0]:
-        usual[kind] = max(float(np.median([_rms(r[kind]) for r in residuals])), LEAST_SIGMA)
-        calm = [r[kind] for r in residuals if _rms(r[kind]) <= _CALM * usual[kind]]
-        tau[kind] = correlation_time(calm)
-    for stop, of in zip(stops, residuals, strict=True):
-        reason = ""
-        for kind in of:
-            unit = "mm" if kind == "position" else "mrad"
-            drift, sigma = _drift(of[kind], min(tau[kind], len(of[kind])))
-            if np.any((drift > _DRIFT * sigma) & (drift > _LEAST_DRIFT[kind])):
-                reason = f"the {kind} drifts by {drift.max() * 1e3:.2g} {unit} while the joints stand"
-            elif _rms(of[kind]) > _ODD_SCATTER * usual[kind]:
-                reason = f"the {kind} scatters {_rms(of[kind]) / usual[kind]:.0f} times as much as usual"
-        if reason:
-            odd.append((stop, reason))
-        else:
-            good.append(stop)
-    return good, odd
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
-def _drift(residuals: Floats, tau: float) -> tuple[Floats, Floats]:
-    """How far the means of both halves are apart, and its sigma from the scatter within them, shape (3,)."""
-    n = len(residuals)
-    first, second = residuals[: n // 2], residuals[n // 2 :]
-    scatter = np.sqrt(0.5 * (first.var(axis=0, ddof=1) + second.var(axis=0, ddof=1)))
-    return np.abs(second.mean(axis=0) - first.mean(axis=0)), scatter * np.sqrt(4.0 * tau / n)
-
-
-def _averaged(
-    stops: Sequence[_Samples], skipped: Sequence[Skipped], estimate: ClockOffset | None, applied: float
+def _average(
+    stops: Sequence[_Samples],
+    residuals: Sequence[dict[str, Floats]],
+    skipped: Sequence[Skipped],
+    estimate: ClockOffset | None,
+    applied: float,
 ) -> Stops:
-    residuals = [stop.residuals() for stop in stops]
-    scatter, sigma = {}, {}
+    """Means of the stops, with their sigmas."""
+    scatter, sigma = dict[str, Scatter](), dict[str, Floats]()
     for kind in residuals[0]:
-        scatter[kind], sigma[kind] = _scatter([r[kind] for r in residuals])
-    scatter["joint"], _ = _scatter([stop.readings - stop.readings.mean(axis=0) for stop in stops])
+        of = [r[kind] for r in residuals]
+        tau = correlation_time(of)
+        sigma[kind] = sigmas_of_means(of, tau)
+        single, mean = np.median([r.std(axis=0) for r in of], axis=0), np.median(sigma[kind], axis=0)
+        slow = is_slow(tau, float(np.median([len(r) for r in of])))
+        scatter[kind] = Scatter(float(single.max()), float(mean.max()), tau, slow)
     rotation = [stop.rotation for stop in stops if stop.rotation is not None]
     return Stops(
         ids=tuple(stop.id for stop in stops),
@@ -320,29 +279,11 @@ def _averaged(
     )
 
 
-def _scatter(residuals: Sequence[Floats]) -> tuple[Scatter, Floats]:
-    """Scatter of one quantity, its largest component's, and the sigma of each stop's mean, shape (n_stops, k)."""
-    tau = correlation_time(residuals)
-    sigma = sigmas_of_means(residuals, tau)
-    single = np.median([r.std(axis=0) for r in residuals], axis=0)
-    n = float(np.median([len(r) for r in residuals]))
-    return Scatter(float(single.max()), float(np.median(sigma, axis=0).max()), tau, is_slow(tau, n)), sigma
-
-
 # --- the table of stops -----------------------------------------------------------------------------------------------
 
 
-_BEGINNING = b"id,begin,seconds,samples,"
-"""How such a table begins."""
-
-
-def require_replaceable(path: Path) -> None:
-    """Check that a table of stops can be written: a CSV that is not there yet, or was written as one.
-
-    Raises:
-        InputError: It cannot.
-    """
-    require_own_csv(path, _BEGINNING)
+TABLE_BEGINNING = b"id,begin,seconds,samples,"
+"""How a table of stops begins."""
 
 
 @checked
@@ -362,7 +303,7 @@ def write_stops(path: Path | str, stops: Stops, robot: Robot) -> None:
         InputError: It cannot be written, or is another file.
     """
     path = Path(path)
-    require_replaceable(path)
+    require_own_csv(path, TABLE_BEGINNING)
     columns: dict[str, Any] = {
         "id": np.array(stops.ids),
         "begin": np.round(stops.interval[:, 0], 3),
