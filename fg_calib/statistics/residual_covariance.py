@@ -12,9 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-import scipy.linalg
 import scipy.sparse
 from numpy.typing import NDArray
+from scipy.sparse import csgraph
+from scipy.sparse.linalg import splu
 
 from fg_calib.graph.error_states import ErrorStates
 from fg_calib.graph.noise_models import PRIVATE_SHARE, RowNoise
@@ -27,14 +28,17 @@ Booleans = NDArray[np.bool_]
 Integers = NDArray[np.int64]
 Sparse = scipy.sparse.csr_array
 
+MANY_ROWS = 16
+"""Rows that an error may reach in a covariance's sparse part; errors of more rows are in its low rank."""
+
 
 @dataclass(frozen=True)
 class ResidualCovariance:
     """Covariance `D + L L^T + P S P^T` of rows.
 
     Attributes:
-        P: Shape (n, k).
-        L: Sparse, shape (n, n_errors).
+        P: Parameters' share and errors of many rows, shape (n, k).
+        L: Errors of few rows, sparse, shape (n, n_errors).
         d: Diagonal of D, shape (n,).
         sign: Diagonal of S, 1 or -1, shape (k,).
     """
@@ -49,6 +53,14 @@ class ResidualCovariance:
         """Variances, shape (n,)."""
         out: Floats = self.d + row_squares(self.L) + (self.P * self.P) @ self.sign
         return out
+
+    @classmethod
+    def build(cls, P: Floats, L: Sparse, d: Floats, sign: Floats) -> ResidualCovariance:
+        """The same covariance with errors that reach many rows, which would fill a sparse factor, among P."""
+        columns = L.tocsc()
+        many = np.diff(columns.indptr) > MANY_ROWS
+        wide = columns[:, many].toarray()
+        return cls(np.hstack([P, wide]), columns[:, ~many].tocsr(), d, np.append(sign, np.ones(wide.shape[1])))
 
     def at(self, rows: Integers) -> ResidualCovariance:
         """The part at some rows."""
@@ -76,15 +88,26 @@ class ResidualCovariance:
             z: The rows, shape (n,).
         """
         added = np.maximum(PRIVATE_SHARE * (self.d + row_squares(self.L)) - self.d, 0.0)
-        A = np.diag(self.d + added) + (self.P * self.sign) @ self.P.T + (self.L @ self.L.T).toarray()
-        factor = scipy.linalg.cho_factor(A, lower=True)
-        chi2, n = float(z @ scipy.linalg.cho_solve(factor, z)), float(len(z))
+        T = scipy.sparse.csc_array(self.L @ self.L.T + scipy.sparse.diags_array(self.d + added))
+        factor, k = splu(T), self.P.shape[1]
+        V, Tz = np.split(factor.solve(np.column_stack([self.P, z])), [k], axis=1)
+        M = np.linalg.inv(np.diag(self.sign) + self.P.T @ V)  # C^-1 = T^-1 - V M V^T
+        chi2, n = float(z @ Tz[:, 0] - (V.T @ z) @ M @ (V.T @ z)), float(len(z))
         if not added.any():
             return chi2, n, n
-        root = np.sqrt(added)
-        B = root[:, None] * scipy.linalg.cho_solve(factor, np.diag(root))  # 1 - B has the moments of the sum
-        expected = n - float(np.trace(B))
-        return chi2, expected, expected**2 / (expected - float(np.trace(B)) + float(np.sum(B * B)))
+        root = np.sqrt(added)[:, None]
+        part = csgraph.connected_components(T, directed=False)[1]  # rows of one part at a time: T^-1 couples no others
+        order = np.argsort(part, kind="stable")
+        place = np.empty(len(z), dtype=np.int64)
+        place[order] = np.arange(len(z)) - np.searchsorted(part[order], part[order])
+        unit = np.zeros((len(z), int(place.max()) + 1))
+        unit[np.arange(len(z)), place] = root[:, 0]
+        B, V = root * factor.solve(unit), root * V  # 1 - (B - V M V^T) has the moments of the sum
+        K = M @ (V.T @ V)
+        trace = float(B[np.arange(len(z)), place].sum() - np.trace(K))
+        squares = np.vdot(B, B) - 2.0 * np.vdot(V @ M, root * factor.solve(root * V)) + np.vdot(K, K.T)
+        expected = n - trace
+        return chi2, expected, expected**2 / (expected - trace + float(squares))
 
 
 @dataclass(frozen=True)
@@ -143,7 +166,7 @@ class RowErrors:
             tangent: T, the covariance of the core.
         """
         P = self.root(tangent)
-        return ResidualCovariance(P, self.L, self.private, -np.ones(P.shape[1]))
+        return ResidualCovariance.build(P, self.L, self.private, -np.ones(P.shape[1]))
 
     def fitted_as_independent(self, tangent: Floats, measurement: Integers) -> ResidualCovariance:
         """Covariance of fitted rows that were weighted as if measurements shared no errors.
@@ -168,7 +191,7 @@ class RowErrors:
         """
         P = self.root(actual)
         if not self.felt.shape[1]:
-            return ResidualCovariance(P, self.L, self.private, np.ones(P.shape[1]))
+            return ResidualCovariance.build(P, self.L, self.private, np.ones(P.shape[1]))
         n = len(tangent)
         felt_ = np.hstack([self.felt[:, :n] @ square_root(tangent), self.felt[:, n:]])
         return _with_cross(P, self.root(tangent), felt_, self.L, self.private)
@@ -178,7 +201,7 @@ def _with_cross(P: Floats, A: Floats, B: Floats, L: Sparse, d: Floats) -> Residu
     """Covariance `D + L L^T + P P^T - A B^T - B A^T`."""
     columns = np.hstack([P, (A - B) / np.sqrt(2.0), (A + B) / np.sqrt(2.0)])
     n, m = P.shape[1], A.shape[1]
-    return ResidualCovariance(columns, L, d, np.concatenate([np.ones(n + m), -np.ones(m)]))
+    return ResidualCovariance.build(columns, L, d, np.concatenate([np.ones(n + m), -np.ones(m)]))
 
 
 class RowModel:
