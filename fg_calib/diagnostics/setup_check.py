@@ -160,7 +160,7 @@ def check_setup(
         setup = setup_of(robot, given)
         if setup is None or (setup.has_landmarks and not doubtful):
             return SetupCheck()
-        return _checked_alone(setup, SetupCheck(nominal_residuals(setup)), doubtful)
+        return _check_alone(setup, doubtful)
 
 
 def check_problem(problem: Problem, before: Floats, *, doubtful: bool = False) -> SetupCheck:
@@ -199,13 +199,11 @@ def check_tables(
                 continue
             setup, one = setup_of(whole.robot, table), SetupCheck()
             if setup is not None and setup.has_landmarks and with_landmarks:
-                one = _checked_alone(setup, SetupCheck(nominal_residuals(setup)), True)
+                one = _check_alone(setup, True)
             elif setup is not None and not setup.has_landmarks and _enough(setup):
-                one = together = SetupCheck(residuals_at(whole, before, whole.robot, number))
-                if one.residuals and (doubtful or one.far):
-                    alone = SetupCheck(nominal_residuals(setup))
-                    one = _checked_alone(setup, alone if 0.0 < alone.excess < one.excess else one, doubtful)
-                joint.append((setup, replace(together, table=label)))
+                together = residuals_at(whole, before, whole.robot, number)
+                one = _check_alone(setup, doubtful, together)
+                joint.append((setup, SetupCheck(together, table=label)))
             checks.append(replace(one, table=label if len(labels) > 1 else ""))
         far = [one for one in checks if one.far] or [one for one in checks if one.explanations]
         found = sorted(far, key=lambda one: (not one.explanations, -one.excess))
@@ -220,13 +218,20 @@ def _enough(setup: Setup) -> bool:
     return n_rows >= 2 * n_free + 6
 
 
-def _checked_alone(setup: Setup, found: SetupCheck, doubtful: bool) -> SetupCheck:
-    """The check of a table, and the mistakes that explain its residuals."""
-    if not found.residuals or not (doubtful or found.far) or found.excess < NEGLIGIBLE_EXCESS:
-        return found
-    if setup.has_landmarks and not found.far:
-        return found
-    return replace(found, explanations=_explanations(setup, found))
+def _check_alone(setup: Setup, doubtful: bool, together: tuple[TypicalResidual, ...] = ()) -> SetupCheck:
+    """The check of a table, and the mistakes that explain its residuals.
+
+    Args:
+        setup: The table.
+        doubtful: Look for a mistake even where the residuals are not far from what is predicted.
+        together: Its residuals with the base and the tool that all tables determine together.
+    """
+    found = SetupCheck(together)
+    if not together or found.far or doubtful:
+        alone = SetupCheck(nominal_residuals(setup))
+        found = alone if not together or 0.0 < alone.excess < found.excess else found
+    look = found.far or (doubtful and not setup.has_landmarks and found.excess >= NEGLIGIBLE_EXCESS)
+    return replace(found, explanations=_explanations(setup, found)) if look else found
 
 
 def _disagreeing(joint: Sequence[tuple[Setup, SetupCheck]]) -> list[SetupCheck]:

@@ -21,7 +21,6 @@ from fg_calib.observability.observed_quantities import ObservedQuantities
 from fg_calib.observability.random_configurations import at_random_configurations
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.kinematics import build_chain, forward
-from fg_calib.robot.model import Parameter
 from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
@@ -104,23 +103,32 @@ class _Motion:
     def reason(self, direction: Floats) -> str:  # noqa: PLR0911 - one return a cause
         """Why a direction, shape (n,), [m] and [rad], has no effect on the measurements."""
         w, dp, turns, moves = self._of_tool(direction)
-        sees_orientation, sees_position = self._seen.orientation, self._seen.position
+        sees_orientation, sees_position, pairs = self._seen.orientation, self._seen.position, self._seen.pairs
+        members = [p for p, v in zip(self._parameters, direction, strict=True) if v != 0.0]
+        units, on_last_axis = {p.unit for p in members}, "the tool point lies on the last axis: " * self._on_last_axis
+        parallel = "parallel directions"
+        if all(p.kind in ("d", "theta") for p in members):
+            parallel = f"parallel axes {', '.join(str(p.owner) for p in members)}"
+        if not turns and not moves and units == {"m"}:
+            return f"{parallel}: only the sum of the shifts along them acts"
         if not turns and not moves:
-            return self._same_motion(direction)
+            return (
+                "only their sum turns about the same axis" if units == {"rad"} else "together they do not move the tool"
+            )
         if not sees_orientation and not moves:
-            if self._on_last_axis:
-                return f"the tool point lies on the last axis: the tool only turns about it, unseen by {self._seen}"
-            return f"the tool only turns about its own point, unseen by {self._seen}"
+            about = "it" if self._on_last_axis else "its own point"
+            return f"{on_last_axis}the tool only turns about {about}, unseen by {self._seen}"
+        if not sees_position and not turns and units == {"rad"}:
+            return f"{parallel}: only the sum of their turns is seen, and no lengths are"
         if not sees_position and not turns:
-            if self._all_turn(direction):
-                return f"{self._parallel(direction)}: only the sum of their turns is seen, and no lengths are"
             return f"the tool only moves without turning, unseen by {self._seen}"
         if self.of_base(direction):
             return BASE
-        in_tool = np.einsum("nji,nj->ni", self._R, w)
-        if self._seen.pairs and not (moves and sees_position) and self._constant(in_tool):
-            return self._tool_turned(direction)
-        if self._seen.pairs and self._common_axis is not None and self._tilts(w, dp, self._common_axis):
+        if pairs and not (moves and sees_position) and self._constant(np.einsum("nji,nj->ni", self._R, w)):
+            of_the_tool = all(p.name.startswith("tool.") for p in members)
+            what = "the tool frame turns by the same in itself everywhere, which no angle between two poses shows"
+            return what if of_the_tool else f"{on_last_axis}{what}"
+        if pairs and self._common_axis is not None and self._tilts(w, dp, self._common_axis):
             return "parallel axes, all of them: it only tilts the arm out of its plane, unseen to first order"
         return NO_CAUSE
 
@@ -129,7 +137,7 @@ class _Motion:
         w, dp, turns, _ = self._of_tool(direction)
         if not self._seen.is_relative(position=True, orientation=turns):
             return False
-        return self._rigid(w, dp, self._seen.position)
+        return self._constant(w) and (not self._seen.position or self._constant(dp - np.cross(w, self._p)))
 
     def _of_tool(self, direction: Floats) -> tuple[Floats, Floats, bool, bool]:
         """Turns and shifts of the tool, shape (n_configurations, 3), and whether these are any."""
@@ -148,39 +156,6 @@ class _Motion:
         along = np.sum(w * axis, axis=1)
         in_plane = dp - np.sum(dp * axis, axis=1, keepdims=True) * axis
         return bool(np.abs(along).max() < 1e-8 and np.abs(in_plane).max() < 1e-8)
-
-    def _tool_turned(self, direction: Floats) -> str:
-        what = "the tool frame turns by the same in itself everywhere, which no angle between two poses shows"
-        of_the_tool = all(p.name.startswith("tool.") for p in self._members(direction))
-        return f"the tool point lies on the last axis: {what}" if self._on_last_axis and not of_the_tool else what
-
-    def _same_motion(self, direction: Floats) -> str:
-        """The cause where several parameters cancel each other completely."""
-        members = self._members(direction)
-        if all(p.unit == "m" for p in members):
-            return f"{self._parallel(direction)}: only the sum of the shifts along them acts"
-        if all(p.unit == "rad" for p in members):
-            return "only their sum turns about the same axis"
-        return "together they do not move the tool"
-
-    def _members(self, direction: Floats) -> list[Parameter]:
-        return [p for p, v in zip(self._parameters, direction, strict=True) if v != 0.0]
-
-    def _all_turn(self, direction: Floats) -> bool:
-        return all(p.unit == "rad" for p in self._members(direction))
-
-    def _parallel(self, direction: Floats) -> str:
-        """`parallel axes 3, 4`: the joints whose axes the members turn about or shift along; else in general words."""
-        members = self._members(direction)
-        if all(p.kind in ("d", "theta") for p in members):
-            return f"parallel axes {', '.join(str(p.owner) for p in members)}"
-        return "parallel directions"
-
-    def _rigid(self, w: Floats, dp: Floats, sees_position: bool) -> bool:
-        """Whether the tool moves everywhere as if the base alone had moved."""
-        if not sees_position:
-            return self._constant(w)
-        return self._constant(w) and self._constant(dp - np.cross(w, self._p))
 
     @staticmethod
     def _constant(values: Floats) -> bool:
