@@ -7,7 +7,7 @@ what its reader should know, as in the verdict on a calibration.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from itertools import chain
 
@@ -19,7 +19,7 @@ from fg_calib.arguments import checked
 from fg_calib.arrays import Brief
 from fg_calib.diagnostics.linearity import find_ambiguous_rows
 from fg_calib.diagnostics.robust_screening import Disagreements, find_disagreements
-from fg_calib.diagnostics.setup_check import SetupCheck, check_tables
+from fg_calib.diagnostics.setup_check import SetupCheck, check_tables, reporting
 from fg_calib.diagnostics.setup_hypotheses import MOTION_M, MOTION_RAD
 from fg_calib.diagnostics.verdict import Statement, listed
 from fg_calib.graph.build import problem_of
@@ -175,7 +175,12 @@ def inspect_job(job: Job) -> Inspection:
     """
     problem = problem_of(job)
     tables = tables_of(job.measurements, job.options)
-    every, setups, disagreements = _check_set_up(problem, job, tables)
+    whole = problem.whole or problem
+    judged = replace(whole, robot=job.robot) if problem.evaluated else whole
+    setups, disagreements = check_tables(judged, whole.start, with_landmarks=True), Disagreements()
+    if not any(check.explanations for check in setups):  # else all rows disagree
+        labels = problem.data.labels if len(tables) > 1 else ("",)
+        disagreements = find_disagreements(job.robot, tables, labels)
     at_nominal = unsolved(problem)
     spread = spread_of(at_nominal)
     n_directions = spread.rank + eliminated(problem, problem.start).rank
@@ -183,7 +188,7 @@ def inspect_job(job: Job) -> Inspection:
         robot=job.robot.name,
         tables=tuple(_survey(at_nominal, number, table) for number, table in enumerate(tables)),
         joints=_joints(problem, job.robot),
-        setups=tuple(next((s for s in setups if s.table == check.table), check) for check in every),
+        setups=tuple(setups),
         disagreements=disagreements,
         identifiability=identifiability_of(problem.whole or problem, problem.start, "practical"),
         expected_error=None if problem.evaluated else expected_error(problem, with_left_out(at_nominal, spread)),
@@ -194,24 +199,9 @@ def inspect_job(job: Job) -> Inspection:
         n_excluded={reason: n for reason, n in problem.n_excluded.items() if n},
         evaluated=problem.evaluated,
     )
-    statements = list(chain(_check_rows(found, job, setups), _check_result(found, job), _check_tables(found, job)))
+    statements = list(chain(_check_rows(found, job), _check_result(found, job), _check_tables(found, job)))
     errors, notes = (tuple(s.text for s in statements if s.severity == severity) for severity in ("error", "note"))
     return replace(found, findings=errors, cautions=notes)
-
-
-def _check_set_up(
-    problem: Problem, job: Job, tables: Sequence[Table]
-) -> tuple[list[SetupCheck], list[SetupCheck], Disagreements]:
-    """The set-up of each table, those that report something, and rows that disagree with the others.
-
-    Where a mistake in the set-up was found single rows are not looked for: all disagree.
-    """
-    whole = problem.whole or problem
-    judged = replace(whole, robot=job.robot) if problem.evaluated else whole
-    every, setups = check_tables(judged, whole.start, with_landmarks=True)
-    if any(check.explanations for check in setups):
-        return every, setups, Disagreements()
-    return every, setups, find_disagreements(job.robot, tables, problem.data.labels if len(tables) > 1 else ("",))
 
 
 def _survey(at_nominal: Solution, number: int, table: Table) -> TableSurvey:
@@ -290,23 +280,24 @@ def _joints(problem: Problem, robot: Robot) -> tuple[JointRange, ...]:
     )  # fmt: skip
 
 
-def _check_rows(found: Inspection, job: Job, setups: Sequence[SetupCheck]) -> Iterator[Statement]:
+def _check_rows(found: Inspection, job: Job) -> Iterator[Statement]:
     """Check set-up, single rows and readings."""
     arm = [p for p in job.robot.parameters if p.estimated and 1 <= p.owner <= job.robot.n_joints]
     has_priors = job.options.has_priors and all(p.tolerance is not None for p in arm)
     wrong, loss = found.disagreements.found, job.options.loss
-    for check in setups:
-        if check.explanations or (check.far and all(check.table != one.table for one in wrong)):
+    for check in reporting(found.setups):
+        if check.explanations or all(check.table != one.table for one in wrong):
             yield Statement("error" if check.explanations or has_priors else "note", str(check))
     if wrong:
         tables, tested = {one.table for one in wrong}, sum(one.test for one in wrong)
         names = [f"{'-'.join(one.ends)}{f' of {one.table}' * (len(tables) > 1)}" for one in wrong]
-        text = "one measurement disagrees" if len(wrong) == 1 else f"{len(wrong)} measurements disagree"
         of = f" of {wrong[0].table}" * (len(tables) == 1 and bool(wrong[0].table))
-        text += f" with the nominal arm far more than the others do ({listed(list(dict.fromkeys(names)))}{of})"
+        text = f"measurements that disagree with the nominal arm far more than the others do: {len(wrong)}"
+        text += f" ({listed(list(dict.fromkeys(names)))}{of})"
         if tested or loss == "none":
-            text += f": look at {'it' if len(wrong) == 1 else 'them'}"
-            text += ", or let a robust loss do so (loss: gnc)" * (loss == "none" and tested < len(wrong))
+            text += ": look at them" + ", or let a robust loss do so (loss: gnc)" * (
+                loss == "none" and tested < len(wrong)
+            )
             text += f"; no loss acts on test rows, of which these are {tested}" * bool(tested)
         yield Statement("error" if tested or loss == "none" else "note", text)
     for joint in found.joints:
@@ -369,7 +360,7 @@ def _check_tables(found: Inspection, job: Job) -> Iterator[Statement]:
     if job.options.estimate_tolerance:
         text = "prior sigmas are to be estimated: accuracy here is for those specified, or 1 mm and 1 mrad"
         yield Statement("note", text)
-    unseen = [t.name for t, check in zip(found.tables, found.setups, strict=False) if not check.residuals]
-    if unseen and len(found.setups) == len(found.tables):
+    unseen = [t.name for t, check in zip(found.tables, found.setups, strict=True) if t.model and not check.residuals]
+    if unseen:
         text = f"{listed(unseen)}: too few rows to look for common mistakes (units, signs, columns) before solving"
         yield Statement("note", text)

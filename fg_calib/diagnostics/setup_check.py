@@ -171,19 +171,22 @@ def check_problem(problem: Problem, before: Floats, *, doubtful: bool = False) -
         before: The parameter vector with base, tool and measurement frame fitted, the arm at nominal.
         doubtful: Look for a mistake even where the residuals are not far from what is predicted.
     """
-    every, found = check_tables(problem, before, doubtful=doubtful, with_landmarks=doubtful)
-    found = found or sorted(every, key=lambda one: -one.excess)[:1]
-    first = replace(found[0], others=tuple(found[1:])) if found else SetupCheck()
-    with_model = [k for k, table in enumerate(problem.data.tables) if table.model is not None]
-    of_table = {k: one.residuals for k, one in zip(with_model, every, strict=True)}
-    unchecked = tuple(label for k, label in enumerate(problem.data.labels) if not of_table.get(k))
-    return replace(first, unchecked=unchecked) if doubtful else first
+    checks = check_tables(problem, before, doubtful=doubtful, with_landmarks=doubtful)
+    found = reporting(checks) or sorted(checks, key=lambda one: -one.excess)[:1]
+    unchecked = [label for label, one in zip(problem.data.labels, checks, strict=True) if not one.residuals]
+    return replace(found[0], others=tuple(found[1:]), unchecked=tuple(unchecked) if doubtful else ())
+
+
+def reporting(checks: Sequence[SetupCheck]) -> list[SetupCheck]:
+    """The checks that report something, those that explain it first, then the worst."""
+    far = [one for one in checks if one.far] or [one for one in checks if one.explanations]
+    return sorted(far, key=lambda one: (not one.explanations, -one.excess))
 
 
 def check_tables(
     problem: Problem, before: Floats, *, doubtful: bool = False, with_landmarks: bool = False
-) -> tuple[list[SetupCheck], list[SetupCheck]]:
-    """The check of each table with a model, and those of them that report something, worst first.
+) -> list[SetupCheck]:
+    """The check of each table.
 
     Args:
         problem: The problem.
@@ -192,22 +195,21 @@ def check_tables(
         with_landmarks: Look at tables whose targets, anchors, planes or boards have to be located first.
     """
     whole, labels = problem.whole or problem, problem.data.labels
-    checks, joint = list[SetupCheck](), list[tuple[Setup, SetupCheck]]()
+    checks, joint = list[SetupCheck](), dict[int, tuple[Setup, SetupCheck]]()
     with one_blas_thread:
         for number, (label, table) in enumerate(zip(labels, problem.data.tables, strict=True)):
-            if table.model is None:
-                continue
             setup, one = setup_of(whole.robot, table), SetupCheck()
             if setup is not None and setup.has_landmarks and with_landmarks:
                 one = _check_alone(setup, True)
             elif setup is not None and not setup.has_landmarks and _enough(setup):
                 together = residuals_at(whole, before, whole.robot, number)
                 one = _check_alone(setup, doubtful, together)
-                joint.append((setup, SetupCheck(together, table=label)))
+                joint[number] = setup, SetupCheck(together, table=label)
             checks.append(replace(one, table=label if len(labels) > 1 else ""))
-        far = [one for one in checks if one.far] or [one for one in checks if one.explanations]
-        found = sorted(far, key=lambda one: (not one.explanations, -one.excess))
-        return checks, found or (_disagreeing(joint) if len(checks) > 1 else [])
+        if len(checks) > 1 and not reporting(checks):
+            for number, one in _disagreeing(joint):
+                checks[number] = one
+    return checks
 
 
 def _enough(setup: Setup) -> bool:
@@ -234,20 +236,19 @@ def _check_alone(setup: Setup, doubtful: bool, together: tuple[TypicalResidual, 
     return replace(found, explanations=_explanations(setup, found)) if look else found
 
 
-def _disagreeing(joint: Sequence[tuple[Setup, SetupCheck]]) -> list[SetupCheck]:
-    """Tables that only a tool and a base of their own fit; those that are farthest off.
+def _disagreeing(joint: dict[int, tuple[Setup, SetupCheck]]) -> list[tuple[int, SetupCheck]]:
+    """Tables that only a tool and a base of their own fit, by their numbers; those that are farthest off.
 
     Args:
         joint: Each table alone, and its residuals with the base and the tool that all tables determine together.
     """
-    alone = [Explanation((OTHER_TOOL,), nominal_residuals(setup)) for setup, _ in joint]
-    spoilt = [
-        replace(one, explanations=(other,))
-        for (_, one), other in zip(joint, alone, strict=True)
-        if one.far and other.excess <= min(EXPLAINED, one.excess / REDUCTION)
-    ]
-    farthest = max((one.excess for one in spoilt), default=0.0)
-    return [one for one in spoilt if one.excess > FARTHEST_SHARE * farthest]
+    found = []
+    for number, (setup, one) in joint.items():
+        alone = Explanation((OTHER_TOOL,), nominal_residuals(setup))
+        if one.far and alone.excess <= min(EXPLAINED, one.excess / REDUCTION):
+            found.append((number, replace(one, explanations=(alone,))))
+    farthest = max((one.excess for _, one in found), default=0.0)
+    return [(number, one) for number, one in found if one.excess > FARTHEST_SHARE * farthest]
 
 
 def _explanations(setup: Setup, given: SetupCheck) -> tuple[Explanation, ...]:

@@ -231,9 +231,10 @@ def check_chi_square(
     if reduced > high:
         cause = "noise specified too small, unmodelled effects, or outliers"
         if gross is not None:
-            who = f"{'outlier' if gross.n == 1 else f'{gross.n} outliers'} ({listed(gross.names)})"
-            them = "it" if gross.n == 1 else "them"
-            cause = f"{who}, {gross.ratio:.3g} without {them}: look at {them}, or let a robust loss do so (loss: gnc)"
+            cause = (
+                f"outliers: {gross.n} ({listed(gross.names)}), {gross.ratio:.3g} without: look at them, or let a robust"
+            )
+            cause += " loss do so (loss: gnc)"
         elif updated:
             cause = "new rows contradict the earlier calibration: has the arm changed? See `fg-calib check`"
         if evaluated:

@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 from scipy import special
 
-from fg_calib.diagnostics.setup_check import check_tables
+from fg_calib.diagnostics.setup_check import check_tables, reporting
 from fg_calib.monitoring.discriminating_design import Advice, advise_configurations
 from fg_calib.monitoring.hypotheses import (
     CERTAIN,
@@ -237,8 +237,8 @@ def _p_value(calibrated: Calibrated, at: Linear) -> float:
 def _unless_misread(found: Check, at: Linear) -> Check:
     """A check that failed, but by a usual mistake in how the table is read, such as its units: then it says nothing."""
     solution = at.placed.solution
-    _, far = check_tables(solution.problem, solution.parameters, doubtful=True, with_landmarks=True)
-    named = tuple(str(one) for one in far if one.explanations)
+    checks = check_tables(solution.problem, solution.parameters, doubtful=True, with_landmarks=True)
+    named = tuple(str(one) for one in reporting(checks) if one.explanations)
     if not named:
         return found
     nothing = replace(found, cautions=(), explanations=(), gross_rows=(), advice=None)

@@ -76,7 +76,10 @@ def test_rows_that_disagree_are_listed(fg_calib, job):
 
     ended = fg_calib("inspect", job(lambda m: replace(m, position=plus(m.position, range(1, 8), 0.03))))
     assert ended.code == 3
-    assert "look at this first: 7 measurements disagree with the nominal arm" in ended.err
+    assert (
+        "look at this first: measurements that disagree with the nominal arm far more than the others do: 7 ("
+        in ended.err
+    )
     part = ended.out[ended.out.index("Rows that disagree with the nominal arm") :]
     assert "and 2 more" in part
 

@@ -130,7 +130,7 @@ def test_rows_that_disagree_with_the_arm_are_named(arm, model, frame, size):
     m = measured(arm, placed=PLACED if frame == "unknown" else None)
     found = inspected(arm, replace(m, position=plus(m.position, [7, 43], [0.0, size, 0.0])), model, frame)
     (finding,) = found.findings
-    assert finding.startswith("2 measurements disagree with the nominal arm far more than the others do")
+    assert finding.startswith("measurements that disagree with the nominal arm far more than the others do: 2 (")
     rows = {one.row: one for one in found.disagreements.found}
     assert set(rows) == {7, 43}
     assert (rows[7].ends, rows[7].kind, rows[7].test, rows[43].test) == (("7",), "position", False, True)
@@ -175,7 +175,7 @@ def test_a_wrong_row_of_every_instrument_is_named(name):
     (one,) = found.disagreements.found
     assert one.row == (-1 if name == "pairs" else 5)
     assert len(found.findings) == 1
-    assert "one measurement disagrees with the nominal arm" in found.findings[0]
+    assert "that disagree with the nominal arm far more than the others do: 1 (" in found.findings[0]
     assert (one.of != "") == (name in ("targets", "anchors", "planes", "sockets", "stations", "board"))
 
 
@@ -183,7 +183,7 @@ def test_a_robust_loss_makes_wrong_rows_a_caution(arm):
     m = measured(arm)
     found = inspected(arm, replace(m, position=plus(m.position, [7], 0.1)), loss="gnc")
     assert found.ready
-    assert found.cautions[0].endswith("(7)")
+    assert found.cautions[0].endswith(": 1 (7)")
 
 
 def test_of_a_long_table_some_rows_are_looked_at_and_it_is_said(arm, monkeypatch):

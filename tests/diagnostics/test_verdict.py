@@ -194,7 +194,12 @@ def chi_square(reduced, p_value=0.5, dof=40):
         ),
         (chi_square(2.1), {"updated": True}, "error", "new rows contradict the earlier calibration"),
         (chi_square(2.1), {"evaluated": True}, "error", "the arm does not predict these test rows"),
-        (chi_square(2.1), {"gross": GrossErrors(1, ("7",), 1.1)}, "error", "outlier (7), 1.1 without it: look at it"),
+        (
+            chi_square(2.1),
+            {"gross": GrossErrors(1, ("7",), 1.1)},
+            "error",
+            "outliers: 1 (7), 1.1 without: look at them",
+        ),
     ],
 )
 def test_chi_square_is_judged_by_its_size_and_its_p_value(chi2, settings, severity, words):
