@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from simulated import measure, plus, small_arm, true_robot
 from touches import reach
 
-from fg_calib import Job, Measurements, Options, Robot, Table, inspect_job, simulate
+from fg_calib import Job, Measurements, Options, Robot, inspect_job, simulate
 from fg_calib.diagnostics import robust_screening as disagreement
 from fg_calib.io.job import read_job
 from fg_calib.robot.kinematics import pose
@@ -109,17 +109,6 @@ def test_a_mistake_in_the_set_up_is_a_finding(arm, mistake):
     assert found.disagreements.found == ()  # not looked for: all rows would
 
 
-@pytest.mark.slow
-def test_a_mistake_in_one_of_two_tables_is_said_of_that_table(arm):
-    good = Table(replace(measured(arm), source="monday.csv"), "position", frame="unknown")
-    spoilt = replace(measured(arm, 1), source="tuesday.csv")
-    spoilt = Table(replace(spoilt, position=spoilt.position * 1e3), "position", frame="unknown")
-    found = inspect_job(Job(None, arm, (good, spoilt), Options()))
-    (finding,) = found.findings
-    assert finding.startswith("tuesday.csv: position residuals fall from")
-    assert [bool(check.explanations) for check in found.setups] == [False, True]
-
-
 # --- single rows -----------------------------------------------------------------------------------------------------
 
 
@@ -211,18 +200,6 @@ def test_copies_of_rows_are_told_from_repeats(arm):
     repeated = inspected(arm, replace(again, position=plus(again.position, [50], 1e-5)))
     assert said(repeated) == ()
     assert (repeated.tables[0].n_copies, repeated.tables[0].n_repeats) == (0, 1)
-
-
-def test_copies_of_measured_pairs_are_told_of():
-    simulation = simulate(scenario(INSTRUMENTS["pairs"], n=40), seed=0)
-    (table,) = simulation.tables
-    m = table.measurements
-    again = m.pairs.select(np.array([*range(m.pairs.n_pairs), 3]))
-    again = replace(again, a=np.append(again.a[:-1], again.b[3]), b=np.append(again.b[:-1], again.a[3]))
-    twice = replace(table, measurements=replace(m, pairs=again))
-    (survey,) = inspect_job(Job(None, simulation.robot, (twice,), Options())).tables
-    assert (survey.n_copies, survey.n_repeats) == (1, 0)
-    assert survey.copy == f"{m.ids[m.pairs.a[3]]}-{m.ids[m.pairs.b[3]]}"
 
 
 def test_test_rows_at_train_configurations_are_told_of(arm):

@@ -61,26 +61,6 @@ def test_nonlinearity_agrees_with_second_differences(monkeypatch, sigma):
     assert check_linearity(solution, found.spread).directions == pytest.approx(expected, rel=0.3)
 
 
-@pytest.mark.slow
-@pytest.mark.long
-@pytest.mark.parametrize("sigma", [1e-5, 1e-4])
-def test_true_errors_exceed_their_covariance_by_the_nonlinearity(monkeypatch, sigma):
-    """150 arms: means agree within four of their standard errors, or a third."""
-    monkeypatch.setattr(linearity, "N_DRAWS", 50)
-    seen, expected = [], []
-    for seed in range(150):
-        solution, found, true = positions(3, sigma, 1000 + seed)
-        spread, scales = found.spread, found.spread.variables.prior_scales
-        inverse = np.linalg.pinv(spread.root[:, : spread.rank] / scales[:, None], rcond=1e-14)
-        off = (true.nominal - solution.parameters[solution.problem.variables.robot_span])[
-            [p.estimated for p in true.parameters]
-        ]
-        seen.append(np.mean((inverse @ (off / scales)) ** 2))
-        expected.append(1.0 + check_linearity(solution, spread).directions)
-    error = float(np.hypot(np.std(seen), np.std(expected)) / np.sqrt(len(seen)))
-    assert abs(np.mean(seen) - np.mean(expected)) < max(4.0 * error, np.mean(expected) / 3.0)
-
-
 def test_few_positions_of_a_wide_arm_are_warned_of_and_more_end_it():
     few, enough = (positions(n, 1e-5, 1)[1].verdict for n in (3, 12))
     assert any(NONLINEAR in text and "measure at more configurations" in text for text in few.warnings)
@@ -143,14 +123,14 @@ def test_one_statement_names_the_rows_and_the_remedy():
 # --- cells where covariances are not honest ------------------------------------------------------------------------
 
 
-def wrists(lengths, *, seed, n=60, k=6, tilt=0.0, nominal=0.0):
-    """Two parallel axes, and across them wrists of which few pairs turn one each: they see its length alone.
+def wrists(lengths, *, seed, n=60, k=6):
+    """Two parallel axes, and across them wrists of which few pairs rotate one each: they see its length alone.
 
-    Of `lengths` one each; the other pairs have the wrists upright, where their lengths act along the axes, unseen, but
-    for `tilt`.
+    Of `lengths` one each, 0 at nominal; the other pairs have the wrists upright, where their lengths act along the
+    axes, unseen.
     """
     rng = np.random.default_rng(seed)
-    rows = [[0.5, 0.0, 0.3, 0.0], [0.4, np.pi / 2, 0.0, 0.0], *([nominal, 0.0, 0.0, 0.0] for _ in lengths)]
+    rows = [[0.5, 0.0, 0.3, 0.0], [0.4, np.pi / 2, 0.0, 0.0], *([0.0, 0.0, 0.0, 0.0] for _ in lengths)]
     robot = Robot.from_dh(rows, convention="dh", tolerance={"a": 5e-3, "d": 1e-3, "alpha": 5e-4, "theta": 5e-4})
     values = true_robot(robot, rng).nominal
     for i, length in enumerate(lengths):
@@ -158,7 +138,7 @@ def wrists(lengths, *, seed, n=60, k=6, tilt=0.0, nominal=0.0):
     n_all = n + k * len(lengths)
     a, b = (np.zeros((n_all, robot.n_joints)) for _ in range(2))
     a[:, :2], b[:, :2] = rng.uniform(-2.5, 2.5, (2, n_all, 2))
-    a[:, 2], b[:, 2] = np.pi / 2 + tilt * rng.normal(size=(2, n_all))
+    a[:, 2] = b[:, 2] = np.pi / 2
     b[n:] = a[n:]
     for i in range(len(lengths)):
         b[n + k * i : n + k * (i + 1), 2 + i] += rng.uniform(1.0, 3.0, k)
@@ -176,37 +156,23 @@ def pairs_of(true, a, b, sigma, rng, *, angles=False):
     return Measurements.from_arrays(np.concatenate([a, b]), pairs=pairs)
 
 
-def short_and_wide(seed, n_wide, n_short=40):
-    """An arm of which 40 pairs turn the last joint alone, its radius 0.1 mm to one side by nominal; others are wide."""
-    rng = np.random.default_rng(seed)
-    rows = [[0.3, np.pi / 2, 0.3, 0.0], [0.4, 0.0, 0.0, 0.0], [1e-4, np.pi / 2, 0.0, 0.0]]
-    robot = Robot.from_dh(rows, tolerance={"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3})
-    a, b = rng.uniform(-2.5, 2.5, (2, n_wide + n_short, 3))
-    b[n_wide:, :2] = a[n_wide:, :2]
-    return robot, pairs_of(true_robot(robot, rng), a, b, SIGMA, rng)
-
-
-WRIST = [
-    *([0.0, np.pi / 2, 0.3, 0.0], [0.4, 0.0, 0.0, 0.0], [0.03, np.pi / 2, 0.0, 0.0]),
-    *([0.0, -np.pi / 2, 0.4, 0.0], [0.0, np.pi / 2, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]),
-]
 GANTRY = [
     *([0.0, -np.pi / 2, 0.1, -np.pi / 2], [0.0, -np.pi / 2, 0.1, -np.pi / 2], [0.0, 0.0, 0.1, 0.0]),
     *([0.0, np.pi / 2, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]),
 ]
 
 
-def one_joint_a_pair(rows, n_prismatic, *, seed, n, tolerance, angles):
-    """An arm of which each pair moves one joint: many a length that nominal has at 0 is the radius of a circle."""
-    rng, revolute = np.random.default_rng(seed), len(rows) - n_prismatic
-    types = ["prismatic"] * n_prismatic + ["revolute"] * revolute
+def gantry(seed, n=40, tolerance=1e-2):
+    """A gantry of which each pair moves one joint: many a length that nominal has at 0 is the radius of a circle."""
+    rng = np.random.default_rng(seed)
     sigmas = dict.fromkeys(("a", "d", "tool", "alpha", "theta"), tolerance)
-    robot = Robot.from_dh(rows, types=types, estimate=["tool.x", "tool.z"], tolerance=sigmas)
-    low, high = np.array([0.0] * n_prismatic + [-2.5] * revolute), np.array([0.4] * n_prismatic + [2.5] * revolute)
-    a, joint, each = rng.uniform(low, high, (n, len(rows))), rng.integers(0, len(rows), n), np.arange(n)
+    types = ["prismatic"] * 3 + ["revolute"] * 2
+    robot = Robot.from_dh(GANTRY, types=types, estimate=["tool.x", "tool.z"], tolerance=sigmas)
+    low, high = np.array([0.0] * 3 + [-2.5] * 2), np.array([0.4] * 3 + [2.5] * 2)
+    a, joint, each = rng.uniform(low, high, (n, 5)), rng.integers(0, 5, n), np.arange(n)
     b = a.copy()
-    b[each, joint] = rng.uniform(low, high, (n, len(rows)))[each, joint]
-    return robot, pairs_of(true_robot(robot, rng), a, b, SIGMA, rng, angles=angles)
+    b[each, joint] = rng.uniform(low, high, (n, 5))[each, joint]
+    return robot, pairs_of(true_robot(robot, rng), a, b, SIGMA, rng, angles=True)
 
 
 QUARTER = np.pi / 2
@@ -232,21 +198,12 @@ def star(name, wider, seed, model):
 
 CELLS = {
     "a length of unknown sign": lambda seed: (*wrists([2.7e-3], seed=seed), "distance"),
-    "a length of unknown sign, off on nominal": lambda seed: (*wrists([6e-3], seed=seed, nominal=5e-3), "distance"),
     "two lengths of unknown sign": lambda seed: (*wrists([3e-3, -4e-3], seed=seed), "distance"),
-    "short pairs beside wide ones": lambda seed: (*short_and_wide(seed, 20), "distance"),
-    "one joint a pair": lambda seed: (
-        *one_joint_a_pair(WRIST, 0, seed=7 + seed, n=20, tolerance=1e-3, angles=False),
-        "distance",
-    ),
-    "a gantry, one joint a pair": lambda seed: (
-        *one_joint_a_pair(GANTRY, 3, seed=100 + seed, n=40, tolerance=1e-2, angles=True),
-        "distance-rotation",
-    ),
+    "a gantry at wide priors": lambda seed: (*gantry(100 + seed), "distance-rotation"),
 }
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("seed", [1, 3])
 @pytest.mark.parametrize("cell", CELLS)
 def test_pairs_of_ambiguous_sign_that_a_result_rests_on_are_named(cell, seed):

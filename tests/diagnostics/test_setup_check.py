@@ -1,6 +1,5 @@
 """Tables spoilt by one usual mistake, or two, are named by it; healthy ones by none."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -12,14 +11,15 @@ from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, small_arm, true_robot
 from sparing import as_case, diagonal
 
+from fg_calib.assessment import assess, solve_job
 from fg_calib.diagnostics import setup_check as mistakes
 from fg_calib.diagnostics.setup_check import EXPLAINED, FAR, REDUCTION, check_setup
 from fg_calib.errors import SolverError
 from fg_calib.graph import solver
-from fg_calib.io.columns import write_csv
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.solver import solve
 from fg_calib.io.job import read_job
 from fg_calib.options import MODELS, PAIR_MODELS, POSE_MODELS
-from fg_calib.robot.inverse import solve_inverse
 
 PLACED = (Rotation.from_euler("xyz", [0.3, -0.7, 1.9]), np.array([1.0, -2.0, 0.5]))
 """World_T_base of a tracker beside the robot."""
@@ -211,18 +211,6 @@ def test_a_mistake_in_the_robot_is_named(tmp_path, model, mistake):
     assert mistake in named(check)
 
 
-@pytest.mark.slow
-def test_a_slide_that_goes_the_other_way_or_in_another_unit_is_named():
-    rng = np.random.default_rng(0)
-    arm = small_arm()
-    m = measure(true_robot(arm, rng), 50, rng)
-    for factor, mistake in (
-        ([1, 1, -1, 1], "joint 3 moves the other way"),
-        ([1, 1, 1e3, 1], "readings of prismatic joints are in mm"),
-    ):
-        assert mistake in named(check_setup(arm, replace(m, readings=m.readings * factor), "pose"))
-
-
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize(("mistake", "frame"), diagonal(ONE, ["known", "unknown"]))
 def test_a_unit_of_one_quantity_or_one_joint_is_named(tmp_path, mistake, frame):
@@ -231,75 +219,24 @@ def test_a_unit_of_one_quantity_or_one_joint_is_named(tmp_path, mistake, frame):
     assert named(check_setup(robot, ONE[mistake](m), "pose", frame)) == mistake
 
 
-def touches(folder, seed=0, distance=0.05):
-    """A job of a ball put into two sockets: readings that bring the true tool point to each in many ways."""
-    robot = ur5e(folder, estimate=["tool.x", "tool.y", "tool.z"])
-    rng = np.random.default_rng(seed)
-    true = true_robot(robot, rng)
-    points = np.repeat([[0.4, 0.2, 0.3], [0.45, 0.2, 0.3]], 25, axis=0)
-    down = Rotation.from_euler("x", np.pi)
-    turned = (Rotation.from_rotvec(rng.normal(scale=0.6, size=(50, 3))) * down).as_matrix()
-    found = solve_inverse(true, points, turned, generator=rng)
-    q = found.readings[found.reached]
-    columns = {f"q{i + 1}": v for i, v in enumerate(q.T)}
-    write_csv(folder / "touches.csv", columns | {"group": np.repeat(["one", "two"], 25)[found.reached]})
-    write_csv(folder / "sockets.csv", {"a": ["one"], "b": ["two"], "distance": [distance]})
-    job = {"robot": "robot.yaml", "measurements": "touches.csv", "pairs": "sockets.csv", "model": "distance"}
-    path = folder / "job.yaml"
-    path.write_text(yaml.safe_dump(job | {"noise": {"point": 1e-4, "distance": 5e-5}}))
-    return read_job(path)
+def test_the_mistake_stands_first_in_the_verdict(tmp_path):
+    m, robot = measured(ur5e(tmp_path), placed=PLACED), ur5e(tmp_path)
+    wrong = replace(m, position=m.position * 1e3)
+    verdict = assess(solve(build_problem(robot, wrong, model="pose", frame="unknown"))).verdict
+    assert verdict.errors[0].startswith("position residuals fall from")
+    assert verdict.errors[0].endswith("mm in the median if x, y, z are in mm, not m")
+    assert not any("systematic" in text for text in (*verdict.errors, *verdict.warnings))
 
 
-@pytest.mark.slow
-def test_touched_points_name_a_joint_that_turns_the_other_way(tmp_path):
-    job = touches(tmp_path)
-    assert not check_setup(job.robot, job.measurements, "distance").far
-    spoilt = replace(job.measurements, readings=job.measurements.readings * only(2, -1, 1))
-    assert "joint 2 moves the other way" in named(check_setup(job.robot, spoilt, "distance"))
-
-
-@pytest.mark.slow
-def test_sockets_whose_distance_is_in_another_unit_are_named(tmp_path):
-    job = touches(tmp_path, distance=50.0)
-    assert named(check_setup(job.robot, job.measurements, "distance")) == "distances are in mm, not m"
-
-
-@pytest.mark.slow
-def test_the_mistake_stands_first_in_report_and_result(tmp_path, fg_calib):
-    m = measured(ur5e(tmp_path), placed=PLACED)
-    job = write_job(tmp_path, replace(m, position=m.position * 1e3), model="pose", frame="unknown")
-    ended = fg_calib("calibrate", job, "--out", tmp_path / "result")
-    assert ended.code == 3
-    said = " ".join(ended.out.split("\n\n")[0].split())
-    assert said.startswith("ur5e: pose, measurement frame unknown DOUBTFUL: position residuals fall from")
-    assert (
-        said.partition(" DOUBTFUL: ")[2]
-        .partition(" DOUBTFUL: ")[0]
-        .endswith("mm in the median if x, y, z are in mm, not m")
-    )
-    assert "the noise there is" not in " ".join(ended.out.split())
-    result = json.loads((tmp_path / "result" / "result.json").read_text())
-    assert result["findings"][0].endswith("if x, y, z are in mm, not m")
-    (explanation,) = result["setup"]["explanations"]
-    assert explanation["mistakes"] == ["x, y, z are in mm, not m"]
-    kinds = [{r["kind"]: r["size"] for r in one["residuals"]} for one in (result["setup"], explanation)]
-    before, after = (sizes["position"] for sizes in kinds)
-    assert before > 100.0
-    assert after < 0.01
-
-
-@pytest.mark.slow
-def test_a_solver_that_gives_up_names_the_mistake_too(tmp_path, fg_calib, monkeypatch):
+def test_a_solver_that_gives_up_names_the_mistake_too(tmp_path, monkeypatch):
     def gives_up(*_, **__):
         raise SolverError("no step can be solved")
 
     m = measured(ur5e(tmp_path))
     job = write_job(tmp_path, replace(m, position=m.position * 1e3), model="pose")
     monkeypatch.setattr(solver, "_fit", gives_up)
-    ended = fg_calib("calibrate", job)
-    assert ended.code == 1
-    assert "no step can be solved" in ended.err
-    assert "if x, y, z are in mm, not m" in ended.err
+    with pytest.raises(SolverError, match=r"^no step can be solved; position .* if x, y, z are in mm, not m"):
+        solve_job(read_job(job))
 
 
 @pytest.mark.sampled(1)

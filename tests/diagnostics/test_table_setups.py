@@ -40,20 +40,6 @@ def said(robot, tables, order):
     return [str(check) for check in (found, *found.others)]
 
 
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_a_forgotten_unknown_frame_of_one_of_two_tables_is_said_of_that_table(tmp_path, order):
-    rng = np.random.default_rng(3)
-    robot = ur5e(tmp_path, estimate=["tool.x", "tool.y", "tool.z"], tolerance=TOLERANCE)
-    true = true_robot(robot, rng)
-    turned = (Rotation.from_rotvec([0.0, 0.0, 1.0]), np.array([2.0, 1.0, 0.0]))
-    wrong = replace(tracker(true, rng, frame=turned), source="other.csv")
-    found = said(robot, [Table(tracker(true, rng), "position"), Table(wrong, "position")], order)
-    assert len(found) == 1
-    assert found[0].startswith("other.csv: position residuals fall from ")
-    assert found[0].endswith(" if the measurement frame is not the base (frame: unknown)")
-
-
 MISTAKES = {
     "bar.csv: distance residuals fall from": "if distances are in m, not mm",
     "bar.csv: distance residuals before calibration are": "no common mistake in a set-up explains it",

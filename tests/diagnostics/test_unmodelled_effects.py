@@ -9,7 +9,7 @@ from instruments import measured_by
 from reported import format_report
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, kstest
-from simulated import measure, plus, true_robot, write_job
+from simulated import measure, plus, true_robot
 from sparing import diagonal
 from systematic import ARMS, PLACED, SIGMA, SIGMA_JOINT, arm, measured, of_joint, problem_of
 
@@ -79,46 +79,6 @@ def test_p_values_of_noise_are_uniform(name, model):
     p = [probability_of_noise(solver(problem_of(*measured(name, rng, unit=unit), model))) for _ in range(100)]
     assert kstest(p, "uniform").pvalue > 1e-3
     assert np.sum(np.array(p) < 0.01) <= binom.ppf(0.999, 100, 0.01)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("effect", EFFECTS)
-def test_true_errors_are_twice_those_claimed_or_more_where_residuals_are_systematic(effect):
-    """With the noise estimated chi-square is 1, and the tool is off by twice what is claimed or more."""
-    ratios = []
-    for seed in range(8):
-        rng = np.random.default_rng(seed)
-        robot, m = measured("6R", rng, effect=EFFECTS[effect])
-        found = assess(estimate_noise(problem_of(robot, m, "position")))
-        assert found.verdict.warnings
-        q = rng.uniform(-2.0, 2.0, (60, 6))
-        true = true_robot(robot, np.random.default_rng(seed))
-        points = pose(true, q + EFFECTS[effect](true, q)).position
-        at = pose(found.robot, q).position
-        rotation, _ = Rotation.align_vectors(points - points.mean(axis=0), at - at.mean(axis=0))
-        off = rotation.apply(at - at.mean(axis=0)) - points + points.mean(axis=0)
-        sigma = found.predict(lambda robot, q=q: pose(robot, q).position, fitted=True).sigma
-        ratios.append(np.sqrt(np.sum(off**2) / np.sum(sigma**2)))
-    assert 1.8 < np.median(ratios) < 4.0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("effect", "verdict"), [("backlash", "GOOD, with warnings: "), (None, "GOOD: ")])
-def test_estimated_noise_does_not_hide_unmodelled_effects(fg_calib, tmp_path, effect, verdict):
-    robot, m = measured("6R", np.random.default_rng(1), effect=EFFECTS.get(effect))
-    ended = fg_calib("calibrate", write_job(tmp_path, robot, m, model="position", frame="unknown", noise="estimate"))
-    assert ended.code == 0
-    assert re.search(f"^{verdict}converged", ended.out, flags=re.M)
-    said = f"{SYSTEMATIC} several times those claimed: rely on the test rows"
-    assert (re.search(said, " ".join(ended.out.split())) is not None) == (effect is not None)
-
-
-@pytest.mark.slow
-def test_noise_is_not_offered_to_be_estimated_where_residuals_are_systematic():
-    robot, m = measured("6R", np.random.default_rng(1), effect=EFFECTS["gravity"], n_test=15)
-    found = assess(solve(problem_of(robot, m, "position")))
-    assert found.verdict.noise_like < NOT_NOISE
-    assert not found.noise_may_be_estimated
 
 
 def test_a_warning_of_systematic_residuals_goes_by_the_p_value():

@@ -1,18 +1,14 @@
 """Structural and practical identifiability of arms whose answer is known, with the reason for every lost direction."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from simulated import measure, paper_robot, small_arm
-from sparing import diagonal
 
 from fg_calib.assessment import assess
-from fg_calib.graph.build import STRUCTURAL_FLOOR, build_problem, random_problem
+from fg_calib.graph.build import build_problem
 from fg_calib.graph.problem import named_triangle
 from fg_calib.graph.solver import solve
-from fg_calib.measurements.kinds.pair import SamePoint
-from fg_calib.observability.identifiability import observability_of, observe_configurations, observe_structure
+from fg_calib.observability.identifiability import observe_configurations, observe_structure
 from fg_calib.observability.reasons import NO_CAUSE, NOT_EXCITED
 from fg_calib.options import Pairing
 from fg_calib.robot.model import Joint, RobotBuilder
@@ -78,33 +74,6 @@ def test_ranks_of_known_arms(robot, ranks, n):
         assert (found.observability.rank, len(found.observability.names)) == (rank, n), model
         assert len(found.lost) == n - rank
         assert found.observability.gap > 1e6
-
-
-RANDOM_11 = RobotBuilder("random-11", "dh-hayati")
-"""An arm whose random configurations often bring the tool near where it was."""
-for _i, (_d, _alpha) in enumerate(((0.0, 90.0), (0.3, 0.0), (0.0, 0.0))):
-    RANDOM_11.add_convention_joint(
-        Joint(f"q{_i + 1}", prismatic=_i == 0),
-        {"a": 0.1, "alpha": np.deg2rad(_alpha), "d": _d, "theta": 0.0, "beta": 0.0},
-    )
-
-DRAWN = [(robot, ranks) for robot, ranks, _ in RANKS] + [
-    (RANDOM_11.build(), (4, 0, 4, 11, 13)),
-    (paper_robot(), (21, 11, 23, 25, 29)),
-]
-
-
-def rank_at(robot, model, seed):
-    problem = random_problem(robot, model, seed=seed)
-    assert not problem.data.n_train(lambda kind: isinstance(kind, SamePoint))
-    return observability_of(problem, problem.start, (), STRUCTURAL_FLOOR).rank
-
-
-@pytest.mark.sampled(9)
-@pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize(("robot", "ranks"), DRAWN, ids=[f"{r.name}-{i}" for i, (r, _) in enumerate(DRAWN)])
-def test_structural_rank_does_not_depend_on_the_draw(robot, ranks, model):
-    assert {rank_at(robot, model, seed) for seed in range(2)} == {ranks[MODELS.index(model)]}
 
 
 def reasons(robot, model, **options):
@@ -199,52 +168,6 @@ def test_weak_directions_and_correlations_are_named():
     assert found.weak[0].signal_to_noise < 10
     assert all(abs(rho) > 0.9 for _, _, rho in found.correlations)
     assert found.weak[0].members
-
-
-def in_other_units(robot, k):
-    """The same robot with lengths times k, those of its tolerances and of its sliding joints' limits among them."""
-
-    def scaled(p):
-        length = k if p.unit == "m" else 1.0
-        return replace(p, nominal=p.nominal * length, tolerance=None if p.tolerance is None else p.tolerance * length)
-
-    joints = tuple(replace(j, lower=j.lower * k, upper=j.upper * k) if j.prismatic else j for j in robot.joints)
-    elements = tuple(replace(e, constant=e.constant * (k if e.axis < 3 else 1.0)) for e in robot.elements)
-    return replace(robot, parameters=tuple(map(scaled, robot.parameters)), joints=joints, elements=elements)
-
-
-TOLERANCES = [None, {"a": 1e-3, "d": 1e-4, "theta": 2e-3}]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("arm", "model", "tolerance"), diagonal(["paper", "small", "scara"], ["pose", "distance-rotation"], TOLERANCES)
-)
-def test_the_answer_does_not_depend_on_the_unit_of_length(arm, model, tolerance):
-    """At the user's configurations and at random ones; the small arm and the scara have sliding joints."""
-    robot = {"paper": paper_robot(tolerance), "small": small_arm(tolerance), "scara": scara(OFF_AXIS)}[arm]
-    robot = replace(robot, joints=tuple(replace(j, lower=-0.5, upper=1.0) for j in robot.joints))
-    rng = np.random.default_rng(5)
-    q = rng.uniform(-0.5, 1.0, (80, robot.n_joints))
-    found = {}
-    for k in (1.0, 1e-3, 1e3):
-        one = in_other_units(robot, k)
-        readings = q * [k if j.prismatic else 1.0 for j in robot.joints]
-        measurements = measure(one, 80, np.random.default_rng(6), readings=readings, sigma=(1e-3 * k, 1e-3))
-        found[k] = [
-            observe_configurations(one, measurements, model).observability,
-            observe_structure(one, model).observability,
-        ]
-    for k in (1e-3, 1e3):
-        for here, metres in zip(found[k], found[1.0], strict=True):
-            assert (here.rank, here.classes) == (metres.rank, metres.classes)
-            assert here.singular_values[: here.rank] == pytest.approx(metres.singular_values[: here.rank], rel=1e-6)
-            both = here.null_space @ metres.null_space.T  # the same space: unit-free directions
-            assert both @ both.T == pytest.approx(np.eye(len(both)), abs=1e-6)
-            assert [g.keep for g in here.relative] == [g.keep for g in metres.relative]
-            assert [w.signal_to_noise for w in here.weak] == pytest.approx(
-                [w.signal_to_noise for w in metres.weak], rel=1e-6
-            )
 
 
 @pytest.mark.sampled(1)
