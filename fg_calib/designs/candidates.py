@@ -24,11 +24,10 @@ from fg_calib.graph.build import places_of, true_problem
 from fg_calib.graph.knowledge import coordinates_of
 from fg_calib.graph.problem import Problem, whitened_jacobian
 from fg_calib.graph.variables import Variables, unknown_prior_rows
-from fg_calib.measurements.dataset import Noise, form_pairs
+from fg_calib.measurements.dataset import Noise
 from fg_calib.measurements.landmarks import Landmarks
 from fg_calib.measurements.table import KnownPoint, Table
 from fg_calib.options import PAIR_MODELS, Gauge, Model, Options, Pairing
-from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
 from fg_calib.simulation.obstacles import blocked_foot
 from fg_calib.simulation.scenario import (
@@ -124,7 +123,7 @@ class Pool(Brief):
 
         Args:
             poses: The poses.
-            pairing: How pairs are formed, or measured, instead.
+            pairing: How pairs are formed instead.
         """
         names = self.problem.data.names[: self.problem.data.n_configurations]
         of_pose: dict[int, list[int]] = {}
@@ -137,8 +136,6 @@ class Pool(Brief):
             if number in self.formed:
                 model, own = self.formed[number]
                 found[number] = replace(table, model=model, frame="known", pairing=pairing or own)
-            elif pairing is not None and table.measurements.pairs is not None:
-                found[number] = _with_pairs(self.robot, table, pairing)
         return [table if _has_rows(table) else select_rows(table, {}) for table in found]
 
     def posterior(self, poses: Integers, pairing: Pairing | None = None) -> Posterior:
@@ -146,7 +143,7 @@ class Pool(Brief):
 
         Args:
             poses: The poses, given ones included.
-            pairing: How pairs are formed, or measured, instead.
+            pairing: How pairs are formed instead.
         """
         before = self.before
         problem = None
@@ -172,28 +169,7 @@ def select_rows(table: Table, order: Mapping[str, int]) -> Table:
     part = m.select(rows)
     if m.groups is not None:
         part = replace(part, groups=replace(m.groups, index=m.groups.index[rows]))
-    if m.pairs is not None:
-        place = np.full(len(ids), -1)
-        place[rows] = np.arange(len(rows))
-        a, b = place[m.pairs.a], place[m.pairs.b]
-        kept = np.flatnonzero((a >= 0) & (b >= 0))
-        part = replace(part, pairs=replace(m.pairs.select(kept), a=a[kept], b=b[kept]))
     return replace(table, measurements=part)
-
-
-def _with_pairs(robot: Robot, table: Table, pairing: Pairing) -> Table:
-    """A table of measured pairs with other pairs of its configurations, as precise as its own."""
-    m = table.measurements
-    assert m.pairs is not None
-    at = pose(robot, m.readings)
-    found = form_pairs(replace(m, pairs=None, position=at.position, rotation=at.rotation), pairing)
-    measured = dict[str, Any]()
-    for kind in ("distance", "angle"):
-        sigma = getattr(m.pairs, f"sigma_{kind}")[:1]
-        unmeasured = not np.isfinite(sigma).all() or not len(sigma)
-        measured[kind] = np.full(found.n_pairs, np.nan) if unmeasured else getattr(found, kind)
-        measured[f"sigma_{kind}"] = np.full(found.n_pairs, np.nan if unmeasured else sigma[0])
-    return replace(table, measurements=replace(m, pairs=replace(found, source=m.pairs.source, **measured)))
 
 
 def _between_used(table: Table, *, known: bool) -> Table:
@@ -209,8 +185,6 @@ def _between_used(table: Table, *, known: bool) -> Table:
 def _has_rows(table: Table) -> bool:
     """Whether a table holds more than the reference of a star."""
     m = table.measurements
-    if m.pairs is not None:
-        return bool(m.pairs.n_pairs)
     return table.model not in PAIR_MODELS or m.groups is not None or m.n_configurations > 1
 
 
@@ -297,8 +271,6 @@ def build_pool(
     """
     scenario = _with_instruments(scenario)
     tables = _measure_all(scenario, found, given)
-    if before is not None:
-        tables = tuple(map(_scale_axes, tables, before.data.tables))
     gauge: Gauge = "none" if scenario.job.get("gauge") == "none" or scenario.job.get("prior") is False else "prior"
     options = Options(tables[0].model or "pose", gauge=gauge) if before is None else before.options
     places = None if before is None else places_of(before, before.start)
@@ -361,7 +333,15 @@ def _find_references(problem: Problem) -> Integers:
 
 
 def _with_instruments(scenario: Scenario) -> Scenario:
-    """The scenario with what measures poses, where it names no instrument, as one."""
+    """The scenario with what measures poses, where it names no instrument, as one.
+
+    Raises:
+        InputError: An instrument measures pairs directly.
+    """
+    for instrument in scenario.instruments:
+        if isinstance(instrument, PairGauge):
+            expected = "model: pose with frame: unknown to choose the configurations of pairs"
+            raise InputError(f"instruments: {instrument.name}", "pairs that are measured directly", expected)
     if scenario.instruments:
         return scenario
     model = scenario.job.get("model", "distance-rotation")
@@ -387,8 +367,6 @@ def _without_noise(scenario: Scenario, readings: Mapping[str, Floats]) -> Scenar
             changes["configurations"] = GivenReadings(readings[i.name])
         if isinstance(i, Tracker) and i.model in PAIR_MODELS and i.pairing.strategy != "star":
             changes |= {"model": MEASURED[i.model], "frame": Placement(np.eye(3), np.zeros(3))}
-        elif isinstance(i, PairGauge):
-            changes["pairs"] = Pairing("star")
         elif isinstance(i, BoardCamera) and not (i.boards or i.fixed) and isinstance(views, BoardViews):
             changes["boards"] = {"board": views.board}
         instruments.append(replace(i, **changes))
@@ -416,19 +394,6 @@ def _with_true_points(simulation: Simulation) -> tuple[Table, ...]:
         replace(t, known={name: KnownPoint(places[name].xyz, known.tolerance) for name, known in t.known.items()})
         for t in simulation.tables
     )
-
-
-def _scale_axes(table: Table, like: Table) -> Table:
-    """A table whose sigmas differ from axis to axis as those of the train rows of another table."""
-    m, of = table.measurements, like.measurements
-    changes = {}
-    for name in ("sigma_position", "sigma_orientation"):
-        sigma, specified = getattr(m, name), getattr(of, name)
-        if sigma is None or specified is None or not np.isfinite(specified[~of.test]).any(axis=0).all():
-            continue
-        axes = np.array([rms_sigma(column, ~of.test) for column in specified.T], dtype=np.float64)
-        changes[name] = sigma * axes / (rms_sigma(specified, ~of.test) or 1.0)
-    return replace(table, measurements=replace(m, **changes))
 
 
 def rms_sigma(sigma: Floats | None, chosen: NDArray[np.bool_]) -> float | None:

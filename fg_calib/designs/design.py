@@ -69,8 +69,7 @@ class Design(FrozenArrays):
         expected: Expected errors of the tool over the task, with these and what was given.
         after_fit: Expected errors after the best rigid fit, where `expected` is in the base frame; else None.
         before: Expected errors with what was given alone; None without it.
-        pairs: Pairs to be measured directly, of configurations in their order, shape (n_pairs, 2); else None.
-        pairings: Expected position errors by how pairs are measured, or formed, [m].
+        pairings: Expected position errors by how pairs are formed, [m].
         random: Median of the expected position errors of as many random poses, [m].
         curve: Expected errors by the number of poses.
         asked: Number of poses that was asked for; None with a target.
@@ -92,7 +91,6 @@ class Design(FrozenArrays):
     expected: PoseRms
     after_fit: PoseRms | None
     before: PoseRms | None
-    pairs: Integers | None
     pairings: Mapping[str, float]
     random: float
     curve: tuple[CurvePoint, ...]
@@ -108,11 +106,6 @@ class Design(FrozenArrays):
     def n(self) -> int:
         """Number of poses."""
         return len(self.readings)
-
-    @property
-    def structure(self) -> str:
-        """Which pairs are measured directly: star or chain; empty where none are."""
-        return "" if self.pairs is None else min(self.pairings, key=lambda name: self.pairings[name])
 
     @property
     def n_candidates(self) -> int:
@@ -257,8 +250,7 @@ def design_from_pool(
     chosen = measurable[found.candidates]
     ordered = chosen[order_by_nearest(pool.robot, pool.readings[chosen])]
     poses = np.concatenate([pool.given, ordered])
-    pairings, pairing = _compare_pairings(pool, poses, task)
-    posterior, tables = pool.posterior(poses, pairing), pool.select_tables(ordered, pairing)
+    posterior, tables = pool.posterior(poses), pool.select_tables(ordered)
     configurations = _configurations_of(pool, ordered, tables)
     data = pool.problem.data
     names, readings = [data.names[k] for k in configurations], data.readings[configurations]
@@ -278,8 +270,7 @@ def design_from_pool(
         expected=expected,
         after_fit=None if task.fitted else posterior.error(replace(task, fitted=True)),
         before=before,
-        pairs=_measured_pairs(names, tables),
-        pairings=pairings,
+        pairings=_compare_pairings(pool, poses, task),
         random=curve[-1].random[1],
         curve=(*curve[:-1], replace(curve[-1], designed=error)),
         asked=n if target is None else None,
@@ -315,18 +306,10 @@ def _error_of_formed_pairs(pool: Pool, task: Task, measurable: Integers) -> Call
     return error
 
 
-def _compare_pairings(pool: Pool, poses: Integers, task: Task) -> tuple[dict[str, float], Pairing | None]:
-    """Expected errors by how pairs are formed or measured, and the pairing to measure; None leaves it as it is."""
-    if pool.formed:
-        strategies: tuple[Literal["star", "chain", "all"], ...] = ("star", "chain", "all")
-        return {one: _position_error(pool.posterior(poses, Pairing(one)), task) for one in strategies}, None
-    if not any(t.measurements.pairs is not None for t in pool.tables):
-        return {}, None
-    errors = {"star": _position_error(pool.posterior(poses), task)}
-    if pool.scenario is None or pool.before is not None or len(pool.given) or len(pool.tables) > 1:
-        return errors, None
-    errors["chain"] = _position_error(pool.posterior(poses, Pairing("chain")), task)
-    return errors, Pairing("chain") if errors["chain"] < errors["star"] else None
+def _compare_pairings(pool: Pool, poses: Integers, task: Task) -> dict[str, float]:
+    """Expected errors by how pairs are formed; none where no pairs are."""
+    strategies: tuple[Literal["star", "chain", "all"], ...] = ("star", "chain", "all")
+    return {one: _position_error(pool.posterior(poses, Pairing(one)), task) for one in strategies if pool.formed}
 
 
 def _configurations_of(pool: Pool, ordered: Integers, tables: list[Table]) -> Integers:
@@ -335,17 +318,6 @@ def _configurations_of(pool: Pool, ordered: Integers, tables: list[Table]) -> In
     used = {name for table in tables for name in table.measurements.ids.tolist()}
     references = [k for k in pool.references.tolist() if pool.problem.data.names[k] in used]
     return np.array([*references, *(last[number] for number in ordered.tolist())], dtype=np.int64)
-
-
-def _measured_pairs(names: list[str], tables: list[Table]) -> Integers | None:
-    """Ends of all pairs that tables measure directly, as places among names, shape (n, 2); None without any."""
-    place, found = {name: k for k, name in enumerate(names)}, []
-    for table in tables:
-        m = table.measurements
-        if m.pairs is not None:
-            where = np.array([place[name] for name in m.ids.tolist()], dtype=np.int64)
-            found.append(where[np.stack([m.pairs.a, m.pairs.b], axis=1)])
-    return np.concatenate(found) if found else None
 
 
 def rename_configurations(table: Table, names: Mapping[str, str]) -> Table:

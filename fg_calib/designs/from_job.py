@@ -36,7 +36,6 @@ from fg_calib.simulation.scenario import (
     Indicator,
     Instrument,
     LengthGauge,
-    PairGauge,
     Placement,
     Plane,
     RandomReadings,
@@ -60,6 +59,10 @@ def solve_for_design(job: Job) -> Problem:
         ProblemError: The measurements lack what the model needs, or do not suffice.
         SolverError: GTSAM could not solve a step at all.
     """
+    for table in job.tables:
+        if table.measurements.pairs is not None:
+            expected = "tables of poses, which pairs may be formed from"
+            raise InputError(table.measurements.source, "pairs that are measured directly", expected)
     gauge = "prior" if job.options.gauge == "keep" else job.options.gauge
     options = replace(job.options, gauge=gauge, folds=None, encoder="propagated")
     solution = solve_job(replace(job, options=options))
@@ -184,7 +187,7 @@ class _Reader:
             if m.groups is not None:
                 sockets = {name: Spot(self.place("L", name)) for name in m.groups.names}
                 return Sockets(**given | {"model": "distance"}, sockets=sockets)
-            return PairGauge(**given) if m.pairs is not None else Tracker(**given, pairing=table.pairing)
+            return Tracker(**given, pairing=table.pairing)
         if model == "anchor":
             offset = float(self.place("O", f"offset of {m.source}")[0]) if table.offset else None
             return LengthGauge(**given, anchors=self.points("A", "anchor"), offset=offset, contact=contact)

@@ -62,7 +62,6 @@ def design_document(design: Design) -> dict[str, Any]:
                 {"id": name, "table": table or None, "readings": q}
                 for name, table, q in zip(design.ids.tolist(), design.group.tolist(), design.readings, strict=True)
             ],
-            "pairs": None if design.pairs is None else design.ids[design.pairs].tolist(),
             "undetermined": [{"relation": relation} for relation in design.observability.lost],
         }
     )
@@ -72,10 +71,7 @@ def design_document(design: Design) -> dict[str, Any]:
 def build_design_report(design: Design) -> RenderableType:
     """A design for the terminal."""
     words = {"star": "each with the first", "chain": "each with the one before", "all": "all that can be formed"}
-    pairs = [
-        (name, _figure(error), words[name] + ", chosen" * (name == design.structure))
-        for name, error in design.pairings.items()
-    ]
+    pairs = [(name, _figure(error), words[name]) for name, error in design.pairings.items()]
     curve = [
         (f"{p.n}", _figure(p.designed), _figure(p.random[1]), f"{_figure(p.random[0])} to {_figure(p.random[2])}")
         for p in design.curve
@@ -93,8 +89,6 @@ def build_design_report(design: Design) -> RenderableType:
 
 def _headline(design: Design) -> str:
     poses = f"{design.n} pose{'s' * (design.n > 1)}"
-    if design.pairs is not None:
-        poses += f" in {len(design.pairs)} pair{'s' * (len(design.pairs) > 1)}"
     if design.target is None:
         return f"{design.pool.robot.name}: where to measure at {poses}"
     reached = "for" if design.reached else "do not reach"
@@ -107,9 +101,8 @@ def _expected(design: Design) -> Iterator[str]:
     if design.before is not None:
         yield f"with the present measurements: {_pose(design.before)}"
     last = design.curve[-1].n
-    random = "random poses, as many" if design.structure in ("", "star") else f"stars of {last} random poses"
     ratio = f" ({design.random / design.expected.position:.2f} times that)" if design.expected.position else ""
-    yield f"{random}: {_mm(design.random)}{ratio}"
+    yield f"random poses, as many: {_mm(design.random)}{ratio}"
     equal = next((p.n for p in design.curve if p.designed <= design.random), None)
     if equal is not None and equal < last:
         yield f"{equal} designed poses are as good as {last} random ones"
@@ -147,7 +140,7 @@ def _notes(design: Design) -> Iterator[str]:
     if design.n > MAX_POSES_LISTED:
         yield f"{design.n - MAX_POSES_LISTED} more poses: --out writes them all"
     best = min(design.pairings, key=lambda name: design.pairings[name], default="")
-    if design.pairs is None and best and design.pairings[best] < 0.95 * (design.expected.position or math.inf):
+    if best and design.pairings[best] < 0.95 * (design.expected.position or math.inf):
         yield f"pairing: {best} in the job is more accurate with the same measurements"
     if lost := len(design.observability.lost):
         yield f"{lost} direction{'s are' if lost > 1 else ' is'} not identifiable: fg-calib observe says which and why"
@@ -155,7 +148,7 @@ def _notes(design: Design) -> Iterator[str]:
         yield "the error over the task depends on what the measurements do not determine"
     if design.target is not None and not design.reached:
         yield _why_missed(design)
-    if design.asked is not None and design.n < design.asked and design.pairs is None:
+    if design.asked is not None and design.n < design.asked:
         yield f"no more than {design.n} poses were found of {design.asked}: --candidates draws more"
     after = math.inf if design.after_fit is None else design.after_fit.position or math.inf
     if design.after_fit is not None and after < 0.5 * (design.expected.position or 0.0):

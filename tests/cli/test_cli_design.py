@@ -35,7 +35,7 @@ TABLE = {"normal": [0.0, 0.0, 1.0], "distance": -100.0}
 
 DOCUMENT = {
     "schema", "robot", "criterion", "n", "n_given", "target", "reached", "fitted", "expected", "before", "random",
-    "undetermined_share", "curve", "pairings", "candidates", "stops", "pairs", "undetermined", "travel",
+    "undetermined_share", "curve", "pairings", "candidates", "stops", "undetermined", "travel",
     "travel_unordered",
 }  # fmt: skip
 FEW = ("--candidates", 25)
@@ -74,7 +74,7 @@ def test_the_document_has_its_keys_in_si(plan, fg_calib):
     assert found.keys() == DOCUMENT
     assert (found["schema"], found["robot"], found["criterion"]) == ("fg-calib/design/1", "small-arm", "I")
     assert (found["n"], found["n_given"], found["target"], found["reached"]) == (4, 0, None, True)
-    assert (found["before"], found["pairs"], found["pairings"]) == (None, None, {})
+    assert (found["before"], found["pairings"]) == (None, {})
     assert found["expected"].keys() == {"position", "orientation"}
     assert 1e-5 < found["expected"]["position"] < found["random"] < 1e-2
     assert found["candidates"] == {"all": {"asked": 25, "taken": 25, "rejected": {}}}
@@ -182,7 +182,6 @@ INSTRUMENTS = {
     "wire": {"instruments": [WIRE]},
     "plane and poses": {"instruments": [{"model": "plane", "name": "table", "planes": {"floor": TABLE}},
                                         {"model": "pose", "name": "tracker"}]},
-    "lengths of pairs": {"instruments": [{"model": "distance", "name": "bar", "pairs": "star"}]},
     "sockets": {"instruments": [{"model": "distance", "name": "sockets", "sockets": 2}],},
     "formed pairs": {"job": {"model": "distance-rotation"}},
 }  # fmt: skip

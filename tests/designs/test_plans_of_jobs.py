@@ -20,9 +20,10 @@ from fg_calib.simulation.scenario import (
     Errors,
     Indicator,
     LengthGauge,
-    PairGauge,
+    Plane,
     RandomReadings,
     Sockets,
+    Spot,
     Tracker,
 )
 from fg_calib.simulation.simulator import simulate
@@ -32,37 +33,23 @@ SILENT = Noise(0.0, 0.0, 0.0, distance=0.0, angle=0.0, point=0.0, pixel=0.0)
 GIVEN = np.random.default_rng(8).uniform(-1.0, 1.0, (5, 4))
 
 
-@pytest.mark.parametrize(
-    "instrument",
-    [PairGauge(model="distance", name="it"), Tracker(model="distance-rotation", name="it", pairing=Pairing("star"))],
-    ids=["measured", "formed"],
-)
-def test_given_configurations_of_a_star_count(instrument):
-    """The first of them is the hub."""
-    plan = design(scenario(instrument, n=20, noise=NOISE), n=6, given=GIVEN, n_candidates=40)
-    assert plan.before is not None
+def test_given_configurations_of_a_star_count():
+    """The first of them is the reference pose."""
+    star = Tracker(model="distance-rotation", name="it", pairing=Pairing("star"))
+    plan = design(scenario(star, n=20, noise=NOISE), n=6, given=GIVEN, n_candidates=40)
     assert plan.expected.position < plan.before.position
-    assert (plan.readings[0] == GIVEN[0]).all()  # pairs with it are measured from there
+    assert (plan.readings[0] == GIVEN[0]).all()
     assert not (plan.readings[1:, None] == GIVEN).all(axis=2).any()
 
 
-@pytest.mark.parametrize(
-    "instrument",
-    [
-        Sockets(name="it", sockets=3),
-        LengthGauge(name="it", anchors=3, contact=True),
-        Indicator(name="it", contact=True),
-    ],
-    ids=["sockets", "anchors", "faces"],
-)
-def test_given_configurations_that_are_not_used_are_refused(instrument):
+def test_given_configurations_that_are_not_used_are_refused():
     """What touches has configurations of its own: with those of others nothing is measured."""
     with pytest.raises(InputError, match="given"):
-        design(scenario(instrument, n=20, noise=NOISE), n=6, given=GIVEN, n_candidates=40)
+        design(scenario(Sockets(name="it", sockets=3), n=20, noise=NOISE), n=6, given=GIVEN, n_candidates=40)
 
 
 def job_of(instrument, n, stated=NOISE, **changes):
-    """A job of what an arm as drawn shows at random configurations."""
+    """A job of what the nominal arm shows at random configurations."""
     given = {"configurations": RandomReadings(n), "errors": Errors("values", {}), "noise": SILENT}
     of = scenario(instrument, stated_noise=stated, **given | changes)
     tables = simulate(of).tables
@@ -83,22 +70,6 @@ def test_a_plan_of_touches_expects_what_a_job_of_all_rows_says_of_itself(n):
     assert plan.expected.position == pytest.approx(said_by_all_rows(job, plan), rel=1e-6)
 
 
-def test_more_rows_are_as_noisy_along_each_axis_as_those_of_the_job():
-    """A tracker that says how well it measures along the beam and across goes on doing so."""
-    rng, arm = np.random.default_rng(0), small_arm(tolerance=TOLERANCE)
-    q = rng.uniform(-1.5, 1.5, (30, 4))
-    at, sigma = pose(arm, q), np.array([1e-5, 1e-3, 1e-5])
-    data = Measurements.from_arrays(
-        q,
-        position=at.position,
-        rotation=at.rotation,
-        sigma_position=np.tile(sigma, (30, 1)),
-        sigma_orientation=2e-4,
-    )
-    plan = design(Job(None, arm, data, Options("pose")), n=4, n_candidates=20)
-    assert plan.tables[0].measurements.sigma_position == pytest.approx(np.tile(sigma, (4, 1)))
-
-
 def test_tolerances_of_a_plan_are_those_that_its_job_found():
     """The arm is ten times better than its tolerances say."""
     rng, arm = np.random.default_rng(1), small_arm(tolerance=TOLERANCE)
@@ -110,3 +81,31 @@ def test_tolerances_of_a_plan_are_those_that_its_job_found():
     found, plan = calibrate_job(job), design(job, n=4, n_candidates=20)
     said = errors_at(found.posterior, plan.task.readings)[plan.task.fitted].position
     assert plan.before.position == pytest.approx(said, rel=0.02)
+
+
+LENGTHS = LengthGauge(name="it", anchors={"a": Spot([1.0, -2.0, 0.5]), "b": Spot([-1.5, 1.0, 1.0])})
+FACES = Indicator(name="it", planes={"floor": Plane([0, 0, 1], -1.0), "wall": Plane([1, 0.1, 0], 2.0)})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("instrument", "n"), [(LENGTHS, 5), (FACES, 3)], ids=["two anchors", "planes"])
+def test_a_plan_expects_what_a_job_of_all_rows_says_of_itself(instrument, n):
+    job = job_of(instrument, 30)
+    plan = design(job, n=n, n_candidates=40)
+    assert plan.expected.position == pytest.approx(said_by_all_rows(job, plan), rel=1e-6)
+
+
+def test_more_rows_are_as_noisy_as_those_of_the_job_were_found_to_be():
+    noise = replace(SILENT, position=3.0 * SIGMA.position, orientation=3.0 * SIGMA.orientation)
+    job = job_of(Tracker(model="pose", name="it"), 60, stated=SIGMA, noise=noise)
+    job = replace(job, options=replace(job.options, estimate_noise=True))
+    found = calibrate_job(job).result.noise_factors["position"] * SIGMA.position
+    plan = design(job, n=4, n_candidates=20)
+    assert plan.tables[0].measurements.sigma_position == pytest.approx(np.full((4, 3), found), rel=1e-6)
+
+
+def test_one_more_pose_of_a_chain_can_be_planned():
+    """It makes no pair by itself, and so adds nothing."""
+    chain = Tracker(model="distance", name="it", pairing=Pairing("chain"))
+    plan = design(job_of(chain, 30), n=1, n_candidates=10)
+    assert plan.expected.position == pytest.approx(plan.before.position, rel=1e-6)
