@@ -6,7 +6,7 @@ import csv
 import logging
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from io import BytesIO, StringIO
@@ -102,18 +102,17 @@ class Table:
         name: File name, or what a frame is called, for messages.
         columns: Names of all its columns, as they are known.
         frame: The columns of use as they were read, without blank rows; those of a CSV are texts.
-        rows: Row of the file that each row of `frame` is, counted from 0 after the header, shape (n_rows,).
-        text: The bytes of a CSV.
-        separator: The character between the cells of a CSV. Where it is no comma, numbers may have decimal commas.
+        places: Where each row of `frame` stands: its line of a CSV, else its 0-based row, shape (n_rows,).
+        separator: The character between the cells of a CSV, empty for others. Where it is no comma, numbers may have
+            decimal commas.
         renamed: By column, its conversion, where the table has its own name for it.
     """
 
     name: str
     columns: tuple[str, ...]
     frame: pl.DataFrame
-    rows: Integers
-    text: bytes = field(default=b"", repr=False)
-    separator: str = ","
+    places: Sequence[int]
+    separator: str = ""
     renamed: Mapping[str, Column] = field(default_factory=dict)
 
     @classmethod
@@ -138,23 +137,23 @@ class Table:
         Raises:
             InputError: It cannot be read, it has no rows, or `columns` does not fit.
         """
-        source = _Source.of(table, name)
+        source = _open(table, name)
         names = list(source.columns)
         chosen = list(range(len(names)))
         if known is not None:
             known, joints = set(known), set(joints)
             names = _understood(source.name, _rename(source, columns or {}, known | joints), known, joints)
             chosen = [i for i, column in enumerate(names) if column in known or column in joints]
-        frame, rows = source.read(chosen)
+        frame, places = source.read(chosen)
         frame.columns = [names[i] for i in chosen]
-        if len(rows) == 0 and chosen:
+        if len(places) == 0 and chosen:
             raise InputError(source.name, "no rows", "at least one")
-        return cls(source.name, tuple(names), frame, rows, source.text, source.separator, dict(columns or {}))
+        return cls(source.name, tuple(names), frame, places, source.separator, dict(columns or {}))
 
     @property
     def n_rows(self) -> int:
         """Number of rows."""
-        return len(self.rows)
+        return len(self.places)
 
     def present(self, *columns: str) -> tuple[str, ...]:
         """Those of `columns` that the table has."""
@@ -197,7 +196,7 @@ class Table:
                 raise InputError(f"{self.name}: {column}", f"type {kind}", "numbers")
         # Columns are numbered, as polars takes names such as * for patterns.
         given = pl.DataFrame([self.frame[column].alias(str(k)) for k, column in enumerate(columns)])
-        read = given.select(_number(name, kind, self.separator != ",") for name, kind in given.schema.items())
+        read = given.select(_number(name, kind, self.separator in (";", "\t")) for name, kind in given.schema.items())
         finite = read.select(pl.all().is_finite().fill_null(optional)).to_numpy()
         values: Floats = np.array(read.to_numpy(), dtype=np.float64).reshape(self.n_rows, len(columns))
         for k, column in enumerate(columns):
@@ -257,9 +256,8 @@ class Table:
             raise InputError(f"{self.place(row)}: {column}", f"found {found}", expected, hint or number_hint(cell))
 
     def place(self, row: int) -> str:
-        """File and line of a row (the header is line 1); of a Parquet file or a frame the 0-based row."""
-        k = int(self.rows[row])
-        return f"{self.name}:{_records(self.text)[k + 1][0]}" if self.text else f"{self.name}: row {k}"
+        """File and line of a row of a CSV (the header is line 1); of a Parquet file or a frame the 0-based row."""
+        return f"{self.name}:{' row ' * (not self.separator)}{self.places[row]}"
 
 
 def _number(name: str, kind: pl.DataType, decimal_comma: bool) -> pl.Expr:
@@ -283,152 +281,108 @@ _ENDINGS = (".csv", ".parquet", ".pq")
 
 @dataclass(frozen=True)
 class _Source:
-    """Where a table is read from: the text of a CSV, the content of a Parquet file, or a frame.
+    """An open table: its columns, without blanks around their names, and how to read those of some numbers.
 
-    Attributes:
-        name: What it is called in messages.
-        columns: Names of its columns, without blanks around them.
-        place: Where they stand, for messages.
-        text: The bytes of a CSV, whose lines end in a newline alone.
-        separator: The character between its cells.
-        content: The bytes of a Parquet file.
-        frame: The frame.
+    Raises:
+        InputError: It has no names of columns, or the same twice.
     """
 
     name: str
-    columns: tuple[str, ...] = ()
-    place: str = ""
-    text: bytes = b""
-    separator: str = ","
-    content: bytes = b""
-    frame: pl.DataFrame | None = None
+    place: str
+    columns: Sequence[str]
+    read: Callable[[list[int]], tuple[pl.DataFrame, Sequence[int]]]
+    separator: str = ""
 
-    @classmethod
-    def of(cls, table: Path | str | Any, name: str) -> _Source:
-        """Open a table and read the names of its columns.
-
-        Raises:
-            InputError: It is missing, or is no table, or has the same name twice.
-        """
-        import polars as pl
-
-        if isinstance(table, str) and not table:
-            raise InputError(name, "found ''", "a path, or a frame of polars or pandas")
-        if not isinstance(table, os.PathLike | str):
-            with _one_line(name, "no table"):
-                frame = _as_polars(table, name)
-            return cls(name, tuple(column.strip() for column in frame.columns), name, frame=frame)._checked()
-        path = Path(table)
-        content = read_bytes(path)
-        if path.suffix.lower() not in _ENDINGS:
-            hint = "save the sheet as CSV" if path.suffix.lower() in (".xlsx", ".xls", ".ods") else ""
-            raise InputError(path.name, f"ending {path.suffix!r}", f"one of {', '.join(_ENDINGS)}", hint)
-        if path.suffix.lower() != ".csv":
-            with _one_line(path.name, "not a Parquet file"):
-                names = list(pl.read_parquet_schema(BytesIO(content)))
-            return cls(path.name, tuple(n.strip() for n in names), path.name, content=content)._checked()
-        for end in (b"\r\r\n", b"\r\n", b"\r"):
-            content = content.replace(end, b"\n")
-        header = re.sub(r'"[^"]*"?', "", decoded(content, path.name).lstrip("\n").partition("\n")[0])
-        separator = max(",;\t", key=header.count)
-        line, record = next(iter(_records(content, 1)), (1, b""))
-        _require_closed(f"{path.name}:{line}", record)
-        text = record.decode(errors="replace").removeprefix("\ufeff")
-        try:
-            names = [cell.strip() for cell in next(csv.reader(StringIO(text, newline=""), delimiter=separator), [])]
-        except csv.Error as error:
-            raise InputError(f"{path.name}:{line}", f"not a CSV: {error}") from None
-        return cls(path.name, tuple(names), f"{path.name}:{line}", content, separator)._checked()
-
-    def _checked(self) -> _Source:
-        names = self.columns
-        if not any(names):
-            found = "an empty file" if not names else "no names of columns"
-            raise InputError(self.place, found, "a header and rows")
-        if len(names) == 1 and "|" in names[0]:
-            raise InputError(self.place, f"one column {shown(names[0])}", "columns with , ; or tab between", "not '|'")
-        check_different(self.place, names)
-        return self
-
-    def read(self, chosen: Sequence[int]) -> tuple[pl.DataFrame, Integers]:
-        """Columns by their numbers, in ascending order, and the rows of the file that their rows are."""
-        import polars as pl
-
-        if self.text:
-            return self._read_csv(chosen)
-        frame = self.frame
-        if frame is None:
-            with _one_line(self.name, "not a Parquet file"):
-                frame = pl.read_parquet(BytesIO(self.content), columns=list(chosen))
-        else:
-            frame = pl.DataFrame([frame[frame.columns[i]] for i in chosen])
-        return frame, np.arange(frame.height)
-
-    def _read_csv(self, chosen: Sequence[int]) -> tuple[pl.DataFrame, Integers]:
-        import polars as pl
-
-        last = len(self.columns) - 1
-        wanted = sorted({*chosen, last})
-        start = len(self.text) - len(self.text.removeprefix(b"\xef\xbb\xbf").lstrip(b"\n"))
-        try:
-            with _one_line(self.name, "not a CSV"):
-                frame = pl.read_csv(
-                    BytesIO(self.text[start:]), columns=wanted, infer_schema=False, separator=self.separator
-                )
-        except InputError:
-            self._check_lengths()
-            raise
-        if b'"' in self.text and len(_records(self.text)) != frame.height + 1:
-            self._check_lengths()
-            raise InputError(self.name, "quotes within cells", "whole cells in quotes, or none")
-        rows = np.arange(frame.height)
-        frame.columns = [str(i) for i in wanted]
-        empty = frame.select(pl.all_horizontal(pl.all().is_null()))[:, 0].to_numpy()
-        if empty.any():  # lines that are blank, and rows whose cells of use are empty
-            records = _records(self.text)
-            separator = self.separator.encode()
-            rows = np.array([k for k in rows if not empty[k] or records[k + 1][1].replace(separator, b"").strip()])
-            frame = frame[rows]
-        if frame[str(last)].is_null().any():  # polars takes a cell that is missing at the end for an empty one
-            self._check_lengths()
-        return frame.select([str(i) for i in chosen]), rows
-
-    def _check_lengths(self) -> None:
-        """Raise for the first row of a CSV that has more or fewer cells than the header."""
-        for line, record in _records(self.text):
-            _require_closed(f"{self.name}:{line}", record)
-            n = re.sub(rb'"[^"]*"?', b"", record).count(self.separator.encode()) + 1
-            if record and n != len(self.columns):
-                hint = "a quote joins it with lines below: is one missing?" if b"\n" in record else ""
-                found = f"{n} cell{'s' * (n != 1)}"
-                raise InputError(f"{self.name}:{line}", found, f"{len(self.columns)} as in the header", hint)
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "columns", [column.strip() for column in self.columns])
+        if len(self.columns) == 1 and "|" in self.columns[0]:
+            found = f"one column {shown(self.columns[0])}"
+            raise InputError(self.place, found, "columns with , ; or tab between", "not '|'")
+        check_different(self.place, self.columns)
 
 
-def _records(text: bytes, most: int | None = None) -> list[tuple[int, bytes]]:
-    """The header and the rows of a CSV, each with the line where it begins; a line break in quotes joins lines.
+def _open(table: Path | str | Any, name: str) -> _Source:
+    """Open a table and read the names of its columns.
 
-    Blank lines count from the header on, as in polars.
+    Raises:
+        InputError: It is missing, or is no table, or has the same name twice.
     """
-    records: list[tuple[int, bytes]] = []
-    parts: list[bytes] = []
-    for line, part in enumerate(text.removesuffix(b"\n").split(b"\n"), start=1):
-        if not parts and not part and not records:
-            continue
-        parts.append(part)
-        joined = b"\n".join(parts)
-        if joined.count(b'"') % 2 == 0:
-            records.append((line - len(parts) + 1, joined))
-            parts = []
-            if most is not None and len(records) == most:
-                return records
-    if parts:
-        records.append((text.removesuffix(b"\n").count(b"\n") + 2 - len(parts), b"\n".join(parts)))
-    return records
+    import polars as pl
+
+    require_polars(name)
+    if not isinstance(table, os.PathLike | str):
+        with _one_line(name, "no table"):
+            frame = _as_polars(table, name)
+        return _Source(name, name, frame.columns, lambda chosen: (frame[:, chosen], range(frame.height)))
+    path = Path(table)
+    content = read_bytes(path)
+    if path.suffix.lower() not in _ENDINGS:
+        hint = "save the sheet as CSV" if path.suffix.lower() in (".xlsx", ".xls", ".ods") else ""
+        raise InputError(path.name, f"ending {path.suffix!r}", f"one of {', '.join(_ENDINGS)}", hint)
+    if path.suffix.lower() == ".csv":
+        return _open_csv(path.name, decoded(content, path.name))
+
+    def read(chosen: list[int]) -> tuple[pl.DataFrame, Sequence[int]]:
+        with _one_line(path.name, "not a Parquet file"):
+            found = pl.read_parquet(BytesIO(content), columns=chosen)
+        return found, range(found.height)
+
+    with _one_line(path.name, "not a Parquet file"):
+        names = list(pl.read_parquet_schema(BytesIO(content)))
+    return _Source(path.name, path.name, names, read)
 
 
-def _require_closed(place: str, record: bytes) -> None:
-    if record.count(b'"') % 2:
-        raise InputError(place, "a quote that is not closed", "whole cells in quotes, or none")
+def _open_csv(name: str, text: str) -> _Source:
+    """Open a CSV, whose separator its header tells."""
+    if text.count('"') % 2:
+        line = next(i for i, one in enumerate(text.splitlines(), start=1) if one.count('"') % 2)
+        raise InputError(f"{name}:{line}", "a quote that is not closed", "whole cells in quotes, or none")
+    separator = max(",;\t", key=re.sub(r'"[^"]*"', "", text.lstrip("\r\n")).partition("\n")[0].count)
+    places, rows = _csv_rows(name, text, separator)
+    if not len(rows):
+        raise InputError(f"{name}:1", "an empty file", "a header and rows")
+    header = rows[0].split(_BETWEEN)
+
+    def read(chosen: list[int]) -> tuple[pl.DataFrame, Sequence[int]]:
+        wrong = (rows.str.count_matches(_BETWEEN, literal=True) != len(header) - 1).arg_true()
+        if len(wrong):
+            row = wrong[0]
+            n, expected = len(rows[row].split(_BETWEEN)), f"{len(header)} as in the header"
+            hint = "a quote joins it with lines below: is one missing?" if "\n" in rows[row] else ""
+            raise InputError(f"{name}:{places[row]}", f"{n} cell{'s' * (n != 1)}", expected, hint)
+        cells = rows[1:].str.split_exact(_BETWEEN, len(header) - 1).struct.unnest()
+        return cells[:, chosen], places[1:].tolist()
+
+    return _Source(name, f"{name}:{places[0]}", header, read, separator)
+
+
+_BETWEEN = "\x1f"
+"""What stands between cells once quotes are resolved: ASCII's own separator of units."""
+
+
+def _csv_rows(name: str, text: str, separator: str) -> tuple[Integers, pl.Series]:
+    """The line where each row of a CSV begins, and its cells with `_BETWEEN` between; rows of empty cells are left out.
+
+    Raises:
+        InputError: A cell in quotes is longer than any cell is.
+    """
+    import polars as pl
+
+    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    places = np.arange(1, len(lines) + 1)
+    rows = pl.Series(lines).str.replace_all(separator, _BETWEEN, literal=True)
+    if '"' in text:
+        reader = csv.reader(StringIO("\n".join(lines), newline=""), delimiter=separator)
+        begin, joined = [1], list[str]()
+        try:
+            for cells in reader:
+                joined.append(_BETWEEN.join(cells))
+                begin.append(reader.line_num + 1)
+        except csv.Error as error:
+            raise InputError(f"{name}:{begin[-1]}", f"not a CSV: {error}") from None
+        places, rows = np.array(begin[:-1]), pl.Series(joined, dtype=pl.String)
+    filled = rows.str.strip_chars(f" \t{_BETWEEN}") != ""
+    return places[filled.to_numpy()], rows.filter(filled)
 
 
 def _rename(source: _Source, columns: Mapping[str, Column], known: set[str]) -> list[str]:
@@ -439,17 +393,12 @@ def _rename(source: _Source, columns: Mapping[str, Column], known: set[str]) -> 
     """
     place = f"{source.name}: columns"
     check_names(place, columns, sorted(known), "column")
-    names, places = list(source.columns), {}
-    for name, column in columns.items():
-        check_names(f"{place}: {name}", [column.name.strip()], source.columns, "column")
-        places[name] = names.index(column.name.strip())
-    check_different(f"{place}: the table's", [column.name.strip() for column in columns.values()])
-    found = list(names)
-    for name, i in places.items():
-        if name in names and names.index(name) not in places.values():
-            found[names.index(name)] = f"{name} (the table's)"
-        found[i] = name
-    return found
+    own = {name: column.name.strip() for name, column in columns.items()}
+    for name, given in own.items():
+        check_names(f"{place}: {name}", [given], source.columns, "column")
+    check_different(f"{place}: the table's", own.values())
+    meant = {given: name for name, given in own.items()}
+    return [meant.get(name) or f"{name} (the table's)" * (name in own) or name for name in source.columns]
 
 
 def _understood(table: str, names: Sequence[str], known: set[str], joints: set[str]) -> list[str]:
@@ -466,21 +415,12 @@ def _understood(table: str, names: Sequence[str], known: set[str], joints: set[s
             raise InputError(table, f"column {shown(name)}", f"{bare}, or another name")
         if name.lower() in known and name.lower() not in given:
             found[i] = name.lower()
-        elif hint := _similar(name, known, given):
+        elif name.lower().startswith("sigma"):
+            sigmas = ", ".join(sorted(column for column in known if column.startswith("sigma_")))
+            _log.warning("%s: column %r is not used; sigmas are %s", table, name, sigmas)
+        elif hint := f"{name.lower()} is" if name.lower() in known else did_you_mean(name, known - given, 0.85):
             _log.warning("%s: column %r is not used; %s", table, name, hint)
     return found
-
-
-def _similar(name: str, known: set[str], given: set[str]) -> str:
-    """The known column that a name may mean; else nothing."""
-    if name.lower() in known:
-        return f"{name.lower()} is"
-    if not name.lower().startswith("sigma"):
-        return did_you_mean(name, known - given, 0.85)
-    sigmas = sorted(column.removeprefix("sigma_") for column in known if column.startswith("sigma_"))
-    rest = name.lower().removeprefix("sigma_")  # else every sigma would be much like every other
-    like = did_you_mean(rest, [column for column in sigmas if f"sigma_{column}" not in given], 0.85)
-    return like.replace("mean ", "mean sigma_") or f"sigmas are {', '.join(f'sigma_{column}' for column in sigmas)}"
 
 
 def _as_polars(table: Any, name: str) -> pl.DataFrame:
@@ -490,6 +430,7 @@ def _as_polars(table: Any, name: str) -> pl.DataFrame:
         InputError: It is no table.
     """
     import polars as pl
+    import polars.selectors as cs
 
     frame = table if isinstance(table, Mapping) else as_frame(name, table)
     if frame is None or not (isinstance(frame, Mapping | pl.DataFrame) or hasattr(frame, "to_dict")):
@@ -500,11 +441,7 @@ def _as_polars(table: Any, name: str) -> pl.DataFrame:
         frame = pl.DataFrame({str(key): _series(values) for key, values in columns.items()})
     if not frame.columns:
         raise InputError(name, "a frame without columns", "a frame with rows")
-    names = frame.columns
-    numbered = [frame[column].alias(str(k)) for k, column in enumerate(names)]  # polars takes * for a pattern
-    frame = pl.DataFrame([one.fill_nan(None) if one.dtype.is_float() else one for one in numbered])
-    frame.columns = names
-    return frame
+    return frame.with_columns(cs.float().fill_nan(None))
 
 
 def _series(values: Any) -> Any:
@@ -513,15 +450,11 @@ def _series(values: Any) -> Any:
 
     if not isinstance(values, list):
         return values
-    missing = ("NAType", "NaTType")
-    cells = [
-        None if type(value).__name__ in missing or (isinstance(value, float) and value != value) else value  # noqa: PLR0124
-        for value in values
-    ]
+    cells = [None if type(value).__name__ in ("NAType", "NaTType") else value for value in values]
     try:
         return pl.Series(cells)
     except (pl.exceptions.PolarsError, TypeError, OverflowError):
-        return pl.Series([None if value is None else str(value) for value in cells], dtype=pl.String)
+        return pl.Series([None if value is None or value != value else str(value) for value in cells], dtype=pl.String)  # noqa: PLR0124
 
 
 @contextmanager
@@ -531,7 +464,6 @@ def _one_line(name: str, what: str) -> Iterator[None]:
     Raises:
         InputError: It makes nothing of a table.
     """
-    require_polars(name)
     try:
         yield
     except (InputError, MemoryError):

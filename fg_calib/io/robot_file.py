@@ -258,6 +258,8 @@ def robot_text(
     """
     if (robot.urdf is None) != (urdf_name is None):
         raise ValueError("a URDF robot, and no other, is written with urdf_name")
+    if robot.urdf is None:
+        _check_writable(robot, place or robot.name)
     units = units or Units()
     mapping: dict[str, Any] = {"name": robot.name}
     if robot.urdf is None:
@@ -278,26 +280,26 @@ def robot_text(
         "tolerance": _Flow(_tolerances(robot, units)),
     }
     kept = {key: value for key, value in mapping.items() if value or key == "joints"}
-    if robot.urdf is None:
-        _check_written(robot, kept, place or robot.name)
     return str(yaml.dump(kept, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=math.inf))
 
 
-def _check_written(robot: Robot, mapping: Mapping[str, Any], place: str) -> None:
-    """Check that what is to be written describes the robot, element by element.
+def _check_writable(robot: Robot, place: str) -> None:
+    """Check that a robot is a base, joints of one convention and a tool, which is all that a robot file can hold.
 
     Raises:
-        InputError: It does not, as the robot has other elements than its convention, a base and a tool.
+        InputError: It has other elements or parameters.
     """
     expected = "base, joints of one convention, tool: all that a robot file can say"
     if robot.convention not in CONVENTIONS:
         raise InputError(place, f"the robot is of the convention {shown(robot.convention)}", expected)
-    try:
-        again = robot_from_mapping(mapping, place, Path())
-    except InputError:
-        return  # figures of a fit that went astray: a result is written whole, and readers refuse such a robot
-    names = [p.name for p in robot.parameters]
-    if [p.name for p in again.parameters] != names or again.elements != robot.elements:
+    values = [{p.kind: p.nominal for p in robot.parameters if p.owner == i} for i in range(robot.n_joints + 2)]
+    builder = RobotBuilder(robot.name, robot.convention)
+    builder.add_frame("base", values[0], 0, False)
+    for joint, row in zip(robot.joints, values[1:], strict=False):
+        builder.add_convention_joint(joint, row)
+    builder.add_frame("tool", values[-1], robot.n_joints + 1, False)
+    plain = builder.build()
+    if [p.name for p in plain.parameters] != [p.name for p in robot.parameters] or plain.elements != robot.elements:
         raise InputError(place, "the robot has elements or parameters of its own", expected)
 
 

@@ -138,12 +138,12 @@ def test_a_name_is_no_pattern(example):
 
 
 def test_a_header_of_another_case_is_understood_and_one_nearly_right_is_told_of(tmp_path, caplog):
-    text = "Q1,q2,q3,X,y,z,Split,sigma_positon,anything\n" + "0,0,0,1,2,3,test,1,1\n"
+    text = "Q1,q2,q3,X,y,z,Split,distnce,anything\n" + "0,0,0,1,2,3,test,1,1\n"
     (tmp_path / "poses.csv").write_text(text.replace("Q1", "q1"))
     found = read_measurements(tmp_path / "poses.csv", ARM)
     assert found.test.tolist() == [True]
     assert found.position.tolist() == [[1.0, 2.0, 3.0]]
-    assert caplog.messages == ["poses.csv: column 'sigma_positon' is not used; did you mean sigma_position?"]
+    assert caplog.messages == ["poses.csv: column 'distnce' is not used; did you mean distance?"]
 
 
 def test_columns_that_look_as_if_they_were_used_are_told_of(tmp_path, caplog):

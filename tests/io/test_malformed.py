@@ -269,7 +269,7 @@ POSES = [
     (b"\xff\xfeq\x001\x00", 'poses.csv: UTF-16 or UTF-32 text, expected UTF-8 text; save it as UTF-8'),
     ("q1,q2\n0,1\n".encode("utf-16-le"), 'poses.csv:1: a null character, expected UTF-8 text; is it UTF-16, or no text at all? save it as UTF-8'),
     (b"PAR1", "poses.csv: no joint columns, expected q1 to q2 for the robot's 2 joints; the columns are PAR1"),
-    (" \n", 'poses.csv:1: no names of columns, expected a header and rows'),
+    (" \n", 'poses.csv:1: an empty file, expected a header and rows'),
     ("{}", "poses.csv: no joint columns, expected q1 to q2 for the robot's 2 joints; the columns are {}"),
     ("<html></html>", "poses.csv: no joint columns, expected q1 to q2 for the robot's 2 joints; the columns are <html></html>"),
     ("q1,q2,group\n0,0,A\n0,1,NA\n", "poses.csv:3: group: found 'NA', expected the name of a point, or an empty cell"),
