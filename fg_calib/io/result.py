@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from functools import cache
 from importlib import metadata
@@ -20,7 +20,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from fg_calib import __version__
 from fg_calib.arguments import checked
-from fg_calib.arrays import Figure, Floats
+from fg_calib.arrays import NORM_TOLERANCE, Figure, Floats
 from fg_calib.assessment import Assessment
 from fg_calib.diagnostics.setup_check import SetupCheck
 from fg_calib.errors import InputError
@@ -568,6 +568,43 @@ def read_result(path: Path | str) -> Result:
     if document["schema"] != SCHEMA:
         raise InputError(str(file), f"schema {document['schema']}", SCHEMA, "calibrate its job again")
     try:
-        return Result.model_validate(document)
+        result = Result.model_validate(document)
     except ValidationError as error:
         raise first_misfit(error, str(file)) from None
+    for key, found, expected in _contradictions(result):
+        raise InputError(f"{file}: {key}", found, expected, "was the file changed?")
+    return result
+
+
+def _contradictions(result: Result) -> Iterator[tuple[str, str, str]]:
+    """What in a result contradicts the rest: the key, what was found and what is expected."""
+    names, of = result.covariance.names, {p.name: p for p in result.parameters}
+    matrices = {"covariance": (result.covariance.matrix, len(names))}
+    matrices["posterior: covariance"] = result.posterior.covariance, sum(map(len, result.posterior.variables.values()))
+    for key, (matrix, n) in matrices.items():
+        with np.errstate(invalid="ignore"):
+            if matrix.size != n * n or (n and matrix.shape != (n, n)):
+                yield key, f"shape {matrix.shape}", f"{n} rows of {n}, one of each name"
+            elif not np.array_equal(matrix, matrix.T, equal_nan=True) or (np.diag(matrix) < 0.0).any():
+                yield key, "no covariance", "a symmetric matrix with variances from 0 on"
+    if len(of) < len(result.parameters) or len(set(names)) < len(names) or not of.keys() >= set(names):
+        yield "covariance: names", "a name twice or of no parameter", "different names of parameters"
+    sigmas = dict(zip(names, np.sqrt(result.covariance.matrix.diagonal()).tolist() if names else (), strict=True))
+    for i, p in enumerate(result.parameters, start=1):
+        if p.sigma is not None and not (p.sigma >= 0.0 and np.isclose(p.sigma, sigmas.get(p.name, 0.0), 1e-9, 0.0)):
+            yield f"parameter {i}: sigma", f"found {p.sigma:g}", f"{sigmas.get(p.name, 0.0):g}, as the covariance says"
+        turns = (p.estimate - p.nominal - p.correction) / (2.0 * np.pi if p.unit == "rad" else np.inf)
+        if not np.isclose(p.estimate - 2.0 * np.pi * np.round(turns), p.nominal + p.correction, 1e-9, 1e-12):
+            yield f"parameter {i}: correction", f"found {p.correction:g}", f"{p.estimate - p.nominal:g}"
+    if result.reduced_chi2 is not None and not np.isclose(result.reduced_chi2 * result.dof, result.chi2, 1e-9, 0.0):
+        yield "reduced_chi2", f"found {result.reduced_chi2:g}", "chi2 / dof"
+    if result.goodness and (n := sum(kind.n for kind in result.goodness.values())) != result.n_residuals:
+        yield "n_residuals", f"found {result.n_residuals}", f"{n}, as goodness says"
+    if result.trustworthy != (result.solver.converged and not result.findings):
+        found = f"{str(result.trustworthy).lower()} with {len(result.findings)} findings"
+        yield "trustworthy", found, "true where the solver converged and nothing was found"
+    for frame in (*result.frames.values(), *filter(None, [result.frame_estimate])):
+        good = [one.shape for one in (frame.xyz, frame.quaternion_xyzw, frame.sigma)] == [(3,), (4,), (6,)]
+        good = good and np.isclose(np.linalg.norm(frame.quaternion_xyzw), 1.0, atol=NORM_TOLERANCE)
+        if not good or (frame.sigma < 0.0).any():
+            yield "frames", "no frame", "xyz, a quaternion of length 1, and six sigmas from 0 on"

@@ -9,8 +9,7 @@ from __future__ import annotations
 import logging
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,12 +35,6 @@ _ORIGIN = {"xyz": ("x", "y", "z"), "rpy": ("roll", "pitch", "yaw")}
 
 ROUNDING = 1e-13
 """Change of an origin's figure, [m] and [rad], that is rounding of the solution: parameters that nothing moves."""
-
-_ATTRIBUTES = {"origin": ("xyz", "rpy"), "axis": ("xyz",), "limit": ("lower", "upper", "effort", "velocity")}
-"""What is read of a joint on the chain, and the attributes that it may have."""
-
-_OTHERS = ("parent", "child", "mimic", "calibration", "dynamics", "safety_controller", "comment")
-"""Other elements of a joint."""
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?inf(inity)?", re.ASCII | re.IGNORECASE)
 
@@ -102,13 +95,16 @@ def read_urdf(
     text, root = _parse(data, path.name)
     builder = RobotBuilder(name or root.get("name") or path.stem, "urdf")
     builder.add_frame("base", frame_values("base", base), 0, False)
-    with _hinting_at_xacro(root):
+    try:
         tree = _Tree(_read_joints(root, path.name), _read_links(root, path.name), path.name)
         base_link = tree.root() if base_link is None else tree.known(base_link)
         tip_link = tree.leaf(base_link) if tip_link is None else tree.known(tip_link)
         n_joints = _add_chain(builder, tree.chain(base_link, tip_link), path.name)
         if n_joints == 0:
             raise InputError(path.name, f"no moving joint between links {base_link!r} and {tip_link!r}", "at least one")
+    except InputError as error:  # elements of xacro may hold what is missing
+        hint = _XACRO if any("xacro" in str(element.tag) for element in root.iter()) else error.hint
+        raise InputError(error.place, error.found, error.expected, hint) from None
     builder.add_frame("tool", frame_values("tool", tool), n_joints + 1, False)
     return builder.build(
         fixed=fixed,
@@ -119,17 +115,6 @@ def read_urdf(
     )
 
 
-@contextmanager
-def _hinting_at_xacro(root: Element) -> Iterator[None]:
-    """Say of a mistake in a file with elements of xacro that it was not expanded: they may hold what is missing."""
-    try:
-        yield
-    except InputError as error:
-        if not any("xacro" in str(element.tag) for element in root.iter()):
-            raise
-        raise InputError(error.place, error.found, error.expected, _XACRO) from None
-
-
 _XACRO = "it holds elements of xacro: expand them by `xacro arm.urdf.xacro > arm.urdf`"
 
 
@@ -137,7 +122,6 @@ def _add_chain(builder: RobotBuilder, chain: Iterable[tuple[_UrdfJoint, bool]], 
     """Add the joints of a chain, each with whether it is passed backwards; the number of those that move."""
     n_joints = 0
     for joint, backwards in chain:
-        _check_spelling(joint, f"{place}:{joint.element.sourceline}: joint {joint.name!r}")
         if joint.element.get("type") == "fixed":
             builder.add_constant_frame(joint.origin, backwards=backwards)
             continue
@@ -145,36 +129,6 @@ def _add_chain(builder: RobotBuilder, chain: Iterable[tuple[_UrdfJoint, bool]], 
         builder.add_urdf_joint(_moving_joint(joint, here), joint.origin, _axis(joint, here), backwards=backwards)
         n_joints += 1
     return n_joints
-
-
-def _check_spelling(joint: _UrdfJoint, place: str) -> None:
-    """Check what on the chain would silently be replaced by a default.
-
-    Raises:
-        InputError: An element is there twice; a name is of another case; angles are of many turns.
-    """
-    read: dict[str, Element] = {}
-    for child in joint.element:
-        tag = child.tag if isinstance(child.tag, str) else "comment"
-        if tag in _ATTRIBUTES and tag in read:
-            raise InputError(place, f"two elements <{tag}>", "one")
-        if tag in _ATTRIBUTES:
-            read[tag] = child
-        elif tag.lower() in _ATTRIBUTES:
-            raise InputError(place, f"element <{tag}>", f"<{tag.lower()}>")
-        elif tag not in _OTHERS and (hint := did_you_mean(tag, _ATTRIBUTES)):
-            _log.warning("%s: element <%s> is not used; %s", place, tag, hint)
-    for tag, element in read.items():
-        for name in map(str, element.attrib):
-            if name not in _ATTRIBUTES[tag] and name.lower() in _ATTRIBUTES[tag]:
-                raise InputError(f"{place}: {tag}", f"attribute {shown_word(name)}", name.lower())
-            if name not in _ATTRIBUTES[tag]:
-                known = ", ".join(_ATTRIBUTES[tag])
-                _log.warning("%s: attribute %s of <%s> is not used; known are %s", place, name, tag, known)
-    angles = [joint.origin[kind] for kind in _ORIGIN["rpy"]]
-    if max(map(abs, angles)) > MOST_ANGLE:
-        found = f"found {' '.join(f'{angle:g}' for angle in angles)}"
-        raise InputError(f"{place}: origin rpy", found, IN_RAD, "are they in deg?")
 
 
 def write_urdf(path: Path | str, robot: Robot) -> None:
@@ -198,11 +152,11 @@ def write_urdf(path: Path | str, robot: Robot) -> None:
 
 def encoding_of(text: str) -> str:
     """The encoding that an XML text declares; UTF-8 if it declares none."""
-    declared = _DECLARED.match(text)
-    return declared[1] if declared else "utf-8"
+    declared = _DECLARATION.match(text)
+    return declared[1] if declared and declared[1] else "utf-8"
 
 
-_DECLARED = re.compile(r"""\ufeff?<\?xml[^>]*?\sencoding\s*=\s*["']([\w.-]+)["']""")
+_DECLARATION = re.compile(r"""\ufeff?<\?xml(?:[^>]*?\sencoding\s*=\s*["']([\w.-]+)["'])?.*?\?>""", re.DOTALL)
 
 
 def urdf_text(text: str, origins: Mapping[str, Mapping[str, float]], zeros: Mapping[str, float] | None = None) -> str:
@@ -227,16 +181,8 @@ def urdf_text(text: str, origins: Mapping[str, Mapping[str, float]], zeros: Mapp
         if zeros is not None and abs(zeros.get(name, 0.0)) > ROUNDING:
             rising = sum(_figures(_attribute(joint, "calibration", "rising", "0")))
             _set(joint, "calibration", {"rising": [rising + zeros[name]]})
-    before, after = _PROLOGUE.match(text), _EPILOGUE.search(text)
-    written = etree.tostring(root, encoding="unicode", with_tail=False)
-    if "\r\n" in text:  # which every parser of XML reads as one newline
-        written = written.replace("\n", "\r\n")
-    return (before[0] if before else "") + written + (after[1] if after else "")
-
-
-_PROLOGUE = re.compile(r"\ufeff?(?:\s|<\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>\[]*(?:\[[^\]]*\]\s*)?>)*", re.DOTALL)
-_EPILOGUE = re.compile(r"</robot\s*>((?:\s|<!--(?:(?!-->).)*-->|<\?(?:(?!\?>).)*\?>)*)\Z", re.DOTALL)
-"""What stands before and after the root element."""
+    declared = _DECLARATION.match(text)
+    return (f"{declared[0]}\n" if declared else "") + str(etree.tostring(root.getroottree(), encoding="unicode")) + "\n"
 
 
 def _set(joint: Element, tag: str, wanted: Mapping[str, Sequence[float]]) -> None:
@@ -330,6 +276,8 @@ def _origin(joint: Element, place: str) -> dict[str, float]:
             raise InputError(f"{place}: origin {attribute}", f"found {shown(text)}", "three finite numbers")
         if max(map(abs, figures)) > MOST_SIZE:
             raise InputError(f"{place}: origin {attribute}", f"found {shown(text)}", ORDINARY)
+        if attribute == "rpy" and max(map(abs, figures)) > MOST_ANGLE:
+            raise InputError(f"{place}: origin rpy", f"found {shown(text)}", IN_RAD, "are they in deg?")
         values |= zip(kinds, figures, strict=True)
     return values
 
@@ -397,22 +345,6 @@ class _Tree:
                     place, f"link {joint.child!r} is the child of joints {first!r} and {joint.name!r}", "one"
                 )
             self._joint_above[joint.child] = joint
-        self._check_circles()
-
-    def _check_circles(self) -> None:
-        """Raise where links are below themselves."""
-        seen: set[str] = set()
-        for link in self._links:
-            up: dict[str, None] = {}  # a set would forget their order
-            at: str | None = link
-            while at is not None and at not in seen:
-                seen.add(at)
-                up[at] = None
-                at = self._joint_above[at].parent if at in self._joint_above else None
-            if at in up:
-                circle = [*up][[*up].index(at) :]
-                found = f"links in a circle: {' below '.join(shown_word(one) for one in (*circle, circle[0]))}"
-                raise InputError(self._place, found, "a tree of links")
 
     def known(self, link: str) -> str:
         """`link`, if there is such a link."""
@@ -423,16 +355,17 @@ class _Tree:
 
     def root(self) -> str:
         """The only link without a parent."""
-        roots = [link for link in self._links if link not in self._joint_above]
         if not self._links:
             raise InputError(self._place, "no links and joints", "<link> and <joint> within <robot>")
-        return self._only(roots, "root", "base_link")
+        roots = dict.fromkeys(self._links_up(link)[-1] for link in self._links)
+        return self._only(list(roots), "root", "base_link")
 
     def leaf(self, base: str) -> str:
         """The only link without a child at or below `base`."""
         below: dict[str, list[str]] = {}
         for joint in self._joint_above.values():
             below.setdefault(joint.parent, []).append(joint.child)
+        self._links_up(base)  # without end where links are in a circle
         reached = [base]
         for link in reached:
             reached += below.get(link, ())
@@ -456,6 +389,9 @@ class _Tree:
         links = [link]
         while links[-1] in self._joint_above:
             links.append(self._joint_above[links[-1]].parent)
+            if links[-1] in links[:-1]:
+                circle = " below ".join(map(shown_word, links[links.index(links[-1]) :]))
+                raise InputError(self._place, f"links in a circle: {circle}", "a tree of links")
         return links
 
     def _only(self, found: list[str], what: str, argument: str) -> str:

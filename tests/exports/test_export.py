@@ -1,6 +1,7 @@
 """Every format has the forward kinematics of the arm: by pinocchio, yourdfpy and products of matrices."""
 
 from functools import partial
+from xml.etree.ElementTree import canonicalize
 
 import numpy as np
 import pytest
@@ -291,13 +292,13 @@ def test_tesseracts_origins_put_into_the_urdf_give_the_tool_poses(arm, tmp_path)
 
 def test_of_a_urdf_only_figures_of_calibrated_origins_change(tmp_path):
     robot = column(tmp_path)
-    assert export(robot, "urdf").text == TREE
+    assert canonicalize(export(robot, "urdf").text) == canonicalize(TREE)
     values = robot.nominal
     values[robot.index("bend.yaw")] = 0.2001
     values[robot.index("turn.z")] = 0.1001
     expected = TREE.replace('rpy="0 1.5707963267948966 0.2"', 'rpy="0.0 1.5707963267948966 0.2001"')
     expected = expected.replace('<origin xyz="0 0 0.1"/>', '<origin xyz="0.0 0.0 0.1001"/>')
-    assert export(robot.with_values(values), "urdf").text == expected
+    assert canonicalize(export(robot.with_values(values), "urdf").text) == canonicalize(expected)
 
 
 @pytest.mark.parametrize("backwards", [False, True])

@@ -101,6 +101,7 @@ def changed(folder, change):
 def move(parameter):
     """Move an estimate by 1 mm."""
     parameter["estimate"] += 1e-3
+    parameter["correction"] += 1e-3
 
 
 @pytest.mark.parametrize(
@@ -110,12 +111,13 @@ def move(parameter):
         (lambda f: (f / "result.json").write_text("[]"), "result.json: no result of a calibration, expected"),
         (lambda f: (f / "result.json").unlink(), "no result.json in this folder"),
         (lambda f: changed(f, lambda d: d.update(schema="fg-calib/result/1")), "schema fg-calib/result/1, expected"),
+        (lambda f: changed(f, lambda d: d["posterior"].update(variables={"K(9)": 22 * ["a"]})), "posterior: other var"),
         (lambda f: changed(f, lambda d: d.update(n_pairs="many")), "result.json: n_pairs: found 'many'"),
         (lambda f: changed(f, lambda d: d["parameters"][2].pop("sigma")), "json: parameter 3: missing key 'sigma'"),
         (lambda f: changed(f, lambda d: d["parameters"].pop()), "robot_calibrated.yaml: other parameters than in"),
         (lambda f: changed(f, lambda d: move(d["parameters"][8])), "robot_calibrated.yaml: other values than in"),
         (lambda f: (f / "robot_calibrated.yaml").unlink(), "neither robot_calibrated.yaml nor robot_calibrated.urdf"),
-        (lambda f: changed(f, lambda d: d["posterior"]["variables"].popitem()), "json: posterior: other variables"),
+        (lambda f: changed(f, lambda d: d["posterior"]["variables"].popitem()), "json: posterior: covariance: shape"),
         (lambda f: (f / "residuals.csv").write_text("kind\n"), "residuals.csv: changed, or of another calibration"),
     ],
 )

