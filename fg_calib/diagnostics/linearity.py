@@ -29,9 +29,9 @@ MAX_ROWS = 5_000
 """Residuals that suffice: of more, so many are drawn evenly where that is possible."""
 
 NEGLIGIBLE, NONLINEAR = 1e-3, 0.1
-"""Mean squared errors beyond the covariance, over it: below which the first draws suffice, above which it matters."""
+"""Mean squared errors beyond the covariance, over it: below which one draw suffices, above which it matters."""
 
-N_FIRST, N_DRAWS = 2, 8
+N_DRAWS = 8
 """Draws of d: sums of all determined directions, each a sigma one way or the other."""
 
 NEAR_SIGMAS = 5.0
@@ -72,7 +72,7 @@ def check_linearity(solution: Solution, spread: Spread) -> Nonlinearity:
             plus, minus = (linear_system(problem, x).step for x in there)
             shifts.append((0.5 * (plus + minus) - here.step)[:n])
             squares = np.mean((np.array(shifts) @ in_sigma.T) ** 2)
-            if len(shifts) == N_FIRST and squares < NEGLIGIBLE:
+            if len(shifts) == 1 and squares < NEGLIGIBLE:
                 break
     except SolverError:
         return Nonlinearity(np.inf)
@@ -122,6 +122,8 @@ def find_ambiguous_rows(solution: Solution, sqrt_cov: Floats, rank: int, table: 
     problem, at = solution.problem, at_parameters(solution.problem, solution.parameters)
     prior = np.diag(problem.variables.prior_scales)
     n_rows, n_near, names, share = 0, 0, list[str](), 0.0
+    if not problem.pair_series:
+        return AmbiguousRows()
     for noise in (noise for noise in solution.noises if len(noise.series.train)):
         s = noise.series
         if s.kind.ends != 2 or not set(s.kind.names) <= {"distance", "angle"} or table not in (None, s.table):

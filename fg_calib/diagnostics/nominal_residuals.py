@@ -28,10 +28,11 @@ from fg_calib.graph.problem import Problem, noises_at, reduced_graph, tables_of
 from fg_calib.graph.solver import levenberg_marquardt_params
 from fg_calib.graph.variables import build_variables
 from fg_calib.measurements import residuals
+from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.kinds import INSTRUMENTS, Instrument
 from fg_calib.measurements.table import Table
 from fg_calib.options import Options, Pairing
-from fg_calib.robot.kinematics import pose
+from fg_calib.robot.kinematics import Poses, forward
 from fg_calib.robot.model import Robot
 
 Floats = NDArray[np.float64]
@@ -198,10 +199,10 @@ def residuals_at(
     series = [s for s in problem.data.series if table in (None, s.table) and len(s.train) and s.kind.ends]
     some = tuple(s.select(s.train[evenly(len(s.train), 3 * MAX_ROWS)]) for s in series)
     sampled = replace(problem, data=replace(problem.data, series=some))
-    there = robot.with_values(parameters[problem.variables.robot_span])
     found: list[TypicalResidual] = []
     for noise, of_arm in with_arm_errors(sampled, parameters, robot):
-        found += _by_kind(noise, np.einsum("nii->ni", of_arm) + noise.sigma**2, there)
+        residual, _, sigma = noise.figures()
+        found += _by_kind(noise, residual**2, np.einsum("nii->ni", of_arm) + sigma**2)
     return tuple(found) if all(np.isfinite([r.size, r.expected]).all() for r in found) else ()
 
 
@@ -226,16 +227,16 @@ def with_arm_errors(problem: Problem, parameters: Floats, robot: Robot) -> Itera
         yield noise, J @ np.swapaxes(J, 1, 2)
 
 
-def _by_kind(noise: RowNoise, variance: Floats, robot: Robot) -> Iterator[TypicalResidual]:
+def _by_kind(noise: RowNoise, squares: Floats, variance: Floats) -> Iterator[TypicalResidual]:
     """Residuals of one series, by kind of noise.
 
     Args:
         noise: Its rows and their noise.
+        squares: Squared residual of each row, shape (n, residual_dim).
         variance: Variance of each row by noise and the arm's errors, shape (n, residual_dim).
-        robot: The robot, tool and base fitted.
     """
     kinds, used = np.array([name.partition(".")[0] for name in noise.series.kind.names]), noise.series.used
-    squares = noise.residual() ** 2
+    poses = forward(noise.place.chain.without_columns(), noise.place.trig, np.unique(noise.series.ends))
     for kind in dict.fromkeys(kinds.tolist()):
         of = (kinds == kind) & used.any(axis=0)
         rows = used[:, of].any(axis=1)
@@ -243,18 +244,13 @@ def _by_kind(noise: RowNoise, variance: Floats, robot: Robot) -> Iterator[Typica
             size, expected = (
                 float(np.median(np.sqrt(np.where(used, v, 0.0)[:, of].sum(axis=1)[rows]))) for v in (squares, variance)
             )
-            unit, motion = _UNITS.get(kind, "m"), _motion(noise, kind, robot)
-            yield TypicalResidual(kind, unit, size, max(expected, 1e-9), motion, int(rows.sum()))
+            motion = _motion(noise.place.measurements, kind, poses)
+            yield TypicalResidual(kind, _UNITS.get(kind, "m"), size, max(expected, 1e-9), motion, int(rows.sum()))
 
 
-def _motion(noise: RowNoise, kind: str, robot: Robot) -> float:
+def _motion(m: Measurements, kind: str, poses: Poses) -> float:
     """How far the arm, or a point's image, typically moves between the rows of a series, [m], [rad] or [px]."""
-    m = noise.place.measurements
-    if kind == "pixel" and m.image is not None:
-        points = m.image[:, :2]
-    else:
-        at = pose(robot, m.readings[np.unique(noise.series.ends)])
-        if _UNITS.get(kind) == "rad":
-            return float(np.median(Rotation.from_matrix(at.rotation[0].T @ at.rotation).magnitude()))
-        points = at.position
+    if _UNITS.get(kind) == "rad":
+        return float(np.median(Rotation.from_matrix(poses.rotation[0].T @ poses.rotation).magnitude()))
+    points = m.image[:, :2] if _UNITS.get(kind) == "px" and m.image is not None else poses.position
     return float(np.median(np.linalg.norm(points - points.mean(axis=0), axis=1)))

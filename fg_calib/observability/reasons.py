@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
+Booleans = NDArray[np.bool_]
 
 NO_CAUSE = "no simple cause found"
 NOT_EXCITED = "not excited by these configurations"
@@ -59,23 +61,28 @@ def explain_relations(
     """The reason for every one of some relations of a problem's parameters, by these names, at a parameter vector."""
     if not lost:
         return ()
-    tables = problem.data.tables
     motion = _Motion(problem, parameters, ObservedQuantities.of(problem))
     directions = np.array([[relation.get(name, 0.0) for name in names] for relation in lost]).T
-    confounding, anywhere = Confounding(problem, parameters, directions), at_random_configurations(problem, parameters)
-    # What custom kinds would show there is not known.
-    effect = np.zeros((1, len(directions))) if anywhere is None else named_triangle(anywhere, anywhere.start)
-    largest = float(np.linalg.norm(effect, axis=0).max())
-    seen = np.linalg.norm(effect @ directions, axis=0) > 1e-6 * largest * np.abs(directions).max(axis=0)
-    touched = any(table.measurements.groups is not None for table in tables)
+    confounding = Confounding(problem, parameters, directions)
+    touched = any(table.measurements.groups is not None for table in problem.data.tables)
+
+    @cache
+    def seen() -> Booleans:
+        """Whether each direction is seen at random configurations; what custom kinds would show there is not known."""
+        anywhere = at_random_configurations(problem, parameters)
+        effect = np.zeros((1, len(directions))) if anywhere is None else named_triangle(anywhere, anywhere.start)
+        largest = float(np.linalg.norm(effect, axis=0).max())
+        shown: Booleans = np.linalg.norm(effect @ directions, axis=0) > 1e-6 * largest * np.abs(directions).max(axis=0)
+        return shown
 
     def reason(k: int, direction: Floats) -> str:
         by = confounding.by(k)
-        if seen[k] and not (by and touched):  # nor what touches of the same points would
+        cause = motion.reason(direction) if by == () else NO_CAUSE
+        if cause != NO_CAUSE:
+            return cause
+        if not (by and touched) and seen()[k]:  # nor is it known what touches of the same points would show
             return NOT_EXCITED
-        if by == ():
-            return motion.reason(direction)
-        return NO_CAUSE if by is None else BASE if motion.of_base(direction) else confounding.words(k)
+        return NO_CAUSE if not by else BASE if motion.of_base(direction) else confounding.words(k)
 
     return tuple(LostDirection(relation, reason(k, directions[:, k])) for k, relation in enumerate(lost))
 
@@ -87,13 +94,17 @@ class _Motion:
         robot = problem.robot.with_values(parameters[problem.variables.robot_span])
         self._parameters = problem.estimated
         self._seen = seen
-        columns = {robot.index(p.name): k for k, p in enumerate(self._parameters)}
+        number = {p.name: i for i, p in enumerate(robot.parameters)}
+        columns = {number[p.name]: k for k, p in enumerate(self._parameters)}
         chain = build_chain(robot, columns).with_joint_columns()
         poses = forward(chain, robot.trig(random_readings(robot, 60, np.random.default_rng(0))))
         n = len(self._parameters)
         self._R, self._p = poses.rotation, poses.position
         self._J = poses.jacobian[:, :, :n]
-        self._scales = np.array([robot.scale_of(p.unit) for p in self._parameters])
+        scale = {unit: robot.scale_of(unit) for unit in ("m", "rad")}
+        self._scales = np.array([scale[p.unit] for p in self._parameters])
+        self._sizes = np.abs(self._J)
+        self._most = [float((J * self._scales).max(initial=0.0)) for J in np.split(self._sizes, 2, axis=1)]
         axes = np.moveaxis(poses.jacobian[:, :3, n:], 2, 1)[:, [not j.prismatic for j in robot.joints]]
         axes = axes * np.where(np.sum(axes * axes[:1, :1], axis=2, keepdims=True) < 0.0, -1.0, 1.0)
         self._common_axis = axes[:, 0] if axes.size and self._constant(axes.reshape(-1, 3)) else None
@@ -122,7 +133,7 @@ class _Motion:
             return f"{parallel}: only the sum of their turns is seen, and no lengths are"
         if not sees_position and not turns:
             return f"the tool only moves without turning, unseen by {self._seen}"
-        if self.of_base(direction):
+        if self._is_of_base(w, dp, turns):
             return BASE
         if pairs and not (moves and sees_position) and self._constant(np.einsum("nji,nj->ni", self._R, w)):
             of_the_tool = all(p.name.startswith("tool.") for p in members)
@@ -135,21 +146,22 @@ class _Motion:
     def of_base(self, direction: Floats) -> bool:
         """Whether a direction moves the arm as if the base alone had moved, and nothing seen says where the base is."""
         w, dp, turns, _ = self._of_tool(direction)
+        return self._is_of_base(w, dp, turns)
+
+    def _is_of_base(self, w: Floats, dp: Floats, turns: bool) -> bool:
         if not self._seen.is_relative(position=True, orientation=turns):
             return False
         return self._constant(w) and (not self._seen.position or self._constant(dp - np.cross(w, self._p)))
 
     def _of_tool(self, direction: Floats) -> tuple[Floats, Floats, bool, bool]:
         """Turns and shifts of the tool, shape (n_configurations, 3), and whether these are any."""
-        w = self._J[:, :3] @ direction
-        dp = self._J[:, 3:] @ direction
-        size_w = float(np.abs(self._J[:, :3] * direction).sum(axis=2).max())
-        size_p = float(np.abs(self._J[:, 3:] * direction).sum(axis=2).max())
-        turns = float(np.abs(w).max()) > _NOTHING * max(size_w, 1e-3 * size_p)
-        moves = float(np.abs(dp).max()) > _NOTHING * max(size_p, 1e-3 * size_w)
+        w, dp = self._J[:, :3] @ direction, self._J[:, 3:] @ direction
+        one_by_one = np.max(self._sizes @ np.abs(direction), axis=0)  # of the tool's six coordinates
+        size_w, size_p = float(one_by_one[:3].max()), float(one_by_one[3:].max())
         share = SUPPORT_TOLERANCE * float(np.abs(direction / self._scales).max())
-        left_w, left_p = (share * float(np.abs(J * self._scales).max()) for J in (self._J[:, :3], self._J[:, 3:]))
-        return w, dp, turns and float(np.abs(w).max()) > left_w, moves and float(np.abs(dp).max()) > left_p
+        turns = float(np.abs(w).max()) > max(_NOTHING * size_w, 1e-3 * _NOTHING * size_p, share * self._most[0])
+        moves = float(np.abs(dp).max()) > max(_NOTHING * size_p, 1e-3 * _NOTHING * size_w, share * self._most[1])
+        return w, dp, turns, moves
 
     def _tilts(self, w: Floats, dp: Floats, axis: Floats) -> bool:
         """Whether the tool moves along the common axis of the joints only, and turns across it only."""
