@@ -432,18 +432,9 @@ class BoardViews(Conditions):
     def __post_init__(self) -> None:
         if self.distance is not None and self.distance[0] > self.distance[1]:
             raise InputError("board: distance", f"found {shown(list(self.distance))}", "the smaller one first")
-        if self.distance is not None and self.radius != 0.5:
-            raise InputError("board: radius", f"found {self.radius:g} m", "none with distance")
-        if self.distance is None and self.cone != math.pi / 3.0:
-            raise InputError("board: cone", f"found {self.cone:g} rad", "none without distance")
-        if self.cone > 0.5 * math.pi + 1e-9:
-            raise InputError("board: cone", f"found {self.cone:g} rad", "at most a quarter turn")
-        if self.field_of_view >= 0.5 * math.pi:
-            raise InputError("board: field_of_view", f"found {self.field_of_view:g} rad", "less than a quarter turn")
-        if self.board_size is not None and not self.field_of_view:
-            raise InputError("board: board_size", f"found {shown(self.board_size)}", "none without field_of_view")
-        if self.posture is not None and self.self_motion != "held":
-            raise InputError("board: posture", f"found {shown(self.posture)}", "none unless self_motion is held")
+        if max(self.cone, self.field_of_view) > 0.5 * math.pi + 1e-9:
+            key = "cone" if self.cone > self.field_of_view else "field_of_view"
+            raise InputError(f"board: {key}", f"found {getattr(self, key):g} rad", "at most a quarter turn")
 
 
 @schema()
@@ -665,6 +656,21 @@ class BoardPoints:
 # --- instruments ------------------------------------------------------------------------------------------------------
 
 
+_MODELS_OF: dict[str, tuple[Model, ...]] = {
+    "PlainInstrument": (),
+    "Sockets": ("distance",),
+    "PairGauge": tuple(PAIR_MODELS),
+    "Tracker": (*POSE_MODELS, *PAIR_MODELS),
+    "LengthGauge": ("anchor",),
+    "Indicator": ("plane",),
+    "BoardCamera": ("board", "pixels"),
+}
+"""Models that each instrument measures; a plain one measures all that no other does."""
+
+_LANDMARKS_OF = {"Sockets": "sockets", "LengthGauge": "anchors", "Indicator": "planes"}
+"""Landmarks of which an instrument needs at least one."""
+
+
 @schema(kw_only=True)
 class Instrument:
     """Fields of all instruments.
@@ -684,15 +690,15 @@ class Instrument:
     stated_noise: NoiseInFile = Field(default_factory=Noise)
     configurations: ConfigurationsInFile | None = None
 
+    def __post_init__(self) -> None:
+        if _MODELS_OF[type(self).__name__]:
+            check(f"instruments: {self.name}: model", self.model, _MODELS_OF[type(self).__name__])
+        landmarks = getattr(self, _LANDMARKS_OF.get(type(self).__name__, ""), None)
+        if landmarks is not None and not landmarks:
+            self._refuse(_LANDMARKS_OF[type(self).__name__], "found none", "at least one")
+
     def _refuse(self, key: str, found: str, expected: str) -> None:
         raise InputError(f"instruments: {self.name}: {key}", found, expected)
-
-    def _require_model(self, *models: Model) -> None:
-        check(f"instruments: {self.name}: model", self.model, models)
-
-    def _require_some(self, key: str, given: object) -> None:
-        if given in (0, {}):
-            self._refuse(key, "found none", "at least one")
 
 
 FrameOfInstrument = Annotated[str | Placement | None, InFile(Any, _frame_in_file, _as_it_is)]
@@ -724,7 +730,7 @@ class Tracker(Instrument):
     pairing: PairingInFile = Field(default_factory=Pairing)
 
     def __post_init__(self) -> None:
-        self._require_model(*POSE_MODELS, *PAIR_MODELS)
+        super().__post_init__()
         if self.targets and not POSE_MODELS.get(self.model, (True, False))[1]:
             self._refuse("targets", f"with model {self.model}", "model position or pose")
         if self.stations > 1 and (self.frame == "base" or self.model in PAIR_MODELS):
@@ -741,9 +747,6 @@ class PairGauge(Instrument):
     """
 
     pairs: PairingInFile = Field(default_factory=Pairing)
-
-    def __post_init__(self) -> None:
-        self._require_model(*PAIR_MODELS)
 
 
 @schema(kw_only=True)
@@ -762,8 +765,7 @@ class LengthGauge(Instrument):
     contact: pydantic.StrictBool = False
 
     def __post_init__(self) -> None:
-        self._require_model("anchor")
-        self._require_some("anchors", self.anchors)
+        super().__post_init__()
         if self.contact and self.offset is not None:
             self._refuse("offset", "with contact", "none: there is no length")
 
@@ -781,10 +783,6 @@ class Indicator(Instrument):
     model: Model = "plane"
     planes: Planes = 3
     contact: pydantic.StrictBool = False
-
-    def __post_init__(self) -> None:
-        self._require_model("plane")
-        self._require_some("planes", self.planes)
 
 
 @schema(kw_only=True)
@@ -812,7 +810,7 @@ class BoardCamera(Instrument):
     from_behind: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        self._require_model("board", "pixels")
+        super().__post_init__()
         pixels = self.model == "pixels"
         for key in ("camera", "corners"):
             if (getattr(self, key) is not None) != pixels:
@@ -821,8 +819,6 @@ class BoardCamera(Instrument):
         if self.fixed and (self.boards or not pixels):
             found = "boards" if self.boards else f"model {self.model}"
             self._refuse("camera", f"fixed, with {found}", "model pixels, and the board on the tool")
-        if self.frame is not None and not self.fixed:
-            self._refuse("frame", "without a fixed camera", "none: the camera is the tool")
 
 
 @schema(kw_only=True)
@@ -835,10 +831,6 @@ class Sockets(Instrument):
 
     model: Model = "distance"
     sockets: Spots = 2
-
-    def __post_init__(self) -> None:
-        self._require_model("distance")
-        self._require_some("sockets", self.sockets)
 
 
 def override_noise(noise: Noise, more: Noise) -> Noise:
@@ -1081,9 +1073,7 @@ def _read_instruments(given: object, stated: Noise | None, source: str, context:
 
 def _class_for(entry: Mapping[str, Any]) -> type[Instrument]:
     """The instrument that measures what the model of a file's entry needs."""
-    model = entry["model"]
-    if model in PAIR_MODELS:
+    if entry["model"] in PAIR_MODELS:
         return Sockets if "sockets" in entry else PairGauge if "pairs" in entry else Tracker
-    other: dict[str, type[Instrument]] = {"anchor": LengthGauge, "plane": Indicator}
-    other |= {"board": BoardCamera, "pixels": BoardCamera} | dict.fromkeys(POSE_MODELS, Tracker)
-    return other.get(model, PlainInstrument)
+    kinds: tuple[type[Instrument], ...] = (Tracker, LengthGauge, Indicator, BoardCamera)
+    return next((kind for kind in kinds if entry["model"] in _MODELS_OF[kind.__name__]), PlainInstrument)

@@ -16,13 +16,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fg_calib.arguments import checked
-from fg_calib.errors import InputError
-from fg_calib.io.atomic import fill_folder, read_text, write_text
+from fg_calib.io.atomic import fill_folder, write_text
 from fg_calib.io.columns import write_csv
 from fg_calib.io.robot_file import write_robot
 from fg_calib.io.units import Units
 from fg_calib.io.urdf import write_urdf
-from fg_calib.io.yaml import read_yaml
 from fg_calib.measurements.dataset import Measurements, Pairs
 from fg_calib.measurements.kinds import GENERIC_COLUMNS
 from fg_calib.measurements.table import Table
@@ -50,7 +48,7 @@ def write_simulation(folder: Path | str, simulation: Simulation) -> tuple[str, .
     place of that, and `truth.yaml`, where landmarks truly are.
 
     Args:
-        folder: Where to; files of these names are replaced where they are of another simulation.
+        folder: Where to; files of these names are replaced where they are of another simulation, others stay.
         simulation: What to write.
 
     Returns:
@@ -81,23 +79,8 @@ def write_simulation(folder: Path | str, simulation: Simulation) -> tuple[str, .
     names = sorted((*tables, *texts, *urdfs, *(f"{name}.yaml" for name in robots)))
     always = ("poses.csv", "robot_nominal.yaml", "robot_true.yaml", "robot_nominal.urdf", "robot_true.urdf")
     job = {"calibration.yaml": _FIRST_WORDS.encode()}
-    fill_folder(folder, write, job | dict.fromkeys((*always, *names, *_earlier_files(folder)), b"") | job)
+    fill_folder(folder, write, job | dict.fromkeys((*always, *names), b"") | job)
     return tuple(names)
-
-
-def _earlier_files(folder: Path) -> tuple[str, ...]:
-    """The tables of a simulation that is in a folder, by its job."""
-    job = folder / "calibration.yaml"
-    try:
-        if not job.is_file() or not read_text(job).startswith(_FIRST_WORDS):
-            return ()
-        tables = read_yaml(job).get("measurements")
-    except InputError:
-        return ()
-    entries = [entry for entry in tables if isinstance(entry, dict)] if isinstance(tables, list) else []
-    names = [entry.get(key) for entry in entries for key in ("table", "pairs")]
-    found = [name for name in names if isinstance(name, str) and Path(name).name == name and name.endswith(".csv")]
-    return (*found, "truth.yaml") if entries else ()
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------

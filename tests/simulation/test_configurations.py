@@ -13,7 +13,7 @@ from fg_calib.errors import InputError
 from fg_calib.robot.inverse import REACHED, random_readings
 from fg_calib.robot.model import Joint, RobotBuilder
 from fg_calib.simulation.obstacles import enters, link_points
-from fg_calib.simulation.scenario import BoardViews, Box, GivenReadings, Placement, RandomReadings, TargetViews
+from fg_calib.simulation.scenario import BoardViews, Box, GivenReadings, Placement, TargetViews
 from fg_calib.simulation.views import number_of
 
 LIMIT = 170.0
@@ -70,16 +70,6 @@ def distances(readings):
 # --- random, and of a table -------------------------------------------------------------------------------------------
 
 
-def test_random_candidates_are_within_the_limits_and_the_same_for_a_seed():
-    found = draw(ARM, RandomReadings(50), 3)
-    assert (len(found.readings), found.asked, found.rejected) == (50, 50, {})
-    assert draw(ARM, RandomReadings(50), 3).readings.tolist() == found.readings.tolist()
-    assert draw(ARM, RandomReadings(50), 4).readings.tolist() != found.readings.tolist()
-    assert len(draw(ARM, RandomReadings(50), n=7).readings) == 7
-    with pytest.raises(ValueError, match="read-only"):
-        found.readings[0] = 0.0
-
-
 def test_rows_of_a_table_outside_the_limits_are_rejected_and_the_order_kept():
     q = np.linspace(-2.0, 2.0, 5)[:, None] * np.ones(7) * np.deg2rad(LIMIT) / 1.5
     found = draw(ARM, GivenReadings(q))
@@ -93,7 +83,7 @@ def test_rows_of_a_table_outside_the_limits_are_rejected_and_the_order_kept():
 BOXES = [Box([-2.0, 0.2, -1.0], [2.0, 0.5, 2.0]), Box([0.3, -2.0, 0.1], [0.9, -0.4, 0.4])]
 
 
-@pytest.mark.parametrize("robot", [ARM, small_arm(), paper_robot(), planar_robot()], ids=lambda robot: robot.name)
+@pytest.mark.parametrize("robot", [ARM, small_arm()], ids=lambda robot: robot.name)
 def test_boxes_are_entered_where_points_along_the_links_are_inside(robot):
     """A thousand points along each line; a cut of a corner shorter than the steps may be missed: none of these is."""
     q = random_readings(robot, 60, np.random.default_rng(1))
@@ -205,29 +195,17 @@ def seen_by(views, robot, readings):
 @pytest.mark.parametrize(("robot", "far"), [(ARM, 3.2), (small_arm(), 4.2)], ids=["arm", "small-arm"])
 def test_the_tracker_sees_the_reflector(robot, far):
     """Within its range and the reflector's acceptance; an arm of four joints is not turned, but drawn until it is."""
-    views = replace(TARGET, distance=(2.0, far))
+    region = Box([-2.0, -0.6, -0.9], [1.0, 1.0, 1.0])
+    views = replace(TARGET, distance=(2.0, far), region=region)
     found = draw(robot, views)
-    away, off, _ = seen_by(views, robot, found.readings)
+    away, off, target = seen_by(views, robot, found.readings)
     assert len(found.readings) == 100
     assert away.min() >= 2.0 - REACHED
     assert away.max() <= far + REACHED
     assert off.max() <= 0.5 + 1e-8
     assert off.max() > 0.4  # to the edge of what it accepts
-    assert set(found.rejected) == {"out of range", "out of reach" if robot is ARM else "not seen"}
-    assert draw(robot, views).readings.tolist() == found.readings.tolist()
-
-
-@pytest.mark.parametrize(
-    ("robot", "region"),
-    [(ARM, Box([0.1, -0.4, 0.0], [0.8, 0.4, 0.9])), (small_arm(), Box([-1.6, -0.7, -0.8], [-0.2, 1.0, 0.8]))],
-    ids=["arm", "small-arm"],
-)
-def test_the_reflector_is_in_the_region(robot, region):
-    found = draw(robot, replace(TARGET, distance=(1.0, 9.0), region=region, count=30))
-    _, off, target = seen_by(TARGET, robot, found.readings)
-    assert len(target) == 30
     assert ((target >= region.lower - REACHED) & (target <= region.upper + REACHED)).all()
-    assert off.max() <= 0.5 + 1e-8
+    assert draw(robot, views).readings.tolist() == found.readings.tolist()
 
 
 # --- what cannot be ---------------------------------------------------------------------------------------------------

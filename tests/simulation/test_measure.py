@@ -13,15 +13,12 @@ from simulated import paper_robot
 from tolerances import rounding
 
 from fg_calib import InputError, calibrate, read_job, simulate, write_simulation
-from fg_calib.measurements.dataset import Noise
 from fg_calib.robot.rotations import rotation_angle
 from fg_calib.simulation.scenario import (
     BoardCamera,
     GivenReadings,
-    Indicator,
     LengthGauge,
     Placement,
-    Plane,
     RandomReadings,
     Spot,
     Tracker,
@@ -32,7 +29,7 @@ EVERY = pytest.mark.parametrize("which", INSTRUMENTS)
 
 @cache
 def exact(which, seed=0):
-    """A simulation without noise, which the calibration is told of all the same; and the true tool frames, 4x4."""
+    """A simulation without noise, of which the calibration is given some; and the true tool frames, 4x4."""
     it = INSTRUMENTS[which]
     more = {"pixels": 400, "camera in the room": 60, "faces": 12}.get(which, 40)
     s = simulate(scenario(replace(it, stated_noise=SIGMA), n=more, noise=EXACT, validation=RandomReadings(7)), seed)
@@ -84,7 +81,6 @@ def test_pairs_are_measured_between_configurations():
     assert pairs.angle == pytest.approx(rotation_angle(turn)[0], abs=rounding(100.0))
 
 
-@pytest.mark.sampled(1)
 @pytest.mark.parametrize("which", ["anchors", "offset", "contact"])
 def test_lengths_go_to_anchors_in_turn(which):
     s, T = exact(which)
@@ -111,7 +107,7 @@ def test_distances_are_across_planes(which):
     assert normals @ normals.T == pytest.approx(np.eye(3), abs=CLOSE)
 
 
-def test_a_camera_on_the_tool_sees_boards_before_it():
+def test_a_camera_on_the_tool_sees_boards_in_front_of_it():
     s, T = exact("board")
     m = s.tables[0].measurements
     wall = as_matrix(WALL["wall"])
@@ -192,7 +188,7 @@ def test_noise_has_its_sigma(which):
         assert np.abs(off.mean(axis=0)).max() < 5.0 * sigma / np.sqrt(len(off))
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("which", INSTRUMENTS)
 def test_every_instrument_calibrates_as_it_is_simulated(which):
     """At a chi-square and errors of the arm that noise explains, within 99.9 %."""
@@ -274,22 +270,13 @@ def test_an_instrument_may_have_configurations_of_its_own_and_shares_the_test_ro
     assert [s.n_configurations(test=test) for test in (False, True)] == [9, 3]
 
 
-def test_what_one_instrument_draws_leaves_the_others_alone():
-    wire, plane = LengthGauge(name="wire"), Indicator(name="plane")
-    alone, both = simulate(scenario(wire)), simulate(scenario(wire, plane))
-    assert alone.tables[0].measurements.length.tolist() == both.tables[0].measurements.length.tolist()
-    louder = simulate(scenario(replace(wire, noise=Noise(distance=2e-4)), plane))
-    assert louder.tables[1].measurements.length.tolist() == both.tables[1].measurements.length.tolist()
-    assert louder.tables[0].measurements.sigma_length[0] == 2e-4
-
-
-def test_a_point_of_one_name_is_one_and_all_are_told_the_same_of_it():
+def test_a_point_of_one_name_is_one_and_is_known_alike_in_all_tables():
     bolt = {"bolt": Spot([1.0, 0.5, 0.2], 1e-3)}
     s = simulate(scenario(LengthGauge(name="wire", anchors=bolt), LengthGauge(name="bar", anchors=bolt)), 2)
-    told = [table.known["bolt"] for table in s.tables]
-    assert told[0].xyz.tolist() == told[1].xyz.tolist()
-    assert told[0].tolerance == 1e-3
-    assert 0.0 < np.abs(told[0].xyz - bolt["bolt"].xyz).max() < 5e-3
+    known = [table.known["bolt"] for table in s.tables]
+    assert known[0].xyz.tolist() == known[1].xyz.tolist()
+    assert known[0].tolerance == 1e-3
+    assert 0.0 < np.abs(known[0].xyz - bolt["bolt"].xyz).max() < 5e-3
     assert calibrate(s.robot, s.tables).trustworthy
     other = {"bolt": Spot([1.0, 0.5, 0.3])}
     with pytest.raises(InputError) as caught:
@@ -301,23 +288,17 @@ def test_a_point_of_one_name_is_one_and_all_are_told_the_same_of_it():
 
 ARM, FEW = paper_robot(), RandomReadings(2)  # no slide, which would go anywhere
 CANNOT = [
-    (LengthGauge(name="it"), {"noise": Noise(1e-3, 1e-3)},
-     "scenario: instruments: it: noise: distance: found none, expected 1 sigma, for model anchor"),
     (LengthGauge(name="it"), {"noise": EXACT},
      "scenario: instruments: it: noise: distance: found 0, expected a number above 0; a calibration takes nothing "
      "for exact: specify what to assume under job: noise: distance"),
     (LengthGauge(name="it", anchors={"far": Spot([50.0, 0, 0])}, contact=True), {"robot": ARM, "configurations": FEW},
      "scenario: instruments: it: far not reached from 2 of 2 configurations, expected points within the joint limits"),
-    (Indicator(name="it", planes={"far": Plane([0, 0, 1], 50.0)}, contact=True), {"robot": ARM, "configurations": FEW},
-     "scenario: instruments: it: no plane is reached from any configuration, expected planes within reach"),
     (BoardCamera(model="board", name="it"), {},
      "scenario: instruments: it: boards: found none, expected boards by name, or configurations: {board: ...}"),
     (BoardCamera(model="pixels", name="it", camera=CAMERA, corners=GRID,
                  boards={"away": Placement(np.eye(3), np.array([0, 0, 900.0]))}), {},
      "scenario: instruments: it: sees no board at any of 60 configurations; configurations: {board: ...} have the "
      "camera look at one"),
-    (Tracker(model="position", name="it", stations=2), {"frame": "base"},
-     "scenario: instruments: it: stations: 2 with frame base, expected 1"),
 ]  # fmt: skip
 
 
