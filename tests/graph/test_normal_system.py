@@ -49,23 +49,27 @@ class Dense:
 STAR = [(0, i) for i in range(1, 20)]
 CHAIN = list(pairwise(range(20)))
 LOOPS = [tuple(pair) for pair in np.random.default_rng(1).integers(0, 20, (60, 2)).tolist() if pair[0] != pair[1]]
-THRESHOLDS = {
-    "rows": {},
-    "states": {},
-    "sparse": {"MAX_DENSE": 0, "MAX_FILL": 0},
-    "iterative": {"MAX_DENSE": 0, "MAX_FILL": 0, "MAX_LOOP_STATES": -1},
+SPARSE = {"MAX_DENSE": 0, "MAX_FILL": 0}
+WAYS = {
+    "dense rows": (STAR, {}, True),
+    "dense states": (LOOPS, {}, False),
+    "trees": (CHAIN, SPARSE, False),
+    "sparse states": (LOOPS, SPARSE | {"MAX_LOOP_STATES": -1}, False),
+    "sparse rows": (LOOPS[:25], SPARSE | {"MAX_LOOP_STATES": -1}, True),
 }
 
 
-@pytest.fixture(params=THRESHOLDS)
+@pytest.fixture(params=WAYS)
 def dense(request, monkeypatch):
     """Systems that each way of elimination is chosen for."""
-    for name, value in THRESHOLDS[request.param].items():
+    pairs, thresholds, of_rows = WAYS[request.param]
+    for name, value in thresholds.items():
         monkeypatch.setattr(error_states, name, value)
-    found = Dense({"rows": STAR, "states": LOOPS, "sparse": CHAIN, "iterative": LOOPS}[request.param])
+    found, solvers, splu = Dense(pairs), [], error_states.splu
+    monkeypatch.setattr(error_states, "splu", lambda *a, **k: solvers.append(splu(*a, **k)) or solvers[-1])
     states = SchurComplement(scipy.sparse.csr_array(found.L), WIDTH)
-    names = {"rows": "_DenseRows", "states": "_DenseStates", "sparse": "_SparseStates", "iterative": "_Iterative"}
-    assert type(states._factor).__name__ == names[request.param]
+    assert states._factor[0] == of_rows
+    assert bool(solvers) == bool(thresholds)
     return found
 
 
@@ -190,9 +194,8 @@ def test_degrees_of_freedom_count_rank_by_one_rule():
     assert determined(np.array([1.0, 1e-5]), floor=1e-6) == 2
 
 
-@pytest.mark.parametrize("limit", ["MAX_ITERATIONS", "MAX_ITERATIVE_STATES"])
-def test_too_many_errors_that_loops_couple_point_to_poses(limit, monkeypatch):
-    for name, value in THRESHOLDS["iterative"].items() | {(limit, 2)}:
+def test_too_many_errors_that_loops_couple_point_to_poses(monkeypatch):
+    for name, value in WAYS["sparse states"][1].items() | {("MAX_SPARSE", 2)}:
         monkeypatch.setattr(error_states, name, value)
     states = SchurComplement(scipy.sparse.csr_array(Dense(LOOPS).L), WIDTH)
     with pytest.raises(SolverError, match="use model pose with frame unknown"):
