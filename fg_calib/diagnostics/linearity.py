@@ -62,13 +62,12 @@ def check_linearity(solution: Solution, spread: Spread) -> Nonlinearity:
     root = spread.root[:, :rank]
     scaled = root / scales[:, None]
     in_sigma = (scaled / np.sum(scaled**2, axis=0)).T / scales  # the inverse of `root`, whose columns are orthogonal
-    here, variables = linear_system(problem, solution.parameters), problem.variables
-    values, shifts = variables.values(solution.parameters), list[Floats]()
+    here, shifts = linear_system(problem, solution.parameters), list[Floats]()
     try:
         while len(shifts) < N_DRAWS:
             core = root @ rng.choice([-1.0, 1.0], rank)
             step = np.concatenate([core, here.left.follow @ core])
-            there = [variables.parameters(variables.moved(values, d)) for d in (step, -step)]
+            there = [problem.variables.moved(solution.parameters, d) for d in (step, -step)]
             plus, minus = (linear_system(problem, x).step for x in there)
             shifts.append((0.5 * (plus + minus) - here.step)[:n])
             squares = np.mean((np.array(shifts) @ in_sigma.T) ** 2)

@@ -104,9 +104,7 @@ def _solve_from(
 
 def _moved(solution: Solution, step: Floats) -> Floats:
     """The parameter vector a step of the core from the estimate, landmarks as they are there."""
-    variables = solution.problem.variables
-    whole = np.concatenate([step, np.zeros(variables.n_nuisance)])
-    return variables.parameters(variables.moved(variables.values(solution.parameters), whole))
+    return solution.problem.variables.moved(solution.parameters, step)
 
 
 def _steps(solution: Solution) -> list[Floats]:
@@ -118,9 +116,7 @@ def _steps(solution: Solution) -> list[Floats]:
     s_nominal, V_nominal = directions(problem, nominal)
     ratio = np.linalg.norm((V.T @ V_nominal) / np.maximum(s, SIGNAL_FLOOR)[:, None], axis=0)
     ratio *= np.maximum(s_nominal, SIGNAL_FLOOR)  # 1 of what is linear, less the farther a square is from its vertex
-    moved = V_nominal.T @ (
-        variables.step(variables.values(nominal), variables.values(solution.parameters))[: len(scales)] / scales
-    )
+    moved = V_nominal.T @ (variables.step(nominal, solution.parameters)[: len(scales)] / scales)
     square = (ratio < SQUARE_SIGMA_RATIO) & (np.abs(moved) > SIGNAL_FLOOR)
     if square.any():
         steps.append(-2.0 * scales * (V_nominal[:, square] @ (moved[square] / (1.0 - ratio[square]))))
@@ -155,7 +151,7 @@ def _is_an_arm(other: Solution, best: Solution) -> bool:
 def _apart(a: Solution, b: Solution) -> bool:
     """Whether the robots of two solutions differ by more than the sigma at either, in some column."""
     variables, eye = a.problem.variables, np.eye(a.problem.variables.n_columns)
-    step = np.abs(variables.step(*(variables.values(one.parameters) for one in (a, b)))[: len(eye)])
+    step = np.abs(variables.step(a.parameters, b.parameters)[: len(eye)])
     variance = np.maximum(*(spread_of(one).variance(eye) for one in (a, b)))  # nan where nothing determines it
     return bool(np.any((step > SEPARATE_SIGMAS * np.sqrt(variance))[: variables.n_robot_columns]))
 

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import sha256
+from typing import Literal
 
 import numpy as np
 import scipy.linalg
@@ -172,9 +173,10 @@ def _sparse_solver(M: Sparse, order: Integers | None = None) -> Callable[[Floats
         order: Order of elimination; minimum degree if None.
     """
     M = (M + scipy.sparse.eye_array(M.shape[0])).tocsr()
-    by, place = ("MMD_AT_PLUS_A", slice(None)) if order is None else ("NATURAL", order)
+    place = slice(None) if order is None else order
     M = M if order is None else M[order][:, order]
     options = {"SymmetricMode": True, "Equil": False}
+    by: Literal["MMD_AT_PLUS_A", "NATURAL"] = "MMD_AT_PLUS_A" if order is None else "NATURAL"
     factor = splu(M.tocsc(), permc_spec=by, diag_pivot_thresh=0.0, options=options)
 
     def solve(b: Floats) -> Floats:

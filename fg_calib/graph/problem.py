@@ -550,10 +550,9 @@ def linear_system(problem: Problem, parameters: Floats, *, with_loss: bool = Fal
     rows, priors = square_root(problem, parameters, with_loss=with_loss), np.column_stack([J, r])
     if not (np.isfinite(rows).all() and np.isfinite(priors).all()):
         raise SolverError("a residual or derivative is not finite")
-    at = v.at(parameters)
 
     def gather() -> LinearRows:
-        return _linear_rows(problem, _with_loss(problem)[0] if with_loss else problem.rows, at)
+        return _linear_rows(problem, _with_loss(problem)[0] if with_loss else problem.rows, v.at(parameters))
 
     return NormalSystem(rows, v.n_columns, v.prior_scales, priors, gather)
 
@@ -569,11 +568,21 @@ def square_root(problem: Problem, parameters: Floats, *, with_loss: bool = False
     Returns:
         Shape (m, n_columns + n_nuisance + 1).
     """
-    v, at = problem.variables, problem.variables.at(parameters)
-    blocks, variance = _with_loss(problem) if with_loss else (problem.rows, 1.0)
-    others = [unknown_prior_rows(v, parameters), known_rows(problem, parameters), added_rows(problem, parameters)]
-    stacked = [np.column_stack([J, r]) for r, J in others]
-    return np.vstack([*stacked, *(block.triangle(at) / np.sqrt(variance) for block in blocks)])
+    v = problem.variables
+    others = [unknown_prior_rows(v, parameters)] if v.nuisance else []
+    if problem.known is not None:
+        others.append(problem.known.at_parameters(v, problem.data.unknowns, parameters))
+    if problem.added:
+        others.append(linearize_factors(problem.added, v, v.values(parameters)))
+    triangles = row_triangles(problem, parameters, with_loss=with_loss)
+    empty = np.zeros((0, v.n_columns + v.n_nuisance + 1))
+    return np.vstack([empty, *(np.column_stack([J, r]) for r, J in others), *triangles])
+
+
+def cost_at(problem: Problem, parameters: Floats) -> float:
+    """Half the sum of squares of all whitened rows and priors at a parameter vector."""
+    priors = prior_rows(problem.variables, parameters)[0]
+    return 0.5 * float(np.sum(square_root(problem, parameters)[:, -1] ** 2) + np.sum(priors**2))
 
 
 def named_rows(variables: Variables, parameters: Floats, J: Floats) -> Floats:
@@ -611,8 +620,9 @@ def whitened_triangle(problem: Problem, parameters: Floats, *, with_loss: bool =
 
 def row_triangles(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> list[Floats]:
     """A square root of [J r] of each block, shape (n_columns + n_nuisance + 1,) * 2 each."""
-    blocks, variance = _with_loss(problem) if with_loss else (problem.rows, 1.0)
-    return [block.triangle(problem.variables.at(parameters)) / np.sqrt(variance) for block in blocks]
+    at, (blocks, variance) = problem.variables.at(parameters), _with_loss(problem) if with_loss else (problem.rows, 1.0)
+    triangles = [block.triangle(at) for block in blocks]
+    return triangles if variance == 1.0 else [triangle / np.sqrt(variance) for triangle in triangles]
 
 
 def directions(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
@@ -692,20 +702,6 @@ def _with_loss(problem: Problem) -> tuple[tuple[WhitenedBlock, ...], float]:
     weights = tuple(w * share[d] for w, d in zip(state.weights, dims, strict=True))
     counted = replace(problem, state=replace(state, weights=weights))
     return _whitened(counted, noises_at(counted, problem.start, fitted=True)), variance
-
-
-def known_rows(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
-    """What earlier rows say, whitened, and its derivatives, shapes (n_known,), (n_known, n_columns + n_nuisance)."""
-    v = problem.variables
-    if problem.known is None:
-        return np.zeros(0), np.zeros((0, v.n_columns + v.n_nuisance))
-    return problem.known.at_parameters(v, problem.data.unknowns, parameters)
-
-
-def added_rows(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
-    """The added factors' whitened rows and derivatives, shapes (n_added,), (n_added, n_columns + n_nuisance)."""
-    v = problem.variables
-    return linearize_factors(problem.added, v, v.values(parameters))
 
 
 def correlation(problem: Problem, parameters: Floats) -> Floats | None:

@@ -33,6 +33,7 @@ from fg_calib.graph.factors import measurement_factors
 from fg_calib.graph.noise_models import NoiseState, RowNoise
 from fg_calib.graph.problem import (
     Problem,
+    cost_at,
     frames_only,
     joint_errors,
     linear_system,
@@ -219,7 +220,7 @@ def solve(problem: Problem, options: SolverOptions | None = None, *, start: NDAr
         if not problem.variables.keys:
             return _taken_as_it_is(problem, clock)
         run = _fit(_started_by_few(problem, options), options)
-        initial_cost = linear_system(problem, problem.start).cost
+        initial_cost = cost_at(problem, problem.start)
         return _solution(run, before, initial_cost, clock)
 
 
@@ -313,10 +314,10 @@ def _learn(problem: Problem, parameters: Floats, weighting: Weighting) -> tuple[
 
 
 class _Point:
-    """A problem linearised at some values.
+    """A problem linearised at a parameter vector.
 
     Attributes:
-        values: GTSAM's values.
+        parameters: The parameter vector.
         system: The normal system.
         cost: Half the sum of squared whitened residuals.
         decrement: How far the optimum still is, [sigma].
@@ -324,10 +325,10 @@ class _Point:
         at_rounding: Whether rounding of the cost is above the decrease that the step promises.
     """
 
-    def __init__(self, problem: Problem, values: gtsam.Values) -> None:
-        self.values = values
+    def __init__(self, problem: Problem, parameters: Floats) -> None:
+        self.parameters = parameters
         with _in_one_line(problem.variables):
-            self.system = linear_system(problem, problem.variables.parameters(values))
+            self.system = linear_system(problem, parameters)
         self.cost, self.decrement = self.system.cost, self.system.decrement
         largest, angle = float(self.system.singular_values.max(initial=0.0)), problem.robot.scale_of("rad")
         self.rounding = 10.0 * float(np.finfo(float).eps) / angle * largest
@@ -355,7 +356,7 @@ class _Descent:
         at, cost = problem.variables.at(problem.start), np.inf
         with np.errstate(over="ignore", invalid="ignore"):
             try:
-                self.here = _Point(problem, problem.variables.values(problem.start))
+                self.here = _Point(problem, problem.start)
                 cost = self.here.cost
             except SolverError:
                 cost = sum(rows.squared_norm(at) for rows in problem.rows)
@@ -367,7 +368,7 @@ class _Descent:
     @property
     def parameters(self) -> Floats:
         """The parameter vector where the descent has arrived."""
-        return self.problem.variables.parameters(self.here.values)
+        return self.here.parameters
 
     @property
     def least(self) -> float:
@@ -381,13 +382,11 @@ class _Descent:
 
     def parameters_after(self, step: Floats | None) -> Floats:
         """The parameter vector after a step, or where the descent has arrived."""
-        variables = self.problem.variables
-        return self.parameters if step is None else variables.parameters(variables.moved(self.here.values, step))
+        return self.parameters if step is None else self.problem.variables.moved(self.parameters, step)
 
     def go_on_with(self, problem: Problem, step: Floats | None) -> None:
         """Take other rows, after a step or at the same place."""
-        variables = problem.variables
-        there = _Point(problem, self.here.values if step is None else variables.moved(self.here.values, step))
+        there = _Point(problem, self.parameters_after(step))
         self.problem = problem
         if step is None:
             self.here = there
@@ -417,7 +416,7 @@ class _Descent:
 
     def _take(self, there: _Point, damping: float) -> None:
         variables = self.problem.variables
-        taken = variables.step(self.here.values, there.values)
+        taken = variables.step(self.parameters, there.parameters)
         length = float(np.linalg.norm(taken / variables.all_scales))
         self.history.append(Iteration(there.cost, damping, length, self.here.decrement))
         self.here = there
@@ -450,7 +449,7 @@ class _Descent:
         for _ in range(PATIENCE):
             last = there
             try:
-                there = _Point(self.problem, self.problem.variables.moved(last.values, last.system.step))
+                there = _Point(self.problem, self.problem.variables.moved(last.parameters, last.system.step))
             except SolverError:
                 return []  # so far off that the rows have no derivative there
             path.append(there)
@@ -467,28 +466,30 @@ class _Descent:
     def _damped(self) -> list[_Point]:
         """Where GTSAM's next damped step leads, undetermined directions held; nothing if none lowers the cost."""
         here, graph, variables = self.here, reduced_graph(self.problem), self.problem.variables
+        start, params = variables.values(here.parameters), levenberg_marquardt_params(self._damping)
         with _in_one_line(variables):
-            optimizer = gtsam.LevenbergMarquardtOptimizer(graph, here.values, levenberg_marquardt_params(self._damping))
+            optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, params)
             cost = optimizer.error()
             optimizer.iterate()
         if not optimizer.error() < cost or optimizer.lambda_() >= MOST_DAMPING:
             return []
         self._damping = max(optimizer.lambda_(), LEAST_DAMPING)
-        step = variables.step(here.values, optimizer.values())
-        held = variables.moved(here.values, here.system.without_null_space(step))
+        there = variables.parameters(optimizer.values())
+        held = variables.moved(here.parameters, here.system.without_null_space(variables.step(here.parameters, there)))
         with _in_one_line(variables):
-            lower = graph.error(held) < cost
-        return [_Point(self.problem, held if lower else gtsam.Values(optimizer.values()))]
+            lower = graph.error(variables.values(held)) < cost
+        return [_Point(self.problem, held if lower else there)]
 
 
 def _solution(run: _Descent, before: Floats, initial_cost: float, clock: float) -> Solution:
-    cost, problem = run.here.cost, run.problem
+    cost, problem, variables = run.here.cost, run.problem, run.problem.variables
+    parameters = variables.parameters(variables.values(run.parameters))  # angles of poses in their usual range
     if problem.state.weights is not None:
-        unweighted = relinearized_at(problem, run.parameters, replace(problem.state, weights=None))
-        cost = linear_system(unweighted, run.parameters).cost
+        unweighted = relinearized_at(problem, parameters, replace(problem.state, weights=None))
+        cost = cost_at(unweighted, parameters)
     return Solution(
         problem=problem,
-        parameters=run.parameters,
+        parameters=parameters,
         before=before,
         converged=run.converged,
         message=run.message,

@@ -239,36 +239,35 @@ class Variables(Brief):
                 parameters[of_v] = values.atVector(v.key)
         return parameters
 
-    def stepped(self, parameters: Floats, step: Floats) -> Floats:
-        """The parameter vector after a tangent step of the core, shape (n_columns,)."""
+    def moved(self, parameters: Floats, step: Floats) -> Floats:
+        """The parameter vector after a tangent step of the core, or of all variables; angles of poses stay near."""
         after = parameters.copy()
-        for v in self.items:
+        for v in self.items + self.nuisance:
             of_v, part = v.places, step[v.columns]
-            if not v.is_pose:
-                after[of_v] += part
-            elif part.any():
+            if not part.any():
+                continue  # a step of the core alone moves no landmark
+            if v.is_pose:
                 after[of_v] = frame_of(pose_of(parameters[of_v]).retract(part), parameters[of_v])
+            elif v.kind == "own":
+                start = only_key(self.own, v.key)
+                value = _retracted(_retracted(start, v.key, parameters[of_v]), v.key, part)
+                after[of_v] = local_coordinates(start, value, v.key)
+            else:
+                after[of_v] += part
         return after
 
-    def step(self, start: gtsam.Values, end: gtsam.Values) -> Floats:
-        """The tangent step from some values to others, shape (n_columns + n_nuisance,)."""
-        return np.concatenate(
-            [
-                local_coordinates(start, end, v.key)
-                if v.kind == "own"
-                else gtsam.Pose3.Logmap(start.atPose3(v.key).between(end.atPose3(v.key)))
-                if v.is_pose
-                else end.atVector(v.key) - start.atVector(v.key)
-                for v in self.items + self.nuisance
-            ]
-        )
-
-    def moved(self, values: gtsam.Values, step: Floats) -> gtsam.Values:
-        """Some values after a tangent step, shape (n_columns + n_nuisance,)."""
-        delta = gtsam.VectorValues()
+    def step(self, start: Floats, end: Floats) -> Floats:
+        """The tangent step from a parameter vector to another, shape (n_columns + n_nuisance,)."""
+        out = np.zeros(self.n_columns + self.n_nuisance)
         for v in self.items + self.nuisance:
-            delta.insert(v.key, step[v.columns])
-        return values.retract(delta)
+            if v.is_pose:
+                out[v.columns] = gtsam.Pose3.Logmap(pose_of(start[v.places]).between(pose_of(end[v.places])))
+            elif v.kind == "own":
+                from_v, to_v = (_retracted(only_key(self.own, v.key), v.key, p[v.places]) for p in (start, end))
+                out[v.columns] = local_coordinates(from_v, to_v, v.key)
+            else:
+                out[v.columns] = end[v.places] - start[v.places]
+        return out
 
     def with_unknowns(self, unknowns: Landmarks, estimated: NDArray[np.bool_]) -> Variables:
         """The same with the measurements' unknowns as nuisance variables, those that are estimated."""
@@ -434,6 +433,13 @@ def only_key(values: gtsam.Values, key: int) -> gtsam.Values:
     return one
 
 
+def _retracted(values: gtsam.Values, key: int, step: Floats) -> gtsam.Values:
+    """The value of the only key after a tangent step."""
+    delta = gtsam.VectorValues()
+    delta.insert(key, step)
+    return values.retract(delta)
+
+
 def local_coordinates(start: gtsam.Values, end: gtsam.Values, key: int) -> Floats:
     """The tangent step from a variable's value to another, whatever its type."""
     step: Floats = only_key(start, key).localCoordinates(only_key(end, key)).at(key)
@@ -515,20 +521,21 @@ def prior_rows(variables: Variables, parameters: Floats, only: Variable | None =
         parameters: The parameter vector.
         only: The variable whose priors are wanted; all if None.
     """
-    nominal = variables.nominal()
     items = variables.items if only is None else (only,)
     n = sum(len(variables.stated[v.symbol][0]) for v in items)
-    r, J, first = np.zeros(n), np.zeros((n, variables.n_columns)), 0
+    nominal, r, J, first = variables.nominal(), np.zeros(n), np.zeros((n, variables.n_columns)), 0
     for v in items:
         stated, weight = variables.stated[v.symbol]
         if not stated:
             continue
-        of_v, rows = v.places, slice(first, first + len(stated))
+        of_v, rows, columns = v.places, slice(first, first + len(stated)), v.columns
+        first = rows.stop
         if v.is_pose:
             off, D = _off_nominal(parameters[of_v], nominal[of_v])
+            r[rows], J[rows, columns] = weight * off[stated], weight[:, None] * D[stated]
         else:
-            off, D = parameters[of_v] - nominal[of_v], np.eye(len(of_v))
-        r[rows], J[rows, v.columns], first = weight * off[stated], weight[:, None] * D[stated], rows.stop
+            r[rows] = weight * (parameters[of_v] - nominal[of_v])[stated]
+            J[np.arange(rows.start, first), columns.start + np.array(stated)] = weight
     return r, J
 
 

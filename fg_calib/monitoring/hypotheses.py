@@ -333,7 +333,7 @@ def _place_changed(hypothesis: ChangeHypothesis, change: Floats, calibrated: Cal
         v = build_variables(robot.with_estimated(names), [False], False)
         step = np.zeros(v.n_columns)
         step[next(i for i in v.items if i.kind == POSES[hypothesis.names[0]]).columns] = change
-        values = v.stepped(np.append(values, np.zeros(6)), step)[: len(values)]
+        values = v.moved(np.append(values, np.zeros(6)), step)[: len(values)]
     else:
         for name, amount in zip(hypothesis.names, change, strict=True):
             if name in zeros:

@@ -98,7 +98,7 @@ class TangentCovariance(FrozenArrays):
         robot = v.robot.with_values(self.parameters[v.robot_span])
 
         def at(step: Floats) -> Floats:
-            moved = robot.with_values(v.stepped(self.parameters, step)[v.robot_span])
+            moved = robot.with_values(v.moved(self.parameters, step)[v.robot_span])
             return np.ravel(np.asarray(function(moved), dtype=np.float64))
 
         columns = [(at(h) - at(-h)) / (2.0 * h.sum()) for h in steps[: v.n_robot_columns]]

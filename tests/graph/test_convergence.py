@@ -122,7 +122,7 @@ def test_solving_again_from_the_answer_moves_nothing(name, gauge, draws):
         assert again.converged, again.message
         spread, scales = spread_of(solution), solution.problem.variables.prior_scales
         variables = solution.problem.variables
-        step = variables.step(solution.values, again.values)[: variables.n_columns]
+        step = variables.step(solution.parameters, again.parameters)[: variables.n_columns]
         variance, direction = np.linalg.eigh(spread.tangent / np.outer(scales, scales))
         known = variance > 1e-12 * variance.max()  # of the others nothing is known
         assert np.linalg.norm((direction.T @ (step / scales))[known] / np.sqrt(variance[known])) < 1e-6

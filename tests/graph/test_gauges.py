@@ -174,7 +174,7 @@ def test_the_derivative_behind_predictions_is_that_in_the_columns():
     v = found.variables
 
     def at(step):
-        return tool_pose(v.robot.with_values(v.stepped(found.parameters, step)[v.robot_span]), q)[:3, 3]
+        return tool_pose(v.robot.with_values(v.moved(found.parameters, step)[v.robot_span]), q)[:3, 3]
 
     J = found.derivative(lambda r: tool_pose(r, q)[:3, 3])
     for k in range(v.n_columns):

@@ -183,7 +183,7 @@ def test_rows_whitened_at_the_optimum_leave_nothing_to_go(problem, n_sigma):
     expected = solve(problem)
     system = linear_system(problem, expected.parameters)
     off = n_sigma * system.root @ np.ones(system.rank) / np.sqrt(system.rank)
-    found = solve(problem, start=problem.variables.stepped(expected.parameters, off))
+    found = solve(problem, start=problem.variables.moved(expected.parameters, off))
     assert found.converged
     assert linear_system(relinearized_at(found.problem, found.parameters), found.parameters).decrement < 3e-7
 

@@ -585,7 +585,7 @@ def test_test_rows_have_no_say_in_the_fit(model, apart):
     alone, beside = (build_problem(robot, tables) for tables in (Table(train, model), together))
     fitted, beside = solve(alone), solve(beside)
     sigma = np.sqrt(np.diag(assess(fitted).spread.tangent))
-    step = fitted.problem.variables.step(fitted.values, beside.values) / sigma
+    step = fitted.problem.variables.step(fitted.parameters, beside.parameters) / sigma
     assert np.abs(step).max() < 1e-6
 
 

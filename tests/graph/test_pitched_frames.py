@@ -164,10 +164,10 @@ def test_priors_of_a_pose_act_about_its_own_axes(frame):
 def test_derivatives_of_priors_are_those_along_the_retraction(frame):
     variables = build_variables(pitched(frame, 90.0), [False])
     rng = np.random.default_rng(1)
-    away = variables.stepped(variables.nominal(), 0.5 * rng.normal(size=variables.n_columns))
+    away = variables.moved(variables.nominal(), 0.5 * rng.normal(size=variables.n_columns))
 
     def residual(step):
-        return prior_rows(variables, variables.stepped(away, step))[0]
+        return prior_rows(variables, variables.moved(away, step))[0]
 
     numeric = central_differences(residual, np.zeros(variables.n_columns))
     assert prior_rows(variables, away)[1] == pytest.approx(numeric, abs=1e-6 * np.abs(numeric).max())

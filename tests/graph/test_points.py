@@ -95,12 +95,11 @@ def test_derivatives_are_central_differences_up_to_a_turn_of_the_residuals():
     variables = problem.variables
     rng = np.random.default_rng(2)
     n = variables.n_columns + variables.n_nuisance
-    values = variables.moved(problem.initial, 1e-2 * rng.normal(size=n))
-    parameters = variables.parameters(values)
+    parameters = variables.moved(problem.start, 1e-2 * rng.normal(size=n))
     for rows, on_core in zip(problem.rows, (True, False), strict=True):
 
         def residual(step, rows=rows):
-            at = variables.at(variables.parameters(variables.moved(values, step)))
+            at = variables.at(variables.moved(parameters, step))
             return rows.linearise(at.without_columns())[0]
 
         r, J = rows.linearise(variables.at(parameters))

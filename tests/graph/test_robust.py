@@ -124,7 +124,7 @@ def test_the_optimum_is_that_of_gtsams_robust_noise_on_factors_of_one_measuremen
     parameters.setAbsoluteErrorTol(0.0)
     parameters.setMaxIterations(200)
     found = gtsam.LevenbergMarquardtOptimizer(graph, solution.values, parameters).optimize()
-    away = variables.step(solution.values, found) / variables.scales
+    away = variables.step(solution.parameters, variables.parameters(found)) / variables.scales
     sigma = np.sqrt(np.diag(assess(solution).spread.tangent)) / variables.scales
     assert np.max(np.abs(away) / sigma) < 1e-4
     assert graph.error(found) == pytest.approx(graph.error(solution.values), rel=rounding(1, 100))

@@ -83,7 +83,7 @@ def test_columns_of_candidates_are_differences_of_their_residuals():
     step = 1e-6 * np.random.default_rng(1).normal(size=v.n_columns + v.n_nuisance)
 
     def residuals(sign):
-        return linearised(replace(problem, start=v.stepped(problem.start, sign * step[: v.n_columns])))[2]
+        return linearised(replace(problem, start=v.moved(problem.start, sign * step[: v.n_columns])))[2]
 
     assert found.columns @ step == pytest.approx(0.5 * (residuals(1.0) - residuals(-1.0)), rel=1e-5, abs=1e-9)
     assert [int(np.sum(of == k)) for k in range(5)] == [6] * 5
